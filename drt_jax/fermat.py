@@ -1,0 +1,270 @@
+"""The Fermat system of a bundle of rays: optical path, its gradient and its Hessian.
+
+A ray is labelled by its object point and the point w_s where it crosses the stop s; unknown
+are its hits on the S - 1 other surfaces and on the sensor, the equations dOP/dw_i = 0 on
+all S surfaces (paper Eqs. 2 and 3). dF_i/dw_j is zero for |i - j| > 1, so the Newton step
+and its transpose cost O(S) a ray.
+
+Arrays here are laid out (component, surface, wavelength, ray): rays last, so that every
+operation is one long elementwise loop. There are D = 1 components for rays in the meridional
+plane (y), D = 2 in general (x, y). Surface S is the sensor.
+"""
+
+import enum
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from . import surface
+from .numerics import safe_divide
+
+__all__ = ["Blocks", "Geometry", "Status", "System", "geometry", "hessian", "optical_path",
+           "residual", "solve", "solve_transposed", "status"]  # fmt: skip
+
+
+class Status(enum.IntEnum):
+    """What became of a ray; the first failure along it wins."""
+
+    OK = 0
+    MISSED = 1  # no forward intersection with a surface
+    TIR = 2  # total internal reflection
+    CLIPPED = 3  # outside a clear aperture
+    UNCONVERGED = 4  # the iteration found no stationary path
+
+
+class System(NamedTuple):
+    """Everything that the path of a ray depends on; the differentiable arguments.
+
+    vertex, curvature, conic (S + 1,) and coefficients (K, S + 1) of the surfaces and the
+    sensor; index (S + 1, W); source (D + 1,), the object point divided by its distance, so
+    that its last component is -1; vergence (), 1/distance in 1/mm, 0 for infinity; stop
+    (D, Q), the points where the rays cross the stop, mm.
+    """
+
+    vertex: Array
+    curvature: Array
+    conic: Array
+    coefficients: Array
+    index: Array
+    source: Array
+    vergence: Array
+    stop: Array
+
+    @property
+    def shape(self) -> tuple[Array, Array, Array]:
+        """Curvature, conic and coefficients, broadcast against (surface, wavelength, ray)."""
+        return (
+            self.curvature[:, None, None],
+            self.conic[:, None, None],
+            self.coefficients[..., None, None],
+        )
+
+
+class Geometry(NamedTuple):
+    """A path drawn out: what its gradient, its Hessian and its status are made of.
+
+    direction (D + 1, S + 1, W, Q): unit vectors of the segments before each surface.
+    inverse_length (S + 1, W, Q): their inverse lengths (the first: vergence over |q|).
+    slope (D, S + 1, W, Q) and bend (D, D, S + 1, W, Q): derivatives of the sag.
+    advance (S, W, Q): z of each surface's hit after that of the one before it.
+    """
+
+    direction: Array
+    inverse_length: Array
+    slope: Array
+    bend: Array
+    advance: Array
+
+
+class Blocks(NamedTuple):
+    """The Jacobian dF/dw: diagonal (D, D, S, W, Q) holds dF_i/dw_i, upper (D, D, S, W, Q)
+    dF_i/dw_{i+1}; dF_{i+1}/dw_i is the transpose of the latter, because F is a gradient."""
+
+    diagonal: Array
+    upper: Array
+
+
+def _points(hits: Array, system: System) -> tuple[Array, Array, Array]:
+    z, slope, bend = surface.sag_derivatives(hits, *system.shape)
+    return jnp.concatenate([hits, (system.vertex[:, None, None] + z)[None]]), slope, bend
+
+
+def geometry(hits: Array, system: System) -> Geometry:
+    """Directions, lengths and sag derivatives of the paths through `hits` (D, S + 1, W, Q).
+
+    The first segment comes from P_0 = source / vergence. It is scaled by the vergence,
+    q = vergence P_1 - source, which has the same direction and stays finite and smooth when
+    the object goes to infinity.
+    """
+    points, slope, bend = _points(hits, system)
+    first = system.vergence * points[:, :1] - system.source[:, None, None, None]
+    step = points[:, 1:] - points[:, :-1]
+    segment = jnp.concatenate([first, step], axis=1)
+    inverse = safe_divide(jnp.ones_like(segment[0]), jnp.sqrt(jnp.sum(segment**2, axis=0)))
+    direction = segment * inverse
+    scale = jnp.concatenate(
+        [inverse[:1] * system.vergence, inverse[1:]], axis=0
+    )
+    return Geometry(direction, scale, slope, bend, step[-1])
+
+
+def optical_path(hits: Array, system: System) -> Array:
+    """Optical path (W, Q) in mm from the object to the sensor (paper Eq. 2).
+
+    Counted from the sphere round the object that passes through the first vertex (a plane
+    for an object at infinity), so that it stays finite for any distance.
+    """
+    points, _, _ = _points(hits, system)
+    v, p, q = system.vergence, system.source[:, None, None], points[:, 0]
+    near = v * q - p
+    # (|q - p/v| - |p/v|) without the cancellation, and without dividing by v
+    first = (v * jnp.sum(q * q, axis=0) - 2 * jnp.sum(q * p, axis=0)) / (
+        jnp.sqrt(jnp.sum(near**2, axis=0)) + jnp.sqrt(jnp.sum(p**2, axis=0))
+    )
+    step = jnp.sqrt(jnp.sum((points[:, 1:] - points[:, :-1]) ** 2, axis=0))
+    lengths = jnp.concatenate([first[None], step])
+    return jnp.sum(system.index[:, :, None] * lengths, axis=0)
+
+
+def residual(hits: Array, system: System) -> Array:
+    """F = dOP/dw on every surface, dimensionless, shape (D, S, W, Q) (paper Eq. 3)."""
+    return _residual(geometry(hits, system), system)
+
+
+def _residual(path: Geometry, system: System) -> Array:
+    ray = system.index[:, :, None] * path.direction
+    change = ray[:, :-1] - ray[:, 1:]
+    return change[:-1] + path.slope[:, :-1] * change[-1]
+
+
+def hessian(path: Geometry, system: System) -> Blocks:
+    """The blocks of dF/dw in closed form from the drawn-out path."""
+    dim = path.slope.shape[0]
+    direction, slope = path.direction, path.slope
+    index = system.index[:, :, None]
+    weight = index * path.inverse_length
+    # t.T_e for the tangents T_e = unit_e + slope_e z of the surface behind a segment ...
+    end = direction[:-1] + slope * direction[-1]
+    # ... and of the one before it.
+    start = direction[:-1, 1:] + slope[:, :-1] * direction[-1, 1:]
+    bend = index[:-1] * direction[-1, :-1] - index[1:] * direction[-1, 1:]
+    diagonal, upper = [], []
+    for e in range(dim):
+        for f in range(dim):
+            same = float(e == f)
+            metric = same + slope[e, :-1] * slope[f, :-1]
+            diagonal.append(
+                weight[:-1] * (metric - end[e, :-1] * end[f, :-1])
+                + weight[1:] * (metric - start[e] * start[f])
+                + bend * path.bend[e, f, :-1]
+            )
+            upper.append(
+                -weight[1:] * (same + slope[e, :-1] * slope[f, 1:] - start[e] * end[f, 1:])
+            )
+    shape = (dim, dim, *diagonal[0].shape)
+    return Blocks(jnp.stack(diagonal).reshape(shape), jnp.stack(upper).reshape(shape))
+
+
+def _matvec(a: Array, x: Array) -> Array:
+    return jnp.sum(a * x[None], axis=1)
+
+
+def _transpose(a: Array) -> Array:
+    return jnp.swapaxes(a, 0, 1)
+
+
+def _inverse(a: Array) -> Array:
+    if a.shape[0] == 1:
+        return safe_divide(jnp.ones_like(a), a)
+    determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    adjugate = jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
+    return safe_divide(adjugate, determinant)
+
+
+def _solve_front(blocks: Blocks, rhs: list[Array]) -> list[Array]:
+    """Surfaces before the stop: block tridiagonal and symmetric; elimination, substitution."""
+    inverses, reduced = [], []
+    for i, b in enumerate(rhs):
+        pivot = blocks.diagonal[:, :, i]
+        if i:
+            upper = blocks.upper[:, :, i - 1]
+            carry = jnp.sum(inverses[-1][:, :, None] * upper[None], axis=1)
+            pivot = pivot - jnp.sum(upper[:, :, None] * carry[:, None], axis=0)
+            b = b - _matvec(_transpose(carry), reduced[-1])
+        inverses.append(_inverse(pivot))
+        reduced.append(b)
+    solution: list[Array] = []
+    for i in reversed(range(len(rhs))):
+        b = reduced[i]
+        if solution:
+            b = b - _matvec(blocks.upper[:, :, i], solution[0])
+        solution.insert(0, _matvec(inverses[i], b))
+    return solution
+
+
+def solve(blocks: Blocks, rhs: Array, stop: int) -> Array:
+    """x with (dF/dw) x = rhs (D, S, W, Q) and x = 0 on the stop; x is (D, S + 1, W, Q)."""
+    surfaces = rhs.shape[1]
+    x = _solve_front(blocks, [rhs[:, i] for i in range(stop)])
+    x.append(jnp.zeros_like(rhs[:, 0]))
+    for i in range(stop, surfaces):
+        b = rhs[:, i] - _matvec(blocks.diagonal[:, :, i], x[i])
+        if i:
+            b = b - _matvec(_transpose(blocks.upper[:, :, i - 1]), x[i - 1])
+        x.append(_matvec(_inverse(blocks.upper[:, :, i]), b))
+    return jnp.stack(x, axis=1)
+
+
+def solve_transposed(blocks: Blocks, rhs: Array, stop: int) -> Array:
+    """y (D, S, W, Q) with (dF/dw)^T y = rhs (D, S + 1, W, Q), the stop's column left out."""
+    surfaces = rhs.shape[1] - 1
+    behind: list[Array] = []  # y on surfaces stop .. S - 1
+    for j in range(surfaces, stop, -1):
+        c = rhs[:, j]
+        if len(behind) > 0:
+            c = c - _matvec(blocks.diagonal[:, :, j], behind[0])
+        if len(behind) > 1:
+            c = c - _matvec(blocks.upper[:, :, j], behind[1])
+        behind.insert(0, _matvec(_inverse(_transpose(blocks.upper[:, :, j - 1])), c))
+    front = [rhs[:, j] for j in range(stop)]
+    if stop:
+        front[-1] = front[-1] - _matvec(blocks.upper[:, :, stop - 1], behind[0])
+    return jnp.stack(_solve_front(blocks, front) + behind, axis=1)
+
+
+def status(hits: Array, system: System) -> Array:
+    """Status (W, Q), int32, of paths that an iteration ended with; clear apertures apart.
+
+    A path is accepted when every component of F is within 64 times what rounding the hits
+    to the last digit changes: for a camera in float64 some 1e-14 radians.
+    """
+    path = geometry(hits, system)
+    index = system.index[:, :, None]
+    exists = surface.domain(hits, *system.shape[:2])[:-1]
+    normal = safe_divide(
+        jnp.ones_like(path.slope[0]), jnp.sqrt(1 + jnp.sum(path.slope**2, axis=0))
+    )[:-1]
+
+    def along(direction):  # cosine of the angle with the surface normal
+        return (direction[-1] - jnp.sum(path.slope[:, :-1] * direction[:-1], axis=0)) * normal
+
+    arriving = along(path.direction[:, :-1])
+    leaving = along(path.direction[:, 1:])
+    sine = jnp.sqrt(jnp.maximum(1 - arriving**2, 0)) * index[:-1]
+    missed = ~exists | (arriving <= 0) | (path.advance <= 0)
+    reflected = sine > index[1:]
+    code = jnp.where(
+        missed, Status.MISSED, jnp.where(reflected, Status.TIR, Status.OK)
+    ).astype(jnp.int32)
+    first = jnp.take_along_axis(code, jnp.argmax(code != 0, axis=0)[None], axis=0)[0]
+
+    eps = jnp.finfo(hits.dtype).eps
+    size = jnp.max(jnp.abs(hits), axis=0)
+    reach = jnp.maximum(size[:-1], size[1:])
+    shake = index[:-1] * (1 + jnp.abs(path.inverse_length[:-1]) * reach)
+    shake = shake + index[1:] * (1 + jnp.abs(path.inverse_length[1:]) * reach)
+    error = jnp.abs(_residual(path, system)) * normal
+    settled = jnp.all(error <= 64 * eps * shake, axis=(0, 1)) & jnp.all(leaving > 0, axis=0)
+    unsettled = jnp.where(settled, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
+    return jnp.where(first != 0, first, unsettled)

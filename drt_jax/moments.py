@@ -1,0 +1,358 @@
+"""Centroid and covariance of the rays on the sensor, and what need not be traced again.
+
+The paper computes both from 256 random rays for each sensor position. Here the pupil
+integral is a Gauss rule whose order follows from the tolerance, on the part of the pupil
+that symmetry leaves; where only the sensor moves the rays behind the lens are traced once,
+because the moments are then exact polynomials in the sensor position; where the object
+distance varies too, those polynomials are interpolated in 1/distance.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from . import pupil, surface
+from .fermat import Status
+from .lens import Lens
+from .numerics import safe_divide
+from .trace import as_field, trace_bundle
+
+__all__ = ["DepthMoments", "FocusMoments", "depth_moments", "focus_moments", "moments_model",
+           "psf_moments", "pupil_order"]  # fmt: skip
+
+_MAX_ORDER = 40
+_MAX_NODES = 64
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class FocusMoments:
+    """Moments of W colours as polynomials in the sensor position: no ray is traced again.
+
+    With d = sensor - reference (mm): centroid = mean + d slope, covariance = spread[0] +
+    d spread[1] + d^2 spread[2]. mean, slope (W, 2); spread (3, W, C) with C = 2 for the
+    variances (xx, yy) when symmetry makes the axes principal, else C = 3 (xx, yy, xy);
+    passed (W,), the fraction of the light that reaches the sensor.
+    """
+
+    reference: Array
+    mean: Array
+    slope: Array
+    spread: Array
+    passed: Array
+
+    def at(self, sensor: ArrayLike) -> tuple[Array, Array]:
+        """Centroid (W, 2) in mm and covariance in mm^2 with the sensor at `sensor` mm.
+
+        The covariance is (W, 2), its diagonal, when the axes are principal by symmetry;
+        else (W, 2, 2).
+        """
+        d = jnp.asarray(sensor, self.reference.dtype) - self.reference
+        spread = self.spread[0] + d * (self.spread[1] + d * self.spread[2])
+        mean = self.mean + d * self.slope
+        return mean, spread if spread.shape[-1] == 2 else _matrix(spread)
+
+
+def _matrix(spread: Array) -> Array:
+    """(W, 2, 2) from the components (xx, yy) or (xx, yy, xy) in the last axis."""
+    xx, yy = spread[..., 0], spread[..., 1]
+    xy = spread[..., 2] if spread.shape[-1] == 3 else jnp.zeros_like(xx)
+    return jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
+
+
+def _concrete(*values: object) -> bool:
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def _symmetry(field: ArrayLike) -> str:
+    """How much of the pupil must be traced, from what is known of the field while tracing.
+
+    A field known to be 0 needs one radius. A single angle lies along y, so half a pupil
+    does. A field whose value is not known and that may lie anywhere needs the whole.
+    """
+    if jnp.ndim(field) == 0:
+        return "meridian" if _concrete(field) and float(field) == 0 else "half"
+    if not _concrete(field) or np.asarray(field)[0] != 0:
+        return "disc"
+    return "meridian" if np.asarray(field)[1] == 0 else "half"
+
+
+def _rule(symmetry: str, order: int) -> tuple[np.ndarray, np.ndarray]:
+    if symmetry == "meridian":
+        return pupil.meridian(order)
+    # An aberration of degree p in the pupil reaches azimuthal order p: as many azimuths on
+    # the half disc as there are radial nodes integrate its square to the same degree.
+    return (pupil.half_disc if symmetry == "half" else pupil.disc)(order, order + 1)
+
+
+def focus_moments(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+    order: int | None = None,
+) -> FocusMoments:
+    """Moments of the rays as functions of the sensor position, about `lens.sensor`.
+
+    Arguments as in `psf_moments`. Differentiable in all lens parameters; rays that fail or
+    are clipped have weight 0, and the rest is normalised. Paper section 4.3.
+    """
+    symmetry = _symmetry(field)
+    if order is None:
+        if _concrete(lens, field, distance, wavelengths):
+            return _converge(lens, field, distance, wavelengths, tolerance)[1]
+        order = pupil_order(lens, field, distance, wavelengths, tolerance)
+    return _plane_moments(lens, field, distance, wavelengths, *_rule(symmetry, order), symmetry)
+
+
+def _plane_moments(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    points: ArrayLike,
+    weights: ArrayLike,
+    symmetry: str,
+) -> FocusMoments:
+    dtype = lens.curvature.dtype
+    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
+    angles = jnp.zeros(1, dtype) if symmetry == "meridian" else as_field(field, dtype)
+    hits, status, _ = trace_bundle(lens, angles, distance, wavelengths, points)
+    last = surface.sag(
+        hits[:, -2], lens.curvature[-1], lens.conic[-1], lens.coefficients[-1]
+    )
+    slope = (hits[:, -1] - hits[:, -2]) / (lens.sensor - lens.vertices[-1] - last)
+    good = status == Status.OK
+    weight = jnp.where(good, jnp.asarray(weights, dtype), 0)
+    passed = jnp.sum(weight, axis=-1)
+    weight = safe_divide(weight, passed[:, None])
+
+    def average(values):
+        return jnp.sum(weight * values, axis=-1)
+
+    x, u = jnp.where(good, hits[:, -1], 0), jnp.where(good, slope, 0)
+    if symmetry == "meridian":
+        # y = rho(r) on one radius; over the full circle <xx> = <yy> = <rho^2> / 2.
+        zero = jnp.zeros((wavelengths.shape[0], 2), dtype)
+        spread = jnp.stack([average(x[0] * x[0]), 2 * average(x[0] * u[0]), average(u[0] * u[0])])
+        spread = jnp.broadcast_to(spread[..., None] / 2, (*spread.shape, 2))
+        return FocusMoments(lens.sensor, zero, zero, spread, passed)
+    mean, tilt = average(x), average(u)
+    if symmetry == "half":
+        # The other half is the mirror image: x averages to 0, and so does x y.
+        mean, tilt = mean.at[0].set(0), tilt.at[0].set(0)
+    x, u = x - mean[..., None], u - tilt[..., None]
+    pairs = ((0, 0), (1, 1)) if symmetry == "half" else ((0, 0), (1, 1), (0, 1))
+    spread = jnp.stack(
+        [
+            jnp.stack([average(x[i] * x[j]) for i, j in pairs], -1),
+            jnp.stack([average(x[i] * u[j] + u[i] * x[j]) for i, j in pairs], -1),
+            jnp.stack([average(u[i] * u[j]) for i, j in pairs], -1),
+        ]
+    )
+    return FocusMoments(lens.sensor, mean.T, tilt.T, spread, passed)
+
+
+def psf_moments(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+    order: int | None = None,
+) -> tuple[Array, Array]:
+    """Centroid (W, 2) in mm and covariance (W, 2, 2) in mm^2 of the rays on the sensor.
+
+    `field`: angle along y, or (x, y), in radians. `distance`: mm from the object plane to
+    the first vertex, inf allowed. `wavelengths` (W,) in um. `tolerance`: relative error of
+    the RMS spot size; the number of rays follows from it (see `pupil_order`) unless `order`
+    is given. Rays fill the stop uniformly. Known zero field: meridional rays only; field
+    along y: half the pupil. Paper section 4.3.
+    """
+    mean, covariance = focus_moments(lens, field, distance, wavelengths, tolerance, order).at(
+        lens.sensor
+    )
+    return mean, covariance if covariance.ndim == 3 else _matrix(covariance)
+
+
+def _blind_order(symmetry: str, tolerance: float) -> int:
+    """Order for a scene whose numbers are not known, inside a trace.
+
+    The error falls by two to three digits with each node on axis and by one off axis for
+    the bundled lenses out to 10 degrees; two nodes are in hand.
+    """
+    digits = -np.log10(tolerance)
+    return int(np.ceil(digits / 2 if symmetry == "meridian" else digits)) + 2
+
+
+def pupil_order(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+) -> int:
+    """Gauss order of the pupil that keeps the RMS spot size within `tolerance` (relative).
+
+    Orders n and n + 1 are compared on the scene itself; half their difference in the
+    covariance, relative to its trace, is the error of n. Inside `jax.jit`, where the scene
+    is not known, a rule with two nodes in hand takes its place: to have the measured order
+    there, call this function outside and pass the result on.
+    """
+    _check_tolerance(tolerance)
+    if _concrete(lens, field, distance, wavelengths):
+        return _converge(lens, field, distance, wavelengths, tolerance)[0]
+    return min(_blind_order(_symmetry(field), tolerance), _MAX_ORDER)
+
+
+def _check_tolerance(tolerance: float) -> None:
+    if not 0 < tolerance < 1:
+        raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
+
+
+def _converge(
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike, tolerance: float
+) -> tuple[int, FocusMoments]:
+    """The order that meets the tolerance, and the moments of the next one that proved it."""
+    _check_tolerance(tolerance)
+    symmetry = _symmetry(field)
+    bound = max(tolerance, 100 * float(jnp.finfo(lens.curvature.dtype).eps))
+    previous = None
+    for order in range(2, _MAX_ORDER + 2):
+        points, weights = _pad(*_rule(symmetry, order))
+        moments = _jitted_moments(lens, field, distance, wavelengths, points, weights, symmetry)
+        _check_passed(moments, wavelengths)
+        spread = np.asarray(moments.spread[0], float)
+        if previous is not None:
+            size = np.sum(spread[:, :2], axis=-1, keepdims=True)
+            change = np.max(np.abs(spread - previous) / np.where(size > 0, size, 1))
+            if change / 2 <= bound:
+                break
+        previous = spread
+    return order - 1, moments
+
+
+def _pad(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fill up with weightless rays, so that all orders share a few compiled programs."""
+    missing = next(size for size in (48, 160, 720, 4000) if size >= weights.size) - weights.size
+    return np.pad(points, ((0, 0), (0, missing))), np.pad(weights, (0, missing))
+
+
+def _check_passed(moments: FocusMoments, wavelengths: ArrayLike) -> None:
+    for passed, wavelength in zip(np.asarray(moments.passed), np.atleast_1d(wavelengths)):
+        if not passed > 0:
+            raise ValueError(
+                f"no ray at {float(wavelength):g} um reaches the sensor: every one misses a "
+                "surface, is totally reflected or is clipped; see trace_rays(...).status"
+            )
+
+
+_jitted_moments = jax.jit(_plane_moments, static_argnums=6)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DepthMoments:
+    """`FocusMoments` as polynomials in 1/distance: no ray is traced for a new depth either.
+
+    near, far: the range in mm. series: a `FocusMoments` whose leaves carry a first axis of
+    Chebyshev coefficients in 1/distance.
+    """
+
+    near: Array
+    far: Array
+    series: FocusMoments
+
+    def at(self, distance: ArrayLike) -> FocusMoments:
+        """The moments of an object at `distance` mm, within near and far."""
+        low, high = 1 / self.far, 1 / self.near
+        x = (2 / jnp.asarray(distance, low.dtype) - high - low) / (high - low)
+        count = self.series.mean.shape[0]
+        basis = [jnp.ones_like(x), x]
+        while len(basis) < count:
+            basis.append(2 * x * basis[-1] - basis[-2])
+        basis = jnp.stack(basis[:count])
+        return jax.tree.map(lambda c: jnp.tensordot(basis, c, axes=1), self.series)
+
+
+def depth_moments(
+    lens: Lens,
+    field: ArrayLike,
+    near: float,
+    far: float,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-9,
+) -> DepthMoments:
+    """Moments for any sensor position and any distance between `near` and `far`, in mm.
+
+    As many Chebyshev nodes in 1/distance as bring the last coefficients of the moments below
+    `tolerance` relative to the first; the pupil order is the larger of those of both ends.
+    """
+    if not 0 < near < far:
+        raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
+    order = max(
+        pupil_order(lens, field, distance, wavelengths, tolerance) for distance in (near, far)
+    )
+    low, high = 1 / far, 1 / near
+    trace = jax.jit(
+        jax.vmap(lambda d: focus_moments(lens, field, d, wavelengths, order=order))
+    )
+    count = 4
+    while True:
+        angle = np.pi * (np.arange(count) + 0.5) / count
+        nodes = (high + low) / 2 + (high - low) / 2 * np.cos(angle)
+        transform = 2 / count * np.cos(np.outer(np.arange(count), angle))
+        transform[0] /= 2
+        series = jax.tree.map(
+            lambda values: jnp.tensordot(jnp.asarray(transform, values.dtype), values, axes=1),
+            trace(jnp.asarray(1 / nodes)),
+        )
+        tail = [
+            float(jnp.max(jnp.abs(c[-2:])) / jnp.max(jnp.abs(c)))
+            for c in (series.spread, series.mean)
+            if jnp.any(c != 0)
+        ]
+        if max(tail, default=0.0) <= tolerance or count >= _MAX_NODES:
+            return DepthMoments(jnp.asarray(near), jnp.asarray(far), series)
+        count *= 2
+
+
+def moments_model(
+    lens: Lens,
+    trained: tuple[str, ...],
+    field: ArrayLike,
+    distances: tuple[float, float],
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], tuple[Array, Array]]]:
+    """The cheapest exact model of the moments for what is trained.
+
+    `trained` names fields of `Lens`; `distances` = (near, far) in mm, equal for one depth.
+    Returns their initial values and a function (values, distance) -> (centroid, covariance
+    as in `FocusMoments.at`). With the sensor alone, nothing is traced inside that function:
+    polynomials in its position, and in 1/distance when the depth varies. Anything else
+    traces the rays anew.
+    """
+    near, far = distances
+    values = {name: getattr(lens, name) for name in trained}
+    if set(trained) == {"sensor"}:
+        if near == far:
+            focus = focus_moments(lens, field, near, wavelengths, tolerance)
+            return values, lambda values, distance: focus.at(values["sensor"])
+        depths = depth_moments(lens, field, near, far, wavelengths, tolerance)
+        return values, lambda values, distance: depths.at(distance).at(values["sensor"])
+    order = max(
+        pupil_order(lens, field, distance, wavelengths, tolerance) for distance in {near, far}
+    )
+
+    def retrace(values, distance):
+        moved = dataclasses.replace(lens, **values)
+        return focus_moments(moved, field, distance, wavelengths, order=order).at(moved.sensor)
+
+    return values, retrace
