@@ -1,0 +1,34 @@
+"""Design a camera lens and the neural network behind it together, by differential ray tracing.
+
+Conventions, everywhere in the package:
+
+- lengths in mm, wavelengths in um, angles in radians (degrees only in files and on the command
+  line); pixels only from `psf` on;
+- light travels towards +z, z = 0 at the first vertex; a positive field angle is light that
+  travels upwards (+y), whose image lies above the axis;
+- curvature c = 1/radius, positive with its centre at larger z; conic k = 0 a sphere, -1 a
+  paraboloid;
+- axes in the order (field, wavelength, ray, surface, xyz) and (batch, y, x, channel);
+- dtypes follow the inputs: enable float64 with `jax.config.update("jax_enable_x64", True)`
+  before loading a lens; the library changes no global setting.
+"""
+
+from .adam import adam, apply_updates
+from .fermat import Status
+from .glass import find_glass, refractive_index
+from .lens import Lens, LensError, lens_names, load_lens
+from .moments import depth_moments, focus_moments, moments_model, psf_moments, pupil_order
+from .network import red_net
+from .paraxial import back_focal_distance, focal_length, image_distance
+from .psf import SeparableKernel, gaussian_psf
+from .sensor import convolve, sensor_layer
+from .snell import trace_snell
+from .trace import Rays, trace_rays
+
+__all__ = [
+    "Lens", "LensError", "Rays", "SeparableKernel", "Status",
+    "adam", "apply_updates", "back_focal_distance", "convolve", "depth_moments", "find_glass",
+    "focal_length", "focus_moments", "gaussian_psf", "image_distance", "lens_names", "load_lens",
+    "moments_model", "psf_moments", "pupil_order", "red_net", "refractive_index", "sensor_layer",
+    "trace_rays", "trace_snell",
+]  # fmt: skip

@@ -299,19 +299,24 @@ def depth_moments(
     order = max(
         pupil_order(lens, field, distance, wavelengths, tolerance) for distance in (near, far)
     )
+    symmetry = _symmetry(field)
+    points, weights = _pad(*_rule(symmetry, order))
     low, high = 1 / far, 1 / near
-    trace = jax.jit(
-        jax.vmap(lambda d: focus_moments(lens, field, d, wavelengths, order=order))
-    )
     count = 4
     while True:
         angle = np.pi * (np.arange(count) + 0.5) / count
         nodes = (high + low) / 2 + (high - low) / 2 * np.cos(angle)
         transform = 2 / count * np.cos(np.outer(np.arange(count), angle))
         transform[0] /= 2
+        traced = [
+            _jitted_moments(lens, field, 1 / node, wavelengths, points, weights, symmetry)
+            for node in nodes
+        ]
         series = jax.tree.map(
-            lambda values: jnp.tensordot(jnp.asarray(transform, values.dtype), values, axes=1),
-            trace(jnp.asarray(1 / nodes)),
+            lambda *values: jnp.tensordot(
+                jnp.asarray(transform, values[0].dtype), jnp.stack(values), axes=1
+            ),
+            *traced,
         )
         tail = [
             float(jnp.max(jnp.abs(c[-2:])) / jnp.max(jnp.abs(c)))
@@ -341,12 +346,15 @@ def moments_model(
     """
     near, far = distances
     values = {name: getattr(lens, name) for name in trained}
-    if set(trained) == {"sensor"}:
+    if set(trained) <= {"sensor"}:
         if near == far:
             focus = focus_moments(lens, field, near, wavelengths, tolerance)
-            return values, lambda values, distance: focus.at(values["sensor"])
-        depths = depth_moments(lens, field, near, far, wavelengths, tolerance)
-        return values, lambda values, distance: depths.at(distance).at(values["sensor"])
+            at = lambda distance: focus  # noqa: E731
+        else:
+            at = depth_moments(lens, field, near, far, wavelengths, tolerance).at
+        return values, lambda values, distance: at(distance).at(
+            values.get("sensor", lens.sensor)
+        )
     order = max(
         pupil_order(lens, field, distance, wavelengths, tolerance) for distance in {near, far}
     )

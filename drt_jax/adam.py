@@ -1,0 +1,61 @@
+"""Adam (Kingma and Ba 2015) as a pair (init, update), with a rate for each group."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+__all__ = ["AdamState", "adam", "apply_updates"]
+
+
+class AdamState(NamedTuple):
+    """count (), int32: updates so far; first, second: moments, shaped as the parameters."""
+
+    count: Array
+    first: Any
+    second: Any
+
+
+def adam(
+    rates: float | Mapping[str, float], b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8
+) -> tuple[Callable[[Any], AdamState], Callable[[Any, AdamState], tuple[Any, AdamState]]]:
+    """The optimiser as (init, update).
+
+    `rates`: one learning rate, or one for each top-level key of the parameters, such as
+    {"optics": 1e-2, "network": 1e-3}. init(parameters) -> state; update(gradients, state) ->
+    (updates, state), the updates to be added to the parameters. Every leaf keeps its dtype.
+    KeyError if a group has no rate.
+    """
+
+    def init(parameters: Any) -> AdamState:
+        zeros = jax.tree.map(jnp.zeros_like, parameters)
+        return AdamState(jnp.zeros((), jnp.int32), zeros, jax.tree.map(jnp.zeros_like, parameters))
+
+    def update(gradients: Any, state: AdamState) -> tuple[Any, AdamState]:
+        count = state.count + 1
+        first = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.first, gradients)
+        second = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.second, gradients)
+
+        def scaled(rate: float, first: Any, second: Any) -> Any:
+            def leaf(m: Array, v: Array) -> Array:
+                steps = count.astype(m.dtype)
+                unbiased = m / (1 - jnp.asarray(b1, m.dtype) ** steps)
+                size = jnp.sqrt(v / (1 - jnp.asarray(b2, v.dtype) ** steps))
+                return -rate * unbiased / (size + eps)
+
+            return jax.tree.map(leaf, first, second)
+
+        if isinstance(rates, Mapping):
+            updates = {group: scaled(rates[group], first[group], second[group]) for group in first}
+        else:
+            updates = scaled(rates, first, second)
+        return updates, AdamState(count, first, second)
+
+    return init, update
+
+
+def apply_updates(parameters: Any, updates: Any) -> Any:
+    """`parameters` + `updates`, leaf by leaf, each in its own dtype."""
+    return jax.tree.map(lambda p, u: p + u.astype(p.dtype), parameters, updates)

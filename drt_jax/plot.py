@@ -1,0 +1,120 @@
+"""Figures: arrays in, axes out. The only module that imports matplotlib."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg", force=False)
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+__all__ = ["convergence", "kernels", "lens_drawing", "patch_grid", "save", "sigma_over_depth"]
+
+_FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
+_COLOURS = ("tab:red", "tab:green", "tab:blue")
+
+
+def new(rows: int = 1, columns: int = 1, width: float = 6.0, height: float = 4.0) -> tuple[Figure, Any]:
+    """A figure and its axes, `width` x `height` inches for each panel."""
+    return plt.subplots(
+        rows, columns, figsize=(width * columns, height * rows), layout="constrained"
+    )
+
+
+def save(figure: Figure, path: Any) -> None:
+    """Write `figure` to `path` at 150 dpi and release it."""
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def lens_drawing(
+    axes: Axes,
+    glass: Sequence[np.ndarray],
+    stop: Sequence[np.ndarray],
+    sensor: np.ndarray,
+    rays: Sequence[Sequence[np.ndarray]],
+) -> Axes:
+    """A lens in section, from the polylines (N, 2) of (z, y) in mm of `drawing.draw`."""
+    for outline in glass:
+        axes.fill(*outline.T, facecolor="#cfe4f5", edgecolor="#30506b", linewidth=0.8)
+    for blade in stop:
+        axes.plot(*blade.T, color="black", linewidth=2.5, solid_capstyle="butt")
+    for fan, colour in zip(rays, _FIELDS * len(rays)):
+        for ray in fan:
+            axes.plot(*ray.T, color=colour, linewidth=0.6)
+    axes.plot(*sensor.T, color="black", linewidth=1.5)
+    axes.set_aspect("equal")
+    axes.set(xlabel="z from the first vertex (mm)", ylabel="y (mm)")
+    return axes
+
+
+def convergence(
+    axes: Axes,
+    traces: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    ylabel: str,
+    level: tuple[float, str] | None = None,
+) -> Axes:
+    """Lines (x, y) by label over training batches; `level`: a horizontal mark and its label."""
+    for label, (x, y) in traces.items():
+        axes.plot(x, y, linewidth=1.1, label=label)
+    if level is not None:
+        axes.axhline(level[0], color="black", linestyle=":", linewidth=1, label=level[1])
+    axes.set(xlabel="training batch", ylabel=ylabel)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return axes
+
+
+def sigma_over_depth(
+    axes: Axes,
+    depths: np.ndarray,
+    curves: Mapping[str, np.ndarray],
+) -> Axes:
+    """Blur (N, 3) in um of R, G, B over `depths` (N,) in m: the first curve dotted and pale,
+    the others solid."""
+    for k, (label, sigma) in enumerate(curves.items()):
+        for channel, colour in enumerate(_COLOURS):
+            axes.plot(
+                depths, sigma[:, channel], color=colour, linestyle=":" if k == 0 else "-",
+                alpha=0.6 if k == 0 else 1.0, label=f"{'RGB'[channel]}, {label}",
+            )  # fmt: skip
+    axes.set(xlabel="object distance (m)", ylabel=r"blur $\sigma$ (µm)", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, ncols=len(curves))
+    return axes
+
+
+def patch_grid(
+    rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str], notes: Mapping[str, Sequence[str]]
+) -> Figure:
+    """Images (H, W, 3), 0 to 1, in labelled rows; `notes` stand in the corner of an image."""
+    figure, axes = plt.subplots(
+        len(rows), len(titles), figsize=(1.7 * len(titles), 1.75 * len(rows) + 0.3),
+        layout="constrained", squeeze=False,
+    )  # fmt: skip
+    for line, (name, images) in zip(axes, rows.items()):
+        line[0].set_ylabel(name)
+        for k, (ax, image) in enumerate(zip(line, images)):
+            ax.imshow(np.clip(image, 0, 1), interpolation="nearest")
+            ax.set(xticks=[], yticks=[])
+            if name in notes:
+                ax.text(
+                    0.04, 0.96, notes[name][k], transform=ax.transAxes, va="top", fontsize=8,
+                    bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.2},
+                )  # fmt: skip
+    for ax, title in zip(axes[0], titles):
+        ax.set_title(title, fontsize=9)
+    return figure
+
+
+def kernels(axes: Sequence[Axes], kernel: np.ndarray, titles: Sequence[str]) -> Sequence[Axes]:
+    """PSF kernels (C, K, K), one an axis, on a common scale."""
+    for ax, values, title in zip(axes, kernel, titles):
+        ax.imshow(values, vmin=0, vmax=np.max(kernel), cmap="magma", origin="lower")
+        ax.set_title(title, fontsize=9)
+        ax.set(xlabel="x (pixels)", ylabel="y (pixels)")
+    return axes

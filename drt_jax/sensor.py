@@ -1,0 +1,56 @@
+"""The sensor layer: image = kernel * scene + noise (paper Eq. 6)."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from .psf import SeparableKernel
+
+__all__ = ["convolve", "sensor_layer"]
+
+
+def _banded(kernel: Array, outputs: int) -> Array:
+    """(C, N, N + K - 1): the matrix whose row i holds the flipped kernel from column i on."""
+    channels, taps = kernel.shape
+    width = outputs + taps - 1
+    row = jnp.pad(kernel[:, ::-1], ((0, 0), (0, outputs)))  # width + 1: each row shifts by one
+    tiled = jnp.tile(row, (1, outputs))[:, : outputs * width]
+    return tiled.reshape(channels, outputs, width)
+
+
+def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
+    """'Valid' convolution of each channel with its own kernel.
+
+    `scenes` (B, H + K - 1, W + K - 1, C) hold true context on all sides, so that the result
+    (B, H, W, C) has no border artefacts. `kernel` [channel, y, x]; a separable one is
+    applied as two banded matrix products, a dense one by 2D convolution.
+    """
+    if isinstance(kernel, SeparableKernel):
+        taps = kernel.row.shape[-1]
+        down = _banded(kernel.column, scenes.shape[1] - taps + 1)
+        across = _banded(kernel.row, scenes.shape[2] - taps + 1)
+        half = jnp.einsum("cyh,bhwc->cbyw", down, scenes)
+        return jnp.einsum("cxw,cbyw->byxc", across, half)
+    return jax.lax.conv_general_dilated(
+        scenes,
+        jnp.moveaxis(kernel[:, ::-1, ::-1], 0, -1)[:, :, None],
+        window_strides=(1, 1),
+        padding="VALID",
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        feature_group_count=scenes.shape[-1],
+    )
+
+
+def sensor_layer(
+    scenes: Array, kernel: SeparableKernel | Array, noise: ArrayLike, key: Array
+) -> Array:
+    """Sensor images (B, H, W, C): `convolve`, plus white Gaussian noise.
+
+    `scenes` as in `convolve`, values 0 to 1; `noise`: standard deviation; `key`: a PRNG key.
+    The kernel is cast to the dtype of the scenes: here the optics meet the network.
+    """
+    kernel = jax.tree.map(lambda array: array.astype(scenes.dtype), kernel)
+    images = convolve(scenes, kernel)
+    white = jax.random.normal(key, images.shape, images.dtype)
+    return images + jnp.asarray(noise, images.dtype) * white

@@ -1,0 +1,187 @@
+"""What the experiments share: the command line, errors, training one job in a run folder."""
+
+import argparse
+import dataclasses
+import datetime
+import pathlib
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+import drt_jax
+from drt_jax import config as configs
+from drt_jax import drawing, plot, train
+from drt_jax.data import DataError, Patches, batches, load_patches
+from drt_jax.runs import Run, deferred_interrupt
+
+_ROOT = pathlib.Path(__file__).resolve().parent.parent
+_REPORT_EVERY = 10
+_ERRORS = (configs.ConfigError, DataError, drt_jax.LensError, ValueError)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """lens: bundled name or YAML path. wavelengths_um: of the R, G, B channels. tolerance:
+    relative error of the blur that fixes the number of rays."""
+
+    lens: str = "double_gauss"
+    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
+    tolerance: float = 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """batches: steps of each job. batch: patches in one. patch: their side in pixels.
+    optics_rate, network_rate: Adam's learning rates (optics in mm). checkpoint_every: in
+    batches."""
+
+    batches: int
+    batch: int = 16
+    patch: int = 64
+    optics_rate: float = 1e-3
+    network_rate: float = 1e-3
+    checkpoint_every: int = 200
+
+    def __post_init__(self) -> None:
+        for name in ("batches", "batch", "patch", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise configs.ConfigError(f"train.{name}: must be at least 1")
+
+
+def main(name: str, kind: type, columns: tuple[str, ...], run: Callable[[Any, Run], None]) -> None:
+    """Command line of one experiment: read the settings, open the folder, run, report errors."""
+    default = _ROOT / "configs" / f"{name}.yaml"
+    parser = argparse.ArgumentParser(
+        prog=f"python -m experiments.{name}",
+        description=(sys.modules[run.__module__].__doc__ or "").strip(),
+        epilog="settings:\n  " + "\n  ".join(configs.describe(kind)),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", metavar="FILE", help=f"YAML settings (default: configs/{name}.yaml)")
+    parser.add_argument(
+        "--set", metavar="KEY=VALUE", nargs="+", action="extend", default=[],
+        help="change settings, such as --set train.batch=8 data.root=photos",
+    )  # fmt: skip
+    parser.add_argument("--out", metavar="DIR", help=f"run folder (default: a new one in runs/{name})")
+    parser.add_argument(
+        "--resume", action="store_true",
+        help="go on with the run in --out (default: the latest in runs/NAME)",
+    )  # fmt: skip
+    options = parser.parse_args()
+    # The caller, not the library, chooses the precision: optics in float64.
+    jax.config.update("jax_enable_x64", True)
+    started = time.perf_counter()
+    folder = None
+    try:
+        folder = _folder(name, options)
+        source = options.config or default
+        if options.resume and not options.config:
+            source = folder / "config.yaml"
+        config = configs.load_config(kind, source, options.set)
+        opened = Run(folder, config, columns, options.resume)
+        print(f"{name}: run folder {folder}")
+        run(config, opened)
+    except KeyboardInterrupt:
+        where = f"; go on with --resume --out {folder}" if folder else ""
+        raise SystemExit(_say(f"stopped{where}", 130)) from None
+    except OSError as error:
+        what = f"{error.filename or folder}: {error.strerror or error}"
+        raise SystemExit(
+            _say(f"{what}; the last checkpoint is whole: mend this, then go on with --resume --out {folder}", 1)
+        ) from error
+    except _ERRORS as error:
+        raise SystemExit(_say(str(error), 2)) from None
+    print(f"done in {time.perf_counter() - started:.0f} s")
+
+
+def _say(message: str, code: int) -> int:
+    print(f"error: {message}" if code != 130 else message, file=sys.stderr)
+    return code
+
+
+def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:
+    if options.out:
+        return pathlib.Path(options.out)
+    parent = pathlib.Path("runs") / name
+    if not options.resume:
+        return parent / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    folders = sorted(p for p in parent.glob("*") if (p / "config.yaml").is_file())
+    if not folders:
+        raise configs.ConfigError(f"nothing to resume in {parent}; name the run folder with --out")
+    return folders[-1]
+
+
+def patches(config: Any, progress: str = "reading images") -> Patches:
+    """Patches of the run's images, with the context that its blur needs; says what was skipped."""
+    side = config.train.patch + config.camera.kernel - 1
+    loaded = load_patches(
+        config.data, side, config.seed, lambda work: tqdm(work, desc=progress, leave=False)
+    )
+    for line in loaded.skipped:
+        print(f"skipped {line}", file=sys.stderr)
+    print(f"{len(loaded.train)} training and {len(loaded.test)} test patches of {side} x {side}")
+    return loaded
+
+
+def train_job(
+    run: Run,
+    job: str,
+    init: Callable,
+    step: Callable,
+    parameters: dict[str, Any],
+    scenes: np.ndarray,
+    noise: float,
+    config: Any,
+    labels: tuple[str, ...] = (),
+) -> dict[str, Any]:
+    """Train one job, or several vectorised ones with a label each, from its last checkpoint on.
+
+    Logs metrics and saves checkpoints in `run`; returns the trained parameters.
+    KeyboardInterrupt, after a checkpoint, if the user asked to stop.
+    """
+    total = config.train.batches
+    first, state = run.load(job, init(parameters), labels or (job,))
+    saved = first
+    bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
+    with bar, deferred_interrupt() as asked:
+
+        def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> bool:
+            nonlocal saved
+            done = start + len(metrics["loss"])
+            for k, label in enumerate(labels or (job,)):
+                run.log(label, start, {n: v[:, k] if labels else v for n, v in metrics.items()})
+            bar.update(len(metrics["loss"]))
+            last = {n: np.array2string(v[-1], precision=3) for n, v in metrics.items()}
+            bar.set_postfix_str(" ".join(f"{n}={last[n]}" for n in ("loss", "sensor_mm") if n in last))
+            if asked() or done == total or done - saved >= config.train.checkpoint_every:
+                run.save(job, done, state)
+                saved = done
+            return asked()
+
+        stream = batches(scenes, config.train.batch, config.seed, first)
+        state = train.fit(step, state, stream, noise, first, total, _REPORT_EVERY, report)
+        if asked() and saved < total:
+            raise KeyboardInterrupt
+    return state[0]
+
+
+def draw_lens(run: Run, lens: drt_jax.Lens, distance: float) -> pathlib.Path:
+    """The lens with its axial beam, as figures/lens.png."""
+    figure, axes = plot.new(width=8, height=4)
+    plot.lens_drawing(axes, *drawing.draw(lens, [0.0], distance))
+    axes.set_title(lens.name)
+    path = run.figures / "lens.png"
+    plot.save(figure, path)
+    return path
+
+
+def table(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+    """A plain-text table."""
+    cells = [header, *([f"{c:.4g}" if isinstance(c, float) else str(c) for c in r] for r in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    return "\n".join("  ".join(c.rjust(w) for c, w in zip(row, widths)) for row in cells)
