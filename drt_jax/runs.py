@@ -56,10 +56,13 @@ class Run:
         return self.folder / "metrics.csv"
 
     def log(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
-        """Append metrics of consecutive steps, the first being `step`; 1D arrays by column."""
+        """Append metrics of consecutive steps, the first being `step`; 1D arrays by column.
+        A column that is not among them stays empty."""
+        values = [[repr(float(v)) for v in rows[c]] if c in rows else None for c in self._columns[2:]]
+        count = max(len(column) for column in values if column)
         lines = [
-            (job, step + i, *(repr(float(rows[c][i])) for c in self._columns[2:]))
-            for i in range(len(rows[self._columns[2]]))
+            (job, step + i, *(column[i] if column else "" for column in values))
+            for i in range(count)
         ]
         new = not self._metrics.exists()
         with open(self._metrics, "a", newline="") as file:
@@ -69,10 +72,10 @@ class Run:
             writer.writerows(lines)
 
     def metrics(self, job: str) -> dict[str, np.ndarray]:
-        """The logged metrics of one job, arrays by column (with `step`)."""
+        """The logged metrics of one job, arrays by column (with `step`); NaN where empty."""
         with open(self._metrics, newline="") as file:
             rows = [row for row in csv.DictReader(file) if row["job"] == job]
-        return {c: np.array([float(row[c]) for row in rows]) for c in self._columns[1:]}
+        return {c: np.array([float(row[c] or "nan") for row in rows]) for c in self._columns[1:]}
 
     def save(self, job: str, step: int, tree: Any) -> None:
         """Checkpoint: the state `tree` of `job` after `step` steps."""

@@ -20,7 +20,6 @@ from drt_jax.data import DataError, Patches, batches, load_patches
 from drt_jax.runs import Run, deferred_interrupt
 
 _ROOT = pathlib.Path(__file__).resolve().parent.parent
-_REPORT_EVERY = 10
 _ERRORS = (configs.ConfigError, DataError, drt_jax.LensError, ValueError)
 
 
@@ -164,7 +163,9 @@ def train_job(
             return asked()
 
         stream = batches(scenes, config.train.batch, config.seed, first)
-        state = train.fit(step, state, stream, noise, first, total, _REPORT_EVERY, report)
+        # Each report waits for the device: rarely where a step takes milliseconds.
+        every = 10 if jax.default_backend() == "cpu" else 113
+        state = train.fit(step, state, stream, noise, first, total, every, report)
         if asked() and saved < total:
             raise KeyboardInterrupt
     return state[0]
@@ -185,3 +186,30 @@ def table(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
     cells = [header, *([f"{c:.4g}" if isinstance(c, float) else str(c) for c in r] for r in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     return "\n".join("  ".join(c.rjust(w) for c, w in zip(row, widths)) for row in cells)
+
+
+def rates(config: Any) -> dict[str, float]:
+    """Adam's learning rates of both groups."""
+    return {"optics": config.train.optics_rate, "network": config.train.network_rate}
+
+
+def final_window(config: Any) -> int:
+    """How many of the last batches a final sensor position is averaged over: a tenth, at
+    least 20, at most all."""
+    return min(config.train.batches, max(20, config.train.batches // 10))
+
+
+def thinned(patches: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` patches (0: all), spread evenly over the set."""
+    if not count or count >= len(patches):
+        return patches
+    return np.asarray(patches[np.linspace(0, len(patches) - 1, count).astype(int)])
+
+
+def rmse_notes(rows: dict[str, Any]) -> dict[str, list[str]]:
+    """RMSE of each image against the truth, as notes for `plot.patch_grid`."""
+    return {
+        name: [f"{np.sqrt(np.mean((t - i) ** 2)):.3f}" for t, i in zip(rows["truth"], images)]
+        for name, images in rows.items()
+        if name != "truth"
+    }
