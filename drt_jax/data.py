@@ -18,7 +18,7 @@ __all__ = ["DataConfig", "DataError", "Patches", "batches", "load_patches"]
 # Colour and texture photographs that lie inside the scikit-image wheel.
 _BUNDLED = (
     "astronaut", "brick", "chelsea", "coffee", "grass", "gravel", "hubble_deep_field",
-    "immunohistochemistry", "retina", "rocket", "stereo_motorcycle", "colorwheel",
+    "immunohistochemistry", "retina", "rocket", "stereo_motorcycle",
 )  # fmt: skip
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 
@@ -120,8 +120,6 @@ def _sources(root: str) -> list[tuple[str, Callable[[], np.ndarray]]]:
 
 
 def _bundled(name: str) -> np.ndarray:
-    if name == "colorwheel":
-        return data.colorwheel()
     image = getattr(data, name)()
     return image[0] if isinstance(image, tuple) else image  # a stereo pair: one scene
 

@@ -50,7 +50,7 @@ class Lens:
     @property
     def vertices(self) -> Array:
         """z of the S vertices, shape (S,), mm; the first is 0."""
-        return jnp.concatenate([jnp.zeros_like(self.thickness[:1]), jnp.cumsum(self.thickness)])
+        return jnp.concatenate([jnp.zeros_like(self.curvature[:1]), jnp.cumsum(self.thickness)])
 
     def index(self, wavelengths: Array) -> Array:
         """Refractive index (S + 1, W) of every medium at `wavelengths` (W,), um.

@@ -12,7 +12,7 @@ from .fermat import Status, System, geometry
 from .implicit import solve_rays
 from .lens import Lens
 from .numerics import safe_divide
-from .paraxial import trace_yu, vertex_curvature
+from .start import first_guess
 
 __all__ = ["Rays", "trace_bundle", "trace_rays"]
 
@@ -47,23 +47,6 @@ def _profile(lens: Lens, rows: list[int]) -> tuple[Array, Array, Array, Array]:
 
     vertex = extend(lens.vertices).at[-1].set(lens.sensor)
     return vertex, extend(lens.curvature), extend(lens.conic), extend(lens.coefficients).T
-
-
-def _start(lens: Lens, system: System, stop: int, field: Array) -> Array:
-    """Paraxial hits through the stop points, (D, S + 1, W, Q)."""
-    bent = vertex_curvature(lens)
-    live = jnp.array(_live_surfaces(lens))
-    curvature = jnp.concatenate([bent[live], jnp.zeros_like(bent[:1])])
-    index = jnp.concatenate([system.index, system.index[-1:]])
-    gaps = jnp.diff(system.vertex)
-    one = jnp.ones_like(index[0])
-    # The first live surface need not be the first vertex: start the ray there.
-    reach = system.vertex[0]
-    axial, _ = trace_yu(curvature, gaps, index, one + reach * system.vergence, system.vergence * one)
-    tilted, _ = trace_yu(curvature, gaps, index, reach * one, one)
-    slope = jnp.tan(field)[:, None, None]
-    amplitude = (system.stop[:, None] - slope * tilted[stop][:, None]) / axial[stop][:, None]
-    return amplitude[:, None] * axial[..., None] + slope[:, None] * tilted[..., None]
 
 
 def _cross_dead_surfaces(lens: Lens, system: System, hits: Array, live: list[int]) -> Array:
@@ -117,8 +100,8 @@ def trace_bundle(
         vergence=1 / jnp.asarray(distance, dtype),
         stop=lens.semi_diameter[lens.stop] * jnp.asarray(pupil, dtype),
     )
-    start = jax.lax.stop_gradient(_start(lens, system, stop, field))
-    hits, status, steps = solve_rays(stop, system, start)
+    guess = first_guess(jax.lax.stop_gradient(system), stop)
+    hits, status, steps = solve_rays(stop, system, guess)
     if len(live) < len(lens.glasses) - 1:
         hits = _cross_dead_surfaces(lens, system, hits, live)
     radius2 = jnp.sum(hits[:, :-1] ** 2, axis=0)
@@ -155,6 +138,6 @@ def trace_rays(
     z = shape[0][:, None, None] + surface.sag(
         hits, shape[1][:, None, None], shape[2][:, None, None], shape[3][..., None, None]
     )
-    z = jnp.where(jnp.isin(status, jnp.array([Status.OK, Status.CLIPPED])), z, 0)
+    z = jnp.where((status == Status.OK) | (status == Status.CLIPPED), z, 0)
     points = jnp.concatenate([hits, z[None]])
     return Rays(jnp.moveaxis(points, (0, 1), (3, 2)), status, steps)

@@ -52,7 +52,13 @@ class Training:
                 raise configs.ConfigError(f"train.{name}: must be at least 1")
 
 
-def main(name: str, kind: type, columns: tuple[str, ...], run: Callable[[Any, Run], None]) -> None:
+def main(
+    name: str,
+    kind: type,
+    columns: tuple[str, ...],
+    run: Callable[[Any, Run], None],
+    argv: list[str] | None = None,
+) -> None:
     """Command line of one experiment: read the settings, open the folder, run, report errors."""
     default = _ROOT / "configs" / f"{name}.yaml"
     parser = argparse.ArgumentParser(
@@ -71,7 +77,7 @@ def main(name: str, kind: type, columns: tuple[str, ...], run: Callable[[Any, Ru
         "--resume", action="store_true",
         help="go on with the run in --out (default: the latest in runs/NAME)",
     )  # fmt: skip
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     # The caller, not the library, chooses the precision: optics in float64.
     jax.config.update("jax_enable_x64", True)
     started = time.perf_counter()
@@ -204,6 +210,12 @@ def thinned(patches: np.ndarray, count: int) -> np.ndarray:
     if not count or count >= len(patches):
         return patches
     return np.asarray(patches[np.linspace(0, len(patches) - 1, count).astype(int)])
+
+
+def textured(patches: np.ndarray, count: int) -> np.ndarray:
+    """`count` patches for a picture, spread evenly over the half with more contrast."""
+    contrast = np.std(patches.reshape(len(patches), -1), axis=1)
+    return thinned(patches[np.argsort(contrast)[len(patches) // 2 :]], count)
 
 
 def rmse_notes(rows: dict[str, Any]) -> dict[str, list[str]]:

@@ -151,7 +151,7 @@ def run(config: Config, run: Run) -> None:
 def _patches(imager, parameters, test, config):
     """Figure 7: truth, sensor image and restored image, a patch for each depth."""
     count = len(config.patch_depth_m)
-    chosen = _common.thinned(test, count)
+    chosen = _common.textured(test, count)
     rows = {"truth": [], "sensor": [], "restored": []}
     for k, depth in enumerate(config.patch_depth_m):
         patch = chosen[k % len(chosen)][None]
@@ -165,5 +165,10 @@ def _patches(imager, parameters, test, config):
     )
 
 
+def main(argv: list[str] | None = None) -> None:
+    """Command line."""
+    _common.main("edof", Config, ("loss", "sensor_mm", "sigma_um", "depth_mm"), run, argv)
+
+
 if __name__ == "__main__":
-    _common.main("edof", Config, ("loss", "sensor_mm", "sigma_um", "depth_mm"), run)
+    main()

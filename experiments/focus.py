@@ -118,5 +118,10 @@ def run(config: Config, run: Run) -> None:
         print(f"figure {item}")
 
 
+def main(argv: list[str] | None = None) -> None:
+    """Command line."""
+    _common.main("focus", Config, ("loss", "sensor_mm", "sigma_um"), run, argv)
+
+
 if __name__ == "__main__":
-    _common.main("focus", Config, ("loss", "sensor_mm", "sigma_um"), run)
+    main()

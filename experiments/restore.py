@@ -121,7 +121,7 @@ def run(config: Config, run: Run) -> None:
 
 
 def _patches(imager, parameters, test, distance, noise):
-    chosen = _common.thinned(test, 6)
+    chosen = _common.textured(test, 6)
     truth, sensor, restored, _ = map(
         np.asarray, imager(parameters, chosen, distance, np.float32(noise), jax.random.key(1))
     )
@@ -129,5 +129,10 @@ def _patches(imager, parameters, test, distance, noise):
     return plot.patch_grid(rows, [""] * len(chosen), _common.rmse_notes(rows))
 
 
+def main(argv: list[str] | None = None) -> None:
+    """Command line."""
+    _common.main("restore", Config, ("loss", "sensor_mm", "sigma_um"), run, argv)
+
+
 if __name__ == "__main__":
-    _common.main("restore", Config, ("loss", "sensor_mm", "sigma_um"), run)
+    main()

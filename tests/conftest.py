@@ -1,0 +1,21 @@
+"""Tests run in float64 and under strict dtype promotion: nothing may change precision silently."""
+
+import pathlib
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+RGB = (0.6, 0.53, 0.48)
+LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
+
+
+@pytest.fixture
+def shared() -> pathlib.Path:
+    """Reference data kept beside the checkout; the test is skipped where there is none."""
+    path = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not path.is_dir():
+        pytest.skip("no reference data beside the checkout")
+    return path

@@ -1,0 +1,46 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drt_jax.glass import Dispersion, Glass, find_glass, refractive_index
+
+# n_d of the catalogue pages and, for CODE V's listing of its Double Gauss sample, the indices
+# that program prints at 656.3, 587.6 and 486.1 nm (6 decimals).
+N_D = {"N-BK7": 1.5168, "SF10": 1.72825, "F2": 1.62004, "SK16": 1.62041, "N-SF11": 1.78472}
+CODE_V = {
+    "N-SSK2": (1.618769, 1.622292, 1.630455),
+    "N-SK2": (1.604134, 1.607379, 1.614860),
+    "F5": (1.598744, 1.603417, 1.614617),
+    "N-SK16": (1.617271, 1.620408, 1.627559),
+}
+
+
+def index(name, *wavelengths):
+    dispersion = Dispersion.of([find_glass(name)])
+    return np.asarray(refractive_index(dispersion, jnp.array(wavelengths))[0])
+
+
+@pytest.mark.parametrize("name", N_D)
+def test_catalogue_index_at_the_d_line(name):
+    np.testing.assert_allclose(index(name, 0.5875618), N_D[name], atol=6e-6)
+
+
+@pytest.mark.parametrize("name", CODE_V)
+def test_indices_that_code_v_prints(name):
+    np.testing.assert_allclose(index(name, 0.6563, 0.5876, 0.4861), CODE_V[name], atol=6e-7)
+
+
+def test_air_and_constant_index():
+    media = Dispersion.of([find_glass("air"), Glass("n", schott=(2.25, 0, 0, 0, 0, 0))])
+    n = refractive_index(media, jnp.array([0.4, 0.7]))
+    np.testing.assert_array_equal(n, [[1, 1], [1.5, 1.5]])
+
+
+def test_old_and_new_glass_types_are_not_mixed_up():
+    assert abs(index("SK16", 0.48) - index("N-SK16", 0.48)) > 1e-6
+
+
+@pytest.mark.parametrize("name, near", [("N-BK8", "N-BK7"), ("nsk16", "N-SK16"), ("sk16", "SK16")])
+def test_unknown_glass_lists_near_names(name, near):
+    with pytest.raises(ValueError, match=f"unknown glass '{name}'.*{near}"):
+        find_glass(name)

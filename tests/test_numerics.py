@@ -1,0 +1,24 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drt_jax.numerics import safe_divide, safe_sqrt
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_finite_where_the_plain_functions_are_not(dtype):
+    zero = jnp.zeros((), dtype)
+    for value in (zero, -zero, jnp.asarray(-1.0, dtype)):
+        assert safe_sqrt(value) == 0 and jax.grad(safe_sqrt)(value) == 0
+    one = jnp.ones((), dtype)
+    assert safe_divide(one, zero) == 0
+    assert jax.grad(safe_divide, argnums=(0, 1))(one, zero) == (0, 0)
+    assert safe_sqrt(one).dtype == dtype and safe_divide(one, zero).dtype == dtype
+
+
+def test_unbiased_elsewhere():
+    x = jnp.array([1e-300, 1e-9, 2.0, 1e300])
+    np.testing.assert_array_equal(safe_sqrt(x), jnp.sqrt(x))
+    np.testing.assert_array_equal(safe_divide(jnp.ones(4), x), 1 / x)
+    np.testing.assert_allclose(jax.vmap(jax.grad(safe_sqrt))(x[1:3]), 0.5 / np.sqrt(x[1:3]), rtol=1e-15)
