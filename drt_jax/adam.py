@@ -1,5 +1,6 @@
 """Adam (Kingma and Ba 2015) as a pair (init, update), with a rate for each group."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -41,8 +42,9 @@ def adam(
         def scaled(rate: float, first: Any, second: Any) -> Any:
             def leaf(m: Array, v: Array) -> Array:
                 steps = count.astype(m.dtype)
-                unbiased = m / (1 - jnp.asarray(b1, m.dtype) ** steps)
-                size = jnp.sqrt(v / (1 - jnp.asarray(b2, v.dtype) ** steps))
+                # 1 - b^steps, without the cancellation that costs float32 five digits
+                unbiased = m / -jnp.expm1(steps * math.log(b1))
+                size = jnp.sqrt(v / -jnp.expm1(steps * math.log(b2)))
                 return -rate * unbiased / (size + eps)
 
             return jax.tree.map(leaf, first, second)

@@ -67,7 +67,22 @@ def _build(cls: type[T], entry: object, source: str, prefix: str) -> T:
         key: _convert(_field(cls, key, source, prefix), value, source, _dotted(prefix, key))
         for key, value in entry.items()
     }
-    return cls(**values)
+    missing = [
+        _dotted(prefix, field.name)
+        for field in dataclasses.fields(cls)
+        if field.name not in values and field.default is dataclasses.MISSING
+    ]
+    if missing:
+        raise ConfigError(f"{source}: missing keys: {', '.join(missing)}")
+    return _checked(lambda: cls(**values), source)
+
+
+def _checked(make: typing.Callable[[], T], source: str) -> T:
+    """What `make` makes; a dataclass that refuses its values is told the source."""
+    try:
+        return make()
+    except ValueError as error:
+        raise ConfigError(f"{source}: {error}") from error
 
 
 def _replace(config: T, keys: list[str], value: object, source: str, prefix: str) -> T:
@@ -80,7 +95,7 @@ def _replace(config: T, keys: list[str], value: object, source: str, prefix: str
         new = _replace(inner, keys[1:], value, source, here)
     else:
         new = _convert(kind, value, source, here)
-    return dataclasses.replace(config, **{keys[0]: new})
+    return _checked(lambda: dataclasses.replace(config, **{keys[0]: new}), source)
 
 
 def _convert(kind: Any, value: object, source: str, key: str) -> Any:
@@ -114,7 +129,7 @@ def _say(kind: Any) -> str:
 
 
 def describe(cls: type, prefix: str = "") -> list[str]:
-    """A line "key: type = default" for each setting, for --help."""
+    """A line "key: type" for each setting, for --help."""
     lines = []
     for field in dataclasses.fields(cls):
         kind = typing.get_type_hints(cls)[field.name]

@@ -3,32 +3,21 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg", force=False)
-
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["convergence", "kernels", "lens_drawing", "patch_grid", "save", "sigma_over_depth"]
+__all__ = ["convergence", "kernels", "lens_drawing", "new", "patch_grid", "sigma_over_depth"]
 
 _FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 _COLOURS = ("tab:red", "tab:green", "tab:blue")
 
 
 def new(rows: int = 1, columns: int = 1, width: float = 6.0, height: float = 4.0) -> tuple[Figure, Any]:
-    """A figure and its axes, `width` x `height` inches for each panel."""
-    return plt.subplots(
-        rows, columns, figsize=(width * columns, height * rows), layout="constrained"
-    )
-
-
-def save(figure: Figure, path: Any) -> None:
-    """Write `figure` to `path` at 150 dpi and release it."""
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    """A figure and its axes, `width` x `height` inches for each panel. Made without pyplot, so
+    that no window opens and no global state changes; write it with `figure.savefig(path)`."""
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained", dpi=150)
+    return figure, figure.subplots(rows, columns)
 
 
 def lens_drawing(
@@ -92,10 +81,9 @@ def patch_grid(
     rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str], notes: Mapping[str, Sequence[str]]
 ) -> Figure:
     """Images (H, W, 3), 0 to 1, in labelled rows; `notes` stand in the corner of an image."""
-    figure, axes = plt.subplots(
-        len(rows), len(titles), figsize=(1.7 * len(titles), 1.75 * len(rows) + 0.3),
-        layout="constrained", squeeze=False,
-    )  # fmt: skip
+    size = 1.7 * len(titles), 1.75 * len(rows) + 0.3
+    figure = Figure(figsize=size, layout="constrained", dpi=150)
+    axes = figure.subplots(len(rows), len(titles), squeeze=False)
     for line, (name, images) in zip(axes, rows.items()):
         line[0].set_ylabel(name)
         for k, (ax, image) in enumerate(zip(line, images)):

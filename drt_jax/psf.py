@@ -14,7 +14,7 @@ __all__ = ["Form", "SeparableKernel", "gaussian_psf"]
 Form = Literal["integrated", "sampled"]
 
 # A Gaussian narrower than this (in pixels) is a point: nothing on the grid can tell.
-_POINT = 1e-6
+_POINT = 1e-4
 _ANGLES, _ANGLE_WEIGHTS = np.polynomial.legendre.leggauss(24)
 _MAX_CORRELATION = 1 - 1e-6
 
@@ -84,10 +84,10 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
     # the correlation (Plackett 1954; Drezner and Wesolowsky 1990), then differences over the
     # corners of each pixel.
     (x, wide_x), (y, wide_y) = (_standardise(edges[:, i], diagonal[:, i]) for i in range(2))
-    scale = safe_sqrt(diagonal[:, 0]) * safe_sqrt(diagonal[:, 1])
-    ratio = safe_divide(covariance[:, 0, 1], scale)
     both = (wide_x & wide_y)[:, 0]
-    ratio = jnp.where(both, jnp.clip(ratio, -_MAX_CORRELATION, _MAX_CORRELATION), 0)
+    scale = jnp.where(both, diagonal[:, 0] * diagonal[:, 1], 1)
+    ratio = jnp.where(both, covariance[:, 0, 1], 0) / jnp.sqrt(scale)
+    ratio = jnp.clip(ratio, -_MAX_CORRELATION, _MAX_CORRELATION)
     limit = jnp.arcsin(ratio)[:, None, None]
     x, y = x[:, None, :], y[:, :, None]
     correction = jnp.zeros_like(x * y)
@@ -102,14 +102,17 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
 
 
 def _sampled(offset: Array, covariance: Array) -> SeparableKernel | Array:
+    """Densities at the pixel centres; 0 for a point, which falls between them."""
     if covariance.ndim == 2:
-        sigma = safe_sqrt(covariance)[..., None]
-        z = safe_divide(offset, jnp.broadcast_to(sigma, offset.shape))
-        density = safe_divide(jnp.exp(-z * z / 2) / (2 * jnp.pi) ** 0.5, sigma)
+        z, wide = _standardise(offset, covariance)
+        sigma = jnp.where(wide, safe_sqrt(covariance)[..., None], 1)
+        density = jnp.where(wide, jnp.exp(-z * z / 2) / (sigma * (2 * jnp.pi) ** 0.5), 0)
         return SeparableKernel(density[:, 1], density[:, 0])
     xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
-    determinant = (xx * yy - xy * xy)[:, None, None]
+    determinant = xx * yy - xy * xy
+    wide = (determinant > _POINT**2 * (xx + yy)) & (xx > 0) & (yy > 0)
+    xx, yy, determinant = (jnp.where(wide, a, 1)[:, None, None] for a in (xx, yy, determinant))
+    xy, wide = jnp.where(wide, xy, 0)[:, None, None], wide[:, None, None]
     x, y = offset[:, 0, None, :], offset[:, 1, :, None]
-    xx, yy, xy = (a[:, None, None] for a in (xx, yy, xy))
-    exponent = safe_divide(yy * x * x - 2 * xy * x * y + xx * y * y, determinant) / 2
-    return safe_divide(jnp.exp(-exponent), 2 * jnp.pi * safe_sqrt(determinant))
+    exponent = (yy * x * x - 2 * xy * x * y + xx * y * y) / (2 * determinant)
+    return jnp.where(wide, jnp.exp(-exponent) / (2 * jnp.pi * jnp.sqrt(determinant)), 0)

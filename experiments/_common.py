@@ -183,13 +183,19 @@ def draw_lens(run: Run, lens: drt_jax.Lens, distance: float) -> pathlib.Path:
     plot.lens_drawing(axes, *drawing.draw(lens, [0.0], distance))
     axes.set_title(lens.name)
     path = run.figures / "lens.png"
-    plot.save(figure, path)
+    figure.savefig(path)
     return path
 
 
 def table(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
     """A plain-text table."""
-    cells = [header, *([f"{c:.4g}" if isinstance(c, float) else str(c) for c in r] for r in rows)]
+
+    def say(value: Any) -> str:
+        if not isinstance(value, float):
+            return str(value)
+        return f"{value:.3f}" if abs(value) >= 10 else f"{value:.4g}"
+
+    cells = [header, *([say(value) for value in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     return "\n".join("  ".join(c.rjust(w) for c, w in zip(row, widths)) for row in cells)
 

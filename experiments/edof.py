@@ -119,7 +119,7 @@ def run(config: Config, run: Run) -> None:
     figure, axes = plot.new(width=7, height=4.5)
     lines = {k: (t["step"], t["sensor_mm"]) for k, t in traces.items()}
     plot.convergence(axes, lines, "sensor position (mm)")
-    plot.save(figure, figures[1])
+    figure.savefig(figures[1])
     final = results["final_mm"][config.starts_mm.index(config.fixed_mm)]
     figure, axes = plot.new(width=7, height=4.5)
     grid = np.linspace(near, far, 121)
@@ -128,8 +128,8 @@ def run(config: Config, run: Run) -> None:
         axes, grid / 1e3,
         {f"{s:.2f} mm": 1e3 * np.asarray(sigma(jnp.asarray(grid), s)) for s in (config.fixed_mm, final)},
     )  # fmt: skip
-    plot.save(figure, figures[2])
-    plot.save(_patches(*models["joint"], test, config), figures[3])
+    figure.savefig(figures[2])
+    _patches(*models["joint"], test, config).savefig(figures[3])
 
     print(_common.table(
         ("start mm", "final mm"), list(zip(results["starts_mm"], results["final_mm"]))

@@ -109,7 +109,7 @@ def run(config: Config, run: Run) -> None:
         plot.convergence(right, {k: (x[:100], y[:100]) for k, (x, y) in lines.items()}, label, level)
         right.set_title("the first 100 batches", fontsize=9)
         figures.append(run.figures / f"{name}.png")
-        plot.save(figure, figures[-1])
+        figure.savefig(figures[-1])
     rows = list(zip(config.starts_mm, final, [str(n) for n in first]))
     print(_common.table(("start mm", "final mm", "batches to within 0.1 mm"), rows))
     print(f"best focus by dense search on the same loss: {best:.3f} mm")

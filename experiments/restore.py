@@ -105,9 +105,9 @@ def run(config: Config, run: Run) -> None:
     figure, axes = plot.new(width=7, height=4.5)
     lines = {k: (t["step"], t["sensor_mm"]) for k, t in traces.items()}
     plot.convergence(axes, lines, "sensor position (mm)")
-    plot.save(figure, figures[0])
+    figure.savefig(figures[0])
     chosen = trained[config.table_starts_mm[0], config.table_noise[0]]
-    plot.save(_patches(test_imager, chosen, test, distance, config.table_noise[0]), figures[1])
+    _patches(test_imager, chosen, test, distance, config.table_noise[0]).savefig(figures[1])
 
     print(_common.table(
         ("start mm", "final mm"), list(zip(results["starts_mm"], results["final_mm"]))

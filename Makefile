@@ -1,0 +1,21 @@
+# `make demo` and `make test` each install what they need first; both work on a fresh machine.
+PYTHON ?= python3
+BIN := .venv/bin
+OUT := runs/demo-$(shell date +%Y%m%d-%H%M%S)
+
+.PHONY: install demo test
+install: .venv/installed
+
+.venv/installed: pyproject.toml
+	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python 3.11 or newer is needed: make PYTHON=python3.12 ...')"
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	touch $@
+
+demo: install
+	$(BIN)/python -m experiments.focus --out $(OUT)/focus
+	$(BIN)/python -m experiments.edof --config configs/demo/edof.yaml --out $(OUT)/edof
+	@echo "Demo finished: pictures in $(OUT)/focus/figures and $(OUT)/edof/figures"
+
+test: install
+	$(BIN)/python -m pytest

@@ -1,0 +1,81 @@
+import dataclasses
+from typing import Literal
+
+import pytest
+
+from drt_jax.config import ConfigError, describe, load_config, save_config
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    batch: int = 16
+    rate: float = 1e-3
+    form: Literal["integrated", "sampled"] = "integrated"
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    starts: tuple[float, ...]
+    name: str = "x"
+    fast: bool = False
+    train: Inner = Inner()
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "some.yaml"
+    path.write_text("starts: [130, 1.5e2]\ntrain: {rate: 1e-4}\n")
+    return path
+
+
+def test_yaml_overrides_and_round_trip(path, tmp_path):
+    config = load_config(Config, path, ["train.batch=8", "starts=[1]", "fast=true", "train.form=sampled"])
+    assert config == Config((1.0,), "x", True, Inner(8, 1e-4, "sampled"))
+    assert isinstance(config.starts[0], float)
+    save_config(config, tmp_path / "resolved.yaml")
+    assert load_config(Config, tmp_path / "resolved.yaml") == config
+
+
+BAD = {
+    "train.bacth=8": r"--set train.bacth=8: unknown key train.bacth; did you mean train.batch\?",
+    "trian.batch=8": r"unknown key trian; did you mean train\?",
+    "train.batch=eight": "train.batch: expected a whole number, got 'eight'",
+    "train.batch=8.5": "train.batch: expected a whole number, got 8.5",
+    "train.batch=true": "train.batch: expected a whole number, got True",
+    "train.rate=fast": "train.rate: expected a number, got 'fast'",
+    "train.form=gauss": "train.form: expected one of integrated, sampled, got 'gauss'",
+    "fast=1": "fast: expected true or false, got 1",
+    "name=3": "name: expected text, got 3",
+    "starts=5": "starts: expected a list, each item a number, got 5",
+    "starts=[a]": r"starts\[0\]: expected a number, got 'a'",
+    "train=3": "train: expected keys and values, got 3",
+    "name.first=3": "name has no keys of its own",
+    "train.batch": "expected key=value",
+    "name=[": "is not a YAML value",
+}
+
+
+@pytest.mark.parametrize("override", BAD)
+def test_bad_overrides_name_the_key(path, override):
+    with pytest.raises(ConfigError, match=BAD[override]):
+        load_config(Config, path, [override])
+
+
+def test_bad_files_name_the_file(tmp_path):
+    cases = {"starts: [1]\nsped: 3": "unknown key sped", "- 1": "expected keys", "a: [": "not a YAML"}
+    for text, message in cases.items():
+        path = tmp_path / "bad.yaml"
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=message) as error:
+            load_config(Config, path)
+        assert str(path) in str(error.value)
+    with pytest.raises(ConfigError, match="No such file"):
+        load_config(Config, tmp_path / "none.yaml")
+    (tmp_path / "empty.yaml").write_text("")
+    with pytest.raises(ConfigError, match="missing keys: starts"):
+        load_config(Config, tmp_path / "empty.yaml")
+
+
+def test_description_lists_every_setting():
+    assert describe(Config)[0] == "starts: a list, each item a number"
+    assert "train.form: one of integrated, sampled" in describe(Config)

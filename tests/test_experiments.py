@@ -1,0 +1,185 @@
+"""Every experiment at toy size: what it writes, that it resumes, how it fails."""
+
+import importlib
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+from skimage import io
+
+from drt_jax.config import load_config
+from drt_jax.runs import Run
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
+SMALL = ["train.batch=2", "train.patch=16", "train.batches=25", "train.checkpoint_every=10",
+         "camera.kernel=9", "data.crops_per_image=2"]  # fmt: skip
+TOY = {
+    "focus": [*SMALL, "starts_mm=[133.0, 134.0]"],
+    "restore": [*SMALL, "starts_mm=[133.0, 134.0]", "table_starts_mm=[133.0]",
+                "table_noise=[0.01, 0.05]", "test_patches=3"],
+    "edof": [*SMALL, "starts_mm=[145.25, 145.5]", "table_depth_m=[5.0, 20.0]",
+             "patch_depth_m=[10.0, 50.0]", "test_patches=3"],
+}  # fmt: skip
+KEYS = {
+    "focus": {"starts_mm", "final_mm", "best_focus_mm", "batches_to_focus", "seconds"},
+    "restore": {"parameters", "starts_mm", "final_mm", "test"},
+    "edof": {"starts_mm", "final_mm", "table"},
+}
+FIGURES = {
+    "focus": {"lens", "figure_4a", "figure_4b"},
+    "restore": {"figure_5a", "restored"},
+    "edof": {"lens", "figure_6a", "figure_6b", "figure_7"},
+}
+
+
+def main(name, *argv):
+    importlib.import_module(f"experiments.{name}").main([*map(str, argv)])
+
+
+def toy(name, folder):
+    main(name, "--out", folder, "--set", *TOY[name])
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    """The run folder of each experiment, run once without a break."""
+    folders = {}
+
+    def run(name):
+        if name not in folders:
+            folders[name] = tmp_path_factory.mktemp("unbroken") / name
+            toy(name, folders[name])
+        return folders[name]
+
+    return run
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_config_loads_strictly(path):
+    kind = importlib.import_module(f"experiments.{path.stem}").Config
+    assert load_config(kind, path) != load_config(kind, path, ["seed=99"])
+
+
+@pytest.mark.parametrize("name", TOY)
+def test_a_run_explains_itself(name, unbroken):
+    folder = unbroken(name)
+    results = json.loads((folder / "results.json").read_text())
+    assert KEYS[name] <= set(results) and len(results["final_mm"]) == 2
+    assert {path.stem for path in (folder / "figures").glob("*.png")} == FIGURES[name]
+    for path in (folder / "figures").glob("*.png"):
+        assert io.imread(path).std() > 5, f"{path} is blank"
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["train"]["batches"] == 25 and config["camera"]["form"] == "integrated"
+    if name == "restore":
+        assert results["parameters"] == 298_947
+        assert [row["noise"] for row in results["test"]] == [0.01, 0.05]
+        assert results["test"][1]["sensor_mae"] > results["test"][0]["sensor_mae"]
+    if name == "edof":
+        assert [row["depth_m"] for row in results["table"]] == [5, 20]
+        assert {"mae", "rmse"} <= set(results["table"][0]["fixed"])
+
+
+@pytest.mark.parametrize("name", TOY)
+def test_an_interrupted_run_resumes_to_the_same_numbers(name, unbroken, tmp_path, monkeypatch, capsys):
+    """Ctrl-C in the middle of a job, then --resume: metrics and results of an unbroken run."""
+    log, calls = Run.log, []
+
+    def interrupting(self, *args):
+        log(self, *args)
+        calls.append(1)
+        if len(calls) == (4 if name == "focus" else 5):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Run, "log", interrupting)
+    with pytest.raises(SystemExit) as stopped:
+        toy(name, tmp_path / "run")
+    assert stopped.value.code == 130 and "--resume" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "results.json").exists()
+    monkeypatch.undo()
+    main(name, "--resume", "--out", tmp_path / "run")
+    same(unbroken(name), tmp_path / "run")
+
+
+def same(wanted, folder):
+    assert (folder / "metrics.csv").read_text() == (wanted / "metrics.csv").read_text()
+    results = [json.loads((f / "results.json").read_text()) for f in (wanted, folder)]
+    for result in results:
+        result.pop("seconds")
+    assert results[0] == results[1]
+
+
+def test_a_killed_run_resumes_to_the_same_numbers(unbroken, tmp_path):
+    """kill -9 once metrics have come: nothing is lost but the steps since the checkpoint."""
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "experiments.focus", "--out", str(folder), "--set", *TOY["focus"]]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (folder / "metrics.csv").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    main("focus", "--resume", "--out", folder)
+    same(unbroken("focus"), folder)
+
+
+def test_finished_run_resumes_at_once(unbroken, capsys):
+    before = (unbroken("focus") / "metrics.csv").read_text()
+    main("focus", "--resume", "--out", unbroken("focus"))
+    assert (unbroken("focus") / "metrics.csv").read_text() == before
+    assert "best focus by dense search" in capsys.readouterr().out
+
+
+FAILURES = {
+    "unknown key": (["--set", "train.bacth=3"], "did you mean train.batch?"),
+    "wrong type": (["--set", "noise=loud"], "noise: expected a number, got 'loud'"),
+    "no config": (["--config", "none.yaml"], "none.yaml: cannot be read"),
+    "unknown lens": (["--set", "scene.lens=triplet"], "no bundled lens 'triplet'"),
+    "no images": (["--set", "data.root=nowhere"], "data.root: nowhere is not a folder"),
+    "bad kernel": (["--set", "camera.kernel=8"], "camera.kernel: expected an odd number"),
+    "no batches": (["--set", "train.batches=0"], "train.batches: must be at least 1"),
+    "too few": (["--set", "data.crops_per_image=1", "train.batch=500"], "do not fill a batch"),
+    "wavelength": (["--set", "scene.wavelengths_um=[0.6,5.0]"], "outside the range of N-SK2"),
+    "nothing to resume": (["--resume"], "nothing to resume"),
+}
+
+
+@pytest.mark.parametrize("case", FAILURES)
+def test_bad_input_gets_one_clear_line_and_an_exit_code(case, tmp_path, capsys, monkeypatch):
+    options, message = FAILURES[case]
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main("focus", "--out", tmp_path / "run", *options)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and message in error and "Traceback" not in error
+
+
+def test_a_second_run_does_not_overwrite_the_first(unbroken, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        toy("focus", unbroken("focus"))
+    assert stopped.value.code == 2 and "holds a run already" in capsys.readouterr().err
+
+
+def test_full_disk_is_reported_with_the_remedy(tmp_path, capsys, monkeypatch):
+    def full(*args):
+        raise OSError(28, "No space left on device", "metrics.csv")
+
+    monkeypatch.setattr(Run, "log", full)
+    with pytest.raises(SystemExit) as stopped:
+        toy("focus", tmp_path / "run")
+    error = capsys.readouterr().err
+    assert stopped.value.code == 1 and "No space left on device" in error and "--resume" in error
+
+
+@pytest.mark.parametrize("name", TOY)
+def test_help_lists_the_settings(name, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(name, "--help")
+    text = capsys.readouterr().out
+    assert stopped.value.code == 0 and "train.optics_rate: a number" in text and "Section 6" in text

@@ -1,0 +1,163 @@
+"""Moments: published numbers, symmetric against general paths, polynomials against tracing."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import focus_moments, load_lens, moments, psf_moments, pupil, pupil_order, trace_rays
+
+from .conftest import LENSES, RGB
+
+# Double Gauss, object at 25 m, mean of R, G, B, in um, found before this package was written.
+SIGMA = {130: 257.8, 132: 105.6, 132.5: 67.6, 133: 29.8, 133.3: 7.9, 133.5: 9.6, 134: 46.8,
+         134.5: 84.8, 135: 122.8}  # fmt: skip
+
+
+@pytest.mark.parametrize("sensor", SIGMA)
+def test_blur_of_the_double_gauss(sensor):
+    lens = dataclasses.replace(load_lens("double_gauss"), sensor=jnp.asarray(float(sensor)))
+    mean, covariance = psf_moments(lens, 0.0, 25000.0, RGB)
+    assert mean.shape == (3, 2) and covariance.shape == (3, 2, 2)
+    np.testing.assert_allclose(1e3 * np.sqrt(covariance[:, 0, 0]).mean(), SIGMA[sensor], atol=0.051)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_meridional_half_and_whole_pupil_agree(name):
+    lens = load_lens(name)
+    wide = 12  # enough azimuths for the general rule to converge to rounding
+    meridian = moments._plane_moments(lens, 0.0, 9000.0, RGB, *pupil.meridian(wide), "meridian")
+    for field in (0.0, 0.1):
+        half = moments._plane_moments(
+            lens, field, 9000.0, RGB, *pupil.half_disc(wide, wide + 1), "half"
+        )
+        disc = moments._plane_moments(lens, field, 9000.0, RGB, *pupil.disc(wide, wide + 1), "disc")
+        np.testing.assert_allclose(disc.spread[..., :2], half.spread, rtol=1e-10, atol=1e-16)
+        np.testing.assert_allclose(disc.spread[..., 2], 0, atol=1e-12)
+        np.testing.assert_allclose(disc.mean, half.mean, rtol=1e-10, atol=1e-12)
+        if field == 0:
+            np.testing.assert_allclose(half.spread, meridian.spread, rtol=1e-10, atol=1e-16)
+
+
+def test_field_in_any_direction_turns_the_moments():
+    lens = load_lens("cooke_triplet")
+    angle, h = 0.6, np.tan(0.15)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    field = np.arctan(turn @ [0.0, h])
+    mean, covariance = psf_moments(lens, np.arctan([0.0, h]), jnp.inf, RGB, 1e-11)
+    turned_mean, turned = psf_moments(lens, field, jnp.inf, RGB, 1e-11)
+    np.testing.assert_allclose(turned_mean, mean @ turn.T, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(turned, turn @ covariance @ turn.T, rtol=1e-8, atol=1e-14)
+
+
+def test_moments_are_those_of_many_random_rays():
+    """The paper's way, with 40,000 rays instead of 256: agrees within 4 standard errors."""
+    lens = load_lens("cooke_triplet")
+    points, _ = pupil.random_disc(40_000, seed=0)
+    hits = np.asarray(trace_rays(lens, 0.2, 5000.0, [0.53], points.T).points[0, :, -1, :2])
+    mean, covariance = psf_moments(lens, 0.2, 5000.0, [0.53])
+    centred = hits - hits.mean(axis=0)
+    np.testing.assert_array_less(
+        np.abs(hits.mean(axis=0) - mean[0]), 4 * hits.std(axis=0) / np.sqrt(len(hits))
+    )
+    products = centred[:, :, None] * centred[:, None, :]
+    error = 4 * products.std(axis=0) / np.sqrt(len(hits))
+    np.testing.assert_array_less(np.abs(products.mean(axis=0) - covariance[0]), error)
+
+
+@pytest.mark.parametrize("field", [0.0, 0.1])
+def test_sensor_polynomial_is_the_traced_moment(field):
+    lens = load_lens("double_gauss")
+    focus = focus_moments(lens, field, 25000.0, RGB, 1e-9)
+    for sensor in (130.0, 133.0, 133.35, 135.0):
+        moved = dataclasses.replace(lens, sensor=jnp.array(sensor))
+        mean, covariance = psf_moments(moved, field, 25000.0, RGB, 1e-9)
+        m, variances = focus.at(sensor)
+        assert variances.shape == (3, 2)  # principal axes by symmetry
+        np.testing.assert_allclose(m, mean, atol=1e-10)
+        diagonal = jnp.diagonal(covariance, 0, 1, 2)
+        np.testing.assert_allclose(variances, diagonal, rtol=2e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("field", [0.0, 0.05])
+def test_depth_interpolation_is_the_traced_moment(field):
+    lens = load_lens("double_gauss_addon")
+    depths = drt_jax.depth_moments(lens, field, 5e3, 5e4, RGB, 1e-11)
+    for distance in (5e3, 6.1e3, 1.7e4, 3.3e4, 5e4):
+        wanted = focus_moments(lens, field, distance, RGB, 1e-11)
+        ours = depths.at(distance)
+        size = np.max(np.asarray(wanted.spread), axis=(1, 2), keepdims=True)
+        np.testing.assert_allclose(ours.spread / size, wanted.spread / size, atol=1e-10)
+        np.testing.assert_allclose(ours.mean, wanted.mean, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["double_gauss", "cooke_triplet"])
+@pytest.mark.parametrize("degrees", [0.0, 5.0, 10.0])
+def test_order_keeps_the_promised_tolerance(name, degrees):
+    lens = load_lens(name)
+    field = np.radians(degrees)
+    exact = psf_moments(lens, field, 25000.0, RGB, order=20)[1]
+    size = np.sqrt(np.trace(exact, axis1=1, axis2=2))
+    before = 0
+    for tolerance in (1e-3, 1e-6, 1e-9):
+        order = pupil_order(lens, field, 25000.0, RGB, tolerance)
+        got = psf_moments(lens, field, 25000.0, RGB, order=order)[1]
+        error = np.max(np.abs(np.sqrt(np.trace(got, axis1=1, axis2=2)) / size - 1))
+        assert error <= tolerance and order > before
+        before = order
+
+
+def test_inside_jit_the_order_follows_a_rule_that_is_on_the_safe_side():
+    lens = load_lens("double_gauss")
+    for field in (0.0, 0.17):
+        got = jax.jit(lambda lens: psf_moments(lens, field, 25000.0, RGB, 1e-6)[1])(lens)
+        exact = psf_moments(lens, field, 25000.0, RGB, 1e-11)[1]
+        np.testing.assert_allclose(got, exact, rtol=2e-6, atol=1e-13)
+
+
+def test_gradient_with_respect_to_the_whole_lens():
+    lens = load_lens("double_gauss")
+
+    def blur(lens):
+        return jnp.sum(psf_moments(lens, 0.1, 25000.0, RGB, order=5)[1])
+
+    gradient = jax.jit(jax.grad(blur))(lens)
+    value = jax.jit(blur)
+    for leaf, k in (("curvature", 2), ("thickness", 5), ("conic", 6), ("semi_diameter", 5)):
+        h = 1e-5 * (abs(float(getattr(lens, leaf)[k])) + 1e-2)
+        shift = lambda s: dataclasses.replace(  # noqa: E731
+            lens, **{leaf: getattr(lens, leaf).at[k].add(s)}
+        )
+        difference = (value(shift(h)) - value(shift(-h))) / (2 * h)
+        np.testing.assert_allclose(getattr(gradient, leaf)[k], difference, rtol=3e-6, atol=1e-12)
+
+
+def test_cheapest_model_agrees_with_retracing():
+    lens = load_lens("double_gauss_addon")
+    near, far = 1e4, 5e4
+    values, cheap = drt_jax.moments_model(lens, ("sensor",), 0.0, (near, far), RGB, 1e-10)
+    everything, retrace = drt_jax.moments_model(
+        lens, ("sensor", "curvature"), 0.0, (near, far), RGB, 1e-10
+    )
+    assert set(values) == {"sensor"} and set(everything) == {"sensor", "curvature"}
+    for distance in (1e4, 2.2e4, 5e4):
+        for a, b in zip(cheap(values, distance), retrace(everything, distance)):
+            np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-14)
+    # In the cheap one no ray is traced: no loop, no square root of a root-finder.
+    assert "while" not in str(jax.make_jaxpr(cheap)(values, 2e4))
+    assert "while" in str(jax.make_jaxpr(retrace)(everything, 2e4))
+
+
+def test_bad_requests():
+    lens = load_lens("singlet")
+    with pytest.raises(ValueError, match="tolerance: expected a number between 0 and 1"):
+        psf_moments(lens, 0.0, jnp.inf, RGB, tolerance=2.0)
+    with pytest.raises(ValueError, match="expected 0 < near < far"):
+        drt_jax.depth_moments(lens, 0.0, 5e4, 1e4, RGB)
+    blocked = dataclasses.replace(lens, semi_diameter=jnp.array([5.0, 12.5, 1e-3]))
+    blocked = dataclasses.replace(blocked, sensor=lens.sensor)
+    with pytest.raises(ValueError, match="no ray at 0.6 um reaches the sensor"):
+        psf_moments(blocked, 0.0, jnp.inf, RGB)

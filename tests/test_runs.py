@@ -1,0 +1,92 @@
+import dataclasses
+import os
+import signal
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drt_jax.config import ConfigError
+from drt_jax.runs import Run, deferred_interrupt
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    batches: int = 10
+
+
+def opened(tmp_path, resume=False, config=Config()):
+    return Run(tmp_path / "run", config, ("loss", "sensor_mm"), resume)
+
+
+def test_metrics_and_checkpoints_round_trip(tmp_path):
+    run = opened(tmp_path)
+    run.log("a", 0, {"loss": np.array([0.1, 1 / 3]), "sensor_mm": np.array([1.0, 2.0])})
+    run.log("b", 0, {"loss": np.array([5.0])})
+    read = run.metrics("a")
+    assert read["loss"][1] == 1 / 3 and read["step"].tolist() == [0, 1]
+    assert np.isnan(run.metrics("b")["sensor_mm"][0])
+    tree = {"x": jnp.array([1.0, jnp.pi]), "y": (jnp.ones((2, 2), jnp.float32), jnp.int32(3))}
+    run.save("a", 2, tree)
+    step, back = run.load("a", tree, ("a",))
+    assert step == 2 and back["x"][1] == jnp.pi and back["y"][0].dtype == jnp.float32
+
+
+def test_metrics_beyond_the_checkpoint_are_dropped(tmp_path):
+    run = opened(tmp_path)
+    for start in (0, 2):
+        run.log("a", start, {"loss": np.ones(2), "sensor_mm": np.ones(2)})
+        run.log("b", start, {"loss": np.ones(2), "sensor_mm": np.ones(2)})
+    run.save("a", 2, jnp.ones(1))
+    with open(run.folder / "metrics.csv", "a") as file:
+        file.write("a,4,0.5")  # a line cut off by a kill
+    again = opened(tmp_path, resume=True)
+    assert again.load("a", jnp.ones(1), ("a",))[0] == 2
+    assert again.metrics("a")["step"].tolist() == [0, 1]
+    assert again.metrics("b")["step"].tolist() == [0, 1, 2, 3]
+    assert again.load("b", jnp.ones(1), ("b",))[0] == 0
+    assert again.metrics("b")["step"].tolist() == []
+
+
+def test_a_failed_write_leaves_the_old_checkpoint(tmp_path, monkeypatch):
+    run = opened(tmp_path)
+    run.save("a", 1, jnp.ones(3))
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="No space left"):
+        run.save("a", 2, jnp.zeros(3))
+    monkeypatch.undo()
+    assert run.load("a", jnp.zeros(3), ("a",))[0] == 1
+    assert not list(run.folder.rglob("*.partial"))
+
+
+def test_clear_errors(tmp_path):
+    with pytest.raises(ConfigError, match="nothing to resume"):
+        opened(tmp_path, resume=True)
+    run = opened(tmp_path)
+    with pytest.raises(ConfigError, match="holds a run already; add --resume"):
+        opened(tmp_path)
+    with pytest.raises(ConfigError, match="started with other settings"):
+        opened(tmp_path, resume=True, config=Config(11))
+    (run.folder / "checkpoints").mkdir()
+    (run.folder / "checkpoints" / "a.npz").write_bytes(b"garbage")
+    with pytest.raises(ConfigError, match="not a checkpoint of this run; delete it"):
+        run.load("a", jnp.ones(1), ("a",))
+
+
+def test_first_interrupt_is_deferred_second_is_not():
+    with deferred_interrupt() as asked:
+        assert not asked()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert asked()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+            while True:  # the signal arrives between two bytecodes
+                pass
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        while True:
+            pass

@@ -1,0 +1,68 @@
+"""The sensor layer against scipy.ndimage."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from drt_jax.psf import SeparableKernel, gaussian_psf
+from drt_jax.sensor import convolve, sensor_layer
+
+
+def kernels(dense):
+    mean = jnp.array([[0.4, -1.2], [0.0, 0.3], [-2.0, 0.0]])
+    covariance = jnp.array([[[4.0, 1.5], [1.5, 2.0]], [[0.3, 0.1], [0.1, 0.2]], [[9.0, 0], [0, 3.0]]])
+    return gaussian_psf(mean, covariance if dense else jnp.diagonal(covariance, 0, 1, 2), 1.0, 9)
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_valid_convolution_is_scipys(dense):
+    scenes = np.random.default_rng(0).random((2, 30, 41, 3))
+    kernel = kernels(dense)
+    ours = convolve(jnp.asarray(scenes), kernel)
+    full = np.asarray(kernel if dense else kernel.dense())
+    assert ours.shape == (2, 22, 33, 3)
+    for b in range(2):
+        for c in range(3):
+            wanted = ndimage.convolve(scenes[b, :, :, c], full[c])[4:-4, 4:-4]
+            np.testing.assert_allclose(ours[b, :, :, c], wanted, atol=1e-14)
+
+
+def test_separable_path_and_its_gradient_agree_with_the_dense_one():
+    scenes = jnp.asarray(np.random.default_rng(1).random((1, 20, 20, 3)))
+    weights = jnp.asarray(np.random.default_rng(2).random((1, 12, 12, 3)))
+
+    def fast(kernel):
+        return jnp.sum(weights * convolve(scenes, kernel))
+
+    def slow(kernel):
+        return jnp.sum(weights * convolve(scenes, kernel.dense()))
+
+    kernel = kernels(False)
+    np.testing.assert_allclose(fast(kernel), slow(kernel), rtol=1e-13)
+    for a, b in zip(jax.grad(fast)(kernel), jax.grad(slow)(kernel)):
+        np.testing.assert_allclose(a, b, rtol=1e-11)
+
+
+def test_a_constant_scene_stays_constant_and_precision_is_the_scenes():
+    scenes = jnp.full((1, 20, 20, 3), 0.25, jnp.float32)
+    image = sensor_layer(scenes, kernels(False), 0.0, jax.random.key(0))
+    assert image.dtype == jnp.float32
+    np.testing.assert_allclose(image, 0.25, rtol=1e-6)
+
+
+def test_noise_is_white_of_the_given_strength_and_follows_the_key():
+    scenes = jnp.zeros((4, 108, 108, 3), jnp.float32)
+    one = sensor_layer(scenes, kernels(False), 0.03, jax.random.key(1))
+    np.testing.assert_allclose(np.std(one), 0.03, rtol=0.02)
+    neighbours = np.corrcoef(np.ravel(one[:, :, 1:]), np.ravel(one[:, :, :-1]))[0, 1]
+    assert abs(neighbours) < 0.02
+    np.testing.assert_array_equal(one, sensor_layer(scenes, kernels(False), 0.03, jax.random.key(1)))
+    assert np.any(one != sensor_layer(scenes, kernels(False), 0.03, jax.random.key(2)))
+
+
+def test_kernel_of_one_pixel_changes_nothing():
+    scenes = jnp.asarray(np.random.default_rng(0).random((1, 5, 6, 3)))
+    kernel = SeparableKernel(jnp.ones((3, 1)), jnp.ones((3, 1)))
+    np.testing.assert_array_equal(convolve(scenes, kernel), scenes)

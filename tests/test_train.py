@@ -1,0 +1,129 @@
+"""The chain and its training step, against the parts put together by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import train
+from drt_jax.psf import gaussian_psf
+from drt_jax.sensor import convolve
+
+from .conftest import RGB
+
+CAMERA = train.Camera(kernel=9)
+
+
+def model(trained=("sensor",), distances=(25000.0, 25000.0)):
+    return drt_jax.moments_model(
+        drt_jax.load_lens("double_gauss"), trained, 0.0, distances, RGB, 1e-9
+    )
+
+
+def scenes(seed=0, count=3):
+    return np.random.default_rng(seed).integers(0, 255, (count, 24, 24, 3), dtype=np.uint8)
+
+
+def test_imager_is_the_chain_by_hand():
+    _, blur = model()
+    imager = train.make_imager(blur, None, CAMERA)
+    sensor = jnp.array(133.2)
+    truth, image, restored, sigma = imager(
+        {"optics": {"sensor": sensor}}, scenes(), jnp.array(25000.0), np.float32(0), jax.random.key(0)
+    )
+    x = scenes().astype(np.float32) / np.float32(255)
+    np.testing.assert_array_equal(truth, x[:, 4:-4, 4:-4])
+    mean, covariance = blur({"sensor": sensor}, 25000.0)
+    kernel = gaussian_psf(mean, covariance, 4.4e-3, 9).dense()
+    np.testing.assert_allclose(image, convolve(jnp.asarray(x, float), kernel), atol=1e-6)
+    assert image.dtype == jnp.float32 and restored is image
+    np.testing.assert_allclose(sigma, np.sqrt(covariance[:, 1]))
+
+
+def test_gradient_of_the_loss_by_the_sensor_position():
+    """Through network, sensor layer, kernel and moments, against finite differences."""
+    init, restore = drt_jax.red_net(2, 4)
+    weights = init(jax.random.key(0))
+    imager = train.make_imager(model()[1], restore, CAMERA)
+
+    def loss(sensor):
+        parameters = {"optics": {"sensor": sensor}, "network": weights}
+        truth, _, restored, _ = imager(
+            parameters, scenes(), jnp.array(25000.0), np.float32(0.01), jax.random.key(0)
+        )
+        return jnp.mean(((restored - truth) ** 2).astype(jnp.float64))
+
+    at, h = jnp.array(133.1), 2e-2
+    central = [(loss(at + k * h) - loss(at - k * h)) / (2 * k * h) for k in (1, 2)]
+    difference = (4 * central[0] - central[1]) / 3
+    np.testing.assert_allclose(jax.grad(loss)(at), difference, rtol=2e-3)
+
+
+@pytest.mark.parametrize("start", [132.9, 133.9])
+def test_training_moves_the_sensor_to_focus_and_compiles_once(start):
+    imager = train.make_imager(model()[1], None, CAMERA)
+    init, step = train.make_step(imager, {"optics": 0.1}, (25000.0, 25000.0), seed=0)
+    state = init({"optics": {"sensor": jnp.array(start)}})
+    reports = []
+
+    def report(first, metrics, state):
+        reports.append((first, metrics))
+        return False
+
+    state = train.fit(
+        step, state, iter(lambda: scenes(), None), 0.01, 0, 40, 16, report
+    )
+    assert [first for first, _ in reports] == [0, 16, 32]
+    assert reports[-1][1]["loss"].shape == (8,)
+    assert abs(float(state[0]["optics"]["sensor"]) - 133.39) < 0.15
+    assert step._cache_size() == 1
+
+
+def test_depth_is_uniform_and_steps_depend_on_seed_and_index_alone():
+    imager = train.make_imager(model(distances=(1e4, 5e4))[1], None, CAMERA)
+    init, step = train.make_step(imager, {"optics": 0.0}, (1e4, 5e4), seed=3)
+    depths = []
+    for k in range(200):
+        _, metrics = step(init({"optics": {"sensor": jnp.array(133.0)}}), scenes(), np.float32(0), np.int32(k))
+        depths.append(float(metrics["depth_mm"]))
+    assert 1e4 <= min(depths) < 1.1e4 and 4.9e4 < max(depths) <= 5e4
+    np.testing.assert_allclose(np.mean(depths), 3e4, atol=2.5e3)
+    _, again = step(init({"optics": {"sensor": jnp.array(133.0)}}), scenes(), np.float32(0), np.int32(7))
+    assert float(again["depth_mm"]) == depths[7]
+
+
+def test_network_stays_in_float32():
+    init_network, restore = drt_jax.red_net(1, 2)
+    imager = train.make_imager(model()[1], restore, CAMERA)
+    init, step = train.make_step(
+        imager, {"optics": 1e-2, "network": 1e-3}, (25000.0, 25000.0), seed=0
+    )
+    state = init({"optics": {"sensor": jnp.array(133.0)}, "network": init_network(jax.random.key(0))})
+    text = str(jax.make_jaxpr(step)(state, scenes(), np.float32(0), np.int32(0)))
+    convolutions = [line for line in text.splitlines() if "conv_general_dilated" in line]
+    assert convolutions and all("f32[" in line and "f64[" not in line for line in convolutions)
+    (parameters, moments), _ = step(state, scenes(), np.float32(0), np.int32(0))
+    assert parameters["optics"]["sensor"].dtype == jnp.float64
+    assert all(a.dtype == jnp.float32 for a in jax.tree.leaves(parameters["network"]))
+
+
+def test_metrics_of_known_images():
+    """A camera that adds 0.1 everywhere has MAE and RMSE 0.1 and PSNR 20 dB."""
+
+    def imager(parameters, patches, distance, noise, key):
+        truth = jnp.asarray(patches, jnp.float32) / 255
+        return truth, truth + 0.1, truth, jnp.zeros(3)
+
+    result = train.evaluate(imager, {}, scenes(count=5), 1.0, 0.0, 0, batch=2)
+    np.testing.assert_allclose(
+        [result["sensor_mae"], result["sensor_rmse"], result["sensor_psnr"]], [0.1, 0.1, 20], rtol=1e-5
+    )
+    assert result["mae"] == result["rmse"] == 0 and result["ssim"] == 1
+
+
+def test_bad_camera():
+    with pytest.raises(ValueError, match="camera.kernel: expected an odd number"):
+        train.Camera(kernel=20)
+    with pytest.raises(ValueError, match="camera.pixel_um"):
+        train.Camera(pixel_um=0.0)
