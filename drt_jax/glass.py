@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 from jax import Array
+from jax.typing import ArrayLike
 
 __all__ = ["Dispersion", "Glass", "find_glass", "refractive_index"]
 
@@ -90,12 +91,12 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     return jnp.sqrt(sellmeier + a @ powers)
 
 
-def check_wavelengths(names: tuple[str, ...], wavelengths: Array) -> None:
+def check_wavelengths(names: tuple[str, ...], wavelengths: ArrayLike) -> None:
     """ValueError if a known wavelength (um) lies outside the range of a catalogue glass.
 
     Inside a trace the values are not known and nothing is checked.
     """
-    if isinstance(wavelengths, jax.core.Tracer):
+    if any(isinstance(value, jax.core.Tracer) for value in jax.tree.leaves(wavelengths)):
         return
     glasses = _catalogue()
     for name in names:

@@ -9,6 +9,7 @@ distance varies too, those polynomials are interpolated in 1/distance.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from jax.typing import ArrayLike
 
 from . import pupil, surface
 from .fermat import Status
+from .glass import check_wavelengths
 from .lens import Lens
 from .numerics import safe_divide
 from .trace import as_field, trace_bundle
@@ -103,6 +105,7 @@ def focus_moments(
     Arguments as in `psf_moments`. Differentiable in all lens parameters; rays that fail or
     are clipped have weight 0, and the rest is normalised. Paper section 4.3.
     """
+    check_wavelengths(lens.glasses, wavelengths)
     symmetry = _symmetry(field)
     if order is None:
         if _concrete(lens, field, distance, wavelengths):
@@ -111,6 +114,7 @@ def focus_moments(
     return _plane_moments(lens, field, distance, wavelengths, *_rule(symmetry, order), symmetry)
 
 
+@partial(jax.jit, static_argnums=6)
 def _plane_moments(
     lens: Lens,
     field: ArrayLike,
@@ -206,6 +210,7 @@ def pupil_order(
     there, call this function outside and pass the result on.
     """
     _check_tolerance(tolerance)
+    check_wavelengths(lens.glasses, wavelengths)
     if _concrete(lens, field, distance, wavelengths):
         return _converge(lens, field, distance, wavelengths, tolerance)[0]
     return min(_blind_order(_symmetry(field), tolerance), _MAX_ORDER)
@@ -226,7 +231,7 @@ def _converge(
     previous = None
     for order in range(2, _MAX_ORDER + 2):
         points, weights = _pad(*_rule(symmetry, order))
-        moments = _jitted_moments(lens, field, distance, wavelengths, points, weights, symmetry)
+        moments = _plane_moments(lens, field, distance, wavelengths, points, weights, symmetry)
         _check_passed(moments, wavelengths)
         spread = np.asarray(moments.spread[0], float)
         if previous is not None:
@@ -251,9 +256,6 @@ def _check_passed(moments: FocusMoments, wavelengths: ArrayLike) -> None:
                 f"no ray at {float(wavelength):g} um reaches the sensor: every one misses a "
                 "surface, is totally reflected or is clipped; see trace_rays(...).status"
             )
-
-
-_jitted_moments = jax.jit(_plane_moments, static_argnums=6)
 
 
 @jax.tree_util.register_dataclass
@@ -309,7 +311,7 @@ def depth_moments(
         transform = 2 / count * np.cos(np.outer(np.arange(count), angle))
         transform[0] /= 2
         traced = [
-            _jitted_moments(lens, field, 1 / node, wavelengths, points, weights, symmetry)
+            _plane_moments(lens, field, 1 / node, wavelengths, points, weights, symmetry)
             for node in nodes
         ]
         series = jax.tree.map(

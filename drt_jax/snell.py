@@ -4,6 +4,7 @@ Written from the textbook formulae (Welford, Aberrations of Optical Systems, ch.
 no formula with the Fermat solver but the sag. One ray at a time; `jax.vmap` for more.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -25,9 +26,12 @@ def _intersect(p: Array, d: Array, c: Array, k: Array, a: Array) -> tuple[Array,
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
     q = p + d * (constant / (linear + root))
     if a.shape[0]:
-        for _ in range(_ASPHERE_STEPS):
+
+        def closer(_, q):
             z, slope, _ = surface.sag_derivatives(q[:2], c, k, a)
-            q = q + d * ((z - q[2]) / (d[2] - slope @ d[:2]))
+            return q + d * ((z - q[2]) / (d[2] - slope @ d[:2]))
+
+        q = jax.lax.fori_loop(0, _ASPHERE_STEPS, closer, q)
     _, slope, _ = surface.sag_derivatives(q[:2], c, k, a)
     normal = jnp.array([-slope[0], -slope[1], jnp.ones_like(slope[0])])
     return q, normal / jnp.linalg.norm(normal), discriminant >= 0

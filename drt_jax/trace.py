@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 
 from . import surface
 from .fermat import Status, System, geometry
+from .glass import check_wavelengths
 from .implicit import solve_rays
 from .lens import Lens
 from .numerics import safe_divide
@@ -128,8 +129,15 @@ def trace_rays(
     `field`: angle in radians along y, or (x, y); positive light travels upwards. `distance`:
     mm from the object plane to the first vertex, inf allowed. `wavelengths` (W,) in um.
     `pupil` (Q, 2), x and y on the stop in units of its semi-diameter. Rays are aimed at the
-    real stop, for every wavelength. Differentiable in everything but the status.
+    real stop, for every wavelength. Differentiable in everything but the status. ValueError
+    for a known wavelength outside the range of a glass.
     """
+    check_wavelengths(lens.glasses, wavelengths)
+    return _trace_rays(lens, field, distance, wavelengths, pupil)
+
+
+@jax.jit
+def _trace_rays(lens, field, distance, wavelengths, pupil) -> Rays:
     wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, lens.curvature.dtype))
     hits, status, steps = trace_bundle(
         lens, as_field(field, lens.curvature.dtype), distance, wavelengths, jnp.asarray(pupil).T

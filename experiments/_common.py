@@ -87,6 +87,8 @@ def main(
         source = options.config or default
         if options.resume and not options.config:
             source = folder / "config.yaml"
+            if not source.is_file():
+                raise configs.ConfigError(f"{folder}: nothing to resume: no config.yaml in it")
         config = configs.load_config(kind, source, options.set)
         opened = Run(folder, config, columns, options.resume)
         print(f"{name}: run folder {folder}")

@@ -46,13 +46,14 @@ def best_focus(imager, scenes: np.ndarray, distance: float, noise: float, span: 
         return jnp.mean(jnp.abs(image - truth))
 
     losses = jax.jit(lambda grid, scenes: jax.lax.map(lambda s: loss(s, scenes), grid))
+    batch = min(32, len(scenes))
     low, high = span
     for _ in range(3):
         grid = np.linspace(low, high, 41)
         step = grid[1] - grid[0]
         total = sum(
-            np.asarray(losses(jnp.asarray(grid), scenes[i : i + 32]), float)
-            for i in range(0, len(scenes) - 31, 32)
+            np.asarray(losses(jnp.asarray(grid), scenes[i : i + batch]), float)
+            for i in range(0, len(scenes) - batch + 1, batch)
         )
         k = int(np.clip(np.argmin(total), 1, len(grid) - 2))
         low, high = grid[k] - 2 * step, grid[k] + 2 * step

@@ -1,12 +1,20 @@
 """Tests run in float64 and under strict dtype promotion: nothing may change precision silently."""
 
+import os
 import pathlib
+import tempfile
 
 import jax
 import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# Tests that run the same program again, also in new processes, need not compile it again.
+_cache = tempfile.TemporaryDirectory(prefix="drt-jax-compiled-")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
+jax.config.update("jax_compilation_cache_dir", _cache.name)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 RGB = (0.6, 0.53, 0.48)
 LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")

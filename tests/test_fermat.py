@@ -33,12 +33,19 @@ def system_of(lens, dim, tangent, vergence, rays=3):
 
 CASES = [(name, dim, v) for name in LENSES for dim in (1, 2) for v in (0.0, 1 / 25000, 1 / 60)]
 
+residual = jax.jit(fermat.residual)
+optical_path = jax.jit(fermat.optical_path)
+hessian = jax.jit(lambda hits, system: fermat.hessian(fermat.geometry(hits, system), system))
+solve = jax.jit(fermat.solve, static_argnums=2)
+solve_transposed = jax.jit(fermat.solve_transposed, static_argnums=2)
+status = jax.jit(fermat.status)
+gradient = jax.jit(jax.grad(lambda hits, system: jnp.sum(fermat.optical_path(hits, system))))
+
 
 @pytest.mark.parametrize("name, dim, vergence", CASES)
 def test_residual_is_the_gradient_of_the_path(name, dim, vergence):
     system, hits = system_of(load_lens(name), dim, 0.2, vergence)
-    gradient = jax.grad(lambda hits: jnp.sum(fermat.optical_path(hits, system)))(hits)
-    np.testing.assert_allclose(fermat.residual(hits, system), gradient[:, :-1], atol=2e-15)
+    np.testing.assert_allclose(residual(hits, system), gradient(hits, system)[:, :-1], atol=2e-15)
 
 
 @pytest.mark.parametrize("name, dim", [("double_gauss", 1), ("double_gauss", 2), ("singlet", 2)])
@@ -48,19 +55,19 @@ def test_blocks_solve_and_transpose_against_the_dense_jacobian(name, dim):
     system = system._replace(index=system.index[:, :1])
     hits = hits[:, :, :1]
     unknown = [i for i in range(hits.shape[1]) if i != lens.stop]
-    dense = jax.jacobian(fermat.residual)(hits, system)[:, :, 0, 0, :, :, 0, 0]
+    dense = jax.jit(jax.jacobian(fermat.residual))(hits, system)[:, :, 0, 0, :, :, 0, 0]
     dense = dense[:, :, :, jnp.array(unknown)].reshape(dim * (hits.shape[1] - 1), -1)
-    blocks = fermat.hessian(fermat.geometry(hits, system), system)
+    blocks = hessian(hits, system)
 
     rhs = jnp.asarray(np.random.default_rng(0).normal(size=hits[:, :-1].shape))
-    x = fermat.solve(blocks, rhs, lens.stop)
+    x = solve(blocks, rhs, lens.stop)
     assert jnp.all(x[:, lens.stop] == 0)
     wanted = jnp.linalg.solve(dense, rhs.ravel())
     scale = float(jnp.max(jnp.abs(wanted)))
     np.testing.assert_allclose(x[:, jnp.array(unknown)].ravel(), wanted, atol=1e-12 * scale)
 
     rhs = jnp.asarray(np.random.default_rng(1).normal(size=hits.shape))
-    y = fermat.solve_transposed(blocks, rhs, lens.stop)
+    y = solve_transposed(blocks, rhs, lens.stop)
     wanted = jnp.linalg.solve(dense.T, rhs[:, jnp.array(unknown)].ravel())
     scale = float(jnp.max(jnp.abs(wanted)))
     np.testing.assert_allclose(y.ravel(), wanted, atol=1e-12 * scale)
@@ -70,12 +77,12 @@ def test_solve_and_transpose_are_adjoint():
     """<y, A^-1 x> = <A^-T y, x> for a bundle."""
     lens = load_lens("double_gauss_addon")
     system, hits = system_of(lens, 2, 0.1, 1 / 25000, rays=5)
-    blocks = fermat.hessian(fermat.geometry(hits, system), system)
+    blocks = hessian(hits, system)
     generator = np.random.default_rng(2)
     x = jnp.asarray(generator.normal(size=hits[:, :-1].shape))
     y = jnp.asarray(generator.normal(size=hits.shape))
-    left = jnp.sum(y * fermat.solve(blocks, x, lens.stop))
-    right = jnp.sum(fermat.solve_transposed(blocks, y, lens.stop) * x)
+    left = jnp.sum(y * solve(blocks, x, lens.stop))
+    right = jnp.sum(solve_transposed(blocks, y, lens.stop) * x)
     np.testing.assert_allclose(left, right, rtol=1e-11)
 
 
@@ -85,8 +92,8 @@ def test_first_segment_is_continuous_to_infinity():
     previous = None
     for distance in (1e4, 1e6, 1e9):
         near = far._replace(vergence=jnp.array(1 / distance))
-        change = float(jnp.max(jnp.abs(fermat.residual(hits, near) - fermat.residual(hits, far))))
-        path = fermat.optical_path(hits, near) - fermat.optical_path(hits, far)
+        change = float(jnp.max(jnp.abs(residual(hits, near) - residual(hits, far))))
+        path = optical_path(hits, near) - optical_path(hits, far)
         assert change < 30 / distance and float(jnp.max(jnp.abs(path))) < 400 / distance
         assert previous is None or change < previous / 50
         previous = change
@@ -103,11 +110,11 @@ def test_status_says_why_a_path_is_none():
     system, _ = system_of(lens, 1, 0.0, 0.0, rays=1)
     system = system._replace(conic=0 * system.conic, coefficients=0 * system.coefficients)
     on_axis = jnp.zeros((1, 4, 3, 1))
-    assert jnp.all(fermat.status(on_axis, system) == Status.OK)
+    assert jnp.all(status(on_axis, system) == Status.OK)
     outside = on_axis.at[0, 1].set(60.0)  # the radius of surface 1 is 51.68
-    assert jnp.all(fermat.status(outside, system) == Status.MISSED)
+    assert jnp.all(status(outside, system) == Status.MISSED)
     elsewhere = on_axis.at[0, 3].set(1.0)
-    assert jnp.all(fermat.status(elsewhere, system) == Status.UNCONVERGED)
+    assert jnp.all(status(elsewhere, system) == Status.UNCONVERGED)
     # 60 degrees inside the glass at the plane exit face: beyond the critical angle
     steep = on_axis.at[0, 2].set(4.0 * np.tan(np.pi / 3))
-    assert jnp.all(fermat.status(steep, system) == Status.TIR)
+    assert jnp.all(status(steep, system) == Status.TIR)

@@ -26,6 +26,9 @@ def entering(points, field, distance):
     return direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
+snell = jax.jit(jax.vmap(trace_snell, (None, None, 0, 0)))
+
+
 def against_snell(lens, rays, field, distance, wavelengths):
     """Largest distance in mm between our hits and those of the sequential trace."""
     worst = 0.0
@@ -33,9 +36,7 @@ def against_snell(lens, rays, field, distance, wavelengths):
         good = np.asarray(rays.status[k]) == Status.OK
         points = np.asarray(rays.points[k])[good]
         direction = entering(points[:, 0], field, distance)
-        hits, ok = jax.vmap(lambda p, d: trace_snell(lens, jnp.asarray(wavelength), p, d))(
-            jnp.asarray(points[:, 0] - 5 * direction), jnp.asarray(direction)
-        )
+        hits, ok = snell(lens, wavelength, points[:, 0] - 5 * direction, direction)
         assert np.all(ok)
         worst = max(worst, float(np.max(np.abs(hits - points))))
     return worst
