@@ -111,7 +111,10 @@ def focus_moments(
         if _concrete(lens, field, distance, wavelengths):
             return _converge(lens, field, distance, wavelengths, tolerance)[1]
         order = pupil_order(lens, field, distance, wavelengths, tolerance)
-    return _plane_moments(lens, field, distance, wavelengths, *_rule(symmetry, order), symmetry)
+    rule = _rule(symmetry, order)
+    if _concrete(lens, field, distance, wavelengths):
+        rule = _pad(*rule)
+    return _plane_moments(lens, field, distance, wavelengths, *rule, symmetry)
 
 
 @partial(jax.jit, static_argnums=6)
@@ -204,8 +207,9 @@ def pupil_order(
 ) -> int:
     """Gauss order of the pupil that keeps the RMS spot size within `tolerance` (relative).
 
-    Orders n and n + 1 are compared on the scene itself; half their difference in the
-    covariance, relative to its trace, is the error of n. Inside `jax.jit`, where the scene
+    Orders n and n + 1 are compared on the scene itself: their difference in the covariance,
+    relative to its trace, is twice the error of n in the spot size, and may be at most
+    `tolerance`, which leaves a factor of two for the error of n + 1. Inside `jax.jit`, where the scene
     is not known, a rule with two nodes in hand takes its place: to have the measured order
     there, call this function outside and pass the result on.
     """
@@ -237,7 +241,7 @@ def _converge(
         if previous is not None:
             size = np.sum(spread[:, :2], axis=-1, keepdims=True)
             change = np.max(np.abs(spread - previous) / np.where(size > 0, size, 1))
-            if change / 2 <= bound:
+            if change <= bound:
                 break
         previous = spread
     return order - 1, moments

@@ -101,8 +101,9 @@ def make_step(
     near, far = depths
 
     def init(parameters: dict[str, Any]) -> tuple[Any, Any]:
-        # A copy: the first step is given the buffers to overwrite.
-        parameters = jax.tree.map(jnp.copy, parameters)
+        # A copy: the first step is given the buffers to overwrite. With its dtype spelt out,
+        # because a weakly typed start would have the step compiled again, and again.
+        parameters = jax.tree.map(lambda p: jnp.array(p, jnp.asarray(p).dtype), parameters)
         make = jax.vmap(init_adam) if vectorised else init_adam
         return parameters, make(parameters)
 

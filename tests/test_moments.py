@@ -10,7 +10,7 @@ import pytest
 import drt_jax
 from drt_jax import focus_moments, load_lens, moments, psf_moments, pupil, pupil_order, trace_rays
 
-from .conftest import LENSES, RGB
+from .conftest import RGB
 
 # Double Gauss, object at 25 m, mean of R, G, B, in um, found before this package was written.
 SIGMA = {130: 257.8, 132: 105.6, 132.5: 67.6, 133: 29.8, 133.3: 7.9, 133.5: 9.6, 134: 46.8,
@@ -25,7 +25,7 @@ def test_blur_of_the_double_gauss(sensor):
     np.testing.assert_allclose(1e3 * np.sqrt(covariance[:, 0, 0]).mean(), SIGMA[sensor], atol=0.051)
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", ["double_gauss_addon", "cooke_triplet"])
 def test_meridional_half_and_whole_pupil_agree(name):
     lens = load_lens(name)
     wide = 12  # enough azimuths for the general rule to converge to rounding

@@ -76,13 +76,14 @@ def test_finite_from_a_point_to_any_width(form, dense, dtype):
         result = result if dense else result.dense()
         return result[0, 8:12, 9:12]
 
+    kernel, jacobian = jax.jit(kernel), jax.jit(jax.jacobian(kernel, argnums=(0, 1)))
     for mean in ([0.0, 0.0], [0.1, 0.5], [0.5, -0.5], [200.0, 0.0]):
         mean = jnp.asarray(mean, dtype)
         for sigma in (0.0, 1e-12, 1e-6, 1e-3, 0.1, 1.0, 24.0, 1e3, 1e6):
             sigma = jnp.asarray(sigma, dtype)
             value = kernel(sigma, mean)
             assert jnp.all(jnp.isfinite(value)) and value.dtype == dtype
-            for slope in jax.jacobian(kernel, argnums=(0, 1))(sigma, mean):
+            for slope in jacobian(sigma, mean):
                 assert jnp.all(jnp.isfinite(slope))
     point = kernel(jnp.zeros((), dtype), jnp.zeros(2, dtype))
     if form == "integrated":
