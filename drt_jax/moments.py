@@ -117,7 +117,6 @@ def focus_moments(
     return _plane_moments(lens, field, distance, wavelengths, *rule, symmetry)
 
 
-@partial(jax.jit, static_argnums=6)
 def _plane_moments(
     lens: Lens,
     field: ArrayLike,
@@ -128,8 +127,24 @@ def _plane_moments(
     symmetry: str,
 ) -> FocusMoments:
     dtype = lens.curvature.dtype
-    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
     angles = jnp.zeros(1, dtype) if symmetry == "meridian" else as_field(field, dtype)
+    # One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
+    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
+    distance, points, weights = (jnp.asarray(a, dtype) for a in (distance, points, weights))
+    return _weigh(lens, angles, distance, wavelengths, points, weights, symmetry)
+
+
+@partial(jax.jit, static_argnums=6)
+def _weigh(
+    lens: Lens,
+    angles: Array,
+    distance: Array,
+    wavelengths: Array,
+    points: Array,
+    weights: Array,
+    symmetry: str,
+) -> FocusMoments:
+    dtype = lens.curvature.dtype
     hits, status, _ = trace_bundle(lens, angles, distance, wavelengths, points)
     last = surface.sag(
         hits[:, -2], lens.curvature[-1], lens.conic[-1], lens.coefficients[-1]
@@ -248,8 +263,9 @@ def _converge(
 
 
 def _pad(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill up with weightless rays, so that all orders share a few compiled programs."""
-    missing = next(size for size in (48, 160, 720, 4000) if size >= weights.size) - weights.size
+    """Fill up with weightless rays, so that all orders share one or two compiled programs."""
+    sizes = (_MAX_ORDER + 1,) if len(points) == 1 else (182, 364, 1722, 3444)
+    missing = next(size for size in sizes if size >= weights.size) - weights.size
     return np.pad(points, ((0, 0), (0, missing))), np.pad(weights, (0, missing))
 
 

@@ -133,15 +133,19 @@ def trace_rays(
     for a known wavelength outside the range of a glass.
     """
     check_wavelengths(lens.glasses, wavelengths)
-    return _trace_rays(lens, field, distance, wavelengths, pupil)
+    dtype = lens.curvature.dtype
+    # One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
+    return _trace_rays(
+        lens, as_field(field, dtype), jnp.asarray(distance, dtype),
+        jnp.atleast_1d(jnp.asarray(wavelengths, dtype)), jnp.asarray(pupil, dtype),
+    )  # fmt: skip
 
 
 @jax.jit
-def _trace_rays(lens, field, distance, wavelengths, pupil) -> Rays:
-    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, lens.curvature.dtype))
-    hits, status, steps = trace_bundle(
-        lens, as_field(field, lens.curvature.dtype), distance, wavelengths, jnp.asarray(pupil).T
-    )
+def _trace_rays(
+    lens: Lens, field: Array, distance: Array, wavelengths: Array, pupil: Array
+) -> Rays:
+    hits, status, steps = trace_bundle(lens, field, distance, wavelengths, pupil.T)
     shape = _profile(lens, list(range(len(lens.glasses) - 1)))
     z = shape[0][:, None, None] + surface.sag(
         hits, shape[1][:, None, None], shape[2][:, None, None], shape[3][..., None, None]

@@ -50,7 +50,7 @@ def direction(tree, leaf):
     return jax.tree_util.tree_map_with_path(fill, tree)
 
 
-@pytest.mark.parametrize("name, dim", [("double_gauss", 2), ("cooke_triplet", 2), ("singlet", 1)])
+@pytest.mark.parametrize("name, dim", [("double_gauss", 2), ("cooke_triplet", 1)])
 def test_against_finite_differences_of_second_order(name, dim):
     """Central differences over a swept step: the error falls with slope 2 until rounding, and
     our derivative is where it points to."""
@@ -150,10 +150,10 @@ def test_second_derivatives_and_transformations():
         moved = dataclasses.replace(lens, curvature=lens.curvature.at[1].set(c))
         return trace_rays(moved, field, 300.0, [0.55], [[0.3, 0.9]]).points[0, 0, -1, 1]
 
-    c, h = lens.curvature[1], 1e-6
+    c, h, tilt = lens.curvature[1], 1e-6, jnp.array(0.05, float)
     slope = jax.jit(jax.value_and_grad(height))
-    second = jax.jit(jax.grad(jax.grad(height)))(c, 0.05)
-    difference = (slope(c + h, 0.05)[1] - slope(c - h, 0.05)[1]) / (2 * h)
+    second = jax.jit(jax.grad(jax.grad(height)))(c, tilt)
+    difference = (slope(c + h, tilt)[1] - slope(c - h, tilt)[1]) / (2 * h)
     np.testing.assert_allclose(second, difference, rtol=1e-6)
     fields = jnp.array([0.0, 0.05, 0.1])
     many = jax.jit(jax.vmap(jax.value_and_grad(height), (None, 0)))(c, fields)
