@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-__all__ = ["ConfigError", "describe", "load_config", "save_config"]
+__all__ = ["ConfigError", "describe", "dump_config", "load_config"]
 
 T = TypeVar("T")
 
@@ -140,11 +140,11 @@ def describe(cls: type, prefix: str = "") -> list[str]:
     return lines
 
 
-def save_config(config: Any, path: pathlib.Path) -> None:
-    """Write the resolved configuration as YAML that `load_config` reads back."""
+def dump_config(config: Any) -> str:
+    """The resolved configuration as YAML that `load_config` reads back."""
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
             return {key: plain(item) for key, item in value.items()}
         return [plain(item) for item in value] if isinstance(value, list | tuple) else value
 
-    path.write_text(yaml.safe_dump(plain(dataclasses.asdict(config)), sort_keys=False))
+    return yaml.safe_dump(plain(dataclasses.asdict(config)), sort_keys=False)

@@ -147,7 +147,8 @@ def _crops(
     generator = np.random.default_rng(seed)
     tops = generator.integers(0, height - side + 1, count)
     lefts = generator.integers(0, width - side + 1, count)
-    return [image[y : y + side, x : x + side] for y, x in zip(tops, lefts)]
+    # Copies, because a view would keep the whole image in memory.
+    return [image[y : y + side, x : x + side].copy() for y, x in zip(tops, lefts)]
 
 
 def _rgb(image: np.ndarray) -> np.ndarray:

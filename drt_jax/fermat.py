@@ -24,7 +24,7 @@ __all__ = ["Blocks", "Geometry", "Status", "System", "geometry", "hessian", "opt
 
 
 class Status(enum.IntEnum):
-    """What became of a ray; the first failure along it wins."""
+    """What became of a ray: the first of MISSED and TIR along it; CLIPPED only if it is whole."""
 
     OK = 0
     MISSED = 1  # no forward intersection with a surface

@@ -8,6 +8,7 @@ distance varies too, those polynomials are interpolated in 1/distance.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from functools import partial
 
@@ -28,6 +29,8 @@ __all__ = ["DepthMoments", "FocusMoments", "depth_moments", "focus_moments", "mo
            "psf_moments", "pupil_order"]  # fmt: skip
 
 _MAX_ORDER = 40
+# A spot below 1 nm is a point: relative to it, rounding would never converge.
+_SMALLEST = 1e-6
 _MAX_NODES = 64
 
 
@@ -102,19 +105,38 @@ def focus_moments(
 ) -> FocusMoments:
     """Moments of the rays as functions of the sensor position, about `lens.sensor`.
 
-    Arguments as in `psf_moments`. Differentiable in all lens parameters; rays that fail or
-    are clipped have weight 0, and the rest is normalised. Paper section 4.3.
+    Arguments as in `psf_moments`; the tolerance holds at any sensor position. Differentiable
+    in all lens parameters; rays that fail or are clipped have weight 0, and the rest is
+    normalised. Paper section 4.3.
     """
+    return _moments(lens, field, distance, wavelengths, tolerance, order, moving=True)
+
+
+def _moments(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float,
+    order: int | None,
+    moving: bool,
+) -> FocusMoments:
     check_wavelengths(lens.glasses, wavelengths)
+    if not (order is None or 1 <= order <= _MAX_ORDER):
+        raise ValueError(f"order: expected 1 to {_MAX_ORDER}, got {order}")
     symmetry = _symmetry(field)
+    known = _concrete(lens, field, distance, wavelengths)
+    if order is None and known:
+        return _converge(lens, field, distance, wavelengths, tolerance, moving)[1]
     if order is None:
-        if _concrete(lens, field, distance, wavelengths):
-            return _converge(lens, field, distance, wavelengths, tolerance)[1]
-        order = pupil_order(lens, field, distance, wavelengths, tolerance)
+        order = _blind_order(symmetry, tolerance)
     rule = _rule(symmetry, order)
-    if _concrete(lens, field, distance, wavelengths):
-        rule = _pad(*rule)
-    return _plane_moments(lens, field, distance, wavelengths, *rule, symmetry)
+    moments = _plane_moments(
+        lens, field, distance, wavelengths, *(_pad(*rule) if known else rule), symmetry
+    )
+    if known:
+        _check_passed(moments, wavelengths)
+    return moments
 
 
 def _plane_moments(
@@ -194,12 +216,12 @@ def psf_moments(
     `field`: angle along y, or (x, y), in radians. `distance`: mm from the object plane to
     the first vertex, inf allowed. `wavelengths` (W,) in um. `tolerance`: relative error of
     the RMS spot size; the number of rays follows from it (see `pupil_order`) unless `order`
-    is given. Rays fill the stop uniformly. Known zero field: meridional rays only; field
+    (1 to 40) is given. ValueError if no ray of a colour arrives; under `jax.jit`, where that
+    cannot be known, both are 0 then (`focus_moments(...).passed` tells). Rays fill the stop uniformly. Known zero field: meridional rays only; field
     along y: half the pupil. Paper section 4.3.
     """
-    mean, covariance = focus_moments(lens, field, distance, wavelengths, tolerance, order).at(
-        lens.sensor
-    )
+    moments = _moments(lens, field, distance, wavelengths, tolerance, order, moving=False)
+    mean, covariance = moments.at(lens.sensor)
     return mean, covariance if covariance.ndim == 3 else _matrix(covariance)
 
 
@@ -209,8 +231,9 @@ def _blind_order(symmetry: str, tolerance: float) -> int:
     The error falls by two to three digits with each node on axis and by one off axis for
     the bundled lenses out to 10 degrees; two nodes are in hand.
     """
+    _check_tolerance(tolerance)
     digits = -np.log10(tolerance)
-    return int(np.ceil(digits / 2 if symmetry == "meridian" else digits)) + 2
+    return min(int(np.ceil(digits / 2 if symmetry == "meridian" else digits)) + 2, _MAX_ORDER)
 
 
 def pupil_order(
@@ -219,8 +242,11 @@ def pupil_order(
     distance: ArrayLike,
     wavelengths: ArrayLike,
     tolerance: float = 1e-6,
+    moving: bool = False,
 ) -> int:
     """Gauss order of the pupil that keeps the RMS spot size within `tolerance` (relative).
+
+    At the lens's sensor position or, if `moving`, at any: there the spot may be far smaller.
 
     Orders n and n + 1 are compared on the scene itself: their difference in the covariance,
     relative to its trace, is twice the error of n in the spot size, and may be at most
@@ -228,11 +254,10 @@ def pupil_order(
     is not known, a rule with two nodes in hand takes its place: to have the measured order
     there, call this function outside and pass the result on.
     """
-    _check_tolerance(tolerance)
     check_wavelengths(lens.glasses, wavelengths)
     if _concrete(lens, field, distance, wavelengths):
-        return _converge(lens, field, distance, wavelengths, tolerance)[0]
-    return min(_blind_order(_symmetry(field), tolerance), _MAX_ORDER)
+        return _converge(lens, field, distance, wavelengths, tolerance, moving)[0]
+    return _blind_order(_symmetry(field), tolerance)
 
 
 def _check_tolerance(tolerance: float) -> None:
@@ -241,9 +266,17 @@ def _check_tolerance(tolerance: float) -> None:
 
 
 def _converge(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike, tolerance: float
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float,
+    moving: bool,
 ) -> tuple[int, FocusMoments]:
-    """The order that meets the tolerance, and the moments of the next one that proved it."""
+    """The order that meets the tolerance, and the moments of the next one that proved it.
+
+    Warns if no order up to the largest does.
+    """
     _check_tolerance(tolerance)
     symmetry = _symmetry(field)
     bound = max(tolerance, 100 * float(jnp.finfo(lens.curvature.dtype).eps))
@@ -252,14 +285,34 @@ def _converge(
         points, weights = _pad(*_rule(symmetry, order))
         moments = _plane_moments(lens, field, distance, wavelengths, points, weights, symmetry)
         _check_passed(moments, wavelengths)
-        spread = np.asarray(moments.spread[0], float)
+        spread = np.asarray(moments.spread, float)
         if previous is not None:
-            size = np.sum(spread[:, :2], axis=-1, keepdims=True)
-            change = np.max(np.abs(spread - previous) / np.where(size > 0, size, 1))
+            change = max(
+                _change(spread, previous, d) for d in (0, *(_best_focus(spread) if moving else ()))
+            )
             if change <= bound:
                 break
         previous = spread
+    else:
+        warnings.warn(
+            f"the spot size has converged to {change:.1e} only, not to {bound:.1e}, with "
+            f"{weights.size} rays a colour; does a clear aperture clip the beam?",
+            stacklevel=4,
+        )
     return order - 1, moments
+
+
+def _best_focus(spread: np.ndarray) -> np.ndarray:
+    """Where the spot of each colour is smallest (W,), mm behind the reference."""
+    _, linear, square = np.sum(spread[..., :2], axis=-1)
+    return -linear / np.where(square > 0, 2 * square, 1)
+
+
+def _change(spread: np.ndarray, previous: np.ndarray, d: float) -> float:
+    """Largest change of the covariance relative to its trace, the sensor at `d` mm."""
+    now, before = (s[0] + d * (s[1] + d * s[2]) for s in (spread, previous))
+    size = np.sum(now[:, :2], axis=-1, keepdims=True)
+    return float(np.max(np.abs(now - before) / np.maximum(size, _SMALLEST**2)))
 
 
 def _pad(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -319,7 +372,8 @@ def depth_moments(
     if not 0 < near < far:
         raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
     order = max(
-        pupil_order(lens, field, distance, wavelengths, tolerance) for distance in (near, far)
+        pupil_order(lens, field, distance, wavelengths, tolerance, moving=True)
+        for distance in (near, far)
     )
     symmetry = _symmetry(field)
     points, weights = _pad(*_rule(symmetry, order))
@@ -345,8 +399,16 @@ def depth_moments(
             for c in (series.spread, series.mean)
             if jnp.any(c != 0)
         ]
-        if max(tail, default=0.0) <= tolerance or count >= _MAX_NODES:
-            return DepthMoments(jnp.asarray(near), jnp.asarray(far), series)
+        done = max(tail, default=0.0) <= tolerance
+        if not done and count >= _MAX_NODES:
+            warnings.warn(
+                f"the moments between {near:g} and {far:g} mm are interpolated to "
+                f"{max(tail):.1e} only, not to {tolerance:.1e}; narrow the range",
+                stacklevel=2,
+            )
+        if done or count >= _MAX_NODES:
+            dtype = lens.curvature.dtype
+            return DepthMoments(jnp.asarray(near, dtype), jnp.asarray(far, dtype), series)
         count *= 2
 
 
@@ -357,12 +419,12 @@ def moments_model(
     distances: tuple[float, float],
     wavelengths: ArrayLike,
     tolerance: float = 1e-6,
-) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], tuple[Array, Array]]]:
+) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]]:
     """The cheapest exact model of the moments for what is trained.
 
     `trained` names fields of `Lens`; `distances` = (near, far) in mm, equal for one depth.
     Returns their initial values and a function (values, distance) -> (centroid, covariance
-    as in `FocusMoments.at`). With the sensor alone, nothing is traced inside that function:
+    as in `FocusMoments.at`, and the fraction (W,) of the light that passes). With the sensor alone, nothing is traced inside that function:
     polynomials in its position, and in 1/distance when the depth varies. Anything else
     traces the rays anew.
     """
@@ -374,15 +436,20 @@ def moments_model(
             at = lambda distance: focus  # noqa: E731
         else:
             at = depth_moments(lens, field, near, far, wavelengths, tolerance).at
-        return values, lambda values, distance: at(distance).at(
-            values.get("sensor", lens.sensor)
-        )
+
+        def from_plane(values, distance):
+            moments = at(distance)
+            return *moments.at(values.get("sensor", lens.sensor)), moments.passed
+
+        return values, from_plane
     order = max(
-        pupil_order(lens, field, distance, wavelengths, tolerance) for distance in {near, far}
+        pupil_order(lens, field, distance, wavelengths, tolerance, moving=True)
+        for distance in {near, far}
     )
 
     def retrace(values, distance):
         moved = dataclasses.replace(lens, **values)
-        return focus_moments(moved, field, distance, wavelengths, order=order).at(moved.sensor)
+        moments = focus_moments(moved, field, distance, wavelengths, order=order)
+        return *moments.at(moved.sensor), moments.passed
 
     return values, retrace

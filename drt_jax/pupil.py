@@ -7,7 +7,7 @@ aberration is smooth. Source: Forbes, JOSA A 5, 1943 (1988).
 
 import numpy as np
 
-__all__ = ["disc", "half_disc", "meridian", "random_disc", "square_grid"]
+__all__ = ["disc", "half_disc", "meridian", "random_disc"]
 
 
 def _gauss(order: int) -> tuple[np.ndarray, np.ndarray]:
@@ -46,11 +46,3 @@ def random_disc(rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     angle = 2 * np.pi * generator.random(rays)
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)])
     return points, np.full(rays, 1 / rays)
-
-
-def square_grid(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, Q) of a side x side grid of cell centres that lie in the disc."""
-    axis = (np.arange(side) + 0.5) / side * 2 - 1
-    points = np.stack(np.meshgrid(axis, axis)).reshape(2, -1)
-    points = points[:, np.sum(points**2, axis=0) <= 1]
-    return points, np.full(points.shape[1], 1 / points.shape[1])

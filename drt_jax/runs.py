@@ -10,6 +10,8 @@ import json
 import os
 import pathlib
 import signal
+import time
+import zipfile
 from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO
 
@@ -17,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .config import ConfigError, load_config, save_config
+from .config import ConfigError, dump_config, load_config
 
 __all__ = ["Run", "deferred_interrupt"]
 
@@ -29,11 +31,12 @@ class Run:
     """
 
     def __init__(self, folder: pathlib.Path, config: Any, columns: tuple[str, ...], resume: bool):
-        """Open the folder. ConfigError if it holds another run, or on resuming a run with
-        another configuration, or one that does not exist."""
+        """Open the folder. ConfigError if it holds another run that has begun to train, or on
+        resuming a run with another configuration, or one that does not exist."""
         self.folder = folder
         self.figures = folder / "figures"
         self._columns = ("job", "step", *columns)
+        self._earlier, self._opened = 0.0, time.perf_counter()
         saved = folder / "config.yaml"
         if resume:
             if not saved.is_file():
@@ -43,17 +46,23 @@ class Run:
                     f"{saved}: the run to resume was started with other settings; "
                     "leave out --config and --set to take its own, or choose another --out"
                 )
-        elif saved.exists():
+        elif self._metrics.exists():
             raise ConfigError(
                 f"{folder}: holds a run already; add --resume to go on with it, "
                 "or choose another --out"
             )
         self.figures.mkdir(parents=True, exist_ok=True)
-        save_config(config, saved)
+        if not resume:
+            self._replace("config.yaml", lambda file: file.write(dump_config(config).encode()))
 
     @property
     def _metrics(self) -> pathlib.Path:
         return self.folder / "metrics.csv"
+
+    @property
+    def seconds(self) -> float:
+        """Time spent on the run, in the processes before a resume too."""
+        return self._earlier + time.perf_counter() - self._opened
 
     def log(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
         """Append metrics of consecutive steps, the first being `step`; 1D arrays by column.
@@ -80,7 +89,8 @@ class Run:
     def save(self, job: str, step: int, tree: Any) -> None:
         """Checkpoint: the state `tree` of `job` after `step` steps."""
         arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
-        self._replace(f"checkpoints/{job}.npz", lambda file: np.savez(file, step=step, **arrays))
+        arrays.update(step=np.asarray(step), seconds=np.asarray(self.seconds))
+        self._replace(f"checkpoints/{job}.npz", lambda file: np.savez(file, **arrays))
 
     def load(self, job: str, tree: Any, logged: tuple[str, ...]) -> tuple[int, Any]:
         """The last checkpoint of `job` as (step, state shaped as `tree`); (0, tree) if none.
@@ -96,7 +106,8 @@ class Run:
                 with np.load(path) as file:
                     stored = [file[f"leaf{i}"] for i in range(len(leaves))]
                     step = int(file["step"])
-            except (OSError, KeyError, ValueError) as error:
+                    self._earlier = max(self._earlier, float(file["seconds"]))
+            except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
                 raise ConfigError(
                     f"{path}: not a checkpoint of this run; delete it to start the job anew"
                 ) from error
@@ -142,15 +153,16 @@ class Run:
 
 
 @contextlib.contextmanager
-def deferred_interrupt() -> Iterator[Callable[[], bool]]:
+def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
     """Turn the first Ctrl-C (or SIGTERM) into a question: yields a function that says whether
-    one came, to be asked where stopping is safe. A second one acts at once."""
+    one came, to be asked where stopping is safe. It calls `notify`; a second one acts at once."""
     asked = False
     previous = {}
 
     def ask(number: int, frame: Any) -> None:
         nonlocal asked
         asked = True
+        notify()
         signal.signal(number, previous[number])
 
     try:

@@ -10,6 +10,10 @@ from .psf import SeparableKernel
 __all__ = ["convolve", "sensor_layer"]
 
 
+# GPUs would round the factors of a float32 product to 10 bits.
+_EXACT = jax.lax.Precision.HIGHEST
+
+
 def _banded(kernel: Array, outputs: int) -> Array:
     """(C, N, N + K - 1): the matrix whose row i holds the flipped kernel from column i on."""
     channels, taps = kernel.shape
@@ -30,8 +34,8 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
         taps = kernel.row.shape[-1]
         down = _banded(kernel.column, scenes.shape[1] - taps + 1)
         across = _banded(kernel.row, scenes.shape[2] - taps + 1)
-        half = jnp.einsum("cyh,bhwc->cbyw", down, scenes)
-        return jnp.einsum("cxw,cbyw->byxc", across, half)
+        half = jnp.einsum("cyh,bhwc->cbyw", down, scenes, precision=_EXACT)
+        return jnp.einsum("cxw,cbyw->byxc", across, half, precision=_EXACT)
     return jax.lax.conv_general_dilated(
         scenes,
         jnp.moveaxis(kernel[:, ::-1, ::-1], 0, -1)[:, :, None],
@@ -39,6 +43,7 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
         padding="VALID",
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
         feature_group_count=scenes.shape[-1],
+        precision=_EXACT,
     )
 
 

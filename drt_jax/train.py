@@ -12,12 +12,13 @@ from jax.typing import ArrayLike
 from skimage import metrics
 
 from .adam import adam, apply_updates
+from .numerics import safe_sqrt
 from .psf import Form, gaussian_psf
 from .sensor import sensor_layer
 
 __all__ = ["Camera", "evaluate", "fit", "make_imager", "make_step"]
 
-Blur = Callable[[dict[str, Array], Array], tuple[Array, Array]]
+Blur = Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]
 Restore = Callable[[Any, Array], Array]
 
 
@@ -44,7 +45,8 @@ def make_imager(blur: Blur, restore: Restore | None, camera: Camera) -> Callable
     camera without a network. The result maps (parameters {"optics", "network"}, scenes uint8
     (B, H + K - 1, W + K - 1, C), distance mm, noise, key) to (truth, sensor image, restored
     image), float32 (B, H, W, C), and the standard deviations (C,) of the blur along y in mm.
-    The kernel is centred on the mean centroid of the colours: patches are registered.
+    The kernel is centred on the mean centroid of the colours: patches are registered. A colour
+    that loses rays is darker by what it loses, and black without any.
     """
     margin = camera.kernel // 2
 
@@ -52,17 +54,17 @@ def make_imager(blur: Blur, restore: Restore | None, camera: Camera) -> Callable
         parameters: dict[str, Any], scenes: Array, distance: Array, noise: ArrayLike, key: Array
     ) -> tuple[Array, Array, Array, Array]:
         scenes = scenes.astype(jnp.float32) / 255
-        mean, covariance = blur(parameters["optics"], distance)
+        mean, covariance, passed = blur(parameters["optics"], distance)
         kernel = gaussian_psf(
             mean - jnp.mean(mean, axis=0), covariance, camera.pixel_um * 1e-3, camera.kernel,
             camera.form,
         )  # fmt: skip
-        image = sensor_layer(scenes, kernel, noise, key)
+        image = sensor_layer(scenes * passed.astype(jnp.float32), kernel, noise, key)
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin
         truth = scenes[:, margin : end[0], margin : end[1]]
         variance = covariance[:, 1] if covariance.ndim == 2 else covariance[:, 1, 1]
-        return truth, image, restored, jnp.sqrt(variance)
+        return truth, image, restored, safe_sqrt(variance)
 
     return imager
 
@@ -137,24 +139,27 @@ def fit(
     first: int,
     last: int,
     every: int,
-    report: Callable[[int, dict[str, np.ndarray], Any], bool],
+    report: Callable[[int, dict[str, np.ndarray], Any], None],
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Any:
     """Run steps `first` to `last` - 1 and return the final state.
 
     After every `every` steps, and at the end, report(start, metrics, state) is called with the
-    metrics of the steps since `start` stacked on the first axis; it returns whether to stop.
-    Between reports nothing waits for the device.
+    metrics of the steps since `start` stacked on the first axis. Between reports nothing waits
+    for the device. `stopped` is asked after each step whether to end early, with a report.
     """
     noise = np.float32(noise)
     pending: list[dict[str, Array]] = []
     for index in range(first, last):
         state, metric = step(state, next(scenes), noise, np.int32(index))
         pending.append(metric)
-        if len(pending) == every or index == last - 1:
+        stop = stopped()
+        if stop or len(pending) == every or index == last - 1:
             stacked = {k: np.stack([np.asarray(m[k]) for m in pending]) for k in metric}
             start, pending = index + 1 - len(pending), []
-            if report(start, stacked, state):
-                break
+            report(start, stacked, state)
+        if stop:
+            break
     return state
 
 

@@ -3,9 +3,11 @@
 import argparse
 import dataclasses
 import datetime
+import math
 import pathlib
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -16,40 +18,73 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import config as configs
 from drt_jax import drawing, plot, train
-from drt_jax.data import DataError, Patches, batches, load_patches
+from drt_jax.data import Patches, batches, load_patches
 from drt_jax.runs import Run, deferred_interrupt
 
 _ROOT = pathlib.Path(__file__).resolve().parent.parent
-_ERRORS = (configs.ConfigError, DataError, drt_jax.LensError, ValueError)
+
+
+def require(condition: bool, message: str) -> None:
+    """ConfigError with the message, which names the key, unless the condition holds."""
+    if not condition:
+        raise configs.ConfigError(message)
+
+
+def require_list(name: str, values: tuple[float, ...], low: float = 0.0) -> None:
+    """ConfigError unless a list of settings has items, all different, finite and above `low`."""
+    require(len(values) > 0, f"{name}: needs at least one item")
+    require(len(set(values)) == len(values), f"{name}: an item stands twice")
+    for value in values:
+        require(low < value < math.inf, f"{name}: expected numbers above {low:g}, got {value!r}")
+
+
+def require_noise(name: str, *values: float) -> None:
+    """ConfigError unless all values are usable as standard deviations."""
+    for value in values:
+        require(0 <= value < math.inf, f"{name}: expected 0 or more, got {value!r}")
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """lens: bundled name or YAML path. wavelengths_um: of the R, G, B channels. tolerance:
-    relative error of the blur that fixes the number of rays."""
+    """lens: bundled name or YAML path. wavelengths_um: of the three channels, R, G, B.
+    tolerance: relative error of the blur that fixes the number of rays."""
 
     lens: str = "double_gauss"
     wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
     tolerance: float = 1e-9
 
+    def __post_init__(self) -> None:
+        require(len(self.wavelengths_um) == 3, "scene.wavelengths_um: expected three, for R, G, B")
+
 
 @dataclasses.dataclass(frozen=True)
 class Training:
     """batches: steps of each job. batch: patches in one. patch: their side in pixels.
-    optics_rate, network_rate: Adam's learning rates (optics in mm). checkpoint_every: in
-    batches."""
+    optics_rate: Adam's learning rate in mm. checkpoint_every: in batches, or when metrics are
+    next written."""
 
     batches: int
     batch: int = 16
     patch: int = 64
     optics_rate: float = 1e-3
-    network_rate: float = 1e-3
     checkpoint_every: int = 200
 
     def __post_init__(self) -> None:
-        for name in ("batches", "batch", "patch", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise configs.ConfigError(f"train.{name}: must be at least 1")
+        for name in ("batches", "batch", "checkpoint_every"):
+            require(getattr(self, name) >= 1, f"train.{name}: must be at least 1")
+        require(self.patch >= 7, "train.patch: must be at least 7, the window of the SSIM")
+        require(0 <= self.optics_rate < math.inf, "train.optics_rate: must be 0 or more")
+
+
+@dataclasses.dataclass(frozen=True)
+class JointTraining(Training):
+    """network_rate: Adam's learning rate of the network; the rest as in `Training`."""
+
+    network_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(0 <= self.network_rate < math.inf, "train.network_rate: must be 0 or more")
 
 
 def main(
@@ -75,7 +110,7 @@ def main(
     parser.add_argument("--out", metavar="DIR", help=f"run folder (default: a new one in runs/{name})")
     parser.add_argument(
         "--resume", action="store_true",
-        help="go on with the run in --out (default: the latest in runs/NAME)",
+        help="go on with the run in --out (default: the latest unfinished one in runs/NAME)",
     )  # fmt: skip
     options = parser.parse_args(argv)
     # The caller, not the library, chooses the precision: optics in float64.
@@ -98,10 +133,13 @@ def main(
         raise SystemExit(_say(f"stopped{where}", 130)) from None
     except OSError as error:
         what = f"{error.filename or folder}: {error.strerror or error}"
-        raise SystemExit(
-            _say(f"{what}; the last checkpoint is whole: mend this, then go on with --resume --out {folder}", 1)
-        ) from error
-    except _ERRORS as error:
+        remedy = "mend this and start again"
+        if folder and (folder / "metrics.csv").exists():
+            remedy = f"the last checkpoint is whole: mend this, then go on with --resume --out {folder}"
+        raise SystemExit(_say(f"{what}; {remedy}", 1)) from error
+    except ValueError as error:
+        if not _ours(error):
+            raise
         raise SystemExit(_say(str(error), 2)) from None
     print(f"done in {time.perf_counter() - started:.0f} s")
 
@@ -111,15 +149,26 @@ def _say(message: str, code: int) -> int:
     return code
 
 
+def _ours(error: ValueError) -> bool:
+    """Whether this project raised it, about its input; any other is a fault to be shown whole."""
+    raised = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+    return raised.parent.name in ("drt_jax", "experiments")
+
+
 def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:
     if options.out:
         return pathlib.Path(options.out)
     parent = pathlib.Path("runs") / name
     if not options.resume:
         return parent / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    folders = sorted(p for p in parent.glob("*") if (p / "config.yaml").is_file())
+    folders = sorted(
+        p for p in parent.glob("*")
+        if (p / "metrics.csv").is_file() and not (p / "results.json").is_file()
+    )  # fmt: skip
     if not folders:
-        raise configs.ConfigError(f"nothing to resume in {parent}; name the run folder with --out")
+        raise configs.ConfigError(
+            f"nothing to resume in {parent}: no unfinished run; name a run folder with --out"
+        )
     return folders[-1]
 
 
@@ -155,9 +204,13 @@ def train_job(
     first, state = run.load(job, init(parameters), labels or (job,))
     saved = first
     bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
-    with bar, deferred_interrupt() as asked:
 
-        def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> bool:
+    def notify() -> None:
+        print("\nstopping after this step; once more stops at once", file=sys.stderr)
+
+    with bar, deferred_interrupt(notify) as asked:
+
+        def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
             nonlocal saved
             done = start + len(metrics["loss"])
             for k, label in enumerate(labels or (job,)):
@@ -168,13 +221,12 @@ def train_job(
             if asked() or done == total or done - saved >= config.train.checkpoint_every:
                 run.save(job, done, state)
                 saved = done
-            return asked()
 
         stream = batches(scenes, config.train.batch, config.seed, first)
         # Each report waits for the device: rarely where a step takes milliseconds.
         every = 10 if jax.default_backend() == "cpu" else 113
-        state = train.fit(step, state, stream, noise, first, total, every, report)
-        if asked() and saved < total:
+        state = train.fit(step, state, stream, noise, first, total, every, report, asked)
+        if asked():
             raise KeyboardInterrupt
     return state[0]
 

@@ -7,7 +7,6 @@ table 2 and results.json.
 """
 
 import dataclasses
-import time
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +15,11 @@ import numpy as np
 import drt_jax
 from drt_jax import network, plot, train
 from drt_jax.data import DataConfig
+from drt_jax.numerics import safe_sqrt
 from drt_jax.runs import Run
 
 from . import _common
-from ._common import Scene, Training
+from ._common import JointTraining, Scene
 from .restore import Net
 
 
@@ -34,7 +34,7 @@ class Config:
 
     starts_mm: tuple[float, ...]
     fixed_mm: float
-    train: Training
+    train: JointTraining
     depth_m: tuple[float, ...] = (10.0, 50.0)
     table_depth_m: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0)
     patch_depth_m: tuple[float, ...] = (10.0, 20.0, 30.0, 40.0, 50.0)
@@ -47,15 +47,24 @@ class Config:
     data: DataConfig = DataConfig()
 
     def __post_init__(self) -> None:
-        if len(self.depth_m) != 2 or not 0 < self.depth_m[0] < self.depth_m[1]:
-            raise ValueError("depth_m: expected the nearest and the farthest distance in m")
-        if self.fixed_mm not in self.starts_mm:
-            raise ValueError(f"fixed_mm: {self.fixed_mm:g} must be one of starts_mm")
+        for name in ("starts_mm", "depth_m", "table_depth_m", "patch_depth_m"):
+            _common.require_list(name, getattr(self, name))
+        _common.require(
+            len(self.depth_m) == 2 and self.depth_m[0] < self.depth_m[1],
+            "depth_m: expected the nearest and the farthest distance in m",
+        )
+        _common.require(
+            any(self.depth_m[0] <= depth <= self.depth_m[1] for depth in self.table_depth_m),
+            "table_depth_m: none lies within depth_m",
+        )
+        _common.require(
+            self.fixed_mm in self.starts_mm, f"fixed_mm: {self.fixed_mm} must be one of starts_mm"
+        )
+        _common.require_noise("noise", self.noise)
 
 
 def run(config: Config, run: Run) -> None:
     """Train jointly and with the sensor fixed, test over depth, write results and figures."""
-    begun = time.perf_counter()
     lens = drt_jax.load_lens(config.scene.lens)
     depths = [*config.depth_m, *config.table_depth_m, *config.patch_depth_m]
     span = 1e3 * min(depths), 1e3 * max(depths)
@@ -75,7 +84,7 @@ def run(config: Config, run: Run) -> None:
     for start in config.starts_mm:
         parameters = {"optics": {"sensor": jnp.asarray(start)}, "network": weights}
         joint[start] = _common.train_job(
-            run, f"start {start:g}", init, step, parameters, patches.train, config.noise, config
+            run, f"start {start}", init, step, parameters, patches.train, config.noise, config
         )
 
     def fixed_blur(values, distance):
@@ -84,7 +93,7 @@ def run(config: Config, run: Run) -> None:
     fixed_imager = train.make_imager(fixed_blur, restore, config.camera)
     init, step = train.make_step(fixed_imager, _common.rates(config), (near, far), config.seed)
     fixed = _common.train_job(
-        run, f"fixed {config.fixed_mm:g}", init, step, {"optics": {}, "network": weights},
+        run, f"fixed {config.fixed_mm}", init, step, {"optics": {}, "network": weights},
         patches.train, config.noise, config,
     )  # fmt: skip
 
@@ -98,7 +107,7 @@ def run(config: Config, run: Run) -> None:
                 model, parameters, test, 1e3 * depth, config.noise, config.seed
             )
         rows.append(row)
-    traces = {f"start {s:g}": run.metrics(f"start {s:g}") for s in config.starts_mm}
+    traces = {f"start {s}": run.metrics(f"start {s}") for s in config.starts_mm}
     window = _common.final_window(config)
     inside = [row for row in rows if near <= 1e3 * row["depth_m"] <= far]
     results = {
@@ -110,7 +119,7 @@ def run(config: Config, run: Run) -> None:
         "mean_mae": {n: float(np.mean([row[n]["mae"] for row in inside])) for n in models},
         "mean_rmse": {n: float(np.mean([row[n]["rmse"] for row in inside])) for n in models},
         "test_patches": len(test),
-        "seconds": time.perf_counter() - begun,
+        "seconds": run.seconds,
     }
     path = run.finish(results)
 
@@ -123,7 +132,7 @@ def run(config: Config, run: Run) -> None:
     final = results["final_mm"][config.starts_mm.index(config.fixed_mm)]
     figure, axes = plot.new(width=7, height=4.5)
     grid = np.linspace(near, far, 121)
-    sigma = jax.vmap(lambda d, s: jnp.sqrt(blur({"sensor": s}, d)[1][:, 0]), in_axes=(0, None))
+    sigma = jax.vmap(lambda d, s: safe_sqrt(blur({"sensor": s}, d)[1][:, 0]), in_axes=(0, None))
     plot.sigma_over_depth(
         axes, grid / 1e3,
         {f"{s:.2f} mm": 1e3 * np.asarray(sigma(jnp.asarray(grid), s)) for s in (config.fixed_mm, final)},

@@ -6,7 +6,6 @@ traced in the loop: the moments are polynomials in the sensor position. Writes f
 """
 
 import dataclasses
-import time
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +32,11 @@ class Config:
     scene: Scene = Scene()
     camera: train.Camera = train.Camera()
     data: DataConfig = DataConfig()
+
+    def __post_init__(self) -> None:
+        _common.require_list("starts_mm", self.starts_mm)
+        _common.require_list("distance_m", (self.distance_m,))
+        _common.require_noise("noise", self.noise)
 
 
 def best_focus(imager, scenes: np.ndarray, distance: float, noise: float, span: tuple) -> float:
@@ -63,7 +67,6 @@ def best_focus(imager, scenes: np.ndarray, distance: float, noise: float, span: 
 
 def run(config: Config, run: Run) -> None:
     """Train all starts together, find the best focus independently, write the results."""
-    begun = time.perf_counter()
     lens = drt_jax.load_lens(config.scene.lens)
     distance = 1e3 * config.distance_m
     _, blur = drt_jax.moments_model(
@@ -77,17 +80,18 @@ def run(config: Config, run: Run) -> None:
         imager, {"optics": config.train.optics_rate}, (distance, distance), config.seed,
         vectorised=True,
     )  # fmt: skip
-    labels = tuple(f"start {start:g}" for start in config.starts_mm)
+    labels = tuple(f"start {start}" for start in config.starts_mm)
     _common.train_job(
         run, "all starts", init, step, {"optics": {"sensor": starts}}, patches.train,
         config.noise, config, labels,
     )  # fmt: skip
-    seconds = time.perf_counter() - begun
+    seconds = run.seconds
 
     traces = {label: run.metrics(label) for label in labels}
     final = [float(np.mean(t["sensor_mm"][-200:])) for t in traces.values()]
     span = min(*config.starts_mm, *final), max(*config.starts_mm, *final)
-    best = best_focus(imager, patches.train[:512], distance, config.noise, span)
+    some = _common.thinned(patches.train, 512)
+    best = best_focus(imager, some, distance, config.noise, span)
     near = [np.flatnonzero(np.abs(t["sensor_mm"] - best) <= 0.1) for t in traces.values()]
     first = [int(hits[0]) if hits.size else None for hits in near]
     results = {

@@ -5,7 +5,6 @@ more network for each level. Writes figure 5a, table 5b and results.json.
 """
 
 import dataclasses
-import time
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,7 @@ from drt_jax.data import DataConfig
 from drt_jax.runs import Run
 
 from . import _common
-from ._common import Scene, Training
+from ._common import JointTraining, Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Config:
     starts_mm: tuple[float, ...]
     table_starts_mm: tuple[float, ...]
     table_noise: tuple[float, ...]
-    train: Training
+    train: JointTraining
     distance_m: float = 25.0
     noise: float = 0.01
     test_patches: int = 0
@@ -50,10 +49,16 @@ class Config:
     camera: train.Camera = train.Camera()
     data: DataConfig = DataConfig()
 
+    def __post_init__(self) -> None:
+        _common.require_list("starts_mm", self.starts_mm)
+        _common.require_list("table_starts_mm", self.table_starts_mm)
+        _common.require_list("table_noise", self.table_noise, -1.0)
+        _common.require_list("distance_m", (self.distance_m,))
+        _common.require_noise("noise", self.noise, *self.table_noise)
+
 
 def run(config: Config, run: Run) -> None:
     """Train every start and noise level, test, write the results and figures."""
-    begun = time.perf_counter()
     lens = drt_jax.load_lens(config.scene.lens)
     distance = 1e3 * config.distance_m
     _, blur = drt_jax.moments_model(
@@ -69,10 +74,10 @@ def run(config: Config, run: Run) -> None:
     test = _common.thinned(patches.test, config.test_patches)
     print(f"RED-Net with {network.count_parameters(weights)} parameters")
 
-    jobs = {(start, config.noise): f"start {start:g}" for start in config.starts_mm}
+    jobs = {(start, config.noise): f"start {start}" for start in config.starts_mm}
     for noise in config.table_noise:
         for start in config.table_starts_mm:
-            jobs.setdefault((start, noise), f"start {start:g} noise {noise:g}")
+            jobs.setdefault((start, noise), f"start {start} noise {noise}")
     trained = {}
     for (start, noise), job in jobs.items():
         parameters = {"optics": {"sensor": jnp.asarray(start)}, "network": weights}
@@ -89,7 +94,7 @@ def run(config: Config, run: Run) -> None:
         for noise in config.table_noise
         for start in config.table_starts_mm
     ]
-    traces = {f"start {s:g}": run.metrics(f"start {s:g}") for s in config.starts_mm}
+    traces = {f"start {s}": run.metrics(f"start {s}") for s in config.starts_mm}
     window = _common.final_window(config)
     results = {
         "parameters": network.count_parameters(weights),
@@ -98,7 +103,7 @@ def run(config: Config, run: Run) -> None:
         "final_window_batches": window,
         "test": rows,
         "test_patches": len(test),
-        "seconds": time.perf_counter() - begun,
+        "seconds": run.seconds,
     }
     path = run.finish(results)
     figures = [run.figures / "figure_5a.png", run.figures / "restored.png"]

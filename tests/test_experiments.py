@@ -108,7 +108,8 @@ def test_an_interrupted_run_resumes_to_the_same_numbers(name, unbroken, tmp_path
 
 
 def same(wanted, folder):
-    assert (folder / "metrics.csv").read_text() == (wanted / "metrics.csv").read_text()
+    rows = [sorted((f / "metrics.csv").read_text().splitlines()) for f in (wanted, folder)]
+    assert rows[0] == rows[1]
     results = [json.loads((f / "results.json").read_text()) for f in (wanted, folder)]
     for result in results:
         result.pop("seconds")
@@ -136,6 +137,22 @@ def test_finished_run_resumes_at_once(unbroken, capsys):
     assert "best focus by dense search" in capsys.readouterr().out
 
 
+def test_interrupt_in_the_last_steps_of_a_job_stops_before_the_next(unbroken, tmp_path, monkeypatch):
+    log = Run.log
+
+    def interrupting(self, job, step, rows):
+        log(self, job, step, rows)
+        if step == 20:  # of 25, in reports of 10: the last of the first job
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Run, "log", interrupting)
+    with pytest.raises(SystemExit) as stopped:
+        toy("restore", tmp_path / "run")
+    assert stopped.value.code == 130
+    jobs = {line.split(",")[0] for line in (tmp_path / "run" / "metrics.csv").read_text().splitlines()[1:]}
+    assert jobs == {"start 133.0"}
+
+
 FAILURES = {
     "unknown key": (["--set", "train.bacth=3"], "did you mean train.batch?"),
     "wrong type": (["--set", "noise=loud"], "noise: expected a number, got 'loud'"),
@@ -145,7 +162,13 @@ FAILURES = {
     "bad kernel": (["--set", "camera.kernel=8"], "camera.kernel: expected an odd number"),
     "no batches": (["--set", "train.batches=0"], "train.batches: must be at least 1"),
     "too few": (["--set", "data.crops_per_image=1", "train.batch=500"], "do not fill a batch"),
-    "wavelength": (["--set", "scene.wavelengths_um=[0.6,5.0]"], "outside the range of N-SK2"),
+    "wavelength": (["--set", "scene.wavelengths_um=[0.6,0.5,5.0]"], "outside the range of N-SK2"),
+    "two colours": (["--set", "scene.wavelengths_um=[0.6,0.5]"], "expected three, for R, G, B"),
+    "no starts": (["--set", "starts_mm=[]"], "starts_mm: needs at least one item"),
+    "twice": (["--set", "starts_mm=[133,133]"], "starts_mm: an item stands twice"),
+    "distance": (["--set", "distance_m=-1"], "distance_m: expected numbers above 0, got -1.0"),
+    "noise": (["--set", "noise=.nan"], "noise: expected 0 or more, got nan"),
+    "no network": (["--set", "train.network_rate=1"], "unknown key train.network_rate"),
     "nothing to resume": (["--resume"], "nothing to resume"),
 }
 
@@ -168,9 +191,9 @@ def test_a_second_run_does_not_overwrite_the_first(unbroken, capsys):
 
 def test_full_disk_is_reported_with_the_remedy(tmp_path, capsys, monkeypatch):
     def full(*args):
-        raise OSError(28, "No space left on device", "metrics.csv")
+        raise OSError(28, "No space left on device", "checkpoint.npz")
 
-    monkeypatch.setattr(Run, "log", full)
+    monkeypatch.setattr(Run, "save", full)
     with pytest.raises(SystemExit) as stopped:
         toy("focus", tmp_path / "run")
     error = capsys.readouterr().err

@@ -110,6 +110,24 @@ def test_order_keeps_the_promised_tolerance(name, degrees):
         before = order
 
 
+def test_tolerance_holds_at_any_sensor_position():
+    """Rays traced with the sensor 3 mm out of focus, where the spot is 30 times larger."""
+    lens = dataclasses.replace(load_lens("double_gauss"), sensor=jnp.array(130.0))
+    exact = focus_moments(lens, 0.0, 25000.0, RGB, order=20)
+    for tolerance in (1e-3, 1e-6, 1e-9):
+        ours = focus_moments(lens, 0.0, 25000.0, RGB, tolerance)
+        for sensor in (130.0, 133.3, 133.37, 133.45):
+            got, wanted = (np.sqrt(m.at(sensor)[1][:, 0]) for m in (ours, exact))
+            np.testing.assert_allclose(got, wanted, rtol=tolerance)
+
+
+def test_slow_convergence_is_said():
+    lens = load_lens("double_gauss")
+    clipped = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[0].set(10.0))
+    with pytest.warns(UserWarning, match="converged to .* only.* does a clear aperture clip"):
+        psf_moments(clipped, 0.0, 25000.0, RGB, 1e-9)
+
+
 def test_inside_jit_the_order_follows_a_rule_that_is_on_the_safe_side():
     lens = load_lens("double_gauss")
     for field in (0.0, 0.17):
@@ -159,5 +177,8 @@ def test_bad_requests():
         drt_jax.depth_moments(lens, 0.0, 5e4, 1e4, RGB)
     blocked = dataclasses.replace(lens, semi_diameter=jnp.array([5.0, 12.5, 1e-3]))
     blocked = dataclasses.replace(blocked, sensor=lens.sensor)
-    with pytest.raises(ValueError, match="no ray at 0.6 um reaches the sensor"):
-        psf_moments(blocked, 0.0, jnp.inf, RGB)
+    for order in (None, 4):
+        with pytest.raises(ValueError, match="no ray at 0.6 um reaches the sensor"):
+            psf_moments(blocked, 0.0, jnp.inf, RGB, order=order)
+    with pytest.raises(ValueError, match="order: expected 1 to 40, got 41"):
+        psf_moments(lens, 0.0, jnp.inf, RGB, order=41)

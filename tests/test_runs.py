@@ -63,18 +63,37 @@ def test_a_failed_write_leaves_the_old_checkpoint(tmp_path, monkeypatch):
     assert not list(run.folder.rglob("*.partial"))
 
 
+def test_seconds_go_on_after_a_resume(tmp_path):
+    run = opened(tmp_path)
+    run.log("a", 0, {"loss": np.ones(1)})
+    run._opened -= 1000.0  # an hour of work, say
+    run.save("a", 1, jnp.ones(1))
+    again = opened(tmp_path, resume=True)
+    again.load("a", jnp.ones(1), ("a",))
+    assert 1000 <= again.seconds < 1100
+
+
+def test_a_run_that_failed_before_its_first_step_leaves_the_folder_free(tmp_path):
+    opened(tmp_path)
+    opened(tmp_path, config=Config(11))
+    assert opened(tmp_path, resume=True, config=Config(11)).folder == tmp_path / "run"
+
+
 def test_clear_errors(tmp_path):
     with pytest.raises(ConfigError, match="nothing to resume"):
         opened(tmp_path, resume=True)
     run = opened(tmp_path)
+    run.log("a", 0, {"loss": np.ones(1)})
     with pytest.raises(ConfigError, match="holds a run already; add --resume"):
         opened(tmp_path)
     with pytest.raises(ConfigError, match="started with other settings"):
         opened(tmp_path, resume=True, config=Config(11))
-    (run.folder / "checkpoints").mkdir()
-    (run.folder / "checkpoints" / "a.npz").write_bytes(b"garbage")
-    with pytest.raises(ConfigError, match="not a checkpoint of this run; delete it"):
-        run.load("a", jnp.ones(1), ("a",))
+    run.save("a", 1, jnp.ones(100))
+    path = run.folder / "checkpoints" / "a.npz"
+    for content in (b"garbage", path.read_bytes()[:200], b""):
+        path.write_bytes(content)
+        with pytest.raises(ConfigError, match="not a checkpoint of this run; delete it"):
+            run.load("a", jnp.ones(1), ("a",))
 
 
 def test_first_interrupt_is_deferred_second_is_not():

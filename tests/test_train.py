@@ -36,7 +36,7 @@ def test_imager_is_the_chain_by_hand():
     )
     x = scenes().astype(np.float32) / np.float32(255)
     np.testing.assert_array_equal(truth, x[:, 4:-4, 4:-4])
-    mean, covariance = blur({"sensor": sensor}, 25000.0)
+    mean, covariance, _ = blur({"sensor": sensor}, 25000.0)
     kernel = gaussian_psf(mean, covariance, 4.4e-3, 9).dense()
     np.testing.assert_allclose(image, convolve(jnp.asarray(x, float), kernel), atol=1e-6)
     assert image.dtype == jnp.float32 and restored is image
@@ -71,7 +71,6 @@ def test_training_moves_the_sensor_to_focus_and_compiles_once(start):
 
     def report(first, metrics, state):
         reports.append((first, metrics))
-        return False
 
     state = train.fit(
         step, state, itertools.repeat(scenes()), 0.01, 0, 40, 16, report
@@ -80,6 +79,35 @@ def test_training_moves_the_sensor_to_focus_and_compiles_once(start):
     assert reports[-1][1]["loss"].shape == (8,)
     assert abs(float(state[0]["optics"]["sensor"]) - 133.39) < 0.15
     assert step._cache_size() == 1
+
+
+def test_training_stops_when_asked_with_a_report():
+    def step(state, scenes, noise, index):
+        return state + 1, {"loss": jnp.asarray(float(index))}
+
+    seen, stop = [], [False, True]
+    state = train.fit(
+        step, 0, itertools.repeat(None), 0.0, 3, 99, 10,
+        lambda start, metrics, state: seen.append((start, metrics["loss"].tolist(), state)),
+        lambda: len(seen) == 1 and stop.pop(0),
+    )  # fmt: skip
+    assert seen == [(3, list(range(3, 13)), 10), (13, [13.0, 14.0], 12)] and state == 12
+
+
+def test_a_colour_without_rays_is_black_and_loses_no_gradient():
+    def blur(values, distance):
+        passed = jnp.array([1.0, 0.5, 0.0])
+        return jnp.zeros((3, 2)), jnp.zeros((3, 2)) * values["sensor"], passed
+
+    imager = train.make_imager(blur, None, CAMERA)
+
+    def image(sensor):
+        return imager({"optics": {"sensor": sensor}}, scenes(), 1.0, np.float32(0), jax.random.key(0))
+
+    truth, sensor_image, _, sigma = image(1.0)
+    np.testing.assert_allclose(sensor_image, truth * np.array([1, 0.5, 0], np.float32), rtol=1e-6)
+    slope = jax.grad(lambda s: sum(jnp.sum(part.astype(float)) for part in image(s)))(1.0)
+    assert jnp.all(sigma == 0) and jnp.isfinite(slope)
 
 
 def test_depth_is_uniform_and_steps_depend_on_seed_and_index_alone():
