@@ -14,10 +14,11 @@ Conventions, everywhere in the package:
 """
 
 from .adam import adam, apply_updates
+from .depth import depth_moments, moments_model
 from .fermat import Status
 from .glass import find_glass, refractive_index
 from .lens import Lens, LensError, lens_names, load_lens
-from .moments import depth_moments, focus_moments, moments_model, psf_moments, pupil_order
+from .moments import focus_moments, psf_moments, pupil_order
 from .network import red_net
 from .paraxial import back_focal_distance, focal_length, image_distance
 from .psf import SeparableKernel, gaussian_psf

@@ -104,10 +104,10 @@ def test_an_interrupted_run_resumes_to_the_same_numbers(name, unbroken, tmp_path
     assert not (tmp_path / "run" / "results.json").exists()
     monkeypatch.undo()
     main(name, "--resume", "--out", tmp_path / "run")
-    same(unbroken(name), tmp_path / "run")
+    assert_same(unbroken(name), tmp_path / "run")
 
 
-def same(wanted, folder):
+def assert_same(wanted, folder):
     rows = [sorted((f / "metrics.csv").read_text().splitlines()) for f in (wanted, folder)]
     assert rows[0] == rows[1]
     results = [json.loads((f / "results.json").read_text()) for f in (wanted, folder)]
@@ -127,7 +127,7 @@ def test_a_killed_run_resumes_to_the_same_numbers(unbroken, tmp_path):
     process.kill()
     process.wait()
     main("focus", "--resume", "--out", folder)
-    same(unbroken("focus"), folder)
+    assert_same(unbroken("focus"), folder)
 
 
 def test_finished_run_resumes_at_once(unbroken, capsys):

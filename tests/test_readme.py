@@ -5,6 +5,8 @@ import re
 
 import pytest
 
+from drt_jax import load_lens
+
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text()
 
@@ -18,6 +20,12 @@ def test_notebook_lines_run(tmp_path, monkeypatch):
         exec(compile(block, "README.md", "exec"), names)
     assert names["gradient"].curvature.shape == (11,)
     assert (tmp_path / "psf.png").stat().st_size > 5000
+
+
+def test_lens_of_your_own_loads(tmp_path):
+    (text,) = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
+    (tmp_path / "my_lens.yaml").write_text(text)
+    assert load_lens(tmp_path / "my_lens.yaml").stop == 2
 
 
 @pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#:]+)\)", TEXT))))
