@@ -112,9 +112,9 @@ def moments_model(
 
     `trained` names fields of `Lens`; `distances` = (near, far) in mm, equal for one depth.
     Returns their initial values and a function (values, distance) -> (centroid, covariance
-    as in `FocusMoments.at`, and the fraction (W,) of the light that passes). With the sensor alone, nothing is traced inside that function:
-    polynomials in its position, and in 1/distance when the depth varies. Anything else
-    traces the rays anew.
+    as in `FocusMoments.at`, and the fraction (W,) of the light that passes). With the sensor
+    alone, nothing is traced inside that function: polynomials in its position, and in
+    1/distance when the depth varies. Anything else traces the rays anew.
     """
     near, far = distances
     values = {name: getattr(lens, name) for name in trained}

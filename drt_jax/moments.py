@@ -101,9 +101,9 @@ def focus_moments(
 ) -> FocusMoments:
     """Moments of the rays as functions of the sensor position, about `lens.sensor`.
 
-    Arguments as in `psf_moments`; the tolerance holds at any sensor position. Differentiable
-    in all lens parameters; rays that fail or are clipped have weight 0, and the rest is
-    normalised. Paper section 4.3.
+    Arguments as in `psf_moments`; the tolerance holds at any sensor position (inside `jax.jit`,
+    see `pupil_order`). Differentiable in all lens parameters; rays that fail or are clipped
+    have weight 0, and the rest is normalised. Paper section 4.3.
     """
     return _moments(lens, field, distance, wavelengths, tolerance, order, moving=True)
 
@@ -209,11 +209,12 @@ def psf_moments(
 ) -> tuple[Array, Array]:
     """Centroid (W, 2) in mm and covariance (W, 2, 2) in mm^2 of the rays on the sensor.
 
-    `field`: angle along y, or (x, y), in radians. `distance`: mm from the object plane to
-    the first vertex, inf allowed. `wavelengths` (W,) in um. `tolerance`: relative error of
-    the RMS spot size; the number of rays follows from it (see `pupil_order`) unless `order`
-    (1 to 40) is given. ValueError if no ray of a colour arrives; under `jax.jit`, where that
-    cannot be known, both are 0 then (`focus_moments(...).passed` tells). Rays fill the stop uniformly. Known zero field: meridional rays only; field
+    `field`: angle along y, or (x, y), in radians. `distance`: mm from the object plane
+    to the first vertex, inf allowed. `wavelengths` (W,) in um. `tolerance`: relative
+    error of the RMS spot size; the number of rays follows from it (see `pupil_order`)
+    unless `order` (1 to 40) is given. ValueError if no ray of a colour arrives; under
+    `jax.jit`, where that cannot be known, both are 0 then (`focus_moments(...).passed`
+    tells). Rays fill the stop uniformly. Known zero field: meridional rays only; field
     along y: half the pupil. Paper section 4.3.
     """
     moments = _moments(lens, field, distance, wavelengths, tolerance, order, moving=False)
@@ -244,11 +245,12 @@ def pupil_order(
 
     At the lens's sensor position or, if `moving`, at any: there the spot may be far smaller.
 
-    Orders n and n + 1 are compared on the scene itself: their difference in the covariance,
-    relative to its trace, is twice the error of n in the spot size, and may be at most
-    `tolerance`, which leaves a factor of two for the error of n + 1. Inside `jax.jit`, where the scene
-    is not known, a rule with two nodes in hand takes its place: to have the measured order
-    there, call this function outside and pass the result on.
+    Orders n and n + 1 are compared on the scene itself: their difference in the
+    covariance, relative to its trace, is twice the error of n in the spot size, and may
+    be at most `tolerance`, which leaves a factor of two for the error of n + 1. Inside
+    `jax.jit`, where the scene is not known, a rule with two nodes in hand takes its
+    place: to have the measured order there, call this function outside and pass the
+    result on.
     """
     check_wavelengths(lens.glasses, wavelengths)
     if _concrete(lens, field, distance, wavelengths):
