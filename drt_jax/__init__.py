@@ -17,18 +17,20 @@ from .adam import adam, apply_updates
 from .depth import depth_moments, moments_model
 from .fermat import Status
 from .glass import find_glass, refractive_index
-from .lens import Lens, LensError, lens_names, load_lens
+from .lens import Lens
 from .moments import focus_moments, psf_moments, pupil_order
 from .network import red_net
 from .paraxial import back_focal_distance, focal_length, image_distance
+from .prescription import LensError, lens_names, load_lens
 from .psf import SeparableKernel, gaussian_psf
 from .sensor import convolve, sensor_layer
 from .snell import trace_snell
-from .trace import Rays, trace_rays
+from .trace import Rays, field_of_height, trace_rays
 
 __all__ = [
     "Lens", "LensError", "Rays", "SeparableKernel", "Status",
-    "adam", "apply_updates", "back_focal_distance", "convolve", "depth_moments", "find_glass",
+    "adam", "apply_updates", "back_focal_distance", "convolve", "depth_moments", "field_of_height",
+    "find_glass",
     "focal_length", "focus_moments", "gaussian_psf", "image_distance", "lens_names", "load_lens",
     "moments_model", "psf_moments", "pupil_order", "red_net", "refractive_index", "sensor_layer",
     "trace_rays", "trace_snell",

@@ -7,9 +7,9 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from . import surface
 from .fermat import Status
 from .lens import Lens
+from .surface import Shape, sag
 from .trace import trace_rays
 
 __all__ = ["Drawing", "draw"]
@@ -65,7 +65,8 @@ def draw(
 
 def _profile(lens: Lens, i: int, vertex: float, semi: float) -> np.ndarray:
     y: Array = jnp.linspace(-semi, semi, _POINTS)
-    z = surface.sag(y[None], lens.curvature[i], lens.conic[i], lens.coefficients[i])
+    shape = Shape(lens.curvature[i], lens.conic[i], lens.coefficients[i])
+    z = sag(jnp.stack([0 * y, y]), shape, lens.forms[i])
     return np.stack([vertex + np.asarray(z), np.asarray(y)], axis=-1)
 
 

@@ -10,17 +10,20 @@ operation is one long elementwise loop. There are D = 1 components for rays in t
 plane (y), D = 2 in general (x, y). Surface S is the sensor.
 """
 
+import dataclasses
 import enum
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from . import surface
-from .numerics import safe_divide
+from .numerics import safe_divide, safe_sqrt
+from .surface import Shape, by_form, domain, sag, sag_derivatives
 
-__all__ = ["Blocks", "Geometry", "Status", "System", "geometry", "hessian", "optical_path",
-           "residual", "solve", "solve_transposed", "status"]  # fmt: skip
+__all__ = ["Blocks", "Geometry", "Status", "System", "arrival", "geometry", "hessian",
+           "optical_path", "residual", "solve", "solve_transposed", "status", "turn"]  # fmt: skip
 
 
 class Status(enum.IntEnum):
@@ -33,13 +36,19 @@ class Status(enum.IntEnum):
     UNCONVERGED = 4  # the iteration found no stationary path
 
 
-class System(NamedTuple):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class System:
     """Everything that the path of a ray depends on; the differentiable arguments.
 
     vertex, curvature, conic (S + 1,) and coefficients (K, S + 1) of the surfaces and the
-    sensor; index (S + 1, W); source (D + 1,), the object point divided by its distance, so
-    that its last component is -1; vergence (), 1/distance in 1/mm, 0 for infinity; stop
-    (D, Q), the points where the rays cross the stop, mm.
+    sensor; offset (2, S + 1) of their vertices from the axis and rotation (3, 3, S + 1) from
+    their own axes to those of the lens, None where there are none; index (S + 1, W); source
+    (D + 1,), the object point divided by its distance, so that its last component is -1;
+    vergence (), 1/distance in 1/mm, 0 for infinity; target (D, Q) or (D, W, Q), the points
+    where the rays cross the stop, mm.
+
+    Static: stop, the index of the stop; forms (S + 1) and mirrors (S).
     """
 
     vertex: Array
@@ -49,32 +58,48 @@ class System(NamedTuple):
     index: Array
     source: Array
     vergence: Array
-    stop: Array
+    target: Array
+    offset: Array | None = None
+    rotation: Array | None = None
+    stop: int = dataclasses.field(metadata={"static": True}, default=0)
+    forms: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
+    mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True}, default=())
 
     @property
-    def shape(self) -> tuple[Array, Array, Array]:
+    def shape(self) -> Shape:
         """Curvature, conic and coefficients, broadcast against (surface, wavelength, ray)."""
-        return (
+        return Shape(
             self.curvature[:, None, None],
             self.conic[:, None, None],
             self.coefficients[..., None, None],
         )
 
+    @property
+    def crossings(self) -> Array:
+        """`target` as (D, W or 1, Q)."""
+        return self.target if self.target.ndim == 3 else self.target[:, None]
+
+    @property
+    def senses(self) -> Array:
+        """1 or -1 (S + 1, 1, 1): light goes along or against the z axis of each surface."""
+        turns = np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
+        return jnp.asarray(turns[:, None, None], self.vertex.dtype)
+
 
 class Geometry(NamedTuple):
     """A path drawn out: what its gradient, its Hessian and its status are made of.
 
-    direction (D + 1, S + 1, W, Q): unit vectors of the segments before each surface.
-    inverse_length (S + 1, W, Q): their inverse lengths (the first: vergence over |q|).
+    before (D + 1, S + 1, W, Q): unit vectors of the segments in front of each surface, along
+    that surface's axes. after (D + 1, S, W, Q): those behind it, along its axes too.
+    inverse_length (S + 1, W, Q): inverse lengths of the former (the first: vergence over |q|).
     slope (D, S + 1, W, Q) and bend (D, D, S + 1, W, Q): derivatives of the sag.
-    advance (S, W, Q): z of each surface's hit after that of the one before it.
     """
 
-    direction: Array
+    before: Array
+    after: Array
     inverse_length: Array
     slope: Array
     bend: Array
-    advance: Array
 
 
 class Blocks(NamedTuple):
@@ -85,9 +110,46 @@ class Blocks(NamedTuple):
     upper: Array
 
 
-def _points(hits: Array, system: System) -> tuple[Array, Array, Array]:
-    z, slope, bend = surface.sag_derivatives(hits, *system.shape)
-    return jnp.concatenate([hits, (system.vertex[:, None, None] + z)[None]]), slope, bend
+def turn(rotation: Array | None, vectors: Array, back: bool = False) -> Array:
+    """`vectors` (3, S, ...) from the axes of each surface to those of the lens, or `back`.
+
+    `rotation` (3, 3, S); None, the axes being the same, returns them as they are.
+    """
+    if rotation is None:
+        return vectors
+    matrix = rotation.reshape(*rotation.shape, *(1,) * (vectors.ndim - 2))
+    return jnp.sum(matrix * (vectors[:, None] if back else vectors[None]), axis=0 if back else 1)
+
+
+def _origin(system: System, dim: int) -> Array:
+    """Vertices of the surfaces and the sensor, (D + 1, S + 1, 1, 1), mm."""
+    across = jnp.zeros((dim, *system.vertex.shape), system.vertex.dtype)
+    across = across if system.offset is None else system.offset
+    return jnp.concatenate([across, system.vertex[None]])[..., None, None]
+
+
+def _segments(hits: Array, system: System) -> tuple[Array, Array, Array, Array]:
+    """First point (D + 1, W, Q), the steps from each to the next (D + 1, S, W, Q), sag
+    derivatives. Steps are sums of small differences: no digit is lost far from the origin."""
+    z, slope, bend = by_form(sag_derivatives, hits, system.shape, system.forms)
+    own = turn(system.rotation, jnp.concatenate([hits, z[None]]))
+    origin = _origin(system, hits.shape[0])
+    step = (origin[:, 1:] - origin[:, :-1]) + (own[:, 1:] - own[:, :-1])
+    return origin[:, 0] + own[:, 0], step, slope, bend
+
+
+def arrival(hits: Array, system: System) -> Array:
+    """Unit vectors (D + 1, W, Q), along the axes of the sensor, of the rays that reach it."""
+    rows = slice(-2, None)
+    rotation = None if system.rotation is None else system.rotation[..., rows]
+    shape = Shape(*(a[..., rows, :, :] for a in system.shape))
+    z = by_form(sag, hits[:, rows], shape, system.forms[rows])
+    own = turn(rotation, jnp.concatenate([hits[:, rows], z[None]]))
+    step = jnp.diff(_origin(system, hits.shape[0])[:, rows] + own, axis=1)
+    if rotation is not None:
+        step = turn(rotation[..., 1:], step, back=True)
+    length = jnp.sqrt(jnp.sum(step**2, axis=0))
+    return (step * safe_divide(jnp.ones_like(length), length))[:, 0]
 
 
 def geometry(hits: Array, system: System) -> Geometry:
@@ -97,16 +159,17 @@ def geometry(hits: Array, system: System) -> Geometry:
     q = vergence P_1 - source, which has the same direction and stays finite and smooth when
     the object goes to infinity.
     """
-    points, slope, bend = _points(hits, system)
-    first = system.vergence * points[:, :1] - system.source[:, None, None, None]
-    step = points[:, 1:] - points[:, :-1]
-    segment = jnp.concatenate([first, step], axis=1)
+    point, step, slope, bend = _segments(hits, system)
+    first = system.vergence * point - system.source[:, None, None]
+    segment = jnp.concatenate([first[:, None], step], axis=1)
     inverse = safe_divide(jnp.ones_like(segment[0]), jnp.sqrt(jnp.sum(segment**2, axis=0)))
     direction = segment * inverse
-    scale = jnp.concatenate(
-        [inverse[:1] * system.vergence, inverse[1:]], axis=0
-    )
-    return Geometry(direction, scale, slope, bend, step[-1])
+    scale = jnp.concatenate([inverse[:1] * system.vergence, inverse[1:]], axis=0)
+    before, after = direction, direction[:, 1:]
+    if system.rotation is not None:
+        before = turn(system.rotation, direction, back=True)
+        after = turn(system.rotation[..., :-1], direction[:, 1:], back=True)
+    return Geometry(before, after, scale, slope, bend)
 
 
 def optical_path(hits: Array, system: System) -> Array:
@@ -115,15 +178,14 @@ def optical_path(hits: Array, system: System) -> Array:
     Counted from the sphere round the object that passes through the first vertex (a plane
     for an object at infinity), so that it stays finite for any distance.
     """
-    points, _, _ = _points(hits, system)
-    v, p, q = system.vergence, system.source[:, None, None], points[:, 0]
+    q, step, _, _ = _segments(hits, system)
+    v, p = system.vergence, system.source[:, None, None]
     near = v * q - p
     # (|q - p/v| - |p/v|) without the cancellation, and without dividing by v
     first = (v * jnp.sum(q * q, axis=0) - 2 * jnp.sum(q * p, axis=0)) / (
         jnp.sqrt(jnp.sum(near**2, axis=0)) + jnp.sqrt(jnp.sum(p**2, axis=0))
     )
-    step = jnp.sqrt(jnp.sum((points[:, 1:] - points[:, :-1]) ** 2, axis=0))
-    lengths = jnp.concatenate([first[None], step])
+    lengths = jnp.concatenate([first[None], safe_sqrt(jnp.sum(step**2, axis=0))])
     return jnp.sum(system.index[:, :, None] * lengths, axis=0)
 
 
@@ -133,22 +195,26 @@ def residual(hits: Array, system: System) -> Array:
 
 
 def _residual(path: Geometry, system: System) -> Array:
-    ray = system.index[:, :, None] * path.direction
-    change = ray[:, :-1] - ray[:, 1:]
+    index = system.index[:, :, None]
+    change = index[:-1] * path.before[:, :-1] - index[1:] * path.after
     return change[:-1] + path.slope[:, :-1] * change[-1]
 
 
 def hessian(path: Geometry, system: System) -> Blocks:
     """The blocks of dF/dw in closed form from the drawn-out path."""
     dim = path.slope.shape[0]
-    direction, slope = path.direction, path.slope
-    index = system.index[:, :, None]
+    slope, index = path.slope, system.index[:, :, None]
     weight = index * path.inverse_length
     # t.T_e for the tangents T_e = unit_e + slope_e z of the surface behind a segment ...
-    end = direction[:-1] + slope * direction[-1]
+    end = path.before[:-1] + slope * path.before[-1]
     # ... and of the one before it.
-    start = direction[:-1, 1:] + slope[:, :-1] * direction[-1, 1:]
-    bend = index[:-1] * direction[-1, :-1] - index[1:] * direction[-1, 1:]
+    start = path.after[:-1] + slope[:, :-1] * path.after[-1]
+    bend = index[:-1] * path.before[-1, :-1] - index[1:] * path.after[-1]
+    if system.rotation is not None:
+        # T_e . T_f of neighbours whose axes differ
+        units = jnp.eye(3, dtype=slope.dtype)[:dim, :, None, None, None]
+        tangent = units + jnp.eye(3, dtype=slope.dtype)[2, :, None, None, None] * slope[:, None]
+        tangent = jax.vmap(lambda t: turn(system.rotation, t))(tangent)
     diagonal, upper = [], []
     for e in range(dim):
         for f in range(dim):
@@ -159,9 +225,11 @@ def hessian(path: Geometry, system: System) -> Blocks:
                 + weight[1:] * (metric - start[e] * start[f])
                 + bend * path.bend[e, f, :-1]
             )
-            upper.append(
-                -weight[1:] * (same + slope[e, :-1] * slope[f, 1:] - start[e] * end[f, 1:])
-            )
+            if system.rotation is None:
+                metric = same + slope[e, :-1] * slope[f, 1:]
+            else:
+                metric = jnp.sum(tangent[e, :, :-1] * tangent[f, :, 1:], axis=0)
+            upper.append(-weight[1:] * (metric - start[e] * end[f, 1:]))
     shape = (dim, dim, *diagonal[0].shape)
     return Blocks(jnp.stack(diagonal).reshape(shape), jnp.stack(upper).reshape(shape))
 
@@ -241,19 +309,20 @@ def status(hits: Array, system: System) -> Array:
     """
     path = geometry(hits, system)
     index = system.index[:, :, None]
-    exists = surface.domain(hits, *system.shape[:2])[:-1]
+    exists = by_form(domain, hits, system.shape, system.forms)
     normal = safe_divide(
         jnp.ones_like(path.slope[0]), jnp.sqrt(1 + jnp.sum(path.slope**2, axis=0))
-    )[:-1]
+    )
 
-    def along(direction):  # cosine of the angle with the surface normal
-        return (direction[-1] - jnp.sum(path.slope[:, :-1] * direction[:-1], axis=0)) * normal
+    def along(direction, slope):  # cosine with the surface normal, times its length
+        return direction[-1] - jnp.sum(slope * direction[:-1], axis=0)
 
-    arriving = along(path.direction[:, :-1])
-    leaving = along(path.direction[:, 1:])
-    sine = jnp.sqrt(jnp.maximum(1 - arriving**2, 0)) * index[:-1]
-    missed = ~exists | (arriving <= 0) | (path.advance <= 0)
-    reflected = sine > index[1:]
+    arriving = along(path.before, path.slope) * normal * system.senses
+    leaving = along(path.after, path.slope[:, :-1]) * system.senses[1:]
+    sine = jnp.sqrt(jnp.maximum(1 - arriving[:-1] ** 2, 0)) * index[:-1]
+    reflected = (sine > index[1:]) & ~np.array(system.mirrors)[:, None, None]
+    reflected = jnp.concatenate([reflected, jnp.zeros_like(reflected[:1])])
+    missed = ~exists | (arriving <= 0)
     code = jnp.where(
         missed, Status.MISSED, jnp.where(reflected, Status.TIR, Status.OK)
     ).astype(jnp.int32)
@@ -264,7 +333,7 @@ def status(hits: Array, system: System) -> Array:
     reach = jnp.maximum(size[:-1], size[1:])
     shake = index[:-1] * (1 + jnp.abs(path.inverse_length[:-1]) * reach)
     shake = shake + index[1:] * (1 + jnp.abs(path.inverse_length[1:]) * reach)
-    error = jnp.abs(_residual(path, system)) * normal
+    error = jnp.abs(_residual(path, system)) * normal[:-1]
     settled = jnp.all(error <= 64 * eps * shake, axis=(0, 1)) & jnp.all(leaving > 0, axis=0)
     unsettled = jnp.where(settled, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
     return jnp.where(first != 0, first, unsettled)

@@ -1,24 +1,26 @@
 """Rays as roots of the Fermat system, with derivatives by the implicit function theorem.
 
 The only module that imports optimistix. The iteration is never differentiated: at a root,
-F(w, p) = 0 gives dw/dp = -(dF/dw)^-1 dF/dp (paper Eq. 4), and the reverse rule below is one
-transposed solve and one vector-Jacobian product.
+F(w, p) = 0 gives dw/dp = -(dF/dw)^-1 dF/dp (paper Eq. 4). Reverse mode is a custom_vjp, one
+transposed solve and one vector-Jacobian product; JAX refuses forward mode through that, so the
+same rule is offered as a custom_jvp beside it.
 """
 
+import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import Array
 
 from . import fermat
 from .fermat import Status, System
 
-__all__ = ["BlockNewton", "solve_rays"]
+__all__ = ["BlockNewton", "solve_rays", "solve_rays_forward"]
 
 _MAX_STEPS = 32
 
@@ -64,20 +66,19 @@ class BlockNewton(optx.AbstractRootFinder):
         return y, aux, {}
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def solve_rays(stop: int, system: System, start: Array) -> tuple[Array, Array, Array]:
-    """Trace a bundle: the stationary paths through the given stop points.
+@jax.custom_jvp
+def solve_rays_forward(system: System, start: Array) -> tuple[Array, Array, Array]:
+    """`solve_rays` for forward mode: `jax.jvp`, `jacfwd`, and higher derivatives.
 
-    `start` (D, S + 1, W, Q), mm: first guess of all hits. Returns the hits, same shape,
-    their `Status` (W, Q), int32, and the number of Newton steps. Differentiable in `system`
-    in reverse mode, also repeatedly; failed rays have zero derivatives, and hits of 0.
+    The same rule: dw = -(dF/dw)^-1 dF/dp dp, one banded solve for each tangent.
     """
-    start = start.at[:, stop].set(jnp.broadcast_to(system.stop[:, None], start[:, stop].shape))
+    crossings = system.crossings
+    start = start.at[:, system.stop].set(jnp.broadcast_to(crossings, start[:, 0].shape))
     solution = optx.root_find(
         fermat.residual,
-        BlockNewton(stop=stop, atol=float(jnp.finfo(start.dtype).eps) ** 0.5 * 0.1),
-        jax.lax.stop_gradient(start),
-        args=jax.lax.stop_gradient(system),
+        BlockNewton(stop=system.stop, atol=float(jnp.finfo(start.dtype).eps) ** 0.5 * 0.1),
+        start,
+        args=system,
         max_steps=_MAX_STEPS,
         throw=False,
     )
@@ -87,32 +88,69 @@ def solve_rays(stop: int, system: System, start: Array) -> tuple[Array, Array, A
     return hits, code, solution.stats["num_steps"]
 
 
-def _forward(stop, system, start):
-    # Through `solve_rays` itself, so that the residuals carry derivatives of their own.
-    result = solve_rays(stop, system, start)
+def _linearised(system: System, hits: Array, code: Array) -> tuple[fermat.Blocks, Callable]:
+    """dF/dw, and F as a function of the system alone, at the hits.
+
+    A failed ray has no Jacobian: the identity takes its place.
+    """
+    ok = code == Status.OK
+    blocks = fermat.hessian(fermat.geometry(hits, system), system)
+    identity = jnp.eye(hits.shape[0], dtype=hits.dtype)[..., None, None, None]
+    blocks = fermat.Blocks(*(jnp.where(ok, block, identity) for block in blocks))
+
+    def residual(system):
+        crossings = jnp.where(ok, system.crossings, 0)
+        return fermat.residual(hits.at[:, system.stop].set(crossings), system)
+
+    return blocks, residual
+
+
+@solve_rays_forward.defjvp
+def _tangents(primals, tangents):
+    system, start = primals
+    # Through the function itself, so that the hits carry derivatives of their own.
+    hits, code, steps = solve_rays_forward(system, start)
+    ok = code == Status.OK
+    blocks, residual = _linearised(system, hits, code)
+    _, change = jax.jvp(residual, (system,), (tangents[0],))
+    moved = -fermat.solve(blocks, jnp.where(ok, change, 0), system.stop)
+    moved = moved.at[:, system.stop].add(
+        jnp.broadcast_to(tangents[0].crossings, moved[:, 0].shape)
+    )
+    moved = jnp.where(ok, moved, 0)
+    none = (np.zeros(a.shape, jax.dtypes.float0) for a in (code, steps))
+    return (hits, code, steps), (moved, *none)
+
+
+@jax.custom_vjp
+def solve_rays(system: System, start: Array) -> tuple[Array, Array, Array]:
+    """Trace a bundle: the stationary paths through the given stop points.
+
+    `start` (D, S + 1, W, Q), mm: first guess of all hits. Returns the hits, same shape,
+    their `Status` (W, Q), int32, and the number of Newton steps. Differentiable in `system`
+    in reverse mode, also repeatedly, and then in forward mode; failed rays have zero
+    derivatives, and hits of 0.
+    """
+    return solve_rays_forward(system, start)
+
+
+def _forward(system, start):
+    result = solve_rays_forward(system, start)
     return result, (system, *result[:2])
 
 
-def _backward(stop, residuals, cotangents):
+def _backward(residuals, cotangents):
     system, hits, code = residuals
     ok = code == Status.OK
     bar = jnp.where(ok, cotangents[0], 0)
-    path = fermat.geometry(hits, system)
-    blocks = fermat.hessian(path, system)
-    # A failed ray has no Jacobian: the identity takes its place.
-    identity = jnp.eye(hits.shape[0], dtype=hits.dtype)[..., None, None, None]
-    blocks = fermat.Blocks(*(jnp.where(ok, block, identity) for block in blocks))
-    adjoint = jnp.where(ok, fermat.solve_transposed(blocks, bar, stop), 0)
-    _, pull_back = jax.vjp(
-        lambda system: fermat.residual(
-            hits.at[:, stop].set(jnp.where(ok, system.stop[:, None], 0)), system
-        ),
-        system,
-    )
+    blocks, residual = _linearised(system, hits, code)
+    adjoint = jnp.where(ok, fermat.solve_transposed(blocks, bar, system.stop), 0)
+    _, pull_back = jax.vjp(residual, system)
     system_bar = pull_back(-adjoint)[0]
-    direct = jnp.sum(bar[:, stop], axis=1)
-    system_bar = system_bar._replace(stop=system_bar.stop + direct)
-    return system_bar, jnp.zeros_like(hits)
+    direct = bar[:, system.stop]  # of the stop points themselves, which are hits too
+    _, pull_back = jax.vjp(lambda a: jnp.broadcast_to(a[:, None] if a.ndim == 2 else a, direct.shape), system.target)
+    target_bar = system_bar.target + pull_back(direct)[0]
+    return dataclasses.replace(system_bar, target=target_bar), jnp.zeros_like(hits)
 
 
 solve_rays.defvjp(_forward, _backward)

@@ -16,10 +16,10 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from . import pupil, surface
+from . import pupil
 from .fermat import Status
 from .glass import check_wavelengths
-from .lens import Lens
+from .lens import Lens, rotation_matrix
 from .numerics import safe_divide
 from .trace import as_field, trace_bundle
 
@@ -70,17 +70,22 @@ def _concrete(*values: object) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def _symmetry(field: ArrayLike) -> str:
+def _symmetry(lens: Lens, field: ArrayLike) -> str:
     """How much of the pupil must be traced, from what is known of the field while tracing.
 
-    A field known to be 0 needs one radius. A single angle lies along y, so half a pupil
-    does. A field whose value is not known and that may lie anywhere needs the whole.
+    In a lens with an axis, a field known to be 0 needs one radius. A single angle lies along
+    y, so half a pupil does. A field whose value is not known and that may lie anywhere, or a
+    lens without symmetry, needs the whole.
     """
+    kind = lens.symmetry
+    if kind == "none":
+        return "disc"
     if jnp.ndim(field) == 0:
-        return "meridian" if _concrete(field) and float(field) == 0 else "half"
+        still = _concrete(field) and float(field) == 0
+        return "meridian" if still and kind == "rotation" else "half"
     if not _concrete(field) or np.asarray(field)[0] != 0:
         return "disc"
-    return "meridian" if np.asarray(field)[1] == 0 else "half"
+    return "meridian" if np.asarray(field)[1] == 0 and kind == "rotation" else "half"
 
 
 def _rule(symmetry: str, order: int) -> tuple[np.ndarray, np.ndarray]:
@@ -98,6 +103,7 @@ def focus_moments(
     wavelengths: ArrayLike,
     tolerance: float = 1e-6,
     order: int | None = None,
+    forward: bool = False,
 ) -> FocusMoments:
     """Moments of the rays as functions of the sensor position, about `lens.sensor`.
 
@@ -105,7 +111,7 @@ def focus_moments(
     see `pupil_order`). Differentiable in all lens parameters; rays that fail or are clipped
     have weight 0, and the rest is normalised. Paper section 4.3.
     """
-    return _moments(lens, field, distance, wavelengths, tolerance, order, moving=True)
+    return _moments(lens, field, distance, wavelengths, tolerance, order, moving=True, forward=forward)
 
 
 def _moments(
@@ -116,11 +122,12 @@ def _moments(
     tolerance: float,
     order: int | None,
     moving: bool,
+    forward: bool,
 ) -> FocusMoments:
     check_wavelengths(lens.glasses, wavelengths)
     if not (order is None or 1 <= order <= _MAX_ORDER):
         raise ValueError(f"order: expected 1 to {_MAX_ORDER}, got {order}")
-    symmetry = _symmetry(field)
+    symmetry = _symmetry(lens, field)
     known = _concrete(lens, field, distance, wavelengths)
     if order is None and known:
         return _converge(lens, field, distance, wavelengths, tolerance, moving)[1]
@@ -128,7 +135,7 @@ def _moments(
         order = _blind_order(symmetry, tolerance)
     rule = _rule(symmetry, order)
     moments = _plane_moments(
-        lens, field, distance, wavelengths, *(_pad(*rule) if known else rule), symmetry
+        lens, field, distance, wavelengths, *(_pad(*rule) if known else rule), symmetry, forward
     )
     if known:
         _check_passed(moments, wavelengths)
@@ -143,16 +150,17 @@ def _plane_moments(
     points: ArrayLike,
     weights: ArrayLike,
     symmetry: str,
+    forward: bool = False,
 ) -> FocusMoments:
     dtype = lens.curvature.dtype
     angles = jnp.zeros(1, dtype) if symmetry == "meridian" else as_field(field, dtype)
     # One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
     wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
     distance, points, weights = (jnp.asarray(a, dtype) for a in (distance, points, weights))
-    return _weigh(lens, angles, distance, wavelengths, points, weights, symmetry)
+    return _weigh(lens, angles, distance, wavelengths, points, weights, symmetry, forward)
 
 
-@partial(jax.jit, static_argnums=6)
+@partial(jax.jit, static_argnums=(6, 7))
 def _weigh(
     lens: Lens,
     angles: Array,
@@ -161,14 +169,16 @@ def _weigh(
     points: Array,
     weights: Array,
     symmetry: str,
+    forward: bool,
 ) -> FocusMoments:
     dtype = lens.curvature.dtype
-    hits, status, _ = trace_bundle(lens, angles, distance, wavelengths, points)
-    last = surface.sag(
-        hits[:, -2], lens.curvature[-1], lens.conic[-1], lens.coefficients[-1]
-    )
-    slope = (hits[:, -1] - hits[:, -2]) / (lens.sensor - lens.vertices[-1] - last)
-    good = status == Status.OK
+    bundle = trace_bundle(lens, angles, distance, wavelengths, points, forward)
+    # How the hits move with the sensor, which goes along the axis of the lens.
+    slope = bundle.arrival[:-1] / bundle.arrival[-1]
+    if lens.tilt is not None:
+        axis = rotation_matrix(lens.tilt[-1])[2]
+        slope = slope * axis[2] - axis[:2, None, None]
+    hits, good = bundle.hits, bundle.status == Status.OK
     weight = jnp.where(good, jnp.asarray(weights, dtype), 0)
     passed = jnp.sum(weight, axis=-1)
     weight = safe_divide(weight, passed[:, None])
@@ -206,6 +216,7 @@ def psf_moments(
     wavelengths: ArrayLike,
     tolerance: float = 1e-6,
     order: int | None = None,
+    forward: bool = False,
 ) -> tuple[Array, Array]:
     """Centroid (W, 2) in mm and covariance (W, 2, 2) in mm^2 of the rays on the sensor.
 
@@ -217,7 +228,7 @@ def psf_moments(
     tells). Rays fill the stop uniformly. Known zero field: meridional rays only; field
     along y: half the pupil. Paper section 4.3.
     """
-    moments = _moments(lens, field, distance, wavelengths, tolerance, order, moving=False)
+    moments = _moments(lens, field, distance, wavelengths, tolerance, order, moving=False, forward=forward)
     mean, covariance = moments.at(lens.sensor)
     return mean, covariance if covariance.ndim == 3 else _matrix(covariance)
 
@@ -255,7 +266,7 @@ def pupil_order(
     check_wavelengths(lens.glasses, wavelengths)
     if _concrete(lens, field, distance, wavelengths):
         return _converge(lens, field, distance, wavelengths, tolerance, moving)[0]
-    return _blind_order(_symmetry(field), tolerance)
+    return _blind_order(_symmetry(lens, field), tolerance)
 
 
 def _check_tolerance(tolerance: float) -> None:
@@ -276,7 +287,7 @@ def _converge(
     Warns if no order up to the largest does.
     """
     _check_tolerance(tolerance)
-    symmetry = _symmetry(field)
+    symmetry = _symmetry(lens, field)
     bound = max(tolerance, 100 * float(jnp.finfo(lens.curvature.dtype).eps))
     previous = None
     for order in range(2, _MAX_ORDER + 2):

@@ -2,9 +2,11 @@
 
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 from .lens import Lens
 from .numerics import safe_divide
+from .surface import vertex_curvature
 
 __all__ = ["back_focal_distance", "focal_length", "image_distance", "trace_yu"]
 
@@ -30,17 +32,17 @@ def trace_yu(
     return jnp.stack(heights), jnp.stack(slopes)
 
 
-def vertex_curvature(lens: Lens) -> Array:
-    """Curvature at the vertices (S,), 1/mm: an r^2 coefficient a adds 2 a."""
-    if lens.coefficients.shape[1]:
-        return lens.curvature + 2 * lens.coefficients[:, 0]
-    return lens.curvature
+def _trace(lens: Lens, wavelengths: Array, slope: ArrayLike) -> tuple[Array, Array]:
+    """Heights and slopes of the ray of height 1 and the given slope at the first vertex."""
+    index = lens.index(wavelengths)
+    index = index * jnp.asarray(lens.senses[:, None], index.dtype)
+    curvature = vertex_curvature(lens.shape, lens.forms, 1)[0]
+    one = jnp.ones_like(index[0])
+    return trace_yu(curvature, lens.thickness, index, one, one * slope)
 
 
 def _parallel_ray(lens: Lens, wavelengths: Array) -> tuple[Array, Array]:
-    index = lens.index(wavelengths)
-    one = jnp.ones_like(index[0])
-    height, slope = trace_yu(vertex_curvature(lens), lens.thickness, index, one, 0 * one)
+    height, slope = _trace(lens, wavelengths, 0.0)
     return height[-1], slope[-1]
 
 
@@ -58,9 +60,6 @@ def back_focal_distance(lens: Lens, wavelengths: Array) -> Array:
 
 def image_distance(lens: Lens, distance: float | Array, wavelengths: Array) -> Array:
     """First vertex to the paraxial image of an axial object at `distance` mm (W,), mm."""
-    index = lens.index(wavelengths)
-    one = jnp.ones_like(index[0])
-    height, slope = trace_yu(
-        vertex_curvature(lens), lens.thickness, index, one, one / jnp.asarray(distance, one.dtype)
-    )
+    distance = jnp.asarray(distance, lens.curvature.dtype)
+    height, slope = _trace(lens, wavelengths, 1 / distance)
     return lens.vertices[-1] + safe_divide(-height[-1], slope[-1])

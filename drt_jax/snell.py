@@ -8,33 +8,38 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from . import surface
-from .lens import Lens
+from .lens import Lens, rotation_matrix
+from .surface import Shape, domain, sag_derivatives
 
 __all__ = ["trace_snell"]
 
-_ASPHERE_STEPS = 12
+_NEWTON_STEPS = 12
 
 
-def _intersect(p: Array, d: Array, c: Array, k: Array, a: Array) -> tuple[Array, Array, Array]:
+def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Array, Array]:
     """Hit of the ray p + s d with the surface at the origin; its normal; whether there is one."""
-    p = p - d * (p[2] / d[2])  # to the vertex plane
-    quadratic = c * (1 + k * d[2] ** 2)
-    linear = d[2] - c * (p[0] * d[0] + p[1] * d[1])
-    constant = c * (p[0] ** 2 + p[1] ** 2)
-    discriminant = linear**2 - quadratic * constant
-    root = jnp.sqrt(jnp.maximum(discriminant, 0))
-    q = p + d * (constant / (linear + root))
-    if a.shape[0]:
+    q = p - d * (p[2] / d[2])  # on the vertex plane
+    met = jnp.array(True)
+    c, k = shape.curvature, shape.conic
+    if form in ("asphere", "odd_asphere"):
+        quadratic = c * (1 + k * d[2] ** 2)
+        linear = d[2] - c * (q[0] * d[0] + q[1] * d[1])
+        constant = c * (q[0] ** 2 + q[1] ** 2)
+        discriminant = linear**2 - quadratic * constant
+        root = jnp.sign(d[2]) * jnp.sqrt(jnp.maximum(discriminant, 0))
+        met = discriminant >= 0
+        q = q + d * (constant / (linear + root))
+    if shape.coefficients.shape[0]:
 
         def closer(_, q):
-            z, slope, _ = surface.sag_derivatives(q[:2], c, k, a)
+            z, slope, _ = sag_derivatives(q[:2], shape, form)
             return q + d * ((z - q[2]) / (d[2] - slope @ d[:2]))
 
-        q = jax.lax.fori_loop(0, _ASPHERE_STEPS, closer, q)
-    _, slope, _ = surface.sag_derivatives(q[:2], c, k, a)
+        q = jax.lax.fori_loop(0, _NEWTON_STEPS, closer, q)
+    z, slope, _ = sag_derivatives(q[:2], shape, form)
+    met = met & domain(q[:2], shape, form) & (jnp.abs(z - q[2]) < 1e-6 * (1 + jnp.abs(z)))
     normal = jnp.array([-slope[0], -slope[1], jnp.ones_like(slope[0])])
-    return q, normal / jnp.linalg.norm(normal), discriminant >= 0
+    return q, normal / jnp.linalg.norm(normal), met
 
 
 def trace_snell(
@@ -43,26 +48,37 @@ def trace_snell(
     """Trace one ray through a lens to its sensor.
 
     `wavelength` () in um; `point` (3,) in mm, anywhere on the ray before the lens;
-    `direction` (3,), a unit vector. Returns the hits (S + 1, 3) in mm, z from the first
-    vertex, and whether the ray met every surface and was refracted there, bool.
+    `direction` (3,), a unit vector. Returns the hits (S + 1, 3) in mm along the axes of the
+    lens, z from the first vertex, and whether the ray met every surface and was refracted or
+    reflected there, bool.
     """
     index = lens.index(jnp.atleast_1d(wavelength))[:, 0]
-    vertices = lens.vertices
+    count = len(lens.forms)
+    vertices = jnp.append(lens.vertices, lens.sensor)
+    shape = Shape(*(jnp.concatenate([a, jnp.zeros_like(a[:1])])
+                    for a in (lens.curvature, lens.conic, lens.coefficients)))  # fmt: skip
     ok, hits = jnp.array(True), []
-    for i in range(lens.curvature.shape[0]):
-        origin = jnp.zeros_like(point).at[2].set(vertices[i])
-        hit, normal, met = _intersect(
-            point - origin, direction, lens.curvature[i], lens.conic[i], lens.coefficients[i]
-        )
-        point = hit + origin
-        ratio = index[i] / index[i + 1]
-        cosine = normal @ direction
-        square = 1 - ratio**2 * (1 - cosine**2)
-        direction = ratio * direction + normal * (
-            jnp.sqrt(jnp.maximum(square, 0)) - ratio * cosine
-        )
-        ok = ok & met & (square >= 0) & (cosine > 0)
+    for i in range(count + 1):
+        across = jnp.zeros(2, point.dtype) if lens.decentre is None else lens.decentre[i]
+        origin = jnp.append(across, vertices[i])
+        turn = None if lens.tilt is None else rotation_matrix(lens.tilt[i])
+        p, d = point - origin, direction
+        if turn is not None:
+            p, d = turn.T @ p, turn.T @ d
+        row = jax.tree.map(lambda a: a[i], shape)
+        hit, normal, met = _intersect(p, d, row, "asphere" if i == count else lens.forms[i])
+        cosine, sense = normal @ d, int(lens.senses[i])
+        ok = ok & met & (sense * cosine > 0)
+        if i < count:
+            ratio = index[i] / index[i + 1]
+            square = 1 - ratio**2 * (1 - cosine**2)
+            ok = ok & (square >= 0)
+            if lens.mirrors[i]:
+                d = d - 2 * cosine * normal
+            else:
+                bend = sense * jnp.sqrt(jnp.maximum(square, 0)) - ratio * cosine
+                d = ratio * d + normal * bend
+        point = (hit if turn is None else turn @ hit) + origin
+        direction = d if turn is None else turn @ d
         hits.append(point)
-    hits.append(point + direction * ((lens.sensor - point[2]) / direction[2]))
     return jnp.stack(hits), ok
-

@@ -1,5 +1,6 @@
 """Lens + field + distance + wavelengths + points on the stop -> rays with a status."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -7,108 +8,170 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from . import surface
-from .fermat import Status, System, geometry
+from .fermat import Status, System, arrival, geometry, optical_path, turn
 from .glass import check_wavelengths
-from .implicit import solve_rays
-from .lens import Lens
+from .implicit import solve_rays, solve_rays_forward
+from .lens import Lens, rotation_matrix
 from .numerics import safe_divide
 from .start import first_guess
+from .surface import Shape, by_form, sag, sag_derivatives
 
-__all__ = ["Rays", "trace_bundle", "trace_rays"]
+__all__ = ["Bundle", "Rays", "field_of_height", "trace_bundle", "trace_rays"]
 
-_LINE_STEPS = 4
+_LINE_STEPS = 5
+
+
+class Bundle(NamedTuple):
+    """Rays in the array layout of `fermat`, rays last.
+
+    hits (D, S + 1, W, Q), mm, along the axes of each surface and the sensor; status (W, Q);
+    arrival (D + 1, W, Q), unit vectors at the sensor, along its axes; path (W, Q), optical
+    path in mm from the object, see `fermat.optical_path`; newton_steps ().
+    """
+
+    hits: Array
+    status: Array
+    arrival: Array
+    path: Array
+    newton_steps: Array
 
 
 class Rays(NamedTuple):
     """Traced rays.
 
-    points (W, Q, S + 1, 3), mm: where they cross the surfaces and the sensor, z from the
-    first vertex; zeros for a ray that failed. status (W, Q), int32, see `Status`.
-    newton_steps (), int32: iterations of the whole bundle.
+    points (W, Q, S + 1, 3), mm: where they cross the surfaces and the sensor, along the axes
+    of the lens, z from the first vertex; zeros for a ray that failed. path (W, Q), mm: the
+    optical path from the object to the sensor, counted from the sphere round the object (the
+    plane wave) that passes through the first vertex; 0 for a ray that failed. status (W, Q),
+    int32, see `Status`. newton_steps (), int32: iterations of the whole bundle.
     """
 
     points: Array
+    path: Array
     status: Array
     newton_steps: Array
+
+
+def field_of_height(height: ArrayLike, distance: ArrayLike) -> Array:
+    """The field angle in radians of an object point `height` mm above the axis.
+
+    `distance` mm from the object plane to the first vertex, finite. Light from above the axis
+    travels downwards, so that the angle is negative.
+    """
+    return -jnp.arctan(jnp.asarray(height, float) / jnp.asarray(distance, float))
 
 
 def _live_surfaces(lens: Lens) -> list[int]:
     """Surfaces that bend or label rays: not those with the same medium on both sides."""
     media = lens.glasses
-    count = len(media) - 1
-    return [i for i in range(count) if i == lens.stop or media[i] != media[i + 1]]
+    return [
+        i
+        for i in range(len(lens.forms))
+        if i == lens.stop or lens.mirrors[i] or media[i] != media[i + 1]
+    ]
 
 
-def _profile(lens: Lens, rows: list[int]) -> tuple[Array, Array, Array, Array]:
-    """Vertex, curvature, conic and coefficients of some surfaces and then the sensor."""
+def system_of(
+    lens: Lens, rows: list[int], field: Array, distance: Array, wavelengths: Array, pupil: Array
+) -> System:
+    """The Fermat system of the surfaces `rows` and the sensor; arguments as `trace_bundle`."""
+    dtype = lens.curvature.dtype
+    places = jnp.array([*rows, len(lens.forms)])
 
     def extend(array):
         return jnp.concatenate([array[jnp.array(rows)], jnp.zeros_like(array[:1])])
 
-    vertex = extend(lens.vertices).at[-1].set(lens.sensor)
-    return vertex, extend(lens.curvature), extend(lens.conic), extend(lens.coefficients).T
+    offset = None if lens.decentre is None else lens.decentre[places].T
+    rotation = None
+    if lens.tilt is not None:
+        rotation = jnp.moveaxis(jax.vmap(rotation_matrix)(lens.tilt[places]), 0, -1)
+    return System(
+        vertex=extend(lens.vertices).at[-1].set(lens.sensor),
+        curvature=extend(lens.curvature),
+        conic=extend(lens.conic),
+        coefficients=extend(lens.coefficients).T,
+        index=lens.index(wavelengths)[jnp.array([0, *(i + 1 for i in rows)])],
+        # Light with a positive field angle travels upwards: the object lies below the axis.
+        source=jnp.concatenate([-jnp.tan(field), -jnp.ones_like(field[:1])]),
+        vergence=1 / jnp.asarray(distance, dtype),
+        target=lens.semi_diameter[lens.stop] * jnp.asarray(pupil, dtype),
+        offset=offset,
+        rotation=rotation,
+        stop=rows.index(lens.stop),
+        forms=(*(lens.forms[i] for i in rows), "asphere"),
+        mirrors=tuple(lens.mirrors[i] for i in rows),
+    )
 
 
-def _cross_dead_surfaces(lens: Lens, system: System, hits: Array, live: list[int]) -> Array:
-    """Insert the points where the straight ray crosses the surfaces left out of the solve."""
+def _cross_dead_surfaces(system: System, whole: System, hits: Array, live: list[int]) -> Array:
+    """Insert the points where the straight ray crosses the surfaces left out of the solve.
+
+    `system` of the live surfaces, `whole` of all.
+    """
     path = geometry(hits, system)
-    z = system.vertex[:, None, None] + surface.sag(hits, *system.shape)
+    dim, count = hits.shape[0], len(whole.mirrors)
+    z = by_form(sag, hits, system.shape, system.forms)
+    own = jnp.concatenate([hits, z[None]])
+
+    def origin(i):
+        across = [] if whole.offset is None else [*whole.offset[:, i]]
+        across = across or [jnp.zeros_like(whole.vertex[i])] * dim
+        return jnp.stack([*across, whole.vertex[i]])[:, None, None, None]
+
     rows = []
-    for i in range(len(lens.glasses) - 1):
+    for i in range(count):
         if i in live:
             rows.append(hits[:, live.index(i)])
             continue
         after = sum(j < i for j in live)  # the live surface, or the sensor, behind it
-        slope = path.direction[:-1, after] / path.direction[-1, after]
-        shape = (lens.curvature[i], lens.conic[i], lens.coefficients[i])
-        depth = lens.vertices[i] - z[after]
-        point = hits[:, after] + slope * depth
+        p, d = own[:, after : after + 1], path.before[:, after : after + 1]
+        far = system.rotation
+        if far is not None:
+            p, d = (turn(far[..., after : after + 1], a) for a in (p, d))
+        p = p + origin([*live, count][after]) - origin(i)
+        if far is not None:
+            p, d = (turn(whole.rotation[..., i : i + 1], a, back=True) for a in (p, d))
+        shape = jax.tree.map(lambda a: a[..., i : i + 1, :, :], whole.shape)
+        length = -safe_divide(p[-1], d[-1])
         for _ in range(_LINE_STEPS):
-            sag, gradient, _ = surface.sag_derivatives(point, *shape)
-            miss = hits[:, after] + slope * (depth + sag) - point
-            # The correction lies along the ray: d(slope sag)/dpoint has rank one.
-            change = safe_divide(jnp.sum(gradient * miss, axis=0), 1 - jnp.sum(gradient * slope, axis=0))
-            point = point + miss + slope * change
-        rows.append(point)
+            w = p[:-1] + d[:-1] * length
+            height, slope, _ = sag_derivatives(w, shape, whole.forms[i])
+            miss = height - p[-1] - d[-1] * length
+            length = length + safe_divide(miss, d[-1] - jnp.sum(slope * d[:-1], axis=0))
+        rows.append((p[:-1] + d[:-1] * length)[:, 0])
     return jnp.stack([*rows, hits[:, -1]], axis=1)
 
 
 def trace_bundle(
-    lens: Lens, field: Array, distance: Array, wavelengths: Array, pupil: ArrayLike
-) -> tuple[Array, Array, Array]:
+    lens: Lens,
+    field: Array,
+    distance: Array,
+    wavelengths: Array,
+    pupil: ArrayLike,
+    forward: bool = False,
+) -> Bundle:
     """Trace rays in the array layout of `fermat`, rays last.
 
     `field` (D,) angles in radians, `distance` () from the object to the first vertex in mm,
-    `wavelengths` (W,) in um, `pupil` (D, Q) points on the unit disc of the stop; D = 1 for
-    rays in the meridional (y, z) plane, else 2. Returns hits (D, S + 1, W, Q) in mm, status
-    (W, Q) and the number of Newton steps.
+    `wavelengths` (W,) in um, `pupil` (D, Q) or (D, W, Q) points on the unit disc of the stop;
+    D = 1 for rays in the meridional (y, z) plane of a lens with rotational symmetry, else 2.
+    `forward`: be differentiable in forward mode.
     """
-    live = _live_surfaces(lens)
-    stop = live.index(lens.stop)
-    media = jnp.array([0] + [i + 1 for i in live])
-    vertex, curvature, conic, coefficients = _profile(lens, live)
-    dtype = vertex.dtype
-    field = jnp.asarray(field, dtype)
-    system = System(
-        vertex=vertex,
-        curvature=curvature,
-        conic=conic,
-        coefficients=coefficients,
-        index=lens.index(wavelengths)[media],
-        # Light with a positive field angle travels upwards: the object lies below the axis.
-        source=jnp.concatenate([-jnp.tan(field), -jnp.ones_like(field[:1])]),
-        vergence=1 / jnp.asarray(distance, dtype),
-        stop=lens.semi_diameter[lens.stop] * jnp.asarray(pupil, dtype),
-    )
-    guess = first_guess(jax.lax.stop_gradient(system), stop)
-    hits, status, steps = solve_rays(stop, system, guess)
-    if len(live) < len(lens.glasses) - 1:
-        hits = _cross_dead_surfaces(lens, system, hits, live)
+    live, count = _live_surfaces(lens), len(lens.forms)
+    field = jnp.asarray(field, lens.curvature.dtype)
+    scene = field, distance, wavelengths, pupil
+    system = system_of(lens, live, *scene)
+    guess = first_guess(jax.lax.stop_gradient(system))
+    solve = solve_rays_forward if forward else solve_rays
+    hits, status, steps = solve(system, guess)
+    last, path = arrival(hits, system), optical_path(hits, system)
+    if len(live) < count:
+        whole = system_of(lens, list(range(count)), *scene)
+        hits = _cross_dead_surfaces(system, whole, hits, live)
     radius2 = jnp.sum(hits[:, :-1] ** 2, axis=0)
     edge2 = (lens.semi_diameter.at[lens.stop].set(jnp.inf) ** 2)[:, None, None]
     clipped = jnp.any(radius2 > edge2, axis=0) & (status == Status.OK)
-    return hits, jnp.where(clipped, jnp.int32(Status.CLIPPED), status), steps
+    return Bundle(hits, jnp.where(clipped, jnp.int32(Status.CLIPPED), status), last, path, steps)
 
 
 def as_field(field: ArrayLike, dtype: jnp.dtype) -> Array:
@@ -122,34 +185,43 @@ def as_field(field: ArrayLike, dtype: jnp.dtype) -> Array:
 
 
 def trace_rays(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike, pupil: ArrayLike
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    pupil: ArrayLike,
+    forward: bool = False,
 ) -> Rays:
     """Trace the rays that cross the stop at given points.
 
-    `field`: angle in radians along y, or (x, y); positive light travels upwards. `distance`:
-    mm from the object plane to the first vertex, inf allowed. `wavelengths` (W,) in um.
-    `pupil` (Q, 2), x and y on the stop in units of its semi-diameter. Rays are aimed at the
-    real stop, for every wavelength. Differentiable in everything but the status. ValueError
-    for a known wavelength outside the range of a glass.
+    `field`: angle in radians along y, or (x, y); positive light travels upwards (for a height
+    in mm, see `field_of_height`). `distance`: mm from the object plane to the first vertex,
+    inf allowed. `wavelengths` (W,) in um. `pupil` (Q, 2), x and y on the stop in units of its
+    semi-diameter. Rays are aimed at the real stop, for every wavelength. Differentiable in
+    everything but the status, in reverse mode or, if `forward`, in forward mode. ValueError for
+    a known wavelength outside the range of a glass.
     """
     check_wavelengths(lens.glasses, wavelengths)
     dtype = lens.curvature.dtype
     # One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
     return _trace_rays(
         lens, as_field(field, dtype), jnp.asarray(distance, dtype),
-        jnp.atleast_1d(jnp.asarray(wavelengths, dtype)), jnp.asarray(pupil, dtype),
+        jnp.atleast_1d(jnp.asarray(wavelengths, dtype)), jnp.asarray(pupil, dtype), forward,
     )  # fmt: skip
 
 
-@jax.jit
+@partial(jax.jit, static_argnums=5)
 def _trace_rays(
-    lens: Lens, field: Array, distance: Array, wavelengths: Array, pupil: Array
+    lens: Lens, field: Array, distance: Array, wavelengths: Array, pupil: Array, forward: bool
 ) -> Rays:
-    hits, status, steps = trace_bundle(lens, field, distance, wavelengths, pupil.T)
-    shape = _profile(lens, list(range(len(lens.glasses) - 1)))
-    z = shape[0][:, None, None] + surface.sag(
-        hits, shape[1][:, None, None], shape[2][:, None, None], shape[3][..., None, None]
-    )
-    z = jnp.where((status == Status.OK) | (status == Status.CLIPPED), z, 0)
-    points = jnp.concatenate([hits, z[None]])
-    return Rays(jnp.moveaxis(points, (0, 1), (3, 2)), status, steps)
+    scene = field, distance, wavelengths, pupil.T
+    bundle = trace_bundle(lens, *scene, forward)
+    whole = system_of(lens, list(range(len(lens.forms))), *scene)
+    z = by_form(sag, bundle.hits, whole.shape, whole.forms)
+    own = turn(whole.rotation, jnp.concatenate([bundle.hits, z[None]]))
+    points = own.at[2].add(whole.vertex[:, None, None])
+    if whole.offset is not None:
+        points = points.at[:2].add(whole.offset[..., None, None])
+    good = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+    points, path = jnp.where(good, points, 0), jnp.where(good, bundle.path, 0)
+    return Rays(jnp.moveaxis(points, (0, 1), (3, 2)), path, bundle.status, bundle.newton_steps)

@@ -1,5 +1,7 @@
 """The closed-form system against automatic differentiation, its solves against dense ones."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +26,10 @@ def system_of(lens, dim, tangent, vergence, rays=3):
         index=lens.index(jnp.array(RGB)),
         source=jnp.array([0.0] * (dim - 1) + [-tangent, -1.0]),
         vergence=jnp.array(vergence),
-        stop=jnp.asarray(stop),
+        target=jnp.asarray(stop),
+        stop=lens.stop,
+        forms=(*lens.forms, "asphere"),
+        mirrors=lens.mirrors,
     )
     hits = stop[:, None, None] * np.linspace(1.2, 0.3, len(lens.glasses))[:, None, None]
     hits = hits + generator.normal(0, 0.02, (dim, len(lens.glasses), 3, rays))
@@ -52,7 +57,7 @@ def test_residual_is_the_gradient_of_the_path(name, dim, vergence):
 def test_blocks_solve_and_transpose_against_the_dense_jacobian(name, dim):
     lens = load_lens(name)
     system, hits = system_of(lens, dim, 0.2, 1 / 500, rays=1)
-    system = system._replace(index=system.index[:, :1])
+    system = dataclasses.replace(system, index=system.index[:, :1])
     hits = hits[:, :, :1]
     unknown = [i for i in range(hits.shape[1]) if i != lens.stop]
     dense = jax.jit(jax.jacobian(fermat.residual))(hits, system)[:, :, 0, 0, :, :, 0, 0]
@@ -91,7 +96,7 @@ def test_first_segment_is_continuous_to_infinity():
     far, hits = system_of(lens, 2, 0.1, 0.0)
     previous = None
     for distance in (1e4, 1e6, 1e9):
-        near = far._replace(vergence=jnp.array(1 / distance))
+        near = dataclasses.replace(far, vergence=jnp.array(1 / distance))
         change = float(jnp.max(jnp.abs(residual(hits, near) - residual(hits, far))))
         path = optical_path(hits, near) - optical_path(hits, far)
         assert change < 30 / distance and float(jnp.max(jnp.abs(path))) < 400 / distance
@@ -108,7 +113,9 @@ def test_zero_blocks_stay_finite():
 def test_status_says_why_a_path_is_none():
     lens = load_lens("singlet")
     system, _ = system_of(lens, 1, 0.0, 0.0, rays=1)
-    system = system._replace(conic=0 * system.conic, coefficients=0 * system.coefficients)
+    system = dataclasses.replace(
+        system, conic=0 * system.conic, coefficients=0 * system.coefficients
+    )
     on_axis = jnp.zeros((1, 4, 3, 1))
     assert jnp.all(status(on_axis, system) == Status.OK)
     outside = on_axis.at[0, 1].set(60.0)  # the radius of surface 1 is 51.68

@@ -50,7 +50,7 @@ BAD = {
     "not a number": (surface(0, thickness=float("nan")), "expected a number"),
     "infinite": (surface(0, thickness=float("inf")), "must be finite"),
     "no thickness": (drop(0, "thickness"), r"thickness: expected a number, got None"),
-    "crossing": (surface(0, thickness=-1.0), r"surfaces\[0\].thickness: must be positive"),
+    "negative thickness": (surface(0, thickness=-1.0), r"surfaces\[0\].thickness: must be positive"),
     "odd power": (surface(0, coefficients={3: 1e-5}), "3 is not an even power"),
     "too wide": (surface(0, semi_diameter=60.0), r"60 mm reaches beyond the surface.* 50 mm"),
     "negative aperture": (surface(2, semi_diameter=-1.0), "must be positive"),

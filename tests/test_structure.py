@@ -10,7 +10,7 @@ import drt_jax
 ROOT = pathlib.Path(drt_jax.__file__).parent
 # From what knows least to what knows most.
 ORDER = (
-    "numerics", "surface", "glass", "lens", "paraxial", "pupil", "fermat", "start", "implicit",
+    "numerics", "surface", "glass", "lens", "prescription", "paraxial", "pupil", "fermat", "start", "implicit",
     "snell", "trace", "moments", "depth", "psf", "sensor", "network", "adam", "data", "config", "runs",
     "train", "drawing", "plot",
 )  # fmt: skip

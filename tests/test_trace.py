@@ -10,6 +10,7 @@ import yaml
 
 import drt_jax
 from drt_jax import Status, load_lens, pupil, trace_rays, trace_snell
+from drt_jax.surface import Shape
 from drt_jax.glass import Dispersion, Glass, find_glass
 
 from .conftest import LENSES, RGB
@@ -178,6 +179,8 @@ def with_dummy(lens, gap, curvature):
         curvature=insert(lens.curvature, curvature),
         conic=insert(lens.conic, 0.0),
         coefficients=jnp.insert(lens.coefficients, i, 0.0, axis=0),
+        forms=(),
+        mirrors=(),
         semi_diameter=insert(lens.semi_diameter, jnp.inf),
         thickness=jnp.concatenate(
             [lens.thickness[:gap], jnp.stack([half, half]), lens.thickness[gap + 1 :]]
@@ -201,7 +204,8 @@ def test_a_surface_that_does_nothing_drops_out(gap, curvature):
     before, dummy, after = (rays.points[:, :, gap + k] for k in range(3))
     assert np.max(np.abs(np.cross(dummy - before, after - dummy))) < 1e-12  # on the ray ...
     sphere = dummy - jnp.array([0.0, 0.0, float(padded.vertices[gap + 1])])
-    sag = drt_jax.surface.sag(jnp.moveaxis(sphere[..., :2], -1, 0), curvature, 0.0, jnp.zeros(0))
+    shape = Shape(jnp.array(curvature), jnp.array(0.0), jnp.zeros(0))
+    sag = drt_jax.surface.sag(jnp.moveaxis(sphere[..., :2], -1, 0), shape)
     np.testing.assert_allclose(sphere[..., 2], sag, atol=1e-12)  # ... and on the surface
 
 
