@@ -20,8 +20,9 @@ from . import pupil
 from .fermat import Status
 from .glass import check_wavelengths
 from .lens import Lens, rotation_matrix
-from .numerics import safe_divide
+from .numerics import known_values, safe_divide, safe_sqrt
 from .trace import as_field, trace_bundle
+from .vignetting import Boundary, ClippedPupil, find_boundary, fitted_nodes
 
 __all__ = ["FocusMoments", "focus_moments", "psf_moments", "pupil_order"]
 
@@ -102,7 +103,8 @@ def focus_moments(
     distance: ArrayLike,
     wavelengths: ArrayLike,
     tolerance: float = 1e-6,
-    order: int | None = None,
+    order: int | ClippedPupil | None = None,
+    soft_edge: float | None = None,
     forward: bool = False,
 ) -> FocusMoments:
     """Moments of the rays as functions of the sensor position, about `lens.sensor`.
@@ -111,102 +113,8 @@ def focus_moments(
     see `pupil_order`). Differentiable in all lens parameters; rays that fail or are clipped
     have weight 0, and the rest is normalised. Paper section 4.3.
     """
-    return _moments(lens, field, distance, wavelengths, tolerance, order, moving=True, forward=forward)
-
-
-def _moments(
-    lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
-    tolerance: float,
-    order: int | None,
-    moving: bool,
-    forward: bool,
-) -> FocusMoments:
-    check_wavelengths(lens.glasses, wavelengths)
-    if not (order is None or 1 <= order <= _MAX_ORDER):
-        raise ValueError(f"order: expected 1 to {_MAX_ORDER}, got {order}")
-    symmetry = _symmetry(lens, field)
-    known = _concrete(lens, field, distance, wavelengths)
-    if order is None and known:
-        return _converge(lens, field, distance, wavelengths, tolerance, moving)[1]
-    if order is None:
-        order = _blind_order(symmetry, tolerance)
-    rule = _rule(symmetry, order)
-    moments = _plane_moments(
-        lens, field, distance, wavelengths, *(_pad(*rule) if known else rule), symmetry, forward
-    )
-    if known:
-        _check_passed(moments, wavelengths)
-    return moments
-
-
-def _plane_moments(
-    lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
-    points: ArrayLike,
-    weights: ArrayLike,
-    symmetry: str,
-    forward: bool = False,
-) -> FocusMoments:
-    dtype = lens.curvature.dtype
-    angles = jnp.zeros(1, dtype) if symmetry == "meridian" else as_field(field, dtype)
-    # One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
-    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
-    distance, points, weights = (jnp.asarray(a, dtype) for a in (distance, points, weights))
-    return _weigh(lens, angles, distance, wavelengths, points, weights, symmetry, forward)
-
-
-@partial(jax.jit, static_argnums=(6, 7))
-def _weigh(
-    lens: Lens,
-    angles: Array,
-    distance: Array,
-    wavelengths: Array,
-    points: Array,
-    weights: Array,
-    symmetry: str,
-    forward: bool,
-) -> FocusMoments:
-    dtype = lens.curvature.dtype
-    bundle = trace_bundle(lens, angles, distance, wavelengths, points, forward)
-    # How the hits move with the sensor, which goes along the axis of the lens.
-    slope = bundle.arrival[:-1] / bundle.arrival[-1]
-    if lens.tilt is not None:
-        axis = rotation_matrix(lens.tilt[-1])[2]
-        slope = slope * axis[2] - axis[:2, None, None]
-    hits, good = bundle.hits, bundle.status == Status.OK
-    weight = jnp.where(good, jnp.asarray(weights, dtype), 0)
-    passed = jnp.sum(weight, axis=-1)
-    weight = safe_divide(weight, passed[:, None])
-
-    def average(values):
-        return jnp.sum(weight * values, axis=-1)
-
-    x, u = jnp.where(good, hits[:, -1], 0), jnp.where(good, slope, 0)
-    if symmetry == "meridian":
-        # y = rho(r) on one radius; over the full circle <xx> = <yy> = <rho^2> / 2.
-        zero = jnp.zeros((wavelengths.shape[0], 2), dtype)
-        spread = jnp.stack([average(x[0] * x[0]), 2 * average(x[0] * u[0]), average(u[0] * u[0])])
-        spread = jnp.broadcast_to(spread[..., None] / 2, (*spread.shape, 2))
-        return FocusMoments(lens.sensor, zero, zero, spread, passed)
-    mean, tilt = average(x), average(u)
-    if symmetry == "half":
-        # The other half is the mirror image: x averages to 0, and so does x y.
-        mean, tilt = mean.at[0].set(0), tilt.at[0].set(0)
-    x, u = x - mean[..., None], u - tilt[..., None]
-    pairs = ((0, 0), (1, 1)) if symmetry == "half" else ((0, 0), (1, 1), (0, 1))
-    spread = jnp.stack(
-        [
-            jnp.stack([average(x[i] * x[j]) for i, j in pairs], -1),
-            jnp.stack([average(x[i] * u[j] + u[i] * x[j]) for i, j in pairs], -1),
-            jnp.stack([average(u[i] * u[j]) for i, j in pairs], -1),
-        ]
-    )
-    return FocusMoments(lens.sensor, mean.T, tilt.T, spread, passed)
+    scene = lens, field, distance, wavelengths
+    return _moments(scene, tolerance, order, soft_edge, forward, moving=True)
 
 
 def psf_moments(
@@ -215,22 +123,55 @@ def psf_moments(
     distance: ArrayLike,
     wavelengths: ArrayLike,
     tolerance: float = 1e-6,
-    order: int | None = None,
+    order: int | ClippedPupil | None = None,
+    soft_edge: float | None = None,
     forward: bool = False,
 ) -> tuple[Array, Array]:
     """Centroid (W, 2) in mm and covariance (W, 2, 2) in mm^2 of the rays on the sensor.
 
     `field`: angle along y, or (x, y), in radians. `distance`: mm from the object plane
     to the first vertex, inf allowed. `wavelengths` (W,) in um. `tolerance`: relative
-    error of the RMS spot size; the number of rays follows from it (see `pupil_order`)
-    unless `order` (1 to 40) is given. ValueError if no ray of a colour arrives; under
-    `jax.jit`, where that cannot be known, both are 0 then (`focus_moments(...).passed`
-    tells). Rays fill the stop uniformly. Known zero field: meridional rays only; field
-    along y: half the pupil. Paper section 4.3.
+    error of the RMS spot size; the number of rays follows from it, unless `order` (1 to 40,
+    or what `pupil_order` returns) is given. `soft_edge`: a width in mm over which clear apertures
+    fade instead of cutting off. `forward`: be differentiable in forward mode.
+
+    Rays fill the stop uniformly; where clear apertures clip it, the nodes are fitted to what is
+    left. ValueError if no ray of a colour arrives; under `jax.jit`, where that cannot be known,
+    both are 0 then (`focus_moments(...).passed` tells). Known zero field: meridional rays only;
+    field along y: half the pupil. Paper section 4.3.
     """
-    moments = _moments(lens, field, distance, wavelengths, tolerance, order, moving=False, forward=forward)
+    scene = lens, field, distance, wavelengths
+    moments = _moments(scene, tolerance, order, soft_edge, forward, moving=False)
     mean, covariance = moments.at(lens.sensor)
     return mean, covariance if covariance.ndim == 3 else _matrix(covariance)
+
+
+def pupil_order(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+    moving: bool = False,
+) -> int | ClippedPupil:
+    """What to pass as `order` to keep the RMS spot size within `tolerance` (relative).
+
+    At the lens's sensor position or, if `moving`, at any: there the spot may be far smaller.
+
+    The Gauss order n of a rule on the stop, or a rule fitted to what clear apertures leave of
+    it. Orders n and n + 1 are compared on the scene itself: their difference in the
+    covariance, relative to its trace, is twice the error of n in the spot size, and may
+    be at most `tolerance`, which leaves a factor of two for the error of n + 1. Inside
+    `jax.jit`, where the scene is not known, a rule with two nodes in hand takes its place,
+    whose clipped rays drop out one by one: to have the measured order there, call this function
+    outside and pass the result on. A fitted rule follows the lens to first order.
+    """
+    check_wavelengths(lens.glasses, wavelengths)
+    symmetry = _symmetry(lens, field)
+    known = known_values((lens, field, distance, wavelengths))
+    if known is None:
+        return _blind_order(symmetry, tolerance)
+    return _converge(known, symmetry, tolerance, moving)[0]
 
 
 def _blind_order(symmetry: str, tolerance: float) -> int:
@@ -244,71 +185,205 @@ def _blind_order(symmetry: str, tolerance: float) -> int:
     return min(int(np.ceil(digits / 2 if symmetry == "meridian" else digits)) + 2, _MAX_ORDER)
 
 
-def pupil_order(
-    lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
-    tolerance: float = 1e-6,
-    moving: bool = False,
-) -> int:
-    """Gauss order of the pupil that keeps the RMS spot size within `tolerance` (relative).
-
-    At the lens's sensor position or, if `moving`, at any: there the spot may be far smaller.
-
-    Orders n and n + 1 are compared on the scene itself: their difference in the
-    covariance, relative to its trace, is twice the error of n in the spot size, and may
-    be at most `tolerance`, which leaves a factor of two for the error of n + 1. Inside
-    `jax.jit`, where the scene is not known, a rule with two nodes in hand takes its
-    place: to have the measured order there, call this function outside and pass the
-    result on.
-    """
-    check_wavelengths(lens.glasses, wavelengths)
-    if _concrete(lens, field, distance, wavelengths):
-        return _converge(lens, field, distance, wavelengths, tolerance, moving)[0]
-    return _blind_order(_symmetry(lens, field), tolerance)
-
-
 def _check_tolerance(tolerance: float) -> None:
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
 
 
-def _converge(
-    lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
+def _moments(
+    scene: tuple,
     tolerance: float,
+    order: int | ClippedPupil | None,
+    soft_edge: float | None,
+    forward: bool,
     moving: bool,
-) -> tuple[int, FocusMoments]:
-    """The order that meets the tolerance, and the moments of the next one that proved it.
-
-    Warns if no order up to the largest does.
-    """
-    _check_tolerance(tolerance)
+) -> FocusMoments:
+    lens, field, _, wavelengths = scene
+    check_wavelengths(lens.glasses, wavelengths)
+    if isinstance(order, int) and not 1 <= order <= _MAX_ORDER:
+        raise ValueError(f"order: expected 1 to {_MAX_ORDER}, got {order}")
+    if soft_edge is not None and not soft_edge > 0:
+        raise ValueError(f"soft_edge: expected a width above 0 mm, got {soft_edge!r}")
     symmetry = _symmetry(lens, field)
-    bound = max(tolerance, 100 * float(jnp.finfo(lens.curvature.dtype).eps))
-    previous = None
-    for order in range(2, _MAX_ORDER + 2):
-        points, weights = _pad(*_rule(symmetry, order))
-        moments = _plane_moments(lens, field, distance, wavelengths, points, weights, symmetry)
-        _check_passed(moments, wavelengths)
+    options = symmetry, soft_edge, forward
+    known = known_values(scene)
+    if known is None:
+        if order is None:
+            order = _blind_order(symmetry, tolerance)
+        rule = order if isinstance(order, ClippedPupil) else _rule(symmetry, order)
+        return _plane_moments(*scene, rule, *options)[0]
+    if order is None:
+        order, moments = _converge(known, symmetry, tolerance, moving, soft_edge)
+        if not forward and _concrete(scene):
+            return moments
+    if isinstance(order, int):
+        rule = _padded_rule(symmetry, order)
+        moments, clipped = _plane_moments(*scene, rule, *options)
+        if soft_edge is not None or not known_values(clipped):
+            return _checked(moments, wavelengths)
+        boundary = _boundary(known, symmetry)
+        if boundary is None:
+            return _checked(moments, wavelengths)
+        order = boundary.rule(order)
+    return _checked(_plane_moments(*scene, order, *options)[0], wavelengths)
+
+
+def _converge(
+    scene: tuple, symmetry: str, tolerance: float, moving: bool, soft_edge: float | None = None
+) -> tuple[int | ClippedPupil, FocusMoments]:
+    """The order that meets the tolerance in a known scene, and the moments of the next one that
+    proved it; where the pupil is clipped, the fitted rule that proved it. Warns if none does."""
+    _check_tolerance(tolerance)
+    bound = max(tolerance, 100 * float(jnp.finfo(scene[0].curvature.dtype).eps))
+    previous, boundary, order = None, None, 2
+    while True:
+        rule = boundary.rule(order) if boundary else _padded_rule(symmetry, order)
+        moments, clipped = _plane_moments(*scene, rule, symmetry, soft_edge, False)
+        if clipped and boundary is None and soft_edge is None:
+            boundary = _boundary(scene, symmetry)
+            if boundary is not None:
+                previous, order = None, 4
+                continue
+        moments = _checked(moments, scene[3])
         spread = np.asarray(moments.spread, float)
         if previous is not None:
             change = max(
                 _change(spread, previous, d) for d in (0, *(_best_focus(spread) if moving else ()))
             )
             if change <= bound:
-                break
-        previous = spread
-    else:
-        warnings.warn(
-            f"the spot size has converged to {change:.1e} only, not to {bound:.1e}, with "
-            f"{weights.size} rays a colour; does a clear aperture clip the beam?",
-            stacklevel=4,
-        )
-    return order - 1, moments
+                return (rule if boundary else order - 1), moments
+        if order > _MAX_ORDER:
+            break
+        previous, order = spread, order + (2 if boundary else 1)
+    warnings.warn(
+        f"the spot size has converged to {change:.1e} only, not to {bound:.1e}, with the order "
+        f"{order}; does the edge of the beam fail, or a soft edge fade too fast?",
+        stacklevel=5,
+    )
+    return (rule if boundary else order - 1), moments
+
+
+def _boundary(scene: tuple, symmetry: str) -> Boundary | None:
+    return find_boundary(*_typed(*scene, symmetry), symmetry)
+
+
+def _typed(
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike, symmetry: str
+) -> tuple[Lens, Array, Array, Array]:
+    """The scene as `trace_bundle` takes it. One type for numbers, NumPy's and JAX's arrays, so
+    that they share a compiled program."""
+    dtype = lens.curvature.dtype
+    angles = jnp.zeros(1, dtype) if symmetry == "meridian" else as_field(field, dtype)
+    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
+    return lens, angles, jnp.asarray(distance, dtype), wavelengths
+
+
+def _rule(symmetry: str, order: int) -> tuple[np.ndarray, np.ndarray]:
+    if symmetry == "meridian":
+        return pupil.meridian(order)
+    # An aberration of degree p in the pupil reaches azimuthal order p: as many azimuths on
+    # the half disc as there are radial nodes integrate its square to the same degree.
+    return (pupil.half_disc if symmetry == "half" else pupil.disc)(order, order + 1)
+
+
+def _padded_rule(symmetry: str, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """A rule filled up with weightless rays, so that all orders share a few compiled programs.
+
+    They run along the rim of the stop, where clear apertures clip first.
+    """
+    points, weights = _rule(symmetry, order)
+    sizes = (_MAX_ORDER + 2,) if symmetry == "meridian" else (208, 416, 1768, 3536)
+    missing = next(size for size in sizes if size >= weights.size + len(points)) - weights.size
+    turn = np.pi if symmetry == "half" else 2 * np.pi
+    angle = -np.pi / 2 + turn * np.arange(missing) / max(missing - 1, 1)
+    rim = np.stack([np.cos(angle), np.sin(angle)]) if len(points) == 2 else np.ones((1, missing))
+    return np.concatenate([points, rim], axis=1), np.pad(weights, (0, missing))
+
+
+def _plane_moments(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    rule: tuple[ArrayLike, ArrayLike] | ClippedPupil,
+    symmetry: str,
+    soft_edge: float | None = None,
+    forward: bool = False,
+) -> tuple[FocusMoments, Array]:
+    scene = _typed(lens, field, distance, wavelengths, symmetry)
+    if not isinstance(rule, ClippedPupil):
+        rule = tuple(jnp.asarray(part, lens.curvature.dtype) for part in rule)
+    if soft_edge is not None:
+        soft_edge = jnp.asarray(soft_edge, lens.curvature.dtype)
+    return _weigh(*scene, rule, soft_edge, symmetry, forward)
+
+
+@partial(jax.jit, static_argnums=(6, 7))
+def _weigh(
+    lens: Lens,
+    angles: Array,
+    distance: Array,
+    wavelengths: Array,
+    rule: tuple[Array, Array] | ClippedPupil,
+    soft_edge: Array | None,
+    symmetry: str,
+    forward: bool,
+) -> tuple[FocusMoments, Array]:
+    """The moments, and whether an aperture clips any ray of the rule."""
+    dtype = lens.curvature.dtype
+    scene = lens, angles, distance, wavelengths
+    if isinstance(rule, ClippedPupil):
+        rule = fitted_nodes(*scene, rule, forward)
+    points, weights = rule
+    bundle = trace_bundle(*scene, points, forward)
+    # How the hits move with the sensor, which goes along the axis of the lens.
+    slope = bundle.arrival[:-1] / bundle.arrival[-1]
+    if lens.tilt is not None:
+        axis = rotation_matrix(lens.tilt[-1])[2]
+        slope = slope * axis[2] - axis[:2, None, None]
+    hits, clipped = bundle.hits, bundle.status == Status.CLIPPED
+    good = bundle.status == Status.OK
+    if isinstance(rule, ClippedPupil) or soft_edge is not None:
+        good = good | clipped
+    weight = jnp.where(good, weights, 0)
+    if soft_edge is not None:
+        weight = weight * _fade(lens, hits, soft_edge)
+    passed = jnp.sum(weight, axis=-1)
+    weight = safe_divide(weight, passed[:, None])
+
+    def average(values):
+        return jnp.sum(weight * values, axis=-1)
+
+    x, u = jnp.where(good, hits[:, -1], 0), jnp.where(good, slope, 0)
+    if symmetry == "meridian":
+        # y = rho(r) on one radius; over the full circle <xx> = <yy> = <rho^2> / 2.
+        zero = jnp.zeros((wavelengths.shape[0], 2), dtype)
+        spread = jnp.stack([average(x[0] * x[0]), 2 * average(x[0] * u[0]), average(u[0] * u[0])])
+        spread = jnp.broadcast_to(spread[..., None] / 2, (*spread.shape, 2))
+        return FocusMoments(lens.sensor, zero, zero, spread, passed), jnp.any(clipped)
+    mean, tilt = average(x), average(u)
+    if symmetry == "half":
+        # The other half is the mirror image: x averages to 0, and so does x y.
+        mean, tilt = mean.at[0].set(0), tilt.at[0].set(0)
+    x, u = x - mean[..., None], u - tilt[..., None]
+    pairs = ((0, 0), (1, 1)) if symmetry == "half" else ((0, 0), (1, 1), (0, 1))
+    spread = jnp.stack(
+        [
+            jnp.stack([average(x[i] * x[j]) for i, j in pairs], -1),
+            jnp.stack([average(x[i] * u[j] + u[i] * x[j]) for i, j in pairs], -1),
+            jnp.stack([average(u[i] * u[j]) for i, j in pairs], -1),
+        ]
+    )
+    return FocusMoments(lens.sensor, mean.T, tilt.T, spread, passed), jnp.any(clipped)
+
+
+def _fade(lens: Lens, hits: Array, width: Array) -> Array:
+    """Transmission (W, Q) of soft apertures: each a logistic step of the given width in r."""
+    radius = safe_sqrt(jnp.sum(hits[:, :-1] ** 2, axis=0))
+    edge = lens.semi_diameter[:, None, None]
+    bounded = jnp.isfinite(edge).at[lens.stop].set(False)
+    within = jnp.where(bounded, (jnp.where(bounded, edge, 0) - radius) / width, jnp.inf)
+    return jnp.prod(jax.nn.sigmoid(within), axis=0)
 
 
 def _best_focus(spread: np.ndarray) -> np.ndarray:
@@ -324,17 +399,12 @@ def _change(spread: np.ndarray, previous: np.ndarray, d: float) -> float:
     return float(np.max(np.abs(now - before) / np.maximum(size, _SMALLEST**2)))
 
 
-def _pad(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill up with weightless rays, so that all orders share one or two compiled programs."""
-    sizes = (_MAX_ORDER + 1,) if len(points) == 1 else (182, 364, 1722, 3444)
-    missing = next(size for size in sizes if size >= weights.size) - weights.size
-    return np.pad(points, ((0, 0), (0, missing))), np.pad(weights, (0, missing))
-
-
-def _check_passed(moments: FocusMoments, wavelengths: ArrayLike) -> None:
-    for passed, wavelength in zip(np.asarray(moments.passed), np.atleast_1d(wavelengths)):
+def _checked(moments: FocusMoments, wavelengths: ArrayLike) -> FocusMoments:
+    passing = np.asarray(known_values(moments.passed))
+    for passed, wavelength in zip(passing, np.atleast_1d(known_values(wavelengths))):
         if not passed > 0:
             raise ValueError(
                 f"no ray at {float(wavelength):g} um reaches the sensor: every one misses a "
                 "surface, is totally reflected or is clipped; see trace_rays(...).status"
             )
+    return moments

@@ -5,10 +5,13 @@ argument, so neither its value nor its derivative can turn into NaN. Nothing is 
 denominator, so ordinary values are not biased.
 """
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["safe_divide", "safe_sqrt"]
+__all__ = ["known_values", "safe_divide", "safe_sqrt"]
 
 
 def safe_sqrt(x: Array) -> Array:
@@ -24,3 +27,27 @@ def safe_divide(numerator: Array, denominator: Array) -> Array:
     """
     good = denominator != 0
     return jnp.where(good, numerator / jnp.where(good, denominator, 1), 0)
+
+
+def known_values(tree: Any) -> Any:
+    """`tree` with its numbers, also where it is being differentiated; None inside `jit` or `vmap`.
+
+    What follows from a scene, such as how many rays it needs, is not differentiated itself but
+    must be decided in an eager `jax.grad`, too. The rule of a custom_jvp is handed the values.
+    """
+    seen: list[tuple] = []
+
+    @jax.custom_jvp
+    def look(*leaves):
+        seen.append(leaves)
+        return jnp.zeros(())
+
+    @look.defjvp
+    def _(primals, tangents):
+        return look(*primals), jnp.zeros(())
+
+    leaves, structure = jax.tree.flatten(tree)
+    look(*leaves)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in seen[-1]):
+        return None
+    return jax.tree.unflatten(structure, seen[-1])

@@ -1,0 +1,292 @@
+"""Quadrature on the part of the pupil that clear apertures leave: nodes fitted to its boundary.
+
+A rule on the whole stop whose clipped rays drop out one by one converges like a sum of pixels.
+Here the boundary is found: in polar coordinates about a point inside, the distance to it is
+smooth but for the corners where one aperture takes over from another. Gauss rules between the
+corners and along the radii converge as fast as without clipping, and because each boundary
+point follows the lens (one Newton step of the aperture's equation), so do the derivatives.
+"""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from .fermat import Status
+from .lens import Lens
+from .trace import trace_bundle
+
+__all__ = ["Boundary", "ClippedPupil", "find_boundary", "fitted_nodes"]
+
+_BATCH = 128  # rays of one search call
+_HALVINGS = 52
+_CORNER_STEPS = 8
+_STENCIL = np.array([-2.0, -1.0, 1.0, 2.0])
+_STENCIL_WEIGHTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12
+_STEP = 1e-3
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ClippedPupil:
+    """A quadrature rule on a clipped pupil, in units of the stop's semi-diameter.
+
+    B boundary points about `centre` (D, W): along unit vectors `direction` (D, W, B) at
+    `radius` (W, B), where the aperture of `surface` (W, B) ends the beam (S: none that moves)
+    with d(r^2)/d(radius) = `slope` (W, B), mm^2. Q nodes: on the way to boundary point `spoke`
+    (Q,) at `fraction` (Q,) of it, with `weight` (W, Q) for a radius of 1.
+
+    order: that of the Gauss rules.
+    """
+
+    centre: Array
+    direction: Array
+    radius: Array
+    surface: Array
+    slope: Array
+    spoke: Array
+    fraction: Array
+    weight: Array
+    order: int = dataclasses.field(metadata={"static": True}, default=0)
+
+
+def fitted_nodes(
+    lens: Lens, field: Array, distance: Array, wavelengths: Array, rule: ClippedPupil,
+    forward: bool,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Nodes (D, W, Q) and weights (W, Q) of the rule, following the lens; the weights add up to
+    the fraction of the stop that is left. Differentiable; arguments as `trace_bundle`."""
+    dtype = lens.curvature.dtype
+    rule = jax.tree.map(lambda a: a if jnp.issubdtype(a.dtype, jnp.integer) else a.astype(dtype), rule)
+    spokes = rule.centre[..., None] + rule.radius * rule.direction
+    bundle = trace_bundle(lens, field, distance, wavelengths, spokes, forward)
+    r2 = jnp.sum(bundle.hits**2, axis=0)
+    r2 = jnp.take_along_axis(r2, rule.surface[None], axis=0)[0]
+    edge = jnp.append(lens.semi_diameter, jnp.ones_like(lens.sensor))[rule.surface]
+    moves = (rule.surface < len(lens.forms)) & (bundle.status != Status.MISSED)
+    moves = moves & (bundle.status != Status.TIR) & (bundle.status != Status.UNCONVERGED)
+    excess = jnp.where(moves, r2 - jnp.where(moves, edge, 1) ** 2, 0)
+    radius = rule.radius - excess / jnp.where(moves, rule.slope, 1)
+    along = radius[:, rule.spoke]
+    points = rule.centre[..., None] + rule.fraction * along * rule.direction[..., rule.spoke]
+    return points, rule.weight * along**2
+
+
+@partial(jax.jit, static_argnums=())
+def _reach(
+    lens: Lens, field: Array, distance: Array, wavelengths: Array, points: Array
+) -> tuple[Array, Array]:
+    bundle = trace_bundle(lens, field, distance, wavelengths, points)
+    failed = (bundle.status != Status.OK) & (bundle.status != Status.CLIPPED)
+    return jnp.sum(bundle.hits[:, :-1] ** 2, axis=0), failed
+
+
+class Boundary:
+    """The boundary of the clipped pupil of one known scene: see `find_boundary`."""
+
+    def __init__(self, scene: tuple, symmetry: str):
+        self.scene, self.symmetry = scene, symmetry
+        lens = scene[0]
+        self.edges = np.asarray(lens.semi_diameter, float).copy()
+        self.edges[lens.stop] = np.inf
+        self.colours = len(scene[3])
+        self.dim = 1 if symmetry == "meridian" else 2
+        self.centre = np.zeros((self.dim, self.colours))
+        self.corners: list[np.ndarray] = [np.zeros(0)] * self.colours
+
+    def _squares(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """r^2 (S, W, N) on the surfaces and which rays fail (W, N), points (D, W, N)."""
+        dtype = self.scene[0].curvature.dtype
+        r2, failed = [], []
+        for i in range(0, points.shape[-1], _BATCH):
+            part = points[..., i : i + _BATCH]
+            full = np.pad(part, ((0, 0), (0, 0), (0, _BATCH - part.shape[-1])))
+            a, b = _reach(*self.scene, jnp.asarray(full, dtype))
+            r2.append(np.asarray(a, float)[..., : part.shape[-1]])
+            failed.append(np.asarray(b)[..., : part.shape[-1]])
+        return np.concatenate(r2, -1), np.concatenate(failed, -1)
+
+    def _excess(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """r^2 / edge^2 - 1 of each aperture (S, W, N); which rays fail."""
+        r2, failed = self._squares(points)
+        return np.where(np.isfinite(self.edges)[:, None, None], r2 / self.edges[:, None, None] ** 2 - 1, -1), failed
+
+    def _inside(self, points: np.ndarray) -> np.ndarray:
+        excess, failed = self._excess(points)
+        return (np.max(excess, axis=0) <= 0) & ~failed
+
+    def _unit(self, angle: np.ndarray) -> np.ndarray:
+        return np.stack([np.cos(angle), np.sin(angle)]) if self.dim == 2 else np.ones((1, *angle.shape))
+
+    def _rim(self, unit: np.ndarray) -> np.ndarray:
+        """Radius (W, N) at which the spokes reach the edge of the stop."""
+        c = self.centre[..., None]
+        along = np.sum(c * unit, axis=0)
+        return -along + np.sqrt(along**2 + 1 - np.sum(c * c, axis=0))
+
+    def at(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Radius (W, N) of the boundary at `angle` (W, N), and the surface that makes it (S: the
+        stop, or rays that fail)."""
+        unit, c = self._unit(angle), self.centre[..., None]
+        rim = self._rim(unit)
+        low, high = np.zeros_like(rim), rim.copy()
+        whole = self._inside(c + rim * unit)
+        low[whole] = rim[whole]
+        for _ in range(_HALVINGS):
+            if np.all(whole):
+                break
+            middle = (low + high) / 2
+            inside = self._inside(c + middle * unit)
+            low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+        excess, _ = self._excess(c + low * unit)
+        surface = np.argmax(excess, axis=0)
+        met = np.max(excess, axis=0) > -1e-6 if self.scene[0].curvature.dtype == np.float64 else np.max(excess, axis=0) > -1e-3
+        return low, np.where(whole | ~met, len(self.edges), surface)
+
+    def _value(self, points: np.ndarray, surface: np.ndarray) -> np.ndarray:
+        """The function (W, N) whose zero is the edge of `surface` (W, N), smooth in the points."""
+        excess, _ = self._excess(points)
+        padded = np.concatenate([excess, np.sum(points**2, axis=0)[None] - 1])
+        return np.take_along_axis(padded, surface[None], axis=0)[0]
+
+    def _corner(self, angle, radius, first, second):
+        """Where two edges cross: Newton's method in (radius, angle), all corners (W, N) at once."""
+        h = 1e-5
+        for _ in range(_CORNER_STEPS):
+            moves = [(0, 0), (h, 0), (-h, 0), (0, h), (0, -h)]
+            points = np.concatenate(
+                [self.centre[..., None] + (radius + a) * self._unit(angle + b) for a, b in moves], -1
+            )
+            values = [
+                self._value(points, np.tile(surface, 5)).reshape(*angle.shape[:-1], 5, -1)
+                for surface in (first, second)
+            ]
+            f, g = (v[:, 0] for v in values)
+            (fr, fa), (gr, ga) = (
+                ((v[:, 1] - v[:, 2]) / (2 * h), (v[:, 3] - v[:, 4]) / (2 * h)) for v in values
+            )
+            det = fr * ga - fa * gr
+            det = np.where(det == 0, 1, det)
+            dr, da = (f * ga - g * fa) / det, (fr * g - gr * f) / det
+            radius, angle = radius - np.clip(dr, -0.05, 0.05), angle - np.clip(da, -0.02, 0.02)
+        return angle
+
+    def locate(self) -> bool:
+        """Find a centre and the corners; False if no ray passes."""
+        half = self.symmetry == "half"
+        if self.dim == 1:
+            return bool(np.all(self._inside(np.zeros((1, self.colours, 1)))))
+        side = np.linspace(-1, 1, 41)
+        x, y = np.meshgrid(side[side >= 0] if half else side, side)
+        grid = np.stack([x, y]).reshape(2, -1)
+        grid = grid[:, np.sum(grid**2, axis=0) <= 1]
+        inside = self._inside(np.repeat(grid[:, None], self.colours, axis=1))
+        if not np.all(np.any(inside, axis=-1)):
+            return False
+        count = np.sum(inside, axis=-1)
+        self.centre = np.stack([np.sum(inside * g, axis=-1) / count for g in grid])
+        if half:
+            self.centre[0] = 0
+        low, high = (-np.pi / 2, np.pi / 2) if half else (-np.pi, np.pi)
+        angle = np.linspace(low, high, 2 * _BATCH + 1)
+        angle = np.repeat(angle[None], self.colours, axis=0)
+        radius, surface = self.at(angle)
+        changes = surface[:, 1:] != surface[:, :-1]
+        most = int(np.max(np.sum(changes, axis=-1)))
+        if most == 0:
+            return True
+        # The same number of corners for every colour, those that are missing repeated.
+        places = [np.flatnonzero(row) for row in changes]
+        count = [len(row) for row in places]
+        places = np.stack([np.resize(row, most) if len(row) else np.zeros(most, int) for row in places])
+        take = partial(np.take_along_axis, indices=places, axis=-1)
+        after = partial(np.take_along_axis, indices=places + 1, axis=-1)
+        start = (take(angle) + after(angle)) / 2
+        found = self._corner(start, (take(radius) + after(radius)) / 2, take(surface), after(surface))
+        step = angle[0, 1] - angle[0, 0]
+        found = np.where(np.abs(found - start) < 2 * step, found, start)
+        self.corners = [np.sort(row[:n]) for row, n in zip(found, count)]
+        return True
+
+    def _panels(self, order: int) -> tuple[np.ndarray, np.ndarray]:
+        """Azimuths (W, B) and weights (W, B): a Gauss rule between neighbouring corners."""
+        half = self.symmetry == "half"
+        if self.dim == 1:
+            return np.zeros((self.colours, 1)), np.ones((self.colours, 1))
+        count = order + 2
+        low, turn = -np.pi / 2, np.pi if half else 2 * np.pi
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        rows = []
+        for corners in self.corners:
+            if not corners.size:  # a smooth boundary: uniform azimuths
+                many = 2 * count
+                angle = low + turn * (np.arange(many) + 0.5) / many
+                rows.append((angle, np.full(many, turn / many)))
+                continue
+            if half:
+                ends = np.concatenate([[low], corners, [low + turn]])
+            else:
+                ends = np.append(corners, corners[0] + turn)
+            middle, width = (ends[1:] + ends[:-1]) / 2, np.diff(ends) / 2
+            angle = middle[:, None] + width[:, None] * nodes
+            rows.append((angle.ravel(), (width[:, None] * weights).ravel()))
+        most = max(len(angle) for angle, _ in rows)
+        angles = np.stack([np.pad(a, (0, most - len(a)), mode="edge") for a, _ in rows])
+        return angles, np.stack([np.pad(w, (0, most - len(w))) for _, w in rows]) / (turn / 2)
+
+    def rule(self, order: int) -> ClippedPupil:
+        """The rule of an order: as many nodes along a spoke, two more spokes between corners."""
+        angle, width = self._panels(order)
+        radius, surface = self.at(angle)
+        unit = self._unit(angle)
+        points = self.centre[..., None, None] + (radius[..., None] + _STEP * _STENCIL) * unit[..., None]
+        r2, _ = self._squares(points.reshape(self.dim, self.colours, -1))
+        r2 = r2.reshape(len(self.edges), *points.shape[1:])
+        own = np.minimum(surface, len(self.edges) - 1)[None, ..., None]
+        slope = np.sum(np.take_along_axis(r2, own, axis=0)[0] * _STENCIL_WEIGHTS, -1) / _STEP
+        surface = np.where(slope > 0, surface, len(self.edges))
+        nodes, weights = np.polynomial.legendre.leggauss(order)
+        nodes, weights = (nodes + 1) / 2, weights / 2
+        if self.dim == 1:  # on the axis r^2 is the variable, as without clipping
+            fraction, along = np.sqrt(nodes), weights
+        else:
+            fraction, along = nodes, weights * nodes
+        spokes = angle.shape[1]
+        spoke, fraction = np.repeat(np.arange(spokes), order), np.tile(fraction, spokes)
+        weight = (width[..., None] * along).reshape(self.colours, -1)
+        # A few sizes for all orders and scenes, so that they share compiled programs.
+        more = _size(spokes, 32) - spokes
+        fill = _size(weight.shape[1], 512) - weight.shape[1]
+        pad = lambda a, n, mode="constant": np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, n)], mode=mode)  # noqa: E731
+        return ClippedPupil(
+            self.centre,
+            pad(unit, more, "edge"),
+            pad(radius, more, "edge"),
+            pad(surface, more, "edge"),
+            pad(slope, more, "edge"),
+            pad(spoke, fill),
+            pad(fraction, fill),
+            pad(weight, fill),
+            order,
+        )
+
+
+def _size(count: int, smallest: int) -> int:
+    while smallest < count:
+        smallest *= 4
+    return smallest
+
+
+def find_boundary(
+    lens: Lens, field: Array, distance: Array, wavelengths: Array, symmetry: str
+) -> Boundary | None:
+    """The boundary of the part of the pupil that clear apertures leave, None if nothing is left.
+
+    `field` (D,), `distance` (), `wavelengths` (W,) as in `trace_bundle`, all known. The part must
+    be seen whole from its centre, as the overlap of the images of circular apertures is.
+    """
+    boundary = Boundary((lens, field, distance, wavelengths), symmetry)
+    return boundary if boundary.locate() else None
