@@ -58,14 +58,10 @@ def depth_moments(
     """Moments for any sensor position and any distance between `near` and `far`, in mm.
 
     As many Chebyshev nodes in 1/distance as bring the last coefficients of the moments below
-    `tolerance` relative to the first; the pupil order is the larger of those of both ends.
+    `tolerance` relative to the first; each node is traced with as many rays as it needs.
     """
     if not 0 < near < far:
         raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
-    order = max(
-        pupil_order(lens, field, distance, wavelengths, tolerance, moving=True)
-        for distance in (near, far)
-    )
     low, high = 1 / far, 1 / near
     count = 4
     while True:
@@ -73,9 +69,7 @@ def depth_moments(
         nodes = (high + low) / 2 + (high - low) / 2 * np.cos(angle)
         transform = 2 / count * np.cos(np.outer(np.arange(count), angle))
         transform[0] /= 2
-        traced = [
-            focus_moments(lens, field, 1 / node, wavelengths, order=order) for node in nodes
-        ]
+        traced = [focus_moments(lens, field, 1 / node, wavelengths, tolerance) for node in nodes]
         series = jax.tree.map(
             lambda *values: jnp.tensordot(
                 jnp.asarray(transform, values[0].dtype), jnp.stack(values), axes=1
@@ -130,10 +124,12 @@ def moments_model(
             return *moments.at(values.get("sensor", lens.sensor)), moments.passed
 
         return values, from_plane
-    order = max(
+    orders = [
         pupil_order(lens, field, distance, wavelengths, tolerance, moving=True)
         for distance in {near, far}
-    )
+    ]
+    # A rule fitted to a clipped pupil holds for one distance.
+    order = orders[0] if len(orders) == 1 else max(getattr(o, "order", o) for o in orders)
 
     def retrace(values, distance):
         moved = dataclasses.replace(lens, **values)

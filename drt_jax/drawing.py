@@ -8,7 +8,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from .fermat import Status
-from .lens import Lens
+from .lens import Lens, rotation_matrix
 from .surface import Shape, sag
 from .trace import trace_rays
 
@@ -18,10 +18,11 @@ _POINTS = 41
 
 
 class Drawing(NamedTuple):
-    """Polylines (N, 2) of (z, y) in mm: glass, closed outlines of the elements; stop, its two
-    blades; sensor; rays, a list for each field."""
+    """Polylines (N, 2) of (z, y) in mm, the section x = 0: glass, closed outlines of the
+    elements; mirrors; stop, its two blades; sensor; rays, a list for each field."""
 
     glass: list[np.ndarray]
+    mirrors: list[np.ndarray]
     stop: list[np.ndarray]
     sensor: np.ndarray
     rays: list[list[np.ndarray]]
@@ -46,28 +47,43 @@ def draw(
         [_path(ray, lead, field, distance) for ray in points] for field, points in zip(fields, good)
     ]
 
-    vertices = np.asarray(lens.vertices)
     semi = np.asarray(lens.semi_diameter)
     semi = np.where(np.isfinite(semi), semi, 1.1 * reach)
-    faces = [_profile(lens, i, vertices[i], semi[i]) for i in range(len(vertices))]
+    faces = [_profile(lens, i, semi[i]) for i in range(len(semi))]
     glass = [
         np.concatenate([faces[i], faces[i + 1][::-1], faces[i][:1]])
         for i in range(len(faces) - 1)
-        if lens.glasses[i + 1] != "air"
+        if lens.glasses[i + 1] != lens.glasses[0]
     ]
-    z, a = vertices[lens.stop], semi[lens.stop]
-    blades = [np.array([[z, sign * a], [z, sign * (a + 0.15 * reach)]]) for sign in (-1, 1)]
-    high = max((abs(path[-1, 1]) for fan in paths for path in fan), default=0.0)
-    high = max(1.1 * high, 0.3 * reach)
-    sensor = np.array([[float(lens.sensor), -high], [float(lens.sensor), high]])
-    return Drawing(glass, blades, sensor, paths)
+    mirrors = [face for face, mirror in zip(faces, lens.mirrors) if mirror]
+    low, high = faces[lens.stop][0], faces[lens.stop][-1]
+    outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
+    blades = [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
+    ends = [path[-1] for fan in paths for path in fan]
+    middle = np.array([[float(lens.sensor), 0.0]])
+    if lens.decentre is not None:
+        middle = middle + np.array([0.0, float(lens.decentre[-1, 1])])
+    wide = max([float(np.linalg.norm(end - middle)) for end in ends], default=0.0)
+    wide = max(1.1 * wide, 0.3 * reach)
+    sensor = _placed(lens, len(semi), np.array([-wide, wide]), np.zeros(2))
+    return Drawing(glass, mirrors, blades, sensor, paths)
 
 
-def _profile(lens: Lens, i: int, vertex: float, semi: float) -> np.ndarray:
-    y: Array = jnp.linspace(-semi, semi, _POINTS)
+def _placed(lens: Lens, i: int, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(z, y) along the axes of the lens of points on surface i (or the sensor)."""
+    points = np.stack([np.zeros_like(y), y, z], axis=-1)
+    if lens.tilt is not None:
+        points = points @ np.asarray(rotation_matrix(lens.tilt[i])).T
+    across = np.zeros(2) if lens.decentre is None else np.asarray(lens.decentre[i])
+    place = lens.sensor if i == len(lens.forms) else lens.vertices[i]
+    return np.stack([points[:, 2] + float(place), points[:, 1] + across[1]], axis=-1)
+
+
+def _profile(lens: Lens, i: int, semi: float) -> np.ndarray:
+    y: Array = jnp.linspace(-semi, semi, _POINTS, dtype=lens.curvature.dtype)
     shape = Shape(lens.curvature[i], lens.conic[i], lens.coefficients[i])
     z = sag(jnp.stack([0 * y, y]), shape, lens.forms[i])
-    return np.stack([vertex + np.asarray(z), np.asarray(y)], axis=-1)
+    return _placed(lens, i, np.asarray(y), np.asarray(z))
 
 
 def _path(points: np.ndarray, lead: float, field: float, distance: float) -> np.ndarray:

@@ -23,6 +23,7 @@ def new(rows: int = 1, columns: int = 1, width: float = 6.0, height: float = 4.0
 def lens_drawing(
     axes: Axes,
     glass: Sequence[np.ndarray],
+    mirrors: Sequence[np.ndarray],
     stop: Sequence[np.ndarray],
     sensor: np.ndarray,
     rays: Sequence[Sequence[np.ndarray]],
@@ -30,6 +31,8 @@ def lens_drawing(
     """A lens in section, from the polylines (N, 2) of (z, y) in mm of `drawing.draw`."""
     for outline in glass:
         axes.fill(*outline.T, facecolor="#cfe4f5", edgecolor="#30506b", linewidth=0.8)
+    for mirror in mirrors:
+        axes.plot(*mirror.T, color="#30506b", linewidth=2)
     for blade in stop:
         axes.plot(*blade.T, color="black", linewidth=2.5, solid_capstyle="butt")
     for fan, colour in zip(rays, _FIELDS * len(rays)):

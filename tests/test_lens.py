@@ -61,6 +61,23 @@ BAD = {
     "no sensor": (lambda e: e.pop("sensor"), "either sensor"),
     "two sensors": (surface(2, thickness=84.0), "either sensor"),
     "empty": (lambda e: e.update(surfaces=[]), "at least one surface"),
+    "infinite curvature": (lambda e: (drop(0, "radius")(e), surface(0, curvature="inf")(e)), "must be finite"),
+    "unknown form": (surface(0, form="zernike"), r"surfaces\[0\].form: unknown form 'zernike'; known: asphere"),
+    "crossing": (
+        lambda e: (surface(0, semi_diameter=20.0)(e), surface(1, semi_diameter=20.0, radius=-50)(e)),
+        r"surfaces\[0\].thickness: 4 mm makes surfaces 0 and 1 cross at .* mm from the axis",
+    ),
+    "mirror with glass": (surface(0, mirror=True), r"surfaces\[0\].glass: behind a mirror is the medium"),
+    "light turned": (
+        lambda e: (drop(0, "glass")(e), surface(0, mirror=True)(e)),
+        r"surfaces\[0\].thickness: must be negative, as a mirror has turned the light",
+    ),
+    "short tilt": (surface(1, tilt=[1.0]), r"surfaces\[1\].tilt: expected a list of 3 numbers"),
+    "text in decentre": (surface(1, decentre=[0, "up"]), r"decentre.1: expected a number, got 'up'"),
+    "no radius in x": (surface(0, form="toroid"), "either radius_x"),
+    "conic_x": (surface(0, form="toroid", radius_x=9.0, conic_x=1.0), "conic_x: a surface of the form toroid has none"),
+    "power of x": (surface(0, form="polynomial_xy", coefficients={"x2": 1.0}), "'x2' is not a power of x and y"),
+    "object": (lambda e: e.update(object={"glass": "N-BK8"}), "object.glass: unknown glass"),
 }
 
 
@@ -91,6 +108,50 @@ def test_own_lens(tmp_path):
     np.testing.assert_array_equal(lens.vertices, [0, 4, 6])
     moved = load_lens(write(tmp_path, lambda e: (e.pop("sensor"), surface(2, thickness=84.0)(e))))
     assert moved.sensor == lens.sensor == 90
+
+
+def test_every_form_from_a_file(tmp_path):
+    entry = {
+        "object": {"index": 1.1},
+        "surfaces": [
+            {"form": "biconic", "radius": 50, "radius_x": 40, "conic_x": -1, "coefficients": {4: 1e-6},
+             "thickness": 3, "glass": "N-BK7"},
+            {"form": "toroid", "radius": 60, "curvature_x": 0.01, "coefficients": {2: 1e-4},
+             "thickness": 3, "tilt": [1.0, 0, 0]},
+            {"form": "odd_asphere", "radius": "inf", "coefficients": {3: 1e-5}, "thickness": 3,
+             "semi_diameter": 2, "stop": True},
+            {"form": "polynomial_xy", "radius": "inf", "coefficients": {"x1y1": 1e-4}, "thickness": 9,
+             "mirror": True, "decentre": [0, 1]},
+        ],
+        "sensor_tilt": [0, 2.0, 0],
+    }  # fmt: skip
+    path = tmp_path / "forms.yaml"
+    path.write_text(yaml.safe_dump(entry))
+    for lens in (load_lens(path), load_lens(entry)):
+        assert lens.forms == ("biconic", "toroid", "odd_asphere", "polynomial_xy")
+        assert lens.mirrors == (False, False, False, True)
+        assert lens.glasses == ("index 1.1", "N-BK7", "air", "air", "air")
+        np.testing.assert_allclose(
+            lens.coefficients,
+            [[1 / 40, -1, 0, 1e-6], [0.01, 1e-4, 0, 0], [0, 0, 1e-5, 0], [0, 0, 0, 1e-4]],
+        )
+        np.testing.assert_allclose(lens.tilt[1], [np.radians(1.0), 0, 0])
+        np.testing.assert_allclose(lens.tilt[-1], [0, np.radians(2.0), 0])
+        np.testing.assert_array_equal(lens.decentre[3], [0, 1])
+        np.testing.assert_array_equal(lens.senses, [1, 1, 1, 1, -1])
+
+
+def test_symmetry_is_found():
+    surfaces = [{"radius": 50, "thickness": 4, "glass": "N-BK7"}, {"radius": "inf", "semi_diameter": 3, "stop": True}]
+
+    def symmetry(**change):
+        return load_lens({"surfaces": [{**surfaces[0], **change}, surfaces[1]], "sensor": 90}).symmetry
+
+    assert symmetry() == symmetry(form="odd_asphere") == "rotation"
+    assert symmetry(form="toroid", radius_x=40) == symmetry(tilt=[3, 0, 0]) == "plane"
+    assert symmetry(decentre=[0, 1]) == "plane"
+    for change in ({"tilt": [0, 1, 0]}, {"decentre": [1, 0]}, {"form": "polynomial_xy"}):
+        assert symmetry(**change) == "none"
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax.numerics import safe_divide, safe_sqrt
+from drt_jax.numerics import known_values, safe_divide, safe_sqrt
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -22,3 +22,21 @@ def test_unbiased_elsewhere():
     np.testing.assert_array_equal(safe_sqrt(x), jnp.sqrt(x))
     np.testing.assert_array_equal(safe_divide(jnp.ones(4), x), 1 / x)
     np.testing.assert_allclose(jax.vmap(jax.grad(safe_sqrt))(x[1:3]), 0.5 / np.sqrt(x[1:3]), rtol=1e-15)
+
+
+def test_values_are_known_while_they_are_differentiated_eagerly():
+    seen = []
+
+    def f(x):
+        seen.append(known_values({"x": x}))
+        return jnp.sum(x**3)
+
+    x = jnp.arange(3.0)
+    for transformed in (f, jax.grad(f), jax.jacfwd(f), jax.grad(lambda x: jnp.sum(jax.grad(f)(x)))):
+        seen.clear()
+        transformed(x)
+        np.testing.assert_array_equal(seen[0]["x"], x)
+    for transformed in (jax.jit(f), jax.vmap(f), jax.jit(jax.grad(f))):
+        seen.clear()
+        transformed(x)
+        assert seen == [None]
