@@ -148,9 +148,10 @@ def _backward(residuals, cotangents):
     _, pull_back = jax.vjp(residual, system)
     system_bar = pull_back(-adjoint)[0]
     direct = bar[:, system.stop]  # of the stop points themselves, which are hits too
-    _, pull_back = jax.vjp(lambda a: jnp.broadcast_to(a[:, None] if a.ndim == 2 else a, direct.shape), system.target)
-    target_bar = system_bar.target + pull_back(direct)[0]
-    return dataclasses.replace(system_bar, target=target_bar), jnp.zeros_like(hits)
+    if system.target.ndim == 2:
+        direct = jnp.sum(direct, axis=1)
+    system_bar = dataclasses.replace(system_bar, target=system_bar.target + direct)
+    return system_bar, jnp.zeros_like(hits)
 
 
 solve_rays.defvjp(_forward, _backward)

@@ -86,8 +86,9 @@ class Lens:
         moves = [self.decentre, self.tilt]
         if any(isinstance(move, jax.core.Tracer) for move in moves):
             return "none"
-        sideways = [np.asarray(a)[:, columns] for a, columns in zip(moves, ([0], [1, 2])) if a is not None]
-        still = not any(np.any(a) for a in sideways)
+        # Neither x, nor a turn about y or z, takes any surface out of the plane x = 0.
+        sideways = ((self.decentre, [0]), (self.tilt, [1, 2]))
+        still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
         return "plane" if still and MIRRORED.issuperset(self.forms) else "none"
 
     def index(self, wavelengths: Array) -> Array:

@@ -198,7 +198,8 @@ def _build(entry: object, where: str, name: str = "lens") -> Lens:
     if not isinstance(surfaces, list) or not surfaces:
         raise LensError(f"{top}: surfaces: expected a list of at least one surface")
     curvature, conic, powers, thickness, semi_diameter = [], [], [], [], []
-    media = [_medium(_known(entry.get("object", {}), _MEDIUM_KEYS, f"{top}: object"), f"{top}: object")]
+    space = f"{top}: object"
+    media = [_medium(_known(entry.get("object", {}), _MEDIUM_KEYS, space), space)]
     stops, forms, mirrors, decentre, tilt, sense = [], [], [], [], [], 1
     moved = any(
         isinstance(s, dict) and ("tilt" in s or "decentre" in s) for s in surfaces
@@ -305,6 +306,6 @@ def _check_crossing(lens: Lens, top: str) -> None:
     for i, j in zip(*np.nonzero(gap < -_TOUCH)):
         raise LensError(
             f"{top}: surfaces[{i}].thickness: {float(lens.thickness[i]):g} mm makes surfaces {i} "
-            f"and {i + 1} cross at {radius[i, j]:.3g} mm from the axis, inside their semi-diameters "
+            f"and {i + 1} cross at {radius[i, j]:.3g} mm from the axis, within their semi-diameters "
             f"of {semi[i]:g} and {semi[i + 1]:g} mm; raise the thickness or lower a semi-diameter"
         )

@@ -50,7 +50,7 @@ class ClippedPupil:
     spoke: Array
     fraction: Array
     weight: Array
-    order: int = dataclasses.field(metadata={"static": True}, default=0)
+    order: int
 
 
 def fitted_nodes(
@@ -60,22 +60,25 @@ def fitted_nodes(
     """Nodes (D, W, Q) and weights (W, Q) of the rule, following the lens; the weights add up to
     the fraction of the stop that is left. Differentiable; arguments as `trace_bundle`."""
     dtype = lens.curvature.dtype
-    rule = jax.tree.map(lambda a: a if jnp.issubdtype(a.dtype, jnp.integer) else a.astype(dtype), rule)
-    spokes = rule.centre[..., None] + rule.radius * rule.direction
+    centre, direction, radius, slope, fraction, weight = (
+        jnp.asarray(a, dtype)
+        for a in (rule.centre[..., None], rule.direction, rule.radius, rule.slope, rule.fraction,
+                  rule.weight)
+    )  # fmt: skip
+    surface, spoke = jnp.asarray(rule.surface), jnp.asarray(rule.spoke)
+    spokes = centre + radius * direction
     bundle = trace_bundle(lens, field, distance, wavelengths, spokes, forward)
     r2 = jnp.sum(bundle.hits**2, axis=0)
-    r2 = jnp.take_along_axis(r2, rule.surface[None], axis=0)[0]
-    edge = jnp.append(lens.semi_diameter, jnp.ones_like(lens.sensor))[rule.surface]
-    moves = (rule.surface < len(lens.forms)) & (bundle.status != Status.MISSED)
-    moves = moves & (bundle.status != Status.TIR) & (bundle.status != Status.UNCONVERGED)
+    r2 = jnp.take_along_axis(r2, surface[None], axis=0)[0]
+    edge = jnp.append(lens.semi_diameter, jnp.ones_like(lens.sensor))[surface]
+    whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+    moves = (surface < len(lens.forms)) & whole
     excess = jnp.where(moves, r2 - jnp.where(moves, edge, 1) ** 2, 0)
-    radius = rule.radius - excess / jnp.where(moves, rule.slope, 1)
-    along = radius[:, rule.spoke]
-    points = rule.centre[..., None] + rule.fraction * along * rule.direction[..., rule.spoke]
-    return points, rule.weight * along**2
+    along = (radius - excess / jnp.where(moves, slope, 1))[:, spoke]
+    return centre + fraction * along * direction[..., spoke], weight * along**2
 
 
-@partial(jax.jit, static_argnums=())
+@jax.jit
 def _reach(
     lens: Lens, field: Array, distance: Array, wavelengths: Array, points: Array
 ) -> tuple[Array, Array]:
@@ -90,6 +93,7 @@ class Boundary:
     def __init__(self, scene: tuple, symmetry: str):
         self.scene, self.symmetry = scene, symmetry
         lens = scene[0]
+        self.dtype = lens.curvature.dtype
         self.edges = np.asarray(lens.semi_diameter, float).copy()
         self.edges[lens.stop] = np.inf
         self.colours = len(scene[3])
@@ -99,12 +103,11 @@ class Boundary:
 
     def _squares(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """r^2 (S, W, N) on the surfaces and which rays fail (W, N), points (D, W, N)."""
-        dtype = self.scene[0].curvature.dtype
         r2, failed = [], []
         for i in range(0, points.shape[-1], _BATCH):
             part = points[..., i : i + _BATCH]
             full = np.pad(part, ((0, 0), (0, 0), (0, _BATCH - part.shape[-1])))
-            a, b = _reach(*self.scene, jnp.asarray(full, dtype))
+            a, b = _reach(*self.scene, jnp.asarray(full, self.dtype))
             r2.append(np.asarray(a, float)[..., : part.shape[-1]])
             failed.append(np.asarray(b)[..., : part.shape[-1]])
         return np.concatenate(r2, -1), np.concatenate(failed, -1)
@@ -112,14 +115,16 @@ class Boundary:
     def _excess(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """r^2 / edge^2 - 1 of each aperture (S, W, N); which rays fail."""
         r2, failed = self._squares(points)
-        return np.where(np.isfinite(self.edges)[:, None, None], r2 / self.edges[:, None, None] ** 2 - 1, -1), failed
+        return r2 / self.edges[:, None, None] ** 2 - 1, failed  # -1 without an aperture
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
         excess, failed = self._excess(points)
         return (np.max(excess, axis=0) <= 0) & ~failed
 
     def _unit(self, angle: np.ndarray) -> np.ndarray:
-        return np.stack([np.cos(angle), np.sin(angle)]) if self.dim == 2 else np.ones((1, *angle.shape))
+        if self.dim == 1:
+            return np.ones((1, *angle.shape))
+        return np.stack([np.cos(angle), np.sin(angle)])
 
     def _rim(self, unit: np.ndarray) -> np.ndarray:
         """Radius (W, N) at which the spokes reach the edge of the stop."""
@@ -143,7 +148,7 @@ class Boundary:
             low, high = np.where(inside, middle, low), np.where(inside, high, middle)
         excess, _ = self._excess(c + low * unit)
         surface = np.argmax(excess, axis=0)
-        met = np.max(excess, axis=0) > -1e-6 if self.scene[0].curvature.dtype == np.float64 else np.max(excess, axis=0) > -1e-3
+        met = np.max(excess, axis=0) > -10 * float(np.sqrt(np.finfo(self.dtype).eps))
         return low, np.where(whole | ~met, len(self.edges), surface)
 
     def _value(self, points: np.ndarray, surface: np.ndarray) -> np.ndarray:
@@ -157,9 +162,8 @@ class Boundary:
         h = 1e-5
         for _ in range(_CORNER_STEPS):
             moves = [(0, 0), (h, 0), (-h, 0), (0, h), (0, -h)]
-            points = np.concatenate(
-                [self.centre[..., None] + (radius + a) * self._unit(angle + b) for a, b in moves], -1
-            )
+            spokes = [(radius + a) * self._unit(angle + b) for a, b in moves]
+            points = self.centre[..., None] + np.concatenate(spokes, -1)
             values = [
                 self._value(points, np.tile(surface, 5)).reshape(*angle.shape[:-1], 5, -1)
                 for surface in (first, second)
@@ -201,11 +205,12 @@ class Boundary:
         # The same number of corners for every colour, those that are missing repeated.
         places = [np.flatnonzero(row) for row in changes]
         count = [len(row) for row in places]
-        places = np.stack([np.resize(row, most) if len(row) else np.zeros(most, int) for row in places])
-        take = partial(np.take_along_axis, indices=places, axis=-1)
-        after = partial(np.take_along_axis, indices=places + 1, axis=-1)
-        start = (take(angle) + after(angle)) / 2
-        found = self._corner(start, (take(radius) + after(radius)) / 2, take(surface), after(surface))
+        places = np.stack([np.resize(row, most) if row.size else [0] * most for row in places])
+        here = partial(np.take_along_axis, indices=places, axis=-1)
+        next_ = partial(np.take_along_axis, indices=places + 1, axis=-1)
+        start = (here(angle) + next_(angle)) / 2
+        middle = (here(radius) + next_(radius)) / 2
+        found = self._corner(start, middle, here(surface), next_(surface))
         step = angle[0, 1] - angle[0, 0]
         found = np.where(np.abs(found - start) < 2 * step, found, start)
         self.corners = [np.sort(row[:n]) for row, n in zip(found, count)]
@@ -242,7 +247,8 @@ class Boundary:
         angle, width = self._panels(order)
         radius, surface = self.at(angle)
         unit = self._unit(angle)
-        points = self.centre[..., None, None] + (radius[..., None] + _STEP * _STENCIL) * unit[..., None]
+        along = radius[..., None] + _STEP * _STENCIL
+        points = self.centre[..., None, None] + along * unit[..., None]
         r2, _ = self._squares(points.reshape(self.dim, self.colours, -1))
         r2 = r2.reshape(len(self.edges), *points.shape[1:])
         own = np.minimum(surface, len(self.edges) - 1)[None, ..., None]
@@ -258,9 +264,12 @@ class Boundary:
         spoke, fraction = np.repeat(np.arange(spokes), order), np.tile(fraction, spokes)
         weight = (width[..., None] * along).reshape(self.colours, -1)
         # A few sizes for all orders and scenes, so that they share compiled programs.
-        more = _size(spokes, 32) - spokes
-        fill = _size(weight.shape[1], 512) - weight.shape[1]
-        pad = lambda a, n, mode="constant": np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, n)], mode=mode)  # noqa: E731
+        more = _size(spokes, 8 if self.dim == 1 else 128) - spokes
+        fill = _size(weight.shape[1], 48 if self.dim == 1 else 2048) - weight.shape[1]
+
+        def pad(a, n, mode="constant"):
+            return np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, n)], mode=mode)
+
         return ClippedPupil(
             self.centre,
             pad(unit, more, "edge"),

@@ -10,8 +10,6 @@ import pytest
 from drt_jax import focus_moments, load_lens, psf_moments, pupil_order, trace_rays
 from drt_jax.vignetting import ClippedPupil
 
-from .conftest import RGB
-
 GREEN = (0.53,)
 
 
@@ -32,12 +30,12 @@ SCENES = {
 }
 
 
-def two_stops(height, field):
-    """Two empty apertures of radius 1, 20 mm apart; a beam tilted by `field` (radians)."""
+def two_stops():
+    """Two apertures of radius 1 with 20 mm of glass between them."""
     return load_lens(
         {
             "surfaces": [
-                {"radius": "inf", "semi_diameter": height, "thickness": 20.0, "index": 1.5},
+                {"radius": "inf", "semi_diameter": 1.0, "thickness": 20.0, "index": 1.5},
                 {"radius": "inf", "semi_diameter": 1.0, "stop": True},
             ],
             "sensor": 21.0,
@@ -48,7 +46,7 @@ def two_stops(height, field):
 def test_overlap_of_two_discs():
     """What two shifted discs have in common: area, centroid and second moments in closed form,
     here from a dense integral over y of the chord (a substitution makes it smooth)."""
-    lens = two_stops(1.0, 0.0)
+    lens = two_stops()
     tilt = np.arcsin(1.5 * np.sin(np.arctan(0.7 / 20)))  # in the glass: 0.7 mm over 20 mm
     moments = focus_moments(lens, tilt, jnp.inf, [0.55], order=10)
     shift = 0.7  # the front aperture, seen from the stop, lies 0.7 above it
@@ -74,11 +72,11 @@ def test_overlap_of_two_discs():
 @pytest.mark.parametrize("name", SCENES)
 def test_converges_like_an_open_pupil(name):
     field, lens = SCENES[name]
-    exact = focus_moments(lens, field, 25000.0, RGB, order=20)
+    exact = focus_moments(lens, field, 25000.0, GREEN, order=20)
     assert 0.3 < np.min(exact.passed) and np.max(exact.passed) < 0.95
     size = np.sum(np.asarray(exact.spread)[0, :, :2], axis=-1)
     for order, error in ((8, 1e-5), (12, 1e-9)):
-        ours = focus_moments(lens, field, 25000.0, RGB, order=order)
+        ours = focus_moments(lens, field, 25000.0, GREEN, order=order)
         change = np.abs(ours.spread[0] - exact.spread[0]) / size[:, None]
         assert np.max(change) < error
         np.testing.assert_allclose(ours.passed, exact.passed, rtol=1e-8)
@@ -135,7 +133,7 @@ def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
     hard = focus_moments(lens, 0.0, 25000.0, GREEN, 1e-6).passed[0]
     errors = [abs(float(passed(lens, width) - hard)) for width in (1.0, 0.5, 0.25)]
     assert errors[2] < errors[1] / 2 < errors[0] / 4 and errors[2] < 0.01
-    slope = jax.jit(jax.grad(lambda lens: passed(lens, 0.5)))(lens).semi_diameter
+    slope = jax.grad(lambda lens: passed(lens, 0.5))(lens).semi_diameter
     h = 1e-4
     moved = [clipped(12.0 + s, 21.0) for s in (h, -h)]
     difference = (passed(moved[0], 0.5) - passed(moved[1], 0.5)) / (2 * h)
@@ -150,6 +148,6 @@ def test_inside_jit_without_a_rule_rays_drop_out():
     value, gradient = jax.jit(
         jax.value_and_grad(lambda lens: jnp.sum(psf_moments(lens, field, 25000.0, GREEN)[1]))
     )(lens)
-    exact = float(jnp.sum(psf_moments(lens, field, 25000.0, GREEN)[1]))
+    exact = float(jnp.sum(psf_moments(lens, field, 25000.0, GREEN, 1e-4)[1]))
     assert abs(value / exact - 1) < 0.2
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
