@@ -11,7 +11,7 @@ ROOT = pathlib.Path(drt_jax.__file__).parent
 # From what knows least to what knows most.
 ORDER = (
     "numerics", "surface", "glass", "lens", "prescription", "paraxial", "pupil", "fermat", "start", "implicit",
-    "snell", "trace", "moments", "depth", "psf", "sensor", "network", "adam", "data", "config", "runs",
+    "snell", "trace", "wavefront", "moments", "depth", "psf", "sensor", "network", "adam", "data", "config", "runs",
     "train", "drawing", "plot",
 )  # fmt: skip
 NO_OPTICS = ("network", "adam", "data", "config", "runs", "plot")
