@@ -105,42 +105,45 @@ def trace_yu(
     return jnp.stack(heights), jnp.stack(slopes)
 
 
-def _signed_index(lens: Lens, wavelengths: Array) -> Array:
+class _Paraxial(NamedTuple):
+    """What paraxial rays see: curvature (S,), gaps (S - 1,), and index (S + 1, W), negative
+    after an odd number of mirrors; static, the index of the stop."""
+
+    curvature: Array
+    gaps: Array
+    index: Array
+    stop: int
+
+
+def _paraxial(lens: Lens, wavelengths: Array) -> _Paraxial:
     index = lens.index(wavelengths)
-    return index * jnp.asarray(lens.senses[:, None], index.dtype)
+    index = index * jnp.asarray(lens.senses[:, None], index.dtype)
+    curvature = vertex_curvature(lens.shape, lens.forms, 1)[0]
+    return _Paraxial(curvature, lens.thickness, index, lens.stop)
 
 
-def _curvature(lens: Lens) -> Array:
-    return vertex_curvature(lens.shape, lens.forms, 1)[0]
+def _trace(system: _Paraxial, height: ArrayLike, slope: ArrayLike) -> tuple[Array, Array]:
+    """Heights and slopes (S, W) of the ray of the given height and slope at the first vertex."""
+    one = jnp.ones_like(system.index[0])
+    return trace_yu(system.curvature, system.gaps, system.index, one * height, one * slope)
 
 
-def _trace(
-    lens: Lens, wavelengths: Array, slope: ArrayLike, height: ArrayLike = 1.0
-) -> tuple[Array, Array]:
-    """Heights and slopes of the ray of the given height and slope at the first vertex."""
-    index = _signed_index(lens, wavelengths)
-    one = jnp.ones_like(index[0])
-    return trace_yu(_curvature(lens), lens.thickness, index, one * height, one * slope)
+def _vergence(lens: Lens, distance: ArrayLike) -> Array:
+    return 1 / jnp.asarray(distance, lens.curvature.dtype)
 
 
-def _parallel_ray(lens: Lens, wavelengths: Array) -> tuple[Array, Array]:
-    height, slope = _trace(lens, wavelengths, 0.0)
-    return height[-1], slope[-1]
-
-
-def chief_ray(lens: Lens, wavelengths: Array, front: bool) -> tuple[Array, Array]:
+def _chief_ray(system: _Paraxial, front: bool) -> tuple[Array, Array]:
     """Height and slope (W,) of a ray through the centre of the stop, where n u = 1 there.
 
     `front`: at the first vertex, before it; else at the last vertex, behind it.
     """
-    index, stop = _signed_index(lens, wavelengths), lens.stop
-    curvature, gaps = _curvature(lens), lens.thickness
+    curvature, gaps, index, stop = system
     if front:  # backwards: the same lens seen from behind
         curvature, gaps, index = -curvature[::-1], gaps[::-1], index[::-1]
-        stop = len(lens.forms) - 1 - stop
+        stop = len(curvature) - 1 - stop
     slope = 1 / index[stop + 1]
     height = jnp.zeros_like(slope)
-    if stop + 1 < len(lens.forms):
+    if stop + 1 < len(curvature):
         height, slope = trace_yu(
             curvature[stop + 1 :], gaps[stop + 1 :], index[stop + 1 :], gaps[stop] * slope, slope
         )
@@ -148,22 +151,70 @@ def chief_ray(lens: Lens, wavelengths: Array, front: bool) -> tuple[Array, Array
     return (-height, slope) if front else (height, slope)
 
 
-def _pupil(lens: Lens, wavelengths: Array, front: bool) -> Pupil:
-    height, slope = chief_ray(lens, wavelengths, front)
+def chief_ray_at_image(lens: Lens, wavelengths: Array) -> tuple[Array, Array]:
+    """Height (W,) in mm and slope (W,), at the last vertex and behind it, of a ray through the
+    centre of the stop; of the size that makes n u = 1 at the stop. `wavelengths` in um."""
+    return _chief_ray(_paraxial(lens, wavelengths), front=False)
+
+
+def _pupil(lens: Lens, system: _Paraxial, front: bool) -> Pupil:
+    height, slope = _chief_ray(system, front)
     # n u times the size of the pupil is the same in all media (Lagrange).
-    index = lens.index(wavelengths)[0 if front else -1]
-    size = lens.semi_diameter[lens.stop] * jnp.ones_like(slope)
-    return Pupil(_quotient(-height, slope), _quotient(size, jnp.abs(index * slope)))
+    bend = jnp.abs(system.index[0 if front else -1] * slope)
+    size = jnp.broadcast_to(lens.semi_diameter[lens.stop], slope.shape)
+    return Pupil(_quotient(-height, slope), _quotient(size, bend))
 
 
 def entrance_pupil(lens: Lens, wavelengths: Array) -> Pupil:
     """The stop as seen from the object; position from the first vertex. `wavelengths` in um."""
-    return _pupil(lens, wavelengths, front=True)
+    return _pupil(lens, _paraxial(lens, wavelengths), front=True)
 
 
 def exit_pupil(lens: Lens, wavelengths: Array) -> Pupil:
     """The stop as seen from the image; position from the last vertex. `wavelengths` in um."""
-    return _pupil(lens, wavelengths, front=False)
+    return _pupil(lens, _paraxial(lens, wavelengths), front=False)
+
+
+def _marginal_ray(lens: Lens, system: _Paraxial, distance: ArrayLike) -> tuple[Array, ...]:
+    """Heights on the surfaces, slopes before and slopes behind them (S, W) of the ray from the
+    axial object point through the rim of the stop."""
+    vergence = _vergence(lens, distance)
+    height, slope = _trace(system, 1.0, vergence)
+    before = jnp.concatenate([jnp.ones_like(slope[:1]) * vergence, slope[:-1]])
+    scale = safe_divide(lens.semi_diameter[lens.stop], height[lens.stop])
+    return height * scale, before * scale, slope * scale
+
+
+def _petzval(system: _Paraxial) -> Array:
+    """Parts (S, W) of the Petzval sum, 1/mm."""
+    index = system.index
+    return -system.curvature[:, None] * (1 / index[1:] - 1 / index[:-1])
+
+
+def first_order(lens: Lens, distance: ArrayLike, wavelengths: Array) -> FirstOrder:
+    """First-order data for an object at `distance` mm, inf allowed; `wavelengths` (W,) in um.
+
+    See `FirstOrder`; focal length, focal distances and pupils do not depend on the distance.
+    """
+    system = _paraxial(lens, wavelengths)
+    index, vergence = system.index, _vergence(lens, distance)
+    y, u = (a[-1] for a in _trace(system, 1.0, 0.0))
+    _, tilted = _trace(system, 0.0, 1.0)
+    axial_y, axial_u = (a[-1] for a in _trace(system, 1.0, vergence))
+    marginal = _marginal_ray(lens, system, distance)[2][-1]
+    one = jnp.ones_like(u)
+    return FirstOrder(
+        focal_length=_quotient(-one, u),
+        back_focal_distance=_quotient(-y, u),
+        front_focal_distance=_quotient(tilted[-1], u),
+        image_distance=lens.vertices[-1] + _quotient(-axial_y, axial_u),
+        f_number=_quotient(one, 2 * jnp.abs(marginal)),
+        numerical_aperture=jnp.abs(index[-1] * marginal),
+        magnification=_quotient(index[0] * vergence, index[-1] * axial_u),
+        entrance_pupil=_pupil(lens, system, front=True),
+        exit_pupil=_pupil(lens, system, front=False),
+        petzval_radius=_quotient(-one, index[-1] * jnp.sum(_petzval(system), axis=0)),
+    )
 
 
 def focal_length(lens: Lens, wavelengths: Array) -> Array:
@@ -172,45 +223,27 @@ def focal_length(lens: Lens, wavelengths: Array) -> Array:
     From the rear principal plane to the focus, along z: in water longer by its index than in
     air, and negative for a concave mirror, whose focus lies before it.
     """
-    _, slope = _parallel_ray(lens, wavelengths)
-    return _quotient(-jnp.ones_like(slope), slope)
+    _, slope = _trace(_paraxial(lens, wavelengths), 1.0, 0.0)
+    return _quotient(-jnp.ones_like(slope[-1]), slope[-1])
 
 
 def back_focal_distance(lens: Lens, wavelengths: Array) -> Array:
     """Last vertex to the image of an infinitely far object (W,), mm; inf for an afocal lens.
     `wavelengths` (W,) in um."""
-    height, slope = _parallel_ray(lens, wavelengths)
-    return _quotient(-height, slope)
+    height, slope = _trace(_paraxial(lens, wavelengths), 1.0, 0.0)
+    return _quotient(-height[-1], slope[-1])
 
 
 def front_focal_distance(lens: Lens, wavelengths: Array) -> Array:
     """First vertex to the front focus (W,), mm, negative where it lies before the lens; inf
     for an afocal lens. `wavelengths` (W,) in um."""
-    _, slope = _parallel_ray(lens, wavelengths)
-    _, tilted = _trace(lens, wavelengths, 1.0, 0.0)
-    return _quotient(tilted[-1], slope)
+    return first_order(lens, jnp.inf, wavelengths).front_focal_distance
 
 
 def image_distance(lens: Lens, distance: ArrayLike, wavelengths: Array) -> Array:
     """First vertex to the paraxial image of an axial object at `distance` mm (W,), mm; inf
     where that lies at infinity. `wavelengths` (W,) in um."""
-    height, slope = _axial_ray(lens, distance, wavelengths)
-    return lens.vertices[-1] + _quotient(-height[-1], slope[-1])
-
-
-def _axial_ray(lens: Lens, distance: ArrayLike, wavelengths: Array) -> tuple[Array, Array]:
-    """Heights and slopes of the ray of height 1 from an axial object at `distance` mm."""
-    return _trace(lens, wavelengths, 1 / jnp.asarray(distance, lens.curvature.dtype))
-
-
-def _marginal_ray(lens: Lens, distance: ArrayLike, wavelengths: Array) -> tuple[Array, ...]:
-    """Heights on the surfaces, slopes before and slopes behind them (S, W) of the ray from the
-    axial object point through the rim of the stop."""
-    vergence = 1 / jnp.asarray(distance, lens.curvature.dtype)
-    height, slope = _axial_ray(lens, distance, wavelengths)
-    before = jnp.concatenate([jnp.ones_like(slope[:1]) * vergence, slope[:-1]])
-    scale = safe_divide(lens.semi_diameter[lens.stop], height[lens.stop])
-    return height * scale, before * scale, slope * scale
+    return first_order(lens, distance, wavelengths).image_distance
 
 
 def numerical_aperture(lens: Lens, distance: ArrayLike, wavelengths: Array) -> Array:
@@ -218,8 +251,7 @@ def numerical_aperture(lens: Lens, distance: ArrayLike, wavelengths: Array) -> A
 
     `distance` from the object to the first vertex in mm, inf allowed; `wavelengths` (W,), um.
     """
-    slope = _marginal_ray(lens, distance, wavelengths)[2][-1]
-    return jnp.abs(lens.index(wavelengths)[-1] * slope)
+    return first_order(lens, distance, wavelengths).numerical_aperture
 
 
 def f_number(lens: Lens, wavelengths: Array, distance: ArrayLike = jnp.inf) -> Array:
@@ -228,8 +260,7 @@ def f_number(lens: Lens, wavelengths: Array, distance: ArrayLike = jnp.inf) -> A
     For an infinitely far object, focal length over diameter of the entrance pupil; else the
     working f-number. `wavelengths` (W,) in um, `distance` in mm.
     """
-    slope = _marginal_ray(lens, distance, wavelengths)[2][-1]
-    return _quotient(jnp.ones_like(slope), 2 * jnp.abs(slope))
+    return first_order(lens, distance, wavelengths).f_number
 
 
 def lateral_magnification(lens: Lens, distance: ArrayLike, wavelengths: Array) -> Array:
@@ -237,10 +268,7 @@ def lateral_magnification(lens: Lens, distance: ArrayLike, wavelengths: Array) -
 
     `distance` from the object to the first vertex in mm; inf gives 0. `wavelengths` (W,), um.
     """
-    index = _signed_index(lens, wavelengths)
-    _, slope = _axial_ray(lens, distance, wavelengths)
-    vergence = 1 / jnp.asarray(distance, lens.curvature.dtype)
-    return _quotient(index[0] * vergence, index[-1] * slope[-1])
+    return first_order(lens, distance, wavelengths).magnification
 
 
 def image_height(
@@ -252,40 +280,14 @@ def image_height(
     axis (`field_of_height` gives the angle of an object point). `distance` in mm, inf allowed;
     `wavelengths` (W,) in um. inf for an image at infinity.
     """
-    index = _signed_index(lens, wavelengths)
-    _, slope = _axial_ray(lens, distance, wavelengths)
+    system = _paraxial(lens, wavelengths)
+    _, slope = _trace(system, 1.0, _vergence(lens, distance))
     tangent = jnp.tan(jnp.asarray(field, lens.curvature.dtype))[..., None]
-    return _quotient(-tangent * index[0], index[-1] * slope[-1])
+    return _quotient(-tangent * system.index[0], system.index[-1] * slope[-1])
 
 
-def _petzval(lens: Lens, index: Array) -> Array:
-    """Parts (S, W) of the Petzval sum, 1/mm."""
-    return -_curvature(lens)[:, None] * (1 / index[1:] - 1 / index[:-1])
-
-
-def first_order(lens: Lens, distance: ArrayLike, wavelengths: Array) -> FirstOrder:
-    """First-order data for an object at `distance` mm, inf allowed; `wavelengths` (W,) in um.
-
-    See `FirstOrder`; focal length, focal distances and pupils do not depend on the distance.
-    """
-    index = _signed_index(lens, wavelengths)
-    petzval = -index[-1] * jnp.sum(_petzval(lens, index), axis=0)
-    return FirstOrder(
-        focal_length(lens, wavelengths),
-        back_focal_distance(lens, wavelengths),
-        front_focal_distance(lens, wavelengths),
-        image_distance(lens, distance, wavelengths),
-        f_number(lens, wavelengths, distance),
-        numerical_aperture(lens, distance, wavelengths),
-        lateral_magnification(lens, distance, wavelengths),
-        entrance_pupil(lens, wavelengths),
-        exit_pupil(lens, wavelengths),
-        _quotient(jnp.ones_like(petzval), petzval),
-    )
-
-
-def _fourth_order(lens: Lens) -> Array:
-    """Coefficient (S,) of r^4 in the sag, beyond the sphere of the vertex curvature, mm^-3."""
+def _fourth_order(lens: Lens, vertex: Array) -> Array:
+    """Coefficient (S,) of r^4 in the sag, beyond the sphere of curvature `vertex` (S,), mm^-3."""
     c, k = lens.curvature, lens.conic
     columns = [3 if form == "odd_asphere" else 1 for form in lens.forms]
     count = lens.coefficients.shape[1]
@@ -295,7 +297,7 @@ def _fourth_order(lens: Lens) -> Array:
             for i, j in enumerate(columns)
         ]
     )
-    return fourth + ((1 + k) * c**3 - _curvature(lens) ** 3) / 8
+    return fourth + ((1 + k) * c**3 - vertex**3) / 8
 
 
 def third_order(
@@ -312,22 +314,22 @@ def third_order(
     if not ROTATIONAL.issuperset(lens.forms):
         others = sorted(set(lens.forms) - ROTATIONAL)
         raise ValueError(f"third order: no theory for surfaces of the form {', '.join(others)}")
-    n = _signed_index(lens, wavelengths)
-    y, u, behind = _marginal_ray(lens, distance, wavelengths)
-    vergence = 1 / jnp.asarray(distance, lens.curvature.dtype)
-    chief = chief_ray(lens, wavelengths, front=True)
+    system = _paraxial(lens, wavelengths)
+    n, vergence = system.index, _vergence(lens, distance)
+    y, u, behind = _marginal_ray(lens, system, distance)
+    chief = _chief_ray(system, front=True)
     # Scaled to the field, the slope of the line from the object point to the first vertex.
     tangent = jnp.tan(jnp.asarray(field, vergence.dtype))
     scale = safe_divide(tangent, chief[1] - vergence * chief[0])
-    chief_y, chief_u = _trace(lens, wavelengths, chief[1] * scale, chief[0] * scale)
+    chief_y, chief_u = _trace(system, chief[0] * scale, chief[1] * scale)
     chief_before = jnp.concatenate([(chief[1] * scale)[None], chief_u[:-1]])
 
-    c = _curvature(lens)[:, None]
+    c = system.curvature[:, None]
     incidence, chief_incidence = n[:-1] * (y * c + u), n[:-1] * (chief_y * c + chief_before)
     invariant = n[0] * (chief_before[0] * y[0] - u[0] * chief_y[0])
     bend = y * (behind / n[1:] - u / n[:-1])
-    petzval = _petzval(lens, n)
-    figure = 8 * _fourth_order(lens)[:, None] * (n[1:] - n[:-1])
+    petzval = _petzval(system)
+    figure = 8 * _fourth_order(lens, system.curvature)[:, None] * (n[1:] - n[:-1])
     s1 = -(incidence**2) * bend + figure * y**4
     s2 = -incidence * chief_incidence * bend + figure * y**3 * chief_y
     s3 = -(chief_incidence**2) * bend + figure * y**2 * chief_y**2

@@ -23,7 +23,7 @@ from .fermat import Status
 from .glass import check_wavelengths
 from .lens import Lens, rotation_matrix
 from .numerics import safe_divide, safe_sqrt
-from .paraxial import chief_ray
+from .paraxial import chief_ray_at_image
 from .trace import as_field, trace_bundle
 
 __all__ = ["Wavefront", "reference_curvature", "rms_wavefront", "wavefront"]
@@ -52,7 +52,7 @@ def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
     Positive for a pupil that the light has passed before the sensor, 0 for a telecentric lens.
     Tilts and decentres are left out. `wavelengths` (W,) in um.
     """
-    height, slope = chief_ray(lens, wavelengths, front=False)
+    height, slope = chief_ray_at_image(lens, wavelengths)
     at_sensor = height + slope * (lens.sensor - lens.vertices[-1])
     return safe_divide(slope * jnp.asarray(lens.senses[-1], slope.dtype), at_sensor)
 
