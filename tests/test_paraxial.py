@@ -20,7 +20,8 @@ image_height = jax.jit(drt_jax.image_height)
 
 
 def thin(gap=None, radius=25.0):
-    """Plano-convex singlet without thickness, n = 1.5: f = 2 R in air. The stop is the plane itself or, given a gap, a plane before (+) or behind it (-)."""
+    """Plano-convex singlet without thickness, n = 1.5: f = 2 R in air. The stop is
+    its plane or, given a gap, another plane before (+) or behind it (-)."""
     stop = {"curvature": 0, "semi_diameter": 2.0, "stop": True}
     glass = {"radius": radius, "index": 1.5}
     plane = {"curvature": 0}
@@ -207,7 +208,8 @@ def test_third_order_of_stigmatic_surfaces_and_of_the_mirror():
     parts = third_order(load_lens(CASSEGRAIN), 0.01, np.inf, GREEN)
     np.testing.assert_allclose(parts.spherical[0], 0, atol=1e-15)
     # k of the secondary for magnification 4: -((m + 1) / (m - 1))^2 = -25/9, not -4
-    best = {"surfaces": [CASSEGRAIN["surfaces"][0], {**CASSEGRAIN["surfaces"][1], "conic": -25 / 9}]}
+    first, second = CASSEGRAIN["surfaces"]
+    best = {"surfaces": [first, second | {"conic": -25 / 9}]}
     total = third_order(load_lens(best), 0.01, np.inf, GREEN).total
     np.testing.assert_allclose(total.spherical, 0, atol=1e-14)
     assert abs(parts.total.spherical[0]) > 1e-3

@@ -185,7 +185,7 @@ def lsst(cases):
 
 @pytest.mark.parametrize("name", ["LSST_trace_0", "LSST_trace_1", "LSST_trace_2"])
 def test_c08_rays(cases, lsst, name):
-    """Positions to 1e-6 mm (seven decimals of metres are printed), cosines to 3e-10."""
+    """Positions to 1e-6 mm, of which 1e-7 mm are printed, cosines to 3e-10."""
     rows = np.array(cases["C08"]["reference"]["rays"][name])[:, 1:]
     start, cosines = rows[0, :3], rows[:, 3:]
     field = np.arctan(cosines[0, :2] / cosines[0, 2])
@@ -270,8 +270,12 @@ def test_c16_wyld_achromat(cases):
 
 HEIGHTS = np.linspace(-1, 1, 7)
 STIGMATIC = {
-    # name: surfaces behind the stop plane, its semi-diameter, gap, focus from the last vertex
-    "ellipsoid": ([{"radius": 10, "conic": -1 / 1.5**2, "index": 1.5, "thickness": 30.0}], 6.0, 5.0),
+    # name: surfaces behind the stop plane up to the focus, its semi-diameter, its distance
+    "ellipsoid": (
+        [{"radius": 10, "conic": -1 / 1.5**2, "index": 1.5, "thickness": 30.0}],
+        6.0,
+        5.0,
+    ),
     "hyperboloid": (
         [
             {"radius": INF, "index": 1.5, "thickness": 5.0},
@@ -280,8 +284,12 @@ STIGMATIC = {
         12.0,
         5.0,
     ),
-    "paraboloid": ([{"radius": -100, "conic": -1, "mirror": True, "thickness": -50.0}], 40.0, 60.0),
-}  # fmt: skip
+    "paraboloid": (
+        [{"radius": -100, "conic": -1, "mirror": True, "thickness": -50.0}],
+        40.0,
+        60.0,
+    ),
+}
 
 
 @pytest.mark.parametrize("name", STIGMATIC)
