@@ -20,18 +20,37 @@ from .glass import find_glass, refractive_index
 from .lens import Lens
 from .moments import focus_moments, psf_moments, pupil_order
 from .network import red_net
-from .paraxial import back_focal_distance, focal_length, image_distance
+from .paraxial import (
+    FirstOrder,
+    Pupil,
+    ThirdOrder,
+    back_focal_distance,
+    entrance_pupil,
+    exit_pupil,
+    f_number,
+    first_order,
+    focal_length,
+    front_focal_distance,
+    image_distance,
+    image_height,
+    lateral_magnification,
+    numerical_aperture,
+    third_order,
+)
 from .prescription import LensError, lens_names, load_lens
 from .psf import SeparableKernel, gaussian_psf
 from .sensor import convolve, sensor_layer
 from .snell import trace_snell
 from .trace import Rays, field_of_height, trace_rays
+from .wavefront import Wavefront, rms_wavefront, wavefront
 
 __all__ = [
-    "Lens", "LensError", "Rays", "SeparableKernel", "Status",
-    "adam", "apply_updates", "back_focal_distance", "convolve", "depth_moments", "field_of_height",
-    "find_glass",
-    "focal_length", "focus_moments", "gaussian_psf", "image_distance", "lens_names", "load_lens",
-    "moments_model", "psf_moments", "pupil_order", "red_net", "refractive_index", "sensor_layer",
-    "trace_rays", "trace_snell",
+    "FirstOrder", "Lens", "LensError", "Pupil", "Rays", "SeparableKernel", "Status", "ThirdOrder",
+    "Wavefront",
+    "adam", "apply_updates", "back_focal_distance", "convolve", "depth_moments", "entrance_pupil",
+    "exit_pupil", "f_number", "field_of_height", "find_glass", "first_order", "focal_length",
+    "focus_moments", "front_focal_distance", "gaussian_psf", "image_distance", "image_height",
+    "lateral_magnification", "lens_names", "load_lens", "moments_model", "numerical_aperture",
+    "psf_moments", "pupil_order", "red_net", "refractive_index", "rms_wavefront", "sensor_layer",
+    "third_order", "trace_rays", "trace_snell", "wavefront",
 ]  # fmt: skip

@@ -21,10 +21,10 @@ _SCHOTT_POWERS = (0, 2, -2, -4, -6, -8)
 class Glass:
     """Dispersion constants of one medium.
 
-    name: as in a prescription. sellmeier: (B1, B2, B3, C1, C2, C3), C in um^2. schott:
-    (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8. range: wavelengths in
-    um for which they hold. n^2 is the sum of both forms; a Sellmeier glass has a0 = 1, a
-    medium of constant index n has a0 = n^2.
+    name: as in a prescription. sellmeier: (B1 .. BT, C1 .. CT), C in um^2, of any number of
+    terms T. schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8. range:
+    wavelengths in um for which they hold. n^2 is the sum of both forms; a Sellmeier glass has
+    a0 = 1, a medium of constant index n has a0 = n^2.
     """
 
     name: str
@@ -38,8 +38,9 @@ class Glass:
 class Dispersion:
     """Dispersion constants of M media as arrays, so that an index can be differentiated.
 
-    strength (M, 3) and resonance (M, 3, um^2) are Sellmeier's B and C; schott (M, 6) the
-    coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
+    strength (M, T) and resonance (M, T, um^2) are Sellmeier's B and C, T = 3 or that of the
+    medium with the most terms, the others padded with zeros; schott (M, 6) the coefficients of
+    L^0, L^2, L^-2, L^-4, L^-6, L^-8.
     """
 
     strength: Array
@@ -49,9 +50,14 @@ class Dispersion:
     @classmethod
     def of(cls, media: list[Glass]) -> "Dispersion":
         """The constants of `media`, in the default floating dtype."""
-        sellmeier = jnp.asarray([m.sellmeier for m in media], float)
-        schott = jnp.asarray([m.schott for m in media], float)
-        return cls(strength=sellmeier[:, :3], resonance=sellmeier[:, 3:], schott=schott)
+        halves = [np.asarray(m.sellmeier, float).reshape(2, -1) for m in media]
+        terms = max(3, *(half.shape[1] for half in halves))
+        padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
+        return cls(
+            strength=jnp.asarray(padded[:, 0], float),
+            resonance=jnp.asarray(padded[:, 1], float),
+            schott=jnp.asarray([m.schott for m in media], float),
+        )
 
 
 @functools.cache

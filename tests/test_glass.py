@@ -30,6 +30,23 @@ def test_indices_that_code_v_prints(name):
     np.testing.assert_allclose(index(name, 0.6563, 0.5876, 0.4861), CODE_V[name], atol=6e-7)
 
 
+def test_water_of_daimon_and_masumura():
+    """Four Sellmeier terms; relative to vacuum, n_D = 1.33335 at 0.5893 um and 20 C, n_d = 1.3334
+    and the range 0.182 to 1.129 um as refractiveindex.info has them."""
+    np.testing.assert_allclose(index("water", 0.5893), 1.33335, atol=5e-6)
+    np.testing.assert_allclose(index("water", 0.5875618), 1.3334, atol=5e-5)
+    assert find_glass("water").range == (0.182, 1.129)
+
+
+def test_more_terms_of_one_medium_change_no_other():
+    """N-BK7 beside water has padded terms and the same index to the last digit."""
+    media = Dispersion.of([find_glass(name) for name in ("water", "N-BK7", "SK16", "air")])
+    assert media.strength.shape == (4, 4)
+    n = refractive_index(media, jnp.array([0.45, 0.65]))
+    alone = [index(name, 0.45, 0.65) for name in ("water", "N-BK7", "SK16", "air")]
+    np.testing.assert_allclose(n, alone, rtol=1e-15)
+
+
 def test_air_and_constant_index():
     media = Dispersion.of([find_glass("air"), Glass("n", schott=(2.25, 0, 0, 0, 0, 0))])
     n = refractive_index(media, jnp.array([0.4, 0.7]))

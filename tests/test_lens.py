@@ -175,39 +175,6 @@ def test_first_order_data_of_the_double_gauss(shared):
     np.testing.assert_allclose(back, data["design_back_distance_infinity"], atol=0.3)
 
 
-def test_first_order_data_that_code_v_prints(shared):
-    """ag_dblgauss.lis: EFL, BFL (4 decimals)."""
-    cases = yaml.safe_load((shared / "reference_cases.yaml").read_text())["cases"]
-    cases = {case["id"]: case for case in cases}
-    rows = cases["C01_dg_f2_codev_axial"]["prescription"]["surfaces"]
-    wanted = cases["C02_dg_f2_codev_first_and_third_order"]["reference"]
-    lens = lens_of(rows, stop=5, semi_diameter=15.0, sensor=200.0)
-    w = jnp.array([0.5876])
-    np.testing.assert_allclose(drt_jax.focal_length(lens, w), wanted["EFL"], atol=6e-5)
-    np.testing.assert_allclose(drt_jax.back_focal_distance(lens, w), wanted["BFL"], atol=6e-5)
-
-
-def lens_of(rows, stop, semi_diameter, sensor):
-    """A lens of constant indices from rows of {c, t, n_after}."""
-    media = [drt_jax.find_glass("air")]
-    media += [
-        drt_jax.glass.Glass(f"n{i}", schott=(row["n_after"] ** 2, 0, 0, 0, 0, 0))
-        for i, row in enumerate(rows)
-    ]
-    count = len(rows)
-    return Lens(
-        curvature=jnp.array([row["c"] for row in rows]),
-        conic=jnp.array([row.get("k", 0.0) for row in rows]),
-        coefficients=jnp.zeros((count, 0)),
-        thickness=jnp.array([row["t"] for row in rows[:-1]]),
-        semi_diameter=jnp.full(count, jnp.inf).at[stop].set(semi_diameter),
-        sensor=jnp.array(sensor),
-        dispersion=drt_jax.glass.Dispersion.of(media),
-        stop=stop,
-        glasses=tuple(medium.name for medium in media),
-    )
-
-
 def test_gradient_with_respect_to_a_lens_is_a_lens():
     lens = load_lens("singlet")
     gradient = jax.grad(lambda lens: drt_jax.focal_length(lens, jnp.array([0.55]))[0])(lens)

@@ -1,0 +1,367 @@
+"""Prescriptions and printed numbers of other programs, and closed forms, through the Fermat tracer.
+
+The cases are those of reference_cases.yaml, named by their id. Where a listing labels rays by
+their height in front of the lens, a stop plane in the same medium, placed before the first
+surface, does so here.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+
+import drt_jax
+from drt_jax import Status, load_lens, trace_rays
+from drt_jax.paraxial import trace_yu
+from drt_jax.surface import Shape, sag, sag_derivatives
+
+INF = np.inf
+
+
+@pytest.fixture
+def cases(shared):
+    rows = yaml.safe_load((shared / "reference_cases.yaml").read_text())["cases"]
+    return {case["id"].split("_")[0]: case for case in rows}
+
+
+def behind_stop(surfaces, gap, semi_diameter, **top):
+    """The lens of `surfaces` behind a stop plane `gap` mm before its first vertex."""
+    plane = {"curvature": 0, "thickness": gap, "semi_diameter": semi_diameter, "stop": True}
+    return load_lens({"surfaces": [plane | top.get("object", {}), *surfaces], **top})
+
+
+def directions(points):
+    """Unit vectors (..., S, 3) between the successive points (..., S + 1, 3) of rays."""
+    step = np.diff(points, axis=-2)
+    return step / np.linalg.norm(step, axis=-1, keepdims=True)
+
+
+def on_y(*heights):
+    return np.stack([np.zeros(len(heights)), heights], axis=1)
+
+
+def focus(points, vertex):
+    """Where rays (Q, S + 1, 3) cross the axis behind their last surface, mm from `vertex`."""
+    (y0, z0), (y1, z1) = points[:, -2, 1:].T, points[:, -1, 1:].T
+    return z0 - y0 * (z1 - z0) / (y1 - y0) - vertex
+
+
+# C01, C02: Double Gauss f/2, ag_dblgauss.seq and ag_dblgauss.lis (CODE V 10.8, 29-Jun-2017).
+
+
+def double_gauss(cases):
+    """Surfaces of C01 as a prescription has them, by glass."""
+    entry = cases["C01"]["prescription"]
+    surfaces = [
+        {"curvature": row["c"], "thickness": row["t"], "glass": glass}
+        for row, glass in zip(entry["surfaces"], entry["glasses"])
+    ]
+    surfaces[-1]["thickness"] += entry["image_defocus"]
+    return surfaces
+
+
+def double_gauss_lens(cases):
+    surfaces = double_gauss(cases)
+    stop = cases["C02"]["reference"]["y_marginal"][5]
+    surfaces[5] |= {"stop": True, "semi_diameter": stop}
+    return load_lens({"surfaces": surfaces})
+
+
+def test_c01_marginal_ray(cases):
+    """x, z, slope and distance at each surface: half a unit of the sixth decimal; angles of
+    incidence: of the second, in degrees."""
+    lens = behind_stop(double_gauss(cases), 10.0, 25.0)
+    rays = trace_rays(lens, 0.0, INF, [0.5876], on_y(1.0, 0.8, 0.6, 0.4))
+    points = np.asarray(rays.points[0, 0, 1:])
+    d = directions(np.asarray(rays.points[0, 0]))
+    vertex = np.append(lens.vertices[1:], lens.sensor)
+    reference = cases["C01"]["reference"]
+    printed = np.array([row[1:] for row in reference["rows"]], float)
+    np.testing.assert_allclose(points[:, 1], printed[:, 0], atol=5.1e-7)
+    np.testing.assert_allclose(points[:, 2] - vertex, printed[:, 1], atol=5.1e-7)
+    np.testing.assert_allclose(d[1:, 1] / d[1:, 2], printed[:-1, 2], atol=5.1e-7)
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    np.testing.assert_allclose(length, printed[:-1, 3], atol=5.1e-7)
+    shape = Shape(lens.curvature[1:], lens.conic[1:], jnp.zeros((0, 11)))
+    slope = np.asarray(sag_derivatives(jnp.asarray(points[:-1, :2].T), shape)[1])
+    normal = np.stack([-slope[0], -slope[1], np.ones(11)], axis=1)
+    cosine = np.sum(normal * d[:-1], axis=1) / np.linalg.norm(normal, axis=1)
+    angle = np.degrees(np.arccos(np.minimum(cosine, 1)))
+    np.testing.assert_allclose(angle, reference["angle_of_incidence_deg"], atol=5.1e-3)
+
+
+def test_c01_ray_errors_and_path_differences(cases):
+    """Transverse errors to half a unit of the sixth decimal; OPD to 0.002 waves."""
+    reference = cases["C01"]["reference"]
+    parts = reference["dx_mm"]
+    labelled = behind_stop(double_gauss(cases), 10.0, 25.0)
+    rays = trace_rays(labelled, 0.0, INF, [0.5876], on_y(*map(float, parts)))
+    np.testing.assert_allclose(rays.points[0, :, -1, 1], [*parts.values()], atol=5.1e-7)
+    lens = double_gauss_lens(cases)
+    pupil = rays.points[0, :, 6, :2] / lens.semi_diameter[5]
+    wave = drt_jax.wavefront(lens, 0.0, INF, [0.5876], pupil)
+    assert np.all(wave.status == Status.OK)
+    np.testing.assert_allclose(wave.opd[0], [*reference["opd_waves"].values()], atol=0.002)
+
+
+def test_c02_first_order_data(cases):
+    """Lengths and f-number to half a unit of the fourth decimal, indices of the sixth."""
+    reference = cases["C02"]["reference"]
+    lens, d = double_gauss_lens(cases), jnp.array([0.5876])
+    first = drt_jax.first_order(lens, INF, d)
+    height = drt_jax.image_height(lens, np.radians(14), INF, d)
+    entrance, leaving = reference["entrance_pupil"], reference["exit_pupil"]
+    pairs = [
+        (first.focal_length, reference["EFL"]),
+        (first.back_focal_distance, reference["BFL"]),
+        (first.front_focal_distance, reference["FFL"]),
+        (first.f_number, reference["FNO"]),
+        (lens.vertices[-1:], reference["OAL"]),
+        (height, reference["image_height_14deg"]),
+        (2 * first.entrance_pupil.semi_diameter, entrance["dia"]),
+        (first.entrance_pupil.position, entrance["from_surf1"]),
+        (2 * first.exit_pupil.semi_diameter, leaving["dia"]),
+        (first.exit_pupil.position, leaving["from_surf11"]),
+    ]
+    ours, printed = (np.array([np.squeeze(pair[k]) for pair in pairs]) for k in (0, 1))
+    np.testing.assert_allclose(ours, printed, atol=5.1e-5)
+    n = lens.index(jnp.array(reference["indices"].pop("at_nm")) / 1e3)
+    for glass, printed in reference["indices"].items():
+        np.testing.assert_allclose(n[lens.glasses.index(glass)], printed, atol=5.1e-7)
+
+
+def test_c02_paraxial_rays(cases):
+    """Heights and slopes at each surface: half a unit of the sixth decimal; and the Fermat
+    rays at a ten thousandth of the aperture have the heights of the paraxial marginal ray."""
+    reference = cases["C02"]["reference"]
+    lens, d = double_gauss_lens(cases), jnp.array([0.5876])
+    tangent = np.tan(np.radians(14))
+    pupil = drt_jax.entrance_pupil(lens, d)
+    starts = {
+        "marginal": (pupil.semi_diameter, jnp.zeros(1)),
+        "chief": (-tangent * pupil.position, jnp.full(1, tangent)),
+    }
+    for name, start in starts.items():
+        y, u = trace_yu(lens.curvature, lens.thickness, lens.index(d), *start)
+        suffix = "_14deg" if name == "chief" else ""
+        np.testing.assert_allclose(y[:, 0], reference[f"y_{name}{suffix}"], atol=6e-7)
+        np.testing.assert_allclose(u[:, 0], reference[f"u_{name}_after"], atol=6e-7)
+    rays = trace_rays(lens, 0.0, INF, d, on_y(1e-4))
+    heights = rays.points[0, 0, :-1, 1] / 1e-4
+    np.testing.assert_allclose(heights, reference["y_marginal"], atol=1.5e-6)
+
+
+def test_c02_third_order_sums(cases):
+    """Transverse, in mm: half a unit of the sixth decimal."""
+    lens = double_gauss_lens(cases)
+    colours = jnp.array([0.6563, 0.5876, 0.4861])
+    total = drt_jax.third_order(lens, np.radians(14), INF, colours).total
+    printed = cases["C02"]["reference"]["third_order_transverse_sums_mm"]
+    assert list(printed) == ["SA", "TCO", "TAS", "SAS", "PTB", "DST", "AX", "LAT", "PTZ"]
+    np.testing.assert_allclose([a[1] for a in total], [*printed.values()], atol=5.1e-7)
+
+
+# C08: LSST, three mirrors and six lens surfaces, Zemax through batoid's test data.
+
+
+@pytest.fixture
+def lsst(cases):
+    entry = cases["C08"]["prescription"]
+    pupil, rows = entry["entrance_pupil"], entry["surfaces"]
+    z = [pupil["z"], *(row["z"] for row in rows)]
+    surfaces = [
+        {
+            "radius": row["R"], "conic": row.get("k", 0.0), "coefficients": row.get("A", {}),
+            "thickness": after - here,
+            **({"mirror": True} if "mirror" in row else {"index": row["n_after"]}),
+        }
+        for row, here, after in zip(rows[:-1], z[1:], z[2:])
+    ]  # fmt: skip
+    return behind_stop(surfaces, -pupil["z"], pupil["radius"])
+
+
+@pytest.mark.parametrize("name", ["LSST_trace_0", "LSST_trace_1", "LSST_trace_2"])
+def test_c08_rays(cases, lsst, name):
+    """Positions to 1e-6 mm, of which 1e-7 mm are printed, cosines to 3e-10."""
+    rows = np.array(cases["C08"]["reference"]["rays"][name])[:, 1:]
+    start, cosines = rows[0, :3], rows[:, 3:]
+    field = np.arctan(cosines[0, :2] / cosines[0, 2])
+    rays = trace_rays(lsst, field, INF, [0.5], [start[:2] / 4180.0])
+    assert rays.status.item() == Status.OK
+    points = np.asarray(rays.points[0, 0])
+    np.testing.assert_allclose(points + [0, 0, start[2]], rows[:, :3], atol=1e-6)
+    ours = directions(points)
+    np.testing.assert_allclose(np.abs(ours), np.abs(cosines[:-1]), atol=3e-10)
+
+
+# C13: a toroid, Zemax through Optiland's tests.
+
+
+def test_c13_toroid(cases):
+    """Rays and sag to 1e-11."""
+    entry, reference = cases["C13"]["prescription"], cases["C13"]["reference"]
+    a1, a2 = entry["a"]
+    toroid = {
+        "form": "toroid", "radius": entry["Ry"], "conic": entry["k"], "radius_x": entry["Rx"],
+        "coefficients": {2: a1, 4: a2}, "thickness": entry["thickness"], "index": entry["n"],
+    }  # fmt: skip
+    lens = behind_stop([toroid, {"radius": INF, "thickness": 10.0}], 2.0, 5.0)
+    starts = np.array([ray["start"] for ray in reference["rays"]])
+    rays = trace_rays(lens, 0.0, INF, [0.55], starts / 5.0)
+    points = np.asarray(rays.points[0])
+    ours = {"x": points[:, -1, 0], "y": points[:, -1, 1]}
+    ours |= dict(zip("LMN", directions(points)[:, -1].T))
+    for i, ray in enumerate(reference["rays"]):
+        for key in ray.keys() - {"start"}:
+            np.testing.assert_allclose(ours[key][i], ray[key], atol=1e-11)
+    shape = Shape(*map(jnp.array, (1 / entry["Ry"], entry["k"], [1 / entry["Rx"], 1e-5])))
+    for x, y, height in reference["sag_for_a1_1e_5_a2_0"]:
+        ours = sag(jnp.array([x, y]), shape, "toroid")
+        np.testing.assert_allclose(ours, height, atol=1e-11)
+
+
+# C16: Wyld's achromat, John Walker's fbench.
+
+LINES = {"D": 5895.944, "C": 6562.816, "F": 4861.344}
+
+
+def wyld(entry, line):
+    """The telescope of C16 with the constant indices of one line."""
+    part = (LINES["D"] - LINES[line]) / (LINES["C"] - LINES["F"])
+    surfaces = []
+    for row in entry["surfaces"]:
+        n = row["n_D"] + part * (row["n_D"] - 1) / row["V"] if "V" in row else 1.0
+        surfaces.append({"radius": row["R"], "index": n, "thickness": row.get("t", 50.0)})
+    lens = behind_stop(surfaces, 1.0, entry["height"])
+    return dataclasses.replace(lens, glasses=tuple("abcdef"))  # one program for all lines
+
+
+def test_c16_wyld_achromat(cases):
+    """Eleven decimals are published: 1e-10 in the foci, some 1e-11 in slopes and differences."""
+    entry, reference = cases["C16"]["prescription"], cases["C16"]["reference"]
+    foci, slopes = {}, {}
+    for line in LINES:
+        lens = wyld(entry, line)
+        points = np.asarray(trace_rays(lens, 0.0, INF, [0.55], on_y(1.0)).points[0])
+        foci[line] = focus(points, lens.vertices[-1])[0]
+        slopes[line] = np.arcsin(-directions(points)[0, -1, 1])
+    lens = wyld(entry, "D")
+    first = drt_jax.first_order(lens, INF, jnp.array([0.55]))
+    paraxial = first.back_focal_distance.item()
+    u = entry["height"] / first.focal_length.item()
+    sine = 1 - paraxial * u / (np.sin(slopes["D"]) * foci["D"])
+    pairs = {
+        "marginal_back_focus": foci["D"],
+        "marginal_slope_rad": slopes["D"],
+        "paraxial_back_focus": paraxial,
+        "paraxial_slope": u,
+        "long_spherical": paraxial - foci["D"],
+        "offense_sine_condition": sine,
+        "axial_chromatic_F_minus_C": foci["F"] - foci["C"],
+    }
+    for key, ours in pairs.items():
+        np.testing.assert_allclose(ours, reference[key], atol=5.1e-11, err_msg=key)
+
+
+# C18: stigmatic surfaces (Descartes); C19: closed forms. Tolerance 1e-12 mm.
+
+HEIGHTS = np.linspace(-1, 1, 7)
+STIGMATIC = {
+    # name: surfaces behind the stop plane up to the focus, its semi-diameter, its distance
+    "ellipsoid": (
+        [{"radius": 10, "conic": -1 / 1.5**2, "index": 1.5, "thickness": 30.0}],
+        6.0,
+        5.0,
+    ),
+    "hyperboloid": (
+        [
+            {"radius": INF, "index": 1.5, "thickness": 5.0},
+            {"radius": -25, "conic": -(1.5**2), "thickness": 50.0},
+        ],
+        12.0,
+        5.0,
+    ),
+    "paraboloid": (
+        [{"radius": -100, "conic": -1, "mirror": True, "thickness": -50.0}],
+        40.0,
+        60.0,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STIGMATIC)
+def test_c18_stigmatic_surfaces(name):
+    """All rays meet in the focus, and their errors do not change with the pupil coordinates."""
+    surfaces, aperture, gap = STIGMATIC[name]
+    lens = behind_stop(surfaces, gap, aperture)
+
+    def errors(pupil):
+        return trace_rays(lens, 0.0, INF, [0.55], pupil).points[0, :, -1, :2]
+
+    value, slope = jax.jit(lambda p: (errors(p), jax.jacrev(errors)(p)))(on_y(*HEIGHTS))
+    np.testing.assert_allclose(value, 0, atol=1e-12)
+    np.testing.assert_allclose(slope, 0, atol=1e-12)
+
+
+def test_c18_aplanatic_point():
+    """Object in n = 1.5 at R (1 + 1/n): virtual image 25 mm before the vertex, sine ratio 1.5."""
+    tangents = np.tan(np.radians([5.0, 20.0, -20.0]))
+    lens = behind_stop(
+        [{"radius": -10, "index": 1.0, "thickness": 5.0}], 5.0, 1.0, object={"index": 1.5}
+    )
+    distance = 50 / 3 - 5  # to the stop plane
+
+    def image(pupil):
+        points = trace_rays(lens, 0.0, distance, [0.55], pupil).points[0]
+        step = points[:, 2] - points[:, 1]
+        at = points[:, 2, :2] + step[:, :2] / step[:, 2:] * (5 - 25 - points[:, 2, 2:])
+        return at, points
+
+    pupil = on_y(*(tangents * distance))
+    at, points = image(pupil)
+    np.testing.assert_allclose(at, 0, atol=1e-12)
+    slope = jax.jit(jax.jacrev(lambda p: image(p)[0]))(pupil)
+    np.testing.assert_allclose(slope, 0, atol=1e-12)
+    sines = directions(np.asarray(points))[:, :, 1]
+    np.testing.assert_allclose(sines[:, 0], np.sin(np.arctan(tangents)), atol=1e-12)
+    np.testing.assert_allclose(sines[:, 0] / sines[:, 1], 1.5, atol=1e-12)
+
+
+def test_c19_plane_parallel_plate():
+    """A ray at 30 degrees through 10 mm of n = 1.5 shifts by 3.8762756430420553 mm."""
+    plate = [{"radius": INF, "index": 1.5, "thickness": 10.0}, {"radius": INF, "thickness": 20.0}]
+    lens = behind_stop(plate, 10.0, 5.0)
+    ray = trace_rays(lens, np.pi / 6, INF, [0.55], on_y(0.2)).points[0, 0]
+    straight = ray[0, 1] + np.tan(np.pi / 6) * 40.0
+    shift = (straight - ray[-1, 1]) / np.tan(np.pi / 6)
+    np.testing.assert_allclose(shift, 3.8762756430420553, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "front, back, thickness, wanted", [(5, -5, 10, 7.5), (50, -50, 10, 51.72413793103448)]
+)
+def test_c19_ball_lens_and_thick_lens(front, back, thickness, wanted):
+    """n D / (4 (n - 1)) and the lensmaker's formula; and Fermat rays close to the axis."""
+    lens = behind_stop(
+        [{"radius": front, "index": 1.5, "thickness": thickness}, {"radius": back, "thickness": 9}],
+        1.0,
+        1.0,
+    )
+    ours = drt_jax.focal_length(lens, jnp.array([0.55]))
+    np.testing.assert_allclose(ours, wanted, atol=1e-12)
+    points = np.asarray(trace_rays(lens, 0.0, INF, [0.55], on_y(1e-4)).points[0])
+    slope = directions(points)[0, -1, 1]
+    np.testing.assert_allclose(-1e-4 / slope, wanted, rtol=1e-7)
+
+
+def test_c19_critical_angle():
+    """From n = 1.5 into air a plane reflects totally from 41.810314895778596 degrees on."""
+    lens = behind_stop([{"radius": INF, "index": 1.0, "thickness": 5.0}], 5.0, 1.0,
+                       object={"index": 1.5})  # fmt: skip
+    critical = np.radians(41.810314895778596)
+    for angle, wanted in ((critical - 1e-6, Status.OK), (critical + 1e-6, Status.TIR)):
+        rays = trace_rays(lens, angle, INF, [0.55], on_y(0.0))
+        assert rays.status.item() == wanted
