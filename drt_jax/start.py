@@ -138,8 +138,10 @@ def _crossing(form: str):
             length = length + safe_divide(constant, linear + jnp.where(d[-1] < 0, -root, root))
             met = discriminant > 0
         steps = _FREEFORM_STEPS if form != "asphere" else _ASPHERE_STEPS
-        for _ in range(steps if shape.coefficients.shape[0] else 0):
-            length = closer(p, d, length, shape)
+        if shape.coefficients.shape[0]:  # a loop: written out, it would be slow to compile
+            length = jax.lax.fori_loop(
+                0, steps, lambda _, length: closer(p, d, length, shape), length
+            )
         w = p[:-1] + d[:-1] * length
         z, slope, _ = sag_derivatives(w, shape, form)
         return w, z, slope, met

@@ -20,6 +20,17 @@ RGB = (0.6, 0.53, 0.48)
 LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
 
 
+def pytest_addoption(parser):
+    """Adds --write-tables: the tests that make a table of `results` write it there."""
+    parser.addoption("--write-tables", action="store_true", help="rewrite the tables in results/")
+
+
+@pytest.fixture
+def write_tables(request) -> bool:
+    """Whether the tables in `results` are to be written."""
+    return request.config.getoption("--write-tables")
+
+
 @pytest.fixture
 def shared() -> pathlib.Path:
     """Reference data kept beside the checkout; the test is skipped where there is none."""

@@ -44,6 +44,60 @@ def test_meridional_half_and_whole_pupil_agree(name):
             np.testing.assert_allclose(half.spread, meridian.spread, rtol=1e-10, atol=1e-16)
 
 
+def close(ours, wanted, rtol):
+    """Each array of a tree within `rtol` of the largest element of the other's."""
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(wanted), strict=True):
+        assert a.shape == b.shape
+        size = np.max(np.abs(b), initial=0)
+        np.testing.assert_allclose(a, b, rtol=0, atol=rtol * size + 1e-18)
+
+
+def test_gradients_of_meridional_half_and_whole_pupil_agree():
+    """By the lens and the distance, within 1e-10 of the largest element of each array."""
+    lens, wide = load_lens("cooke_triplet"), 12
+    rules = {
+        "meridian": pupil.meridian(wide),
+        "half": pupil.half_disc(wide, wide + 1),
+        "disc": pupil.disc(wide, wide + 1),
+    }
+    weights = np.random.default_rng(0).normal(size=(3, 2, 2))
+
+    def scalar(lens, field, distance, symmetry):
+        traced = moments._plane_moments(lens, field, distance, RGB[:2], *rules[symmetry], symmetry)
+        # On axis the centroid is 0, and the gradient of what rounding leaves of it is no number.
+        return jnp.sum(weights * traced.spread[..., :2]) + field * jnp.sum(traced.mean[:, 1])
+
+    gradient = jax.jit(jax.grad(scalar, argnums=(0, 2)), static_argnums=3)
+    for field in (0.0, 0.1):
+        half, disc = (gradient(lens, field, 9000.0, kind) for kind in ("half", "disc"))
+        close(disc, half, 1e-10)
+        if field == 0:
+            close(half, gradient(lens, field, 9000.0, "meridian"), 1e-10)
+
+
+@pytest.mark.parametrize("field", [0.0, 0.1])
+def test_a_centred_lens_given_zero_tilts_and_decentres_is_the_same(field):
+    """Moments and their gradients by everything that both have, 1e-10."""
+    lens = load_lens("cooke_triplet")
+    count = len(lens.forms)
+    given = dataclasses.replace(
+        lens, decentre=jnp.zeros((count + 1, 2)), tilt=jnp.zeros((count + 1, 3))
+    )
+
+    def blur(lens, distance):
+        mean, covariance = psf_moments(lens, field, distance, RGB[:2], order=4)
+        turn = 0.3 * covariance[:, 0, 0] + covariance[:, 1, 1]
+        return jnp.sum(turn) + field * jnp.sum(mean), (mean, covariance)
+
+    blur = jax.jit(jax.value_and_grad(blur, argnums=(0, 1), has_aux=True))
+    (_, plain), gradient = blur(lens, 9000.0)
+    (_, general), other = blur(given, 9000.0)
+    np.testing.assert_allclose(general[0], plain[0], rtol=1e-10, atol=1e-13)
+    np.testing.assert_allclose(general[1], plain[1], rtol=1e-10, atol=1e-16)
+    assert np.all(np.isfinite(other[0].tilt)) and np.all(np.isfinite(other[0].decentre))
+    close((dataclasses.replace(other[0], tilt=None, decentre=None), other[1]), gradient, 1e-10)
+
+
 def test_field_in_any_direction_turns_the_moments():
     lens = load_lens("cooke_triplet")
     angle, h = 0.6, np.tan(0.15)
@@ -82,6 +136,51 @@ def test_sensor_polynomial_is_the_traced_moment(field):
         np.testing.assert_allclose(m, mean, atol=1e-10)
         diagonal = jnp.diagonal(covariance, 0, 1, 2)
         np.testing.assert_allclose(variances, diagonal, rtol=2e-9, atol=1e-13)
+
+
+def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
+    """By the whole lens, the distance and the sensor position, 1e-10; 2.5 mm from the sensor
+    about which the polynomial was made."""
+    lens = load_lens("double_gauss")
+    scene = lens, 25000.0, jnp.array(131.0)
+
+    def polynomial(lens, distance, sensor):
+        mean, variances = focus_moments(lens, 0.1, distance, RGB[:2], order=4).at(sensor)
+        return jnp.sum(mean) + jnp.sum(variances)
+
+    def traced(lens, distance, sensor):
+        moved = dataclasses.replace(lens, sensor=sensor)
+        mean, covariance = psf_moments(moved, 0.1, distance, RGB[:2], order=4)
+        return jnp.sum(mean) + jnp.sum(jnp.trace(covariance, axis1=1, axis2=2))
+
+    ours = jax.jit(jax.grad(polynomial, argnums=(0, 1, 2)))(*scene)
+    wanted = jax.jit(jax.grad(traced, argnums=(0, 1, 2)))(*scene)
+    # The position of the sensor is its own argument: the lens's sensor only sets the origin.
+    assert abs(ours[0].sensor) < 1e-10 * abs(ours[2]) and wanted[0].sensor == 0
+    ours = dataclasses.replace(ours[0], sensor=wanted[0].sensor), *ours[1:]
+    close(ours, wanted, 1e-10)
+
+
+def test_gradient_of_the_depth_interpolation_is_the_traced_one():
+    """By the distance and the sensor position, 1e-10 of the largest over the range."""
+    lens = load_lens("double_gauss_addon")
+    depths = drt_jax.depth_moments(lens, 0.05, 5e3, 5e4, RGB[:2], 1e-13)
+
+    def interpolated(distance, sensor):
+        mean, variances = depths.at(1 / distance).at(sensor)
+        return mean[:, 1] * 1e-2, variances
+
+    def traced(distance, sensor):
+        moved = dataclasses.replace(lens, sensor=sensor)
+        mean, covariance = psf_moments(moved, 0.05, 1 / distance, RGB[:2], order=16)
+        return mean[:, 1] * 1e-2, jnp.diagonal(covariance, 0, 1, 2)
+
+    ours, wanted = (
+        jax.jit(jax.vmap(jax.jacrev(f, argnums=(0, 1)), (0, None)))
+        for f in (interpolated, traced)
+    )
+    scene = 1 / jnp.array([5.1e3, 7e3, 1.7e4, 4.9e4]), lens.sensor
+    close(ours(*scene), wanted(*scene), 1e-10)
 
 
 @pytest.mark.parametrize("field", [0.0, 0.05])

@@ -1,0 +1,318 @@
+"""An independent sequential trace in plain NumPy, for derivatives by a complex step.
+
+Nothing of the package is used. Rays are refracted one surface after the other by Snell's law
+(Welford, Aberrations of Optical Systems, ch. 4; Spencer and Murty, JOSA 52, 672, 1962) and
+aimed at the stop by Newton's method. All functions are analytic, so that a parameter moved by
+i h gives its derivative as Im(f) / h without any difference (Squire and Trapp, SIAM Rev. 40,
+110, 1998): h = 1e-30 leaves no truncation.
+
+Arrays may have leading axes, one place for each moved parameter; behind them come
+(wavelength, ray). Lengths in mm, angles in radians, wavelengths in um; surfaces, signs, tilts
+and decentres as in the package.
+"""
+
+import dataclasses
+
+import numpy as np
+
+STEP = 1e-30
+LENS = ("curvature", "conic", "coefficients", "thickness", "semi_diameter", "sensor")
+MOVES = ("decentre", "tilt")
+MEDIA = ("schott", "strength", "resonance")
+SCENE = ("field", "distance")
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A lens and its object. `values`: the arrays of a `drt_jax.Lens` by name, those of its
+    dispersion, field (2,) and distance (). joined (S,): surfaces with the same glass on both
+    sides, which are one medium."""
+
+    values: dict[str, np.ndarray]
+    stop: int
+    forms: tuple[str, ...]
+    mirrors: tuple[bool, ...]
+    joined: tuple[bool, ...]
+    wavelengths: np.ndarray
+
+    @classmethod
+    def of(cls, lens, field, distance, wavelengths):
+        count = len(lens.forms)
+        values = {name: np.asarray(getattr(lens, name)) for name in LENS}
+        values |= {name: np.asarray(getattr(lens.dispersion, name)) for name in MEDIA}
+        for name, columns in zip(MOVES, (2, 3)):
+            array = getattr(lens, name)
+            values[name] = np.zeros((count + 1, columns)) if array is None else np.asarray(array)
+        field = np.asarray(field, float)
+        values["field"] = np.array([0.0, field]) if field.ndim == 0 else field
+        values["distance"] = np.asarray(distance, float)
+        joined = tuple(
+            lens.glasses[i] == lens.glasses[i + 1] and not lens.mirrors[i] and i != lens.stop
+            for i in range(count)
+        )
+        return cls(values, lens.stop, lens.forms, lens.mirrors, joined, np.asarray(wavelengths))
+
+    def replace(self, **values):
+        return dataclasses.replace(self, values=self.values | values)
+
+
+def _powers(x, count):
+    """1, x, x^2, ... by multiplication: exact for an imaginary part of 1e-30."""
+    powers = [np.ones_like(x)]
+    for _ in range(count):
+        powers.append(powers[-1] * x)
+    return powers
+
+
+def _series(powers, first, step, a):
+    """sum_j a_j x^(first + j step), and its derivative by x."""
+    total, slope = 0 * powers[0], 0 * powers[0]
+    for j, coefficient in enumerate(a):
+        p = first + j * step
+        total = total + coefficient * powers[p]
+        slope = slope + p * coefficient * powers[p - 1]
+    return total, slope
+
+
+def surface(form, x, y, c, k, a):
+    """Sag and its slopes along x and y; `a` is a list of coefficients."""
+    if form == "biconic":
+        (cx, kx), rest = a[:2], a[2:]
+        root = np.sqrt(1 - (1 + kx) * cx**2 * x**2 - (1 + k) * c**2 * y**2)
+        top = cx * x**2 + c * y**2
+        z = top / (1 + root)
+        zx = 2 * cx * x / (1 + root) + top * (1 + kx) * cx**2 * x / (root * (1 + root) ** 2)
+        zy = 2 * c * y / (1 + root) + top * (1 + k) * c**2 * y / (root * (1 + root) ** 2)
+        r2 = x**2 + y**2
+        more, slope = _series(_powers(r2, len(rest) + 1), 1, 1, rest)
+        return z + more, zx + 2 * x * slope, zy + 2 * y * slope
+    if form == "toroid":
+        cx, rest = a[0], a[1:]
+        root = np.sqrt(1 - (1 + k) * c**2 * y**2)
+        more, slope = _series(_powers(y, 2 * len(rest) + 1), 2, 2, rest)
+        g, bent = c * y**2 / (1 + root) + more, c * y / root + slope
+        # The circle (z - 1/cx)^2 + x^2 = (1/cx - g)^2, without its cancellation.
+        z = (2 * g - cx * g**2 + cx * x**2) / (1 + np.sqrt((1 - cx * g) ** 2 - (cx * x) ** 2))
+        return z, cx * x / (1 - cx * z), bent * (1 - cx * g) / (1 - cx * z)
+    r2 = x**2 + y**2
+    root = np.sqrt(1 - (1 + k) * c**2 * r2)
+    z, zx, zy = c * r2 / (1 + root), c * x / root, c * y / root
+    if form == "asphere":
+        more, slope = _series(_powers(r2, len(a) + 1), 1, 1, a)
+        return z + more, zx + 2 * x * slope, zy + 2 * y * slope
+    if form == "odd_asphere":
+        r = np.sqrt(r2)
+        more, slope = _series(_powers(r, len(a) + 1), 1, 1, a)
+        return z + more, zx + slope * x / r, zy + slope * y / r
+    if form != "polynomial_xy":
+        raise ValueError(form)
+    xs, ys = _powers(x, len(a) + 1), _powers(y, len(a) + 1)
+    degree, j = 1, 0
+    for coefficient in a:  # x, y, x^2, x y, y^2, x^3, ...
+        i = degree - j
+        z = z + coefficient * xs[i] * ys[j]
+        if i:
+            zx = zx + i * coefficient * xs[i - 1] * ys[j]
+        if j:
+            zy = zy + j * coefficient * xs[i] * ys[j - 1]
+        degree, j = (degree, j + 1) if i else (degree + 1, 0)
+    return z, zx, zy
+
+
+def _wide(value):
+    """A parameter (...) against (..., wavelength, ray)."""
+    return np.asarray(value)[..., None, None]
+
+
+def _rotate(v, axis, angle):
+    """The vector `v` turned right-handed about a coordinate axis."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    p, q = (axis + 1) % 3, (axis + 2) % 3
+    turned = [None] * 3
+    turned[axis] = v[axis]
+    turned[p] = cosine * v[p] - sine * v[q]
+    turned[q] = sine * v[p] + cosine * v[q]
+    return turned
+
+
+def indices(scene):
+    """Refractive index (..., S + 1, W) of the media."""
+    square = scene.wavelengths**2
+    b, c, a = (scene.values[name][..., None] for name in ("strength", "resonance", "schott"))
+    n2 = np.sum(b * square / (square - c), axis=-2)
+    for j, power in enumerate((0, 2, -2, -4, -6, -8)):
+        n2 = n2 + a[..., j, :] * scene.wavelengths ** float(power)
+    n = np.sqrt(n2)
+    for i, joined in enumerate(scene.joined):
+        if joined:
+            n[..., i + 1, :] = n[..., i, :]
+    return n
+
+
+def vertices(scene):
+    """z of the S vertices and the sensor (..., S + 1)."""
+    thickness, sensor = scene.values["thickness"], scene.values["sensor"]
+    batch = np.broadcast_shapes(thickness.shape[:-1], sensor.shape)
+    z = [np.zeros(batch, complex)]
+    for i in range(thickness.shape[-1]):
+        z.append(z[-1] + thickness[..., i])
+    return np.stack([*z, np.broadcast_to(sensor, batch)], axis=-1)
+
+
+def trace(scene, x, y, stop_only=False):
+    """Rays through the points (x, y, 0) mm, (..., W, Q).
+
+    Returns the hits along the axes of each surface and the sensor, S + 1 triples; those along
+    the axes of the lens; the optical path in mm, as the package counts it: from the sphere
+    round the object (the plane wave) through the first vertex. With `stop_only`, the hits up to
+    the stop.
+    """
+    values, n, z0 = scene.values, indices(scene), vertices(scene)
+    far = np.all(np.isinf(np.real(values["distance"])))
+    v = 0.0 if far else 1 / _wide(values["distance"])
+    tangent = [np.tan(_wide(values["field"][..., i])) for i in (0, 1)]
+    point = [x + 0j, y + 0j, 0 * (x + y) + 0j]
+    segment = [v * point[0] + tangent[0], v * point[1] + tangent[1], 1 + 0 * point[2]]
+    length = np.sqrt(sum(s**2 for s in segment))
+    d = [s / length for s in segment]
+    count = len(scene.forms)
+    own_hits, hits, path = [], [], None
+    for i in range(count + 1):
+        origin = [*(_wide(values["decentre"][..., i, j]) for j in (0, 1)), _wide(z0[..., i])]
+        tilt = [_wide(values["tilt"][..., i, j]) for j in range(3)]
+        p = [a - b for a, b in zip(point, origin)]
+        for axis in range(3):
+            p, d = _rotate(p, axis, -tilt[axis]), _rotate(d, axis, -tilt[axis])
+        s = -p[2] / d[2]
+        zx = zy = 0 * s
+        if i < count:
+            c, k = _wide(values["curvature"][..., i]), _wide(values["conic"][..., i])
+            a = values["coefficients"]
+            a = [_wide(a[..., i, j]) for j in range(a.shape[-1])]
+            for _ in range(14):
+                q = [a_ + b * s for a_, b in zip(p, d)]
+                z, zx, zy = surface(scene.forms[i], q[0], q[1], c, k, a)
+                s = s + (z - q[2]) / (d[2] - zx * d[0] - zy * d[1])
+            q = [a_ + b * s for a_, b in zip(p, d)]
+            z, zx, zy = surface(scene.forms[i], q[0], q[1], c, k, a)
+            q[2] = z
+        else:
+            q = [p[0] + d[0] * s, p[1] + d[1] * s, 0 * s]
+        own_hits.append(q)
+        if stop_only and i == scene.stop:
+            return own_hits
+        before = n[..., i, :, None]
+        own_d = d
+        back = q
+        for axis in (2, 1, 0):
+            back = _rotate(back, axis, tilt[axis])
+        point = [a_ + b for a_, b in zip(back, origin)]
+        hits.append(point)
+        if i == 0:
+            # |P - P0| - |P0| for P0 = -(tangent, 1) / v, by the difference of two squares.
+            source = [-tangent[0], -tangent[1], -1.0]
+            first = [v * a_ - b for a_, b in zip(point, source)]
+            top = sum(v * a_**2 - 2 * a_ * b for a_, b in zip(point, source))
+            sizes = np.sqrt(sum(a_**2 for a_ in first)) + np.sqrt(sum(b**2 for b in source))
+            path = before * top / sizes
+        else:
+            path = path + before * s
+        if i == count:
+            break
+        size = np.sqrt(1 + zx**2 + zy**2)
+        normal = [-zx / size, -zy / size, 1 / size]
+        cosine = sum(a_ * b for a_, b in zip(normal, own_d))
+        sign = np.where(np.real(cosine) < 0, -1.0, 1.0)
+        normal, cosine = [sign * a_ for a_ in normal], sign * cosine
+        # n sin is kept, also where a mirror lies between media that are moved apart.
+        ratio = before / n[..., i + 1, :, None]
+        leaving = np.sqrt(1 - ratio**2 * (1 - cosine**2))
+        leaving = -leaving if scene.mirrors[i] else leaving
+        d = [ratio * a_ + (leaving - ratio * cosine) * b for a_, b in zip(own_d, normal)]
+        for axis in (2, 1, 0):
+            d = _rotate(d, axis, tilt[axis])
+    return own_hits, hits, path
+
+
+def _aimed(scene, pupil):
+    """Where rays (W, Q) through the stop points `pupil` (2, Q) enter, and the 2 x 2 inverse of
+    how the stop point follows. Field and aperture are opened in steps."""
+    shape = (len(scene.wavelengths), pupil.shape[1])
+    radius = scene.values["semi_diameter"][scene.stop]
+    x, y = (np.broadcast_to(0.3 * radius * p, shape) for p in pupil)
+    for part in (0.3, 0.6, 0.8, 0.9, 1.0):
+        eased = scene.replace(field=part * scene.values["field"])
+        for _ in range(40):
+            by_x = trace(eased, x + 1j * STEP, y, stop_only=True)[-1]
+            by_y = trace(eased, x, y + 1j * STEP, stop_only=True)[-1]
+            miss = [np.real(by_x[j]) - part * radius * pupil[j] for j in (0, 1)]
+            (a, b), (c, d) = (np.imag([by_x[j], by_y[j]]) / STEP for j in (0, 1))
+            inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
+            step = [inverse[j, 0] * miss[0] + inverse[j, 1] * miss[1] for j in (0, 1)]
+            x, y = x - step[0], y - step[1]
+            if np.max(np.abs(step)) < 1e-13 * (1 + np.max(np.abs([x, y]))):
+                break
+        else:
+            raise ArithmeticError(f"rays do not reach the stop: {np.max(np.abs(step))} mm")
+    return x, y, inverse
+
+
+def aim(scene, pupil, start=None):
+    """(x, y), (..., W, Q), of the rays through the stop points `pupil` (2, Q), in units of the
+    stop's semi-diameter. The scene may be complex; `start`, the result of `_aimed`."""
+    plain = scene.replace(**{k: np.real(v) for k, v in scene.values.items()})
+    x, y, inverse = _aimed(plain, pupil) if start is None else start
+    radius = _wide(scene.values["semi_diameter"][..., scene.stop])
+    for _ in range(3):
+        hit = trace(scene, x, y, stop_only=True)[-1]
+        miss = [hit[j] - radius * pupil[j] for j in (0, 1)]
+        x = x - inverse[0, 0] * miss[0] - inverse[0, 1] * miss[1]
+        y = y - inverse[1, 0] * miss[0] - inverse[1, 1] * miss[1]
+    return x, y
+
+
+def outputs(scene, rule, symmetry, points, starts=(None, None)):
+    """centroid (..., W, 2), covariance (..., W, 2, 2), path (..., W, Q) and hits
+    (..., W, Q, S + 1, 3) along the axes of the lens.
+
+    The moments are averages over `rule` = points (2, n) and weights of the disc ("disc"), of
+    its half x > 0 ("half") or of the radius x = 0, y > 0 ("meridian"); path and hits are those
+    of the rays through `points` (2, Q).
+    """
+    nodes, weights = rule
+    own, _, _ = trace(scene, *aim(scene, nodes, starts[0]))
+    x, y, _ = own[-1]
+
+    def average(values):
+        return np.sum(weights * values, axis=-1)
+
+    zero = 0 * average(x)
+    if symmetry == "meridian":
+        mean, (xx, yy, xy) = [zero, zero], [average(y * y) / 2] * 2 + [zero]
+    else:
+        mean = [zero if symmetry == "half" else average(x), average(y)]
+        x, y = x - mean[0][..., None], y - mean[1][..., None]
+        xx, yy, xy = average(x * x), average(y * y), average(x * y)
+        xy = zero if symmetry == "half" else xy
+    covariance = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
+    _, hits, path = trace(scene, *aim(scene, points, starts[1]))
+    hits = np.stack([np.stack(np.broadcast_arrays(*hit), -1) for hit in hits], -2)
+    return {"centroid": np.stack(mean, -1), "covariance": covariance, "path": path, "hits": hits}
+
+
+def jacobian(scene, rule, symmetry, points, names):
+    """{output: {parameter: array, shape of the output + shape of the parameter}}, all elements
+    of the parameters `names` by a complex step."""
+    starts = _aimed(scene, rule[0]), _aimed(scene, points)
+    jacobians = {}
+    for name in names:
+        value = scene.values[name]
+        moved = value + 1j * STEP * np.eye(value.size).reshape(value.size, *value.shape)
+        if name == "semi_diameter":  # those of the other surfaces may be infinite
+            moved = np.where(np.isinf(value), np.inf, moved)
+        batch = {k: v[None] for k, v in scene.values.items()} | {name: moved}
+        for output, f in outputs(scene.replace(**batch), rule, symmetry, points, starts).items():
+            f = np.moveaxis(np.broadcast_to(f, (value.size, *f.shape[1:])), 0, -1)
+            column = np.imag(f).reshape(*f.shape[:-1], *value.shape) / STEP
+            jacobians.setdefault(output, {})[name] = column
+    return jacobians

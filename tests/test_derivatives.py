@@ -1,0 +1,329 @@
+"""Every derivative against an independent trace: `drt_jax` in reverse and in forward mode against
+the complex step through `oracle`, whose own derivatives are proved by 50-digit differences."""
+
+import pathlib
+import re
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+from drt_jax import load_lens, psf_moments, pupil, trace_rays
+
+from . import oracle, test_surface
+
+WAVELENGTHS = (0.6, 0.48)
+ORDER = 3
+POINTS = np.array([[0.3, 0.9], [-0.5, 0.2], [0.1, -0.6]])
+OUTPUTS = ("centroid", "covariance", "path")
+TABLE = pathlib.Path(__file__).parents[1] / "results" / "derivatives" / "derivatives.md"
+LARGEST = 1e-8
+
+# All forms, everything tilted and decentred, a refracting stop.
+FREEFORM = [
+    {"radius": 60, "conic": -0.3, "coefficients": {4: 1e-6, 6: -2e-9}, "thickness": 6,
+     "glass": "N-BK7", "tilt": [0.6, -0.8, 0.3], "decentre": [0.1, -0.2]},
+    {"form": "odd_asphere", "radius": -150, "conic": 0.5, "thickness": 3,
+     "coefficients": {1: 5e-4, 3: 1e-5, 4: -3e-7}, "tilt": [-0.4, 0.5, 0.0],
+     "decentre": [-0.2, 0.3]},
+    {"form": "polynomial_xy", "radius": 80, "conic": -0.7, "thickness": 6, "glass": "F2",
+     "coefficients": {"x1y0": 1e-3, "x0y1": -2e-3, "x2y0": 1e-4, "x1y1": 2e-4, "x0y2": -1e-4,
+                      "x2y1": 3e-6}, "tilt": [0.3, 0.2, -0.7], "decentre": [0.3, 0.1]},
+    {"form": "biconic", "radius": -90, "conic": 0.4, "radius_x": -120, "conic_x": -0.5,
+     "coefficients": {4: 1e-6}, "thickness": 5, "semi_diameter": 5, "stop": True,
+     "tilt": [0.7, 0.4, 1.0], "decentre": [-0.1, 0.25]},
+    {"form": "toroid", "radius": 75, "conic": -0.2, "radius_x": 85, "coefficients": {4: 2e-6},
+     "thickness": 5, "index": 1.6, "tilt": [-0.5, 0.6, 2.0], "decentre": [0.15, -0.1]},
+    {"radius": -110, "conic": 0.1, "coefficients": {4: -1e-6}, "tilt": [0.2, 0.9, -0.4],
+     "decentre": [-0.3, 0.2]},
+]  # fmt: skip
+# Two mirrors side by side, turned by 30 degrees; the second is curved. The stop is behind them.
+FOLDED = [
+    {"radius": 120, "conic": -0.5, "thickness": 6, "glass": "N-BK7"},
+    {"radius": -300, "thickness": 24},
+    {"radius": "inf", "thickness": -10, "mirror": True, "tilt": [30, 0, 0]},
+    {"form": "biconic", "radius": -900, "conic": 0.3, "radius_x": -700, "conic_x": -0.4,
+     "thickness": 12, "mirror": True, "tilt": [30, 0.5, 0], "decentre": [0.1, 17.3205]},
+    {"radius": "inf", "thickness": 8, "semi_diameter": 6, "stop": True,
+     "decentre": [0, 17.3205]},
+    {"radius": 70, "conic": 0.2, "thickness": 5, "glass": "SF10", "decentre": [0.3, 17.4],
+     "tilt": [0.3, -0.2, 0.1]},
+    {"radius": 150, "coefficients": {4: 1e-6}, "decentre": [-0.2, 17.3]},
+]  # fmt: skip
+# Rotational, with a surface inside a glass, which bends nothing.
+ROUND = [
+    {"radius": 45, "conic": -0.6, "coefficients": {4: 1e-6, 6: -1e-9}, "thickness": 4,
+     "glass": "N-BK7"},
+    {"radius": 200, "thickness": 3, "glass": "N-BK7"},
+    {"form": "odd_asphere", "radius": -180, "conic": 0.4, "thickness": 4,
+     "coefficients": {2: 1e-4, 3: 1e-5, 4: -2e-7}},
+    {"radius": "inf", "thickness": 4, "semi_diameter": 7, "stop": True},
+    {"radius": -60, "conic": 0.3, "coefficients": {4: -1e-6}, "thickness": 3, "glass": "SF10"},
+    {"radius": 140, "conic": 0.2},
+]  # fmt: skip
+
+
+# Lens, field in radians, distances in mm, part of the pupil that the moments are taken over.
+SCENES = {
+    "freeform": (
+        {"surfaces": FREEFORM, "sensor": 110, "sensor_tilt": [1.5, -2.0, 3.0],
+         "sensor_decentre": [0.4, -0.3]}, [0.06, -0.09], (300.0,), "disc"),
+    "folded": (
+        {"surfaces": FOLDED, "sensor": 100, "sensor_tilt": [0.5, 0.3, 0.0],
+         "sensor_decentre": [0.0, 17.0]}, [0.02, 0.03], (500.0,), "disc"),
+    "double_gauss": ("double_gauss", np.radians(10), (25000.0, np.inf), "half"),
+    "on_axis": ({"surfaces": ROUND, "sensor": 110}, 0.0, (400.0,), "meridian"),
+}  # fmt: skip
+TITLES = {
+    "freeform": "No symmetry, all forms, tilts and decentres; field (0.06, -0.09), 300 mm",
+    "folded": "Two mirrors; field (0.02, 0.03), 500 mm",
+    "double_gauss": "Double Gauss, half the pupil; 10 degrees, {} mm",
+    "on_axis": "Rotational aspheres on axis, meridional rays; 400 mm",
+}
+HEADER = f"""# Derivatives of the centroid, the covariance and the optical path
+
+Largest relative errors of our derivatives, in reverse / forward mode, in float64. The reference
+is the complex step (h = 1e-30) through an independent Snell trace (`tests/oracle.py`), which is
+itself proved against 50-digit central differences. Written by
+
+    python -m pytest tests/test_derivatives.py --write-tables
+
+Colours {WAVELENGTHS[0]} and {WAVELENGTHS[1]} um; moments by `psf_moments(..., order={ORDER})`, \
+paths of {len(POINTS)} rays by
+`trace_rays`. Each number is the largest, over the elements of the output and of the array of
+the parameter, of |ours - reference| / max(|reference|, 1e-4 x the largest |reference| of that
+array for that element of the output). 0: both are exactly 0, or equal. `schott`, `strength`
+and `resonance` are the constants of the refractive indices; semi_diameter is that of the stop.
+No entry may exceed {LARGEST:g} (tilts and decentres include the sensor's).
+"""
+
+
+def parameters(name, distance):
+    """The differentiated arguments, and the names of the rows."""
+    source, field, _, symmetry = SCENES[name]
+    lens = load_lens(source)
+    arguments = {"lens": lens, "distance": jnp.asarray(distance)}
+    if symmetry != "meridian":
+        arguments["field"] = jnp.asarray(field, float)
+    rows = [*oracle.LENS, *oracle.MEDIA]
+    rows += oracle.MOVES if lens.tilt is not None else ()
+    rows += ("field",) if "field" in arguments else ()
+    rows += ("distance",) if np.isfinite(distance) else ()
+    return arguments, [row for row in rows if row != "coefficients" or lens.coefficients.size]
+
+
+def derivatives(forward):
+    """A compiled function from the arguments to the derivatives of all outputs."""
+
+    def outputs(arguments):
+        scene = arguments["lens"], arguments.get("field", 0.0), arguments["distance"], WAVELENGTHS
+        mean, covariance = psf_moments(*scene, order=ORDER, forward=forward)
+        return mean, covariance, trace_rays(*scene, POINTS, forward).path
+
+    return jax.jit((jax.jacfwd if forward else jax.jacrev)(outputs))
+
+
+def of_row(tree, row):
+    """The derivative by one parameter."""
+    if row in oracle.SCENE:
+        return np.asarray(tree[row])
+    lens = tree["lens"]
+    return np.asarray(getattr(lens.dispersion if row in oracle.MEDIA else lens, row))
+
+
+def relative_error(ours, reference, rank):
+    """As the header of the table says; `rank` is that of the parameter's array."""
+    if reference.size == 0:
+        return 0.0
+    assert ours.shape == reference.shape and np.all(np.isfinite(ours))
+    axes = tuple(range(reference.ndim - rank, reference.ndim))
+    size = np.abs(reference)
+    scale = np.maximum(size, 1e-4 * np.max(size, axis=axes, keepdims=True))
+    error = np.abs(ours - reference)
+    return float(np.max(np.where(error == 0, 0, error / np.where(scale == 0, 1e-300, scale))))
+
+
+def write_section(title, rows):
+    """Put one scene's table into the file."""
+    text = TABLE.read_text() if TABLE.is_file() else ""
+    sections = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S))
+    lines = [f"| parameter | {' | '.join(OUTPUTS)} |", "|--" * (1 + len(OUTPUTS)) + "|"]
+    for row, cells in rows.items():
+        cells = (" / ".join(f"{error:.1e}" if error else "0" for error in cell) for cell in cells)
+        lines.append(f"| {row} | {' | '.join(cells)} |")
+    sections[title] = "\n" + "\n".join(lines) + "\n"
+    ordered = [t for t in titles() if t in sections]
+    TABLE.parent.mkdir(parents=True, exist_ok=True)
+    TABLE.write_text(
+        HEADER + "".join(f"\n## {t}\n\n{sections[t].strip()}\n" for t in ordered)
+    )
+
+
+def title_of(name, distance):
+    return TITLES[name].format("infinitely many" if np.isinf(distance) else f"{distance:g}")
+
+
+def titles():
+    return [title_of(name, distance) for name in SCENES for distance in SCENES[name][2]]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_all_derivatives_agree_with_the_complex_step(name, write_tables):
+    _, field, distances, symmetry = SCENES[name]
+    rule = pupil.meridian(ORDER) if symmetry == "meridian" else (
+        pupil.half_disc if symmetry == "half" else pupil.disc)(ORDER, ORDER + 1)  # fmt: skip
+    nodes, weights = rule
+    if len(nodes) == 1:
+        nodes = np.concatenate([np.zeros_like(nodes), nodes])
+    reverse, forward = derivatives(False), derivatives(True)
+    for distance in distances:
+        arguments, rows = parameters(name, distance)
+        ours = [mode(arguments) for mode in (reverse, forward)]
+        lens = arguments["lens"]
+        scene = oracle.Scene.of(lens, field, distance, WAVELENGTHS)
+        wanted = oracle.jacobian(scene, (nodes, weights), symmetry, POINTS.T, rows)
+        table = {}
+        for row in rows:
+            table[row] = []
+            for i, output in enumerate(OUTPUTS):
+                reference, rank = wanted[output][row], scene.values[row].ndim
+                if row == "field" and np.ndim(field) == 0:  # one angle, along y
+                    reference, rank = reference[..., 1], 0
+                both = [of_row(tree[i], row) for tree in ours]
+                table[row].append([relative_error(each, reference, rank) for each in both])
+                assert relative_error(*both, rank) <= 1e-10, (row, output)
+        if write_tables:
+            write_section(title_of(name, distance), table)
+        worst = {row: max(map(max, cells)) for row, cells in table.items()}
+        assert max(worst.values()) <= LARGEST, worst
+        if np.isinf(distance):
+            assert all(np.all(of_row(tree[i], "distance") == 0) for tree in ours for i in range(3))
+
+
+def test_the_committed_table_is_complete():
+    text = TABLE.read_text()
+    for name in SCENES:
+        for distance in SCENES[name][2]:
+            section = text.split(f"## {title_of(name, distance)}\n")[1].split("\n## ")[0]
+            cells = [line.strip("| ").split(" | ") for line in section.splitlines() if "|" in line]
+            assert cells[0] == ["parameter", *OUTPUTS]
+            assert [row[0] for row in cells[2:]] == parameters(name, distance)[1]
+            numbers = [float(n) for row in cells[2:] for cell in row[1:] for n in cell.split("/")]
+            assert len(numbers) == 2 * len(OUTPUTS) * len(cells[2:])
+            assert max(numbers) <= LARGEST
+
+
+def exact_trace(scene, x, y):
+    """One ray of the first colour in mpmath: stop point, path, sensor point. `scene` holds
+    nested lists of mpf; only the sags are shared, with the tests of `surface`."""
+    mpf, sqrt, small = mpmath.mpf, mpmath.sqrt, mpmath.mpf(10) ** -17
+    tangent = [mpmath.tan(a) for a in scene["field"]]
+    source = mpmath.matrix([-t * scene["distance"] for t in tangent] + [-scene["distance"]])
+    point = source
+    d = mpmath.matrix([x, y, 0]) - source
+    d = d / mpmath.norm(d)
+    square = mpf(WAVELENGTHS[0]) ** 2
+    n = [
+        sqrt(sum(b * square / (square - c) for b, c in zip(bs, cs))
+             + sum(a * square ** (p // 2) for a, p in zip(s, (0, 2, -2, -4, -6, -8))))
+        for bs, cs, s in zip(scene["strength"], scene["resonance"], scene["schott"])
+    ]  # fmt: skip
+    path, z0, count = -mpmath.norm(source) * n[0], mpf(0), len(scene["forms"])
+    for i in range(count + 1):
+        if i:
+            z0 = scene["sensor"] if i == count else z0 + scene["thickness"][i - 1]
+        turn = mpmath.eye(3)
+        for axis, angle in enumerate(scene["tilt"][i]):
+            one = mpmath.eye(3)
+            p, q = (axis + 1) % 3, (axis + 2) % 3
+            one[p, p] = one[q, q] = mpmath.cos(angle)
+            one[q, p], one[p, q] = mpmath.sin(angle), -mpmath.sin(angle)
+            turn = turn * one
+        origin = mpmath.matrix([*scene["decentre"][i], z0])
+        p, t = turn.T * (point - origin), turn.T * d
+
+        def sag(x, y):
+            if i == count:
+                return mpf(0)
+            k = len(scene["coefficients"][i])
+            return getattr(test_surface, f"exact_{scene['forms'][i]}")(
+                x, y, scene["curvature"][i], scene["conic"][i], scene["coefficients"][i][:k]
+            )
+
+        def above(s):
+            return p[2] + s * t[2] - sag(p[0] + s * t[0], p[1] + s * t[1])
+
+        s = -p[2] / t[2]
+        for _ in range(7):
+            s -= above(s) * 2 * small / (above(s + small) - above(s - small))
+        hit = p + s * t
+        path += n[i] * s
+        if i == scene["stop"]:
+            at_stop = hit[0], hit[1]
+        point = turn * hit + origin
+        if i == count:
+            return at_stop, path, [point[j] for j in range(3)]
+        h, x, y = small, hit[0], hit[1]
+        normal = mpmath.matrix([
+            (sag(x - h, y) - sag(x + h, y)) / (2 * h), (sag(x, y - h) - sag(x, y + h)) / (2 * h), 1
+        ])  # fmt: skip
+        normal = turn * normal / mpmath.norm(normal)
+        cosine = (normal.T * d)[0]
+        along = (d - cosine * normal) * (n[i] / n[i + 1])
+        side = mpmath.sign(cosine) * (-1 if scene["mirrors"][i] else 1)
+        d = along + side * sqrt(1 - mpmath.norm(along) ** 2) * normal
+
+
+@pytest.mark.parametrize("name", ["freeform", "folded"])
+def test_oracle_against_50_digits(name):
+    """Along a random direction in each array: paths and sensor points of two rays, 1e-12."""
+    arguments, rows = parameters(name, SCENES[name][2][0])
+    _, field, (distance,), _ = SCENES[name]
+    scene = oracle.Scene.of(arguments["lens"], field, distance, WAVELENGTHS[:1])
+    points, generator = POINTS[:2].T, np.random.default_rng(4)
+    start = oracle._aimed(scene, points)
+    for row in rows:
+        value = scene.values[row]
+        # A high power that is 0 would be moved far beyond where differences are small.
+        still = 0 if row == "coefficients" else 1e-3
+        step = generator.uniform(0.5, 1, value.shape) * np.where(value == 0, still, np.abs(value))
+        step = np.where(np.isinf(value), 0, step)
+        imaginary = np.where(np.isinf(value), value, value + 1j * oracle.STEP * step)
+        moved = scene.replace(**{row: imaginary})
+        _, hits, path = oracle.trace(moved, *oracle.aim(moved, points, start))
+        ours = [np.imag(np.broadcast_to(a, path.shape)) / oracle.STEP for a in (path, *hits[-1])]
+        for ray in range(2):
+            with mpmath.workdps(50):
+                wanted = exact_difference(scene, row, step, points[:, ray], start, ray)
+            scale = np.max(np.abs(wanted[1:]))
+            for got, exact, size in zip(ours, wanted, [abs(wanted[0])] + [scale] * 3):
+                assert abs(got[0, ray] - exact) <= 1e-12 * size, (row, ray)
+
+
+def exact_difference(scene, row, step, point, start, ray):
+    """d(path, sensor point) along `step` in the array `row`, by a central difference."""
+    h = mpmath.mpf(10) ** -10
+    ends = []
+    for side in (1, -1):
+        values = {k: _exact(v) for k, v in scene.values.items() if k != row}
+        values[row] = _exact(scene.values[row], side * h, step)
+        values |= {"forms": scene.forms, "mirrors": scene.mirrors, "stop": scene.stop}
+        x, y = (mpmath.mpf(float(a[0, ray])) for a in start[:2])
+        inverse = mpmath.matrix(start[2][:, :, 0, ray].tolist())
+        radius = values["semi_diameter"][scene.stop]
+        for _ in range(5):
+            at_stop, path, end = exact_trace(values, x, y)
+            miss = [a - radius * mpmath.mpf(float(b)) for a, b in zip(at_stop, point)]
+            x, y = mpmath.matrix([x, y]) - inverse * mpmath.matrix(miss)
+        ends.append([path, *end])
+    return [float((a - b) / (2 * h)) for a, b in zip(*ends)]
+
+
+def _exact(value, h=0, step=None):
+    """Nested lists of mpf, of value + h step."""
+    if np.ndim(value):
+        steps = np.zeros_like(value) if step is None else step
+        return [_exact(v, h, s) for v, s in zip(value, steps)]
+    return mpmath.mpf(float(value)) + h * mpmath.mpf(0.0 if step is None else float(step))
