@@ -81,7 +81,8 @@ class AccuracyScene:
     def label(self) -> str:
         """A name of its own for results and progress."""
         far = "inf" if math.isinf(self.distance_m) else f"{self.distance_m:g} m"
-        words = [pathlib.Path(self.lens).stem, f"{self.field_deg:g} deg", far, f"{self.defocus_mm:+g} mm"]
+        words = [pathlib.Path(self.lens).stem, f"{self.field_deg:g} deg", far]
+        words.append(f"{self.defocus_mm:+g} mm")
         if self.vignetted:
             words.append(f"clear {self.front_mm:g} {self.rear_mm:g} mm")
         return ", ".join([*words, *(["float32"] if self.dtype == "float32" else [])])
@@ -282,24 +283,20 @@ def curves(config: Config, setting: Setting, advance: Callable[[], Any]) -> np.n
     nominal, timed = 0, (math.nan, math.nan)
     for method, size in methods(config, scene):
         if method == _QUADRATURE:
-            functions = quadrature(size, axial, config.wavelengths_um, not scene.vignetted)
-            found = setting.measure(functions[1], value=functions[0])
-            times = seconds(lambda: functions[0](*arguments)), seconds(
-                lambda: functions[1](*arguments, row)
-            )
-            rows.append([pupil_points(size, axial), *found, *times])
+            value, gradient = quadrature(size, axial, config.wavelengths_um, not scene.vignetted)
+            found = setting.measure(gradient, value=value)
+            calls = lambda: value(*arguments), lambda: gradient(*arguments, row)
+            rows.append([pupil_points(size, axial), *found, *map(seconds, calls)])
         else:
             value, gradient = sampled(config.wavelengths_um)
             choices = patterns(size, config.seeds)[method]
             if size != nominal:  # the time of a pattern depends on its size alone
                 extra = padded(*choices[0], size, row.dtype)
-                value(*arguments, *extra)
-                nominal = size
-                timed = (seconds(lambda: value(*arguments, *extra)), math.nan)
+                jax.block_until_ready(value(*arguments, *extra))
+                nominal, timed = size, (seconds(lambda: value(*arguments, *extra)), math.nan)
             shape = next(n for n in shapes if n >= size)
             found = [
-                setting.measure(gradient, padded(*choice, shape, row.dtype))
-                for choice in choices
+                setting.measure(gradient, padded(*pattern, shape, row.dtype)) for pattern in choices
             ]
             rows.append([choices[0][1].size, *np.median(found, axis=0), *timed])
         advance()
@@ -388,13 +385,12 @@ def summary(rows: list[dict], promises: list[dict], truths: list[dict]) -> None:
             wanted = panel, method, size
             some = [r for r in rows if (r["panel"], r["method"], r["size"]) == wanted]
             if some:
-                column = [
+                rays, error, slope, time_ = (
                     float(np.median([r[key] for r in some]))
-                    for key in ("rays", "relative_error", "gradient_error")
-                ]
+                    for key in ("rays", "relative_error", "gradient_error", "seconds")
+                )
                 worst = max(r["relative_error"] for r in some)
-                ms = 1e3 * float(np.median([r["seconds"] for r in some]))
-                lines.append((panel, method, int(column[0]), *column[1:], worst, ms))
+                lines.append((panel, method, int(rays), error, slope, worst, 1e3 * time_))
     header = ("scenes", "method", "rays", "sigma error", "gradient error", "worst sigma", "ms")
     print(_common.table(header, lines))
     lines = []
@@ -413,11 +409,12 @@ def summary(rows: list[dict], promises: list[dict], truths: list[dict]) -> None:
 def draw(run: Run, rows: list[dict]) -> list:
     """Error over time and over rays, a panel for each group of scenes."""
     paths = []
-    for name, x, y, xlabel, ylabel in (
-        ("time_error", "seconds", "relative_error", "time of a call (ms)", "error of σ"),
-        ("rays_error", "rays", "relative_error", "rays a colour", "error of σ"),
-        ("gradient_error", "rays", "gradient_error", "rays a colour", "error of the gradient of σ"),
+    for name, x, y, xlabel in (
+        ("time_error", "seconds", "relative_error", "time of a call (ms)"),
+        ("rays_error", "rays", "relative_error", "rays a colour"),
+        ("gradient_error", "rays", "gradient_error", "rays a colour"),
     ):
+        ylabel = f"relative error of {'σ' if y == 'relative_error' else 'the gradient of σ'}"
         panels = [panel for panel in _PANEL_TITLES if any(r["panel"] == panel for r in rows)]
         columns = min(2, len(panels))
         figure, axes = plot.new(-(-len(panels) // columns), columns, 5.2, 3.9)
@@ -436,7 +433,7 @@ def draw(run: Run, rows: list[dict]) -> list:
                 if method == "random" and 256 in groups:
                     k = list(groups).index(256)
                     note = across[k], float(np.median(curves[method][1][k])), "the paper's 256 rays"
-            plot.error_curves(ax, curves, xlabel, f"{ylabel}, relative", note)
+            plot.error_curves(ax, curves, xlabel, ylabel, note)
             count = len({r["scene"] for r in here})
             ax.set_title(f"{panel}, {count} scene{'s' * (count != 1)}", fontsize=10)
         paths.append(run.figures / f"{name}.png")

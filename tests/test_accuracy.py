@@ -51,8 +51,7 @@ def test_gauss_rule_is_exact_to_its_degree(order):
     beyond = average(rule, lambda x, y: (x * x + y * y) ** (2 * order))
     assert abs(beyond - 1 / (2 * order + 1)) > 1e-17 + 4.0 ** (-2 * order) / 50 / (2 * order + 1)
     for m in range(1, 2 * (order + 1)):
-        np.testing.assert_allclose(average(rule, lambda x, y: np.real((x + 1j * y) ** m)), 0, atol=1e-14)
-        np.testing.assert_allclose(average(rule, lambda x, y: np.imag((x + 1j * y) ** m)), 0, atol=1e-14)
+        np.testing.assert_allclose(average(rule, lambda x, y: (x + 1j * y) ** m), 0, atol=1e-14)
 
 
 @pytest.mark.parametrize("rings", [1, 8, 30])
@@ -71,8 +70,9 @@ def test_square_grid_is_even_and_covers_the_area():
     for side in (7, 18, 200):
         pattern = pupil.square_grid(side)
         np.testing.assert_allclose(pattern[1].size, np.pi / 4 * side**2, rtol=1 / side)
-        for function in (lambda x, y: x, lambda x, y: y, lambda x, y: x * y, lambda x, y: x * x - y * y):
-            np.testing.assert_allclose(average(pattern, function), 0, atol=1e-14)
+        for m in (1, 2, 3):
+            got = average(pattern, lambda x, y: (x + 1j * y) ** m)
+            np.testing.assert_allclose(got, 0, atol=1e-14)
         square = average(pattern, lambda x, y: x * x + y * y)
         np.testing.assert_allclose(square, 0.5, rtol=1 / side)
 
