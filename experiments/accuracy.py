@@ -408,14 +408,13 @@ def summary(rows: list[dict], promises: list[dict], truths: list[dict]) -> None:
 
 def draw(run: Run, rows: list[dict]) -> list:
     """Error over time and over rays, a panel for each group of scenes."""
-    paths = []
+    paths, panels = [], [p for p in _PANEL_TITLES if any(r["panel"] == p for r in rows)]
     for name, x, y, xlabel in (
         ("time_error", "seconds", "relative_error", "time of a call (ms)"),
         ("rays_error", "rays", "relative_error", "rays a colour"),
         ("gradient_error", "rays", "gradient_error", "rays a colour"),
     ):
         ylabel = f"relative error of {'σ' if y == 'relative_error' else 'the gradient of σ'}"
-        panels = [panel for panel in _PANEL_TITLES if any(r["panel"] == panel for r in rows)]
         columns = min(2, len(panels))
         figure, axes = plot.new(-(-len(panels) // columns), columns, 5.2, 3.9)
         for ax in np.ravel(axes)[len(panels) :]:
