@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["convergence", "kernels", "lens_drawing", "new", "patch_grid", "sigma_over_depth"]
+__all__ = ["convergence", "error_curves", "kernels", "lens_drawing", "new", "patch_grid",
+           "sigma_over_depth"]  # fmt: skip
 
 _FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 _COLOURS = ("tab:red", "tab:green", "tab:blue")
@@ -56,6 +57,41 @@ def convergence(
     if level is not None:
         axes.axhline(level[0], color="black", linestyle=":", linewidth=1, label=level[1])
     axes.set(xlabel="training batch", ylabel=ylabel)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return axes
+
+
+def error_curves(
+    axes: Axes,
+    curves: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float]]]],
+    xlabel: str,
+    ylabel: str,
+    note: tuple[float, float, str] | None = None,
+) -> Axes:
+    """Errors by label over cost, both logarithmic: (x (N,), errors (N, M) of M scenes).
+
+    The line is the median of the scenes, the band goes from the best to the worst; errors that
+    are not known (None) or 0 are left out. `note`: x, y and a text that points there.
+    """
+    for k, (label, (x, errors)) in enumerate(curves.items()):
+        known = [[e for e in row if e] for row in errors]
+        rows = [(a, min(row), float(np.median(row)), max(row)) for a, row in zip(x, known) if row]
+        if not rows:
+            continue
+        across, low, middle, high = zip(*rows)
+        colour = f"C{k}"
+        axes.fill_between(across, low, high, color=colour, alpha=0.12, linewidth=0)
+        axes.plot(
+            across, middle, color=colour, marker="osD^v"[k % 5], markersize=4,
+            linewidth=2.2 if k == 0 else 1.2, label=label, zorder=3 if k == 0 else 2,
+        )  # fmt: skip
+    if note is not None:
+        axes.annotate(
+            note[2], note[:2], xytext=(18, 14), textcoords="offset points", fontsize=8,
+            arrowprops={"arrowstyle": "-", "linewidth": 0.7},
+        )  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return axes
