@@ -193,11 +193,12 @@ def test_float32_gradient_is_the_rounded_float64_one(name):
 
 POINTS = np.array([[0.3, 0.9], [-0.5, 0.2]])
 FIELDS = jnp.array([0.0, 0.05, 0.1])
+SINGLET = load_lens("singlet")
 
 
 def hits_of(parameters, field, forward=False):
-    """Sensor points (R, 2) of two rays through the singlet, and what they depend on."""
-    lens = dataclasses.replace(load_lens("singlet"), **parameters)
+    """Sensor points (2, 2) of two rays through the singlet with other `parameters`."""
+    lens = dataclasses.replace(SINGLET, **parameters)
     return trace_rays(lens, field, 300.0, [0.55], POINTS, forward).points[0, :, -1, :2]
 
 
@@ -208,8 +209,7 @@ def height(parameters, field, forward=False):
 
 
 def parameters_of_singlet():
-    lens = load_lens("singlet")
-    return {name: getattr(lens, name) for name in ("curvature", "conic", "thickness", "sensor")}
+    return {name: getattr(SINGLET, name) for name in ("curvature", "conic", "thickness", "sensor")}
 
 
 def close(a, b, rtol):
@@ -277,8 +277,8 @@ def test_hessian_vector_products():
     close(jax.jit(jax.grad(along))(p), products, 1e-10)
     close(jax.jit(jax.jacfwd(lambda p: slope(p, True)))(p), products, 1e-10)
 
-    lens, weights = load_lens("singlet"), np.random.default_rng(5).normal(size=(2, 2))
-    scene = oracle.Scene.of(lens, field, 300.0, [0.55])
+    weights = np.random.default_rng(5).normal(size=(2, 2))
+    scene = oracle.Scene.of(SINGLET, field, 300.0, [0.55])
 
     def reference(h):
         """Gradient of `height` at p + h v, by complex steps."""
