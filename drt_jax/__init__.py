@@ -40,7 +40,7 @@ from .paraxial import (
 from .prescription import LensError, lens_names, load_lens
 from .psf import SeparableKernel, gaussian_psf
 from .sensor import convolve, sensor_layer
-from .snell import trace_snell
+from .snell import launch_paraxial, trace_snell
 from .trace import Rays, field_of_height, trace_rays
 from .wavefront import Wavefront, rms_wavefront, wavefront
 
@@ -50,7 +50,7 @@ __all__ = [
     "adam", "apply_updates", "back_focal_distance", "convolve", "depth_moments", "entrance_pupil",
     "exit_pupil", "f_number", "field_of_height", "find_glass", "first_order", "focal_length",
     "focus_moments", "front_focal_distance", "gaussian_psf", "image_distance", "image_height",
-    "lateral_magnification", "lens_names", "load_lens", "moments_model", "numerical_aperture",
+    "lateral_magnification", "launch_paraxial", "lens_names", "load_lens", "moments_model", "numerical_aperture",
     "psf_moments", "pupil_order", "red_net", "refractive_index", "rms_wavefront", "sensor_layer",
     "third_order", "trace_rays", "trace_snell", "wavefront",
 ]  # fmt: skip

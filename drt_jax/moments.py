@@ -81,7 +81,7 @@ def _symmetry(lens: Lens, field: ArrayLike) -> str:
     kind = lens.symmetry
     if kind == "none":
         return "disc"
-    if jnp.ndim(field) == 0:
+    if np.ndim(field) == 0:
         still = _concrete(field) and float(field) == 0
         return "meridian" if still and kind == "rotation" else "half"
     if not _concrete(field) or np.asarray(field)[0] != 0:

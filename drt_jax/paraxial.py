@@ -8,6 +8,7 @@ Aberrations of Optical Systems (1986), ch. 3, 6, 8, 10.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
@@ -93,16 +94,19 @@ def trace_yu(
     `slope` (...) at the first vertex, before it. Returns the heights on the S surfaces and
     the slopes behind them, both (S, ...).
     """
-    heights, slopes = [], []
-    for i in range(curvature.shape[0]):
-        if i:
-            height = height + gaps[i - 1] * slope
-        slope = (index[i] * slope - height * curvature[i] * (index[i + 1] - index[i])) / index[
-            i + 1
-        ]
-        heights.append(height)
-        slopes.append(slope)
-    return jnp.stack(heights), jnp.stack(slopes)
+
+    def step(ray, surface):
+        height, slope = ray
+        gap, curvature, before, after = surface
+        height = height + gap * slope
+        slope = (before * slope - height * curvature * (after - before)) / after
+        return (height, slope), (height, slope)
+
+    gaps = jnp.concatenate([jnp.zeros_like(curvature.ravel()[:1]), gaps])
+    shape = jnp.broadcast_shapes(height.shape, slope.shape, curvature.shape[1:], index.shape[1:])
+    ray = jnp.broadcast_to(height, shape), jnp.broadcast_to(slope, shape)
+    # A loop over the surfaces, not unrolled: these arrays are tiny, compiling them is what costs.
+    return jax.lax.scan(step, ray, (gaps, curvature, index[:-1], index[1:]))[1]
 
 
 class _Paraxial(NamedTuple):

@@ -7,11 +7,13 @@ no formula with the Fermat solver but the sag. One ray at a time; `jax.vmap` for
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 from .lens import Lens, rotation_matrix
+from .paraxial import entrance_pupil
 from .surface import Shape, domain, sag_derivatives
 
-__all__ = ["trace_snell"]
+__all__ = ["launch_paraxial", "trace_snell"]
 
 _NEWTON_STEPS = 12
 
@@ -82,3 +84,26 @@ def trace_snell(
         direction = d if turn is None else turn @ d
         hits.append(point)
     return jnp.stack(hits), ok
+
+
+def launch_paraxial(
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelength: ArrayLike, pupil: Array
+) -> tuple[Array, Array]:
+    """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming.
+
+    `field` in radians along y, `distance` in mm from the object plane to the first vertex (inf
+    allowed), `wavelength` () in um, `pupil` (Q, 2) in units of the pupil's semi-diameter.
+    Returns points (Q, 3) in mm on the first vertex plane and unit directions (Q, 3), for
+    `trace_snell`. The entrance pupil must not be infinitely far away. The Fermat tracer aims at
+    the real stop instead; the difference is the aberration of the pupil.
+    """
+    image = entrance_pupil(lens, jnp.atleast_1d(jnp.asarray(wavelength, pupil.dtype)))
+    place, radius = image.position[0], image.semi_diameter[0]
+    v = 1 / jnp.asarray(distance, pupil.dtype)
+    tangent = jnp.tan(jnp.asarray(field, pupil.dtype))
+    target = jnp.concatenate([radius * pupil, jnp.broadcast_to(place, (len(pupil), 1))], axis=1)
+    one = jnp.ones_like(tangent)
+    # From the object point (0, -tangent, -1) / v; the scale v keeps it finite.
+    direction = v * target + jnp.stack([0 * one, tangent, one])
+    points = target - direction * (place / direction[:, 2:])
+    return points, direction / jnp.linalg.norm(direction, axis=1, keepdims=True)

@@ -40,13 +40,15 @@ class Rays(NamedTuple):
     """Traced rays.
 
     points (W, Q, S + 1, 3), mm: where they cross the surfaces and the sensor, along the axes
-    of the lens, z from the first vertex; zeros for a ray that failed. path (W, Q), mm: the
+    of the lens, z from the first vertex; zeros for a ray that failed. directions, same shape:
+    unit vectors (direction cosines) in front of each surface and the sensor. path (W, Q), mm: the
     optical path from the object to the sensor, counted from the sphere round the object (the
     plane wave) that passes through the first vertex; 0 for a ray that failed. status (W, Q),
     int32, see `Status`. newton_steps (), int32: iterations of the whole bundle.
     """
 
     points: Array
+    directions: Array
     path: Array
     status: Array
     newton_steps: Array
@@ -222,6 +224,13 @@ def _trace_rays(
     points = own.at[2].add(whole.vertex[:, None, None])
     if whole.offset is not None:
         points = points.at[:2].add(whole.offset[..., None, None])
+    first = whole.vergence * points[:, :1] - whole.source[:, None, None, None]
+    steps = jnp.concatenate([first, points[:, 1:] - points[:, :-1]], axis=1)
+    length = jnp.sqrt(jnp.sum(steps**2, axis=0))
+    directions = steps * safe_divide(jnp.ones_like(length), length)
     good = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
-    points, path = jnp.where(good, points, 0), jnp.where(good, bundle.path, 0)
-    return Rays(jnp.moveaxis(points, (0, 1), (3, 2)), path, bundle.status, bundle.newton_steps)
+    points, directions = (
+        jnp.moveaxis(jnp.where(good, a, 0), (0, 1), (3, 2)) for a in (points, directions)
+    )
+    path = jnp.where(good, bundle.path, 0)
+    return Rays(points, directions, path, bundle.status, bundle.newton_steps)

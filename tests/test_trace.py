@@ -174,3 +174,20 @@ def test_failed_rays_carry_a_status_and_no_nan():
 def test_bad_field_shape():
     with pytest.raises(ValueError, match="one angle or two"):
         trace_rays(load_lens("singlet"), [0.0, 0.1, 0.2], jnp.inf, [0.55], [[0.0, 0.0]])
+
+
+def test_directions_and_paraxial_launch():
+    """A lens whose stop is its first surface: its entrance pupil is the stop itself, so that
+    aiming at it paraxially finds the same rays; directions are those between the points."""
+    lens = load_lens("singlet")
+    pupil_points = jnp.array([[0.0, 0.0], [0.3, -0.8], [-0.5, 0.5]])
+    for distance in (jnp.inf, 400.0):
+        rays = trace_rays(lens, 0.1, distance, [0.55], pupil_points)
+        start, direction = drt_jax.launch_paraxial(lens, 0.1, distance, 0.55, pupil_points)
+        np.testing.assert_allclose(direction, rays.directions[0, :, 0], atol=1e-14)
+        hits, ok = snell(lens, 0.55, start, direction)
+        assert np.all(ok)
+        np.testing.assert_allclose(hits, rays.points[0], atol=1e-11)
+        steps = np.diff(np.asarray(rays.points[0]), axis=1)
+        steps /= np.linalg.norm(steps, axis=-1, keepdims=True)
+        np.testing.assert_allclose(rays.directions[0, :, 1:], steps, atol=1e-13)
