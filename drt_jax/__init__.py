@@ -50,7 +50,8 @@ __all__ = [
     "adam", "apply_updates", "back_focal_distance", "convolve", "depth_moments", "entrance_pupil",
     "exit_pupil", "f_number", "field_of_height", "find_glass", "first_order", "focal_length",
     "focus_moments", "front_focal_distance", "gaussian_psf", "image_distance", "image_height",
-    "lateral_magnification", "launch_paraxial", "lens_names", "load_lens", "moments_model", "numerical_aperture",
+    "lateral_magnification", "launch_paraxial", "lens_names", "load_lens", "moments_model",
+    "numerical_aperture",
     "psf_moments", "pupil_order", "red_net", "refractive_index", "rms_wavefront", "sensor_layer",
     "third_order", "trace_rays", "trace_snell", "wavefront",
 ]  # fmt: skip
