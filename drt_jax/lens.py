@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from .glass import Dispersion, check_wavelengths, refractive_index
 from .surface import MIRRORED, ROTATIONAL, Shape
@@ -91,12 +92,13 @@ class Lens:
         still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
         return "plane" if still and MIRRORED.issuperset(self.forms) else "none"
 
-    def index(self, wavelengths: Array) -> Array:
+    def index(self, wavelengths: ArrayLike) -> Array:
         """Refractive index (S + 1, W) of every medium at `wavelengths` (W,), um.
 
         ValueError, naming the range, for a known wavelength outside that of a glass.
         """
         check_wavelengths(self.glasses, wavelengths)
+        wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, self.curvature.dtype))
         return refractive_index(self.dispersion, wavelengths)
 
 

@@ -119,7 +119,7 @@ class _Paraxial(NamedTuple):
     stop: int
 
 
-def _paraxial(lens: Lens, wavelengths: Array) -> _Paraxial:
+def _paraxial(lens: Lens, wavelengths: ArrayLike) -> _Paraxial:
     index = lens.index(wavelengths)
     index = index * jnp.asarray(lens.senses[:, None], index.dtype)
     curvature = vertex_curvature(lens.shape, lens.forms, 1)[0]
@@ -155,7 +155,7 @@ def _chief_ray(system: _Paraxial, front: bool) -> tuple[Array, Array]:
     return (-height, slope) if front else (height, slope)
 
 
-def chief_ray_at_image(lens: Lens, wavelengths: Array) -> tuple[Array, Array]:
+def chief_ray_at_image(lens: Lens, wavelengths: ArrayLike) -> tuple[Array, Array]:
     """Height (W,) in mm and slope (W,), at the last vertex and behind it, of a ray through the
     centre of the stop; of the size that makes n u = 1 at the stop. `wavelengths` in um."""
     return _chief_ray(_paraxial(lens, wavelengths), front=False)
@@ -169,12 +169,12 @@ def _pupil(lens: Lens, system: _Paraxial, front: bool) -> Pupil:
     return Pupil(_quotient(-height, slope), _quotient(size, bend))
 
 
-def entrance_pupil(lens: Lens, wavelengths: Array) -> Pupil:
+def entrance_pupil(lens: Lens, wavelengths: ArrayLike) -> Pupil:
     """The stop as seen from the object; position from the first vertex. `wavelengths` in um."""
     return _pupil(lens, _paraxial(lens, wavelengths), front=True)
 
 
-def exit_pupil(lens: Lens, wavelengths: Array) -> Pupil:
+def exit_pupil(lens: Lens, wavelengths: ArrayLike) -> Pupil:
     """The stop as seen from the image; position from the last vertex. `wavelengths` in um."""
     return _pupil(lens, _paraxial(lens, wavelengths), front=False)
 
@@ -195,7 +195,7 @@ def _petzval(system: _Paraxial) -> Array:
     return -system.curvature[:, None] * (1 / index[1:] - 1 / index[:-1])
 
 
-def first_order(lens: Lens, distance: ArrayLike, wavelengths: Array) -> FirstOrder:
+def first_order(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> FirstOrder:
     """First-order data for an object at `distance` mm, inf allowed; `wavelengths` (W,) in um.
 
     See `FirstOrder`; focal length, focal distances and pupils do not depend on the distance.
@@ -221,7 +221,7 @@ def first_order(lens: Lens, distance: ArrayLike, wavelengths: Array) -> FirstOrd
     )
 
 
-def focal_length(lens: Lens, wavelengths: Array) -> Array:
+def focal_length(lens: Lens, wavelengths: ArrayLike) -> Array:
     """Effective focal length (W,), mm; inf for an afocal lens. `wavelengths` (W,) in um.
 
     From the rear principal plane to the focus, along z: in water longer by its index than in
@@ -231,26 +231,26 @@ def focal_length(lens: Lens, wavelengths: Array) -> Array:
     return _quotient(-jnp.ones_like(slope[-1]), slope[-1])
 
 
-def back_focal_distance(lens: Lens, wavelengths: Array) -> Array:
+def back_focal_distance(lens: Lens, wavelengths: ArrayLike) -> Array:
     """Last vertex to the image of an infinitely far object (W,), mm; inf for an afocal lens.
     `wavelengths` (W,) in um."""
     height, slope = _trace(_paraxial(lens, wavelengths), 1.0, 0.0)
     return _quotient(-height[-1], slope[-1])
 
 
-def front_focal_distance(lens: Lens, wavelengths: Array) -> Array:
+def front_focal_distance(lens: Lens, wavelengths: ArrayLike) -> Array:
     """First vertex to the front focus (W,), mm, negative where it lies before the lens; inf
     for an afocal lens. `wavelengths` (W,) in um."""
     return first_order(lens, jnp.inf, wavelengths).front_focal_distance
 
 
-def image_distance(lens: Lens, distance: ArrayLike, wavelengths: Array) -> Array:
+def image_distance(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
     """First vertex to the paraxial image of an axial object at `distance` mm (W,), mm; inf
     where that lies at infinity. `wavelengths` (W,) in um."""
     return first_order(lens, distance, wavelengths).image_distance
 
 
-def numerical_aperture(lens: Lens, distance: ArrayLike, wavelengths: Array) -> Array:
+def numerical_aperture(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
     """Paraxial n u of the marginal ray at the image (W,), positive; 0 for an image at infinity.
 
     `distance` from the object to the first vertex in mm, inf allowed; `wavelengths` (W,), um.
@@ -258,7 +258,7 @@ def numerical_aperture(lens: Lens, distance: ArrayLike, wavelengths: Array) -> A
     return first_order(lens, distance, wavelengths).numerical_aperture
 
 
-def f_number(lens: Lens, wavelengths: Array, distance: ArrayLike = jnp.inf) -> Array:
+def f_number(lens: Lens, wavelengths: ArrayLike, distance: ArrayLike = jnp.inf) -> Array:
     """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity.
 
     For an infinitely far object, focal length over diameter of the entrance pupil; else the
@@ -267,7 +267,7 @@ def f_number(lens: Lens, wavelengths: Array, distance: ArrayLike = jnp.inf) -> A
     return first_order(lens, distance, wavelengths).f_number
 
 
-def lateral_magnification(lens: Lens, distance: ArrayLike, wavelengths: Array) -> Array:
+def lateral_magnification(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
     """Image height over object height (W,), negative where the image is upside down.
 
     `distance` from the object to the first vertex in mm; inf gives 0. `wavelengths` (W,), um.
@@ -276,7 +276,7 @@ def lateral_magnification(lens: Lens, distance: ArrayLike, wavelengths: Array) -
 
 
 def image_height(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: Array
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike
 ) -> Array:
     """Paraxial image height (..., W), mm, of the fields `field` (...), radians.
 
@@ -305,7 +305,7 @@ def _fourth_order(lens: Lens, vertex: Array) -> Array:
 
 
 def third_order(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: Array
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike
 ) -> ThirdOrder:
     """Third-order aberrations of each surface, see `ThirdOrder`; `.total` sums them up.
 
