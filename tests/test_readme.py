@@ -15,10 +15,11 @@ def test_notebook_lines_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
     assert blocks
+    names: dict = {}  # one notebook
     for block in blocks:
-        names: dict = {}
         exec(compile(block, "README.md", "exec"), names)
     assert names["gradient"].curvature.shape == (11,)
+    assert names["wave"].opd.shape == (3, 3) and names["jacobian"].thickness.shape == (3, 2, 2, 10)
     assert (tmp_path / "psf.png").stat().st_size > 5000
 
 
