@@ -88,8 +88,8 @@ def error_curves(
         )  # fmt: skip
     if note is not None:
         axes.annotate(
-            note[2], note[:2], xytext=(18, 14), textcoords="offset points", fontsize=8,
-            arrowprops={"arrowstyle": "-", "linewidth": 0.7},
+            note[2], note[:2], xytext=(0, 22), textcoords="offset points", fontsize=8,
+            ha="center", arrowprops={"arrowstyle": "-", "linewidth": 0.7},
         )  # fmt: skip
     axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3)

@@ -218,7 +218,7 @@ def errors(truth: list[Moments], colours: tuple, gradients: list, surfaces: int)
         groups = slice(0, surfaces), slice(surfaces, None)
         wrong = np.asarray(gradients[k], float) - exact[k]
         norms = [np.linalg.norm(wrong[g]) / np.linalg.norm(exact[k][g]) for g in groups]
-        values.append(float(max(norms)))
+        values.append(float(np.max(norms)))
     return values
 
 
@@ -318,12 +318,6 @@ def tolerances(config: Config, setting: Setting) -> np.ndarray:
     return np.array(rows, float)
 
 
-def _plain(value: float) -> float | int | None:
-    if math.isnan(value):
-        return None
-    return int(value) if value > 1 and value == int(value) else value
-
-
 def run(config: Config, run: Run) -> None:
     """Measure all scenes, one after the other, draw and print what was found."""
     rows: list[dict] = []
@@ -356,8 +350,9 @@ def run(config: Config, run: Run) -> None:
                 run.log(scene.label, 0, dict(zip(_COLUMNS, found["curves"].T)))
             base = {"scene": scene.label, "panel": scene.panel, "dtype": scene.dtype}
             for (method, size), values in zip(names, np.asarray(found["curves"])):
-                numbers = {key: _plain(float(v)) for key, v in zip(_COLUMNS, values)}
-                rows.append({**base, "method": method, "size": size, **numbers})
+                numbers = [None if math.isnan(v) else float(v) for v in values[1:]]
+                row = {**base, "method": method, "size": size, "rays": int(values[0])}
+                rows.append({**row, **dict(zip(_COLUMNS[1:], numbers))})
             for tolerance, values in zip(config.tolerances, np.asarray(found["tolerances"])):
                 numbers = {"order": int(values[0]), "rays": int(values[1])}
                 numbers["relative_error"] = float(values[2])
@@ -407,14 +402,14 @@ def summary(rows: list[dict], promises: list[dict], truths: list[dict]) -> None:
 
 
 def draw(run: Run, rows: list[dict]) -> list:
-    """Error over time and over rays, a panel for each group of scenes."""
+    """Error over time and over rays, a panel for each group of scenes; median and range."""
     paths, panels = [], [p for p in _PANEL_TITLES if any(r["panel"] == p for r in rows)]
     for name, x, y, xlabel in (
         ("time_error", "seconds", "relative_error", "time of a call (ms)"),
         ("rays_error", "rays", "relative_error", "rays a colour"),
         ("gradient_error", "rays", "gradient_error", "rays a colour"),
     ):
-        ylabel = f"relative error of {'σ' if y == 'relative_error' else 'the gradient of σ'}"
+        ylabel = "error of σ, relative" if y == "relative_error" else "error of dσ, relative"
         columns = min(2, len(panels))
         figure, axes = plot.new(-(-len(panels) // columns), columns, 5.2, 3.9)
         for ax in np.ravel(axes)[len(panels) :]:
@@ -424,8 +419,10 @@ def draw(run: Run, rows: list[dict]) -> list:
             here = [r for r in rows if r["panel"] == panel]
             for method in dict.fromkeys(r["method"] for r in here):
                 some = [r for r in here if r["method"] == method]
-                sizes = sorted({r["size"] for r in some})
-                groups = {size: [r for r in some if r["size"] == size] for size in sizes}
+                groups = {k: [r for r in some if r["size"] == k] for k in {r["size"] for r in some}}
+                # A size that few scenes have would bend the line of their median.
+                most = max(map(len, groups.values()))
+                groups = {k: g for k, g in sorted(groups.items()) if 2 * len(g) >= most}
                 scale = 1e3 if x == "seconds" else 1.0
                 across = [scale * float(np.median([r[x] for r in g])) for g in groups.values()]
                 curves[method] = across, [[r[y] for r in g] for g in groups.values()]
