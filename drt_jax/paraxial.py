@@ -345,7 +345,8 @@ def third_order(
         2 * y * chief_incidence - chief_y * incidence
     )
     s5 = s5 + figure * y * chief_y**3
-    spread = n[:, jnp.argmin(wavelengths)] - n[:, jnp.argmax(wavelengths)]
+    colours = jnp.atleast_1d(jnp.asarray(wavelengths, n.dtype))
+    spread = n[:, jnp.argmin(colours)] - n[:, jnp.argmax(colours)]
     spread = spread[:, None] / n
     colour = y * (spread[1:] - spread[:-1])
     half = safe_divide(jnp.ones_like(n[-1]), 2 * n[-1] * behind[-1])
