@@ -22,7 +22,7 @@ from .glass import check_wavelengths
 from .lens import Lens, rotation_matrix
 from .numerics import known_values, safe_divide, safe_sqrt
 from .trace import as_field, trace_bundle
-from .vignetting import Boundary, ClippedPupil, find_boundary, fitted_nodes
+from .vignetting import ClippedPupil, find_boundary, fitted_nodes
 
 __all__ = ["FocusMoments", "focus_moments", "psf_moments", "pupil_order"]
 
@@ -171,18 +171,19 @@ def pupil_order(
     known = known_values((lens, field, distance, wavelengths))
     if known is None:
         return _blind_order(symmetry, tolerance)
-    return _converge(known, symmetry, tolerance, moving)[0]
+    with jax.ensure_compile_time_eval():
+        return _converge(known, symmetry, tolerance, moving)[0]
 
 
 def _blind_order(symmetry: str, tolerance: float) -> int:
     """Order for a scene whose numbers are not known, inside a trace.
 
-    The error falls by two to three digits with each node on axis and by one off axis for
-    the bundled lenses out to 10 degrees; two nodes are in hand.
+    The error falls by two to three digits with each node, on axis and off, for the bundled
+    lenses out to 14 degrees (`experiments.accuracy`); two nodes are in hand, off axis three.
     """
     _check_tolerance(tolerance)
     digits = -np.log10(tolerance)
-    return min(int(np.ceil(digits / 2 if symmetry == "meridian" else digits)) + 2, _MAX_ORDER)
+    return min(int(np.ceil(digits / 2)) + (2 if symmetry == "meridian" else 3), _MAX_ORDER)
 
 
 def _check_tolerance(tolerance: float) -> None:
@@ -206,26 +207,39 @@ def _moments(
         raise ValueError(f"soft_edge: expected a width above 0 mm, got {soft_edge!r}")
     symmetry = _symmetry(lens, field)
     options = symmetry, soft_edge, forward
-    known = known_values(scene)
+    known = known_values((scene, order if isinstance(order, ClippedPupil) else None))
     if known is None:
         if order is None:
             order = _blind_order(symmetry, tolerance)
         rule = order if isinstance(order, ClippedPupil) else _rule(symmetry, order)
         return _plane_moments(*scene, rule, *options)[0]
-    if order is None:
-        order, moments = _converge(known, symmetry, tolerance, moving, soft_edge)
-        if not forward and _concrete(scene):
-            return moments
-    if isinstance(order, int):
-        rule = _padded_rule(symmetry, order)
-        moments, clipped = _plane_moments(*scene, rule, *options)
-        if soft_edge is not None or not known_values(clipped):
-            return _checked(moments, wavelengths)
-        boundary = _boundary(known, symmetry)
-        if boundary is None:
-            return _checked(moments, wavelengths)
-        order = boundary.rule(order)
-    return _checked(_plane_moments(*scene, order, *options)[0], wavelengths)
+    known = known[0]
+    # Outside of any trace, also where this is called inside one: what follows is all known.
+    with jax.ensure_compile_time_eval():
+        if order is None:
+            order, moments = _converge(known, symmetry, tolerance, moving, soft_edge)
+        elif isinstance(order, int):
+            order, moments = _of_order(known, symmetry, order, soft_edge)
+        else:
+            moments = _plane_moments(*known, order, symmetry, soft_edge)[0]
+        _check_passed(moments, known[3])
+    if not forward and _concrete(scene):
+        return moments
+    rule = order if isinstance(order, ClippedPupil) else _padded_rule(symmetry, order)
+    return _plane_moments(*scene, rule, *options)[0]
+
+
+def _of_order(
+    scene: tuple, symmetry: str, order: int, soft_edge: float | None
+) -> tuple[int | ClippedPupil, FocusMoments]:
+    """The rule of an order, fitted to the pupil if it is clipped, and its moments."""
+    moments, clipped = _plane_moments(*scene, _padded_rule(symmetry, order), symmetry, soft_edge)
+    if soft_edge is None and clipped:
+        boundary = find_boundary(*_typed(*scene, symmetry), symmetry)
+        if boundary is not None:
+            rule = boundary.rule(order)
+            return rule, _plane_moments(*scene, rule, symmetry)[0]
+    return order, moments
 
 
 def _converge(
@@ -234,22 +248,25 @@ def _converge(
     """The order that meets the tolerance in a known scene, and the moments of the next one that
     proved it; where the pupil is clipped, the fitted rule that proved it. Warns if none does."""
     _check_tolerance(tolerance)
-    bound = max(tolerance, 100 * float(jnp.finfo(scene[0].curvature.dtype).eps))
+    eps = float(jnp.finfo(scene[0].curvature.dtype).eps)
     previous, boundary, order = None, None, 2
     while True:
         rule = boundary.rule(order) if boundary else _padded_rule(symmetry, order)
-        moments, clipped = _plane_moments(*scene, rule, symmetry, soft_edge, False)
+        moments, clipped = _plane_moments(*scene, rule, symmetry, soft_edge)
         if clipped and boundary is None and soft_edge is None:
-            boundary = _boundary(scene, symmetry)
+            boundary = find_boundary(*_typed(*scene, symmetry), symmetry)
             if boundary is not None:
                 previous, order = None, 4
                 continue
-        moments = _checked(moments, scene[3])
+        _check_passed(moments, scene[3])
         spread = np.asarray(moments.spread, float)
         if previous is not None:
-            change = max(
-                _change(spread, previous, d) for d in (0, *(_best_focus(spread) if moving else ()))
-            )
+            places = (0, *(_best_focus(spread) if moving else ()))
+            change = max(_change(spread, previous, d) for d in places)
+            # Hits are rounded to some last digits of the length of the lens.
+            size = np.sqrt(np.min(np.sum(spread[0, :, :2], axis=-1)))
+            rounding = 4 * eps * abs(float(scene[0].sensor)) / max(size, _SMALLEST)
+            bound = max(tolerance, 100 * eps, rounding)
             if change <= bound:
                 return (rule if boundary else order - 1), moments
         if order > _MAX_ORDER:
@@ -261,10 +278,6 @@ def _converge(
         stacklevel=5,
     )
     return (rule if boundary else order - 1), moments
-
-
-def _boundary(scene: tuple, symmetry: str) -> Boundary | None:
-    return find_boundary(*_typed(*scene, symmetry), symmetry)
 
 
 def _typed(
@@ -399,12 +412,10 @@ def _change(spread: np.ndarray, previous: np.ndarray, d: float) -> float:
     return float(np.max(np.abs(now - before) / np.maximum(size, _SMALLEST**2)))
 
 
-def _checked(moments: FocusMoments, wavelengths: ArrayLike) -> FocusMoments:
-    passing = np.asarray(known_values(moments.passed))
-    for passed, wavelength in zip(passing, np.atleast_1d(known_values(wavelengths))):
+def _check_passed(moments: FocusMoments, wavelengths: ArrayLike) -> None:
+    for passed, wavelength in zip(np.asarray(moments.passed), np.atleast_1d(wavelengths)):
         if not passed > 0:
             raise ValueError(
                 f"no ray at {float(wavelength):g} um reaches the sensor: every one misses a "
                 "surface, is totally reflected or is clipped; see trace_rays(...).status"
             )
-    return moments

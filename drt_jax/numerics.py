@@ -30,11 +30,14 @@ def safe_divide(numerator: Array, denominator: Array) -> Array:
 
 
 def known_values(tree: Any) -> Any:
-    """`tree` with its numbers, also where it is being differentiated; None inside `jit` or `vmap`.
+    """`tree` with its numbers, also while it is being differentiated; None for what `jit` or `vmap`
+    is to fill in.
 
     What follows from a scene, such as how many rays it needs, is not differentiated itself but
     must be decided in an eager `jax.grad`, too. The rule of a custom_jvp is handed the values.
     """
+    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
+        return tree
     seen: list[tuple] = []
 
     @jax.custom_jvp

@@ -17,7 +17,6 @@ import functools
 import math
 import pathlib
 import time
-import warnings
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -29,6 +28,7 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import Lens, Status, plot, pupil
 from drt_jax.runs import Run
+from drt_jax.vignetting import ClippedPupil, find_boundary
 
 from . import _common
 from ._reference import Moments, flatten, reference
@@ -129,24 +129,38 @@ def _pull(measure: Callable[[Lens], Measured], lens: Lens, row: jax.Array) -> tu
 
 
 @functools.cache
-def quadrature(order: int, axial: bool, wavelengths: tuple[float, ...], compiled: bool):
-    """(value, gradient) functions of psf_moments: of a lens, field, distance (and row).
+def quadrature(order: int | None, axial: bool, wavelengths: tuple[float, ...]):
+    """(value, gradient) functions of psf_moments: of a lens, field, distance, rule (and row).
 
-    A field known to be on axis is a constant, as in `psf_moments`. Not compiled as a whole, the
-    call sees the numbers of its scene, as a vignetted pupil needs.
+    A field known to be on axis is a constant, as in `psf_moments`. rule: None, or without an
+    `order` the one that is fitted to the scene's clipped pupil.
     """
 
-    def measure(field, distance, lens):
+    def measure(field, distance, rule, lens):
         field = 0.0 if axial else field
-        return _measured(*drt_jax.psf_moments(lens, field, distance, wavelengths, order=order))
+        moments = drt_jax.psf_moments(
+            lens, field, distance, wavelengths, order=rule if order is None else order
+        )
+        return _measured(*moments)
 
-    def value(lens, field, distance):
-        return measure(field, distance, lens)[1]
+    def value(lens, field, distance, rule):
+        return measure(field, distance, rule, lens)[1]
 
-    def gradient(lens, field, distance, row):
-        return _pull(functools.partial(measure, field, distance), lens, row)
+    def gradient(lens, field, distance, rule, row):
+        return _pull(functools.partial(measure, field, distance, rule), lens, row)
 
-    return (jax.jit(value), jax.jit(gradient)) if compiled else (value, gradient)
+    return jax.jit(value), jax.jit(gradient)
+
+
+def fitted_rule(setting: "Setting", order: int, wavelengths: tuple[float, ...]) -> ClippedPupil:
+    """The rule of an order on what the clear apertures of a vignetted scene leave."""
+    lens, (field, distance) = setting.lens, setting.arguments
+    axial = setting.scene.field_deg == 0
+    angles = jnp.zeros(1, field.dtype) if axial else jnp.stack([0 * field, field])
+    colours = jnp.asarray(wavelengths, field.dtype)
+    boundary = find_boundary(lens, angles, distance, colours, "meridian" if axial else "half")
+    _common.require(boundary is not None, f"scenes: no light passes {setting.scene.label}")
+    return boundary.rule(order)
 
 
 @functools.cache
@@ -268,8 +282,11 @@ def methods(config: Config, scene: AccuracyScene) -> list[tuple[str, int]]:
     return rows + [(name, rays) for rays in counts for name in patterns(16, 1)]
 
 
-def pupil_points(order: int, axial: bool) -> int:
-    """Rays of a quadrature of that order: on one radius, or n + 1 azimuths of half a disc."""
+def pupil_points(order: int | ClippedPupil, axial: bool) -> int:
+    """Rays of a quadrature of that order: on one radius, or n + 1 azimuths of half a disc; of a
+    fitted rule, those that carry weight."""
+    if isinstance(order, ClippedPupil):
+        return int(np.count_nonzero(order.weight[0]))
     return order if axial else order * (order + 1)
 
 
@@ -283,10 +300,13 @@ def curves(config: Config, setting: Setting, advance: Callable[[], Any]) -> np.n
     nominal, timed = 0, (math.nan, math.nan)
     for method, size in methods(config, scene):
         if method == _QUADRATURE:
-            value, gradient = quadrature(size, axial, config.wavelengths_um, not scene.vignetted)
-            found = setting.measure(gradient, value=value)
-            calls = lambda: value(*arguments), lambda: gradient(*arguments, row)
-            rows.append([pupil_points(size, axial), *found, *map(seconds, calls)])
+            rule, order = None, size
+            if scene.vignetted:
+                rule, order = fitted_rule(setting, size, config.wavelengths_um), None
+            value, gradient = quadrature(order, axial, config.wavelengths_um)
+            found = setting.measure(gradient, (rule,), value=value)
+            calls = lambda: value(*arguments, rule), lambda: gradient(*arguments, rule, row)
+            rows.append([pupil_points(rule or size, axial), *found, *map(seconds, calls)])
         else:
             value, gradient = sampled(config.wavelengths_um)
             choices = patterns(size, config.seeds)[method]
@@ -309,12 +329,11 @@ def tolerances(config: Config, setting: Setting) -> np.ndarray:
     field = 0.0 if scene.field_deg == 0 else setting.arguments[0]
     arguments = setting.lens, field, setting.arguments[1], config.wavelengths_um
     for tolerance in config.tolerances:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a clipped beam converges slowly
-            order = drt_jax.pupil_order(*arguments, tolerance)
-            colours = _measured(*drt_jax.psf_moments(*arguments, order=order))[1]
+        order = drt_jax.pupil_order(*arguments, tolerance)
+        colours = _measured(*drt_jax.psf_moments(*arguments, order=order))[1]
         error = errors(setting.truth, colours, [], setting.lens.curvature.size)[0]
-        rows.append([order, pupil_points(order, scene.field_deg == 0), error])
+        rays = pupil_points(order, scene.field_deg == 0)
+        rows.append([getattr(order, "order", order), rays, error])
     return np.array(rows, float)
 
 

@@ -285,3 +285,12 @@ def test_bad_requests():
             psf_moments(blocked, 0.0, jnp.inf, RGB, order=order)
     with pytest.raises(ValueError, match="order: expected 1 to 40, got 41"):
         psf_moments(lens, 0.0, jnp.inf, RGB, order=41)
+
+
+def test_a_lens_fixed_inside_jit_is_a_known_scene():
+    """Orders are found, and nothing of a closed-over lens is traced into the program."""
+    lens = load_lens("singlet")
+    for order in (None, 3):
+        scaled = jax.jit(lambda s, n=order: s * psf_moments(lens, 0.0, 25e3, RGB, order=n)[1])
+        assert "while" not in str(jax.make_jaxpr(scaled)(1.0))
+        np.testing.assert_allclose(scaled(2.0), 2 * psf_moments(lens, 0.0, 25e3, RGB, order=order)[1])
