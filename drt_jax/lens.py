@@ -26,7 +26,9 @@ class Lens:
     meaning is that of the surface's form (see `surface`; asphere: of r^2, r^4, ... in mm^-1,
     mm^-3, ...); thickness (S - 1,) between vertices, negative where a mirror has turned the
     light; semi_diameter (S,), the clear aperture (inf: none), at the stop the aperture
-    itself; sensor (), its z; dispersion of the S + 1 media, the first before the first surface.
+    itself; sensor (), its z; dispersion of the S + 1 media, the first before the first surface
+    (a surface with the same medium on both sides is not traced: its light keeps the constants
+    of the medium in front).
 
     decentre (S + 1, 2) and tilt (S + 1, 3), of the surfaces and the sensor, each about its own
     place on the axis: x and y in mm; angles about x, then the turned y, then the turned z, in

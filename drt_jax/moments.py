@@ -133,7 +133,8 @@ def psf_moments(
     to the first vertex, inf allowed. `wavelengths` (W,) in um. `tolerance`: relative
     error of the RMS spot size; the number of rays follows from it, unless `order` (1 to 40,
     or what `pupil_order` returns) is given. `soft_edge`: a width in mm over which clear apertures
-    fade instead of cutting off. `forward`: be differentiable in forward mode.
+    fade instead of cutting off. `forward`: be differentiable in forward mode (`jax.jvp`,
+    `jax.jacfwd`) instead of reverse mode; without it JAX refuses, naming a custom_vjp function.
 
     Rays fill the stop uniformly; where clear apertures clip it, the nodes are fitted to what is
     left. ValueError if no ray of a colour arrives; under `jax.jit`, where that cannot be known,

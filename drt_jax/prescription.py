@@ -45,6 +45,11 @@ def load_lens(source: str | pathlib.Path | Mapping) -> Lens:
     The arrays have JAX's default floating dtype: float64 where the caller enabled it.
     LensError for a missing file, an unknown key or glass, or numbers that make no lens.
     """
+    with jax.ensure_compile_time_eval():  # a lens loaded inside a jitted function is a constant
+        return _load(source)
+
+
+def _load(source: str | pathlib.Path | Mapping) -> Lens:
     if isinstance(source, Mapping):
         return _build(dict(source), "lens")
     path = pathlib.Path(source)

@@ -200,8 +200,9 @@ def trace_rays(
     in mm, see `field_of_height`). `distance`: mm from the object plane to the first vertex,
     inf allowed. `wavelengths` (W,) in um. `pupil` (Q, 2), x and y on the stop in units of its
     semi-diameter. Rays are aimed at the real stop, for every wavelength. Differentiable in
-    everything but the status, in reverse mode or, if `forward`, in forward mode. ValueError for
-    a known wavelength outside the range of a glass.
+    everything but the status, in reverse mode or, if `forward`, in forward mode (`jax.jvp`,
+    `jax.jacfwd`); a Hessian-vector product is `jax.jvp` of `jax.grad`, without `forward`.
+    ValueError for a known wavelength outside the range of a glass.
     """
     check_wavelengths(lens.glasses, wavelengths)
     dtype = lens.curvature.dtype

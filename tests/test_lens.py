@@ -202,3 +202,8 @@ def test_one_compilation_serves_lenses_of_one_shape():
     power(lens)
     power(dataclasses.replace(lens, curvature=2 * lens.curvature))
     assert len(traced) == 1
+
+
+def test_a_lens_may_be_loaded_inside_jit():
+    power = jax.jit(lambda s: s / drt_jax.focal_length(load_lens("singlet"), [0.55])[0])
+    np.testing.assert_allclose(power(1.0), 1 / drt_jax.focal_length(load_lens("singlet"), [0.55])[0])
