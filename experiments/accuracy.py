@@ -13,10 +13,8 @@ compiled call; gradient_seconds: of one with its gradient in reverse mode.
 """
 
 import dataclasses
-import functools
 import math
 import pathlib
-import time
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -26,12 +24,14 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import Lens, Status, plot, pupil
+from drt_jax import Lens, plot
 from drt_jax.runs import Run
-from drt_jax.vignetting import ClippedPupil, find_boundary
 
 from . import _common
-from ._reference import Moments, flatten, reference
+from ._methods import (
+    fitted_rule, measured, padded, patterns, pupil_points, quadrature, sampled, seconds,
+)  # fmt: skip
+from ._reference import Moments, reference
 
 _QUADRATURE = "quadrature"
 _ERRORS = ("relative_error", "centroid_error", "gradient_error", "centroid_gradient_error")
@@ -39,8 +39,6 @@ _COLUMNS = ("rays", *_ERRORS, "seconds", "gradient_seconds")
 _PANEL_TITLES = ("on axis", "off axis", "vignetted", "float32")
 # Patterns are filled up to these sizes where only errors count, to be compiled once each.
 _SHAPES = (1024, 16384)
-# A call is repeated until so many seconds have passed, at least 3 and at most 15 times.
-_TIMING = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,111 +110,6 @@ class Config:
         _common.require(self.seeds >= 1, "seeds: must be at least 1")
 
 
-# What a method yields: (2,) sigma of the mean colour and height of the mean centroid, to be
-# differentiated, and the sigmas (W,) and centroids (W, 2) of the colours, all in mm.
-Measured = tuple[jax.Array, tuple[jax.Array, jax.Array]]
-
-
-def _measured(mean: jax.Array, covariance: jax.Array) -> Measured:
-    sigma = jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
-    return jnp.stack([jnp.mean(sigma), jnp.mean(mean[:, 1])]), (sigma, mean)
-
-
-def _pull(measure: Callable[[Lens], Measured], lens: Lens, row: jax.Array) -> tuple:
-    """Colours, and the derivatives (P,) of row . (sigma, centroid) by reverse mode."""
-    _, back, colours = jax.vjp(measure, lens, has_aux=True)
-    return colours, flatten(back(row)[0])
-
-
-@functools.cache
-def quadrature(order: int | None, axial: bool, wavelengths: tuple[float, ...]):
-    """(value, gradient) functions of psf_moments: of a lens, field, distance, rule (and row).
-
-    A field known to be on axis is a constant, as in `psf_moments`. rule: None, or without an
-    `order` the one that is fitted to the scene's clipped pupil.
-    """
-
-    def measure(field, distance, rule, lens):
-        field = 0.0 if axial else field
-        moments = drt_jax.psf_moments(
-            lens, field, distance, wavelengths, order=rule if order is None else order
-        )
-        return _measured(*moments)
-
-    def value(lens, field, distance, rule):
-        return measure(field, distance, rule, lens)[1]
-
-    def gradient(lens, field, distance, rule, row):
-        return _pull(functools.partial(measure, field, distance, rule), lens, row)
-
-    return jax.jit(value), jax.jit(gradient)
-
-
-def fitted_rule(setting: "Setting", order: int, wavelengths: tuple[float, ...]) -> ClippedPupil:
-    """The rule of an order on what the clear apertures of a vignetted scene leave."""
-    lens, (field, distance) = setting.lens, setting.arguments
-    axial = setting.scene.field_deg == 0
-    angles = jnp.zeros(1, field.dtype) if axial else jnp.stack([0 * field, field])
-    colours = jnp.asarray(wavelengths, field.dtype)
-    boundary = find_boundary(lens, angles, distance, colours, "meridian" if axial else "half")
-    _common.require(boundary is not None, f"scenes: no light passes {setting.scene.label}")
-    return boundary.rule(order)
-
-
-@functools.cache
-def sampled(wavelengths: tuple[float, ...]):
-    """(value, gradient): sums over given points (Q, 2) on the stop and their weights (Q,)."""
-
-    def measure(field, distance, points, weights, lens):
-        rays = drt_jax.trace_rays(lens, field, distance, wavelengths, points)
-        weights = jnp.where(rays.status == Status.OK, weights, 0)
-        weights = (weights / jnp.sum(weights, axis=1, keepdims=True))[..., None]
-        spot = rays.points[:, :, -1, :2]
-        mean = jnp.sum(weights * spot, axis=1)
-        spot = spot - mean[:, None]
-        return _measured(mean, jnp.einsum("wqi,wqj->wij", weights * spot, spot))
-
-    def value(lens, field, distance, points, weights):
-        return measure(field, distance, points, weights, lens)[1]
-
-    def gradient(lens, field, distance, points, weights, row):
-        return _pull(functools.partial(measure, field, distance, points, weights), lens, row)
-
-    return jax.jit(value), jax.jit(gradient)
-
-
-def patterns(rays: int, seeds: int) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Points and weights of each method with at most `rays` points; of `random`, several."""
-    sides = range(2 * math.isqrt(rays), 0, -1)
-    side = next(n for n in sides if pupil.square_grid(n)[1].size <= rays)
-    rings = int((math.sqrt(12 * rays - 3) - 3) / 6)
-    return {
-        "random": [pupil.random_disc(rays, seed) for seed in range(seeds)],
-        "square grid": [pupil.square_grid(side)],
-        "hexapolar": [pupil.hexapolar(rings)],
-        "Sobol": [pupil.sobol_disc(rays)],
-    }
-
-
-def padded(points: np.ndarray, weights: np.ndarray, rays: int, dtype: Any) -> tuple:
-    """The pattern as arrays (rays, 2) and (rays,), filled up with weightless rays."""
-    missing = rays - weights.size
-    return (
-        jnp.asarray(np.pad(points, ((0, 0), (0, missing))).T, dtype),
-        jnp.asarray(np.pad(weights, (0, missing)), dtype),
-    )
-
-
-def seconds(call: Callable[[], Any]) -> float:
-    """Median wall time of a call whose program is compiled."""
-    times: list[float] = []
-    while len(times) < 3 or (sum(times) < _TIMING and len(times) < 15):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
-
-
 def errors(truth: list[Moments], colours: tuple, gradients: list, surfaces: int) -> list[float]:
     """The four errors of `_ERRORS`; NaN for what was not computed or has no scale."""
     sigma = np.array([moments.sigma for moments in truth])
@@ -282,14 +175,6 @@ def methods(config: Config, scene: AccuracyScene) -> list[tuple[str, int]]:
     return rows + [(name, rays) for rays in counts for name in patterns(16, 1)]
 
 
-def pupil_points(order: int | ClippedPupil, axial: bool) -> int:
-    """Rays of a quadrature of that order: on one radius, or n + 1 azimuths of half a disc; of a
-    fitted rule, those that carry weight."""
-    if isinstance(order, ClippedPupil):
-        return int(np.count_nonzero(order.weight[0]))
-    return order if axial else order * (order + 1)
-
-
 def curves(config: Config, setting: Setting, advance: Callable[[], Any]) -> np.ndarray:
     """Rows of `_COLUMNS`, one for each of `methods`."""
     scene, rows = setting.scene, []
@@ -302,7 +187,7 @@ def curves(config: Config, setting: Setting, advance: Callable[[], Any]) -> np.n
         if method == _QUADRATURE:
             rule, order = None, size
             if scene.vignetted:
-                rule, order = fitted_rule(setting, size, config.wavelengths_um), None
+                rule, order = fitted_rule(size, axial, config.wavelengths_um, *arguments), None
             value, gradient = quadrature(order, axial, config.wavelengths_um)
             found = setting.measure(gradient, (rule,), value=value)
             calls = lambda: value(*arguments, rule), lambda: gradient(*arguments, rule, row)
@@ -330,7 +215,7 @@ def tolerances(config: Config, setting: Setting) -> np.ndarray:
     arguments = setting.lens, field, setting.arguments[1], config.wavelengths_um
     for tolerance in config.tolerances:
         order = drt_jax.pupil_order(*arguments, tolerance)
-        colours = _measured(*drt_jax.psf_moments(*arguments, order=order))[1]
+        colours = measured(*drt_jax.psf_moments(*arguments, order=order))[1]
         error = errors(setting.truth, colours, [], setting.lens.curvature.size)[0]
         rays = pupil_points(order, scene.field_deg == 0)
         rows.append([getattr(order, "order", order), rays, error])
