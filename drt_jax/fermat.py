@@ -330,9 +330,10 @@ def status(hits: Array, system: System) -> Array:
 
     eps = jnp.finfo(hits.dtype).eps
     size = jnp.max(jnp.abs(hits), axis=0)
-    reach = jnp.maximum(size[:-1], size[1:])
-    shake = index[:-1] * (1 + jnp.abs(path.inverse_length[:-1]) * reach)
-    shake = shake + index[1:] * (1 + jnp.abs(path.inverse_length[1:]) * reach)
+    # Of the segment in front of each surface: a far hit excuses no error of another segment.
+    reach = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
+    turned = 1 + jnp.abs(path.inverse_length) * reach
+    shake = index[:-1] * turned[:-1] + index[1:] * turned[1:]
     error = jnp.abs(_residual(path, system)) * normal[:-1]
     settled = jnp.all(error <= 64 * eps * shake, axis=(0, 1)) & jnp.all(leaving > 0, axis=0)
     unsettled = jnp.where(settled, Status.OK, Status.UNCONVERGED).astype(jnp.int32)

@@ -14,7 +14,7 @@ from jax import Array
 from .fermat import Status, System
 from .numerics import safe_divide, safe_sqrt
 from .paraxial import trace_yu
-from .surface import Shape, sag_derivatives, vertex_curvature
+from .surface import Shape, sag, sag_derivatives, vertex_curvature
 
 __all__ = ["Guess", "first_guess"]
 
@@ -24,13 +24,12 @@ _FREEFORM_STEPS = 8
 # `_LOOSE` of the beam's radius there is left to the solver. Else the search goes on until all are
 # within `_TIGHT` or given up.
 _AIM_STEPS = 2
-_MAX_AIM_STEPS = 64
 _LOOSE, _TIGHT = 0.03, 1e-6
-# Where to begin again, in units of the paraxial aim, when that fails; then on a spiral.
-_SCALES = (1.0, 0.75, 0.5, 0.25, 0.0, 1.25)
-_GOLDEN = 2.399963229728653  # angle in radians that spreads points evenly
-# A step shorter than this part of the width of the search leads nowhere.
-_STALLED = 1e-7
+# The search after that begins where, in each of `_TILES` tiles a side, of `_FAN` rays a side, a
+# ray comes nearest: a folded beam reaches one stop point from several. An attempt ends after so
+# many trials in a row that came no nearer, or so many in all.
+_TILES, _FAN = 3, 15
+_PATIENCE, _ATTEMPT = 5, 16
 # A guess that leans more than this (cosine with the axis) is not trusted.
 _FLATTEST = 0.01
 
@@ -46,16 +45,25 @@ class Guess(NamedTuple):
 
 class _Aim(NamedTuple):
     """aim, step (D, W, Q): the best launch point and the step to the next trial; miss (D, W, Q),
-    of the best at the stop; inverse (D, D, W, Q), launch point by stop point; found (W, Q),
-    whether any trial arrived; fate (W, Q), of the last trial; count ()."""
+    of the best at the stop, length far (W, Q), inf before one arrived; inverse (D, D, W, Q),
+    launch by stop point; attempt, age and bad (W, Q): the attempts made, the trials of this one
+    and those in a row that came no nearer; fate (W, Q), of the last ray lost; count (), of
+    trials; starts (K, D, W, Q), where attempts begin; round (), 1 after the fan; last (),
+    the attempts allowed."""
 
     aim: Array
     step: Array
     miss: Array
+    far: Array
     inverse: Array
-    found: Array
+    attempt: Array
+    age: Array
+    bad: Array
     fate: Array
     count: Array
+    starts: Array
+    round: Array
+    last: Array
 
 
 def first_guess(system: System) -> Guess:
@@ -89,9 +97,11 @@ def first_guess(system: System) -> Guess:
     paraxial = amplitude[:, None] * axial[..., None] + tangent[:, None] * tilted[..., None]
 
     # Aim at a point on the vertex plane of the first surface.
-    aim = paraxial[:, 0]
     missed = jnp.int32(Status.OK)
-    if stop:
+    if stop == 0:
+        aim = _launch(system)
+    else:
+        aim = paraxial[:, 0]
         aim, missed = _search(system, aim, safe_divide(axial[:, 0, :, None], magnification))
     hits, fate = _trace(system, aim, count)
     if system.offset is not None:
@@ -101,80 +111,132 @@ def first_guess(system: System) -> Guess:
     )
 
 
+def _launch(system: System) -> Array:
+    """Where rays through the points of a stop that comes first cross its vertex plane."""
+    w = system.crossings
+    shape = Shape(*(a[..., 0, :, :] for a in system.shape))
+    own = jnp.concatenate([w, sag(w, shape, system.forms[0])[None]])
+    if system.rotation is not None:
+        own = jnp.sum(system.rotation[..., 0, None, None] * own[None], axis=1)
+    across = jnp.zeros_like(own[:-1, :1, :1]) if system.offset is None else (
+        system.offset[:, 0, None, None])  # fmt: skip
+    point = own + jnp.concatenate([across, 0 * own[-1:, :1, :1] + system.vertex[0]])
+    direction = system.vergence * point - system.source[:, None, None]
+    aim = point[:-1] - safe_divide(direction[:-1] * own[-1], direction[-1])
+    return jnp.broadcast_to(aim, (w.shape[0], system.index.shape[1], w.shape[2]))
+
+
 def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
     """Launch points (D, W, Q) of rays through the stop points, and why there is none (W, Q).
 
-    Broyden's method, which begins with the paraxial `scale` (D, W, 1) of launch by stop point;
-    a step after which the ray is lost or farther off is halved; where the steps lead nowhere,
-    the search begins anew elsewhere.
+    Broyden's method. It begins with the paraxial `aim` and `scale` (D, W, 1) of launch by stop
+    point; a step after which the ray is lost or farther off is halved. Rays that this does not
+    find begin anew where a ray of a fan comes near, with a small step along each component to
+    learn the derivatives.
     """
-    stop, dtype = system.stop, aim.dtype
-    dim = aim.shape[0]
+    stop, dtype, dim = system.stop, aim.dtype, aim.shape[0]
+    starts = _TILES**dim
     beam = jnp.max(_length(system.crossings))
     lean = _length(system.source[:-1])
     depth = jnp.abs(system.vertex[stop] - system.vertex[0])
     width = 2 * beam + lean * (depth + beam) + 0.02 * depth
     beam = jnp.where(beam > 0, beam, 0.1 * width)
     # Where the stop is imaged to infinity, the paraxial aim lies beyond any lens.
-    aim = aim * jnp.minimum(1, safe_divide(4 * width, _length(aim)))
-    identity = jnp.eye(dim, dtype=dtype)[..., None, None]
-    inverse = jnp.broadcast_to(identity * scale, (dim, *aim.shape))
+    aim = aim * jnp.minimum(1, 4 * width / jnp.maximum(_length(aim), width))
     tight = jnp.maximum(_TIGHT, 256 * jnp.finfo(dtype).eps) * beam
-    scales = jnp.asarray(_SCALES, dtype)
-
-    def fresh(count):
-        """The launch point to begin with at trial `count`."""
-        k = count.astype(dtype)
-        angle = _GOLDEN * k
-        round_ = jnp.stack([jnp.sin(angle), jnp.cos(angle)])[-dim:, None, None]
-        spread = width * jnp.sqrt(k / _MAX_AIM_STEPS) * round_
-        some = jnp.minimum(count, len(_SCALES) - 1)
-        return jnp.where(count < len(_SCALES), aim * scales[some], spread)
-
-    def off(state):
-        return jnp.where(state.found, _length(state.miss), jnp.inf)
+    probe = 1e-4 * width * jnp.eye(dim, dtype=dtype)[..., None, None]
+    shape = jnp.broadcast_shapes(aim.shape, system.crossings.shape)
+    aim, none = jnp.broadcast_to(aim, shape), jnp.zeros(shape, dtype)
+    zero = jnp.zeros(shape[1:], jnp.int32)
 
     def again(state):
-        far = off(state)
-        ended = jnp.all(far <= _LOOSE * beam) & (state.count == _AIM_STEPS)
-        return ~ended & jnp.any(far > tight) & (state.count < _MAX_AIM_STEPS)
+        first = (state.round == 0) & jnp.all(state.far <= _LOOSE * beam)
+        return (
+            ~(first & (state.count == _AIM_STEPS))
+            & jnp.any((state.far > tight) & (state.attempt < state.last))
+            & (state.count < _ATTEMPT * starts)
+        )
 
     def body(state):
-        trial = jnp.where(state.found, state.aim + state.step, fresh(state.count))
+        first, fresh = state.age == 0, state.starts[0]
+        for k in range(1, starts):
+            fresh = jnp.where(state.attempt == k, state.starts[k], fresh)
+        trial = jnp.where(first, fresh, state.aim + state.step)
         hits, fate = _trace(system, trial, stop + 1)
         miss, arrived = system.crossings - hits[:, stop], fate == Status.OK
-        better = arrived & (_length(miss) < off(state))
+        far = jnp.where(arrived, _length(miss), jnp.inf)
+        better = far < state.far
         # Broyden's update from the best ray to this one.
         moved, change = trial - state.aim, state.miss - miss
         back = jnp.sum(state.inverse * change, axis=1)
         row = jnp.sum(moved[:, None] * state.inverse, axis=0)
         scale = jnp.sum(row * change, axis=0)
-        usable = arrived & state.found & (jnp.abs(scale) > 1e-3 * jnp.sum(moved**2, axis=0))
-        correction = safe_divide((moved - back)[:, None] * row, jnp.where(usable, scale, 0))
-        inverse = state.inverse + correction
-        step = jnp.sum(inverse * jnp.where(better, miss, state.miss), axis=1)
+        usable = arrived & ~first & (jnp.abs(scale) > 1e-3 * jnp.sum(moved**2, axis=0))
+        inverse = state.inverse + safe_divide(
+            (moved - back)[:, None] * row, jnp.where(usable, scale, 0)
+        )
+        best, miss = (jnp.where(better, a, b) for a, b in ((trial, state.aim), (miss, state.miss)))
+        far = jnp.minimum(far, state.far)
         # Never farther than the search is wide; after a bad step, half as far at most.
-        bound = jnp.where(better, width, _length(state.step) / 2)
+        step = jnp.sum(inverse * miss, axis=1)
+        bad = jnp.where(better, 0, state.bad + 1)
+        probing = (state.round > 0) & (state.age < dim)
         step = jnp.where(arrived, step, state.step / 2)
+        bound = jnp.where(better | (state.age <= dim), width, _length(state.step) / 2)
         step = step * jnp.minimum(1, safe_divide(bound, _length(step)))
-        found = state.found | arrived
-        far = jnp.where(better, _length(miss), off(state))
-        stalled = found & (_length(step) < _STALLED * width) & (far > tight)
-        return _Aim(
-            jnp.where(better, trial, state.aim), step, jnp.where(better, miss, state.miss),
-            inverse, found & ~stalled, fate, state.count + 1,
+        for d in range(dim):
+            step = jnp.where(probing & (state.age == d), probe[d], step)
+        age = state.age + 1
+        ended = (first & ~arrived) | (~probing & (bad > _PATIENCE)) | (age > _ATTEMPT)
+        ended = ended & (far > tight) & (state.attempt < state.last)
+        return state._replace(
+            aim=best, step=step, miss=miss, far=jnp.where(ended, jnp.inf, far), inverse=inverse,
+            attempt=state.attempt + ended, age=jnp.where(ended, 0, age),
+            bad=jnp.where(ended, 0, bad), fate=jnp.where(arrived, state.fate, fate),
+            count=state.count + 1,
         )  # fmt: skip
 
-    shape = jnp.broadcast_shapes(aim.shape, system.crossings.shape)
-    aim = jnp.broadcast_to(aim, shape)
-    none = jnp.zeros(shape[1:], bool)
+    def fan(state):
+        """The launch points nearest to what is not found yet."""
+        side = np.linspace(-1, 1, _TILES * _FAN)
+        side = (2 * side * (0.3 + 0.7 * side**2)).reshape(_TILES, _FAN)
+        points = np.stack(np.meshgrid(*[np.arange(side.size)] * dim, indexing="ij"))
+        points = side.ravel()[points].reshape(dim, *(_TILES, _FAN) * dim)
+        tiles = (0, *range(1, 2 * dim, 2), *range(2, 2 * dim + 1, 2))
+        points = jnp.asarray(points.transpose(tiles).reshape(dim, 1, -1), dtype) * width
+        points = jnp.broadcast_to(points, (dim, shape[1], points.shape[-1]))
+        hits, fate = _trace(system, points, stop + 1)
+        miss = _length(system.crossings[..., None] - hits[:, stop, :, None])
+        far = jnp.where((fate == Status.OK)[:, None], miss, jnp.inf)
+        nearest = jnp.argmin(far.reshape(*shape[1:], starts, -1), axis=-1)
+        nearest = nearest + far.shape[-1] // starts * np.arange(starts, dtype=nearest.dtype)
+        chosen = jnp.take_along_axis(points[:, :, None], nearest[None], axis=-1)
+        done = state.far <= _LOOSE * beam
+        return state._replace(
+            starts=jnp.moveaxis(chosen, -1, 0), far=jnp.where(done, state.far, jnp.inf),
+            attempt=jnp.where(done, state.attempt, 0), age=jnp.where(done, state.age, 0),
+            bad=zero, count=jnp.int32(0), round=state.round + 1, last=jnp.int32(starts),
+        )  # fmt: skip
+
+    def stage(state):
+        # A loop of one turn, rather than a branch, so that under `vmap` too it costs nothing.
+        lost = (state.count > 0) & (state.round == 0)
+        state = jax.lax.while_loop(lambda s: lost & (s.round == 0), fan, state)
+        state = jax.lax.while_loop(again, body, state)
+        return state
+
+    def unsolved(state):
+        return (state.count == 0) | ((state.round == 0) & jnp.any(state.far > _LOOSE * beam))
+
+    inverse = jnp.eye(dim, dtype=dtype)[..., None, None] * jnp.where(scale == 0, 1, scale)
     start = _Aim(
-        aim, jnp.zeros(shape, dtype), jnp.zeros(shape, dtype), inverse, none,
-        none.astype(jnp.int32), jnp.array(0),
+        aim, none, none, jnp.full(shape[1:], jnp.inf, dtype),
+        jnp.broadcast_to(inverse, (dim, *shape)), zero, zero, zero, zero, jnp.int32(0),
+        jnp.broadcast_to(aim, (starts, *shape)), jnp.int32(0), jnp.int32(1),
     )  # fmt: skip
-    end = jax.lax.while_loop(again, body, start)
+    end = jax.lax.while_loop(unsolved, stage, start)
     failed = jnp.where(end.fate == Status.OK, jnp.int32(Status.UNCONVERGED), end.fate)
-    return end.aim, jnp.where(off(end) <= _LOOSE * beam, jnp.int32(Status.OK), failed)
+    return end.aim, jnp.where(end.far <= _LOOSE * beam, jnp.int32(Status.OK), failed)
 
 
 def _length(a: Array) -> Array:
