@@ -28,8 +28,8 @@ _LOOSE, _TIGHT = 0.03, 1e-6
 # The search after that begins where, in each of `_TILES` tiles a side, of `_FAN` rays a side, a
 # ray comes nearest: a folded beam reaches one stop point from several. An attempt ends after so
 # many trials in a row that came no nearer, or so many in all.
-_TILES, _FAN = 3, 15
-_PATIENCE, _ATTEMPT = 5, 16
+_TILES, _FAN = 3, 21
+_PATIENCE, _ATTEMPT = 7, 28
 # A guess that leans more than this (cosine with the axis) is not trusted.
 _FLATTEST = 0.01
 
@@ -49,7 +49,8 @@ class _Aim(NamedTuple):
     launch by stop point; attempt, age and bad (W, Q): the attempts made, the trials of this one
     and those in a row that came no nearer; fate (W, Q), of the last ray lost; count (), of
     trials; starts (K, D, W, Q), where attempts begin; round (), 1 after the fan; last (),
-    the attempts allowed."""
+    the attempts allowed; hits (D, S + 1, W, Q) and known (W, Q), those of the best launch points
+    and what becomes of these rays; again (), whether there was a first round."""
 
     aim: Array
     step: Array
@@ -64,6 +65,9 @@ class _Aim(NamedTuple):
     starts: Array
     round: Array
     last: Array
+    hits: Array
+    known: Array
+    again: Array
 
 
 def first_guess(system: System) -> Guess:
@@ -97,18 +101,14 @@ def first_guess(system: System) -> Guess:
     paraxial = amplitude[:, None] * axial[..., None] + tangent[:, None] * tilted[..., None]
 
     # Aim at a point on the vertex plane of the first surface.
-    missed = jnp.int32(Status.OK)
     if stop == 0:
-        aim = _launch(system)
+        hits, fate = _trace(system, _launch(system), count)
     else:
-        aim = paraxial[:, 0]
-        aim, missed = _search(system, aim, safe_divide(axial[:, 0, :, None], magnification))
-    hits, fate = _trace(system, aim, count)
+        scale = safe_divide(axial[:, 0, :, None], magnification)
+        hits, fate = _search(system, paraxial[:, 0], scale)
     if system.offset is not None:
         paraxial = paraxial - system.offset[..., None, None]
-    return Guess(
-        jnp.where(fate == Status.OK, hits, paraxial), jnp.where(missed != Status.OK, missed, fate)
-    )
+    return Guess(jnp.where(fate == Status.OK, hits, paraxial), fate)
 
 
 def _launch(system: System) -> Array:
@@ -127,15 +127,16 @@ def _launch(system: System) -> Array:
 
 
 def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
-    """Launch points (D, W, Q) of rays through the stop points, and why there is none (W, Q).
+    """Hits (D, S + 1, W, Q) of rays nearly through the stop points, and why there is none (W, Q).
 
     Broyden's method. It begins with the paraxial `aim` and `scale` (D, W, 1) of launch by stop
     point; a step after which the ray is lost or farther off is halved. Rays that this does not
-    find begin anew where a ray of a fan comes near, with a small step along each component to
-    learn the derivatives.
+    find, or that it finds and the surfaces behind the stop lose, begin anew where a ray of a fan
+    comes near and reaches the sensor, with a small step along each component to learn the
+    derivatives.
     """
     stop, dtype, dim = system.stop, aim.dtype, aim.shape[0]
-    starts = _TILES**dim
+    starts, count = _TILES**dim, len(system.forms)
     beam = jnp.max(_length(system.crossings))
     lean = _length(system.source[:-1])
     depth = jnp.abs(system.vertex[stop] - system.vertex[0])
@@ -162,7 +163,7 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
         for k in range(1, starts):
             fresh = jnp.where(state.attempt == k, state.starts[k], fresh)
         trial = jnp.where(first, fresh, state.aim + state.step)
-        hits, fate = _trace(system, trial, stop + 1)
+        hits, fate = _trace(system, trial, jnp.where(state.round == 0, stop + 1, count))
         miss, arrived = system.crossings - hits[:, stop], fate == Status.OK
         far = jnp.where(arrived, _length(miss), jnp.inf)
         better = far < state.far
@@ -177,12 +178,14 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
         )
         best, miss = (jnp.where(better, a, b) for a, b in ((trial, state.aim), (miss, state.miss)))
         far = jnp.minimum(far, state.far)
-        # Never farther than the search is wide; after a bad step, half as far at most.
+        # After a bad step half as far at most, after a good one twice as far.
         step = jnp.sum(inverse * miss, axis=1)
         bad = jnp.where(better, 0, state.bad + 1)
         probing = (state.round > 0) & (state.age < dim)
         step = jnp.where(arrived, step, state.step / 2)
-        bound = jnp.where(better | (state.age <= dim), width, _length(state.step) / 2)
+        bound = jnp.where(better, 2, 0.5).astype(dtype) * _length(state.step)
+        early = jnp.where(state.round > 0, width / 8, width)
+        bound = jnp.where(first | (state.age == jnp.where(state.round > 0, dim, 0)), early, bound)
         step = step * jnp.minimum(1, safe_divide(bound, _length(step)))
         for d in range(dim):
             step = jnp.where(probing & (state.age == d), probe[d], step)
@@ -205,13 +208,13 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
         tiles = (0, *range(1, 2 * dim, 2), *range(2, 2 * dim + 1, 2))
         points = jnp.asarray(points.transpose(tiles).reshape(dim, 1, -1), dtype) * width
         points = jnp.broadcast_to(points, (dim, shape[1], points.shape[-1]))
-        hits, fate = _trace(system, points, stop + 1)
+        hits, fate = _trace(system, points, count)
         miss = _length(system.crossings[..., None] - hits[:, stop, :, None])
         far = jnp.where((fate == Status.OK)[:, None], miss, jnp.inf)
         nearest = jnp.argmin(far.reshape(*shape[1:], starts, -1), axis=-1)
         nearest = nearest + far.shape[-1] // starts * np.arange(starts, dtype=nearest.dtype)
         chosen = jnp.take_along_axis(points[:, :, None], nearest[None], axis=-1)
-        done = state.far <= _LOOSE * beam
+        done = state.known == Status.OK
         return state._replace(
             starts=jnp.moveaxis(chosen, -1, 0), far=jnp.where(done, state.far, jnp.inf),
             attempt=jnp.where(done, state.attempt, 0), age=jnp.where(done, state.age, 0),
@@ -220,32 +223,38 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
 
     def stage(state):
         # A loop of one turn, rather than a branch, so that under `vmap` too it costs nothing.
-        lost = (state.count > 0) & (state.round == 0)
-        state = jax.lax.while_loop(lambda s: lost & (s.round == 0), fan, state)
+        state = jax.lax.while_loop(lambda s: s.again & (s.round == 0), fan, state)
         state = jax.lax.while_loop(again, body, state)
-        return state
+        hits, fate = _trace(system, state.aim, count)
+        last = jnp.where(state.fate == Status.OK, jnp.int32(Status.UNCONVERGED), state.fate)
+        fate = jnp.where(state.far <= _LOOSE * beam, fate, last)
+        # If the fan does not help, the first attempt knows best what stops the ray.
+        kept = state.again & (fate != Status.OK)
+        return state._replace(
+            hits=hits, known=jnp.where(kept, state.known, fate), again=jnp.bool_(True)
+        )
 
     def unsolved(state):
-        return (state.count == 0) | ((state.round == 0) & jnp.any(state.far > _LOOSE * beam))
+        return ~state.again | ((state.round == 0) & jnp.any(state.known != Status.OK))
 
     inverse = jnp.eye(dim, dtype=dtype)[..., None, None] * jnp.where(scale == 0, 1, scale)
     start = _Aim(
         aim, none, none, jnp.full(shape[1:], jnp.inf, dtype),
         jnp.broadcast_to(inverse, (dim, *shape)), zero, zero, zero, zero, jnp.int32(0),
         jnp.broadcast_to(aim, (starts, *shape)), jnp.int32(0), jnp.int32(1),
+        jnp.zeros((dim, count, *shape[1:]), dtype), zero, jnp.bool_(False),
     )  # fmt: skip
     end = jax.lax.while_loop(unsolved, stage, start)
-    failed = jnp.where(end.fate == Status.OK, jnp.int32(Status.UNCONVERGED), end.fate)
-    return end.aim, jnp.where(end.far <= _LOOSE * beam, jnp.int32(Status.OK), failed)
+    return end.hits, end.known
 
 
 def _length(a: Array) -> Array:
     return jnp.sqrt(jnp.sum(a * a, axis=0))
 
 
-def _trace(system: System, aim: Array, count: int) -> tuple[Array, Array]:
-    """Sequential trace over the first `count` surfaces: hits (D, count, W, Q), and what became
-    of the ray, a `Status` (W, Q)."""
+def _trace(system: System, aim: Array, count: int | Array) -> tuple[Array, Array]:
+    """Sequential trace over the first `count` surfaces: hits (D, S + 1, W, Q), 0 on the others,
+    and what became of the ray, a `Status` (W, Q)."""
     height = jnp.broadcast_to(system.vertex[0], aim.shape[1:])
     point = jnp.concatenate([aim, height[None]])
     direction = system.vergence * point - system.source[:, None, None]
@@ -255,12 +264,12 @@ def _trace(system: System, aim: Array, count: int) -> tuple[Array, Array]:
     offset = jnp.zeros((aim.shape[0], len(system.forms)), aim.dtype)
     offset = offset if system.offset is None else system.offset
     origin = jnp.concatenate([offset, system.vertex[None]])[..., None, None]
-    kinds = sorted(set(system.forms[:count]))
+    kinds = sorted(set(system.forms))
     crossings = [_crossing(kind) for kind in kinds]
 
-    def step(carry, xs):
-        point, d, fate = carry
-        origin, rotation, kind, shape, before, after, senses = xs
+    def step(i, carry):
+        point, d, fate, hits = carry
+        origin, rotation, kind, shape, before, after, senses = jax.tree.map(lambda a: a[i], rows)
         p = point - origin
         if rotation is not None:
             p = jnp.sum(rotation[..., None, None] * p[:, None], axis=0)
@@ -284,19 +293,21 @@ def _trace(system: System, aim: Array, count: int) -> tuple[Array, Array]:
         if rotation is not None:
             own = jnp.sum(rotation[..., None, None] * own[None], axis=1)
             d = jnp.sum(rotation[..., None, None] * d[None], axis=1)
-        return (own + origin, d, fate), w
+        return own + origin, d, fate, hits.at[:, i].set(w)
 
     flat = jnp.broadcast_to(direction[-1] <= _FLATTEST, aim.shape[1:])
-    carry = point, direction, jnp.where(flat, jnp.int32(Status.MISSED), jnp.int32(Status.OK))
-    rotation = None if system.rotation is None else jnp.moveaxis(system.rotation, -1, 0)[:count]
-    xs = (
-        jnp.moveaxis(origin, 1, 0)[:count], rotation,
-        np.array([kinds.index(form) for form in system.forms[:count]]),
-        Shape(system.curvature[:count], system.conic[:count], system.coefficients.T[:count]),
-        index[:count], index[1 : count + 1], jnp.stack([senses[:-1], senses[1:]], 1)[:count],
+    flat = jnp.broadcast_to(direction[-1] <= _FLATTEST, aim.shape[1:])
+    fate = jnp.where(flat, jnp.int32(Status.MISSED), jnp.int32(Status.OK))
+    hits = jnp.zeros((aim.shape[0], len(system.forms), *aim.shape[1:]), aim.dtype)
+    rotation = None if system.rotation is None else jnp.moveaxis(system.rotation, -1, 0)
+    rows = (
+        jnp.moveaxis(origin, 1, 0), rotation,
+        jnp.array([kinds.index(form) for form in system.forms]),
+        Shape(system.curvature, system.conic, system.coefficients.T),
+        index[:-1], index[1:], jnp.stack([senses[:-1], senses[1:]], 1),
     )  # fmt: skip
-    (_, _, fate), hits = jax.lax.scan(step, carry, xs)
-    return jnp.moveaxis(hits, 0, 1), fate
+    _, _, fate, hits = jax.lax.fori_loop(0, count, step, (point, direction, fate, hits))
+    return hits, fate
 
 
 def _crossing(form: str):
