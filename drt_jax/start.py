@@ -25,11 +25,12 @@ _FREEFORM_STEPS = 8
 # within `_TIGHT` or given up.
 _AIM_STEPS = 2
 _LOOSE, _TIGHT = 0.03, 1e-6
-# The search after that begins where, in each of `_TILES` tiles a side, of `_FAN` rays a side, a
-# ray comes nearest: a folded beam reaches one stop point from several. An attempt ends after so
-# many trials in a row that came no nearer, or so many in all.
-_TILES, _FAN = 3, 21
-_PATIENCE, _ATTEMPT = 7, 28
+# The search after that sends a fan of rays, in `_TILES` tiles a side of `_FAN` rays a side, and
+# begins where it comes nearest, in the `_STARTS` best tiles: a folded beam reaches one stop point
+# from several sides. An attempt ends after so many trials in a row that came no nearer, or so
+# many in all.
+_TILES, _FAN, _STARTS = 7, 9, 6
+_PATIENCE, _ATTEMPT = 8, 48
 # A guess that leans more than this (cosine with the axis) is not trusted.
 _FLATTEST = 0.01
 
@@ -136,7 +137,7 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
     derivatives.
     """
     stop, dtype, dim = system.stop, aim.dtype, aim.shape[0]
-    starts, count = _TILES**dim, len(system.forms)
+    starts, count = min(_STARTS, _TILES**dim), len(system.forms)
     beam = jnp.max(_length(system.crossings))
     lean = _length(system.source[:-1])
     depth = jnp.abs(system.vertex[stop] - system.vertex[0])
@@ -194,7 +195,7 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
         ended = ended & (far > tight) & (state.attempt < state.last)
         return state._replace(
             aim=best, step=step, miss=miss, far=jnp.where(ended, jnp.inf, far), inverse=inverse,
-            attempt=state.attempt + ended, age=jnp.where(ended, 0, age),
+            attempt=state.attempt + ended.astype(jnp.int32), age=jnp.where(ended, 0, age),
             bad=jnp.where(ended, 0, bad), fate=jnp.where(arrived, state.fate, fate),
             count=state.count + 1,
         )  # fmt: skip
@@ -211,8 +212,10 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
         hits, fate = _trace(system, points, count)
         miss = _length(system.crossings[..., None] - hits[:, stop, :, None])
         far = jnp.where((fate == Status.OK)[:, None], miss, jnp.inf)
-        nearest = jnp.argmin(far.reshape(*shape[1:], starts, -1), axis=-1)
-        nearest = nearest + far.shape[-1] // starts * np.arange(starts, dtype=nearest.dtype)
+        far = far.reshape(*shape[1:], _TILES**dim, _FAN**dim)
+        nearest = jnp.argmin(far, axis=-1).astype(jnp.int32)
+        best = jax.lax.top_k(-jnp.min(far, axis=-1), starts)[1]
+        nearest = jnp.take_along_axis(nearest, best, axis=-1) + best * _FAN**dim
         chosen = jnp.take_along_axis(points[:, :, None], nearest[None], axis=-1)
         done = state.known == Status.OK
         return state._replace(
@@ -229,7 +232,7 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
         last = jnp.where(state.fate == Status.OK, jnp.int32(Status.UNCONVERGED), state.fate)
         fate = jnp.where(state.far <= _LOOSE * beam, fate, last)
         # If the fan does not help, the first attempt knows best what stops the ray.
-        kept = state.again & (fate != Status.OK)
+        kept = state.again & (fate != Status.OK) & (state.known != Status.UNCONVERGED)
         return state._replace(
             hits=hits, known=jnp.where(kept, state.known, fate), again=jnp.bool_(True)
         )

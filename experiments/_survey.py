@@ -92,7 +92,7 @@ def _shoot(lens, points, directions):
     step = jnp.diff(hits, axis=1)
     if lens.tilt is not None:
         step = jnp.einsum("sij,msi->msj", jax.vmap(rotation_matrix)(lens.tilt[1:]), step)
-    return hits, ok & jnp.all(step[..., 2] * lens.senses[1:] >= 0, axis=1)
+    return hits, ok & jnp.all(step[..., 2] * jnp.asarray(lens.senses[1:], step.dtype) >= 0, axis=1)
 
 
 def _plain(lens, field, distance, pupil):
