@@ -75,7 +75,8 @@ def first_guess(system: System) -> Guess:
     """Hits of rays near those through the stop points of `system`.
 
     Rays are traced forward by Snell's law, aimed through the paraxial entrance pupil, and
-    re-aimed by what they miss the stop point; where such a ray fails, paraxial hits stand in.
+    re-aimed by what they miss the stop point (see `_search`); where no ray is found, paraxial
+    hits stand in. Where the stop is the first surface there is nothing to search for.
     """
     stop, count = system.stop, len(system.forms)
     dim = system.target.shape[0]
@@ -101,7 +102,7 @@ def first_guess(system: System) -> Guess:
     amplitude = safe_divide(target - tangent * tilted[:, stop, :, None], magnification)
     paraxial = amplitude[:, None] * axial[..., None] + tangent[:, None] * tilted[..., None]
 
-    # Aim at a point on the vertex plane of the first surface.
+    # Rays are labelled by where they would cross the vertex plane of the first surface.
     if stop == 0:
         hits, fate = _trace(system, _launch(system), count)
     else:
@@ -208,6 +209,8 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
         points = side.ravel()[points].reshape(dim, *(_TILES, _FAN) * dim)
         tiles = (0, *range(1, 2 * dim, 2), *range(2, 2 * dim + 1, 2))
         points = jnp.asarray(points.transpose(tiles).reshape(dim, 1, -1), dtype) * width
+        # XLA would work out what does not depend on the state before the loop, needed or not.
+        points = jnp.where(state.round == 0, points, 0)
         points = jnp.broadcast_to(points, (dim, shape[1], points.shape[-1]))
         hits, fate = _trace(system, points, count)
         miss = _length(system.crossings[..., None] - hits[:, stop, :, None])
@@ -298,7 +301,6 @@ def _trace(system: System, aim: Array, count: int | Array) -> tuple[Array, Array
             d = jnp.sum(rotation[..., None, None] * d[None], axis=1)
         return own + origin, d, fate, hits.at[:, i].set(w)
 
-    flat = jnp.broadcast_to(direction[-1] <= _FLATTEST, aim.shape[1:])
     flat = jnp.broadcast_to(direction[-1] <= _FLATTEST, aim.shape[1:])
     fate = jnp.where(flat, jnp.int32(Status.MISSED), jnp.int32(Status.OK))
     hits = jnp.zeros((aim.shape[0], len(system.forms), *aim.shape[1:]), aim.dtype)

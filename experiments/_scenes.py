@@ -294,7 +294,8 @@ def camera(rng, count, name):
     terms[..., 1] = rng.uniform(-5e-3, 5e-3, (count, surfaces)) / rim**4
     batch = dataclasses.replace(
         jax.tree.map(jnp.asarray, batch), curvature=vary(batch.curvature),
-        thickness=vary(batch.thickness), conic=jnp.asarray(rng.uniform(-0.2, 0.2, (count, surfaces))),
+        thickness=vary(batch.thickness),
+        conic=jnp.asarray(rng.uniform(-0.2, 0.2, (count, surfaces))),
         coefficients=jnp.asarray(terms), sensor=vary(batch.sensor, 0.003),
     )  # fmt: skip
     widest = {"singlet": 5.0, "double_gauss": 14.0}.get(name, 20.0) * 1.2

@@ -20,11 +20,11 @@ __all__ = ["COUNTS", "survey"]
 COUNTS = ("missed", "tir", "clipped", "unconverged")
 _BATCH = 200  # scenes to a call: all batches of one structure share a compiled program
 _SHOTS = 24  # rays of a scene that the sequential trace follows in one call
-_ORDER = 3  # of the pupil rule whose moments are differentiated
+_ORDER = 2  # of the pupil rule whose moments are differentiated
 _ROUNDINGS = 1000  # how many roundings of the hits two traces may be apart
 _GRID = 41  # launch points along each side of the search for a ray that was not found
-_STARTS = 5  # candidates refined for each such ray
-_REFINE = 30
+_STARTS = 4  # candidates refined for each such ray
+_REFINE = 25
 _STOP_MISS = 1e-9  # mm
 
 
@@ -101,7 +101,7 @@ def _plain(lens, field, distance, pupil):
 
 
 # Few scenes, many programs: what takes long is to compile them.
-_QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+_QUICK = {"xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
 _compiled = {
     function.__name__[1:]: jax.jit(jax.vmap(function), compiler_options=_QUICK)
     for function in (_scene, _moments, _shoot, _plain)

@@ -30,7 +30,7 @@ class Config:
     names of those to run, empty for all.
     """
 
-    scenes: int = 600
+    scenes: int = 620
     seed: int = 0
     families: tuple[str, ...] = ()
 
@@ -102,13 +102,14 @@ def run(config: Config, run: Run) -> None:
     ]  # fmt: skip
     print(_common.table(header, lines))
     print(f"{sums['scenes']} scenes, {sums['rays']} rays: {sums['nan_values']} values and "
-          f"{sums['nan_gradients']} derivatives not finite, {sums['disagree_with_snell']} good rays "
-          f"that Snell's law denies")  # fmt: skip
+          f"{sums['nan_gradients']} derivatives not finite, {sums['disagree_with_snell']} good "
+          "rays that Snell's law denies")  # fmt: skip
     print(f"rays reported as failed that Snell's law can trace: {sums['traceable']}, "
           f"{sums['traceable_per_10000']:.2f} in 10,000")  # fmt: skip
     figure, axes = plot.new(1, 2, 6, 5)
     plot.by_family(axes[0], {k: v[0] for k, v in spread.items()}, "Newton steps of a scene")
-    plot.by_family(axes[1], {k: 1e3 * v[1] for k, v in spread.items()}, "float32 error (µm)", log=True)
+    errors = {name: 1e3 * values for name, (_, values) in spread.items()}
+    plot.by_family(axes[1], errors, "float32 error (µm)", log=True)
     figure.savefig(run.figures / "families.png")
     print(f"results in {path}\nfigure {run.figures / 'families.png'}")
 
