@@ -148,7 +148,7 @@ def arrival(hits: Array, system: System) -> Array:
     step = jnp.diff(_origin(system, hits.shape[0])[:, rows] + own, axis=1)
     if rotation is not None:
         step = turn(rotation[..., 1:], step, back=True)
-    length = jnp.sqrt(jnp.sum(step**2, axis=0))
+    length = safe_sqrt(jnp.sum(step**2, axis=0))
     return (step * safe_divide(jnp.ones_like(length), length))[:, 0]
 
 
@@ -162,7 +162,7 @@ def geometry(hits: Array, system: System) -> Geometry:
     point, step, slope, bend = _segments(hits, system)
     first = system.vergence * point - system.source[:, None, None]
     segment = jnp.concatenate([first[:, None], step], axis=1)
-    inverse = safe_divide(jnp.ones_like(segment[0]), jnp.sqrt(jnp.sum(segment**2, axis=0)))
+    inverse = safe_divide(jnp.ones_like(segment[0]), safe_sqrt(jnp.sum(segment**2, axis=0)))
     direction = segment * inverse
     scale = jnp.concatenate([inverse[:1] * system.vergence, inverse[1:]], axis=0)
     before, after = direction, direction[:, 1:]

@@ -174,7 +174,7 @@ def _weigh(
     dtype = lens.curvature.dtype
     bundle = trace_bundle(lens, angles, distance, wavelengths, points, forward)
     # How the hits move with the sensor, which goes along the axis of the lens.
-    slope = bundle.arrival[:-1] / bundle.arrival[-1]
+    slope = safe_divide(bundle.arrival[:-1], bundle.arrival[-1])
     if lens.tilt is not None:
         axis = rotation_matrix(lens.tilt[-1])[2]
         slope = slope * axis[2] - axis[:2, None, None]

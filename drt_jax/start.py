@@ -21,7 +21,7 @@ __all__ = ["Guess", "first_guess"]
 _ASPHERE_STEPS = 3
 _FREEFORM_STEPS = 8
 # Two re-aims serve an ordinary lens: a bundle whose rays then miss the stop points by less than
-# `_LOOSE` of the beam's radius there is left to the solver. Else the search goes on until all are
+# `_LOOSE` of the beam's radius or of the gaps beside the stop is left to the solver. Else the search goes on until all are
 # within `_TIGHT` or given up.
 _AIM_STEPS = 2
 _LOOSE, _TIGHT = 0.03, 1e-6
@@ -146,14 +146,20 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
     beam = jnp.where(beam > 0, beam, 0.1 * width)
     # Where the stop is imaged to infinity, the paraxial aim lies beyond any lens.
     aim = aim * jnp.minimum(1, 4 * width / jnp.maximum(_length(aim), width))
-    tight = jnp.maximum(_TIGHT, 256 * jnp.finfo(dtype).eps) * beam
+    span = jnp.maximum(2 * width, 1.6 * jnp.max(_length(aim)))  # of the fan
+    # Where the stop all but touches a neighbour, a small miss is a large angle there.
+    gap = jnp.min(jnp.abs(jnp.diff(system.vertex[stop - 1 : stop + 2])))
+    loose = _LOOSE * jnp.minimum(beam, gap)
+    tight = jnp.minimum(_TIGHT * beam, _LOOSE * gap)
+    tight = jnp.maximum(tight, 256 * jnp.finfo(dtype).eps * beam)
+    loose = jnp.maximum(loose, tight)
     probe = 1e-4 * width * jnp.eye(dim, dtype=dtype)[..., None, None]
     shape = jnp.broadcast_shapes(aim.shape, system.crossings.shape)
     aim, none = jnp.broadcast_to(aim, shape), jnp.zeros(shape, dtype)
     zero = jnp.zeros(shape[1:], jnp.int32)
 
     def again(state):
-        first = (state.round == 0) & jnp.all(state.far <= _LOOSE * beam)
+        first = (state.round == 0) & jnp.all(state.far <= loose)
         return (
             ~(first & (state.count == _AIM_STEPS))
             & jnp.any((state.far > tight) & (state.attempt < state.last))
@@ -204,11 +210,11 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
     def fan(state):
         """The launch points nearest to what is not found yet."""
         side = np.linspace(-1, 1, _TILES * _FAN)
-        side = (2 * side * (0.3 + 0.7 * side**2)).reshape(_TILES, _FAN)
+        side = (side * (0.3 + 0.7 * side**2)).reshape(_TILES, _FAN)
         points = np.stack(np.meshgrid(*[np.arange(side.size)] * dim, indexing="ij"))
         points = side.ravel()[points].reshape(dim, *(_TILES, _FAN) * dim)
         tiles = (0, *range(1, 2 * dim, 2), *range(2, 2 * dim + 1, 2))
-        points = jnp.asarray(points.transpose(tiles).reshape(dim, 1, -1), dtype) * width
+        points = jnp.asarray(points.transpose(tiles).reshape(dim, 1, -1), dtype) * span
         # XLA would work out what does not depend on the state before the loop, needed or not.
         points = jnp.where(state.round == 0, points, 0)
         points = jnp.broadcast_to(points, (dim, shape[1], points.shape[-1]))
@@ -233,7 +239,7 @@ def _search(system: System, aim: Array, scale: Array) -> tuple[Array, Array]:
         state = jax.lax.while_loop(again, body, state)
         hits, fate = _trace(system, state.aim, count)
         last = jnp.where(state.fate == Status.OK, jnp.int32(Status.UNCONVERGED), state.fate)
-        fate = jnp.where(state.far <= _LOOSE * beam, fate, last)
+        fate = jnp.where(state.far <= loose, fate, last)
         # If the fan does not help, the first attempt knows best what stops the ray.
         kept = state.again & (fate != Status.OK) & (state.known != Status.UNCONVERGED)
         return state._replace(

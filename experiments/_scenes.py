@@ -162,18 +162,27 @@ def edge(rng, count, stop):
 
 
 def touching(rng, count, stop):
-    """Surfaces that touch at their vertices or all but do, stop included."""
+    """Surfaces that touch: gaps of 0, of less than a coordinate's last digit, and of 1e-8 mm."""
+    return _close(rng, count, stop, [0.0, 1e-17, 1e-8])
+
+
+def close(rng, count, stop):
+    """Surfaces that all but touch, stop and sensor included: gaps of 1e-6 to 1e-2 mm."""
+    return _close(rng, count, stop, [1e-6, 1e-4, 1e-2])
+
+
+def _close(rng, count, stop, gaps):
     parts, media, h = _parts(rng, count, stop)
-    gap = rng.choice([0.0, 1e-15, 1e-9, 1e-4, 1.0], (count, 4))
+    gap = rng.choice(gaps, (count, 4))
     thickness = np.where(rng.random((count, 4)) < 0.4, gap, parts["thickness"])
     # Neighbours that touch must not cross: the same shape, or both planes.
     c = parts["curvature"]
     for i in range(4):
-        c[:, i + 1] = np.where(thickness[:, i] < 1e-3, c[:, i], c[:, i + 1])
-    back = rng.choice([0.0, 1e-9, 1.0, 30.0], count)
-    flat = back < 1e-3  # the sensor on the last surface
+        c[:, i + 1] = np.where(thickness[:, i] <= 1e-2, c[:, i], c[:, i + 1])
+    back = rng.choice([*gaps, 1.0, 30.0], count)
+    flat = back < 0.1  # the sensor on the last surface
     c[:, 4] = np.where(flat, 0, c[:, 4])
-    c[:, 3] = np.where(flat & (thickness[:, 3] < 1e-3), 0, c[:, 3])
+    c[:, 3] = np.where(flat & (thickness[:, 3] <= 1e-2), 0, c[:, 3])
     sensor = np.sum(thickness, axis=1) + back + np.where(flat, 0, h)
     return _scenes(rng, parts | {"thickness": thickness, "sensor": sensor}, media, stop)
 
@@ -311,7 +320,8 @@ FAMILIES = {
     "asphere": Family(asphere, (0, 2, 4)),
     "index": Family(index, (0, 2, 4)),
     "edge": Family(edge, (0, 2, 4)),
-    "touching": Family(touching, (0, 2, 4)),
+    "close": Family(close, (0, 2, 4)),
+    "touching": Family(touching, (2,), 0.2),
     "distance": Family(distance, (0, 2, 4)),
     "focus": Family(focus, (0, 2, 4)),
     "field": Family(field, (0, 2, 4)),

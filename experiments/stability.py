@@ -88,6 +88,9 @@ def run(config: Config, run: Run) -> None:
     sums = {key: sum(row[key] for row in rows) for key in (
         *_COLUMNS, "nan_values", "nan_gradients", "disagree_with_snell")}  # fmt: skip
     sums["traceable_per_10000"] = 1e4 * sums["traceable"] / sums["rays"]
+    apart = [row for row in rows if row["name"] != "touching"]
+    lost, rays = (sum(row[key] for row in apart) for key in ("traceable", "rays"))
+    sums["traceable_per_10000_but_touching"] = 1e4 * lost / max(rays, 1)
     cameras = [row for row in rows if row["name"].startswith("camera")]
     sums["camera_float32_error_p99"] = max((r["float32_error_p99"] for r in cameras), default=0.0)
     results = {"families": rows, "total": sums, "seconds": time.perf_counter() - began}
@@ -105,7 +108,8 @@ def run(config: Config, run: Run) -> None:
           f"{sums['nan_gradients']} derivatives not finite, {sums['disagree_with_snell']} good "
           "rays that Snell's law denies")  # fmt: skip
     print(f"rays reported as failed that Snell's law can trace: {sums['traceable']}, "
-          f"{sums['traceable_per_10000']:.2f} in 10,000")  # fmt: skip
+          f"{sums['traceable_per_10000']:.2f} in 10,000; without surfaces that touch "
+          f"{sums['traceable_per_10000_but_touching']:.2f}")  # fmt: skip
     figure, axes = plot.new(1, 2, 6, 5)
     plot.by_family(axes[0], {k: v[0] for k, v in spread.items()}, "Newton steps of a scene")
     errors = {name: 1e3 * values for name, (_, values) in spread.items()}
