@@ -148,7 +148,7 @@ def arrival(hits: Array, system: System) -> Array:
     step = jnp.diff(_origin(system, hits.shape[0])[:, rows] + own, axis=1)
     if rotation is not None:
         step = turn(rotation[..., 1:], step, back=True)
-    length = jnp.sqrt(jnp.sum(step**2, axis=0))
+    length = safe_sqrt(jnp.sum(step**2, axis=0))
     return (step * safe_divide(jnp.ones_like(length), length))[:, 0]
 
 
@@ -162,7 +162,7 @@ def geometry(hits: Array, system: System) -> Geometry:
     point, step, slope, bend = _segments(hits, system)
     first = system.vergence * point - system.source[:, None, None]
     segment = jnp.concatenate([first[:, None], step], axis=1)
-    inverse = safe_divide(jnp.ones_like(segment[0]), jnp.sqrt(jnp.sum(segment**2, axis=0)))
+    inverse = safe_divide(jnp.ones_like(segment[0]), safe_sqrt(jnp.sum(segment**2, axis=0)))
     direction = segment * inverse
     scale = jnp.concatenate([inverse[:1] * system.vergence, inverse[1:]], axis=0)
     before, after = direction, direction[:, 1:]
@@ -330,9 +330,10 @@ def status(hits: Array, system: System) -> Array:
 
     eps = jnp.finfo(hits.dtype).eps
     size = jnp.max(jnp.abs(hits), axis=0)
-    reach = jnp.maximum(size[:-1], size[1:])
-    shake = index[:-1] * (1 + jnp.abs(path.inverse_length[:-1]) * reach)
-    shake = shake + index[1:] * (1 + jnp.abs(path.inverse_length[1:]) * reach)
+    # Of the segment in front of each surface: a far hit excuses no error of another segment.
+    reach = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
+    turned = 1 + jnp.abs(path.inverse_length) * reach
+    shake = index[:-1] * turned[:-1] + index[1:] * turned[1:]
     error = jnp.abs(_residual(path, system)) * normal[:-1]
     settled = jnp.all(error <= 64 * eps * shake, axis=(0, 1)) & jnp.all(leaving > 0, axis=0)
     unsettled = jnp.where(settled, Status.OK, Status.UNCONVERGED).astype(jnp.int32)

@@ -351,7 +351,7 @@ def _weigh(
     points, weights = rule
     bundle = trace_bundle(*scene, points, forward)
     # How the hits move with the sensor, which goes along the axis of the lens.
-    slope = bundle.arrival[:-1] / bundle.arrival[-1]
+    slope = safe_divide(bundle.arrival[:-1], bundle.arrival[-1])
     if lens.tilt is not None:
         axis = rotation_matrix(lens.tilt[-1])[2]
         slope = slope * axis[2] - axis[:2, None, None]

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["convergence", "error_curves", "kernels", "lens_drawing", "new", "patch_grid",
-           "sigma_over_depth"]  # fmt: skip
+__all__ = ["by_family", "convergence", "error_curves", "kernels", "lens_drawing", "new",
+           "patch_grid", "sigma_over_depth"]  # fmt: skip
 
 _FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 _COLOURS = ("tab:red", "tab:green", "tab:blue")
@@ -144,4 +144,26 @@ def kernels(axes: Sequence[Axes], kernel: np.ndarray, titles: Sequence[str]) -> 
         ax.imshow(values, vmin=0, vmax=np.max(kernel), cmap="magma", origin="lower")
         ax.set_title(title, fontsize=9)
         ax.set(xlabel="x (pixels)", ylabel="y (pixels)")
+    return axes
+
+
+def by_family(
+    axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bool = False
+) -> Axes:
+    """Samples (N,) of each family as a box from the first to the third quartile with its median,
+    whiskers from the 1st to the 99th percentile, and the largest as a point; on a logarithmic
+    scale if `log`, which leaves out samples of 0."""
+    names = [name for name, values in samples.items() if np.size(values)]
+    shown = [np.asarray(samples[name], float) for name in names]
+    shown = [values[values > 0] if log else values for values in shown]
+    axes.boxplot(shown, orientation="horizontal", whis=(1, 99), showfliers=False, widths=0.6)
+    for k, values in enumerate(shown):
+        if values.size:
+            axes.plot(np.max(values), k + 1, marker=".", color="tab:red", linestyle="none")
+    axes.set_yticks(range(1, len(names) + 1), names)
+    axes.invert_yaxis()
+    if log:
+        axes.set_xscale("log")
+    axes.set_xlabel(label)
+    axes.grid(axis="x", alpha=0.3)
     return axes

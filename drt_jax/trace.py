@@ -165,7 +165,10 @@ def trace_bundle(
     system = system_of(lens, live, *scene)
     guess = first_guess(jax.lax.stop_gradient(system))
     solve = solve_rays_forward if forward else solve_rays
-    hits, status, steps = solve(system, guess)
+    hits, status, steps = solve(system, guess.hits)
+    # Where no path was found, the ray that came nearest knows better why than the iteration.
+    known = (status != Status.OK) & (guess.fate != Status.OK)
+    status = jnp.where(known, guess.fate, status)
     last, path = arrival(hits, system), optical_path(hits, system)
     if len(live) < count:
         whole = system_of(lens, list(range(count)), *scene)

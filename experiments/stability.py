@@ -1,0 +1,127 @@
+"""Thousands of random scenes made to break the tracer: are its numbers, its derivatives and its
+verdicts to be trusted?
+
+Every ray that is reported good is compared with a sequential trace by Snell's law; for every ray
+that is not, that trace searches for one through the same point of the stop. Writes results.json
+and a figure of steps and errors by family.
+"""
+
+import dataclasses
+import time
+
+import numpy as np
+from tqdm import tqdm
+
+from drt_jax import Status, plot
+from drt_jax.runs import Run
+
+from . import _common
+from ._scenes import FAMILIES, draw
+from ._survey import COUNTS, survey
+
+_COLUMNS = ("scenes", "rays", "ok", *COUNTS, "traceable")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment; see configs/stability.yaml.
+
+    scenes: of a family of full size, some have half. seed: of all random numbers. families: the
+    names of those to run, empty for all.
+    """
+
+    scenes: int = 620
+    seed: int = 0
+    families: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _common.require(self.scenes >= 3, "scenes: must be at least 3")
+        for name in self.families:
+            known = ", ".join(FAMILIES)
+            _common.require(name in FAMILIES, f"families: unknown {name!r}; known: {known}")
+
+
+def row_of(name: str, parts: list[dict]) -> dict[str, object]:
+    """The row of a family in results.json, from the surveys of its variants."""
+
+    def joined(key: str) -> np.ndarray:
+        return np.concatenate([part[key] for part in parts])
+
+    status, lost = joined("status"), joined("lost")
+    steps, errors = joined("steps"), joined("float32_error")
+    row = {"name": name, "scenes": len(status), "rays": status.size}
+    for code in Status:
+        row[code.name.lower()] = int(np.sum(status == code))
+    row |= {
+        "nan_values": sum(part["nan_values"] for part in parts),
+        "nan_gradients": sum(part["nan_gradients"] for part in parts),
+        "disagree_with_snell": int(np.sum(joined("disagree"))),
+        "newton_steps_median": float(np.median(steps)),
+        "newton_steps_max": int(np.max(steps)),
+        "float32_error_p99": float(np.percentile(errors, 99)) if errors.size else 0.0,
+        "traceable": int(np.sum(lost)),
+        "traceable_per_10000": 1e4 * float(np.mean(lost)),
+        "snell_error_max_roundings": float(np.max(joined("ratio"))),
+        "float32_rays": int(errors.size),
+        "dtype": FAMILIES[name].dtype,
+    }  # fmt: skip
+    return row
+
+
+def run(config: Config, run: Run) -> None:
+    """Draw and survey the families one by one, print the table, write the results."""
+    began = time.perf_counter()
+    names = config.families or tuple(FAMILIES)
+    total = sum(len(FAMILIES[name].variants) for name in names)
+    rows, spread = [], {}
+    with tqdm(total=total, unit="batch", dynamic_ncols=True) as bar:
+        for k, name in enumerate(names):
+            bar.set_description(name)
+            parts = []
+            for scenes in draw(name, config.scenes, config.seed):
+                parts.append(survey(scenes))
+                bar.update()
+            rows.append(row_of(name, parts))
+            spread[name] = (np.concatenate([part["steps"] for part in parts]),
+                            np.concatenate([part["float32_error"] for part in parts]))  # fmt: skip
+            run.log(name, k, {c: np.array([float(rows[-1][c])]) for c in _COLUMNS})
+    sums = {key: sum(row[key] for row in rows) for key in (
+        *_COLUMNS, "nan_values", "nan_gradients", "disagree_with_snell")}  # fmt: skip
+    sums["traceable_per_10000"] = 1e4 * sums["traceable"] / sums["rays"]
+    apart = [row for row in rows if row["name"] != "touching"]
+    lost, rays = (sum(row[key] for row in apart) for key in ("traceable", "rays"))
+    sums["traceable_per_10000_but_touching"] = 1e4 * lost / max(rays, 1)
+    cameras = [row for row in rows if row["name"].startswith("camera")]
+    sums["camera_float32_error_p99"] = max((r["float32_error_p99"] for r in cameras), default=0.0)
+    results = {"families": rows, "total": sums, "seconds": time.perf_counter() - began}
+    path = run.finish(results)
+    header = ("family", "scenes", "rays", "ok", "missed", "tir", "clipped", "unconv.", "traceable",
+              "NaN", "NaN grad", "not Snell", "steps", "max", "float32 p99 mm")  # fmt: skip
+    lines = [
+        (r["name"], *(r[c] for c in ("scenes", "rays", "ok", *COUNTS, "traceable", "nan_values",
+         "nan_gradients", "disagree_with_snell")), f"{r['newton_steps_median']:g}",
+         r["newton_steps_max"], f"{r['float32_error_p99']:.1e}")
+        for r in rows
+    ]  # fmt: skip
+    print(_common.table(header, lines))
+    print(f"{sums['scenes']} scenes, {sums['rays']} rays: {sums['nan_values']} values and "
+          f"{sums['nan_gradients']} derivatives not finite, {sums['disagree_with_snell']} good "
+          "rays that Snell's law denies")  # fmt: skip
+    print(f"rays reported as failed that Snell's law can trace: {sums['traceable']}, "
+          f"{sums['traceable_per_10000']:.2f} in 10,000; without surfaces that touch "
+          f"{sums['traceable_per_10000_but_touching']:.2f}")  # fmt: skip
+    figure, axes = plot.new(1, 2, 6, 5)
+    plot.by_family(axes[0], {k: v[0] for k, v in spread.items()}, "Newton steps of a scene")
+    errors = {name: 1e3 * values for name, (_, values) in spread.items()}
+    plot.by_family(axes[1], errors, "float32 error (µm)", log=True)
+    figure.savefig(run.figures / "families.png")
+    print(f"results in {path}\nfigure {run.figures / 'families.png'}")
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Command line."""
+    _common.main("stability", Config, _COLUMNS, run, argv)
+
+
+if __name__ == "__main__":
+    main()
