@@ -22,7 +22,7 @@ from .trace import trace_bundle
 __all__ = ["Boundary", "ClippedPupil", "find_boundary", "fitted_nodes"]
 
 _BATCH = 128  # rays of one search call
-_HALVINGS = 52
+_TRIALS = 60
 _CORNER_STEPS = 8
 _STENCIL = np.array([-2.0, -1.0, 1.0, 2.0])
 _STENCIL_WEIGHTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12
@@ -117,9 +117,14 @@ class Boundary:
         r2, failed = self._squares(points)
         return r2 / self.edges[:, None, None] ** 2 - 1, failed  # -1 without an aperture
 
-    def _inside(self, points: np.ndarray) -> np.ndarray:
+    def _worst(self, points: np.ndarray) -> np.ndarray:
+        """How far (W, N) rays are outside the aperture that they meet worst: above 0, clipped; 1 for
+        a ray that fails."""
         excess, failed = self._excess(points)
-        return (np.max(excess, axis=0) <= 0) & ~failed
+        return np.where(failed, 1.0, np.max(excess, axis=0))
+
+    def _inside(self, points: np.ndarray) -> np.ndarray:
+        return self._worst(points) <= 0
 
     def _unit(self, angle: np.ndarray) -> np.ndarray:
         if self.dim == 1:
@@ -138,14 +143,26 @@ class Boundary:
         unit, c = self._unit(angle), self.centre[..., None]
         rim = self._rim(unit)
         low, high = np.zeros_like(rim), rim.copy()
-        whole = self._inside(c + rim * unit)
-        low[whole] = rim[whole]
-        for _ in range(_HALVINGS):
-            if np.all(whole):
+        f_low, f_high = self._worst(c + 0 * unit), self._worst(c + rim * unit)
+        whole = f_high <= 0
+        found = np.where(whole, rim, low)
+        # The Illinois method, every third step a bisection: a ray that fails has no height.
+        tiny = 16 * float(np.finfo(self.dtype).eps)
+        side = np.zeros(rim.shape, int)
+        for k in range(_TRIALS):
+            done = whole | (high - low <= tiny)
+            if np.all(done):
                 break
-            middle = (low + high) / 2
-            inside = self._inside(c + middle * unit)
-            low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+            secant = (low * f_high - high * f_low) / np.where(done, 1, f_high - f_low)
+            middle = (low + high) / 2 if k % 3 == 0 else np.clip(secant, low, high)
+            f = self._worst(c + middle * unit)
+            inside, hit = f <= 0, np.abs(f) <= tiny
+            f_low = np.where(inside, f, f_low * np.where(side == -1, 0.5, 1))
+            f_high = np.where(inside, f_high * np.where(side == 1, 0.5, 1), f)
+            side = np.where(inside, 1, -1)
+            low, high = np.where(inside | hit, middle, low), np.where(inside & ~hit, high, middle)
+            found = np.where(done, found, low)
+        low = found
         excess, _ = self._excess(c + low * unit)
         surface = np.argmax(excess, axis=0)
         met = np.max(excess, axis=0) > -10 * float(np.sqrt(np.finfo(self.dtype).eps))

@@ -60,6 +60,7 @@ def row_of(name: str, parts: list[dict]) -> dict[str, object]:
         "newton_steps_max": int(np.max(steps)),
         "float32_error_p99": float(np.percentile(errors, 99)) if errors.size else 0.0,
         "traceable": int(np.sum(lost)),
+        "traceable_unconverged": int(np.sum(lost & (status == Status.UNCONVERGED))),
         "traceable_per_10000": 1e4 * float(np.mean(lost)),
         "snell_error_max_roundings": float(np.max(joined("ratio"))),
         "float32_rays": int(errors.size),
