@@ -63,7 +63,8 @@ def test_gradients_of_meridional_half_and_whole_pupil_agree():
     weights = np.random.default_rng(0).normal(size=(3, 2, 2))
 
     def scalar(lens, field, distance, symmetry):
-        traced = moments._plane_moments(lens, field, distance, RGB[:2], *rules[symmetry], symmetry)
+        scene = lens, field, distance, RGB[:2]
+        traced = moments._plane_moments(*scene, rules[symmetry], symmetry)[0]
         # On axis the centroid is 0, and the gradient of what rounding leaves of it is no number.
         return jnp.sum(weights * traced.spread[..., :2]) + field * jnp.sum(traced.mean[:, 1])
 
