@@ -170,7 +170,9 @@ def titles():
     return [title_of(name, distance) for name in SCENES for distance in SCENES[name][2]]
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [n if n == "double_gauss" else pytest.param(n, marks=pytest.mark.slow) for n in SCENES]
+)
 def test_all_derivatives_agree_with_the_complex_step(name, write_tables):
     _, field, distances, symmetry = SCENES[name]
     rule = pupil.meridian(ORDER) if symmetry == "meridian" else (
