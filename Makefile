@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 OUT := runs/demo-$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: install demo test
+.PHONY: install demo test test-all
 install: .venv/installed
 
 .venv/installed: pyproject.toml
@@ -19,3 +19,7 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest
+
+# The larger scenes as well: half an hour.
+test-all: install
+	$(BIN)/python -m pytest -m ""

@@ -120,7 +120,9 @@ def kept(lens, field, distance, size, tolerances):
 
 @pytest.mark.parametrize("distance", [25e3, math.inf])
 @pytest.mark.parametrize("degrees", [0.0, 5.0, 10.0, 14.0])
-@pytest.mark.parametrize("name", ["double_gauss", "cooke_triplet"])
+@pytest.mark.parametrize(
+    "name", ["double_gauss", pytest.param("cooke_triplet", marks=pytest.mark.slow)]
+)
 def test_spot_size_keeps_its_tolerance(name, degrees, distance):
     """In focus and 1 mm out, against orders whose own error is rounding."""
     field = np.radians(degrees)
@@ -139,6 +141,7 @@ def truth(lens, field, distance):
     return np.array([moments.sigma for moments in found])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "distance"), [(0.0, 25e3), (14.0, math.inf)])
 def test_spot_size_keeps_its_tolerance_against_snells_law(degrees, distance):
     lens, field = focused("double_gauss", distance), np.radians(degrees)
@@ -166,6 +169,7 @@ CLIPPED = {
 }
 
 
+@pytest.mark.slow
 def test_reference_of_a_clipped_beam():
     """On axis the ring alone limits a parallel beam, so that it may as well be the stop; off
     axis the two circles overlap, and a million points of a grid sum to the same."""
@@ -208,6 +212,7 @@ def small_run(tmp_path_factory):
     return folder / "run"
 
 
+@pytest.mark.slow
 def test_small_run_of_the_experiment(small_run):
     results = json.loads((small_run / "results.json").read_text())
     rows = results["curves"]
@@ -228,6 +233,7 @@ def test_small_run_of_the_experiment(small_run):
         assert (small_run / "figures" / f"{name}.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_finished_run_resumes_to_the_same_numbers(small_run, capsys):
     before = json.loads((small_run / "results.json").read_text())
     accuracy.main(["--resume", "--out", str(small_run)])

@@ -218,6 +218,7 @@ def close(a, b, rtol):
         np.testing.assert_allclose(x, y, rtol=0, atol=rtol * (np.max(np.abs(y)) + 1e-300))
 
 
+@pytest.mark.slow
 def test_transformations_compose():
     """grad, jacrev, vmap and jit of each other, over fields and over lenses."""
     p = parameters_of_singlet()
@@ -256,6 +257,7 @@ def test_forward_is_the_transpose_of_reverse():
     np.testing.assert_allclose(left, right, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_hessian_vector_products():
     """Forward over reverse, reverse over reverse and forward over forward agree; and with
     differences of the gradient by a complex step through the oracle."""

@@ -9,6 +9,7 @@ from experiments import _survey
 from experiments._scenes import FAMILIES, draw
 from experiments.stability import row_of
 
+pytestmark = pytest.mark.slow
 SCENES = 50
 # One static structure, so that a few compiled programs serve all: five surfaces, the stop third.
 NAMES = ("curvature", "asphere", "index", "edge", "close", "touching", "distance", "focus", "field")

@@ -69,7 +69,9 @@ def test_overlap_of_two_discs():
     np.testing.assert_allclose(mean[0, 1] - np.tan(tilt) * 1.0, half, rtol=1e-11)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "any direction")) for n in SCENES]
+)
 def test_converges_like_an_open_pupil(name):
     field, lens = SCENES[name]
     exact = focus_moments(lens, field, 25000.0, GREEN, order=20)
@@ -98,7 +100,9 @@ def test_agrees_with_many_rays_that_drop_out():
     np.testing.assert_allclose(mean[0], hits.mean(axis=0), atol=2e-3 * np.sqrt(spread.max()))
 
 
-@pytest.mark.parametrize("name", ["on axis", "front and rear"])
+@pytest.mark.parametrize(
+    "name", ["on axis", pytest.param("front and rear", marks=pytest.mark.slow)]
+)
 def test_gradients_follow_the_boundary(name):
     """Against fourth-order differences of the value, also to the semi-diameters themselves, in an
     eager gradient and with a rule handed into jit."""
