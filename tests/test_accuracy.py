@@ -119,7 +119,9 @@ def kept(lens, field, distance, size, tolerances):
 
 
 @pytest.mark.parametrize("distance", [25e3, math.inf])
-@pytest.mark.parametrize("degrees", [0.0, 5.0, 10.0, 14.0])
+@pytest.mark.parametrize(
+    "degrees", [0.0, pytest.param(5.0, marks=pytest.mark.slow), 10.0, 14.0]
+)
 @pytest.mark.parametrize(
     "name", ["double_gauss", pytest.param("cooke_triplet", marks=pytest.mark.slow)]
 )
@@ -150,7 +152,11 @@ def test_spot_size_keeps_its_tolerance_against_snells_law(degrees, distance):
 
 @pytest.mark.parametrize(
     ("degrees", "distance", "front", "rear"),
-    [(0.0, 25e3, 12.0, 20.0), (10.0, 25e3, 16.0, 12.0), (14.0, math.inf, 20.0, 14.0)],
+    [
+        (0.0, 25e3, 12.0, 20.0),
+        pytest.param(10.0, 25e3, 16.0, 12.0, marks=pytest.mark.slow),
+        pytest.param(14.0, math.inf, 20.0, 14.0, marks=pytest.mark.slow),
+    ],
 )
 def test_vignetted_spot_size_keeps_its_tolerance(degrees, distance, front, rear):
     lens = focused("double_gauss", distance)

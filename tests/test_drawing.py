@@ -12,7 +12,7 @@ FOLDED = {
         {"radius": "inf", "semi_diameter": 8, "stop": True, "thickness": 10},
         {"radius": 60, "thickness": 5, "glass": "N-BK7", "semi_diameter": 12},
         {"radius": -200, "thickness": 30, "semi_diameter": 12},
-        {"radius": "inf", "mirror": True, "tilt": [45, 0, 0], "thickness": 0.0, "semi_diameter": 18},
+        {"radius": "inf", "mirror": True, "tilt": [45, 0, 0], "semi_diameter": 18},
     ],
     "sensor": 45.0,
     "sensor_decentre": [0, 60],

@@ -25,7 +25,9 @@ def test_blur_of_the_double_gauss(sensor):
     np.testing.assert_allclose(1e3 * np.sqrt(covariance[:, 0, 0]).mean(), SIGMA[sensor], atol=0.051)
 
 
-@pytest.mark.parametrize("name", ["double_gauss_addon", "cooke_triplet"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("double_gauss_addon", marks=pytest.mark.slow), "cooke_triplet"]
+)
 def test_meridional_half_and_whole_pupil_agree(name):
     lens = load_lens(name)
     wide = 12  # enough azimuths for the general rule to converge to rounding
@@ -76,7 +78,7 @@ def test_gradients_of_meridional_half_and_whole_pupil_agree():
             close(half, gradient(lens, field, 9000.0, "meridian"), 1e-10)
 
 
-@pytest.mark.parametrize("field", [0.0, 0.1])
+@pytest.mark.parametrize("field", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_a_centred_lens_given_zero_tilts_and_decentres_is_the_same(field):
     """Moments and their gradients by everything that both have, 1e-10."""
     lens = load_lens("cooke_triplet")
@@ -139,6 +141,7 @@ def test_sensor_polynomial_is_the_traced_moment(field):
         np.testing.assert_allclose(variances, diagonal, rtol=2e-9, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
     """By the whole lens, the distance and the sensor position, 1e-10; 2.5 mm from the sensor
     about which the polynomial was made."""
@@ -162,6 +165,7 @@ def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
     close(ours, wanted, 1e-10)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_depth_interpolation_is_the_traced_one():
     """By the distance and the sensor position, 1e-10 of the largest over the range."""
     lens = load_lens("double_gauss_addon")
@@ -196,6 +200,7 @@ def test_depth_interpolation_is_the_traced_moment(field):
         np.testing.assert_allclose(ours.mean, wanted.mean, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["double_gauss", "cooke_triplet"])
 @pytest.mark.parametrize("degrees", [0.0, 5.0, 10.0])
 def test_order_keeps_the_promised_tolerance(name, degrees):
