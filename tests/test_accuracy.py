@@ -110,7 +110,7 @@ def focused(name, distance, defocus=0.0):
     return dataclasses.replace(lens, sensor=jnp.asarray(sensor, lens.sensor.dtype))
 
 
-def kept(lens, field, distance, size, tolerances):
+def assert_kept(lens, field, distance, size, tolerances):
     """Every tolerance is kept: errors of the spot size, the worst colour, relative."""
     for tolerance in tolerances:
         got = spot_size(psf_moments(lens, field, distance, RGB, tolerance)[1])
@@ -134,7 +134,7 @@ def test_spot_size_keeps_its_tolerance(name, degrees, distance):
             spot_size(psf_moments(lens, field, distance, RGB, order=order)[1]) for order in (17, 18)
         )
         np.testing.assert_allclose(size, again, rtol=2e-12)
-        kept(lens, field, distance, size, TOLERANCES)
+        assert_kept(lens, field, distance, size, TOLERANCES)
 
 
 def truth(lens, field, distance):
@@ -147,7 +147,7 @@ def truth(lens, field, distance):
 @pytest.mark.parametrize(("degrees", "distance"), [(0.0, 25e3), (14.0, math.inf)])
 def test_spot_size_keeps_its_tolerance_against_snells_law(degrees, distance):
     lens, field = focused("double_gauss", distance), np.radians(degrees)
-    kept(lens, field, distance, truth(lens, field, distance), TOLERANCES)
+    assert_kept(lens, field, distance, truth(lens, field, distance), TOLERANCES)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_vignetted_spot_size_keeps_its_tolerance(degrees, distance, front, rear)
     lens = focused("double_gauss", distance)
     semi = lens.semi_diameter.at[0].set(front).at[-1].set(rear)
     lens, field = dataclasses.replace(lens, semi_diameter=semi), np.radians(degrees)
-    kept(lens, field, distance, truth(lens, field, distance), TOLERANCES)
+    assert_kept(lens, field, distance, truth(lens, field, distance), TOLERANCES)
 
 
 # A ring of 3 mm before a stop of 4 mm on the only surface, of 60 mm focal length in the glass.

@@ -212,7 +212,7 @@ def parameters_of_singlet():
     return {name: getattr(SINGLET, name) for name in ("curvature", "conic", "thickness", "sensor")}
 
 
-def close(a, b, rtol):
+def assert_close(a, b, rtol):
     """Each array of a tree within `rtol` of the largest element of the other's."""
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=rtol * (np.max(np.abs(y)) + 1e-300))
@@ -226,18 +226,18 @@ def test_transformations_compose():
     one_by_one = [gradient(p, field) for field in FIELDS]
     wanted = jax.tree.map(lambda *g: jnp.stack(g), *one_by_one)
     heights = jax.vmap(height, (None, 0))
-    close(jax.grad(height)(p, FIELDS[1]), one_by_one[1], 1e-12)  # no jit
-    close(jax.jit(jax.vmap(jax.grad(height), (None, 0)))(p, FIELDS), wanted, 1e-12)
-    close(jax.vmap(gradient, (None, 0))(p, FIELDS), wanted, 1e-12)
-    close(jax.jit(jax.jacrev(heights))(p, FIELDS), wanted, 1e-12)
+    assert_close(jax.grad(height)(p, FIELDS[1]), one_by_one[1], 1e-12)  # no jit
+    assert_close(jax.jit(jax.vmap(jax.grad(height), (None, 0)))(p, FIELDS), wanted, 1e-12)
+    assert_close(jax.vmap(gradient, (None, 0))(p, FIELDS), wanted, 1e-12)
+    assert_close(jax.jit(jax.jacrev(heights))(p, FIELDS), wanted, 1e-12)
     total = jax.jit(jax.grad(lambda p, f: jnp.sum(heights(p, f))))(p, FIELDS)
-    close(total, jax.tree.map(lambda g: jnp.sum(g, axis=0), wanted), 1e-12)
+    assert_close(total, jax.tree.map(lambda g: jnp.sum(g, axis=0), wanted), 1e-12)
     scales = jnp.array([0.9, 1.0, 1.1])
     many = jax.tree.map(lambda a: scales.reshape(-1, *(1,) * a.ndim) * a, p)
     lenses = jax.jit(jax.vmap(jax.grad(height), (0, None)))(many, FIELDS[1])
     for i in range(len(scales)):
         one = gradient(jax.tree.map(lambda a: a[i], many), FIELDS[1])
-        close(jax.tree.map(lambda a: a[i], lenses), one, 1e-12)
+        assert_close(jax.tree.map(lambda a: a[i], lenses), one, 1e-12)
 
 
 def test_forward_is_the_transpose_of_reverse():
@@ -245,7 +245,7 @@ def test_forward_is_the_transpose_of_reverse():
     arguments = parameters_of_singlet(), FIELDS[2]
     reverse = jax.jit(jax.jacrev(hits_of, argnums=(0, 1)))(*arguments)
     forward = jax.jit(jax.jacfwd(lambda *a: hits_of(*a, forward=True), argnums=(0, 1)))(*arguments)
-    close(forward, reverse, 1e-10)
+    assert_close(forward, reverse, 1e-10)
     generator = np.random.default_rng(6)
     x = jax.tree.map(lambda a: jnp.asarray(generator.normal(size=a.shape)), arguments)
     ybar = jnp.asarray(generator.normal(size=(2, 2)))
@@ -276,8 +276,8 @@ def test_hessian_vector_products():
         g = gradient(p, field)
         return sum(jnp.vdot(a, b) for a, b in zip(jax.tree.leaves(g), jax.tree.leaves(v)))
 
-    close(jax.jit(jax.grad(along))(p), products, 1e-10)
-    close(jax.jit(jax.jacfwd(lambda p: slope(p, True)))(p), products, 1e-10)
+    assert_close(jax.jit(jax.grad(along))(p), products, 1e-10)
+    assert_close(jax.jit(jax.jacfwd(lambda p: slope(p, True)))(p), products, 1e-10)
 
     weights = np.random.default_rng(5).normal(size=(2, 2))
     scene = oracle.Scene.of(SINGLET, field, 300.0, [0.55])
@@ -297,7 +297,7 @@ def test_hessian_vector_products():
         jax.tree.map(lambda a, b: (a - b) / (2 * h), reference(h), reference(-h))
         for h in (2e-3, 1e-3)
     )
-    close(products, jax.tree.map(lambda c, f: (4 * f - c) / 3, coarse, fine), 1e-8)
+    assert_close(products, jax.tree.map(lambda c, f: (4 * f - c) / 3, coarse, fine), 1e-8)
 
 
 def test_failed_rays_leave_forward_tangents_alone():

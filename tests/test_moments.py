@@ -46,7 +46,7 @@ def test_meridional_half_and_whole_pupil_agree(name):
             np.testing.assert_allclose(half.spread, meridian.spread, rtol=1e-10, atol=1e-16)
 
 
-def close(ours, wanted, rtol):
+def assert_close(ours, wanted, rtol):
     """Each array of a tree within `rtol` of the largest element of the other's."""
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(wanted), strict=True):
         assert a.shape == b.shape
@@ -73,9 +73,9 @@ def test_gradients_of_meridional_half_and_whole_pupil_agree():
     gradient = jax.jit(jax.grad(scalar, argnums=(0, 2)), static_argnums=3)
     for field in (0.0, 0.1):
         half, disc = (gradient(lens, field, 9000.0, kind) for kind in ("half", "disc"))
-        close(disc, half, 1e-10)
+        assert_close(disc, half, 1e-10)
         if field == 0:
-            close(half, gradient(lens, field, 9000.0, "meridian"), 1e-10)
+            assert_close(half, gradient(lens, field, 9000.0, "meridian"), 1e-10)
 
 
 @pytest.mark.parametrize("field", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
@@ -98,7 +98,7 @@ def test_a_centred_lens_given_zero_tilts_and_decentres_is_the_same(field):
     np.testing.assert_allclose(general[0], plain[0], rtol=1e-10, atol=1e-13)
     np.testing.assert_allclose(general[1], plain[1], rtol=1e-10, atol=1e-16)
     assert np.all(np.isfinite(other[0].tilt)) and np.all(np.isfinite(other[0].decentre))
-    close((dataclasses.replace(other[0], tilt=None, decentre=None), other[1]), gradient, 1e-10)
+    assert_close((dataclasses.replace(other[0], tilt=None, decentre=None), other[1]), gradient, 1e-10)
 
 
 def test_field_in_any_direction_turns_the_moments():
@@ -162,7 +162,7 @@ def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
     # The position of the sensor is its own argument: the lens's sensor only sets the origin.
     assert abs(ours[0].sensor) < 1e-10 * abs(ours[2]) and wanted[0].sensor == 0
     ours = dataclasses.replace(ours[0], sensor=wanted[0].sensor), *ours[1:]
-    close(ours, wanted, 1e-10)
+    assert_close(ours, wanted, 1e-10)
 
 
 @pytest.mark.slow
@@ -185,7 +185,7 @@ def test_gradient_of_the_depth_interpolation_is_the_traced_one():
         for f in (interpolated, traced)
     )
     scene = 1 / jnp.array([5.1e3, 7e3, 1.7e4, 4.9e4]), lens.sensor
-    close(ours(*scene), wanted(*scene), 1e-10)
+    assert_close(ours(*scene), wanted(*scene), 1e-10)
 
 
 @pytest.mark.parametrize("field", [0.0, 0.05])
