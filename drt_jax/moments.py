@@ -21,7 +21,7 @@ from .fermat import Status
 from .glass import check_wavelengths
 from .lens import Lens, rotation_matrix
 from .numerics import known_values, safe_divide, safe_sqrt
-from .trace import as_field, trace_bundle
+from .trace import trace_bundle, typed_scene
 from .vignetting import ClippedPupil, find_boundary, fitted_nodes
 
 __all__ = ["FocusMoments", "focus_moments", "psf_moments", "pupil_order"]
@@ -284,12 +284,9 @@ def _converge(
 def _typed(
     lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike, symmetry: str
 ) -> tuple[Lens, Array, Array, Array]:
-    """The scene as `trace_bundle` takes it. One type for numbers, NumPy's and JAX's arrays, so
-    that they share a compiled program."""
-    dtype = lens.curvature.dtype
-    angles = jnp.zeros(1, dtype) if symmetry == "meridian" else as_field(field, dtype)
-    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
-    return lens, angles, jnp.asarray(distance, dtype), wavelengths
+    """The scene as `trace_bundle` takes it: a field of one angle for meridional rays."""
+    scene = typed_scene(lens, field, distance, wavelengths)
+    return (lens, jnp.zeros_like(scene[1][:1]), *scene[2:]) if symmetry == "meridian" else scene
 
 
 def _rule(symmetry: str, order: int) -> tuple[np.ndarray, np.ndarray]:

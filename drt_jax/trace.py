@@ -189,6 +189,18 @@ def as_field(field: ArrayLike, dtype: jnp.dtype) -> Array:
     return field
 
 
+def typed_scene(
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike
+) -> tuple[Lens, Array, Array, Array]:
+    """The lens, field (2,), distance () and wavelengths (W,), arrays of the lens's dtype.
+
+    One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
+    """
+    dtype = lens.curvature.dtype
+    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
+    return lens, as_field(field, dtype), jnp.asarray(distance, dtype), wavelengths
+
+
 def trace_rays(
     lens: Lens,
     field: ArrayLike,
@@ -208,12 +220,8 @@ def trace_rays(
     ValueError for a known wavelength outside the range of a glass.
     """
     check_wavelengths(lens.glasses, wavelengths)
-    dtype = lens.curvature.dtype
-    # One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
-    return _trace_rays(
-        lens, as_field(field, dtype), jnp.asarray(distance, dtype),
-        jnp.atleast_1d(jnp.asarray(wavelengths, dtype)), jnp.asarray(pupil, dtype), forward,
-    )  # fmt: skip
+    points = jnp.asarray(pupil, lens.curvature.dtype)
+    return _trace_rays(*typed_scene(lens, field, distance, wavelengths), points, forward)
 
 
 @partial(jax.jit, static_argnums=5)

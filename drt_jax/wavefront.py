@@ -24,7 +24,7 @@ from .glass import check_wavelengths
 from .lens import Lens, rotation_matrix
 from .numerics import safe_divide, safe_sqrt
 from .paraxial import chief_ray_at_image
-from .trace import as_field, trace_bundle
+from .trace import trace_bundle, typed_scene
 
 __all__ = ["Wavefront", "reference_curvature", "rms_wavefront", "wavefront"]
 
@@ -75,13 +75,10 @@ def wavefront(
     the lens. ValueError for a known wavelength outside the range of a glass.
     """
     check_wavelengths(lens.glasses, wavelengths)
-    dtype = lens.curvature.dtype
-    # One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
-    return _wavefront(
-        lens, as_field(field, dtype), jnp.asarray(distance, dtype),
-        jnp.atleast_1d(jnp.asarray(wavelengths, dtype)), jnp.asarray(pupil, dtype),
-        None if curvature is None else jnp.asarray(curvature, dtype), forward,
-    )  # fmt: skip
+    points = jnp.asarray(pupil, lens.curvature.dtype)
+    kappa = None if curvature is None else jnp.asarray(curvature, lens.curvature.dtype)
+    scene = typed_scene(lens, field, distance, wavelengths)
+    return _wavefront(*scene, points, kappa, forward)
 
 
 @partial(jax.jit, static_argnums=6)

@@ -9,6 +9,7 @@ import tempfile
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jax
+import numpy as np
 import pytest
 
 jax.config.update("jax_enable_x64", True)
@@ -43,3 +44,11 @@ def shared() -> pathlib.Path:
     if not path.is_dir():
         pytest.skip("no reference data beside the checkout")
     return path
+
+
+def assert_close(ours, wanted, rtol, floor=0.0):
+    """Each array of a tree within `rtol` of the largest element of the other's, plus `floor`."""
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(wanted), strict=True):
+        assert a.shape == b.shape
+        size = np.max(np.abs(b), initial=0)
+        np.testing.assert_allclose(a, b, rtol=0, atol=rtol * size + floor)

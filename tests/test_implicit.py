@@ -14,7 +14,7 @@ from drt_jax.implicit import solve_rays
 from drt_jax.trace import trace_bundle
 
 from . import oracle
-from .conftest import RGB
+from .conftest import RGB, assert_close
 from .test_fermat import system_of
 
 # One parameter group a row: (name, how large a relative step still is a small change).
@@ -210,12 +210,6 @@ def height(parameters, field, forward=False):
 
 def parameters_of_singlet():
     return {name: getattr(SINGLET, name) for name in ("curvature", "conic", "thickness", "sensor")}
-
-
-def assert_close(a, b, rtol):
-    """Each array of a tree within `rtol` of the largest element of the other's."""
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, rtol=0, atol=rtol * (np.max(np.abs(y)) + 1e-300))
 
 
 @pytest.mark.slow
