@@ -19,6 +19,7 @@ from jax import Array
 
 from . import fermat
 from .fermat import Status, System
+from .search import find_rays
 
 __all__ = ["BlockNewton", "solve_rays", "solve_rays_forward"]
 
@@ -33,9 +34,10 @@ class _State(NamedTuple):
 class BlockNewton(optx.AbstractRootFinder):
     """Newton's method for a bundle of Fermat paths, with the banded solve of `fermat`.
 
-    All rays step together; a ray whose correction is not finite stays where it is, so that
-    it cannot spoil the others. Ends when no ray moved more than `atol` mm: convergence is
-    quadratic, so that the hits are then right to rounding.
+    Its arguments are the system and which rays are to move (W, Q). These step together; one whose
+    correction is not finite stays where it is, so that it cannot spoil the others. Ends when no ray moved more than `atol` mm: convergence is
+    quadratic, so that the hits are then right to rounding. An error e becomes e^2 / gap, so
+    that where surfaces are less than 1 mm apart, moves count for more, by the root of the gap.
     """
 
     stop: int = eqx.field(static=True)
@@ -50,11 +52,13 @@ class BlockNewton(optx.AbstractRootFinder):
     def step(self, fn, y, args, options, state, tags) -> tuple[Array, _State, Any]:
         """One Newton step of every ray."""
         f, aux = fn(y, args)
-        blocks = fermat.hessian(fermat.geometry(y, args), args)
-        correction = fermat.solve(blocks, f, self.stop)
-        usable = jnp.all(jnp.isfinite(correction), axis=(0, 1))
+        system, active = args
+        path = fermat.geometry(y, system)
+        correction = fermat.solve(fermat.hessian(path, system), f, self.stop)
+        usable = active & jnp.all(jnp.isfinite(correction), axis=(0, 1))
         correction = jnp.where(usable, correction, 0)
-        change = jnp.max(jnp.abs(correction), initial=0)
+        weight = jnp.sqrt(jnp.maximum(jnp.max(path.inverse_length, axis=0), 1))
+        change = jnp.max(jnp.abs(correction) * weight, initial=0)
         return y - correction, _State(change, state.step + 1), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
@@ -67,25 +71,27 @@ class BlockNewton(optx.AbstractRootFinder):
 
 
 @jax.custom_jvp
-def solve_rays_forward(system: System, start: Array) -> tuple[Array, Array, Array]:
+def solve_rays_forward(system: System) -> tuple[Array, Array, Array]:
     """`solve_rays` for forward mode: `jax.jvp`, `jacfwd`, and higher derivatives.
 
     The same rule: dw = -(dF/dw)^-1 dF/dp dp, one banded solve for each tangent.
     """
-    crossings = system.crossings
-    start = start.at[:, system.stop].set(jnp.broadcast_to(crossings, start[:, 0].shape))
-    solution = optx.root_find(
-        fermat.residual,
-        BlockNewton(stop=system.stop, atol=float(jnp.finfo(start.dtype).eps) ** 0.5 * 0.1),
-        start,
-        args=system,
-        max_steps=_MAX_STEPS,
-        throw=False,
-    )
-    hits = solution.value
-    code = fermat.status(hits, system)
-    hits = jnp.where(code == Status.OK, hits, 0)
-    return hits, code, solution.stats["num_steps"]
+
+    def polish(hits, active):
+        crossings = jnp.broadcast_to(system.crossings, hits[:, 0].shape)
+        solution = optx.root_find(
+            lambda hits, args: fermat.residual(hits, args[0]),
+            BlockNewton(stop=system.stop, atol=float(jnp.finfo(hits.dtype).eps) ** 0.5 * 0.1),
+            hits.at[:, system.stop].set(crossings),
+            args=(system, active),
+            max_steps=_MAX_STEPS,
+            throw=False,
+        )
+        solved = active & (fermat.status(solution.value, system) == Status.OK)
+        return solution.value, solved, solution.stats["num_steps"]
+
+    hits, status, steps = find_rays(system, polish)
+    return jnp.where(status == Status.OK, hits, 0), status, steps
 
 
 def _linearised(system: System, hits: Array, code: Array) -> tuple[fermat.Blocks, Callable]:
@@ -107,9 +113,9 @@ def _linearised(system: System, hits: Array, code: Array) -> tuple[fermat.Blocks
 
 @solve_rays_forward.defjvp
 def _tangents(primals, tangents):
-    system, start = primals
+    (system,) = primals
     # Through the function itself, so that the hits carry derivatives of their own.
-    hits, code, steps = solve_rays_forward(system, start)
+    hits, code, steps = solve_rays_forward(system)
     ok = code == Status.OK
     blocks, residual = _linearised(system, hits, code)
     _, change = jax.jvp(residual, (system,), (tangents[0],))
@@ -123,19 +129,18 @@ def _tangents(primals, tangents):
 
 
 @jax.custom_vjp
-def solve_rays(system: System, start: Array) -> tuple[Array, Array, Array]:
+def solve_rays(system: System) -> tuple[Array, Array, Array]:
     """Trace a bundle: the stationary paths through the given stop points.
 
-    `start` (D, S + 1, W, Q), mm: first guess of all hits. Returns the hits, same shape,
-    their `Status` (W, Q), int32, and the number of Newton steps. Differentiable in `system`
-    in reverse mode, also repeatedly, and then in forward mode; failed rays have zero
-    derivatives, and hits of 0.
+    Returns all hits (D, S + 1, W, Q), mm, their `Status` (W, Q), int32, and the number of Newton
+    steps. Differentiable in `system` in reverse mode, also repeatedly, and then in forward mode;
+    failed rays have zero derivatives, and hits of 0.
     """
-    return solve_rays_forward(system, start)
+    return solve_rays_forward(system)
 
 
-def _forward(system, start):
-    result = solve_rays_forward(system, start)
+def _forward(system):
+    result = solve_rays_forward(system)
     return result, (system, *result[:2])
 
 
@@ -151,7 +156,7 @@ def _backward(residuals, cotangents):
     if system.target.ndim == 2:
         direct = jnp.sum(direct, axis=1)
     system_bar = dataclasses.replace(system_bar, target=system_bar.target + direct)
-    return system_bar, jnp.zeros_like(hits)
+    return (system_bar,)
 
 
 solve_rays.defvjp(_forward, _backward)

@@ -13,7 +13,6 @@ from .glass import check_wavelengths
 from .implicit import solve_rays, solve_rays_forward
 from .lens import Lens, rotation_matrix
 from .numerics import safe_divide
-from .start import first_guess
 from .surface import Shape, by_form, sag, sag_derivatives
 
 __all__ = ["Bundle", "Rays", "field_of_height", "trace_bundle", "trace_rays"]
@@ -163,12 +162,8 @@ def trace_bundle(
     field = jnp.asarray(field, lens.curvature.dtype)
     scene = field, distance, wavelengths, pupil
     system = system_of(lens, live, *scene)
-    guess = first_guess(jax.lax.stop_gradient(system))
     solve = solve_rays_forward if forward else solve_rays
-    hits, status, steps = solve(system, guess.hits)
-    # Where no path was found, the ray that came nearest knows better why than the iteration.
-    known = (status != Status.OK) & (guess.fate != Status.OK)
-    status = jnp.where(known, guess.fate, status)
+    hits, status, steps = solve(system)
     last, path = arrival(hits, system), optical_path(hits, system)
     if len(live) < count:
         whole = system_of(lens, list(range(count)), *scene)

@@ -103,7 +103,7 @@ def test_against_optimistix_and_the_unrolled_iteration(name, dim):
         return hits.at[:, stop].set(jnp.broadcast_to(system.crossings, hits[:, stop].shape))
 
     def ours(system):
-        hits, status, _ = solve_rays(system, start)
+        hits, status, _ = solve_rays(system)
         return jnp.sum(weights * hits), status
 
     def theirs(system):
