@@ -27,6 +27,8 @@ _SURFACE_KEYS = (
 )  # fmt: skip
 # Neighbours that overlap by less at their rims touch (mm).
 _TOUCH = 1e-4
+# The direction of a ray between vertices closer than this (mm) drowns in rounding.
+_CLOSEST = 1e-6
 
 
 class LensError(ValueError):
@@ -234,11 +236,12 @@ def _build(entry: object, where: str, name: str = "lens") -> Lens:
         tilt.append(_vector(surface, "tilt", where, 3))
         if i < len(surfaces) - 1:
             thickness.append(_finite(surface, "thickness", where))
-            if thickness[-1] * sense <= 0 and not moved:
+            if thickness[-1] * sense < _CLOSEST and not moved:
                 raise LensError(
                     f"{where}.thickness: must be {'positive' if sense > 0 else 'negative'}"
-                    f"{'' if sense > 0 else ', as a mirror has turned the light'}; where the "
-                    "stop touches a surface, mark that surface itself with stop: true"
+                    f"{'' if sense > 0 else ', as a mirror has turned the light'}, at least "
+                    f"{_CLOSEST} mm; leave out one of two surfaces that touch, and where the stop "
+                    "touches a surface, mark that surface itself with stop: true"
                 )
     if len(stops) != 1:
         raise LensError(f"{top}: surfaces: {len(stops)} have stop: true, exactly one must")

@@ -280,7 +280,7 @@ def _spread(system: System, state: _Aim, fan: Array, loose: Array) -> _Aim:
     near = (state.far <= loose) & ~solved
     return state._replace(
         nearest=jnp.moveaxis(chosen, -1, 0).astype(jnp.int32),
-        far=jnp.where(solved, 0, jnp.inf), step=jnp.where(near, 0, state.step),
+        far=jnp.where(solved, 0, jnp.inf).astype(state.far.dtype), step=jnp.where(near, 0, state.step),
         attempt=jnp.where(near, jnp.int32(-1), 0), age=jnp.zeros_like(state.age),
         bad=jnp.zeros_like(state.bad), trials=jnp.int32(0), stage=jnp.int32(_SECOND),
     )  # fmt: skip

@@ -51,6 +51,7 @@ BAD = {
     "infinite": (surface(0, thickness=float("inf")), "must be finite"),
     "no thickness": (drop(0, "thickness"), r"thickness: expected a number, got None"),
     "negative thickness": (surface(0, thickness=-1.0), r"surfaces\[0\].thickness: must be positive"),
+    "touching": (surface(0, thickness=1e-8), r"surfaces\[0\].thickness: .* leave out one of two"),
     "odd power": (surface(0, coefficients={3: 1e-5}), "3 is not an even power"),
     "too wide": (surface(0, semi_diameter=60.0), r"60 mm reaches beyond the surface.* 50 mm"),
     "negative aperture": (surface(2, semi_diameter=-1.0), "must be positive"),
