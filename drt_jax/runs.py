@@ -6,6 +6,7 @@ predecessor in one step, and metrics that lie beyond it are dropped when the run
 
 import contextlib
 import csv
+import io
 import json
 import os
 import pathlib
@@ -126,8 +127,9 @@ class Run:
             return
 
         def write(file: BinaryIO) -> None:
-            text = "\n".join(",".join(row) for row in [header, *kept]) + "\n"
-            file.write(text.encode())
+            text = io.StringIO(newline="")
+            csv.writer(text).writerows([header, *kept])
+            file.write(text.getvalue().encode())
 
         self._replace("metrics.csv", write)
 

@@ -20,7 +20,7 @@ __all__ = ["launch", "shoot"]
 # of the ray's length or of 1 mm.
 _STEPS, _SETTLED = 20, 1e-7
 # A ray that leans more than this (cosine with the axis) is not followed.
-_FLATTEST = 0.01
+_FLATTEST = 1e-4
 
 
 def launch(system: System) -> Array:
@@ -75,7 +75,7 @@ def shoot(system: System, aim: Array) -> tuple[Array, Array, Array]:
         lost = ~met | (refracted[-1] * senses[1] <= _FLATTEST)
         here = jnp.where(met & (square <= 0), Status.TIR, jnp.where(lost, Status.MISSED, Status.OK))
         fate = jnp.where(fate == Status.OK, here.astype(jnp.int32), fate)
-        passed = passed + (fate == Status.OK)
+        passed = passed + (fate == Status.OK).astype(jnp.int32)
         # A failed ray goes straight on, and stays finite.
         d = jnp.where(fate == Status.OK, refracted, d)
         own = jnp.concatenate([w, z[None]])

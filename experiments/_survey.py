@@ -15,10 +15,16 @@ from drt_jax.trace import system_of
 
 from ._scenes import RAYS, WAVELENGTH, Scenes
 
-__all__ = ["COUNTS", "survey"]
+__all__ = ["COUNTS", "KEYS", "survey"]
 
 COUNTS = ("missed", "tir", "clipped", "unconverged")
-_BATCH = 200  # scenes to a call: all batches of one structure share a compiled program
+# What `survey` returns: arrays over scenes and rays, and two counts.
+KEYS = (
+    "disagree", "float32_error", "lost", "nan_gradients", "nan_values", "ratio", "residual", "status",
+    "steps",
+)  # fmt: skip
+_BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
+_BOTH = 4  # one scene of so many of a float64 family is traced in float32 too
 _SHOTS = 24  # rays of a scene that the sequential trace follows in one call
 _ORDER = 2  # of the pupil rule whose moments are differentiated
 _ROUNDINGS = 1000  # how many roundings of the hits two traces may be apart
@@ -244,11 +250,11 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray | int]:
     points = rays.points[:, 0].astype(float)
     good = (status == Status.OK) | (status == Status.CLIPPED)
     disagree, ratio = _disagree(exact, points, good, eps)
-    # The same scenes, rounded to float32, in both precisions.
-    rough = _half(scenes, "float32")
+    # Scenes rounded to float32, in both precisions.
     if dtype == np.float32:
-        single, reached = rays.points, rays.status
+        rough, single, reached = scenes, rays.points, rays.status
     else:
+        rough = jax.tree.map(lambda a: a[::_BOTH], _half(scenes, "float32"))
         single, reached = _run(_compiled["plain"], *rough)
     double = _run(_compiled["scene"], *_half(rough, "float64"))[0]
     both = (reached == Status.OK) & (double.status == Status.OK)

@@ -227,6 +227,7 @@ def run(config: Config, run: Run) -> None:
     rows: list[dict] = []
     promises: list[dict] = []
     truths: list[dict] = []
+    kind: tuple = ()
     total = sum(len(methods(config, scene)) + 1 for scene in config.scenes)
     with tqdm(total=total, unit="method", dynamic_ncols=True) as bar:
         for scene in config.scenes:
@@ -241,6 +242,9 @@ def run(config: Config, run: Run) -> None:
             if step:
                 bar.update(len(names) + 1)
             else:
+                kind, before = (scene.lens, scene.dtype, scene.vignetted), kind
+                if kind != before:  # thousands of kernels exhaust what a process may map
+                    jax.clear_caches()
                 setting = prepare(scene, config.wavelengths_um)
                 bar.update()
                 found = {

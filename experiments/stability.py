@@ -7,8 +7,8 @@ and a figure of steps and errors by family.
 """
 
 import dataclasses
-import time
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -17,7 +17,7 @@ from drt_jax.runs import Run
 
 from . import _common
 from ._scenes import FAMILIES, draw
-from ._survey import COUNTS, survey
+from ._survey import COUNTS, KEYS, survey
 
 _COLUMNS = ("scenes", "rays", "ok", *COUNTS, "traceable")
 
@@ -41,28 +41,34 @@ class Config:
             _common.require(name in FAMILIES, f"families: unknown {name!r}; known: {known}")
 
 
-def row_of(name: str, parts: list[dict]) -> dict[str, object]:
-    """The row of a family in results.json, from the surveys of its variants."""
+def joined(parts: list[dict]) -> dict[str, np.ndarray]:
+    """The surveys of a family's variants as one: arrays end to end, counts added up."""
+    return {
+        key: np.concatenate([part[key] for part in parts])
+        if np.ndim(value)
+        else np.asarray(sum(part[key] for part in parts))
+        for key, value in parts[0].items()
+    }
 
-    def joined(key: str) -> np.ndarray:
-        return np.concatenate([part[key] for part in parts])
 
-    status, lost = joined("status"), joined("lost")
-    steps, errors = joined("steps"), joined("float32_error")
+def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, object]:
+    """The row of a family in results.json, from its survey."""
+    status, lost = found["status"], found["lost"]
+    steps, errors = found["steps"], found["float32_error"]
     row = {"name": name, "scenes": len(status), "rays": status.size}
     for code in Status:
         row[code.name.lower()] = int(np.sum(status == code))
     row |= {
-        "nan_values": sum(part["nan_values"] for part in parts),
-        "nan_gradients": sum(part["nan_gradients"] for part in parts),
-        "disagree_with_snell": int(np.sum(joined("disagree"))),
+        "nan_values": int(found["nan_values"]),
+        "nan_gradients": int(found["nan_gradients"]),
+        "disagree_with_snell": int(np.sum(found["disagree"])),
         "newton_steps_median": float(np.median(steps)),
         "newton_steps_max": int(np.max(steps)),
         "float32_error_p99": float(np.percentile(errors, 99)) if errors.size else 0.0,
         "traceable": int(np.sum(lost)),
         "traceable_unconverged": int(np.sum(lost & (status == Status.UNCONVERGED))),
         "traceable_per_10000": 1e4 * float(np.mean(lost)),
-        "snell_error_max_roundings": float(np.max(joined("ratio"))),
+        "snell_error_max_roundings": float(np.max(found["ratio"])),
         "float32_rays": int(errors.size),
         "dtype": FAMILIES[name].dtype,
     }  # fmt: skip
@@ -71,21 +77,33 @@ def row_of(name: str, parts: list[dict]) -> dict[str, object]:
 
 def run(config: Config, run: Run) -> None:
     """Draw and survey the families one by one, print the table, write the results."""
-    began = time.perf_counter()
     names = config.families or tuple(FAMILIES)
     total = sum(len(FAMILIES[name].variants) for name in names)
-    rows, spread = [], {}
+    rows, spread, known = [], {}, set()
     with tqdm(total=total, unit="batch", dynamic_ncols=True) as bar:
-        for k, name in enumerate(names):
+        for name in names:
             bar.set_description(name)
-            parts = []
-            for scenes in draw(name, config.scenes, config.seed):
-                parts.append(survey(scenes))
-                bar.update()
-            rows.append(row_of(name, parts))
-            spread[name] = (np.concatenate([part["steps"] for part in parts]),
-                            np.concatenate([part["float32_error"] for part in parts]))  # fmt: skip
-            run.log(name, k, {c: np.array([float(rows[-1][c])]) for c in _COLUMNS})
+            batches = list(draw(name, config.scenes, config.seed))
+            empty = dict.fromkeys(KEYS, np.zeros(0))
+            step, found = run.load(name, empty, (name,))
+            if step:
+                bar.update(len(batches))
+            else:
+                kinds = {(jax.tree.structure(b), b.distance.dtype) for b in batches}
+                if not kinds <= known:  # drop other programs: what a process may map has an end
+                    jax.clear_caches()
+                known = kinds | (known if kinds <= known else set())
+                parts = []
+                for scenes in batches:
+                    parts.append(survey(scenes))
+                    bar.update()
+                found = joined(parts)
+                run.save(name, 1, found)
+            found = {key: np.asarray(value) for key, value in found.items()}
+            rows.append(row_of(name, found))
+            spread[name] = found["steps"], found["float32_error"]
+            if not step:
+                run.log(name, 0, {c: np.array([float(rows[-1][c])]) for c in _COLUMNS})
     sums = {key: sum(row[key] for row in rows) for key in (
         *_COLUMNS, "nan_values", "nan_gradients", "disagree_with_snell")}  # fmt: skip
     sums["traceable_per_10000"] = 1e4 * sums["traceable"] / sums["rays"]
@@ -94,7 +112,7 @@ def run(config: Config, run: Run) -> None:
     sums["traceable_per_10000_but_touching"] = 1e4 * lost / max(rays, 1)
     cameras = [row for row in rows if row["name"].startswith("camera")]
     sums["camera_float32_error_p99"] = max((r["float32_error_p99"] for r in cameras), default=0.0)
-    results = {"families": rows, "total": sums, "seconds": time.perf_counter() - began}
+    results = {"families": rows, "total": sums, "seconds": run.seconds}
     path = run.finish(results)
     header = ("family", "scenes", "rays", "ok", "missed", "tir", "clipped", "unconv.", "traceable",
               "NaN", "NaN grad", "not Snell", "steps", "max", "float32 p99 mm")  # fmt: skip

@@ -36,16 +36,16 @@ def test_metrics_beyond_the_checkpoint_are_dropped(tmp_path):
     run = opened(tmp_path)
     for start in (0, 2):
         run.log("a", start, {"loss": np.ones(2), "sensor_mm": np.ones(2)})
-        run.log("b", start, {"loss": np.ones(2), "sensor_mm": np.ones(2)})
+        run.log("b, 5 deg", start, {"loss": np.ones(2), "sensor_mm": np.ones(2)})
     run.save("a", 2, jnp.ones(1))
     with open(run.folder / "metrics.csv", "a") as file:
         file.write("a,4,0.5")  # a line cut off by a kill
     again = opened(tmp_path, resume=True)
     assert again.load("a", jnp.ones(1), ("a",))[0] == 2
     assert again.metrics("a")["step"].tolist() == [0, 1]
-    assert again.metrics("b")["step"].tolist() == [0, 1, 2, 3]
-    assert again.load("b", jnp.ones(1), ("b",))[0] == 0
-    assert again.metrics("b")["step"].tolist() == []
+    assert again.metrics("b, 5 deg")["step"].tolist() == [0, 1, 2, 3]
+    assert again.load("b, 5 deg", jnp.ones(1), ("b, 5 deg",))[0] == 0
+    assert again.metrics("b, 5 deg")["step"].tolist() == []
 
 
 def test_a_failed_write_leaves_the_old_checkpoint(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from drt_jax import Status
 from experiments import _survey
 from experiments._scenes import FAMILIES, draw
-from experiments.stability import row_of
+from experiments.stability import joined, row_of
 
 pytestmark = pytest.mark.slow
 SCENES = 50
@@ -25,7 +25,7 @@ def rows():
         for name in NAMES:
             share = FAMILIES[name].share
             surveys[name] = [_survey.survey(s) for s in draw(name, SCENES / share, 1, (2,))]
-    return {name: row_of(name, parts) for name, parts in surveys.items()}
+    return {name: row_of(name, joined(parts)) for name, parts in surveys.items()}
 
 
 @pytest.mark.parametrize("name", NAMES)
