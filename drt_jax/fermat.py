@@ -305,7 +305,8 @@ def status(hits: Array, system: System) -> Array:
     """Status (W, Q), int32, of paths that an iteration ended with; clear apertures apart.
 
     A path is accepted when every component of F is within 64 times what rounding the hits
-    to the last digit changes: for a camera in float64 some 1e-14 radians.
+    to the last digit changes: for a camera in float64 some 1e-14 radians. Where that is more than
+    1e-6 radians (2e-2 in float32), the hits determine no direction, and the path is not accepted.
     """
     path = geometry(hits, system)
     index = system.index[:, :, None]
@@ -335,6 +336,9 @@ def status(hits: Array, system: System) -> Array:
     turned = 1 + jnp.abs(path.inverse_length) * reach
     shake = index[:-1] * turned[:-1] + index[1:] * turned[1:]
     error = jnp.abs(_residual(path, system)) * normal[:-1]
-    settled = jnp.all(error <= 64 * eps * shake, axis=(0, 1)) & jnp.all(leaving > 0, axis=0)
+    # Where a ray all but touches two surfaces at once, its direction between them is unknown.
+    known = shake <= 4 / jnp.sqrt(eps)
+    settled = jnp.all((error <= 64 * eps * shake) & known, axis=(0, 1))
+    settled = settled & jnp.all(leaving > 0, axis=0)
     unsettled = jnp.where(settled, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
     return jnp.where(first != 0, first, unsettled)

@@ -35,9 +35,10 @@ class BlockNewton(optx.AbstractRootFinder):
     """Newton's method for a bundle of Fermat paths, with the banded solve of `fermat`.
 
     Its arguments are the system and which rays are to move (W, Q). These step together; one whose
-    correction is not finite stays where it is, so that it cannot spoil the others. Ends when no ray moved more than `atol` mm: convergence is
-    quadratic, so that the hits are then right to rounding. An error e becomes e^2 / gap, so
-    that where surfaces are less than 1 mm apart, moves count for more, by the root of the gap.
+    correction is not finite stays where it is, so that it cannot spoil the others. Ends when no
+    ray moved more than `atol` mm: convergence is quadratic, so that the hits are then right to
+    rounding. An error e becomes e^2 / gap: where surfaces are less than 1 mm apart, moves count
+    for more, by the root of the gap.
     """
 
     stop: int = eqx.field(static=True)

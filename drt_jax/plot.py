@@ -97,6 +97,19 @@ def error_curves(
     return axes
 
 
+def programs(
+    axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], title: str
+) -> Axes:
+    """Points (time of a call in ms, relative error) by program, both axes logarithmic."""
+    for name, points in marks.items():
+        axes.plot(*zip(*points), marker="o", linestyle="none", markersize=8, label=name)
+    axes.set(xscale="log", yscale="log", title=title)
+    axes.set(xlabel="time of a call (ms)", ylabel="error, relative")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return axes
+
+
 def sigma_over_depth(
     axes: Axes,
     depths: np.ndarray,

@@ -40,10 +40,11 @@ _FIRST, _SPREAD, _SECOND = range(3)
 class _Aim(NamedTuple):
     """aim, step (D, W, Q): the best launch point and the step to the next trial; miss (D, W, Q),
     of the best at the stop, length far (W, Q), inf before one arrived; inverse (D, D, W, Q),
-    launch by stop point; hits (D, S + 1, W, Q) and fate (W, Q), of the best; attempt (W, Q), -1 for one that goes on from the first search; age and
-    bad (W, Q): the trials of this attempt and those in a row that came no nearer; lost (W, Q), the
-    fate of the last ray that did not arrive; trials (), of the search; nearest (K, W, Q), the
-    rays of the fan that attempts begin with; stage (); status (W, Q) and steps (), so far."""
+    launch by stop point; hits (D, S + 1, W, Q) and fate (W, Q), of the best; attempt (W, Q), -1 for
+    one that goes on from the first search; age and bad (W, Q): the trials of this attempt and
+    those in a row that came no nearer; lost (W, Q), the fate of the last ray that did not arrive;
+    trials (), of the search; nearest (K, W, Q), the rays of the fan that attempts begin with;
+    stage (); status (W, Q) and steps (), so far."""
 
     aim: Array
     step: Array

@@ -24,7 +24,8 @@ _FLATTEST = 1e-4
 
 
 def launch(system: System) -> Array:
-    """Where rays through the points of a stop that comes first cross its vertex plane, (D, W, Q)."""
+    """Where rays through the points of a first surface that is the stop cross its vertex plane,
+    (D, W, Q), mm."""
     w = system.crossings
     shape = Shape(*(a[..., 0, :, :] for a in system.shape))
     own = jnp.concatenate([w, sag(w, shape, system.forms[0])[None]])

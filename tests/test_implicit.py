@@ -172,7 +172,9 @@ def test_second_derivatives_and_transformations():
             np.testing.assert_allclose(a[k], b, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["double_gauss", "cooke_triplet"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("double_gauss", marks=pytest.mark.slow), "cooke_triplet"]
+)
 def test_float32_gradient_is_the_rounded_float64_one(name):
     """The blur 5 mm out of focus: no difference of nearly equal hits is left in it."""
     lens = load_lens(name)

@@ -170,7 +170,9 @@ THIRD = {
 }
 
 
-@pytest.mark.parametrize("name", THIRD)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "immersed" else n for n in THIRD]
+)
 def test_third_order_is_what_real_rays_show_near_the_axis(name):
     """Errors in the paraxial image plane of real rays, whose aperture and field shrink together
     by t: over t^3, and with its t^2 removed, they are the polynomial of the Seidel sums. What
