@@ -20,8 +20,8 @@ __all__ = ["COUNTS", "KEYS", "survey"]
 COUNTS = ("missed", "tir", "clipped", "unconverged")
 # What `survey` returns: arrays over scenes and rays, and two counts.
 KEYS = (
-    "disagree", "float32_error", "lost", "nan_gradients", "nan_values", "ratio", "residual", "status",
-    "steps",
+    "disagree", "float32_error", "lost", "nan_gradients", "nan_values", "ratio", "residual",
+    "status", "steps",
 )  # fmt: skip
 _BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
 _BOTH = 4  # one scene of so many of a float64 family is traced in float32 too
