@@ -46,6 +46,7 @@ def test_meridional_half_and_whole_pupil_agree(name):
             np.testing.assert_allclose(half.spread, meridian.spread, rtol=1e-10, atol=1e-16)
 
 
+@pytest.mark.slow
 def test_gradients_of_meridional_half_and_whole_pupil_agree():
     """By the lens and the distance, within 1e-10 of the largest element of each array."""
     lens, wide = load_lens("cooke_triplet"), 12

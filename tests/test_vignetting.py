@@ -43,6 +43,7 @@ def two_stops():
     )
 
 
+@pytest.mark.slow
 def test_overlap_of_two_discs():
     """What two shifted discs have in common: area, centroid and second moments in closed form,
     here from a dense integral over y of the chord (a substitution makes it smooth)."""
