@@ -54,9 +54,10 @@ def _residual(lens, field, distance, pupil, points):
         own = fermat.turn(system.rotation, own, back=True)
     hits = own[:2, :, None]
     error = jnp.max(jnp.abs(fermat.residual(hits, system)), axis=(0, 1, 2))
-    inverse = jnp.max(jnp.abs(fermat.geometry(hits, system).inverse_length), axis=(0, 1))
+    path = fermat.geometry(hits, system)
+    inverse = jnp.max(jnp.abs(path.inverse_length), axis=(0, 1))
     size = jnp.max(jnp.abs(points), axis=(1, 2))
-    slope = jnp.max(jnp.abs(fermat.geometry(hits, system).slope), axis=(0, 1, 2))
+    slope = jnp.max(jnp.abs(path.slope), axis=(0, 1, 2))
     bound = _ROUNDINGS / 5 * jnp.finfo(points.dtype).eps * (1 + size * inverse) * (1 + slope)
     return error, bound
 
