@@ -12,6 +12,7 @@ plane (y), D = 2 in general (x, y). Surface S is the sensor.
 
 import dataclasses
 import enum
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,7 +24,7 @@ from .numerics import safe_divide, safe_sqrt
 from .surface import Shape, by_form, domain, sag, sag_derivatives
 
 __all__ = ["Blocks", "Geometry", "Status", "System", "arrival", "geometry", "hessian",
-           "optical_path", "residual", "solve", "solve_transposed", "status", "turn"]  # fmt: skip
+           "optical_path", "residual", "solve", "solve_transposed", "stationary", "turn"]  # fmt: skip
 
 
 class Status(enum.IntEnum):
@@ -301,44 +302,71 @@ def solve_transposed(blocks: Blocks, rhs: Array, stop: int) -> Array:
     return jnp.stack(_solve_front(blocks, front) + behind, axis=1)
 
 
-def status(hits: Array, system: System) -> Array:
-    """Status (W, Q), int32, of paths that an iteration ended with; clear apertures apart.
+def stationary(hits: Array, system: System) -> Array:
+    """Whether these paths are rays, (W, Q), bool: forward, on surfaces that exist, and F = 0.
 
-    A path is accepted when every component of F is within 64 times what rounding the hits
-    to the last digit changes: for a camera in float64 some 1e-14 radians. Where that is more than
-    1e-6 radians (2e-2 in float32), the hits determine no direction, and the path is not accepted.
+    F counts as 0 where every component is within 64 times what rounding the hits to the last
+    digit changes: for a camera in float64 some 1e-14 radians. Where that is more than 1e-6
+    radians (2e-2 in float32), the hits determine no direction, and the path is not accepted.
     """
-    path = geometry(hits, system)
-    index = system.index[:, :, None]
-    exists = by_form(domain, hits, system.shape, system.forms)
-    normal = safe_divide(
-        jnp.ones_like(path.slope[0]), jnp.sqrt(1 + jnp.sum(path.slope**2, axis=0))
-    )
+    # A loop over the surfaces, not arrays over them: what belongs to one stays in the cache.
+    dim, surfaces, eps = hits.shape[0], hits.shape[1], jnp.finfo(hits.dtype).eps
+    kinds = sorted(set(system.forms))
+    rotation = None if system.rotation is None else jnp.moveaxis(system.rotation, -1, 0)
+    rows = (
+        jnp.moveaxis(hits, 1, 0), _origin(system, dim)[:, :, 0, 0].T, rotation,
+        Shape(system.curvature, system.conic, system.coefficients.T), system.index[..., None],
+        system.senses, jnp.array([kinds.index(form) for form in system.forms]),
+    )  # fmt: skip
 
-    def along(direction, slope):  # cosine with the surface normal, times its length
-        return direction[-1] - jnp.sum(slope * direction[:-1], axis=0)
+    def drawn(kind, w, shape):
+        z, slope, _ = sag_derivatives(w, shape, kind)
+        return z, tuple(slope), domain(w, shape, kind)
 
-    arriving = along(path.before, path.slope) * normal * system.senses
-    leaving = along(path.after, path.slope[:, :-1]) * system.senses[1:]
-    sine = jnp.sqrt(jnp.maximum(1 - arriving[:-1] ** 2, 0)) * index[:-1]
-    reflected = (sine > index[1:]) & ~np.array(system.mirrors)[:, None, None]
-    reflected = jnp.concatenate([reflected, jnp.zeros_like(reflected[:1])])
-    missed = ~exists | (arriving <= 0)
-    code = jnp.where(
-        missed, Status.MISSED, jnp.where(reflected, Status.TIR, Status.OK)
-    ).astype(jnp.int32)
-    first = jnp.take_along_axis(code, jnp.argmax(code != 0, axis=0)[None], axis=0)[0]
+    def turned(rotation, vector, back=False):
+        if rotation is None:
+            return vector
+        matrix = rotation.T if back else rotation
+        return tuple(sum(matrix[i, j] * vector[j] for j in range(3)) for i in range(3))
 
-    eps = jnp.finfo(hits.dtype).eps
-    size = jnp.max(jnp.abs(hits), axis=0)
-    # Of the segment in front of each surface: a far hit excuses no error of another segment.
-    reach = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
-    turned = 1 + jnp.abs(path.inverse_length) * reach
-    shake = index[:-1] * turned[:-1] + index[1:] * turned[1:]
-    error = jnp.abs(_residual(path, system)) * normal[:-1]
-    # Where a ray all but touches two surfaces at once, its direction between them is unknown.
-    known = shake <= 4 / jnp.sqrt(eps)
-    settled = jnp.all((error <= 64 * eps * shake) & known, axis=(0, 1))
-    settled = settled & jnp.all(leaving > 0, axis=0)
-    unsettled = jnp.where(settled, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
-    return jnp.where(first != 0, first, unsettled)
+    def forward(direction, slope):
+        return direction[-1] - sum(a * b for a, b in zip(slope, direction))
+
+    def walk(i, carry):
+        last, bad = carry
+        w, origin, rotation, shape, index, sense, kind = jax.tree.map(lambda a: a[i], rows)
+        draw = [partial(drawn, kind) for kind in kinds]
+        draw = draw[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, draw)
+        z, slope, exists = draw(w, shape)
+        point = tuple(a + o for a, o in zip(turned(rotation, (*w, z)), origin))
+        # The first segment as in `geometry`.
+        step = tuple(
+            jnp.where(i == 0, system.vergence * a - s, a - b)
+            for a, b, s in zip(point, last["point"], system.source)
+        )
+        inverse = safe_divide(jnp.ones_like(z), jnp.sqrt(sum(a * a for a in step)))
+        ray = tuple(a * inverse for a in step)
+        before, after = turned(rotation, ray, True), turned(last["rotation"], ray, True)
+        # Of the segment in front of each surface: a far hit excuses no error of another segment.
+        size = jnp.abs(w[0]) if dim == 1 else jnp.maximum(jnp.abs(w[0]), jnp.abs(w[1]))
+        scale = jnp.where(i == 0, jnp.abs(system.vergence), 1) * inverse
+        shake = index * (1 + scale * jnp.maximum(size, last["size"]))
+        both = last["shake"] + shake
+        change = tuple(last["index"] * a - index * b for a, b in zip(last["before"], after))
+        error = [jnp.abs(a + b * change[-1]) for a, b in zip(change, last["slope"])]
+        error = error[0] if dim == 1 else jnp.maximum(*error)
+        lean = 1 + sum(a * a for a in last["slope"])
+        # Where a ray all but touches two surfaces at once, its direction between them is unknown.
+        good = (error**2 <= (64 * eps * both) ** 2 * lean) & (both <= 4 / jnp.sqrt(eps))
+        ways = forward(last["before"], last["slope"]) * last["sense"], forward(after, last["slope"]) * sense
+        good = ((good & (jnp.minimum(*ways) > 0)) | (i == 0)) & exists
+        new = {"point": point, "before": before, "slope": slope, "size": size, "shake": shake,
+               "index": index, "sense": sense, "rotation": rotation}  # fmt: skip
+        return new, bad + jnp.where(good, 0, 1).astype(jnp.int32)
+
+    none = jnp.zeros(hits.shape[2:], hits.dtype)
+    last = {"point": (none,) * (dim + 1), "before": (none,) * (dim + 1), "slope": (none,) * dim,
+            "size": none, "shake": none, "index": rows[4][0],
+            "sense": rows[5][0], "rotation": None if rotation is None else rotation[0]}  # fmt: skip
+    last, bad = jax.lax.fori_loop(0, surfaces, walk, (last, none.astype(jnp.int32)))
+    return (bad == 0) & (forward(last["before"], last["slope"]) * last["sense"] > 0)

@@ -18,12 +18,16 @@ import optimistix as optx
 from jax import Array
 
 from . import fermat
+from .aiming import NODES, Aiming, fit, nodes, unknown
 from .fermat import Status, System
 from .search import find_rays
 
 __all__ = ["BlockNewton", "solve_rays", "solve_rays_forward"]
 
 _MAX_STEPS = 32
+# More rays than `_MANY` are aimed by polynomials and solved in tiles, of all wavelengths together
+# `_TILE` rays if they suffice to fit to: what belongs to a surface stays in the cache of a core.
+_MANY, _TILE = 1024, 1024
 
 
 class _State(NamedTuple):
@@ -47,8 +51,9 @@ class BlockNewton(optx.AbstractRootFinder):
     norm: Callable = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        """The state before the first step."""
-        return _State(jnp.array(jnp.inf, y.dtype), jnp.array(0))
+        """The state before the first step; there is none if no ray is to move."""
+        change = jnp.where(jnp.any(args[1]), jnp.inf, 0).astype(y.dtype)
+        return _State(change, jnp.array(0))
 
     def step(self, fn, y, args, options, state, tags) -> tuple[Array, _State, Any]:
         """One Newton step of every ray."""
@@ -71,28 +76,89 @@ class BlockNewton(optx.AbstractRootFinder):
         return y, aux, {}
 
 
+def _solve(system: System, aiming: Aiming | None = None) -> tuple[Array, Array, Array]:
+    """`solve_rays` of one tile of rays, without derivatives."""
+
+    def polish(hits, active):
+        crossings = jnp.broadcast_to(system.crossings, hits[:, 0].shape)
+        hits = hits.at[:, system.stop].set(crossings)
+
+        def turn(state):
+            hits, solved, steps, turns = state
+            solution = optx.root_find(
+                lambda hits, args: fermat.residual(hits, args[0]),
+                BlockNewton(stop=system.stop, atol=float(jnp.finfo(hits.dtype).eps) ** 0.5 * 0.1),
+                hits,
+                args=(system, active & ~solved & (turns > 0)),
+                max_steps=_MAX_STEPS,
+                throw=False,
+            )
+            hits = solution.value
+            solved = active & fermat.stationary(hits, system)
+            return hits, solved, steps + solution.stats["num_steps"], turns + 1
+
+        # Rays that were aimed well are stationary before any step.
+        start = hits, jnp.zeros_like(active), jnp.int32(0), jnp.int32(aiming is None)
+        hits, solved, steps, _ = jax.lax.while_loop(
+            lambda state: (state[-1] < 2) & ((state[-1] == 0) | jnp.any(active & ~state[1])),
+            turn, start,
+        )  # fmt: skip
+        return hits, solved, steps
+
+    hits, status, steps = find_rays(system, polish, aiming)
+    return jnp.where(status == Status.OK, hits, 0), status, steps
+
+
+def _tiles(system: System) -> tuple[int, int]:
+    """How many tiles of how many rays; one for a bundle that is no larger."""
+    count, dim = system.target.shape[-1], len(system.target)
+    size = max(NODES, _TILE // system.index.shape[1])
+    return (1, count) if dim == 1 or count <= max(size, _MANY) else (-(-count // size), size)
+
+
+def _padded(array: Array, tiles: int, size: int) -> Array:
+    """`array` (..., Q), its last ray repeated to fill the tiles."""
+    missing = tiles * size - array.shape[-1]
+    return jnp.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)], mode="edge")
+
+
+def _tile(array: Array, start: Array, size: int) -> Array:
+    return jax.lax.dynamic_slice_in_dim(array, start, size, axis=-1)
+
+
+def _put(array: Array, part: Array, start: Array) -> Array:
+    return jax.lax.dynamic_update_slice_in_dim(array, part, start, axis=-1)
+
+
 @jax.custom_jvp
 def solve_rays_forward(system: System) -> tuple[Array, Array, Array]:
     """`solve_rays` for forward mode: `jax.jvp`, `jacfwd`, and higher derivatives.
 
     The same rule: dw = -(dF/dw)^-1 dF/dp dp, one banded solve for each tangent.
     """
+    tiles, size = _tiles(system)
+    if tiles == 1:
+        return _solve(system)
+    count, waves = system.target.shape[-1], system.index.shape[1]
+    target, few = _padded(system.target, tiles, size), _padded(nodes(system), 1, size)
+    few = few if target.ndim == 2 else few[:, None]
 
-    def polish(hits, active):
-        crossings = jnp.broadcast_to(system.crossings, hits[:, 0].shape)
-        solution = optx.root_find(
-            lambda hits, args: fermat.residual(hits, args[0]),
-            BlockNewton(stop=system.stop, atol=float(jnp.finfo(hits.dtype).eps) ** 0.5 * 0.1),
-            hits.at[:, system.stop].set(crossings),
-            args=(system, active),
-            max_steps=_MAX_STEPS,
-            throw=False,
-        )
-        solved = active & (fermat.status(solution.value, system) == Status.OK)
-        return solution.value, solved, solution.stats["num_steps"]
+    def solve(k, carry):
+        hits, status, steps, aiming = carry
+        # The first tile are the rays that the aiming is fitted to.
+        start = (k - 1) * size
+        own = jnp.where(k == 0, few, _tile(target, start, size))
+        found = _solve(dataclasses.replace(system, target=own), aiming)
+        good = found[1] == Status.OK
+        aiming = jax.lax.cond(k == 0, lambda: fit(system, found[0][:, 0], good), lambda: aiming)
+        hits, status = _put(hits, found[0], start), _put(status, found[1], start)
+        return hits, status, jnp.where(k == 0, 0, jnp.maximum(steps, found[2])), aiming
 
-    hits, status, steps = find_rays(system, polish)
-    return jnp.where(status == Status.OK, hits, 0), status, steps
+    shape = waves, tiles * size
+    hits = jnp.zeros((len(target), len(system.forms), *shape), target.dtype)
+    carry = hits, jnp.zeros(shape, jnp.int32), jnp.int32(0), unknown(system)
+    hits, status, steps, _ = jax.lax.fori_loop(0, tiles + 1, solve, carry)
+    return hits[..., :count], status[..., :count], steps
 
 
 def _linearised(system: System, hits: Array, code: Array) -> tuple[fermat.Blocks, Callable]:
@@ -145,10 +211,10 @@ def _forward(system):
     return result, (system, *result[:2])
 
 
-def _backward(residuals, cotangents):
-    system, hits, code = residuals
+def _adjoint(system: System, hits: Array, code: Array, bar: Array) -> System:
+    """The cotangent of the system from that of the hits."""
     ok = code == Status.OK
-    bar = jnp.where(ok, cotangents[0], 0)
+    bar = jnp.where(ok, bar, 0)
     blocks, residual = _linearised(system, hits, code)
     adjoint = jnp.where(ok, fermat.solve_transposed(blocks, bar, system.stop), 0)
     _, pull_back = jax.vjp(residual, system)
@@ -156,8 +222,30 @@ def _backward(residuals, cotangents):
     direct = bar[:, system.stop]  # of the stop points themselves, which are hits too
     if system.target.ndim == 2:
         direct = jnp.sum(direct, axis=1)
-    system_bar = dataclasses.replace(system_bar, target=system_bar.target + direct)
-    return (system_bar,)
+    return dataclasses.replace(system_bar, target=system_bar.target + direct)
+
+
+def _backward(residuals, cotangents):
+    system, *rays = *residuals, cotangents[0]
+    tiles, size = _tiles(system)
+    if tiles == 1:
+        return (_adjoint(system, *rays),)
+    count = system.target.shape[-1]
+    # The rays that fill the last tile have failed, and no derivative.
+    filling = jnp.arange(tiles * size) < count
+    rays = [_padded(a, tiles, size) for a in (system.target, *rays)]
+    rays[2] = jnp.where(filling, rays[2], Status.UNCONVERGED)
+
+    def add(k, total):
+        target, hits, code, bar = (_tile(a, k * size, size) for a in rays)
+        part = _adjoint(dataclasses.replace(system, target=target), hits, code, bar)
+        target = _put(total.target, part.target, k * size)
+        total = jax.tree.map(jnp.add, dataclasses.replace(total, target=part.target), part)
+        return dataclasses.replace(total, target=target)
+
+    zero = jax.tree.map(jnp.zeros_like, dataclasses.replace(system, target=rays[0]))
+    total = jax.lax.fori_loop(0, tiles, add, zero)
+    return (dataclasses.replace(total, target=total.target[..., :count]),)
 
 
 solve_rays.defvjp(_forward, _backward)

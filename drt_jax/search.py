@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from .aiming import Aiming
 from .fermat import Status, System
 from .numerics import safe_divide
 from .paraxial import trace_yu
@@ -64,18 +65,21 @@ class _Aim(NamedTuple):
     steps: Array
 
 
-def find_rays(system: System, polish: Callable) -> tuple[Array, Array, Array]:
+def find_rays(
+    system: System, polish: Callable, aiming: Aiming | None = None
+) -> tuple[Array, Array, Array]:
     """Hits (D, S + 1, W, Q), mm, their `Status` (W, Q), int32, and Newton steps () of the rays
     through the stop points of `system`.
 
-    `polish(hits, active)` improves the hits of the `active` (W, Q) rays and returns them, which
-    of all are solved (W, Q), and its steps (). Status of a ray that is not solved: what stopped
+    `polish(hits, active)` improves the hits of the `active` (W, Q) rays and returns all, which of
+    the active ones are solved (W, Q), and its steps (). Status of a ray that is not solved: what stopped
     the rays nearest to the stop point; UNCONVERGED if a ray that came near reached the sensor, or
     if nothing stopped them and yet none came near. Where the stop is the first surface, there is
-    nothing to search for.
+    nothing to search for. `aiming`: where to launch the rays, if that is known well.
     """
     if system.stop == 0:
-        hits, fate, _ = shoot(system, launch(system))
+        hits, fate, _ = shoot(system, launch(system, system.crossings))
+        hits = jnp.where(fate == Status.OK, hits, 0)
         hits, solved, steps = polish(hits, fate == Status.OK)
         return hits, _verdict(fate, solved), steps
 
@@ -97,7 +101,7 @@ def find_rays(system: System, polish: Callable) -> tuple[Array, Array, Array]:
     def search(state):
         second = state.stage == _SECOND
         last = jnp.where(second, _STARTS, 1)
-        goal = jnp.where(second, exact, tight)
+        goal = jnp.where(second, exact, tight if aiming is None else rounding / 4)
 
         def going(state):
             near = ~second & (state.trials == _AIM_STEPS) & jnp.all(state.far <= loose)
@@ -130,9 +134,8 @@ def find_rays(system: System, polish: Callable) -> tuple[Array, Array, Array]:
         done = state.status == Status.OK
         lost = jnp.where(state.lost == Status.OK, Status.UNCONVERGED, state.lost)
         fate = jnp.where(state.far <= loose, state.fate, lost)
-        fate = jnp.where(done, Status.OK, fate)
-        hits, solved, steps = polish(state.hits, fate == Status.OK)
-        status = _verdict(fate, solved)
+        hits, solved, steps = polish(state.hits, ~done & (fate == Status.OK))
+        status = _verdict(fate, done | solved)
         # If the fan does not help, the first search knows best what stops the ray.
         kept = (state.stage == _SECOND) & (status != Status.OK)
         kept = kept & (state.status != Status.UNCONVERGED)
@@ -146,11 +149,14 @@ def find_rays(system: System, polish: Callable) -> tuple[Array, Array, Array]:
         return (state.stage == _FIRST) | ((state.stage == _SPREAD) & failed)
 
     inverse = jnp.eye(dim, dtype=dtype)[..., None, None] * jnp.where(scale == 0, 1, scale)
+    inverse = jnp.broadcast_to(inverse, (dim, *shape))
+    if aiming is not None:
+        aimed = aiming.at(system.crossings)
+        aim, inverse = (jnp.where(aiming.good, *pair) for pair in zip(aimed, (aim, inverse)))
     zero, nothing = jnp.zeros(shape[1:], jnp.int32), jnp.int32(0)
     start = _Aim(
         aim, none, none, jnp.full(shape[1:], jnp.inf, dtype),
-        jnp.broadcast_to(inverse, (dim, *shape)),
-        jnp.zeros((dim, len(system.forms), *shape[1:]), dtype), zero, zero, zero, zero, zero,
+        inverse, jnp.zeros((dim, len(system.forms), *shape[1:]), dtype), zero, zero, zero, zero, zero,
         nothing, jnp.zeros((_starts(dim), *shape[1:]), jnp.int32), jnp.int32(_FIRST),
         zero + Status.UNCONVERGED, nothing,
     )  # fmt: skip

@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["FORMS", "ROTATIONAL", "Shape", "domain", "powers_xy", "sag", "sag_derivatives",
+__all__ = ["FORMS", "RIM", "ROTATIONAL", "Shape", "domain", "powers_xy", "sag", "sag_derivatives",
            "vertex_curvature"]  # fmt: skip
 
 # A square root is used up to the rim where the normal of a sphere leans within 0.57 degrees
 # (cos = 0.01) of 90 degrees. Beyond, it continues smoothly and stays positive, so that an
 # iteration which strays outside stays finite and can come back; a ray that ends there has
 # missed the surface.
-_RIM = 1e-4
+RIM = 1e-4
 # Nearer to the axis than this (mm^2) an odd power of r is flat: its derivative at 0 is none.
 _AXIS = 1e-16
 
@@ -39,8 +39,8 @@ class Shape(NamedTuple):
 
 
 def _root(argument: Array) -> Array:
-    inside = argument > _RIM
-    beyond = _RIM**0.5 / (1 + (1 - jnp.where(inside, _RIM, argument) / _RIM) / 2)
+    inside = argument > RIM
+    beyond = RIM**0.5 / (1 + (1 - jnp.where(inside, RIM, argument) / RIM) / 2)
     return jnp.where(inside, jnp.sqrt(jnp.where(inside, argument, 1)), beyond)
 
 
@@ -172,15 +172,18 @@ def sag(w: Array, shape: Shape, form: str = "asphere") -> Array:
 
 def domain(w: Array, shape: Shape, form: str = "asphere") -> Array:
     """True where the surface exists at `w` ((D, ...), mm); the shape of `w[0]`, bool."""
-    return FORMS[form](w, shape)[1] > _RIM
+    return FORMS[form](w, shape)[1] > RIM
 
 
 def sag_derivatives(w: Array, shape: Shape, form: str = "asphere") -> tuple[Array, Array, Array]:
     """Sag, its gradient and its Hessian by the transverse coordinates.
 
     `w` (D, ...) in mm. Returns arrays of shapes (...), (D, ...) and (D, D, ...). Derived from
-    `sag` by automatic differentiation, so that a new surface form is one formula.
+    `sag` by automatic differentiation, so that a new surface form is one formula; but the form
+    of nearly all surfaces, an asphere, has them written out with one root and one division.
     """
+    if form == "asphere":
+        return _asphere_derivatives(w, shape)
 
     def slopes(w):
         z, pull_back = jax.vjp(lambda w: sag(w, shape, form), w)
@@ -192,6 +195,25 @@ def sag_derivatives(w: Array, shape: Shape, form: str = "asphere") -> tuple[Arra
         gradient, column, z = jax.jvp(slopes, (w,), (unit,), has_aux=True)
         columns.append(column)
     return z, gradient, jnp.stack(columns)
+
+
+def _asphere_derivatives(w: Array, shape: Shape) -> tuple[Array, Array, Array]:
+    c, bent = shape.curvature, (1 + shape.conic) * shape.curvature**2
+    r2 = sum(a * a for a in w)
+    argument = 1 - bent * r2
+    inverse = 1 / jnp.sqrt(jnp.maximum(argument, RIM))
+    # z and its derivatives by r^2; beyond the rim, it goes on with the slope of the rim.
+    z, first = c * r2 / (1 + _root(argument)), c / 2 * inverse
+    second = jnp.where(argument > RIM, c * bent / 4 * inverse**3, 0)
+    if shape.coefficients.shape[0]:
+        z = z + r2 * _horner(r2, shape.coefficients)
+        once = [(j + 1) * a for j, a in enumerate(shape.coefficients)]
+        first = first + _horner(r2, once)
+        second = second + _horner(r2, [(j + 1) * a for j, a in enumerate(once[1:])])
+    pairs = [[4 * a * b * second for b in w] for a in w]
+    for d, row in enumerate(pairs):
+        row[d] = row[d] + 2 * first
+    return z, 2 * w * first, jnp.stack([jnp.stack(row) for row in pairs])
 
 
 def vertex_curvature(shape: Shape, forms: tuple[str, ...], dim: int) -> Array:

@@ -11,8 +11,8 @@ ROOT = pathlib.Path(drt_jax.__file__).parent
 # From what knows least to what knows most.
 ORDER = (
     "numerics", "surface", "glass", "lens", "prescription", "paraxial", "pupil", "fermat",
-    "sequential", "search", "implicit", "snell", "trace", "wavefront", "vignetting", "moments", "depth", "psf", "sensor",
-    "network", "adam", "data", "config", "runs", "train", "drawing", "plot",
+    "sequential", "aiming", "search", "implicit", "snell", "trace", "wavefront", "vignetting",
+    "moments", "depth", "psf", "sensor", "network", "adam", "data", "config", "runs", "train", "drawing", "plot",
 )  # fmt: skip
 NO_OPTICS = ("network", "adam", "data", "config", "runs", "plot")
 OPTICS = ORDER[: ORDER.index("sensor") + 1]
