@@ -236,7 +236,11 @@ def hessian(path: Geometry, system: System) -> Blocks:
 
 
 def _matvec(a: Array, x: Array) -> Array:
-    return jnp.sum(a * x[None], axis=1)
+    return jnp.stack([sum(b * y for b, y in zip(row, x)) for row in a])
+
+
+def _matmul(a: Array, b: Array) -> Array:
+    return jnp.stack([_matvec(a, column) for column in jnp.swapaxes(b, 0, 1)], axis=1)
 
 
 def _transpose(a: Array) -> Array:
@@ -251,55 +255,82 @@ def _inverse(a: Array) -> Array:
     return safe_divide(adjugate, determinant)
 
 
-def _solve_front(blocks: Blocks, rhs: list[Array]) -> list[Array]:
-    """Surfaces before the stop: block tridiagonal and symmetric; elimination, substitution."""
-    inverses, reduced = [], []
-    for i, b in enumerate(rhs):
-        pivot = blocks.diagonal[:, :, i]
-        if i:
-            upper = blocks.upper[:, :, i - 1]
-            carry = jnp.sum(inverses[-1][:, :, None] * upper[None], axis=1)
-            pivot = pivot - jnp.sum(upper[:, :, None] * carry[:, None], axis=0)
-            b = b - _matvec(_transpose(carry), reduced[-1])
-        inverses.append(_inverse(pivot))
-        reduced.append(b)
-    solution: list[Array] = []
-    for i in reversed(range(len(rhs))):
-        b = reduced[i]
-        if solution:
-            b = b - _matvec(blocks.upper[:, :, i], solution[0])
-        solution.insert(0, _matvec(inverses[i], b))
-    return solution
+def _rows(a: Array, first: int, last: int) -> Array:
+    """Rows `first` to `last` (excluded) of a (..., surfaces, W, Q), surfaces first; 0 where there
+    are none."""
+    a = jnp.moveaxis(a, -3, 0)
+    below, above = max(-first, 0), max(last - a.shape[0], 0)
+    a = a[max(first, 0) : min(last, a.shape[0])]
+    return jnp.pad(a, ((below, above), *[(0, 0)] * (a.ndim - 1))) if below or above else a
+
+
+def _solve_front(blocks: Blocks, rhs: Array, stop: int, at_stop: Array) -> Array:
+    """Solution (stop, D, W, Q) on the surfaces before the stop, whose block tridiagonal part is
+    symmetric, given that at the stop: elimination, substitution."""
+    if stop == 0:
+        return jnp.zeros((0, *at_stop.shape), rhs.dtype)
+
+    def eliminate(before, row):
+        inverse, reduced = before
+        diagonal, upper, b = row
+        carry = _matmul(inverse, upper)
+        pivot = diagonal - _matmul(_transpose(upper), carry)
+        here = _inverse(pivot), b - _matvec(_transpose(carry), reduced)
+        return here, here
+
+    def substitute(behind, row):
+        inverse, reduced, upper = row
+        x = _matvec(inverse, reduced - _matvec(upper, behind))
+        return x, x
+
+    diagonal = _rows(blocks.diagonal, 0, stop)
+    above = _rows(blocks.upper, -1, stop - 1)
+    nothing = jnp.zeros_like(diagonal[0]), jnp.zeros_like(at_stop)
+    _, (inverses, reduced) = jax.lax.scan(
+        eliminate, nothing, (diagonal, above, _rows(rhs, 0, stop))
+    )
+    upper = _rows(blocks.upper, 0, stop)
+    return jax.lax.scan(substitute, at_stop, (inverses, reduced, upper), reverse=True)[1]
 
 
 def solve(blocks: Blocks, rhs: Array, stop: int) -> Array:
     """x with (dF/dw) x = rhs (D, S, W, Q) and x = 0 on the stop; x is (D, S + 1, W, Q)."""
-    surfaces = rhs.shape[1]
-    x = _solve_front(blocks, [rhs[:, i] for i in range(stop)])
-    x.append(jnp.zeros_like(rhs[:, 0]))
-    for i in range(stop, surfaces):
-        b = rhs[:, i] - _matvec(blocks.diagonal[:, :, i], x[i])
-        if i:
-            b = b - _matvec(_transpose(blocks.upper[:, :, i - 1]), x[i - 1])
-        x.append(_matvec(_inverse(blocks.upper[:, :, i]), b))
-    return jnp.stack(x, axis=1)
+    count, none = rhs.shape[1], jnp.zeros_like(rhs[:, 0])
+
+    def march(before, row):
+        earlier, here = before
+        diagonal, above, upper, b = row
+        b = b - _matvec(diagonal, here) - _matvec(_transpose(above), earlier)
+        behind = _matvec(_inverse(upper), b)
+        return (here, behind), behind
+
+    front = _solve_front(blocks, rhs, stop, none)
+    rows = (
+        _rows(blocks.diagonal, stop, count), _rows(blocks.upper, stop - 1, count - 1),
+        _rows(blocks.upper, stop, count), _rows(rhs, stop, count),
+    )  # fmt: skip
+    _, behind = jax.lax.scan(march, (front[-1] if stop else none, none), rows)
+    return jnp.moveaxis(jnp.concatenate([front, none[None], behind]), 0, 1)
 
 
 def solve_transposed(blocks: Blocks, rhs: Array, stop: int) -> Array:
     """y (D, S, W, Q) with (dF/dw)^T y = rhs (D, S + 1, W, Q), the stop's column left out."""
-    surfaces = rhs.shape[1] - 1
-    behind: list[Array] = []  # y on surfaces stop .. S - 1
-    for j in range(surfaces, stop, -1):
-        c = rhs[:, j]
-        if len(behind) > 0:
-            c = c - _matvec(blocks.diagonal[:, :, j], behind[0])
-        if len(behind) > 1:
-            c = c - _matvec(blocks.upper[:, :, j], behind[1])
-        behind.insert(0, _matvec(_inverse(_transpose(blocks.upper[:, :, j - 1])), c))
-    front = [rhs[:, j] for j in range(stop)]
-    if stop:
-        front[-1] = front[-1] - _matvec(blocks.upper[:, :, stop - 1], behind[0])
-    return jnp.stack(_solve_front(blocks, front) + behind, axis=1)
+    count, none = rhs.shape[1] - 1, jnp.zeros_like(rhs[:, 0])
+
+    def march(behind, row):
+        here, later = behind
+        diagonal, below, upper, c = row
+        c = c - _matvec(diagonal, here) - _matvec(below, later)
+        before = _matvec(_inverse(_transpose(upper)), c)
+        return (before, here), before
+
+    rows = (
+        _rows(blocks.diagonal, stop + 1, count + 1), _rows(blocks.upper, stop + 1, count + 1),
+        _rows(blocks.upper, stop, count), _rows(rhs, stop + 1, count + 1),
+    )  # fmt: skip
+    _, behind = jax.lax.scan(march, (none, none), rows, reverse=True)
+    front = _solve_front(blocks, rhs, stop, behind[0])
+    return jnp.moveaxis(jnp.concatenate([front, behind]), 0, 1)
 
 
 def stationary(hits: Array, system: System) -> Array:

@@ -87,7 +87,7 @@ def _solve(system: System, aiming: Aiming | None = None) -> tuple[Array, Array, 
             hits, solved, steps, turns = state
             solution = optx.root_find(
                 lambda hits, args: fermat.residual(hits, args[0]),
-                BlockNewton(stop=system.stop, atol=float(jnp.finfo(hits.dtype).eps) ** 0.5 * 0.1),
+                BlockNewton(stop=system.stop, atol=10 * float(jnp.finfo(hits.dtype).eps) ** 0.5),
                 hits,
                 args=(system, active & ~solved & (turns > 0)),
                 max_steps=_MAX_STEPS,
@@ -97,10 +97,11 @@ def _solve(system: System, aiming: Aiming | None = None) -> tuple[Array, Array, 
             solved = active & fermat.stationary(hits, system)
             return hits, solved, steps + solution.stats["num_steps"], turns + 1
 
-        # Rays that were aimed well are stationary before any step.
-        start = hits, jnp.zeros_like(active), jnp.int32(0), jnp.int32(aiming is None)
+        # Rays that were aimed well are stationary before any step; a few others need one more.
+        first = int(aiming is None)
+        start = hits, jnp.zeros_like(active), jnp.int32(0), jnp.int32(first)
         hits, solved, steps, _ = jax.lax.while_loop(
-            lambda state: (state[-1] < 2) & ((state[-1] == 0) | jnp.any(active & ~state[1])),
+            lambda state: (state[-1] <= 2) & ((state[-1] <= first) | jnp.any(active & ~state[1])),
             turn, start,
         )  # fmt: skip
         return hits, solved, steps

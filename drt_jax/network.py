@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from .convolution import convolve_3x3
+
 __all__ = ["count_parameters", "red_net"]
 
 Parameters = list[dict[str, Array]]
@@ -53,7 +55,7 @@ def red_net(
     def apply(parameters: Parameters, images: Array) -> Array:
         features, kept = images, {}
         for i, layer in enumerate(parameters):
-            features = _convolve(features, layer["kernel"]) + layer["bias"]
+            features = convolve_3x3(features, layer["kernel"]) + layer["bias"]
             if i >= layers:
                 mirror = 2 * layers - 2 - i
                 if mirror in kept:
@@ -65,12 +67,6 @@ def red_net(
         return images + features if input_skip else features
 
     return init, apply
-
-
-def _convolve(images: Array, kernel: Array) -> Array:
-    return jax.lax.conv_general_dilated(
-        images, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
 
 
 def count_parameters(parameters: object) -> int:

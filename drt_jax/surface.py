@@ -63,7 +63,7 @@ def asphere(w: Array, shape: Shape) -> tuple[Array, Array]:
     z = c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + a_0 r^2 + a_1 r^4 + ...; paper Eq. 1 is k = 0
     without coefficients.
     """
-    r2 = jnp.sum(w * w, axis=0)
+    r2 = sum(a * a for a in w)
     z, argument = _conic(r2, shape.curvature, shape.conic)
     if shape.coefficients.shape[0]:
         z = z + r2 * _horner(r2, shape.coefficients)
@@ -72,7 +72,7 @@ def asphere(w: Array, shape: Shape) -> tuple[Array, Array]:
 
 def odd_asphere(w: Array, shape: Shape) -> tuple[Array, Array]:
     """Conic and every power of r: ... + a_0 r + a_1 r^2 + a_2 r^3 + ..."""
-    r2 = jnp.sum(w * w, axis=0)
+    r2 = sum(a * a for a in w)
     z, argument = _conic(r2, shape.curvature, shape.conic)
     off = r2 > _AXIS
     r = jnp.where(off, jnp.sqrt(jnp.where(off, r2, 1)), 0)

@@ -168,7 +168,7 @@ def trace_bundle(
     if len(live) < count:
         whole = system_of(lens, list(range(count)), *scene)
         hits = _cross_dead_surfaces(system, whole, hits, live)
-    radius2 = jnp.sum(hits[:, :-1] ** 2, axis=0)
+    radius2 = sum(a**2 for a in hits[:, :-1])
     edge2 = (lens.semi_diameter.at[lens.stop].set(jnp.inf) ** 2)[:, None, None]
     clipped = jnp.any(radius2 > edge2, axis=0) & (status == Status.OK)
     return Bundle(hits, jnp.where(clipped, jnp.int32(Status.CLIPPED), status), last, path, steps)

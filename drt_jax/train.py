@@ -70,13 +70,12 @@ def make_imager(blur: Blur, restore: Restore | None, camera: Camera) -> Callable
 
 
 def compiler_options() -> dict[str, str] | None:
-    """XLA options for a training step: on a CPU, convolutions through the faster of its two
-    libraries (a RED-Net step of 16 patches of 64x64 takes 0.93 s instead of 1.27 s on two
-    cores). Set for each compilation, never globally."""
+    """XLA options for a training step: on a CPU, a choice of passes with which a RED-Net step takes
+    a tenth less time (see docs/performance.md). Set for each compilation, never globally."""
     if jax.default_backend() != "cpu":
         return None
-    options = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"}
-    try:  # an experimental option: a release of jaxlib may not know it
+    options = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_FAST_COMPILE"}
+    try:  # a release of jaxlib may not know it
         jax.jit(lambda x: x + 1, compiler_options=options).lower(0.0).compile()
     except Exception:
         return None

@@ -4,12 +4,14 @@ Calls alternate, and their medians are compared. Errors are relative: of the RMS
 or the worse of sigma and its derivatives by curvatures and thicknesses, against an integral over a
 sequential trace by Snell's law. Peers are an extra, `pip install -e '.[peers]'`; a missing one has
 a row that says so. Writes results.json, whose `rows` hold `task`, `ours_s`, `peer`, `peer_s`,
-`ratio` (theirs by ours), `ours_error`, `peer_error`, `compile_s` and `peak_mb` (ours), and a
-picture of run time against error.
+`ratio` (theirs by ours), `ours_error`, `peer_error`, `compile_s`, `peak_mb` and `kernels` (ours);
+beside them `counts`, what a training step traces, and `work`, how run time grows with rays,
+surfaces and wavelengths. Draws run time against error, and the growth.
 """
 
 import dataclasses
 import math
+import re
 import subprocess
 import sys
 import time
@@ -28,7 +30,8 @@ from drt_jax.runs import Run
 from . import _common, _peers
 from ._reference import reference
 
-_COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", "compile_s", "peak_mb")
+_COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", "compile_s", "peak_mb",
+            "kernels")  # fmt: skip
 _FIRST = """
 import time; start = time.perf_counter()
 import jax; jax.config.update("jax_enable_x64", True)
@@ -78,16 +81,20 @@ class Ours:
     call: Callable
     compile_s: float
     peak_mb: float
+    kernels: int
 
 
 def compiled(function: Callable, *arguments, **options) -> Ours:
-    """Compile `function` for its arguments, tracing included, and tell the memory it will hold."""
+    """Compile `function` for its arguments, tracing included; tell the memory it will hold, and how
+    many kernels it consists of (those in a loop once)."""
     start = time.perf_counter()
     program = jax.jit(function, **options).lower(*arguments).compile()
     seconds = time.perf_counter() - start
     memory = program.memory_analysis()
     held = memory.temp_size_in_bytes + memory.output_size_in_bytes
-    return Ours(lambda: jax.block_until_ready(program(*arguments)), seconds, held / 2**20)
+    text = program.as_text()
+    kernels = len(re.findall(r" (?:fusion|dot|convolution|custom-call)\(", text))
+    return Ours(lambda: jax.block_until_ready(program(*arguments)), seconds, held / 2**20, kernels)
 
 
 def alternate(calls: list[Callable], repeats: int) -> list[float]:
@@ -113,7 +120,7 @@ def rows_of(
     ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
     seconds, *others = alternate([ours.call, *(call for call, _ in ready.values())], repeats)
     base = {"task": task, "ours_s": seconds, "ours_error": error}
-    base |= {"compile_s": ours.compile_s, "peak_mb": ours.peak_mb}
+    base |= {"compile_s": ours.compile_s, "peak_mb": ours.peak_mb, "kernels": ours.kernels}
     found = dict(zip(ready, others))
     rows = []
     for name, peer in peers.items():
@@ -283,7 +290,7 @@ def first_task(config: Config) -> list[dict]:
         rows.append({
             "task": f"first sigma and gradient in a new process, {where}", "peer": "",
             "ours_s": float(np.median(times)), "peer_s": None, "ratio": None, "ours_error": None,
-            "peer_error": None, "compile_s": None, "peak_mb": None, "note": "",
+            "peer_error": None, "compile_s": None, "peak_mb": None, "kernels": None, "note": "",
         })  # fmt: skip
     return rows
 

@@ -12,9 +12,9 @@ ROOT = pathlib.Path(drt_jax.__file__).parent
 ORDER = (
     "numerics", "surface", "glass", "lens", "prescription", "paraxial", "pupil", "fermat",
     "sequential", "aiming", "search", "implicit", "snell", "trace", "wavefront", "vignetting",
-    "moments", "depth", "psf", "sensor", "network", "adam", "data", "config", "runs", "train", "drawing", "plot",
+    "moments", "depth", "psf", "sensor", "convolution", "network", "adam", "data", "config", "runs", "train", "drawing", "plot",
 )  # fmt: skip
-NO_OPTICS = ("network", "adam", "data", "config", "runs", "plot")
+NO_OPTICS = ("convolution", "network", "adam", "data", "config", "runs", "plot")
 OPTICS = ORDER[: ORDER.index("sensor") + 1]
 ONLY = {"optimistix": "implicit", "matplotlib": "plot", "skimage": ("data", "train")}
 
