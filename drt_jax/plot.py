@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["by_family", "convergence", "error_curves", "kernels", "lens_drawing", "new",
-           "patch_grid", "sigma_over_depth"]  # fmt: skip
+__all__ = ["by_family", "convergence", "error_curves", "growth", "kernels", "lens_drawing", "new",
+           "patch_grid", "programs", "sigma_over_depth"]  # fmt: skip
 
 _FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 _COLOURS = ("tab:red", "tab:green", "tab:blue")
@@ -157,6 +157,22 @@ def kernels(axes: Sequence[Axes], kernel: np.ndarray, titles: Sequence[str]) -> 
         ax.imshow(values, vmin=0, vmax=np.max(kernel), cmap="magma", origin="lower")
         ax.set_title(title, fontsize=9)
         ax.set(xlabel="x (pixels)", ylabel="y (pixels)")
+    return axes
+
+
+def growth(axes: Axes, series: Mapping[str, Sequence[tuple[float, float]]]) -> Axes:
+    """Run time (s) against the number of each kind of thing, both logarithmic, and a line of
+    slope one."""
+    for name, points in series.items():
+        number, seconds = np.asarray(points, float).T
+        axes.loglog(number, 1e3 * seconds, marker="o", label=name)
+    low, high = axes.get_xlim()
+    number, seconds = np.asarray(points, float)[-1]
+    line = np.array([low, high])
+    axes.plot(line, 1e3 * seconds * line / number, color="grey", linestyle=":", label="linear")
+    axes.set(xlabel="number", ylabel="run time (ms)", xlim=(low, high))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
     return axes
 
 

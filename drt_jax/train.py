@@ -16,7 +16,7 @@ from .numerics import safe_sqrt
 from .psf import Form, gaussian_psf
 from .sensor import sensor_layer
 
-__all__ = ["Camera", "evaluate", "fit", "make_imager", "make_step"]
+__all__ = ["Camera", "evaluate", "fit", "make_imager", "make_step", "value_and_gradient"]
 
 Blur = Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]
 Restore = Callable[[Any, Array], Array]

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import datetime
 import math
+import os
 import pathlib
 import sys
 import time
@@ -115,6 +116,7 @@ def main(
     options = parser.parse_args(argv)
     # The caller, not the library, chooses the precision: optics in float64.
     jax.config.update("jax_enable_x64", True)
+    _keep_programs()
     started = time.perf_counter()
     folder = None
     try:
@@ -142,6 +144,14 @@ def main(
             raise
         raise SystemExit(_say(str(error), 2)) from None
     print(f"done in {time.perf_counter() - started:.0f} s")
+
+
+def _keep_programs() -> None:
+    """Keep compiled programs for the next run, in JAX_COMPILATION_CACHE_DIR or the user's cache."""
+    if not jax.config.jax_compilation_cache_dir:
+        home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "drt_jax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 def _say(message: str, code: int) -> int:

@@ -11,9 +11,11 @@ surfaces and wavelengths. Draws run time against error, and the growth.
 
 import dataclasses
 import math
+import os
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 
@@ -27,7 +29,7 @@ from drt_jax import Lens, Status, network, plot, pupil, train
 from drt_jax.adam import adam, apply_updates
 from drt_jax.runs import Run
 
-from . import _common, _peers
+from . import _common, _peers, _work
 from ._reference import reference
 
 _COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", "compile_s", "peak_mb",
@@ -49,7 +51,8 @@ class Config:
 
     repeats: timed calls of each program (fewer where they take long). rays: those a peer samples
     a pupil with. bundle: rays of the task of many rays. batch, patch: of the network's step.
-    tasks: the names of those to run, empty for all. seed: of the rays and images.
+    tasks: the names of those to run, empty for all. growth: whether to measure how run time grows
+    with the scene. seed: of the rays and images.
     """
 
     lens: str = "double_gauss"
@@ -62,6 +65,7 @@ class Config:
     batch: int = 16
     patch: int = 64
     tasks: tuple[str, ...] = ()
+    growth: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -87,14 +91,26 @@ class Ours:
 def compiled(function: Callable, *arguments, **options) -> Ours:
     """Compile `function` for its arguments, tracing included; tell the memory it will hold, and how
     many kernels it consists of (those in a loop once)."""
+    return loaded(jax.jit(function, **options), *arguments)
+
+
+def loaded(function: Callable, *arguments) -> Ours:
+    """The same of a jitted function. Arguments that it donates, it is given as copies."""
     start = time.perf_counter()
-    program = jax.jit(function, **options).lower(*arguments).compile()
+    program = function.lower(*arguments).compile()
     seconds = time.perf_counter() - start
     memory = program.memory_analysis()
     held = memory.temp_size_in_bytes + memory.output_size_in_bytes
     text = program.as_text()
     kernels = len(re.findall(r" (?:fusion|dot|convolution|custom-call)\(", text))
-    return Ours(lambda: jax.block_until_ready(program(*arguments)), seconds, held / 2**20, kernels)
+    donated = [info.donated for info in jax.tree.leaves(function.lower(*arguments).args_info)]
+
+    def call():
+        leaves, structure = jax.tree.flatten(arguments)
+        given = [jnp.array(a) if gone else a for a, gone in zip(leaves, donated)]
+        return jax.block_until_ready(program(*jax.tree.unflatten(structure, given)))
+
+    return Ours(call, seconds, held / 2**20, kernels)
 
 
 def alternate(calls: list[Callable], repeats: int) -> list[float]:
@@ -243,56 +259,106 @@ def bundle_task(config: Config) -> list[dict]:
     except _peers.Missing as missing:
         peers["batoid"] = str(missing)
     rows = rows_of(f"{config.bundle} skew rays", ours, own, peers, config.repeats)
+    devices = os.cpu_count() or 1
+    shared = _work.spread_over_devices(
+        config.lens, field, distance, config.wavelengths_um[0], config.bundle, config.seed,
+        config.repeats, devices,
+    )  # fmt: skip
+    peer = rows[0]["peer_s"]
+    rows.append({
+        **rows[0], "task": f"{config.bundle} skew rays, {devices} CPU devices", "ours_s": shared,
+        "ratio": peer and peer / shared, "compile_s": None, "peak_mb": None, "kernels": None,
+    })  # fmt: skip
+
+    back = compiled(jax.grad(lambda lens: jnp.mean(_squares(lens, field, distance, waves, points))), lens)
+    rows.append({
+        **rows[0], "task": f"{config.bundle} skew rays and their gradient", "peer": "",
+        "ours_s": alternate([back.call], 3)[0], "peer_s": None, "ratio": None, "peer_error": None,
+        "ours_error": None, "compile_s": back.compile_s, "peak_mb": back.peak_mb,
+        "kernels": back.kernels, "note": "",
+    })  # fmt: skip
     for row in rows:
         row["ours_rays_per_s"] = config.bundle / row["ours_s"]
-        row["bytes_per_ray"] = row["peak_mb"] * 2**20 / config.bundle
+        if row["peak_mb"] is not None:
+            row["bytes_per_ray"] = row["peak_mb"] * 2**20 / config.bundle
     return rows
 
 
+def _squares(lens, field, distance, waves, points):
+    rays = drt_jax.trace_rays(lens, field, distance, waves, points)
+    return rays.points[0, :, -1, :2] ** 2
+
+
 def network_task(config: Config) -> list[dict]:
-    """One Adam step of the restoration network alone."""
+    """One Adam step of optics and network together, and of the network alone."""
     rng = np.random.default_rng(config.seed)
+    lens, distance = drt_jax.load_lens(config.lens), 1e3 * config.distance_m
+    init, apply = network.red_net()
+    weights = init(jax.random.key(config.seed))
+    camera, rates = train.Camera(), {"optics": 1e-3, "network": 1e-3}
+    values, blur = drt_jax.moments_model(
+        lens, ("sensor",), 0.0, (distance, distance), config.wavelengths_um
+    )
+    side = config.patch + camera.kernel - 1
+    scenes = rng.integers(0, 256, (config.batch, side, side, 3)).astype(np.uint8)
+    start, step = train.make_step(
+        train.make_imager(blur, apply, camera), rates, (distance, distance), config.seed
+    )
+    state = start({"optics": values, "network": weights})
+    joint = loaded(step, state, scenes, np.float32(0.01), np.int32(0))
     shape = (config.batch, config.patch, config.patch, 3)
     images, truth = (jnp.asarray(rng.random(shape), jnp.float32) for _ in range(2))
-    init, apply = network.red_net()
-    start, update = adam({"network": 1e-3})
-    parameters = {"network": init(jax.random.key(0))}
+    begin, update = adam(rates)
 
-    def step(parameters, moments, images, truth):
+    def alone(parameters, moments, images, truth):
         def loss(parameters):
             return jnp.mean(jnp.abs(apply(parameters["network"], images) - truth))
 
         updates, moments = update(jax.grad(loss)(parameters), moments)
         return apply_updates(parameters, updates), moments
 
+    parameters = {"network": weights}
     options = {"compiler_options": train.compiler_options()}
-    ours = compiled(step, parameters, start(parameters), images, truth, **options)
+    only = compiled(alone, parameters, begin(parameters), images, truth, **options)
     peers: dict[str, tuple | str] = {}
     try:
         call, version = _peers.network_step(config.batch, config.patch, 1e-3)
-        peers[f"torch {version}, channels last"] = (call, None)
+        peers[f"torch {version}, network alone, channels last"] = (call, None)
     except _peers.Missing as missing:
         peers["torch"] = str(missing)
-    task = f"RED-Net step, {config.batch} of {config.patch}x{config.patch}"
-    return rows_of(task, ours, None, peers, min(config.repeats, 5))
+    peers["ours, network alone"] = (only.call, None)
+    task = f"joint step with RED-Net, {config.batch} of {config.patch}x{config.patch}"
+    return rows_of(task, joint, None, peers, min(config.repeats, 9))
 
 
 def first_task(config: Config) -> list[dict]:
-    """A new process: import, load a lens, trace, gradient."""
+    """A new process: import, load a lens, trace, gradient; and the same once more, with the
+    compiled programs kept in a folder."""
     rows = []
     for field, where in ((0.0, "on axis"), (math.radians(config.field_deg), f"{config.field_deg:g} degrees")):
         code = _FIRST.format(lens=config.lens, field=field, distance=1e3 * config.distance_m)
-        times = []
-        for _ in range(3):
-            done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-            _common.require(done.returncode == 0, f"lens: a new process failed: {done.stderr[-500:]}")
-            times.append(float(done.stdout.split()[-1]))
-        rows.append({
-            "task": f"first sigma and gradient in a new process, {where}", "peer": "",
-            "ours_s": float(np.median(times)), "peer_s": None, "ratio": None, "ours_error": None,
-            "peer_error": None, "compile_s": None, "peak_mb": None, "kernels": None, "note": "",
-        })  # fmt: skip
+        with tempfile.TemporaryDirectory() as folder:
+            kept = {"JAX_COMPILATION_CACHE_DIR": folder,
+                    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}  # fmt: skip
+            _in_a_new_process(code, kept)
+            for more, extra in (("", {}), (", programs kept", kept)):
+                times = [_in_a_new_process(code, extra) for _ in range(3)]
+                rows.append({
+                    "task": f"first sigma and gradient in a new process, {where}{more}",
+                    "peer": "", "ours_s": float(np.median(times)), "peer_s": None, "ratio": None,
+                    "ours_error": None, "peer_error": None, "compile_s": None, "peak_mb": None,
+                    "kernels": None, "note": "",
+                })  # fmt: skip
     return rows
+
+
+def _in_a_new_process(code: str, environment: dict[str, str]) -> float:
+    clean = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=clean | environment
+    )
+    _common.require(done.returncode == 0, f"lens: a new process failed: {done.stderr[-500:]}")
+    return float(done.stdout.split()[-1])
 
 
 TASKS = {
@@ -308,6 +374,8 @@ TASKS = {
 
 def run(config: Config, run: Run) -> None:
     """Run the tasks one by one, print the table, draw run time against error."""
+    # Programs kept from another run would hide what compiling takes.
+    jax.config.update("jax_enable_compilation_cache", False)
     rows: list[dict] = []
     names = config.tasks or tuple(TASKS)
     with tqdm(names, unit="task", dynamic_ncols=True) as bar:
@@ -318,7 +386,11 @@ def run(config: Config, run: Run) -> None:
                 columns = {c: np.array([float(row[c])]) for c in _COLUMNS if row[c] is not None}
                 run.log(name, k, columns)
             rows += found
-    path = run.finish({"rows": rows, "seconds": run.seconds})
+    lens, distance = drt_jax.load_lens(config.lens), 1e3 * config.distance_m
+    results = {"rows": rows, "counts": _work.counts(lens, distance, config.wavelengths_um)}
+    if config.growth:
+        results["work"] = _work.growth(lens, math.radians(config.field_deg), distance, 5)
+    path = run.finish({**results, "seconds": run.seconds})
     header = ("task", "ours ms", "peer", "peer ms", "ratio", "our error", "its error", "compile s", "MB")
 
     def number(value, scale=1.0, form=".3g"):
@@ -330,7 +402,14 @@ def run(config: Config, run: Run) -> None:
          number(r["peer_error"], form=".1e"), number(r["compile_s"]), number(r["peak_mb"]))
         for r in rows
     ]))  # fmt: skip
+    for name, count in results["counts"].items():
+        print(f"{name}: rays are solved for {count} times in a training step")
     print(f"results in {path}")
+    if config.growth:
+        figure, axes = plot.new(1, 1, 5.5, 4)
+        plot.growth(axes, results["work"])
+        figure.savefig(run.figures / "work.png")
+        print(f"figure {run.figures / 'work.png'}")
     tasks = list(dict.fromkeys(r["task"] for r in rows if r["task"].startswith("sigma")))
     if tasks:
         figure, axes = plot.new(1, len(tasks), 4.5, 4)
