@@ -369,11 +369,11 @@ def stationary(hits: Array, system: System) -> Array:
         draw = [partial(drawn, kind) for kind in kinds]
         draw = draw[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, draw)
         z, slope, exists = draw(w, shape)
-        point = tuple(a + o for a, o in zip(turned(rotation, (*w, z)), origin))
-        # The first segment as in `geometry`.
+        own = turned(rotation, (*w, z))
+        # As in `geometry`: the first segment scaled, the others sums of small differences.
         step = tuple(
-            jnp.where(i == 0, system.vergence * a - s, a - b)
-            for a, b, s in zip(point, last["point"], system.source)
+            jnp.where(i == 0, system.vergence * (a + o) - s, (a - b) + (o - q))
+            for a, b, o, q, s in zip(own, last["own"], origin, last["origin"], system.source)
         )
         inverse = safe_divide(jnp.ones_like(z), jnp.sqrt(sum(a * a for a in step)))
         ray = tuple(a * inverse for a in step)
@@ -391,12 +391,12 @@ def stationary(hits: Array, system: System) -> Array:
         good = (error**2 <= (64 * eps * both) ** 2 * lean) & (both <= 4 / jnp.sqrt(eps))
         ways = forward(last["before"], last["slope"]) * last["sense"], forward(after, last["slope"]) * sense
         good = ((good & (jnp.minimum(*ways) > 0)) | (i == 0)) & exists
-        new = {"point": point, "before": before, "slope": slope, "size": size, "shake": shake,
+        new = {"own": own, "origin": origin, "before": before, "slope": slope, "size": size, "shake": shake,
                "index": index, "sense": sense, "rotation": rotation}  # fmt: skip
         return new, bad + jnp.where(good, 0, 1).astype(jnp.int32)
 
     none = jnp.zeros(hits.shape[2:], hits.dtype)
-    last = {"point": (none,) * (dim + 1), "before": (none,) * (dim + 1), "slope": (none,) * dim,
+    last = {"own": (none,) * (dim + 1), "origin": rows[1][0], "before": (none,) * (dim + 1), "slope": (none,) * dim,
             "size": none, "shake": none, "index": rows[4][0],
             "sense": rows[5][0], "rotation": None if rotation is None else rotation[0]}  # fmt: skip
     last, bad = jax.lax.fori_loop(0, surfaces, walk, (last, none.astype(jnp.int32)))

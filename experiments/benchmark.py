@@ -34,6 +34,7 @@ from ._reference import reference
 
 _COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", "compile_s", "peak_mb",
             "kernels")  # fmt: skip
+_TURN = 0.05
 _FIRST = """
 import time; start = time.perf_counter()
 import jax; jax.config.update("jax_enable_x64", True)
@@ -115,7 +116,11 @@ def loaded(function: Callable, *arguments) -> Ours:
 
 def alternate(calls: list[Callable], repeats: int) -> list[float]:
     """Median seconds of each call, made in turns after one that does not count; those that take
-    over a second are made three times."""
+    over a second are made three times.
+
+    A turn lasts at least `_TURN` s and its first call does not count either: the threads of another
+    program go on spinning for a while, and would be counted against this one.
+    """
     times: list[list[float]] = [[] for _ in calls]
     for call in calls:
         call()
@@ -123,9 +128,11 @@ def alternate(calls: list[Callable], repeats: int) -> list[float]:
         for call, taken in zip(calls, times):
             if k >= 3 and np.median(taken) > 1:
                 continue
-            start = time.perf_counter()
             call()
-            taken.append(time.perf_counter() - start)
+            began = time.perf_counter()
+            while (start := time.perf_counter()) - began < _TURN:
+                call()
+                taken.append(time.perf_counter() - start)
     return [float(np.median(taken)) for taken in times]
 
 

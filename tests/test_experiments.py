@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 
+import jax
 import pytest
 import yaml
 from skimage import io
@@ -206,3 +207,25 @@ def test_help_lists_the_settings(name, capsys):
         main(name, "--help")
     text = capsys.readouterr().out
     assert stopped.value.code == 0 and "train.optics_rate: a number" in text and "Section 6" in text
+
+
+def test_benchmark_without_peers(tmp_path, capsys, monkeypatch):
+    """One task: a row for each peer, which is measured or says what is missing, and the counts."""
+    from experiments import _peers, benchmark
+
+    def missing(*_):
+        raise _peers.Missing("not installed")
+
+    monkeypatch.setattr(_peers, "spot", missing)
+    options = ["tasks=[axial]", "growth=false", "repeats=1"]
+    try:
+        benchmark.main(["--out", str(tmp_path / "run"), "--set", *options])
+    finally:  # the benchmark compiles everything anew
+        jax.config.update("jax_enable_compilation_cache", True)
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert [(row["peer"], row["peer_s"], row["note"]) for row in results["rows"]] == [
+        ("optiland", None, "not installed"), ("batoid", None, "not installed"),
+    ]  # fmt: skip
+    assert all(row["ours_s"] > 0 and row["ours_error"] < 1e-8 for row in results["rows"])
+    solves = list(results["counts"].values())
+    assert solves[:2] == [0, 0] and solves[2] > 0
