@@ -419,8 +419,9 @@ def run(config: Config, run: Run) -> None:
         print(f"figure {run.figures / 'work.png'}")
     tasks = list(dict.fromkeys(r["task"] for r in rows if r["task"].startswith("sigma")))
     if tasks:
-        figure, axes = plot.new(1, len(tasks), 4.5, 4)
-        for axis, task in zip(np.atleast_1d(axes), tasks):
+        across = min(2, len(tasks))
+        figure, axes = plot.new(-(-len(tasks) // across), across, 4.5, 3.2)
+        for axis, task in zip(np.ravel(axes), tasks):
             some = [r for r in rows if r["task"] == task]
             marks = {"drt_jax": [(1e3 * some[0]["ours_s"], some[0]["ours_error"])]}
             marks |= {r["peer"]: [(1e3 * r["peer_s"], r["peer_error"])] for r in some if r["peer_s"]}
