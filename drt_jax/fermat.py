@@ -24,7 +24,8 @@ from .numerics import safe_divide, safe_sqrt
 from .surface import Shape, by_form, domain, sag, sag_derivatives
 
 __all__ = ["Blocks", "Geometry", "Status", "System", "arrival", "geometry", "hessian",
-           "optical_path", "residual", "solve", "solve_transposed", "stationary", "turn"]  # fmt: skip
+           "optical_path", "residual", "solve", "solve_transposed", "stationary", "turn",
+           "turned"]  # fmt: skip
 
 
 class Status(enum.IntEnum):
@@ -120,6 +121,14 @@ def turn(rotation: Array | None, vectors: Array, back: bool = False) -> Array:
         return vectors
     matrix = rotation.reshape(*rotation.shape, *(1,) * (vectors.ndim - 2))
     return jnp.sum(matrix * (vectors[:, None] if back else vectors[None]), axis=0 if back else 1)
+
+
+def turned(rotation: Array | None, vector: tuple, back: bool = False) -> tuple:
+    """`turn` for one surface, `rotation` (3, 3), and a vector as a tuple of components."""
+    if rotation is None:
+        return vector
+    matrix = rotation.T if back else rotation
+    return tuple(sum(a * b for a, b in zip(row, vector)) for row in matrix)
 
 
 def _origin(system: System, dim: int) -> Array:
@@ -354,12 +363,6 @@ def stationary(hits: Array, system: System) -> Array:
         z, slope, _ = sag_derivatives(w, shape, kind)
         return z, tuple(slope), domain(w, shape, kind)
 
-    def turned(rotation, vector, back=False):
-        if rotation is None:
-            return vector
-        matrix = rotation.T if back else rotation
-        return tuple(sum(matrix[i, j] * vector[j] for j in range(3)) for i in range(3))
-
     def forward(direction, slope):
         return direction[-1] - sum(a * b for a, b in zip(slope, direction))
 
@@ -389,15 +392,17 @@ def stationary(hits: Array, system: System) -> Array:
         lean = 1 + sum(a * a for a in last["slope"])
         # Where a ray all but touches two surfaces at once, its direction between them is unknown.
         good = (error**2 <= (64 * eps * both) ** 2 * lean) & (both <= 4 / jnp.sqrt(eps))
-        ways = forward(last["before"], last["slope"]) * last["sense"], forward(after, last["slope"]) * sense
-        good = ((good & (jnp.minimum(*ways) > 0)) | (i == 0)) & exists
-        new = {"own": own, "origin": origin, "before": before, "slope": slope, "size": size, "shake": shake,
-               "index": index, "sense": sense, "rotation": rotation}  # fmt: skip
+        arrives = forward(last["before"], last["slope"]) * last["sense"]
+        leaves = forward(after, last["slope"]) * sense
+        good = ((good & (jnp.minimum(arrives, leaves) > 0)) | (i == 0)) & exists
+        new = {"own": own, "origin": origin, "before": before, "slope": slope, "size": size,
+               "shake": shake, "index": index, "sense": sense, "rotation": rotation}  # fmt: skip
         return new, bad + jnp.where(good, 0, 1).astype(jnp.int32)
 
     none = jnp.zeros(hits.shape[2:], hits.dtype)
-    last = {"own": (none,) * (dim + 1), "origin": rows[1][0], "before": (none,) * (dim + 1), "slope": (none,) * dim,
-            "size": none, "shake": none, "index": rows[4][0],
-            "sense": rows[5][0], "rotation": None if rotation is None else rotation[0]}  # fmt: skip
+    vector = (none,) * (dim + 1)
+    last = {"own": vector, "origin": rows[1][0], "before": vector, "slope": vector[:-1],
+            "size": none, "shake": none, "index": rows[4][0], "sense": rows[5][0],
+            "rotation": None if rotation is None else rotation[0]}  # fmt: skip
     last, bad = jax.lax.fori_loop(0, surfaces, walk, (last, none.astype(jnp.int32)))
     return (bad == 0) & (forward(last["before"], last["slope"]) * last["sense"] > 0)

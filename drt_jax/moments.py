@@ -289,14 +289,6 @@ def _typed(
     return (lens, jnp.zeros_like(scene[1][:1]), *scene[2:]) if symmetry == "meridian" else scene
 
 
-def _rule(symmetry: str, order: int) -> tuple[np.ndarray, np.ndarray]:
-    if symmetry == "meridian":
-        return pupil.meridian(order)
-    # An aberration of degree p in the pupil reaches azimuthal order p: as many azimuths on
-    # the half disc as there are radial nodes integrate its square to the same degree.
-    return (pupil.half_disc if symmetry == "half" else pupil.disc)(order, order + 1)
-
-
 def _padded_rule(symmetry: str, order: int) -> tuple[np.ndarray, np.ndarray]:
     """A rule filled up with weightless rays, so that all orders share a few compiled programs.
 

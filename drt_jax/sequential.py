@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .fermat import Status, System
+from .fermat import Status, System, turned
 from .numerics import safe_divide, safe_sqrt
 from .surface import RIM, Shape, domain, sag, sag_derivatives
 
@@ -30,9 +30,8 @@ def launch(system: System, w: Array) -> Array:
     """Where the rays that meet the first surface at w (D, W or 1, Q) cross its vertex plane,
     (D, W, Q), mm."""
     shape = Shape(*(a[..., 0, :, :] for a in system.shape))
-    own = (*w, sag(w, shape, system.forms[0]))
-    if system.rotation is not None:
-        own = _turned(system.rotation[..., 0], own)
+    rotation = None if system.rotation is None else system.rotation[..., 0]
+    own = turned(rotation, (*w, sag(w, shape, system.forms[0])))
     across = jnp.zeros(w.shape[0], w.dtype) if system.offset is None else system.offset[:, 0]
     point = *(a + o for a, o in zip(own, across)), own[-1] + system.vertex[0]
     direction = tuple(system.vergence * a - s for a, s in zip(point, system.source))
@@ -43,11 +42,6 @@ def launch(system: System, w: Array) -> Array:
 
 def _dot(a: tuple, b: tuple) -> Array:
     return sum(x * y for x, y in zip(a, b))
-
-
-def _turned(rotation: Array, vector: tuple, back: bool = False) -> tuple:
-    rows = rotation.T if back else rotation
-    return tuple(_dot(rows[i], vector) for i in range(3))
 
 
 def shoot(system: System, aim: Array) -> tuple[Array, Array, Array]:
@@ -78,8 +72,7 @@ def shoot(system: System, aim: Array) -> tuple[Array, Array, Array]:
         point, d, fate, passed, hits = carry
         origin, rotation, kind, shape, ratio, sense, leaving = jax.tree.map(lambda a: a[i], rows)
         p = tuple(a - o for a, o in zip(point, origin))
-        if rotation is not None:
-            p, d = _turned(rotation, p, back=True), _turned(rotation, d, back=True)
+        p, d = turned(rotation, p, back=True), turned(rotation, d, back=True)
         cross = crossings[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, crossings)
         own, normal, along, met, length = cross(p, d, shape, fate == Status.OK)
         shrink = 1 / jnp.sqrt(_dot(normal, normal))
@@ -93,8 +86,7 @@ def shoot(system: System, aim: Array) -> tuple[Array, Array, Array]:
         bent = (leaving * safe_sqrt(square) - ratio * cosine) * shrink
         d = tuple(ratio * a + bent * n for a, n in zip(d, normal))
         hits = hits.at[:, i].set(jnp.stack(own[:-1]))
-        if rotation is not None:
-            own, d = _turned(rotation, own), _turned(rotation, d)
+        own, d = turned(rotation, own), turned(rotation, d)
         return tuple(a + o for a, o in zip(own, origin)), d, fate, passed, hits
 
     fate = jnp.zeros(aim.shape[1:], jnp.int32)
@@ -120,16 +112,20 @@ def _crossing(form: str, settled: float, p: tuple, d: tuple, shape: Shape, going
         root = jnp.where(d[-1] < 0, -root, root)
         # Of the two ways to write a root, the one that does not subtract what is alike.
         alike = linear * root < 0
-        above, below = jnp.where(alike, linear - root, constant), jnp.where(alike, square, linear + root)
+        above = jnp.where(alike, linear - root, constant)
+        below = jnp.where(alike, square, linear + root)
         length, met = safe_divide(above, below), discriminant > 0
         if not shape.coefficients.shape[0]:
             own = tuple(a + b * length for a, b in zip(p, d))
             normal = *(-c * a for a in own[:-1]), 1 - (1 + k) * c * own[-1]
             return own, normal, root, met & (normal[-1] > RIM**0.5), length
 
+    def reached(length):
+        return jnp.stack([a + b * length for a, b in zip(p[:-1], d)])
+
     def closer(state):
         count, length, _ = state
-        z, slope, _ = sag_derivatives(jnp.stack([a + b * length for a, b in zip(p, d)][:-1]), shape, form)
+        z, slope, _ = sag_derivatives(reached(length), shape, form)
         miss = z - p[-1] - d[-1] * length
         change = safe_divide(miss, d[-1] - _dot(slope, d))
         return count + 1, length + change, jnp.abs(change) <= settled * (1 + jnp.abs(length))
@@ -139,7 +135,7 @@ def _crossing(form: str, settled: float, p: tuple, d: tuple, shape: Shape, going
         closer,
         (0, length, jnp.zeros(length.shape, bool)),
     )
-    w = jnp.stack([a + b * length for a, b in zip(p, d)][:-1])
+    w = reached(length)
     z, slope, _ = sag_derivatives(w, shape, form)
     normal = *(-a for a in slope), jnp.ones_like(z)
     return (*w, z), normal, _dot(normal, d), met & domain(w, shape, form), length
