@@ -8,6 +8,7 @@ same rule is offered as a custom_jvp beside it.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,7 @@ from .aiming import NODES, Aiming, fit, nodes, unknown
 from .fermat import Status, System
 from .search import find_rays
 
-__all__ = ["BlockNewton", "solve_rays", "solve_rays_forward"]
+__all__ = ["BlockNewton", "Found", "solve_rays", "solve_rays_forward"]
 
 _MAX_STEPS = 32
 # More rays than `_MANY` are aimed by polynomials and solved in tiles, of all wavelengths together
@@ -76,8 +77,17 @@ class BlockNewton(optx.AbstractRootFinder):
         return y, aux, {}
 
 
-def _solve(system: System, aiming: Aiming | None = None) -> tuple[Array, Array, Array]:
-    """`solve_rays` of one tile of rays, without derivatives."""
+class Found(NamedTuple):
+    """Solved rays: hits (D, S + 1, W, Q), mm, 0 for failed ones; their `Status` (W, Q), int32; the
+    number of Newton steps ()."""
+
+    hits: Array
+    status: Array
+    steps: Array
+
+
+def _solve(system: System, thorough: bool, aiming: Aiming | None = None) -> Found:
+    """`find` for one tile of rays."""
 
     def polish(hits, active):
         crossings = jnp.broadcast_to(system.crossings, hits[:, 0].shape)
@@ -106,8 +116,8 @@ def _solve(system: System, aiming: Aiming | None = None) -> tuple[Array, Array, 
         )  # fmt: skip
         return hits, solved, steps
 
-    hits, status, steps = find_rays(system, polish, aiming)
-    return jnp.where(status == Status.OK, hits, 0), status, steps
+    hits, status, steps = find_rays(system, polish, aiming, thorough)
+    return Found(jnp.where(status == Status.OK, hits, 0), status, steps)
 
 
 def _tiles(system: System) -> tuple[int, int]:
@@ -131,15 +141,11 @@ def _put(array: Array, part: Array, start: Array) -> Array:
     return jax.lax.dynamic_update_slice_in_dim(array, part, start, axis=-1)
 
 
-@jax.custom_jvp
-def solve_rays_forward(system: System) -> tuple[Array, Array, Array]:
-    """`solve_rays` for forward mode: `jax.jvp`, `jacfwd`, and higher derivatives.
-
-    The same rule: dw = -(dF/dw)^-1 dF/dp dp, one banded solve for each tangent.
-    """
+def _find(system: System, thorough: bool) -> Found:
+    """All rays of a bundle, without derivatives, in tiles."""
     tiles, size = _tiles(system)
     if tiles == 1:
-        return _solve(system)
+        return _solve(system, thorough)
     count, waves = system.target.shape[-1], system.index.shape[1]
     target, few = _padded(system.target, tiles, size), _padded(nodes(system), 1, size)
     few = few if target.ndim == 2 else few[:, None]
@@ -149,17 +155,26 @@ def solve_rays_forward(system: System) -> tuple[Array, Array, Array]:
         # The first tile are the rays that the aiming is fitted to.
         start = (k - 1) * size
         own = jnp.where(k == 0, few, _tile(target, start, size))
-        found = _solve(dataclasses.replace(system, target=own), aiming)
-        good = found[1] == Status.OK
-        aiming = jax.lax.cond(k == 0, lambda: fit(system, found[0][:, 0], good), lambda: aiming)
-        hits, status = _put(hits, found[0], start), _put(status, found[1], start)
-        return hits, status, jnp.where(k == 0, 0, jnp.maximum(steps, found[2])), aiming
+        found = _solve(dataclasses.replace(system, target=own), thorough, aiming)
+        good = found.status == Status.OK
+        aiming = jax.lax.cond(k == 0, lambda: fit(system, found.hits[:, 0], good), lambda: aiming)
+        hits, status = _put(hits, found.hits, start), _put(status, found.status, start)
+        return hits, status, jnp.where(k == 0, 0, jnp.maximum(steps, found.steps)), aiming
 
     shape = waves, tiles * size
     hits = jnp.zeros((len(target), len(system.forms), *shape), target.dtype)
     carry = hits, jnp.zeros(shape, jnp.int32), jnp.int32(0), unknown(system)
     hits, status, steps, _ = jax.lax.fori_loop(0, tiles + 1, solve, carry)
-    return hits[..., :count], status[..., :count], steps
+    return Found(hits[..., :count], status[..., :count], steps)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def solve_rays_forward(system: System, found: Found | None = None, thorough: bool = True) -> Found:
+    """`solve_rays` for forward mode: `jax.jvp`, `jacfwd`, and higher derivatives.
+
+    The same rule: dw = -(dF/dw)^-1 dF/dp dp, one banded solve for each tangent.
+    """
+    return _find(system, thorough) if found is None else found
 
 
 def _linearised(system: System, hits: Array, code: Array) -> tuple[fermat.Blocks, Callable]:
@@ -180,10 +195,11 @@ def _linearised(system: System, hits: Array, code: Array) -> tuple[fermat.Blocks
 
 
 @solve_rays_forward.defjvp
-def _tangents(primals, tangents):
-    (system,) = primals
+def _tangents(thorough, primals, tangents):
+    system, found = primals
     # Through the function itself, so that the hits carry derivatives of their own.
-    hits, code, steps = solve_rays_forward(system)
+    found = solve_rays_forward(system, found, thorough)
+    hits, code, _ = found
     ok = code == Status.OK
     blocks, residual = _linearised(system, hits, code)
     _, change = jax.jvp(residual, (system,), (tangents[0],))
@@ -192,24 +208,24 @@ def _tangents(primals, tangents):
         jnp.broadcast_to(tangents[0].crossings, moved[:, 0].shape)
     )
     moved = jnp.where(ok, moved, 0)
-    none = (np.zeros(a.shape, jax.dtypes.float0) for a in (code, steps))
-    return (hits, code, steps), (moved, *none)
+    none = (np.zeros(a.shape, jax.dtypes.float0) for a in found[1:])
+    return found, Found(moved, *none)
 
 
-@jax.custom_vjp
-def solve_rays(system: System) -> tuple[Array, Array, Array]:
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def solve_rays(system: System, found: Found | None = None, thorough: bool = True) -> Found:
     """Trace a bundle: the stationary paths through the given stop points.
 
-    Returns all hits (D, S + 1, W, Q), mm, their `Status` (W, Q), int32, and the number of Newton
-    steps. Differentiable in `system` in reverse mode, also repeatedly, and then in forward mode;
-    failed rays have zero derivatives, and hits of 0.
+    Differentiable in `system` in reverse mode, also repeatedly, and then in forward mode; failed
+    rays have zero derivatives. `found`: the result, where it is known already and the derivatives
+    alone are of interest. Not `thorough`: rays that the first search does not find have failed.
     """
-    return solve_rays_forward(system)
+    return solve_rays_forward(system, found, thorough)
 
 
-def _forward(system):
-    result = solve_rays_forward(system)
-    return result, (system, *result[:2])
+def _forward(system, found, thorough):
+    found = solve_rays_forward(system, found, thorough)
+    return found, (system, *found[:2])
 
 
 def _adjoint(system: System, hits: Array, code: Array, bar: Array) -> System:
@@ -226,11 +242,11 @@ def _adjoint(system: System, hits: Array, code: Array, bar: Array) -> System:
     return dataclasses.replace(system_bar, target=system_bar.target + direct)
 
 
-def _backward(residuals, cotangents):
+def _backward(thorough, residuals, cotangents):
     system, *rays = *residuals, cotangents[0]
     tiles, size = _tiles(system)
     if tiles == 1:
-        return (_adjoint(system, *rays),)
+        return _adjoint(system, *rays), None
     count = system.target.shape[-1]
     # The rays that fill the last tile have failed, and no derivative.
     filling = jnp.arange(tiles * size) < count
@@ -246,7 +262,7 @@ def _backward(residuals, cotangents):
 
     zero = jax.tree.map(jnp.zeros_like, dataclasses.replace(system, target=rays[0]))
     total = jax.lax.fori_loop(0, tiles, add, zero)
-    return (dataclasses.replace(total, target=total.target[..., :count]),)
+    return dataclasses.replace(total, target=total.target[..., :count]), None
 
 
 solve_rays.defvjp(_forward, _backward)

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from . import pupil
 from .fermat import Status
 from .glass import check_wavelengths
+from .implicit import Found
 from .lens import Lens, rotation_matrix
 from .numerics import known_values, safe_divide, safe_sqrt
 from .trace import trace_bundle, typed_scene
@@ -54,12 +55,19 @@ class FocusMoments:
         The covariance is (W, 2), its diagonal, when the axes are principal by symmetry;
         else (W, 2, 2).
         """
-        d = jnp.asarray(sensor, self.reference.dtype) - self.reference
-        spread = self.spread[0] + d * (self.spread[1] + d * self.spread[2])
-        mean = self.mean + d * self.slope
-        return mean, spread if spread.shape[-1] == 2 else _matrix(spread)
+        return _at(self, jnp.asarray(sensor, self.reference.dtype))
 
 
+@jax.jit
+def _at(moments: FocusMoments, sensor: Array) -> tuple[Array, Array]:
+    # One program rather than one for each operation.
+    d = sensor - moments.reference
+    spread = moments.spread[0] + d * (moments.spread[1] + d * moments.spread[2])
+    mean = moments.mean + d * moments.slope
+    return mean, spread if spread.shape[-1] == 2 else _matrix(spread)
+
+
+@jax.jit
 def _matrix(spread: Array) -> Array:
     """(W, 2, 2) from the components (xx, yy) or (xx, yy, xy) in the last axis."""
     xx, yy = spread[..., 0], spread[..., 1]
@@ -172,7 +180,7 @@ def pupil_order(
     known = known_values((lens, field, distance, wavelengths))
     if known is None:
         return _blind_order(symmetry, tolerance)
-    with jax.ensure_compile_time_eval():
+    with jax.core.eval_context():
         return _converge(known, symmetry, tolerance, moving)[0]
 
 
@@ -216,44 +224,62 @@ def _moments(
         return _plane_moments(*scene, rule, *options)[0]
     known = known[0]
     # Outside of any trace, also where this is called inside one: what follows is all known.
-    with jax.ensure_compile_time_eval():
+    with jax.core.eval_context():
         if order is None:
-            order, moments = _converge(known, symmetry, tolerance, moving, soft_edge)
+            order, moments, found = _converge(known, symmetry, tolerance, moving, soft_edge)
         elif isinstance(order, int):
-            order, moments = _of_order(known, symmetry, order, soft_edge)
+            order, moments, found = _of_order(known, symmetry, order, soft_edge)
         else:
-            moments = _plane_moments(*known, order, symmetry, soft_edge)[0]
+            moments, _, found = _known_moments(known, order, symmetry, soft_edge)
         _check_passed(moments, known[3])
     if not forward and _concrete(scene):
         return moments
+    # The rays are known; what is left is to weigh and to differentiate them.
     rule = order if isinstance(order, ClippedPupil) else _padded_rule(symmetry, order)
-    return _plane_moments(*scene, rule, *options)[0]
+    return _plane_moments(*scene, rule, *options, found)[0]
+
+
+def _known_moments(
+    scene: tuple,
+    rule: tuple[ArrayLike, ArrayLike] | ClippedPupil,
+    symmetry: str,
+    soft_edge: float | None,
+) -> tuple[FocusMoments, Array, Found]:
+    """`_plane_moments` of a known scene: few need a program that can search for rays twice."""
+    weighed = _plane_moments(*scene, rule, symmetry, soft_edge, thorough=False)
+    if np.all(np.asarray(weighed[2].status) == Status.OK):
+        return weighed
+    return _plane_moments(*scene, rule, symmetry, soft_edge)
 
 
 def _of_order(
     scene: tuple, symmetry: str, order: int, soft_edge: float | None
-) -> tuple[int | ClippedPupil, FocusMoments]:
-    """The rule of an order, fitted to the pupil if it is clipped, and its moments."""
-    moments, clipped = _plane_moments(*scene, _padded_rule(symmetry, order), symmetry, soft_edge)
+) -> tuple[int | ClippedPupil, FocusMoments, Found]:
+    """The rule of an order, fitted to the pupil if it is clipped, its moments and rays."""
+    rule = _padded_rule(symmetry, order)
+    moments, clipped, found = _known_moments(scene, rule, symmetry, soft_edge)
     if soft_edge is None and clipped:
         boundary = find_boundary(*_typed(*scene, symmetry), symmetry)
         if boundary is not None:
             rule = boundary.rule(order)
-            return rule, _plane_moments(*scene, rule, symmetry)[0]
-    return order, moments
+            moments, _, found = _known_moments(scene, rule, symmetry, None)
+            return rule, moments, found
+    return order, moments, found
 
 
 def _converge(
     scene: tuple, symmetry: str, tolerance: float, moving: bool, soft_edge: float | None = None
-) -> tuple[int | ClippedPupil, FocusMoments]:
-    """The order that meets the tolerance in a known scene, and the moments of the next one that
-    proved it; where the pupil is clipped, the fitted rule that proved it. Warns if none does."""
+) -> tuple[int | ClippedPupil, FocusMoments, Found]:
+    """The order that meets the tolerance in a known scene, the moments of the next one that
+    proved it, and the rays of the first; where the pupil is clipped, all of the fitted rule that
+    proved it. Warns if none does."""
     _check_tolerance(tolerance)
     eps = float(jnp.finfo(scene[0].curvature.dtype).eps)
-    previous, boundary, order = None, None, 2
+    previous, boundary, found, order = None, None, None, 2
     while True:
         rule = boundary.rule(order) if boundary else _padded_rule(symmetry, order)
-        moments, clipped = _plane_moments(*scene, rule, symmetry, soft_edge)
+        before = found
+        moments, clipped, found = _known_moments(scene, rule, symmetry, soft_edge)
         if clipped and boundary is None and soft_edge is None:
             boundary = find_boundary(*_typed(*scene, symmetry), symmetry)
             if boundary is not None:
@@ -269,16 +295,16 @@ def _converge(
             rounding = 4 * eps * abs(float(scene[0].sensor)) / max(size, _SMALLEST)
             bound = max(tolerance, 100 * eps, rounding)
             if change <= bound:
-                return (rule if boundary else order - 1), moments
+                break
         if order > _MAX_ORDER:
+            warnings.warn(
+                f"the spot size has converged to {change:.1e} only, not to {bound:.1e}, with the "
+                f"order {order}; does the edge of the beam fail, or a soft edge fade too fast?",
+                stacklevel=5,
+            )
             break
         previous, order = spread, order + (2 if boundary else 1)
-    warnings.warn(
-        f"the spot size has converged to {change:.1e} only, not to {bound:.1e}, with the order "
-        f"{order}; does the edge of the beam fail, or a soft edge fade too fast?",
-        stacklevel=5,
-    )
-    return (rule if boundary else order - 1), moments
+    return (rule, moments, found) if boundary else (order - 1, moments, before)
 
 
 def _typed(
@@ -312,16 +338,18 @@ def _plane_moments(
     symmetry: str,
     soft_edge: float | None = None,
     forward: bool = False,
-) -> tuple[FocusMoments, Array]:
+    found: Found | None = None,
+    thorough: bool = True,
+) -> tuple[FocusMoments, Array, Found]:
     scene = _typed(lens, field, distance, wavelengths, symmetry)
     if not isinstance(rule, ClippedPupil):
         rule = tuple(jnp.asarray(part, lens.curvature.dtype) for part in rule)
     if soft_edge is not None:
         soft_edge = jnp.asarray(soft_edge, lens.curvature.dtype)
-    return _weigh(*scene, rule, soft_edge, symmetry, forward)
+    return _weigh(*scene, rule, soft_edge, found, symmetry, forward, thorough)
 
 
-@partial(jax.jit, static_argnums=(6, 7))
+@partial(jax.jit, static_argnums=(7, 8, 9))
 def _weigh(
     lens: Lens,
     angles: Array,
@@ -329,16 +357,20 @@ def _weigh(
     wavelengths: Array,
     rule: tuple[Array, Array] | ClippedPupil,
     soft_edge: Array | None,
+    found: Found | None,
     symmetry: str,
     forward: bool,
-) -> tuple[FocusMoments, Array]:
-    """The moments, and whether an aperture clips any ray of the rule."""
+    thorough: bool,
+) -> tuple[FocusMoments, Array, Found]:
+    """The moments, whether an aperture clips any ray of the rule, and its rays; these may be known
+    already, see `solve_rays`."""
     dtype = lens.curvature.dtype
     scene = lens, angles, distance, wavelengths
     if isinstance(rule, ClippedPupil):
         rule = fitted_nodes(*scene, rule, forward)
     points, weights = rule
-    bundle = trace_bundle(*scene, points, forward)
+    bundle = trace_bundle(*scene, points, forward, found, thorough)
+    found = jax.lax.stop_gradient(bundle.found)
     # How the hits move with the sensor, which goes along the axis of the lens.
     slope = safe_divide(bundle.arrival[:-1], bundle.arrival[-1])
     if lens.tilt is not None:
@@ -363,7 +395,8 @@ def _weigh(
         zero = jnp.zeros((wavelengths.shape[0], 2), dtype)
         spread = jnp.stack([average(x[0] * x[0]), 2 * average(x[0] * u[0]), average(u[0] * u[0])])
         spread = jnp.broadcast_to(spread[..., None] / 2, (*spread.shape, 2))
-        return FocusMoments(lens.sensor, zero, zero, spread, passed), jnp.any(clipped)
+        moments = FocusMoments(lens.sensor, zero, zero, spread, passed)
+        return moments, jnp.any(clipped), found
     mean, tilt = average(x), average(u)
     if symmetry == "half":
         # The other half is the mirror image: x averages to 0, and so does x y.
@@ -377,7 +410,8 @@ def _weigh(
             jnp.stack([average(u[i] * u[j]) for i, j in pairs], -1),
         ]
     )
-    return FocusMoments(lens.sensor, mean.T, tilt.T, spread, passed), jnp.any(clipped)
+    moments = FocusMoments(lens.sensor, mean.T, tilt.T, spread, passed)
+    return moments, jnp.any(clipped), found
 
 
 def _fade(lens: Lens, hits: Array, width: Array) -> Array:

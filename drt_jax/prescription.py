@@ -47,7 +47,7 @@ def load_lens(source: str | pathlib.Path | Mapping) -> Lens:
     The arrays have JAX's default floating dtype: float64 where the caller enabled it.
     LensError for a missing file, an unknown key or glass, or numbers that make no lens.
     """
-    with jax.ensure_compile_time_eval():  # a lens loaded inside a jitted function is a constant
+    with jax.core.eval_context():  # a lens loaded inside a jitted function is a constant
         return _load(source)
 
 
@@ -305,12 +305,15 @@ def _check_crossing(lens: Lens, top: str) -> None:
     semi = np.asarray(lens.semi_diameter)
     common = np.minimum(semi[:-1], semi[1:])
     reach = np.where(np.isfinite(common), common, 0.0)
-    radius = jnp.asarray(reach[:, None] * np.linspace(0, 1, 17), lens.curvature.dtype)
+    radius = (reach[:, None] * np.linspace(0, 1, 17)).astype(lens.curvature.dtype)
     if not radius.size:
         return
-    front = _sags(radius, jax.tree.map(lambda a: a[..., :-1], lens.shape), lens.forms[:-1])
-    back = _sags(radius, jax.tree.map(lambda a: a[..., 1:], lens.shape), lens.forms[1:])
-    gap = np.asarray(lens.thickness[:, None] + back - front) * lens.senses[1:-1, None]
+    shape = Shape(*(np.asarray(a) for a in (lens.curvature, lens.conic, lens.coefficients)))
+    shape = shape._replace(coefficients=shape.coefficients.T)
+    front = _sags(radius, jax.tree.map(lambda a: a[..., :-1], shape), lens.forms[:-1])
+    back = _sags(radius, jax.tree.map(lambda a: a[..., 1:], shape), lens.forms[1:])
+    gap = np.asarray(lens.thickness)[:, None] + np.asarray(back) - np.asarray(front)
+    gap = gap * lens.senses[1:-1, None]
     for i, j in zip(*np.nonzero(gap < -_TOUCH)):
         raise LensError(
             f"{top}: surfaces[{i}].thickness: {float(lens.thickness[i]):g} mm makes surfaces {i} "

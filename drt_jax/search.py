@@ -66,7 +66,7 @@ class _Aim(NamedTuple):
 
 
 def find_rays(
-    system: System, polish: Callable, aiming: Aiming | None = None
+    system: System, polish: Callable, aiming: Aiming | None = None, thorough: bool = True
 ) -> tuple[Array, Array, Array]:
     """Hits (D, S + 1, W, Q), mm, their `Status` (W, Q), int32, and Newton steps () of the rays
     through the stop points of `system`.
@@ -75,7 +75,8 @@ def find_rays(
     the active ones are solved (W, Q), and its steps (). Status of a ray that is not solved: what stopped
     the rays nearest to the stop point; UNCONVERGED if a ray that came near reached the sensor, or
     if nothing stopped them and yet none came near. Where the stop is the first surface, there is
-    nothing to search for. `aiming`: where to launch the rays, if that is known well.
+    nothing to search for. `aiming`: where to launch the rays, if that is known well. Not
+    `thorough`: no second search.
     """
     if system.stop == 0:
         hits, fate, _ = shoot(system, launch(system, system.crossings))
@@ -99,7 +100,7 @@ def find_rays(
     exact = jnp.maximum(jnp.minimum(_EXACT * beam, tight), rounding)
 
     def search(state):
-        second = state.stage == _SECOND
+        second = (state.stage == _SECOND) & thorough
         last = jnp.where(second, _STARTS, 1)
         goal = jnp.where(second, exact, tight if aiming is None else rounding / 4)
 
@@ -109,7 +110,7 @@ def find_rays(
             return ~near & jnp.any(open_) & (state.trials < _ATTEMPT * last)
 
         def trial(state):
-            state = _trial(system, state, fan, width)
+            state = _trial(system, state, second, fan, width)
             probing = second & (state.attempt >= 0) & (state.age <= dim)
             ended = ~probing & ((state.bad > _PATIENCE) | (state.age > _ATTEMPT))
             ended = ended | (second & (state.age == 1) & jnp.isinf(state.far))
@@ -127,9 +128,10 @@ def find_rays(
 
     def turn(state):
         # A loop of one turn, rather than a branch, so that under `vmap` too it costs nothing.
-        state = jax.lax.while_loop(
-            lambda s: s.stage == _SPREAD, lambda s: _spread(system, s, fan, loose), state
-        )
+        if thorough:
+            state = jax.lax.while_loop(
+                lambda s: s.stage == _SPREAD, lambda s: _spread(system, s, fan, loose), state
+            )
         state = search(state)
         done = state.status == Status.OK
         lost = jnp.where(state.lost == Status.OK, Status.UNCONVERGED, state.lost)
@@ -145,7 +147,7 @@ def find_rays(
         )  # fmt: skip
 
     def unsolved(state):
-        failed = jnp.any(state.status != Status.OK)
+        failed = jnp.any(state.status != Status.OK) & thorough
         return (state.stage == _FIRST) | ((state.stage == _SPREAD) & failed)
 
     inverse = jnp.eye(dim, dtype=dtype)[..., None, None] * jnp.where(scale == 0, 1, scale)
@@ -160,7 +162,7 @@ def find_rays(
         nothing, jnp.zeros((_starts(dim), *shape[1:]), jnp.int32), jnp.int32(_FIRST),
         zero + Status.UNCONVERGED, nothing,
     )  # fmt: skip
-    end = jax.lax.while_loop(unsolved, turn, start)
+    end = jax.lax.while_loop(unsolved, turn, start) if thorough else turn(start)
     return end.hits, end.status, end.steps
 
 
@@ -208,14 +210,13 @@ def _sizes(system: System) -> tuple[Array, Array]:
     return jnp.where(beam > 0, beam, 0.1 * width), width
 
 
-def _trial(system: System, state: _Aim, fan: Array, width: Array) -> _Aim:
+def _trial(system: System, state: _Aim, second: Array, fan: Array, width: Array) -> _Aim:
     """One trial of every ray, and by Broyden's method the step to the next.
 
     After a step with which the ray is lost or farther off, the next is half as long; an attempt
     that begins with a ray of the fan learns the derivatives by a small step along each component.
     """
     dim, dtype = state.aim.shape[0], state.aim.dtype
-    second = state.stage == _SECOND
     fresh = second & (state.attempt >= 0)
     first = fresh & (state.age == 0)
     which = jnp.clip(state.attempt, 0, state.nearest.shape[0] - 1)[None]

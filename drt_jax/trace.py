@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 
 from .fermat import Status, System, arrival, geometry, optical_path, turn
 from .glass import check_wavelengths
-from .implicit import solve_rays, solve_rays_forward
+from .implicit import Found, solve_rays, solve_rays_forward
 from .lens import Lens, rotation_matrix
 from .numerics import safe_divide
 from .surface import Shape, by_form, sag, sag_derivatives
@@ -25,14 +25,15 @@ class Bundle(NamedTuple):
 
     hits (D, S + 1, W, Q), mm, along the axes of each surface and the sensor; status (W, Q);
     arrival (D + 1, W, Q), unit vectors at the sensor, along its axes; path (W, Q), optical
-    path in mm from the object, see `fermat.optical_path`; newton_steps ().
+    path in mm from the object, see `fermat.optical_path`; found, what the solver
+    returned, of the surfaces that bend or stop light.
     """
 
     hits: Array
     status: Array
     arrival: Array
     path: Array
-    newton_steps: Array
+    found: Found
 
 
 class Rays(NamedTuple):
@@ -150,20 +151,23 @@ def trace_bundle(
     wavelengths: Array,
     pupil: ArrayLike,
     forward: bool = False,
+    found: Found | None = None,
+    thorough: bool = True,
 ) -> Bundle:
     """Trace rays in the array layout of `fermat`, rays last.
 
     `field` (D,) angles in radians, `distance` () from the object to the first vertex in mm,
     `wavelengths` (W,) in um, `pupil` (D, Q) or (D, W, Q) points on the unit disc of the stop;
     D = 1 for rays in the meridional (y, z) plane of a lens with rotational symmetry, else 2.
-    `forward`: be differentiable in forward mode.
+    `forward`: be differentiable in forward mode. `found`, `thorough`: see `solve_rays`.
     """
     live, count = _live_surfaces(lens), len(lens.forms)
     field = jnp.asarray(field, lens.curvature.dtype)
     scene = field, distance, wavelengths, pupil
     system = system_of(lens, live, *scene)
     solve = solve_rays_forward if forward else solve_rays
-    hits, status, steps = solve(system)
+    found = solve(system, found, thorough)
+    hits, status, _ = found
     last, path = arrival(hits, system), optical_path(hits, system)
     if len(live) < count:
         whole = system_of(lens, list(range(count)), *scene)
@@ -171,7 +175,7 @@ def trace_bundle(
     radius2 = sum(a**2 for a in hits[:, :-1])
     edge2 = (lens.semi_diameter.at[lens.stop].set(jnp.inf) ** 2)[:, None, None]
     clipped = jnp.any(radius2 > edge2, axis=0) & (status == Status.OK)
-    return Bundle(hits, jnp.where(clipped, jnp.int32(Status.CLIPPED), status), last, path, steps)
+    return Bundle(hits, jnp.where(clipped, jnp.int32(Status.CLIPPED), status), last, path, found)
 
 
 def as_field(field: ArrayLike, dtype: jnp.dtype) -> Array:
@@ -240,4 +244,4 @@ def _trace_rays(
         jnp.moveaxis(jnp.where(good, a, 0), (0, 1), (3, 2)) for a in (points, directions)
     )
     path = jnp.where(good, bundle.path, 0)
-    return Rays(points, directions, path, bundle.status, bundle.newton_steps)
+    return Rays(points, directions, path, bundle.status, bundle.found.steps)
