@@ -2,9 +2,8 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
-from jax import Array
 from jax.typing import ArrayLike
 
 from .fermat import Status
@@ -36,8 +35,8 @@ def draw(
     rays: int = 7,
 ) -> Drawing:
     """Draw a lens with `rays` meridional rays for each field angle (radians, along y)."""
-    heights = jnp.linspace(-1.0, 1.0, rays)
-    pupil = jnp.stack([jnp.zeros_like(heights), heights], axis=-1)
+    heights = np.linspace(-1.0, 1.0, rays)
+    pupil = np.stack([np.zeros_like(heights), heights], axis=-1)
     fields = [float(field) for field in np.atleast_1d(fields)]
     fans = [trace_rays(lens, field, distance, [wavelength], pupil) for field in fields]
     good = [np.asarray(fan.points[0])[np.asarray(fan.status[0]) == Status.OK] for fan in fans]
@@ -79,11 +78,13 @@ def _placed(lens: Lens, i: int, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return np.stack([points[:, 2] + float(place), points[:, 1] + across[1]], axis=-1)
 
 
+_sag = jax.jit(sag, static_argnums=2)
+
+
 def _profile(lens: Lens, i: int, semi: float) -> np.ndarray:
-    y: Array = jnp.linspace(-semi, semi, _POINTS, dtype=lens.curvature.dtype)
-    shape = Shape(lens.curvature[i], lens.conic[i], lens.coefficients[i])
-    z = sag(jnp.stack([0 * y, y]), shape, lens.forms[i])
-    return _placed(lens, i, np.asarray(y), np.asarray(z))
+    y = np.linspace(-semi, semi, _POINTS).astype(lens.curvature.dtype)
+    shape = Shape(*(np.asarray(a)[i] for a in (lens.curvature, lens.conic, lens.coefficients)))
+    return _placed(lens, i, y, np.asarray(_sag(np.stack([0 * y, y]), shape, lens.forms[i])))
 
 
 def _path(points: np.ndarray, lead: float, field: float, distance: float) -> np.ndarray:

@@ -38,11 +38,14 @@ class Camera:
             raise ValueError(f"camera.pixel_um: expected a positive number, got {self.pixel_um}")
 
 
-def make_imager(blur: Blur, restore: Restore | None, camera: Camera) -> Callable[..., tuple]:
+def make_imager(
+    blur: Blur, restore: Restore | None, camera: Camera, forward: bool = False
+) -> Callable[..., tuple]:
     """The chain moments -> PSF -> sensor layer -> network as one function.
 
     `blur` as `moments_model` returns it; `restore` (parameters, images) -> images, None for a
-    camera without a network. The result maps (parameters {"optics", "network"}, scenes uint8
+    camera without a network. `forward`: made for values and forward mode, as `make_step` uses it
+    where a single number is trained. The result maps (parameters {"optics", "network"}, scenes uint8
     (B, H + K - 1, W + K - 1, C), distance mm, noise, key) to (truth, sensor image, restored
     image), float32 (B, H, W, C), and the standard deviations (C,) of the blur along y in mm.
     The kernel is centred on the mean centroid of the colours: patches are registered. A colour
@@ -59,7 +62,7 @@ def make_imager(blur: Blur, restore: Restore | None, camera: Camera) -> Callable
             mean - jnp.mean(mean, axis=0), covariance, camera.pixel_um * 1e-3, camera.kernel,
             camera.form,
         )  # fmt: skip
-        image = sensor_layer(scenes * passed.astype(jnp.float32), kernel, noise, key)
+        image = sensor_layer(scenes * passed.astype(jnp.float32), kernel, noise, key, forward)
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin
         truth = scenes[:, margin : end[0], margin : end[1]]

@@ -73,7 +73,7 @@ def run(config: Config, run: Run) -> None:
         lens, ("sensor",), 0.0, (distance, distance), config.scene.wavelengths_um,
         config.scene.tolerance,
     )  # fmt: skip
-    imager = train.make_imager(blur, None, config.camera)
+    imager = train.make_imager(blur, None, config.camera, forward=True)
     patches = _common.patches(config)
     starts = jnp.asarray(config.starts_mm)
     init, step = train.make_step(
