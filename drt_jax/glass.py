@@ -12,6 +12,8 @@ import yaml
 from jax import Array
 from jax.typing import ArrayLike
 
+from .numerics import concrete
+
 __all__ = ["Dispersion", "Glass", "find_glass", "refractive_index"]
 
 # The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
@@ -104,7 +106,7 @@ def check_wavelengths(names: tuple[str, ...], wavelengths: ArrayLike) -> None:
 
     Inside a trace the values are not known and nothing is checked.
     """
-    if any(isinstance(value, jax.core.Tracer) for value in jax.tree.leaves(wavelengths)):
+    if not concrete(wavelengths):
         return
     glasses = _catalogue()
     for name in names:

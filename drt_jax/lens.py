@@ -9,6 +9,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from .glass import Dispersion, check_wavelengths, refractive_index
+from .numerics import concrete
 from .surface import MIRRORED, ROTATIONAL, Shape
 
 __all__ = ["Lens", "rotation_matrix"]
@@ -86,8 +87,7 @@ class Lens:
             if ROTATIONAL.issuperset(self.forms):
                 return "rotation"
             return "plane" if MIRRORED.issuperset(self.forms) else "none"
-        moves = [self.decentre, self.tilt]
-        if any(isinstance(move, jax.core.Tracer) for move in moves):
+        if not concrete((self.decentre, self.tilt)):
             return "none"
         # Neither x, nor a turn about y or z, takes any surface out of the plane x = 0.
         sideways = ((self.decentre, [0]), (self.tilt, [1, 2]))

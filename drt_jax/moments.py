@@ -21,7 +21,7 @@ from .fermat import Status
 from .glass import check_wavelengths
 from .implicit import Found
 from .lens import Lens, rotation_matrix
-from .numerics import known_values, safe_divide, safe_sqrt
+from .numerics import concrete, known_values, safe_divide, safe_sqrt
 from .trace import trace_bundle, typed_scene
 from .vignetting import ClippedPupil, find_boundary, fitted_nodes
 
@@ -75,10 +75,6 @@ def _matrix(spread: Array) -> Array:
     return jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
 
 
-def _concrete(*values: object) -> bool:
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
-
-
 def _symmetry(lens: Lens, field: ArrayLike) -> str:
     """How much of the pupil must be traced, from what is known of the field while tracing.
 
@@ -90,9 +86,9 @@ def _symmetry(lens: Lens, field: ArrayLike) -> str:
     if kind == "none":
         return "disc"
     if np.ndim(field) == 0:
-        still = _concrete(field) and float(field) == 0
+        still = concrete(field) and float(field) == 0
         return "meridian" if still and kind == "rotation" else "half"
-    if not _concrete(field) or np.asarray(field)[0] != 0:
+    if not concrete(field) or np.asarray(field)[0] != 0:
         return "disc"
     return "meridian" if np.asarray(field)[1] == 0 and kind == "rotation" else "half"
 
@@ -232,7 +228,7 @@ def _moments(
         else:
             moments, _, found = _known_moments(known, order, symmetry, soft_edge)
         _check_passed(moments, known[3])
-    if not forward and _concrete(scene):
+    if not forward and concrete(scene):
         return moments
     # The rays are known; what is left is to weigh and to differentiate them.
     rule = order if isinstance(order, ClippedPupil) else _padded_rule(symmetry, order)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["known_values", "safe_divide", "safe_sqrt"]
+__all__ = ["concrete", "known_values", "safe_divide", "safe_sqrt"]
 
 
 def safe_sqrt(x: Array) -> Array:
@@ -29,6 +29,11 @@ def safe_divide(numerator: Array, denominator: Array) -> Array:
     return jnp.where(good, numerator / jnp.where(good, denominator, 1), 0)
 
 
+def concrete(tree: Any) -> bool:
+    """Whether `tree` holds numbers alone: none that `jit` is to fill in, or that are differentiated."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def known_values(tree: Any) -> Any:
     """`tree` with its numbers, also while it is being differentiated; None for what `jit` or `vmap`
     is to fill in.
@@ -36,7 +41,7 @@ def known_values(tree: Any) -> Any:
     What follows from a scene, such as how many rays it needs, is not differentiated itself but
     must be decided in an eager `jax.grad`, too. The rule of a custom_jvp is handed the values.
     """
-    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
+    if concrete(tree):
         return tree
     seen: list[tuple] = []
 
@@ -51,6 +56,6 @@ def known_values(tree: Any) -> Any:
 
     leaves, structure = jax.tree.flatten(tree)
     look(*leaves)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in seen[-1]):
+    if not concrete(seen[-1]):
         return None
     return jax.tree.unflatten(structure, seen[-1])

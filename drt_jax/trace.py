@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -12,7 +13,7 @@ from .fermat import Status, System, arrival, geometry, optical_path, turn
 from .glass import check_wavelengths
 from .implicit import Found, solve_rays, solve_rays_forward
 from .lens import Lens, rotation_matrix
-from .numerics import safe_divide
+from .numerics import concrete, safe_divide
 from .surface import Shape, by_form, sag, sag_derivatives
 
 __all__ = ["Bundle", "Rays", "field_of_height", "trace_bundle", "trace_rays"]
@@ -219,16 +220,26 @@ def trace_rays(
     ValueError for a known wavelength outside the range of a glass.
     """
     check_wavelengths(lens.glasses, wavelengths)
-    points = jnp.asarray(pupil, lens.curvature.dtype)
-    return _trace_rays(*typed_scene(lens, field, distance, wavelengths), points, forward)
+    scene = *typed_scene(lens, field, distance, wavelengths), jnp.asarray(pupil, lens.curvature.dtype)
+    if concrete(scene):  # few need a program that can search for rays twice
+        rays = _trace_rays(*scene, thorough=False)
+        if np.all(np.isin(np.asarray(rays.status), (Status.OK, Status.CLIPPED))):
+            return rays
+    return _trace_rays(*scene, forward)
 
 
-@partial(jax.jit, static_argnums=5)
+@partial(jax.jit, static_argnames=("forward", "thorough"))
 def _trace_rays(
-    lens: Lens, field: Array, distance: Array, wavelengths: Array, pupil: Array, forward: bool
+    lens: Lens,
+    field: Array,
+    distance: Array,
+    wavelengths: Array,
+    pupil: Array,
+    forward: bool = False,
+    thorough: bool = True,
 ) -> Rays:
     scene = field, distance, wavelengths, pupil.T
-    bundle = trace_bundle(lens, *scene, forward)
+    bundle = trace_bundle(lens, *scene, forward, thorough=thorough)
     whole = system_of(lens, list(range(len(lens.forms))), *scene)
     z = by_form(sag, bundle.hits, whole.shape, whole.forms)
     own = turn(whole.rotation, jnp.concatenate([bundle.hits, z[None]]))
