@@ -354,7 +354,8 @@ def stationary(hits: Array, system: System) -> Array:
     kinds = sorted(set(system.forms))
     rotation = None if system.rotation is None else jnp.moveaxis(system.rotation, -1, 0)
     rows = (
-        jnp.moveaxis(hits, 1, 0), _origin(system, dim)[:, :, 0, 0].T, rotation,
+        np.arange(surfaces) == 0, jnp.moveaxis(hits, 1, 0),
+        _origin(system, dim)[:, :, 0, 0].T, rotation,
         Shape(system.curvature, system.conic, system.coefficients.T), system.index[..., None],
         system.senses, jnp.array([kinds.index(form) for form in system.forms]),
     )  # fmt: skip
@@ -366,16 +367,16 @@ def stationary(hits: Array, system: System) -> Array:
     def forward(direction, slope):
         return direction[-1] - sum(a * b for a, b in zip(slope, direction))
 
-    def walk(i, carry):
+    def walk(carry, row):
         last, bad = carry
-        w, origin, rotation, shape, index, sense, kind = jax.tree.map(lambda a: a[i], rows)
+        first, w, origin, rotation, shape, index, sense, kind = row
         draw = [partial(drawn, kind) for kind in kinds]
         draw = draw[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, draw)
         z, slope, exists = draw(w, shape)
         own = turned(rotation, (*w, z))
         # As in `geometry`: the first segment scaled, the others sums of small differences.
         step = tuple(
-            jnp.where(i == 0, system.vergence * (a + o) - s, (a - b) + (o - q))
+            jnp.where(first, system.vergence * (a + o) - s, (a - b) + (o - q))
             for a, b, o, q, s in zip(own, last["own"], origin, last["origin"], system.source)
         )
         inverse = safe_divide(jnp.ones_like(z), jnp.sqrt(sum(a * a for a in step)))
@@ -383,7 +384,7 @@ def stationary(hits: Array, system: System) -> Array:
         before, after = turned(rotation, ray, True), turned(last["rotation"], ray, True)
         # Of the segment in front of each surface: a far hit excuses no error of another segment.
         size = jnp.abs(w[0]) if dim == 1 else jnp.maximum(jnp.abs(w[0]), jnp.abs(w[1]))
-        scale = jnp.where(i == 0, jnp.abs(system.vergence), 1) * inverse
+        scale = jnp.where(first, jnp.abs(system.vergence), 1) * inverse
         shake = index * (1 + scale * jnp.maximum(size, last["size"]))
         both = last["shake"] + shake
         change = tuple(last["index"] * a - index * b for a, b in zip(last["before"], after))
@@ -394,15 +395,15 @@ def stationary(hits: Array, system: System) -> Array:
         good = (error**2 <= (64 * eps * both) ** 2 * lean) & (both <= 4 / jnp.sqrt(eps))
         arrives = forward(last["before"], last["slope"]) * last["sense"]
         leaves = forward(after, last["slope"]) * sense
-        good = ((good & (jnp.minimum(arrives, leaves) > 0)) | (i == 0)) & exists
+        good = ((good & (jnp.minimum(arrives, leaves) > 0)) | first) & exists
         new = {"own": own, "origin": origin, "before": before, "slope": slope, "size": size,
                "shake": shake, "index": index, "sense": sense, "rotation": rotation}  # fmt: skip
-        return new, bad + jnp.where(good, 0, 1).astype(jnp.int32)
+        return (new, bad + jnp.where(good, 0, 1).astype(jnp.int32)), None
 
     none = jnp.zeros(hits.shape[2:], hits.dtype)
     vector = (none,) * (dim + 1)
-    last = {"own": vector, "origin": rows[1][0], "before": vector, "slope": vector[:-1],
-            "size": none, "shake": none, "index": rows[4][0], "sense": rows[5][0],
+    last = {"own": vector, "origin": rows[2][0], "before": vector, "slope": vector[:-1],
+            "size": none, "shake": none, "index": rows[5][0], "sense": rows[6][0],
             "rotation": None if rotation is None else rotation[0]}  # fmt: skip
-    last, bad = jax.lax.fori_loop(0, surfaces, walk, (last, none.astype(jnp.int32)))
+    (last, bad), _ = jax.lax.scan(walk, (last, none.astype(jnp.int32)), rows)
     return (bad == 0) & (forward(last["before"], last["slope"]) * last["sense"] > 0)

@@ -11,6 +11,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from .fermat import Status, System, turned
@@ -62,15 +63,15 @@ def shoot(system: System, aim: Array) -> tuple[Array, Array, Array]:
     settled = max(_SETTLED, 16 * float(jnp.finfo(aim.dtype).eps))
     crossings = [partial(_crossing, kind, settled) for kind in kinds]
     rows = (
-        jnp.concatenate([offset, system.vertex[None]]).T, rotation,
+        np.arange(count) == 0, jnp.concatenate([offset, system.vertex[None]]).T, rotation,
         jnp.array([kinds.index(form) for form in system.forms]),
         Shape(system.curvature, system.conic, system.coefficients.T),
         (index[:-1] / index[1:])[..., None], senses[:-1], senses[1:],
     )  # fmt: skip
 
-    def step(i, carry):
-        point, d, fate, passed, hits = carry
-        origin, rotation, kind, shape, ratio, sense, leaving = jax.tree.map(lambda a: a[i], rows)
+    def step(carry, row):
+        point, d, fate, passed = carry
+        first, origin, rotation, kind, shape, ratio, sense, leaving = row
         p = tuple(a - o for a, o in zip(point, origin))
         p, d = turned(rotation, p, back=True), turned(rotation, d, back=True)
         cross = crossings[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, crossings)
@@ -79,21 +80,19 @@ def shoot(system: System, aim: Array) -> tuple[Array, Array, Array]:
         cosine = along * shrink
         square = 1 - ratio**2 * (1 - cosine**2)
         # Light goes forwards, and meets a surface from the front.
-        met = met & (d[-1] * sense > _FLATTEST) & ((length > 0) | (i == 0)) & (along * sense > 0)
+        met = met & (d[-1] * sense > _FLATTEST) & ((length > 0) | first) & (along * sense > 0)
         here = jnp.where(met, jnp.where(square > 0, Status.OK, Status.TIR), Status.MISSED)
         fate = jnp.where(fate == Status.OK, here.astype(jnp.int32), fate)
         passed = passed + (fate == Status.OK).astype(jnp.int32)
         bent = (leaving * safe_sqrt(square) - ratio * cosine) * shrink
         d = tuple(ratio * a + bent * n for a, n in zip(d, normal))
-        hits = hits.at[:, i].set(jnp.stack(own[:-1]))
+        hit = jnp.stack(own[:-1])
         own, d = turned(rotation, own), turned(rotation, d)
-        return tuple(a + o for a, o in zip(own, origin)), d, fate, passed, hits
+        return (tuple(a + o for a, o in zip(own, origin)), d, fate, passed), hit
 
     fate = jnp.zeros(aim.shape[1:], jnp.int32)
-    hits = jnp.zeros((aim.shape[0], count, *aim.shape[1:]), aim.dtype)
-    carry = point, direction, fate, jnp.zeros_like(fate), hits
-    _, _, fate, passed, hits = jax.lax.fori_loop(0, count, step, carry)
-    return hits, fate, passed
+    carry, hits = jax.lax.scan(step, (point, direction, fate, jnp.zeros_like(fate)), rows)
+    return jnp.moveaxis(hits, 0, 1), *carry[2:]
 
 
 def _crossing(form: str, settled: float, p: tuple, d: tuple, shape: Shape, going: Array) -> tuple:

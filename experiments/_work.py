@@ -74,7 +74,7 @@ def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[
     scenes = jnp.zeros((1, 32 + 20, 32 + 20, 3), jnp.uint8)
     for name, (trained, depths) in cases.items():
         values, blur = drt_jax.moments_model(lens, trained, 0.0, depths, wavelengths)
-        imager = train.make_imager(blur, None, train.Camera())
+        imager = train.make_imager(blur, None, train.Camera(), forward=len(trained) == 1)
         init, step = train.make_step(imager, {"optics": 1e-3}, depths, 0)
         state = init({"optics": values})
         program = step.trace(state, scenes, np.float32(0), np.int32(0)).jaxpr
