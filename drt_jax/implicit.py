@@ -87,7 +87,7 @@ class Found(NamedTuple):
 
 
 def _solve(system: System, thorough: bool, aiming: Aiming | None = None) -> Found:
-    """`find` for one tile of rays."""
+    """`_find` for one tile of rays."""
 
     def polish(hits, active):
         crossings = jnp.broadcast_to(system.crossings, hits[:, 0].shape)
@@ -218,7 +218,7 @@ def solve_rays(system: System, found: Found | None = None, thorough: bool = True
 
     Differentiable in `system` in reverse mode, also repeatedly, and then in forward mode; failed
     rays have zero derivatives. `found`: the result, where it is known already and the derivatives
-    alone are of interest. Not `thorough`: rays that the first search does not find have failed.
+    alone are of interest. Else, not `thorough`: rays that the first search does not find have failed.
     """
     return solve_rays_forward(system, found, thorough)
 

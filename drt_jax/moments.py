@@ -218,7 +218,7 @@ def _moments(
             order = _blind_order(symmetry, tolerance)
         rule = order if isinstance(order, ClippedPupil) else _rule(symmetry, order)
         return _plane_moments(*scene, rule, *options)[0]
-    known = known[0]
+    known, fitted = known
     # Outside of any trace, also where this is called inside one: what follows is all known.
     with jax.core.eval_context():
         if order is None:
@@ -226,9 +226,9 @@ def _moments(
         elif isinstance(order, int):
             order, moments, found = _of_order(known, symmetry, order, soft_edge)
         else:
-            moments, _, found = _known_moments(known, order, symmetry, soft_edge)
+            moments, _, found = _known_moments(known, fitted, symmetry, soft_edge)
         _check_passed(moments, known[3])
-    if not forward and concrete(scene):
+    if concrete((scene, order)):
         return moments
     # The rays are known; what is left is to weigh and to differentiate them.
     rule = order if isinstance(order, ClippedPupil) else _padded_rule(symmetry, order)
@@ -240,12 +240,19 @@ def _known_moments(
     rule: tuple[ArrayLike, ArrayLike] | ClippedPupil,
     symmetry: str,
     soft_edge: float | None,
+    failing: bool = False,
 ) -> tuple[FocusMoments, Array, Found]:
-    """`_plane_moments` of a known scene: few need a program that can search for rays twice."""
-    weighed = _plane_moments(*scene, rule, symmetry, soft_edge, thorough=False)
-    if np.all(np.asarray(weighed[2].status) == Status.OK):
-        return weighed
+    """`_plane_moments` of a known scene: few need a program that can search for rays twice, tried
+    first if rays are known to be `failing`."""
+    if not failing:
+        weighed = _plane_moments(*scene, rule, symmetry, soft_edge, thorough=False)
+        if not _failing(weighed[2]):
+            return weighed
     return _plane_moments(*scene, rule, symmetry, soft_edge)
+
+
+def _failing(found: Found) -> bool:
+    return bool(np.any(np.asarray(found.status) != Status.OK))
 
 
 def _of_order(
@@ -274,8 +281,8 @@ def _converge(
     previous, boundary, found, order = None, None, None, 2
     while True:
         rule = boundary.rule(order) if boundary else _padded_rule(symmetry, order)
-        before = found
-        moments, clipped, found = _known_moments(scene, rule, symmetry, soft_edge)
+        before, failing = found, found is not None and _failing(found)
+        moments, clipped, found = _known_moments(scene, rule, symmetry, soft_edge, failing)
         if clipped and boundary is None and soft_edge is None:
             boundary = find_boundary(*_typed(*scene, symmetry), symmetry)
             if boundary is not None:
@@ -296,7 +303,7 @@ def _converge(
             warnings.warn(
                 f"the spot size has converged to {change:.1e} only, not to {bound:.1e}, with the "
                 f"order {order}; does the edge of the beam fail, or a soft edge fade too fast?",
-                stacklevel=5,
+                stacklevel=4,
             )
             break
         previous, order = spread, order + (2 if boundary else 1)

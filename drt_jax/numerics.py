@@ -30,7 +30,8 @@ def safe_divide(numerator: Array, denominator: Array) -> Array:
 
 
 def concrete(tree: Any) -> bool:
-    """Whether `tree` holds numbers alone: none that `jit` is to fill in, or that are differentiated."""
+    """Whether all numbers of `tree` are known: none is for `jit` or `vmap` to fill in, and none is
+    being differentiated."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 

@@ -147,7 +147,7 @@ def find_rays(
         )  # fmt: skip
 
     def unsolved(state):
-        failed = jnp.any(state.status != Status.OK) & thorough
+        failed = jnp.any(state.status != Status.OK)
         return (state.stage == _FIRST) | ((state.stage == _SPREAD) & failed)
 
     inverse = jnp.eye(dim, dtype=dtype)[..., None, None] * jnp.where(scale == 0, 1, scale)

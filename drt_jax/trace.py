@@ -14,7 +14,7 @@ from .glass import check_wavelengths
 from .implicit import Found, solve_rays, solve_rays_forward
 from .lens import Lens, rotation_matrix
 from .numerics import concrete, safe_divide
-from .surface import Shape, by_form, sag, sag_derivatives
+from .surface import by_form, sag, sag_derivatives
 
 __all__ = ["Bundle", "Rays", "field_of_height", "trace_bundle", "trace_rays"]
 
@@ -220,10 +220,12 @@ def trace_rays(
     ValueError for a known wavelength outside the range of a glass.
     """
     check_wavelengths(lens.glasses, wavelengths)
-    scene = *typed_scene(lens, field, distance, wavelengths), jnp.asarray(pupil, lens.curvature.dtype)
+    scene = typed_scene(lens, field, distance, wavelengths)
+    scene = *scene, jnp.asarray(pupil, lens.curvature.dtype)
     if concrete(scene):  # few need a program that can search for rays twice
         rays = _trace_rays(*scene, thorough=False)
-        if np.all(np.isin(np.asarray(rays.status), (Status.OK, Status.CLIPPED))):
+        # Inside `jit` even a scene of constants has a status that is not known.
+        if concrete(rays) and np.all(np.isin(rays.status, (Status.OK, Status.CLIPPED))):
             return rays
     return _trace_rays(*scene, forward)
 

@@ -1,6 +1,5 @@
 """What is measured on a batch of random scenes: finite numbers, Snell's law, rays not found."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +12,7 @@ from drt_jax import Status, fermat
 from drt_jax.lens import rotation_matrix
 from drt_jax.trace import system_of
 
-from ._scenes import RAYS, WAVELENGTH, Scenes
+from ._scenes import WAVELENGTH, Scenes
 
 __all__ = ["COUNTS", "KEYS", "survey"]
 

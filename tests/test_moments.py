@@ -1,6 +1,7 @@
 """Moments: published numbers, symmetric against general paths, polynomials against tracing."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -294,3 +295,19 @@ def test_a_lens_fixed_inside_jit_is_a_known_scene():
         scaled = jax.jit(lambda s, n=order: s * psf_moments(lens, 0.0, 25e3, RGB, order=n)[1])
         assert "while" not in str(jax.make_jaxpr(scaled)(1.0))
         np.testing.assert_allclose(scaled(2.0), 2 * psf_moments(lens, 0.0, 25e3, RGB, order=order)[1])
+
+
+@pytest.mark.parametrize("field, name", [(0.0, "double_gauss"), (0.15, "cooke_triplet")])
+def test_an_eager_gradient_is_that_of_a_program(field, name):
+    """Eagerly, the rays that the order was found with are differentiated, not traced again."""
+    lens = load_lens(name)
+
+    def size(sensor, curvature, order=None):
+        moved = dataclasses.replace(lens, sensor=sensor, curvature=curvature)
+        return psf_moments(moved, field, 5e3, RGB, order=order)[1][1, 1, 1] ** 0.5
+
+    order = pupil_order(lens, field, 5e3, RGB)
+    scene = lens.sensor, lens.curvature
+    whole = jax.jit(jax.value_and_grad(partial(size, order=order), (0, 1)))(*scene)
+    for a, b in zip(jax.tree.leaves(jax.value_and_grad(size, (0, 1))(*scene)), jax.tree.leaves(whole)):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * float(jnp.max(jnp.abs(b))))

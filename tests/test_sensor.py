@@ -16,11 +16,11 @@ def kernels(dense):
     return gaussian_psf(mean, covariance if dense else jnp.diagonal(covariance, 0, 1, 2), 1.0, 9)
 
 
-@pytest.mark.parametrize("dense", [False, True])
-def test_valid_convolution_is_scipys(dense):
+@pytest.mark.parametrize("dense, forward", [(False, False), (False, True), (True, False)])
+def test_valid_convolution_is_scipys(dense, forward):
     scenes = np.random.default_rng(0).random((2, 30, 41, 3))
     kernel = kernels(dense)
-    ours = convolve(jnp.asarray(scenes), kernel)
+    ours = convolve(jnp.asarray(scenes), kernel, forward)
     full = np.asarray(kernel if dense else kernel.dense())
     assert ours.shape == (2, 22, 33, 3)
     for b in range(2):
@@ -43,6 +43,23 @@ def test_separable_path_and_its_gradient_agree_with_the_dense_one():
     np.testing.assert_allclose(fast(kernel), slow(kernel), rtol=1e-13)
     for a, b in zip(jax.grad(fast)(kernel), jax.grad(slow)(kernel)):
         np.testing.assert_allclose(a, b, rtol=1e-11)
+
+
+def test_the_form_for_forward_mode_has_the_derivatives_of_the_other():
+    rng = np.random.default_rng(3)
+    scenes, change = (jnp.asarray(rng.random((2, 20, 24, 3))) for _ in range(2))
+    kernel = kernels(False)
+    moved = SeparableKernel(kernel.column**2, kernel.row**3)
+
+    def both(forward):
+        def moves(scenes, kernel):
+            return convolve(scenes, kernel, forward)
+
+        tangent = jax.jvp(moves, (scenes, kernel), (change, moved))[1]
+        return tangent, *jax.tree.leaves(jax.vjp(moves, scenes, kernel)[1](tangent))
+
+    for a, b in zip(both(True), both(False)):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * float(jnp.max(jnp.abs(b))))
 
 
 def test_a_constant_scene_stays_constant_and_precision_is_the_scenes():

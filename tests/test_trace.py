@@ -191,3 +191,11 @@ def test_directions_and_paraxial_launch():
         steps = np.diff(np.asarray(rays.points[0]), axis=1)
         steps /= np.linalg.norm(steps, axis=-1, keepdims=True)
         np.testing.assert_allclose(rays.directions[0, :, 1:], steps, atol=1e-13)
+
+
+def test_a_scene_of_constants_inside_jit():
+    lens, points = load_lens("singlet"), jnp.array([[0.0, 0.3], [0.0, 0.9]])
+    inside = jax.jit(lambda: trace_rays(lens, 0.0, 1e3, jnp.array([0.53]), points).points)()
+    np.testing.assert_allclose(
+        inside, trace_rays(lens, 0.0, 1e3, jnp.array([0.53]), points).points, rtol=0, atol=1e-12
+    )
