@@ -218,7 +218,8 @@ def solve_rays(system: System, found: Found | None = None, thorough: bool = True
 
     Differentiable in `system` in reverse mode, also repeatedly, and then in forward mode; failed
     rays have zero derivatives. `found`: the result, where it is known already and the derivatives
-    alone are of interest. Else, not `thorough`: rays that the first search does not find have failed.
+    alone are of interest. Else, if not `thorough`, rays that the first search does not find have
+    failed.
     """
     return solve_rays_forward(system, found, thorough)
 

@@ -44,9 +44,9 @@ def make_imager(
     """The chain moments -> PSF -> sensor layer -> network as one function.
 
     `blur` as `moments_model` returns it; `restore` (parameters, images) -> images, None for a
-    camera without a network. `forward`: made for values and forward mode, which
-    `make_step` uses where a single number is trained. The result maps (parameters {"optics", "network"}, scenes uint8
-    (B, H + K - 1, W + K - 1, C), distance mm, noise, key) to (truth, sensor image, restored
+    camera without a network. `forward`: made for values and forward mode, which `make_step` uses
+    where a single number is trained. The result maps (parameters {"optics", "network"}, scenes
+    uint8 (B, H + K - 1, W + K - 1, C), distance mm, noise, key) to (truth, sensor image, restored
     image), float32 (B, H, W, C), and the standard deviations (C,) of the blur along y in mm.
     The kernel is centred on the mean centroid of the colours: patches are registered. A colour
     that loses rays is darker by what it loses, and black without any.
