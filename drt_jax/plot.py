@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -92,6 +93,8 @@ def error_curves(
             ha="center", arrowprops={"arrowstyle": "-", "linewidth": 0.7},
         )  # fmt: skip
     axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+    # Over less than a decade or so, labels between the powers of ten would overlap.
+    axes.xaxis.set_minor_locator(ticker.LogLocator(subs=(2, 5)))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return axes
