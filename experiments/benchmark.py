@@ -297,7 +297,7 @@ def _squares(lens, field, distance, waves, points):
 
 
 def network_task(config: Config) -> list[dict]:
-    """One Adam step of optics and network together, and of the network alone."""
+    """One Adam step of optics and network; the network alone; all before it, there and back."""
     rng = np.random.default_rng(config.seed)
     lens, distance = drt_jax.load_lens(config.lens), 1e3 * config.distance_m
     init, apply = network.red_net()
@@ -337,15 +337,15 @@ def network_task(config: Config) -> list[dict]:
     sensor = train.make_imager(blur, None, camera)
 
     def front(values, scenes, noise, key):
-        """Moments, kernels, sensor images with noise, and back from a gradient of these."""
-        run = lambda v: sensor({"optics": v}, scenes, distance, noise, key)[1]  # noqa: E731
-        image, back = jax.vjp(run, values)
-        return image, back(truth)
+        def image(values):
+            return sensor({"optics": values}, scenes, distance, noise, key)[1]
+
+        value, back = jax.vjp(image, values)
+        return value, back(truth)
 
     arguments = values, jnp.asarray(scenes), np.float32(0.01), jax.random.key(config.seed)
-    peers["ours, optics, noise and sensor layer alone"] = (
-        compiled(front, *arguments, **options).call, None,
-    )  # fmt: skip
+    rest = compiled(front, *arguments, **options)
+    peers["ours, optics, noise and sensor layer alone"] = (rest.call, None)
     task = f"joint step with RED-Net, {config.batch} of {config.patch}x{config.patch}"
     return rows_of(task, joint, None, peers, min(config.repeats, 9))
 
