@@ -324,8 +324,7 @@ def network_task(config: Config) -> list[dict]:
         updates, moments = update(jax.grad(loss)(parameters), moments)
         return apply_updates(parameters, updates), moments
 
-    parameters = {"network": weights}
-    options = {"compiler_options": train.compiler_options()}
+    parameters, options = {"network": weights}, {"compiler_options": train.compiler_options()}
     only = compiled(alone, parameters, begin(parameters), images, truth, **options)
     peers: dict[str, tuple | str] = {}
     try:
@@ -343,8 +342,8 @@ def network_task(config: Config) -> list[dict]:
         value, back = jax.vjp(image, values)
         return value, back(truth)
 
-    arguments = values, jnp.asarray(scenes), np.float32(0.01), jax.random.key(config.seed)
-    rest = compiled(front, *arguments, **options)
+    key = jax.random.key(config.seed)
+    rest = compiled(front, values, jnp.asarray(scenes), np.float32(0.01), key, **options)
     peers["ours, optics, noise and sensor layer alone"] = (rest.call, None)
     task = f"joint step with RED-Net, {config.batch} of {config.patch}x{config.patch}"
     return rows_of(task, joint, None, peers, min(config.repeats, 9))
