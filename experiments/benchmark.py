@@ -90,21 +90,22 @@ class Ours:
 
 
 def compiled(function: Callable, *arguments, **options) -> Ours:
-    """Compile `function` for its arguments, tracing included; tell the memory it will hold, and how
-    many kernels it consists of (those in a loop once)."""
+    """`function` compiled for its arguments, tracing included; the memory it will hold, and how many
+    kernels it consists of (those in a loop once)."""
     return loaded(jax.jit(function, **options), *arguments)
 
 
 def loaded(function: Callable, *arguments) -> Ours:
     """The same of a jitted function. Arguments that it donates, it is given as copies."""
     start = time.perf_counter()
-    program = function.lower(*arguments).compile()
+    lowered = function.lower(*arguments)
+    program = lowered.compile()
     seconds = time.perf_counter() - start
     memory = program.memory_analysis()
     held = memory.temp_size_in_bytes + memory.output_size_in_bytes
     text = program.as_text()
     kernels = len(re.findall(r" (?:fusion|dot|convolution|custom-call)\(", text))
-    donated = [info.donated for info in jax.tree.leaves(function.lower(*arguments).args_info)]
+    donated = [info.donated for info in jax.tree.leaves(lowered.args_info)]
 
     def call():
         leaves, structure = jax.tree.flatten(arguments)
