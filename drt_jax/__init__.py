@@ -13,14 +13,14 @@ Conventions, everywhere in the package:
   before loading a lens; the library changes no global setting.
 """
 
-from .adam import adam, apply_updates
-from .depth import depth_moments, moments_model
-from .fermat import Status
-from .glass import find_glass, refractive_index
-from .lens import Lens
-from .moments import focus_moments, psf_moments, pupil_order
-from .network import red_net
-from .paraxial import (
+from .learn.adam import adam, apply_updates
+from .image.depth import depth_moments, moments_model
+from .rays.fermat import Status
+from .lens.glass import find_glass, refractive_index
+from .lens.lens import Lens
+from .image.moments import focus_moments, psf_moments, pupil_order
+from .learn.network import red_net
+from .lens.paraxial import (
     FirstOrder,
     Pupil,
     ThirdOrder,
@@ -37,21 +37,54 @@ from .paraxial import (
     numerical_aperture,
     third_order,
 )
-from .prescription import LensError, lens_names, load_lens
-from .psf import SeparableKernel, gaussian_psf
-from .sensor import convolve, sensor_layer
-from .snell import launch_paraxial, trace_snell
-from .trace import Rays, field_of_height, trace_rays
-from .wavefront import Wavefront, rms_wavefront, wavefront
+from .files.prescription import LensError, lens_names, load_lens
+from .image.kernel import SeparableKernel, gaussian_psf
+from .image.sensor import convolve, sensor_layer
+from .rays.snell import launch_paraxial, trace_snell
+from .rays.trace import Rays, field_of_height, trace_rays
+from .image.wavefront import Wavefront, rms_wavefront, wavefront
 
 __all__ = [
-    "FirstOrder", "Lens", "LensError", "Pupil", "Rays", "SeparableKernel", "Status", "ThirdOrder",
+    "FirstOrder",
+    "Lens",
+    "LensError",
+    "Pupil",
+    "Rays",
+    "SeparableKernel",
+    "Status",
+    "ThirdOrder",
     "Wavefront",
-    "adam", "apply_updates", "back_focal_distance", "convolve", "depth_moments", "entrance_pupil",
-    "exit_pupil", "f_number", "field_of_height", "find_glass", "first_order", "focal_length",
-    "focus_moments", "front_focal_distance", "gaussian_psf", "image_distance", "image_height",
-    "lateral_magnification", "launch_paraxial", "lens_names", "load_lens", "moments_model",
+    "adam",
+    "apply_updates",
+    "back_focal_distance",
+    "convolve",
+    "depth_moments",
+    "entrance_pupil",
+    "exit_pupil",
+    "f_number",
+    "field_of_height",
+    "find_glass",
+    "first_order",
+    "focal_length",
+    "focus_moments",
+    "front_focal_distance",
+    "gaussian_psf",
+    "image_distance",
+    "image_height",
+    "lateral_magnification",
+    "launch_paraxial",
+    "lens_names",
+    "load_lens",
+    "moments_model",
     "numerical_aperture",
-    "psf_moments", "pupil_order", "red_net", "refractive_index", "rms_wavefront", "sensor_layer",
-    "third_order", "trace_rays", "trace_snell", "wavefront",
-]  # fmt: skip
+    "psf_moments",
+    "pupil_order",
+    "red_net",
+    "refractive_index",
+    "rms_wavefront",
+    "sensor_layer",
+    "third_order",
+    "trace_rays",
+    "trace_snell",
+    "wavefront",
+]

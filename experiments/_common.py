@@ -17,10 +17,12 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import config as configs
-from drt_jax import drawing, plot, train
-from drt_jax.data import Patches, batches, load_patches
-from drt_jax.runs import Run, deferred_interrupt
+from drt_jax.runs import config as configs
+from drt_jax.show import layout as drawing
+from drt_jax.show import plot
+from drt_jax.learn import train
+from drt_jax.learn.data import Patches, batches, load_patches
+from drt_jax.runs.folder import Run, deferred_interrupt
 
 _ROOT = pathlib.Path(__file__).resolve().parent.parent
 
@@ -103,16 +105,25 @@ def main(
         epilog="settings:\n  " + "\n  ".join(configs.describe(kind)),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--config", metavar="FILE", help=f"YAML settings (default: configs/{name}.yaml)")
     parser.add_argument(
-        "--set", metavar="KEY=VALUE", nargs="+", action="extend", default=[],
+        "--config", metavar="FILE", help=f"YAML settings (default: configs/{name}.yaml)"
+    )
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        nargs="+",
+        action="extend",
+        default=[],
         help="change settings, such as --set train.batch=8 data.root=photos",
-    )  # fmt: skip
-    parser.add_argument("--out", metavar="DIR", help=f"run folder (default: a new one in runs/{name})")
+    )
     parser.add_argument(
-        "--resume", action="store_true",
+        "--out", metavar="DIR", help=f"run folder (default: a new one in runs/{name})"
+    )
+    parser.add_argument(
+        "--resume",
+        action="store_true",
         help="go on with the run in --out (default: the latest unfinished one in runs/NAME)",
-    )  # fmt: skip
+    )
     options = parser.parse_args(argv)
     # The caller, not the library, chooses the precision: optics in float64.
     jax.config.update("jax_enable_x64", True)
@@ -137,7 +148,9 @@ def main(
         what = f"{error.filename or folder}: {error.strerror or error}"
         remedy = "mend this and start again"
         if folder and (folder / "metrics.csv").exists():
-            remedy = f"the last checkpoint is whole: mend this, then go on with --resume --out {folder}"
+            remedy = (
+                f"the last checkpoint is whole: mend this, then go on with --resume --out {folder}"
+            )
         raise SystemExit(_say(f"{what}; {remedy}", 1)) from error
     except ValueError as error:
         if not _ours(error):
@@ -172,9 +185,10 @@ def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:
     if not options.resume:
         return parent / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     folders = sorted(
-        p for p in parent.glob("*")
+        p
+        for p in parent.glob("*")
         if (p / "metrics.csv").is_file() and not (p / "results.json").is_file()
-    )  # fmt: skip
+    )
     if not folders:
         raise configs.ConfigError(
             f"nothing to resume in {parent}: no unfinished run; name a run folder with --out"
@@ -227,7 +241,9 @@ def train_job(
                 run.log(label, start, {n: v[:, k] if labels else v for n, v in metrics.items()})
             bar.update(len(metrics["loss"]))
             last = {n: np.array2string(v[-1], precision=3) for n, v in metrics.items()}
-            bar.set_postfix_str(" ".join(f"{n}={last[n]}" for n in ("loss", "sensor_mm") if n in last))
+            bar.set_postfix_str(
+                " ".join(f"{n}={last[n]}" for n in ("loss", "sensor_mm") if n in last)
+            )
             if asked() or done == total or done - saved >= config.train.checkpoint_every:
                 run.save(job, done, state)
                 saved = done

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import Lens, Status, pupil
-from drt_jax.vignetting import ClippedPupil, find_boundary
+from drt_jax import Lens, Status
+from drt_jax.pupil import rules as pupil
+from drt_jax.pupil.clipped import ClippedPupil, find_boundary
 
 from . import _common
 from ._reference import flatten
@@ -62,9 +63,13 @@ def quadrature(order: int | None, axial: bool, wavelengths: tuple[float, ...]):
 
 
 def fitted_rule(
-    order: int, axial: bool, wavelengths: tuple[float, ...], lens: Lens, field: jax.Array,
+    order: int,
+    axial: bool,
+    wavelengths: tuple[float, ...],
+    lens: Lens,
+    field: jax.Array,
     distance: jax.Array,
-) -> ClippedPupil:  # fmt: skip
+) -> ClippedPupil:
     """The rule of an order on what the clear apertures of a vignetted scene leave."""
     angles = jnp.zeros(1, field.dtype) if axial else jnp.stack([0 * field, field])
     colours = jnp.asarray(wavelengths, field.dtype)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 import drt_jax
-from drt_jax import pupil
+from drt_jax.pupil import rules as pupil
 
 __all__ = ["PEERS", "Missing", "batoid_rays", "network_step", "spot"]
 
@@ -70,9 +70,12 @@ def _optiland(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
         optic.add_surface(index=0, thickness=lens.distance)
         for i, (c, gap) in enumerate(zip(lens.curvature, lens.gaps)):
             optic.add_surface(
-                index=i + 1, radius=1 / c if c else np.inf, thickness=gap,
-                material=IdealMaterial(n=float(index[i + 1])), is_stop=i == lens.stop,
-            )  # fmt: skip
+                index=i + 1,
+                radius=1 / c if c else np.inf,
+                thickness=gap,
+                material=IdealMaterial(n=float(index[i + 1])),
+                is_stop=i == lens.stop,
+            )
         optic.add_surface(index=len(lens.gaps) + 1)
         optic.set_aperture("float_by_stop_size", 2 * lens.semi)
         optic.set_field_type("object_height")
@@ -111,7 +114,9 @@ def _optiland(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
             bent = np.where(lens.curvature == 0, np.nan, lens.curvature)  # planes have no radius
             by_curvature = -by_radius / bent**2
             values.append(float(sigma.detach()))
-            slopes.append([*by_curvature, *(np.sum(place[1:]) - np.cumsum(np.append(0, place[1:-1])))])
+            slopes.append(
+                [*by_curvature, *(np.sum(place[1:]) - np.cumsum(np.append(0, place[1:-1])))]
+            )
         return np.array(values), np.array(slopes)
 
     return value, gradient
@@ -122,15 +127,24 @@ def _batoid_optic(module, curvature, gaps, index):
     media = [module.ConstMedium(float(n)) for n in index]
     items = []
     for i, c in enumerate(curvature):
-        items.append(module.RefractiveInterface(
-            module.Sphere(1 / c) if c else module.Plane(), name=f"s{i}",
-            coordSys=module.CoordSys(origin=[0, 0, places[i]]),
-            inMedium=media[i], outMedium=media[i + 1],
-        ))  # fmt: skip
-    items.append(module.Detector(
-        module.Plane(), name="sensor", coordSys=module.CoordSys(origin=[0, 0, places[-1]]),
-        inMedium=media[-1], outMedium=media[-1],
-    ))  # fmt: skip
+        items.append(
+            module.RefractiveInterface(
+                module.Sphere(1 / c) if c else module.Plane(),
+                name=f"s{i}",
+                coordSys=module.CoordSys(origin=[0, 0, places[i]]),
+                inMedium=media[i],
+                outMedium=media[i + 1],
+            )
+        )
+    items.append(
+        module.Detector(
+            module.Plane(),
+            name="sensor",
+            coordSys=module.CoordSys(origin=[0, 0, places[-1]]),
+            inMedium=media[-1],
+            outMedium=media[-1],
+        )
+    )
     return module.CompoundOptic(items, name="lens", inMedium=media[0], outMedium=media[-1])
 
 

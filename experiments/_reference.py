@@ -179,10 +179,13 @@ def _gradient(values, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
         step = _STEP_CURVATURE if k < count else _STEP_LENGTH
         unit = step * np.eye(start.size)[k]
         near, far, farther = (
-            (values(_moved(lens, jnp.asarray(start + n * unit)))
-             - values(_moved(lens, jnp.asarray(start - n * unit)))) / (2 * n * step)
+            (
+                values(_moved(lens, jnp.asarray(start + n * unit)))
+                - values(_moved(lens, jnp.asarray(start - n * unit)))
+            )
+            / (2 * n * step)
             for n in (1, 2, 4)
-        )  # fmt: skip
+        )
         columns.append((4 * near - far) / 3)
         changes.append(columns[-1] - (4 * far - farther) / 3)
     return np.stack(columns, axis=1), np.stack(changes, axis=1)
@@ -220,8 +223,11 @@ def reference(
         norm = max(float(np.linalg.norm(slopes[0])), np.finfo(float).tiny)
         results.append(
             Moments(
-                float(sigma), float(value[1]), slopes, float(error),
+                float(sigma),
+                float(value[1]),
+                slopes,
+                float(error),
                 float(np.linalg.norm(changes[0])) / norm,
             )
-        )  # fmt: skip
+        )
     return results

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax.glass import Dispersion
+from drt_jax.lens.glass import Dispersion
 
 __all__ = ["FAMILIES", "RAYS", "WAVELENGTH", "Scenes", "draw"]
 
@@ -48,8 +48,11 @@ def _lens(parts: dict, index: np.ndarray, stop: int, **static) -> drt_jax.Lens:
     arrays = {name: jnp.asarray(value, float) for name, value in parts.items()}
     return drt_jax.Lens(
         dispersion=Dispersion(jnp.asarray(zero), jnp.asarray(zero), jnp.asarray(schott)),
-        stop=stop, glasses=tuple(f"medium {i}" for i in range(media)), **arrays, **static,
-    )  # fmt: skip
+        stop=stop,
+        glasses=tuple(f"medium {i}" for i in range(media)),
+        **arrays,
+        **static,
+    )
 
 
 def _pupil(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -74,9 +77,11 @@ def _parts(rng: np.random.Generator, count: int, stop: int, f_number: tuple = (1
     number = np.exp(rng.uniform(*np.log(f_number), count))
     n = rng.uniform(1.4, 1.95, (count, 3))
     one = np.ones(count)
-    plane = {0: [one, one, n[:, 0], one, n[:, 1], one],
-             2: [one, n[:, 0], one, one, n[:, 1], one],
-             4: [one, n[:, 0], one, n[:, 1], one, one]}[stop]  # fmt: skip
+    plane = {
+        0: [one, one, n[:, 0], one, n[:, 1], one],
+        2: [one, n[:, 0], one, one, n[:, 1], one],
+        4: [one, n[:, 0], one, n[:, 1], one, one],
+    }[stop]
     cemented = [one, n[:, 0], n[:, 1], one, n[:, 2], one]
     alone = rng.random(count) < 0.5
     index = np.where(alone[:, None], np.stack(plane, 1), np.stack(cemented, 1))
@@ -92,10 +97,13 @@ def _parts(rng: np.random.Generator, count: int, stop: int, f_number: tuple = (1
     semi = np.full((count, 5), np.inf)
     semi[:, stop] = h
     parts = {
-        "curvature": curvature, "conic": np.zeros((count, 5)),
-        "coefficients": np.zeros((count, 5, 2)), "thickness": thickness, "semi_diameter": semi,
+        "curvature": curvature,
+        "conic": np.zeros((count, 5)),
+        "coefficients": np.zeros((count, 5, 2)),
+        "thickness": thickness,
+        "semi_diameter": semi,
         "sensor": np.sum(thickness, axis=1) + h * rng.uniform(1, 8, count),
-    }  # fmt: skip
+    }
     return parts, index, h
 
 
@@ -242,12 +250,16 @@ def mirror(rng, count, stop):
     semi = np.full((count, 2), np.inf)
     semi[:, stop] = h * (1 if stop == 0 else 0.4)
     parts = {
-        "curvature": np.stack([first, second], 1), "conic": rng.uniform(-4, 0.5, (count, 2)),
-        "coefficients": np.zeros((count, 2, 0)), "thickness": -gap[:, None],
-        "semi_diameter": semi, "sensor": h * rng.uniform(-1, 3, count),
-    }  # fmt: skip
-    return _scenes(rng, parts, np.ones((count, 3)), stop, (0, 3), (np.inf, 1e6, 1e4),
-                   mirrors=(True, True))  # fmt: skip
+        "curvature": np.stack([first, second], 1),
+        "conic": rng.uniform(-4, 0.5, (count, 2)),
+        "coefficients": np.zeros((count, 2, 0)),
+        "thickness": -gap[:, None],
+        "semi_diameter": semi,
+        "sensor": h * rng.uniform(-1, 3, count),
+    }
+    return _scenes(
+        rng, parts, np.ones((count, 3)), stop, (0, 3), (np.inf, 1e6, 1e4), mirrors=(True, True)
+    )
 
 
 def folded(rng, count, stop):
@@ -263,13 +275,18 @@ def folded(rng, count, stop):
     semi = np.full((count, 4), np.inf)
     semi[:, stop] = h
     parts = {
-        "curvature": np.stack([zero, c[:, 0], c[:, 1], zero], 1), "conic": np.zeros((count, 4)),
-        "coefficients": np.zeros((count, 4, 0)), "thickness": np.diff(z, axis=1)[:, :3],
-        "semi_diameter": semi, "sensor": z[:, 4], "tilt": tilt,
+        "curvature": np.stack([zero, c[:, 0], c[:, 1], zero], 1),
+        "conic": np.zeros((count, 4)),
+        "coefficients": np.zeros((count, 4, 0)),
+        "thickness": np.diff(z, axis=1)[:, :3],
+        "semi_diameter": semi,
+        "sensor": z[:, 4],
+        "tilt": tilt,
         "decentre": np.stack([np.zeros((count, 5)), y], -1),
-    }  # fmt: skip
-    return _scenes(rng, parts, np.ones((count, 5)), stop, (0, 5),
-                   mirrors=(False, True, True, False))  # fmt: skip
+    }
+    return _scenes(
+        rng, parts, np.ones((count, 5)), stop, (0, 5), mirrors=(False, True, True, False)
+    )
 
 
 def freeform(rng, count, stop):
@@ -302,11 +319,13 @@ def camera(rng, count, name):
     terms = np.zeros((count, surfaces, 2))
     terms[..., 1] = rng.uniform(-5e-3, 5e-3, (count, surfaces)) / rim**4
     batch = dataclasses.replace(
-        jax.tree.map(jnp.asarray, batch), curvature=vary(batch.curvature),
+        jax.tree.map(jnp.asarray, batch),
+        curvature=vary(batch.curvature),
         thickness=vary(batch.thickness),
         conic=jnp.asarray(rng.uniform(-0.2, 0.2, (count, surfaces))),
-        coefficients=jnp.asarray(terms), sensor=vary(batch.sensor, 0.003),
-    )  # fmt: skip
+        coefficients=jnp.asarray(terms),
+        sensor=vary(batch.sensor, 0.003),
+    )
     widest = {"singlet": 5.0, "double_gauss": 14.0}.get(name, 20.0) * 1.2
     far = rng.choice([300.0, 1e3, 25e3, 1e9, np.inf], count)
     return Scenes(batch, _fields(rng, count, 0, widest), far, _pupil(rng, count))

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import Status, fermat
-from drt_jax.lens import rotation_matrix
-from drt_jax.trace import system_of
+from drt_jax import Status
+from drt_jax.rays import fermat
+from drt_jax.lens.lens import rotation_matrix
+from drt_jax.rays.trace import system_of
 
 from ._scenes import WAVELENGTH, Scenes
 
@@ -19,9 +20,16 @@ __all__ = ["COUNTS", "KEYS", "survey"]
 COUNTS = ("missed", "tir", "clipped", "unconverged")
 # What `survey` returns: arrays over scenes and rays, and two counts.
 KEYS = (
-    "disagree", "float32_error", "lost", "nan_gradients", "nan_values", "ratio", "residual",
-    "status", "steps",
-)  # fmt: skip
+    "disagree",
+    "float32_error",
+    "lost",
+    "nan_gradients",
+    "nan_values",
+    "ratio",
+    "residual",
+    "status",
+    "steps",
+)
 _BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
 _BOTH = 4  # one scene of so many of a float64 family is traced in float32 too
 _SHOTS = 24  # rays of a scene that the sequential trace follows in one call
@@ -264,10 +272,13 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray | int]:
     if some.size:
         lost[some] = _search(jax.tree.map(lambda a: a[some], exact), failed[some])
     return {
-        "status": status, "steps": rays.newton_steps,
+        "status": status,
+        "steps": rays.newton_steps,
         "nan_values": _infinite((rays.points, rays.path, moments)),
         "nan_gradients": _infinite((slope, moments_slope)),
-        "disagree": disagree | (good & (error > bound)), "ratio": np.where(good, ratio, 0),
+        "disagree": disagree | (good & (error > bound)),
+        "ratio": np.where(good, ratio, 0),
         "residual": np.where(good, error / bound, 0),
-        "lost": lost, "float32_error": np.max(np.abs(single - double.points), axis=(-1, -2))[both],
-    }  # fmt: skip
+        "lost": lost,
+        "float32_error": np.max(np.abs(single - double.points), axis=(-1, -2))[both],
+    }

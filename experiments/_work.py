@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import Lens, pupil, train
+from drt_jax import Lens
+from drt_jax.pupil import rules as pupil
+from drt_jax.learn import train
 
 _SPREAD = """
 import sys, time
@@ -17,7 +19,7 @@ import jax; jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", {devices})
 import numpy as np
 import drt_jax
-from drt_jax import pupil
+from drt_jax.pupil import rules as pupil
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 lens = drt_jax.load_lens({lens!r})
 def trace(points):
@@ -49,7 +51,13 @@ def median_seconds(call, repeats: int) -> float:
 
 
 def spread_over_devices(
-    lens: str, field: float, distance: float, wave: float, count: int, seed: int, repeats: int,
+    lens: str,
+    field: float,
+    distance: float,
+    wave: float,
+    count: int,
+    seed: int,
+    repeats: int,
     devices: int,
 ) -> float:
     """Seconds to trace `count` rays shared among so many CPU devices, in a process of its own:
@@ -85,9 +93,14 @@ def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[
 def _plates(count: int) -> Lens:
     """`count` surfaces of thin, weak lenses, the stop in the middle."""
     surfaces = [
-        {"radius": 1e5 * (-1) ** i, "thickness": 0.1, "index": 1.0 if i % 2 else 1.5,
-         "semi_diameter": 50.0} for i in range(count)
-    ]  # fmt: skip
+        {
+            "radius": 1e5 * (-1) ** i,
+            "thickness": 0.1,
+            "index": 1.0 if i % 2 else 1.5,
+            "semi_diameter": 50.0,
+        }
+        for i in range(count)
+    ]
     surfaces[-1]["index"] = 1.0
     surfaces[count // 2] |= {"stop": True, "semi_diameter": 5.0}
     return drt_jax.load_lens({"name": f"{count} surfaces", "surfaces": surfaces})

@@ -24,13 +24,21 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import Lens, plot
-from drt_jax.runs import Run
+from drt_jax import Lens
+from drt_jax.show import plot
+from drt_jax.runs.folder import Run
 
 from . import _common
 from ._methods import (
-    fitted_rule, measured, padded, patterns, pupil_points, quadrature, sampled, seconds,
-)  # fmt: skip
+    fitted_rule,
+    measured,
+    padded,
+    patterns,
+    pupil_points,
+    quadrature,
+    sampled,
+    seconds,
+)
 from ._reference import Moments, reference
 
 _QUADRATURE = "quadrature"

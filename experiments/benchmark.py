@@ -25,15 +25,27 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import Lens, Status, network, plot, pupil, train
-from drt_jax.adam import adam, apply_updates
-from drt_jax.runs import Run
+from drt_jax import Lens, Status
+from drt_jax.learn import network
+from drt_jax.show import plot
+from drt_jax.pupil import rules as pupil
+from drt_jax.learn import train
+from drt_jax.learn.adam import adam, apply_updates
+from drt_jax.runs.folder import Run
 
 from . import _common, _peers, _work
 from ._reference import reference
 
-_COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", "compile_s", "peak_mb",
-            "kernels")  # fmt: skip
+_COLUMNS = (
+    "ours_s",
+    "peer_s",
+    "ratio",
+    "ours_error",
+    "peer_error",
+    "compile_s",
+    "peak_mb",
+    "kernels",
+)
 _TURN = 0.05
 _FIRST = """
 import time; start = time.perf_counter()
@@ -154,7 +166,9 @@ def rows_of(
         else:
             row["note"] = peer
         rows.append(row)
-    return rows or [{**base, "peer": "", "peer_s": None, "ratio": None, "peer_error": None, "note": ""}]
+    return rows or [
+        {**base, "peer": "", "peer_s": None, "ratio": None, "peer_error": None, "note": ""}
+    ]
 
 
 def _parts(lens: Lens) -> dict:
@@ -179,7 +193,9 @@ def _slope_error(slopes: np.ndarray, truth: list, count: int) -> float:
     for group in (slice(0, count), slice(count, None)):
         known = np.isfinite(slopes[:, group])
         wrong = np.where(known, slopes[:, group] - exact[:, group], 0)
-        worst = max(worst, np.linalg.norm(wrong) / np.linalg.norm(np.where(known, exact[:, group], 0)))
+        worst = max(
+            worst, np.linalg.norm(wrong) / np.linalg.norm(np.where(known, exact[:, group], 0))
+        )
     return float(worst)
 
 
@@ -269,22 +285,47 @@ def bundle_task(config: Config) -> list[dict]:
     rows = rows_of(f"{config.bundle} skew rays", ours, own, peers, config.repeats)
     devices = os.cpu_count() or 1
     shared = _work.spread_over_devices(
-        config.lens, field, distance, config.wavelengths_um[0], config.bundle, config.seed,
-        config.repeats, devices,
-    )  # fmt: skip
+        config.lens,
+        field,
+        distance,
+        config.wavelengths_um[0],
+        config.bundle,
+        config.seed,
+        config.repeats,
+        devices,
+    )
     peer = rows[0]["peer_s"]
-    rows.append({
-        **rows[0], "task": f"{config.bundle} skew rays, {devices} CPU devices", "ours_s": shared,
-        "ratio": peer and peer / shared, "compile_s": None, "peak_mb": None, "kernels": None,
-    })  # fmt: skip
+    rows.append(
+        {
+            **rows[0],
+            "task": f"{config.bundle} skew rays, {devices} CPU devices",
+            "ours_s": shared,
+            "ratio": peer and peer / shared,
+            "compile_s": None,
+            "peak_mb": None,
+            "kernels": None,
+        }
+    )
 
-    back = compiled(jax.grad(lambda lens: jnp.mean(_squares(lens, field, distance, waves, points))), lens)
-    rows.append({
-        **rows[0], "task": f"{config.bundle} skew rays and their gradient", "peer": "",
-        "ours_s": alternate([back.call], 3)[0], "peer_s": None, "ratio": None, "peer_error": None,
-        "ours_error": None, "compile_s": back.compile_s, "peak_mb": back.peak_mb,
-        "kernels": back.kernels, "note": "",
-    })  # fmt: skip
+    back = compiled(
+        jax.grad(lambda lens: jnp.mean(_squares(lens, field, distance, waves, points))), lens
+    )
+    rows.append(
+        {
+            **rows[0],
+            "task": f"{config.bundle} skew rays and their gradient",
+            "peer": "",
+            "ours_s": alternate([back.call], 3)[0],
+            "peer_s": None,
+            "ratio": None,
+            "peer_error": None,
+            "ours_error": None,
+            "compile_s": back.compile_s,
+            "peak_mb": back.peak_mb,
+            "kernels": back.kernels,
+            "note": "",
+        }
+    )
     for row in rows:
         row["ours_rays_per_s"] = config.bundle / row["ours_s"]
         if row["peak_mb"] is not None:
@@ -354,20 +395,34 @@ def first_task(config: Config) -> list[dict]:
     """A new process: import, load a lens, trace, gradient; and the same once more, with the
     compiled programs kept in a folder."""
     rows = []
-    for field, where in ((0.0, "on axis"), (math.radians(config.field_deg), f"{config.field_deg:g} degrees")):
+    for field, where in (
+        (0.0, "on axis"),
+        (math.radians(config.field_deg), f"{config.field_deg:g} degrees"),
+    ):
         code = _FIRST.format(lens=config.lens, field=field, distance=1e3 * config.distance_m)
         with tempfile.TemporaryDirectory() as folder:
-            kept = {"JAX_COMPILATION_CACHE_DIR": folder,
-                    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}  # fmt: skip
+            kept = {
+                "JAX_COMPILATION_CACHE_DIR": folder,
+                "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            }
             _in_a_new_process(code, kept)
             for more, extra in (("", {}), (", programs kept", kept)):
                 times = [_in_a_new_process(code, extra) for _ in range(3)]
-                rows.append({
-                    "task": f"first sigma and gradient in a new process, {where}{more}",
-                    "peer": "", "ours_s": float(np.median(times)), "peer_s": None, "ratio": None,
-                    "ours_error": None, "peer_error": None, "compile_s": None, "peak_mb": None,
-                    "kernels": None, "note": "",
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "task": f"first sigma and gradient in a new process, {where}{more}",
+                        "peer": "",
+                        "ours_s": float(np.median(times)),
+                        "peer_s": None,
+                        "ratio": None,
+                        "ours_error": None,
+                        "peer_error": None,
+                        "compile_s": None,
+                        "peak_mb": None,
+                        "kernels": None,
+                        "note": "",
+                    }
+                )
     return rows
 
 
@@ -410,17 +465,40 @@ def run(config: Config, run: Run) -> None:
     if config.growth:
         results["work"] = _work.growth(lens, math.radians(config.field_deg), distance, 5)
     path = run.finish({**results, "seconds": run.seconds})
-    header = ("task", "ours ms", "peer", "peer ms", "ratio", "our error", "its error", "compile s", "MB")
+    header = (
+        "task",
+        "ours ms",
+        "peer",
+        "peer ms",
+        "ratio",
+        "our error",
+        "its error",
+        "compile s",
+        "MB",
+    )
 
     def number(value, scale=1.0, form=".3g"):
         return "" if value is None else format(scale * value, form)
 
-    print(_common.table(header, [
-        (r["task"], number(r["ours_s"], 1e3), r["peer"] if not r["note"] else r["note"],
-         number(r["peer_s"], 1e3), number(r["ratio"]), number(r["ours_error"], form=".1e"),
-         number(r["peer_error"], form=".1e"), number(r["compile_s"]), number(r["peak_mb"]))
-        for r in rows
-    ]))  # fmt: skip
+    print(
+        _common.table(
+            header,
+            [
+                (
+                    r["task"],
+                    number(r["ours_s"], 1e3),
+                    r["peer"] if not r["note"] else r["note"],
+                    number(r["peer_s"], 1e3),
+                    number(r["ratio"]),
+                    number(r["ours_error"], form=".1e"),
+                    number(r["peer_error"], form=".1e"),
+                    number(r["compile_s"]),
+                    number(r["peak_mb"]),
+                )
+                for r in rows
+            ],
+        )
+    )
     for name, count in results["counts"].items():
         print(f"{name}: rays are solved for {count} times in a training step")
     print(f"results in {path}")
@@ -436,7 +514,9 @@ def run(config: Config, run: Run) -> None:
         for axis, task in zip(np.ravel(axes), tasks):
             some = [r for r in rows if r["task"] == task]
             marks = {"drt_jax": [(1e3 * some[0]["ours_s"], some[0]["ours_error"])]}
-            marks |= {r["peer"]: [(1e3 * r["peer_s"], r["peer_error"])] for r in some if r["peer_s"]}
+            marks |= {
+                r["peer"]: [(1e3 * r["peer_s"], r["peer_error"])] for r in some if r["peer_s"]
+            }
             plot.programs(axis, marks, task)
         figure.savefig(run.figures / "peers.png")
         print(f"figure {run.figures / 'peers.png'}")

@@ -13,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import network, plot, train
-from drt_jax.data import DataConfig
+from drt_jax.learn import network
+from drt_jax.show import plot
+from drt_jax.learn import train
+from drt_jax.learn.data import DataConfig
 from drt_jax.numerics import safe_sqrt
-from drt_jax.runs import Run
+from drt_jax.runs.folder import Run
 
 from . import _common
 from ._common import JointTraining, Scene
@@ -93,9 +95,15 @@ def run(config: Config, run: Run) -> None:
     fixed_imager = train.make_imager(fixed_blur, restore, config.camera)
     init, step = train.make_step(fixed_imager, _common.rates(config), (near, far), config.seed)
     fixed = _common.train_job(
-        run, f"fixed {config.fixed_mm}", init, step, {"optics": {}, "network": weights},
-        patches.train, config.noise, config,
-    )  # fmt: skip
+        run,
+        f"fixed {config.fixed_mm}",
+        init,
+        step,
+        {"optics": {}, "network": weights},
+        patches.train,
+        config.noise,
+        config,
+    )
 
     best = joint[config.fixed_mm]
     models = {"fixed": (jax.jit(fixed_imager), fixed), "joint": (jax.jit(imager), best)}
@@ -134,19 +142,27 @@ def run(config: Config, run: Run) -> None:
     grid = np.linspace(near, far, 121)
     sigma = jax.vmap(lambda d, s: safe_sqrt(blur({"sensor": s}, d)[1][:, 0]), in_axes=(0, None))
     plot.sigma_over_depth(
-        axes, grid / 1e3,
-        {f"{s:.2f} mm": 1e3 * np.asarray(sigma(jnp.asarray(grid), s)) for s in (config.fixed_mm, final)},
-    )  # fmt: skip
+        axes,
+        grid / 1e3,
+        {
+            f"{s:.2f} mm": 1e3 * np.asarray(sigma(jnp.asarray(grid), s))
+            for s in (config.fixed_mm, final)
+        },
+    )
     figure.savefig(figures[2])
     _patches(*models["joint"], test, config).savefig(figures[3])
 
-    print(_common.table(
-        ("start mm", "final mm"), list(zip(results["starts_mm"], results["final_mm"]))
-    ))  # fmt: skip
-    print(_common.table(
-        ("depth m", "MAE fixed", "MAE joint", "RMSE fixed", "RMSE joint"),
-        [(r["depth_m"], *(r[n][m] for m in ("mae", "rmse") for n in models)) for r in rows],
-    ))  # fmt: skip
+    print(
+        _common.table(
+            ("start mm", "final mm"), list(zip(results["starts_mm"], results["final_mm"]))
+        )
+    )
+    print(
+        _common.table(
+            ("depth m", "MAE fixed", "MAE joint", "RMSE fixed", "RMSE joint"),
+            [(r["depth_m"], *(r[n][m] for m in ("mae", "rmse") for n in models)) for r in rows],
+        )
+    )
     mean = results["mean_mae"]
     print(
         f"mean MAE from {config.depth_m[0]:g} to {config.depth_m[1]:g} m: sensor fixed at "
@@ -164,9 +180,7 @@ def _patches(imager, parameters, test, config):
     rows = {"truth": [], "sensor": [], "restored": []}
     for k, depth in enumerate(config.patch_depth_m):
         patch = chosen[k % len(chosen)][None]
-        images = imager(
-            parameters, patch, 1e3 * depth, np.float32(config.noise), jax.random.key(k)
-        )
+        images = imager(parameters, patch, 1e3 * depth, np.float32(config.noise), jax.random.key(k))
         for name, image in zip(rows, images):
             rows[name].append(np.asarray(image)[0])
     return plot.patch_grid(

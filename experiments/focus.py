@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import plot, train
-from drt_jax.data import DataConfig
-from drt_jax.runs import Run
+from drt_jax.show import plot
+from drt_jax.learn import train
+from drt_jax.learn.data import DataConfig
+from drt_jax.runs.folder import Run
 
 from . import _common
 from ._common import Scene, Training
@@ -70,21 +71,35 @@ def run(config: Config, run: Run) -> None:
     lens = drt_jax.load_lens(config.scene.lens)
     distance = 1e3 * config.distance_m
     _, blur = drt_jax.moments_model(
-        lens, ("sensor",), 0.0, (distance, distance), config.scene.wavelengths_um,
+        lens,
+        ("sensor",),
+        0.0,
+        (distance, distance),
+        config.scene.wavelengths_um,
         config.scene.tolerance,
-    )  # fmt: skip
+    )
     imager = train.make_imager(blur, None, config.camera, forward=True)
     patches = _common.patches(config)
     starts = jnp.asarray(config.starts_mm)
     init, step = train.make_step(
-        imager, {"optics": config.train.optics_rate}, (distance, distance), config.seed,
+        imager,
+        {"optics": config.train.optics_rate},
+        (distance, distance),
+        config.seed,
         vectorised=True,
-    )  # fmt: skip
+    )
     labels = tuple(f"start {start}" for start in config.starts_mm)
     _common.train_job(
-        run, "all starts", init, step, {"optics": {"sensor": starts}}, patches.train,
-        config.noise, config, labels,
-    )  # fmt: skip
+        run,
+        "all starts",
+        init,
+        step,
+        {"optics": {"sensor": starts}},
+        patches.train,
+        config.noise,
+        config,
+        labels,
+    )
     seconds = run.seconds
 
     traces = {label: run.metrics(label) for label in labels}
@@ -111,7 +126,9 @@ def run(config: Config, run: Run) -> None:
         lines = {k: (t["step"], t[column]) for k, t in traces.items()}
         level = (best, f"best focus {best:.2f}") if column == "sensor_mm" else None
         plot.convergence(left, lines, label, level)
-        plot.convergence(right, {k: (x[:100], y[:100]) for k, (x, y) in lines.items()}, label, level)
+        plot.convergence(
+            right, {k: (x[:100], y[:100]) for k, (x, y) in lines.items()}, label, level
+        )
         right.set_title("the first 100 batches", fontsize=9)
         figures.append(run.figures / f"{name}.png")
         figure.savefig(figures[-1])

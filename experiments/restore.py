@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import network, plot, train
-from drt_jax.data import DataConfig
-from drt_jax.runs import Run
+from drt_jax.learn import network
+from drt_jax.show import plot
+from drt_jax.learn import train
+from drt_jax.learn.data import DataConfig
+from drt_jax.runs.folder import Run
 
 from . import _common
 from ._common import JointTraining, Scene
@@ -62,9 +64,13 @@ def run(config: Config, run: Run) -> None:
     lens = drt_jax.load_lens(config.scene.lens)
     distance = 1e3 * config.distance_m
     _, blur = drt_jax.moments_model(
-        lens, ("sensor",), 0.0, (distance, distance), config.scene.wavelengths_um,
+        lens,
+        ("sensor",),
+        0.0,
+        (distance, distance),
+        config.scene.wavelengths_um,
         config.scene.tolerance,
-    )  # fmt: skip
+    )
     init_network, restore = drt_jax.red_net(**dataclasses.asdict(config.network))
     weights = init_network(jax.random.key(config.seed))
     imager = train.make_imager(blur, restore, config.camera)
@@ -89,7 +95,9 @@ def run(config: Config, run: Run) -> None:
             "noise": noise,
             "start_mm": start,
             "sensor_mm": float(trained[start, noise]["optics"]["sensor"]),
-            **train.evaluate(test_imager, trained[start, noise], test, distance, noise, config.seed),
+            **train.evaluate(
+                test_imager, trained[start, noise], test, distance, noise, config.seed
+            ),
         }
         for noise in config.table_noise
         for start in config.table_starts_mm
@@ -114,11 +122,23 @@ def run(config: Config, run: Run) -> None:
     chosen = trained[config.table_starts_mm[0], config.table_noise[0]]
     _patches(test_imager, chosen, test, distance, config.table_noise[0]).savefig(figures[1])
 
-    print(_common.table(
-        ("start mm", "final mm"), list(zip(results["starts_mm"], results["final_mm"]))
-    ))  # fmt: skip
-    columns = ("noise", "start_mm", "mae", "rmse", "psnr", "ssim", "sensor_mae", "sensor_rmse",
-               "sensor_psnr", "sensor_ssim")  # fmt: skip
+    print(
+        _common.table(
+            ("start mm", "final mm"), list(zip(results["starts_mm"], results["final_mm"]))
+        )
+    )
+    columns = (
+        "noise",
+        "start_mm",
+        "mae",
+        "rmse",
+        "psnr",
+        "ssim",
+        "sensor_mae",
+        "sensor_rmse",
+        "sensor_psnr",
+        "sensor_ssim",
+    )
     print(_common.table(columns, [tuple(row[c] for c in columns) for row in rows]))
     print(f"results in {path}")
     for item in figures:

@@ -12,8 +12,9 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from drt_jax import Status, plot
-from drt_jax.runs import Run
+from drt_jax import Status
+from drt_jax.show import plot
+from drt_jax.runs.folder import Run
 
 from . import _common
 from ._scenes import FAMILIES, draw
@@ -71,7 +72,7 @@ def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, object]:
         "snell_error_max_roundings": float(np.max(found["ratio"])),
         "float32_rays": int(errors.size),
         "dtype": FAMILIES[name].dtype,
-    }  # fmt: skip
+    }
     return row
 
 
@@ -104,8 +105,10 @@ def run(config: Config, run: Run) -> None:
             spread[name] = found["steps"], found["float32_error"]
             if not step:
                 run.log(name, 0, {c: np.array([float(rows[-1][c])]) for c in _COLUMNS})
-    sums = {key: sum(row[key] for row in rows) for key in (
-        *_COLUMNS, "nan_values", "nan_gradients", "disagree_with_snell")}  # fmt: skip
+    sums = {
+        key: sum(row[key] for row in rows)
+        for key in (*_COLUMNS, "nan_values", "nan_gradients", "disagree_with_snell")
+    }
     sums["traceable_per_10000"] = 1e4 * sums["traceable"] / sums["rays"]
     apart = [row for row in rows if row["name"] != "touching"]
     lost, rays = (sum(row[key] for row in apart) for key in ("traceable", "rays"))
@@ -114,21 +117,56 @@ def run(config: Config, run: Run) -> None:
     sums["camera_float32_error_p99"] = max((r["float32_error_p99"] for r in cameras), default=0.0)
     results = {"families": rows, "total": sums, "seconds": run.seconds}
     path = run.finish(results)
-    header = ("family", "scenes", "rays", "ok", "missed", "tir", "clipped", "unconv.", "traceable",
-              "NaN", "NaN grad", "not Snell", "steps", "max", "float32 p99 mm")  # fmt: skip
+    header = (
+        "family",
+        "scenes",
+        "rays",
+        "ok",
+        "missed",
+        "tir",
+        "clipped",
+        "unconv.",
+        "traceable",
+        "NaN",
+        "NaN grad",
+        "not Snell",
+        "steps",
+        "max",
+        "float32 p99 mm",
+    )
     lines = [
-        (r["name"], *(r[c] for c in ("scenes", "rays", "ok", *COUNTS, "traceable", "nan_values",
-         "nan_gradients", "disagree_with_snell")), f"{r['newton_steps_median']:g}",
-         r["newton_steps_max"], f"{r['float32_error_p99']:.1e}")
+        (
+            r["name"],
+            *(
+                r[c]
+                for c in (
+                    "scenes",
+                    "rays",
+                    "ok",
+                    *COUNTS,
+                    "traceable",
+                    "nan_values",
+                    "nan_gradients",
+                    "disagree_with_snell",
+                )
+            ),
+            f"{r['newton_steps_median']:g}",
+            r["newton_steps_max"],
+            f"{r['float32_error_p99']:.1e}",
+        )
         for r in rows
-    ]  # fmt: skip
+    ]
     print(_common.table(header, lines))
-    print(f"{sums['scenes']} scenes, {sums['rays']} rays: {sums['nan_values']} values and "
-          f"{sums['nan_gradients']} derivatives not finite, {sums['disagree_with_snell']} good "
-          "rays that Snell's law denies")  # fmt: skip
-    print(f"rays reported as failed that Snell's law can trace: {sums['traceable']}, "
-          f"{sums['traceable_per_10000']:.2f} in 10,000; without surfaces that touch "
-          f"{sums['traceable_per_10000_but_touching']:.2f}")  # fmt: skip
+    print(
+        f"{sums['scenes']} scenes, {sums['rays']} rays: {sums['nan_values']} values and "
+        f"{sums['nan_gradients']} derivatives not finite, {sums['disagree_with_snell']} good "
+        "rays that Snell's law denies"
+    )
+    print(
+        f"rays reported as failed that Snell's law can trace: {sums['traceable']}, "
+        f"{sums['traceable_per_10000']:.2f} in 10,000; without surfaces that touch "
+        f"{sums['traceable_per_10000_but_touching']:.2f}"
+    )
     figure, axes = plot.new(1, 2, 6, 5)
     plot.by_family(axes[0], {k: v[0] for k, v in spread.items()}, "Newton steps of a scene")
     errors = {name: 1e3 * values for name, (_, values) in spread.items()}

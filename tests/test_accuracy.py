@@ -11,7 +11,8 @@ import pytest
 from scipy.stats import qmc
 
 import drt_jax
-from drt_jax import load_lens, psf_moments, pupil
+from drt_jax import load_lens, psf_moments
+from drt_jax.pupil import rules as pupil
 from experiments import accuracy
 from experiments._reference import reference
 
@@ -119,9 +120,7 @@ def assert_kept(lens, field, distance, size, tolerances):
 
 
 @pytest.mark.parametrize("distance", [25e3, math.inf])
-@pytest.mark.parametrize(
-    "degrees", [0.0, pytest.param(5.0, marks=pytest.mark.slow), 10.0, 14.0]
-)
+@pytest.mark.parametrize("degrees", [0.0, pytest.param(5.0, marks=pytest.mark.slow), 10.0, 14.0])
 @pytest.mark.parametrize(
     "name", ["double_gauss", pytest.param("cooke_triplet", marks=pytest.mark.slow)]
 )
@@ -211,10 +210,18 @@ def small_run(tmp_path_factory):
         "{surfaces: [{radius: 20.0, index: 1.5, semi_diameter: 4.0, stop: true}], sensor: 60.0}"
     )
     scenes = f"scenes=[{{lens: {path}, field_deg: 3, distance_m: .inf, defocus_mm: 0.5}}]"
-    accuracy.main([
-        "--out", str(folder / "run"), "--set", scenes, "orders=[2, 8]", "rays=[256]",
-        "tolerances=[1e-3, 1e-6]", "seeds=2",
-    ])  # fmt: skip
+    accuracy.main(
+        [
+            "--out",
+            str(folder / "run"),
+            "--set",
+            scenes,
+            "orders=[2, 8]",
+            "rays=[256]",
+            "tolerances=[1e-3, 1e-6]",
+            "seeds=2",
+        ]
+    )
     return folder / "run"
 
 
@@ -223,7 +230,11 @@ def test_small_run_of_the_experiment(small_run):
     results = json.loads((small_run / "results.json").read_text())
     rows = results["curves"]
     assert [row["method"] for row in rows] == ["quadrature"] * 2 + [
-        "random", "square grid", "hexapolar", "Sobol"]  # fmt: skip
+        "random",
+        "square grid",
+        "hexapolar",
+        "Sobol",
+    ]
     known = {"scene", "method", "dtype", "rays", "relative_error", "gradient_error", "seconds"}
     assert all(known <= set(row) and row["seconds"] > 0 for row in rows)
     assert len({row["scene"] for row in rows}) == 1 and rows[0]["rays"] == 6

@@ -17,7 +17,9 @@ def parameters():
 def gradients(step):
     generator = np.random.default_rng(step)
     return jax.tree.map(
-        lambda p: jnp.asarray(generator.normal(size=p.shape) * 10.0 ** generator.uniform(-9, 3), p.dtype),
+        lambda p: jnp.asarray(
+            generator.normal(size=p.shape) * 10.0 ** generator.uniform(-9, 3), p.dtype
+        ),
         parameters(),
     )
 
@@ -31,7 +33,9 @@ def test_updates_are_those_of_optax():
         change, state = update(gradients(step), state)
         with jax.numpy_dtype_promotion("standard"):  # optax needs it
             wanted, other = reference.update(gradients(step), other)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-12), change, wanted)
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-12), change, wanted
+        )
         ours, theirs = apply_updates(ours, change), optax.apply_updates(theirs, wanted)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), ours, theirs)
 
@@ -43,7 +47,9 @@ def test_each_group_has_its_rate_and_each_leaf_its_dtype():
     one, _ = adam(1.0)[1](gradients(0), adam(1.0)[0](parameters()))
     for group, rate in (("optics", 0.5), ("network", 1e-3)):
         jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, rate * b, rtol=1e-6), change[group], one[group]
+            lambda a, b: np.testing.assert_allclose(a, rate * b, rtol=1e-6),
+            change[group],
+            one[group],
         )
     for tree in (change, state.first, state.second, apply_updates(parameters(), change)):
         jax.tree.map(lambda a, b: np.testing.assert_equal(a.dtype, b.dtype), tree, parameters())

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Status, implicit, load_lens, pupil, trace_rays
+from drt_jax import Status, load_lens, trace_rays
+from drt_jax.rays import implicit
+from drt_jax.pupil import rules as pupil
 
 RAYS, FIELD, WAVES = 2500, 0.17, (0.6, 0.48)
 
@@ -54,7 +56,9 @@ def test_gradients_are_those_of_small_bundles(lens, points):
 
     gradient = jax.jit(jax.grad(total, (0, 1, 2), allow_int=True))
     whole = gradient(lens, FIELD, points, weight)
-    parts = [gradient(lens, FIELD, points[i : i + 500], weight[i : i + 500]) for i in range(0, RAYS, 500)]
+    parts = [
+        gradient(lens, FIELD, points[i : i + 500], weight[i : i + 500]) for i in range(0, RAYS, 500)
+    ]
     lenses = [part[0] for part in parts]
     for name in ("curvature", "conic", "thickness", "sensor", "semi_diameter"):
         small = sum(getattr(one, name) for one in lenses)
@@ -71,13 +75,17 @@ def test_gradients_are_those_of_small_bundles(lens, points):
 def test_forward_mode(lens, points):
     def sensor(curvature):
         changed = dataclasses.replace(lens, curvature=curvature)
-        return trace_rays(changed, FIELD, 25e3, WAVES[:1], points, forward=True).points[0, :, -1, :2]
+        return trace_rays(changed, FIELD, 25e3, WAVES[:1], points, forward=True).points[
+            0, :, -1, :2
+        ]
 
     step = 1e-6 * jnp.cos(jnp.arange(lens.curvature.size))
     slope = jax.jit(lambda: jax.jvp(sensor, (lens.curvature,), (step,))[1])()
     value = jax.jit(sensor)
     change = value(lens.curvature + 1e-2 * step) - value(lens.curvature - 1e-2 * step)
-    np.testing.assert_allclose(slope, change / 2e-2, rtol=0, atol=1e-6 * float(jnp.max(jnp.abs(slope))))
+    np.testing.assert_allclose(
+        slope, change / 2e-2, rtol=0, atol=1e-6 * float(jnp.max(jnp.abs(slope)))
+    )
 
 
 @pytest.mark.slow
@@ -94,7 +102,9 @@ def test_rays_that_fail_are_told_apart(lens, points):
         whole.points, jnp.concatenate([part.points for part in parts], axis=1), rtol=0, atol=1e-11
     )
     gradient = jax.grad(
-        lambda field: jnp.sum(trace_rays(lens, field, 25e3, WAVES[:1], points[:1500]).points[:, :, -1])
+        lambda field: jnp.sum(
+            trace_rays(lens, field, 25e3, WAVES[:1], points[:1500]).points[:, :, -1]
+        )
     )(0.4)
     assert jnp.isfinite(gradient)
 
@@ -107,7 +117,9 @@ def test_memory_a_ray_keeps_for_the_backward_pass(lens):
 
         def solve(points):
             scene = jnp.array([0.0, FIELD]), jnp.array(25e3), jnp.array(WAVES[:1])
-            system = drt_jax.trace.system_of(lens, drt_jax.trace._live_surfaces(lens), *scene, points)
+            system = drt_jax.rays.trace.system_of(
+                lens, drt_jax.rays.trace._live_surfaces(lens), *scene, points
+            )
             return jax.vjp(implicit.solve_rays, system)
 
         out = jax.eval_shape(solve, points)

@@ -3,7 +3,7 @@ from typing import Literal
 
 import pytest
 
-from drt_jax.config import ConfigError, describe, dump_config, load_config
+from drt_jax.runs.config import ConfigError, describe, dump_config, load_config
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,9 @@ def path(tmp_path):
 
 
 def test_yaml_overrides_and_round_trip(path, tmp_path):
-    config = load_config(Config, path, ["train.batch=8", "starts=[1]", "fast=true", "train.form=sampled"])
+    config = load_config(
+        Config, path, ["train.batch=8", "starts=[1]", "fast=true", "train.form=sampled"]
+    )
     assert config == Config((1.0,), "x", True, Inner(8, 1e-4, "sampled"))
     assert isinstance(config.starts[0], float)
     (tmp_path / "resolved.yaml").write_text(dump_config(config))
@@ -62,7 +64,11 @@ def test_bad_overrides_name_the_key(path, override):
 
 
 def test_bad_files_name_the_file(tmp_path):
-    cases = {"starts: [1]\nsped: 3": "unknown key sped", "- 1": "expected keys", "a: [": "not a YAML"}
+    cases = {
+        "starts: [1]\nsped: 3": "unknown key sped",
+        "- 1": "expected keys",
+        "a: [": "not a YAML",
+    }
     for text, message in cases.items():
         path = tmp_path / "bad.yaml"
         path.write_text(text)

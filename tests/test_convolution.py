@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import convolution
-from drt_jax.convolution import convolve_3x3
+from drt_jax.learn import convolution
+from drt_jax.learn.convolution import convolve_3x3
 
 
 def plain(images, kernel):
@@ -14,8 +14,9 @@ def plain(images, kernel):
     height, width = images.shape[1:3]
     return sum(
         padded[:, i : i + height, j : j + width] @ np.asarray(kernel[i, j], float)
-        for i in range(3) for j in range(3)
-    )  # fmt: skip
+        for i in range(3)
+        for j in range(3)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +36,19 @@ def test_value_and_gradients(case, dtype, bound):
 
     text = jax.jit(convolve_3x3).lower(images, kernel).compile().as_text()
     assert "convolution(" not in text  # or this test compares XLA with itself
-    ours, theirs = jax.jit(lambda: both(convolve_3x3))(), jax.jit(lambda: both(convolution._direct))()
+    ours, theirs = (
+        jax.jit(lambda: both(convolve_3x3))(),
+        jax.jit(lambda: both(convolution._direct))(),
+    )
     for a, b in zip(ours, theirs):
         assert a.dtype == dtype
         assert float(jnp.max(jnp.abs(a - b))) < bound * float(jnp.max(jnp.abs(b)))
     np.testing.assert_allclose(ours[0], plain(images, kernel), atol=8 * bound)
 
 
-@pytest.mark.parametrize("shape, out", [((1, 32, 33, 32), 32), ((1, 32, 32, 3), 32), ((2, 8, 8, 40), 40)])
+@pytest.mark.parametrize(
+    "shape, out", [((1, 32, 33, 32), 32), ((1, 32, 32, 3), 32), ((2, 8, 8, 40), 40)]
+)
 def test_other_shapes(shape, out):
     rng = np.random.default_rng(1)
     images, kernel = rng.standard_normal(shape), rng.standard_normal((3, 3, shape[-1], out))

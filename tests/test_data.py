@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from skimage import io
 
-from drt_jax.data import DataConfig, DataError, batches, load_patches
+from drt_jax.learn.data import DataConfig, DataError, batches, load_patches
 
 
 @pytest.fixture

@@ -10,7 +10,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from drt_jax import load_lens, psf_moments, pupil, trace_rays
+from drt_jax import load_lens, psf_moments, trace_rays
+from drt_jax.pupil import rules as pupil
 
 from . import oracle, test_surface
 
@@ -23,59 +24,150 @@ LARGEST = 1e-8
 
 # All forms, everything tilted and decentred, a refracting stop.
 FREEFORM = [
-    {"radius": 60, "conic": -0.3, "coefficients": {4: 1e-6, 6: -2e-9}, "thickness": 6,
-     "glass": "N-BK7", "tilt": [0.6, -0.8, 0.3], "decentre": [0.1, -0.2]},
-    {"form": "odd_asphere", "radius": -150, "conic": 0.5, "thickness": 3,
-     "coefficients": {1: 5e-4, 3: 1e-5, 4: -3e-7}, "tilt": [-0.4, 0.5, 0.0],
-     "decentre": [-0.2, 0.3]},
-    {"form": "polynomial_xy", "radius": 80, "conic": -0.7, "thickness": 6, "glass": "F2",
-     "coefficients": {"x1y0": 1e-3, "x0y1": -2e-3, "x2y0": 1e-4, "x1y1": 2e-4, "x0y2": -1e-4,
-                      "x2y1": 3e-6}, "tilt": [0.3, 0.2, -0.7], "decentre": [0.3, 0.1]},
-    {"form": "biconic", "radius": -90, "conic": 0.4, "radius_x": -120, "conic_x": -0.5,
-     "coefficients": {4: 1e-6}, "thickness": 5, "semi_diameter": 5, "stop": True,
-     "tilt": [0.7, 0.4, 1.0], "decentre": [-0.1, 0.25]},
-    {"form": "toroid", "radius": 75, "conic": -0.2, "radius_x": 85, "coefficients": {4: 2e-6},
-     "thickness": 5, "index": 1.6, "tilt": [-0.5, 0.6, 2.0], "decentre": [0.15, -0.1]},
-    {"radius": -110, "conic": 0.1, "coefficients": {4: -1e-6}, "tilt": [0.2, 0.9, -0.4],
-     "decentre": [-0.3, 0.2]},
-]  # fmt: skip
+    {
+        "radius": 60,
+        "conic": -0.3,
+        "coefficients": {4: 1e-6, 6: -2e-9},
+        "thickness": 6,
+        "glass": "N-BK7",
+        "tilt": [0.6, -0.8, 0.3],
+        "decentre": [0.1, -0.2],
+    },
+    {
+        "form": "odd_asphere",
+        "radius": -150,
+        "conic": 0.5,
+        "thickness": 3,
+        "coefficients": {1: 5e-4, 3: 1e-5, 4: -3e-7},
+        "tilt": [-0.4, 0.5, 0.0],
+        "decentre": [-0.2, 0.3],
+    },
+    {
+        "form": "polynomial_xy",
+        "radius": 80,
+        "conic": -0.7,
+        "thickness": 6,
+        "glass": "F2",
+        "coefficients": {
+            "x1y0": 1e-3,
+            "x0y1": -2e-3,
+            "x2y0": 1e-4,
+            "x1y1": 2e-4,
+            "x0y2": -1e-4,
+            "x2y1": 3e-6,
+        },
+        "tilt": [0.3, 0.2, -0.7],
+        "decentre": [0.3, 0.1],
+    },
+    {
+        "form": "biconic",
+        "radius": -90,
+        "conic": 0.4,
+        "radius_x": -120,
+        "conic_x": -0.5,
+        "coefficients": {4: 1e-6},
+        "thickness": 5,
+        "semi_diameter": 5,
+        "stop": True,
+        "tilt": [0.7, 0.4, 1.0],
+        "decentre": [-0.1, 0.25],
+    },
+    {
+        "form": "toroid",
+        "radius": 75,
+        "conic": -0.2,
+        "radius_x": 85,
+        "coefficients": {4: 2e-6},
+        "thickness": 5,
+        "index": 1.6,
+        "tilt": [-0.5, 0.6, 2.0],
+        "decentre": [0.15, -0.1],
+    },
+    {
+        "radius": -110,
+        "conic": 0.1,
+        "coefficients": {4: -1e-6},
+        "tilt": [0.2, 0.9, -0.4],
+        "decentre": [-0.3, 0.2],
+    },
+]
 # Two mirrors side by side, turned by 30 degrees; the second is curved. The stop is behind them.
 FOLDED = [
     {"radius": 120, "conic": -0.5, "thickness": 6, "glass": "N-BK7"},
     {"radius": -300, "thickness": 24},
     {"radius": "inf", "thickness": -10, "mirror": True, "tilt": [30, 0, 0]},
-    {"form": "biconic", "radius": -900, "conic": 0.3, "radius_x": -700, "conic_x": -0.4,
-     "thickness": 12, "mirror": True, "tilt": [30, 0.5, 0], "decentre": [0.1, 17.3205]},
-    {"radius": "inf", "thickness": 8, "semi_diameter": 6, "stop": True,
-     "decentre": [0, 17.3205]},
-    {"radius": 70, "conic": 0.2, "thickness": 5, "glass": "SF10", "decentre": [0.3, 17.4],
-     "tilt": [0.3, -0.2, 0.1]},
+    {
+        "form": "biconic",
+        "radius": -900,
+        "conic": 0.3,
+        "radius_x": -700,
+        "conic_x": -0.4,
+        "thickness": 12,
+        "mirror": True,
+        "tilt": [30, 0.5, 0],
+        "decentre": [0.1, 17.3205],
+    },
+    {"radius": "inf", "thickness": 8, "semi_diameter": 6, "stop": True, "decentre": [0, 17.3205]},
+    {
+        "radius": 70,
+        "conic": 0.2,
+        "thickness": 5,
+        "glass": "SF10",
+        "decentre": [0.3, 17.4],
+        "tilt": [0.3, -0.2, 0.1],
+    },
     {"radius": 150, "coefficients": {4: 1e-6}, "decentre": [-0.2, 17.3]},
-]  # fmt: skip
+]
 # Rotational, with a surface inside a glass, which bends nothing.
 ROUND = [
-    {"radius": 45, "conic": -0.6, "coefficients": {4: 1e-6, 6: -1e-9}, "thickness": 4,
-     "glass": "N-BK7"},
+    {
+        "radius": 45,
+        "conic": -0.6,
+        "coefficients": {4: 1e-6, 6: -1e-9},
+        "thickness": 4,
+        "glass": "N-BK7",
+    },
     {"radius": 200, "thickness": 3, "glass": "N-BK7"},
-    {"form": "odd_asphere", "radius": -180, "conic": 0.4, "thickness": 4,
-     "coefficients": {2: 1e-4, 3: 1e-5, 4: -2e-7}},
+    {
+        "form": "odd_asphere",
+        "radius": -180,
+        "conic": 0.4,
+        "thickness": 4,
+        "coefficients": {2: 1e-4, 3: 1e-5, 4: -2e-7},
+    },
     {"radius": "inf", "thickness": 4, "semi_diameter": 7, "stop": True},
     {"radius": -60, "conic": 0.3, "coefficients": {4: -1e-6}, "thickness": 3, "glass": "SF10"},
     {"radius": 140, "conic": 0.2},
-]  # fmt: skip
+]
 
 
 # Lens, field in radians, distances in mm, part of the pupil that the moments are taken over.
 SCENES = {
     "freeform": (
-        {"surfaces": FREEFORM, "sensor": 110, "sensor_tilt": [1.5, -2.0, 3.0],
-         "sensor_decentre": [0.4, -0.3]}, [0.06, -0.09], (300.0,), "disc"),
+        {
+            "surfaces": FREEFORM,
+            "sensor": 110,
+            "sensor_tilt": [1.5, -2.0, 3.0],
+            "sensor_decentre": [0.4, -0.3],
+        },
+        [0.06, -0.09],
+        (300.0,),
+        "disc",
+    ),
     "folded": (
-        {"surfaces": FOLDED, "sensor": 100, "sensor_tilt": [0.5, 0.3, 0.0],
-         "sensor_decentre": [0.0, 17.0]}, [0.02, 0.03], (500.0,), "disc"),
+        {
+            "surfaces": FOLDED,
+            "sensor": 100,
+            "sensor_tilt": [0.5, 0.3, 0.0],
+            "sensor_decentre": [0.0, 17.0],
+        },
+        [0.02, 0.03],
+        (500.0,),
+        "disc",
+    ),
     "double_gauss": ("double_gauss", np.radians(10), (25000.0, np.inf), "half"),
     "on_axis": ({"surfaces": ROUND, "sensor": 110}, 0.0, (400.0,), "meridian"),
-}  # fmt: skip
+}
 TITLES = {
     "freeform": "No symmetry, all forms, tilts and decentres; field (0.06, -0.09), 300 mm",
     "folded": "Two mirrors; field (0.02, 0.03), 500 mm",
@@ -157,9 +249,7 @@ def write_section(title, rows):
     sections[title] = "\n" + "\n".join(lines) + "\n"
     ordered = [t for t in titles() if t in sections]
     TABLE.parent.mkdir(parents=True, exist_ok=True)
-    TABLE.write_text(
-        HEADER + "".join(f"\n## {t}\n\n{sections[t].strip()}\n" for t in ordered)
-    )
+    TABLE.write_text(HEADER + "".join(f"\n## {t}\n\n{sections[t].strip()}\n" for t in ordered))
 
 
 def title_of(name, distance):
@@ -175,8 +265,11 @@ def titles():
 )
 def test_all_derivatives_agree_with_the_complex_step(name, write_tables):
     _, field, distances, symmetry = SCENES[name]
-    rule = pupil.meridian(ORDER) if symmetry == "meridian" else (
-        pupil.half_disc if symmetry == "half" else pupil.disc)(ORDER, ORDER + 1)  # fmt: skip
+    rule = (
+        pupil.meridian(ORDER)
+        if symmetry == "meridian"
+        else (pupil.half_disc if symmetry == "half" else pupil.disc)(ORDER, ORDER + 1)
+    )
     nodes, weights = rule
     if len(nodes) == 1:
         nodes = np.concatenate([np.zeros_like(nodes), nodes])
@@ -230,10 +323,12 @@ def exact_trace(scene, x, y):
     d = d / mpmath.norm(d)
     square = mpf(WAVELENGTHS[0]) ** 2
     n = [
-        sqrt(sum(b * square / (square - c) for b, c in zip(bs, cs))
-             + sum(a * square ** (p // 2) for a, p in zip(s, (0, 2, -2, -4, -6, -8))))
+        sqrt(
+            sum(b * square / (square - c) for b, c in zip(bs, cs))
+            + sum(a * square ** (p // 2) for a, p in zip(s, (0, 2, -2, -4, -6, -8)))
+        )
         for bs, cs, s in zip(scene["strength"], scene["resonance"], scene["schott"])
-    ]  # fmt: skip
+    ]
     path, z0, count = -mpmath.norm(source) * n[0], mpf(0), len(scene["forms"])
     for i in range(count + 1):
         if i:
@@ -270,9 +365,13 @@ def exact_trace(scene, x, y):
         if i == count:
             return at_stop, path, [point[j] for j in range(3)]
         h, x, y = small, hit[0], hit[1]
-        normal = mpmath.matrix([
-            (sag(x - h, y) - sag(x + h, y)) / (2 * h), (sag(x, y - h) - sag(x, y + h)) / (2 * h), 1
-        ])  # fmt: skip
+        normal = mpmath.matrix(
+            [
+                (sag(x - h, y) - sag(x + h, y)) / (2 * h),
+                (sag(x, y - h) - sag(x, y + h)) / (2 * h),
+                1,
+            ]
+        )
         normal = turn * normal / mpmath.norm(normal)
         cosine = (normal.T * d)[0]
         along = (d - cosine * normal) * (n[i] / n[i + 1])

@@ -5,7 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from drt_jax import drawing, load_lens
+from drt_jax import load_lens
+from drt_jax.show import layout as drawing
 
 FOLDED = {
     "surfaces": [

@@ -14,20 +14,36 @@ import pytest
 import yaml
 from skimage import io
 
-from drt_jax.config import load_config
-from drt_jax.runs import Run
+from drt_jax.runs.config import load_config
+from drt_jax.runs.folder import Run
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
-SMALL = ["train.batch=2", "train.patch=16", "train.batches=25", "train.checkpoint_every=10",
-         "camera.kernel=9", "data.crops_per_image=2"]  # fmt: skip
+SMALL = [
+    "train.batch=2",
+    "train.patch=16",
+    "train.batches=25",
+    "train.checkpoint_every=10",
+    "camera.kernel=9",
+    "data.crops_per_image=2",
+]
 TOY = {
     "focus": [*SMALL, "starts_mm=[133.0, 134.0]"],
-    "restore": [*SMALL, "starts_mm=[133.0, 134.0]", "table_starts_mm=[133.0]",
-                "table_noise=[0.01, 0.05]", "test_patches=3"],
-    "edof": [*SMALL, "starts_mm=[145.25, 145.5]", "table_depth_m=[5.0, 20.0]",
-             "patch_depth_m=[10.0, 50.0]", "test_patches=3"],
-}  # fmt: skip
+    "restore": [
+        *SMALL,
+        "starts_mm=[133.0, 134.0]",
+        "table_starts_mm=[133.0]",
+        "table_noise=[0.01, 0.05]",
+        "test_patches=3",
+    ],
+    "edof": [
+        *SMALL,
+        "starts_mm=[145.25, 145.5]",
+        "table_depth_m=[5.0, 20.0]",
+        "patch_depth_m=[10.0, 50.0]",
+        "test_patches=3",
+    ],
+}
 KEYS = {
     "focus": {"starts_mm", "final_mm", "best_focus_mm", "batches_to_focus", "seconds"},
     "restore": {"parameters", "starts_mm", "final_mm", "test"},
@@ -88,7 +104,9 @@ def test_a_run_explains_itself(name, unbroken):
 
 
 @pytest.mark.parametrize("name", TOY)
-def test_an_interrupted_run_resumes_to_the_same_numbers(name, unbroken, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_run_resumes_to_the_same_numbers(
+    name, unbroken, tmp_path, monkeypatch, capsys
+):
     """Ctrl-C in the middle of a job, then --resume: metrics and results of an unbroken run."""
     log, calls = Run.log, []
 
@@ -120,8 +138,18 @@ def assert_same(wanted, folder):
 def test_a_killed_run_resumes_to_the_same_numbers(unbroken, tmp_path):
     """kill -9 once metrics have come: nothing is lost but the steps since the checkpoint."""
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "experiments.focus", "--out", str(folder), "--set", *TOY["focus"]]
-    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    command = [
+        sys.executable,
+        "-m",
+        "experiments.focus",
+        "--out",
+        str(folder),
+        "--set",
+        *TOY["focus"],
+    ]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+    )
     deadline = time.monotonic() + 120
     while not (folder / "metrics.csv").exists() and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -138,7 +166,9 @@ def test_finished_run_resumes_at_once(unbroken, capsys):
     assert "best focus by dense search" in capsys.readouterr().out
 
 
-def test_interrupt_in_the_last_steps_of_a_job_stops_before_the_next(unbroken, tmp_path, monkeypatch):
+def test_interrupt_in_the_last_steps_of_a_job_stops_before_the_next(
+    unbroken, tmp_path, monkeypatch
+):
     log = Run.log
 
     def interrupting(self, job, step, rows):
@@ -150,7 +180,10 @@ def test_interrupt_in_the_last_steps_of_a_job_stops_before_the_next(unbroken, tm
     with pytest.raises(SystemExit) as stopped:
         toy("restore", tmp_path / "run")
     assert stopped.value.code == 130
-    jobs = {line.split(",")[0] for line in (tmp_path / "run" / "metrics.csv").read_text().splitlines()[1:]}
+    jobs = {
+        line.split(",")[0]
+        for line in (tmp_path / "run" / "metrics.csv").read_text().splitlines()[1:]
+    }
     assert jobs == {"start 133.0"}
 
 
@@ -224,8 +257,9 @@ def test_benchmark_without_peers(tmp_path, capsys, monkeypatch):
         jax.config.update("jax_enable_compilation_cache", True)
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     assert [(row["peer"], row["peer_s"], row["note"]) for row in results["rows"]] == [
-        ("optiland", None, "not installed"), ("batoid", None, "not installed"),
-    ]  # fmt: skip
+        ("optiland", None, "not installed"),
+        ("batoid", None, "not installed"),
+    ]
     assert all(row["ours_s"] > 0 and row["ours_error"] < 1e-8 for row in results["rows"])
     solves = list(results["counts"].values())
     assert solves[:2] == [0, 0] and solves[2] > 0

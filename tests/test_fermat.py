@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import fermat, load_lens
-from drt_jax.fermat import Blocks, System
+from drt_jax import load_lens
+from drt_jax.rays import fermat
+from drt_jax.rays.fermat import Blocks, System
 
 from .conftest import LENSES, RGB
 

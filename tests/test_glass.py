@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax.glass import Dispersion, Glass, find_glass, refractive_index
+from drt_jax.lens.glass import Dispersion, Glass, find_glass, refractive_index
 
 # n_d of the catalogue pages and, for CODE V's listing of its Double Gauss sample, the indices
 # that program prints at 656.3, 587.6 and 486.1 nm (6 decimals).

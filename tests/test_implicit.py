@@ -9,16 +9,26 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from drt_jax import Status, fermat, load_lens, pupil, trace_rays
-from drt_jax.implicit import solve_rays
-from drt_jax.trace import trace_bundle
+from drt_jax import Status, load_lens, trace_rays
+from drt_jax.rays import fermat
+from drt_jax.pupil import rules as pupil
+from drt_jax.rays.implicit import solve_rays
+from drt_jax.rays.trace import trace_bundle
 
 from . import oracle
 from .conftest import RGB, assert_close
 from .test_fermat import system_of
 
 # One parameter group a row: (name, how large a relative step still is a small change).
-LEAVES = ("curvature", "conic", "coefficients", "thickness", "semi_diameter", "sensor", "dispersion")
+LEAVES = (
+    "curvature",
+    "conic",
+    "coefficients",
+    "thickness",
+    "semi_diameter",
+    "sensor",
+    "dispersion",
+)
 
 
 def problem(name, dim):
@@ -67,7 +77,9 @@ def test_against_finite_differences_of_second_order(name, dim):
     moves["field"] = (zero, jnp.full_like(field, 0.1), 0.0)
     moves["distance"] = (zero, 0 * field, 100.0)
     for leaf, (dl, df, dd) in moves.items():
-        ours = sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient[0]), jax.tree.leaves(dl)))
+        ours = sum(
+            jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient[0]), jax.tree.leaves(dl))
+        )
         ours = float(ours + jnp.vdot(gradient[1], df) + gradient[2] * dd)
 
         def moved(h):

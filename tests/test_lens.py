@@ -39,9 +39,15 @@ def drop(i, key):
 
 
 BAD = {
-    "unknown key": (surface(0, radus=3.0), r"surfaces\[0\]: unknown key 'radus'; did you mean 'radius'"),
+    "unknown key": (
+        surface(0, radus=3.0),
+        r"surfaces\[0\]: unknown key 'radus'; did you mean 'radius'",
+    ),
     "unknown top key": (lambda e: e.update(sensr=1), "unknown key 'sensr'; did you mean 'sensor'"),
-    "unknown glass": (surface(0, glass="N-BK8"), r"surfaces\[0\].glass: unknown glass 'N-BK8'.*N-BK7"),
+    "unknown glass": (
+        surface(0, glass="N-BK8"),
+        r"surfaces\[0\].glass: unknown glass 'N-BK8'.*N-BK7",
+    ),
     "glass and index": (surface(0, index=1.5), "either glass or index"),
     "index below 1": (lambda e: (drop(0, "glass")(e), surface(0, index=0.9)(e)), "below 1"),
     "zero radius": (surface(0, radius=0), r"surfaces\[0\].radius: 0 is no surface"),
@@ -50,7 +56,10 @@ BAD = {
     "not a number": (surface(0, thickness=float("nan")), "expected a number"),
     "infinite": (surface(0, thickness=float("inf")), "must be finite"),
     "no thickness": (drop(0, "thickness"), r"thickness: expected a number, got None"),
-    "negative thickness": (surface(0, thickness=-1.0), r"surfaces\[0\].thickness: must be positive"),
+    "negative thickness": (
+        surface(0, thickness=-1.0),
+        r"surfaces\[0\].thickness: must be positive",
+    ),
     "touching": (surface(0, thickness=1e-8), r"surfaces\[0\].thickness: .* leave out one of two"),
     "odd power": (surface(0, coefficients={3: 1e-5}), "3 is not an even power"),
     "too wide": (surface(0, semi_diameter=60.0), r"60 mm reaches beyond the surface.* 50 mm"),
@@ -58,26 +67,50 @@ BAD = {
     "no stop": (surface(2, stop=False), "0 have stop: true"),
     "two stops": (surface(0, stop=True, semi_diameter=9.0), "2 have stop: true"),
     "open stop": (drop(2, "semi_diameter"), r"surfaces\[2\].semi_diameter: the stop needs one"),
-    "sensor in the lens": (lambda e: e.update(sensor=5.0), "sensor: 5 mm lies before the last vertex"),
+    "sensor in the lens": (
+        lambda e: e.update(sensor=5.0),
+        "sensor: 5 mm lies before the last vertex",
+    ),
     "no sensor": (lambda e: e.pop("sensor"), "either sensor"),
     "two sensors": (surface(2, thickness=84.0), "either sensor"),
     "empty": (lambda e: e.update(surfaces=[]), "at least one surface"),
-    "infinite curvature": (lambda e: (drop(0, "radius")(e), surface(0, curvature="inf")(e)), "must be finite"),
-    "unknown form": (surface(0, form="zernike"), r"surfaces\[0\].form: unknown form 'zernike'; known: asphere"),
+    "infinite curvature": (
+        lambda e: (drop(0, "radius")(e), surface(0, curvature="inf")(e)),
+        "must be finite",
+    ),
+    "unknown form": (
+        surface(0, form="zernike"),
+        r"surfaces\[0\].form: unknown form 'zernike'; known: asphere",
+    ),
     "crossing": (
-        lambda e: (surface(0, semi_diameter=20.0)(e), surface(1, semi_diameter=20.0, radius=-50)(e)),
+        lambda e: (
+            surface(0, semi_diameter=20.0)(e),
+            surface(1, semi_diameter=20.0, radius=-50)(e),
+        ),
         r"surfaces\[0\].thickness: 4 mm makes surfaces 0 and 1 cross at .* mm from the axis",
     ),
-    "mirror with glass": (surface(0, mirror=True), r"surfaces\[0\].glass: behind a mirror is the medium"),
+    "mirror with glass": (
+        surface(0, mirror=True),
+        r"surfaces\[0\].glass: behind a mirror is the medium",
+    ),
     "light turned": (
         lambda e: (drop(0, "glass")(e), surface(0, mirror=True)(e)),
         r"surfaces\[0\].thickness: must be negative, as a mirror has turned the light",
     ),
     "short tilt": (surface(1, tilt=[1.0]), r"surfaces\[1\].tilt: expected a list of 3 numbers"),
-    "text in decentre": (surface(1, decentre=[0, "up"]), r"decentre.1: expected a number, got 'up'"),
+    "text in decentre": (
+        surface(1, decentre=[0, "up"]),
+        r"decentre.1: expected a number, got 'up'",
+    ),
     "no radius in x": (surface(0, form="toroid"), "either radius_x"),
-    "conic_x": (surface(0, form="toroid", radius_x=9.0, conic_x=1.0), "conic_x: a surface of the form toroid has none"),
-    "power of x": (surface(0, form="polynomial_xy", coefficients={"x2": 1.0}), "'x2' is not a power of x and y"),
+    "conic_x": (
+        surface(0, form="toroid", radius_x=9.0, conic_x=1.0),
+        "conic_x: a surface of the form toroid has none",
+    ),
+    "power of x": (
+        surface(0, form="polynomial_xy", coefficients={"x2": 1.0}),
+        "'x2' is not a power of x and y",
+    ),
     "object": (lambda e: e.update(object={"glass": "N-BK8"}), "object.glass: unknown glass"),
 }
 
@@ -115,17 +148,42 @@ def test_every_form_from_a_file(tmp_path):
     entry = {
         "object": {"index": 1.1},
         "surfaces": [
-            {"form": "biconic", "radius": 50, "radius_x": 40, "conic_x": -1, "coefficients": {4: 1e-6},
-             "thickness": 3, "glass": "N-BK7"},
-            {"form": "toroid", "radius": 60, "curvature_x": 0.01, "coefficients": {2: 1e-4},
-             "thickness": 3, "tilt": [1.0, 0, 0]},
-            {"form": "odd_asphere", "radius": "inf", "coefficients": {3: 1e-5}, "thickness": 3,
-             "semi_diameter": 2, "stop": True},
-            {"form": "polynomial_xy", "radius": "inf", "coefficients": {"x1y1": 1e-4}, "thickness": 9,
-             "mirror": True, "decentre": [0, 1]},
+            {
+                "form": "biconic",
+                "radius": 50,
+                "radius_x": 40,
+                "conic_x": -1,
+                "coefficients": {4: 1e-6},
+                "thickness": 3,
+                "glass": "N-BK7",
+            },
+            {
+                "form": "toroid",
+                "radius": 60,
+                "curvature_x": 0.01,
+                "coefficients": {2: 1e-4},
+                "thickness": 3,
+                "tilt": [1.0, 0, 0],
+            },
+            {
+                "form": "odd_asphere",
+                "radius": "inf",
+                "coefficients": {3: 1e-5},
+                "thickness": 3,
+                "semi_diameter": 2,
+                "stop": True,
+            },
+            {
+                "form": "polynomial_xy",
+                "radius": "inf",
+                "coefficients": {"x1y1": 1e-4},
+                "thickness": 9,
+                "mirror": True,
+                "decentre": [0, 1],
+            },
         ],
         "sensor_tilt": [0, 2.0, 0],
-    }  # fmt: skip
+    }
     path = tmp_path / "forms.yaml"
     path.write_text(yaml.safe_dump(entry))
     for lens in (load_lens(path), load_lens(entry)):
@@ -143,10 +201,15 @@ def test_every_form_from_a_file(tmp_path):
 
 
 def test_symmetry_is_found():
-    surfaces = [{"radius": 50, "thickness": 4, "glass": "N-BK7"}, {"radius": "inf", "semi_diameter": 3, "stop": True}]
+    surfaces = [
+        {"radius": 50, "thickness": 4, "glass": "N-BK7"},
+        {"radius": "inf", "semi_diameter": 3, "stop": True},
+    ]
 
     def symmetry(**change):
-        return load_lens({"surfaces": [{**surfaces[0], **change}, surfaces[1]], "sensor": 90}).symmetry
+        return load_lens(
+            {"surfaces": [{**surfaces[0], **change}, surfaces[1]], "sensor": 90}
+        ).symmetry
 
     assert symmetry() == symmetry(form="odd_asphere") == "rotation"
     assert symmetry(form="toroid", radius_x=40) == symmetry(tilt=[3, 0, 0]) == "plane"
@@ -187,7 +250,9 @@ def test_gradient_with_respect_to_a_lens_is_a_lens():
 
 
 def test_wavelength_outside_a_glass_names_its_range():
-    with pytest.raises(ValueError, match=re.escape("0.9 um is outside the range of SK16, 0.4 to 0.7")):
+    with pytest.raises(
+        ValueError, match=re.escape("0.9 um is outside the range of SK16, 0.4 to 0.7")
+    ):
         load_lens("cooke_triplet").index(jnp.array([0.55, 0.9]))
 
 
@@ -207,4 +272,6 @@ def test_one_compilation_serves_lenses_of_one_shape():
 
 def test_a_lens_may_be_loaded_inside_jit():
     power = jax.jit(lambda s: s / drt_jax.focal_length(load_lens("singlet"), [0.55])[0])
-    np.testing.assert_allclose(power(1.0), 1 / drt_jax.focal_length(load_lens("singlet"), [0.55])[0])
+    np.testing.assert_allclose(
+        power(1.0), 1 / drt_jax.focal_length(load_lens("singlet"), [0.55])[0]
+    )

@@ -9,13 +9,24 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import focus_moments, load_lens, moments, psf_moments, pupil, pupil_order, trace_rays
+from drt_jax import focus_moments, load_lens, psf_moments, pupil_order, trace_rays
+from drt_jax.image import moments
+from drt_jax.pupil import rules as pupil
 
 from .conftest import RGB, assert_close
 
 # Double Gauss, object at 25 m, mean of R, G, B, in um, found before this package was written.
-SIGMA = {130: 257.8, 132: 105.6, 132.5: 67.6, 133: 29.8, 133.3: 7.9, 133.5: 9.6, 134: 46.8,
-         134.5: 84.8, 135: 122.8}  # fmt: skip
+SIGMA = {
+    130: 257.8,
+    132: 105.6,
+    132.5: 67.6,
+    133: 29.8,
+    133.3: 7.9,
+    133.5: 9.6,
+    134: 46.8,
+    134.5: 84.8,
+    135: 122.8,
+}
 
 
 @pytest.mark.parametrize("sensor", SIGMA)
@@ -176,8 +187,7 @@ def test_gradient_of_the_depth_interpolation_is_the_traced_one():
         return mean[:, 1] * 1e-2, jnp.diagonal(covariance, 0, 1, 2)
 
     ours, wanted = (
-        jax.jit(jax.vmap(jax.jacrev(f, argnums=(0, 1)), (0, None)))
-        for f in (interpolated, traced)
+        jax.jit(jax.vmap(jax.jacrev(f, argnums=(0, 1)), (0, None))) for f in (interpolated, traced)
     )
     scene = 1 / jnp.array([5.1e3, 7e3, 1.7e4, 4.9e4]), lens.sensor
     assert_close(ours(*scene), wanted(*scene), 1e-10, 1e-18)
@@ -294,7 +304,9 @@ def test_a_lens_fixed_inside_jit_is_a_known_scene():
     for order in (None, 3):
         scaled = jax.jit(lambda s, n=order: s * psf_moments(lens, 0.0, 25e3, RGB, order=n)[1])
         assert "while" not in str(jax.make_jaxpr(scaled)(1.0))
-        np.testing.assert_allclose(scaled(2.0), 2 * psf_moments(lens, 0.0, 25e3, RGB, order=order)[1])
+        np.testing.assert_allclose(
+            scaled(2.0), 2 * psf_moments(lens, 0.0, 25e3, RGB, order=order)[1]
+        )
 
 
 @pytest.mark.parametrize("field, name", [(0.0, "double_gauss"), (0.15, "cooke_triplet")])
@@ -309,5 +321,7 @@ def test_an_eager_gradient_is_that_of_a_program(field, name):
     order = pupil_order(lens, field, 5e3, RGB)
     scene = lens.sensor, lens.curvature
     whole = jax.jit(jax.value_and_grad(partial(size, order=order), (0, 1)))(*scene)
-    for a, b in zip(jax.tree.leaves(jax.value_and_grad(size, (0, 1))(*scene)), jax.tree.leaves(whole)):
+    for a, b in zip(
+        jax.tree.leaves(jax.value_and_grad(size, (0, 1))(*scene)), jax.tree.leaves(whole)
+    ):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * float(jnp.max(jnp.abs(b))))

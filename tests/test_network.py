@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drt_jax import red_net
-from drt_jax.network import count_parameters
+from drt_jax.learn.network import count_parameters
 
 
 def test_parameter_count_of_the_paper():
@@ -28,7 +28,9 @@ def test_against_a_plain_numpy_network(skip_every, input_skip):
         out = np.zeros((*x.shape[:3], p["bias"].size)) + np.asarray(p["bias"])
         for i in range(3):
             for j in range(3):
-                out += padded[:, i : i + x.shape[1], j : j + x.shape[2]] @ np.asarray(p["kernel"][i, j])
+                out += padded[:, i : i + x.shape[1], j : j + x.shape[2]] @ np.asarray(
+                    p["kernel"][i, j]
+                )
         return out
 
     x, outputs = image, []

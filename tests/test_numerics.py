@@ -21,7 +21,9 @@ def test_unbiased_elsewhere():
     x = jnp.array([1e-300, 1e-9, 2.0, 1e300])
     np.testing.assert_array_equal(safe_sqrt(x), jnp.sqrt(x))
     np.testing.assert_array_equal(safe_divide(jnp.ones(4), x), 1 / x)
-    np.testing.assert_allclose(jax.vmap(jax.grad(safe_sqrt))(x[1:3]), 0.5 / np.sqrt(x[1:3]), rtol=1e-15)
+    np.testing.assert_allclose(
+        jax.vmap(jax.grad(safe_sqrt))(x[1:3]), 0.5 / np.sqrt(x[1:3]), rtol=1e-15
+    )
 
 
 def test_values_are_known_while_they_are_differentiated_eagerly():

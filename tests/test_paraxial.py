@@ -121,11 +121,17 @@ def test_afocal_lens_is_infinite_and_has_no_nan():
 
 CASSEGRAIN = {
     "surfaces": [
-        {"radius": -1000, "conic": -1, "mirror": True, "semi_diameter": 100, "stop": True,
-         "thickness": -375.0},
+        {
+            "radius": -1000,
+            "conic": -1,
+            "mirror": True,
+            "semi_diameter": 100,
+            "stop": True,
+            "thickness": -375.0,
+        },
         {"radius": -1000 / 3, "conic": -4.0, "mirror": True, "thickness": 475.0},
     ]
-}  # fmt: skip
+}
 
 
 def test_cassegrain():
@@ -144,24 +150,41 @@ def test_cassegrain():
 IMMERSED = {
     "object": {"index": 1.2},
     "surfaces": [
-        {"radius": 40, "conic": -0.7, "coefficients": {2: 3e-4, 4: -2e-6}, "thickness": 6,
-         "glass": "N-SK16"},
+        {
+            "radius": 40,
+            "conic": -0.7,
+            "coefficients": {2: 3e-4, 4: -2e-6},
+            "thickness": 6,
+            "glass": "N-SK16",
+        },
         {"radius": -90, "coefficients": {4: 3e-6}, "thickness": 4},
         {"curvature": 0, "semi_diameter": 5, "stop": True, "thickness": 3},
-        {"radius": 60, "form": "odd_asphere", "conic": 0.5, "coefficients": {2: -2e-4, 4: 1e-6},
-         "thickness": 3, "glass": "SF10"},
+        {
+            "radius": 60,
+            "form": "odd_asphere",
+            "conic": 0.5,
+            "coefficients": {2: -2e-4, 4: 1e-6},
+            "thickness": 3,
+            "glass": "SF10",
+        },
         {"radius": -50, "glass": "water"},
     ],
     "sensor": 150.0,
-}  # fmt: skip
+}
 MANGIN = {
     "surfaces": [
         {"radius": -150, "conic": 0.4, "index": 1.5, "thickness": 12.0},
-        {"radius": -200, "coefficients": {4: 2e-8}, "mirror": True, "semi_diameter": 20.0,
-         "stop": True, "thickness": -12.0},
+        {
+            "radius": -200,
+            "coefficients": {4: 2e-8},
+            "mirror": True,
+            "semi_diameter": 20.0,
+            "stop": True,
+            "thickness": -12.0,
+        },
         {"radius": -150, "conic": 0.4, "thickness": -80.0},
     ]
-}  # fmt: skip
+}
 THIRD = {
     "double_gauss": ("double_gauss", 2000.0),
     "immersed": (IMMERSED, 200.0),
@@ -220,8 +243,15 @@ def test_third_order_of_stigmatic_surfaces_and_of_the_mirror():
 
 
 def test_third_order_needs_an_axis():
-    entry = {"form": "toroid", "radius": 50, "radius_x": 40, "index": 1.5, "stop": True,
-             "semi_diameter": 3.0, "thickness": 90.0}  # fmt: skip
+    entry = {
+        "form": "toroid",
+        "radius": 50,
+        "radius_x": 40,
+        "index": 1.5,
+        "stop": True,
+        "semi_diameter": 3.0,
+        "thickness": 90.0,
+    }
     with pytest.raises(ValueError, match="of the form toroid"):
         drt_jax.third_order(load_lens({"surfaces": [entry]}), 0.1, np.inf, GREEN)
 
@@ -274,8 +304,13 @@ def test_gradients_batches_and_one_program_for_all():
     reference = jnp.ones((20, 3))
     reference = merit(lens)[1]
     leaves = ("curvature", "thickness", "conic", "coefficients", "semi_diameter")
-    step = {"curvature": 1e-5, "thickness": 1e-2, "conic": 1e-2, "coefficients": 1e-8,
-            "semi_diameter": 1e-2}  # fmt: skip
+    step = {
+        "curvature": 1e-5,
+        "thickness": 1e-2,
+        "conic": 1e-2,
+        "coefficients": 1e-8,
+        "semi_diameter": 1e-2,
+    }
     moves = []
     for name in leaves:
         leaf = getattr(lens, name)

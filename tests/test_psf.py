@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from drt_jax.psf import SeparableKernel, gaussian_psf
+from drt_jax.image.kernel import SeparableKernel, gaussian_psf
 
 PIXEL = 4.4e-3
 
@@ -22,8 +22,9 @@ def pixel_integral(mean, covariance, x, y):
     return value
 
 
-@pytest.mark.parametrize("covariance", [[[4, 1.5], [1.5, 2]], [[0.3, -0.1], [-0.1, 0.2]],
-                                        [[9, 8.5], [8.5, 9]]])  # fmt: skip
+@pytest.mark.parametrize(
+    "covariance", [[[4, 1.5], [1.5, 2]], [[0.3, -0.1], [-0.1, 0.2]], [[9, 8.5], [8.5, 9]]]
+)
 def test_rotated_kernel_is_the_pixel_integral(covariance):
     mean, covariance = np.array([0.3, -0.2]), np.array(covariance, float)
     kernel = gaussian_psf(
@@ -49,17 +50,27 @@ def test_diagonal_covariance_gives_the_separable_kernel(form):
 def test_equation_5_as_printed():
     covariance = np.array([[4.0, 1.5], [1.5, 2.0]])
     kernel = gaussian_psf(
-        jnp.array([[0.5, 0.0]]) * PIXEL, jnp.asarray(covariance[None]) * PIXEL**2, PIXEL, 5, "sampled"
+        jnp.array([[0.5, 0.0]]) * PIXEL,
+        jnp.asarray(covariance[None]) * PIXEL**2,
+        PIXEL,
+        5,
+        "sampled",
     )[0]
     d = np.array([1 - 0.5, -2.0])
-    wanted = np.exp(-d @ np.linalg.inv(covariance) @ d / 2) / (2 * np.pi * np.sqrt(np.linalg.det(covariance)))
+    wanted = np.exp(-d @ np.linalg.inv(covariance) @ d / 2) / (
+        2 * np.pi * np.sqrt(np.linalg.det(covariance))
+    )
     np.testing.assert_allclose(kernel[0, 3], wanted, rtol=1e-13)
 
 
 def test_energy_of_the_printed_form_is_lost_or_made_up():
     """Why it is not the default: 11 % of the light at sigma 24 px, more than all at 0.3 px."""
     energy = [
-        float(jnp.sum(gaussian_psf(jnp.zeros((1, 2)), jnp.full((1, 2), s**2), 1.0, 21, "sampled").dense()))
+        float(
+            jnp.sum(
+                gaussian_psf(jnp.zeros((1, 2)), jnp.full((1, 2), s**2), 1.0, 21, "sampled").dense()
+            )
+        )
         for s in (24.0, 0.3)
     ]
     assert 0.10 < energy[0] < 0.12 and energy[1] > 1.2

@@ -15,8 +15,8 @@ import yaml
 
 import drt_jax
 from drt_jax import Status, load_lens, trace_rays
-from drt_jax.paraxial import trace_yu
-from drt_jax.surface import Shape, sag, sag_derivatives
+from drt_jax.lens.paraxial import trace_yu
+from drt_jax.lens.surface import Shape, sag, sag_derivatives
 
 INF = np.inf
 
@@ -174,12 +174,14 @@ def lsst(cases):
     z = [pupil["z"], *(row["z"] for row in rows)]
     surfaces = [
         {
-            "radius": row["R"], "conic": row.get("k", 0.0), "coefficients": row.get("A", {}),
+            "radius": row["R"],
+            "conic": row.get("k", 0.0),
+            "coefficients": row.get("A", {}),
             "thickness": after - here,
             **({"mirror": True} if "mirror" in row else {"index": row["n_after"]}),
         }
         for row, here, after in zip(rows[:-1], z[1:], z[2:])
-    ]  # fmt: skip
+    ]
     return behind_stop(surfaces, -pupil["z"], pupil["radius"])
 
 
@@ -205,9 +207,14 @@ def test_c13_toroid(cases):
     entry, reference = cases["C13"]["prescription"], cases["C13"]["reference"]
     a1, a2 = entry["a"]
     toroid = {
-        "form": "toroid", "radius": entry["Ry"], "conic": entry["k"], "radius_x": entry["Rx"],
-        "coefficients": {2: a1, 4: a2}, "thickness": entry["thickness"], "index": entry["n"],
-    }  # fmt: skip
+        "form": "toroid",
+        "radius": entry["Ry"],
+        "conic": entry["k"],
+        "radius_x": entry["Rx"],
+        "coefficients": {2: a1, 4: a2},
+        "thickness": entry["thickness"],
+        "index": entry["n"],
+    }
     lens = behind_stop([toroid, {"radius": INF, "thickness": 10.0}], 2.0, 5.0)
     starts = np.array([ray["start"] for ray in reference["rays"]])
     rays = trace_rays(lens, 0.0, INF, [0.55], starts / 5.0)
@@ -359,8 +366,9 @@ def test_c19_ball_lens_and_thick_lens(front, back, thickness, wanted):
 
 def test_c19_critical_angle():
     """From n = 1.5 into air a plane reflects totally from 41.810314895778596 degrees on."""
-    lens = behind_stop([{"radius": INF, "index": 1.0, "thickness": 5.0}], 5.0, 1.0,
-                       object={"index": 1.5})  # fmt: skip
+    lens = behind_stop(
+        [{"radius": INF, "index": 1.0, "thickness": 5.0}], 5.0, 1.0, object={"index": 1.5}
+    )
     critical = np.radians(41.810314895778596)
     for angle, wanted in ((critical - 1e-6, Status.OK), (critical + 1e-6, Status.TIR)):
         rays = trace_rays(lens, angle, INF, [0.55], on_y(0.0))

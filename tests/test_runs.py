@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax.config import ConfigError
-from drt_jax.runs import Run, deferred_interrupt
+from drt_jax.runs.config import ConfigError
+from drt_jax.runs.folder import Run, deferred_interrupt
 
 
 @dataclasses.dataclass(frozen=True)

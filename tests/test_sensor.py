@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from drt_jax.psf import SeparableKernel, gaussian_psf
-from drt_jax.sensor import convolve, sensor_layer
+from drt_jax.image.kernel import SeparableKernel, gaussian_psf
+from drt_jax.image.sensor import convolve, sensor_layer
 
 
 def kernels(dense):
     mean = jnp.array([[0.4, -1.2], [0.0, 0.3], [-2.0, 0.0]])
-    covariance = jnp.array([[[4.0, 1.5], [1.5, 2.0]], [[0.3, 0.1], [0.1, 0.2]], [[9.0, 0], [0, 3.0]]])
+    covariance = jnp.array(
+        [[[4.0, 1.5], [1.5, 2.0]], [[0.3, 0.1], [0.1, 0.2]], [[9.0, 0], [0, 3.0]]]
+    )
     return gaussian_psf(mean, covariance if dense else jnp.diagonal(covariance, 0, 1, 2), 1.0, 9)
 
 
@@ -75,7 +77,9 @@ def test_noise_is_white_of_the_given_strength_and_follows_the_key():
     np.testing.assert_allclose(np.std(one), 0.03, rtol=0.02)
     neighbours = np.corrcoef(np.ravel(one[:, :, 1:]), np.ravel(one[:, :, :-1]))[0, 1]
     assert abs(neighbours) < 0.02
-    np.testing.assert_array_equal(one, sensor_layer(scenes, kernels(False), 0.03, jax.random.key(1)))
+    np.testing.assert_array_equal(
+        one, sensor_layer(scenes, kernels(False), 0.03, jax.random.key(1))
+    )
     assert np.any(one != sensor_layer(scenes, kernels(False), 0.03, jax.random.key(2)))
 
 

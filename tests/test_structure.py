@@ -10,10 +10,36 @@ import drt_jax
 ROOT = pathlib.Path(drt_jax.__file__).parent
 # From what knows least to what knows most.
 ORDER = (
-    "numerics", "surface", "glass", "lens", "prescription", "paraxial", "pupil", "fermat",
-    "sequential", "aiming", "search", "implicit", "snell", "trace", "wavefront", "vignetting",
-    "moments", "depth", "psf", "sensor", "convolution", "network", "adam", "data", "config", "runs", "train", "drawing", "plot",
-)  # fmt: skip
+    "numerics",
+    "surface",
+    "glass",
+    "lens",
+    "prescription",
+    "paraxial",
+    "pupil",
+    "fermat",
+    "sequential",
+    "aiming",
+    "search",
+    "implicit",
+    "snell",
+    "trace",
+    "wavefront",
+    "vignetting",
+    "moments",
+    "depth",
+    "psf",
+    "sensor",
+    "convolution",
+    "network",
+    "adam",
+    "data",
+    "config",
+    "runs",
+    "train",
+    "drawing",
+    "plot",
+)
 NO_OPTICS = ("convolution", "network", "adam", "data", "config", "runs", "plot")
 OPTICS = ORDER[: ORDER.index("sensor") + 1]
 ONLY = {"optimistix": "implicit", "matplotlib": "plot", "skimage": ("data", "train")}

@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 import yaml
 
-from drt_jax.surface import (
-    FORMS, MIRRORED, ROTATIONAL, Shape, by_form, domain, powers_xy, sag, sag_derivatives,
+from drt_jax.lens.surface import (
+    FORMS,
+    MIRRORED,
+    ROTATIONAL,
+    Shape,
+    by_form,
+    domain,
+    powers_xy,
+    sag,
+    sag_derivatives,
     vertex_curvature,
-)  # fmt: skip
+)
 
 
 def conic(r2, c, k):
@@ -63,9 +71,13 @@ SHAPES = {
     "toroid": ("toroid", 1 / 50, -0.5, [1 / 100, 1e-5, 2e-6]),
     "toroid, other sense": ("toroid", 1 / 50, -0.5, [-1 / 70]),
     "toroid, flat in x": ("toroid", 1 / 50, 0.0, [0.0, 1e-4]),
-    "polynomial": ("polynomial_xy", 1 / 70, -1.0,
-                   [1e-3, -2e-3, 1e-4, 3e-4, -2e-4, 1e-6, 2e-6, 3e-6, 4e-6]),
-}  # fmt: skip
+    "polynomial": (
+        "polynomial_xy",
+        1 / 70,
+        -1.0,
+        [1e-3, -2e-3, 1e-4, 3e-4, -2e-4, 1e-6, 2e-6, 3e-6, 4e-6],
+    ),
+}
 
 
 def shape_of(name, dtype=jnp.float64):
@@ -141,7 +153,9 @@ def test_forms_side_by_side_are_each_their_own():
     shape = Shape(
         jnp.stack([r.curvature for r in rows])[:, None],
         jnp.stack([r.conic for r in rows])[:, None],
-        jnp.stack([jnp.pad(r.coefficients, (0, widest - len(r.coefficients))) for r in rows], 1)[..., None],
+        jnp.stack([jnp.pad(r.coefficients, (0, widest - len(r.coefficients))) for r in rows], 1)[
+            ..., None
+        ],
     )
     w = jnp.asarray(np.random.default_rng(0).uniform(-5, 5, (2, len(names), 4)))
     together = by_form(sag_derivatives, w, shape, tuple(SHAPES[n][0] for n in names))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Status, load_lens, pupil, trace_rays, trace_snell
-from drt_jax.surface import Shape
+from drt_jax import Status, load_lens, trace_rays, trace_snell
+from drt_jax.pupil import rules as pupil
+from drt_jax.lens.surface import Shape
 
 from .conftest import LENSES, RGB
 
@@ -145,7 +146,7 @@ def test_a_surface_that_does_nothing_drops_out(gap, curvature):
     assert np.max(np.abs(np.cross(dummy - before, after - dummy))) < 1e-12  # on the ray ...
     sphere = dummy - jnp.array([0.0, 0.0, float(padded.vertices[gap + 1])])
     shape = Shape(jnp.array(curvature), jnp.array(0.0), jnp.zeros(0))
-    sag = drt_jax.surface.sag(jnp.moveaxis(sphere[..., :2], -1, 0), shape)
+    sag = drt_jax.lens.surface.sag(jnp.moveaxis(sphere[..., :2], -1, 0), shape)
     np.testing.assert_allclose(sphere[..., 2], sag, atol=1e-12)  # ... and on the surface
 
 

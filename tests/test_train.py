@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import train
-from drt_jax.psf import gaussian_psf
-from drt_jax.sensor import convolve
+from drt_jax.learn import train
+from drt_jax.image.kernel import gaussian_psf
+from drt_jax.image.sensor import convolve
 
 from .conftest import RGB
 
@@ -32,7 +32,11 @@ def test_imager_is_the_chain_by_hand():
     imager = train.make_imager(blur, None, CAMERA)
     sensor = jnp.array(133.2)
     truth, image, restored, sigma = imager(
-        {"optics": {"sensor": sensor}}, scenes(), jnp.array(25000.0), np.float32(0), jax.random.key(0)
+        {"optics": {"sensor": sensor}},
+        scenes(),
+        jnp.array(25000.0),
+        np.float32(0),
+        jax.random.key(0),
     )
     x = scenes().astype(np.float32) / np.float32(255)
     np.testing.assert_array_equal(truth, x[:, 4:-4, 4:-4])
@@ -72,9 +76,7 @@ def test_training_moves_the_sensor_to_focus_and_compiles_once(start):
     def report(first, metrics, state):
         reports.append((first, metrics))
 
-    state = train.fit(
-        step, state, itertools.repeat(scenes()), 0.01, 0, 40, 16, report
-    )
+    state = train.fit(step, state, itertools.repeat(scenes()), 0.01, 0, 40, 16, report)
     assert [first for first, _ in reports] == [0, 16, 32]
     assert reports[-1][1]["loss"].shape == (8,)
     assert abs(float(state[0]["optics"]["sensor"]) - 133.39) < 0.15
@@ -87,10 +89,16 @@ def test_training_stops_when_asked_with_a_report():
 
     seen, stop = [], [False, True]
     state = train.fit(
-        step, 0, itertools.repeat(None), 0.0, 3, 99, 10,
+        step,
+        0,
+        itertools.repeat(None),
+        0.0,
+        3,
+        99,
+        10,
         lambda start, metrics, state: seen.append((start, metrics["loss"].tolist(), state)),
         lambda: len(seen) == 1 and stop.pop(0),
-    )  # fmt: skip
+    )
     assert seen == [(3, list(range(3, 13)), 10), (13, [13.0, 14.0], 12)] and state == 12
 
 
@@ -102,7 +110,9 @@ def test_a_colour_without_rays_is_black_and_loses_no_gradient():
     imager = train.make_imager(blur, None, CAMERA)
 
     def image(sensor):
-        return imager({"optics": {"sensor": sensor}}, scenes(), 1.0, np.float32(0), jax.random.key(0))
+        return imager(
+            {"optics": {"sensor": sensor}}, scenes(), 1.0, np.float32(0), jax.random.key(0)
+        )
 
     truth, sensor_image, _, sigma = image(1.0)
     np.testing.assert_allclose(sensor_image, truth * np.array([1, 0.5, 0], np.float32), rtol=1e-6)
@@ -115,11 +125,15 @@ def test_depth_is_uniform_and_steps_depend_on_seed_and_index_alone():
     init, step = train.make_step(imager, {"optics": 0.0}, (1e4, 5e4), seed=3)
     depths = []
     for k in range(200):
-        _, metrics = step(init({"optics": {"sensor": jnp.array(133.0)}}), scenes(), np.float32(0), np.int32(k))
+        _, metrics = step(
+            init({"optics": {"sensor": jnp.array(133.0)}}), scenes(), np.float32(0), np.int32(k)
+        )
         depths.append(float(metrics["depth_mm"]))
     assert 1e4 <= min(depths) < 1.1e4 and 4.9e4 < max(depths) <= 5e4
     np.testing.assert_allclose(np.mean(depths), 3e4, atol=2.5e3)
-    _, again = step(init({"optics": {"sensor": jnp.array(133.0)}}), scenes(), np.float32(0), np.int32(7))
+    _, again = step(
+        init({"optics": {"sensor": jnp.array(133.0)}}), scenes(), np.float32(0), np.int32(7)
+    )
     assert float(again["depth_mm"]) == depths[7]
 
 
@@ -129,7 +143,9 @@ def test_network_stays_in_float32():
     init, step = train.make_step(
         imager, {"optics": 1e-2, "network": 1e-3}, (25000.0, 25000.0), seed=0
     )
-    state = init({"optics": {"sensor": jnp.array(133.0)}, "network": init_network(jax.random.key(0))})
+    state = init(
+        {"optics": {"sensor": jnp.array(133.0)}, "network": init_network(jax.random.key(0))}
+    )
     text = step.lower(state, scenes(), np.float32(0), np.int32(0)).as_text()
     convolutions = [line for line in text.splitlines() if "stablehlo.convolution" in line]
     assert convolutions and all("xf32>" in line and "f64" not in line for line in convolutions)
@@ -148,7 +164,9 @@ def test_metrics_of_known_images():
 
     result = train.evaluate(imager, {}, scenes(count=5), 1.0, 0.0, 0, batch=2)
     np.testing.assert_allclose(
-        [result["sensor_mae"], result["sensor_rmse"], result["sensor_psnr"]], [0.1, 0.1, 20], rtol=1e-5
+        [result["sensor_mae"], result["sensor_rmse"], result["sensor_psnr"]],
+        [0.1, 0.1, 20],
+        rtol=1e-5,
     )
     assert result["mae"] == result["rmse"] == 0 and result["ssim"] == 1
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drt_jax import focus_moments, load_lens, psf_moments, pupil_order, trace_rays
-from drt_jax.vignetting import ClippedPupil
+from drt_jax.pupil.clipped import ClippedPupil
 
 GREEN = (0.53,)
 
@@ -71,8 +71,14 @@ def test_overlap_of_two_discs():
 
 
 @pytest.mark.parametrize(
-    "name", ["on axis", *(pytest.param(n, marks=pytest.mark.slow)
-          for n in ("front", "front and rear", "any direction"))]
+    "name",
+    [
+        "on axis",
+        *(
+            pytest.param(n, marks=pytest.mark.slow)
+            for n in ("front", "front and rear", "any direction")
+        ),
+    ],
 )
 def test_converges_like_an_open_pupil(name):
     field, lens = SCENES[name]
@@ -120,8 +126,13 @@ def test_gradients_follow_the_boundary(name):
     assert isinstance(rule, ClippedPupil)
     inside = jax.jit(jax.grad(blur))(lens, rule)
     eager = jax.grad(lambda lens: blur(lens, rule.order))(lens)
-    for leaf, k in (("curvature", 2), ("thickness", 4), ("semi_diameter", 0), ("semi_diameter", 10),
-                    ("semi_diameter", 5)):  # fmt: skip
+    for leaf, k in (
+        ("curvature", 2),
+        ("thickness", 4),
+        ("semi_diameter", 0),
+        ("semi_diameter", 10),
+        ("semi_diameter", 5),
+    ):
         value = getattr(lens, leaf)
         h = 1e-4 * max(abs(float(value[k])), 1e-2)
         away = lambda s: dataclasses.replace(lens, **{leaf: value.at[k].add(s)})  # noqa: E731

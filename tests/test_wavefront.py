@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Status, load_lens, pupil, trace_snell, wavefront
+from drt_jax import Status, load_lens, trace_snell
+from drt_jax.pupil import rules as pupil
+from drt_jax.image import wavefront
 
 WAVE = 0.55
 HEIGHTS = np.stack([np.zeros(5), np.linspace(-1, 1, 5)], axis=1)
@@ -191,6 +193,4 @@ def test_rms_of_pure_defocus():
     points, weights = pupil.disc(4, 5)
     opd = 0.7 * jnp.sum(jnp.asarray(points) ** 2, axis=0)[None]
     wave = drt_jax.Wavefront(opd, jnp.zeros(opd.shape, jnp.int32), jnp.zeros((1, 2)))
-    np.testing.assert_allclose(
-        drt_jax.rms_wavefront(wave, weights), 0.7 / np.sqrt(12), rtol=1e-12
-    )
+    np.testing.assert_allclose(drt_jax.rms_wavefront(wave, weights), 0.7 / np.sqrt(12), rtol=1e-12)

@@ -1,0 +1,1 @@
+"""What the rays make of a point: moments, wavefront, kernels, the sensor."""

@@ -1,0 +1,139 @@
+"""Moments over a range of object distances, and the cheapest model for what is trained.
+
+Where the object distance varies, the polynomials of `moments` are interpolated in 1/distance,
+in which they are smooth to infinity.
+"""
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..lens.lens import Lens
+from .moments import FocusMoments, focus_moments, pupil_order
+
+__all__ = ["DepthMoments", "depth_moments", "moments_model"]
+
+_MAX_NODES = 64
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DepthMoments:
+    """`FocusMoments` as polynomials in 1/distance: no ray is traced for a new depth either.
+
+    near, far: the range in mm. series: a `FocusMoments` whose leaves carry a first axis of
+    Chebyshev coefficients in 1/distance.
+    """
+
+    near: Array
+    far: Array
+    series: FocusMoments
+
+    def at(self, distance: ArrayLike) -> FocusMoments:
+        """The moments of an object at `distance` mm, within near and far."""
+        low, high = 1 / self.far, 1 / self.near
+        x = (2 / jnp.asarray(distance, low.dtype) - high - low) / (high - low)
+        count = self.series.mean.shape[0]
+        basis = [jnp.ones_like(x), x]
+        while len(basis) < count:
+            basis.append(2 * x * basis[-1] - basis[-2])
+        basis = jnp.stack(basis[:count])
+        return jax.tree.map(lambda c: jnp.tensordot(basis, c, axes=1), self.series)
+
+
+def depth_moments(
+    lens: Lens,
+    field: ArrayLike,
+    near: float,
+    far: float,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-9,
+) -> DepthMoments:
+    """Moments for any sensor position and any distance between `near` and `far`, in mm.
+
+    As many Chebyshev nodes in 1/distance as bring the last coefficients of the moments below
+    `tolerance` relative to the first; each node is traced with as many rays as it needs.
+    """
+    if not 0 < near < far:
+        raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
+    low, high = 1 / far, 1 / near
+    count = 4
+    while True:
+        angle = np.pi * (np.arange(count) + 0.5) / count
+        nodes = (high + low) / 2 + (high - low) / 2 * np.cos(angle)
+        transform = 2 / count * np.cos(np.outer(np.arange(count), angle))
+        transform[0] /= 2
+        traced = [focus_moments(lens, field, 1 / node, wavelengths, tolerance) for node in nodes]
+        series = jax.tree.map(
+            lambda *values: jnp.tensordot(
+                jnp.asarray(transform, values[0].dtype), jnp.stack(values), axes=1
+            ),
+            *traced,
+        )
+        tail = [
+            float(jnp.max(jnp.abs(c[-2:])) / jnp.max(jnp.abs(c)))
+            for c in (series.spread, series.mean)
+            if jnp.any(c != 0)
+        ]
+        done = max(tail, default=0.0) <= tolerance
+        if not done and count >= _MAX_NODES:
+            warnings.warn(
+                f"the moments between {near:g} and {far:g} mm are interpolated to "
+                f"{max(tail):.1e} only, not to {tolerance:.1e}; narrow the range",
+                stacklevel=2,
+            )
+        if done or count >= _MAX_NODES:
+            dtype = lens.curvature.dtype
+            return DepthMoments(jnp.asarray(near, dtype), jnp.asarray(far, dtype), series)
+        count *= 2
+
+
+def moments_model(
+    lens: Lens,
+    trained: tuple[str, ...],
+    field: ArrayLike,
+    distances: tuple[float, float],
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]]:
+    """The cheapest exact model of the moments for what is trained.
+
+    `trained` names fields of `Lens`; `distances` = (near, far) in mm, equal for one depth.
+    Returns their initial values and a function (values, distance) -> (centroid, covariance
+    as in `FocusMoments.at`, and the fraction (W,) of the light that passes). With the sensor
+    alone, nothing is traced inside that function: polynomials in its position, and in
+    1/distance when the depth varies. Anything else traces the rays anew.
+    """
+    near, far = distances
+    values = {name: getattr(lens, name) for name in trained}
+    if set(trained) <= {"sensor"}:
+        if near == far:
+            focus = focus_moments(lens, field, near, wavelengths, tolerance)
+            at = lambda distance: focus  # noqa: E731
+        else:
+            at = depth_moments(lens, field, near, far, wavelengths, tolerance).at
+
+        def from_plane(values, distance):
+            moments = at(distance)
+            return *moments.at(values.get("sensor", lens.sensor)), moments.passed
+
+        return values, from_plane
+    orders = [
+        pupil_order(lens, field, distance, wavelengths, tolerance, moving=True)
+        for distance in {near, far}
+    ]
+    # A rule fitted to a clipped pupil holds for one distance.
+    order = orders[0] if len(orders) == 1 else max(getattr(o, "order", o) for o in orders)
+
+    def retrace(values, distance):
+        moved = dataclasses.replace(lens, **values)
+        moments = focus_moments(moved, field, distance, wavelengths, order=order)
+        return *moments.at(moved.sensor), moments.passed
+
+    return values, retrace

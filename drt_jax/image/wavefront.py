@@ -1,0 +1,130 @@
+"""Optical path difference of the rays against a sphere round the image point.
+
+For a colour, the chief ray (through the centre of the stop) meets the sensor at C. The
+reference sphere has its centre at C and its radius R along the chief ray to the plane of the
+paraxial exit pupil, positive against the light. Written in kappa = 1 / R, so that a telecentric
+exit pupil (kappa = 0) is a point like any other: a ray with the unit direction d that meets
+the sensor at P = C + e met the sphere at the distance R + t before P, where
+
+    t = e.d + kappa X / (1 + sqrt(1 + kappa^2 X)),    X = (e.d)^2 - e^2.
+
+Source: Welford, Aberrations of Optical Systems (1986), ch. 7.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..rays.fermat import Status
+from ..lens.glass import check_wavelengths
+from ..lens.lens import Lens, rotation_matrix
+from ..numerics import safe_divide, safe_sqrt
+from ..lens.paraxial import chief_ray_at_image
+from ..rays.trace import trace_bundle, typed_scene
+
+__all__ = ["Wavefront", "reference_curvature", "rms_wavefront", "wavefront"]
+
+_MM = 1e-3  # per um
+
+
+class Wavefront(NamedTuple):
+    """Optical path differences of rays.
+
+    opd (W, Q) in waves, path of the chief ray less path of the ray, both to the reference
+    sphere: positive where the wavefront is ahead of the sphere; 0 for a ray that failed or is
+    clipped. status (W, Q), int32, see `Status`; where the chief ray of a colour failed, no ray
+    has an opd, and its status is its own or, if that is OK or CLIPPED, the chief ray's.
+    image (W, 2), mm: where the chief rays meet the sensor, along its axes; 0 if they failed.
+    """
+
+    opd: Array
+    status: Array
+    image: Array
+
+
+def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
+    """1 / distance (W,) from the paraxial exit pupil to the sensor, along the light, 1/mm.
+
+    Positive for a pupil that the light has passed before the sensor, 0 for a telecentric lens.
+    Tilts and decentres are left out. `wavelengths` (W,) in um.
+    """
+    height, slope = chief_ray_at_image(lens, wavelengths)
+    at_sensor = height + slope * (lens.sensor - lens.vertices[-1])
+    return safe_divide(slope * jnp.asarray(lens.senses[-1], slope.dtype), at_sensor)
+
+
+def wavefront(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    pupil: ArrayLike,
+    forward: bool = False,
+    curvature: ArrayLike | None = None,
+) -> Wavefront:
+    """Optical path difference of the rays that cross the stop at given points.
+
+    `field`, `distance`, `wavelengths` (W,), `pupil` (Q, 2) and `forward` as in `trace_rays`.
+    `curvature` () or (W,) in 1/mm: kappa of the reference sphere along the axis, in place of
+    `reference_curvature`; needed for a lens folded by tilted mirrors, whose exit pupil the
+    paraxial trace cannot know. Differentiable like `trace_rays`; the reference sphere moves with
+    the lens. ValueError for a known wavelength outside the range of a glass.
+    """
+    check_wavelengths(lens.glasses, wavelengths)
+    points = jnp.asarray(pupil, lens.curvature.dtype)
+    kappa = None if curvature is None else jnp.asarray(curvature, lens.curvature.dtype)
+    scene = typed_scene(lens, field, distance, wavelengths)
+    return _wavefront(*scene, points, kappa, forward)
+
+
+@partial(jax.jit, static_argnums=6)
+def _wavefront(
+    lens: Lens,
+    field: Array,
+    distance: Array,
+    wavelengths: Array,
+    pupil: Array,
+    curvature: Array | None,
+    forward: bool,
+) -> Wavefront:
+    points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil]).T  # the chief ray first
+    bundle = trace_bundle(lens, field, distance, wavelengths, points, forward)
+    whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+    chief_ok = whole[:, :1]
+    good = chief_ok & (bundle.status == Status.OK)
+
+    if curvature is None:
+        curvature = reference_curvature(lens, wavelengths)
+    # cosine between the chief ray and the axis of the lens
+    axis = jnp.array([0, 0, 1], points.dtype)
+    axis = axis if lens.tilt is None else rotation_matrix(lens.tilt[-1])[2]
+    cosine = jnp.abs(jnp.sum(axis[:, None] * bundle.arrival[..., 0], axis=0))
+    kappa = (curvature * cosine)[:, None]
+
+    hit = bundle.hits[:, -1]
+    image = jnp.where(chief_ok, hit[..., :1], 0)
+    e = jnp.where(good, hit - image, 0)
+    along = jnp.sum(e * bundle.arrival[:-1], axis=0)
+    x = along**2 - jnp.sum(e**2, axis=0)
+    to_sphere = along + kappa * x / (1 + safe_sqrt(1 + kappa**2 * x))
+    path = bundle.path[:, :1] - bundle.path + lens.index(wavelengths)[-1][:, None] * to_sphere
+    opd = jnp.where(good, path, 0) / (_MM * wavelengths[:, None])
+    status = jnp.where(chief_ok | ~whole, bundle.status, bundle.status[:, :1])
+    return Wavefront(opd[:, 1:], status[:, 1:], image[..., 0].T)
+
+
+def rms_wavefront(wave: Wavefront, weights: ArrayLike) -> Array:
+    """Root mean square (W,) of the opd about its mean, in waves; 0 if no ray has one.
+
+    `weights` (Q,) of the points, as from `pupil.disc`; failed and clipped rays count for
+    nothing. The tilt that the chief ray leaves is kept.
+    """
+    good = wave.status == Status.OK
+    weight = jnp.where(good, jnp.asarray(weights, wave.opd.dtype), 0)
+    weight = safe_divide(weight, jnp.sum(weight, axis=1, keepdims=True))
+    mean = jnp.sum(weight * wave.opd, axis=1, keepdims=True)
+    return safe_sqrt(jnp.sum(weight * (wave.opd - mean) ** 2, axis=1))

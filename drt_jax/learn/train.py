@@ -1,0 +1,223 @@
+"""Joint training of optics and network: loss, jitted step, loop, evaluation."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+from skimage import metrics
+
+from .adam import adam, apply_updates
+from ..numerics import safe_sqrt
+from ..image.kernel import Form, gaussian_psf
+from ..image.sensor import sensor_layer
+
+__all__ = ["Camera", "evaluate", "fit", "make_imager", "make_step", "value_and_gradient"]
+
+Blur = Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]
+Restore = Callable[[Any, Array], Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """The sensor layer's constants: pixel pitch in um, kernel size in pixels (odd), kernel
+    form (see `psf`)."""
+
+    pixel_um: float = 4.4
+    kernel: int = 21
+    form: Form = "integrated"
+
+    def __post_init__(self) -> None:
+        if self.kernel < 1 or self.kernel % 2 == 0:
+            raise ValueError(f"camera.kernel: expected an odd number of pixels, got {self.kernel}")
+        if not self.pixel_um > 0:
+            raise ValueError(f"camera.pixel_um: expected a positive number, got {self.pixel_um}")
+
+
+def make_imager(
+    blur: Blur, restore: Restore | None, camera: Camera, forward: bool = False
+) -> Callable[..., tuple]:
+    """The chain moments -> PSF -> sensor layer -> network as one function.
+
+    `blur` as `moments_model` returns it; `restore` (parameters, images) -> images, None for a
+    camera without a network. `forward`: made for values and forward mode, which `make_step` uses
+    where a single number is trained. The result maps (parameters {"optics", "network"}, scenes
+    uint8 (B, H + K - 1, W + K - 1, C), distance mm, noise, key) to (truth, sensor image, restored
+    image), float32 (B, H, W, C), and the standard deviations (C,) of the blur along y in mm.
+    The kernel is centred on the mean centroid of the colours: patches are registered. A colour
+    that loses rays is darker by what it loses, and black without any.
+    """
+    margin = camera.kernel // 2
+
+    def imager(
+        parameters: dict[str, Any], scenes: Array, distance: Array, noise: ArrayLike, key: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        scenes = scenes.astype(jnp.float32) / 255
+        mean, covariance, passed = blur(parameters["optics"], distance)
+        kernel = gaussian_psf(
+            mean - jnp.mean(mean, axis=0),
+            covariance,
+            camera.pixel_um * 1e-3,
+            camera.kernel,
+            camera.form,
+        )
+        image = sensor_layer(scenes * passed.astype(jnp.float32), kernel, noise, key, forward)
+        restored = image if restore is None else restore(parameters["network"], image)
+        end = scenes.shape[1] - margin, scenes.shape[2] - margin
+        truth = scenes[:, margin : end[0], margin : end[1]]
+        variance = covariance[:, 1] if covariance.ndim == 2 else covariance[:, 1, 1]
+        return truth, image, restored, safe_sqrt(variance)
+
+    return imager
+
+
+def compiler_options() -> dict[str, str] | None:
+    """XLA options for a training step: on a CPU, a choice of passes with which a RED-Net step takes
+    a tenth less time (see docs/performance.md). Set for each compilation, never globally."""
+    if jax.default_backend() != "cpu":
+        return None
+    options = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_FAST_COMPILE"}
+    try:  # a release of jaxlib may not know it
+        jax.jit(lambda x: x + 1, compiler_options=options).lower(0.0).compile()
+    except Exception:
+        return None
+    return options
+
+
+def value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:
+    """((value, extras), gradient) of `loss` (parameters) -> (value, extras).
+
+    In forward mode where a single number is trained, such as the sensor position: it takes two
+    thirds of the time, and turns no images over (paper section 3 says when either mode pays).
+    """
+    leaves, structure = jax.tree.flatten(parameters)
+    if sum(leaf.size for leaf in leaves) > 1:
+        return jax.value_and_grad(loss, has_aux=True)(parameters)
+    ones = jax.tree.map(jnp.ones_like, parameters)
+    value, slope, extras = jax.jvp(loss, (parameters,), (ones,), has_aux=True)
+    gradients = [slope.astype(leaf.dtype).reshape(leaf.shape) for leaf in leaves]
+    return (value, extras), jax.tree.unflatten(structure, gradients)
+
+
+def make_step(
+    imager: Callable[..., tuple],
+    rates: dict[str, float],
+    depths: tuple[float, float],
+    seed: int,
+    vectorised: bool = False,
+) -> tuple[Callable, Callable]:
+    """Adam on the mean absolute error as (init, step).
+
+    `rates`: learning rates of the groups "optics" (mm for the sensor) and "network";
+    `depths`: the object distance of each step is uniform between them, mm. init(parameters)
+    -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the state donated.
+    Noise and depth are functions of `seed` and the step index. metrics: loss, sensor_mm,
+    sigma_um (mean over the colours), depth_mm, each () or, `vectorised` over the first axis
+    of all parameters, (N,).
+    """
+    init_adam, update = adam(rates)
+    near, far = depths
+
+    def init(parameters: dict[str, Any]) -> tuple[Any, Any]:
+        # A copy: the first step is given the buffers to overwrite. With its dtype spelt out,
+        # because a weakly typed start would have the step compiled again, and again.
+        parameters = jax.tree.map(lambda p: jnp.array(p, jnp.asarray(p).dtype), parameters)
+        make = jax.vmap(init_adam) if vectorised else init_adam
+        return parameters, make(parameters)
+
+    def step(state: tuple[Any, Any], scenes: Array, noise: Array, index: Array):
+        parameters, moments = state
+        noise_key, depth_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
+        distance = jax.random.uniform(depth_key, dtype=jnp.result_type(float))
+        distance = near + (far - near) * distance
+
+        def loss(parameters):
+            truth, _, restored, sigma = imager(parameters, scenes, distance, noise, noise_key)
+            return jnp.mean(jnp.abs(restored - truth)), jnp.mean(sigma)
+
+        (error, sigma), gradients = value_and_gradient(loss, parameters)
+        updates, moments = update(gradients, moments)
+        report = {"loss": error, "sigma_um": 1e3 * sigma, "depth_mm": distance}
+        if "sensor" in parameters["optics"]:
+            report["sensor_mm"] = parameters["optics"]["sensor"]
+        return (apply_updates(parameters, updates), moments), report
+
+    if vectorised:
+        step = jax.vmap(step, in_axes=(0, None, None, None))
+    return init, jax.jit(step, donate_argnums=0, compiler_options=compiler_options())
+
+
+def fit(
+    step: Callable,
+    state: Any,
+    scenes: Iterator[np.ndarray],
+    noise: float,
+    first: int,
+    last: int,
+    every: int,
+    report: Callable[[int, dict[str, np.ndarray], Any], None],
+    stopped: Callable[[], bool] = lambda: False,
+) -> Any:
+    """Run steps `first` to `last` - 1 and return the final state.
+
+    After every `every` steps, and at the end, report(start, metrics, state) is called with the
+    metrics of the steps since `start` stacked on the first axis. Between reports nothing waits
+    for the device. `stopped` is asked after each step whether to end early, with a report.
+    """
+    noise = np.float32(noise)
+    pending: list[dict[str, Array]] = []
+    for index in range(first, last):
+        state, metric = step(state, next(scenes), noise, np.int32(index))
+        pending.append(metric)
+        stop = stopped()
+        if stop or len(pending) == every or index == last - 1:
+            stacked = {k: np.stack([np.asarray(m[k]) for m in pending]) for k in metric}
+            start, pending = index + 1 - len(pending), []
+            report(start, stacked, state)
+        if stop:
+            break
+    return state
+
+
+def evaluate(
+    imager: Callable[..., tuple],
+    parameters: dict[str, Any],
+    patches: np.ndarray,
+    distance: float,
+    noise: float,
+    seed: int,
+    batch: int = 32,
+) -> dict[str, float]:
+    """Image quality over all `patches` (N, P, P, C), uint8, with the object at `distance` mm.
+
+    mae and rmse over all values, psnr (dB) and ssim as means over the patches, of the
+    restored images; the same with the prefix sensor_ for the images before the network.
+    Metrics by scikit-image, for values from 0 to 1; images are not clipped.
+    """
+    totals: dict[str, list[float]] = {}
+    for start in range(0, len(patches), batch):
+        part = np.asarray(patches[start : start + batch])
+        filled = np.concatenate([part, np.zeros((batch - len(part), *part.shape[1:]), np.uint8)])
+        key = jax.random.fold_in(jax.random.key(seed), start)
+        truth, sensor, restored, _ = imager(parameters, filled, distance, np.float32(noise), key)
+        truth, sensor, restored = (np.asarray(a)[: len(part)] for a in (truth, sensor, restored))
+        for prefix, images in (("", restored), ("sensor_", sensor)):
+            for true, image in zip(truth, images):
+                values = {
+                    "mae": np.mean(np.abs(true - image)),
+                    "mse": metrics.mean_squared_error(true, image),
+                    "psnr": metrics.peak_signal_noise_ratio(true, image, data_range=1),
+                    "ssim": metrics.structural_similarity(
+                        true, image, data_range=1, channel_axis=-1
+                    ),
+                }
+                for name, value in values.items():
+                    totals.setdefault(prefix + name, []).append(float(value))
+    means = {name: float(np.mean(values)) for name, values in totals.items()}
+    for prefix in ("", "sensor_"):
+        means[prefix + "rmse"] = means.pop(prefix + "mse") ** 0.5
+    return means

@@ -1,0 +1,1 @@
+"""The lens: surfaces, glasses, the pytree, Gaussian optics."""

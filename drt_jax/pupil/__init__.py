@@ -1,0 +1,1 @@
+"""Where rays cross the stop: quadrature rules."""

@@ -1,0 +1,1 @@
+"""Rays: the Fermat system, the search for its roots, their derivatives."""
