@@ -12,7 +12,7 @@ from drt_jax.learn import train
 from drt_jax.image.kernel import gaussian_psf
 from drt_jax.image.sensor import convolve
 
-from .conftest import RGB
+from ..conftest import RGB
 
 CAMERA = train.Camera(kernel=9)
 
