@@ -1,0 +1,1 @@
+"""Configuration and the folder of a run."""

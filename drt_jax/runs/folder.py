@@ -1,0 +1,179 @@
+"""The folder of a run: resolved config, metrics as they come, checkpoints, results, figures.
+
+Everything is written so that a run killed at any moment can go on: a checkpoint replaces its
+predecessor in one step, and metrics that lie beyond it are dropped when the run resumes.
+"""
+
+import contextlib
+import csv
+import io
+import json
+import os
+import pathlib
+import signal
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from typing import Any, BinaryIO
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .config import ConfigError, dump_config, load_config
+
+__all__ = ["Run", "deferred_interrupt"]
+
+
+class Run:
+    """One run in one folder; several jobs (starting points, say) may share it.
+
+    folder: created if need be. columns: of metrics.csv, after `job` and `step`.
+    """
+
+    def __init__(self, folder: pathlib.Path, config: Any, columns: tuple[str, ...], resume: bool):
+        """Open the folder. ConfigError if it holds another run that has begun to train, or on
+        resuming a run with another configuration, or one that does not exist."""
+        self.folder = folder
+        self.figures = folder / "figures"
+        self._columns = ("job", "step", *columns)
+        self._earlier, self._opened = 0.0, time.perf_counter()
+        saved = folder / "config.yaml"
+        if resume:
+            if not saved.is_file():
+                raise ConfigError(f"{folder}: nothing to resume: no config.yaml in it")
+            if load_config(type(config), saved) != config:
+                raise ConfigError(
+                    f"{saved}: the run to resume was started with other settings; "
+                    "leave out --config and --set to take its own, or choose another --out"
+                )
+        elif self._metrics.exists():
+            raise ConfigError(
+                f"{folder}: holds a run already; add --resume to go on with it, "
+                "or choose another --out"
+            )
+        self.figures.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            self._replace("config.yaml", lambda file: file.write(dump_config(config).encode()))
+
+    @property
+    def _metrics(self) -> pathlib.Path:
+        return self.folder / "metrics.csv"
+
+    @property
+    def seconds(self) -> float:
+        """Time spent on the run, in the processes before a resume too."""
+        return self._earlier + time.perf_counter() - self._opened
+
+    def log(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
+        """Append metrics of consecutive steps, the first being `step`; 1D arrays by column.
+        A column that is not among them stays empty."""
+        values = [[repr(float(v)) for v in rows[c]] if c in rows else None for c in self._columns[2:]]
+        count = max(len(column) for column in values if column)
+        lines = [
+            (job, step + i, *(column[i] if column else "" for column in values))
+            for i in range(count)
+        ]
+        new = not self._metrics.exists()
+        with open(self._metrics, "a", newline="") as file:
+            writer = csv.writer(file)
+            if new:
+                writer.writerow(self._columns)
+            writer.writerows(lines)
+
+    def metrics(self, job: str) -> dict[str, np.ndarray]:
+        """The logged metrics of one job, arrays by column (with `step`); NaN where empty."""
+        with open(self._metrics, newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["job"] == job]
+        return {c: np.array([float(row[c] or "nan") for row in rows]) for c in self._columns[1:]}
+
+    def save(self, job: str, step: int, tree: Any) -> None:
+        """Checkpoint: the state `tree` of `job` after `step` steps."""
+        arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
+        arrays.update(step=np.asarray(step), seconds=np.asarray(self.seconds))
+        self._replace(f"checkpoints/{job}.npz", lambda file: np.savez(file, **arrays))
+
+    def load(self, job: str, tree: Any, logged: tuple[str, ...]) -> tuple[int, Any]:
+        """The last checkpoint of `job` as (step, state shaped as `tree`); (0, tree) if none.
+
+        `logged`: the names under which the job logs; their metrics beyond the checkpoint are
+        dropped.
+        """
+        path = self.folder / "checkpoints" / f"{job}.npz"
+        step = 0
+        if path.is_file():
+            leaves, structure = jax.tree.flatten(tree)
+            try:
+                with np.load(path) as file:
+                    stored = [file[f"leaf{i}"] for i in range(len(leaves))]
+                    step = int(file["step"])
+                    self._earlier = max(self._earlier, float(file["seconds"]))
+            except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+                raise ConfigError(
+                    f"{path}: not a checkpoint of this run; delete it to start the job anew"
+                ) from error
+            tree = jax.tree.unflatten(structure, [jnp.asarray(leaf) for leaf in stored])
+        self._truncate(logged, step)
+        return step, tree
+
+    def _truncate(self, jobs: tuple[str, ...], step: int) -> None:
+        if not self._metrics.exists():
+            return
+        with open(self._metrics, newline="") as file:
+            header, *rows = list(csv.reader(file)) or [self._columns]
+        whole = [row for row in rows if len(row) == len(self._columns)]
+        kept = [row for row in whole if row[0] not in jobs or int(row[1]) < step]
+        if len(kept) == len(rows):
+            return
+
+        def write(file: BinaryIO) -> None:
+            text = io.StringIO(newline="")
+            csv.writer(text).writerows([header, *kept])
+            file.write(text.getvalue().encode())
+
+        self._replace("metrics.csv", write)
+
+    def finish(self, results: dict[str, Any]) -> pathlib.Path:
+        """Write results.json and return its path."""
+        text = json.dumps(results, indent=2) + "\n"
+        self._replace("results.json", lambda file: file.write(text.encode()))
+        return self.folder / "results.json"
+
+    def _replace(self, name: str, write: Callable[[BinaryIO], Any]) -> None:
+        """Write a file whole or not at all."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch = path.with_name(path.name + ".partial")
+        try:
+            with open(scratch, "wb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(scratch, path)
+        finally:
+            scratch.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C (or SIGTERM) into a question: yields a function that says whether
+    one came, to be asked where stopping is safe. It calls `notify`; a second one acts at once."""
+    asked = False
+    previous = {}
+
+    def ask(number: int, frame: Any) -> None:
+        nonlocal asked
+        asked = True
+        notify()
+        signal.signal(number, previous[number])
+
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            previous[number] = signal.signal(number, ask)
+    except ValueError:  # not in the main thread: leave signals to whoever is
+        pass
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
