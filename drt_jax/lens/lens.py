@@ -9,35 +9,40 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from .glass import Dispersion, check_wavelengths, refractive_index
-from ..numerics import concrete
-from .surface import MIRRORED, ROTATIONAL, Shape
+from .surface import Shape, surface_sag
 
-__all__ = ["Lens", "rotation_matrix"]
+__all__ = ["Lens", "rotation_matrix", "sag"]
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Lens:
-    """S surfaces and a flat sensor.
+    """S surfaces and, as the last row of every array over surfaces, the sensor.
 
     All arrays are differentiable leaves of one floating dtype; `jax.grad` with respect to a
     lens returns a `Lens`. Lengths in mm, z along the axis from the first vertex.
 
-    curvature (S,) 1/mm; conic (S,), 0 a sphere, -1 a paraboloid; coefficients (S, K), whose
-    meaning is that of the surface's form (see `surface`; asphere: of r^2, r^4, ... in mm^-1,
-    mm^-3, ...); thickness (S - 1,) between vertices, negative where a mirror has turned the
-    light; semi_diameter (S,), the clear aperture (inf: none), at the stop the aperture
-    itself; sensor (), its z; dispersion of the S + 1 media, the first before the first surface
-    (a surface with the same medium on both sides is not traced: its light keeps the constants
-    of the medium in front).
+    curvature: (S + 1,) in 1/mm.
+    conic: (S + 1,), 0 a sphere, -1 a paraboloid.
+    coefficients: (S + 1, K), whose meaning is that of the surface's form (see `surface`;
+        asphere: of r^2, r^4, ... in mm^-1, mm^-3, ...).
+    thickness: (S - 1,) between the vertices of the surfaces, in mm; negative where a mirror has
+        turned the light, and where a stop that bends no light lies behind a vertex in front of it.
+    semi_diameter: (S + 1,) in mm, the clear aperture (inf: none), at the stop the aperture itself.
+    sensor: (), its z in mm.
+    dispersion: of the S + 1 media, the first before the first surface. Light keeps the constants
+        of the medium in front of a surface with the same medium on both sides.
+    decentre: (S + 1, 2), x and y in mm, each surface about its own place on the axis; None for a
+        centred lens, which costs nothing.
+    tilt: (S + 1, 3) in radians, about x, then the turned y, then the turned z, right-handed; None
+        likewise.
 
-    decentre (S + 1, 2) and tilt (S + 1, 3), of the surfaces and the sensor, each about its own
-    place on the axis: x and y in mm; angles about x, then the turned y, then the turned z, in
-    radians, right-handed. None, for a centred lens, costs nothing.
-
-    Static: stop, the index of the stop surface; glasses, the names of the S + 1 media; forms,
-    a name in `surface.FORMS` for each surface, and mirrors, whether it reflects (empty: all
-    aspheres, no mirrors); name.
+    Static:
+    stop: the index of the stop surface.
+    glasses: the names of the S + 1 media.
+    forms: a name in `surface.FORMS` for each of the S + 1 rows (empty: all aspheres).
+    mirrors: whether each of the S surfaces reflects (empty: none does).
+    name: of the lens.
     """
 
     curvature: Array
@@ -55,19 +60,30 @@ class Lens:
     mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True}, default=())
     name: str = dataclasses.field(metadata={"static": True}, default="")
 
-    def __post_init__(self):
-        count = len(self.glasses) - 1
-        object.__setattr__(self, "forms", self.forms or ("asphere",) * count)
-        object.__setattr__(self, "mirrors", self.mirrors or (False,) * count)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "forms", self.forms or ("asphere",) * (self.count + 1))
+        object.__setattr__(self, "mirrors", self.mirrors or (False,) * self.count)
+
+    @property
+    def count(self) -> int:
+        """How many surfaces S there are, without the sensor."""
+        return len(self.glasses) - 1
+
+    @property
+    def live(self) -> tuple[int, ...]:
+        """The surfaces that bend light: mirrors, and those between different media."""
+        media = self.glasses
+        return tuple(i for i in range(self.count) if self.mirrors[i] or media[i] != media[i + 1])
 
     @property
     def vertices(self) -> Array:
-        """z of the S vertices, shape (S,), mm; the first is 0."""
-        return jnp.concatenate([jnp.zeros_like(self.curvature[:1]), jnp.cumsum(self.thickness)])
+        """z of the S vertices and the sensor, shape (S + 1,), mm; the first is 0."""
+        first = jnp.zeros_like(self.sensor)[None]
+        return jnp.concatenate([first, jnp.cumsum(self.thickness), self.sensor[None]])
 
     @property
     def shape(self) -> Shape:
-        """Curvature (S,), conic (S,) and coefficients (K, S)."""
+        """Curvature (S + 1,), conic (S + 1,) and coefficients (K, S + 1)."""
         return Shape(self.curvature, self.conic, self.coefficients.T)
 
     @property
@@ -75,24 +91,6 @@ class Lens:
         """Direction (S + 1,) in which light goes before each surface and before the sensor: 1
         along its own z axis, -1 against it after an odd number of mirrors."""
         return np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
-
-    @property
-    def symmetry(self) -> str:
-        """ "rotation" about the axis, "plane" (x -> -x leaves the lens alone) or "none".
-
-        Of a tilted or decentred lens, "plane" is found from its values: inside a trace, where
-        they are not known, it has no symmetry.
-        """
-        if self.decentre is None and self.tilt is None:
-            if ROTATIONAL.issuperset(self.forms):
-                return "rotation"
-            return "plane" if MIRRORED.issuperset(self.forms) else "none"
-        if not concrete((self.decentre, self.tilt)):
-            return "none"
-        # Neither x, nor a turn about y or z, takes any surface out of the plane x = 0.
-        sideways = ((self.decentre, [0]), (self.tilt, [1, 2]))
-        still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
-        return "plane" if still and MIRRORED.issuperset(self.forms) else "none"
 
     def index(self, wavelengths: ArrayLike) -> Array:
         """Refractive index (S + 1, W) of every medium at `wavelengths` (W,), um.
@@ -112,3 +110,13 @@ def rotation_matrix(tilt: Array) -> Array:
     about_y = jnp.array([[cy, zero, sy], [zero, one, zero], [-sy, zero, cy]])
     about_z = jnp.array([[cz, -sz, zero], [sz, cz, zero], [zero, zero, one]])
     return about_x @ about_y @ about_z
+
+
+def sag(lens: Lens, surface: int, x: ArrayLike, y: ArrayLike) -> Array:
+    """Height of a surface above its vertex plane, mm, along its own axes.
+
+    surface: 0 to S - 1, or S for the sensor. x, y: mm, of shapes that broadcast together.
+    """
+    x, y = jnp.broadcast_arrays(*(jnp.asarray(a, lens.curvature.dtype) for a in (x, y)))
+    row = jax.tree.map(lambda a: a[..., surface], lens.shape)
+    return surface_sag((x, y), row, lens.forms[surface])

@@ -1,16 +1,16 @@
 """The shape of a surface: sag, its slopes and second derivatives, and where it exists.
 
 A point on a surface is its transverse coordinates w (paper Eq. 1): one (height in the
-meridional plane, y) or two (x, y). The component axis comes first, so that `w[0]`, `w[1]` are
-arrays over surfaces and rays; the functions of one form are elementwise in the rest.
+meridional plane, y) or two (x, y), as a tuple of arrays or an array with the component axis
+first; the functions of one form are elementwise in the rest.
 
-A form is one function (w, shape) -> (sag, argument), the surface existing where `argument` > 0,
-and one line in `FORMS`. Slopes, curvatures at the vertex and the derivative rules follow from
-it by automatic differentiation.
+A form is one record in `FORMS`: a function (w, shape) -> (sag, argument), the surface existing
+where `argument` > 0, and its symmetry. Slopes, curvatures at the vertex and the derivative rules
+follow from the function by automatic differentiation.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,13 @@ from jax import Array
 __all__ = [
     "FORMS",
     "RIM",
-    "ROTATIONAL",
+    "Form",
     "Shape",
+    "by_form",
     "domain",
     "powers_xy",
-    "sag",
     "sag_derivatives",
+    "surface_sag",
     "vertex_curvature",
 ]
 
@@ -37,6 +38,9 @@ RIM = 1e-4
 # Nearer to the axis than this (mm^2) an odd power of r is flat: its derivative at 0 is none.
 _AXIS = 1e-16
 
+# Transverse coordinates: D arrays, x and y or y alone.
+Point = Sequence[Array] | Array
+
 
 class Shape(NamedTuple):
     """Parameters of surfaces as arrays: curvature c (...) in 1/mm, conic k (...) and
@@ -45,6 +49,10 @@ class Shape(NamedTuple):
     curvature: Array
     conic: Array
     coefficients: Array
+
+
+def _square(w: Point) -> Array:
+    return sum((a * a for a in w[1:]), w[0] * w[0])
 
 
 def _root(argument: Array) -> Array:
@@ -66,22 +74,22 @@ def _horner(x: Array, coefficients: Array | list[Array]) -> Array:
     return total
 
 
-def asphere(w: Array, shape: Shape) -> tuple[Array, Array]:
+def asphere(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Plane, sphere, conic and even asphere.
 
     z = c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + a_0 r^2 + a_1 r^4 + ...; paper Eq. 1 is k = 0
     without coefficients.
     """
-    r2 = sum(a * a for a in w)
+    r2 = _square(w)
     z, argument = _conic(r2, shape.curvature, shape.conic)
     if shape.coefficients.shape[0]:
         z = z + r2 * _horner(r2, shape.coefficients)
     return z, argument
 
 
-def odd_asphere(w: Array, shape: Shape) -> tuple[Array, Array]:
+def odd_asphere(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Conic and every power of r: ... + a_0 r + a_1 r^2 + a_2 r^3 + ..."""
-    r2 = sum(a * a for a in w)
+    r2 = _square(w)
     z, argument = _conic(r2, shape.curvature, shape.conic)
     off = r2 > _AXIS
     r = jnp.where(off, jnp.sqrt(jnp.where(off, r2, 1)), 0)
@@ -89,7 +97,7 @@ def odd_asphere(w: Array, shape: Shape) -> tuple[Array, Array]:
     return z + r * odd + r2 * even, argument
 
 
-def biconic(w: Array, shape: Shape) -> tuple[Array, Array]:
+def biconic(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Another conic in each direction: c and k hold for y, a_0 and a_1 are c and k for x.
 
     z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2)), and then
@@ -103,7 +111,7 @@ def biconic(w: Array, shape: Shape) -> tuple[Array, Array]:
     return z + r2 * _horner(r2, shape.coefficients[2:]), argument
 
 
-def toroid(w: Array, shape: Shape) -> tuple[Array, Array]:
+def toroid(w: Point, shape: Shape) -> tuple[Array, Array]:
     """A curve g(y) turned about an axis along y at the distance 1 / a_0 from the vertex.
 
     g is the conic of c and k plus a_1 y^2 + a_2 y^4 + ...; a_0 is the curvature in x.
@@ -124,9 +132,9 @@ def powers_xy(count: int) -> list[tuple[int, int]]:
     return pairs[:count]
 
 
-def polynomial_xy(w: Array, shape: Shape) -> tuple[Array, Array]:
+def polynomial_xy(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Conic and a polynomial: ... + a_0 x + a_1 y + a_2 x^2 + a_3 x y + a_4 y^2 + a_5 x^3 + ..."""
-    z, argument = _conic(jnp.sum(w * w, axis=0), shape.curvature, shape.conic)
+    z, argument = _conic(_square(w), shape.curvature, shape.conic)
     pairs = powers_xy(len(shape.coefficients))
     degree = max((i + j for i, j in pairs), default=0)
     rows = []  # a polynomial in y for each power of x
@@ -139,74 +147,87 @@ def polynomial_xy(w: Array, shape: Shape) -> tuple[Array, Array]:
     return z + _horner(w[0], rows), argument
 
 
-FORMS: dict[str, Callable[[Array, Shape], tuple[Array, Array]]] = {
-    "asphere": asphere,
-    "odd_asphere": odd_asphere,
-    "biconic": biconic,
-    "toroid": toroid,
-    "polynomial_xy": polynomial_xy,
+class Form(NamedTuple):
+    """A kind of surface.
+
+    function: (w, shape) -> (sag in mm, argument), as described at the top of this file.
+    symmetry: "rotation" about the z axis, "plane" (x -> -x leaves it alone) or "none".
+    """
+
+    function: Callable[[Point, Shape], tuple[Array, Array]]
+    symmetry: Literal["rotation", "plane", "none"]
+
+
+FORMS: dict[str, Form] = {
+    "asphere": Form(asphere, "rotation"),
+    "odd_asphere": Form(odd_asphere, "rotation"),
+    "biconic": Form(biconic, "plane"),
+    "toroid": Form(toroid, "plane"),
+    "polynomial_xy": Form(polynomial_xy, "none"),
 }
-# Forms that may be traced in the meridional plane alone, and those that x -> -x leaves alone.
-ROTATIONAL = frozenset({"asphere", "odd_asphere"})
-MIRRORED = ROTATIONAL | {"biconic", "toroid"}
 
 
-def by_form(function: Callable, w: Array, shape: Shape, forms: tuple[str, ...]) -> object:
+def by_form(function: Callable, w: Point, shape: Shape, forms: tuple[str, ...]) -> Any:
     """`function(w, shape, form)` for arrays over surfaces, `forms[i]` being that of surface i.
 
-    `w` (D, S, ...), shape arrays (S, ...) and (K, S, ...), all of the same rank but for their
-    first axis. The results of the forms that occur are put in order along the surface axis.
+    `w` D arrays (S, ...), shape arrays (S, ...) and (K, S, ...), all of the same rank but for
+    the first axis of coefficients. The results of the forms that occur, trees of arrays (S, ...),
+    are put in order along the surface axis.
     """
     kinds = sorted(set(forms))
     if len(kinds) == 1:
         return function(w, shape, kinds[0])
     rows = {kind: np.flatnonzero([form == kind for form in forms]) for kind in kinds}
     parts = [
-        function(w[:, r], Shape(shape.curvature[r], shape.conic[r], shape.coefficients[:, r]), kind)
+        function(
+            tuple(a[r] for a in w),
+            Shape(shape.curvature[r], shape.conic[r], shape.coefficients[:, r]),
+            kind,
+        )
         for kind, r in rows.items()
     ]
-    axis = 1 - w.ndim  # of the surfaces, counted from the end
     order = np.argsort(np.concatenate(list(rows.values())))
-    return jax.tree.map(
-        lambda *values: jnp.take(jnp.concatenate(values, axis=axis), order, axis=axis), *parts
-    )
+    return jax.tree.map(lambda *values: jnp.concatenate(values)[order], *parts)
 
 
-def sag(w: Array, shape: Shape, form: str = "asphere") -> Array:
-    """Height above the vertex plane, mm, shape of `w[0]`; `w` (D, ...) in mm."""
-    return FORMS[form](w, shape)[0]
+def surface_sag(w: Point, shape: Shape, form: str = "asphere") -> Array:
+    """Height above the vertex plane, mm, shape of `w[0]`; `w`: D arrays in mm."""
+    return FORMS[form].function(w, shape)[0]
 
 
-def domain(w: Array, shape: Shape, form: str = "asphere") -> Array:
-    """True where the surface exists at `w` ((D, ...), mm); the shape of `w[0]`, bool."""
-    return FORMS[form](w, shape)[1] > RIM
+def domain(w: Point, shape: Shape, form: str = "asphere") -> Array:
+    """True where the surface exists at `w` (D arrays, mm); the shape of `w[0]`, bool."""
+    return FORMS[form].function(w, shape)[1] > RIM
 
 
-def sag_derivatives(w: Array, shape: Shape, form: str = "asphere") -> tuple[Array, Array, Array]:
+def sag_derivatives(
+    w: Point, shape: Shape, form: str = "asphere"
+) -> tuple[Array, tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
     """Sag, its gradient and its Hessian by the transverse coordinates.
 
-    `w` (D, ...) in mm. Returns arrays of shapes (...), (D, ...) and (D, D, ...). Derived from
-    `sag` by automatic differentiation, so that a new surface form is one formula; but the form
-    of nearly all surfaces, an asphere, has them written out with one root and one division.
+    `w`: D arrays in mm. Returns an array, D of them and D rows of D, all shaped as `w[0]`. By
+    automatic differentiation of the form, so that a new one is one formula; but that of nearly
+    all surfaces, an asphere, has them written out with one root and one division.
     """
+    w = tuple(w)
     if form == "asphere":
         return _asphere_derivatives(w, shape)
 
     def slopes(w):
-        z, pull_back = jax.vjp(lambda w: sag(w, shape, form), w)
+        z, pull_back = jax.vjp(lambda w: surface_sag(w, shape, form), w)
         return pull_back(jnp.ones_like(z))[0], z
 
-    columns = []
-    for d in range(w.shape[0]):
-        unit = jnp.zeros_like(w).at[d].set(1)
-        gradient, column, z = jax.jvp(slopes, (w,), (unit,), has_aux=True)
-        columns.append(column)
-    return z, gradient, jnp.stack(columns)
+    rows = []
+    for d in range(len(w)):
+        unit = tuple(jnp.full_like(a, float(k == d)) for k, a in enumerate(w))
+        slope, row, z = jax.jvp(slopes, (w,), (unit,), has_aux=True)
+        rows.append(row)
+    return z, slope, tuple(rows)
 
 
-def _asphere_derivatives(w: Array, shape: Shape) -> tuple[Array, Array, Array]:
+def _asphere_derivatives(w: tuple[Array, ...], shape: Shape) -> Any:
     c, bent = shape.curvature, (1 + shape.conic) * shape.curvature**2
-    r2 = sum(a * a for a in w)
+    r2 = _square(w)
     argument = 1 - bent * r2
     inverse = 1 / jnp.sqrt(jnp.maximum(argument, RIM))
     # z and its derivatives by r^2; beyond the rim, it goes on with the slope of the rim.
@@ -217,17 +238,19 @@ def _asphere_derivatives(w: Array, shape: Shape) -> tuple[Array, Array, Array]:
         once = [(j + 1) * a for j, a in enumerate(shape.coefficients)]
         first = first + _horner(r2, once)
         second = second + _horner(r2, [(j + 1) * a for j, a in enumerate(once[1:])])
-    pairs = [[4 * a * b * second for b in w] for a in w]
-    for d, row in enumerate(pairs):
-        row[d] = row[d] + 2 * first
-    return z, 2 * w * first, jnp.stack([jnp.stack(row) for row in pairs])
+    bend = tuple(
+        tuple(4 * a * b * second + (2 * first if i == j else 0) for j, b in enumerate(w))
+        for i, a in enumerate(w)
+    )
+    return z, tuple(2 * a * first for a in w), bend
 
 
-def vertex_curvature(shape: Shape, forms: tuple[str, ...], dim: int) -> Array:
-    """Curvature of S surfaces at their vertices along each component, (dim, S), 1/mm."""
+def vertex_curvature(shape: Shape, forms: tuple[str, ...], dim: int) -> tuple[Array, ...]:
+    """Curvature of S surfaces at their vertices along each of `dim` components: `dim` arrays (S,),
+    1/mm; `shape` with arrays (S,) and (K, S)."""
     if set(forms) == {"asphere"}:
         bend = shape.curvature + (2 * shape.coefficients[0] if len(shape.coefficients) else 0)
-        return jnp.broadcast_to(bend, (dim, *bend.shape))
-    at_vertex = jnp.zeros((2, len(forms)), shape.curvature.dtype)
-    _, _, bend = by_form(sag_derivatives, at_vertex, shape, forms)
-    return jnp.stack([bend[0, 0], bend[1, 1]])[2 - dim :]
+        return (bend,) * dim
+    zero = jnp.zeros_like(shape.curvature)
+    _, _, bend = by_form(sag_derivatives, (zero, zero), shape, forms)
+    return (bend[0][0], bend[1][1])[2 - dim :]
