@@ -1,0 +1,113 @@
+"""Classical sequential ray trace by Snell's law: the oracle and the baseline.
+
+Written from the textbook formulae (Welford, Aberrations of Optical Systems, ch. 4), sharing
+no formula with the Fermat solver but the sag. One ray at a time; `jax.vmap` for more.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..lens.lens import Lens, rotation_matrix
+from ..lens.paraxial import entrance_pupil
+from ..lens.surface import Shape, domain, sag_derivatives
+
+__all__ = ["launch_paraxial", "trace_snell"]
+
+_NEWTON_STEPS = 12
+
+
+def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Array, Array]:
+    """Hit of the ray p + s d with the surface at the origin; its normal; whether there is one."""
+    q = p - d * (p[2] / d[2])  # on the vertex plane
+    met = jnp.array(True)
+    c, k = shape.curvature, shape.conic
+    if form in ("asphere", "odd_asphere"):
+        quadratic = c * (1 + k * d[2] ** 2)
+        linear = d[2] - c * (q[0] * d[0] + q[1] * d[1])
+        constant = c * (q[0] ** 2 + q[1] ** 2)
+        discriminant = linear**2 - quadratic * constant
+        root = jnp.sign(d[2]) * jnp.sqrt(jnp.maximum(discriminant, 0))
+        met = discriminant >= 0
+        q = q + d * (constant / (linear + root))
+    if shape.coefficients.shape[0]:
+
+        def closer(_, q):
+            z, slope, _ = sag_derivatives(q[:2], shape, form)
+            return q + d * ((z - q[2]) / (d[2] - slope @ d[:2]))
+
+        q = jax.lax.fori_loop(0, _NEWTON_STEPS, closer, q)
+    z, slope, _ = sag_derivatives(q[:2], shape, form)
+    met = met & domain(q[:2], shape, form) & (jnp.abs(z - q[2]) < 1e-6 * (1 + jnp.abs(z)))
+    normal = jnp.array([-slope[0], -slope[1], jnp.ones_like(slope[0])])
+    return q, normal / jnp.linalg.norm(normal), met
+
+
+def trace_snell(
+    lens: Lens, wavelength: Array, point: Array, direction: Array
+) -> tuple[Array, Array]:
+    """Trace one ray through a lens to its sensor.
+
+    `wavelength` () in um; `point` (3,) in mm, anywhere on the ray before the lens;
+    `direction` (3,), a unit vector. Returns the hits (S + 1, 3) in mm along the axes of the
+    lens, z from the first vertex, and whether the ray met every surface and was refracted or
+    reflected there, bool.
+    """
+    index = lens.index(jnp.atleast_1d(wavelength))[:, 0]
+    count = len(lens.forms)
+    vertices = jnp.append(lens.vertices, lens.sensor)
+    shape = Shape(
+        *(
+            jnp.concatenate([a, jnp.zeros_like(a[:1])])
+            for a in (lens.curvature, lens.conic, lens.coefficients)
+        )
+    )
+    ok, hits = jnp.array(True), []
+    for i in range(count + 1):
+        across = jnp.zeros(2, point.dtype) if lens.decentre is None else lens.decentre[i]
+        origin = jnp.append(across, vertices[i])
+        turn = None if lens.tilt is None else rotation_matrix(lens.tilt[i])
+        p, d = point - origin, direction
+        if turn is not None:
+            p, d = turn.T @ p, turn.T @ d
+        row = jax.tree.map(lambda a: a[i], shape)
+        hit, normal, met = _intersect(p, d, row, "asphere" if i == count else lens.forms[i])
+        cosine, sense = normal @ d, int(lens.senses[i])
+        ok = ok & met & (sense * cosine > 0)
+        if i < count:
+            ratio = index[i] / index[i + 1]
+            square = 1 - ratio**2 * (1 - cosine**2)
+            ok = ok & (square >= 0)
+            if lens.mirrors[i]:
+                d = d - 2 * cosine * normal
+            else:
+                bend = sense * jnp.sqrt(jnp.maximum(square, 0)) - ratio * cosine
+                d = ratio * d + normal * bend
+        point = (hit if turn is None else turn @ hit) + origin
+        direction = d if turn is None else turn @ d
+        hits.append(point)
+    return jnp.stack(hits), ok
+
+
+def launch_paraxial(
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelength: ArrayLike, pupil: Array
+) -> tuple[Array, Array]:
+    """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming.
+
+    `field` in radians along y, `distance` in mm from the object plane to the first vertex (inf
+    allowed), `wavelength` () in um, `pupil` (Q, 2) in units of the pupil's semi-diameter.
+    Returns points (Q, 3) in mm on the first vertex plane and unit directions (Q, 3), for
+    `trace_snell`. The entrance pupil must not be infinitely far away. The Fermat tracer aims at
+    the real stop instead; the difference is the aberration of the pupil.
+    """
+    image = entrance_pupil(lens, jnp.atleast_1d(jnp.asarray(wavelength, pupil.dtype)))
+    place, radius = image.position[0], image.semi_diameter[0]
+    v = 1 / jnp.asarray(distance, pupil.dtype)
+    tangent = jnp.tan(jnp.asarray(field, pupil.dtype))
+    target = jnp.concatenate([radius * pupil, jnp.broadcast_to(place, (len(pupil), 1))], axis=1)
+    one = jnp.ones_like(tangent)
+    # From the object point (0, -tangent, -1) / v; the scale v keeps it finite.
+    direction = v * target + jnp.stack([0 * one, tangent, one])
+    points = target - direction * (place / direction[:, 2:])
+    return points, direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
