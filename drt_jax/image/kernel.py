@@ -2,6 +2,7 @@
 
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -33,27 +34,34 @@ class SeparableKernel(NamedTuple):
 def gaussian_psf(
     mean: Array, covariance: Array, pixel: float, size: int = 21, form: Form = "integrated"
 ) -> SeparableKernel | Array:
-    """Gaussian kernels of C channels on a `size` x `size` grid of square pixels.
+    """Gaussian kernels [channel, y, x] of C channels, in the dtype of `mean`.
 
-    `mean` (C, 2), x and y from the centre of the grid, mm; `covariance` mm^2, (C, 2) for a
-    diagonal one (the result is then separable), else (C, 2, 2); `pixel` in mm. "integrated":
-    each pixel collects what falls on its area, and the kernel is normalised to sum 1.
-    "sampled": Eq. 5 as printed, the density at the pixel centres, not normalised: it sums to
-    less than 1 for a wide blur and to anything for a narrow one.
+    mean: (C, 2), x and y from the centre of the grid, mm.
+    covariance: mm^2, (C, 2) for a diagonal one (the result is then separable), else (C, 2, 2).
+    pixel: the side of a pixel, mm.
+    size: pixels along a side of the grid.
+    form: "integrated": each pixel collects what falls on its area, and the kernel is normalised
+        to sum 1. "sampled": Eq. 5 as printed, the density at the pixel centres, not normalised:
+        it sums to less than 1 for a wide blur and to anything for a narrow one.
 
-    Returns kernels indexed [channel, y, x], in the dtype of `mean`. As the blur shrinks to a
-    point, and as it grows beyond the grid, values and derivatives stay finite.
+    As the blur shrinks to a point, and as it grows beyond the grid, values and derivatives stay
+    finite. A channel of infinite covariance (no ray arrived) is black, its derivatives are 0.
     """
     if form not in ("integrated", "sampled"):
         raise ValueError(f"form: expected 'integrated' or 'sampled', got {form!r}")
+    infinite = jnp.isinf(covariance)
+    lost = jnp.any(infinite, axis=tuple(range(1, covariance.ndim)))
     mean = mean / pixel
-    covariance = covariance / pixel**2
+    covariance = jnp.where(infinite, 0, covariance) / pixel**2
     dtype = mean.dtype
+    kernel: SeparableKernel | Array
     if form == "sampled":
         grid = jnp.arange(size, dtype=dtype) - (size - 1) / 2
-        return _sampled(grid - mean[..., None], covariance)
-    edges = jnp.arange(size + 1, dtype=dtype) - size / 2 - mean[..., None]
-    return _integrated(edges, covariance)
+        kernel = _sampled(grid - mean[..., None], covariance)
+    else:
+        edges = jnp.arange(size + 1, dtype=dtype) - size / 2 - mean[..., None]
+        kernel = _integrated(edges, covariance)
+    return jax.tree.map(lambda k: jnp.where(jnp.expand_dims(lost, range(1, k.ndim)), 0, k), kernel)
 
 
 def _normalised(kernel: Array, axes: tuple[int, ...]) -> Array:

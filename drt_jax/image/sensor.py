@@ -1,5 +1,7 @@
 """The sensor layer: image = kernel * scene + noise (paper Eq. 6)."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -7,8 +9,9 @@ from jax.typing import ArrayLike
 
 from .kernel import SeparableKernel
 
-__all__ = ["convolve", "sensor_layer"]
+__all__ = ["Convolve", "convolve", "convolve_taps", "sensor_layer"]
 
+Convolve = Callable[[Array, SeparableKernel | Array], Array]
 
 # GPUs would round the factors of a float32 product to 10 bits.
 _EXACT = jax.lax.Precision.HIGHEST
@@ -46,17 +49,15 @@ def _by_bands(scenes: Array, kernel: SeparableKernel) -> Array:
     return jnp.einsum("cxw,cbyw->byxc", across, half, precision=_EXACT)
 
 
-def convolve(scenes: Array, kernel: SeparableKernel | Array, forward: bool = False) -> Array:
+def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
     """'Valid' convolution of each channel with its own kernel.
 
-    `scenes` (B, H + K - 1, W + K - 1, C) hold true context on all sides, so that the result
-    (B, H, W, C) has no border artefacts. `kernel` [channel, y, x]; a separable one is
-    applied as two banded matrix products or, on a CPU and `forward`, tap by tap: the faster form
-    for values and forward mode, ten times slower in reverse. A dense one by 2D convolution.
+    scenes: (B, H + K - 1, W + K - 1, C), with true context on all sides, so that the result
+        (B, H, W, C) has no border artefacts.
+    kernel: [channel, y, x]. A separable one is applied as two products with banded matrices,
+        a dense one by 2D convolution.
     """
     if isinstance(kernel, SeparableKernel):
-        if forward:
-            return jax.lax.platform_dependent(scenes, kernel, cpu=_by_taps, default=_by_bands)
         return _by_bands(scenes, kernel)
     return jax.lax.conv_general_dilated(
         scenes,
@@ -69,20 +70,29 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array, forward: bool = Fal
     )
 
 
+def convolve_taps(scenes: Array, kernel: SeparableKernel | Array) -> Array:
+    """`convolve`, on a CPU with a separable kernel tap by tap: the faster form for values and
+    forward mode, ten times slower in reverse. Arguments and result as there."""
+    if not isinstance(kernel, SeparableKernel):
+        return convolve(scenes, kernel)
+    return jax.lax.platform_dependent(scenes, kernel, cpu=_by_taps, default=_by_bands)
+
+
 def sensor_layer(
     scenes: Array,
     kernel: SeparableKernel | Array,
     noise: ArrayLike,
     key: Array,
-    forward: bool = False,
+    convolve: Convolve = convolve,
 ) -> Array:
-    """Sensor images (B, H, W, C): `convolve`, plus white Gaussian noise.
+    """Sensor images (B, H, W, C): the convolved scenes plus white Gaussian noise.
 
-    `scenes` as in `convolve`, values 0 to 1; `noise`: standard deviation; `key`: a PRNG key;
-    `forward`: see `convolve`.
-    The kernel is cast to the dtype of the scenes: here the optics meet the network.
+    scenes: (B, H + K - 1, W + K - 1, C), values 0 to 1.
+    kernel: [channel, y, x]; cast to the dtype of the scenes: here the optics meet the network.
+    noise: standard deviation, ().
+    key: a PRNG key.
+    convolve: `convolve` or `convolve_taps`.
     """
-    kernel = jax.tree.map(lambda array: array.astype(scenes.dtype), kernel)
-    images = convolve(scenes, kernel, forward)
+    images = convolve(scenes, jax.tree.map(lambda array: array.astype(scenes.dtype), kernel))
     white = jax.random.normal(key, images.shape, images.dtype)
     return images + jnp.asarray(noise, images.dtype) * white

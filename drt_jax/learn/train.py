@@ -14,7 +14,7 @@ from skimage import metrics
 from .adam import adam, apply_updates
 from ..numerics import safe_sqrt
 from ..image.kernel import Form, gaussian_psf
-from ..image.sensor import sensor_layer
+from ..image.sensor import Convolve, convolve, sensor_layer
 
 __all__ = ["Camera", "evaluate", "fit", "make_imager", "make_step", "value_and_gradient"]
 
@@ -39,13 +39,13 @@ class Camera:
 
 
 def make_imager(
-    blur: Blur, restore: Restore | None, camera: Camera, forward: bool = False
+    blur: Blur, restore: Restore | None, camera: Camera, convolve: Convolve = convolve
 ) -> Callable[..., tuple]:
     """The chain moments -> PSF -> sensor layer -> network as one function.
 
     `blur` as `moments_model` returns it; `restore` (parameters, images) -> images, None for a
-    camera without a network. `forward`: made for values and forward mode, which `make_step` uses
-    where a single number is trained. The result maps (parameters {"optics", "network"}, scenes
+    camera without a network. `convolve`: of `image.sensor`; `convolve_taps` pays for values and in
+    forward mode, which `make_step` uses where a single number is trained. The result maps (parameters {"optics", "network"}, scenes
     uint8 (B, H + K - 1, W + K - 1, C), distance mm, noise, key) to (truth, sensor image, restored
     image), float32 (B, H, W, C), and the standard deviations (C,) of the blur along y in mm.
     The kernel is centred on the mean centroid of the colours: patches are registered. A colour
@@ -65,7 +65,7 @@ def make_imager(
             camera.kernel,
             camera.form,
         )
-        image = sensor_layer(scenes * passed.astype(jnp.float32), kernel, noise, key, forward)
+        image = sensor_layer(scenes * passed.astype(jnp.float32), kernel, noise, key, convolve)
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin
         truth = scenes[:, margin : end[0], margin : end[1]]

@@ -17,9 +17,7 @@ class ConfigError(ValueError):
     """A configuration that cannot be used; the message names the source, the key, the remedy."""
 
 
-def load_config(
-    cls: type[T], path: str | pathlib.Path, overrides: typing.Sequence[str] = ()
-) -> T:
+def load_config(cls: type[T], path: str | pathlib.Path, overrides: typing.Sequence[str] = ()) -> T:
     """Read `path` (YAML) into the dataclass `cls`, then apply overrides like "train.batch=8".
 
     Keys left out keep their default. ConfigError for a file that cannot be read, an unknown
@@ -62,7 +60,9 @@ def _field(cls: type, key: object, source: str, prefix: str) -> Any:
 
 def _build(cls: type[T], entry: object, source: str, prefix: str) -> T:
     if not isinstance(entry, dict):
-        raise ConfigError(f"{source}: {prefix or 'the file'}: expected keys and values, got {entry!r}")
+        raise ConfigError(
+            f"{source}: {prefix or 'the file'}: expected keys and values, got {entry!r}"
+        )
     values = {
         key: _convert(_field(cls, key, source, prefix), value, source, _dotted(prefix, key))
         for key, value in entry.items()
@@ -104,8 +104,9 @@ def _convert(kind: Any, value: object, source: str, key: str) -> Any:
         return _build(kind, value, source, key)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple and isinstance(value, list | tuple):
-        return tuple(_convert(arguments[0], item, source, f"{key}[{i}]")
-                     for i, item in enumerate(value))
+        return tuple(
+            _convert(arguments[0], item, source, f"{key}[{i}]") for i, item in enumerate(value)
+        )
     if origin is typing.Literal and value in arguments:
         return value
     if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
@@ -142,6 +143,7 @@ def describe(cls: type, prefix: str = "") -> list[str]:
 
 def dump_config(config: Any) -> str:
     """The resolved configuration as YAML that `load_config` reads back."""
+
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
             return {key: plain(item) for key, item in value.items()}

@@ -68,7 +68,9 @@ class Run:
     def log(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
         """Append metrics of consecutive steps, the first being `step`; 1D arrays by column.
         A column that is not among them stays empty."""
-        values = [[repr(float(v)) for v in rows[c]] if c in rows else None for c in self._columns[2:]]
+        values = [
+            [repr(float(v)) for v in rows[c]] if c in rows else None for c in self._columns[2:]
+        ]
         count = max(len(column) for column in values if column)
         lines = [
             (job, step + i, *(column[i] if column else "" for column in values))

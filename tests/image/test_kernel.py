@@ -101,6 +101,31 @@ def test_finite_from_a_point_to_any_width(form, dense, dtype):
         assert point[2, 1] == 1 and jnp.sum(point) == 1
 
 
+@pytest.mark.parametrize("form", ["integrated", "sampled"])
+@pytest.mark.parametrize(
+    "lost", [[jnp.inf, jnp.inf], [[jnp.inf, 0.0], [0.0, jnp.inf]], [[jnp.inf] * 2] * 2]
+)
+def test_an_infinite_blur_is_black_and_has_no_slope(form, lost):
+    """What moments inside a trace say of a colour that passes no ray; the others do not notice."""
+    lost = jnp.array(lost)
+    seen = jnp.array([4.0, 2.0]) if lost.ndim == 1 else jnp.array([[4.0, 1.0], [1.0, 2.0]])
+
+    @jax.jit
+    def all_of(covariance):
+        def kernel(covariance):
+            result = gaussian_psf(jnp.zeros((2, 2)), covariance, 1.0, 5, form)
+            return result if lost.ndim == 2 else result.dense()
+
+        return kernel(covariance), jax.jacfwd(kernel)(covariance), jax.jacrev(kernel)(covariance)
+
+    value, forward, reverse = all_of(jnp.stack([seen, lost]))
+    assert jnp.all(value[1] == 0) and jnp.all(forward[1] == 0) and jnp.all(reverse[1] == 0)
+    assert jnp.all(forward[0][:, :, 1] == 0) and jnp.all(reverse[0][:, :, 1] == 0)
+    wanted = all_of(jnp.stack([seen, seen]))
+    for ours, theirs in zip((value, forward, reverse), wanted, strict=True):
+        np.testing.assert_allclose(ours[0], theirs[0], atol=1e-15)
+
+
 def test_derivative_of_the_kernel():
     def corner(parameters):
         mean, (xx, yy, xy) = parameters[:2], parameters[2:]
