@@ -6,16 +6,23 @@ aimed at the stop by Newton's method. All functions are analytic, so that a para
 i h gives its derivative as Im(f) / h without any difference (Squire and Trapp, SIAM Rev. 40,
 110, 1998): h = 1e-30 leaves no truncation.
 
+A surface with the same medium on both sides, stop or not, is off the path: the straight ray
+behind the last surface in front of it, prolonged forwards or backwards, crosses it somewhere,
+and goes on from where it was.
+
 Arrays may have leading axes, one place for each moved parameter; behind them come
 (wavelength, ray). Lengths in mm, angles in radians, wavelengths in um; surfaces, signs, tilts
-and decentres as in the package.
+and decentres as in the package, the sensor the last row.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
 STEP = 1e-30
+# As in the package: a conic ends where the square of the cosine of its normal falls below this.
+RIM = 1e-4
 LENS = ("curvature", "conic", "coefficients", "thickness", "semi_diameter", "sensor")
 MOVES = ("decentre", "tilt")
 MEDIA = ("schott", "strength", "resonance")
@@ -26,7 +33,7 @@ SCENE = ("field", "distance")
 class Scene:
     """A lens and its object. `values`: the arrays of a `drt_jax.Lens` by name, those of its
     dispersion, field (2,) and distance (). joined (S,): surfaces with the same glass on both
-    sides, which are one medium."""
+    sides and no mirror, which are off the path."""
 
     values: dict[str, np.ndarray]
     stop: int
@@ -37,7 +44,7 @@ class Scene:
 
     @classmethod
     def of(cls, lens, field, distance, wavelengths):
-        count = len(lens.forms)
+        count = len(lens.mirrors)
         values = {name: np.asarray(getattr(lens, name)) for name in LENS}
         values |= {name: np.asarray(getattr(lens.dispersion, name)) for name in MEDIA}
         for name, columns in zip(MOVES, (2, 3)):
@@ -47,13 +54,19 @@ class Scene:
         values["field"] = np.array([0.0, field]) if field.ndim == 0 else field
         values["distance"] = np.asarray(distance, float)
         joined = tuple(
-            lens.glasses[i] == lens.glasses[i + 1] and not lens.mirrors[i] and i != lens.stop
-            for i in range(count)
+            lens.glasses[i] == lens.glasses[i + 1] and not lens.mirrors[i] for i in range(count)
         )
         return cls(values, lens.stop, lens.forms, lens.mirrors, joined, np.asarray(wavelengths))
 
     def replace(self, **values):
         return dataclasses.replace(self, values=self.values | values)
+
+    @classmethod
+    def stack(cls, scenes):
+        """Scenes of one structure as one with a leading axis."""
+        first = scenes[0]
+        arrays = {k: np.stack([each.values[k] for each in scenes]) for k in first.values}
+        return dataclasses.replace(first, values=arrays)
 
 
 def _powers(x, count):
@@ -159,13 +172,97 @@ def vertices(scene):
     return np.stack([*z, np.broadcast_to(sensor, batch)], axis=-1)
 
 
-def trace(scene, x, y, stop_only=False):
-    """Rays through the points (x, y, 0) mm, (..., W, Q).
+class Trace(NamedTuple):
+    """own, hits: triples along the axes of each surface and along those of the lens, S + 1 each;
+    path (..., W, Q), mm; good (..., W, Q): real rays that meet every surface, the sensor and the
+    dummies, from the front, forwards from live surface to live surface, and without total
+    reflection."""
 
-    Returns the hits along the axes of each surface and the sensor, S + 1 triples; those along
-    the axes of the lens; the optical path in mm, as the package counts it: from the sphere
-    round the object (the plane wave) through the first vertex. With `stop_only`, the hits up to
-    the stop.
+    own: list
+    hits: list
+    path: np.ndarray
+    good: np.ndarray
+
+
+def _dot(a, b):
+    return sum(x * y for x, y in zip(a, b))
+
+
+def _to_conic(p, d, c, k):
+    """Real distance along p + s d to the conic of c and k, where the ray crosses it from the
+    side where its vertex plane lies in front; to the vertex plane if it misses the conic."""
+    p, d, c, k = ([np.real(a) for a in p], [np.real(a) for a in d], np.real(c), np.real(k))
+    plane = -p[2] / d[2]
+    p = [p[0] + plane * d[0], p[1] + plane * d[1]]
+    # c (x^2 + y^2 + (1 + k) z^2) = 2 z: square s^2 - 2 linear s + constant = 0
+    square = c * (1 + k * d[2] ** 2)
+    linear, constant = d[2] - c * _dot(p, d[:2]), c * _dot(p, p)
+    discriminant = linear**2 - square * constant
+    root = np.sign(d[2]) * np.sqrt(np.maximum(discriminant, 0))
+    alike = linear * root < 0
+    above = np.where(alike, linear - root, constant)
+    below = np.where(alike, square, linear + root)
+    meets = (discriminant > 0) & (below != 0)
+    return plane + np.where(meets, above / np.where(meets, below, 1), 0)
+
+
+def _rim(form, x, y, c, k, a):
+    """What must stay above `RIM` on the surface."""
+    if form == "biconic":
+        return 1 - (1 + a[1]) * a[0] ** 2 * x**2 - (1 + k) * c**2 * y**2
+    if form == "toroid":
+        z = surface(form, 0 * y, y, c, k, a)[0]
+        return np.minimum(1 - (1 + k) * c**2 * y**2, (1 - a[0] * z) ** 2 - (a[0] * x) ** 2)
+    return 1 - (1 + k) * c**2 * (x**2 + y**2)
+
+
+def _cross(form, p, d, shape):
+    """Where p + s d crosses a surface: the point, the slopes there, s, and whether it does."""
+    conic = form in ("asphere", "odd_asphere", "polynomial_xy")
+    s = (_to_conic(p, d, *shape[:2]) if conic else -p[2] / d[2]) + 0j
+    for _ in range(14):
+        q = [a + b * s for a, b in zip(p, d)]
+        z, zx, zy = surface(form, q[0], q[1], *shape)
+        s = s + (z - q[2]) / (d[2] - zx * d[0] - zy * d[1])
+    q = [a + b * s for a, b in zip(p, d)]
+    z, zx, zy = surface(form, q[0], q[1], *shape)
+    c, k, a = shape
+    real = [np.real(v) for v in (q[0], q[1], c, k)]
+    met = _rim(form, *real, [np.real(v) for v in a]) > RIM
+    # A ray that misses ends anywhere, or circles.
+    met &= np.abs(np.real(z - q[2])) < 1e-10 * (1 + np.abs(np.real(s)))
+    met &= np.real(d[2] - zx * d[0] - zy * d[1]) * np.real(d[2]) > 0
+    return [q[0], q[1], z], (zx, zy), s, met
+
+
+def _bend(d, slopes, ratio, mirror):
+    """Direction behind a surface, the cosine of the incidence against its normal along z, and
+    whether the light passes."""
+    size = np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
+    normal = [-slopes[0] / size, -slopes[1] / size, 1 / size]
+    along = _dot(normal, d)
+    sign = np.where(np.real(along) < 0, -1.0, 1.0)
+    normal, cosine = [sign * a for a in normal], sign * along
+    square = 1 - ratio**2 * (1 - cosine**2)
+    # n sin is kept, also where a mirror lies between media that are moved apart.
+    leaving = -np.sqrt(square) if mirror else np.sqrt(square)
+    bent = [ratio * a + (leaving - ratio * cosine) * b for a, b in zip(d, normal)]
+    return bent, along, np.real(square) > 0
+
+
+def _from_source(point, v, tangent):
+    """|P - P0| - |P0| for P0 = -(tangent, 1) / v, by the difference of two squares."""
+    source = [-tangent[0], -tangent[1], -1.0]
+    first = [v * a - b for a, b in zip(point, source)]
+    top = sum(v * a**2 - 2 * a * b for a, b in zip(point, source))
+    return top / (np.sqrt(_dot(first, first)) + np.sqrt(_dot(source, source)))
+
+
+def trace(scene, x, y, stop_only=False):
+    """Rays through the points (x, y, 0) mm, (..., W, Q), to a `Trace`.
+
+    The optical path is counted as the package does: from the sphere round the object (the plane
+    wave) through the first vertex. With `stop_only`, the list `own` up to the stop.
     """
     values, n, z0 = scene.values, indices(scene), vertices(scene)
     far = np.all(np.isinf(np.real(values["distance"])))
@@ -173,72 +270,56 @@ def trace(scene, x, y, stop_only=False):
     tangent = [np.tan(_wide(values["field"][..., i])) for i in (0, 1)]
     point = [x + 0j, y + 0j, 0 * (x + y) + 0j]
     segment = [v * point[0] + tangent[0], v * point[1] + tangent[1], 1 + 0 * point[2]]
-    length = np.sqrt(sum(s**2 for s in segment))
+    length = np.sqrt(_dot(segment, segment))
     d = [s / length for s in segment]
-    count = len(scene.forms)
+    count, sense = len(scene.mirrors), 1
     own_hits, hits, path = [], [], None
+    good = np.ones(np.broadcast_shapes(*(np.shape(a) for a in d)), bool)
     for i in range(count + 1):
         origin = [*(_wide(values["decentre"][..., i, j]) for j in (0, 1)), _wide(z0[..., i])]
         tilt = [_wide(values["tilt"][..., i, j]) for j in range(3)]
-        p = [a - b for a, b in zip(point, origin)]
+        p, own_d = [a - b for a, b in zip(point, origin)], d
         for axis in range(3):
-            p, d = _rotate(p, axis, -tilt[axis]), _rotate(d, axis, -tilt[axis])
-        s = -p[2] / d[2]
-        zx = zy = 0 * s
-        if i < count:
-            c, k = _wide(values["curvature"][..., i]), _wide(values["conic"][..., i])
-            a = values["coefficients"]
-            a = [_wide(a[..., i, j]) for j in range(a.shape[-1])]
-            for _ in range(14):
-                q = [a_ + b * s for a_, b in zip(p, d)]
-                z, zx, zy = surface(scene.forms[i], q[0], q[1], c, k, a)
-                s = s + (z - q[2]) / (d[2] - zx * d[0] - zy * d[1])
-            q = [a_ + b * s for a_, b in zip(p, d)]
-            z, zx, zy = surface(scene.forms[i], q[0], q[1], c, k, a)
-            q[2] = z
-        else:
-            q = [p[0] + d[0] * s, p[1] + d[1] * s, 0 * s]
+            p, own_d = _rotate(p, axis, -tilt[axis]), _rotate(own_d, axis, -tilt[axis])
+        a = values["coefficients"]
+        shape = [_wide(values[name][..., i]) for name in ("curvature", "conic")]
+        shape.append([_wide(a[..., i, j]) for j in range(a.shape[-1])])
+        q, slopes, s, met = _cross(scene.forms[i], p, own_d, shape)
+        good = good & met
         own_hits.append(q)
         if stop_only and i == scene.stop:
             return own_hits
-        before = n[..., i, :, None]
-        own_d = d
         back = q
         for axis in (2, 1, 0):
             back = _rotate(back, axis, tilt[axis])
-        point = [a_ + b for a_, b in zip(back, origin)]
-        hits.append(point)
-        if i == 0:
-            # |P - P0| - |P0| for P0 = -(tangent, 1) / v, by the difference of two squares.
-            source = [-tangent[0], -tangent[1], -1.0]
-            first = [v * a_ - b for a_, b in zip(point, source)]
-            top = sum(v * a_**2 - 2 * a_ * b for a_, b in zip(point, source))
-            sizes = np.sqrt(sum(a_**2 for a_ in first)) + np.sqrt(sum(b**2 for b in source))
-            path = before * top / sizes
+        hits.append([a + b for a, b in zip(back, origin)])
+        if i < count and scene.joined[i]:
+            continue
+        point, before = hits[-1], n[..., i, :, None]
+        if path is None:
+            path = before * _from_source(point, v, tangent)
         else:
-            path = path + before * s
+            path, good = path + before * s, good & (np.real(s) > 0)
+        good &= np.real(own_d[2]) * sense > 0
         if i == count:
             break
-        size = np.sqrt(1 + zx**2 + zy**2)
-        normal = [-zx / size, -zy / size, 1 / size]
-        cosine = sum(a_ * b for a_, b in zip(normal, own_d))
-        sign = np.where(np.real(cosine) < 0, -1.0, 1.0)
-        normal, cosine = [sign * a_ for a_ in normal], sign * cosine
-        # n sin is kept, also where a mirror lies between media that are moved apart.
         ratio = before / n[..., i + 1, :, None]
-        leaving = np.sqrt(1 - ratio**2 * (1 - cosine**2))
-        leaving = -leaving if scene.mirrors[i] else leaving
-        d = [ratio * a_ + (leaving - ratio * cosine) * b for a_, b in zip(own_d, normal)]
+        own_d, along, passes = _bend(own_d, slopes, ratio, scene.mirrors[i])
+        good = good & passes & (np.real(along) * sense > 0)
+        sense = -sense if scene.mirrors[i] else sense
         for axis in (2, 1, 0):
-            d = _rotate(d, axis, tilt[axis])
-    return own_hits, hits, path
+            own_d = _rotate(own_d, axis, tilt[axis])
+        d = own_d
+    return Trace(own_hits, hits, path, good)
 
 
-def _aimed(scene, pupil):
-    """Where rays (W, Q) through the stop points `pupil` (2, Q) enter, and the 2 x 2 inverse of
-    how the stop point follows. Field and aperture are opened in steps."""
-    shape = (len(scene.wavelengths), pupil.shape[1])
-    radius = scene.values["semi_diameter"][scene.stop]
+def reach(scene, pupil):
+    """Where rays (..., W, Q) through the stop points `pupil` (2, Q) enter; the 2 x 2 inverse of
+    how the stop point follows; and whether the last Newton step was rounding. The scene is real.
+    Field and aperture are opened in steps."""
+    lead = np.broadcast_shapes(*(scene.values[k].shape[:-1] for k in ("field", "curvature")))
+    shape = (*lead, len(scene.wavelengths), pupil.shape[1])
+    radius = _wide(scene.values["semi_diameter"][..., scene.stop])
     x, y = (np.broadcast_to(0.3 * radius * p, shape) for p in pupil)
     for part in (0.3, 0.6, 0.8, 0.9, 1.0):
         eased = scene.replace(field=part * scene.values["field"])
@@ -249,12 +330,20 @@ def _aimed(scene, pupil):
             (a, b), (c, d) = (np.imag([by_x[j], by_y[j]]) / STEP for j in (0, 1))
             inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
             step = [inverse[j, 0] * miss[0] + inverse[j, 1] * miss[1] for j in (0, 1)]
+            step = np.where(np.isfinite(step), step, 1.0)
             x, y = x - step[0], y - step[1]
-            if np.max(np.abs(step)) < 1e-13 * (1 + np.max(np.abs([x, y]))):
+            settled = np.max(np.abs(step), axis=0) < 1e-13 * (1 + np.hypot(x, y))
+            if np.all(settled):
                 break
-        else:
-            raise ArithmeticError(f"rays do not reach the stop: {np.max(np.abs(step))} mm")
-    return x, y, inverse
+    return x, y, inverse, settled
+
+
+def _aimed(scene, pupil):
+    """The first three results of `reach`; ArithmeticError where there is no ray."""
+    *start, settled = reach(scene, pupil)
+    if not np.all(settled):
+        raise ArithmeticError(f"{np.sum(~settled)} rays do not reach the stop")
+    return start
 
 
 def aim(scene, pupil, start=None):
@@ -271,6 +360,11 @@ def aim(scene, pupil, start=None):
     return x, y
 
 
+def xyz(rays):
+    """The hits of a `Trace` along the axes of the lens, (..., W, Q, S + 1, 3)."""
+    return np.stack([np.stack(np.broadcast_arrays(*hit), -1) for hit in rays.hits], -2)
+
+
 def outputs(scene, rule, symmetry, points, starts=(None, None)):
     """centroid (..., W, 2), covariance (..., W, 2, 2), path (..., W, Q) and hits
     (..., W, Q, S + 1, 3) along the axes of the lens.
@@ -280,8 +374,7 @@ def outputs(scene, rule, symmetry, points, starts=(None, None)):
     of the rays through `points` (2, Q).
     """
     nodes, weights = rule
-    own, _, _ = trace(scene, *aim(scene, nodes, starts[0]))
-    x, y, _ = own[-1]
+    x, y, _ = trace(scene, *aim(scene, nodes, starts[0])).own[-1]
 
     def average(values):
         return np.sum(weights * values, axis=-1)
@@ -295,9 +388,9 @@ def outputs(scene, rule, symmetry, points, starts=(None, None)):
         xx, yy, xy = average(x * x), average(y * y), average(x * y)
         xy = zero if symmetry == "half" else xy
     covariance = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
-    _, hits, path = trace(scene, *aim(scene, points, starts[1]))
-    hits = np.stack([np.stack(np.broadcast_arrays(*hit), -1) for hit in hits], -2)
-    return {"centroid": np.stack(mean, -1), "covariance": covariance, "path": path, "hits": hits}
+    rays = trace(scene, *aim(scene, points, starts[1]))
+    centroid = np.stack(mean, -1)
+    return {"centroid": centroid, "covariance": covariance, "path": rays.path, "hits": xyz(rays)}
 
 
 def jacobian(scene, rule, symmetry, points, names):
