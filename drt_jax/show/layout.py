@@ -1,24 +1,31 @@
-"""Outlines of a lens and rays through it, as polylines in the (z, y) plane to be plotted."""
+"""A lens in section: its outlines and rays as polylines in the (z, y) plane, and their picture."""
 
+import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
-from jax.typing import ArrayLike
+from matplotlib.axes import Axes
 
-from ..rays.fermat import Status
-from ..lens.lens import Lens, rotation_matrix
-from ..lens.surface import Shape, sag
+from ..lens.lens import Lens, rotation_matrix, sag
+from ..rays.status import Status
 from ..rays.trace import trace_rays
 
-__all__ = ["Drawing", "draw"]
+__all__ = ["Drawing", "draw", "lens_drawing"]
 
 _POINTS = 41
+_FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 
 
 class Drawing(NamedTuple):
-    """Polylines (N, 2) of (z, y) in mm, the section x = 0: glass, closed outlines of the
-    elements; mirrors; stop, its two blades; sensor; rays, a list for each field."""
+    """Polylines (N, 2) of (z, y) in mm, the section x = 0.
+
+    glass: closed outlines of the elements.
+    mirrors: their faces.
+    stop: its two blades, also where it pokes through a surface.
+    sensor: its face.
+    rays: a list for each field.
+    """
 
     glass: list[np.ndarray]
     mirrors: list[np.ndarray]
@@ -29,43 +36,65 @@ class Drawing(NamedTuple):
 
 def draw(
     lens: Lens,
-    fields: ArrayLike = (0.0,),
+    fields: float | Sequence[float] = 0.0,
     distance: float = float("inf"),
     wavelength: float = 0.55,
     rays: int = 7,
 ) -> Drawing:
-    """Draw a lens with `rays` meridional rays for each field angle (radians, along y)."""
+    """The polylines of a lens and of a fan of meridional rays for each field.
+
+    fields: angles along y, radians.
+    distance: from the object to the first vertex, mm.
+    wavelength: um.
+    rays: how many for each field; those that do not arrive are left out.
+    """
+    angles = [float(angle) for angle in np.atleast_1d(fields)]
     heights = np.linspace(-1.0, 1.0, rays)
     pupil = np.stack([np.zeros_like(heights), heights], axis=-1)
-    fields = [float(field) for field in np.atleast_1d(fields)]
-    fans = [trace_rays(lens, field, distance, [wavelength], pupil) for field in fields]
-    good = [np.asarray(fan.points[0])[np.asarray(fan.status[0]) == Status.OK] for fan in fans]
-    reach = max([float(np.max(np.abs(p[..., 1]))) for p in good if p.size], default=1.0)
-    lead = 0.15 * float(lens.sensor)
+    # A surface that bends no light is no corner of a ray, nor a face of glass.
+    corners = [*lens.live, lens.count]
+    hits = []
+    for angle in angles:
+        fan = trace_rays(lens, angle, distance, wavelength, pupil)
+        arrived = np.asarray(fan.status[0]) == Status.OK
+        hits.append(np.asarray(fan.points[0])[arrived][:, corners, :0:-1])
+    drawn = np.concatenate([np.zeros((1, 2)), *(hit.reshape(-1, 2) for hit in hits)])
+    reach = float(np.max(np.abs(drawn[:, 1]))) or 1.0
+    z = np.concatenate([drawn[:, 0], np.asarray(lens.vertices)])
+    start = np.min(z) - 0.15 * np.ptp(z)
     paths = [
-        [_path(ray, lead, field, distance) for ray in points] for field, points in zip(fields, good)
+        [_path(ray, start, angle, distance) for ray in hit]
+        for angle, hit in zip(angles, hits, strict=True)
     ]
-
     semi = np.asarray(lens.semi_diameter)
     semi = np.where(np.isfinite(semi), semi, 1.1 * reach)
-    faces = [_profile(lens, i, semi[i]) for i in range(len(semi))]
+    faces = [_profile(lens, i, semi[i]) for i in range(lens.count)]
     glass = [
-        np.concatenate([faces[i], faces[i + 1][::-1], faces[i][:1]])
-        for i in range(len(faces) - 1)
+        np.concatenate([faces[i], faces[j][::-1], faces[i][:1]])
+        for i, j in itertools.pairwise(lens.live)
         if lens.glasses[i + 1] != lens.glasses[0]
     ]
-    mirrors = [face for face, mirror in zip(faces, lens.mirrors) if mirror]
-    low, high = faces[lens.stop][0], faces[lens.stop][-1]
-    outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
-    blades = [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
-    ends = [path[-1] for fan in paths for path in fan]
-    middle = np.array([[float(lens.sensor), 0.0]])
-    if lens.decentre is not None:
-        middle = middle + np.array([0.0, float(lens.decentre[-1, 1])])
-    wide = max([float(np.linalg.norm(end - middle)) for end in ends], default=0.0)
-    wide = max(1.1 * wide, 0.3 * reach)
-    sensor = _placed(lens, len(semi), np.array([-wide, wide]), np.zeros(2))
-    return Drawing(glass, mirrors, blades, sensor, paths)
+    mirrors = [face for face, mirror in zip(faces, lens.mirrors, strict=True) if mirror]
+    return Drawing(
+        glass, mirrors, _blades(faces[lens.stop], reach), _sensor(lens, paths, reach), paths
+    )
+
+
+def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
+    """The polylines that `draw` gives, on the axes of a figure."""
+    for outline in drawing.glass:
+        axes.fill(*outline.T, facecolor="#cfe4f5", edgecolor="#30506b", linewidth=0.8)
+    for mirror in drawing.mirrors:
+        axes.plot(*mirror.T, color="#30506b", linewidth=2)
+    for fan, colour in zip(drawing.rays, itertools.cycle(_FIELDS)):
+        for ray in fan:
+            axes.plot(*ray.T, color=colour, linewidth=0.6)
+    for blade in drawing.stop:
+        axes.plot(*blade.T, color="black", linewidth=2.5, solid_capstyle="butt", zorder=3)
+    axes.plot(*drawing.sensor.T, color="black", linewidth=1.5)
+    axes.set_aspect("equal")
+    axes.set(xlabel="z from the first vertex (mm)", ylabel="y (mm)")
+    return axes
 
 
 def _placed(lens: Lens, i: int, y: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -73,23 +102,31 @@ def _placed(lens: Lens, i: int, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     points = np.stack([np.zeros_like(y), y, z], axis=-1)
     if lens.tilt is not None:
         points = points @ np.asarray(rotation_matrix(lens.tilt[i])).T
-    across = np.zeros(2) if lens.decentre is None else np.asarray(lens.decentre[i])
-    place = lens.sensor if i == len(lens.forms) else lens.vertices[i]
-    return np.stack([points[:, 2] + float(place), points[:, 1] + across[1]], axis=-1)
-
-
-_sag = jax.jit(sag, static_argnums=2)
+    up = 0.0 if lens.decentre is None else float(lens.decentre[i, 1])
+    return points[:, :0:-1] + np.array([float(lens.vertices[i]), up])
 
 
 def _profile(lens: Lens, i: int, semi: float) -> np.ndarray:
-    y = np.linspace(-semi, semi, _POINTS).astype(lens.curvature.dtype)
-    shape = Shape(*(np.asarray(a)[i] for a in (lens.curvature, lens.conic, lens.coefficients)))
-    return _placed(lens, i, y, np.asarray(_sag(np.stack([0 * y, y]), shape, lens.forms[i])))
+    y = np.linspace(-semi, semi, _POINTS)
+    return _placed(lens, i, y, np.asarray(sag(lens, i, 0.0, y)))
 
 
-def _path(points: np.ndarray, lead: float, field: float, distance: float) -> np.ndarray:
-    """(z, y) of a ray from `lead` mm before the first vertex to the sensor."""
-    first = points[0]
-    slope = (first[1] / distance + np.tan(field)) / (first[2] / distance + 1)
-    start = [-lead, first[1] - slope * (first[2] + lead)]
-    return np.concatenate([[start], points[:, [2, 1]]])
+def _path(corners: np.ndarray, start: float, angle: float, distance: float) -> np.ndarray:
+    """(z, y) of a ray from the plane `start` before the lens through its corners."""
+    z, y = corners[0]
+    slope = (y / distance + np.tan(angle)) / (z / distance + 1)
+    return np.concatenate([[[start, y - slope * (z - start)]], corners])
+
+
+def _blades(face: np.ndarray, reach: float) -> list[np.ndarray]:
+    low, high = face[0], face[-1]
+    outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
+    return [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
+
+
+def _sensor(lens: Lens, paths: list[list[np.ndarray]], reach: float) -> np.ndarray:
+    """As wide as the rays that meet it, about its centre."""
+    middle = _placed(lens, lens.count, np.zeros(1), np.zeros(1))
+    ends = [float(np.linalg.norm(path[-1] - middle)) for fan in paths for path in fan]
+    wide = max(1.1 * max(ends, default=0.0), 0.3 * reach)
+    return _placed(lens, lens.count, np.array([-wide, wide]), np.zeros(2))

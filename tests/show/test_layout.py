@@ -4,9 +4,9 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from drt_jax import load_lens
-from drt_jax.show import layout as drawing
+from drt_jax import load_lens, show
 
 FOLDED = {
     "surfaces": [
@@ -19,11 +19,20 @@ FOLDED = {
     "sensor_decentre": [0, 60],
     "sensor_tilt": [90, 0, 0],
 }
+# The vertex of the front surface lies 0.2 mm before its stop, its rim behind.
+PHONE = {
+    "surfaces": [
+        {"radius": "inf", "semi_diameter": 1.0, "stop": True, "thickness": -0.2},
+        {"radius": 1.7, "thickness": 0.8, "glass": "N-BK7", "semi_diameter": 1.2},
+        {"radius": -9.0, "semi_diameter": 1.2},
+    ],
+    "sensor": 3.0,
+}
 
 
 def test_a_folded_lens():
     lens = load_lens(FOLDED)
-    drawn = drawing.draw(lens, [0.0, 0.05])
+    drawn = show.draw(lens, [0.0, 0.05])
     assert len(drawn.glass) == 1 and len(drawn.mirrors) == 1 and len(drawn.stop) == 2
     np.testing.assert_allclose(drawn.glass[0][0], drawn.glass[0][-1])  # a closed outline
     np.testing.assert_allclose(drawn.mirrors[0][:, 0] - 45, drawn.mirrors[0][:, 1], atol=1e-12)
@@ -41,5 +50,28 @@ def test_a_folded_lens():
 def test_a_lens_without_apertures_is_drawn_to_its_rays():
     lens = load_lens("singlet")
     semi = jnp.full_like(lens.semi_diameter, jnp.inf).at[0].set(5.0)
-    drawn = drawing.draw(dataclasses.replace(lens, semi_diameter=semi))
+    drawn = show.draw(dataclasses.replace(lens, semi_diameter=semi))
     assert 5 < np.max(drawn.glass[0][:, 1]) < 8
+
+
+@pytest.mark.parametrize("distance", [np.inf, 40.0])
+def test_a_stop_that_pokes_through_a_surface_is_drawn_and_is_no_corner_of_a_ray(distance):
+    drawn = show.draw(load_lens(PHONE), 0.1, distance)
+    for side, blade in zip((-1, 1), drawn.stop, strict=True):
+        np.testing.assert_allclose(blade[:, 0], 0, atol=1e-12)
+        assert blade[0, 1] == side and abs(blade[1, 1]) > 1
+    (face,) = drawn.glass
+    assert face[:, 0].min() < -0.19 and face[0, 0] > 0  # the stop lies between vertex and rim
+    paths = np.stack(drawn.rays[0])  # start, two faces, sensor
+    assert paths.shape == (7, 4, 2) and np.all(np.diff(paths[:, :, 0]) > 0)
+    z, y = np.moveaxis(paths[:, :2], -1, 0)
+    crossed = y[:, 1] - z[:, 1] * np.diff(y)[:, 0] / np.diff(z)[:, 0]
+    np.testing.assert_allclose(crossed, np.linspace(-1, 1, 7), atol=1e-9)
+
+
+def test_the_picture_holds_every_line():
+    drawn = show.draw(load_lens(FOLDED), [0.0, 0.05])
+    figure, axes = show.new()
+    show.lens_drawing(axes, drawn)
+    assert len(axes.lines) == 1 + 14 + 2 + 1 and len(axes.patches) == 1
+    assert figure.axes == [axes]
