@@ -3,19 +3,25 @@ PYTHON ?= python3
 BIN := .venv/bin
 OUT := runs/demo-$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: install demo test test-all
+.PHONY: install demo check test test-all
 install: .venv/installed
 
 .venv/installed: pyproject.toml
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python 3.11 or newer is needed: make PYTHON=python3.12 ...')"
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	touch $@
 
 demo: install
 	$(BIN)/python -m experiments.focus --out $(OUT)/focus
 	$(BIN)/python -m experiments.edof --config configs/demo/edof.yaml --out $(OUT)/edof
 	@echo "Demo finished: pictures in $(OUT)/focus/figures and $(OUT)/edof/figures"
+
+# Style and types.
+check: install
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
 
 test: install
 	$(BIN)/python -m pytest
