@@ -23,7 +23,6 @@ from .learn.network import red_net
 from .lens.paraxial import (
     FirstOrder,
     Pupil,
-    ThirdOrder,
     back_focal_distance,
     entrance_pupil,
     exit_pupil,
@@ -35,9 +34,10 @@ from .lens.paraxial import (
     image_height,
     lateral_magnification,
     numerical_aperture,
-    third_order,
 )
-from .files.prescription import LensError, lens_names, load_lens
+from .lens.seidel import ThirdOrder, third_order
+from .files.specs import LensError
+from .files.yaml import lens_names, load_lens
 from .image.kernel import SeparableKernel, gaussian_psf
 from .image.sensor import convolve, sensor_layer
 from .rays.snell import launch_paraxial, trace_snell

@@ -14,7 +14,15 @@ from jax.typing import ArrayLike
 
 from ..numerics import concrete
 
-__all__ = ["Dispersion", "Glass", "find_glass", "refractive_index"]
+__all__ = [
+    "Dispersion",
+    "Glass",
+    "check_wavelengths",
+    "common_range",
+    "find_glass",
+    "known_index",
+    "refractive_index",
+]
 
 # The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -25,16 +33,19 @@ _SCHOTT_POWERS = (0, 2, -2, -4, -6, -8)
 class Glass:
     """Dispersion constants of one medium.
 
-    name: as in a prescription. sellmeier: (B1 .. BT, C1 .. CT), C in um^2, of any number of
-    terms T. schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8. range:
-    wavelengths in um for which they hold. n^2 is the sum of both forms; a Sellmeier glass has
-    a0 = 1, a medium of constant index n has a0 = n^2.
+    n^2 is the sum of both forms; a Sellmeier glass has a0 = 1, a medium of constant index n has
+    a0 = n^2.
+
+    name: as in a prescription.
+    sellmeier: (B1 .. BT, C1 .. CT), C in um^2, of any number of terms T.
+    schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
+    range: wavelengths in um for which they hold; of no glass, 0.1 nm to 1 m.
     """
 
     name: str
     sellmeier: tuple[float, ...] = (0.0,) * 6
     schott: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    range: tuple[float, float] = (0.0, float("inf"))
+    range: tuple[float, float] = (1e-4, 1e6)
 
 
 @jax.tree_util.register_dataclass
@@ -42,9 +53,11 @@ class Glass:
 class Dispersion:
     """Dispersion constants of M media as arrays, so that an index can be differentiated.
 
-    strength (M, T) and resonance (M, T, um^2) are Sellmeier's B and C, T = 3 or that of the
-    medium with the most terms, the others padded with zeros; schott (M, 6) the coefficients of
-    L^0, L^2, L^-2, L^-4, L^-6, L^-8.
+    T = 3 or the number of terms of the medium with the most, the others padded with zeros.
+
+    strength: (M, T), Sellmeier's B.
+    resonance: (M, T), Sellmeier's C in um^2.
+    schott: (M, 6), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
     """
 
     strength: Array
@@ -57,11 +70,9 @@ class Dispersion:
         halves = [np.asarray(m.sellmeier, float).reshape(2, -1) for m in media]
         terms = max(3, *(half.shape[1] for half in halves))
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
-        return cls(
-            strength=jnp.asarray(padded[:, 0], float),
-            resonance=jnp.asarray(padded[:, 1], float),
-            schott=jnp.asarray([m.schott for m in media], float),
-        )
+        parts = padded[:, 0], padded[:, 1], np.asarray([m.schott for m in media])
+        dtype = jnp.result_type(float)
+        return cls(*(jax.device_put(part.astype(dtype)) for part in parts))
 
 
 @functools.cache
@@ -92,25 +103,55 @@ def find_glass(name: str) -> Glass:
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     """Index of each medium at each wavelength, shape (M, W).
 
-    `wavelengths` (W,) in um. Relative to air, whose own index is taken as 1.
+    Relative to air, whose own index is taken as 1.
+
+    dispersion: of M media.
+    wavelengths: (W,) in um.
     """
-    square = wavelengths**2
-    b, c, a = dispersion.strength, dispersion.resonance, dispersion.schott
-    sellmeier = jnp.sum(b[:, :, None] * square / (square - c[:, :, None]), axis=1)
+    b, c = dispersion.strength[..., None], dispersion.resonance[..., None]
+    square = (wavelengths**2)[None, None]
+    sellmeier = jnp.sum(b * square / (square - c), axis=1)
     powers = jnp.stack([wavelengths**p for p in _SCHOTT_POWERS])
-    return jnp.sqrt(sellmeier + a @ powers)
+    return jnp.sqrt(sellmeier + dispersion.schott @ powers)
+
+
+def _range(name: str) -> tuple[float, float]:
+    """Wavelengths in um for which the constants of a medium hold."""
+    return _catalogue().get(name, Glass(name)).range
+
+
+def common_range(names: tuple[str, ...]) -> tuple[float, float]:
+    """The shortest and the longest wavelength, um, at which all media have a known index.
+
+    names: of media; one that is not in the catalogue has a constant index. The first number is the
+    larger one if there is no such wavelength.
+    """
+    low, high = zip(*map(_range, names))
+    return max(low), min(high)
+
+
+def known_index(names: tuple[str, ...], wavelengths: Array) -> Array:
+    """Whether all media have a known index at each wavelength, bool (W,); also inside a trace.
+
+    names: of media.
+    wavelengths: (W,) in um.
+    """
+    low, high = common_range(names)
+    return (wavelengths >= low) & (wavelengths <= high)
 
 
 def check_wavelengths(names: tuple[str, ...], wavelengths: ArrayLike) -> None:
-    """ValueError if a known wavelength (um) lies outside the range of a catalogue glass.
+    """ValueError if a known wavelength lies outside the range of a medium.
 
-    Inside a trace the values are not known and nothing is checked.
+    Inside a trace the values are not known and nothing is checked: see `known_index`.
+
+    names: of media.
+    wavelengths: (W,) or one, um.
     """
     if not concrete(wavelengths):
         return
-    glasses = _catalogue()
     for name in names:
-        low, high = glasses[name].range if name in glasses else (0.0, np.inf)
+        low, high = _range(name)
         for value in np.atleast_1d(np.asarray(wavelengths)):
             if not low <= value <= high:
                 raise ValueError(

@@ -1,0 +1,139 @@
+"""Third-order aberrations: the Seidel sums of a lens with an axis, and its paraxial colour.
+
+Source of the formulae: Welford, Aberrations of Optical Systems (1986), ch. 8, 10.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..numerics import safe_divide
+from .lens import Lens
+from .paraxial import (
+    ParaxialRay,
+    ParaxialSystem,
+    chief_ray,
+    marginal_ray,
+    paraxial_system,
+    petzval_parts,
+    trace_ray,
+)
+from .surface import FORMS
+
+__all__ = ["ThirdOrder", "third_order"]
+
+
+class ThirdOrder(NamedTuple):
+    """Third-order aberrations at the paraxial image, the parts of the surfaces.
+
+    Transverse, of the ray through the rim of the stop from the edge of the field; signed as
+    CODE V prints SA, TCO, TAS, SAS, PTB, DST, AX, LAT, PTZ.
+
+    spherical: (S, W) in mm.
+    tangential_coma: (S, W) in mm.
+    tangential_astigmatism: (S, W) in mm, of the tangential image, from the paraxial image plane.
+    sagittal_astigmatism: (S, W) in mm, of the sagittal image, likewise.
+    petzval_blur: (S, W) in mm.
+    distortion: (S, W) in mm.
+    axial_colour: (S, W) in mm, the shortest wavelength against the longest.
+    lateral_colour: (S, W) in mm, likewise.
+    petzval_curvature: (S, W) in 1/mm.
+    """
+
+    spherical: Array
+    tangential_coma: Array
+    tangential_astigmatism: Array
+    sagittal_astigmatism: Array
+    petzval_blur: Array
+    distortion: Array
+    axial_colour: Array
+    lateral_colour: Array
+    petzval_curvature: Array
+
+    @property
+    def total(self) -> "ThirdOrder":
+        """The sums over the surfaces, each (W,)."""
+        return ThirdOrder(*(jnp.sum(part, axis=0) for part in self))
+
+
+def _fourth_order(lens: Lens, vertex: Array) -> Array:
+    """Coefficient (S,) of r^4 in the sag, beyond the sphere of curvature `vertex` (S,), mm^-3."""
+    c, k = lens.curvature[:-1], lens.conic[:-1]
+    columns = np.array([3 if form == "odd_asphere" else 1 for form in lens.forms[:-1]])
+    powers = jnp.pad(lens.coefficients[:-1], ((0, 0), (0, 4)))
+    fourth = powers[np.arange(lens.count), columns]
+    return fourth + ((1 + k) * c**3 - vertex**3) / 8
+
+
+def _field_ray(system: ParaxialSystem, vergence: Array, tangent: Array) -> ParaxialRay:
+    """The chief ray from the edge of the field, the tangent of whose angle is given."""
+    height, slope = chief_ray(system, front=True)
+    # Scaled to the field, the slope of the line from the object point to the first vertex.
+    scale = safe_divide(tangent, slope - vergence * height)
+    return trace_ray(system, height * scale, slope * scale)
+
+
+def _seidel(
+    system: ParaxialSystem, figure: Array, marginal: ParaxialRay, chief: ParaxialRay
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Seidel's five terms (S, W), mm. `figure` (S,): coefficients of r^4 beyond the sphere."""
+    n, c = system.index, system.curvature[:, None]
+    y, chief_y = marginal.height, chief.height
+    a, chief_a = n[:-1] * (y * c + marginal.before), n[:-1] * (chief_y * c + chief.before)
+    bend = y * (marginal.behind / n[1:] - marginal.before / n[:-1])
+    invariant = n[0] * (chief.before[0] * y[0] - marginal.before[0] * chief_y[0])
+    aspheric = 8 * figure[:, None] * (n[1:] - n[:-1])
+    # Welford's quotient of the chief and the marginal incidence, written without it.
+    change, step = 1 / n[1:] - 1 / n[:-1], 1 / n[1:] ** 2 - 1 / n[:-1] ** 2
+    s5 = chief_y * chief_a * c * change * (2 * y * chief_a - chief_y * a) - chief_a**3 * y * step
+    return (
+        -(a**2) * bend + aspheric * y**4,
+        -a * chief_a * bend + aspheric * y**3 * chief_y,
+        -(chief_a**2) * bend + aspheric * y**2 * chief_y**2,
+        (invariant**2)[None] * petzval_parts(system),
+        s5 + aspheric * y * chief_y**3,
+    )
+
+
+def third_order(
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike
+) -> ThirdOrder:
+    """Third-order aberrations of each surface, see `ThirdOrder`; `.total` sums them up.
+
+    Conics and the r^2 and r^4 terms of aspheres count; odd powers of r have no place in this
+    theory and are left out. Transverse aberrations are 0 for an image at infinity, colour is 0
+    for one wavelength. ValueError for a surface without rotational symmetry.
+
+    field: () in radians, the edge of the field.
+    distance: from the object to the first vertex in mm, inf allowed.
+    wavelengths: (W,) in um.
+    """
+    others = sorted({form for form in lens.forms if FORMS[form].symmetry != "rotation"})
+    if others:
+        raise ValueError(f"third order: no theory for surfaces of the form {', '.join(others)}")
+    system = paraxial_system(lens, wavelengths)
+    vergence = 1 / jnp.asarray(distance, lens.curvature.dtype)
+    n, c = system.index, system.curvature[:, None]
+    marginal = marginal_ray(system, vergence)
+    chief = _field_ray(system, vergence, jnp.tan(jnp.asarray(field, n.dtype)))
+    figure = _fourth_order(lens, system.curvature)
+    s1, s2, s3, s4, s5 = _seidel(system, figure, marginal, chief)
+
+    colours = jnp.atleast_1d(jnp.asarray(wavelengths, n.dtype))
+    spread = (n[:, jnp.argmin(colours)] - n[:, jnp.argmax(colours)])[:, None] / n
+    colour = n[:-1] * marginal.height * (spread[1:] - spread[:-1])
+    half = safe_divide(jnp.ones_like(n[-1]), 2 * n[-1] * marginal.behind[-1])[None]
+    return ThirdOrder(
+        spherical=half * s1,
+        tangential_coma=3 * half * s2,
+        tangential_astigmatism=half * (3 * s3 + s4),
+        sagittal_astigmatism=half * (s3 + s4),
+        petzval_blur=half * s4,
+        distortion=half * s5,
+        axial_colour=2 * half * colour * (marginal.height * c + marginal.before),
+        lateral_colour=2 * half * colour * (chief.height * c + chief.before),
+        petzval_curvature=-n[-1:] * petzval_parts(system),
+    )
