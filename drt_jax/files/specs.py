@@ -74,7 +74,7 @@ class _Entry:
         self.values: dict[Any, Any] = values
         for key in values:
             if key not in keys:
-                near = difflib.get_close_matches(str(key), map(str, keys), n=1)
+                near = difflib.get_close_matches(str(key), map(str, keys), n=1, cutoff=0.7)
                 hint = f"did you mean {near[0]!r}? " if near else ""
                 raise self.error("", f"unknown key {key!r}; {hint}known: {known}")
 
@@ -156,6 +156,8 @@ def _medium(entry: _Entry) -> Glass:
         value = entry.number("index")
         if value < 1:
             raise entry.error("index", f"{value:g} is below 1")
+        if value == 1:  # the same medium as air, so that a surface between both bends no light
+            return find_glass("air")
         return Glass(f"index {value!r}", schott=(value**2, 0.0, 0.0, 0.0, 0.0, 0.0))
     try:
         return find_glass(str(entry.values.get("glass", "air")))

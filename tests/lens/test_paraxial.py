@@ -10,7 +10,7 @@ import pytest
 import drt_jax
 from drt_jax import Status, load_lens, trace_rays, trace_snell
 
-from .conftest import RGB
+from ..conftest import RGB
 
 GREEN = jnp.array([0.55])
 COLOURS = jnp.array(RGB)

@@ -1,8 +1,17 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax.lens.glass import Dispersion, Glass, find_glass, refractive_index
+from drt_jax.lens.glass import (
+    Dispersion,
+    Glass,
+    check_wavelengths,
+    common_range,
+    find_glass,
+    known_index,
+    refractive_index,
+)
 
 # n_d of the catalogue pages and, for CODE V's listing of its Double Gauss sample, the indices
 # that program prints at 656.3, 587.6 and 486.1 nm (6 decimals).
@@ -61,3 +70,27 @@ def test_old_and_new_glass_types_are_not_mixed_up():
 def test_unknown_glass_lists_near_names(name, near):
     with pytest.raises(ValueError, match=f"unknown glass '{name}'.*{near}"):
         find_glass(name)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_range_of_the_glasses_is_known_inside_a_trace(dtype):
+    """SK16: 0.4 to 0.7 um, its ends included in either precision; F2 begins at 0.32 um."""
+    names = ("air", "F2", "SK16", "index 1.5")
+    assert common_range(names) == (0.4, 0.7)
+    w = jnp.array([0.1, 0.4, 0.55, 0.7, 0.71, jnp.nan, -0.5], dtype)
+    known = jax.jit(known_index, static_argnums=0)(names, w)
+    np.testing.assert_array_equal(known, [False, True, True, True, False, False, False])
+    check_wavelengths(names, w[1:4])
+    for wrong in (*w[:1], *w[4:]):
+        with pytest.raises(ValueError, match="um is outside the range of"):
+            check_wavelengths(names, wrong)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_without_a_glass_any_wavelength_but_zero_will_do(dtype):
+    low, high = common_range(("air", "index 1.5"))
+    w = jnp.array([0.0, low, 10.6, high], dtype)
+    np.testing.assert_array_equal(known_index(("air",), w), [False, True, True, True])
+    media = Dispersion.of([Glass("n", schott=(2.25, 0, 0, 0, 0, 0))])
+    n = refractive_index(jax.tree.map(lambda a: a.astype(dtype), media), w[1:])
+    np.testing.assert_array_equal(n, [[1.5] * 3])
