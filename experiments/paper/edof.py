@@ -2,36 +2,39 @@
 
 The object distance is random in each batch. Every starting position of the sensor is trained
 jointly with its network; one start also with the sensor fixed, for comparison. No ray is
-traced in the loop: the moments are interpolated in 1/distance. Writes figures 6a, 6b and 7,
-table 2 and results.json.
+traced in the loop: the moments are interpolated in 1/distance. Draws the lens and figures 6a, 6b
+and 7, and writes table 2.
 """
 
 import dataclasses
+import pathlib
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax.learn import network
-from drt_jax.show import plot
+from drt_jax import show
 from drt_jax.learn import train
 from drt_jax.learn.data import DataConfig
 from drt_jax.numerics import safe_sqrt
 from drt_jax.runs.folder import Run
 
-from . import _common
-from ._common import JointTraining, Scene
-from .restore import Net
+from . import _command, _common, _training
+from ._training import JointTraining, Net, Scene
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Settings of the experiment; see configs/edof.yaml.
 
-    depth_m: nearest and farthest object in training. fixed_mm: the start that is also trained
-    with the sensor fixed; one of starts_mm. table_depth_m: depths of table 2; patch_depth_m:
-    those of figure 7. test_patches: how many of the test patches are used (0: all).
+    fixed_mm: the start that is also trained with the sensor fixed; one of starts_mm.
+    depth_m: nearest and farthest object in training.
+    table_depth_m: depths of table 2.
+    patch_depth_m: depths of figure 7.
+    test_patches: how many of the test patches are used (0: all).
     """
 
     starts_mm: tuple[float, ...]
@@ -65,132 +68,120 @@ class Config:
         _common.require_noise("noise", self.noise)
 
 
-def run(config: Config, run: Run) -> None:
-    """Train jointly and with the sensor fixed, test over depth, write results and figures."""
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Train jointly and with the sensor fixed, and test over depth."""
     lens = drt_jax.load_lens(config.scene.lens)
-    depths = [*config.depth_m, *config.table_depth_m, *config.patch_depth_m]
-    span = 1e3 * min(depths), 1e3 * max(depths)
-    _, blur = drt_jax.moments_model(
-        lens, ("sensor",), 0.0, span, config.scene.wavelengths_um, config.scene.tolerance
-    )
-    init_network, restore = drt_jax.red_net(**dataclasses.asdict(config.network))
-    weights = init_network(jax.random.key(config.seed))
-    print(f"RED-Net with {network.count_parameters(weights)} parameters")
-    patches = _common.patches(config)
-    test = _common.thinned(patches.test, config.test_patches)
+    depths = *config.depth_m, *config.table_depth_m, *config.patch_depth_m
+    blur = config.scene.blur(lens, 1e3 * min(depths), 1e3 * max(depths))
+    weights, restore, _ = config.network.build(config.seed)
+    patches = _training.patches(config)
     near, far = (1e3 * depth for depth in config.depth_m)
 
-    imager = train.make_imager(blur, restore, config.camera)
-    init, step = train.make_step(imager, _common.rates(config), (near, far), config.seed)
+    def trained(job: str, blur: Callable, optics: dict) -> tuple[Callable, dict]:
+        imager = train.make_imager(blur, restore, config.camera)
+        functions = train.make_step(imager, config.train.rates, (near, far), config.seed)
+        parameters = {"optics": optics, "network": weights}
+        scenes, noise = patches.train, config.noise
+        found = _training.train_job(run, job, functions, parameters, scenes, noise, config)
+        return jax.jit(imager), found
+
     joint = {}
     for start in config.starts_mm:
-        parameters = {"optics": {"sensor": jnp.asarray(start)}, "network": weights}
-        joint[start] = _common.train_job(
-            run, f"start {start}", init, step, parameters, patches.train, config.noise, config
-        )
+        sensor = {"sensor": jnp.asarray(start)}
+        joint[start] = trained(_training.start_label(start), blur, sensor)
+    place = {"sensor": jnp.asarray(config.fixed_mm)}
+    fixed = trained(f"fixed {config.fixed_mm}", lambda _, distance: blur(place, distance), {})
+    models = {"fixed": fixed, "joint": joint[config.fixed_mm]}
+    results = _training.start_results(run, config, ("sensor_mm",))
+    final = results["final_mm"][config.starts_mm.index(config.fixed_mm)]
+    return {
+        **results,
+        **tested(config, models, _training.thinned(patches.test, config.test_patches)),
+        **blur_over_depth(blur, (config.fixed_mm, final), near, far),
+    }
 
-    def fixed_blur(values, distance):
-        return blur({"sensor": jnp.asarray(config.fixed_mm)}, distance)
 
-    fixed_imager = train.make_imager(fixed_blur, restore, config.camera)
-    init, step = train.make_step(fixed_imager, _common.rates(config), (near, far), config.seed)
-    fixed = _common.train_job(
-        run,
-        f"fixed {config.fixed_mm}",
-        init,
-        step,
-        {"optics": {}, "network": weights},
-        patches.train,
-        config.noise,
-        config,
-    )
-
-    best = joint[config.fixed_mm]
-    models = {"fixed": (jax.jit(fixed_imager), fixed), "joint": (jax.jit(imager), best)}
-    rows = []
+def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[str, Any]:
+    """Errors of both models over depth, and patches of the joint one."""
+    noise, rows = config.noise, []
     for depth in config.table_depth_m:
-        row = {"depth_m": depth}
-        for name, (model, parameters) in models.items():
-            row[name] = train.evaluate(
-                model, parameters, test, 1e3 * depth, config.noise, config.seed
-            )
-        rows.append(row)
-    traces = {f"start {s}": run.metrics(f"start {s}") for s in config.starts_mm}
-    window = _common.final_window(config)
-    inside = [row for row in rows if near <= 1e3 * row["depth_m"] <= far]
-    results = {
-        "starts_mm": list(config.starts_mm),
-        "final_mm": [float(np.mean(t["sensor_mm"][-window:])) for t in traces.values()],
-        "final_window_batches": window,
-        "joint_sensor_mm": float(best["optics"]["sensor"]),
+        errors = {
+            name: train.evaluate(*model, test, 1e3 * depth, noise, config.seed)
+            for name, model in models.items()
+        }
+        rows.append({"depth_m": depth, **errors})
+    near, far = config.depth_m
+    inside = [row for row in rows if near <= row["depth_m"] <= far]
+    chosen = _training.textured(test, len(config.patch_depth_m))
+    parts = []
+    for k, depth in enumerate(config.patch_depth_m):
+        some, key = chosen[k % len(chosen)][None], jax.random.key(k)
+        model = models["joint"]
+        parts.append(_training.images(*model, some, 1e3 * depth, np.float32(noise), key))
+    return {
+        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
+        "joint_sensor_mm": float(models["joint"][1]["optics"]["sensor"]),
+        "depth_m": list(config.depth_m),
+        "patch_depth_m": list(config.patch_depth_m),
         "table": rows,
         "mean_mae": {n: float(np.mean([row[n]["mae"] for row in inside])) for n in models},
         "mean_rmse": {n: float(np.mean([row[n]["rmse"] for row in inside])) for n in models},
         "test_patches": len(test),
-        "seconds": run.seconds,
     }
-    path = run.finish(results)
 
-    figures = [_common.draw_lens(run, lens, far)]
-    figures += [run.figures / f"figure_{name}.png" for name in ("6a", "6b", "7")]
-    figure, axes = plot.new(width=7, height=4.5)
-    lines = {k: (t["step"], t["sensor_mm"]) for k, t in traces.items()}
-    plot.convergence(axes, lines, "sensor position (mm)")
-    figure.savefig(figures[1])
-    final = results["final_mm"][config.starts_mm.index(config.fixed_mm)]
-    figure, axes = plot.new(width=7, height=4.5)
+
+def blur_over_depth(blur: Callable, sensors: tuple, near: float, far: float) -> dict[str, Any]:
+    """Blur in um along y of each colour, by depth in m, at sensor positions in mm."""
     grid = np.linspace(near, far, 121)
     sigma = jax.vmap(lambda d, s: safe_sqrt(blur({"sensor": s}, d)[1][:, 0]), in_axes=(0, None))
-    plot.sigma_over_depth(
-        axes,
-        grid / 1e3,
-        {
-            f"{s:.2f} mm": 1e3 * np.asarray(sigma(jnp.asarray(grid), s))
-            for s in (config.fixed_mm, final)
-        },
-    )
-    figure.savefig(figures[2])
-    _patches(*models["joint"], test, config).savefig(figures[3])
-
-    print(
-        _common.table(
-            ("start mm", "final mm"), list(zip(results["starts_mm"], results["final_mm"]))
-        )
-    )
-    print(
-        _common.table(
-            ("depth m", "MAE fixed", "MAE joint", "RMSE fixed", "RMSE joint"),
-            [(r["depth_m"], *(r[n][m] for m in ("mae", "rmse") for n in models)) for r in rows],
-        )
-    )
-    mean = results["mean_mae"]
-    print(
-        f"mean MAE from {config.depth_m[0]:g} to {config.depth_m[1]:g} m: sensor fixed at "
-        f"{config.fixed_mm:g} mm {mean['fixed']:.5f}, trained jointly {mean['joint']:.5f}"
-    )
-    print(f"results in {path}")
-    for item in figures:
-        print(f"figure {item}")
+    curves = [1e3 * np.asarray(sigma(jnp.asarray(grid), sensor)) for sensor in sensors]
+    return {
+        "blur_sensor_mm": list(sensors),
+        "blur_depth_m": grid / 1e3,
+        "blur_um": np.stack(curves),
+    }
 
 
-def _patches(imager, parameters, test, config):
-    """Figure 7: truth, sensor image and restored image, a patch for each depth."""
-    count = len(config.patch_depth_m)
-    chosen = _common.textured(test, count)
-    rows = {"truth": [], "sensor": [], "restored": []}
-    for k, depth in enumerate(config.patch_depth_m):
-        patch = chosen[k % len(chosen)][None]
-        images = imager(parameters, patch, 1e3 * depth, np.float32(config.noise), jax.random.key(k))
-        for name, image in zip(rows, images):
-            rows[name].append(np.asarray(image)[0])
-    return plot.patch_grid(
-        rows, [f"{depth:g} m" for depth in config.patch_depth_m], _common.rmse_notes(rows)
-    )
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Beside the paper, and table 2."""
+    mean, rows = results["mean_mae"], results["table"]
+    better = [r["depth_m"] for r in rows if r["fixed"]["mae"] < r["joint"]["mae"]]
+    beside = [
+        ("plane that all starts reach", "145.29 mm", _training.reached(results)),
+        (
+            "joint against fixed sensor, over the depths of training",
+            "joint better, but for 15 to 20 m",
+            f"mean MAE {mean['joint']:.4f} against {mean['fixed']:.4f}; "
+            f"fixed better at {', '.join(f'{depth:g}' for depth in better) or 'no'} m",
+        ),
+    ]
+    errors = [(m.upper() + " " + n, n, m) for n in ("fixed", "joint") for m in ("mae", "rmse")]
+    lines = [(title, *(f"{row[n][m]:.4f}" for row in rows)) for title, n, m in errors]
+    header = "depth m", *(f"{row['depth_m']:g}" for row in rows)
+    return {
+        "edof": _common.table(("", "paper", "here"), beside),
+        "edof, table 2": _common.table(header, lines),
+    }
+
+
+def report(results: dict[str, Any], figures: pathlib.Path) -> str:
+    """Draw the lens and figures 6a, 6b and 7."""
+    far = 1e3 * results["depth_m"][1]
+    _training.draw_lens(results["lens"], far, figures / "lens.png")
+    _training.draw_sensor(results, figures / "figure_6a.png")
+    figure, axes = show.new(width=7, height=4.5)
+    labels = [f"{sensor:.2f} mm" for sensor in results["blur_sensor_mm"]]
+    show.sigma_over_depth(axes, results["blur_depth_m"], dict(zip(labels, results["blur_um"])))
+    figure.savefig(figures / "figure_6b.png")
+    titles = [f"{depth:g} m" for depth in results["patch_depth_m"]]
+    _training.draw_patches(results, titles, figures / "figure_7.png")
+    return "\n\n".join(tables(results).values())
 
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    _common.main("edof", Config, ("loss", "sensor_mm", "sigma_um", "depth_mm"), run, argv)
+    columns = "loss", "sensor_mm", "sigma_um", "depth_mm"
+    _command.main("edof", Config, columns, run, report, argv)
 
 
 if __name__ == "__main__":

@@ -1,24 +1,28 @@
 """Section 6.1 of the paper: focus a lens by gradient descent through the sensor layer alone.
 
 Several starting positions of the sensor are trained together, without a network. No ray is
-traced in the loop: the moments are polynomials in the sensor position. Writes figures 4a and
-4b and results.json.
+traced in the loop: the moments are polynomials in the sensor position. Draws the lens and
+figures 4a and 4b.
 """
 
 import dataclasses
+import pathlib
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax.show import plot
+from drt_jax import show
+from drt_jax.image.sensor import convolve_taps
 from drt_jax.learn import train
 from drt_jax.learn.data import DataConfig
 from drt_jax.runs.folder import Run
 
-from . import _common
-from ._common import Scene, Training
+from . import _command, _common, _training
+from ._training import Scene, Training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,19 +44,11 @@ class Config:
         _common.require_noise("noise", self.noise)
 
 
-def best_focus(imager, scenes: np.ndarray, distance: float, noise: float, span: tuple) -> float:
-    """Sensor position of least training loss: a dense search, then a parabola at its minimum."""
-    key = jax.random.key(0)
-
-    def loss(sensor, scenes):
-        truth, image, _, _ = imager(
-            {"optics": {"sensor": sensor}}, scenes, distance, np.float32(noise), key
-        )
-        return jnp.mean(jnp.abs(image - truth))
-
+def best_focus(loss: Callable, scenes: np.ndarray, low: float, high: float) -> float:
+    """Sensor position between `low` and `high` mm of least `loss` (sensor, scenes), in mm: a dense
+    search, then a parabola at its minimum."""
     losses = jax.jit(lambda grid, scenes: jax.lax.map(lambda s: loss(s, scenes), grid))
     batch = min(32, len(scenes))
-    low, high = span
     for _ in range(3):
         grid = np.linspace(low, high, 41)
         step = grid[1] - grid[0]
@@ -66,83 +62,72 @@ def best_focus(imager, scenes: np.ndarray, distance: float, noise: float, span: 
     return float(grid[k] + step * (left - right) / (2 * (left - 2 * middle + right)))
 
 
-def run(config: Config, run: Run) -> None:
-    """Train all starts together, find the best focus independently, write the results."""
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Train all starts together, and find the best focus independently."""
     lens = drt_jax.load_lens(config.scene.lens)
     distance = 1e3 * config.distance_m
-    _, blur = drt_jax.moments_model(
-        lens,
-        ("sensor",),
-        0.0,
-        (distance, distance),
-        config.scene.wavelengths_um,
-        config.scene.tolerance,
-    )
-    imager = train.make_imager(blur, None, config.camera, forward=True)
-    patches = _common.patches(config)
-    starts = jnp.asarray(config.starts_mm)
-    init, step = train.make_step(
-        imager,
-        {"optics": config.train.optics_rate},
-        (distance, distance),
-        config.seed,
-        vectorised=True,
-    )
-    labels = tuple(f"start {start}" for start in config.starts_mm)
-    _common.train_job(
-        run,
-        "all starts",
-        init,
-        step,
-        {"optics": {"sensor": starts}},
-        patches.train,
-        config.noise,
-        config,
-        labels,
-    )
-    seconds = run.seconds
+    blur = config.scene.blur(lens, distance, distance)
+    imager = train.make_imager(blur, None, config.camera, convolve_taps)
+    patches = _training.patches(config)
+    rates, depths = {"optics": config.train.optics_rate}, (distance, distance)
+    functions = train.make_step(imager, rates, depths, config.seed, vectorised=True)
+    labels = tuple(map(_training.start_label, config.starts_mm))
+    starts = {"optics": {"sensor": jnp.asarray(config.starts_mm)}}
+    scenes = patches.train
+    _training.train_job(run, "all starts", functions, starts, scenes, config.noise, config, labels)
+    results = _training.start_results(run, config, ("sensor_mm", "sigma_um"))
 
-    traces = {label: run.metrics(label) for label in labels}
-    final = [float(np.mean(t["sensor_mm"][-200:])) for t in traces.values()]
-    span = min(*config.starts_mm, *final), max(*config.starts_mm, *final)
-    some = _common.thinned(patches.train, 512)
-    best = best_focus(imager, some, distance, config.noise, span)
-    near = [np.flatnonzero(np.abs(t["sensor_mm"] - best) <= 0.1) for t in traces.values()]
+    def loss(sensor, scenes):
+        key, noise = jax.random.key(0), np.float32(config.noise)
+        truth, image, _, _ = imager({"optics": {"sensor": sensor}}, scenes, distance, noise, key)
+        return jnp.mean(jnp.abs(image - truth))
+
+    every = *config.starts_mm, *results["final_mm"]
+    best = best_focus(loss, _training.thinned(scenes, 512), min(every), max(every))
+    near = [np.flatnonzero(np.abs(trace - best) <= 0.1) for trace in results["sensor_mm"]]
     first = [int(hits[0]) if hits.size else None for hits in near]
-    results = {
-        "starts_mm": list(config.starts_mm),
-        "final_mm": final,
-        "best_focus_mm": best,
-        "batches_to_focus": first,
-        "seconds": seconds,
-    }
-    path = run.finish(results)
-    figures = [_common.draw_lens(run, lens, distance)]
-    for name, column, label in (
-        ("figure_4a", "sensor_mm", "sensor position (mm)"),
-        ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)"),
+    return results | {"best_focus_mm": best, "batches_to_focus": first, "distance_mm": distance}
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Beside the paper, and each start."""
+    best = f"{results['best_focus_mm']:.3f}"
+    starts, first = results["starts_mm"], results["batches_to_focus"]
+    beside = [
+        (
+            "plane that all starts reach",
+            "133.35 mm",
+            f"{_training.reached(results)} (dense search on the same loss: {best})",
+        ),
+        (
+            f"batches until within 0.1 mm, starts {', '.join(f'{s:g}' for s in starts)} mm",
+            '"within the first 60"',
+            ", ".join(map(str, first)),
+        ),
+        ("training of all starts", "", _common.duration(results["seconds"])),
+    ]
+    return {"focus": _common.table(("", "paper", "here"), beside)}
+
+
+def report(results: dict[str, Any], figures: pathlib.Path) -> str:
+    """Draw the lens and figures 4a and 4b."""
+    _training.draw_lens(results["lens"], results["distance_mm"], figures / "lens.png")
+    best = results["best_focus_mm"]
+    for name, column, label, level in (
+        ("figure_4a", "sensor_mm", "sensor position (mm)", (best, f"best focus {best:.2f}")),
+        ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)", None),
     ):
-        figure, (left, right) = plot.new(1, 2, 5.5, 4)
-        lines = {k: (t["step"], t[column]) for k, t in traces.items()}
-        level = (best, f"best focus {best:.2f}") if column == "sensor_mm" else None
-        plot.convergence(left, lines, label, level)
-        plot.convergence(
-            right, {k: (x[:100], y[:100]) for k, (x, y) in lines.items()}, label, level
-        )
+        figure, (left, right) = show.new(1, 2, 5.5, 4)
+        show.convergence(left, _training.start_lines(results, column), label, level)
+        show.convergence(right, _training.start_lines(results, column, 100), label, level)
         right.set_title("the first 100 batches", fontsize=9)
-        figures.append(run.figures / f"{name}.png")
-        figure.savefig(figures[-1])
-    rows = list(zip(config.starts_mm, final, [str(n) for n in first]))
-    print(_common.table(("start mm", "final mm", "batches to within 0.1 mm"), rows))
-    print(f"best focus by dense search on the same loss: {best:.3f} mm")
-    print(f"training took {seconds:.1f} s; results in {path}")
-    for item in figures:
-        print(f"figure {item}")
+        figure.savefig(figures / f"{name}.png")
+    return tables(results)["focus"]
 
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    _common.main("focus", Config, ("loss", "sensor_mm", "sigma_um"), run, argv)
+    _command.main("focus", Config, ("loss", "sensor_mm", "sigma_um"), run, report, argv)
 
 
 if __name__ == "__main__":

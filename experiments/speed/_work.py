@@ -1,25 +1,44 @@
-"""What `benchmark` counts: the work in a training step, and how run time grows with a scene."""
+"""What `benchmark` measures with: compiled programs, rows, other processes, growing scenes."""
 
+import dataclasses
+import os
+import re
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import Lens
-from drt_jax.pupil import rules as pupil
+from drt_jax import Lens, pupil
+from drt_jax.image.sensor import convolve, convolve_taps
 from drt_jax.learn import train
 
+from . import _common
+
+Row = dict[str, Any]
+
+_FIRST = """
+import time; start = time.perf_counter()
+import jax; jax.config.update("jax_enable_x64", True)
+import drt_jax
+lens = drt_jax.load_lens({lens!r})
+sigma = lambda lens: drt_jax.psf_moments(lens, {field}, {distance}, [0.53])[1][0, 1, 1] ** 0.5
+jax.block_until_ready(jax.value_and_grad(sigma)(lens))
+print(time.perf_counter() - start)
+"""
 _SPREAD = """
-import sys, time
 import jax; jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", {devices})
 import numpy as np
 import drt_jax
-from drt_jax.pupil import rules as pupil
+from drt_jax import pupil
+from experiments._common import medians
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 lens = drt_jax.load_lens({lens!r})
 def trace(points):
@@ -30,43 +49,115 @@ rays = PartitionSpec("rays")
 trace = jax.jit(jax.shard_map(trace, mesh=mesh, in_specs=rays, out_specs=rays, check_vma=False))
 points = jax.device_put(pupil.random_disc({count}, {seed})[0].T, NamedSharding(mesh, rays))
 assert not np.any(np.asarray(trace(points)[1]))
-times = []
-for _ in range({repeats}):
-    start = time.perf_counter()
-    jax.block_until_ready(trace(points))
-    times.append(time.perf_counter() - start)
-print(np.median(times))
+print(medians([lambda: trace(points)], {repeats})[0])
 """
 
 
-def median_seconds(call, repeats: int) -> float:
-    """Median of `repeats` calls after one that does not count."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+@dataclasses.dataclass(frozen=True)
+class Ours:
+    """A compiled program of ours.
+
+    call: what it is called with no more.
+    measured: seconds that compiling took, MiB that it holds, and of how many kernels it consists
+        (those in a loop once).
+    """
+
+    call: Callable
+    measured: dict[str, float]
 
 
-def spread_over_devices(
-    lens: str,
-    field: float,
-    distance: float,
-    wave: float,
-    count: int,
-    seed: int,
-    repeats: int,
-    devices: int,
-) -> float:
-    """Seconds to trace `count` rays shared among so many CPU devices, in a process of its own:
-    JAX fixes their number when it starts."""
-    code = _SPREAD.format(**locals())
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(f"a process with {devices} devices failed: {done.stderr[-500:]}")
+def compiled(function: Callable, *arguments: Any, **options: Any) -> Ours:
+    """`function` compiled for its arguments, tracing included."""
+    return loaded(jax.jit(function, **options), *arguments)
+
+
+def loaded(function: Callable, *arguments: Any) -> Ours:
+    """The same of a jitted function. Arguments that it donates, it is given as copies."""
+    start = time.perf_counter()
+    lowered = function.lower(*arguments)
+    program = lowered.compile()
+    seconds = time.perf_counter() - start
+    memory = program.memory_analysis()
+    held = memory.temp_size_in_bytes + memory.output_size_in_bytes
+    kernels = len(re.findall(r" (?:fusion|dot|convolution|custom-call)\(", program.as_text()))
+    donated = [info.donated for info in jax.tree.leaves(lowered.args_info)]
+
+    def call():
+        leaves, structure = jax.tree.flatten(arguments)
+        given = [jnp.array(a) if gone else a for a, gone in zip(leaves, donated)]
+        return jax.block_until_ready(program(*jax.tree.unflatten(structure, given)))
+
+    measured = {"compile_s": seconds, "peak_mb": held / 2**20, "kernels": kernels}
+    return Ours(call, measured)
+
+
+def row(task: str, seconds: float, **known: Any) -> Row:
+    """A row of results.json; what is not known is None."""
+    columns = ("ours_error", "compile_s", "peak_mb", "kernels", "peer_s", "ratio", "peer_error")
+    empty = {"task": task, "ours_s": seconds, "peer": "", "note": "", **dict.fromkeys(columns)}
+    return empty | known
+
+
+def rows_of(
+    task: str, ours: Ours, error: float | None, peers: dict[str, tuple | str], repeats: int
+) -> list[Row]:
+    """Rows of one task: `peers` by name, (call, error) or why there is none."""
+    ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
+    calls = [ours.call, *(call for call, _ in ready.values())]
+    seconds, *others = _common.medians(calls, repeats)
+    found, rows = dict(zip(ready, others)), []
+    for name, peer in peers.items():
+        if name in found:
+            ratio = found[name] / seconds
+            known = {"peer_s": found[name], "ratio": ratio, "peer_error": peer[1]}
+        else:
+            known = {"note": peer}
+        rows.append(row(task, seconds, ours_error=error, peer=name, **ours.measured, **known))
+    return rows
+
+
+def in_a_new_process(code: str, environment: dict[str, str]) -> float:
+    """The number that Python code prints last, run without a cache but for `environment`."""
+    clean = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=clean | environment,
+        cwd=_common.ROOT,
+    )
+    _common.require(done.returncode == 0, f"lens: a new process failed: {done.stderr[-500:]}")
     return float(done.stdout.split()[-1])
+
+
+def first_seconds(lens: str, field: float, distance: float) -> list[float]:
+    """Seconds from the start of a process to a first gradient: anew, and with programs kept."""
+    code = _FIRST.format(lens=lens, field=field, distance=distance)
+    with tempfile.TemporaryDirectory() as folder:
+        kept = {
+            "JAX_COMPILATION_CACHE_DIR": folder,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        }
+        in_a_new_process(code, kept)
+        times = [[in_a_new_process(code, extra) for _ in range(3)] for extra in ({}, kept)]
+    return [float(np.median(some)) for some in times]
+
+
+def spread_over_devices(config: Any, devices: int) -> float:
+    """Seconds to trace the bundle of `benchmark` shared among so many CPU devices, in a process of
+    its own: JAX fixes their number when it starts."""
+    _, field, distance = config.scene
+    code = _SPREAD.format(
+        lens=config.lens,
+        field=field,
+        distance=distance,
+        wave=config.wavelengths_um[0],
+        count=config.bundle,
+        seed=config.seed,
+        repeats=config.repeats,
+        devices=devices,
+    )
+    return in_a_new_process(code, {})
 
 
 def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[str, int]:
@@ -82,7 +173,8 @@ def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[
     scenes = jnp.zeros((1, 32 + 20, 32 + 20, 3), jnp.uint8)
     for name, (trained, depths) in cases.items():
         values, blur = drt_jax.moments_model(lens, trained, 0.0, depths, wavelengths)
-        imager = train.make_imager(blur, None, train.Camera(), forward=len(trained) == 1)
+        kind = convolve_taps if len(trained) == 1 else convolve
+        imager = train.make_imager(blur, None, train.Camera(), kind)
         init, step = train.make_step(imager, {"optics": 1e-3}, depths, 0)
         state = init({"optics": values})
         program = step.trace(state, scenes, np.float32(0), np.int32(0)).jaxpr
@@ -117,17 +209,17 @@ def growth(lens: Lens, field: float, distance: float, repeats: int) -> dict[str,
             traced = drt_jax.trace_rays(lens, angle, distance, waves, points)
             return traced.points[:, :, -1], traced.status
 
-        program = jax.jit(trace).lower(points).compile()
-        if jnp.any(program(points)[1] != drt_jax.Status.OK):
+        program = compiled(trace, points)
+        if jnp.any(program.call()[1] != drt_jax.Status.OK):
             raise RuntimeError(f"{lens.name}: rays of the measurement fail")
-        return median_seconds(lambda: jax.block_until_ready(program(points)), repeats)
+        return _common.medians([program.call], repeats)[0]
 
     green = jnp.array([0.53])
-    found: dict[str, list] = {"rays": [], "surfaces": [], "wavelengths": []}
-    for rays in (256, 1024, 4096, 16384, 65536, 262144):
-        found["rays"].append((rays, seconds(lens, rays, green)))
-    for count in (3, 10, 30, 100, 300, 1000, 3000):
-        found["surfaces"].append((count, seconds(_plates(count), 256, green, 0.001)))
-    for waves in (1, 3, 10, 30, 100, 300, 1000):
-        found["wavelengths"].append((waves, seconds(lens, 64, jnp.linspace(0.45, 0.65, waves))))
-    return found
+    decades = [(n, jnp.linspace(0.45, 0.65, n)) for n in (1, 3, 10, 30, 100, 300, 1000)]
+    return {
+        "rays": [(n, seconds(lens, n, green)) for n in (256, 1024, 4096, 16384, 65536, 262144)],
+        "surfaces": [
+            (n, seconds(_plates(n), 256, green, 0.001)) for n in (3, 10, 30, 100, 300, 1000, 3000)
+        ],
+        "wavelengths": [(n, seconds(lens, 64, waves)) for n, waves in decades],
+    }

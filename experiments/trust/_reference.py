@@ -18,7 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drt_jax import Lens, trace_snell
+from drt_jax import Lens
+
+from .snell import trace_snell
 
 # The plane of q lies this far before the first vertex (mm).
 _LEAD = 5.0
@@ -34,9 +36,12 @@ _STEP_CURVATURE, _STEP_LENGTH = 2e-7, 2e-4
 class Moments(NamedTuple):
     """Of one colour, with derivatives by (curvatures, thicknesses and the sensor).
 
-    sigma: RMS spot radius, mm; centroid: its y, mm; gradient (2, P) of both. error: change of
-    both values, relative to sigma, when every node moves; gradient_error: change of sigma's
-    gradient, relative to its norm, when the step of the differences doubles.
+    sigma: RMS spot radius, mm.
+    centroid: its y, mm.
+    gradient: (2, P) of both.
+    error: change of both values, relative to sigma, when every node moves.
+    gradient_error: change of sigma's gradient, relative to its norm, when the step of the
+        differences doubles.
     """
 
     sigma: float
@@ -48,14 +53,14 @@ class Moments(NamedTuple):
 
 def flatten(lens: Lens) -> Array:
     """Curvatures, thicknesses and the sensor of a lens (or of a gradient) in one array (P,)."""
-    return jnp.concatenate([lens.curvature, lens.thickness, lens.sensor[None]])
+    return jnp.concatenate([lens.curvature[:-1], lens.thickness, lens.sensor[None]])
 
 
 def _moved(lens: Lens, values: Array) -> Lens:
     """The lens with `values` (P,) as in `flatten`."""
-    count = lens.curvature.size
+    curvature = lens.curvature.at[:-1].set(values[: lens.count])
     return dataclasses.replace(
-        lens, curvature=values[:count], thickness=values[count:-1], sensor=values[-1]
+        lens, curvature=curvature, thickness=values[lens.count : -1], sensor=values[-1]
     )
 
 
@@ -109,7 +114,7 @@ class _Pupil:
         padded[: len(q)] = q
         hits, ok = _hits(lens or self.lens, self.scene, padded)
         radius2 = np.sum(np.asarray(hits)[: len(q), :-1] ** 2, axis=-1)
-        limit2 = np.asarray(self.lens.semi_diameter) ** 2
+        limit2 = np.asarray(self.lens.semi_diameter)[:-1] ** 2
         return np.where(np.asarray(ok)[: len(q), None], radius2 / limit2 - 1, 1.0)
 
     def edge(self, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -173,10 +178,9 @@ def _integral(pupil: _Pupil):
 def _gradient(values, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """(2, P) derivatives of variance and centroid, and their change with the step."""
     start = np.asarray(flatten(lens))
-    count = lens.curvature.size
     columns, changes = [], []
     for k in range(start.size):
-        step = _STEP_CURVATURE if k < count else _STEP_LENGTH
+        step = _STEP_CURVATURE if k < lens.count else _STEP_LENGTH
         unit = step * np.eye(start.size)[k]
         near, far, farther = (
             (

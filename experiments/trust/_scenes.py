@@ -1,22 +1,18 @@
-"""Random scenes made to break a ray tracer, in families that share their static structure."""
+"""Parts of which random scenes are made: lenses, fields, pupil points."""
 
-import dataclasses
-from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
 from drt_jax.lens.glass import Dispersion
 
-__all__ = ["FAMILIES", "RAYS", "WAVELENGTH", "Scenes", "draw"]
+__all__ = ["WAVELENGTH", "Scenes", "fields", "lens_of", "pupil_points", "scenes_of", "two_elements"]
 
 RAYS = 8  # of each scene: the chief ray, three on the rim, the rest at random
 WAVELENGTH = 0.55
 _FAR = (np.inf, 1e3, 200.0)
-_FREEFORM = ("biconic", "toroid", "odd_asphere", "polynomial_xy", "asphere")
 
 
 class Scenes(NamedTuple):
@@ -29,40 +25,34 @@ class Scenes(NamedTuple):
     pupil: np.ndarray
 
 
-class Family(NamedTuple):
-    """variants: what `make(generator, count, variant)` is called with, scenes shared out evenly.
-    share: how many scenes for one of the other families."""
-
-    make: Callable[[np.random.Generator, int, object], Scenes]
-    variants: tuple
-    share: float = 1.0
-    dtype: str = "float64"
-
-
-def _lens(parts: dict, index: np.ndarray, stop: int, **static) -> drt_jax.Lens:
-    """A batch of lenses from arrays (N, ...) and constant indices (N, S + 1)."""
+def lens_of(parts: dict, index: np.ndarray, stop: int, **static) -> drt_jax.Lens:
+    """A batch of lenses from arrays (N, ...) of S surfaces, to which the sensor is added, and
+    constant indices (N, S + 1); `static`: fields of the lens, media all different by default."""
     count, media = index.shape
     schott = np.zeros((count, media, 6))
     schott[..., 0] = index**2
     zero = np.zeros((count, media, 3))
+    last = {"curvature": 0.0, "conic": 0.0, "coefficients": 0.0, "semi_diameter": np.inf}
+    for name, value in last.items():
+        row = np.full_like(parts[name][:, :1], value)
+        parts = parts | {name: np.concatenate([parts[name], row], axis=1)}
     arrays = {name: jnp.asarray(value, float) for name, value in parts.items()}
     return drt_jax.Lens(
         dispersion=Dispersion(jnp.asarray(zero), jnp.asarray(zero), jnp.asarray(schott)),
         stop=stop,
-        glasses=tuple(f"medium {i}" for i in range(media)),
+        **{"glasses": tuple(f"medium {i}" for i in range(media))} | static,
         **arrays,
-        **static,
     )
 
 
-def _pupil(rng: np.random.Generator, count: int) -> np.ndarray:
+def pupil_points(rng: np.random.Generator, count: int) -> np.ndarray:
     radius, angle = np.sqrt(rng.random((count, RAYS))), 2 * np.pi * rng.random((count, RAYS))
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     points[:, :4] = [[0, 0], [0, 1], [0, -1], [1, 0]]
     return points
 
 
-def _fields(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
+def fields(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
     """Angles of `low` to `high` degrees in any direction; a third along y, as users ask for."""
     size, turn = rng.uniform(low, high, count), 2 * np.pi * rng.random(count)
     turn = np.where(rng.random(count) < 1 / 3, np.pi / 2, turn)
@@ -70,7 +60,9 @@ def _fields(rng: np.random.Generator, count: int, low: float, high: float) -> np
     return np.arctan(np.stack([slope * np.cos(turn), slope * np.sin(turn)], axis=-1))
 
 
-def _parts(rng: np.random.Generator, count: int, stop: int, f_number: tuple = (1.4, 16)) -> tuple:
+def two_elements(
+    rng: np.random.Generator, count: int, stop: int, f_number: tuple = (1.4, 16)
+) -> tuple:
     """Two elements, or three cemented ones, of about the f-number, the stop at surface `stop`:
     a plane in air or a refracting surface. Returns the parts of a lens, and indices."""
     h = np.exp(rng.uniform(np.log(1), np.log(20), count))
@@ -107,262 +99,9 @@ def _parts(rng: np.random.Generator, count: int, stop: int, f_number: tuple = (1
     return parts, index, h
 
 
-def _scenes(rng, parts, index, stop, fields=(0.0, 15.0), distances=_FAR, **static) -> Scenes:
+def scenes_of(rng, parts, index, stop, angles=(0.0, 15.0), distances=_FAR, **static) -> Scenes:
     count = len(index)
-    field = _fields(rng, count, *fields)
+    field = fields(rng, count, *angles)
     field[rng.random(count) < 0.1] = 0
     distance = rng.choice(distances, count)
-    return Scenes(_lens(parts, index, stop, **static), field, distance, _pupil(rng, count))
-
-
-def aperture(rng, count, stop):
-    """f/0.7 to f/32."""
-    parts, index, _ = _parts(rng, count, stop, (0.7, 32))
-    return _scenes(rng, parts, index, stop)
-
-
-def curvature(rng, count, stop):
-    """Curvatures through zero, exact and as good as, and near-hemispherical ones."""
-    parts, index, h = _parts(rng, count, stop)
-    tiny = rng.choice([0.0, -0.0, 1e-300, -1e-16, 1e-12, -1e-9, 1e-6], (count, 5))
-    steep = rng.choice([-1, 1], (count, 5)) * rng.uniform(0.8, 1.02, (count, 5)) / h[:, None]
-    pick = rng.random((count, 5))
-    change = np.where(pick < 0.3, tiny, np.where(pick > 0.85, steep, parts["curvature"]))
-    return _scenes(rng, parts | {"curvature": change}, index, stop)
-
-
-def conic(rng, count, stop):
-    """Paraboloids, hyperboloids to k = -30, and oblate ellipsoids to k = 3."""
-    parts, index, _ = _parts(rng, count, stop, (0.8, 8))
-    low = -np.exp(rng.uniform(0, np.log(30), (count, 5)))
-    k = np.where(rng.random((count, 5)) < 0.2, -1.0, low)
-    k = np.where(rng.random((count, 5)) < 0.2, rng.uniform(0, 3, (count, 5)), k)
-    return _scenes(rng, parts | {"conic": k}, index, stop)
-
-
-def asphere(rng, count, stop):
-    """Aspheric departures of up to a tenth of the semi-diameter at the rim, terms of r^2 and
-    r^4 against each other."""
-    parts, index, h = _parts(rng, count, stop)
-    rim = h[:, None] * rng.uniform(-0.1, 0.1, (count, 5)) * rng.random((count, 1)) ** 2
-    a4 = rim / h[:, None] ** 4
-    a2 = -rng.random((count, 5)) * rim / h[:, None] ** 2
-    return _scenes(rng, parts | {"coefficients": np.stack([a2, a4], -1)}, index, stop)
-
-
-def index(rng, count, stop):
-    """Neighbouring indices equal, or apart by 1e-12 to 1e-2; some lenses all but vanish."""
-    parts, media, _ = _parts(rng, count, stop)
-    near = 1 + rng.choice([0.0, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2], media.shape)
-    close = rng.random(media.shape) < 0.5
-    media = np.where(close, near * rng.choice([1.0, 1.5, 1.9], (count, 1)), media)
-    return _scenes(rng, parts, media, stop)
-
-
-def edge(rng, count, stop):
-    """Rays that miss, graze or are totally reflected: stops too wide for steep surfaces, and
-    light that leaves glass at a slant."""
-    parts, media, h = _parts(rng, count, stop, (0.7, 2))
-    parts["semi_diameter"] = parts["semi_diameter"] * rng.uniform(1, 2.5, (count, 1))
-    slanted = rng.random(count) < 0.3
-    media[:, 0] = np.where(slanted, rng.uniform(1.4, 1.9, count), media[:, 0])
-    return _scenes(rng, parts, media, stop, (0, 40))
-
-
-def touching(rng, count, stop):
-    """Surfaces that touch: gaps of 0, of less than a coordinate's last digit, and of 1e-8 mm."""
-    return _close(rng, count, stop, [0.0, 1e-17, 1e-8])
-
-
-def close(rng, count, stop):
-    """Surfaces that all but touch, stop and sensor included: gaps of 1e-6 to 1e-2 mm."""
-    return _close(rng, count, stop, [1e-6, 1e-4, 1e-2])
-
-
-def _close(rng, count, stop, gaps):
-    parts, media, h = _parts(rng, count, stop)
-    gap = rng.choice(gaps, (count, 4))
-    thickness = np.where(rng.random((count, 4)) < 0.4, gap, parts["thickness"])
-    # Neighbours that touch must not cross: the same shape, or both planes.
-    c = parts["curvature"]
-    for i in range(4):
-        c[:, i + 1] = np.where(thickness[:, i] <= 1e-2, c[:, i], c[:, i + 1])
-    back = rng.choice([*gaps, 1.0, 30.0], count)
-    flat = back < 0.1  # the sensor on the last surface
-    c[:, 4] = np.where(flat, 0, c[:, 4])
-    c[:, 3] = np.where(flat & (thickness[:, 3] <= 1e-2), 0, c[:, 3])
-    sensor = np.sum(thickness, axis=1) + back + np.where(flat, 0, h)
-    return _scenes(rng, parts | {"thickness": thickness, "sensor": sensor}, media, stop)
-
-
-def distance(rng, count, stop):
-    """Objects at 10 mm, between, at 1e9 mm and at infinity."""
-    parts, media, _ = _parts(rng, count, stop, (1.4, 16))
-    return _scenes(rng, parts, media, stop, (0, 20), (10.0, 20.0, 50.0, 1e5, 1e9, 1e15, np.inf))
-
-
-def focus(rng, count, stop):
-    """The sensor exactly at the paraxial focus; and stigmatic ellipsoids, whose spot is 0."""
-    parts, media, h = _parts(rng, count, stop, (1, 16))
-    scenes = _scenes(rng, parts, media, stop, (0, 5))
-    image = jax.vmap(lambda lens, d: drt_jax.image_distance(lens, d, jnp.array([WAVELENGTH]))[0])
-    last = np.sum(parts["thickness"], axis=1)
-    sensor = np.asarray(jax.jit(image)(scenes.lens, jnp.asarray(scenes.distance)))
-    sensor = np.where((sensor > last) & (sensor < last + 40 * h), sensor, parts["sensor"])
-    ideal = rng.random(count) < 0.3
-    n, c = media[:, 1], rng.uniform(0.05, 0.6, count) / h
-    media = np.where(ideal[:, None], n[:, None], media)
-    media[:, 0] = 1
-    n = media[:, 1]
-    glass = ideal & (n > 1)
-    bend, k = parts["curvature"].copy(), parts["conic"].copy()
-    bend[:, 0], k[:, 0] = np.where(glass, c, bend[:, 0]), np.where(glass, -1 / n**2, 0)
-    bend[:, 1:] = np.where(ideal[:, None], 0, bend[:, 1:])
-    sensor = np.where(glass, n / (c * np.where(n > 1, n - 1, 1)), sensor)
-    sensor = np.maximum(sensor, last + 0.1)
-    parts = parts | {"curvature": bend, "conic": k, "sensor": sensor}
-    field = np.where(ideal[:, None], 0, scenes.field)
-    far = np.where(ideal, np.inf, scenes.distance)
-    return Scenes(_lens(parts, media, stop), field, far, scenes.pupil)
-
-
-def field(rng, count, stop):
-    """Fields of 20 to 45 degrees."""
-    parts, media, _ = _parts(rng, count, stop, (2, 16))
-    return _scenes(rng, parts, media, stop, (20, 45))
-
-
-def tilted(rng, count, stop):
-    """Surfaces and sensor tilted by up to 10 degrees and decentred by up to a tenth."""
-    parts, media, h = _parts(rng, count, stop, (2, 16))
-    size = rng.random((count, 1, 1))
-    parts["tilt"] = np.radians(rng.uniform(-10, 10, (count, 6, 3))) * size
-    parts["decentre"] = rng.uniform(-0.1, 0.1, (count, 6, 2)) * size * h[:, None, None]
-    return _scenes(rng, parts, media, stop)
-
-
-def mirror(rng, count, stop):
-    """Two mirrors facing each other, concave and convex, conic."""
-    h = rng.uniform(5, 50, count)
-    gap = h * rng.uniform(1.5, 6, count)
-    first = -rng.uniform(0.05, 0.7, count) / h
-    second = -rng.uniform(-0.5, 1.2, count) / h
-    semi = np.full((count, 2), np.inf)
-    semi[:, stop] = h * (1 if stop == 0 else 0.4)
-    parts = {
-        "curvature": np.stack([first, second], 1),
-        "conic": rng.uniform(-4, 0.5, (count, 2)),
-        "coefficients": np.zeros((count, 2, 0)),
-        "thickness": -gap[:, None],
-        "semi_diameter": semi,
-        "sensor": h * rng.uniform(-1, 3, count),
-    }
-    return _scenes(
-        rng, parts, np.ones((count, 3)), stop, (0, 3), (np.inf, 1e6, 1e4), mirrors=(True, True)
-    )
-
-
-def folded(rng, count, stop):
-    """A periscope: two plane or weakly curved mirrors at 45 degrees, the stop behind or before."""
-    h, reach = rng.uniform(2, 6, count), rng.uniform(20, 60, count)
-    zero = np.zeros(count)
-    c = rng.choice([0.0, 1e-3, -1e-3], (count, 2))
-    z = np.stack([zero, zero + 20, zero + 20, zero + 40, zero + 70], 1)
-    y = np.stack([zero, zero, reach, reach, reach], 1)
-    tilt = np.zeros((count, 5, 3))
-    tilt[:, 1:3, 0] = np.radians(45) + np.radians(rng.uniform(-2, 2, (count, 2)))
-    tilt[:, 3] = np.radians(rng.uniform(-3, 3, (count, 3)))
-    semi = np.full((count, 4), np.inf)
-    semi[:, stop] = h
-    parts = {
-        "curvature": np.stack([zero, c[:, 0], c[:, 1], zero], 1),
-        "conic": np.zeros((count, 4)),
-        "coefficients": np.zeros((count, 4, 0)),
-        "thickness": np.diff(z, axis=1)[:, :3],
-        "semi_diameter": semi,
-        "sensor": z[:, 4],
-        "tilt": tilt,
-        "decentre": np.stack([np.zeros((count, 5)), y], -1),
-    }
-    return _scenes(
-        rng, parts, np.ones((count, 5)), stop, (0, 5), mirrors=(False, True, True, False)
-    )
-
-
-def freeform(rng, count, stop):
-    """A biconic, a toroid, odd powers, a polynomial and an asphere."""
-    parts, media, h = _parts(rng, count, stop, (1.4, 16))
-    size = h[:, None]
-    terms = np.zeros((count, 5, 5))
-    c = parts["curvature"]
-    terms[:, 0, 0] = c[:, 0] * rng.uniform(-1, 1.5, count)
-    terms[:, 0, 1] = rng.uniform(-3, 0, count)
-    terms[:, 1, 0] = c[:, 1] * rng.choice([0.0, 0.5, 1.0, -1.0], count)
-    powers = np.array([1, 2, 3, 4, 5])
-    terms[:, 2] = rng.uniform(-0.02, 0.02, (count, 5)) * size / size**powers
-    terms[:, 3] = rng.uniform(-0.03, 0.03, (count, 5)) * size / size ** np.array([1, 1, 2, 2, 2])
-    terms[:, 4, 1] = rng.uniform(-0.03, 0.03, count) / h**3
-    return _scenes(rng, parts | {"coefficients": terms}, media, stop, forms=_FREEFORM)
-
-
-def camera(rng, count, name):
-    """A bundled lens with parameters off by 3 %, fields to 1.2 times its own, objects from
-    300 mm on, aspheric terms of some um at the rim of the stop."""
-    lens = drt_jax.load_lens(name)
-    surfaces = len(lens.forms)
-    batch = jax.tree.map(lambda a: np.broadcast_to(a, (count, *a.shape)), lens)
-
-    def vary(a, size=0.03):
-        return jnp.asarray(a * (1 + size * rng.uniform(-1, 1, a.shape)))
-
-    rim = float(lens.semi_diameter[lens.stop])
-    terms = np.zeros((count, surfaces, 2))
-    terms[..., 1] = rng.uniform(-5e-3, 5e-3, (count, surfaces)) / rim**4
-    batch = dataclasses.replace(
-        jax.tree.map(jnp.asarray, batch),
-        curvature=vary(batch.curvature),
-        thickness=vary(batch.thickness),
-        conic=jnp.asarray(rng.uniform(-0.2, 0.2, (count, surfaces))),
-        coefficients=jnp.asarray(terms),
-        sensor=vary(batch.sensor, 0.003),
-    )
-    widest = {"singlet": 5.0, "double_gauss": 14.0}.get(name, 20.0) * 1.2
-    far = rng.choice([300.0, 1e3, 25e3, 1e9, np.inf], count)
-    return Scenes(batch, _fields(rng, count, 0, widest), far, _pupil(rng, count))
-
-
-_CAMERAS = ("double_gauss", "cooke_triplet", "singlet")
-FAMILIES = {
-    "aperture": Family(aperture, (0, 2, 4)),
-    "curvature": Family(curvature, (0, 2, 4)),
-    "conic": Family(conic, (0, 2, 4)),
-    "asphere": Family(asphere, (0, 2, 4)),
-    "index": Family(index, (0, 2, 4)),
-    "edge": Family(edge, (0, 2, 4)),
-    "close": Family(close, (0, 2, 4)),
-    "touching": Family(touching, (2,), 0.2),
-    "distance": Family(distance, (0, 2, 4)),
-    "focus": Family(focus, (0, 2, 4)),
-    "field": Family(field, (0, 2, 4)),
-    "tilted": Family(tilted, (4,)),
-    "mirror": Family(mirror, (1,)),
-    "folded": Family(folded, (3,), 0.5),
-    "freeform": Family(freeform, (2,), 0.5),
-    "camera": Family(camera, _CAMERAS),
-    "camera, float32": Family(camera, _CAMERAS, 1.0, "float32"),
-    "aperture, float32": Family(aperture, (2,), 0.5, "float32"),
-    "asphere, float32": Family(asphere, (2,), 0.5, "float32"),
-    "field, float32": Family(field, (2,), 0.5, "float32"),
-}
-
-
-def draw(name: str, count: int, seed: int, variants: tuple | None = None) -> Iterator[Scenes]:
-    """The scenes of a family, one batch for each variant, always the same for a seed."""
-    family = FAMILIES[name]
-    number = list(FAMILIES).index(name)
-    variants = family.variants if variants is None else variants
-    each = -(-max(1, round(count * family.share)) // len(variants))
-    for k, variant in enumerate(variants):
-        rng = np.random.default_rng((seed, number, k))
-        scenes = family.make(rng, each, variant)
-        yield jax.tree.map(lambda a: np.asarray(a, family.dtype), scenes)
+    return Scenes(lens_of(parts, index, stop, **static), field, distance, pupil_points(rng, count))

@@ -9,15 +9,16 @@ import numpy as np
 
 import drt_jax
 from drt_jax import Status
-from drt_jax.rays import fermat
 from drt_jax.lens.lens import rotation_matrix
-from drt_jax.rays.trace import system_of
+from drt_jax.lens.surface import Shape, sag_derivatives
+from drt_jax.numerics import safe_sqrt
+from drt_jax.pupil import Gauss
 
 from ._scenes import WAVELENGTH, Scenes
+from .snell import trace_snell
 
-__all__ = ["COUNTS", "KEYS", "survey"]
+__all__ = ["KEYS", "survey"]
 
-COUNTS = ("missed", "tir", "clipped", "unconverged")
 # What `survey` returns: arrays over scenes and rays, and two counts.
 KEYS = (
     "disagree",
@@ -33,7 +34,7 @@ KEYS = (
 _BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
 _BOTH = 4  # one scene of so many of a float64 family is traced in float32 too
 _SHOTS = 24  # rays of a scene that the sequential trace follows in one call
-_ORDER = 2  # of the pupil rule whose moments are differentiated
+_RULE = Gauss(2, "disc")  # whose moments are differentiated
 _ROUNDINGS = 1000  # how many roundings of the hits two traces may be apart
 _GRID = 41  # launch points along each side of the search for a ray that was not found
 _STARTS = 4  # candidates refined for each such ray
@@ -46,27 +47,47 @@ def _weights(shape: tuple) -> jnp.ndarray:
     return 1 + np.sin(1 + np.arange(np.prod(shape), dtype=float)).reshape(shape) / 2
 
 
-def _system(lens, field, distance, pupil):
-    rows, colour = list(range(len(lens.forms))), jnp.full(1, WAVELENGTH, pupil.dtype)
-    return system_of(lens, rows, field, distance, colour, pupil.T)
+def _own(lens, i, vector):
+    """A vector (3,) along the axes of surface i."""
+    return vector if lens.tilt is None else rotation_matrix(lens.tilt[i]).T @ vector
+
+
+def _place(lens, i, point):
+    """A point (3,) along the axes of surface i, from its vertex."""
+    across = jnp.zeros_like(point[:2]) if lens.decentre is None else lens.decentre[i]
+    return _own(lens, i, point - jnp.append(across, lens.vertices[i]))
 
 
 def _residual(lens, field, distance, pupil, points):
-    """Largest |F| (RAYS,) of traced points, and the bound of rounding on it: `_ROUNDINGS / 5`
-    times what changing the last digit of a coordinate changes."""
-    system = _system(lens, field, distance, pupil)
-    own = jnp.moveaxis(points, (1, 2), (1, 0)).at[2].add(-system.vertex[:, None])
-    if system.offset is not None:
-        own = own.at[:2].add(-system.offset[..., None])
-        own = fermat.turn(system.rotation, own, back=True)
-    hits = own[:2, :, None]
-    error = jnp.max(jnp.abs(fermat.residual(hits, system)), axis=(0, 1, 2))
-    path = fermat.geometry(hits, system)
-    inverse = jnp.max(jnp.abs(path.inverse_length), axis=(0, 1))
-    size = jnp.max(jnp.abs(points), axis=(1, 2))
-    slope = jnp.max(jnp.abs(path.slope), axis=(0, 1, 2))
-    bound = _ROUNDINGS / 5 * jnp.finfo(points.dtype).eps * (1 + size * inverse) * (1 + slope)
-    return error, bound
+    """How far traced points (S + 1, 3) of a ray are from a stationary path through its stop point,
+    and the bound of rounding on it: `_ROUNDINGS / 5` times what changing the last digit of a
+    coordinate changes.
+
+    Along a stationary path, n e - n' e' is normal to each surface that bends light, e and e' being
+    the directions before and behind it, n and n' the indices.
+    """
+    live, (x, y) = [*lens.live, lens.count], jnp.tan(field)
+    index = lens.index(jnp.full(1, WAVELENGTH, points.dtype))[:, 0]
+    path = points[jnp.array(live)]
+    # From the object, scaled by 1/distance, and from point to point.
+    entering = path[0] / distance + jnp.stack([x, y, jnp.ones_like(x)])
+    steps = jnp.concatenate([entering[None], jnp.diff(path, axis=0)])
+    length = jnp.linalg.norm(steps, axis=1)
+    inverse = 1 / jnp.where(length > 0, length, jnp.finfo(points.dtype).tiny ** 0.5)
+    e = steps * inverse[:, None]
+    errors, slopes = [], []
+    for k, i in enumerate(lens.live):
+        row = Shape(lens.curvature[i], lens.conic[i], lens.coefficients[i])
+        slope = jnp.stack(sag_derivatives(_place(lens, i, path[k])[:2], row, lens.forms[i])[1])
+        kink = _own(lens, i, index[i] * e[k] - index[i + 1] * e[k + 1])
+        errors.append(jnp.max(jnp.abs(kink[:2] + slope * kink[2])))
+        slopes.append(jnp.max(jnp.abs(slope)))
+    stop = lens.stop
+    miss = _place(lens, stop, points[stop])[:2] - lens.semi_diameter[stop] * pupil
+    size = jnp.max(jnp.abs(points))
+    error = jnp.maximum(jnp.max(jnp.stack(errors)), jnp.max(jnp.abs(miss)) / (1 + size))
+    rounding = jnp.finfo(points.dtype).eps * (1 + size * jnp.max(inverse[1:]))
+    return error, _ROUNDINGS / 5 * rounding * (1 + jnp.max(jnp.stack(slopes)))
 
 
 def _scene(lens, field, distance, pupil):
@@ -81,32 +102,29 @@ def _scene(lens, field, distance, pupil):
         return value, rays
 
     slope, rays = jax.grad(scalar, argnums=(0, 1, 2), has_aux=True)(lens, field, distance)
-    error, bound = _residual(lens, field, distance, pupil, rays.points[0])
-    return rays, slope, error, bound
+    residual = jax.vmap(_residual, (None, None, None, 0, 0))
+    return rays, slope, *residual(lens, field, distance, pupil, rays.points[0])
 
 
 def _moments(lens, field, distance):
-    """Moments and the derivatives of a sum of them by everything."""
+    """Moments and the derivatives of a sum of them by everything; 0 for the infinite covariance of
+    a colour that passes no ray."""
     colour = jnp.full(1, WAVELENGTH, field.dtype)
 
     def scalar(lens, field, distance):
-        mean, covariance = drt_jax.psf_moments(lens, field, distance, colour, order=_ORDER)
-        root = drt_jax.numerics.safe_sqrt(covariance[0, 0, 0])
-        return jnp.sum(mean) + jnp.sum(covariance) + root, (mean, covariance)
+        mean, covariance = found = drt_jax.psf_moments(lens, field, distance, colour, rule=_RULE)
+        none = (found.passed == 0)[:, None, None] & jnp.isposinf(covariance)
+        covariance = jnp.where(none, 0, covariance)
+        value = jnp.sum(mean) + jnp.sum(covariance) + safe_sqrt(covariance[0, 0, 0])
+        return value, (mean, covariance, found.passed)
 
     return jax.grad(scalar, argnums=(0, 1, 2), has_aux=True)(lens, field, distance)
 
 
 def _shoot(lens, points, directions):
-    """Hits and success of the sequential trace, which alone would also follow light backwards
-    to a surface that lies behind the one before it."""
-    hits, ok = jax.vmap(drt_jax.trace_snell, (None, None, 0, 0))(
-        lens, jnp.asarray(WAVELENGTH, points.dtype), points, directions
-    )
-    step = jnp.diff(hits, axis=1)
-    if lens.tilt is not None:
-        step = jnp.einsum("sij,msi->msj", jax.vmap(rotation_matrix)(lens.tilt[1:]), step)
-    return hits, ok & jnp.all(step[..., 2] * jnp.asarray(lens.senses[1:], step.dtype) >= 0, axis=1)
+    """Hits and success of the sequential trace."""
+    trace = jax.vmap(trace_snell, (None, None, 0, 0))
+    return trace(lens, jnp.asarray(WAVELENGTH, points.dtype), points, directions)
 
 
 def _plain(lens, field, distance, pupil):
@@ -139,12 +157,9 @@ def _infinite(tree: Any) -> int:
 
 def _entering(points, field, distance):
     """Unit directions (N, M, 3) of the light at `points` (N, M, 3) before the lens."""
-    tangent = np.tan(field)[:, None]
-    far = np.isinf(distance)[:, None, None]
-    reach = np.where(np.isinf(distance), 1, distance)[:, None]
-    source = np.concatenate([-tangent * reach[..., None], -reach[..., None]], axis=-1)
-    straight = np.concatenate([tangent, np.ones_like(tangent[..., :1])], axis=-1)
-    direction = np.where(far, straight, points - source)
+    # From the object, scaled by 1/distance.
+    slope = np.concatenate([np.tan(field), np.ones((len(field), 1))], axis=1)
+    direction = points / distance[:, None, None] + slope[:, None]
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 
@@ -184,6 +199,35 @@ def _disagree(scenes, points, good, eps) -> np.ndarray:
     return good & (wide | (~ok[0] & ~edge)), off / (eps * size * grown)
 
 
+def _crossing(scenes, aims):
+    """Where Snell rays through launch points (N, M, 2) of the first vertex plane cross the stop,
+    along its axes, and whether they arrive."""
+    points = np.concatenate([aims, np.zeros_like(aims[..., :1])], axis=-1)
+    hits, ok = _launch(scenes, points)
+    stop = scenes.lens.stop
+    own = jax.vmap(jax.vmap(lambda lens, p: _place(lens, stop, p), (None, 0)))
+    return np.asarray(own(scenes.lens, hits[:, :, stop]))[..., :2], ok
+
+
+def _closer(scenes, trial, target, best):
+    """One step of Newton's method with halving from launch points `trial` (N, M, 2): the miss of
+    the stop point, whether it is at most `best` and rays beside it arrive too, and the step (the
+    last to be halved where that is not so)."""
+    h = 1e-7 * (1 + np.abs(trial).max(axis=-1, keepdims=True))
+    aims = np.concatenate([trial, *(trial + h * unit for unit in np.eye(2))], axis=1)
+    here, ok = _crossing(scenes, aims)
+    (at, dx, dy), (ok, okx, oky) = np.split(here, 3, 1), np.split(ok, 3, 1)
+    miss = np.linalg.norm(at - target, axis=-1)
+    better = ok & (miss <= best)
+    whole = better & okx & oky
+    jacobian = np.stack([dx - at, dy - at], -1) / h[..., None]
+    jacobian = np.where(whole[..., None, None], jacobian, np.eye(2)) + 1e-14 * np.eye(2)
+    singular = np.abs(np.linalg.det(jacobian)) < 1e-12
+    jacobian = np.where(singular[..., None, None], np.eye(2), jacobian)
+    step = np.linalg.solve(jacobian, (target - at)[..., None])[..., 0]
+    return miss, better, whole, step
+
+
 def _search(scenes: Scenes, wanted: np.ndarray) -> np.ndarray:
     """Whether Snell's law carries a ray to each stop point (N, RAYS) that is `wanted`.
 
@@ -191,27 +235,13 @@ def _search(scenes: Scenes, wanted: np.ndarray) -> np.ndarray:
     with halving. A ray counts if it meets the stop point within `_STOP_MISS` and if rays
     beside it also reach the sensor.
     """
-    lens = scenes.lens
-    stop, count = lens.stop, len(scenes.distance)
-    height = lens.semi_diameter[:, stop]
-    place = np.concatenate([np.zeros((count, 1)), np.cumsum(lens.thickness, axis=1)], axis=1)
-    origin = np.stack([np.zeros(count), np.zeros(count), place[:, stop]], 1)
-    back = np.broadcast_to(np.eye(3), (count, 3, 3))
-    if lens.decentre is not None:
-        origin[:, :2] = lens.decentre[:, stop]
-        back = np.asarray(jax.vmap(rotation_matrix)(jnp.asarray(lens.tilt[:, stop])))
-
-    def crossing(aims):
-        points = np.concatenate([aims, np.zeros_like(aims[..., :1])], axis=-1)
-        hits, ok = _launch(scenes, points)
-        own = np.einsum("nij,nmi->nmj", back, hits[:, :, stop] - origin[:, None])
-        return own[..., :2], ok
-
-    slope = np.linalg.norm(np.tan(scenes.field), axis=1)
-    reach = 3 * height + 1.5 * slope * (np.abs(place[:, stop]) + height)
+    stop, slope = scenes.lens.stop, np.linalg.norm(np.tan(scenes.field), axis=1)
+    height = scenes.lens.semi_diameter[:, stop]
+    place = np.sum(scenes.lens.thickness[:, :stop], axis=1)
+    reach = 3 * height + 1.5 * slope * (np.abs(place) + height)
     side = np.linspace(-1, 1, _GRID)
     grid = np.stack(np.meshgrid(side, side), -1).reshape(1, -1, 2) * reach[:, None, None]
-    there, ok = crossing(grid)
+    there, ok = _crossing(scenes, grid)
     target = height[:, None, None] * scenes.pupil
     found = np.zeros(wanted.shape, bool)
     far = np.linalg.norm(there[:, None] - target[:, :, None], axis=-1)
@@ -221,22 +251,11 @@ def _search(scenes: Scenes, wanted: np.ndarray) -> np.ndarray:
         best = np.take_along_axis(far, start[..., None], axis=2)[..., 0]
         step, trial = np.zeros_like(aim), aim
         for _ in range(_REFINE):
-            h = 1e-7 * (1 + np.abs(trial).max(axis=-1, keepdims=True))
-            units = np.eye(2)
-            here, ok = crossing(np.concatenate([trial, *(trial + h * u for u in units)], axis=1))
-            (at, dx, dy), (ok, okx, oky) = np.split(here, 3, 1), np.split(ok, 3, 1)
-            miss = np.linalg.norm(at - target, axis=-1)
-            better = ok & (miss <= best)
+            miss, better, whole, newton = _closer(scenes, trial, target, best)
             aim = np.where(better[..., None], trial, aim)
             best = np.where(better, miss, best)
-            jacobian = np.stack([dx - at, dy - at], -1) / h[..., None]
-            jacobian = np.where((okx & oky & better)[..., None, None], jacobian, np.eye(2))
-            jacobian = jacobian + 1e-14 * np.eye(2)
-            singular = np.abs(np.linalg.det(jacobian)) < 1e-12
-            jacobian = np.where(singular[..., None, None], np.eye(2), jacobian)
-            newton = np.linalg.solve(jacobian, (target - at)[..., None])[..., 0]
-            step = np.where((better & okx & oky)[..., None], newton, step / 2)
-            found |= wanted & better & okx & oky & (miss < _STOP_MISS)
+            step = np.where(whole[..., None], newton, step / 2)
+            found |= wanted & whole & (miss < _STOP_MISS)
             if np.all(found | ~wanted):
                 return found
             trial = aim + step
@@ -273,7 +292,7 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray | int]:
         lost[some] = _search(jax.tree.map(lambda a: a[some], exact), failed[some])
     return {
         "status": status,
-        "steps": rays.newton_steps,
+        "steps": np.max(rays.newton_steps.reshape(len(status), -1), axis=1),
         "nan_values": _infinite((rays.points, rays.path, moments)),
         "nan_gradients": _infinite((slope, moments_slope)),
         "disagree": disagree | (good & (error > bound)),

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from ..lens.lens import Lens, rotation_matrix
-from ..lens.paraxial import entrance_pupil
-from ..lens.surface import Shape, domain, sag_derivatives
+from drt_jax import Lens, entrance_pupil
+from drt_jax.lens.lens import rotation_matrix
+from drt_jax.lens.surface import Shape, domain, sag_derivatives
 
 __all__ = ["launch_paraxial", "trace_snell"]
 
@@ -35,13 +35,24 @@ def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Arra
 
         def closer(_, q):
             z, slope, _ = sag_derivatives(q[:2], shape, form)
-            return q + d * ((z - q[2]) / (d[2] - slope @ d[:2]))
+            return q + d * ((z - q[2]) / (d[2] - slope[0] * d[0] - slope[1] * d[1]))
 
         q = jax.lax.fori_loop(0, _NEWTON_STEPS, closer, q)
     z, slope, _ = sag_derivatives(q[:2], shape, form)
     met = met & domain(q[:2], shape, form) & (jnp.abs(z - q[2]) < 1e-6 * (1 + jnp.abs(z)))
-    normal = jnp.array([-slope[0], -slope[1], jnp.ones_like(slope[0])])
+    normal = jnp.stack([-slope[0], -slope[1], jnp.ones_like(z)])
     return q, normal / jnp.linalg.norm(normal), met
+
+
+def _bend(d: Array, normal: Array, ratio: Array, sense: int, mirror: bool) -> tuple[Array, Array]:
+    """The direction behind a surface, `ratio` the index before by that behind it; whether there
+    is one and light came from the side it goes to, `sense` along the normal."""
+    cosine = normal @ d
+    if mirror:
+        return d - 2 * cosine * normal, sense * cosine > 0
+    square = 1 - ratio**2 * (1 - cosine**2)
+    along = sense * jnp.sqrt(jnp.maximum(square, 0)) - ratio * cosine
+    return ratio * d + normal * along, (square >= 0) & (sense * cosine > 0)
 
 
 def trace_snell(
@@ -49,44 +60,37 @@ def trace_snell(
 ) -> tuple[Array, Array]:
     """Trace one ray through a lens to its sensor.
 
-    `wavelength` () in um; `point` (3,) in mm, anywhere on the ray before the lens;
-    `direction` (3,), a unit vector. Returns the hits (S + 1, 3) in mm along the axes of the
-    lens, z from the first vertex, and whether the ray met every surface and was refracted or
-    reflected there, bool.
+    A surface that bends no light is crossed by the straight line through the point before it,
+    forwards or backwards, and the ray goes on from that point.
+
+    wavelength: () in um.
+    point: (3,) in mm, anywhere on the ray before the lens.
+    direction: (3,), a unit vector.
+    Returns the hits (S + 1, 3) in mm along the axes of the lens, z from the first vertex, and
+    whether the ray met every surface, went forwards from each that bends light to the next, and
+    was refracted or reflected there, bool.
     """
     index = lens.index(jnp.atleast_1d(wavelength))[:, 0]
-    count = len(lens.forms)
-    vertices = jnp.append(lens.vertices, lens.sensor)
-    shape = Shape(
-        *(
-            jnp.concatenate([a, jnp.zeros_like(a[:1])])
-            for a in (lens.curvature, lens.conic, lens.coefficients)
-        )
-    )
-    ok, hits = jnp.array(True), []
-    for i in range(count + 1):
+    ok, hits, begun = jnp.array(True), [], False
+    for i, z in enumerate(lens.vertices):
         across = jnp.zeros(2, point.dtype) if lens.decentre is None else lens.decentre[i]
-        origin = jnp.append(across, vertices[i])
-        turn = None if lens.tilt is None else rotation_matrix(lens.tilt[i])
-        p, d = point - origin, direction
-        if turn is not None:
-            p, d = turn.T @ p, turn.T @ d
-        row = jax.tree.map(lambda a: a[i], shape)
-        hit, normal, met = _intersect(p, d, row, "asphere" if i == count else lens.forms[i])
-        cosine, sense = normal @ d, int(lens.senses[i])
-        ok = ok & met & (sense * cosine > 0)
-        if i < count:
+        origin = jnp.append(across, z)
+        axes = jnp.eye(3, dtype=point.dtype) if lens.tilt is None else rotation_matrix(lens.tilt[i])
+        p, d = axes.T @ (point - origin), axes.T @ direction
+        row = Shape(lens.curvature[i], lens.conic[i], lens.coefficients[i])
+        hit, normal, met = _intersect(p, d, row, lens.forms[i])
+        hits.append(axes @ hit + origin)
+        ok = ok & met
+        if i < lens.count and i not in lens.live:
+            continue
+        sense = int(lens.senses[i])
+        if begun:
+            ok = ok & (sense * (hit - p)[2] >= 0)
+        if i < lens.count:
             ratio = index[i] / index[i + 1]
-            square = 1 - ratio**2 * (1 - cosine**2)
-            ok = ok & (square >= 0)
-            if lens.mirrors[i]:
-                d = d - 2 * cosine * normal
-            else:
-                bend = sense * jnp.sqrt(jnp.maximum(square, 0)) - ratio * cosine
-                d = ratio * d + normal * bend
-        point = (hit if turn is None else turn @ hit) + origin
-        direction = d if turn is None else turn @ d
-        hits.append(point)
+            d, bent = _bend(d, normal, ratio, sense, lens.mirrors[i])
+            ok = ok & bent
+        point, direction, begun = hits[-1], axes @ d, True
     return jnp.stack(hits), ok
 
 
@@ -95,11 +99,15 @@ def launch_paraxial(
 ) -> tuple[Array, Array]:
     """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming.
 
-    `field` in radians along y, `distance` in mm from the object plane to the first vertex (inf
-    allowed), `wavelength` () in um, `pupil` (Q, 2) in units of the pupil's semi-diameter.
+    The Fermat tracer aims at the real stop instead; the difference is the aberration of the
+    pupil, which must not be infinitely far away.
+
+    field: radians along y.
+    distance: mm from the object plane to the first vertex, inf allowed.
+    wavelength: () in um.
+    pupil: (Q, 2) in units of the pupil's semi-diameter.
     Returns points (Q, 3) in mm on the first vertex plane and unit directions (Q, 3), for
-    `trace_snell`. The entrance pupil must not be infinitely far away. The Fermat tracer aims at
-    the real stop instead; the difference is the aberration of the pupil.
+    `trace_snell`.
     """
     image = entrance_pupil(lens, jnp.atleast_1d(jnp.asarray(wavelength, pupil.dtype)))
     place, radius = image.position[0], image.semi_diameter[0]

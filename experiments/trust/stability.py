@@ -2,25 +2,37 @@
 verdicts to be trusted?
 
 Every ray that is reported good is compared with a sequential trace by Snell's law; for every ray
-that is not, that trace searches for one through the same point of the stop. Writes results.json
-and a figure of steps and errors by family.
+that is not, that trace searches for one through the same point of the stop. Draws steps and errors
+by family.
 """
 
 import dataclasses
+import pathlib
+from typing import Any
 
 import jax
 import numpy as np
 from tqdm import tqdm
 
-from drt_jax import Status
-from drt_jax.show import plot
+from drt_jax import Status, show
 from drt_jax.runs.folder import Run
 
-from . import _common
-from ._scenes import FAMILIES, draw
-from ._survey import COUNTS, KEYS, survey
+from . import _command, _common
+from ._families import FAMILIES, draw
+from ._survey import KEYS, survey
 
-_COLUMNS = ("scenes", "rays", "ok", *COUNTS, "traceable")
+# Of each family in metrics.csv, and summed over all in results.json.
+_COLUMNS = (
+    "scenes",
+    "rays",
+    *(status.name.lower() for status in Status),
+    "traceable",
+    "nan_values",
+    "nan_gradients",
+    "disagree_with_snell",
+)
+# Programs of more structures than this exhaust what a process may map.
+_STRUCTURES = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,9 +49,7 @@ class Config:
 
     def __post_init__(self) -> None:
         _common.require(self.scenes >= 3, "scenes: must be at least 3")
-        for name in self.families:
-            known = ", ".join(FAMILIES)
-            _common.require(name in FAMILIES, f"families: unknown {name!r}; known: {known}")
+        _common.require_known("families", self.families, FAMILIES)
 
 
 def joined(parts: list[dict]) -> dict[str, np.ndarray]:
@@ -52,132 +62,124 @@ def joined(parts: list[dict]) -> dict[str, np.ndarray]:
     }
 
 
-def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, object]:
+def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
     """The row of a family in results.json, from its survey."""
     status, lost = found["status"], found["lost"]
     steps, errors = found["steps"], found["float32_error"]
-    row = {"name": name, "scenes": len(status), "rays": status.size}
-    for code in Status:
-        row[code.name.lower()] = int(np.sum(status == code))
-    row |= {
+    return {
+        "name": name,
+        "what": " ".join((FAMILIES[name].make.__doc__ or "").split()),
+        "dtype": FAMILIES[name].dtype,
+        "scenes": len(status),
+        "rays": status.size,
+        **{code.name.lower(): int(np.sum(status == code)) for code in Status},
         "nan_values": int(found["nan_values"]),
         "nan_gradients": int(found["nan_gradients"]),
         "disagree_with_snell": int(np.sum(found["disagree"])),
         "newton_steps_median": float(np.median(steps)),
         "newton_steps_max": int(np.max(steps)),
+        "float32_rays": int(errors.size),
         "float32_error_p99": float(np.percentile(errors, 99)) if errors.size else 0.0,
         "traceable": int(np.sum(lost)),
         "traceable_unconverged": int(np.sum(lost & (status == Status.UNCONVERGED))),
         "traceable_per_10000": 1e4 * float(np.mean(lost)),
         "snell_error_max_roundings": float(np.max(found["ratio"])),
-        "float32_rays": int(errors.size),
-        "dtype": FAMILIES[name].dtype,
+        "residual_max_of_bound": float(np.max(found["residual"])),
     }
-    return row
 
 
-def run(config: Config, run: Run) -> None:
-    """Draw and survey the families one by one, print the table, write the results."""
-    names = config.families or tuple(FAMILIES)
-    total = sum(len(FAMILIES[name].variants) for name in names)
-    rows, spread, known = [], {}, set()
-    with tqdm(total=total, unit="batch", dynamic_ncols=True) as bar:
-        for name in names:
-            bar.set_description(name)
+def totals(rows: list[dict]) -> dict[str, float]:
+    """Sums over all families, and rates of rays that are lost."""
+    sums: dict[str, float] = {key: sum(row[key] for row in rows) for key in _COLUMNS}
+    for name, some in (
+        ("traceable_per_10000", rows),
+        ("traceable_per_10000_but_touching", [row for row in rows if row["name"] != "touching"]),
+    ):
+        lost, rays = (sum(row[key] for row in some) for key in ("traceable", "rays"))
+        sums[name] = 1e4 * lost / max(rays, 1)
+    cameras = [row["float32_error_p99"] for row in rows if row["name"].startswith("camera")]
+    return sums | {"camera_float32_error_p99": max(cameras, default=0.0)}
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Draw and survey the families one by one."""
+    rows, samples, known = [], [], set()
+    bar = tqdm(config.families or FAMILIES, unit="family", dynamic_ncols=True)
+    for name in bar:
+        bar.set_description(name)
+
+        def measure(name: str = name) -> dict[str, np.ndarray]:
             batches = list(draw(name, config.scenes, config.seed))
-            empty = dict.fromkeys(KEYS, np.zeros(0))
-            step, found = run.load(name, empty, (name,))
-            if step:
-                bar.update(len(batches))
-            else:
-                kinds = {(jax.tree.structure(b), b.distance.dtype) for b in batches}
-                if not kinds <= known:  # drop other programs: what a process may map has an end
-                    jax.clear_caches()
-                known = kinds | (known if kinds <= known else set())
-                parts = []
-                for scenes in batches:
-                    parts.append(survey(scenes))
-                    bar.update()
-                found = joined(parts)
-                run.save(name, 1, found)
-            found = {key: np.asarray(value) for key, value in found.items()}
-            rows.append(row_of(name, found))
-            spread[name] = found["steps"], found["float32_error"]
-            if not step:
-                run.log(name, 0, {c: np.array([float(rows[-1][c])]) for c in _COLUMNS})
-    sums = {
-        key: sum(row[key] for row in rows)
-        for key in (*_COLUMNS, "nan_values", "nan_gradients", "disagree_with_snell")
+            known.update((jax.tree.structure(b), b.distance.dtype) for b in batches)
+            if len(known) > _STRUCTURES:
+                known.clear()
+                jax.clear_caches()
+            found = joined([survey(scenes) for scenes in batches])
+            row = row_of(name, found)
+            run.log(name, 0, {key: np.array([float(row[key])]) for key in _COLUMNS})
+            return found
+
+        found = _common.remembered(run, name, KEYS, measure)
+        rows.append(row_of(name, found))
+        samples.append((found["steps"], found["float32_error"]))
+    steps, errors = (np.concatenate(parts) for parts in zip(*samples))
+    return {
+        "families": rows,
+        "total": totals(rows),
+        "seconds": run.seconds,
+        "newton_steps": steps.astype(np.int32),
+        "float32_error_mm": errors.astype(np.float32),
     }
-    sums["traceable_per_10000"] = 1e4 * sums["traceable"] / sums["rays"]
-    apart = [row for row in rows if row["name"] != "touching"]
-    lost, rays = (sum(row[key] for row in apart) for key in ("traceable", "rays"))
-    sums["traceable_per_10000_but_touching"] = 1e4 * lost / max(rays, 1)
-    cameras = [row for row in rows if row["name"].startswith("camera")]
-    sums["camera_float32_error_p99"] = max((r["float32_error_p99"] for r in cameras), default=0.0)
-    results = {"families": rows, "total": sums, "seconds": run.seconds}
-    path = run.finish(results)
-    header = (
-        "family",
-        "scenes",
-        "rays",
-        "ok",
-        "missed",
-        "tir",
-        "clipped",
-        "unconv.",
-        "traceable",
-        "NaN",
-        "NaN grad",
-        "not Snell",
-        "steps",
-        "max",
-        "float32 p99 mm",
-    )
-    lines = [
-        (
-            r["name"],
-            *(
-                r[c]
-                for c in (
-                    "scenes",
-                    "rays",
-                    "ok",
-                    *COUNTS,
-                    "traceable",
-                    "nan_values",
-                    "nan_gradients",
-                    "disagree_with_snell",
-                )
-            ),
-            f"{r['newton_steps_median']:g}",
-            r["newton_steps_max"],
-            f"{r['float32_error_p99']:.1e}",
-        )
-        for r in rows
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Each family, and the whole."""
+    header = ["family", "rays", "good", "lost", "not finite", "not Snell"]
+    header += ["Newton steps, median and most", "float32 within, 99 %"]
+    rows = []
+    for row in results["families"]:
+        values = row["rays"], row["ok"], row["traceable"]
+        bad = row["nan_values"] + row["nan_gradients"], row["disagree_with_snell"]
+        steps = f"{row['newton_steps_median']:g}, {row['newton_steps_max']}"
+        what = f"{row['name']}: {row['what']}" if row.get("what") else row["name"]
+        rows.append((what, *values, *bad, steps, f"{row['float32_error_p99']:.1e} mm"))
+    total = results["total"]
+    lost = total["traceable_per_10000_but_touching"]
+    beside = [
+        ("scenes", total["scenes"]),
+        ("rays", total["rays"]),
+        ("values that are not finite", total["nan_values"]),
+        ("derivatives that are not finite", total["nan_gradients"]),
+        ("good rays that Snell's law denies", total["disagree_with_snell"]),
+        ("rays in 10,000 that it finds and we do not", f"{total['traceable_per_10000']:.2f}"),
+        ("the same without surfaces that touch", f"{lost:.2f}"),
     ]
-    print(_common.table(header, lines))
-    print(
-        f"{sums['scenes']} scenes, {sums['rays']} rays: {sums['nan_values']} values and "
-        f"{sums['nan_gradients']} derivatives not finite, {sums['disagree_with_snell']} good "
-        "rays that Snell's law denies"
-    )
-    print(
-        f"rays reported as failed that Snell's law can trace: {sums['traceable']}, "
-        f"{sums['traceable_per_10000']:.2f} in 10,000; without surfaces that touch "
-        f"{sums['traceable_per_10000_but_touching']:.2f}"
-    )
-    figure, axes = plot.new(1, 2, 6, 5)
-    plot.by_family(axes[0], {k: v[0] for k, v in spread.items()}, "Newton steps of a scene")
-    errors = {name: 1e3 * values for name, (_, values) in spread.items()}
-    plot.by_family(axes[1], errors, "float32 error (µm)", log=True)
-    figure.savefig(run.figures / "families.png")
-    print(f"results in {path}\nfigure {run.figures / 'families.png'}")
+    return {
+        "stability": _common.table(("of all families", ""), beside),
+        "stability, families": _common.table(header, rows),
+    }
+
+
+def report(results: dict[str, Any], figures: pathlib.Path) -> str:
+    """Draw steps and float32 errors by family."""
+    rows = results["families"]
+
+    def by_family(samples: np.ndarray, size: str) -> dict[str, np.ndarray]:
+        ends = np.cumsum([row[size] for row in rows])[:-1]
+        return dict(zip([row["name"] for row in rows], np.split(samples, ends)))
+
+    figure, axes = show.new(1, 2, 6, 5)
+    steps = by_family(results["newton_steps"], "scenes")
+    show.by_family(axes[0], steps, "Newton steps of a scene")
+    errors = by_family(1e3 * results["float32_error_mm"], "float32_rays")
+    show.by_family(axes[1], errors, "float32 error (µm)", log=True)
+    figure.savefig(figures / "families.png")
+    return "\n\n".join(tables(results).values())
 
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    _common.main("stability", Config, _COLUMNS, run, argv)
+    _command.main("stability", Config, _COLUMNS, run, report, argv)
 
 
 if __name__ == "__main__":
