@@ -1,8 +1,11 @@
-"""Tests run in float64 and under strict dtype promotion: nothing may change precision silently."""
+"""Tests run in float64, under strict promotion of dtypes and ranks, and with warnings as errors:
+nothing may change precision or shape silently."""
 
 import os
 import pathlib
+import signal
 import tempfile
+from collections.abc import Iterator
 
 # Most of the time of a test is compilation, and machine code that is not optimised compiles three
 # times faster; what it computes is the same. Read when JAX starts.
@@ -14,6 +17,7 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Tests that run the same program again, in this process or another, need not compile it again.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -44,6 +48,14 @@ def shared() -> pathlib.Path:
     if not path.is_dir():
         pytest.skip("no reference data beside the checkout")
     return path
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Ctrl-C is heard, also where the tests were started with SIGINT ignored (`nohup`, some CI)."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def assert_close(ours, wanted, rtol, floor=0.0):

@@ -56,11 +56,11 @@ def gaussian_psf(
     dtype = mean.dtype
     kernel: SeparableKernel | Array
     if form == "sampled":
-        grid = jnp.arange(size, dtype=dtype) - (size - 1) / 2
-        kernel = _sampled(grid - mean[..., None], covariance)
+        centres = jnp.arange(size, dtype=dtype)[None, None] - (size - 1) / 2
+        kernel = _sampled(centres - mean[..., None], covariance)
     else:
-        edges = jnp.arange(size + 1, dtype=dtype) - size / 2 - mean[..., None]
-        kernel = _integrated(edges, covariance)
+        edges = jnp.arange(size + 1, dtype=dtype)[None, None] - size / 2
+        kernel = _integrated(edges - mean[..., None], covariance)
     return jax.tree.map(lambda k: jnp.where(jnp.expand_dims(lost, range(1, k.ndim)), 0, k), kernel)
 
 
@@ -97,13 +97,12 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
     ratio = jnp.where(both, covariance[:, 0, 1], 0) / jnp.sqrt(scale)
     ratio = jnp.clip(ratio, -_MAX_CORRELATION, _MAX_CORRELATION)
     limit = jnp.arcsin(ratio)[:, None, None]
-    x, y = x[:, None, :], y[:, :, None]
-    correction = jnp.zeros_like(x * y)
-    for node, weight in zip(_ANGLES.tolist(), _ANGLE_WEIGHTS.tolist()):
-        angle = limit * ((1 + node) / 2)
-        exponent = (x * x - 2 * x * y * jnp.sin(angle) + y * y) / (2 * jnp.cos(angle) ** 2)
-        correction = correction + weight * jnp.exp(-exponent)
-    correction = correction * limit / (4 * jnp.pi)
+    rule = (_ANGLES, _ANGLE_WEIGHTS)
+    nodes, weights = (jnp.asarray(a, ratio.dtype).reshape(-1, 1, 1, 1) for a in rule)
+    angle = limit[None] * ((1 + nodes) / 2)
+    x, y = x[None, :, None, :], y[None, :, :, None]
+    exponent = (x * x - 2 * x * y * jnp.sin(angle) + y * y) / (2 * jnp.cos(angle) ** 2)
+    correction = jnp.sum(weights * jnp.exp(-exponent), axis=0) * limit / (4 * jnp.pi)
     kernel = column[:, :, None] * row[:, None, :]
     kernel = kernel + jnp.diff(jnp.diff(correction, axis=-1), axis=-2)
     return _normalised(kernel, (-2, -1))

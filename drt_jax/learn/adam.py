@@ -12,9 +12,10 @@ __all__ = ["AdamState", "adam", "apply_updates"]
 
 
 class AdamState(NamedTuple):
-    """count (), int32: updates so far; first, second: moments, shaped as the parameters."""
+    """steps: (), int32, updates so far.
+    first, second: moments of the gradient, shaped as the parameters."""
 
-    count: Array
+    steps: Array
     first: Any
     second: Any
 
@@ -24,10 +25,13 @@ def adam(
 ) -> tuple[Callable[[Any], AdamState], Callable[[Any, AdamState], tuple[Any, AdamState]]]:
     """The optimiser as (init, update).
 
-    `rates`: one learning rate, or one for each top-level key of the parameters, such as
-    {"optics": 1e-2, "network": 1e-3}. init(parameters) -> state; update(gradients, state) ->
-    (updates, state), the updates to be added to the parameters. Every leaf keeps its dtype.
-    KeyError if a group has no rate.
+    rates: one learning rate, or one for each top-level key of the parameters, such as
+        {"optics": 1e-2, "network": 1e-3}. KeyError, in `update`, if a group has none.
+    b1, b2: how much of the first and second moment is kept in each step.
+    eps: added to the root of the second moment.
+
+    init(parameters) -> state; update(gradients, state) -> (updates, state), the updates to be
+    added to the parameters. Every leaf keeps its dtype.
     """
 
     def init(parameters: Any) -> AdamState:
@@ -35,17 +39,15 @@ def adam(
         return AdamState(jnp.zeros((), jnp.int32), zeros, jax.tree.map(jnp.zeros_like, parameters))
 
     def update(gradients: Any, state: AdamState) -> tuple[Any, AdamState]:
-        count = state.count + 1
+        steps = state.steps + 1
         first = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.first, gradients)
         second = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.second, gradients)
 
         def scaled(rate: float, first: Any, second: Any) -> Any:
             def leaf(m: Array, v: Array) -> Array:
-                steps = count.astype(m.dtype)
                 # 1 - b^steps, without the cancellation that costs float32 five digits
-                unbiased = m / -jnp.expm1(steps * math.log(b1))
-                size = jnp.sqrt(v / -jnp.expm1(steps * math.log(b2)))
-                return -rate * unbiased / (size + eps)
+                kept = [-jnp.expm1(steps.astype(m.dtype) * math.log(b)) for b in (b1, b2)]
+                return -rate * (m / kept[0]) / (jnp.sqrt(v / kept[1]) + eps)
 
             return jax.tree.map(leaf, first, second)
 
@@ -53,7 +55,7 @@ def adam(
             updates = {group: scaled(rates[group], first[group], second[group]) for group in first}
         else:
             updates = scaled(rates, first, second)
-        return updates, AdamState(count, first, second)
+        return updates, AdamState(steps, first, second)
 
     return init, update
 

@@ -28,17 +28,19 @@ _KERNEL = (
     (1 / 6, -_T / 6, 1 / 3),
     (0, 0, 1),
 )
-_OUTPUT = tuple(tuple(p**k for p in (0.0, _S, -_S, _T, -_T)) + (float(k == 3),) for k in range(4))
+_OUTPUT = tuple((*(p**k for p in (0.0, _S, -_S, _T, -_T)), float(k == 3)) for k in range(4))
 # Below this many channels the transforms cost more than the products they save, and small
 # images are not worth the ten seconds of compilation.
 _CHANNELS, _PIXELS = 32, 1024
 
 
 def convolve_3x3(images: Array, kernel: Array) -> Array:
-    """`images` (B, H, W, in) with `kernel` (3, 3, in, out), stride 1, zeros beyond the edges.
+    """The convolution (B, H, W, out) of stride 1, with zeros beyond the edges.
 
-    (B, H, W, out), in their common floating dtype. In float32 its error is some 1e-6 of the
-    largest value, as that of any convolution.
+    images: (B, H, W, in).
+    kernel: (3, 3, in, out), of the same floating dtype.
+
+    In float32 the error is some 1e-6 of the largest value, as that of any convolution.
     """
     (height, width), (into, out) = images.shape[1:3], kernel.shape[2:]
     if into != out or into < _CHANNELS or height % 4 or width % 4 or height * width < _PIXELS:

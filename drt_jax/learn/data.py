@@ -5,6 +5,7 @@ the sensor layer sees true context on all sides. Nothing is downloaded.
 """
 
 import dataclasses
+import functools
 import pathlib
 import tempfile
 import warnings
@@ -32,6 +33,10 @@ _BUNDLED = (
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 
 
+# A name, and a function that reads the image.
+Source = tuple[str, Callable[[], np.ndarray]]
+
+
 class DataError(ValueError):
     """Images that cannot be used; the message names the folder or file and the remedy."""
 
@@ -41,9 +46,10 @@ class DataConfig:
     """Where patches come from.
 
     root: "bundled", or a folder searched with its subfolders (DTD: its `images` folder).
-    crops_per_image: random crops an image. test_fraction: share of the images, not of the
-    crops, kept for testing. memory_map: a folder on a disk with room, for sets that should
-    not lie in memory; empty: in memory.
+    crops_per_image: random crops an image.
+    test_fraction: share of the images, not of the crops, kept for testing.
+    memory_map: a folder on a disk with room, for sets that should not lie in memory; empty: in
+        memory.
     """
 
     root: str = "bundled"
@@ -54,8 +60,8 @@ class DataConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Patches:
-    """train, test: uint8 (N, P, P, 3), in memory or memory-mapped. skipped: what was left
-    out, a line for each file with the reason."""
+    """train, test: uint8 (N, P, P, 3), in memory or memory-mapped.
+    skipped: what was left out, a line for each file with the reason."""
 
     train: np.ndarray
     test: np.ndarray
@@ -65,35 +71,39 @@ class Patches:
 def load_patches(
     config: DataConfig, side: int, seed: int, progress: Callable[[list], Iterator] = iter
 ) -> Patches:
-    """Crop `side` x `side` patches, split by image into train and test.
+    """Random square patches, split by image into train and test.
 
-    The same `config`, `side` and `seed` give the same patches. `progress` wraps the loop over
-    the images (tqdm). Damaged or too small files are skipped and named in the result.
-    DataError for a folder that does not exist, or without a usable image on either side.
+    config: where they come from.
+    side: of a patch, in pixels.
+    seed: the same `config`, `side` and `seed` give the same patches.
+    progress: wraps the loop over the images (tqdm).
+
+    Damaged or too small files are skipped and named in the result. DataError for a folder that
+    does not exist, or without a usable image on either side.
     """
     if config.crops_per_image < 1 or not 0 < config.test_fraction < 1:
-        raise DataError(
-            "data: crops_per_image must be at least 1 and test_fraction between 0 and 1"
-        )
+        raise DataError("data: crops_per_image: at least 1; test_fraction: between 0 and 1")
     sources = _sources(config.root)
-    order = np.random.default_rng([seed, 0]).permutation(len(sources))
+    order = np.random.default_rng([seed, 0]).permutation(len(sources)).tolist()
     count = max(1, round(config.test_fraction * len(sources)))
-    groups = {"train": sorted(order[count:]), "test": sorted(order[:count])}
     skipped: list[str] = []
-    made = {}
-    for name, group in groups.items():
+
+    def collected(name: str, group: list[int]) -> np.ndarray:
         crops = (
             crop
-            for i in progress(group)
-            for crop in _crops(*sources[i], config.crops_per_image, side, [seed, 1, i], skipped)
+            for i in progress(sorted(group))
+            for crop in _crops(sources[i], config.crops_per_image, side, [seed, 1, i], skipped)
         )
-        made[name] = _collect(crops, side, config.memory_map)
-        if not len(made[name]):
+        patches = _collect(crops, side, config.memory_map)
+        if not len(patches):
             raise DataError(
                 f"data.root: {config.root}: no usable {name} image; each must measure at least "
                 f"{side} x {side} pixels. " + " ".join(skipped[:3])
             )
-    return Patches(made["train"], made["test"], tuple(skipped))
+        return patches
+
+    train, test = collected("train", order[count:]), collected("test", order[:count])
+    return Patches(train, test, tuple(skipped))
 
 
 def _collect(crops: Iterator[np.ndarray], side: int, folder: str) -> np.ndarray:
@@ -112,20 +122,17 @@ def _collect(crops: Iterator[np.ndarray], side: int, folder: str) -> np.ndarray:
         raise DataError(f"data.memory_map: {folder}: {error.strerror}") from error
 
 
-def _sources(root: str) -> list[tuple[str, Callable[[], np.ndarray]]]:
+def _sources(root: str) -> list[Source]:
     if root == "bundled":
-        return [(name, lambda name=name: _bundled(name)) for name in _BUNDLED]
+        return [(name, functools.partial(_bundled, name)) for name in _BUNDLED]
     folder = pathlib.Path(root).expanduser()
     if not folder.is_dir():
-        raise DataError(
-            f"data.root: {root} is not a folder; give one with images, or the word bundled"
-        )
+        raise DataError(f"data.root: {root} is not a folder; give one with images, or bundled")
     paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES)
     if not paths:
-        raise DataError(
-            f"data.root: {root} holds no image ({', '.join(_SUFFIXES)}), nor do its subfolders"
-        )
-    return [(str(path), lambda path=path: io.imread(path)) for path in paths]
+        kinds = ", ".join(_SUFFIXES)
+        raise DataError(f"data.root: {root} holds no image ({kinds}), nor do its subfolders")
+    return [(str(path), functools.partial(io.imread, path)) for path in paths]
 
 
 def _bundled(name: str) -> np.ndarray:
@@ -134,13 +141,9 @@ def _bundled(name: str) -> np.ndarray:
 
 
 def _crops(
-    name: str,
-    read: Callable[[], np.ndarray],
-    count: int,
-    side: int,
-    seed: list[int],
-    skipped: list[str],
+    source: Source, count: int, side: int, seed: list[int], skipped: list[str]
 ) -> list[np.ndarray]:
+    name, read = source
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -174,9 +177,10 @@ def _rgb(image: np.ndarray) -> np.ndarray:
 def batches(patches: np.ndarray, size: int, seed: int, start: int = 0) -> Iterator[np.ndarray]:
     """Endless batches (size, P, P, 3): a fresh permutation each epoch, the rest dropped.
 
-    Batch number k is a function of `seed` and k alone, so that a resumed run starts at
-    `start` and sees what an unbroken one would have seen. DataError if there are fewer
-    patches than a batch holds.
+    patches: uint8 (N, P, P, 3).
+    size: patches in a batch; DataError if there are fewer.
+    seed, start: batch number k is a function of `seed` and k alone, so that a resumed run starts
+        at `start` and sees what an unbroken one would have seen.
     """
     per_epoch = len(patches) // size
     if not per_epoch:

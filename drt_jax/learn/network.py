@@ -6,6 +6,7 @@ mirrored kernel, so one primitive serves both halves. Source: Mao, Shen and Yang
 (ref. 32 of the paper).
 """
 
+import itertools
 from collections.abc import Callable
 
 import jax
@@ -24,12 +25,14 @@ def red_net(
 ) -> tuple[Callable[[Array], Parameters], Callable[[Parameters, Array], Array]]:
     """The network as (init, apply).
 
-    `skip_every` n adds the output of every n-th convolution, counted from the middle, to
-    that of its mirror image before the ReLU (0: no such skips; the original's choice is 2).
-    `input_skip` adds the input to the output, so that the network learns the correction. Then
-    the last layer starts at a tenth of its usual scale: the network begins near the identity,
-    the optics see the plain image loss from the first step on, and the first Adam steps do not
-    kill the ReLUs (started at zero, they did: nothing was learned at a rate of 1e-3).
+    layers: convolutions before and after the middle, each.
+    channels: of the layers between the first and the last.
+    skip_every: n adds the output of every n-th convolution, counted from the middle, to that of
+        its mirror image before the ReLU (0: no such skips; the original's choice is 2).
+    input_skip: adds the input to the output, so that the network learns the correction. Then
+        the last layer starts at a tenth of its usual scale: the network begins near the identity,
+        the optics see the plain image loss from the first step on, and the first Adam steps do
+        not kill the ReLUs (started at zero, they did: nothing was learned at a rate of 1e-3).
 
     init(key) -> parameters, float32: a list of {"kernel" (3, 3, in, out), "bias" (out,)}.
     apply(parameters, images (B, H, W, 3) float32) -> restored images of the same shape.
@@ -40,26 +43,23 @@ def red_net(
 
     def init(key: Array) -> Parameters:
         parameters = []
-        for i, (fan_in, fan_out) in enumerate(zip(widths[:-1], widths[1:])):
-            kernel = jax.random.normal(
-                jax.random.fold_in(key, i), (3, 3, fan_in, fan_out), jnp.float32
-            )
+        for i, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
+            shape = (3, 3, fan_in, fan_out)
+            kernel = jax.random.normal(jax.random.fold_in(key, i), shape, jnp.float32)
             scale = (2 / (9 * fan_in)) ** 0.5  # He et al. 2015, for ReLU
             if input_skip and i == 2 * layers - 1:
                 scale = 0.1 * scale
-            parameters.append(
-                {"kernel": kernel * jnp.float32(scale), "bias": jnp.zeros(fan_out, jnp.float32)}
-            )
+            bias = jnp.zeros(fan_out, jnp.float32)
+            parameters.append({"kernel": kernel * jnp.float32(scale), "bias": bias})
         return parameters
 
     def apply(parameters: Parameters, images: Array) -> Array:
-        features, kept = images, {}
+        features = images
+        kept: dict[int, Array] = {}
         for i, layer in enumerate(parameters):
-            features = convolve_3x3(features, layer["kernel"]) + layer["bias"]
-            if i >= layers:
-                mirror = 2 * layers - 2 - i
-                if mirror in kept:
-                    features = features + kept[mirror]
+            features = convolve_3x3(features, layer["kernel"]) + layer["bias"].reshape(1, 1, 1, -1)
+            if i >= layers and (mirror := 2 * layers - 2 - i) in kept:
+                features = features + kept[mirror]
             if i < 2 * layers - 1:
                 features = jax.nn.relu(features)
             if skip_every and i < layers - 1 and (layers - 1 - i) % skip_every == 0:

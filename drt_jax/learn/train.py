@@ -11,21 +11,34 @@ from jax import Array
 from jax.typing import ArrayLike
 from skimage import metrics
 
-from .adam import adam, apply_updates
-from ..numerics import safe_sqrt
 from ..image.kernel import Form, gaussian_psf
 from ..image.sensor import Convolve, convolve, sensor_layer
+from ..numerics import safe_divide, safe_sqrt
+from .adam import adam, apply_updates
 
-__all__ = ["Camera", "evaluate", "fit", "make_imager", "make_step", "value_and_gradient"]
+__all__ = [
+    "Camera",
+    "compiler_options",
+    "evaluate",
+    "fit",
+    "make_imager",
+    "make_step",
+    "value_and_gradient",
+]
 
 Blur = Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]
 Restore = Callable[[Any, Array], Array]
+Imager = Callable[..., tuple[Array, Array, Array, Array]]
 
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """The sensor layer's constants: pixel pitch in um, kernel size in pixels (odd), kernel
-    form (see `psf`)."""
+    """The sensor layer's constants.
+
+    pixel_um: side of a pixel, um.
+    kernel: side of the kernel, pixels, odd.
+    form: of the kernel, see `image.kernel`.
+    """
 
     pixel_um: float = 4.4
     kernel: int = 21
@@ -40,16 +53,20 @@ class Camera:
 
 def make_imager(
     blur: Blur, restore: Restore | None, camera: Camera, convolve: Convolve = convolve
-) -> Callable[..., tuple]:
+) -> Imager:
     """The chain moments -> PSF -> sensor layer -> network as one function.
 
-    `blur` as `moments_model` returns it; `restore` (parameters, images) -> images, None for a
-    camera without a network. `convolve`: of `image.sensor`; `convolve_taps` pays for values and in
-    forward mode, which `make_step` uses where a single number is trained. The result maps (parameters {"optics", "network"}, scenes
-    uint8 (B, H + K - 1, W + K - 1, C), distance mm, noise, key) to (truth, sensor image, restored
-    image), float32 (B, H, W, C), and the standard deviations (C,) of the blur along y in mm.
-    The kernel is centred on the mean centroid of the colours: patches are registered. A colour
-    that loses rays is darker by what it loses, and black without any.
+    blur: as `moments_model` returns it.
+    restore: (parameters, images) -> images; None for a camera without a network.
+    camera: the constants of the sensor.
+    convolve: of `image.sensor`; `convolve_taps` for values and forward mode, which `make_step`
+        uses where a single number is trained.
+
+    The result maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
+    distance mm, noise, key) to (truth, sensor image, restored image), float32 (B, H, W, C), and
+    the standard deviations (C,) of the blur along y in mm. The kernel is centred on the mean
+    centroid of the colours that arrive: patches are registered. A colour that loses rays is
+    darker by what it loses, and black without any.
     """
     margin = camera.kernel // 2
 
@@ -58,14 +75,13 @@ def make_imager(
     ) -> tuple[Array, Array, Array, Array]:
         scenes = scenes.astype(jnp.float32) / 255
         mean, covariance, passed = blur(parameters["optics"], distance)
-        kernel = gaussian_psf(
-            mean - jnp.mean(mean, axis=0),
-            covariance,
-            camera.pixel_um * 1e-3,
-            camera.kernel,
-            camera.form,
-        )
-        image = sensor_layer(scenes * passed.astype(jnp.float32), kernel, noise, key, convolve)
+        arrives = passed > 0
+        total = jnp.sum(jnp.where(arrives[:, None], mean, 0), axis=0, keepdims=True)
+        offset = mean - safe_divide(total, jnp.sum(arrives, dtype=mean.dtype))
+        pixel = camera.pixel_um * 1e-3
+        kernel = gaussian_psf(offset, covariance, pixel, camera.kernel, camera.form)
+        light = jnp.expand_dims(passed.astype(jnp.float32), (0, 1, 2))
+        image = sensor_layer(scenes * light, kernel, noise, key, convolve)
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin
         truth = scenes[:, margin : end[0], margin : end[1]]
@@ -89,7 +105,9 @@ def compiler_options() -> dict[str, str] | None:
 
 
 def value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:
-    """((value, extras), gradient) of `loss` (parameters) -> (value, extras).
+    """((value, extras), gradient) of a loss.
+
+    loss: (parameters) -> (value, extras).
 
     In forward mode where a single number is trained, such as the sensor position: it takes two
     thirds of the time, and turns no images over (paper section 3 says when either mode pays).
@@ -104,7 +122,7 @@ def value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, An
 
 
 def make_step(
-    imager: Callable[..., tuple],
+    imager: Imager,
     rates: dict[str, float],
     depths: tuple[float, float],
     seed: int,
@@ -112,12 +130,15 @@ def make_step(
 ) -> tuple[Callable, Callable]:
     """Adam on the mean absolute error as (init, step).
 
-    `rates`: learning rates of the groups "optics" (mm for the sensor) and "network";
-    `depths`: the object distance of each step is uniform between them, mm. init(parameters)
-    -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the state donated.
-    Noise and depth are functions of `seed` and the step index. metrics: loss, sensor_mm,
-    sigma_um (mean over the colours), depth_mm, each () or, `vectorised` over the first axis
-    of all parameters, (N,).
+    imager: as `make_imager` returns it.
+    rates: learning rates of the groups "optics" (mm for the sensor) and "network".
+    depths: the object distance of each step is uniform between them, mm.
+    seed: noise and depth are functions of it and of the step index.
+    vectorised: over the first axis of all parameters, of N jobs.
+
+    init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the
+    state donated. metrics: loss, sensor_mm, sigma_um (mean over the colours), depth_mm, each ()
+    or, vectorised, (N,).
     """
     init_adam, update = adam(rates)
     near, far = depths
@@ -162,16 +183,22 @@ def fit(
     report: Callable[[int, dict[str, np.ndarray], Any], None],
     stopped: Callable[[], bool] = lambda: False,
 ) -> Any:
-    """Run steps `first` to `last` - 1 and return the final state.
+    """Run steps and return the final state.
 
-    After every `every` steps, and at the end, report(start, metrics, state) is called with the
-    metrics of the steps since `start` stacked on the first axis. Between reports nothing waits
-    for the device. `stopped` is asked after each step whether to end early, with a report.
+    step, state: as `make_step` gives them.
+    scenes: uint8 (B, P, P, C), a batch for each step.
+    noise: standard deviation, of values from 0 to 1.
+    first, last: the steps `first` to `last` - 1 are run.
+    every: so many steps, and at the end, report(start, metrics, state) is called with the metrics
+        of the steps since `start` stacked on the first axis. Between reports nothing waits for
+        the device.
+    report: see there.
+    stopped: asked after each step whether to end early, with a report.
     """
-    noise = np.float32(noise)
+    strength = np.float32(noise)
     pending: list[dict[str, Array]] = []
     for index in range(first, last):
-        state, metric = step(state, next(scenes), noise, np.int32(index))
+        state, metric = step(state, next(scenes), strength, np.int32(index))
         pending.append(metric)
         stop = stopped()
         if stop or len(pending) == every or index == last - 1:
@@ -184,7 +211,7 @@ def fit(
 
 
 def evaluate(
-    imager: Callable[..., tuple],
+    imager: Imager,
     parameters: dict[str, Any],
     patches: np.ndarray,
     distance: float,
@@ -192,32 +219,40 @@ def evaluate(
     seed: int,
     batch: int = 32,
 ) -> dict[str, float]:
-    """Image quality over all `patches` (N, P, P, C), uint8, with the object at `distance` mm.
+    """Image quality over patches.
+
+    imager: as `make_imager` returns it.
+    parameters: of its optics and network.
+    patches: uint8 (N, P, P, C).
+    distance: of the object, mm.
+    noise: standard deviation, of values from 0 to 1.
+    seed: of the noise.
+    batch: patches that are imaged at a time.
 
     mae and rmse over all values, psnr (dB) and ssim as means over the patches, of the
     restored images; the same with the prefix sensor_ for the images before the network.
     Metrics by scikit-image, for values from 0 to 1; images are not clipped.
     """
-    totals: dict[str, list[float]] = {}
+    rows: list[dict[str, float]] = []
     for start in range(0, len(patches), batch):
         part = np.asarray(patches[start : start + batch])
         filled = np.concatenate([part, np.zeros((batch - len(part), *part.shape[1:]), np.uint8)])
         key = jax.random.fold_in(jax.random.key(seed), start)
-        truth, sensor, restored, _ = imager(parameters, filled, distance, np.float32(noise), key)
-        truth, sensor, restored = (np.asarray(a)[: len(part)] for a in (truth, sensor, restored))
-        for prefix, images in (("", restored), ("sensor_", sensor)):
-            for true, image in zip(truth, images):
-                values = {
-                    "mae": np.mean(np.abs(true - image)),
-                    "mse": metrics.mean_squared_error(true, image),
-                    "psnr": metrics.peak_signal_noise_ratio(true, image, data_range=1),
-                    "ssim": metrics.structural_similarity(
-                        true, image, data_range=1, channel_axis=-1
-                    ),
-                }
-                for name, value in values.items():
-                    totals.setdefault(prefix + name, []).append(float(value))
-    means = {name: float(np.mean(values)) for name, values in totals.items()}
+        images = imager(parameters, filled, distance, np.float32(noise), key)[:3]
+        for truth, sensor, restored in zip(*(np.asarray(a)[: len(part)] for a in images)):
+            before = {f"sensor_{k}": v for k, v in _quality(truth, sensor).items()}
+            rows.append(_quality(truth, restored) | before)
+    means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     for prefix in ("", "sensor_"):
         means[prefix + "rmse"] = means.pop(prefix + "mse") ** 0.5
     return means
+
+
+def _quality(truth: np.ndarray, image: np.ndarray) -> dict[str, float]:
+    similarity = metrics.structural_similarity(truth, image, data_range=1, channel_axis=-1)
+    return {
+        "mae": float(np.mean(np.abs(truth - image))),
+        "mse": metrics.mean_squared_error(truth, image),
+        "psnr": metrics.peak_signal_noise_ratio(truth, image, data_range=1),
+        "ssim": similarity,
+    }

@@ -1,10 +1,12 @@
 """Strict configuration: YAML and overrides into a dataclass; nothing unknown, nothing guessed."""
 
+import contextlib
 import dataclasses
 import difflib
 import pathlib
 import typing
-from typing import Any, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, TypeVar
 
 import yaml
 
@@ -17,11 +19,15 @@ class ConfigError(ValueError):
     """A configuration that cannot be used; the message names the source, the key, the remedy."""
 
 
-def load_config(cls: type[T], path: str | pathlib.Path, overrides: typing.Sequence[str] = ()) -> T:
-    """Read `path` (YAML) into the dataclass `cls`, then apply overrides like "train.batch=8".
+def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str] = ()) -> T:
+    """Read a YAML file into a dataclass.
 
-    Keys left out keep their default. ConfigError for a file that cannot be read, an unknown
-    key (with the nearest known one) or a value of the wrong type.
+    cls: the dataclass; keys left out of the file keep its defaults.
+    path: of the file.
+    overrides: like "train.batch=8", applied afterwards.
+
+    ConfigError for a file that cannot be read, an unknown key (with the nearest known one) or a
+    value of the wrong type.
     """
     path = pathlib.Path(path)
     try:
@@ -47,7 +53,8 @@ def _dotted(prefix: str, key: object) -> str:
     return f"{prefix}.{key}" if prefix else str(key)
 
 
-def _field(cls: type, key: object, source: str, prefix: str) -> Any:
+def _kind(cls: type, key: str, source: str, prefix: str) -> Any:
+    """The type of a setting; ConfigError if there is none of that name."""
     known = typing.get_type_hints(cls)
     if key not in known:
         near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
@@ -58,13 +65,12 @@ def _field(cls: type, key: object, source: str, prefix: str) -> Any:
     return known[key]
 
 
-def _build(cls: type[T], entry: object, source: str, prefix: str) -> T:
+def _build(cls: Any, entry: object, source: str, prefix: str) -> Any:
     if not isinstance(entry, dict):
-        raise ConfigError(
-            f"{source}: {prefix or 'the file'}: expected keys and values, got {entry!r}"
-        )
+        where = prefix or "the file"
+        raise ConfigError(f"{source}: {where}: expected keys and values, got {entry!r}")
     values = {
-        key: _convert(_field(cls, key, source, prefix), value, source, _dotted(prefix, key))
+        key: _convert(_kind(cls, key, source, prefix), value, source, _dotted(prefix, key))
         for key, value in entry.items()
     }
     missing = [
@@ -74,28 +80,30 @@ def _build(cls: type[T], entry: object, source: str, prefix: str) -> T:
     ]
     if missing:
         raise ConfigError(f"{source}: missing keys: {', '.join(missing)}")
-    return _checked(lambda: cls(**values), source)
+    with _naming(source):
+        return cls(**values)
 
 
-def _checked(make: typing.Callable[[], T], source: str) -> T:
-    """What `make` makes; a dataclass that refuses its values is told the source."""
+@contextlib.contextmanager
+def _naming(source: str) -> Iterator[None]:
+    """What a dataclass refuses, with its source."""
     try:
-        return make()
+        yield
     except ValueError as error:
         raise ConfigError(f"{source}: {error}") from error
 
 
-def _replace(config: T, keys: list[str], value: object, source: str, prefix: str) -> T:
-    kind = _field(type(config), keys[0], source, prefix)
-    here = _dotted(prefix, keys[0])
-    if len(keys) > 1:
-        inner = getattr(config, keys[0])
-        if not dataclasses.is_dataclass(inner):
-            raise ConfigError(f"{source}: {here} has no keys of its own")
-        new = _replace(inner, keys[1:], value, source, here)
-    else:
+def _replace(config: Any, keys: list[str], value: object, source: str, prefix: str) -> Any:
+    name, *rest = keys
+    kind, here = _kind(type(config), name, source, prefix), _dotted(prefix, name)
+    if not rest:
         new = _convert(kind, value, source, here)
-    return _checked(lambda: dataclasses.replace(config, **{keys[0]: new}), source)
+    elif dataclasses.is_dataclass(kind):
+        new = _replace(getattr(config, name), rest, value, source, here)
+    else:
+        raise ConfigError(f"{source}: {here} has no keys of its own")
+    with _naming(source):
+        return dataclasses.replace(config, **{name: new})
 
 
 def _convert(kind: Any, value: object, source: str, key: str) -> Any:
@@ -104,16 +112,13 @@ def _convert(kind: Any, value: object, source: str, key: str) -> Any:
         return _build(kind, value, source, key)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple and isinstance(value, list | tuple):
-        return tuple(
-            _convert(arguments[0], item, source, f"{key}[{i}]") for i, item in enumerate(value)
-        )
-    if origin is typing.Literal and value in arguments:
+        items = enumerate(value)
+        return tuple(_convert(arguments[0], item, source, f"{key}[{i}]") for i, item in items)
+    if origin is Literal and value in arguments:
         return value
     if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
-        try:
+        with contextlib.suppress(ValueError):
             return float(value)  # YAML 1.1 reads 1e-3 as text
-        except ValueError:
-            pass
     if kind in (bool, int, str) and type(value) is kind:
         return value
     raise ConfigError(f"{source}: {key}: expected {_say(kind)}, got {value!r}")
@@ -123,13 +128,13 @@ def _say(kind: Any) -> str:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
         return f"a list, each item {_say(arguments[0])}"
-    if origin is typing.Literal:
+    if origin is Literal:
         return "one of " + ", ".join(map(str, arguments))
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
     return names.get(kind, getattr(kind, "__name__", str(kind)))
 
 
-def describe(cls: type, prefix: str = "") -> list[str]:
+def describe(cls: Any, prefix: str = "") -> list[str]:
     """A line "key: type" for each setting, for --help."""
     lines = []
     for field in dataclasses.fields(cls):

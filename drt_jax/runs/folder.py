@@ -11,6 +11,7 @@ import json
 import os
 import pathlib
 import signal
+import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
@@ -26,14 +27,19 @@ __all__ = ["Run", "deferred_interrupt"]
 
 
 class Run:
-    """One run in one folder; several jobs (starting points, say) may share it.
-
-    folder: created if need be. columns: of metrics.csv, after `job` and `step`.
-    """
+    """One run in one folder; several jobs (starting points, say) may share it."""
 
     def __init__(self, folder: pathlib.Path, config: Any, columns: tuple[str, ...], resume: bool):
-        """Open the folder. ConfigError if it holds another run that has begun to train, or on
-        resuming a run with another configuration, or one that does not exist."""
+        """Open the folder.
+
+        folder: created if need be.
+        config: a dataclass, all settings of the run.
+        columns: of metrics.csv, after `job` and `step`.
+        resume: whether to go on with the run that the folder holds.
+
+        ConfigError if it holds another run that has begun to train, or on resuming a run with
+        another configuration, or one that does not exist.
+        """
         self.folder = folder
         self.figures = folder / "figures"
         self._columns = ("job", "step", *columns)
@@ -66,22 +72,22 @@ class Run:
         return self._earlier + time.perf_counter() - self._opened
 
     def log(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
-        """Append metrics of consecutive steps, the first being `step`; 1D arrays by column.
-        A column that is not among them stays empty."""
-        values = [
-            [repr(float(v)) for v in rows[c]] if c in rows else None for c in self._columns[2:]
-        ]
-        count = max(len(column) for column in values if column)
-        lines = [
-            (job, step + i, *(column[i] if column else "" for column in values))
-            for i in range(count)
+        """Append metrics of consecutive steps.
+
+        step: the first of them.
+        rows: (N,) values of N steps by column; a column that is not among them stays empty.
+        """
+        count = max(len(values) for values in rows.values())
+        columns = [
+            [repr(float(v)) for v in rows[c]] if c in rows else [""] * count
+            for c in self._columns[2:]
         ]
         new = not self._metrics.exists()
         with open(self._metrics, "a", newline="") as file:
             writer = csv.writer(file)
             if new:
                 writer.writerow(self._columns)
-            writer.writerows(lines)
+            writer.writerows((job, step + i, *row) for i, row in enumerate(zip(*columns)))
 
     def metrics(self, job: str) -> dict[str, np.ndarray]:
         """The logged metrics of one job, arrays by column (with `step`); NaN where empty."""
@@ -91,25 +97,25 @@ class Run:
 
     def save(self, job: str, step: int, tree: Any) -> None:
         """Checkpoint: the state `tree` of `job` after `step` steps."""
-        arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
-        arrays.update(step=np.asarray(step), seconds=np.asarray(self.seconds))
+        arrays: dict[str, Any] = {f"leaf{i}": a for i, a in enumerate(jax.tree.leaves(tree))}
+        arrays |= {"step": step, "seconds": self.seconds}
         self._replace(f"checkpoints/{job}.npz", lambda file: np.savez(file, **arrays))
 
     def load(self, job: str, tree: Any, logged: tuple[str, ...]) -> tuple[int, Any]:
-        """The last checkpoint of `job` as (step, state shaped as `tree`); (0, tree) if none.
+        """The last checkpoint of `job` as (step, state); (0, tree) if there is none.
 
-        `logged`: the names under which the job logs; their metrics beyond the checkpoint are
-        dropped.
+        tree: a state of the same structure.
+        logged: the names under which the job logs; their metrics beyond the checkpoint are dropped.
         """
         path = self.folder / "checkpoints" / f"{job}.npz"
         step = 0
         if path.is_file():
             leaves, structure = jax.tree.flatten(tree)
             try:
-                with np.load(path) as file:
-                    stored = [file[f"leaf{i}"] for i in range(len(leaves))]
-                    step = int(file["step"])
-                    self._earlier = max(self._earlier, float(file["seconds"]))
+                with open(path, "rb") as file, np.load(file) as saved:
+                    stored = [saved[f"leaf{i}"] for i in range(len(leaves))]
+                    step = int(saved["step"])
+                    self._earlier = max(self._earlier, float(saved["seconds"]))
             except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
                 raise ConfigError(
                     f"{path}: not a checkpoint of this run; delete it to start the job anew"
@@ -122,7 +128,7 @@ class Run:
         if not self._metrics.exists():
             return
         with open(self._metrics, newline="") as file:
-            header, *rows = list(csv.reader(file)) or [self._columns]
+            header, *rows = list(csv.reader(file)) or [list(self._columns)]
         whole = [row for row in rows if len(row) == len(self._columns)]
         kept = [row for row in whole if row[0] not in jobs or int(row[1]) < step]
         if len(kept) == len(rows):
@@ -159,21 +165,26 @@ class Run:
 @contextlib.contextmanager
 def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
     """Turn the first Ctrl-C (or SIGTERM) into a question: yields a function that says whether
-    one came, to be asked where stopping is safe. It calls `notify`; a second one acts at once."""
+    one came, to be asked where stopping is safe. A second one acts at once.
+
+    notify: called when the first one comes.
+
+    A signal that is ignored, as SIGINT is under `nohup`, stays so.
+    """
     asked = False
-    previous = {}
+    # Only the main thread may handle signals; None: a handler from outside Python.
+    main = threading.current_thread() is threading.main_thread()
+    handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM) if main}
+    previous = {n: h for n, h in handlers.items() if h not in (None, signal.SIG_IGN)}
 
     def ask(number: int, frame: Any) -> None:
         nonlocal asked
         asked = True
+        signal.signal(number, previous[signal.Signals(number)])
         notify()
-        signal.signal(number, previous[number])
 
-    try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            previous[number] = signal.signal(number, ask)
-    except ValueError:  # not in the main thread: leave signals to whoever is
-        pass
+    for number in previous:
+        signal.signal(number, ask)
     try:
         yield lambda: asked
     finally:

@@ -127,6 +127,7 @@ def test_an_infinite_blur_is_black_and_has_no_slope(form, lost):
 
 
 def test_derivative_of_the_kernel():
+    @jax.jit
     def corner(parameters):
         mean, (xx, yy, xy) = parameters[:2], parameters[2:]
         covariance = jnp.array([[xx, xy], [xy, yy]])[None]

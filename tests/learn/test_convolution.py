@@ -58,7 +58,7 @@ def test_other_shapes(shape, out):
 
 
 def test_forward_mode_and_vmap(case):
-    images, kernel, weight = (jnp.asarray(a) for a in case)
+    images, kernel, _ = (jnp.asarray(a) for a in case)
     moved = jax.jit(lambda: jax.jvp(lambda k: convolve_3x3(images, k), (kernel,), (kernel,))[1])()
     np.testing.assert_allclose(moved, plain(images, kernel), atol=1e-11)
     many = jax.jit(jax.vmap(lambda k: convolve_3x3(images, k)))(jnp.stack([kernel, 2 * kernel]))

@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 from skimage import io
@@ -68,7 +70,7 @@ def test_clear_errors(tmp_path, folder):
         load_patches(DataConfig(root=str(tmp_path / "empty")), 40, 0)
     with pytest.raises(DataError, match="no usable train image.*200 x 200.*smaller than 200"):
         load_patches(DataConfig(root=str(folder)), 200, 0)
-    with pytest.raises(DataError, match="crops_per_image must be at least 1"):
+    with pytest.raises(DataError, match="crops_per_image: at least 1"):
         load_patches(DataConfig(crops_per_image=0), 40, 0)
     with pytest.raises(DataError, match="data.memory_map: .*nowhere"):
         load_patches(DataConfig(root=str(folder), memory_map=str(tmp_path / "nowhere")), 40, 0)
@@ -81,7 +83,7 @@ def test_batches_cover_each_epoch_and_resume_anywhere():
     stream = batches(patches, 3, seed=5)
     seen = [next(stream)[:, 0, 0, 0].tolist() for _ in range(9)]
     for epoch in range(3):
-        drawn = sum(seen[3 * epoch : 3 * epoch + 3], [])
+        drawn = list(itertools.chain(*seen[3 * epoch : 3 * epoch + 3]))
         assert len(set(drawn)) == 9  # no patch twice in an epoch
     assert seen[:3] != seen[3:6]
     for start in (0, 1, 3, 7):

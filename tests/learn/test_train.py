@@ -1,5 +1,6 @@
 """The chain and its training step, against the parts put together by hand."""
 
+import functools
 import itertools
 
 import jax
@@ -8,19 +9,20 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax.learn import train
 from drt_jax.image.kernel import gaussian_psf
 from drt_jax.image.sensor import convolve
+from drt_jax.learn import train
 
 from ..conftest import RGB
 
 CAMERA = train.Camera(kernel=9)
 
 
-def model(trained=("sensor",), distances=(25000.0, 25000.0)):
-    return drt_jax.moments_model(
-        drt_jax.load_lens("double_gauss"), trained, 0.0, distances, RGB, 1e-9
-    )
+@functools.cache
+def blur(near=25000.0, far=25000.0):
+    """The moments of a lens whose sensor moves."""
+    lens = drt_jax.load_lens("double_gauss")
+    return drt_jax.moments_model(lens, ("sensor",), 0.0, (near, far), RGB, 1e-9)[1]
 
 
 def scenes(seed=0, count=3):
@@ -28,8 +30,7 @@ def scenes(seed=0, count=3):
 
 
 def test_imager_is_the_chain_by_hand():
-    _, blur = model()
-    imager = train.make_imager(blur, None, CAMERA)
+    imager = train.make_imager(blur(), None, CAMERA)
     sensor = jnp.array(133.2)
     truth, image, restored, sigma = imager(
         {"optics": {"sensor": sensor}},
@@ -40,7 +41,7 @@ def test_imager_is_the_chain_by_hand():
     )
     x = scenes().astype(np.float32) / np.float32(255)
     np.testing.assert_array_equal(truth, x[:, 4:-4, 4:-4])
-    mean, covariance, _ = blur({"sensor": sensor}, 25000.0)
+    mean, covariance, _ = blur()({"sensor": sensor}, 25000.0)
     kernel = gaussian_psf(mean, covariance, 4.4e-3, 9).dense()
     np.testing.assert_allclose(image, convolve(jnp.asarray(x, float), kernel), atol=1e-6)
     assert image.dtype == jnp.float32 and restored is image
@@ -51,7 +52,7 @@ def test_gradient_of_the_loss_by_the_sensor_position():
     """Through network, sensor layer, kernel and moments, against finite differences."""
     init, restore = drt_jax.red_net(2, 4)
     weights = init(jax.random.key(0))
-    imager = train.make_imager(model()[1], restore, CAMERA)
+    imager = train.make_imager(blur(), restore, CAMERA)
 
     def loss(sensor):
         parameters = {"optics": {"sensor": sensor}, "network": weights}
@@ -68,7 +69,7 @@ def test_gradient_of_the_loss_by_the_sensor_position():
 
 @pytest.mark.parametrize("start", [132.9, 133.9])
 def test_training_moves_the_sensor_to_focus_and_compiles_once(start):
-    imager = train.make_imager(model()[1], None, CAMERA)
+    imager = train.make_imager(blur(), None, CAMERA)
     init, step = train.make_step(imager, {"optics": 0.1}, (25000.0, 25000.0), seed=0)
     state = init({"optics": {"sensor": jnp.array(start)}})
     reports = []
@@ -102,26 +103,32 @@ def test_training_stops_when_asked_with_a_report():
     assert seen == [(3, list(range(3, 13)), 10), (13, [13.0, 14.0], 12)] and state == 12
 
 
-def test_a_colour_without_rays_is_black_and_loses_no_gradient():
+def test_a_colour_without_rays_is_black_and_moves_no_other():
     def blur(values, distance):
         passed = jnp.array([1.0, 0.5, 0.0])
-        return jnp.zeros((3, 2)), jnp.zeros((3, 2)) * values["sensor"], passed
+        mean = 17 + jnp.zeros((3, 2)) * values["sensor"]
+        covariance = jnp.zeros((3, 2)) * values["sensor"]
+        lost = passed[:, None] == 0
+        return jnp.where(lost, 0, mean), jnp.where(lost, jnp.inf, covariance), passed
 
     imager = train.make_imager(blur, None, CAMERA)
+    others = (jnp.array(1.0), np.float32(0), jax.random.key(0))
 
+    @jax.jit
     def image(sensor):
-        return imager(
-            {"optics": {"sensor": sensor}}, scenes(), 1.0, np.float32(0), jax.random.key(0)
-        )
+        return imager({"optics": {"sensor": sensor}}, scenes(), *others)
 
     truth, sensor_image, _, sigma = image(1.0)
-    np.testing.assert_allclose(sensor_image, truth * np.array([1, 0.5, 0], np.float32), rtol=1e-6)
-    slope = jax.grad(lambda s: sum(jnp.sum(part.astype(float)) for part in image(s)))(1.0)
-    assert jnp.all(sigma == 0) and jnp.isfinite(slope)
+    wanted = truth * np.array([[[[1, 0.5, 0]]]], np.float32)
+    np.testing.assert_allclose(sensor_image, wanted, rtol=1e-6)
+    forward = jax.jacfwd(image)(1.0)
+    reverse = [jax.jacrev(lambda s, k=k: image(s)[k])(1.0) for k in range(4)]
+    assert all(jnp.all(slope == 0) for slope in (*forward, *reverse))
+    np.testing.assert_array_equal(sigma, [0, 0, np.inf])
 
 
 def test_depth_is_uniform_and_steps_depend_on_seed_and_index_alone():
-    imager = train.make_imager(model(distances=(1e4, 5e4))[1], None, CAMERA)
+    imager = train.make_imager(blur(1e4, 5e4), None, CAMERA)
     init, step = train.make_step(imager, {"optics": 0.0}, (1e4, 5e4), seed=3)
     depths = []
     for k in range(200):
@@ -139,7 +146,7 @@ def test_depth_is_uniform_and_steps_depend_on_seed_and_index_alone():
 
 def test_network_stays_in_float32():
     init_network, restore = drt_jax.red_net(1, 2)
-    imager = train.make_imager(model()[1], restore, CAMERA)
+    imager = train.make_imager(blur(), restore, CAMERA)
     init, step = train.make_step(
         imager, {"optics": 1e-2, "network": 1e-3}, (25000.0, 25000.0), seed=0
     )
@@ -149,7 +156,7 @@ def test_network_stays_in_float32():
     text = step.lower(state, scenes(), np.float32(0), np.int32(0)).as_text()
     convolutions = [line for line in text.splitlines() if "stablehlo.convolution" in line]
     assert convolutions and all("xf32>" in line and "f64" not in line for line in convolutions)
-    (parameters, moments), _ = step(state, scenes(), np.float32(0), np.int32(0))
+    (parameters, _), _ = step(state, scenes(), np.float32(0), np.int32(0))
     assert parameters["optics"]["sensor"].dtype == jnp.float64
     assert all(a.dtype == jnp.float32 for a in jax.tree.leaves(parameters["network"]))
 

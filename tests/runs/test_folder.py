@@ -1,6 +1,9 @@
 import dataclasses
 import os
 import signal
+import subprocess
+import sys
+import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -96,16 +99,48 @@ def test_clear_errors(tmp_path):
             run.load("a", jnp.ones(1), ("a",))
 
 
-def test_first_interrupt_is_deferred_second_is_not():
+def press_ctrl_c():
+    """KeyboardInterrupt where the handler raises it; a handler runs between two bytecodes."""
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.05)
+
+
+def test_first_interrupt_is_deferred_second_is_not(ctrl_c):
     with deferred_interrupt() as asked:
         assert not asked()
-        os.kill(os.getpid(), signal.SIGINT)
+        press_ctrl_c()
         assert asked()
         with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
-            while True:  # the signal arrives between two bytecodes
-                pass
+            press_ctrl_c()
     with pytest.raises(KeyboardInterrupt):
-        os.kill(os.getpid(), signal.SIGINT)
-        while True:
-            pass
+        press_ctrl_c()
+
+
+IGNORED = """
+import signal
+from drt_jax.runs.folder import deferred_interrupt
+
+handler = signal.getsignal(signal.SIGTERM)
+with deferred_interrupt() as asked:
+    signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN and not asked()
+    signal.raise_signal(signal.SIGTERM)
+    assert asked()
+assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+assert signal.getsignal(signal.SIGTERM) == handler
+"""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [sys.executable, "-c", IGNORED],
+        [*f"{sys.executable} -m pytest -n 0 -p no:cacheprovider -k deferred".split(), __file__],
+    ],
+    ids=["a run", "these tests"],
+)
+def test_an_ignored_interrupt_stays_ignored(command):
+    """As `nohup` starts a program: the run goes on, and the test above neither fails nor waits."""
+    started = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *command]
+    done = subprocess.run(started, timeout=100, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
