@@ -91,7 +91,9 @@ def duration(seconds: float | None) -> str:
     """A time in the unit that suits it."""
     if seconds is None:
         return ""
-    return f"{seconds:.2g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
+    if seconds >= 1:
+        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
+    return f"{1e3 * seconds:.3g} ms"
 
 
 def medians(calls: Sequence[Callable[[], Any]], repeats: int) -> list[float]:

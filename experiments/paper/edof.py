@@ -149,9 +149,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     beside = [
         ("plane that all starts reach", "145.29 mm", _training.reached(results)),
         (
-            "joint against fixed sensor, over the depths of training",
+            "joint against fixed sensor",
             "joint better, but for 15 to 20 m",
-            f"mean MAE {mean['joint']:.4f} against {mean['fixed']:.4f}; "
+            f"mean MAE over the depths of training {mean['joint']:.4f} against {mean['fixed']:.4f}; "
             f"fixed better at {', '.join(f'{depth:g}' for depth in better) or 'no'} m",
         ),
     ]

@@ -1,0 +1,49 @@
+"""Write the tables of README.md and docs/ from the results in results/.
+
+A block between `<!-- table: NAME -->` and `<!-- end -->` is replaced by the table of that name, as
+the experiments print it: `python -m experiments.tables`.
+"""
+
+import importlib
+import pathlib
+import re
+
+from . import _common
+
+_NAMES = ("focus", "restore", "edof", "accuracy", "stability", "benchmark")
+_BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def pages() -> list[pathlib.Path]:
+    """The files that hold tables."""
+    return [_common.ROOT / "README.md", *sorted((_common.ROOT / "docs").glob("*.md"))]
+
+
+def all_tables() -> dict[str, str]:
+    """The tables of all experiments by name, from their committed results."""
+    found = {}
+    for name in _NAMES:
+        experiment = importlib.import_module(f"experiments.{name}")
+        found |= experiment.tables(_common.read_results(_common.ROOT / "results" / name))
+    return found
+
+
+def filled(text: str, tables: dict[str, str]) -> str:
+    """A page with its blocks replaced. ConfigError for a table that there is not."""
+    for _, name, _ in _BLOCK.findall(text):
+        _common.require_known("tables", (name,), tables)
+    return _BLOCK.sub(lambda m: f"{m[1]}{tables[m[2]]}\n{m[3]}", text)
+
+
+def main() -> None:
+    """Command line."""
+    tables = all_tables()
+    for page in pages():
+        text = filled(page.read_text(), tables)
+        if text != page.read_text():
+            page.write_text(text)
+            print(f"written: {page}")
+
+
+if __name__ == "__main__":
+    main()
