@@ -194,7 +194,7 @@ def test_c08_rays(cases, lsst, name):
     rays = trace_rays(lsst, field, INF, [0.5], [start[:2] / 4180.0])
     assert rays.status.item() == Status.OK
     points = np.asarray(rays.points[0, 0])
-    np.testing.assert_allclose(points + [0, 0, start[2]], rows[:, :3], atol=1e-6)
+    np.testing.assert_allclose(points + np.array([0, 0, start[2]]), rows[:, :3], atol=1e-6)
     ours = directions(points)
     np.testing.assert_allclose(np.abs(ours), np.abs(cosines[:-1]), atol=3e-10)
 

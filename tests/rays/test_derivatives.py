@@ -1,6 +1,7 @@
 """Every derivative against an independent trace: `drt_jax` in reverse and in forward mode against
 the complex step through `oracle`, whose own derivatives are proved by 50-digit differences."""
 
+import dataclasses
 import pathlib
 import re
 
@@ -10,16 +11,17 @@ import mpmath
 import numpy as np
 import pytest
 
-from drt_jax import load_lens, psf_moments, trace_rays
-from drt_jax.pupil import rules as pupil
+from drt_jax import load_lens, psf_moments, pupil, trace_rays
+from drt_jax.pupil.rules import Gauss
 
-from . import oracle, test_surface
+from .. import oracle
+from ..lens import test_surface
 
 WAVELENGTHS = (0.6, 0.48)
 ORDER = 3
 POINTS = np.array([[0.3, 0.9], [-0.5, 0.2], [0.1, -0.6]])
 OUTPUTS = ("centroid", "covariance", "path")
-TABLE = pathlib.Path(__file__).parents[1] / "results" / "derivatives" / "derivatives.md"
+TABLE = pathlib.Path(__file__).parents[2] / "results" / "derivatives" / "derivatives.md"
 LARGEST = 1e-8
 
 # All forms, everything tilted and decentred, a refracting stop.
@@ -180,10 +182,10 @@ Largest relative errors of our derivatives, in reverse / forward mode, in float6
 is the complex step (h = 1e-30) through an independent Snell trace (`tests/oracle.py`), which is
 itself proved against 50-digit central differences. Written by
 
-    python -m pytest tests/test_derivatives.py --write-tables
+    python -m pytest tests/rays/test_derivatives.py --write-tables
 
-Colours {WAVELENGTHS[0]} and {WAVELENGTHS[1]} um; moments by `psf_moments(..., order={ORDER})`, \
-paths of {len(POINTS)} rays by
+Colours {WAVELENGTHS[0]} and {WAVELENGTHS[1]} um; moments by `psf_moments(..., \
+rule=Gauss({ORDER}, symmetry))`, paths of {len(POINTS)} rays by
 `trace_rays`. Each number is the largest, over the elements of the output and of the array of
 the parameter, of |ours - reference| / max(|reference|, 1e-4 x the largest |reference| of that
 array for that element of the output). 0: both are exactly 0, or equal. Both modes agree within
@@ -193,10 +195,19 @@ and decentres include the sensor's).
 """
 
 
+def load(name):
+    """The lens of a scene; the freeform has a curved sensor."""
+    lens = load_lens(SCENES[name][0])
+    if name != "freeform":
+        return lens
+    curvature, conic = lens.curvature.at[-1].set(-1 / 150), lens.conic.at[-1].set(0.4)
+    return dataclasses.replace(lens, curvature=curvature, conic=conic)
+
+
 def parameters(name, distance):
     """The differentiated arguments, and the names of the rows."""
-    source, field, _, symmetry = SCENES[name]
-    lens = load_lens(source)
+    _, field, _, symmetry = SCENES[name]
+    lens = load(name)
     arguments = {"lens": lens, "distance": jnp.asarray(distance)}
     if symmetry != "meridian":
         arguments["field"] = jnp.asarray(field, float)
@@ -207,15 +218,16 @@ def parameters(name, distance):
     return arguments, [row for row in rows if row != "coefficients" or lens.coefficients.size]
 
 
-def derivatives(forward):
-    """A compiled function from the arguments to the derivatives of all outputs."""
+def derivatives(mode, symmetry):
+    """A compiled function from the arguments to the derivatives of all outputs; `mode` is
+    `jax.jacrev` or `jax.jacfwd`."""
 
     def outputs(arguments):
         scene = arguments["lens"], arguments.get("field", 0.0), arguments["distance"], WAVELENGTHS
-        mean, covariance = psf_moments(*scene, order=ORDER, forward=forward)
-        return mean, covariance, trace_rays(*scene, POINTS, forward).path
+        mean, covariance = psf_moments(*scene, rule=Gauss(ORDER, symmetry))
+        return mean, covariance, trace_rays(*scene, POINTS).path
 
-    return jax.jit((jax.jacfwd if forward else jax.jacrev)(outputs))
+    return jax.jit(mode(outputs))
 
 
 def of_row(tree, row):
@@ -273,10 +285,10 @@ def test_all_derivatives_agree_with_the_complex_step(name, write_tables):
     nodes, weights = rule
     if len(nodes) == 1:
         nodes = np.concatenate([np.zeros_like(nodes), nodes])
-    reverse, forward = derivatives(False), derivatives(True)
+    modes = [derivatives(mode, symmetry) for mode in (jax.jacrev, jax.jacfwd)]
     for distance in distances:
         arguments, rows = parameters(name, distance)
-        ours = [mode(arguments) for mode in (reverse, forward)]
+        ours = [mode(arguments) for mode in modes]
         lens = arguments["lens"]
         scene = oracle.Scene.of(lens, field, distance, WAVELENGTHS)
         wanted = oracle.jacobian(scene, (nodes, weights), symmetry, POINTS.T, rows)
@@ -312,44 +324,36 @@ def test_the_committed_table_is_complete():
             assert max(numbers) <= LARGEST
 
 
+def exact_place(scene, i, z0):
+    """Origin of row `i`, the rotation from its axes to those of the lens, and its sag."""
+    turn = mpmath.eye(3)
+    for axis, angle in enumerate(scene["tilt"][i]):
+        one = mpmath.eye(3)
+        p, q = (axis + 1) % 3, (axis + 2) % 3
+        one[p, p] = one[q, q] = mpmath.cos(angle)
+        one[q, p], one[p, q] = mpmath.sin(angle), -mpmath.sin(angle)
+        turn = turn * one
+    formula = getattr(test_surface, f"exact_{scene['forms'][i]}")
+    shape = scene["curvature"][i], scene["conic"][i], scene["coefficients"][i]
+    return mpmath.matrix([*scene["decentre"][i], z0]), turn, lambda x, y: formula(x, y, *shape)
+
+
 def exact_trace(scene, x, y):
     """One ray of the first colour in mpmath: stop point, path, sensor point. `scene` holds
     nested lists of mpf; only the sags are shared, with the tests of `surface`."""
-    mpf, sqrt, small = mpmath.mpf, mpmath.sqrt, mpmath.mpf(10) ** -17
+    mpf, small = mpmath.mpf, mpmath.mpf(10) ** -17
     tangent = [mpmath.tan(a) for a in scene["field"]]
     source = mpmath.matrix([-t * scene["distance"] for t in tangent] + [-scene["distance"]])
+    point = mpmath.matrix([x, y, 0])
+    d = (point - source) / mpmath.norm(point - source)
     point = source
-    d = mpmath.matrix([x, y, 0]) - source
-    d = d / mpmath.norm(d)
-    square = mpf(WAVELENGTHS[0]) ** 2
-    n = [
-        sqrt(
-            sum(b * square / (square - c) for b, c in zip(bs, cs))
-            + sum(a * square ** (p // 2) for a, p in zip(s, (0, 2, -2, -4, -6, -8)))
-        )
-        for bs, cs, s in zip(scene["strength"], scene["resonance"], scene["schott"])
-    ]
-    path, z0, count = -mpmath.norm(source) * n[0], mpf(0), len(scene["forms"])
+    n = exact_indices(scene)
+    path, z0, count = -mpmath.norm(source) * n[0], mpf(0), len(scene["mirrors"])
     for i in range(count + 1):
         if i:
             z0 = scene["sensor"] if i == count else z0 + scene["thickness"][i - 1]
-        turn = mpmath.eye(3)
-        for axis, angle in enumerate(scene["tilt"][i]):
-            one = mpmath.eye(3)
-            p, q = (axis + 1) % 3, (axis + 2) % 3
-            one[p, p] = one[q, q] = mpmath.cos(angle)
-            one[q, p], one[p, q] = mpmath.sin(angle), -mpmath.sin(angle)
-            turn = turn * one
-        origin = mpmath.matrix([*scene["decentre"][i], z0])
+        origin, turn, sag = exact_place(scene, i, z0)
         p, t = turn.T * (point - origin), turn.T * d
-
-        def sag(x, y):
-            if i == count:
-                return mpf(0)
-            k = len(scene["coefficients"][i])
-            return getattr(test_surface, f"exact_{scene['forms'][i]}")(
-                x, y, scene["curvature"][i], scene["conic"][i], scene["coefficients"][i][:k]
-            )
 
         def above(s):
             return p[2] + s * t[2] - sag(p[0] + s * t[0], p[1] + s * t[1])
@@ -358,25 +362,39 @@ def exact_trace(scene, x, y):
         for _ in range(7):
             s -= above(s) * 2 * small / (above(s + small) - above(s - small))
         hit = p + s * t
-        path += n[i] * s
         if i == scene["stop"]:
             at_stop = hit[0], hit[1]
+        if i < count and scene["joined"][i]:
+            continue
+        path += n[i] * s
         point = turn * hit + origin
         if i == count:
             return at_stop, path, [point[j] for j in range(3)]
         h, x, y = small, hit[0], hit[1]
-        normal = mpmath.matrix(
-            [
-                (sag(x - h, y) - sag(x + h, y)) / (2 * h),
-                (sag(x, y - h) - sag(x, y + h)) / (2 * h),
-                1,
-            ]
-        )
-        normal = turn * normal / mpmath.norm(normal)
+        slopes = [
+            (sag(x - h, y) - sag(x + h, y)) / (2 * h),
+            (sag(x, y - h) - sag(x, y + h)) / (2 * h),
+        ]
+        normal = turn * mpmath.matrix([*slopes, 1])
+        normal = normal / mpmath.norm(normal)
         cosine = (normal.T * d)[0]
         along = (d - cosine * normal) * (n[i] / n[i + 1])
         side = mpmath.sign(cosine) * (-1 if scene["mirrors"][i] else 1)
-        d = along + side * sqrt(1 - mpmath.norm(along) ** 2) * normal
+        d = along + side * mpmath.sqrt(1 - mpmath.norm(along) ** 2) * normal
+
+
+def exact_indices(scene):
+    """Of the first colour; behind a surface off the path, that in front of it."""
+    square = mpmath.mpf(WAVELENGTHS[0]) ** 2
+    n = []
+    for i, (bs, cs, s) in enumerate(zip(scene["strength"], scene["resonance"], scene["schott"])):
+        if i and scene["joined"][i - 1]:
+            n.append(n[-1])
+            continue
+        n2 = sum(b * square / (square - c) for b, c in zip(bs, cs))
+        n2 += sum(a * square ** (p // 2) for a, p in zip(s, (0, 2, -2, -4, -6, -8)))
+        n.append(mpmath.sqrt(n2))
+    return n
 
 
 @pytest.mark.parametrize("name, rays", [("freeform", 2), ("folded", 1)])
@@ -395,8 +413,9 @@ def test_oracle_against_50_digits(name, rays):
         step = np.where(np.isinf(value), 0, step)
         imaginary = np.where(np.isinf(value), value, value + 1j * oracle.STEP * step)
         moved = scene.replace(**{row: imaginary})
-        _, hits, path = oracle.trace(moved, *oracle.aim(moved, points, start))
-        ours = [np.imag(np.broadcast_to(a, path.shape)) / oracle.STEP for a in (path, *hits[-1])]
+        traced = oracle.trace(moved, *oracle.aim(moved, points, start))
+        ours = [traced.path, *traced.hits[-1]]
+        ours = [np.imag(np.broadcast_to(a, traced.path.shape)) / oracle.STEP for a in ours]
         for ray in range(rays):
             with mpmath.workdps(50):
                 wanted = exact_difference(scene, row, step, points[:, ray], start, ray)
@@ -412,7 +431,7 @@ def exact_difference(scene, row, step, point, start, ray):
     for side in (1, -1):
         values = {k: _exact(v) for k, v in scene.values.items() if k != row}
         values[row] = _exact(scene.values[row], side * h, step)
-        values |= {"forms": scene.forms, "mirrors": scene.mirrors, "stop": scene.stop}
+        values |= {k: getattr(scene, k) for k in ("forms", "mirrors", "joined", "stop")}
         x, y = (mpmath.mpf(float(a[0, ray])) for a in start[:2])
         inverse = mpmath.matrix(start[2][:, :, 0, ray].tolist())
         radius = values["semi_diameter"][scene.stop]
