@@ -1,56 +1,61 @@
-"""Data flows one way: a module imports only from those above it."""
+"""The house: data flows one way, each outside package has its place, nothing grows too large."""
 
 import ast
+import graphlib
 import pathlib
+import subprocess
+import sys
 
 import pytest
 
 import drt_jax
 
-ROOT = pathlib.Path(drt_jax.__file__).parent
-# From what knows least to what knows most.
-ORDER = (
+PACKAGE = pathlib.Path(drt_jax.__file__).parent
+ROOT = PACKAGE.parent
+# From what knows least to what knows most; a floor is a folder or a module beside the folders.
+FLOORS = (
     "numerics",
-    "surface",
-    "glass",
     "lens",
-    "prescription",
-    "paraxial",
+    "rays",
     "pupil",
-    "fermat",
-    "sequential",
-    "aiming",
-    "search",
-    "implicit",
-    "snell",
-    "trace",
-    "wavefront",
-    "vignetting",
-    "moments",
-    "depth",
-    "psf",
-    "sensor",
-    "convolution",
-    "network",
-    "adam",
-    "data",
-    "config",
+    "image",
+    "design",
+    "learn",
+    "files",
+    "show",
+    "parallel",
     "runs",
-    "train",
-    "drawing",
-    "plot",
 )
-NO_OPTICS = ("convolution", "network", "adam", "data", "config", "runs", "plot")
-OPTICS = ORDER[: ORDER.index("sensor") + 1]
-ONLY = {"optimistix": "implicit", "matplotlib": "plot", "skimage": ("data", "train")}
+# These floors know no optics formula: what they may import of the package.
+FREE = {"learn": {"numerics", "image.kernel", "image.sensor"}, "show": set(), "runs": set()}
+FREE_BUT = {"show.layout"}
+# Outside packages that belong to some modules or floors alone.
+ONLY = {
+    "optimistix": {"rays.aim", "rays.solve"},
+    "matplotlib": {"show"},
+    "skimage": {"learn.data", "learn.train"},
+    "yaml": {"files", "lens.glass", "runs.config"},
+    "tqdm": set(),
+    "experiments": set(),
+    "tests": set(),
+}
+MODULES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+    if path != PACKAGE / "__init__.py"
+}
+OURS = [*PACKAGE.rglob("*.py"), *(ROOT / "experiments").rglob("*.py")]
 
 
-def imports(name):
-    """Modules of the package and outside packages that a module imports."""
+def imports(path):
+    """Modules of the package, and outside packages, that a file imports."""
     inside, outside = set(), set()
-    for node in ast.walk(ast.parse((ROOT / f"{name}.py").read_text())):
+    here = path.relative_to(PACKAGE).parent.parts
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level:
-            inside |= {node.module} if node.module else {alias.name for alias in node.names}
+            base = [*here[: len(here) - node.level + 1], *(node.module or "").split(".")]
+            name = ".".join(filter(None, base))
+            inside |= {name} if name in MODULES else {f"{name}.{a.name}" for a in node.names}
         elif isinstance(node, ast.ImportFrom):
             outside.add(node.module.split(".")[0])
         elif isinstance(node, ast.Import):
@@ -58,18 +63,55 @@ def imports(name):
     return inside, outside
 
 
-def test_every_module_has_its_place():
-    assert {path.stem for path in ROOT.glob("*.py")} - {"__init__"} == set(ORDER)
+def floor(name):
+    return name.split(".")[0]
 
 
-@pytest.mark.parametrize("name", ORDER)
+@pytest.mark.parametrize("name", MODULES)
 def test_imports_point_upwards(name):
-    inside, outside = imports(name)
-    assert inside <= set(ORDER[: ORDER.index(name)])
-    if name in NO_OPTICS:
-        assert not inside & set(OPTICS)
-    for package, allowed in ONLY.items():
-        assert package not in outside or name in allowed
-    text = (ROOT / f"{name}.py").read_text()
-    assert "config.update" not in text, "the library changes no global setting"
-    assert "print(" not in text, "the library is silent"
+    assert floor(name) in FLOORS
+    inside, outside = imports(MODULES[name])
+    above = FLOORS[: FLOORS.index(floor(name)) + 1]
+    assert {floor(other) for other in inside} <= set(above)
+    if floor(name) in FREE and name not in FREE_BUT:
+        assert {o for o in inside if floor(o) != floor(name)} <= FREE[floor(name)]
+    for package in outside & set(ONLY):
+        assert {name, floor(name)} & ONLY[package], f"{package} belongs to {ONLY[package]}"
+    assert "drt_jax" not in outside, "inside the package, imports are relative"
+
+
+def test_no_module_imports_itself_by_a_detour():
+    graphlib.TopologicalSorter({n: imports(path)[0] for n, path in MODULES.items()}).prepare()
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_the_library_is_silent_and_changes_no_global_setting(name):
+    calls = [n.func for n in ast.walk(ast.parse(MODULES[name].read_text())) if type(n) is ast.Call]
+    for call in map(ast.unparse, calls):
+        assert call != "print" and not call.endswith("config.update")
+
+
+def test_importing_the_package_draws_nothing_in():
+    code = "import sys, drt_jax; print(*sorted({n.split('.')[0] for n in sys.modules}))"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert not {"matplotlib", "skimage", "experiments"} & set(loaded.stdout.split())
+
+
+def test_every_public_name_exists_and_is_listed_once():
+    assert sorted(set(drt_jax.__all__)) == sorted(drt_jax.__all__)
+    assert all(hasattr(drt_jax, name) for name in drt_jax.__all__)
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_grows_too_large(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= 400
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno < 60, node.name
+
+
+def test_the_house_is_small():
+    assert sum(len(path.read_text().splitlines()) for path in OURS) < 8_200
