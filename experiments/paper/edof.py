@@ -151,7 +151,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         (
             "joint against fixed sensor",
             "joint better, but for 15 to 20 m",
-            f"mean MAE over the depths of training {mean['joint']:.4f} against {mean['fixed']:.4f}; "
+            f"mean MAE over training depths {mean['joint']:.4f} against {mean['fixed']:.4f}; "
             f"fixed better at {', '.join(f'{depth:g}' for depth in better) or 'no'} m",
         ),
     ]

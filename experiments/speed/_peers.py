@@ -6,12 +6,13 @@ hold about as many rays as asked for. Differences in definition are its error.
 
 import importlib
 import importlib.metadata
+import itertools
 from collections.abc import Callable
 
 import numpy as np
 
 import drt_jax
-from drt_jax.pupil import rules as pupil
+from drt_jax import pupil
 
 __all__ = ["PEERS", "Missing", "batoid_rays", "network_step", "spot"]
 
@@ -35,7 +36,7 @@ class Lens:
     the sensor, indices (S + 1, W), field in radians, object distance."""
 
     def __init__(self, lens: drt_jax.Lens, field: float, distance: float, wavelengths) -> None:
-        self.curvature = np.asarray(lens.curvature, float)
+        self.curvature = np.asarray(lens.curvature, float)[:-1]
         thickness = np.asarray(lens.thickness, float)
         self.gaps = np.append(thickness, float(lens.sensor) - np.sum(thickness))
         self.index = np.asarray(lens.index(np.asarray(wavelengths)), float)
@@ -51,7 +52,8 @@ def _rings(rays: int) -> int:
 
 def spot(name: str, lens: Lens, rays: int) -> tuple[Callable, Callable, str]:
     """(value, gradient, version) of the RMS spot radius sigma: value() -> (W,) in mm;
-    gradient() -> (W,), (W, 2 S), the latter by curvatures and gaps, NaN where the peer has none."""
+    gradient() -> (W,), (W, 2 S), the latter by curvatures, thicknesses and the sensor position, NaN
+    where the peer has none."""
     module, version = load(name)
     return (*{"optiland": _optiland, "batoid": _batoid}[name](module, lens, rays), version)
 
@@ -114,37 +116,22 @@ def _optiland(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
             bent = np.where(lens.curvature == 0, np.nan, lens.curvature)  # planes have no radius
             by_curvature = -by_radius / bent**2
             values.append(float(sigma.detach()))
-            slopes.append(
-                [*by_curvature, *(np.sum(place[1:]) - np.cumsum(np.append(0, place[1:-1])))]
-            )
+            behind = np.cumsum(place[-2:0:-1])[::-1]  # a thickness moves all vertices behind it
+            slopes.append([*by_curvature, *behind, place[-1]])
         return np.array(values), np.array(slopes)
 
     return value, gradient
 
 
 def _batoid_optic(module, curvature, gaps, index):
-    places = np.append(0, np.cumsum(gaps))
     media = [module.ConstMedium(float(n)) for n in index]
     items = []
-    for i, c in enumerate(curvature):
-        items.append(
-            module.RefractiveInterface(
-                module.Sphere(1 / c) if c else module.Plane(),
-                name=f"s{i}",
-                coordSys=module.CoordSys(origin=[0, 0, places[i]]),
-                inMedium=media[i],
-                outMedium=media[i + 1],
-            )
-        )
-    items.append(
-        module.Detector(
-            module.Plane(),
-            name="sensor",
-            coordSys=module.CoordSys(origin=[0, 0, places[-1]]),
-            inMedium=media[-1],
-            outMedium=media[-1],
-        )
-    )
+    for i, (c, place) in enumerate(zip([*curvature, 0], np.append(0, np.cumsum(gaps)))):
+        kind = module.RefractiveInterface if i < len(curvature) else module.Detector
+        shape = module.Sphere(1 / c) if c else module.Plane()
+        where = module.CoordSys(origin=[0, 0, place])
+        around = {"inMedium": media[i], "outMedium": media[min(i + 1, len(media) - 1)]}
+        items.append(kind(shape, name=f"s{i}", coordSys=where, **around))
     return module.CompoundOptic(items, name="lens", inMedium=media[0], outMedium=media[-1])
 
 
@@ -168,13 +155,16 @@ def _batoid(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
     def value(curvature=lens.curvature, gaps=lens.gaps):
         return np.array([trace(curvature, gaps, k) for k in range(len(lens.wavelengths))])
 
+    count = len(lens.gaps)
+    shift = np.eye(count)
+    shift[:-1, -1] = -1  # a thickness does not move the sensor
+
     def gradient():
-        base, slopes = value(), []
-        for group, step in ((0, 1e-7), (1, 1e-6)):
-            for i in range(len(lens.gaps)):
-                moved = [lens.curvature.copy(), lens.gaps.copy()]
-                moved[group][i] += step
-                slopes.append((value(*moved) - base) / step)
+        base, h = value(), 1e-7 * np.eye(count)
+        moved = [value(curvature=lens.curvature + row) for row in h]
+        slopes = [(found - base) / 1e-7 for found in moved]
+        moved = [value(gaps=lens.gaps + 1e-6 * row) for row in shift]
+        slopes += [(found - base) / 1e-6 for found in moved]
         return base, np.array(slopes).T
 
     return value, gradient
@@ -203,10 +193,8 @@ def network_step(batch: int, patch: int, rate: float) -> tuple[Callable, str]:
     class RedNet(nn.Module):
         def __init__(self):
             super().__init__()
-            widths = [3] + [64] * 9 + [3]
-            self.layers = nn.ModuleList(
-                nn.Conv2d(a, b, 3, padding=1) for a, b in zip(widths[:-1], widths[1:])
-            )
+            pairs = itertools.pairwise([3] + [64] * 9 + [3])
+            self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairs)
 
         def forward(self, images):
             features, kept = images, {}

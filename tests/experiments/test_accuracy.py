@@ -12,11 +12,11 @@ from scipy.stats import qmc
 
 import drt_jax
 from drt_jax import load_lens, psf_moments
-from drt_jax.pupil import rules as pupil
+from drt_jax import pupil
 from experiments import accuracy
 from experiments._reference import reference
 
-from .conftest import RGB
+from ..conftest import RGB
 
 PATTERNS = {
     "meridian": pupil.meridian(5),
@@ -129,8 +129,9 @@ def test_spot_size_keeps_its_tolerance(name, degrees, distance):
     field = np.radians(degrees)
     for defocus in (0.0, 1.0):
         lens = focused(name, distance, defocus)
+        rules = (pupil.Gauss(order, "half" if degrees else "meridian") for order in (17, 18))
         size, again = (
-            spot_size(psf_moments(lens, field, distance, RGB, order=order)[1]) for order in (17, 18)
+            spot_size(psf_moments(lens, field, distance, RGB, rule=rule)[1]) for rule in rules
         )
         np.testing.assert_allclose(size, again, rtol=2e-12)
         assert_kept(lens, field, distance, size, TOLERANCES)
@@ -159,7 +160,7 @@ def test_spot_size_keeps_its_tolerance_against_snells_law(degrees, distance):
 )
 def test_vignetted_spot_size_keeps_its_tolerance(degrees, distance, front, rear):
     lens = focused("double_gauss", distance)
-    semi = lens.semi_diameter.at[0].set(front).at[-1].set(rear)
+    semi = lens.semi_diameter.at[0].set(front).at[-2].set(rear)
     lens, field = dataclasses.replace(lens, semi_diameter=semi), np.radians(degrees)
     assert_kept(lens, field, distance, truth(lens, field, distance), TOLERANCES)
 
@@ -179,7 +180,7 @@ def test_reference_of_a_clipped_beam():
     """On axis the ring alone limits a parallel beam, so that it may as well be the stop; off
     axis the two circles overlap, and a million points of a grid sum to the same."""
     lens = load_lens(CLIPPED)
-    alone = dataclasses.replace(lens, semi_diameter=jnp.array([np.inf, 3.0]))
+    alone = dataclasses.replace(lens, semi_diameter=jnp.array([np.inf, 3.0, np.inf]))
     clipped, round_ = (reference(a, 0.0, math.inf, [0.55])[0] for a in (lens, alone))
     np.testing.assert_allclose(clipped.sigma, round_.sigma, rtol=1e-12)
     assert clipped.error < 1e-12

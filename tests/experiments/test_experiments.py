@@ -14,10 +14,12 @@ import pytest
 import yaml
 from skimage import io
 
+from drt_jax.learn import train
 from drt_jax.runs.config import load_config
 from drt_jax.runs.folder import Run
+from experiments import _common, tables
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
 SMALL = [
     "train.batch=2",
@@ -163,7 +165,43 @@ def test_finished_run_resumes_at_once(unbroken, capsys):
     before = (unbroken("focus") / "metrics.csv").read_text()
     main("focus", "--resume", "--out", unbroken("focus"))
     assert (unbroken("focus") / "metrics.csv").read_text() == before
-    assert "best focus by dense search" in capsys.readouterr().out
+    assert "dense search on the same loss" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", TOY)
+def test_pictures_are_drawn_again_without_the_run(name, unbroken, tmp_path, monkeypatch, capsys):
+    """From the results alone: the same pictures to the last byte, and the same tables."""
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    for path in unbroken(name).glob("results.*"):
+        (folder / path.name).write_bytes(path.read_bytes())
+    monkeypatch.setattr(train, "fit", None)
+    main(name, "--report", "--out", folder)
+    assert "| " in capsys.readouterr().out
+    drawn = {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
+    assert drawn == {p.name: p.read_bytes() for p in (unbroken(name) / "figures").iterdir()}
+
+
+def test_tables_of_the_pages_are_those_of_the_results():
+    """`python -m experiments.tables` has nothing to write."""
+    found, used = tables.all_tables(), []
+    for page in tables.pages():
+        text = page.read_text()
+        assert tables.filled(text, found) == text, f"{page.name}: run python -m experiments.tables"
+        used += [name for name in found if f"<!-- table: {name} -->" in text]
+    assert sorted(used) == sorted(found)
+    with pytest.raises(ValueError, match="unknown 'none'"):
+        tables.filled("<!-- table: none -->\n<!-- end -->", found)
+
+
+def test_a_table_can_be_read_as_text():
+    text = _common.table(("a", "bc"), [(1, 0.123456), ("long", None)])
+    assert text.splitlines() == [
+        "| a    | bc     |",
+        "|------|--------|",
+        "| 1    | 0.1235 |",
+        "| long |        |",
+    ]
 
 
 def test_interrupt_in_the_last_steps_of_a_job_stops_before_the_next(
@@ -204,6 +242,7 @@ FAILURES = {
     "noise": (["--set", "noise=.nan"], "noise: expected 0 or more, got nan"),
     "no network": (["--set", "train.network_rate=1"], "unknown key train.network_rate"),
     "nothing to resume": (["--resume"], "nothing to resume"),
+    "nothing to report": (["--report"], "no results.json in it: the run is not finished"),
 }
 
 

@@ -6,13 +6,15 @@ import pytest
 
 from drt_jax import Status
 from experiments import _survey
-from experiments._scenes import FAMILIES, draw
+from experiments._families import FAMILIES, draw
 from experiments.stability import joined, row_of
 
 pytestmark = pytest.mark.slow
 SCENES = 50
 # One static structure, so that a few compiled programs serve all: five surfaces, the stop third.
 NAMES = ("curvature", "asphere", "index", "edge", "close", "touching", "distance", "focus", "field")
+# Stops that are labels: one structure of each family.
+LABELS = {"phone": 3, "offaxis": "second"}
 # Rays in 10,000 that Snell's law can trace and we do not find.
 LIMIT = 1
 
@@ -22,13 +24,13 @@ def rows():
     surveys = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_survey, "_BATCH", SCENES)
-        for name in NAMES:
+        for name, variant in {**dict.fromkeys(NAMES, 2), **LABELS}.items():
             share = FAMILIES[name].share
-            surveys[name] = [_survey.survey(s) for s in draw(name, SCENES / share, 1, (2,))]
+            surveys[name] = [_survey.survey(s) for s in draw(name, SCENES / share, 1, (variant,))]
     return {name: row_of(name, joined(parts)) for name, parts in surveys.items()}
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *LABELS])
 def test_numbers_are_finite_and_good_rays_obey_snell(rows, name):
     row = rows[name]
     assert row["rays"] == 8 * SCENES
