@@ -16,15 +16,7 @@ from ..image.sensor import Convolve, convolve, sensor_layer
 from ..numerics import safe_divide, safe_sqrt
 from .adam import adam, apply_updates
 
-__all__ = [
-    "Camera",
-    "compiler_options",
-    "evaluate",
-    "fit",
-    "make_imager",
-    "make_step",
-    "value_and_gradient",
-]
+__all__ = ["Camera", "compiler_options", "evaluate", "fit", "make_imager", "make_step"]
 
 Blur = Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]
 Restore = Callable[[Any, Array], Array]
@@ -104,7 +96,7 @@ def compiler_options() -> dict[str, str] | None:
     return options
 
 
-def value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:
+def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:
     """((value, extras), gradient) of a loss.
 
     loss: (parameters) -> (value, extras).
@@ -160,7 +152,7 @@ def make_step(
             truth, _, restored, sigma = imager(parameters, scenes, distance, noise, noise_key)
             return jnp.mean(jnp.abs(restored - truth)), jnp.mean(sigma)
 
-        (error, sigma), gradients = value_and_gradient(loss, parameters)
+        (error, sigma), gradients = _value_and_gradient(loss, parameters)
         updates, moments = update(gradients, moments)
         report = {"loss": error, "sigma_um": 1e3 * sigma, "depth_mm": distance}
         if "sensor" in parameters["optics"]:

@@ -5,7 +5,7 @@ import dataclasses
 import difflib
 import pathlib
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, TypeVar
 
 import yaml
@@ -45,71 +45,43 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
             value = yaml.safe_load(text)
         except yaml.YAMLError as error:
             raise ConfigError(f"--set {override}: {text!r} is not a YAML value") from error
-        config = _replace(config, key.strip().split("."), value, f"--set {override}", "")
+        for name in reversed(key.strip().split(".")):
+            value = {name: value}
+        config = _build(cls, value, f"--set {override}", "", config)
     return config
 
 
-def _dotted(prefix: str, key: object) -> str:
-    return f"{prefix}.{key}" if prefix else str(key)
+def _build(cls: Any, entry: object, source: str, prefix: str, old: Any = None) -> Any:
+    """The dataclass `cls` with the values of `entry`, the others those of `old` or defaults.
 
-
-def _kind(cls: type, key: str, source: str, prefix: str) -> Any:
-    """The type of a setting; ConfigError if there is none of that name."""
-    known = typing.get_type_hints(cls)
-    if key not in known:
-        near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
-        hint = f"did you mean {_dotted(prefix, near[0])}? " if near else ""
-        raise ConfigError(
-            f"{source}: unknown key {_dotted(prefix, key)}; {hint}known here: {', '.join(known)}"
-        )
-    return known[key]
-
-
-def _build(cls: Any, entry: object, source: str, prefix: str) -> Any:
+    source: what messages name. prefix: the keys that lead here, each with a dot behind.
+    """
     if not isinstance(entry, dict):
-        where = prefix or "the file"
+        where = prefix.rstrip(".") or "the file"
         raise ConfigError(f"{source}: {where}: expected keys and values, got {entry!r}")
-    values = {
-        key: _convert(_kind(cls, key, source, prefix), value, source, _dotted(prefix, key))
-        for key, value in entry.items()
-    }
-    missing = [
-        _dotted(prefix, field.name)
-        for field in dataclasses.fields(cls)
-        if field.name not in values and field.default is dataclasses.MISSING
-    ]
+    known = typing.get_type_hints(cls)
+    values = {}
+    for key, value in entry.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+            hint = f"did you mean {prefix}{near[0]}? " if near else ""
+            listed = ", ".join(known)
+            raise ConfigError(f"{source}: unknown key {prefix}{key}; {hint}known here: {listed}")
+        values[key] = _convert(known[key], value, source, prefix + key, getattr(old, key, None))
+    needed = (f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING)
+    missing = [prefix + name for name in needed if old is None and name not in values]
     if missing:
         raise ConfigError(f"{source}: missing keys: {', '.join(missing)}")
-    with _naming(source):
-        return cls(**values)
-
-
-@contextlib.contextmanager
-def _naming(source: str) -> Iterator[None]:
-    """What a dataclass refuses, with its source."""
     try:
-        yield
-    except ValueError as error:
+        return cls(**values) if old is None else dataclasses.replace(old, **values)
+    except ValueError as error:  # a dataclass that refuses its values
         raise ConfigError(f"{source}: {error}") from error
 
 
-def _replace(config: Any, keys: list[str], value: object, source: str, prefix: str) -> Any:
-    name, *rest = keys
-    kind, here = _kind(type(config), name, source, prefix), _dotted(prefix, name)
-    if not rest:
-        new = _convert(kind, value, source, here)
-    elif dataclasses.is_dataclass(kind):
-        new = _replace(getattr(config, name), rest, value, source, here)
-    else:
-        raise ConfigError(f"{source}: {here} has no keys of its own")
-    with _naming(source):
-        return dataclasses.replace(config, **{name: new})
-
-
-def _convert(kind: Any, value: object, source: str, key: str) -> Any:
+def _convert(kind: Any, value: object, source: str, key: str, old: Any = None) -> Any:
     """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...] or a Literal."""
     if dataclasses.is_dataclass(kind):
-        return _build(kind, value, source, key)
+        return _build(kind, value, source, f"{key}.", old)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple and isinstance(value, list | tuple):
         items = enumerate(value)

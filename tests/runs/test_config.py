@@ -30,7 +30,7 @@ def path(tmp_path):
 
 def test_yaml_overrides_and_round_trip(path, tmp_path):
     config = load_config(
-        Config, path, ["train.batch=8", "starts=[1]", "fast=true", "train.form=sampled"]
+        Config, path, ["train.batch=8", "starts=[1]", "fast=true", "train={form: sampled}"]
     )
     assert config == Config((1.0,), "x", True, Inner(8, 1e-4, "sampled"))
     assert isinstance(config.starts[0], float)
@@ -51,7 +51,7 @@ BAD = {
     "starts=5": "starts: expected a list, each item a number, got 5",
     "starts=[a]": r"starts\[0\]: expected a number, got 'a'",
     "train=3": "train: expected keys and values, got 3",
-    "name.first=3": "name has no keys of its own",
+    "name.first=3": "name: expected text, got {'first': 3}",
     "train.batch": "expected key=value",
     "name=[": "is not a YAML value",
 }
