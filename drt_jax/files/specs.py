@@ -1,7 +1,6 @@
 """Prescriptions: a lens built from a mapping, its entries checked before anything is traced."""
 
 import difflib
-import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -21,21 +20,9 @@ __all__ = ["LensError", "build_lens"]
 _TOP_KEYS = ("name", "source", "object", "surfaces", "sensor", "sensor_tilt", "sensor_decentre")
 _MEDIUM_KEYS = ("glass", "index")
 _SURFACE_KEYS = (
-    "form",
-    "radius",
-    "curvature",
-    "conic",
-    "radius_x",
-    "curvature_x",
-    "conic_x",
-    "coefficients",
-    "thickness",
-    *_MEDIUM_KEYS,
-    "mirror",
-    "semi_diameter",
-    "stop",
-    "tilt",
-    "decentre",
+    *("form", "radius", "curvature", "conic", "radius_x", "curvature_x", "conic_x"),
+    *("coefficients", "thickness", *_MEDIUM_KEYS, "mirror", "semi_diameter", "stop"),
+    *("tilt", "decentre"),
 )
 _EVEN = tuple(range(2, 400, 2))
 # What the columns of a form's coefficients are: keys of a surface, and after them powers.
@@ -52,6 +39,7 @@ _ROUND = ("asphere", "odd_asphere", "polynomial_xy")
 _TOUCH = 1e-4
 # The direction of a ray between vertices closer than this (mm) drowns in rounding.
 _CLOSEST = 1e-6
+_by_form = jax.jit(by_form, static_argnums=(0, 3))
 
 
 class LensError(ValueError):
@@ -277,9 +265,9 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         mirrors=tuple(surface.flag("mirror") for surface in surfaces),
         name=str(top.values.get("name", name)),
     )
-    pairs = _neighbours(lens, rows)
-    _check_order(lens, pairs, gaps)
-    _check_crossing(lens, pairs, gaps)
+    pairs = _pairs(lens, rows, gaps)
+    _check_order(lens, pairs)
+    _check_crossing(lens, pairs)
     return lens
 
 
@@ -293,30 +281,46 @@ def _table(rows: Sequence[Sequence[float]], width: int) -> Array:
     return _array([[*row, *[0.0] * (width - len(row))] for row in rows])
 
 
-def _neighbours(lens: Lens, rows: list[_Row]) -> list[tuple[int, int]]:
-    """Rows that light meets one right after the other on the axis, the last pair with the sensor.
+class _Pair(NamedTuple):
+    """Rows `i` and `j` that light on the axis meets one right after the other.
 
-    Those are the surfaces that bend light: the straight ray between two of them may cross a stop
-    that bends none before the first or behind the second, so that it may lie anywhere. A pair of
-    which one is tilted or decentred is left out: away from the axis, or at an angle to it, it may
-    lie before its neighbour there and behind it where the light goes.
+    distance: mm from the vertex of `i` to that of `j`, along the z axis.
+    sense: 1 where light travels along that axis, -1 where a mirror has turned it.
+    """
+
+    i: int
+    j: int
+    distance: float
+    sense: int
+
+
+def _pairs(lens: Lens, rows: list[_Row], gaps: list[float]) -> list[_Pair]:
+    """Neighbours among the surfaces that bend light; of the last pair, one is the sensor.
+
+    The straight ray between two of them may cross a stop that bends none before the first or
+    behind the second, so that it may lie anywhere. A pair of which one is tilted or decentred is
+    left out: away from the axis, or at an angle to it, it may lie before its neighbour there and
+    behind it where the light goes.
     """
     off = [any(row.decentre) or any(row.tilt) for row in rows]
-    chain = [*(lens.live or (lens.stop,)), lens.count]
-    return [(i, j) for i, j in itertools.pairwise(chain) if not off[i] and not off[j]]
+    chain = itertools.pairwise([*(lens.live or (lens.stop,)), lens.count])
+    return [
+        _Pair(i, j, sum(gaps[i:j]), int(lens.senses[i + 1]))
+        for i, j in chain
+        if not off[i] and not off[j]
+    ]
 
 
-def _check_order(lens: Lens, pairs: list[tuple[int, int]], gaps: list[float]) -> None:
+def _check_order(lens: Lens, pairs: list[_Pair]) -> None:
     """LensError where light would have to go backwards from a surface to the next or the sensor."""
-    for i, j in pairs:
-        sense = int(lens.senses[i + 1])
-        if sense * sum(gaps[i:j]) >= _CLOSEST:
+    for i, j, distance, sense in pairs:
+        if sense * distance >= _CLOSEST:
             continue
         turned = "" if sense > 0 else ", as a mirror has turned the light"
         if j == lens.count:
             raise LensError(
                 f"sensor: {float(lens.sensor):g} mm lies before the vertex of surface {i} at "
-                f"{sum(gaps[:i]):g} mm{turned}"
+                f"{float(lens.vertices[i]):g} mm{turned}"
             )
         reach = "" if j == i + 1 else f" up to surface {j}, in sum"
         raise LensError(
@@ -325,32 +329,24 @@ def _check_order(lens: Lens, pairs: list[tuple[int, int]], gaps: list[float]) ->
         )
 
 
-@functools.partial(jax.jit, static_argnames="forms")
-def _sags(radius: Array, shape: tuple[Array, ...], forms: tuple[str, ...]) -> Array:
-    """Sag (R, N) in mm of R surfaces at the distances `radius` (R, N), mm, from their axes.
-
-    `shape`: curvature (R, 1), conic (R, 1), coefficients (K, R, 1).
-    """
-    return by_form(surface_sag, (jnp.zeros_like(radius), radius), Shape(*shape), forms)
-
-
-def _check_crossing(lens: Lens, pairs: list[tuple[int, int]], gaps: list[float]) -> None:
+def _check_crossing(lens: Lens, pairs: list[_Pair]) -> None:
     """LensError where neighbours overlap inside both their clear apertures."""
-    pairs = [(i, j) for i, j in pairs if j < lens.count]
+    pairs = [pair for pair in pairs if pair.j < lens.count]
     if not pairs:
         return
     semi = np.asarray(lens.semi_diameter)
-    common = [min(semi[i], semi[j]) for i, j in pairs]
-    reach = np.where(np.isfinite(common), common, 0.0).astype(semi.dtype)
-    radius = reach[:, None] * np.linspace(0, 1, 17, dtype=semi.dtype)
-    rows = [i for pair in zip(*pairs) for i in pair]
-    columns = (lens.curvature, lens.conic, lens.coefficients)
-    shape = tuple(np.asarray(a)[rows].T[..., None] for a in columns)
-    forms = tuple(lens.forms[i] for i in rows)
-    front, back = np.split(np.asarray(_sags(np.concatenate([radius, radius]), shape, forms)), 2)
-    for k, (i, j) in enumerate(pairs):
-        distance = sum(gaps[i:j])
-        overlap = -lens.senses[i + 1] * (distance + back[k] - front[k])
+    common = np.array([min(semi[pair.i], semi[pair.j]) for pair in pairs])
+    radius = np.where(np.isfinite(common), common, 0)[:, None] * np.linspace(0, 1, 17)
+    rows = [*(pair.i for pair in pairs), *(pair.j for pair in pairs)]
+    y = np.concatenate([radius, radius]).astype(semi.dtype)
+    shape = jax.tree.map(
+        lambda a: np.asarray(a)[rows].T[..., None],
+        Shape(lens.curvature, lens.conic, lens.coefficients),
+    )
+    z = _by_form(surface_sag, (np.zeros_like(y), y), shape, tuple(lens.forms[i] for i in rows))
+    front, back = np.split(np.asarray(z), 2)
+    for k, (i, j, distance, sense) in enumerate(pairs):
+        overlap = sense * (front[k] - back[k] - distance)
         if np.any(overlap > _TOUCH):
             where = radius[k, np.argmax(overlap > _TOUCH)]
             raise LensError(

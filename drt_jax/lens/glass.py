@@ -152,9 +152,9 @@ def check_wavelengths(names: tuple[str, ...], wavelengths: ArrayLike) -> None:
         return
     for name in names:
         low, high = _range(name)
-        for value in np.atleast_1d(np.asarray(wavelengths)):
+        for value in np.ravel(np.asarray(wavelengths)):
             if not low <= value <= high:
+                bounds = f"{low:g} to {high:g} um"
                 raise ValueError(
-                    f"wavelength {value:g} um is outside the range of {name}, "
-                    f"{low:g} to {high:g} um"
+                    f"wavelength {value:g} um is outside the range of {name}, {bounds}"
                 )
