@@ -255,6 +255,13 @@ def test_stop_plane_that_touches_a_lens(shared):
     np.testing.assert_allclose(lens.vertices, [0, 0, 1, 20.792])
 
 
+def test_index_1_is_air():
+    """A surface between them bends no light, so that it need not keep its order."""
+    surfaces = in_order(FRONT, 1.0, BACK | {"index": 1.0}, 5.0, {"radius": 9.0}, -5.0, STOP, 20.0)
+    lens = load_lens({"object": {"index": 1}, **surfaces})
+    assert lens.glasses == ("air", "index 1.5", "air", "air", "air") and lens.live == (0, 1)
+
+
 DUMMY = {"radius": 5.0, "semi_diameter": 4.0}
 WIDE = {**FRONT, "semi_diameter": 10.0}
 BACKWARDS = {
