@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from drt_jax.image.kernel import SeparableKernel, gaussian_psf
+from drt_jax.image import kernel as kernels
+from drt_jax.image.kernel import SeparableKernel
 
+gaussian_psf = jax.jit(kernels.gaussian_psf, static_argnums=(2, 3, 4))
 PIXEL = 4.4e-3
 
 

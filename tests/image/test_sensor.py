@@ -1,23 +1,30 @@
 """The sensor layer against scipy.ndimage."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from drt_jax.image import sensor
 from drt_jax.image.kernel import SeparableKernel, gaussian_psf
-from drt_jax.image.sensor import convolve, convolve_taps, sensor_layer
 
 from ..conftest import assert_close
 
+convolve, convolve_taps = jax.jit(sensor.convolve), jax.jit(sensor.convolve_taps)
+sensor_layer = jax.jit(sensor.sensor_layer)
 
+
+@functools.cache
 def kernels(dense):
     mean = jnp.array([[0.4, -1.2], [0.0, 0.3], [-2.0, 0.0]])
     covariance = jnp.array(
         [[[4.0, 1.5], [1.5, 2.0]], [[0.3, 0.1], [0.1, 0.2]], [[9.0, 0], [0, 3.0]]]
     )
-    return gaussian_psf(mean, covariance if dense else jnp.diagonal(covariance, 0, 1, 2), 1.0, 9)
+    covariance = covariance if dense else jnp.diagonal(covariance, 0, 1, 2)
+    return jax.jit(gaussian_psf, static_argnums=(2, 3))(mean, covariance, 1.0, 9)
 
 
 @pytest.mark.parametrize("dense", [False, True])

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import red_net
+from drt_jax import adam, apply_updates, red_net
 from drt_jax.learn.network import count_parameters
 
 
@@ -58,8 +58,6 @@ def test_starts_near_the_identity_and_keeps_float32():
 
 def test_learns_to_denoise():
     """A small network, trained for 150 steps, beats the noisy image it is given."""
-    from drt_jax import adam, apply_updates
-
     init, apply = red_net(2, 8)
     clean = jnp.full((4, 16, 16, 3), 0.5, jnp.float32)
     noisy = clean + 0.1 * jax.random.normal(jax.random.key(0), clean.shape, jnp.float32)
