@@ -50,9 +50,10 @@ def shared() -> pathlib.Path:
     return path
 
 
-@pytest.fixture
+@pytest.fixture(scope="session", autouse=True)
 def ctrl_c() -> Iterator[None]:
-    """Ctrl-C is heard, also where the tests were started with SIGINT ignored (`nohup`, some CI)."""
+    """Ctrl-C is heard, also where the tests were started with SIGINT ignored (`nohup`, some CI):
+    some of them press it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -105,7 +105,7 @@ def press_ctrl_c():
     time.sleep(0.05)
 
 
-def test_first_interrupt_is_deferred_second_is_not(ctrl_c):
+def test_first_interrupt_is_deferred_second_is_not():
     with deferred_interrupt() as asked:
         assert not asked()
         press_ctrl_c()
