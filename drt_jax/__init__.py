@@ -13,13 +13,23 @@ Conventions, everywhere in the package:
   before loading a lens; the library changes no global setting.
 """
 
-from .learn.adam import adam, apply_updates
+from .files.specs import LensError
+from .files.yaml import lens_names, load_lens
+from .image.converged import (
+    converged_focus_rule,
+    converged_rule,
+    focus_moments,
+    psf_moments,
+)
 from .image.depth import depth_moments, moments_model
-from .rays.fermat import Status
-from .lens.glass import find_glass, refractive_index
-from .lens.lens import Lens
-from .image.moments import focus_moments, psf_moments, pupil_order
+from .image.kernel import SeparableKernel, gaussian_psf
+from .image.moments import FocusMoments, Moments, moments
+from .image.sensor import convolve, sensor_layer
+from .image.wavefront import Wavefront, rms_wavefront, wavefront
+from .learn.adam import adam, apply_updates
 from .learn.network import red_net
+from .lens.glass import find_glass, refractive_index
+from .lens.lens import Lens, sag
 from .lens.paraxial import (
     FirstOrder,
     Pupil,
@@ -35,28 +45,36 @@ from .lens.paraxial import (
     lateral_magnification,
     numerical_aperture,
 )
+from .lens.scene import Scene, field_of_height, scene_of
 from .lens.seidel import ThirdOrder, third_order
-from .files.specs import LensError
-from .files.yaml import lens_names, load_lens
-from .image.kernel import SeparableKernel, gaussian_psf
-from .image.sensor import convolve, sensor_layer
-from .rays.snell import launch_paraxial, trace_snell
-from .rays.trace import Rays, field_of_height, trace_rays
-from .image.wavefront import Wavefront, rms_wavefront, wavefront
+from .pupil.clipped import Clipped
+from .pupil.rules import Gauss, Pattern, PupilRule, Soft, pupil_points, symmetry_of
+from .rays.status import Status
+from .rays.trace import Rays, trace_rays
 
 __all__ = [
+    "Clipped",
     "FirstOrder",
+    "FocusMoments",
+    "Gauss",
     "Lens",
     "LensError",
+    "Moments",
+    "Pattern",
     "Pupil",
+    "PupilRule",
     "Rays",
+    "Scene",
     "SeparableKernel",
+    "Soft",
     "Status",
     "ThirdOrder",
     "Wavefront",
     "adam",
     "apply_updates",
     "back_focal_distance",
+    "converged_focus_rule",
+    "converged_rule",
     "convolve",
     "depth_moments",
     "entrance_pupil",
@@ -72,19 +90,21 @@ __all__ = [
     "image_distance",
     "image_height",
     "lateral_magnification",
-    "launch_paraxial",
     "lens_names",
     "load_lens",
+    "moments",
     "moments_model",
     "numerical_aperture",
     "psf_moments",
-    "pupil_order",
+    "pupil_points",
     "red_net",
     "refractive_index",
     "rms_wavefront",
+    "sag",
+    "scene_of",
     "sensor_layer",
+    "symmetry_of",
     "third_order",
     "trace_rays",
-    "trace_snell",
     "wavefront",
 ]

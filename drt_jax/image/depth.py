@@ -15,7 +15,12 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
-from .moments import FocusMoments, focus_moments, pupil_order
+from ..lens.scene import scene_of
+from ..pupil.clipped import Clipped
+from ..pupil.rules import Gauss, PupilRule
+from ..rays.solve import solve_reverse
+from .converged import converged_focus_rule, focus_moments
+from .moments import FocusMoments, moments
 
 __all__ = ["DepthMoments", "depth_moments", "moments_model"]
 
@@ -124,16 +129,21 @@ def moments_model(
             return *moments.at(values.get("sensor", lens.sensor)), moments.passed
 
         return values, from_plane
-    orders = [
-        pupil_order(lens, field, distance, wavelengths, tolerance, moving=True)
+    rules = [
+        converged_focus_rule(lens, field, distance, wavelengths, tolerance)
         for distance in {near, far}
     ]
-    # A rule fitted to a clipped pupil holds for one distance.
-    order = orders[0] if len(orders) == 1 else max(getattr(o, "order", o) for o in orders)
+    rule = max(rules, key=_cost)
 
     def retrace(values, distance):
         moved = dataclasses.replace(lens, **values)
-        moments = focus_moments(moved, field, distance, wavelengths, order=order)
-        return *moments.at(moved.sensor), moments.passed
+        scene = scene_of(moved, field, distance, wavelengths)
+        found = moments(moved, scene, rule, solve_reverse)
+        return *found.at(moved.sensor), found.passed
 
     return values, retrace
+
+
+def _cost(rule: PupilRule) -> tuple[bool, int]:
+    """Of two rules that were found for one lens, the greater serves both scenes."""
+    return isinstance(rule, Clipped), rule.order if isinstance(rule, Gauss | Clipped) else 0

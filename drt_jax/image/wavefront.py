@@ -11,7 +11,6 @@ the sensor at P = C + e met the sphere at the distance R + t before P, where
 Source: Welford, Aberrations of Optical Systems (1986), ch. 7.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -19,12 +18,14 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from ..rays.fermat import Status
-from ..lens.glass import check_wavelengths
+from ..lens.glass import check_wavelengths, common_range
 from ..lens.lens import Lens, rotation_matrix
-from ..numerics import safe_divide, safe_sqrt
 from ..lens.paraxial import chief_ray_at_image
-from ..rays.trace import trace_bundle, typed_scene
+from ..lens.scene import Scene, scene_of
+from ..numerics import safe_divide, safe_sqrt
+from ..rays.status import Status
+from ..rays.system import dot
+from ..rays.trace import trace_bundle
 
 __all__ = ["Wavefront", "reference_curvature", "rms_wavefront", "wavefront"]
 
@@ -34,11 +35,12 @@ _MM = 1e-3  # per um
 class Wavefront(NamedTuple):
     """Optical path differences of rays.
 
-    opd (W, Q) in waves, path of the chief ray less path of the ray, both to the reference
-    sphere: positive where the wavefront is ahead of the sphere; 0 for a ray that failed or is
-    clipped. status (W, Q), int32, see `Status`; where the chief ray of a colour failed, no ray
-    has an opd, and its status is its own or, if that is OK or CLIPPED, the chief ray's.
-    image (W, 2), mm: where the chief rays meet the sensor, along its axes; 0 if they failed.
+    opd: (W, Q) in waves, path of the chief ray less path of the ray, both to the reference
+        sphere: positive where the wavefront is ahead of the sphere; 0 for a ray that failed or is
+        clipped.
+    status: (W, Q), int32, see `Status`; where the chief ray of a colour failed, no ray has an opd,
+        and its status is its own or, if that is OK or CLIPPED, the chief ray's.
+    image: (W, 2) in mm, where the chief rays meet the sensor, along its axes; 0 if they failed.
     """
 
     opd: Array
@@ -53,7 +55,7 @@ def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
     Tilts and decentres are left out. `wavelengths` (W,) in um.
     """
     height, slope = chief_ray_at_image(lens, wavelengths)
-    at_sensor = height + slope * (lens.sensor - lens.vertices[-1])
+    at_sensor = height + slope * (lens.sensor - lens.vertices[-2])
     return safe_divide(slope * jnp.asarray(lens.senses[-1], slope.dtype), at_sensor)
 
 
@@ -63,58 +65,53 @@ def wavefront(
     distance: ArrayLike,
     wavelengths: ArrayLike,
     pupil: ArrayLike,
-    forward: bool = False,
     curvature: ArrayLike | None = None,
 ) -> Wavefront:
     """Optical path difference of the rays that cross the stop at given points.
 
-    `field`, `distance`, `wavelengths` (W,), `pupil` (Q, 2) and `forward` as in `trace_rays`.
-    `curvature` () or (W,) in 1/mm: kappa of the reference sphere along the axis, in place of
-    `reference_curvature`; needed for a lens folded by tilted mirrors, whose exit pupil the
-    paraxial trace cannot know. Differentiable like `trace_rays`; the reference sphere moves with
-    the lens. ValueError for a known wavelength outside the range of a glass.
+    field, distance, wavelengths (W,), pupil (Q, 2): as in `trace_rays`.
+    curvature: () or (W,) in 1/mm, kappa of the reference sphere along the axis, in place of
+        `reference_curvature`; needed for a lens folded by tilted mirrors, whose exit pupil the
+        paraxial trace cannot know.
+
+    Differentiable like `trace_rays`; the reference sphere moves with the lens. ValueError for a
+    known wavelength outside the range of a glass.
     """
     check_wavelengths(lens.glasses, wavelengths)
     points = jnp.asarray(pupil, lens.curvature.dtype)
+    scene = scene_of(lens, field, distance, wavelengths)
     kappa = None if curvature is None else jnp.asarray(curvature, lens.curvature.dtype)
-    scene = typed_scene(lens, field, distance, wavelengths)
-    return _wavefront(*scene, points, kappa, forward)
+    return _wavefront(lens, scene, points, kappa)
 
 
-@partial(jax.jit, static_argnums=6)
-def _wavefront(
-    lens: Lens,
-    field: Array,
-    distance: Array,
-    wavelengths: Array,
-    pupil: Array,
-    curvature: Array | None,
-    forward: bool,
-) -> Wavefront:
-    points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil]).T  # the chief ray first
-    bundle = trace_bundle(lens, field, distance, wavelengths, points, forward)
+@jax.jit
+def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) -> Wavefront:
+    colours = scene.wavelengths
+    points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil])  # the chief ray first
+    bundle = trace_bundle(lens, scene, (points[:, 0], points[:, 1]))
     whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     chief_ok = whole[:, :1]
     good = chief_ok & (bundle.status == Status.OK)
 
     if curvature is None:
-        curvature = reference_curvature(lens, wavelengths)
+        curvature = reference_curvature(lens, colours)
     # cosine between the chief ray and the axis of the lens
     axis = jnp.array([0, 0, 1], points.dtype)
     axis = axis if lens.tilt is None else rotation_matrix(lens.tilt[-1])[2]
-    cosine = jnp.abs(jnp.sum(axis[:, None] * bundle.arrival[..., 0], axis=0))
+    cosine = jnp.abs(dot(axis, tuple(a[:, 0] for a in bundle.arrival)))
     kappa = (curvature * cosine)[:, None]
 
-    hit = bundle.hits[:, -1]
-    image = jnp.where(chief_ok, hit[..., :1], 0)
-    e = jnp.where(good, hit - image, 0)
-    along = jnp.sum(e * bundle.arrival[:-1], axis=0)
-    x = along**2 - jnp.sum(e**2, axis=0)
+    hit = tuple(h[-1] for h in bundle.hits)
+    image = tuple(jnp.where(chief_ok, h[:, :1], 0) for h in hit)
+    e = tuple(jnp.where(good, h - i, 0) for h, i in zip(hit, image, strict=True))
+    along = dot(e, bundle.arrival[:-1])
+    x = along**2 - dot(e, e)
     to_sphere = along + kappa * x / (1 + safe_sqrt(1 + kappa**2 * x))
-    path = bundle.path[:, :1] - bundle.path + lens.index(wavelengths)[-1][:, None] * to_sphere
-    opd = jnp.where(good, path, 0) / (_MM * wavelengths[:, None])
+    index = lens.index(jnp.clip(colours, *common_range(lens.glasses)))[-1][:, None]
+    path = bundle.path[:, :1] - bundle.path + index * to_sphere
+    opd = jnp.where(good, path, 0) / (_MM * colours[:, None])
     status = jnp.where(chief_ok | ~whole, bundle.status, bundle.status[:, :1])
-    return Wavefront(opd[:, 1:], status[:, 1:], image[..., 0].T)
+    return Wavefront(opd[:, 1:], status[:, 1:], jnp.concatenate(image, axis=-1))
 
 
 def rms_wavefront(wave: Wavefront, weights: ArrayLike) -> Array:

@@ -1,125 +1,187 @@
-"""Where rays cross the stop: quadrature points on the unit disc and their weights.
+"""Quadrature rules on the pupil: which rays stand for all the light of a point.
 
-All rules integrate over the area of the disc with weights that sum to 1. The order n of a
-Gauss rule is its number of nodes in t = r^2, the variable in which a rotationally symmetric
-aberration is smooth. Source: Forbes, JOSA A 5, 1943 (1988). The moments use the Gauss rules;
-the patterns of equal weights are what other programs use, for comparison.
+A rule is a value: a frozen pytree whose kind, order and symmetry are static. It chooses points on
+the stop, their weights, and what part of a traced ray counts. Weights add up to 1 over the light
+that fills the stop; what is missing is the light that is lost.
 """
 
+import abc
+import dataclasses
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..lens.lens import Lens
+from ..lens.scene import Scene, scene_of
+from ..lens.surface import FORMS
+from ..numerics import concrete, safe_sqrt
+from ..rays.status import Status
+from ..rays.system import Vector, dot
+from ..rays.trace import Bundle
+from . import patterns
 
 __all__ = [
-    "disc",
-    "half_disc",
-    "hexapolar",
-    "meridian",
-    "random_disc",
-    "sobol",
-    "sobol_disc",
-    "square_grid",
+    "MAX_ORDER",
+    "Gauss",
+    "Pattern",
+    "PupilRule",
+    "Soft",
+    "Symmetry",
+    "gauss_points",
+    "pupil_points",
+    "symmetry_of",
 ]
 
-_SOBOL_BITS = 30
+# How much of the pupil stands for all of it: one radius, half of it (x > 0), or the whole disc.
+Symmetry = Literal["meridian", "half", "disc"]
+MAX_ORDER = 42
 
 
-def _gauss(order: int) -> tuple[np.ndarray, np.ndarray]:
-    nodes, weights = np.polynomial.legendre.leggauss(order)
-    return np.sqrt((nodes + 1) / 2), weights / 2
+def symmetry_of(lens: Lens, field: ArrayLike) -> Symmetry:
+    """How much of the pupil must be traced for a field: an angle along y or (x, y), in radians.
 
-
-def meridian(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (1, n) and weights (n,) on one radius: enough for an axial object."""
-    radius, weights = _gauss(order)
-    return radius[None], weights
-
-
-def half_disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, n m) in the half x > 0 and weights: enough for a field along y.
-
-    n Gauss nodes in r^2 times m uniform azimuths, the mirror half of a rule of 2 m.
+    In a lens with an axis, a field known to be 0 needs one radius; one along y needs half a pupil,
+    if x -> -x leaves the lens alone. ValueError inside a trace where the answer depends on values
+    that are not known there.
     """
-    radius, weights = _gauss(order)
-    angle = np.pi * ((np.arange(azimuths) + 0.5) / azimuths - 0.5)
-    points = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))])
-    return points.reshape(2, -1), np.repeat(weights / azimuths, azimuths)
+    moves = (lens.decentre, lens.tilt)
+    if not concrete((field, moves)):
+        raise ValueError(
+            "the symmetry of a pupil follows from known numbers: ask for it, or for a rule, "
+            "outside of jax.jit and jax.vmap"
+        )
+    kinds = {FORMS[form].symmetry for form in lens.forms}
+    # Neither x, nor a turn about y or z, takes any surface out of the plane x = 0.
+    sideways = ((lens.decentre, [0]), (lens.tilt, [1, 2]))
+    still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
+    angles = np.asarray(field)
+    if "none" in kinds or not still or (angles.ndim and angles[0] != 0):
+        return "disc"
+    axial = kinds == {"rotation"} and all(a is None for a in moves) and not np.any(angles)
+    return "meridian" if axial else "half"
 
 
-def disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, 2 n m) and weights of the same rule on the whole disc."""
-    points, weights = half_disc(order, azimuths)
-    mirrored = points * np.array([[-1.0], [1.0]])
-    return np.concatenate([points, mirrored], axis=1), np.tile(weights / 2, 2)
+class PupilRule(abc.ABC):
+    """A rule: `points` on the stop with weights, and the `transmission` of each ray."""
+
+    symmetry: Symmetry
+
+    @abc.abstractmethod
+    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+        """Points, D arrays (Q,) or (W, Q) on the unit disc of the stop, D = 1 for the meridian, and
+        weights (1, Q) or (W, Q)."""
+
+    def transmission(self, lens: Lens, bundle: Bundle) -> Array:
+        """What part of each ray (W, Q) arrives; 0 for rays that fail or are clipped."""
+        return (bundle.status == Status.OK).astype(bundle.path.dtype)
 
 
-def random_disc(rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform random points (2, rays), as the paper's 256 rays, and equal weights."""
-    generator = np.random.default_rng(seed)
-    return _of_square(generator.random(rays), generator.random(rays))
+def gauss_points(order: int, symmetry: Symmetry) -> tuple[np.ndarray, np.ndarray]:
+    """Points (D, Q) and weights (Q,) of the Gauss rule of an order on what symmetry leaves.
 
-
-def _of_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the unit square on the disc: r = sqrt(u), azimuth 2 pi v; equal weights."""
-    radius, angle = np.sqrt(u), 2 * np.pi * v
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)])
-    return points, np.full(len(u), 1 / len(u))
-
-
-def _count(what: str, value: int) -> None:
-    if not value >= 1:
-        raise ValueError(f"{what}: expected at least 1, got {value!r}")
-
-
-def square_grid(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, Q) of a square grid inside the disc and equal weights.
-
-    The centres of `side` x `side` cells of the square round the disc; those in the disc stay.
-    ValueError for a side below 1.
+    An aberration of degree p in the pupil reaches azimuthal order p: as many azimuths on the half
+    disc as there are radial nodes, and one, integrate its square to the same degree.
     """
-    _count("side", side)
-    line = (np.arange(side) + 0.5) / side * 2 - 1
-    points = np.stack(np.meshgrid(line, line)).reshape(2, -1)
-    points = points[:, np.sum(points**2, axis=0) <= 1]
-    return points, np.full(points.shape[1], 1 / points.shape[1])
+    if symmetry == "meridian":
+        return patterns.meridian(order)
+    return (patterns.half_disc if symmetry == "half" else patterns.disc)(order, order + 1)
 
 
-def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, Q), Q = 1 + 3 n (n + 1): the centre and n rings of 6, 12, 18, ...; equal weights.
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Gauss(PupilRule):
+    """Gauss rule on the stop. Rays that fail or are clipped drop out one by one.
 
-    Each ray stands for the same area of the disc: a ring of 6 k lies at the radius that halves
-    the area of its annulus. (Lens design programs often put the outermost ring on the rim and
-    so count the rim twice.) ValueError for fewer than 1 ring.
+    order: nodes in r^2, 1 to 42; n on the meridian, n (n + 1) on half a pupil.
+    symmetry: see `symmetry_of`.
     """
-    _count("rings", rings)
-    k = np.arange(1, rings + 1)
-    total = 1 + 3 * rings * (rings + 1)
-    radius = np.sqrt((1 + 3 * k * k) / total)  # the mean of r^2 at its edges, 1 + 3 k (k +- 1)
-    points = [np.zeros((2, 1))]
-    for ring, r in zip(k, radius):
-        angle = 2 * np.pi * (np.arange(6 * ring) + 0.5) / (6 * ring)
-        points.append(r * np.stack([np.cos(angle), np.sin(angle)]))
-    return np.concatenate(points, axis=1), np.full(total, 1 / total)
+
+    order: int = dataclasses.field(metadata={"static": True})
+    symmetry: Symmetry = dataclasses.field(metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        check_order(self.order)
+
+    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+        """Points and weights of the order: constants."""
+        points, weights = gauss_points(self.order, self.symmetry)
+        dtype = lens.curvature.dtype
+        return tuple(jnp.asarray(p, dtype) for p in points), jnp.asarray(weights, dtype)[None]
 
 
-def sobol(count: int) -> np.ndarray:
-    """The first points (2, count) of the Sobol sequence in the unit square, not scrambled.
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Soft(PupilRule):
+    """Gauss rule behind clear apertures that fade instead of cutting off: each is a logistic step.
 
-    Direction numbers of the polynomials 1 and x + 1, Gray-code order: Antonov and Saleev, USSR
-    Comput. Math. Math. Phys. 19, 252 (1980). Best at powers of two. ValueError for a count below 1.
+    order, symmetry: as of `Gauss`.
+    width: (), mm over which an aperture fades.
     """
-    _count("count", count)
-    bits = np.arange(_SOBOL_BITS)
-    second = [1]
-    for _ in bits[1:]:
-        second.append(second[-1] ^ (second[-1] << 1))
-    directions = np.array([np.ones_like(bits), second]) << (_SOBOL_BITS - 1 - bits)
-    index = np.arange(count)
-    gray = index ^ (index >> 1)
-    points = np.zeros((2, count), np.int64)
-    for bit in bits[: int(count).bit_length()]:
-        points ^= np.where(gray >> bit & 1, directions[:, bit : bit + 1], 0)
-    return points / 2.0**_SOBOL_BITS
+
+    order: int = dataclasses.field(metadata={"static": True})
+    symmetry: Symmetry = dataclasses.field(metadata={"static": True})
+    width: ArrayLike
+
+    def __post_init__(self) -> None:
+        check_order(self.order)
+        if isinstance(self.width, int | float) and not self.width > 0:
+            raise ValueError(f"width: expected a number above 0 mm, got {self.width!r}")
+
+    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+        """Points and weights of the order: constants."""
+        return Gauss(self.order, self.symmetry).points(lens, scene)
+
+    def transmission(self, lens: Lens, bundle: Bundle) -> Array:
+        """The product of the steps of all apertures but the stop."""
+        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        radius = safe_sqrt(dot(bundle.hits, bundle.hits))
+        edge = lens.semi_diameter[:, None, None]
+        bounded = jnp.isfinite(edge).at[lens.stop].set(False)
+        width = jnp.asarray(self.width, radius.dtype)
+        within = jnp.where(bounded, (jnp.where(bounded, edge, 0) - radius) / width, jnp.inf)
+        return jnp.where(whole, jnp.prod(jax.nn.sigmoid(within), axis=0), 0)
 
 
-def sobol_disc(rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, rays) of the Sobol sequence and equal weights: r^2 and azimuth are its axes."""
-    return _of_square(*sobol(rays))
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Pattern(PupilRule):
+    """Any points on the stop, such as those of `pupil.hexapolar`; clipped rays drop out.
+
+    positions: (2, Q), x and y in units of the stop's semi-diameter; (1, Q) on the meridian.
+    weights: (Q,), adding up to 1 for a stop filled with light.
+    """
+
+    positions: ArrayLike
+    weights: ArrayLike
+    symmetry: Symmetry = dataclasses.field(metadata={"static": True}, default="disc")
+
+    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+        """The points and weights as they are."""
+        dtype = lens.curvature.dtype
+        return tuple(jnp.asarray(self.positions, dtype)), jnp.asarray(self.weights, dtype)[None]
+
+
+def check_order(order: int) -> None:
+    """ValueError for an order that no rule has."""
+    if not isinstance(order, int) or not 1 <= order <= MAX_ORDER:
+        raise ValueError(f"order: expected a whole number from 1 to {MAX_ORDER}, got {order!r}")
+
+
+def pupil_points(
+    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike, rule: PupilRule
+) -> tuple[Array, Array]:
+    """Where the rays of a rule cross the stop, (W, Q, 2) in units of its semi-diameter, and their
+    weights (W, Q), which follow the lens. Arguments as in `trace_rays`.
+
+    Points of the meridian lie on the y axis, and stand for all azimuths.
+    """
+    scene = scene_of(lens, field, distance, wavelengths)
+    points, weights = rule.points(lens, scene)
+    shape = (scene.wavelengths.shape[0], weights.shape[-1])
+    x, y = (points[0] * 0, points[0]) if len(points) == 1 else points
+    stacked = jnp.stack([jnp.broadcast_to(a, shape) for a in (x, y)], axis=-1)
+    return stacked, jnp.broadcast_to(weights, shape)

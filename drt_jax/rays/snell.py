@@ -1,113 +1,224 @@
-"""Classical sequential ray trace by Snell's law: the oracle and the baseline.
+"""The sequential trace by Snell's law: what rays are aimed with, and the one intersection routine.
 
-Written from the textbook formulae (Welford, Aberrations of Optical Systems, ch. 4), sharing
-no formula with the Fermat solver but the sag. One ray at a time; `jax.vmap` for more.
+Its rays are labelled by where they cross the vertex plane of the first surface, their `launch`.
+Arrays have any shape: () for one ray, or (wavelength, ray) beside an index (wavelength, 1).
+
+Source: Welford, Aberrations of Optical Systems (1986), ch. 4.
 """
+
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
-from ..lens.lens import Lens, rotation_matrix
-from ..lens.paraxial import entrance_pupil
-from ..lens.surface import Shape, domain, sag_derivatives
+from ..lens.surface import RIM, Shape, domain, sag_derivatives, surface_sag
+from ..numerics import safe_divide, safe_sqrt
+from .status import Status
+from .system import Placed, System, Vector, dot, turn
 
-__all__ = ["launch_paraxial", "trace_snell"]
+__all__ = ["Trace", "cross", "launch_at", "reach", "shoot", "shoot_to_stop"]
 
-_NEWTON_STEPS = 12
-
-
-def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Array, Array]:
-    """Hit of the ray p + s d with the surface at the origin; its normal; whether there is one."""
-    q = p - d * (p[2] / d[2])  # on the vertex plane
-    met = jnp.array(True)
-    c, k = shape.curvature, shape.conic
-    if form in ("asphere", "odd_asphere"):
-        quadratic = c * (1 + k * d[2] ** 2)
-        linear = d[2] - c * (q[0] * d[0] + q[1] * d[1])
-        constant = c * (q[0] ** 2 + q[1] ** 2)
-        discriminant = linear**2 - quadratic * constant
-        root = jnp.sign(d[2]) * jnp.sqrt(jnp.maximum(discriminant, 0))
-        met = discriminant >= 0
-        q = q + d * (constant / (linear + root))
-    if shape.coefficients.shape[0]:
-
-        def closer(_, q):
-            z, slope, _ = sag_derivatives(q[:2], shape, form)
-            return q + d * ((z - q[2]) / (d[2] - slope @ d[:2]))
-
-        q = jax.lax.fori_loop(0, _NEWTON_STEPS, closer, q)
-    z, slope, _ = sag_derivatives(q[:2], shape, form)
-    met = met & domain(q[:2], shape, form) & (jnp.abs(z - q[2]) < 1e-6 * (1 + jnp.abs(z)))
-    normal = jnp.array([-slope[0], -slope[1], jnp.ones_like(slope[0])])
-    return q, normal / jnp.linalg.norm(normal), met
+# Newton steps along a ray to a surface that is no conic; the last must be shorter than `_SETTLED`
+# of the ray's length or of 1 mm.
+_STEPS, _SETTLED = 20, 1e-7
+# A ray that leans more than this (cosine with the axis) is not followed.
+_FLATTEST = 1e-4
 
 
-def trace_snell(
-    lens: Lens, wavelength: Array, point: Array, direction: Array
-) -> tuple[Array, Array]:
-    """Trace one ray through a lens to its sensor.
+class Trace(NamedTuple):
+    """Rays traced one surface after the other.
 
-    `wavelength` () in um; `point` (3,) in mm, anywhere on the ray before the lens;
-    `direction` (3,), a unit vector. Returns the hits (S + 1, 3) in mm along the axes of the
-    lens, z from the first vertex, and whether the ray met every surface and was refracted or
-    reflected there, bool.
+    hits: D arrays (R, ...), transverse coordinates on the rows in mm; void behind a failure.
+    fate: (...), int32, OK, MISSED or TIR, see `Status`.
+    shake: (...), the most that rounding the hits turns a segment by, in units of rounding.
     """
-    index = lens.index(jnp.atleast_1d(wavelength))[:, 0]
-    count = len(lens.forms)
-    vertices = jnp.append(lens.vertices, lens.sensor)
-    shape = Shape(
-        *(
-            jnp.concatenate([a, jnp.zeros_like(a[:1])])
-            for a in (lens.curvature, lens.conic, lens.coefficients)
-        )
+
+    hits: Vector
+    fate: Array
+    shake: Array
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[Array, Array]:
+    """Length s at which p + s d meets a surface of a form at the origin, and whether it does.
+
+    p, d: D + 1 components along the axes of the surface; d of any length, s counts in it.
+    shape: of the surface. going: bool, rays that must settle; others may come out wrong.
+    Differentiable in p, d and shape by the implicit function theorem.
+    """
+    length, met = -safe_divide(p[-1], d[-1]), jnp.ones(p[0].shape, bool)  # to the vertex plane
+    if form == "asphere":
+        # c (x^2 + y^2 + (1 + k) z^2) = 2 z at p + s d: square s^2 - 2 linear s + constant = 0
+        c, k = shape.curvature, shape.conic
+        flat = *d[:-1], (1 + k) * d[-1]
+        square, linear = c * dot(flat, d), d[-1] - c * dot(flat, p)
+        constant = c * (dot(p[:-1], p[:-1]) + (1 + k) * p[-1] ** 2) - 2 * p[-1]
+        discriminant = linear**2 - square * constant
+        root = safe_sqrt(discriminant)
+        root = jnp.where(d[-1] < 0, -root, root)
+        # Of the two ways to write a root, the one that does not subtract what is alike.
+        alike = linear * root < 0
+        above = jnp.where(alike, linear - root, constant)
+        below = jnp.where(alike, square, linear + root)
+        length, met = safe_divide(above, below), discriminant > 0
+        if not shape.coefficients.shape[0]:
+            return length, met & (1 - (1 + k) * c * (p[-1] + length * d[-1]) > RIM**0.5)
+    size = jnp.sqrt(dot(d, d))
+    settled = max(_SETTLED, 16 * float(jnp.finfo(length.dtype).eps))
+
+    def closer(state):
+        count, length, _ = state
+        _, miss, rate = _gap(form, p, d, shape, length)
+        change = safe_divide(miss, rate)
+        small = jnp.abs(change) * size <= settled * (1 + jnp.abs(length) * size)
+        return count + 1, length + change, small
+
+    start = 0, length, jnp.zeros(length.shape, bool)
+    _, length, met = jax.lax.while_loop(
+        lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, start
     )
-    ok, hits = jnp.array(True), []
-    for i in range(count + 1):
-        across = jnp.zeros(2, point.dtype) if lens.decentre is None else lens.decentre[i]
-        origin = jnp.append(across, vertices[i])
-        turn = None if lens.tilt is None else rotation_matrix(lens.tilt[i])
-        p, d = point - origin, direction
-        if turn is not None:
-            p, d = turn.T @ p, turn.T @ d
-        row = jax.tree.map(lambda a: a[i], shape)
-        hit, normal, met = _intersect(p, d, row, "asphere" if i == count else lens.forms[i])
-        cosine, sense = normal @ d, int(lens.senses[i])
-        ok = ok & met & (sense * cosine > 0)
-        if i < count:
-            ratio = index[i] / index[i + 1]
-            square = 1 - ratio**2 * (1 - cosine**2)
-            ok = ok & (square >= 0)
-            if lens.mirrors[i]:
-                d = d - 2 * cosine * normal
-            else:
-                bend = sense * jnp.sqrt(jnp.maximum(square, 0)) - ratio * cosine
-                d = ratio * d + normal * bend
-        point = (hit if turn is None else turn @ hit) + origin
-        direction = d if turn is None else turn @ d
-        hits.append(point)
-    return jnp.stack(hits), ok
+    return length, met & domain(_along(p, d, length)[:-1], shape, form)
 
 
-def launch_paraxial(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelength: ArrayLike, pupil: Array
-) -> tuple[Array, Array]:
-    """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming.
+def _along(p: Vector, d: Vector, length: Array) -> Vector:
+    return tuple(a + length * b for a, b in zip(p, d, strict=True))
 
-    `field` in radians along y, `distance` in mm from the object plane to the first vertex (inf
-    allowed), `wavelength` () in um, `pupil` (Q, 2) in units of the pupil's semi-diameter.
-    Returns points (Q, 3) in mm on the first vertex plane and unit directions (Q, 3), for
-    `trace_snell`. The entrance pupil must not be infinitely far away. The Fermat tracer aims at
-    the real stop instead; the difference is the aberration of the pupil.
+
+def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple:
+    """Slopes of the sag, how far above the ray the surface is, and how fast the ray closes in."""
+    *across, z = _along(p, d, length)
+    height, slope, _ = sag_derivatives(across, shape, form)
+    return slope, height - z, d[-1] - dot(slope, d[:-1])
+
+
+@reach.defjvp
+def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
+    p, d, shape, going = primals
+    length, met = reach(form, p, d, shape, going)
+
+    def miss(p, d, shape):
+        *across, z = _along(p, d, length)
+        return surface_sag(across, shape, form) - z
+
+    _, change = jax.jvp(miss, (p, d, shape), tangents[:3])
+    _, _, rate = _gap(form, p, d, shape, length)
+    moved = safe_divide(change, rate)
+    return (length, met), (moved, np.zeros(met.shape, jax.dtypes.float0))
+
+
+def _meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:
+    """Where rays meet a surface: the point, a normal of any length along z, whether, and s."""
+    length, met = reach(form, p, d, shape, going)
+    own = _along(p, d, length)
+    if form == "asphere" and not shape.coefficients.shape[0]:
+        c = shape.curvature
+        normal = *(-c * a for a in own[:-1]), 1 - (1 + shape.conic) * c * own[-1]
+    else:
+        _, slope, _ = sag_derivatives(own[:-1], shape, form)
+        normal = *(-a for a in slope), jnp.ones_like(own[-1])
+    return own, normal, met, length
+
+
+def cross(surface: Placed, form: str, point: Vector, direction: Vector) -> tuple[Vector, Array]:
+    """Where straight lines, prolonged either way, cross one surface: D arrays, mm along its axes,
+    and whether they do.
+
+    point, direction: D + 1 arrays along the axes of the lens.
     """
-    image = entrance_pupil(lens, jnp.atleast_1d(jnp.asarray(wavelength, pupil.dtype)))
-    place, radius = image.position[0], image.semi_diameter[0]
-    v = 1 / jnp.asarray(distance, pupil.dtype)
-    tangent = jnp.tan(jnp.asarray(field, pupil.dtype))
-    target = jnp.concatenate([radius * pupil, jnp.broadcast_to(place, (len(pupil), 1))], axis=1)
-    one = jnp.ones_like(tangent)
-    # From the object point (0, -tangent, -1) / v; the scale v keeps it finite.
-    direction = v * target + jnp.stack([0 * one, tangent, one])
-    points = target - direction * (place / direction[:, 2:])
-    return points, direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
+    p, d = surface.local(point, direction)
+    length, met = reach(form, p, d, surface.shape, jnp.ones(p[0].shape, bool))
+    return _along(p, d, length)[:-1], met
+
+
+def launch_at(system: System, w: Vector) -> Vector:
+    """Launch, D arrays in mm, of the rays that meet the first row at `w`, D arrays."""
+    first = jax.tree.map(lambda a: a[0], system.rows)
+    own = turn(first.rotation, (*w, surface_sag(w, first.shape, system.forms[0])))
+    point = tuple(a + o for a, o in zip(own, first.origin(len(w)), strict=True))
+    depth = own[-1] / _towards(system, point)[-1]
+    return tuple(a - d * depth for a, d in zip(point[:-1], _towards(system, point), strict=False))
+
+
+def _towards(system: System, point: Vector) -> Vector:
+    """Direction, of any length, of the light at a point before the lens."""
+    return tuple(system.vergence * p - s for p, s in zip(point, system.source, strict=True))
+
+
+def _begin(system: System, launch: Vector) -> tuple[Vector, Vector]:
+    point = *launch, jnp.broadcast_to(system.rows.vertex[0], launch[0].shape)
+    direction = _towards(system, point)
+    shrink = 1 / jnp.sqrt(dot(direction, direction))
+    return point, tuple(d * shrink for d in direction)
+
+
+def _refract(d: Vector, normal: Vector, ratio: Array, sense: Array, leaving: Array) -> tuple:
+    """Direction behind a surface by Snell's law in vector form, whether the light comes from its
+    front, and whether it gets through. ratio: of the indices before and behind; sense, leaving:
+    1 or -1, along or against z before and behind."""
+    along = dot(normal, d)
+    shrink = 1 / jnp.sqrt(dot(normal, normal))
+    cosine = along * shrink
+    square = 1 - ratio**2 * (1 - cosine**2)
+    bent = (leaving * safe_sqrt(square) - ratio * cosine) * shrink
+    front = (d[-1] * sense > _FLATTEST) & (along * sense > 0)
+    return tuple(ratio * a + bent * n for a, n in zip(d, normal, strict=True)), front, square > 0
+
+
+def _follow(system: System, launch: Vector, count: int) -> tuple[Vector, Vector, Trace]:
+    """Points and directions, along the axes of the lens, behind the first `count` rows."""
+    kinds = sorted(set(system.forms))
+    index = jnp.concatenate([system.index, system.index[-1:]])
+    senses = np.append(system.senses, system.senses[-1])
+    some = slice(None, count)
+    rows = (
+        np.arange(count) == 0,
+        jax.tree.map(lambda a: a[some], system.rows),
+        np.array([kinds.index(form) for form in system.forms[some]], np.int32),
+        (index[:-1] / index[1:])[some],
+        senses[:-1][some],
+        senses[1:][some],
+    )
+
+    def step(carry, row):
+        point, direction, fate, shake, size = carry
+        first, surface, kind, ratio, sense, leaving = row
+        p, d = surface.local(point, direction)
+        meet = [partial(_meet, kind) for kind in kinds]
+        meet = meet[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, meet)
+        own, normal, met, length = meet(p, d, surface.shape, fate == Status.OK)
+        bent, front, through = _refract(d, normal, ratio, sense, leaving)
+        met = met & front & ((length > 0) | first)
+        here = jnp.where(met, jnp.where(through, Status.OK, Status.TIR), Status.MISSED)
+        fate = jnp.where(fate == Status.OK, here.astype(jnp.int32), fate)
+        wide = jnp.sqrt(dot(own[:-1], own[:-1]))
+        turned = safe_divide(jnp.maximum(wide, size), jnp.where(first, 0, length))
+        shake = jnp.maximum(shake, jnp.where(fate == Status.OK, turned, 0))
+        origin = surface.origin(len(own) - 1)
+        point = tuple(a + o for a, o in zip(turn(surface.rotation, own), origin, strict=True))
+        return (point, turn(surface.rotation, bent), fate, shake, wide), own[:-1]
+
+    zero = jnp.zeros_like(launch[0])
+    start = *_begin(system, launch), jnp.zeros(zero.shape, jnp.int32), zero, zero
+    (point, direction, fate, shake, _), hits = jax.lax.scan(step, start, rows)
+    return point, direction, Trace(hits, fate, shake)
+
+
+def shoot(system: System, launch: Vector) -> Trace:
+    """Trace rays to the sensor; `launch` D arrays in mm on the vertex plane of the first row."""
+    return _follow(system, launch, len(system.forms))[2]
+
+
+def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:
+    """Where rays cross the stop, D arrays in mm along its axes, and their fate so far (...)."""
+    point, direction, trace = _follow(system, launch, system.before)
+    if system.stop is None:
+        row = system.before
+        surface, form = jax.tree.map(lambda a: a[row], system.rows), system.forms[row]
+    else:
+        surface, form = system.stop, system.stop_form
+    crossing, met = cross(surface, form, point, direction)
+    missed = jnp.where(met, Status.OK, Status.MISSED).astype(jnp.int32)
+    return crossing, jnp.where(trace.fate == Status.OK, missed, trace.fate)

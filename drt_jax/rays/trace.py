@@ -1,6 +1,5 @@
-"""Lens + field + distance + wavelengths + points on the stop -> rays with a status."""
+"""Lens + scene + points on the stop -> rays with a status."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -9,43 +8,47 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from .fermat import Status, System, arrival, geometry, optical_path, turn
-from ..lens.glass import check_wavelengths
-from .implicit import Found, solve_rays, solve_rays_forward
-from ..lens.lens import Lens, rotation_matrix
-from ..numerics import concrete, safe_divide
-from ..lens.surface import by_form, sag, sag_derivatives
+from ..lens.glass import check_wavelengths, known_index
+from ..lens.lens import Lens
+from ..lens.scene import Scene, scene_of
+from ..lens.surface import by_form, surface_sag
+from . import fermat
+from .snell import cross
+from .solve import Solver, solve
+from .status import Status
+from .system import System, Vector, dot, placed, system_of, turn
 
-__all__ = ["Bundle", "Rays", "field_of_height", "trace_bundle", "trace_rays"]
-
-_LINE_STEPS = 5
+__all__ = ["Bundle", "Rays", "trace_bundle", "trace_rays"]
 
 
 class Bundle(NamedTuple):
     """Rays in the array layout of `fermat`, rays last.
 
-    hits (D, S + 1, W, Q), mm, along the axes of each surface and the sensor; status (W, Q);
-    arrival (D + 1, W, Q), unit vectors at the sensor, along its axes; path (W, Q), optical
-    path in mm from the object, see `fermat.optical_path`; found, what the solver
-    returned, of the surfaces that bend or stop light.
+    hits: D arrays (S + 1, W, Q) in mm, along the axes of each surface and the sensor.
+    status: (W, Q), int32, see `Status`.
+    arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along its axes.
+    path: (W, Q), optical path in mm from the object, see `fermat.optical_path`.
+    steps: (), int32, steps of Newton's method.
     """
 
-    hits: Array
+    hits: Vector
     status: Array
-    arrival: Array
+    arrival: Vector
     path: Array
-    found: Found
+    steps: Array
 
 
 class Rays(NamedTuple):
     """Traced rays.
 
-    points (W, Q, S + 1, 3), mm: where they cross the surfaces and the sensor, along the axes
-    of the lens, z from the first vertex; zeros for a ray that failed. directions, same shape:
-    unit vectors (direction cosines) in front of each surface and the sensor. path (W, Q), mm: the
-    optical path from the object to the sensor, counted from the sphere round the object (the
-    plane wave) that passes through the first vertex; 0 for a ray that failed. status (W, Q),
-    int32, see `Status`. newton_steps (), int32: iterations of the whole bundle.
+    points: (W, Q, S + 1, 3) in mm, where they cross the surfaces and the sensor, along the axes
+        of the lens, z from the first vertex; zeros for a ray that failed.
+    directions: (W, Q, S + 1, 3), unit vectors (direction cosines) in front of each surface and
+        the sensor.
+    path: (W, Q) in mm, the optical path from the object to the sensor, counted from the sphere
+        round the object (the plane wave) through the first vertex; 0 for a ray that failed.
+    status: (W, Q), int32, see `Status`.
+    newton_steps: (), int32, steps of the whole bundle, aiming included.
     """
 
     points: Array
@@ -55,150 +58,69 @@ class Rays(NamedTuple):
     newton_steps: Array
 
 
-def field_of_height(height: ArrayLike, distance: ArrayLike) -> Array:
-    """The field angle in radians of an object point `height` mm above the axis.
-
-    `distance` mm from the object plane to the first vertex, finite. Light from above the axis
-    travels downwards, so that the angle is negative.
-    """
-    return -jnp.arctan(jnp.asarray(height, float) / jnp.asarray(distance, float))
-
-
-def _live_surfaces(lens: Lens) -> list[int]:
-    """Surfaces that bend or label rays: not those with the same medium on both sides."""
-    media = lens.glasses
-    return [
-        i
-        for i in range(len(lens.forms))
-        if i == lens.stop or lens.mirrors[i] or media[i] != media[i + 1]
-    ]
+def _point_and_direction(system: System, hits: Vector) -> tuple[Vector, Vector]:
+    """Hits on the rows, and unit vectors in front of them, D + 1 arrays (R, W, Q) each, along the
+    axes of the lens."""
+    heights = by_form(surface_sag, hits, system.rows.wide, system.forms)
+    own = turn(system.rows.rotation, (*hits, heights))
+    origin = system.rows.origin(system.dim)
+    point = tuple(p + o[:, None, None] for p, o in zip(own, origin, strict=True))
+    return point, turn(system.rows.rotation, fermat.geometry(hits, system).before)
 
 
-def system_of(
-    lens: Lens, rows: list[int], field: Array, distance: Array, wavelengths: Array, pupil: Array
-) -> System:
-    """The Fermat system of the surfaces `rows` and the sensor; arguments as `trace_bundle`."""
-    dtype = lens.curvature.dtype
-    places = jnp.array([*rows, len(lens.forms)])
-
-    def extend(array):
-        return jnp.concatenate([array[jnp.array(rows)], jnp.zeros_like(array[:1])])
-
-    offset = None if lens.decentre is None else lens.decentre[places].T
-    rotation = None
-    if lens.tilt is not None:
-        rotation = jnp.moveaxis(jax.vmap(rotation_matrix)(lens.tilt[places]), 0, -1)
-    return System(
-        vertex=extend(lens.vertices).at[-1].set(lens.sensor),
-        curvature=extend(lens.curvature),
-        conic=extend(lens.conic),
-        coefficients=extend(lens.coefficients).T,
-        index=lens.index(wavelengths)[jnp.array([0, *(i + 1 for i in rows)])],
-        # Light with a positive field angle travels upwards: the object lies below the axis.
-        source=jnp.concatenate([-jnp.tan(field), -jnp.ones_like(field[:1])]),
-        vergence=1 / jnp.asarray(distance, dtype),
-        target=lens.semi_diameter[lens.stop] * jnp.asarray(pupil, dtype),
-        offset=offset,
-        rotation=rotation,
-        stop=rows.index(lens.stop),
-        forms=(*(lens.forms[i] for i in rows), "asphere"),
-        mirrors=tuple(lens.mirrors[i] for i in rows),
-    )
+def _rows_behind(lens: Lens) -> list[int]:
+    """The row of the system that each surface and the sensor is, or that lies behind it."""
+    return [sum(j < i for j in lens.live) for i in range(lens.count + 1)]
 
 
-def _cross_dead_surfaces(system: System, whole: System, hits: Array, live: list[int]) -> Array:
-    """Insert the points where the straight ray crosses the surfaces left out of the solve.
-
-    `system` of the live surfaces, `whole` of all.
-    """
-    path = geometry(hits, system)
-    dim, count = hits.shape[0], len(whole.mirrors)
-    z = by_form(sag, hits, system.shape, system.forms)
-    own = jnp.concatenate([hits, z[None]])
-
-    def origin(i):
-        across = [] if whole.offset is None else [*whole.offset[:, i]]
-        across = across or [jnp.zeros_like(whole.vertex[i])] * dim
-        return jnp.stack([*across, whole.vertex[i]])[:, None, None, None]
-
-    rows = []
-    for i in range(count):
-        if i in live:
-            rows.append(hits[:, live.index(i)])
+def _whole(lens: Lens, system: System, hits: Vector, status: Array) -> tuple[Vector, Array]:
+    """Hits on all surfaces, those that bend no light included, and status: where the straight
+    ray, prolonged either way, does not meet such a surface, it is MISSED."""
+    if len(lens.live) == lens.count:
+        return hits, status
+    point, direction = _point_and_direction(system, hits)
+    rows: list[Vector] = []
+    for i, row in enumerate(_rows_behind(lens)):
+        if i in lens.live or i == lens.count:
+            rows.append(tuple(h[row] for h in hits))
             continue
-        after = sum(j < i for j in live)  # the live surface, or the sensor, behind it
-        p, d = own[:, after : after + 1], path.before[:, after : after + 1]
-        far = system.rotation
-        if far is not None:
-            p, d = (turn(far[..., after : after + 1], a) for a in (p, d))
-        p = p + origin([*live, count][after]) - origin(i)
-        if far is not None:
-            p, d = (turn(whole.rotation[..., i : i + 1], a, back=True) for a in (p, d))
-        shape = jax.tree.map(lambda a: a[..., i : i + 1, :, :], whole.shape)
-        length = -safe_divide(p[-1], d[-1])
-        for _ in range(_LINE_STEPS):
-            w = p[:-1] + d[:-1] * length
-            height, slope, _ = sag_derivatives(w, shape, whole.forms[i])
-            miss = height - p[-1] - d[-1] * length
-            length = length + safe_divide(miss, d[-1] - jnp.sum(slope * d[:-1], axis=0))
-        rows.append((p[:-1] + d[:-1] * length)[:, 0])
-    return jnp.stack([*rows, hits[:, -1]], axis=1)
+        line = tuple(p[row] for p in point), tuple(d[row] for d in direction)
+        crossing, met = cross(placed(lens, i), lens.forms[i], *line)
+        missed = (status == Status.OK) & ~met
+        status = jnp.where(missed, Status.MISSED, status).astype(jnp.int32)
+        rows.append(crossing)
+    whole = status == Status.OK
+    return tuple(jnp.where(whole, jnp.stack(a), 0) for a in zip(*rows, strict=True)), status
 
 
-def trace_bundle(
-    lens: Lens,
-    field: Array,
-    distance: Array,
-    wavelengths: Array,
-    pupil: ArrayLike,
-    forward: bool = False,
-    found: Found | None = None,
-    thorough: bool = True,
-) -> Bundle:
+def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:
     """Trace rays in the array layout of `fermat`, rays last.
 
-    `field` (D,) angles in radians, `distance` () from the object to the first vertex in mm,
-    `wavelengths` (W,) in um, `pupil` (D, Q) or (D, W, Q) points on the unit disc of the stop;
-    D = 1 for rays in the meridional (y, z) plane of a lens with rotational symmetry, else 2.
-    `forward`: be differentiable in forward mode. `found`, `thorough`: see `solve_rays`.
+    points: D arrays (Q,) or (W, Q) on the unit disc of the stop, or any part of its plane; D = 1
+        for rays in the meridional (y, z) plane of a lens with rotational symmetry and an object
+        on its axis, else 2.
+    solver: `solve`, for all modes of derivatives, or `solve_reverse`.
     """
-    live, count = _live_surfaces(lens), len(lens.forms)
-    field = jnp.asarray(field, lens.curvature.dtype)
-    scene = field, distance, wavelengths, pupil
-    system = system_of(lens, live, *scene)
-    solve = solve_rays_forward if forward else solve_rays
-    found = solve(system, found, thorough)
-    hits, status, _ = found
-    last, path = arrival(hits, system), optical_path(hits, system)
-    if len(live) < count:
-        whole = system_of(lens, list(range(count)), *scene)
-        hits = _cross_dead_surfaces(system, whole, hits, live)
-    radius2 = sum(a**2 for a in hits[:, :-1])
-    edge2 = (lens.semi_diameter.at[lens.stop].set(jnp.inf) ** 2)[:, None, None]
-    clipped = jnp.any(radius2 > edge2, axis=0) & (status == Status.OK)
-    return Bundle(hits, jnp.where(clipped, jnp.int32(Status.CLIPPED), status), last, path, found)
+    return _traced(lens, scene, points, solver)[0]
 
 
-def as_field(field: ArrayLike, dtype: jnp.dtype) -> Array:
-    """A field, one angle (along y) or two (x, y) in radians, as (2,)."""
-    field = jnp.asarray(field, dtype)
-    if field.ndim == 0:
-        return jnp.stack([jnp.zeros_like(field), field])
-    if field.shape != (2,):
-        raise ValueError(f"field: expected one angle or two, got shape {field.shape}")
-    return field
-
-
-def typed_scene(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike
-) -> tuple[Lens, Array, Array, Array]:
-    """The lens, field (2,), distance () and wavelengths (W,), arrays of the lens's dtype.
-
-    One type for numbers, NumPy's and JAX's arrays, so that they share a compiled program.
-    """
-    dtype = lens.curvature.dtype
-    wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
-    return lens, as_field(field, dtype), jnp.asarray(distance, dtype), wavelengths
+def _traced(
+    lens: Lens, scene: Scene, points: Vector, solver: Solver
+) -> tuple[Bundle, System, Vector]:
+    """The bundle, and its system with the hits on the rows of that."""
+    system = system_of(lens, scene, len(points))
+    waves = scene.wavelengths.shape[0]
+    radius = lens.semi_diameter[lens.stop]
+    target = tuple(jnp.broadcast_to(radius * p, (waves, p.shape[-1])) for p in points)
+    found = solver(system, target)
+    known = known_index(lens.glasses, scene.wavelengths)[:, None]
+    status = jnp.where(known, found.status, jnp.int32(Status.NO_INDEX))
+    last, path = fermat.arrival(found.hits, system), fermat.optical_path(found.hits, system)
+    hits, status = _whole(lens, system, found.hits, status)
+    edge = lens.semi_diameter.at[lens.stop].set(jnp.inf)[:, None, None]
+    outside = jnp.any(dot(hits, hits) > edge**2, axis=0) & (status == Status.OK)
+    status = jnp.where(outside, Status.CLIPPED, status).astype(jnp.int32)
+    return Bundle(hits, status, last, path, found.steps), system, found.hits
 
 
 def trace_rays(
@@ -207,54 +129,38 @@ def trace_rays(
     distance: ArrayLike,
     wavelengths: ArrayLike,
     pupil: ArrayLike,
-    forward: bool = False,
 ) -> Rays:
     """Trace the rays that cross the stop at given points.
 
-    `field`: angle in radians along y, or (x, y); positive light travels upwards (for a height
-    in mm, see `field_of_height`). `distance`: mm from the object plane to the first vertex,
-    inf allowed. `wavelengths` (W,) in um. `pupil` (Q, 2), x and y on the stop in units of its
-    semi-diameter. Rays are aimed at the real stop, for every wavelength. Differentiable in
-    everything but the status, in reverse mode or, if `forward`, in forward mode (`jax.jvp`,
-    `jax.jacfwd`); a Hessian-vector product is `jax.jvp` of `jax.grad`, without `forward`.
-    ValueError for a known wavelength outside the range of a glass.
+    field: angle in radians along y, or (x, y); positive light travels upwards (for a height in
+        mm, see `field_of_height`).
+    distance: mm from the object plane to the first vertex, inf allowed.
+    wavelengths: (W,) in um.
+    pupil: (Q, 2), x and y on the stop in units of its semi-diameter.
+
+    Rays are aimed at the real stop, for every wavelength. Differentiable in everything but the
+    status, in every mode and to any order. ValueError for a known wavelength outside the range of
+    a glass; inside a trace its rays have the status NO_INDEX.
     """
     check_wavelengths(lens.glasses, wavelengths)
-    scene = typed_scene(lens, field, distance, wavelengths)
-    scene = *scene, jnp.asarray(pupil, lens.curvature.dtype)
-    if concrete(scene):  # few need a program that can search for rays twice
-        rays = _trace_rays(*scene, thorough=False)
-        # Inside `jit` even a scene of constants has a status that is not known.
-        if concrete(rays) and np.all(np.isin(rays.status, (Status.OK, Status.CLIPPED))):
-            return rays
-    return _trace_rays(*scene, forward)
+    scene = scene_of(lens, field, distance, wavelengths)
+    return _trace_rays(lens, scene, jnp.asarray(pupil, lens.curvature.dtype))
 
 
-@partial(jax.jit, static_argnames=("forward", "thorough"))
-def _trace_rays(
-    lens: Lens,
-    field: Array,
-    distance: Array,
-    wavelengths: Array,
-    pupil: Array,
-    forward: bool = False,
-    thorough: bool = True,
-) -> Rays:
-    scene = field, distance, wavelengths, pupil.T
-    bundle = trace_bundle(lens, *scene, forward, thorough=thorough)
-    whole = system_of(lens, list(range(len(lens.forms))), *scene)
-    z = by_form(sag, bundle.hits, whole.shape, whole.forms)
-    own = turn(whole.rotation, jnp.concatenate([bundle.hits, z[None]]))
-    points = own.at[2].add(whole.vertex[:, None, None])
-    if whole.offset is not None:
-        points = points.at[:2].add(whole.offset[..., None, None])
-    first = whole.vergence * points[:, :1] - whole.source[:, None, None, None]
-    steps = jnp.concatenate([first, points[:, 1:] - points[:, :-1]], axis=1)
-    length = jnp.sqrt(jnp.sum(steps**2, axis=0))
-    directions = steps * safe_divide(jnp.ones_like(length), length)
+@jax.jit
+def _trace_rays(lens: Lens, scene: Scene, pupil: Array) -> Rays:
+    bundle, system, hits = _traced(lens, scene, (pupil[:, 0], pupil[:, 1]), solve)
     good = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
-    points, directions = (
-        jnp.moveaxis(jnp.where(good, a, 0), (0, 1), (3, 2)) for a in (points, directions)
-    )
+    rows = placed(lens, range(lens.count + 1))
+    heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
+    own = turn(rows.rotation, (*bundle.hits, heights))
+    points = (p + o[:, None, None] for p, o in zip(own, rows.origin(2), strict=True))
+    _, direction = _point_and_direction(system, hits)
+    behind = np.array(_rows_behind(lens))
+
+    def stacked(vector):  # (3, S + 1, W, Q) -> (W, Q, S + 1, 3)
+        return jnp.where(good, jnp.stack(tuple(vector)), 0).transpose(2, 3, 1, 0)
+
+    directions = stacked(d[behind] for d in direction)
     path = jnp.where(good, bundle.path, 0)
-    return Rays(points, directions, path, bundle.status, bundle.found.steps)
+    return Rays(stacked(points), directions, path, bundle.status, bundle.steps)

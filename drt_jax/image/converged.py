@@ -1,0 +1,237 @@
+"""Moments to a tolerance: the rule of the pupil that a scene needs, found by trying it.
+
+What must know numbers is here. Inside `jax.jit` and `jax.vmap` the number of rays cannot follow
+from values: `psf_moments` and `focus_moments` then take the rule, made outside.
+"""
+
+import warnings
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..lens.glass import check_wavelengths
+from ..lens.lens import Lens
+from ..lens.scene import Scene, scene_of
+from ..numerics import known_values
+from ..pupil.clipped import Clipped
+from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
+from ..rays.status import Status
+from ..rays.trace import trace_bundle
+from .moments import FocusMoments, Moments, weigh
+
+__all__ = ["converged_focus_rule", "converged_rule", "focus_moments", "psf_moments"]
+
+_MAX_ORDER = 40
+# A spot below 1 nm is a point: relative to it, rounding would never converge.
+_SMALLEST = 1e-6
+# Where a pupil is clipped, the first order tried, and the step to the next.
+_CLIPPED = 4, 2
+
+
+def psf_moments(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+    rule: PupilRule | None = None,
+) -> Moments:
+    """Centroid and covariance of the rays on the sensor: `mean, covariance = psf_moments(...)`.
+
+    field: angle along y, or (x, y), in radians.
+    distance: mm from the object plane to the first vertex, inf allowed.
+    wavelengths: (W,) in um.
+    tolerance: relative error of the RMS spot size; the rule follows from it.
+    rule: of the pupil, instead of a tolerance; needed inside `jax.jit` and `jax.vmap`, where
+        `converged_rule`, called outside, makes it.
+
+    See `Moments`. Rays fill the stop uniformly. Differentiable in all arguments but the last two,
+    in every mode. ValueError if no ray of a colour arrives or a wavelength is outside the range of
+    a glass; inside a trace, where that cannot be known, `passed` is 0 and the covariance inf then.
+    Paper section 4.3.
+    """
+    found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
+    return found.full(lens.sensor)
+
+
+def focus_moments(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+    rule: PupilRule | None = None,
+) -> FocusMoments:
+    """Moments of the rays as functions of the sensor position, about `lens.sensor`; see
+    `FocusMoments`. The sensor is flat.
+
+    Arguments as of `psf_moments`; the tolerance holds at any sensor position, and a rule for it
+    comes from `converged_focus_rule`.
+    """
+    return _moments(lens, field, distance, wavelengths, tolerance, rule, best_focus)
+
+
+def converged_rule(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+) -> PupilRule:
+    """The rule that keeps the RMS spot size on the sensor within `tolerance` (relative).
+
+    Arguments as of `psf_moments`, all known numbers. A Gauss rule on the stop or, where rays are
+    clipped or fail, one fitted to what is left. Two orders are compared on the scene itself: their
+    difference in the covariance, relative to its trace, is twice the error of the first in the
+    spot size, and may be at most `tolerance`, which leaves a factor of two for the error of the
+    second. Warns if no order does. ValueError inside a trace, or if no ray arrives.
+    """
+    return _converge(lens, field, distance, wavelengths, tolerance, at_sensor)[0]
+
+
+def converged_focus_rule(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float = 1e-6,
+) -> PupilRule:
+    """`converged_rule` for any sensor position: where the spot is smallest, it may be far smaller
+    than on the sensor, and the tolerance is relative to it."""
+    return _converge(lens, field, distance, wavelengths, tolerance, best_focus)[0]
+
+
+def at_sensor(spread: np.ndarray) -> list[np.ndarray]:
+    """Where the spot must be right: at the sensor, 0 mm from the reference."""
+    return [np.zeros(spread.shape[1])]
+
+
+def best_focus(spread: np.ndarray) -> list[np.ndarray]:
+    """Where the spot must be right: at the sensor, and where that of each colour is smallest, (W,)
+    mm behind the reference."""
+    _, linear, square = np.sum(spread[..., :2], axis=-1)
+    return [*at_sensor(spread), -linear / np.where(square > 0, 2 * square, 1)]
+
+
+def _moments(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float,
+    rule: PupilRule | None,
+    places: Callable,
+) -> FocusMoments:
+    check_wavelengths(lens.glasses, wavelengths)
+    if rule is None:
+        rule = _converge(lens, field, distance, wavelengths, tolerance, places)[1]
+    found, _ = _weigh(lens, scene_of(lens, field, distance, wavelengths), rule)
+    passed = known_values(found.passed)
+    if passed is not None:
+        _check_passed(passed, wavelengths)
+    return found
+
+
+@jax.jit
+def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[FocusMoments, Array]:
+    """Moments, and whether any ray of the rule is clipped or fails."""
+    points, weights = rule.points(lens, scene)
+    bundle = trace_bundle(lens, scene, points)
+    return weigh(lens, rule, weights, bundle), jnp.any(bundle.status != Status.OK)
+
+
+def _converge(
+    lens: Lens,
+    field: ArrayLike,
+    distance: ArrayLike,
+    wavelengths: ArrayLike,
+    tolerance: float,
+    places: Callable,
+) -> tuple[PupilRule, PupilRule]:
+    """The rule that meets the tolerance, and the same as it was evaluated."""
+    if not 0 < tolerance < 1:
+        raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
+    check_wavelengths(lens.glasses, wavelengths)
+    known = known_values((lens, field, distance, wavelengths))
+    if known is None:
+        raise ValueError(
+            "inside jax.jit or jax.vmap the number of rays cannot follow from a tolerance: make "
+            "the rule outside and pass it on, rule=drt_jax.converged_rule(lens, field, distance, "
+            "wavelengths, tolerance)"
+        )
+    # Outside of any trace, also where this is called inside one: what follows is all known.
+    with jax.core.eval_context():
+        lens, field, distance, wavelengths = known
+        scene = scene_of(lens, field, distance, wavelengths)
+        return _try_orders(lens, scene, symmetry_of(lens, field), tolerance, places)
+
+
+def _try_orders(
+    lens: Lens, scene: Scene, symmetry: Symmetry, tolerance: float, places: Callable
+) -> tuple[PupilRule, PupilRule]:
+    eps = float(jnp.finfo(lens.curvature.dtype).eps)
+    previous, before, clipped, order = None, None, False, 2
+    while True:
+        rule: PupilRule = Clipped(order, symmetry) if clipped else _padded(order, symmetry)
+        found, failing = _weigh(lens, scene, rule)
+        if bool(failing) and not clipped:
+            previous, clipped, order = None, True, _CLIPPED[0]
+            continue
+        _check_passed(np.asarray(found.passed), scene.wavelengths)
+        spread = np.asarray(found.spread, float)
+        change = bound = np.inf
+        if previous is not None:
+            change = max(_change(spread, previous, d) for d in places(spread))
+            # Hits are rounded to some last digits of the length of the lens.
+            size = np.sqrt(np.min(np.sum(spread[0, :, :2], axis=-1)))
+            rounding = 4 * eps * abs(float(lens.sensor)) / max(size, _SMALLEST)
+            bound = max(tolerance, 100 * eps, rounding)
+            if change <= bound:
+                break
+        if order > _MAX_ORDER:
+            warnings.warn(
+                f"the spot size has converged to {change:.1e} only, not to {bound:.1e}, with the "
+                f"order {order}; does the edge of the beam fail?",
+                stacklevel=4,
+            )
+            break
+        previous, before, order = spread, rule, order + (_CLIPPED[1] if clipped else 1)
+    if clipped:
+        return rule, rule
+    return Gauss(order - 1, symmetry), before or rule
+
+
+def _padded(order: int, symmetry: Symmetry) -> Pattern:
+    """A Gauss rule filled up with weightless rays, so that orders share a few compiled programs.
+
+    They run along the rim of the stop, where clear apertures clip first.
+    """
+    points, weights = gauss_points(order, symmetry)
+    sizes = (_MAX_ORDER + 2,) if symmetry == "meridian" else (208, 416, 1768, 3696)
+    missing = next(size for size in sizes if size >= weights.size + len(points)) - weights.size
+    turn = np.pi if symmetry == "half" else 2 * np.pi
+    angle = -np.pi / 2 + turn * np.arange(missing) / max(missing - 1, 1)
+    rim = np.stack([np.cos(angle), np.sin(angle)]) if len(points) == 2 else np.ones((1, missing))
+    filled = np.concatenate([points, rim], axis=1)
+    return Pattern(filled, np.pad(weights, (0, missing)), symmetry)
+
+
+def _change(spread: np.ndarray, previous: np.ndarray, d: np.ndarray) -> float:
+    """Largest change of the covariance relative to its trace, the sensor at `d` (W,) mm."""
+    d = d[:, None]
+    now, before = (s[0] + d * (s[1] + d * s[2]) for s in (spread, previous))
+    size = np.sum(now[:, :2], axis=-1, keepdims=True)
+    return float(np.max(np.abs(now - before) / np.maximum(size, _SMALLEST**2)))
+
+
+def _check_passed(passed: np.ndarray, wavelengths: ArrayLike) -> None:
+    for share, wavelength in zip(np.asarray(passed), np.atleast_1d(wavelengths), strict=True):
+        if not share > 0:
+            raise ValueError(
+                f"no ray at {float(wavelength):g} um reaches the sensor: every one misses a "
+                "surface, is totally reflected or is clipped; see trace_rays(...).status"
+            )

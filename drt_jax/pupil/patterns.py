@@ -1,0 +1,125 @@
+"""Points on the unit disc of the stop and their weights, as arrays.
+
+All rules integrate over the area of the disc with weights that sum to 1. The order n of a
+Gauss rule is its number of nodes in t = r^2, the variable in which a rotationally symmetric
+aberration is smooth. Source: Forbes, JOSA A 5, 1943 (1988). The moments use the Gauss rules;
+the patterns of equal weights are what other programs use, for comparison.
+"""
+
+import numpy as np
+
+__all__ = [
+    "disc",
+    "half_disc",
+    "hexapolar",
+    "meridian",
+    "random_disc",
+    "sobol",
+    "sobol_disc",
+    "square_grid",
+]
+
+_SOBOL_BITS = 30
+
+
+def _gauss(order: int) -> tuple[np.ndarray, np.ndarray]:
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    return np.sqrt((nodes + 1) / 2), weights / 2
+
+
+def meridian(order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (1, n) and weights (n,) on one radius: enough for an axial object."""
+    radius, weights = _gauss(order)
+    return radius[None], weights
+
+
+def half_disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (2, n m) in the half x > 0 and weights: enough for a field along y.
+
+    n Gauss nodes in r^2 times m uniform azimuths, the mirror half of a rule of 2 m.
+    """
+    radius, weights = _gauss(order)
+    angle = np.pi * ((np.arange(azimuths) + 0.5) / azimuths - 0.5)
+    points = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))])
+    return points.reshape(2, -1), np.repeat(weights / azimuths, azimuths)
+
+
+def disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (2, 2 n m) and weights of the same rule on the whole disc."""
+    points, weights = half_disc(order, azimuths)
+    mirrored = points * np.array([[-1.0], [1.0]])
+    return np.concatenate([points, mirrored], axis=1), np.tile(weights / 2, 2)
+
+
+def random_disc(rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform random points (2, rays), as the paper's 256 rays, and equal weights."""
+    generator = np.random.default_rng(seed)
+    return _of_square(generator.random(rays), generator.random(rays))
+
+
+def _of_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the unit square on the disc: r = sqrt(u), azimuth 2 pi v; equal weights."""
+    radius, angle = np.sqrt(u), 2 * np.pi * v
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)])
+    return points, np.full(len(u), 1 / len(u))
+
+
+def _count(what: str, value: int) -> None:
+    if not value >= 1:
+        raise ValueError(f"{what}: expected at least 1, got {value!r}")
+
+
+def square_grid(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (2, Q) of a square grid inside the disc and equal weights.
+
+    The centres of `side` x `side` cells of the square round the disc; those in the disc stay.
+    ValueError for a side below 1.
+    """
+    _count("side", side)
+    line = (np.arange(side) + 0.5) / side * 2 - 1
+    points = np.stack(np.meshgrid(line, line)).reshape(2, -1)
+    points = points[:, np.sum(points**2, axis=0) <= 1]
+    return points, np.full(points.shape[1], 1 / points.shape[1])
+
+
+def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (2, Q), Q = 1 + 3 n (n + 1): the centre and n rings of 6, 12, 18, ...; equal weights.
+
+    Each ray stands for the same area of the disc: a ring of 6 k lies at the radius that halves
+    the area of its annulus. (Lens design programs often put the outermost ring on the rim and
+    so count the rim twice.) ValueError for fewer than 1 ring.
+    """
+    _count("rings", rings)
+    k = np.arange(1, rings + 1)
+    total = 1 + 3 * rings * (rings + 1)
+    radius = np.sqrt((1 + 3 * k * k) / total)  # the mean of r^2 at its edges, 1 + 3 k (k +- 1)
+    points = [np.zeros((2, 1))]
+    for ring, r in zip(k, radius):
+        angle = 2 * np.pi * (np.arange(6 * ring) + 0.5) / (6 * ring)
+        points.append(r * np.stack([np.cos(angle), np.sin(angle)]))
+    return np.concatenate(points, axis=1), np.full(total, 1 / total)
+
+
+def sobol(count: int) -> np.ndarray:
+    """The first points (2, count) of the Sobol sequence in the unit square, not scrambled.
+
+    Direction numbers of the polynomials 1 and x + 1, Gray-code order: Antonov and Saleev, USSR
+    Comput. Math. Math. Phys. 19, 252 (1980). Best at powers of two. ValueError for a count below 1.
+    """
+    _count("count", count)
+    bits = np.arange(_SOBOL_BITS)
+    second = [1]
+    for _ in bits[1:]:
+        second.append(second[-1] ^ (second[-1] << 1))
+    directions = np.array([np.ones_like(bits), second]) << (_SOBOL_BITS - 1 - bits)
+    index = np.arange(count)
+    gray = index ^ (index >> 1)
+    points = np.zeros((2, count), np.int64)
+    for bit in bits[: int(count).bit_length()]:
+        points ^= np.where(gray >> bit & 1, directions[:, bit : bit + 1], 0)
+    return points / 2.0**_SOBOL_BITS
+
+
+def sobol_disc(rays: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (2, rays) of the Sobol sequence and equal weights: r^2 and azimuth are its axes."""
+    return _of_square(*sobol(rays))

@@ -1,0 +1,264 @@
+"""Aiming: from where to launch a ray so that it crosses the stop at a wanted point.
+
+Newton's method in the launch point of one ray, mapped over a bundle, from where paraxial optics
+puts it. Rays that this does not find, and only those, start again from a fan of rays over the
+first surface.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax import Array
+
+from ..lens.paraxial import trace_yu
+from ..lens.surface import Shape, vertex_curvature
+from ..numerics import safe_divide
+from .fermat import label
+from .snell import shoot, shoot_to_stop
+from .status import Status
+from .system import System, Vector, dot
+
+__all__ = [
+    "STARTS",
+    "AimNewton",
+    "Aimed",
+    "Fan",
+    "aim",
+    "beam_size",
+    "no_fan",
+    "paraxial_launch",
+    "starts_of",
+    "trace_fan",
+]
+
+# A ray counts as aimed if it misses its stop point by less than `_NEAR` of the beam's radius: one
+# more step of Newton's method, which converges quadratically, then brings it there to rounding.
+_NEAR = 1e-6
+# Steps of one search; it ends after `_PATIENCE` in a row that came no nearer.
+_STEPS, _PATIENCE = 48, 12
+# The fan has `_TILES` tiles a side of `_FAN` rays a side; a stop point takes the ray that comes
+# nearest of each of its `STARTS` nearest tiles.
+_TILES, _FAN, STARTS = 15, 5, 24
+
+
+class _State(NamedTuple):
+    """move: D numbers, from the best launch so far to the next trial, mm. far: by how much the best
+    misses its stop point, mm, inf before one arrived. bad: trials in a row that came no nearer."""
+
+    move: Vector
+    far: Array
+    bad: Array
+
+
+class AimNewton(optx.AbstractRootFinder):
+    """Newton's method for one launch point, damped: after a step with which the ray is lost or
+    farther off, the next is half as long; after a good one, at most twice as long.
+
+    The function returns the miss (D numbers) and the fate of the ray as its auxiliary output.
+    Options: "reach", the longest first step in mm. Ends when the miss is at most `atol` mm, and
+    the step that remains is taken; or with RESULTS.nonlinear_divergence.
+    """
+
+    rtol: float
+    atol: Array
+    norm: Callable = optx.two_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
+        """The state before the first trial, at the launch that is given."""
+        far = jnp.full(y[0].shape, jnp.inf, y[0].dtype)
+        return _State(tuple(jnp.zeros_like(a) for a in y), far, jnp.zeros((), jnp.int32))
+
+    def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
+        """One trial."""
+        trial = tuple(a + b for a, b in zip(y, state.move, strict=True))
+        miss, columns, fate = _derivatives(lambda y: fn(y, args), trial)
+        far = jnp.where(fate == Status.OK, self.norm(miss), jnp.inf)
+        better = far < state.far
+        newton = tuple(-a for a in _divide(columns, miss))
+        bound = jnp.where(jnp.isinf(state.far), options["reach"], 2 * self.norm(state.move))
+        newton = tuple(a * jnp.minimum(1, safe_divide(bound, self.norm(newton))) for a in newton)
+        move = tuple(jnp.where(better, a, b / 2) for a, b in zip(newton, state.move, strict=True))
+        y = tuple(jnp.where(better, a, b) for a, b in zip(trial, y, strict=True))
+        bad = jnp.where(better, 0, state.bad + 1).astype(jnp.int32)
+        return y, _State(move, jnp.minimum(far, state.far), bad), fate
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
+        """Whether the ray is aimed, or given up."""
+        given_up = state.bad > jnp.where(jnp.isinf(state.far), 0, _PATIENCE)
+        near = state.far <= self.atol
+        results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        return near | given_up, optx.RESULTS.where(given_up & ~near, *results)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """The last step, from the best launch."""
+        near = state.far <= self.atol
+        y = tuple(a + jnp.where(near, b, 0) for a, b in zip(y, state.move, strict=True))
+        return y, aux, {}
+
+
+def _derivatives(function: Callable, y: Vector) -> tuple[Vector, Vector, Any]:
+    """Value, D numbers, of a function of D numbers, its derivatives by each, D arrays (D,), and its
+    auxiliary output: all in one trace."""
+    units = tuple(jnp.asarray(u, y[0].dtype) for u in np.eye(len(y)))
+
+    def along(unit):
+        return jax.jvp(function, (y,), (unit,), has_aux=True)
+
+    return jax.vmap(along, out_axes=(None, 0, None))(units)
+
+
+def _divide(columns: Vector, miss: Vector) -> Vector:
+    """x with J x = miss, where columns[i][k] = dmiss_i / dx_k; 0 where J is singular."""
+    if len(miss) == 1:
+        return (safe_divide(miss[0], columns[0][0]),)
+    (p, q), (r, s) = columns
+    determinant = p * s - q * r
+    x, y = s * miss[0] - q * miss[1], p * miss[1] - r * miss[0]
+    return safe_divide(x, determinant), safe_divide(y, determinant)
+
+
+class Aimed(NamedTuple):
+    """launch: D arrays (W, Q) in mm. status: (W, Q), OK for an aimed ray; else what stopped it
+    before the stop, UNCONVERGED if nothing did. steps: (), trials of the whole bundle."""
+
+    launch: Vector
+    status: Array
+    steps: Array
+
+
+def aim(system: System, target: Vector, launch: Vector, beam: Array, reach: Array) -> Aimed:
+    """Aim rays at stop points `target`, D arrays (W, Q) in mm, from first guesses `launch`.
+
+    beam, reach: () radius of the beam at the stop, and the longest first step, mm.
+    """
+    eps = float(jnp.finfo(launch[0].dtype).eps)
+    solver = AimNewton(rtol=0.0, atol=max(_NEAR, 64 * eps) * beam)
+
+    def one(index, target, launch):
+        own = eqx.tree_at(lambda s: s.index, system, index)
+
+        def miss(launch, target):
+            crossing, fate = shoot_to_stop(own, launch)
+            return tuple(a - b for a, b in zip(crossing, target, strict=True)), fate
+
+        solution = optx.root_find(
+            miss,
+            solver,
+            launch,
+            args=target,
+            options={"reach": reach},
+            has_aux=True,
+            max_steps=_STEPS,
+            throw=False,
+        )
+        lost = jnp.where(solution.aux == Status.OK, Status.UNCONVERGED, solution.aux)
+        found = solution.result == optx.RESULTS.successful
+        status = jnp.where(found, Status.OK, lost).astype(jnp.int32)
+        return solution.value, status, solution.stats["num_steps"]
+
+    bundle = jax.vmap(jax.vmap(one, (None, 0, 0)), (1, 0, 0))
+    launch, status, steps = bundle(system.index[..., 0], target, launch)
+    return Aimed(launch, status, jnp.max(steps).astype(jnp.int32))
+
+
+def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
+    """Radius of the beam at the stop, and how wide it may be on the first surface, mm."""
+    beam = jnp.sqrt(jnp.max(dot(target, target)))
+    lean = jnp.sqrt(dot(system.source[:-1], system.source[:-1]))
+    stop = system.rows.vertex[system.before] if system.stop is None else system.stop.vertex
+    depth = jnp.abs(stop - system.rows.vertex[0])
+    width = 2 * beam + lean * (depth + beam) + 0.02 * depth
+    return jnp.where(beam > 0, beam, 0.1 * width), width
+
+
+def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
+    """Launch of the rays through the paraxial entrance pupil to stop points `target`, D arrays
+    (W, Q) in mm; tilts are left out. At most 4 times `width` from the axis, mm: where the stop is
+    imaged to infinity, the pupil lies beyond any lens."""
+    dim, rows, before = system.dim, system.rows, system.before
+    dtype = target[0].dtype
+    live = system.stop is None
+    stop = jax.tree.map(lambda a: a[before], rows) if live else system.stop
+    # The surfaces before the stop; then a plane without power at the stop, which may lie anywhere.
+    shape = Shape(*(a[..., :before] for a in (rows.curvature, rows.conic, rows.coefficients.T)))
+    bent = jnp.stack(vertex_curvature(shape, system.forms[:before], dim), axis=-1)
+    bent = jnp.concatenate([bent, jnp.zeros((1, dim), dtype)])[..., None]
+    gaps = jnp.diff(jnp.append(rows.vertex[:before], stop.vertex))
+    # In a mirrored space, distances and indices are both negative.
+    index = system.index[: before + 1] * system.senses[: before + 1, None, None]
+    index = jnp.moveaxis(jnp.concatenate([index, index[-1:]]), -1, 1)
+    one = jnp.ones((dim, system.index.shape[1]), dtype)
+    first = rows.vertex[0] if before else stop.vertex
+    v = system.vergence
+    # Two rays: from the object's point on the axis, and slanted.
+    axial, _ = trace_yu(bent, gaps, index, one * (1 + first * v), one * v)
+    tilted, _ = trace_yu(bent, gaps, index, one * first, one)
+    launch = []
+    for d, wanted in enumerate((*target, stop.vertex)[:dim]):
+        tangent = -system.source[d]
+        if stop.offset is not None:
+            wanted = wanted + stop.offset[d]
+        amplitude = safe_divide(wanted - tangent * tilted[-1, d, :, None], axial[-1, d, :, None])
+        start = amplitude * axial[0, d, :, None] + tangent * tilted[0, d, :, None]
+        launch.append(start)
+    # The light at z = `first`, brought to the vertex plane of the first row.
+    depth, near = rows.vertex[0] - first, 1 / (v * first + 1)
+    launch = [a + depth * near * (v * a - s) for a, s in zip(launch, system.source, strict=False)]
+    far = jnp.sqrt(dot(launch, launch))
+    shrink = jnp.minimum(1, 4 * width / jnp.maximum(far, width))
+    return tuple(a * shrink for a in launch)
+
+
+def _fan(dim: int) -> np.ndarray:
+    """Launch points (D, tiles, rays of a tile) between -1 and 1, denser in the middle."""
+    side = np.linspace(-1, 1, _TILES * _FAN)
+    side = (side * (0.3 + 0.7 * side**2)).reshape(_TILES, _FAN)
+    places = np.meshgrid(*[np.arange(side.size)] * dim, indexing="ij")
+    points = side.ravel()[np.stack(places)].reshape(dim, *(_TILES, _FAN) * dim)
+    tiles = (0, *range(1, 2 * dim, 2), *range(2, 2 * dim + 1, 2))
+    return points.transpose(tiles).reshape(dim, _TILES**dim, _FAN**dim)
+
+
+class Fan(NamedTuple):
+    """A fan of rays over the first surface.
+
+    launch: D arrays (tiles, rays of a tile), mm. there: D arrays (W, tiles, rays of a tile), where
+    those that reach the sensor cross the stop, mm; inf for the others.
+    """
+
+    launch: Vector
+    there: Vector
+
+
+def no_fan(system: System, waves: int) -> Fan:
+    """A fan before it is traced."""
+    points = jnp.asarray(_fan(system.dim), system.index.dtype)
+    nowhere = jnp.full((waves, *points.shape[1:]), jnp.inf, points.dtype)
+    return Fan(tuple(points), (nowhere,) * system.dim)
+
+
+def trace_fan(system: System, fan: Fan, reach: Array) -> Fan:
+    """The fan of launches up to `reach` mm from the axis, traced."""
+    launch = tuple(reach * jnp.asarray(a, reach.dtype) for a in _fan(system.dim))
+    shape = fan.there[0].shape
+    flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
+    trace = shoot(system, flat)
+    there = label(trace.hits, system)
+    good = trace.fate == Status.OK
+    return Fan(launch, tuple(jnp.where(good, a, jnp.inf).reshape(shape) for a in there))
+
+
+def starts_of(fan: Fan, target: Vector, ranks: Array) -> Vector:
+    """Launches, D arrays (W, K, N), for stop points, D arrays (W, K): the rays of the fan that come
+    nearest, each the nearest of one tile, the tiles by rank; `ranks` (N,)."""
+    gaps = (a[:, :, None, None] - b[:, None] for a, b in zip(target, fan.there, strict=True))
+    far = sum(g * g for g in gaps)  # (W, K, tiles, rays)
+    near, which = jnp.min(far, axis=-1), jnp.argmin(far, axis=-1)
+    order = jax.lax.top_k(-near, min(STARTS, near.shape[-1]))[1][..., ranks]
+    chosen = jnp.take_along_axis(which, order, axis=-1)
+    return tuple(a[order, chosen] for a in fan.launch)

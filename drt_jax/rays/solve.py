@@ -1,0 +1,306 @@
+"""Rays as roots of the Fermat system, with derivatives by the implicit function theorem.
+
+The search is never differentiated: at a root of E(w, p) = 0, the Fermat equations and the label,
+dw/dp = -(dE/dw)^-1 dE/dp (paper Eq. 4). `attach` gives known hits these derivatives in every
+mode; `solve_reverse` is the same as a `jax.custom_vjp`, which keeps nothing but the hits.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax import Array
+
+from . import fermat, linear
+from .aim import STARTS, Fan, aim, beam_size, no_fan, paraxial_launch, starts_of, trace_fan
+from .bundle import in_tiles, polynomial_launch, tiles_of
+from .snell import shoot
+from .status import Status
+from .system import System, Vector, dot
+
+__all__ = ["BlockNewton", "Found", "attach", "find", "find_many", "solve", "solve_reverse"]
+
+_MAX_STEPS = 16
+
+
+class Found(NamedTuple):
+    """Rays of a bundle.
+
+    hits: D arrays (R, W, Q) in mm on the live surfaces and the sensor; 0 for failed rays.
+    status: (W, Q), int32, see `Status`.
+    steps: (), int32, steps of Newton's method that the bundle took, aiming included.
+    """
+
+    hits: Vector
+    status: Array
+    steps: Array
+
+
+class _State(NamedTuple):
+    """solved: (W, Q). change: (), largest correction of the last step, mm. step: ()."""
+
+    solved: Array
+    change: Array
+    step: Array
+
+
+class BlockNewton(optx.AbstractRootFinder):
+    """Newton's method for a bundle of Fermat paths, with the march of `linear` as its solve.
+
+    Its arguments are (system, target, which rays are to move (W, Q)). These step together; one
+    whose correction is not finite stays where it is, so that it cannot spoil the others. Ends
+    when all of them are stationary to rounding (see `fermat.stationary`), or when none moves by
+    more than `atol` + `rtol` of its hits any more: then RESULTS.nonlinear_divergence, and the state
+    tells which are solved.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
+        """The state before the first step; no step is taken if no ray is to move."""
+        return _State(~args[2], jnp.full((), jnp.inf, y[0].dtype), jnp.zeros((), jnp.int32))
+
+    def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
+        """One Newton step of every ray that is not stationary yet."""
+        system, target, _ = args
+        (forces, shift, path), aux = fn(y, args)
+        solved = state.solved | fermat.stationary(y, path, system, target)
+        change = linear.solve(y, path, system, ~solved, forces, shift)
+        finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
+        moves = finite & ~solved
+        change = tuple(jnp.where(moves, c, 0) for c in change)
+        size = self.norm(change) / (1 + self.rtol / self.atol * self.norm(y))
+        y = tuple(a - c for a, c in zip(y, change, strict=True))
+        return y, _State(solved, size, state.step + 1), aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
+        """Whether all rays are stationary, or none moves any more."""
+        done, still = jnp.all(state.solved), state.change <= self.atol
+        results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        return done | still, optx.RESULTS.where(still & ~done, *results)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Nothing to add."""
+        return y, aux, {}
+
+
+def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tuple:
+    """Hits of the `active` rays (W, Q) made stationary; which rays are solved, and the steps."""
+
+    def equations(hits, args):
+        system, target, _ = args
+        path = fermat.geometry(hits, system)
+        miss = (a - b for a, b in zip(fermat.label(hits, system), target, strict=True))
+        return (fermat.residual(path, system), tuple(miss), path), None
+
+    eps = float(jnp.finfo(hits[0].dtype).eps)
+    solution = optx.root_find(
+        equations,
+        BlockNewton(rtol=2 * eps, atol=2 * eps),
+        hits,
+        args=(system, target, active),
+        has_aux=True,
+        max_steps=_MAX_STEPS,
+        throw=False,
+    )
+    all_solved = solution.result == optx.RESULTS.successful
+    return solution.value, all_solved | solution.state.solved, solution.stats["num_steps"]
+
+
+def exact(system: System, target: Vector, hits: Vector) -> Array:
+    """Whether traced rays cross the stop at their points to rounding, (W, Q), bool."""
+    eps = float(jnp.finfo(hits[0].dtype).eps)
+    miss = tuple(a - b for a, b in zip(fermat.label(hits, system), target, strict=True))
+    size = jnp.sqrt(jnp.max(dot(hits, hits), axis=0)) + jnp.sqrt(dot(target, target))
+    return dot(miss, miss) <= (64 * eps * size) ** 2
+
+
+def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
+    """The rays through stop points `target`, D arrays (W, Q) in mm; not differentiable.
+
+    launch: D arrays (W, Q) in mm, where to start instead of at the paraxial entrance pupil.
+    Rays that are not found at once are sought again in a fan; those that miss their stop points by
+    more than rounding are polished on the Fermat system.
+    """
+    sizes = beam_size(system, target)
+    launch = paraxial_launch(system, target, sizes[1]) if launch is None else launch
+    search = _search(system, target, launch, sizes)
+    good = search.status == Status.OK
+    hits = tuple(jnp.where(good, a, 0) for a in search.hits)
+    hits, solved, steps = _polish(system, target, hits, good & ~exact(system, target, hits))
+    status = jnp.where(good & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
+    hits = tuple(jnp.where(status == Status.OK, a, 0) for a in hits)
+    return Found(hits, status, (search.steps + steps).astype(jnp.int32))
+
+
+class _Search(NamedTuple):
+    """hits: D arrays (R, W, Q), mm. status: (W, Q). left: (W, Q), rays that failed and still are to
+    be sought in the fan. fan: as far as it is traced. turn, steps: ()."""
+
+    hits: Vector
+    status: Array
+    left: Array
+    fan: Fan
+    turn: Array
+    steps: Array
+
+
+def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Search:
+    """First all rays from their first launch; then those that failed, a few a turn, each from
+    several rays of a fan. One loop with as many places as there are rays, so that under `vmap` too
+    the fan costs nothing while no ray is missing."""
+    waves, rays = target[0].shape
+    starts = min(STARTS, rays)
+    few, rounds = rays // starts, -(-STARTS // starts)
+    wide = jnp.maximum(2 * sizes[1], 1.6 * jnp.sqrt(jnp.max(dot(launch, launch))))
+
+    def places(a):  # (W, few, starts or 1) -> (W, Q)
+        a = jnp.broadcast_to(a, (waves, few, starts)).reshape(waves, -1)
+        return jnp.pad(a, ((0, 0), (0, rays - few * starts)), mode="edge")
+
+    def turn(state):
+        first, tried = state.turn == 0, jnp.maximum(state.turn - 1, 0) % rounds
+        fan, _ = jax.lax.while_loop(
+            lambda s: s[1],
+            lambda s: (trace_fan(system, s[0], wide), jnp.array(False)),
+            (state.fan, state.turn == 1),
+        )
+        rows = jax.vmap(lambda left: jnp.nonzero(left, size=few, fill_value=rays)[0])(state.left)
+        wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
+        begin = starts_of(fan, wanted, tried * starts + jnp.arange(starts, dtype=jnp.int32))
+        own = (places(a[..., None]) for a in wanted)
+        own = tuple(jnp.where(first, a, b) for a, b in zip(target, own, strict=True))
+        begin = tuple(jnp.where(first, a, places(b)) for a, b in zip(launch, begin, strict=True))
+        reach = jnp.where(first, sizes[1], sizes[1] / 8)
+        aimed = aim(system, own, begin, sizes[0], reach)
+        hits, status = _verdict(system, aimed.launch, aimed.status)
+
+        good = (status[:, : few * starts] == Status.OK).reshape(waves, few, starts)
+        best = jnp.arange(few)[None] * starts + jnp.argmax(good, axis=-1)  # (W, few)
+        found = jnp.where(jnp.any(good, axis=-1), rows, rays)
+        put = jax.vmap(lambda a, r, new: a.at[r].set(new, mode="drop"))
+        some = jax.vmap(put, (0, None, 0))
+        chosen = (jnp.take_along_axis(h, best[None], axis=-1) for h in hits)
+        sought = tuple(some(a, found, c) for a, c in zip(state.hits, chosen, strict=True))
+        ok = jnp.full(found.shape, Status.OK, jnp.int32)
+        over = jnp.where(tried == rounds - 1, rows, found)
+        left = put(state.left, over, jnp.zeros(over.shape, bool))
+        return _Search(
+            tuple(jnp.where(first, a, b) for a, b in zip(hits, sought, strict=True)),
+            jnp.where(first, status, put(state.status, found, ok)),
+            jnp.where(first, status != Status.OK, left),
+            fan,
+            state.turn + 1,
+            state.steps + aimed.steps,
+        )
+
+    zero = jnp.zeros((len(system.forms), waves, rays), target[0].dtype)
+    status = jnp.zeros((waves, rays), jnp.int32)
+    none = jnp.int32(0)
+    start = _Search((zero,) * len(target), status, status > 0, no_fan(system, waves), none, none)
+    return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left), turn, start)
+
+
+def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Array]:
+    """Hits of rays, and their status where that of aiming them is OK. A ray that turns by more
+    than 1e-6 (float32: 2e-2) when its hits are rounded determines no path."""
+    trace = shoot(system, launch)
+    eps = float(jnp.finfo(launch[0].dtype).eps)
+    drowned = (trace.fate == Status.OK) & (trace.shake > 4 / eps**0.5)
+    fate = jnp.where(drowned, jnp.int32(Status.UNCONVERGED), trace.fate)
+    return trace.hits, jnp.where(status == Status.OK, fate, status)
+
+
+def find_many(system: System, target: Vector) -> Found:
+    """`find`; a large bundle in tiles, its rays launched by polynomials and searched for only
+    where these miss."""
+    if len(target) == 1 or tiles_of(target[0].shape[1], target[0].shape[0])[0] == 1:
+        return find(system, target)
+    launch_of = polynomial_launch(system, target)
+
+    def tile(target):
+        launch = launch_of(target)
+        hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
+        solved = exact(system, target, hits) & (status == Status.OK)
+        start = Found(hits, status, jnp.int32(0)), ~jnp.all(solved)
+
+        def turn(state):
+            return find(system, target, launch), jnp.array(False)
+
+        found, _ = jax.lax.while_loop(lambda state: state[1], turn, start)
+        return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
+
+    found = in_tiles(tile, target)
+    return found._replace(steps=jnp.max(found.steps))
+
+
+@jax.custom_jvp
+def attach(system: System, target: Vector, hits: Vector, good: Array) -> Vector:
+    """Known hits with their derivatives by the system and the stop points, in every mode.
+
+    target: D arrays (W, Q) in mm. hits: D arrays (R, W, Q) in mm of the rays through them. good:
+    (W, Q), bool, the rays that have derivatives.
+    """
+    return hits
+
+
+@attach.defjvp
+def _attach_jvp(primals: Any, tangents: Any) -> tuple[Vector, Vector]:
+    system, target, hits, good = primals
+    # Through the function itself, so that the hits carry derivatives of their own.
+    hits = attach(system, target, hits, good)
+
+    def tangent(target, moved_target, hits, good):
+        return _moved(system, tangents[0], target, moved_target, hits, good)
+
+    return hits, in_tiles(tangent, target, tangents[1], hits, good)
+
+
+def _moved(
+    system: System, moving: System, target: Vector, moving_target: Vector, hits: Vector, good: Array
+) -> Vector:
+    """Tangents of the hits from those of the system and the stop points (paper Eq. 4)."""
+
+    def equations(system, target):
+        path = fermat.geometry(hits, system)
+        miss = (a - b for a, b in zip(fermat.label(hits, system), target, strict=True))
+        return (fermat.residual(path, system), tuple(miss)), path
+
+    _, change, path = jax.jvp(equations, (system, target), (moving, moving_target), has_aux=True)
+    forces, shift = (tuple(jnp.where(good, -a, 0) for a in part) for part in change)
+    moved = linear.solve(hits, path, system, good, forces, shift)
+    return tuple(jnp.where(good, a, 0) for a in moved)
+
+
+def solve(system: System, target: Vector) -> Found:
+    """The rays through stop points `target`, D arrays (W, Q) in mm, differentiable in every mode
+    and to any order; failed rays have zero derivatives."""
+    found = find_many(*jax.lax.stop_gradient((system, target)))
+    return found._replace(hits=attach(system, target, found.hits, found.status == Status.OK))
+
+
+# What finds the rays of a system through stop points.
+Solver = Callable[[System, Vector], Found]
+
+
+@jax.custom_vjp
+def solve_reverse(system: System, target: Vector) -> Found:
+    """`solve` for reverse mode alone: nothing is kept but the hits, and a step is faster."""
+    return find_many(system, target)
+
+
+def _forward(system: System, target: Vector) -> tuple[Found, tuple]:
+    found = find_many(system, target)
+    return found, (system, target, found.hits, found.status == Status.OK)
+
+
+def _backward(kept: tuple, cotangent: Found) -> tuple[System, Vector]:
+    _, pull_back = jax.vjp(lambda system, target: attach(system, target, *kept[2:]), *kept[:2])
+    return pull_back(cotangent.hits)
+
+
+solve_reverse.defvjp(_forward, _backward)

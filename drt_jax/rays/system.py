@@ -1,0 +1,162 @@
+"""What a bundle of rays goes through: the live surfaces in their places, and the stop as a label.
+
+Vectors are tuples of components: D = 1 for rays in the meridional plane (y) or 2 (x, y), and z
+where a vector has it; each an array of one number a ray. XLA joins sums of components into few
+long loops, where a sum over an axis becomes a library call.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..lens.glass import common_range
+from ..lens.lens import Lens, rotation_matrix
+from ..lens.scene import Scene
+from ..lens.surface import Shape
+
+__all__ = ["Placed", "System", "Vector", "dot", "placed", "system_of", "turn"]
+
+Vector = tuple[Array, ...]
+
+
+def dot(a: Any, b: Any) -> Array:
+    """Sum of products of two vectors of the same number of components."""
+    first, *others = (x * y for x, y in zip(a, b, strict=True))
+    return sum(others, first)
+
+
+def turn(rotation: Array | None, vector: Vector, back: bool = False) -> Vector:
+    """A vector from the axes of its surface to those of the lens, or `back`.
+
+    rotation: (3, 3), or (R, 3, 3) for components (R, ...); None: the axes are the same.
+    """
+    if rotation is None:
+        return vector
+    extra = (1,) * (vector[0].ndim + 2 - rotation.ndim)
+    rows = [[rotation[..., i, j] for j in range(3)] for i in range(3)]
+    rows = [[a.reshape(*a.shape, *extra) for a in row] for row in rows]
+    return tuple(dot(row, vector) for row in (zip(*rows, strict=True) if back else rows))
+
+
+class Placed(NamedTuple):
+    """R surfaces in their places, or one: its arrays without the first axis.
+
+    vertex: (R,), z along the lens in mm.
+    curvature: (R,) in 1/mm.
+    conic: (R,).
+    coefficients: (R, K), see `lens.surface`.
+    offset: (R, 2), x and y of the vertices in mm; None for none.
+    rotation: (R, 3, 3) from the axes of the surfaces to those of the lens; None for none.
+    """
+
+    vertex: Array
+    curvature: Array
+    conic: Array
+    coefficients: Array
+    offset: Array | None
+    rotation: Array | None
+
+    @property
+    def shape(self) -> Shape:
+        """Curvature, conic and coefficients (K, ...), to be broadcast against rays."""
+        return Shape(self.curvature, self.conic, jnp.moveaxis(self.coefficients, -1, 0))
+
+    @property
+    def wide(self) -> Shape:
+        """The shape, to be broadcast against (surface, wavelength, ray)."""
+        return Shape(*(a[..., None, None] for a in self.shape))
+
+    def origin(self, dim: int) -> Vector:
+        """The vertices as vectors of `dim` + 1 components."""
+        zero = jnp.zeros_like(self.vertex)
+        offset = (zero,) * dim if self.offset is None else tuple(jnp.moveaxis(self.offset, -1, 0))
+        return *offset, self.vertex
+
+    def local(self, point: Vector, direction: Vector) -> tuple[Vector, Vector]:
+        """A line along the axes of one surface, from its vertex."""
+        origin = self.origin(len(point) - 1)
+        shifted = tuple(p - o for p, o in zip(point, origin, strict=True))
+        return turn(self.rotation, shifted, back=True), turn(self.rotation, direction, back=True)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class System:
+    """Everything that the path of a ray depends on; the differentiable arguments.
+
+    rows: the L live surfaces, those that bend light, and the sensor: R = L + 1.
+    stop: the stop in its place if it bends no light, else None.
+    index: (R, W, 1), of the medium in front of each row; (R,) for a single ray.
+    source: (D + 1,), the object point divided by its distance; its last component is -1.
+    vergence: (), 1/distance in 1/mm, 0 for infinity.
+
+    Static:
+    before: how many live surfaces lie before the stop.
+    forms: of the R rows.
+    stop_form: of the stop.
+    mirrors: whether each of the L live surfaces reflects.
+    """
+
+    rows: Placed
+    stop: Placed | None
+    index: Array
+    source: Array
+    vergence: Array
+    before: int = dataclasses.field(metadata={"static": True})
+    forms: tuple[str, ...] = dataclasses.field(metadata={"static": True})
+    stop_form: str = dataclasses.field(metadata={"static": True})
+    mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True})
+
+    @property
+    def dim(self) -> int:
+        """D, the number of transverse components."""
+        return self.source.shape[0] - 1
+
+    @property
+    def senses(self) -> np.ndarray:
+        """1 or -1 (R,): light goes along or against the z axis before each row."""
+        turned = np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
+        return turned.astype(self.index.dtype)
+
+
+def placed(lens: Lens, rows: Any) -> Placed:
+    """Surfaces of a lens by index: a list of them, or one."""
+    rows = np.asarray(rows)
+    rotation = None
+    if lens.tilt is not None:
+        tilts = lens.tilt[rows]
+        rotation = (jax.vmap(rotation_matrix) if rows.ndim else rotation_matrix)(tilts)
+    return Placed(
+        lens.vertices[rows],
+        lens.curvature[rows],
+        lens.conic[rows],
+        lens.coefficients[rows],
+        None if lens.decentre is None else lens.decentre[rows],
+        rotation,
+    )
+
+
+def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
+    """The system of a lens and a scene for rays of `dim` components: 2, or 1 for the meridional
+    rays of an axial object in a lens with rotational symmetry."""
+    live, stop = lens.live, lens.stop
+    # Wavelengths without an index have one that is finite; their rays fail, see `Status`.
+    colours = jnp.clip(scene.wavelengths, *common_range(lens.glasses))
+    rows = [*live, lens.count]
+    field = scene.field[2 - dim :]
+    return System(
+        rows=placed(lens, rows),
+        stop=None if stop in live else placed(lens, stop),
+        index=lens.index(colours)[np.array([0, *(i + 1 for i in live)]), :, None],
+        # Light with a positive field angle travels upwards: the object lies below the axis.
+        source=jnp.concatenate([-jnp.tan(field), -jnp.ones_like(field[:1])]),
+        vergence=1 / scene.distance,
+        before=sum(i < stop for i in live),
+        forms=tuple(lens.forms[i] for i in rows),
+        stop_form=lens.forms[stop],
+        mirrors=tuple(lens.mirrors[i] for i in live),
+    )
