@@ -4,6 +4,9 @@ Written from the textbook formulae (Welford, Aberrations of Optical Systems, ch.
 no formula with the Fermat solver but the sag. One ray at a time; `jax.vmap` for more.
 """
 
+from functools import partial
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -44,15 +47,50 @@ def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Arra
     return q, normal / jnp.linalg.norm(normal), met
 
 
-def _bend(d: Array, normal: Array, ratio: Array, sense: int, mirror: bool) -> tuple[Array, Array]:
-    """The direction behind a surface, `ratio` the index before by that behind it; whether there
-    is one and light came from the side it goes to, `sense` along the normal."""
+class _Row(NamedTuple):
+    """A surface or the sensor, or with a first axis all of them.
+
+    shape, form: what `_intersect` takes, the form by its place among those of the lens.
+    origin, axes: of the vertex, mm; from the surface's axes to those of the lens.
+    live: whether light bends here; the sensor counts as live.
+    mirror, sense: whether it reflects; 1 or -1, light goes along or against its z axis.
+    ratio: the index in front by that behind.
+    """
+
+    shape: Shape
+    form: Array
+    origin: Array
+    axes: Array
+    live: Array
+    mirror: Array
+    sense: Array
+    ratio: Array
+
+
+def _rows(lens: Lens, wavelength: Array, forms: list[str]) -> _Row:
+    index, dtype = lens.index(jnp.atleast_1d(wavelength))[:, 0], wavelength.dtype
+    across = jnp.zeros((lens.count + 1, 2), dtype) if lens.decentre is None else lens.decentre
+    tilt = jnp.zeros((lens.count + 1, 3), dtype) if lens.tilt is None else lens.tilt
+    return _Row(
+        Shape(lens.curvature, lens.conic, lens.coefficients),
+        jnp.array([forms.index(form) for form in lens.forms]),
+        jnp.concatenate([across, lens.vertices[:, None]], axis=1),
+        jax.vmap(rotation_matrix)(tilt),
+        jnp.array([i in (*lens.live, lens.count) for i in range(lens.count + 1)]),
+        jnp.array([*lens.mirrors, False]),
+        jnp.asarray(lens.senses, dtype),
+        index / jnp.append(index[1:], index[-1]),
+    )
+
+
+def _bend(d: Array, normal: Array, row: _Row) -> tuple[Array, Array]:
+    """The direction behind a surface, and whether there is one and light came from its front."""
     cosine = normal @ d
-    if mirror:
-        return d - 2 * cosine * normal, sense * cosine > 0
-    square = 1 - ratio**2 * (1 - cosine**2)
-    along = sense * jnp.sqrt(jnp.maximum(square, 0)) - ratio * cosine
-    return ratio * d + normal * along, (square >= 0) & (sense * cosine > 0)
+    square = 1 - row.ratio**2 * (1 - cosine**2)
+    along = row.sense * jnp.sqrt(jnp.maximum(square, 0)) - row.ratio * cosine
+    refracted, reflected = row.ratio * d + normal * along, d - 2 * cosine * normal
+    whole = (row.mirror | (square >= 0)) & (row.sense * cosine > 0)
+    return jnp.where(row.mirror, reflected, refracted), whole
 
 
 def trace_snell(
@@ -70,28 +108,23 @@ def trace_snell(
     whether the ray met every surface, went forwards from each that bends light to the next, and
     was refracted or reflected there, bool.
     """
-    index = lens.index(jnp.atleast_1d(wavelength))[:, 0]
-    ok, hits, begun = jnp.array(True), [], False
-    for i, z in enumerate(lens.vertices):
-        across = jnp.zeros(2, point.dtype) if lens.decentre is None else lens.decentre[i]
-        origin = jnp.append(across, z)
-        axes = jnp.eye(3, dtype=point.dtype) if lens.tilt is None else rotation_matrix(lens.tilt[i])
-        p, d = axes.T @ (point - origin), axes.T @ direction
-        row = Shape(lens.curvature[i], lens.conic[i], lens.coefficients[i])
-        hit, normal, met = _intersect(p, d, row, lens.forms[i])
-        hits.append(axes @ hit + origin)
-        ok = ok & met
-        if i < lens.count and i not in lens.live:
-            continue
-        sense = int(lens.senses[i])
-        if begun:
-            ok = ok & (sense * (hit - p)[2] >= 0)
-        if i < lens.count:
-            ratio = index[i] / index[i + 1]
-            d, bent = _bend(d, normal, ratio, sense, lens.mirrors[i])
-            ok = ok & bent
-        point, direction, begun = hits[-1], axes @ d, True
-    return jnp.stack(hits), ok
+    forms = sorted(set(lens.forms))
+    branches = [partial(_intersect, form=form) for form in forms]
+
+    def cross(ray, row):
+        point, direction, begun, ok = ray
+        p, d = row.axes.T @ (point - row.origin), row.axes.T @ direction
+        hit, normal, met = jax.lax.switch(row.form, branches, p, d, row.shape)
+        ahead = ~begun | (row.sense * (hit - p)[2] >= 0)
+        bent, whole = _bend(d, normal, row)
+        hit = row.axes @ hit + row.origin
+        behind = jnp.where(row.live, hit, point), jnp.where(row.live, row.axes @ bent, direction)
+        return (*behind, begun | row.live, ok & met & (~row.live | (ahead & whole))), hit
+
+    start = point, direction, jnp.array(False), jnp.array(True)
+    wavelength = jnp.asarray(wavelength, point.dtype)
+    (*_, ok), hits = jax.lax.scan(cross, start, _rows(lens, wavelength, forms))
+    return hits, ok
 
 
 def launch_paraxial(
