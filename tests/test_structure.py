@@ -99,11 +99,6 @@ def test_importing_the_package_draws_nothing_in():
     assert not {"matplotlib", "skimage", "experiments"} & set(loaded.stdout.split())
 
 
-def test_every_public_name_exists_and_is_listed_once():
-    assert sorted(set(drt_jax.__all__)) == sorted(drt_jax.__all__)
-    assert all(hasattr(drt_jax, name) for name in drt_jax.__all__)
-
-
 @pytest.mark.parametrize("path", OURS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_nothing_grows_too_large(path):
     text = path.read_text()

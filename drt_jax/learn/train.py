@@ -181,10 +181,9 @@ def fit(
     scenes: uint8 (B, P, P, C), a batch for each step.
     noise: standard deviation, of values from 0 to 1.
     first, last: the steps `first` to `last` - 1 are run.
-    every: so many steps, and at the end, report(start, metrics, state) is called with the metrics
-        of the steps since `start` stacked on the first axis. Between reports nothing waits for
-        the device.
-    report: see there.
+    every, report: after so many steps, and at the end, report(start, metrics, state) is called
+        with the metrics since `start` stacked on the first axis; between, nothing waits for the
+        device.
     stopped: asked after each step whether to end early, with a report.
     """
     strength = np.float32(noise)
@@ -211,19 +210,16 @@ def evaluate(
     seed: int,
     batch: int = 32,
 ) -> dict[str, float]:
-    """Image quality over patches.
+    """Image quality over patches, by scikit-image, for values from 0 to 1, not clipped.
 
     imager: as `make_imager` returns it.
     parameters: of its optics and network.
-    patches: uint8 (N, P, P, C).
+    patches: uint8 (N, P, P, C), imaged `batch` at a time.
     distance: of the object, mm.
-    noise: standard deviation, of values from 0 to 1.
-    seed: of the noise.
-    batch: patches that are imaged at a time.
+    noise, seed: standard deviation, and what it is drawn from.
 
-    mae and rmse over all values, psnr (dB) and ssim as means over the patches, of the
-    restored images; the same with the prefix sensor_ for the images before the network.
-    Metrics by scikit-image, for values from 0 to 1; images are not clipped.
+    mae and rmse over all values, psnr (dB) and ssim as means over the patches, of the restored
+    images; the same with the prefix sensor_ for the images before the network.
     """
     rows: list[dict[str, float]] = []
     for start in range(0, len(patches), batch):

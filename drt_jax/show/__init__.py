@@ -8,29 +8,14 @@ figure.savefig("lens.png")
 """
 
 from .figures import (
-    by_family,
-    convergence,
-    error_curves,
-    growth,
-    kernels,
-    new,
-    patch_grid,
-    programs,
-    sigma_over_depth,
+    by_family as by_family,
+    convergence as convergence,
+    error_curves as error_curves,
+    growth as growth,
+    kernels as kernels,
+    new as new,
+    patch_grid as patch_grid,
+    programs as programs,
+    sigma_over_depth as sigma_over_depth,
 )
-from .layout import Drawing, draw, lens_drawing
-
-__all__ = [
-    "Drawing",
-    "by_family",
-    "convergence",
-    "draw",
-    "error_curves",
-    "growth",
-    "kernels",
-    "lens_drawing",
-    "new",
-    "patch_grid",
-    "programs",
-    "sigma_over_depth",
-]
+from .layout import Drawing as Drawing, draw as draw, lens_drawing as lens_drawing
