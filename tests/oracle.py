@@ -226,11 +226,12 @@ def _cross(form, p, d, shape):
         s = s + (z - q[2]) / (d[2] - zx * d[0] - zy * d[1])
     q = [a + b * s for a, b in zip(p, d)]
     z, zx, zy = surface(form, q[0], q[1], *shape)
-    c, k, a = shape
+    z_miss, (c, k, a) = np.real(z - q[2]), shape
     real = [np.real(v) for v in (q[0], q[1], c, k)]
     met = _rim(form, *real, [np.real(v) for v in a]) > RIM
-    # A ray that misses ends anywhere, or circles.
-    met &= np.abs(np.real(z - q[2])) < 1e-10 * (1 + np.abs(np.real(s)))
+    # A ray that misses ends anywhere, or circles, or meets the formula off the real numbers.
+    small = 1e-10 * (1 + np.abs(np.real(s)))
+    met &= (np.abs(z_miss) < small) & (np.abs(np.imag(s)) < small)
     met &= np.real(d[2] - zx * d[0] - zy * d[1]) * np.real(d[2]) > 0
     return [q[0], q[1], z], (zx, zy), s, met
 
@@ -258,6 +259,7 @@ def _from_source(point, v, tangent):
     return top / (np.sqrt(_dot(first, first)) + np.sqrt(_dot(source, source)))
 
 
+@np.errstate(all="ignore")  # of rays that are not good
 def trace(scene, x, y, stop_only=False):
     """Rays through the points (x, y, 0) mm, (..., W, Q), to a `Trace`.
 
@@ -313,6 +315,7 @@ def trace(scene, x, y, stop_only=False):
     return Trace(own_hits, hits, path, good)
 
 
+@np.errstate(all="ignore")
 def reach(scene, pupil):
     """Where rays (..., W, Q) through the stop points `pupil` (2, Q) enter; the 2 x 2 inverse of
     how the stop point follows; and whether the last Newton step was rounding. The scene is real.
@@ -323,7 +326,7 @@ def reach(scene, pupil):
     x, y = (np.broadcast_to(0.3 * radius * p, shape) for p in pupil)
     for part in (0.3, 0.6, 0.8, 0.9, 1.0):
         eased = scene.replace(field=part * scene.values["field"])
-        for _ in range(40):
+        for _ in range(30 if part == 1 else 8):
             by_x = trace(eased, x + 1j * STEP, y, stop_only=True)[-1]
             by_y = trace(eased, x, y + 1j * STEP, stop_only=True)[-1]
             miss = [np.real(by_x[j]) - part * radius * pupil[j] for j in (0, 1)]

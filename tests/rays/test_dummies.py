@@ -1,0 +1,96 @@
+"""Surfaces that bend no light are crossed by the straight ray, and every crossing is checked."""
+
+import numpy as np
+import pytest
+
+from drt_jax import Status, load_lens, trace_rays
+
+from .. import oracle
+from .traced import WAVELENGTHS, assert_same_rays, hexapolar, truth
+
+POINTS = hexapolar(3)
+STOP = {"radius": "inf", "thickness": 3, "semi_diameter": 4, "stop": True}
+PLATE = [
+    {"radius": -500, "thickness": 4, "glass": "N-BK7"},
+    {"radius": -300, "thickness": 20},
+]
+
+
+def before_the_stop(radius, semi_diameter):
+    """A plate behind a stop, and 12 mm before that a dummy sphere."""
+    dummy = {"radius": radius, "thickness": 12, "semi_diameter": semi_diameter}
+    return load_lens({"surfaces": [dummy, STOP, *PLATE]})
+
+
+def crossing(radius, points, directions):
+    """Where lines (Q, 3), (Q, 3) cross the half of the sphere about (0, 0, `radius`) that holds
+    the origin, from the side where its vertex plane lies in front; and whether they do."""
+    offset = points - [0, 0, radius]
+    along = np.sum(offset * directions, axis=1)
+    square = along**2 - np.sum(offset**2, axis=1) + radius**2
+    root = np.sqrt(np.maximum(square, 0))
+    s = -along - np.sign(radius) * np.sign(directions[:, 2]) * root
+    hit = points + s[:, None] * directions
+    # The package draws a sphere to where its normal leans by acos(0.01).
+    return hit, (square > 0) & (1 - hit[:, 2] / radius > 0.01)
+
+
+@pytest.mark.parametrize("field", [0.0, 0.3, 0.6, 0.8])
+@pytest.mark.parametrize("radius, semi_diameter", [(10.0, 9.9), (10.0, 8.5), (-10.0, 9.9)])
+def test_steep_dummy_before_the_stop(radius, semi_diameter, field):
+    """The truth is where a line meets a sphere: OK inside the aperture, CLIPPED outside, MISSED
+    beside the sphere; points on the ray to 1e-10 mm."""
+    lens = before_the_stop(radius, semi_diameter)
+    rays = trace_rays(lens, field, np.inf, WAVELENGTHS, POINTS)
+    stop = np.concatenate([4 * POINTS, np.full((len(POINTS), 1), 12.0)], axis=1)
+    hit, meets = crossing(radius, stop, np.tile([0, np.sin(field), np.cos(field)], (len(stop), 1)))
+    inside = np.hypot(*hit[:, :2].T) <= semi_diameter
+    wanted = np.where(meets, np.where(inside, Status.OK, Status.CLIPPED), Status.MISSED)
+    np.testing.assert_array_equal(rays.status[0], wanted)
+    points = np.asarray(rays.points[0])
+    np.testing.assert_allclose(points[meets, 0], hit[meets], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(points[meets, 1], stop[meets], rtol=0, atol=1e-11)
+    assert np.all(points[~meets] == 0)
+
+
+def test_the_rays_behind_do_not_know_of_a_dummy():
+    """Without the dummy: the same points, path and directions to 1e-12."""
+    with_it = trace_rays(before_the_stop(10.0, 9.9), 0.6, np.inf, WAVELENGTHS, POINTS)
+    lens = load_lens({"surfaces": [STOP, *PLATE]})
+    without = trace_rays(lens, 0.6, np.inf, WAVELENGTHS, POINTS)
+    shift = np.array([0, 0, 12.0])
+    np.testing.assert_allclose(with_it.points[:, :, 1:], without.points + shift, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(with_it.directions[:, :, 1:], without.directions, atol=1e-12)
+    # The path is counted from the plane wave through the first vertex.
+    path = with_it.path - 12 * np.cos(0.6)
+    np.testing.assert_allclose(path, without.path, rtol=0, atol=1e-12)
+
+
+# Behind, inside and in front of what bends light; aspheric, tilted and decentred; poked through.
+SCATTERED = [
+    {"radius": 9, "conic": -0.4, "thickness": 1, "semi_diameter": 7, "decentre": [0.4, -0.3]},
+    {"radius": 40, "thickness": 1, "glass": "N-BK7"},
+    {"radius": -8, "coefficients": {4: 1e-3}, "thickness": 3, "glass": "N-BK7", "tilt": [4, 9, 1]},
+    {"radius": -60, "thickness": 2},
+    {"radius": 12, "thickness": -1.5, "tilt": [-9, 3, 2], "semi_diameter": 4, "stop": True},
+    {"radius": -7, "conic": 0.3, "thickness": 2.5, "semi_diameter": 5},
+    {"radius": -30, "coefficients": {4: 1e-5}, "thickness": 3, "glass": "SF10"},
+    {"radius": 80, "thickness": 3},
+    {"radius": -6, "thickness": 20, "decentre": [0.0, 1.0]},
+]
+
+
+@pytest.mark.parametrize("field", [[0.0, 0.0], [0.1, 0.3], [-0.2, -0.45]])
+def test_scattered_dummies_and_a_curved_stop(field):
+    """Every crossing as the oracle has it, to 1e-10 mm; and what misses one is MISSED."""
+    lens = load_lens({"surfaces": SCATTERED})
+    scene = oracle.Scene.of(lens, field, 200.0, WAVELENGTHS)
+    rays = trace_rays(lens, field, 200.0, WAVELENGTHS, POINTS)
+    wanted = truth(scene, POINTS)
+    edge = np.append(lens.semi_diameter[:-1], np.inf)
+    edge[lens.stop] = np.inf
+    clipped = wanted.exists & np.any(wanted.heights > edge, axis=-1)
+    np.testing.assert_array_equal(rays.status == Status.CLIPPED, clipped)
+    missed = ~wanted.exists
+    assert np.all(np.isin(rays.status[missed], (Status.MISSED, Status.TIR)))
+    assert_same_rays(rays, wanted._replace(exists=wanted.exists & ~clipped), 1e-10)
