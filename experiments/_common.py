@@ -63,13 +63,14 @@ def read_results(folder: pathlib.Path) -> dict[str, Any]:
     return results
 
 
-def remembered(run: Run, job: str, keys: Iterable[str], measure: Callable[[], dict]) -> dict:
-    """The arrays, by key, that `measure` returns; from the checkpoint if there is one."""
-    done, found = run.load(job, dict.fromkeys(keys, np.zeros(0)), (job,))
-    if not done:
-        found = measure()
-        run.save(job, 1, found)
-    return {key: np.asarray(value) for key, value in found.items()}
+def remembered(run: Run, job: str, measure: Callable[[], Any]) -> Any:
+    """What `measure` returns, written as JSON; from the checkpoint of the job if there is one."""
+    done, text = run.load(job, np.zeros(0, np.uint8), (job,))
+    if done:
+        return json.loads(np.asarray(text).tobytes())
+    found = measure()
+    run.save(job, 1, np.frombuffer(json.dumps(found).encode(), np.uint8))
+    return found
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

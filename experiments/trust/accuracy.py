@@ -9,36 +9,31 @@ relative_error: of the RMS spot radius sigma, the worst colour. centroid_error: 
 the centroids over sigma, the worst colour. gradient_error: of the derivatives of sigma (mean of
 the colours) by all curvatures, and by all thicknesses and the sensor position: the norm of the
 difference over that of the reference, the worse of the two groups. seconds: median time of a
-compiled call; gradient_seconds: of one with its gradient in reverse mode.
+compiled call; gradient_seconds: of one with its gradients in reverse mode.
 """
 
 import dataclasses
 import math
 import pathlib
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import Lens, pupil, show
+from drt_jax import Lens, PupilRule, pupil, show
 from drt_jax.runs.folder import Run
 
 from . import _command, _common
-from ._methods import measured, padded, patterns, programs, rays_of
-from ._reference import Moments, reference
+from ._reference import Moments, flatten, reference
 
 _QUADRATURE = "quadrature"
-_ERRORS = ("relative_error", "centroid_error", "gradient_error", "centroid_gradient_error")
-_COLUMNS = ("rays", *_ERRORS, "seconds", "gradient_seconds")
-_PROMISE = ("order", "rays", "relative_error")
-_TRUTH = ("sigma_mm", "centroid_mm", "reference_error", "reference_gradient_error")
+_COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")
 _PANELS = ("on axis", "off axis", "vignetted", "float32")
-# Patterns are filled up to these sizes where only errors count, to be compiled once each.
-_SHAPES = (1024, 16384)
 # What the table shows: the default tolerance, and patterns of so many rays.
 _DEFAULT, _RANDOM, _MANY = 1e-6, 256, 16384
 
@@ -99,10 +94,15 @@ class AccuracyScene:
             words.append(f"clear {self.front_mm:g} {self.rear_mm:g} mm")
         return ", ".join([*words, *(["float32"] if self.dtype == "float32" else [])])
 
-    def rule(self, order: int) -> drt_jax.PupilRule:
+    def rule(self, order: int) -> PupilRule:
         """The rule of an order that `converged_rule` would try."""
-        kind = pupil.Clipped if self.vignetted else pupil.Gauss
+        kind = drt_jax.Clipped if self.vignetted else drt_jax.Gauss
         return kind(order, "meridian" if self.axial else "half")
+
+    @property
+    def about(self) -> dict[str, str]:
+        """What the rows of results.json say about the scene."""
+        return {"scene": self.label, "panel": self.panel, "dtype": self.dtype}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,62 +133,93 @@ class Config:
         _common.require(min(every) >= 1 and max(every) <= 40, "orders: expected 1 to 40")
         _common.require(self.seeds >= 1, "seeds: must be at least 1")
 
-    def orders_of(self, scene: AccuracyScene) -> tuple[int, ...]:
-        """The orders of the quadrature that a scene is measured with."""
-        return scene.orders or self.orders
 
-    def sizes_of(self, scene: AccuracyScene) -> list[int]:
-        """The nominal sizes of the patterns that a scene is measured with."""
-        return [rays for rays in self.rays if rays <= scene.most_rays]
+@jax.jit
+def spot(*arguments: Any) -> tuple[Array, Array]:
+    """sigmas (W,) and centroids (W, 2) of the colours in mm; the arguments of psf_moments, with a
+    rule."""
+    *scene, rule = arguments
+    mean, covariance = drt_jax.psf_moments(*scene, rule=rule)
+    return jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]), mean
 
 
-def errors(truth: list[Moments], colours: tuple, gradients: list, surfaces: int) -> list[float]:
-    """The four errors of `_ERRORS`; NaN for what was not computed or has no scale."""
-    sigma = np.array([moments.sigma for moments in truth])
+@jax.jit
+def spot_and_gradients(lens: Lens, *rest: Any) -> tuple[tuple[Array, Array], Array]:
+    """`spot`, and by reverse mode the derivatives (2, P) of the mean over the colours of sigma and
+    of the height of the centroid."""
+
+    def means(lens):
+        sigma, mean = found = spot(lens, *rest)
+        return jnp.stack([jnp.mean(sigma), jnp.mean(mean[:, 1])]), found
+
+    _, back, found = jax.vjp(means, lens, has_aux=True)
+    rows = jnp.eye(2, dtype=lens.sensor.dtype)
+    return found, jax.vmap(lambda row: flatten(back(row)[0]))(rows)
+
+
+def patterns(rays: int, seeds: int, dtype: Any) -> dict[str, list[PupilRule]]:
+    """What other programs sum over: at most `rays` points by each method, filled up with weightless
+    ones, so that all of one size share a program; of `random`, several."""
+    sides = range(2 * math.isqrt(rays), 0, -1)
+    side = next(n for n in sides if pupil.square_grid(n)[1].size <= rays)
+    rings = int((math.sqrt(12 * rays - 3) - 3) / 6)
+
+    def padded(pattern):
+        points, weights = pattern
+        missing = rays - weights.size
+        points, weights = np.pad(points, ((0, 0), (0, missing))), np.pad(weights, (0, missing))
+        return drt_jax.Pattern(points.astype(dtype), weights.astype(dtype))
+
+    return {
+        "random": [padded(pupil.random_disc(rays, seed)) for seed in range(seeds)],
+        "square grid": [padded(pupil.square_grid(side))],
+        "hexapolar": [padded(pupil.hexapolar(rings))],
+        "Sobol": [padded(pupil.sobol_disc(rays))],
+    }
+
+
+def spot_errors(truth: list[Moments], sigma: Array, mean: Array) -> tuple[float, float]:
+    """relative_error and centroid_error."""
+    exact = np.array([moments.sigma for moments in truth])
     centroid = np.array([moments.centroid for moments in truth])
-    got, mean = (np.asarray(a, float) for a in colours)
-    shift = np.hypot(mean[:, 0], mean[:, 1] - centroid) / sigma
-    values = [float(np.max(np.abs(got / sigma - 1))), float(np.max(shift))]
+    x, y = np.asarray(mean, float).T
+    shift = np.hypot(x, y - centroid) / exact
+    return float(np.max(np.abs(np.asarray(sigma, float) / exact - 1))), float(np.max(shift))
+
+
+def gradient_error(exact: np.ndarray, slopes: np.ndarray, surfaces: int) -> float:
+    """Norm of the error over that of the truth (P,), the worse of both groups; NaN if that is 0."""
+    groups = slice(0, surfaces), slice(surfaces, None)
+    norms = [(np.linalg.norm(slopes[g] - exact[g]), np.linalg.norm(exact[g])) for g in groups]
+    return max((wrong / size for wrong, size in norms if size), default=math.nan)
+
+
+def measured(arguments: tuple, truth: list[Moments], rules: Sequence[PupilRule]) -> dict:
+    """Columns of `curves` for rules of a kind and size: the median error, the time of the first."""
     exact = np.mean([moments.gradient for moments in truth], axis=0)
-    for k in range(2):
-        if k >= len(gradients) or (k == 1 and not np.any(centroid)):
-            values.append(math.nan)
-            continue
-        groups = slice(0, surfaces), slice(surfaces, None)
-        wrong = np.asarray(gradients[k], float) - exact[k]
-        norms = [np.linalg.norm(wrong[g]) / np.linalg.norm(exact[k][g]) for g in groups]
-        values.append(float(np.max(norms)))
-    return values
+    rows = []
+    for rule in rules:
+        found, slopes = spot_and_gradients(*arguments, rule)
+        pairs = zip(exact, np.asarray(slopes, float))
+        wrong = [gradient_error(a, b, arguments[0].count) for a, b in pairs]
+        rows.append([*spot_errors(truth, *found), *wrong])
+    names = ("relative_error", "centroid_error", "gradient_error", "centroid_gradient_error")
+    values = [None if math.isnan(value) else float(value) for value in np.median(rows, axis=0)]
+    first = rules[0]
+    calls = [lambda: spot(*arguments, first), lambda: spot_and_gradients(*arguments, first)]
+    seconds = _common.medians(calls, 2)
+    rays = {"rays": count_rays(arguments, first), **dict(zip(names, values))}
+    return rays | dict(zip(("seconds", "gradient_seconds"), seconds))
 
 
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """A scene made ready.
-
-    scene: what it is. lens: in the precision of the scene. arguments: field and distance, arrays.
-    wavelengths: um. truth: of each colour.
-    """
-
-    scene: AccuracyScene
-    lens: Lens
-    arguments: tuple
-    wavelengths: tuple[float, ...]
-    truth: list[Moments]
-
-    def measure(self, gradient: Callable, pattern: tuple = ()) -> list[float]:
-        """Errors (4,) of one method, a function of `programs`."""
-        rows = np.eye(1 if self.scene.axial else 2, 2)
-        rows = jnp.asarray(rows, self.lens.sensor.dtype)
-        found = [gradient(self.lens, *self.arguments, *pattern, row) for row in rows]
-        return errors(self.truth, found[0][0], [slope for _, slope in found], self.lens.count)
-
-    def seconds(self, program: Callable, *rest: Any) -> float:
-        """Median time of a call of a compiled program."""
-        return _common.medians([lambda: program(self.lens, *self.arguments, *rest)], 2)[0]
+def count_rays(arguments: tuple, rule: PupilRule) -> int:
+    """How many rays of the first colour carry weight."""
+    weights = drt_jax.pupil_points(*arguments, rule)[1]
+    return int(np.count_nonzero(np.asarray(weights)[0]))
 
 
-def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> Setting:
-    """Read the lens, focus it on axis, clip it, and integrate the reference."""
+def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple, list[Moments]]:
+    """Arguments of psf_moments, the lens focused on axis and clipped; and the reference."""
     lens = drt_jax.load_lens(scene.lens)
     distance, field = 1e3 * scene.distance_m, math.radians(scene.field_deg)
     spread = drt_jax.focus_moments(lens, 0.0, distance, wavelengths, 1e-9).spread
@@ -200,64 +231,38 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> Setting:
     lens = dataclasses.replace(lens, sensor=jnp.asarray(sensor, semi.dtype), semi_diameter=semi)
     truth = reference(lens, field, distance, wavelengths)
     if scene.axial:  # by symmetry; what the integral leaves is rounding
-        truth = [moments._replace(centroid=0.0) for moments in truth]
-    dtype = jnp.dtype(scene.dtype)
-    lens = jax.tree.map(lambda a: a.astype(dtype), lens)
-    arguments = jnp.asarray(field, dtype), jnp.asarray(distance, dtype)
-    return Setting(scene, lens, arguments, wavelengths, truth)
+        flat = np.array([[1.0], [0.0]])
+        truth = [m._replace(centroid=0.0, gradient=flat * m.gradient) for m in truth]
+    arguments = lens, field, distance, np.array(wavelengths)
+    return jax.tree.map(lambda a: jnp.asarray(a, scene.dtype), arguments), truth
 
 
-def rule_row(setting: Setting, order: int) -> list[float]:
-    """A row of `_COLUMNS` for the quadrature of an order."""
-    scene, row = setting.scene, jnp.asarray([1.0, 0.0], setting.lens.sensor.dtype)
-    rule = scene.rule(order)
-    value, gradient = programs(rule, scene.axial, setting.wavelengths)
-    rays = rays_of(rule, setting.lens, *setting.arguments, setting.wavelengths)
-    found = setting.measure(gradient)
-    return [rays, *found, setting.seconds(value), setting.seconds(gradient, row)]
-
-
-def pattern_rows(setting: Setting, size: int, config: Config) -> list[list[float]]:
-    """Rows of `_COLUMNS` for the patterns of a nominal size, on which alone time depends."""
-    scene, dtype = setting.scene, setting.lens.sensor.dtype
-    value, gradient = programs(None, scene.axial, setting.wavelengths)
-    choices = patterns(size, config.seeds)
-    seconds = setting.seconds(value, *padded(*choices["random"][0], size, dtype))
-    shapes = sorted({n for n in config.rays if n in _SHAPES} | {max(config.rays)})
-    shape = next(n for n in shapes if n >= size)
-    rows = []
-    for some in choices.values():
-        found = [setting.measure(gradient, padded(*pattern, shape, dtype)) for pattern in some]
-        rows.append([some[0][1].size, *np.median(found, axis=0), seconds, math.nan])
-    return rows
-
-
-def tolerances(config: Config, setting: Setting) -> np.ndarray:
-    """(T, 3): of each requested tolerance the order, the rays a colour and the error of sigma."""
-    rows = []
-    field = 0.0 if setting.scene.axial else setting.arguments[0]
-    arguments = setting.lens, field, setting.arguments[1], config.wavelengths_um
+def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[dict]]:
+    """Rows of results.json for one scene; logs its curves."""
+    arguments, truth = prepare(scene, config.wavelengths_um)
+    kinds = [(_QUADRATURE, n, [scene.rule(n)]) for n in scene.orders or config.orders]
+    for size in (n for n in config.rays if n <= scene.most_rays):
+        found = patterns(size, config.seeds, scene.dtype)
+        kinds += [(name, size, rules) for name, rules in found.items()]
+    curves = [
+        scene.about | {"method": name, "size": size} | measured(arguments, truth, rules)
+        for name, size, rules in kinds
+    ]
+    run.log(scene.label, 0, {c: np.array([row[c] for row in curves], float) for c in _COLUMNS})
+    # A rule follows from known numbers: on axis, those of the field.
+    known = arguments[0], 0.0 if scene.axial else arguments[1], *arguments[2:]
+    kept = []
     for tolerance in config.tolerances:
-        rule = drt_jax.converged_rule(*arguments, tolerance)
-        colours = measured(*drt_jax.psf_moments(*arguments, rule=rule))[1]
-        error = errors(setting.truth, colours, [], setting.lens.count)[0]
-        rows.append([rule.order, rays_of(rule, *arguments), error])
-    return np.array(rows, float)
-
-
-def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, np.ndarray]:
-    """Everything about one scene, rows as in results.json; logs its curves."""
-    setting = prepare(scene, config.wavelengths_um)
-    curves = [rule_row(setting, order) for order in config.orders_of(scene)]
-    for size in config.sizes_of(scene):
-        curves += pattern_rows(setting, size, config)
-    run.log(scene.label, 0, dict(zip(_COLUMNS, np.array(curves, float).T)))
-    truth = [(m.sigma, m.centroid, m.error, m.gradient_error) for m in setting.truth]
-    return {
-        "curves": np.array(curves, float),
-        "tolerances": tolerances(config, setting),
-        "truth": np.array(truth),
-    }
+        rule = drt_jax.converged_rule(*known, tolerance)
+        error = spot_errors(truth, *spot(*arguments, rule))[0]
+        row = {"tolerance": tolerance, "order": rule.order, "rays": count_rays(arguments, rule)}
+        kept.append(scene.about | row | {"relative_error": error})
+    exact = []
+    for colour, m in zip(config.wavelengths_um, truth):
+        row = {"wavelength_um": colour, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
+        errors = {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
+        exact.append(scene.about | row | errors)
+    return {"curves": curves, "tolerances": kept, "truth": exact}
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -270,25 +275,10 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         kind, before = (scene.lens, scene.dtype, scene.vignetted), kind
         if kind != before:  # thousands of kernels exhaust what a process may map
             jax.clear_caches()
-        found = _common.remembered(run, scene.label, results, lambda: measure(config, scene, run))
-        methods = [(_QUADRATURE, order) for order in config.orders_of(scene)]
-        methods += [(name, size) for size in config.sizes_of(scene) for name in patterns(16, 1)]
-        base = {"scene": scene.label, "panel": scene.panel, "dtype": scene.dtype}
-        for key, names, firsts in (
-            ("curves", _COLUMNS, [{"method": name, "size": size} for name, size in methods]),
-            ("tolerances", _PROMISE, [{"tolerance": t} for t in config.tolerances]),
-            ("truth", _TRUTH, [{"wavelength_um": w} for w in config.wavelengths_um]),
-        ):
-            for first, row in zip(firsts, found[key].tolist()):
-                results[key].append(base | first | dict(zip(names, map(plain, row))))
+        found = _common.remembered(run, scene.label, lambda: measure(config, scene, run))
+        for key, rows in found.items():
+            results[key] += rows
     return results | {"seconds": run.seconds}
-
-
-def plain(value: float) -> float | int | None:
-    """A number for results.json: whole ones as such, None for NaN."""
-    if math.isnan(value):
-        return None
-    return int(value) if value.is_integer() and value else value
 
 
 def middle(rows: list[dict], key: str) -> float:
@@ -357,7 +347,8 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
             count = len({r["scene"] for r in here})
             ax.set_title(f"{panel}, {count} scene{'s' * (count != 1)}", fontsize=10)
         figure.savefig(figures / f"{name}.png")
-    error, slope = (max(t[key] for t in results["truth"]) for key in _TRUTH[2:])
+    keys = "reference_error", "reference_gradient_error"
+    error, slope = (max(row[key] for row in results["truth"]) for key in keys)
     truth = f"errors of the reference, at most: values {error:.0e}, gradients {slope:.0e}"
     return "\n\n".join([*tables(results).values(), truth])
 

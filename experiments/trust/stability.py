@@ -19,7 +19,7 @@ from drt_jax.runs.folder import Run
 
 from . import _command, _common
 from ._families import FAMILIES, draw
-from ._survey import KEYS, survey
+from ._survey import survey
 
 # Of each family in metrics.csv, and summed over all in results.json.
 _COLUMNS = (
@@ -103,33 +103,34 @@ def totals(rows: list[dict]) -> dict[str, float]:
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Draw and survey the families one by one."""
-    rows, samples, known = [], [], set()
+    found, known = [], set()
     bar = tqdm(config.families or FAMILIES, unit="family", dynamic_ncols=True)
     for name in bar:
         bar.set_description(name)
-
-        def measure(name: str = name) -> dict[str, np.ndarray]:
-            batches = list(draw(name, config.scenes, config.seed))
-            known.update((jax.tree.structure(b), b.distance.dtype) for b in batches)
-            if len(known) > _STRUCTURES:
-                known.clear()
-                jax.clear_caches()
-            found = joined([survey(scenes) for scenes in batches])
-            row = row_of(name, found)
-            run.log(name, 0, {key: np.array([float(row[key])]) for key in _COLUMNS})
-            return found
-
-        found = _common.remembered(run, name, KEYS, measure)
-        rows.append(row_of(name, found))
-        samples.append((found["steps"], found["float32_error"]))
-    steps, errors = (np.concatenate(parts) for parts in zip(*samples))
+        found.append(_common.remembered(run, name, lambda: measure(config, name, run, known)))
+    rows = [family["row"] for family in found]
+    steps, errors = (sum((family[k] for family in found), []) for k in ("steps", "errors"))
     return {
         "families": rows,
         "total": totals(rows),
         "seconds": run.seconds,
-        "newton_steps": steps.astype(np.int32),
-        "float32_error_mm": errors.astype(np.float32),
+        "newton_steps": np.array(steps, np.int32),
+        "float32_error_mm": np.array(errors, np.float32),
     }
+
+
+def measure(config: Config, name: str, run: Run, known: set) -> dict[str, Any]:
+    """The row of a family, and samples of the steps of its scenes and of errors in float32 (mm);
+    logs the row. `known`: structures whose programs are kept."""
+    batches = list(draw(name, config.scenes, config.seed))
+    known.update((jax.tree.structure(batch), batch.distance.dtype) for batch in batches)
+    if len(known) > _STRUCTURES:
+        known.clear()
+        jax.clear_caches()
+    found = joined([survey(scenes) for scenes in batches])
+    row = row_of(name, found)
+    run.log(name, 0, {key: np.array([float(row[key])]) for key in _COLUMNS})
+    return {"row": row, "steps": found["steps"].tolist(), "errors": found["float32_error"].tolist()}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
