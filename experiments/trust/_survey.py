@@ -167,7 +167,7 @@ def _search(lens, field, distance, pupil):
     reach = 3 * height + 1.5 * slope * (jnp.abs(lens.vertices[stop]) + height)
     side = jnp.linspace(-1, 1, _GRID) * reach
     grid = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2)
-    there, (_, ok) = jax.vmap(crossing)(grid)
+    there, ok = jax.vmap(crossing)(grid)
 
     def found(target):
         far = jnp.where(ok, jnp.linalg.norm(there - target, axis=1), jnp.inf)
