@@ -1,6 +1,10 @@
-"""The closed-form system against automatic differentiation, its solves against dense ones."""
+"""The Fermat system against automatic differentiation and geometry, `linear` against dense solves.
+
+For a stop that bends no light and one that does, tilted systems, one component and two.
+"""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,121 +12,228 @@ import numpy as np
 import pytest
 
 from drt_jax import load_lens
-from drt_jax.rays import fermat
-from drt_jax.rays.fermat import Blocks, System
+from drt_jax.lens.surface import Shape, sag_derivatives
+from drt_jax.rays import fermat, linear
+from drt_jax.rays.system import dot
 
-from .conftest import LENSES, RGB
+from .systems import COLOURS, DISTANCE, meridional, rough_path, system_with
+
+CASES = {
+    "meridional": ("between", 1, False),
+    "meridional, live stop": ("live", 1, False),
+    "centred": ("between", 2, False),
+    "tilted, stop in front": ("in front", 2, True),
+    "tilted, live stop": ("live", 2, True),
+}
+RAYS = 3
+ALL = jnp.ones((len(COLOURS), RAYS), bool)
 
 
-def system_of(lens, dim, tangent, vergence, rays=3):
-    """A system, and hits near but not at a stationary path."""
-    extend = lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])])  # noqa: E731
-    generator = np.random.default_rng(3)
-    stop = generator.uniform(-0.5, 0.5, (dim, rays)) * float(lens.semi_diameter[lens.stop])
-    system = System(
-        vertex=jnp.append(lens.vertices, lens.sensor),
-        curvature=extend(lens.curvature),
-        conic=extend(lens.conic) + 0.1,
-        coefficients=jnp.full((2, len(lens.glasses)), 1e-6),
-        index=lens.index(jnp.array(RGB)),
-        source=jnp.array([0.0] * (dim - 1) + [-tangent, -1.0]),
-        vergence=jnp.array(vergence),
-        target=jnp.asarray(stop),
-        stop=lens.stop,
-        forms=(*lens.forms, "asphere"),
-        mirrors=lens.mirrors,
+def equations(hits, system):
+    """F and the label."""
+    return fermat.residual(fermat.geometry(hits, system), system), fermat.label(hits, system)
+
+
+class Answers(NamedTuple):
+    """path, gradient: of a bundle. equations: F and the label. columns: their Jacobian, a leading
+    axis (R D), the derivatives by one component of one hit, of all rays at once. solved, pulled:
+    what `linear` makes of forces and a shift, and its transpose of `other`."""
+
+    path: jax.Array
+    gradient: tuple
+    equations: tuple
+    columns: tuple
+    solved: tuple
+    pulled: tuple
+
+
+@jax.jit
+def answers(system, hits, good, forces, shift, other):
+    """Everything at once: one program for a kind of system."""
+    gradient = jax.grad(lambda w: jnp.sum(fermat.optical_path(w, system)))(hits)
+    rows, dim = len(system.forms), len(hits)
+    units = jnp.eye(rows * dim).reshape(-1, dim, rows, 1, 1)
+    units = jnp.broadcast_to(units, (*units.shape[:3], *hits[0].shape[1:]))
+    both, push = jax.linearize(lambda w: equations(w, system), hits)
+    columns = jax.vmap(push)(tuple(units[:, d] for d in range(dim)))
+    path = fermat.geometry(hits, system)
+    solved, pull_back = jax.vjp(
+        lambda *given: linear.solve(hits, path, system, good, *given), forces, shift
     )
-    hits = stop[:, None, None] * np.linspace(1.2, 0.3, len(lens.glasses))[:, None, None]
-    hits = hits + generator.normal(0, 0.02, (dim, len(lens.glasses), 3, rays))
-    return system, jnp.asarray(hits)
+    length = fermat.optical_path(hits, system)
+    return Answers(length, gradient, both, columns, solved, pull_back(other))
 
 
-CASES = [(name, dim, v) for name in LENSES for dim in (1, 2) for v in (0.0, 1 / 25000, 1 / 60)]
-
-residual = jax.jit(fermat.residual)
-optical_path = jax.jit(fermat.optical_path)
-hessian = jax.jit(lambda hits, system: fermat.hessian(fermat.geometry(hits, system), system))
-solve = jax.jit(fermat.solve, static_argnums=2)
-solve_transposed = jax.jit(fermat.solve_transposed, static_argnums=2)
-stationary = jax.jit(fermat.stationary)
-gradient = jax.jit(jax.grad(lambda hits, system: jnp.sum(fermat.optical_path(hits, system))))
+def given(hits):
+    """Random forces, shift and `other` for a bundle."""
+    generator = np.random.default_rng(0)
+    dim, shape = len(hits), hits[0].shape
+    shapes = (shape[0] - 1, *shape[1:]), shape[1:], shape
+    return tuple(tuple(jnp.asarray(generator.normal(size=(dim, *s)))) for s in shapes)
 
 
-@pytest.mark.parametrize("name, dim, vergence", CASES)
-def test_residual_is_the_gradient_of_the_path(name, dim, vergence):
-    system, hits = system_of(load_lens(name), dim, 0.2, vergence)
-    np.testing.assert_allclose(residual(hits, system), gradient(hits, system)[:, :-1], atol=2e-15)
+def flat(vector, rest=()):
+    """(W, Q, all components) of D arrays (R, W, Q) and D arrays (W, Q)."""
+    rows = [np.moveaxis(np.asarray(a), 0, -1) for a in vector]
+    return np.concatenate([*rows, *(np.asarray(a)[..., None] for a in rest)], axis=-1)
 
 
-@pytest.mark.parametrize("name, dim", [("double_gauss", 1), ("double_gauss", 2), ("singlet", 2)])
-def test_blocks_solve_and_transpose_against_the_dense_jacobian(name, dim):
-    lens = load_lens(name)
-    system, hits = system_of(lens, dim, 0.2, 1 / 500, rays=1)
-    system = dataclasses.replace(system, index=system.index[:, :1])
-    hits = hits[:, :, :1]
-    unknown = [i for i in range(hits.shape[1]) if i != lens.stop]
-    dense = jax.jit(jax.jacobian(fermat.residual))(hits, system)[:, :, 0, 0, :, :, 0, 0]
-    dense = dense[:, :, :, jnp.array(unknown)].reshape(dim * (hits.shape[1] - 1), -1)
-    blocks = hessian(hits, system)
-
-    rhs = jnp.asarray(np.random.default_rng(0).normal(size=hits[:, :-1].shape))
-    x = solve(blocks, rhs, lens.stop)
-    assert jnp.all(x[:, lens.stop] == 0)
-    wanted = jnp.linalg.solve(dense, rhs.ravel())
-    scale = float(jnp.max(jnp.abs(wanted)))
-    np.testing.assert_allclose(x[:, jnp.array(unknown)].ravel(), wanted, atol=1e-12 * scale)
-
-    rhs = jnp.asarray(np.random.default_rng(1).normal(size=hits.shape))
-    y = solve_transposed(blocks, rhs, lens.stop)
-    wanted = jnp.linalg.solve(dense.T, rhs[:, jnp.array(unknown)].ravel())
-    scale = float(jnp.max(jnp.abs(wanted)))
-    np.testing.assert_allclose(y.ravel(), wanted, atol=1e-12 * scale)
+@pytest.fixture(scope="module", params=CASES)
+def case(request):
+    """A system, a path through it that is no ray, and what is differentiated there."""
+    stop, dim, tilted = CASES[request.param]
+    system = system_with(stop, dim, tilted)
+    hits = rough_path(system, RAYS)
+    return system, hits, answers(system, hits, ALL, *given(hits))
 
 
-def test_solve_and_transpose_are_adjoint():
-    """<y, A^-1 x> = <A^-T y, x> for a bundle."""
-    lens = load_lens("double_gauss_addon")
-    system, hits = system_of(lens, 2, 0.1, 1 / 25000, rays=5)
-    blocks = hessian(hits, system)
-    generator = np.random.default_rng(2)
-    x = jnp.asarray(generator.normal(size=hits[:, :-1].shape))
-    y = jnp.asarray(generator.normal(size=hits.shape))
-    left = jnp.sum(y * solve(blocks, x, lens.stop))
-    right = jnp.sum(solve_transposed(blocks, y, lens.stop) * x)
+def placed_points(surface, w, sag):
+    """Points (..., 3) along the axes of the lens, from (..., 2) and (...) along the surface's."""
+    own = np.concatenate([w, sag[..., None]], axis=-1)
+    turned = own if surface.rotation is None else own @ np.asarray(surface.rotation).T
+    origin = np.zeros(2) if surface.offset is None else np.asarray(surface.offset)
+    return turned + np.append(origin, surface.vertex)
+
+
+def sag_of(surface, w):
+    shape = Shape(*(np.asarray(a) for a in surface.shape))
+    return np.asarray(sag_derivatives((w[..., 0], w[..., 1]), shape)[0])
+
+
+def wide(vector):
+    """(..., 2) of one or two components; one is y."""
+    x = [np.zeros_like(vector[0])] if len(vector) == 1 else []
+    return np.stack([*x, *map(np.asarray, vector)], axis=-1)
+
+
+def corners(system, hits):
+    """The hits (R, W, Q, 3) along the axes of the lens, and the object point (3,), in NumPy."""
+    rows = [jax.tree.map(lambda a, i=i: a[i], system.rows) for i in range(len(system.forms))]
+    w = wide(hits)
+    points = [placed_points(row, w[i], sag_of(row, w[i])) for i, row in enumerate(rows)]
+    source = np.asarray(system.source) / float(system.vergence)
+    return np.stack(points), np.append(np.zeros(3 - source.size), source)
+
+
+def test_residual_is_the_gradient_of_the_path(case):
+    """But for the component that belongs to the sensor: nothing is stationary there."""
+    _, _, all_of = case
+    for ours, wanted in zip(all_of.equations[0], all_of.gradient, strict=True):
+        np.testing.assert_allclose(ours, wanted[:-1], rtol=0, atol=4e-15)
+
+
+def test_path_and_label_against_geometry(case):
+    """Lengths summed up in NumPy, from the sphere round the object through the first vertex of the
+    lens; and a point of the stop on the line through the hits that enclose it."""
+    system, hits, all_of = case
+    path, (_, label) = all_of.path, all_of.equations
+    points, source = corners(system, hits)
+    whole = np.concatenate([np.broadcast_to(source, points[:1].shape), points])
+    lengths = np.linalg.norm(np.diff(whole, axis=0), axis=-1)
+    lengths[0] -= np.linalg.norm(source)
+    np.testing.assert_allclose(path, np.sum(system.index * lengths, axis=0), atol=1e-12)
+    if system.stop is None:
+        np.testing.assert_array_equal(label, [h[system.before] for h in hits])
+        return
+    crossing = placed_points(system.stop, wide(label), sag_of(system.stop, wide(label)))
+    one, other = whole[system.before], whole[system.before + 1]
+    along = (other - one) / np.linalg.norm(other - one, axis=-1, keepdims=True)
+    np.testing.assert_allclose(np.cross(crossing - other, along), 0, atol=1e-12)
+
+
+def test_linear_solves_the_dense_jacobian_and_its_transpose(case):
+    """For random forces; and <y, A^-1 x> = <A^-T y, x>."""
+    _, hits, all_of = case
+    dense = np.moveaxis(flat_columns(all_of.columns), 0, -1)  # (W, Q, equations, unknowns)
+    forces, shift, other = given(hits)
+    value, pulled = all_of.solved, all_of.pulled
+    wanted = np.linalg.solve(dense, flat(forces, shift)[..., None])[..., 0]
+    size = np.max(np.abs(wanted))
+    np.testing.assert_allclose(flat(value), wanted, atol=1e-12 * size)
+    wanted = np.linalg.solve(np.swapaxes(dense, -1, -2), flat(other)[..., None])[..., 0]
+    size = np.max(np.abs(wanted))
+    np.testing.assert_allclose(flat(*pulled), wanted, atol=1e-12 * size)
+    left = sum(np.vdot(a, b) for a, b in zip(other, value, strict=True))
+    right = sum(np.vdot(a, b) for a, b in zip(jax.tree.leaves(pulled), (*forces, *shift)))
     np.testing.assert_allclose(left, right, rtol=1e-11)
 
 
+def flat_columns(columns):
+    """(columns, W, Q, equations) of the Jacobian."""
+    forces, shift = columns
+    return np.stack(
+        [flat([f[i] for f in forces], [s[i] for s in shift]) for i in range(len(shift[0]))]
+    )
+
+
+def test_nothing_is_asked_of_the_distance_to_the_stop():
+    """The stop on a surface, before and behind it: the same path, one and the same solution up to
+    what the stop moves; a path drawn through one point stays finite where its rays are left out."""
+    system = system_with("in front", 2, True)
+    hits = rough_path(system, RAYS)
+    moves = []
+    for gap in (-1e-6, 0.0, 1e-6):
+        vertex = system.rows.vertex[0] - gap
+        placed = system.stop._replace(vertex=vertex, rotation=system.rows.rotation[0])
+        near = dataclasses.replace(system, stop=placed)
+        moves.append(np.stack(answers(near, hits, ALL, *given(hits)).solved))
+    assert np.all(np.isfinite(moves))
+    step = np.max(np.abs(np.diff(moves, axis=0)))
+    assert 0 < step < 1e-5 * np.max(np.abs(moves[0]))
+
+
+def test_rays_of_no_interest_come_out_finite():
+    """All hits at one point in planes without distance: no length, no direction."""
+    system = system_with("between", 2)
+    rows, stop = (jax.tree.map(jnp.zeros_like, a) for a in (system.rows, system.stop))
+    system = dataclasses.replace(system, rows=rows, stop=stop)
+    hits = tuple(jnp.zeros_like(h) for h in rough_path(system, RAYS))
+    all_of = answers(system, hits, ~ALL, *given(hits))
+    assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves((all_of.solved, all_of.pulled)))
+
+
 def test_first_segment_is_continuous_to_infinity():
-    lens = load_lens("double_gauss")
-    far, hits = system_of(lens, 2, 0.1, 0.0)
+    system = system_with("between", 2, False, np.inf)
+    hits = rough_path(system, RAYS)
+    far = answers(system, hits, ALL, *given(hits))
     previous = None
     for distance in (1e4, 1e6, 1e9):
-        near = dataclasses.replace(far, vergence=jnp.array(1 / distance))
-        change = float(jnp.max(jnp.abs(residual(hits, near) - residual(hits, far))))
-        path = optical_path(hits, near) - optical_path(hits, far)
-        assert change < 30 / distance and float(jnp.max(jnp.abs(path))) < 400 / distance
+        nearer = dataclasses.replace(system, vergence=jnp.asarray(1 / distance, float))
+        near = answers(nearer, hits, ALL, *given(hits))
+        change = np.max(np.abs(np.subtract(near.equations[0], far.equations[0])))
+        assert change < 30 / distance and np.max(np.abs(near.path - far.path)) < 400 / distance
         assert previous is None or change < previous / 50
         previous = change
 
 
-def test_zero_blocks_stay_finite():
-    zeros = jnp.zeros((2, 2, 4, 1, 1))
-    solved = fermat.solve(Blocks(zeros, zeros), jnp.ones((2, 4, 1, 1)), 2)
-    assert jnp.all(jnp.isfinite(solved))
+@jax.jit
+def stationary(hits, system, target):
+    return fermat.stationary(hits, fermat.geometry(hits, system), system, target)
 
 
 def test_only_rays_are_stationary():
-    lens = load_lens("singlet")
-    system, _ = system_of(lens, 1, 0.0, 0.0, rays=1)
-    system = dataclasses.replace(
-        system, conic=0 * system.conic, coefficients=0 * system.coefficients
-    )
-    on_axis = jnp.zeros((1, 4, 3, 1))
-    assert jnp.all(stationary(on_axis, system))
-    outside = on_axis.at[0, 1].set(60.0)  # the radius of surface 1 is 51.68
-    assert not jnp.any(stationary(outside, system))
-    elsewhere = on_axis.at[0, 3].set(1.0)
-    assert not jnp.any(stationary(elsewhere, system))
+    system = meridional(load_lens("singlet"), [0.6, 0.5])
+    target = (jnp.zeros((2, 1)),)
+    on_axis = jnp.zeros((3, 2, 1))
+    assert np.all(stationary((on_axis,), system, target))
+    assert not np.any(stationary((on_axis,), system, (target[0] + 1e-9,)))  # another stop point
+    outside = on_axis.at[0].set(60.0)  # the radius of the first surface is 51.68
+    assert not np.any(stationary((outside,), system, target))
+    elsewhere = on_axis.at[2].set(1.0)
+    assert not np.any(stationary((elsewhere,), system, target))
     # 60 degrees inside the glass at the plane exit face: beyond the critical angle
-    steep = on_axis.at[0, 2].set(4.0 * np.tan(np.pi / 3))
-    assert not jnp.any(stationary(steep, system))
+    steep = on_axis.at[1].set(4.0 * np.tan(np.pi / 3))
+    assert not np.any(stationary((steep,), system, target))
+
+
+def test_arrival_is_the_last_segment():
+    """Along the axes of the tilted sensor."""
+    system = system_with("live", 2, True)
+    hits = rough_path(system, RAYS)
+    points, _ = corners(system, hits)
+    step = points[-1] - points[-2]
+    step = step @ np.asarray(system.rows.rotation[-1])
+    ours = np.moveaxis(np.stack(jax.jit(fermat.arrival)(hits, system)), 0, -1)
+    np.testing.assert_allclose(ours, step / np.sqrt(np.sum(step**2, -1, keepdims=True)), atol=1e-14)
+    np.testing.assert_allclose(dot(ours.T, ours.T), 1, rtol=1e-14)
+    assert DISTANCE * float(system.vergence) == 1

@@ -1,0 +1,63 @@
+"""Small systems of every kind, and paths through them that are not yet rays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drt_jax import load_lens, scene_of
+from drt_jax.rays.system import system_of
+
+COLOURS = (0.6, 0.48)
+DISTANCE = 300.0
+LIVE = [
+    {"radius": 45, "conic": -0.4, "coefficients": {4: 1e-6}, "thickness": 4, "glass": "N-BK7"},
+    {"radius": -90, "conic": 0.5, "coefficients": {4: -2e-6}, "thickness": 8},
+    {"radius": -40, "coefficients": {4: 1e-6}, "thickness": 3, "glass": "SF10"},
+    {"radius": -150, "conic": 1.0, "coefficients": {4: 1e-7}, "thickness": 5},
+]
+MIRROR = {"radius": -400, "conic": -1, "coefficients": {4: 1e-8}, "mirror": True, "thickness": -5}
+STOP = {"radius": -70, "conic": 0.3, "semi_diameter": 4.0, "stop": True}
+# Where the stop is: in the list of the surfaces, bending no light, or one of them.
+PLACES = {"in front": 0, "between": 2, "behind": None, "live": 2}
+
+
+def lens_with(stop, tilted=False):
+    """Two lenses and a curved stop; `tilted` adds a mirror, tilts and decentres everything."""
+    rows = [dict(row) for row in (*LIVE, *([MIRROR] if tilted else []))]
+    place = len(rows) if PLACES[stop] is None else PLACES[stop]
+    if stop == "live":
+        rows[place] |= {"semi_diameter": 4.0, "stop": True}
+    else:
+        rows.insert(place, STOP | {"thickness": 3.0})
+    rows[-1]["thickness"] = -20.0 if tilted else 25.0  # to the sensor
+    if not tilted:
+        return load_lens({"surfaces": rows})
+    generator = np.random.default_rng(0)
+    for row in rows:
+        row["tilt"] = generator.uniform(-2, 2, 3).tolist()
+        row["decentre"] = generator.uniform(-0.2, 0.2, 2).tolist()
+    moved = {"sensor_tilt": [3.0, -2.0, 5.0], "sensor_decentre": [0.2, -0.4]}
+    return load_lens({"surfaces": rows} | moved)
+
+
+_system_of = jax.jit(system_of, static_argnums=2)
+
+
+def system_with(stop, dim=2, tilted=False, distance=DISTANCE):
+    """The system of such a lens; the object is off the axis, also for D = 1."""
+    lens = lens_with(stop, tilted)
+    return _system_of(lens, scene_of(lens, [0.03, -0.05], distance, COLOURS), dim)
+
+
+def meridional(lens, colours):
+    """The system of a lens for meridional rays, the object on the axis at infinity."""
+    return _system_of(lens, scene_of(lens, 0.0, jnp.inf, colours), 1)
+
+
+def rough_path(system, rays=3, seed=3):
+    """Hits, D arrays (R, W, Q) in mm, of paths that are no rays."""
+    generator = np.random.default_rng(seed)
+    shape = (len(system.forms), system.index.shape[1], rays)
+    taper = np.linspace(1.2, 0.3, shape[0])[:, None, None]
+    hits = generator.uniform(-3, 3, (system.dim, 1, 1, rays)) * taper
+    return tuple(jnp.asarray(hits + generator.normal(0, 0.05, (system.dim, *shape))))
