@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drt_jax import load_lens, scene_of
+from drt_jax.lens.surface import sag_derivatives
 from drt_jax.rays.system import system_of
 
 COLOURS = (0.6, 0.48)
@@ -40,12 +41,32 @@ def lens_with(stop, tilted=False):
     return load_lens({"surfaces": rows} | moved)
 
 
+def freeform():
+    """Surfaces of three forms, all tilted and decentred; the stop is one of them."""
+    rows = [
+        {"form": "toroid", "radius": 75, "radius_x": 85, "coefficients": {4: 2e-6}, "index": 1.5},
+        {"form": "polynomial_xy", "radius": -70, "coefficients": {"x1y1": 1e-4, "x0y3": 1e-5}},
+        {"radius": -110, "conic": 0.1, "coefficients": {4: -1e-6}, "index": 1.7},
+        {"form": "toroid", "radius": -90, "radius_x": -120},
+    ]
+    rows[1] |= {"semi_diameter": 4.0, "stop": True}
+    generator = np.random.default_rng(1)
+    for row in rows:
+        row |= {"thickness": 5.0, "tilt": generator.uniform(-2, 2, 3).tolist()}
+        row["decentre"] = generator.uniform(-0.2, 0.2, 2).tolist()
+    return load_lens({"surfaces": rows})
+
+
 _system_of = jax.jit(system_of, static_argnums=2)
 
 
 def system_with(stop, dim=2, tilted=False, distance=DISTANCE):
     """The system of such a lens; the object is off the axis, also for D = 1."""
-    lens = lens_with(stop, tilted)
+    return scene_system(lens_with(stop, tilted), distance, dim)
+
+
+def scene_system(lens, distance=DISTANCE, dim=2):
+    """The system of a lens and an object off the axis."""
     return _system_of(lens, scene_of(lens, [0.03, -0.05], distance, COLOURS), dim)
 
 
@@ -61,3 +82,28 @@ def rough_path(system, rays=3, seed=3):
     taper = np.linspace(1.2, 0.3, shape[0])[:, None, None]
     hits = generator.uniform(-3, 3, (system.dim, 1, 1, rays)) * taper
     return tuple(jnp.asarray(hits + generator.normal(0, 0.05, (system.dim, *shape))))
+
+
+def wide(vector):
+    """(..., 2) of one or two components; one is y."""
+    x = [np.zeros_like(vector[0])] if len(vector) == 1 else []
+    return np.stack([*x, *map(np.asarray, vector)], axis=-1)
+
+
+def on_surface(surface, form, w):
+    """Points (..., 3), along the axes of the lens, of a `Placed` surface at `w` (..., 2)."""
+    z = np.asarray(sag_derivatives((w[..., 0], w[..., 1]), surface.shape, form)[0])
+    own = np.concatenate([w, z[..., None]], axis=-1)
+    turned = own if surface.rotation is None else own @ np.asarray(surface.rotation).T
+    offset = np.zeros(2) if surface.offset is None else np.asarray(surface.offset)
+    return turned + np.append(offset, surface.vertex)
+
+
+def corners(system, hits):
+    """The hits (R, W, Q, 3) along the axes of the lens, and the object point (3,), by NumPy; at
+    infinity, the object is its direction."""
+    rows = [jax.tree.map(lambda a, i=i: a[i], system.rows) for i in range(len(system.forms))]
+    w = wide(hits)
+    points = [on_surface(row, system.forms[i], w[i]) for i, row in enumerate(rows)]
+    source = np.append(np.zeros(2 - system.dim), system.source)
+    return np.stack(points), source / (float(system.vergence) or 1.0)

@@ -12,11 +12,19 @@ import numpy as np
 import pytest
 
 from drt_jax import load_lens
-from drt_jax.lens.surface import Shape, sag_derivatives
 from drt_jax.rays import fermat, linear
 from drt_jax.rays.system import dot
 
-from .systems import COLOURS, DISTANCE, meridional, rough_path, system_with
+from .systems import (
+    COLOURS,
+    DISTANCE,
+    corners,
+    meridional,
+    on_surface,
+    rough_path,
+    system_with,
+    wide,
+)
 
 CASES = {
     "meridional": ("between", 1, False),
@@ -87,34 +95,6 @@ def case(request):
     return system, hits, answers(system, hits, ALL, *given(hits))
 
 
-def placed_points(surface, w, sag):
-    """Points (..., 3) along the axes of the lens, from (..., 2) and (...) along the surface's."""
-    own = np.concatenate([w, sag[..., None]], axis=-1)
-    turned = own if surface.rotation is None else own @ np.asarray(surface.rotation).T
-    origin = np.zeros(2) if surface.offset is None else np.asarray(surface.offset)
-    return turned + np.append(origin, surface.vertex)
-
-
-def sag_of(surface, w):
-    shape = Shape(*(np.asarray(a) for a in surface.shape))
-    return np.asarray(sag_derivatives((w[..., 0], w[..., 1]), shape)[0])
-
-
-def wide(vector):
-    """(..., 2) of one or two components; one is y."""
-    x = [np.zeros_like(vector[0])] if len(vector) == 1 else []
-    return np.stack([*x, *map(np.asarray, vector)], axis=-1)
-
-
-def corners(system, hits):
-    """The hits (R, W, Q, 3) along the axes of the lens, and the object point (3,), in NumPy."""
-    rows = [jax.tree.map(lambda a, i=i: a[i], system.rows) for i in range(len(system.forms))]
-    w = wide(hits)
-    points = [placed_points(row, w[i], sag_of(row, w[i])) for i, row in enumerate(rows)]
-    source = np.asarray(system.source) / float(system.vergence)
-    return np.stack(points), np.append(np.zeros(3 - source.size), source)
-
-
 def test_residual_is_the_gradient_of_the_path(case):
     """But for the component that belongs to the sensor: nothing is stationary there."""
     _, _, all_of = case
@@ -135,7 +115,7 @@ def test_path_and_label_against_geometry(case):
     if system.stop is None:
         np.testing.assert_array_equal(label, [h[system.before] for h in hits])
         return
-    crossing = placed_points(system.stop, wide(label), sag_of(system.stop, wide(label)))
+    crossing = on_surface(system.stop, system.stop_form, wide(label))
     one, other = whole[system.before], whole[system.before + 1]
     along = (other - one) / np.linalg.norm(other - one, axis=-1, keepdims=True)
     np.testing.assert_allclose(np.cross(crossing - other, along), 0, atol=1e-12)

@@ -1,0 +1,227 @@
+"""The one intersection routine and the sequential trace: closed forms, and the yardstick."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from experiments.snell import trace_snell
+
+from drt_jax import Status, load_lens
+from drt_jax.lens.surface import FORMS, Shape, domain, surface_sag
+from drt_jax.rays import fermat, snell
+
+from ..lens.test_surface import SHAPES
+from .systems import COLOURS, DISTANCE, corners, freeform, lens_with, meridional, scene_system
+
+CONICS = ("plane", "sphere", "ellipsoid", "paraboloid", "hyperboloid")
+GROUPS = {"conics": CONICS} | {
+    form: [n for n in SHAPES if SHAPES[n][0] == form and n not in CONICS] for form in FORMS
+}
+STEPS = 10.0 ** -np.arange(1.0, 7.5, 0.5)
+
+
+def stacked(names):
+    """Shapes of one form, to be broadcast against (shape, ray)."""
+    most = max(len(SHAPES[n][3]) for n in names)
+    rows = [np.pad(SHAPES[n][3], (0, most - len(SHAPES[n][3]))) for n in names]
+    c, k = (np.array([SHAPES[n][i] for n in names])[:, None] for i in (1, 2))
+    return Shape(c, k, np.array(rows).T[..., None])
+
+
+def lines(count, rays=8):
+    """Lines (shape, ray) some mm in front of a vertex, forwards and, every other, backwards;
+    directions of any length."""
+    generator = np.random.default_rng(0)
+    shape = (count, rays)
+    p = [generator.uniform(-6, 6, shape), generator.uniform(-6, 6, shape)]
+    p = (*p, generator.uniform(-8, 8, shape))
+    d = [generator.uniform(-0.4, 0.4, shape), generator.uniform(-0.4, 0.4, shape)]
+    sign = np.where(np.arange(rays) % 2, -1.0, 1.0) * np.ones(shape)
+    scale = generator.uniform(0.3, 3, shape)
+    d = (*(scale * a for a in d), scale * sign)
+    return p, d
+
+
+class Met(NamedTuple):
+    """length, slope, bend: (places, shape, ray), how far a line goes to a surface, and its first
+    and second derivative along a way. met: (shape, ray). miss: (shape, ray), mm, by how much the
+    point misses the surface, which exists there: exists."""
+
+    length: np.ndarray
+    slope: np.ndarray
+    bend: np.ndarray
+    met: np.ndarray
+    miss: np.ndarray
+    exists: np.ndarray
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def along_a_way(form, p, d, shape, way, places):
+    """All that is asked of a form: one program."""
+    going = jnp.ones(p[0].shape, bool)
+
+    def at(h):
+        moved = jax.tree.map(lambda a, v: a + h * v, (p, d, shape), way)
+        return snell.reach(form, *moved, going)[0]
+
+    def slope(h):
+        value, first = jax.jvp(at, (h,), (jnp.ones_like(h),))
+        return first, value
+
+    def both(h):
+        first, second, value = jax.jvp(slope, (h,), (jnp.ones_like(h),), has_aux=True)
+        return value, first, second
+
+    length, met = snell.reach(form, p, d, shape, going)
+    *across, z = (a + length * b for a, b in zip(p, d, strict=True))
+    miss = surface_sag(across, shape, form) - z
+    return Met(*jax.vmap(both)(places), met, miss, domain(across, shape, form))
+
+
+@pytest.fixture(scope="module", params=GROUPS)
+def case(request):
+    """Names of shapes, their arguments, and what happens along a random way from these."""
+    names = GROUPS[request.param]
+    shape, (p, d) = stacked(names), lines(len(names))
+    generator = np.random.default_rng(2)
+    sizes = [0.3 * np.ones_like(a) for a in (*p, *d)]
+    # Of the size of what is there; a plane may bend by 1e-3 per mm.
+    units = (1e-3, 0.1, 0.0)
+    sizes += [np.where(a == 0, u, 0.1 * np.abs(a)) for a, u in zip(shape, units, strict=True)]
+    way = [size * generator.uniform(-1, 1, size.shape) for size in sizes]
+    way = tuple(way[:3]), tuple(way[3:6]), Shape(*way[6:])
+    places = np.concatenate([[0.0], STEPS, -STEPS])
+    found = along_a_way(SHAPES[names[0]][0], p, d, shape, way, places)
+    return names, (p, d, shape), jax.tree.map(np.asarray, found)
+
+
+def test_rays_meet_the_surface(case):
+    *_, found = case
+    assert np.all(found.met) and np.all(found.exists)
+    np.testing.assert_allclose(found.miss, 0, atol=2e-14)
+
+
+@pytest.mark.parametrize("case", ["conics"], indirect=True)
+def test_conics_against_the_roots_of_their_equation(case):
+    """Of the two points of a conic on a line, the one on the half that holds the vertex, where
+    1 - (1 + k) c z is positive, that the line crosses from the side where its vertex plane lies."""
+    names, (p, d, shape), found = case
+    for i in range(len(names)):
+        c, k = shape.curvature[i, 0], shape.conic[i, 0]
+        for q in range(p[0].shape[1]):
+            (x, y, z), (u, v, w) = ([a[i, q] for a in vector] for vector in (p, d))
+            square = c * (u * u + v * v + (1 + k) * w * w)
+            linear = 2 * (c * (x * u + y * v + (1 + k) * z * w) - w)
+            constant = c * (x * x + y * y + (1 + k) * z * z) - 2 * z
+            roots = np.roots([square, linear, constant] if square else [linear, constant])
+            upper = 1 - (1 + k) * c * (z + roots * w)
+            rate = w * upper - c * (u * (x + roots * u) + v * (y + roots * v))
+            (s,) = roots[(upper > 0) & (rate * w > 0)]
+            np.testing.assert_allclose(found.length[0, i, q], s, rtol=1e-12)
+
+
+def test_derivatives_of_the_length(case):
+    """First and second against central differences: of second order in the step until rounding,
+    and there to 1e-9."""
+    *_, found = case
+    count = len(STEPS)
+    for function, derivative in ((found.length, found.slope), (found.slope, found.bend)):
+        plus, minus = function[1 : 1 + count], function[1 + count :]
+        error = np.abs((plus - minus) / (2 * STEPS[:, None, None]) - derivative[0])
+        scale = 1 + np.abs(derivative[0])
+        assert np.all(np.min(error / scale, axis=0) < 1e-9)
+        worst = np.max(error / scale, axis=(1, 2))
+        clear = np.cumprod(worst > 1e-8).astype(bool)
+        assert np.sum(clear) >= 3
+        slope = np.polyfit(np.log(STEPS[clear][-4:]), np.log(worst[clear][-4:]), 1)[0]
+        assert 1.9 < slope < 2.1
+
+
+def test_lines_that_meet_nothing():
+    """Beside a sphere of R = 10, beyond its rim, along a plane."""
+    reach = jax.jit(snell.reach, static_argnums=0)
+    shape = Shape(np.array([0.1, 0.1, 0.0]), np.zeros(3), np.zeros((0, 3)))
+    p = tuple(np.array(a) for a in ([0.0, 0.0, 0.0], [10.5, 9.9999, 1.0], [-5.0, -5.0, -5.0]))
+    d = tuple(np.array(a) for a in ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0]))
+    for terms in (0, 1):
+        wider = shape._replace(coefficients=np.zeros((terms, 3)))
+        length, met = reach("asphere", p, d, wider, np.ones(3, bool))
+        assert np.all(np.isfinite(length)) and not np.any(met[:2])
+
+
+shoot = jax.jit(snell.shoot)
+yardstick = jax.jit(jax.vmap(trace_snell, (None, None, 0, 0)))
+
+
+def launches(rays=20):
+    """Random points on the vertex plane of the first surface, the same for two colours."""
+    points = np.random.default_rng(0).uniform(-4, 4, (2, 1, rays))
+    return tuple(jnp.asarray(np.broadcast_to(points, (2, 2, rays))))
+
+
+@pytest.mark.parametrize("lens", [lens_with("between", True), freeform()], ids=["mirror", "forms"])
+@pytest.mark.parametrize("distance", [DISTANCE, np.inf])
+def test_a_trace_against_the_yardstick(lens, distance):
+    """Hits within 1e-12 mm; and how far rounding them turns a segment."""
+    system, launch = scene_system(lens, distance), launches()
+    trace = shoot(system, launch)
+    assert np.all(trace.fate == Status.OK)
+    points, source = corners(system, trace.hits)
+    start = np.stack([*map(np.asarray, launch), np.zeros(launch[0].shape)], axis=-1)
+    direction = -source if np.isinf(distance) else start - source
+    direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction = np.broadcast_to(direction, start.shape)
+    begin = start - 5 * direction
+    rows = [*lens.live, lens.count]
+    for k, colour in enumerate(COLOURS):
+        hits, ok = yardstick(lens, jnp.asarray(colour, float), begin[k], direction[k])
+        assert np.all(ok)
+        wanted = np.moveaxis(np.asarray(hits), 1, 0)[rows]
+        np.testing.assert_allclose(points[:, k], wanted, rtol=0, atol=1e-12)
+    wide = np.sqrt(np.sum(np.square(trace.hits), axis=0))
+    length = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    wanted = np.max(np.maximum(wide[1:], wide[:-1]) / length, axis=0)
+    np.testing.assert_allclose(trace.shake, wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize("stop", ["in front", "live"])
+def test_launch_and_stop_of_a_ray(stop):
+    """The trace to the stop crosses it where the label of the whole ray says; and the first hit of
+    a ray leads back to its launch."""
+
+    @jax.jit
+    def there_and_back(system, launch, hits):
+        first = tuple(h[0] for h in hits)
+        crossing = snell.shoot_to_stop(system, launch)
+        return crossing, fermat.label(hits, system), snell.launch_at(system, first)
+
+    system, launch = scene_system(lens_with(stop, True)), launches()
+    hits = shoot(system, launch).hits
+    (crossing, fate), label, back = there_and_back(system, launch, hits)
+    assert np.all(fate == Status.OK)
+    np.testing.assert_allclose(crossing, label, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(back, launch, rtol=0, atol=1e-12)
+
+
+def test_fates():
+    """What stops a ray first: a plane glass face beyond the critical angle; the curved one missed;
+    surfaces that cross, so that the second lies behind the ray; all without a number that is not
+    finite."""
+    faces = [
+        {"radius": "inf", "thickness": 60.0, "index": 1.5, "semi_diameter": 5.0, "stop": True},
+        {"radius": -50, "thickness": 50.0},
+    ]
+    heights = jnp.asarray([[0.0, 32.0, 34.0, 49.0, 51.0]])
+    lens = load_lens({"surfaces": faces})
+    flat = shoot(meridional(lens, [0.55]), (heights,)).fate[0]
+    # sin(critical) = 1 / 1.5: at 33.3 mm of R = 50; the sphere ends at 50 mm.
+    assert flat.tolist() == [Status.OK, Status.OK, Status.TIR, Status.TIR, Status.MISSED]
+    faces[0] |= {"radius": 20, "thickness": 2.0, "semi_diameter": 1.0}
+    faces[1]["radius"] = 50  # crosses the first face 11.5 mm from the axis
+    crossed = shoot(meridional(load_lens({"surfaces": faces}), [0.55]), (heights / 2,))
+    assert crossed.fate[0].tolist()[0] == Status.OK
+    assert set(crossed.fate[0].tolist()[1:]) == {Status.MISSED}
+    assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(crossed))
