@@ -248,7 +248,7 @@ def _asphere_derivatives(w: tuple[Array, ...], shape: Shape) -> Any:
 def vertex_curvature(shape: Shape, forms: tuple[str, ...], dim: int) -> tuple[Array, ...]:
     """Curvature of S surfaces at their vertices along each of `dim` components: `dim` arrays (S,),
     1/mm; `shape` with arrays (S,) and (K, S)."""
-    if set(forms) == {"asphere"}:
+    if set(forms) <= {"asphere"}:
         bend = shape.curvature + (2 * shape.coefficients[0] if len(shape.coefficients) else 0)
         return (bend,) * dim
     zero = jnp.zeros_like(shape.curvature)

@@ -187,17 +187,18 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
     # The surfaces before the stop; then a plane without power at the stop, which may lie anywhere.
     shape = Shape(*(a[..., :before] for a in (rows.curvature, rows.conic, rows.coefficients.T)))
     bent = jnp.stack(vertex_curvature(shape, system.forms[:before], dim), axis=-1)
-    bent = jnp.concatenate([bent, jnp.zeros((1, dim), dtype)])[..., None]
+    bent = jnp.concatenate([bent, jnp.zeros((1, dim), dtype)])[:, None, :, None]
     gaps = jnp.diff(jnp.append(rows.vertex[:before], stop.vertex))
     # In a mirrored space, distances and indices are both negative.
     index = system.index[: before + 1] * system.senses[: before + 1, None, None]
-    index = jnp.moveaxis(jnp.concatenate([index, index[-1:]]), -1, 1)
-    one = jnp.ones((dim, system.index.shape[1]), dtype)
+    index = jnp.moveaxis(jnp.concatenate([index, index[-1:]]), -1, 1)[:, None]
+    one = jnp.ones((2, dim, system.index.shape[1]), dtype)
     first = rows.vertex[0] if before else stop.vertex
     v = system.vergence
     # Two rays: from the object's point on the axis, and slanted.
-    axial, _ = trace_yu(bent, gaps, index, one * (1 + first * v), one * v)
-    tilted, _ = trace_yu(bent, gaps, index, one * first, one)
+    height = one * jnp.stack([1 + first * v, first])[:, None, None]
+    slope = one * jnp.stack([v, jnp.ones_like(v)])[:, None, None]
+    (axial, tilted), _ = (jnp.moveaxis(a, 1, 0) for a in trace_yu(bent, gaps, index, height, slope))
     launch = []
     for d, wanted in enumerate((*target, stop.vertex)[:dim]):
         tangent = -system.source[d]

@@ -28,6 +28,7 @@ __all__ = [
     "geometry",
     "label",
     "optical_path",
+    "ray_at",
     "residual",
     "stationary",
 ]
@@ -73,13 +74,13 @@ def geometry(hits: Vector, system: System) -> Path:
     point, step = _segments(hits, z, system)
     first = (system.vergence * p - s for p, s in zip(point, system.source, strict=True))
     segment = tuple(jnp.concatenate([f[None], s]) for f, s in zip(first, step, strict=True))
-    length = safe_sqrt(dot(segment, segment))
-    inverse = safe_divide(jnp.ones_like(length), length)
-    direction = tuple(s * inverse for s in segment)
+    length = _length(segment)
+    shrink = _inverse(length)
+    direction = tuple(s * shrink for s in segment)
     behind = tuple(d[1:] for d in direction)
     before = turn(rotation, direction, back=True)
     after = turn(None if rotation is None else rotation[:-1], behind, back=True)
-    return Path(before, after, length, system.vergence * inverse[0], slope, bend)
+    return Path(before, after, length, system.vergence * shrink[0], slope, bend)
 
 
 def residual(path: Path, system: System) -> Vector:
@@ -91,37 +92,46 @@ def residual(path: Path, system: System) -> Vector:
     return tuple(c + s[:-1] * along for c, s in zip(across, path.slope, strict=True))
 
 
-def label(hits: Vector, system: System) -> Vector:
-    """Where the paths through `hits`, D arrays (R, W, Q), cross the stop: D arrays (W, Q), mm
-    along its axes."""
-    row = system.before
-    if system.stop is None:
-        return tuple(h[row] for h in hits)
+def ray_at(hits: Vector, system: System, row: int) -> tuple[Vector, Vector]:
+    """Points of one row and unit vectors in front of it, D + 1 arrays (W, Q) each, along the axes
+    of the lens, of the paths through `hits`, D arrays (R, W, Q)."""
     some = slice(max(row - 1, 0), row + 1)
-    rows = jax.tree.map(lambda a: a[some], system.rows)
+    part = dataclasses.replace(system, rows=jax.tree.map(lambda a: a[some], system.rows))
     hits = tuple(h[some] for h in hits)
-    heights = by_form(surface_sag, hits, rows.wide, system.forms[some])
-    part = dataclasses.replace(system, rows=rows)
+    heights = by_form(surface_sag, hits, part.rows.wide, system.forms[some])
     point, step = _segments(hits, heights, part)
     if row:
         direction = tuple(s[0] for s in step)
+        point = tuple(p + d for p, d in zip(point, direction, strict=True))
     else:
         direction = tuple(
             system.vergence * p - s for p, s in zip(point, system.source, strict=True)
         )
-    return cross(system.stop, system.stop_form, point, direction)[0]
+    shrink = _inverse(_length(direction))
+    return point, tuple(d * shrink for d in direction)
+
+
+def label(hits: Vector, system: System) -> Vector:
+    """Where the paths through `hits`, D arrays (R, W, Q), cross the stop: D arrays (W, Q), mm
+    along its axes."""
+    if system.stop is None:
+        return tuple(h[system.before] for h in hits)
+    return cross(system.stop, system.stop_form, *ray_at(hits, system, system.before))[0]
 
 
 def arrival(hits: Vector, system: System) -> Vector:
     """Unit vectors, D + 1 arrays (W, Q), along the axes of the sensor, of the rays reaching it."""
-    rows = jax.tree.map(lambda a: a[-2:], system.rows)
-    hits = tuple(h[-2:] for h in hits)
-    heights = by_form(surface_sag, hits, rows.wide, system.forms[-2:])
-    _, step = _segments(hits, heights, dataclasses.replace(system, rows=rows))
-    own = turn(None if rows.rotation is None else rows.rotation[1:], step, back=True)
-    length = safe_sqrt(dot(own, own))
-    inverse = safe_divide(jnp.ones_like(length), length)
-    return tuple((a * inverse)[0] for a in own)
+    rotation = system.rows.rotation
+    _, direction = ray_at(hits, system, len(system.forms) - 1)
+    return turn(None if rotation is None else rotation[-1], direction, back=True)
+
+
+def _length(vector: Vector) -> Array:
+    return safe_sqrt(dot(vector, vector))
+
+
+def _inverse(length: Array) -> Array:
+    return safe_divide(jnp.ones_like(length), length)
 
 
 def optical_path(hits: Vector, system: System) -> Array:
@@ -135,10 +145,9 @@ def optical_path(hits: Vector, system: System) -> Array:
     p = tuple(system.source)
     near = tuple(system.vergence * a - b for a, b in zip(q, p, strict=True))
     # (|q - p/v| - |p/v|) without the cancellation, and without dividing by v
-    first = (system.vergence * dot(q, q) - 2 * dot(q, p)) / (
-        jnp.sqrt(dot(near, near)) + jnp.sqrt(dot(p, p))
-    )
-    lengths = jnp.concatenate([first[None], safe_sqrt(dot(step, step))])
+    far = _length(near) + _length(p)
+    first = (system.vergence * dot(q, q) - 2 * dot(q, p)) / far
+    lengths = jnp.concatenate([first[None], _length(step)])
     return jnp.sum(system.index * lengths, axis=0)
 
 
@@ -154,8 +163,8 @@ def stationary(hits: Vector, path: Path, system: System, target: Vector) -> Arra
     index, senses = system.index, system.senses[:, None, None]
     size = jnp.sqrt(dot(hits, hits))
     widest = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
-    inverse = safe_divide(jnp.ones_like(path.length), path.length).at[0].set(jnp.abs(path.spread))
-    shake = index * (1 + inverse * widest)
+    near = _inverse(path.length).at[0].set(jnp.abs(path.spread))
+    shake = index * (1 + near * widest)
     both = shake[:-1] + shake[1:]
     gradient, slope = residual(path, system), tuple(s[:-1] for s in path.slope)
     bound = 64 * eps * both * jnp.sqrt(1 + dot(slope, slope))

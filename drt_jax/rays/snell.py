@@ -105,8 +105,7 @@ def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
 
     _, change = jax.jvp(miss, (p, d, shape), tangents[:3])
     _, _, rate = _gap(form, p, d, shape, length)
-    moved = safe_divide(change, rate)
-    return (length, met), (moved, np.zeros(met.shape, jax.dtypes.float0))
+    return (length, met), (safe_divide(change, rate), np.zeros(met.shape, jax.dtypes.float0))
 
 
 def _meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:
