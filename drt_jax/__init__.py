@@ -13,98 +13,52 @@ Conventions, everywhere in the package:
   before loading a lens; the library changes no global setting.
 """
 
-from .files.specs import LensError
-from .files.yaml import lens_names, load_lens
+from .files.specs import LensError as LensError
+from .files.yaml import lens_names as lens_names, load_lens as load_lens
 from .image.converged import (
-    converged_focus_rule,
-    converged_rule,
-    focus_moments,
-    psf_moments,
+    converged_focus_rule as converged_focus_rule,
+    converged_rule as converged_rule,
+    focus_moments as focus_moments,
+    psf_moments as psf_moments,
 )
-from .image.depth import depth_moments, moments_model
-from .image.kernel import SeparableKernel, gaussian_psf
-from .image.moments import FocusMoments, Moments, moments
-from .image.sensor import convolve, sensor_layer
-from .image.wavefront import Wavefront, rms_wavefront, wavefront
-from .learn.adam import adam, apply_updates
-from .learn.network import red_net
-from .lens.glass import find_glass, refractive_index
-from .lens.lens import Lens, sag
+from .image.depth import depth_moments as depth_moments, moments_model as moments_model
+from .image.kernel import SeparableKernel as SeparableKernel, gaussian_psf as gaussian_psf
+from .image.moments import FocusMoments as FocusMoments, Moments as Moments, moments as moments
+from .image.sensor import convolve as convolve, sensor_layer as sensor_layer
+from .image.wavefront import (
+    Wavefront as Wavefront,
+    rms_wavefront as rms_wavefront,
+    wavefront as wavefront,
+)
+from .learn.adam import adam as adam, apply_updates as apply_updates
+from .learn.network import red_net as red_net
+from .lens.glass import find_glass as find_glass, refractive_index as refractive_index
+from .lens.lens import Lens as Lens, sag as sag
 from .lens.paraxial import (
-    FirstOrder,
-    Pupil,
-    back_focal_distance,
-    entrance_pupil,
-    exit_pupil,
-    f_number,
-    first_order,
-    focal_length,
-    front_focal_distance,
-    image_distance,
-    image_height,
-    lateral_magnification,
-    numerical_aperture,
+    FirstOrder as FirstOrder,
+    Pupil as Pupil,
+    back_focal_distance as back_focal_distance,
+    entrance_pupil as entrance_pupil,
+    exit_pupil as exit_pupil,
+    f_number as f_number,
+    first_order as first_order,
+    focal_length as focal_length,
+    front_focal_distance as front_focal_distance,
+    image_distance as image_distance,
+    image_height as image_height,
+    lateral_magnification as lateral_magnification,
+    numerical_aperture as numerical_aperture,
 )
-from .lens.scene import Scene, field_of_height, scene_of
-from .lens.seidel import ThirdOrder, third_order
-from .pupil.clipped import Clipped
-from .pupil.rules import Gauss, Pattern, PupilRule, Soft, pupil_points, symmetry_of
-from .rays.status import Status
-from .rays.trace import Rays, trace_rays
-
-__all__ = [
-    "Clipped",
-    "FirstOrder",
-    "FocusMoments",
-    "Gauss",
-    "Lens",
-    "LensError",
-    "Moments",
-    "Pattern",
-    "Pupil",
-    "PupilRule",
-    "Rays",
-    "Scene",
-    "SeparableKernel",
-    "Soft",
-    "Status",
-    "ThirdOrder",
-    "Wavefront",
-    "adam",
-    "apply_updates",
-    "back_focal_distance",
-    "converged_focus_rule",
-    "converged_rule",
-    "convolve",
-    "depth_moments",
-    "entrance_pupil",
-    "exit_pupil",
-    "f_number",
-    "field_of_height",
-    "find_glass",
-    "first_order",
-    "focal_length",
-    "focus_moments",
-    "front_focal_distance",
-    "gaussian_psf",
-    "image_distance",
-    "image_height",
-    "lateral_magnification",
-    "lens_names",
-    "load_lens",
-    "moments",
-    "moments_model",
-    "numerical_aperture",
-    "psf_moments",
-    "pupil_points",
-    "red_net",
-    "refractive_index",
-    "rms_wavefront",
-    "sag",
-    "scene_of",
-    "sensor_layer",
-    "symmetry_of",
-    "third_order",
-    "trace_rays",
-    "wavefront",
-]
+from .lens.scene import Scene as Scene, field_of_height as field_of_height, scene_of as scene_of
+from .lens.seidel import ThirdOrder as ThirdOrder, third_order as third_order
+from .pupil.clipped import Clipped as Clipped
+from .pupil.rules import (
+    Gauss as Gauss,
+    Pattern as Pattern,
+    PupilRule as PupilRule,
+    Soft as Soft,
+    pupil_points as pupil_points,
+    symmetry_of as symmetry_of,
+)
+from .rays.status import Status as Status
+from .rays.trace import Rays as Rays, trace_rays as trace_rays

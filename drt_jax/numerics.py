@@ -11,8 +11,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["concrete", "known_values", "safe_divide", "safe_sqrt"]
-
 
 def safe_sqrt(x: Array) -> Array:
     """Square root of `x`; 0, with derivative 0, where `x` <= 0. Any shape, floating dtype."""

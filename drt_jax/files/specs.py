@@ -15,8 +15,6 @@ from ..lens.glass import Dispersion, Glass, find_glass
 from ..lens.lens import Lens
 from ..lens.surface import FORMS, Shape, by_form, powers_xy, surface_sag
 
-__all__ = ["LensError", "build_lens"]
-
 _TOP_KEYS = ("name", "source", "object", "surfaces", "sensor", "sensor_tilt", "sensor_decentre")
 _MEDIUM_KEYS = ("glass", "index")
 _SURFACE_KEYS = (

@@ -9,8 +9,6 @@ import yaml
 from ..lens.lens import Lens
 from .specs import LensError, build_lens
 
-__all__ = ["lens_names", "load_lens"]
-
 _BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
 
 

@@ -23,8 +23,6 @@ from ..rays.status import Status
 from ..rays.trace import trace_bundle
 from .moments import FocusMoments, Moments, weigh
 
-__all__ = ["converged_focus_rule", "converged_rule", "focus_moments", "psf_moments"]
-
 _MAX_ORDER = 40
 # A spot below 1 nm is a point: relative to it, rounding would never converge.
 _SMALLEST = 1e-6

@@ -22,8 +22,6 @@ from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
 from .moments import FocusMoments, moments
 
-__all__ = ["DepthMoments", "depth_moments", "moments_model"]
-
 _MAX_NODES = 64
 
 
@@ -45,10 +43,10 @@ class DepthMoments:
         low, high = 1 / self.far, 1 / self.near
         x = (2 / jnp.asarray(distance, low.dtype) - high - low) / (high - low)
         count = self.series.mean.shape[0]
-        basis = [jnp.ones_like(x), x]
-        while len(basis) < count:
-            basis.append(2 * x * basis[-1] - basis[-2])
-        basis = jnp.stack(basis[:count])
+        terms = [jnp.ones_like(x), x]
+        while len(terms) < count:
+            terms.append(2 * x * terms[-1] - terms[-2])
+        basis = jnp.stack(terms[:count])
         return jax.tree.map(lambda c: jnp.tensordot(basis, c, axes=1), self.series)
 
 

@@ -10,8 +10,6 @@ from jax.scipy.special import erf
 
 from ..numerics import safe_divide, safe_sqrt
 
-__all__ = ["Form", "SeparableKernel", "gaussian_psf"]
-
 Form = Literal["integrated", "sampled"]
 
 # A Gaussian narrower than this (in pixels) is a point: nothing on the grid can tell.

@@ -21,8 +21,6 @@ from ..rays.solve import Solver, solve
 from ..rays.system import Vector
 from ..rays.trace import Bundle, trace_bundle
 
-__all__ = ["FocusMoments", "Moments", "moments", "weigh"]
-
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)

@@ -9,8 +9,6 @@ from jax.typing import ArrayLike
 
 from .kernel import SeparableKernel
 
-__all__ = ["Convolve", "convolve", "convolve_taps", "sensor_layer"]
-
 Convolve = Callable[[Array, SeparableKernel | Array], Array]
 
 # GPUs would round the factors of a float32 product to 10 bits.

@@ -27,8 +27,6 @@ from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import trace_bundle
 
-__all__ = ["Wavefront", "reference_curvature", "rms_wavefront", "wavefront"]
-
 _MM = 1e-3  # per um
 
 

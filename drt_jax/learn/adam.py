@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["AdamState", "adam", "apply_updates"]
-
 
 class AdamState(NamedTuple):
     """steps: (), int32, updates so far.

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-__all__ = ["convolve_3x3"]
-
 # F(4x4, 3x3): 4x4 outputs from 6x6 inputs with 36 instead of 144 products for each pair of
 # channels, y = A^T [(G w G^T) * (B^T x B)] A. Lavin and Gray, CVPR 2016; at the points 0,
 # +-sqrt(1/2), +-sqrt(2) and infinity, which halve the rounding error of the usual 0, +-1, +-2.

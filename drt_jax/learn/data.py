@@ -14,8 +14,6 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from skimage import color, data, io, util
 
-__all__ = ["DataConfig", "DataError", "Patches", "batches", "load_patches"]
-
 # Colour and texture photographs that lie inside the scikit-image wheel.
 _BUNDLED = (
     "astronaut",

@@ -15,8 +15,6 @@ from jax import Array
 
 from .convolution import convolve_3x3
 
-__all__ = ["count_parameters", "red_net"]
-
 Parameters = list[dict[str, Array]]
 
 

@@ -16,8 +16,6 @@ from ..image.sensor import Convolve, convolve, sensor_layer
 from ..numerics import safe_divide, safe_sqrt
 from .adam import adam, apply_updates
 
-__all__ = ["Camera", "compiler_options", "evaluate", "fit", "make_imager", "make_step"]
-
 Blur = Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]
 Restore = Callable[[Any, Array], Array]
 Imager = Callable[..., tuple[Array, Array, Array, Array]]

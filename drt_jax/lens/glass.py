@@ -14,16 +14,6 @@ from jax.typing import ArrayLike
 
 from ..numerics import concrete
 
-__all__ = [
-    "Dispersion",
-    "Glass",
-    "check_wavelengths",
-    "common_range",
-    "find_glass",
-    "known_index",
-    "refractive_index",
-]
-
 # The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _SCHOTT_POWERS = (0, 2, -2, -4, -6, -8)

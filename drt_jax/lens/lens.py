@@ -11,8 +11,6 @@ from jax.typing import ArrayLike
 from .glass import Dispersion, check_wavelengths, refractive_index
 from .surface import Shape, surface_sag
 
-__all__ = ["Lens", "rotation_matrix", "sag"]
-
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)

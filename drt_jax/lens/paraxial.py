@@ -18,31 +18,6 @@ from ..numerics import safe_divide
 from .lens import Lens
 from .surface import vertex_curvature
 
-__all__ = [
-    "FirstOrder",
-    "ParaxialRay",
-    "ParaxialSystem",
-    "Pupil",
-    "back_focal_distance",
-    "chief_ray",
-    "chief_ray_at_image",
-    "entrance_pupil",
-    "exit_pupil",
-    "f_number",
-    "first_order",
-    "focal_length",
-    "front_focal_distance",
-    "image_distance",
-    "image_height",
-    "lateral_magnification",
-    "marginal_ray",
-    "numerical_aperture",
-    "paraxial_system",
-    "petzval_parts",
-    "trace_ray",
-    "trace_yu",
-]
-
 
 class Pupil(NamedTuple):
     """An image of the stop; inf where the lens is telecentric.

@@ -9,8 +9,6 @@ from jax.typing import ArrayLike
 
 from .lens import Lens
 
-__all__ = ["Scene", "field_of_height", "scene_of"]
-
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)

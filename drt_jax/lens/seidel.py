@@ -23,8 +23,6 @@ from .paraxial import (
 )
 from .surface import FORMS
 
-__all__ = ["ThirdOrder", "third_order"]
-
 
 class ThirdOrder(NamedTuple):
     """Third-order aberrations at the paraxial image, the parts of the surfaces.

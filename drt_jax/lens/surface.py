@@ -17,19 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = [
-    "FORMS",
-    "RIM",
-    "Form",
-    "Shape",
-    "by_form",
-    "domain",
-    "powers_xy",
-    "sag_derivatives",
-    "surface_sag",
-    "vertex_curvature",
-]
-
 # A square root is used up to the rim where the normal of a sphere leans within 0.57 degrees
 # (cos = 0.01) of 90 degrees. Beyond, it continues smoothly and stays positive, so that an
 # iteration which strays outside stays finite and can come back; a ray that ends there has

@@ -8,17 +8,6 @@ the patterns of equal weights are what other programs use, for comparison.
 
 import numpy as np
 
-__all__ = [
-    "disc",
-    "half_disc",
-    "hexapolar",
-    "meridian",
-    "random_disc",
-    "sobol",
-    "sobol_disc",
-    "square_grid",
-]
-
 _SOBOL_BITS = 30
 
 

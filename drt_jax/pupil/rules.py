@@ -24,18 +24,6 @@ from ..rays.system import Vector, dot
 from ..rays.trace import Bundle
 from . import patterns
 
-__all__ = [
-    "MAX_ORDER",
-    "Gauss",
-    "Pattern",
-    "PupilRule",
-    "Soft",
-    "Symmetry",
-    "gauss_points",
-    "pupil_points",
-    "symmetry_of",
-]
-
 # How much of the pupil stands for all of it: one radius, half of it (x > 0), or the whole disc.
 Symmetry = Literal["meridian", "half", "disc"]
 MAX_ORDER = 42

@@ -23,19 +23,6 @@ from .snell import shoot, shoot_to_stop
 from .status import Status
 from .system import System, Vector, dot
 
-__all__ = [
-    "STARTS",
-    "AimNewton",
-    "Aimed",
-    "Fan",
-    "aim",
-    "beam_size",
-    "no_fan",
-    "paraxial_launch",
-    "starts_of",
-    "trace_fan",
-]
-
 # A ray counts as aimed if it misses its stop point by less than `_NEAR` of the beam's radius: one
 # more step of Newton's method, which converges quadratically, then brings it there to rounding.
 _NEAR = 1e-6
@@ -65,7 +52,7 @@ class AimNewton(optx.AbstractRootFinder):
     """
 
     rtol: float
-    atol: Array
+    atol: Any  # a number or an array
     norm: Callable = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
@@ -146,7 +133,7 @@ def aim(system: System, target: Vector, launch: Vector, beam: Array, reach: Arra
             crossing, fate = shoot_to_stop(own, launch)
             return tuple(a - b for a, b in zip(crossing, target, strict=True)), fate
 
-        solution = optx.root_find(
+        solution: optx.Solution = optx.root_find(
             miss,
             solver,
             launch,
@@ -170,8 +157,7 @@ def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
     """Radius of the beam at the stop, and how wide it may be on the first surface, mm."""
     beam = jnp.sqrt(jnp.max(dot(target, target)))
     lean = jnp.sqrt(dot(system.source[:-1], system.source[:-1]))
-    stop = system.rows.vertex[system.before] if system.stop is None else system.stop.vertex
-    depth = jnp.abs(stop - system.rows.vertex[0])
+    depth = jnp.abs(system.at_stop[0].vertex - system.rows.vertex[0])
     width = 2 * beam + lean * (depth + beam) + 0.02 * depth
     return jnp.where(beam > 0, beam, 0.1 * width), width
 
@@ -182,8 +168,7 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
     imaged to infinity, the pupil lies beyond any lens."""
     dim, rows, before = system.dim, system.rows, system.before
     dtype = target[0].dtype
-    live = system.stop is None
-    stop = jax.tree.map(lambda a: a[before], rows) if live else system.stop
+    stop, _ = system.at_stop
     # The surfaces before the stop; then a plane without power at the stop, which may lie anywhere.
     shape = Shape(*(a[..., :before] for a in (rows.curvature, rows.conic, rows.coefficients.T)))
     bent = jnp.stack(vertex_curvature(shape, system.forms[:before], dim), axis=-1)
@@ -200,7 +185,7 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
     slope = one * jnp.stack([v, jnp.ones_like(v)])[:, None, None]
     (axial, tilted), _ = (jnp.moveaxis(a, 1, 0) for a in trace_yu(bent, gaps, index, height, slope))
     launch = []
-    for d, wanted in enumerate((*target, stop.vertex)[:dim]):
+    for d, wanted in enumerate(target):
         tangent = -system.source[d]
         if stop.offset is not None:
             wanted = wanted + stop.offset[d]

@@ -17,8 +17,6 @@ from .aim import aim, beam_size, paraxial_launch
 from .status import Status
 from .system import System, Vector, dot
 
-__all__ = ["in_tiles", "polynomial_launch", "tiles_of"]
-
 # More rays than `_MANY` are aimed by polynomials and solved in tiles of `_TILE` rays, of all
 # wavelengths together: what belongs to a surface then stays in the cache of a core.
 _MANY, _TILE = 1024, 1024

@@ -22,17 +22,6 @@ from ..numerics import safe_divide, safe_sqrt
 from .snell import cross
 from .system import System, Vector, dot, turn
 
-__all__ = [
-    "Path",
-    "arrival",
-    "geometry",
-    "label",
-    "optical_path",
-    "ray_at",
-    "residual",
-    "stationary",
-]
-
 
 class Path(NamedTuple):
     """A path drawn out: what its gradient, its differentials and its status are made of.
@@ -116,7 +105,7 @@ def label(hits: Vector, system: System) -> Vector:
     along its axes."""
     if system.stop is None:
         return tuple(h[system.before] for h in hits)
-    return cross(system.stop, system.stop_form, *ray_at(hits, system, system.before))[0]
+    return cross(*system.at_stop, *ray_at(hits, system, system.before))[0]
 
 
 def arrival(hits: Vector, system: System) -> Vector:

@@ -17,8 +17,6 @@ from jax import Array
 from .fermat import Path, label
 from .system import System, Vector, dot, turn
 
-__all__ = ["solve"]
-
 
 class _Row(NamedTuple):
     """What a march needs of one live surface and the segment to the next row; see `Path`. ahead:
@@ -28,7 +26,7 @@ class _Row(NamedTuple):
     after: Vector
     slope: Vector
     bend: tuple[Vector, ...]
-    index: Array
+    index_before: Array
     index_behind: Array
     rotation: Array | None
     length: Array
@@ -60,9 +58,9 @@ def _step(
 ) -> tuple[Vector, Vector]:
     """From one row to the next: changes of the hit, D arrays, and of the direction in front of it,
     D + 1 arrays, along the axes of the row. force: D arrays, the change of its equation."""
-    jump = row.index * row.before[-1] - row.index_behind * row.after[-1]
+    jump = row.index_before * row.before[-1] - row.index_behind * row.after[-1]
     pull = tuple(
-        row.index * (v + s * swung[-1]) + jump * dot(bend, moved) - f
+        row.index_before * (v + s * swung[-1]) + jump * dot(bend, moved) - f
         for v, s, bend, f in zip(swung, row.slope, row.bend, force, strict=False)
     )
     # The change of direction behind: its product with the tangents is known, with itself 0.
@@ -108,8 +106,8 @@ def solve(
 
     def step(state, given):
         row, force = given
-        free = jax.vmap(lambda state: _step(row, good, *state, none))(state[0])
-        forced = _step(row, good, *state[1], force)
+        free = jax.vmap(lambda moved, swung: _step(row, good, moved, swung, none))(*state[0])
+        forced = _step(row, good, state[1][0], state[1][1], force)
         return (free, forced), (free[0], forced[0])
 
     # `dim` marches from unit changes of the first hit, and one that the forces make.

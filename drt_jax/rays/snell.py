@@ -19,8 +19,6 @@ from ..numerics import safe_divide, safe_sqrt
 from .status import Status
 from .system import Placed, System, Vector, dot, turn
 
-__all__ = ["Trace", "cross", "launch_at", "reach", "shoot", "shoot_to_stop"]
-
 # Newton steps along a ray to a surface that is no conic; the last must be shorter than `_SETTLED`
 # of the ray's length or of 1 mm.
 _STEPS, _SETTLED = 20, 1e-7
@@ -185,8 +183,8 @@ def _follow(system: System, launch: Vector, count: int) -> tuple[Vector, Vector,
         point, direction, fate, shake, size = carry
         first, surface, kind, ratio, sense, leaving = row
         p, d = surface.local(point, direction)
-        meet = [partial(_meet, kind) for kind in kinds]
-        meet = meet[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, meet)
+        each = [partial(_meet, kind) for kind in kinds]
+        meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, each)
         own, normal, met, length = meet(p, d, surface.shape, fate == Status.OK)
         bent, front, through = _refract(d, normal, ratio, sense, leaving)
         met = met & front & ((length > 0) | first)
@@ -213,11 +211,6 @@ def shoot(system: System, launch: Vector) -> Trace:
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:
     """Where rays cross the stop, D arrays in mm along its axes, and their fate so far (...)."""
     point, direction, trace = _follow(system, launch, system.before)
-    if system.stop is None:
-        row = system.before
-        surface, form = jax.tree.map(lambda a: a[row], system.rows), system.forms[row]
-    else:
-        surface, form = system.stop, system.stop_form
-    crossing, met = cross(surface, form, point, direction)
+    crossing, met = cross(*system.at_stop, point, direction)
     missed = jnp.where(met, Status.OK, Status.MISSED).astype(jnp.int32)
     return crossing, jnp.where(trace.fate == Status.OK, missed, trace.fate)

@@ -20,8 +20,6 @@ from .snell import shoot
 from .status import Status
 from .system import System, Vector, dot
 
-__all__ = ["BlockNewton", "Found", "attach", "find", "find_many", "solve", "solve_reverse"]
-
 _MAX_STEPS = 16
 
 
@@ -98,7 +96,7 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
         return (fermat.residual(path, system), tuple(miss), path), None
 
     eps = float(jnp.finfo(hits[0].dtype).eps)
-    solution = optx.root_find(
+    solution: optx.Solution = optx.root_find(
         equations,
         BlockNewton(rtol=2 * eps, atol=2 * eps),
         hits,
@@ -172,8 +170,9 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
         rows = jax.vmap(lambda left: jnp.nonzero(left, size=few, fill_value=rays)[0])(state.left)
         wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
         begin = starts_of(fan, wanted, tried * starts + jnp.arange(starts, dtype=jnp.int32))
-        own = (places(a[..., None]) for a in wanted)
-        own = tuple(jnp.where(first, a, b) for a, b in zip(target, own, strict=True))
+        own = tuple(
+            jnp.where(first, a, places(b[..., None])) for a, b in zip(target, wanted, strict=True)
+        )
         begin = tuple(jnp.where(first, a, places(b)) for a, b in zip(launch, begin, strict=True))
         reach = jnp.where(first, sizes[1], sizes[1] / 8)
         aimed = aim(system, own, begin, sizes[0], reach)

@@ -2,8 +2,6 @@
 
 import enum
 
-__all__ = ["Status"]
-
 
 class Status(enum.IntEnum):
     """The first of MISSED and TIR along a ray; CLIPPED only if it is whole."""

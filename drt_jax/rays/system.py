@@ -18,8 +18,6 @@ from ..lens.lens import Lens, rotation_matrix
 from ..lens.scene import Scene
 from ..lens.surface import Shape
 
-__all__ = ["Placed", "System", "Vector", "dot", "placed", "system_of", "turn"]
-
 Vector = tuple[Array, ...]
 
 
@@ -115,6 +113,14 @@ class System:
     def dim(self) -> int:
         """D, the number of transverse components."""
         return self.source.shape[0] - 1
+
+    @property
+    def at_stop(self) -> tuple[Placed, str]:
+        """The stop in its place, and its form, whether it bends light or not."""
+        if self.stop is not None:
+            return self.stop, self.stop_form
+        row = self.before
+        return jax.tree.map(lambda a: a[row], self.rows), self.forms[row]
 
     @property
     def senses(self) -> np.ndarray:

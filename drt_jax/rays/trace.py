@@ -18,8 +18,6 @@ from .solve import Solver, solve
 from .status import Status
 from .system import System, Vector, dot, placed, system_of, turn
 
-__all__ = ["Bundle", "Rays", "trace_bundle", "trace_rays"]
-
 
 class Bundle(NamedTuple):
     """Rays in the array layout of `fermat`, rays last.

@@ -10,8 +10,6 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
-__all__ = ["ConfigError", "describe", "dump_config", "load_config"]
-
 T = TypeVar("T")
 
 

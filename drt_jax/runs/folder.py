@@ -23,8 +23,6 @@ import numpy as np
 
 from .config import ConfigError, dump_config, load_config
 
-__all__ = ["Run", "deferred_interrupt"]
-
 
 class Run:
     """One run in one folder; several jobs (starting points, say) may share it."""

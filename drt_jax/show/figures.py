@@ -8,18 +8,6 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = [
-    "by_family",
-    "convergence",
-    "error_curves",
-    "growth",
-    "kernels",
-    "new",
-    "patch_grid",
-    "programs",
-    "sigma_over_depth",
-]
-
 _COLOURS = ("tab:red", "tab:green", "tab:blue")
 
 

@@ -11,8 +11,6 @@ from ..lens.lens import Lens, rotation_matrix, sag
 from ..rays.status import Status
 from ..rays.trace import trace_rays
 
-__all__ = ["Drawing", "draw", "lens_drawing"]
-
 _POINTS = 41
 _FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 
