@@ -115,9 +115,9 @@ def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:
 
 
 def _show(folder: pathlib.Path, report: Report) -> None:
-    figures = folder / "figures"
+    results, figures = _common.read_results(folder), folder / "figures"
     figures.mkdir(exist_ok=True)
-    print(report(_common.read_results(folder), figures))
+    print(report(results, figures))
     print(f"results in {folder / 'results.json'}, figures in {figures}")
 
 

@@ -1,4 +1,4 @@
-"""What the paper's experiments share: settings, a trained job, pictures of it."""
+"""What the paper's experiments share: settings, trained jobs, tables and pictures of them."""
 
 import dataclasses
 import math
@@ -14,10 +14,10 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import show
 from drt_jax.learn import network, train
-from drt_jax.learn.data import Patches, batches, load_patches
+from drt_jax.learn.data import DataConfig, batches, load_patches
 from drt_jax.runs.folder import Run, deferred_interrupt
 
-from ._common import require
+from ._common import require, require_list, require_noise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Scene:
     def __post_init__(self) -> None:
         require(len(self.wavelengths_um) == 3, "scene.wavelengths_um: expected three, for R, G, B")
 
-    def blur(self, lens: drt_jax.Lens, near: float, far: float) -> Callable:
+    def blur(self, near: float, far: float) -> Callable:
         """The blur by the sensor's position and the distance, from `near` to `far` mm."""
-        return drt_jax.moments_model(
-            lens, ("sensor",), 0.0, (near, far), self.wavelengths_um, self.tolerance
-        )[1]
+        lens, span = drt_jax.load_lens(self.lens), (near, far)
+        waves, tolerance = self.wavelengths_um, self.tolerance
+        return drt_jax.moments_model(lens, ("sensor",), 0.0, span, waves, tolerance)[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,13 @@ class Training:
         for name in ("batches", "batch", "checkpoint_every"):
             require(getattr(self, name) >= 1, f"train.{name}: must be at least 1")
         require(self.patch >= 7, "train.patch: must be at least 7, the window of the SSIM")
-        require(0 <= self.optics_rate < math.inf, "train.optics_rate: must be 0 or more")
+        for name, rate in self.rates.items():
+            require(0 <= rate < math.inf, f"train.{name}_rate: must be 0 or more")
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Learning rates of the groups of parameters."""
+        return {"optics": self.optics_rate}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,13 +79,9 @@ class JointTraining(Training):
 
     network_rate: float = 1e-3
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(0 <= self.network_rate < math.inf, "train.network_rate: must be 0 or more")
-
     @property
     def rates(self) -> dict[str, float]:
-        """The learning rates of both groups of parameters."""
+        """Learning rates of the groups of parameters."""
         return {"optics": self.optics_rate, "network": self.network_rate}
 
 
@@ -94,88 +96,131 @@ class Net:
     skip_every: int = 2
     input_skip: bool = True
 
-    def build(self, seed: int) -> tuple[Any, Callable, int]:
-        """Its first weights, its function, and how many parameters it has."""
-        init, restore = drt_jax.red_net(**dataclasses.asdict(self))
-        weights = init(jax.random.key(seed))
-        count = network.count_parameters(weights)
-        print(f"RED-Net with {count} parameters")
-        return weights, restore, count
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Settings of all three experiments.
 
-def patches(config: Any) -> Patches:
-    """Patches of the run's images, with the context that its blur needs; says what was skipped."""
-    side = config.train.patch + config.camera.kernel - 1
-    loaded = load_patches(
-        config.data, side, config.seed, lambda work: tqdm(work, desc="reading images", leave=False)
-    )
-    for line in loaded.skipped:
-        print(f"skipped {line}", file=sys.stderr)
-    print(f"{len(loaded.train)} training and {len(loaded.test)} test patches of {side} x {side}")
-    return loaded
-
-
-def train_job(
-    run: Run,
-    job: str,
-    functions: tuple[Callable, Callable],
-    parameters: dict[str, Any],
-    scenes: np.ndarray,
-    noise: float,
-    config: Any,
-    labels: tuple[str, ...] = (),
-) -> dict[str, Any]:
-    """Train one job, or several vectorised ones with a label each, from its last checkpoint on.
-
-    run: where metrics and checkpoints go. functions: of `train.make_step`. parameters: to start
-    from. scenes: training patches. noise: standard deviation. Returns the trained parameters.
-    KeyboardInterrupt, after a checkpoint, if the user asked to stop.
+    starts_mm: sensor positions from which training starts.
+    noise: standard deviation of the sensor's, for values from 0 to 1.
+    seed: of the patches, the noise and the network.
     """
-    init, step = functions
-    labels, several, total = labels or (job,), bool(labels), config.train.batches
-    first, state = run.load(job, init(parameters), labels)
-    saved = first
-    bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
 
-    def notify() -> None:
-        print("\nstopping after this step; once more stops at once", file=sys.stderr)
+    starts_mm: tuple[float, ...]
+    train: Training
+    noise: float = 0.01
+    seed: int = 0
+    scene: Scene = Scene()
+    camera: train.Camera = train.Camera()
+    data: DataConfig = DataConfig()
 
-    with bar, deferred_interrupt(notify) as asked:
+    def __post_init__(self) -> None:
+        require_list("starts_mm", self.starts_mm)
+        require_noise("noise", self.noise)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JointSettings(Settings):
+    """Settings of the experiments with a network.
+
+    test_patches: how many of the test patches are used (0: all).
+    """
+
+    train: JointTraining
+    test_patches: int = 0
+    network: Net = Net()
+
+
+class Jobs:
+    """The training jobs of a run.
+
+    test: patches to measure on. weights, restore, parameters: of the network, the first at its
+    start, if the settings have one.
+    """
+
+    def __init__(self, run: Run, config: Settings, near: float, far: float) -> None:
+        """near, far: of the objects in training, mm."""
+        self._run, self._config, self._depths = run, config, (near, far)
+        side = config.train.patch + config.camera.kernel - 1
+        reading = lambda work: tqdm(work, desc="reading images", leave=False)  # noqa: E731
+        patches = load_patches(config.data, side, config.seed, reading)
+        for line in patches.skipped:
+            print(f"skipped {line}", file=sys.stderr)
+        counts = f"{len(patches.train)} training and {len(patches.test)} test patches"
+        print(f"{counts} of {side} x {side}")
+        self.scenes = patches.train
+        if isinstance(config, JointSettings):
+            self.test = thinned(patches.test, config.test_patches)
+            init, self.restore = drt_jax.red_net(**dataclasses.asdict(config.network))
+            self.weights = init(jax.random.key(config.seed))
+            self.parameters = network.count_parameters(self.weights)
+            print(f"RED-Net with {self.parameters} parameters")
+
+    def step(self, imager: Callable, several: bool = False) -> tuple[Callable, Callable]:
+        """(init, step) for an imager, of several jobs at once or of one."""
+        rates, seed = self._config.train.rates, self._config.seed
+        return train.make_step(imager, rates, self._depths, seed, vectorised=several)
+
+    def train(
+        self,
+        job: str,
+        functions: tuple[Callable, Callable],
+        parameters: dict[str, Any],
+        noise: float | None = None,
+        labels: tuple[str, ...] = (),
+    ) -> dict[str, Any]:
+        """Train one job, or several at once with a label each, from its last checkpoint on.
+
+        functions: of `step`. parameters: to start from. noise: if not that of the settings.
+        Returns the trained parameters. KeyboardInterrupt, after a checkpoint, if the user asked to
+        stop.
+        """
+        run, setting = self._run, self._config.train
+        noise = self._config.noise if noise is None else noise
+        init, step = functions
+        first, state = run.load(job, init(parameters), labels or (job,))
+        saved, total = first, setting.batches
+        bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
 
         def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
             nonlocal saved
             done = start + len(metrics["loss"])
-            for k, label in enumerate(labels):
-                run.log(label, start, {n: v[:, k] if several else v for n, v in metrics.items()})
+            for k, label in enumerate(labels or (job,)):
+                run.log(label, start, {n: v[:, k] if labels else v for n, v in metrics.items()})
             bar.update(len(metrics["loss"]))
             bar.set_postfix_str(f"loss={np.array2string(metrics['loss'][-1], precision=3)}")
-            if asked() or done == total or done - saved >= config.train.checkpoint_every:
+            if asked() or done == total or done - saved >= setting.checkpoint_every:
                 run.save(job, done, state)
                 saved = done
 
-        stream = batches(scenes, config.train.batch, config.seed, first)
+        stream = batches(self.scenes, setting.batch, self._config.seed, first)
         # Each report waits for the device: rarely where a step takes milliseconds.
         every = 10 if jax.default_backend() == "cpu" else 113
-        state = train.fit(step, state, stream, noise, first, total, every, report, asked)
-        if asked():
-            raise KeyboardInterrupt
-    return state[0]
+        with bar, deferred_interrupt(_stopping) as asked:
+            state = train.fit(step, state, stream, noise, first, total, every, report, asked)
+            if asked():
+                raise KeyboardInterrupt
+        return state[0]
+
+    def results(self, *columns: str) -> dict[str, Any]:
+        """What is kept of the training of all starts, which log as `start_label`: their final
+        sensor positions, averaged over the last tenth of the batches (at least 20, at most all),
+        and metrics by column (starts, batches)."""
+        config = self._config
+        window = min(config.train.batches, max(20, config.train.batches // 10))
+        traces = [self._run.metrics(start_label(start)) for start in config.starts_mm]
+        return {
+            "lens": config.scene.lens,
+            "starts_mm": list(config.starts_mm),
+            "final_mm": [float(np.mean(trace["sensor_mm"][-window:])) for trace in traces],
+            "final_window_batches": window,
+            "seconds": self._run.seconds,
+            **{column: np.stack([trace[column] for trace in traces]) for column in columns},
+        }
 
 
-def start_results(run: Run, config: Any, columns: tuple[str, ...]) -> dict[str, Any]:
-    """What is kept of the training of all starts, which log as `start_label`: their final sensor
-    positions, averaged over the last tenth of the batches (at least 20, at most all), and metrics
-    by column (starts, batches)."""
-    window = min(config.train.batches, max(20, config.train.batches // 10))
-    traces = [run.metrics(start_label(start)) for start in config.starts_mm]
-    return {
-        "lens": config.scene.lens,
-        "starts_mm": list(config.starts_mm),
-        "final_mm": [float(np.mean(trace["sensor_mm"][-window:])) for trace in traces],
-        "final_window_batches": window,
-        "seconds": run.seconds,
-        **{column: np.stack([trace[column] for trace in traces]) for column in columns},
-    }
+def _stopping() -> None:
+    print("\nstopping after this step; once more stops at once", file=sys.stderr)
 
 
 def start_label(start: float) -> str:
@@ -192,9 +237,8 @@ def start_lines(results: dict[str, Any], column: str, batches: int | None = None
 
 def reached(results: dict[str, Any]) -> str:
     """The planes at which the starts ended, in words."""
-    low, high = min(results["final_mm"]), max(results["final_mm"])
-    same = f"{low:.3f}" == f"{high:.3f}"
-    return f"{low:.3f} mm" if same else f"{low:.3f} to {high:.3f} mm"
+    low, high = (f"{end(results['final_mm']):.3f}" for end in (min, max))
+    return f"{low} mm" if low == high else f"{low} to {high} mm"
 
 
 def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
@@ -213,16 +257,19 @@ def draw_lens(name: str, distance: float, path: pathlib.Path) -> None:
     figure.savefig(path)
 
 
+_IMAGES = ("truth", "sensor", "restored")
+
+
 def images(imager: Callable, parameters: Any, scenes: np.ndarray, *rest: Any) -> dict:
     """Truth, sensor and restored images of patches, for `draw_patches`."""
-    names = "truth", "sensor", "restored"
-    return {n: np.asarray(a, np.float16) for n, a in zip(names, imager(parameters, scenes, *rest))}
+    found = zip(_IMAGES, imager(parameters, scenes, *rest))
+    return {name: np.asarray(image, np.float16) for name, image in found}
 
 
 def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path) -> None:
     """Picture of the `images`, each but the truth with its RMSE."""
-    rows = {name: np.float32(results[name]) for name in ("truth", "sensor", "restored")}
-    errors = {name: rows[name] - rows["truth"] for name in ("sensor", "restored")}
+    rows = {name: np.float32(results[name]) for name in _IMAGES}
+    errors = {name: rows[name] - rows["truth"] for name in _IMAGES[1:]}
     notes = {n: [f"{np.sqrt(np.mean(e**2)):.3f}" for e in some] for n, some in errors.items()}
     show.patch_grid(rows, titles, notes).savefig(path)
 

@@ -7,6 +7,7 @@ and 7, and writes table 2.
 """
 
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Callable
 from typing import Any
@@ -15,113 +16,95 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import drt_jax
 from drt_jax import show
 from drt_jax.learn import train
-from drt_jax.learn.data import DataConfig
 from drt_jax.numerics import safe_sqrt
 from drt_jax.runs.folder import Run
 
 from . import _command, _common, _training
-from ._training import JointTraining, Net, Scene
+from ._training import Scene
 
 
-@dataclasses.dataclass(frozen=True)
-class Config:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(_training.JointSettings):
     """Settings of the experiment; see configs/edof.yaml.
 
     fixed_mm: the start that is also trained with the sensor fixed; one of starts_mm.
     depth_m: nearest and farthest object in training.
     table_depth_m: depths of table 2.
     patch_depth_m: depths of figure 7.
-    test_patches: how many of the test patches are used (0: all).
     """
 
-    starts_mm: tuple[float, ...]
     fixed_mm: float
-    train: JointTraining
     depth_m: tuple[float, ...] = (10.0, 50.0)
     table_depth_m: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0)
     patch_depth_m: tuple[float, ...] = (10.0, 20.0, 30.0, 40.0, 50.0)
-    noise: float = 0.01
-    test_patches: int = 0
-    seed: int = 0
-    network: Net = Net()
     scene: Scene = Scene(lens="double_gauss_addon")
-    camera: train.Camera = train.Camera()
-    data: DataConfig = DataConfig()
 
     def __post_init__(self) -> None:
-        for name in ("starts_mm", "depth_m", "table_depth_m", "patch_depth_m"):
+        super().__post_init__()
+        for name in ("depth_m", "table_depth_m", "patch_depth_m"):
             _common.require_list(name, getattr(self, name))
         _common.require(
             len(self.depth_m) == 2 and self.depth_m[0] < self.depth_m[1],
             "depth_m: expected the nearest and the farthest distance in m",
         )
         _common.require(
-            any(self.depth_m[0] <= depth <= self.depth_m[1] for depth in self.table_depth_m),
-            "table_depth_m: none lies within depth_m",
+            any(map(self.trained_at, self.table_depth_m)), "table_depth_m: none lies within depth_m"
         )
         _common.require(
             self.fixed_mm in self.starts_mm, f"fixed_mm: {self.fixed_mm} must be one of starts_mm"
         )
-        _common.require_noise("noise", self.noise)
+
+    def trained_at(self, depth: float) -> bool:
+        """Whether a depth in m lies within those of training."""
+        return self.depth_m[0] <= depth <= self.depth_m[1]
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Train jointly and with the sensor fixed, and test over depth."""
-    lens = drt_jax.load_lens(config.scene.lens)
     depths = *config.depth_m, *config.table_depth_m, *config.patch_depth_m
-    blur = config.scene.blur(lens, 1e3 * min(depths), 1e3 * max(depths))
-    weights, restore, _ = config.network.build(config.seed)
-    patches = _training.patches(config)
+    blur = config.scene.blur(1e3 * min(depths), 1e3 * max(depths))
     near, far = (1e3 * depth for depth in config.depth_m)
-
-    def trained(job: str, blur: Callable, optics: dict) -> tuple[Callable, dict]:
-        imager = train.make_imager(blur, restore, config.camera)
-        functions = train.make_step(imager, config.train.rates, (near, far), config.seed)
-        parameters = {"optics": optics, "network": weights}
-        scenes, noise = patches.train, config.noise
-        found = _training.train_job(run, job, functions, parameters, scenes, noise, config)
-        return jax.jit(imager), found
-
-    joint = {}
+    jobs = _training.Jobs(run, config, near, far)
+    imager = train.make_imager(blur, jobs.restore, config.camera)
+    functions, joint = jobs.step(imager), {}
     for start in config.starts_mm:
-        sensor = {"sensor": jnp.asarray(start)}
-        joint[start] = trained(_training.start_label(start), blur, sensor)
+        parameters = {"optics": {"sensor": jnp.asarray(start)}, "network": jobs.weights}
+        joint[start] = jobs.train(_training.start_label(start), functions, parameters)
     place = {"sensor": jnp.asarray(config.fixed_mm)}
-    fixed = trained(f"fixed {config.fixed_mm}", lambda _, distance: blur(place, distance), {})
-    models = {"fixed": fixed, "joint": joint[config.fixed_mm]}
-    results = _training.start_results(run, config, ("sensor_mm",))
+    still = train.make_imager(lambda _, depth: blur(place, depth), jobs.restore, config.camera)
+    parameters = {"optics": {}, "network": jobs.weights}
+    fixed = jobs.train(f"fixed {config.fixed_mm}", jobs.step(still), parameters)
+    best = joint[config.fixed_mm]
+    models = {"fixed": (jax.jit(still), fixed), "joint": (jax.jit(imager), best)}
+    results = jobs.results("sensor_mm")
     final = results["final_mm"][config.starts_mm.index(config.fixed_mm)]
     return {
         **results,
-        **tested(config, models, _training.thinned(patches.test, config.test_patches)),
+        **tested(config, models, jobs.test),
         **blur_over_depth(blur, (config.fixed_mm, final), near, far),
+        "joint_sensor_mm": float(best["optics"]["sensor"]),
+        "depth_m": list(config.depth_m),
     }
 
 
 def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[str, Any]:
     """Errors of both models over depth, and patches of the joint one."""
-    noise, rows = config.noise, []
+    noise, rows, parts = config.noise, [], []
     for depth in config.table_depth_m:
         errors = {
             name: train.evaluate(*model, test, 1e3 * depth, noise, config.seed)
             for name, model in models.items()
         }
         rows.append({"depth_m": depth, **errors})
-    near, far = config.depth_m
-    inside = [row for row in rows if near <= row["depth_m"] <= far]
+    inside = [row for row in rows if config.trained_at(row["depth_m"])]
     chosen = _training.textured(test, len(config.patch_depth_m))
-    parts = []
     for k, depth in enumerate(config.patch_depth_m):
-        some, key = chosen[k % len(chosen)][None], jax.random.key(k)
-        model = models["joint"]
-        parts.append(_training.images(*model, some, 1e3 * depth, np.float32(noise), key))
+        some, rest = chosen[k % len(chosen)][None], (np.float32(noise), jax.random.key(k))
+        parts.append(_training.images(*models["joint"], some, 1e3 * depth, *rest))
     return {
         **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
-        "joint_sensor_mm": float(models["joint"][1]["optics"]["sensor"]),
-        "depth_m": list(config.depth_m),
         "patch_depth_m": list(config.patch_depth_m),
         "table": rows,
         "mean_mae": {n: float(np.mean([row[n]["mae"] for row in inside])) for n in models},
@@ -178,11 +161,9 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
     return "\n\n".join(tables(results).values())
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Command line."""
-    columns = "loss", "sensor_mm", "sigma_um", "depth_mm"
-    _command.main("edof", Config, columns, run, report, argv)
-
+main = functools.partial(
+    _command.main, "edof", Config, ("loss", "sensor_mm", "sigma_um", "depth_mm"), run, report
+)
 
 if __name__ == "__main__":
     main()

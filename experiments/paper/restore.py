@@ -5,6 +5,7 @@ more network for each level. Draws figure 5a and restored patches, and writes ta
 """
 
 import dataclasses
+import functools
 import pathlib
 from typing import Any
 
@@ -12,80 +13,60 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import drt_jax
 from drt_jax.learn import train
-from drt_jax.learn.data import DataConfig
 from drt_jax.runs.folder import Run
 
 from . import _command, _common, _training
-from ._training import JointTraining, Net, Scene
 
 
-@dataclasses.dataclass(frozen=True)
-class Config:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(_training.JointSettings):
     """Settings of the experiment; see configs/restore.yaml.
 
     starts_mm: trained at `noise`.
     table_starts_mm: trained at each of table_noise.
-    test_patches: how many of the test patches the table is measured on (0: all).
     """
 
-    starts_mm: tuple[float, ...]
     table_starts_mm: tuple[float, ...]
     table_noise: tuple[float, ...]
-    train: JointTraining
     distance_m: float = 25.0
-    noise: float = 0.01
-    test_patches: int = 0
-    seed: int = 0
-    network: Net = Net()
-    scene: Scene = Scene()
-    camera: train.Camera = train.Camera()
-    data: DataConfig = DataConfig()
 
     def __post_init__(self) -> None:
-        _common.require_list("starts_mm", self.starts_mm)
+        super().__post_init__()
         _common.require_list("table_starts_mm", self.table_starts_mm)
         _common.require_list("table_noise", self.table_noise, -1.0)
         _common.require_list("distance_m", (self.distance_m,))
-        _common.require_noise("noise", self.noise, *self.table_noise)
+        _common.require_noise("table_noise", *self.table_noise)
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Train every start and noise level, and test."""
-    lens = drt_jax.load_lens(config.scene.lens)
     distance = 1e3 * config.distance_m
-    weights, restore, count = config.network.build(config.seed)
-    blur = config.scene.blur(lens, distance, distance)
-    imager = train.make_imager(blur, restore, config.camera)
-    functions = train.make_step(imager, config.train.rates, (distance, distance), config.seed)
-    patches = _training.patches(config)
-    test = _training.thinned(patches.test, config.test_patches)
-
-    jobs = {(start, config.noise): _training.start_label(start) for start in config.starts_mm}
+    jobs = _training.Jobs(run, config, distance, distance)
+    blur = config.scene.blur(distance, distance)
+    imager = train.make_imager(blur, jobs.restore, config.camera)
+    functions, imager = jobs.step(imager), jax.jit(imager)
+    names = {(start, config.noise): _training.start_label(start) for start in config.starts_mm}
     table = [(start, noise) for noise in config.table_noise for start in config.table_starts_mm]
     for start, noise in table:
-        jobs.setdefault((start, noise), f"{_training.start_label(start)} noise {noise}")
+        names.setdefault((start, noise), f"{_training.start_label(start)} noise {noise}")
     trained = {}
-    for (start, noise), job in jobs.items():
-        parameters = {"optics": {"sensor": jnp.asarray(start)}, "network": weights}
-        trained[start, noise] = _training.train_job(
-            run, job, functions, parameters, patches.train, noise, config
-        )
-    imager, rows = jax.jit(imager), []
+    for (start, noise), job in names.items():
+        parameters = {"optics": {"sensor": jnp.asarray(start)}, "network": jobs.weights}
+        trained[start, noise] = jobs.train(job, functions, parameters, noise)
+    rows = []
     for start, noise in table:
         found = trained[start, noise]
         row = {"noise": noise, "start_mm": start, "sensor_mm": float(found["optics"]["sensor"])}
-        rows.append(row | train.evaluate(imager, found, test, distance, noise, config.seed))
-    start, noise = table[0]
-    some, key = _training.textured(test, 6), jax.random.key(1)
-    found = trained[start, noise]
+        rows.append(row | train.evaluate(imager, found, jobs.test, distance, noise, config.seed))
+    some, noise = _training.textured(jobs.test, 6), np.float32(table[0][1])
+    found, key = trained[table[0]], jax.random.key(1)
     return {
-        **_training.start_results(run, config, ("sensor_mm",)),
-        **_training.images(imager, found, some, distance, np.float32(noise), key),
-        "parameters": count,
+        **jobs.results("sensor_mm"),
+        **_training.images(imager, found, some, distance, noise, key),
+        "parameters": jobs.parameters,
         "test": rows,
-        "test_patches": len(test),
+        "test_patches": len(jobs.test),
     }
 
 
@@ -119,10 +100,9 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
     return "\n\n".join(tables(results).values())
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Command line."""
-    _command.main("restore", Config, ("loss", "sensor_mm", "sigma_um"), run, report, argv)
-
+main = functools.partial(
+    _command.main, "restore", Config, ("loss", "sensor_mm", "sigma_um"), run, report
+)
 
 if __name__ == "__main__":
     main()

@@ -58,67 +58,66 @@ def spot(name: str, lens: Lens, rays: int) -> tuple[Callable, Callable, str]:
     return (*{"optiland": _optiland, "batoid": _batoid}[name](module, lens, rays), version)
 
 
+def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
+    """An Optiland lens for one wavelength, indices (S + 1,)."""
+    optic = importlib.import_module("optiland.optic").Optic()
+    material = importlib.import_module("optiland.materials").IdealMaterial
+    optic.add_surface(index=0, thickness=lens.distance)
+    for i, (c, gap) in enumerate(zip(lens.curvature, lens.gaps)):
+        optic.add_surface(
+            index=i + 1,
+            radius=1 / c if c else np.inf,
+            thickness=gap,
+            material=material(n=float(index[i + 1])),
+            is_stop=i == lens.stop,
+        )
+    optic.add_surface(index=len(lens.gaps) + 1)
+    optic.set_aperture("float_by_stop_size", 2 * lens.semi)
+    optic.set_field_type("object_height")
+    optic.add_field(y=-lens.distance * np.tan(lens.field))
+    optic.add_wavelength(wavelength, is_primary=True)
+    return optic
+
+
 def _optiland(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
     torch, _ = load("torch")
     backend = importlib.import_module("optiland.backend")
-    Optic = importlib.import_module("optiland.optic").Optic
-    IdealMaterial = importlib.import_module("optiland.materials").IdealMaterial
     backend.set_backend("torch")
     backend.set_precision("float64")
     backend.grad_mode.enable()
-    systems = []
-    for index, wavelength in zip(lens.index.T, lens.wavelengths):
-        optic = Optic()
-        optic.add_surface(index=0, thickness=lens.distance)
-        for i, (c, gap) in enumerate(zip(lens.curvature, lens.gaps)):
-            optic.add_surface(
-                index=i + 1,
-                radius=1 / c if c else np.inf,
-                thickness=gap,
-                material=IdealMaterial(n=float(index[i + 1])),
-                is_stop=i == lens.stop,
-            )
-        optic.add_surface(index=len(lens.gaps) + 1)
-        optic.set_aperture("float_by_stop_size", 2 * lens.semi)
-        optic.set_field_type("object_height")
-        optic.add_field(y=-lens.distance * np.tan(lens.field))
-        optic.add_wavelength(wavelength, is_primary=True)
-        systems.append(optic)
-    rings = _rings(rays)
+    pairs = zip(lens.index.T, lens.wavelengths)
+    systems = [(_optiland_system(lens, index, wave), wave) for index, wave in pairs]
 
     def one(optic, wavelength):
-        hits = optic.trace(0, 1 if lens.field else 0, wavelength, rings, "hexapolar")
+        hits = optic.trace(0, 1 if lens.field else 0, wavelength, _rings(rays), "hexapolar")
         return torch.sqrt(hits.x.var(unbiased=False) + hits.y.var(unbiased=False))
 
-    def slope_of(leaf, otherwise):
-        known = torch.is_tensor(leaf) and leaf.grad is not None
-        return float(leaf.grad) if known else otherwise
+    def slopes(leaves, otherwise):
+        known = [torch.is_tensor(leaf) and leaf.grad is not None for leaf in leaves]
+        return np.array([float(a.grad) if k else otherwise for a, k in zip(leaves, known)])
 
     def value():
         backend.grad_mode.disable()
         with torch.no_grad():
-            sigma = [float(one(o, w)) for o, w in zip(systems, lens.wavelengths)]
+            sigma = [float(one(*system)) for system in systems]
         backend.grad_mode.enable()
         return np.array(sigma)
 
     def gradient():
-        values, slopes = [], []
-        for optic, wavelength in zip(systems, lens.wavelengths):
-            surfaces = list(optic.surface_group.surfaces)[1:]
-            radii = [s.geometry.radius for s in surfaces]
-            places = [s.geometry.cs.z for s in surfaces]
+        values, rows = [], []
+        bent = np.where(lens.curvature == 0, np.nan, lens.curvature)  # planes have no radius
+        for optic, wavelength in systems:
+            shapes = [surface.geometry for surface in optic.surface_group.surfaces][1:]
+            radii, places = [shape.radius for shape in shapes], [shape.cs.z for shape in shapes]
             for leaf in filter(torch.is_tensor, (*radii, *places)):
                 leaf.grad = None
             sigma = one(optic, wavelength)
             sigma.backward()
-            by_radius = np.array([slope_of(r, np.nan) for r in radii[:-1]])
-            place = np.array([slope_of(z, 0.0) for z in places])
-            bent = np.where(lens.curvature == 0, np.nan, lens.curvature)  # planes have no radius
-            by_curvature = -by_radius / bent**2
-            values.append(float(sigma.detach()))
+            place = slopes(places, 0.0)
             behind = np.cumsum(place[-2:0:-1])[::-1]  # a thickness moves all vertices behind it
-            slopes.append([*by_curvature, *behind, place[-1]])
-        return np.array(values), np.array(slopes)
+            values.append(float(sigma.detach()))
+            rows.append([*(-slopes(radii[:-1], np.nan) / bent**2), *behind, place[-1]])
+        return np.array(values), np.array(rows)
 
     return value, gradient
 

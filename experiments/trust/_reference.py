@@ -161,8 +161,9 @@ def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Arra
     even = jnp.linspace(-jnp.pi / 2, jnp.pi / 2, _PANELS + 1)
     ends = jnp.sort(jnp.concatenate([even, corners]))
     x, w = np.polynomial.legendre.leggauss(_AZIMUTHS)
-    width = jnp.diff(ends)[:, None] / 2
-    azimuth, width = (ends[:-1, None] + width * (1 + x)).ravel(), (width * w).ravel()
+    half = jnp.diff(ends)[:, None] / 2
+    azimuth = (ends[:-1, None] + half * (1 + x)[None]).ravel()
+    width = (half * w[None]).ravel()
 
     def values(parameters):
         moved = _moved(lens, parameters)
