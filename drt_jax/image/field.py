@@ -1,0 +1,74 @@
+"""From a field angle to its image point, and back, by the real chief ray."""
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..lens.glass import check_wavelengths
+from ..lens.lens import Lens
+from ..lens.paraxial import image_height
+from ..lens.scene import Scene, scene_of
+from ..numerics import safe_divide
+from ..rays.trace import trace_bundle
+
+_STEPS = 20
+
+
+def image_point(lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
+    """Where the chief rays, through the centre of the stop, meet the sensor: (W, 2) in mm, x and y
+    along its axes; 0 where they fail. Arguments as in `trace_rays`. Differentiable in every mode.
+
+    The centroid of a spot is another point: see `psf_moments`.
+    """
+    check_wavelengths(lens.glasses, wavelengths)
+    return _image_point(lens, scene_of(lens, field, distance, wavelengths))
+
+
+@jax.jit
+def _image_point(lens: Lens, scene: Scene) -> Array:
+    centre = jnp.zeros(1, lens.curvature.dtype)
+    hits = trace_bundle(lens, scene, (centre, centre)).hits
+    return jnp.concatenate([h[-1] for h in hits], axis=-1)
+
+
+def field_of_image(
+    lens: Lens, point: ArrayLike, distance: ArrayLike, wavelength: ArrayLike
+) -> Array:
+    """The field (2,), radians along x and y, whose chief ray meets the sensor at `point`.
+
+    point: (2,) in mm along the axes of the sensor. distance: as in `trace_rays`. wavelength: one,
+    um. Newton's method from the paraxial field; derivatives by the implicit function theorem. inf
+    where no field was found.
+    """
+    check_wavelengths(lens.glasses, wavelength)
+    dtype = lens.curvature.dtype
+    wanted = jnp.asarray(point, dtype)
+    if wanted.shape != (2,):
+        raise ValueError(f"point: expected x and y, got shape {wanted.shape}")
+    scene = scene_of(lens, jnp.zeros(2, dtype), distance, wavelength)
+    return _field_of_image(lens, scene, wanted)
+
+
+@jax.jit
+def _field_of_image(lens: Lens, scene: Scene, wanted: Array) -> Array:
+    dtype = wanted.dtype
+    unit = image_height(lens, jnp.asarray(jnp.pi / 4, dtype), scene.distance, scene.wavelengths)[0]
+    start = jnp.arctan(safe_divide(wanted, jnp.broadcast_to(unit, (2,))))
+    eps = float(jnp.finfo(dtype).eps)
+
+    def miss(field, args):
+        lens, scene, wanted = args
+        return _image_point(lens, Scene(field, scene.distance, scene.wavelengths))[0] - wanted
+
+    solution: optx.Solution = optx.root_find(
+        miss,
+        optx.Newton(rtol=16 * eps, atol=64 * eps),
+        start,
+        args=(lens, scene, wanted),
+        max_steps=_STEPS,
+        throw=False,
+    )
+    found = solution.result == optx.RESULTS.successful
+    return jnp.where(found, solution.value, jnp.inf)
