@@ -162,7 +162,7 @@ def spread_over_devices(config: Any, devices: int) -> float:
 
 def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[str, int]:
     """How many times a training step solves for rays, by what is trained: occurrences of
-    `solve_rays` in the jaxpr of a step."""
+    `attach` (`rays.solve`) in the jaxpr of a step."""
     near, far = distance / 2, distance
     cases = {
         "sensor trained, one depth": (("sensor",), (far, far)),
@@ -178,7 +178,7 @@ def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[
         init, step = train.make_step(imager, {"optics": 1e-3}, depths, 0)
         state = init({"optics": values})
         program = step.trace(state, scenes, np.float32(0), np.int32(0)).jaxpr
-        found[name] = str(program).count("name=solve_rays")
+        found[name] = str(program).count("name=attach")
     return found
 
 

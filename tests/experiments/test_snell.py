@@ -1,0 +1,59 @@
+"""The sequential trace that everything is compared with, against closed forms."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drt_jax import load_lens
+from experiments.snell import trace_snell
+
+trace = jax.jit(jax.vmap(trace_snell, (None, None, 0, None)))
+WAVE = jnp.asarray(0.55)
+ALONG = jnp.array([0.0, 0.0, 1.0])
+HEIGHTS = jnp.array([[0.0, 0.0, -5.0], [0.0, 1.5, -5.0], [1.0, -0.5, -5.0]])
+
+
+def test_paraboloid_and_ellipsoid_are_stigmatic():
+    """Parallel light meets the focus of a paraboloid, and that of an ellipsoid of glass with
+    k = -1/n^2, n R / (n - 1) behind its vertex."""
+    mirror = {"radius": -40.0, "conic": -1.0, "mirror": True, "stop": True, "semi_diameter": 5.0}
+    glass = {"radius": 20.0, "conic": -1 / 2.25, "index": 1.5, "stop": True, "semi_diameter": 5.0}
+    for surface, focus in ((mirror, -20.0), (glass, 60.0)):
+        lens = load_lens({"surfaces": [surface], "sensor": focus})
+        hits, ok = trace(lens, WAVE, HEIGHTS, ALONG)
+        assert np.all(ok)
+        np.testing.assert_allclose(hits[:, -1], np.tile([0, 0, focus], (3, 1)), atol=1e-13)
+
+
+def test_a_surface_that_bends_no_light_is_on_the_line_and_changes_nothing():
+    """A stop plane before, at and behind the first vertex; tilted light."""
+    direction = jnp.array([0.1, 0.3, 1.0]) / jnp.sqrt(1.1)
+    found = []
+    for gap in (0.6, 0.0, -0.4):
+        surfaces = [
+            {"radius": "inf", "thickness": gap, "stop": True, "semi_diameter": 2.0},
+            {"radius": 8.0, "thickness": 3.0, "index": 1.5, "semi_diameter": 4.0},
+            {"radius": -9.0, "thickness": 10.0, "semi_diameter": 4.0},
+        ]
+        lens = load_lens({"surfaces": surfaces})
+        start = HEIGHTS + jnp.array([[0.0, 0.0, gap]])
+        hits, ok = trace(lens, WAVE, start, direction)
+        assert np.all(ok)
+        at_stop = start + direction[None] * (-start[:, 2:] / direction[2])
+        np.testing.assert_allclose(hits[:, 0], at_stop, atol=1e-14)
+        found.append(np.asarray(hits[:, 1:]) - [0, 0, gap])
+    np.testing.assert_allclose(found[1], found[0], atol=1e-13)
+    np.testing.assert_allclose(found[2], found[0], atol=1e-13)
+
+
+def test_light_does_not_go_backwards_between_surfaces_that_bend_it():
+    surfaces = [
+        {"radius": 8.0, "thickness": 3.0, "index": 1.5, "stop": True, "semi_diameter": 3.0},
+        {"radius": -9.0, "thickness": 10.0},
+    ]
+    lens = load_lens({"surfaces": surfaces})
+    crossed = dataclasses.replace(lens, thickness=-lens.thickness)
+    for lens, forwards in ((lens, True), (crossed, False)):
+        assert np.all(trace(lens, WAVE, HEIGHTS, ALONG)[1] == forwards)
