@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,112 +12,124 @@ import drt_jax
 
 from ._scenes import WAVELENGTH, Scenes, fields, lens_of, pupil_points, scenes_of, two_elements
 
-__all__ = ["FAMILIES", "draw"]
-
 _FREEFORM = ("biconic", "toroid", "odd_asphere", "polynomial_xy", "asphere", "asphere")
 _PLASTICS = (1.535, 1.544, 1.614, 1.661)
 
+Make = Callable[[np.random.Generator, int, Any], Scenes]
+
 
 class Family(NamedTuple):
-    """variants: what `make(generator, count, variant)` is called with, scenes shared out evenly.
-    share: how many scenes for one of the other families."""
+    """Scenes of a kind.
 
-    make: Callable[[np.random.Generator, int, object], Scenes]
-    variants: tuple
+    what: in words.
+    make: (generator, how many, variant) -> scenes; `variants`, among which they are shared out.
+    share: how many scenes for one of the other families.
+    """
+
+    what: str
+    make: Make
+    variants: tuple = (0, 2, 4)
     share: float = 1.0
     dtype: str = "float64"
 
 
-def aperture(rng, count, stop):
-    """f/0.7 to f/32."""
-    parts, index, _ = two_elements(rng, count, stop, (0.7, 32))
-    return scenes_of(rng, parts, index, stop)
+def elements(change: Callable | None = None, f_number: tuple = (1.4, 16), **scenes: Any) -> Make:
+    """`two_elements`, changed in place by change(generator, parts, h, media); the rest as of
+    `scenes_of`. A variant is the index of the stop."""
+
+    def make(rng, count, stop):
+        parts, h, media = two_elements(rng, count, stop, f_number)
+        if change:
+            change(rng, parts, h, media)
+        return scenes_of(rng, parts, h, stop, media, **scenes)
+
+    return make
 
 
-def curvature(rng, count, stop):
-    """Curvatures through zero, exact and as good as, and near-hemispherical ones."""
-    parts, index, h = two_elements(rng, count, stop)
-    tiny = rng.choice([0.0, -0.0, 1e-300, -1e-16, 1e-12, -1e-9, 1e-6], (count, 5))
-    steep = rng.choice([-1, 1], (count, 5)) * rng.uniform(0.8, 1.02, (count, 5)) / h[:, None]
-    pick = rng.random((count, 5))
+def curvature(rng, parts, h, media):
+    """Through zero, exact and as good as; and near-hemispherical."""
+    shape = parts["curvature"].shape
+    tiny = rng.choice([0.0, -0.0, 1e-300, -1e-16, 1e-12, -1e-9, 1e-6], shape)
+    steep = rng.choice([-1, 1], shape) * rng.uniform(0.8, 1.02, shape) / h[:, None]
+    pick = rng.random(shape)
     change = np.where(pick < 0.3, tiny, np.where(pick > 0.85, steep, parts["curvature"]))
-    return scenes_of(rng, parts | {"curvature": change}, index, stop)
+    parts["curvature"] = change
 
 
-def conic(rng, count, stop):
-    """Paraboloids, hyperboloids to k = -30, and oblate ellipsoids to k = 3."""
-    parts, index, _ = two_elements(rng, count, stop, (0.8, 8))
-    low = -np.exp(rng.uniform(0, np.log(30), (count, 5)))
-    k = np.where(rng.random((count, 5)) < 0.2, -1.0, low)
-    k = np.where(rng.random((count, 5)) < 0.2, rng.uniform(0, 3, (count, 5)), k)
-    return scenes_of(rng, parts | {"conic": k}, index, stop)
+def conic(rng, parts, h, media):
+    """Paraboloids, hyperboloids, oblate ellipsoids."""
+    shape = parts["conic"].shape
+    low = -np.exp(rng.uniform(0, np.log(30), shape))
+    k = np.where(rng.random(shape) < 0.2, -1.0, low)
+    parts["conic"] = np.where(rng.random(shape) < 0.2, rng.uniform(0, 3, shape), k)
 
 
-def asphere(rng, count, stop):
-    """Aspheric departures of up to a tenth of the semi-diameter at the rim, terms of r^2 and
-    r^4 against each other."""
-    parts, index, h = two_elements(rng, count, stop)
-    rim = h[:, None] * rng.uniform(-0.1, 0.1, (count, 5)) * rng.random((count, 1)) ** 2
-    a4 = rim / h[:, None] ** 4
-    a2 = -rng.random((count, 5)) * rim / h[:, None] ** 2
-    return scenes_of(rng, parts | {"coefficients": np.stack([a2, a4], -1)}, index, stop)
+def asphere(rng, parts, h, media):
+    """Terms of r^2 and r^4 against each other."""
+    shape, h = parts["conic"].shape, h[:, None]
+    rim = h * rng.uniform(-0.1, 0.1, shape) * rng.random(h.shape) ** 2
+    a4, a2 = rim / h**4, -rng.random(shape) * rim / h**2
+    parts["coefficients"] = np.stack([a2, a4], -1)
 
 
-def index(rng, count, stop):
-    """Neighbouring indices equal, or apart by 1e-12 to 1e-2; some lenses all but vanish."""
-    parts, media, _ = two_elements(rng, count, stop)
+def index(rng, parts, h, media):
+    """Neighbours equal or nearly so; some lenses all but vanish."""
     near = 1 + rng.choice([0.0, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2], media.shape)
     close = rng.random(media.shape) < 0.5
-    media = np.where(close, near * rng.choice([1.0, 1.5, 1.9], (count, 1)), media)
-    return scenes_of(rng, parts, media, stop)
+    media[:] = np.where(close, near * rng.choice([1.0, 1.5, 1.9], (len(h), 1)), media)
 
 
-def edge(rng, count, stop):
-    """Rays that miss, graze or are totally reflected: stops too wide for steep surfaces, and
-    light that leaves glass at a slant."""
-    parts, media, _ = two_elements(rng, count, stop, (0.7, 2))
-    parts["semi_diameter"] = parts["semi_diameter"] * rng.uniform(1, 2.5, (count, 1))
-    slanted = rng.random(count) < 0.3
-    media[:, 0] = np.where(slanted, rng.uniform(1.4, 1.9, count), media[:, 0])
-    return scenes_of(rng, parts, media, stop, (0, 40))
+def edge(rng, parts, h, media):
+    """Stops too wide for steep surfaces, and light that leaves glass at a slant."""
+    h *= rng.uniform(1, 2.5, h.shape)
+    slanted = rng.random(h.shape) < 0.3
+    media[:, 0] = np.where(slanted, rng.uniform(1.4, 1.9, h.shape), media[:, 0])
 
 
-def touching(rng, count, stop):
-    """Surfaces that touch: gaps of 0, of less than a coordinate's last digit, and of 1e-8 mm."""
-    return _close(rng, count, stop, [0.0, 1e-17, 1e-8])
+def gaps(*sizes: float) -> Callable:
+    """Gaps of some sizes between surfaces, and before the sensor."""
+
+    def change(rng, parts, h, media):
+        gap = rng.choice(sizes, (len(h), 4))
+        thickness = np.where(rng.random(gap.shape) < 0.4, gap, parts["thickness"])
+        # Neighbours that touch must not cross: the same shape, or both planes.
+        c = parts["curvature"]
+        for i in range(4):
+            c[:, i + 1] = np.where(thickness[:, i] <= 1e-2, c[:, i], c[:, i + 1])
+        back = rng.choice([*sizes, 1.0, 30.0], len(h))
+        flat = back < 0.1  # the sensor on the last surface
+        c[:, 4] = np.where(flat, 0, c[:, 4])
+        c[:, 3] = np.where(flat & (thickness[:, 3] <= 1e-2), 0, c[:, 3])
+        sensor = np.sum(thickness, axis=1) + back + np.where(flat, 0, h)
+        parts |= {"thickness": thickness, "sensor": sensor}
+
+    return change
 
 
-def close(rng, count, stop):
-    """Surfaces that all but touch, stop and sensor included: gaps of 1e-6 to 1e-2 mm."""
-    return _close(rng, count, stop, [1e-6, 1e-4, 1e-2])
+def tilted(rng, parts, h, media):
+    """Surfaces and sensor."""
+    size = rng.random((len(h), 1, 1))
+    parts["tilt"] = np.radians(rng.uniform(-10, 10, (len(h), 6, 3))) * size
+    parts["decentre"] = rng.uniform(-0.1, 0.1, (len(h), 6, 2)) * size * h[:, None, None]
 
 
-def _close(rng, count, stop, gaps):
-    parts, media, h = two_elements(rng, count, stop)
-    gap = rng.choice(gaps, (count, 4))
-    thickness = np.where(rng.random((count, 4)) < 0.4, gap, parts["thickness"])
-    # Neighbours that touch must not cross: the same shape, or both planes.
-    c = parts["curvature"]
-    for i in range(4):
-        c[:, i + 1] = np.where(thickness[:, i] <= 1e-2, c[:, i], c[:, i + 1])
-    back = rng.choice([*gaps, 1.0, 30.0], count)
-    flat = back < 0.1  # the sensor on the last surface
-    c[:, 4] = np.where(flat, 0, c[:, 4])
-    c[:, 3] = np.where(flat & (thickness[:, 3] <= 1e-2), 0, c[:, 3])
-    sensor = np.sum(thickness, axis=1) + back + np.where(flat, 0, h)
-    return scenes_of(rng, parts | {"thickness": thickness, "sensor": sensor}, media, stop)
-
-
-def distance(rng, count, stop):
-    """Objects at 10 mm, between, at 1e9 mm and at infinity."""
-    parts, media, _ = two_elements(rng, count, stop, (1.4, 16))
-    return scenes_of(rng, parts, media, stop, (0, 20), (10.0, 20.0, 50.0, 1e5, 1e9, 1e15, np.inf))
+def freeform(rng, parts, h, media):
+    """A biconic, a toroid, odd powers, a polynomial and an asphere."""
+    c, size, count = parts["curvature"], h[:, None], len(h)
+    terms, powers = np.zeros((count, 5, 5)), np.array([1, 2, 3, 4, 5])
+    terms[:, 0, 0] = c[:, 0] * rng.uniform(-1, 1.5, count)
+    terms[:, 0, 1] = rng.uniform(-3, 0, count)
+    terms[:, 1, 0] = c[:, 1] * rng.choice([0.0, 0.5, 1.0, -1.0], count)
+    terms[:, 2] = rng.uniform(-0.02, 0.02, (count, 5)) * size / size**powers
+    terms[:, 3] = rng.uniform(-0.03, 0.03, (count, 5)) * size / size ** np.array([1, 1, 2, 2, 2])
+    terms[:, 4, 1] = rng.uniform(-0.03, 0.03, count) / h**3
+    parts["coefficients"] = terms
 
 
 def focus(rng, count, stop):
     """The sensor exactly at the paraxial focus; and stigmatic ellipsoids, whose spot is 0."""
-    parts, media, h = two_elements(rng, count, stop, (1, 16))
-    scenes = scenes_of(rng, parts, media, stop, (0, 5))
+    parts, h, media = two_elements(rng, count, stop, (1, 16))
+    scenes = scenes_of(rng, parts, h, stop, media, (0, 5))
     image = jax.vmap(lambda lens, d: drt_jax.image_distance(lens, d, jnp.array([WAVELENGTH]))[0])
     last = np.sum(parts["thickness"], axis=1)
     sensor = np.asarray(jax.jit(image)(scenes.lens, jnp.asarray(scenes.distance)))
@@ -128,55 +140,33 @@ def focus(rng, count, stop):
     media[:, 0] = 1
     n = media[:, 1]
     glass = ideal & (n > 1)
-    bend, k = parts["curvature"].copy(), parts["conic"].copy()
+    bend, k = parts["curvature"], parts["conic"]
     bend[:, 0], k[:, 0] = np.where(glass, c, bend[:, 0]), np.where(glass, -1 / n**2, 0)
     bend[:, 1:] = np.where(ideal[:, None], 0, bend[:, 1:])
     sensor = np.where(glass, n / (c * np.where(n > 1, n - 1, 1)), sensor)
-    sensor = np.maximum(sensor, last + 0.1)
-    parts = parts | {"curvature": bend, "conic": k, "sensor": sensor}
+    parts["sensor"] = np.maximum(sensor, last + 0.1)
     field = np.where(ideal[:, None], 0, scenes.field)
     far = np.where(ideal, np.inf, scenes.distance)
-    return Scenes(lens_of(parts, media, stop), field, far, scenes.pupil)
-
-
-def field(rng, count, stop):
-    """Fields of 20 to 45 degrees."""
-    parts, media, _ = two_elements(rng, count, stop, (2, 16))
-    return scenes_of(rng, parts, media, stop, (20, 45))
-
-
-def tilted(rng, count, stop):
-    """Surfaces and sensor tilted by up to 10 degrees and decentred by up to a tenth."""
-    parts, media, h = two_elements(rng, count, stop, (2, 16))
-    size = rng.random((count, 1, 1))
-    parts["tilt"] = np.radians(rng.uniform(-10, 10, (count, 6, 3))) * size
-    parts["decentre"] = rng.uniform(-0.1, 0.1, (count, 6, 2)) * size * h[:, None, None]
-    return scenes_of(rng, parts, media, stop)
+    return Scenes(lens_of(parts, h, stop, media), field, far, scenes.pupil)
 
 
 def mirror(rng, count, stop):
-    """Two mirrors facing each other, concave and convex, conic."""
+    """Concave and convex ones, facing each other."""
     h = rng.uniform(5, 50, count)
     gap = h * rng.uniform(1.5, 6, count)
-    first = -rng.uniform(0.05, 0.7, count) / h
-    second = -rng.uniform(-0.5, 1.2, count) / h
-    semi = np.full((count, 2), np.inf)
-    semi[:, stop] = h * (1 if stop == 0 else 0.4)
+    first, second = -rng.uniform(0.05, 0.7, count) / h, -rng.uniform(-0.5, 1.2, count) / h
     parts = {
         "curvature": np.stack([first, second], 1),
         "conic": rng.uniform(-4, 0.5, (count, 2)),
-        "coefficients": np.zeros((count, 2, 0)),
         "thickness": -gap[:, None],
-        "semi_diameter": semi,
         "sensor": h * rng.uniform(-1, 3, count),
     }
-    return scenes_of(
-        rng, parts, np.ones((count, 3)), stop, (0, 3), (np.inf, 1e6, 1e4), mirrors=(True, True)
-    )
+    far = (np.inf, 1e6, 1e4)
+    return scenes_of(rng, parts, 0.4 * h, stop, None, (0, 3), far, mirrors=(True, True))
 
 
 def folded(rng, count, stop):
-    """A periscope: two plane or weakly curved mirrors at 45 degrees, the stop behind or before."""
+    """A periscope of plane or weakly curved mirrors, the stop behind them."""
     h, reach = rng.uniform(2, 6, count), rng.uniform(20, 60, count)
     zero = np.zeros(count)
     c = rng.choice([0.0, 1e-3, -1e-3], (count, 2))
@@ -185,42 +175,18 @@ def folded(rng, count, stop):
     tilt = np.zeros((count, 5, 3))
     tilt[:, 1:3, 0] = np.radians(45) + np.radians(rng.uniform(-2, 2, (count, 2)))
     tilt[:, 3] = np.radians(rng.uniform(-3, 3, (count, 3)))
-    semi = np.full((count, 4), np.inf)
-    semi[:, stop] = h
     parts = {
         "curvature": np.stack([zero, c[:, 0], c[:, 1], zero], 1),
-        "conic": np.zeros((count, 4)),
-        "coefficients": np.zeros((count, 4, 0)),
         "thickness": np.diff(z, axis=1)[:, :3],
-        "semi_diameter": semi,
         "sensor": z[:, 4],
         "tilt": tilt,
-        "decentre": np.stack([np.zeros((count, 5)), y], -1),
+        "decentre": np.stack([0 * y, y], -1),
     }
-    return scenes_of(
-        rng, parts, np.ones((count, 5)), stop, (0, 5), mirrors=(False, True, True, False)
-    )
-
-
-def freeform(rng, count, stop):
-    """A biconic, a toroid, odd powers, a polynomial and an asphere."""
-    parts, media, h = two_elements(rng, count, stop, (1.4, 16))
-    size = h[:, None]
-    terms = np.zeros((count, 5, 5))
-    c = parts["curvature"]
-    terms[:, 0, 0] = c[:, 0] * rng.uniform(-1, 1.5, count)
-    terms[:, 0, 1] = rng.uniform(-3, 0, count)
-    terms[:, 1, 0] = c[:, 1] * rng.choice([0.0, 0.5, 1.0, -1.0], count)
-    powers = np.array([1, 2, 3, 4, 5])
-    terms[:, 2] = rng.uniform(-0.02, 0.02, (count, 5)) * size / size**powers
-    terms[:, 3] = rng.uniform(-0.03, 0.03, (count, 5)) * size / size ** np.array([1, 1, 2, 2, 2])
-    terms[:, 4, 1] = rng.uniform(-0.03, 0.03, count) / h**3
-    return scenes_of(rng, parts | {"coefficients": terms}, media, stop, forms=_FREEFORM)
+    return scenes_of(rng, parts, h, stop, None, (0, 5), mirrors=(False, True, True, False))
 
 
 def phone(rng, count, elements):
-    """Plastic aspheres to r^12, f about 4 mm, f/1.6 to f/2.4, fields to 40 degrees, the stop from
-    0.6 mm before to 0.6 mm behind the first vertex."""
+    """So many elements of a plastic, of f about 4 mm; the stop a label."""
     surfaces, f = 2 * elements, rng.uniform(3.5, 4.5, count)
     h = f / (2 * rng.uniform(1.6, 2.4, count))
     n = rng.choice(_PLASTICS, (count, elements))
@@ -243,17 +209,15 @@ def phone(rng, count, elements):
     terms = terms / height[..., None] ** powers
     rows = {"curvature": c, "conic": rng.uniform(-4, 0.5, c.shape), "coefficients": terms}
     parts = {name: np.insert(a, 0, 0, axis=1) for name, a in rows.items()}
-    parts["semi_diameter"] = np.full((count, surfaces + 1), np.inf)
-    parts["semi_diameter"][:, 0] = h
     parts["thickness"] = thickness
     parts["sensor"] = np.sum(thickness, axis=1) + rng.uniform(0.5, 1.5, count)
     glasses = "air", *(f"medium {i}" if i % 2 else "air" for i in range(surfaces + 1))
-    return scenes_of(rng, parts, media, 0, (0, 40), glasses=glasses)
+    return scenes_of(rng, parts, h, 0, media, (0, 40), glasses=glasses)
 
 
 def offaxis(rng, count, stop):
-    """Three mirrors that fold the beam, all tilted and decentred; the stop a plane that the first
-    or the second pokes through or touches, or the second itself."""
+    """Three mirrors that fold the beam, tilted and decentred; the stop a label at the first or the
+    second, or the second itself."""
     h = rng.uniform(5, 30, count)
     reach = h[:, None] * rng.uniform(3, 8, (count, 3))
     angle, place = np.zeros(count), np.zeros((count, 4, 2))
@@ -280,19 +244,14 @@ def offaxis(rng, count, stop):
         z = np.insert(z, row, z[:, row] - gap, axis=1)
         parts = {name: np.insert(a, row, 0, axis=1) for name, a in parts.items()}
         mirrors.insert(row, False)
-    surfaces = len(mirrors)
-    parts |= {"coefficients": np.zeros((count, surfaces, 0)), "tilt": tilt, "decentre": decentre}
     parts |= {"thickness": np.diff(z, axis=1)[:, :-1], "sensor": z[:, -1] - z[:, 0]}
-    parts["semi_diameter"] = np.full((count, surfaces), np.inf)
-    parts["semi_diameter"][:, row] = h
-    air, far = ("air",) * (surfaces + 1), (np.inf, 1e6, 1e4)
-    media = np.ones((count, surfaces + 1))
-    return scenes_of(rng, parts, media, row, (0, 3), far, glasses=air, mirrors=tuple(mirrors))
+    parts |= {"tilt": tilt, "decentre": decentre}
+    static = {"glasses": ("air",) * (len(mirrors) + 1), "mirrors": tuple(mirrors)}
+    return scenes_of(rng, parts, h, row, None, (0, 3), (np.inf, 1e6, 1e4), **static)
 
 
 def camera(rng, count, name):
-    """A bundled lens with parameters off by 3 %, fields to 1.2 times its own, objects from
-    300 mm on, aspheric terms of some um at the rim of the stop."""
+    """A bundled lens off by 3 %, with aspheric terms of some um at the rim of the stop."""
     lens = drt_jax.load_lens(name)
     surfaces = lens.count
     batch = jax.tree.map(lambda a: np.broadcast_to(a, (count, *a.shape)), lens)
@@ -318,29 +277,37 @@ def camera(rng, count, name):
 
 
 _CAMERAS = ("double_gauss", "cooke_triplet", "singlet")
+_EVERYWHERE = (10.0, 20.0, 50.0, 1e5, 1e9, 1e15, np.inf)
+_NEAR = "gaps of 1e-6 to 1e-2 mm, stop and sensor included"
+_MIRRORS = "three tilted, decentred mirrors, the stop at one: a plane through it, or itself"
+_PHONE = "3 to 5 aspheres to r^12, f/1.6 to f/2.4, to 40 degrees, stop -0.6 to 0.6 mm behind vertex"
 FAMILIES = {
-    "aperture": Family(aperture, (0, 2, 4)),
-    "curvature": Family(curvature, (0, 2, 4)),
-    "conic": Family(conic, (0, 2, 4)),
-    "asphere": Family(asphere, (0, 2, 4)),
-    "index": Family(index, (0, 2, 4)),
-    "edge": Family(edge, (0, 2, 4)),
-    "close": Family(close, (0, 2, 4)),
-    "touching": Family(touching, (2,), 0.2),
-    "distance": Family(distance, (0, 2, 4)),
-    "focus": Family(focus, (0, 2, 4)),
-    "field": Family(field, (0, 2, 4)),
-    "tilted": Family(tilted, (4,)),
-    "mirror": Family(mirror, (1,)),
-    "folded": Family(folded, (3,), 0.5),
-    "freeform": Family(freeform, (2,), 0.5),
-    "camera": Family(camera, _CAMERAS),
-    "camera, float32": Family(camera, _CAMERAS, 1.0, "float32"),
-    "aperture, float32": Family(aperture, (2,), 0.5, "float32"),
-    "asphere, float32": Family(asphere, (2,), 0.5, "float32"),
-    "field, float32": Family(field, (2,), 0.5, "float32"),
-    "phone": Family(phone, (3, 4, 5), 0.5),
-    "offaxis": Family(offaxis, ("first", "second", "itself"), 0.5),
+    "aperture": Family("f/0.7 to f/32", elements(f_number=(0.7, 32))),
+    "curvature": Family("zero, nearly zero, to hemispherical", elements(curvature)),
+    "conic": Family("constants of -30 to 3", elements(conic, (0.8, 8))),
+    "asphere": Family("departure to a tenth of the semi-diameter", elements(asphere)),
+    "index": Family("neighbours equal, or apart by 1e-12 to 1e-2", elements(index)),
+    "edge": Family("misses, grazing, total reflection", elements(edge, (0.7, 2), angles=(0, 40))),
+    "close": Family(_NEAR, elements(gaps(1e-6, 1e-4, 1e-2))),
+    "touching": Family("gaps of 0, 1e-17 and 1e-8 mm", elements(gaps(0.0, 1e-17, 1e-8)), (2,), 0.2),
+    "distance": Family("10 mm to infinity", elements(angles=(0, 20), distances=_EVERYWHERE)),
+    "focus": Family("sensor at the paraxial focus; stigmatic ellipsoids", focus),
+    "field": Family("20 to 45 degrees", elements(f_number=(2, 16), angles=(20, 45))),
+    "tilted": Family("by 10 degrees, decentred by a tenth", elements(tilted, (2, 16)), (4,)),
+    "mirror": Family("two conic mirrors facing each other", mirror, (1,)),
+    "folded": Family("a periscope", folded, (3,), 0.5),
+    "freeform": Family(
+        "biconic, toroid, odd powers, XY polynomial", elements(freeform, forms=_FREEFORM), (2,), 0.5
+    ),
+    "camera": Family("three bundled lenses off by 3 %", camera, _CAMERAS),
+    "camera, float32": Family("the same", camera, _CAMERAS, 1.0, "float32"),
+    "aperture, float32": Family("as aperture", elements(f_number=(0.7, 32)), (2,), 0.5, "float32"),
+    "asphere, float32": Family("as asphere", elements(asphere), (2,), 0.5, "float32"),
+    "field, float32": Family(
+        "as field", elements(f_number=(2, 16), angles=(20, 45)), (2,), 0.5, "float32"
+    ),
+    "phone": Family(_PHONE, phone, (3, 4, 5), 0.5),
+    "offaxis": Family(_MIRRORS, offaxis, ("first", "second", "itself"), 0.5),
 }
 
 

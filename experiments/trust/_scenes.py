@@ -25,24 +25,31 @@ class Scenes(NamedTuple):
     pupil: np.ndarray
 
 
-def lens_of(parts: dict, index: np.ndarray, stop: int, **static) -> drt_jax.Lens:
-    """A batch of lenses from arrays (N, ...) of S surfaces, to which the sensor is added, and
-    constant indices (N, S + 1); `static`: fields of the lens, media all different by default."""
-    count, media = index.shape
-    schott = np.zeros((count, media, 6))
-    schott[..., 0] = index**2
-    zero = np.zeros((count, media, 3))
-    last = {"curvature": 0.0, "conic": 0.0, "coefficients": 0.0, "semi_diameter": np.inf}
-    for name, value in last.items():
-        row = np.full_like(parts[name][:, :1], value)
-        parts = parts | {name: np.concatenate([parts[name], row], axis=1)}
+def lens_of(
+    parts: dict, h: np.ndarray, stop: int, media: np.ndarray | None = None, **static
+) -> drt_jax.Lens:
+    """A batch of lenses.
+
+    parts: arrays (N, ...) of S surfaces, to which the sensor is added; conic and coefficients may
+        be missing.
+    h: (N,), semi-diameter of the stop in mm; other surfaces have none.
+    media: (N, S + 1), constant indices, by default 1; static: other fields of the lens.
+    """
+    count, surfaces = parts["curvature"].shape
+    zero, semi = np.zeros((count, surfaces)), np.full((count, surfaces), np.inf)
+    semi[:, stop] = h
+    rows = {"conic": zero, "coefficients": np.zeros((count, surfaces, 0)), "semi_diameter": semi}
+    parts = rows | parts
+    for name in ("curvature", *rows):
+        last = np.full_like(parts[name][:, :1], np.inf if name == "semi_diameter" else 0)
+        parts[name] = np.concatenate([parts[name], last], axis=1)
+    schott = np.zeros((count, surfaces + 1, 6))
+    schott[..., 0] = 1 if media is None else media**2
+    none = jnp.zeros((count, surfaces + 1, 3))
+    names = {"glasses": tuple(f"medium {i}" for i in range(surfaces + 1))}
     arrays = {name: jnp.asarray(value, float) for name, value in parts.items()}
-    return drt_jax.Lens(
-        dispersion=Dispersion(jnp.asarray(zero), jnp.asarray(zero), jnp.asarray(schott)),
-        stop=stop,
-        **{"glasses": tuple(f"medium {i}" for i in range(media))} | static,
-        **arrays,
-    )
+    constants = Dispersion(none, none, jnp.asarray(schott))
+    return drt_jax.Lens(dispersion=constants, stop=stop, **names | static, **arrays)
 
 
 def pupil_points(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -64,7 +71,7 @@ def two_elements(
     rng: np.random.Generator, count: int, stop: int, f_number: tuple = (1.4, 16)
 ) -> tuple:
     """Two elements, or three cemented ones, of about the f-number, the stop at surface `stop`:
-    a plane in air or a refracting surface. Returns the parts of a lens, and indices."""
+    a plane in air or a refracting surface. Returns parts of `lens_of`, h and media."""
     h = np.exp(rng.uniform(np.log(1), np.log(20), count))
     number = np.exp(rng.uniform(*np.log(f_number), count))
     n = rng.uniform(1.4, 1.95, (count, 3))
@@ -86,22 +93,21 @@ def two_elements(
     steepest = np.max(np.abs(curvature), axis=1) * h
     curvature = curvature * np.minimum(1, 0.9 / steepest)[:, None]
     thickness = h[:, None] * rng.uniform(0.1, 0.9, (count, 4)) + 0.5
-    semi = np.full((count, 5), np.inf)
-    semi[:, stop] = h
     parts = {
         "curvature": curvature,
         "conic": np.zeros((count, 5)),
         "coefficients": np.zeros((count, 5, 2)),
         "thickness": thickness,
-        "semi_diameter": semi,
         "sensor": np.sum(thickness, axis=1) + h * rng.uniform(1, 8, count),
     }
-    return parts, index, h
+    return parts, h, index
 
 
-def scenes_of(rng, parts, index, stop, angles=(0.0, 15.0), distances=_FAR, **static) -> Scenes:
-    count = len(index)
+def scenes_of(rng, parts, h, stop, media=None, angles=(0, 15), distances=_FAR, **static) -> Scenes:
+    """Scenes of `lens_of`, fields from and to so many degrees, a tenth of them 0, and distances
+    from a list in mm."""
+    count = len(h)
     field = fields(rng, count, *angles)
     field[rng.random(count) < 0.1] = 0
-    distance = rng.choice(distances, count)
-    return Scenes(lens_of(parts, index, stop, **static), field, distance, pupil_points(rng, count))
+    lens = lens_of(parts, h, stop, media, **static)
+    return Scenes(lens, field, rng.choice(distances, count), pupil_points(rng, count))

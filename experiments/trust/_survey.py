@@ -1,6 +1,5 @@
 """What is measured on a batch of random scenes: finite numbers, Snell's law, rays not found."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax

@@ -68,7 +68,7 @@ def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
     steps, errors = found["steps"], found["float32_error"]
     return {
         "name": name,
-        "what": " ".join((FAMILIES[name].make.__doc__ or "").split()),
+        "what": FAMILIES[name].what,
         "dtype": FAMILIES[name].dtype,
         "scenes": len(status),
         "rays": status.size,
