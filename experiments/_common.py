@@ -73,6 +73,14 @@ def remembered(run: Run, job: str, measure: Callable[[], Any]) -> Any:
     return found
 
 
+def grouped(rows: Iterable[dict], *keys: str) -> dict[tuple, list[dict]]:
+    """Rows by their values of the keys, in the order of their first."""
+    groups: dict[tuple, list[dict]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return groups
+
+
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A Markdown table that can be read as plain text too; nothing is shown for None."""
 

@@ -22,6 +22,8 @@ from drt_jax.learn import train
 from . import _common
 
 Row = dict[str, Any]
+# What is known of a program that was compiled, see `Ours`.
+MEASURED = ("compile_s", "peak_mb", "kernels")
 
 _FIRST = """
 import time; start = time.perf_counter()
@@ -87,15 +89,13 @@ def loaded(function: Callable, *arguments: Any) -> Ours:
         given = [jnp.array(a) if gone else a for a, gone in zip(leaves, donated)]
         return jax.block_until_ready(program(*jax.tree.unflatten(structure, given)))
 
-    measured = {"compile_s": seconds, "peak_mb": held / 2**20, "kernels": kernels}
-    return Ours(call, measured)
+    return Ours(call, dict(zip(MEASURED, (seconds, held / 2**20, kernels))))
 
 
 def row(task: str, seconds: float, **known: Any) -> Row:
     """A row of results.json; what is not known is None."""
-    columns = ("ours_error", "compile_s", "peak_mb", "kernels", "peer_s", "ratio", "peer_error")
-    empty = {"task": task, "ours_s": seconds, "peer": "", "note": "", **dict.fromkeys(columns)}
-    return empty | known
+    unknown = dict.fromkeys(("ours_error", *MEASURED, "peer_s", "ratio", "peer_error"))
+    return {"task": task, "ours_s": seconds, "peer": "", "note": ""} | unknown | known
 
 
 def rows_of(

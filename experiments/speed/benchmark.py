@@ -10,6 +10,7 @@ surfaces and wavelengths. Draws run time against error, and the growth.
 """
 
 import dataclasses
+import functools
 import math
 import os
 import pathlib
@@ -31,16 +32,7 @@ from ._reference import Moments, reference
 from ._work import Row, compiled, loaded, rows_of
 from .snell import trace_snell
 
-_COLUMNS = (
-    "ours_s",
-    "peer_s",
-    "ratio",
-    "ours_error",
-    "peer_error",
-    "compile_s",
-    "peak_mb",
-    "kernels",
-)
+_COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", *_work.MEASURED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -314,25 +306,21 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
         figure, axes = show.new(1, 1, 5.5, 4)
         show.growth(axes, results["work"])
         figure.savefig(figures / "work.png")
-    rows = [row for row in results["rows"] if row["task"].startswith("sigma")]
-    tasks = list(dict.fromkeys(row["task"] for row in rows))
-    if tasks:
+    spots = [row for row in results["rows"] if row["task"].startswith("sigma")]
+    if spots:
+        tasks = _common.grouped(spots, "task")
         across = min(2, len(tasks))
         figure, axes = show.new(-(-len(tasks) // across), across, 4.5, 3.2)
-        for axis, task in zip(np.ravel(axes), tasks):
-            some = [row for row in rows if row["task"] == task]
-            marks = {"drt_jax": [(1e3 * some[0]["ours_s"], some[0]["ours_error"])]}
-            measured = [row for row in some if row["peer_s"]]
-            marks |= {r["peer"]: [(1e3 * r["peer_s"], r["peer_error"])] for r in measured}
+        for axis, ((task,), rows) in zip(np.ravel(axes), tasks.items()):
+            marks = {"drt_jax": [(1e3 * rows[0]["ours_s"], rows[0]["ours_error"])]}
+            peers = [row for row in rows if row["peer_s"]]
+            marks |= {row["peer"]: [(1e3 * row["peer_s"], row["peer_error"])] for row in peers}
             show.programs(axis, marks, task)
         figure.savefig(figures / "peers.png")
     return "\n\n".join(tables(results).values())
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Command line."""
-    _command.main("benchmark", Config, _COLUMNS, run, report, argv)
-
+main = functools.partial(_command.main, "benchmark", Config, _COLUMNS, run, report)
 
 if __name__ == "__main__":
     main()

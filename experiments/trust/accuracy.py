@@ -13,6 +13,7 @@ compiled call; gradient_seconds: of one with its gradients in reverse mode.
 """
 
 import dataclasses
+import functools
 import math
 import pathlib
 from collections.abc import Sequence
@@ -29,11 +30,11 @@ from drt_jax import Lens, PupilRule, pupil, show
 from drt_jax.runs.folder import Run
 
 from . import _command, _common
+from ._common import grouped
 from ._reference import Moments, flatten, reference
 
 _QUADRATURE = "quadrature"
 _COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")
-_PANELS = ("on axis", "off axis", "vignetted", "float32")
 # What the table shows: the default tolerance, and patterns of so many rays.
 _DEFAULT, _RANDOM, _MANY = 1e-6, 256, 16384
 
@@ -289,62 +290,53 @@ def middle(rows: list[dict], key: str) -> float:
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Methods by panel, and what the promised tolerances cost and kept."""
     lines = []
-    for panel in _PANELS:
-        groups: dict[tuple[str, int], list[dict]] = {}
-        for row in results["curves"]:
-            if row["panel"] == panel:
-                groups.setdefault((row["method"], row["size"]), []).append(row)
-        for (method, _), some in shown(groups):
-            error, slope = (f"{middle(some, k):.1e}" for k in ("relative_error", "gradient_error"))
-            rays, time = int(middle(some, "rays")), _common.duration(middle(some, "seconds"))
+    for (panel,), some in grouped(results["curves"], "panel").items():
+        for method, rows in shown(grouped(some, "method", "size")):
+            error, slope = (f"{middle(rows, k):.1e}" for k in ("relative_error", "gradient_error"))
+            rays, time = int(middle(rows, "rays")), _common.duration(middle(rows, "seconds"))
             lines.append((panel, method, rays, error, slope, time))
     header = "scenes", "method", "rays a colour", "error of sigma", "of its gradient", "a call"
-    kept, promised = [], []
-    for panel in _PANELS:
-        some = [p for p in results["tolerances"] if p["panel"] == panel]
-        promised = list(dict.fromkeys(p["tolerance"] for p in some)) or promised
-        cells = []
-        for tolerance in promised:
-            here = [p for p in some if p["tolerance"] == tolerance]
-            worst, most = (max(p[k] for p in here) for k in ("relative_error", "rays"))
+    promises, kept = results["tolerances"], []
+    for (panel,), some in grouped(promises, "panel").items():
+        cells = [panel]
+        for rows in grouped(some, "tolerance").values():
+            worst, most = (max(row[k] for row in rows) for k in ("relative_error", "rays"))
             cells.append(f"{most}, {worst:.1e}")
-        kept.append((panel, *cells))
+        kept.append(cells)
+    promised = [f"{tolerance:.0e}" for (tolerance,) in grouped(promises, "tolerance")]
     return {
         "accuracy": _common.table(header, lines),
-        "accuracy, tolerances": _common.table(
-            ("most rays a colour, worst error", *(f"{t:.0e}" for t in promised)), kept
-        ),
+        "accuracy, tolerances": _common.table(("most rays a colour, worst error", *promised), kept),
     }
 
 
-def shown(groups: dict[tuple[str, int], list[dict]]) -> list[tuple[tuple[str, int], list[dict]]]:
-    """Of the measured (method, size): the first two orders within the default tolerance, random
-    rays as in the paper, and the best of large patterns."""
-    rules = [k for k, rows in groups.items() if k[0] == _QUADRATURE]
-    chosen = [k for k in rules if middle(groups[k], "relative_error") < _DEFAULT][:2] or rules[-1:]
-    chosen += [k for k in groups if k == ("random", _RANDOM)]
-    large = [k for k in groups if k[0] not in (_QUADRATURE, "random") and k[1] == _MANY]
-    chosen += sorted(large, key=lambda k: middle(groups[k], "relative_error"))[:1]
-    return [(k, groups[k]) for k in chosen]
+def shown(groups: dict[tuple, list[dict]]) -> list[tuple[str, list[dict]]]:
+    """Of rows by (method, size): the first two orders within the default tolerance, random rays as
+    in the paper, and the best of large patterns."""
+    errors = {kind: middle(rows, "relative_error") for kind, rows in groups.items()}
+    rules = [kind for kind in groups if kind[0] == _QUADRATURE]
+    chosen = [kind for kind in rules if errors[kind] < _DEFAULT][:2] or rules[-1:]
+    chosen += [kind for kind in groups if kind == ("random", _RANDOM)]
+    large = [kind for kind in groups if kind[0] != "random" and kind[1] == _MANY]
+    chosen += sorted(large, key=errors.__getitem__)[:1]
+    return [(kind[0], groups[kind]) for kind in chosen]
 
 
 def report(results: dict[str, Any], figures: pathlib.Path) -> str:
     """Draw error over time and over rays, a panel for each group of scenes; median and range."""
-    rows = results["curves"]
-    panels = [p for p in _PANELS if any(r["panel"] == p for r in rows)]
+    panels = grouped(results["curves"], "panel")
+    columns = min(2, len(panels))
     for name, x, y, xlabel, ylabel in (
         ("time_error", "seconds", "relative_error", "time of a call (ms)", "σ"),
         ("rays_error", "rays", "relative_error", "rays a colour", "σ"),
         ("gradient_error", "rays", "gradient_error", "rays a colour", "dσ"),
     ):
-        columns = min(2, len(panels))
         figure, axes = show.new(-(-len(panels) // columns), columns, 5.2, 3.9)
         for ax in np.ravel(axes)[len(panels) :]:
             ax.set_visible(False)
-        for ax, panel in zip(np.ravel(axes), panels):
-            here = [r for r in rows if r["panel"] == panel]
-            draw_panel(ax, here, x, y, (xlabel, f"error of {ylabel}, relative"))
-            count = len({r["scene"] for r in here})
+        for ax, ((panel,), rows) in zip(np.ravel(axes), panels.items()):
+            draw_panel(ax, rows, x, y, (xlabel, f"error of {ylabel}, relative"))
+            count = len(grouped(rows, "scene"))
             ax.set_title(f"{panel}, {count} scene{'s' * (count != 1)}", fontsize=10)
         figure.savefig(figures / f"{name}.png")
     keys = "reference_error", "reference_gradient_error"
@@ -356,24 +348,20 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
 def draw_panel(axes: Any, rows: list[dict], x: str, y: str, labels: tuple[str, str]) -> None:
     """Column y over column x of the scenes of a panel, by method."""
     curves, note = {}, None
-    for method in dict.fromkeys(r["method"] for r in rows):
-        some = [r for r in rows if r["method"] == method]
-        groups = {k: [r for r in some if r["size"] == k] for k in {r["size"] for r in some}}
+    for (method,), some in grouped(rows, "method").items():
+        groups = sorted(grouped(some, "size").items())
         # A size that few scenes have would bend the line of their median.
-        most = max(map(len, groups.values()))
-        groups = {k: g for k, g in sorted(groups.items()) if 2 * len(g) >= most}
-        across = {k: middle(g, x) * (1e3 if x == "seconds" else 1) for k, g in groups.items()}
-        curves[method] = list(across.values()), [[r[y] for r in g] for g in groups.values()]
-        if method == "random" and _RANDOM in groups:
-            place = across[_RANDOM], middle(groups[_RANDOM], y)
-            note = *place, f"the paper's {_RANDOM} rays"
+        most = max(len(group) for _, group in groups)
+        groups = [(size, group) for (size,), group in groups if 2 * len(group) >= most]
+        across = [middle(group, x) * (1e3 if x == "seconds" else 1) for _, group in groups]
+        curves[method] = across, [[row[y] for row in group] for _, group in groups]
+        for place, (size, group) in zip(across, groups):
+            if (method, size) == ("random", _RANDOM):
+                note = place, middle(group, y), f"the paper's {_RANDOM} rays"
     show.error_curves(axes, curves, *labels, note)
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Command line."""
-    _command.main("accuracy", Config, _COLUMNS, run, report, argv)
-
+main = functools.partial(_command.main, "accuracy", Config, _COLUMNS, run, report)
 
 if __name__ == "__main__":
     main()

@@ -7,6 +7,7 @@ by family.
 """
 
 import dataclasses
+import functools
 import pathlib
 from typing import Any
 
@@ -178,10 +179,7 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
     return "\n\n".join(tables(results).values())
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Command line."""
-    _command.main("stability", Config, _COLUMNS, run, report, argv)
-
+main = functools.partial(_command.main, "stability", Config, _COLUMNS, run, report)
 
 if __name__ == "__main__":
     main()
