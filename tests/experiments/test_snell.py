@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from experiments.snell import trace_snell
 
 from drt_jax import load_lens
-from experiments.snell import trace_snell
 
 trace = jax.jit(jax.vmap(trace_snell, (None, None, 0, None)))
 WAVE = jnp.asarray(0.55)

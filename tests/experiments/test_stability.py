@@ -3,11 +3,11 @@
 import jax
 import numpy as np
 import pytest
+from experiments._families import FAMILIES, draw
+from experiments.stability import joined, row_of
 
 from drt_jax import Status
 from experiments import _survey
-from experiments._families import FAMILIES, draw
-from experiments.stability import joined, row_of
 
 pytestmark = pytest.mark.slow
 SCENES = 50
