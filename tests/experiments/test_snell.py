@@ -55,5 +55,5 @@ def test_light_does_not_go_backwards_between_surfaces_that_bend_it():
     ]
     lens = load_lens({"surfaces": surfaces})
     crossed = dataclasses.replace(lens, thickness=-lens.thickness)
-    for lens, forwards in ((lens, True), (crossed, False)):
-        assert np.all(trace(lens, WAVE, HEIGHTS, ALONG)[1] == forwards)
+    for each, forwards in ((lens, True), (crossed, False)):
+        assert np.all(trace(each, WAVE, HEIGHTS, ALONG)[1] == forwards)
