@@ -162,8 +162,8 @@ def by_form(function: Callable, w: Point, shape: Shape, forms: tuple[str, ...]) 
     are put in order along the surface axis.
     """
     kinds = sorted(set(forms))
-    if len(kinds) == 1:
-        return function(w, shape, kinds[0])
+    if len(kinds) <= 1:
+        return function(w, shape, *(kinds or ["asphere"]))
     rows = {kind: np.flatnonzero([form == kind for form in forms]) for kind in kinds}
     parts = [
         function(

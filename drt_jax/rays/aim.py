@@ -18,7 +18,7 @@ from jax import Array
 from ..lens.paraxial import trace_yu
 from ..lens.surface import Shape, vertex_curvature
 from ..numerics import safe_divide
-from .fermat import label
+from .fermat import geometry, label, up_to
 from .snell import shoot, shoot_to_stop
 from .status import Status
 from .system import System, Vector, dot
@@ -35,11 +35,13 @@ _TILES, _FAN, STARTS = 15, 5, 24
 
 class _State(NamedTuple):
     """move: D numbers, from the best launch so far to the next trial, mm. far: by how much the best
-    misses its stop point, mm, inf before one arrived. bad: trials in a row that came no nearer."""
+    misses its stop point, mm, inf before one arrived. bad: trials in a row that came no nearer.
+    folded: whether the best crosses the stop on the other side of a fold of the beam."""
 
     move: Vector
     far: Array
     bad: Array
+    folded: Array
 
 
 class AimNewton(optx.AbstractRootFinder):
@@ -47,7 +49,9 @@ class AimNewton(optx.AbstractRootFinder):
     farther off, the next is half as long; after a good one, at most twice as long.
 
     The function returns the miss (D numbers) and the fate of the ray as its auxiliary output.
-    Options: "reach", the longest first step in mm. Ends when the miss is at most `atol` mm, and
+    Options: "reach", the longest first step in mm; "upright", whether trials beyond a fold of the
+    beam, where its image on the stop is turned over, are as bad as lost ones: of two rays through
+    one stop point, neighbours then take the same. Ends when the miss is at most `atol` mm, and
     the step that remains is taken; or with RESULTS.nonlinear_divergence.
     """
 
@@ -58,13 +62,16 @@ class AimNewton(optx.AbstractRootFinder):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """The state before the first trial, at the launch that is given."""
         far = jnp.full(y[0].shape, jnp.inf, y[0].dtype)
-        return _State(tuple(jnp.zeros_like(a) for a in y), far, jnp.zeros((), jnp.int32))
+        none = tuple(jnp.zeros_like(a) for a in y)
+        return _State(none, far, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
 
     def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
         """One trial."""
         trial = tuple(a + b for a, b in zip(y, state.move, strict=True))
         miss, columns, fate = _derivatives(lambda y: fn(y, args), trial)
-        far = jnp.where(fate == Status.OK, self.norm(miss), jnp.inf)
+        folded = _determinant(columns) < 0
+        counts = (fate == Status.OK) & ~(folded & options.get("upright", False))
+        far = jnp.where(counts, self.norm(miss), jnp.inf)
         better = far < state.far
         newton = tuple(-a for a in _divide(columns, miss))
         bound = jnp.where(jnp.isinf(state.far), options["reach"], 2 * self.norm(state.move))
@@ -72,7 +79,8 @@ class AimNewton(optx.AbstractRootFinder):
         move = tuple(jnp.where(better, a, b / 2) for a, b in zip(newton, state.move, strict=True))
         y = tuple(jnp.where(better, a, b) for a, b in zip(trial, y, strict=True))
         bad = jnp.where(better, 0, state.bad + 1).astype(jnp.int32)
-        return y, _State(move, jnp.minimum(far, state.far), bad), fate
+        folded = jnp.where(better, folded, state.folded)
+        return y, _State(move, jnp.minimum(far, state.far), bad, folded), fate
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
         """Whether the ray is aimed, or given up."""
@@ -104,26 +112,44 @@ def _divide(columns: Vector, miss: Vector) -> Vector:
     if len(miss) == 1:
         return (safe_divide(miss[0], columns[0][0]),)
     (p, q), (r, s) = columns
-    determinant = p * s - q * r
+    determinant = _determinant(columns)
     x, y = s * miss[0] - q * miss[1], p * miss[1] - r * miss[0]
     return safe_divide(x, determinant), safe_divide(y, determinant)
 
 
+def _determinant(columns: Vector) -> Array:
+    """Of 2 x 2 derivatives; 1 for a single one, whose sign tells no fold."""
+    if len(columns) == 1:
+        return jnp.ones_like(columns[0][0])
+    (p, q), (r, s) = columns
+    return p * s - q * r
+
+
 class Aimed(NamedTuple):
     """launch: D arrays (W, Q) in mm. status: (W, Q), OK for an aimed ray; else what stopped it
-    before the stop, UNCONVERGED if nothing did. steps: (), trials of the whole bundle."""
+    before the stop, UNCONVERGED if nothing did. folded: (W, Q), see `AimNewton`. steps: (), trials
+    of the whole bundle."""
 
     launch: Vector
     status: Array
+    folded: Array
     steps: Array
 
 
-def aim(system: System, target: Vector, launch: Vector, beam: Array, reach: Array) -> Aimed:
+def aim(
+    system: System,
+    target: Vector,
+    launch: Vector,
+    sizes: tuple[Array, Array],
+    upright: Array | bool = False,
+) -> Aimed:
     """Aim rays at stop points `target`, D arrays (W, Q) in mm, from first guesses `launch`.
 
-    beam, reach: () radius of the beam at the stop, and the longest first step, mm.
+    sizes: () radius of the beam at the stop, and the longest first step, mm. upright: see
+    `AimNewton`.
     """
     eps = float(jnp.finfo(launch[0].dtype).eps)
+    beam, reach = sizes
     solver = AimNewton(rtol=0.0, atol=max(_NEAR, 64 * eps) * beam)
 
     def one(index, target, launch):
@@ -138,7 +164,7 @@ def aim(system: System, target: Vector, launch: Vector, beam: Array, reach: Arra
             solver,
             launch,
             args=target,
-            options={"reach": reach},
+            options={"reach": reach, "upright": jnp.asarray(upright)},
             has_aux=True,
             max_steps=_STEPS,
             throw=False,
@@ -146,11 +172,11 @@ def aim(system: System, target: Vector, launch: Vector, beam: Array, reach: Arra
         lost = jnp.where(solution.aux == Status.OK, Status.UNCONVERGED, solution.aux)
         found = solution.result == optx.RESULTS.successful
         status = jnp.where(found, Status.OK, lost).astype(jnp.int32)
-        return solution.value, status, solution.stats["num_steps"]
+        return solution.value, status, solution.state.folded, solution.stats["num_steps"]
 
     bundle = jax.vmap(jax.vmap(one, (None, 0, 0)), (1, 0, 0))
-    launch, status, steps = bundle(system.index[..., 0], target, launch)
-    return Aimed(launch, status, jnp.max(steps).astype(jnp.int32))
+    launch, status, folded, steps = bundle(system.index[..., 0], target, launch)
+    return Aimed(launch, status, folded, jnp.max(steps).astype(jnp.int32))
 
 
 def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
@@ -234,7 +260,8 @@ def trace_fan(system: System, fan: Fan, reach: Array) -> Fan:
     shape = fan.there[0].shape
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
     trace = shoot(system, flat)
-    there = label(trace.hits, system)
+    hits, part = up_to(trace.hits, system, system.before)
+    there = label(hits, geometry(hits, part), part)
     good = trace.fate == Status.OK
     return Fan(launch, tuple(jnp.where(good, a, jnp.inf).reshape(shape) for a in there))
 

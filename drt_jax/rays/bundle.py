@@ -75,8 +75,8 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
     radius = jnp.sqrt(jnp.max(dot(target, target)))
     waves = target[0].shape[0]
     wanted = tuple(jnp.broadcast_to(radius * p, (waves, p.size)) for p in points)
-    sizes = beam_size(system, wanted)
-    aimed = aim(system, wanted, paraxial_launch(system, wanted, sizes[1]), *sizes)
+    sizes, upright = beam_size(system, wanted), system.rows.rotation is None
+    aimed = aim(system, wanted, paraxial_launch(system, wanted, sizes[1]), sizes, upright)
     good = jnp.all(aimed.status == Status.OK)
 
     pairs = np.array([(i, d - i) for d in range(_DEGREE + 1) for i in range(d + 1)])

@@ -29,6 +29,7 @@ class Path(NamedTuple):
     before: D + 1 arrays (R, W, Q), unit vectors in front of each row, along that row's axes.
     after: D + 1 arrays (L, W, Q), unit vectors behind each live surface, along its axes.
     length: (R, W, Q), of the segments in front of the rows, mm; void for the first.
+    height: (R, W, Q), the sag in mm.
     spread: (W, Q), how fast the direction of the light turns over the first surface, 1/mm.
     slope: D arrays (R, W, Q), derivatives of the sag.
     bend: D rows of D arrays (R, W, Q), second derivatives of the sag, 1/mm.
@@ -37,6 +38,7 @@ class Path(NamedTuple):
     before: Vector
     after: Vector
     length: Array
+    height: Array
     spread: Array
     slope: Vector
     bend: tuple[Vector, ...]
@@ -69,7 +71,7 @@ def geometry(hits: Vector, system: System) -> Path:
     behind = tuple(d[1:] for d in direction)
     before = turn(rotation, direction, back=True)
     after = turn(None if rotation is None else rotation[:-1], behind, back=True)
-    return Path(before, after, length, system.vergence * shrink[0], slope, bend)
+    return Path(before, after, length, z, system.vergence * shrink[0], slope, bend)
 
 
 def residual(path: Path, system: System) -> Vector:
@@ -81,38 +83,59 @@ def residual(path: Path, system: System) -> Vector:
     return tuple(c + s[:-1] * along for c, s in zip(across, path.slope, strict=True))
 
 
-def ray_at(hits: Vector, system: System, row: int) -> tuple[Vector, Vector]:
-    """Points of one row and unit vectors in front of it, D + 1 arrays (W, Q) each, along the axes
-    of the lens, of the paths through `hits`, D arrays (R, W, Q)."""
+def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
+    """Hits and system of one row and the one before it, if there is one: all that a ray there
+    depends on."""
     some = slice(max(row - 1, 0), row + 1)
-    part = dataclasses.replace(system, rows=jax.tree.map(lambda a: a[some], system.rows))
-    hits = tuple(h[some] for h in hits)
-    heights = by_form(surface_sag, hits, part.rows.wide, system.forms[some])
-    point, step = _segments(hits, heights, part)
-    if row:
-        direction = tuple(s[0] for s in step)
-        point = tuple(p + d for p, d in zip(point, direction, strict=True))
-    else:
-        direction = tuple(
-            system.vergence * p - s for p, s in zip(point, system.source, strict=True)
-        )
-    shrink = _inverse(_length(direction))
-    return point, tuple(d * shrink for d in direction)
+    rows = jax.tree.map(lambda a: a[some], system.rows)
+    forms, before = system.forms[some], min(system.before, 1)
+    part = dataclasses.replace(system, rows=rows, forms=forms, before=before)
+    return tuple(h[some] for h in hits), part
 
 
-def label(hits: Vector, system: System) -> Vector:
+def ray_at(hits: Vector, path: Path, system: System, row: int) -> tuple[Vector, Vector]:
+    """Points of one row and unit vectors in front of it, D + 1 arrays (W, Q) each, along the axes
+    of the lens."""
+    rotation = None if system.rows.rotation is None else system.rows.rotation[row]
+    origin = (a[row] for a in system.rows.origin(len(hits)))
+    own = turn(rotation, (*(h[row] for h in hits), path.height[row]))
+    point = tuple(o + p for o, p in zip(origin, own, strict=True))
+    return point, turn(rotation, tuple(b[row] for b in path.before))
+
+
+def label(hits: Vector, path: Path, system: System) -> Vector:
     """Where the paths through `hits`, D arrays (R, W, Q), cross the stop: D arrays (W, Q), mm
     along its axes."""
     if system.stop is None:
         return tuple(h[system.before] for h in hits)
-    return cross(*system.at_stop, *ray_at(hits, system, system.before))[0]
+    return cross(*system.at_stop, *ray_at(hits, path, system, system.before))[0]
 
 
 def arrival(hits: Vector, system: System) -> Vector:
     """Unit vectors, D + 1 arrays (W, Q), along the axes of the sensor, of the rays reaching it."""
-    rotation = system.rows.rotation
-    _, direction = ray_at(hits, system, len(system.forms) - 1)
-    return turn(None if rotation is None else rotation[-1], direction, back=True)
+    path = geometry(*up_to(hits, system, len(system.forms) - 1))
+    return tuple(b[-1] for b in path.before)
+
+
+def exact(hits: Vector, system: System, target: Vector) -> Array:
+    """Whether paths cross the stop at their points `target`, D arrays (W, Q) in mm, to rounding:
+    (W, Q), bool."""
+    hits, part = up_to(hits, system, system.before)
+    return _met(hits, geometry(hits, part), part, target)
+
+
+def _met(hits: Vector, path: Path, system: System, target: Vector) -> Array:
+    eps = float(jnp.finfo(hits[0].dtype).eps)
+    miss = tuple(a - b for a, b in zip(label(hits, path, system), target, strict=True))
+    scale = jnp.max(_width(hits, system), axis=0) + jnp.sqrt(dot(target, target))
+    return dot(miss, miss) <= (64 * eps * scale) ** 2
+
+
+def _width(hits: Vector, system: System) -> Array:
+    """How large the coordinates of hits are, (R, W, Q) in mm: what their rounding scales with."""
+    width = jnp.sqrt(dot(hits, hits))
+    offset = system.rows.offset
+    return width if offset is None else width + jnp.max(jnp.abs(offset), axis=1)[:, None, None]
 
 
 def _length(vector: Vector) -> Array:
@@ -150,7 +173,7 @@ def stationary(hits: Vector, path: Path, system: System, target: Vector) -> Arra
     """
     eps = float(jnp.finfo(hits[0].dtype).eps)
     index, senses = system.index, system.senses[:, None, None]
-    size = jnp.sqrt(dot(hits, hits))
+    size = _width(hits, system)
     widest = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
     near = _inverse(path.length).at[0].set(jnp.abs(path.spread))
     shake = index * (1 + near * widest)
@@ -161,9 +184,7 @@ def stationary(hits: Vector, path: Path, system: System, target: Vector) -> Arra
     good = good & (_forward(path.after, slope) * senses[1:] > 0)
     exists = by_form(domain, hits, system.rows.wide, system.forms)
     exists = exists & (_forward(path.before, path.slope) * senses > 0)
-    miss = tuple(a - b for a, b in zip(label(hits, system), target, strict=True))
-    scale = jnp.max(size, axis=0) + jnp.sqrt(dot(target, target))
-    met = dot(miss, miss) <= (64 * eps * scale) ** 2
+    met = _met(hits, path, system, target)
     return jnp.all(good, axis=0) & jnp.all(exists, axis=0) & met
 
 

@@ -8,13 +8,15 @@ length of a segment, and every derivative mode, transposition among them, is JAX
 is linear in its forces.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .fermat import Path, label
+from .fermat import Path, ray_at
+from .snell import cross
 from .system import System, Vector, dot, turn
 
 
@@ -108,20 +110,37 @@ def solve(
         row, force = given
         free = jax.vmap(lambda moved, swung: _step(row, good, moved, swung, none))(*state[0])
         forced = _step(row, good, state[1][0], state[1][1], force)
-        return (free, forced), (free[0], forced[0])
+        return (free, forced), (free, forced)
 
     # `dim` marches from unit changes of the first hit, and one that the forces make.
     _, (free, forced) = jax.lax.scan(step, start, (_rows(path, system), forces))
-    free = tuple(jnp.concatenate([u[None], f]) for u, f in zip(units, free, strict=True))
-    forced = tuple(jnp.concatenate([z[None], f]) for z, f in zip(none, forced, strict=True))
-    _, crossing = jax.linearize(lambda w: label(w, system), hits)
+    marched = (free, forced)
+    free, forced = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, marched)
+    crossing = _crossing(hits, path, system)
     columns = jax.vmap(crossing, 1)(free)
     wanted = tuple(s - c for s, c in zip(shift, crossing(forced), strict=True))
     weights = _divide([[c[k] for k in range(dim)] for c in columns], wanted, good)
     return tuple(
         f + sum(weights[k][None] * u[:, k] for k in range(dim))
-        for f, u in zip(forced, free, strict=True)
+        for f, u in zip(forced[0], free[0], strict=True)
     )
+
+
+def _crossing(hits: Vector, path: Path, system: System) -> Callable:
+    """The change of the label, D arrays (W, Q), as a function of those of hits and directions."""
+    row = system.before
+    if system.stop is None:
+        return lambda marched: tuple(m[row] for m in marched[0])
+    rotation = None if system.rows.rotation is None else system.rows.rotation[row]
+    line = ray_at(hits, path, system, row)
+    _, push = jax.linearize(lambda *line: cross(*system.at_stop, *line)[0], *line)
+
+    def change(marched):
+        moved, swung = (tuple(a[row] for a in part) for part in marched)
+        point = *moved, dot(tuple(s[row] for s in path.slope), moved)
+        return push(turn(rotation, point), turn(rotation, swung))
+
+    return change
 
 
 def _divide(matrix: list[list[Array]], b: Vector, good: Array) -> Vector:

@@ -61,7 +61,9 @@ def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[
         alike = linear * root < 0
         above = jnp.where(alike, linear - root, constant)
         below = jnp.where(alike, square, linear + root)
-        length, met = safe_divide(above, below), discriminant > 0
+        met = discriminant > 0
+        # Where the conic is missed, an asphere is sought from the vertex plane.
+        length = jnp.where(met, safe_divide(above, below), length)
         if not shape.coefficients.shape[0]:
             return length, met & (1 - (1 + k) * c * (p[-1] + length * d[-1]) > RIM**0.5)
     size = jnp.sqrt(dot(d, d))

@@ -92,7 +92,7 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
     def equations(hits, args):
         system, target, _ = args
         path = fermat.geometry(hits, system)
-        miss = (a - b for a, b in zip(fermat.label(hits, system), target, strict=True))
+        miss = (a - b for a, b in zip(fermat.label(hits, path, system), target, strict=True))
         return (fermat.residual(path, system), tuple(miss), path), None
 
     eps = float(jnp.finfo(hits[0].dtype).eps)
@@ -109,14 +109,6 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
     return solution.value, all_solved | solution.state.solved, solution.stats["num_steps"]
 
 
-def exact(system: System, target: Vector, hits: Vector) -> Array:
-    """Whether traced rays cross the stop at their points to rounding, (W, Q), bool."""
-    eps = float(jnp.finfo(hits[0].dtype).eps)
-    miss = tuple(a - b for a, b in zip(fermat.label(hits, system), target, strict=True))
-    size = jnp.sqrt(jnp.max(dot(hits, hits), axis=0)) + jnp.sqrt(dot(target, target))
-    return dot(miss, miss) <= (64 * eps * size) ** 2
-
-
 def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
     """The rays through stop points `target`, D arrays (W, Q) in mm; not differentiable.
 
@@ -129,7 +121,7 @@ def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
     search = _search(system, target, launch, sizes)
     good = search.status == Status.OK
     hits = tuple(jnp.where(good, a, 0) for a in search.hits)
-    hits, solved, steps = _polish(system, target, hits, good & ~exact(system, target, hits))
+    hits, solved, steps = _polish(system, target, hits, good & ~fermat.exact(hits, system, target))
     status = jnp.where(good & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
     hits = tuple(jnp.where(status == Status.OK, a, 0) for a in hits)
     return Found(hits, status, (search.steps + steps).astype(jnp.int32))
@@ -175,11 +167,15 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
         )
         begin = tuple(jnp.where(first, a, places(b)) for a, b in zip(launch, begin, strict=True))
         reach = jnp.where(first, sizes[1], sizes[1] / 8)
-        aimed = aim(system, own, begin, sizes[0], reach)
+        aimed = aim(system, own, begin, (sizes[0], reach), first & (system.rows.rotation is None))
         hits, status = _verdict(system, aimed.launch, aimed.status)
 
-        good = (status[:, : few * starts] == Status.OK).reshape(waves, few, starts)
-        best = jnp.arange(few)[None] * starts + jnp.argmax(good, axis=-1)  # (W, few)
+        good, folded = (
+            a[:, : few * starts].reshape(waves, few, starts)
+            for a in (status == Status.OK, aimed.folded)
+        )
+        best = jnp.argmax(jnp.where(good, 2 - folded.astype(jnp.int32), 0), axis=-1)
+        best = jnp.arange(few)[None] * starts + best  # (W, few)
         found = jnp.where(jnp.any(good, axis=-1), rows, rays)
         put = jax.vmap(lambda a, r, new: a.at[r].set(new, mode="drop"))
         some = jax.vmap(put, (0, None, 0))
@@ -216,7 +212,16 @@ def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Arr
 
 def find_many(system: System, target: Vector) -> Found:
     """`find`; a large bundle in tiles, its rays launched by polynomials and searched for only
-    where these miss."""
+    where these miss. A stop point that is not finite is MISSED and changes no other ray."""
+    known = jnp.all(jnp.isfinite(jnp.stack(target)), axis=0)
+    found = _find_many(system, tuple(jnp.where(known, a, 0) for a in target))
+    return found._replace(
+        hits=tuple(jnp.where(known, a, 0) for a in found.hits),
+        status=jnp.where(known, found.status, jnp.int32(Status.MISSED)),
+    )
+
+
+def _find_many(system: System, target: Vector) -> Found:
     if len(target) == 1 or tiles_of(target[0].shape[1], target[0].shape[0])[0] == 1:
         return find(system, target)
     launch_of = polynomial_launch(system, target)
@@ -224,7 +229,7 @@ def find_many(system: System, target: Vector) -> Found:
     def tile(target):
         launch = launch_of(target)
         hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
-        solved = exact(system, target, hits) & (status == Status.OK)
+        solved = fermat.exact(hits, system, target) & (status == Status.OK)
         start = Found(hits, status, jnp.int32(0)), ~jnp.all(solved)
 
         def turn(state):
@@ -266,7 +271,7 @@ def _moved(
 
     def equations(system, target):
         path = fermat.geometry(hits, system)
-        miss = (a - b for a, b in zip(fermat.label(hits, system), target, strict=True))
+        miss = (a - b for a, b in zip(fermat.label(hits, path, system), target, strict=True))
         return (fermat.residual(path, system), tuple(miss)), path
 
     _, change, path = jax.jvp(equations, (system, target), (moving, moving_target), has_aux=True)
