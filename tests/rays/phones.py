@@ -241,4 +241,4 @@ def load(name, position=None, place=0):
         if surfaces[place - 1].get("index"):
             stop["index"] = surfaces[place - 1]["index"]
     surfaces.insert(place, stop)
-    return load_lens({"surfaces": surfaces, "name": name})
+    return load_lens({"surfaces": surfaces})

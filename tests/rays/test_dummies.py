@@ -58,8 +58,8 @@ def test_the_rays_behind_do_not_know_of_a_dummy():
     with_it = trace_rays(before_the_stop(10.0, 9.9), 0.6, np.inf, WAVELENGTHS, POINTS)
     lens = load_lens({"surfaces": [STOP, *PLATE]})
     without = trace_rays(lens, 0.6, np.inf, WAVELENGTHS, POINTS)
-    shift = np.array([0, 0, 12.0])
-    np.testing.assert_allclose(with_it.points[:, :, 1:], without.points + shift, rtol=0, atol=1e-12)
+    points = np.asarray(without.points) + [0, 0, 12.0]
+    np.testing.assert_allclose(with_it.points[:, :, 1:], points, rtol=0, atol=1e-12)
     np.testing.assert_allclose(with_it.directions[:, :, 1:], without.directions, atol=1e-12)
     # The path is counted from the plane wave through the first vertex.
     path = with_it.path - 12 * np.cos(0.6)

@@ -100,8 +100,8 @@ def along_the_slide(slopes, lens):
     [
         ("3 elements, f/2.0, stop at +0.1 mm", 0, 1.0),
         ("5 elements, f/1.6, stop at +0.3 mm", 0, 0.9),
-        ("3 elements, f/2.4, stop at +0 mm", 2, 0.7),
-        ("4 elements, f/2.0, stop at +0.2 mm", 2, 0.6),
+        ("3 elements, f/2.4, stop at -0.6 mm", 2, 1.0),
+        ("5 elements, f/1.8, stop at -0.2 mm", 2, 1.0),
     ],
 )
 def test_the_stop_slides_through_a_surface(name, place, pupil):
@@ -115,17 +115,16 @@ def test_the_stop_slides_through_a_surface(name, place, pupil):
     heights, slopes = [], []
     for lens, scene, *each in zip(lenses, every, *wanted):
         rays, slope = ours(lens, scene.values["field"], points, PICKED)
-        assert_same_rays(rays, Truth(*each), 1e-11, f"{name}, stop {lens.thickness[0]} mm")
+        assert_same_rays(rays, Truth(*each), 1e-11, f"{name}, {lens.thickness}")
         heights.append(np.asarray(rays.points[0, picked, -1, :2]).ravel())
         by_place = along_the_slide(slope, lens).reshape(len(PICKED), 3)
         slopes.append(by_place[:, :2].ravel())
     heights, slopes, step = np.array(heights), np.array(slopes), positions[1] - positions[0]
     # Hermite's rule: what a step adds is the mean derivative of its ends, up to h^3 / 12 f'''.
     jump = heights[1:] - heights[:-1] - step / 2 * (slopes[1:] + slopes[:-1])
-    print(np.max(np.abs(jump)) / step**3, np.max(np.abs(np.diff(slopes, 2, axis=0))) / step**2)
-    assert np.max(np.abs(jump)) <= 5 * step**3
+    assert np.max(np.abs(jump)) <= 0.1 * step**3
     for array in (heights, slopes):
-        assert np.max(np.abs(np.diff(array, 2, axis=0))) <= 20 * step**2
+        assert np.max(np.abs(np.diff(array, 2, axis=0))) <= 2 * step**2
 
 
 @pytest.mark.parametrize("system, stop", mirrors.STOPS)
@@ -155,7 +154,7 @@ BEHIND = {
     "between lens and sensor": (20.0, 0.0),
     "cutting into the lens": (-1.0, 5.0),
     "in front of the lens": (-8.0, -4.0),
-    "beyond the sensor": (60.0, 3.0),
+    "far beyond the sensor": (150.0, 3.0),
 }
 
 

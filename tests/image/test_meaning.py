@@ -1,0 +1,128 @@
+"""One call, one meaning: the same numbers eagerly and inside `jax.jit`; what fails looks bad."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import Gauss, Status, load_lens, psf_moments, trace_rays
+
+from ..conftest import assert_close
+
+RULE = Gauss(4, "half")
+SCENE = (0.05, np.inf, (0.6, 0.48))
+
+
+@jax.jit
+def blur(lens, field, distance, wavelengths):
+    """Moments by `RULE`, and the gradient by the lens of the sum of all variances."""
+
+    def total(lens):
+        spot = psf_moments(lens, field, distance, wavelengths, rule=RULE)
+        return jnp.sum(spot.covariance), spot
+
+    return jax.grad(total, has_aux=True)(lens)
+
+
+def typed(field, distance, wavelengths):
+    """A scene as arrays, so that all share one program."""
+    return jnp.asarray(float(field)), jnp.asarray(float(distance)), jnp.asarray(wavelengths)
+
+
+@pytest.fixture(scope="module")
+def singlet():
+    return load_lens("singlet")
+
+
+@pytest.mark.parametrize("how", [jax.jit, jax.vmap])
+@pytest.mark.parametrize("call", ["psf_moments", "focus_moments", "converged_rule"])
+def test_inside_a_trace_a_rule_is_asked_for(singlet, how, call):
+    function = how(lambda field: getattr(drt_jax, call)(singlet, field, *SCENE[1:]))
+    with pytest.raises(ValueError, match=r"rule=drt_jax\.converged_rule"):
+        function(jnp.zeros(2) if how is jax.vmap else 0.0)
+
+
+def test_a_tolerance_inside_an_eager_gradient(singlet):
+    """The numbers are known there: the same gradient as with the rule, to 1e-12."""
+    rule = drt_jax.converged_rule(singlet, *SCENE)
+
+    def total(lens, rule=None):
+        return jnp.sum(psf_moments(lens, *SCENE, rule=rule).covariance)
+
+    assert_close(jax.grad(total)(singlet), jax.grad(total)(singlet, rule), 1e-12)
+
+
+CLIPPED = pytest.param("double_gauss", np.radians(14), np.inf, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("name, field, distance", [("singlet", 0.0, 1e4), CLIPPED])
+def test_eager_and_compiled_agree(name, field, distance):
+    """Moments to 1e-12 and the gradient of the variances to 1e-10, at the default tolerance."""
+    lens, colours = load_lens(name), (0.6, 0.48)
+    rule = drt_jax.converged_rule(lens, field, distance, colours)
+
+    def total(lens, rule=None):
+        spot = psf_moments(lens, field, distance, colours, rule=rule)
+        return jnp.sum(spot.covariance), spot
+
+    compiled, inside = jax.jit(jax.grad(total, has_aux=True))(lens, rule)
+    eager, outside = jax.grad(total, has_aux=True)(lens)
+    assert np.all(np.isfinite(inside.covariance)) and np.all(inside.passed > 0)
+    assert_close(outside, inside, 1e-12)
+    assert_close(eager, compiled, 1e-10)
+    plain = psf_moments(lens, field, distance, colours)
+    assert_close(plain, inside, 1e-12)
+    if name == "double_gauss":
+        assert isinstance(rule, drt_jax.Clipped) and np.all(inside.passed < 0.9)
+
+
+def test_a_lens_that_passes_no_ray(singlet):
+    """An error outside; inside, a variance of inf, nothing passed and derivatives of 0."""
+    scene = (1.3, np.inf, (0.6, 0.48))
+    with pytest.raises(ValueError, match="no ray"):
+        psf_moments(singlet, *scene)
+    with pytest.raises(ValueError, match="no ray"):
+        psf_moments(singlet, *scene, rule=RULE)
+    gradient, spot = blur(singlet, *typed(*scene))
+    assert np.all(np.isposinf(spot.covariance[:, [0, 1], [0, 1]]))
+    assert np.all(spot.passed == 0)
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
+
+
+def test_a_wavelength_without_an_index(singlet):
+    """An error outside; inside, that colour looks as bad as can be, and moves no other."""
+    for call in (psf_moments, drt_jax.converged_rule):
+        with pytest.raises(ValueError, match=r"0\.1 um is outside the range"):
+            call(singlet, *SCENE[:2], (0.6, 0.1))
+    with pytest.raises(ValueError, match=r"0\.1 um is outside the range"):
+        trace_rays(singlet, *SCENE[:2], (0.1,), np.zeros((1, 2)))
+    gradient, spot = blur(singlet, *typed(*SCENE[:2], (0.6, 0.1)))
+    assert np.all(np.isposinf(spot.covariance[1, [0, 1], [0, 1]])) and spot.passed[1] == 0
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
+    _, good = blur(singlet, *typed(*SCENE))
+    np.testing.assert_allclose(spot.covariance[0], good.covariance[0], rtol=1e-12, atol=1e-20)
+    assert np.any(gradient.curvature != 0)
+
+
+def test_rays_mean_the_same_inside(singlet):
+    """Points, path and status of rays that arrive, are clipped and miss; and of no index."""
+    lens = dataclasses.replace(singlet, semi_diameter=singlet.semi_diameter.at[1].set(4.0))
+    pupil = np.stack(np.meshgrid([0.0], np.linspace(-3, 3, 13)), -1).reshape(-1, 2)
+
+    @jax.jit
+    def inside(lens, field, distance, wavelengths):
+        return trace_rays(lens, field, distance, wavelengths, pupil)
+
+    rays = inside(lens, *typed(0.1, np.inf, (0.6,)))
+    again = trace_rays(lens, 0.1, np.inf, (0.6,), pupil)
+    kinds = {Status(int(status)) for status in np.unique(again.status)}
+    assert {Status.OK, Status.CLIPPED} <= kinds
+    np.testing.assert_array_equal(rays.status, again.status)
+    for ours, other in zip(rays[:3], again[:3]):
+        np.testing.assert_allclose(ours, other, rtol=0, atol=1e-12)
+    dark = inside(lens, *typed(0.1, np.inf, (0.1,)))
+    assert np.all(dark.status == Status.NO_INDEX)
+    assert np.all(dark.points == 0) and np.all(dark.path == 0)
