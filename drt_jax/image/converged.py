@@ -6,6 +6,8 @@ from values: `psf_moments` and `focus_moments` then take the rule, made outside.
 
 import warnings
 from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +18,13 @@ from jax.typing import ArrayLike
 from ..lens.glass import check_wavelengths
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
-from ..numerics import known_values
+from ..numerics import concrete, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
+from ..rays.solve import Found, reattach, solve
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
-from .moments import FocusMoments, Moments, weigh
+from .moments import FocusMoments, Moments, moments, weigh
 
 _MAX_ORDER = 40
 # A spot below 1 nm is a point: relative to it, rounding would never converge.
@@ -88,7 +91,7 @@ def converged_rule(
     spot size, and may be at most `tolerance`, which leaves a factor of two for the error of the
     second. Warns if no order does. ValueError inside a trace, or if no ray arrives.
     """
-    return _converge(lens, field, distance, wavelengths, tolerance, at_sensor)[0]
+    return _converge(lens, field, distance, wavelengths, tolerance, at_sensor).rule
 
 
 def converged_focus_rule(
@@ -100,7 +103,7 @@ def converged_focus_rule(
 ) -> PupilRule:
     """`converged_rule` for any sensor position: where the spot is smallest, it may be far smaller
     than on the sensor, and the tolerance is relative to it."""
-    return _converge(lens, field, distance, wavelengths, tolerance, best_focus)[0]
+    return _converge(lens, field, distance, wavelengths, tolerance, best_focus).rule
 
 
 def at_sensor(spread: np.ndarray) -> list[np.ndarray]:
@@ -125,9 +128,14 @@ def _moments(
     places: Callable,
 ) -> FocusMoments:
     check_wavelengths(lens.glasses, wavelengths)
+    scene = scene_of(lens, field, distance, wavelengths)
     if rule is None:
-        rule = _converge(lens, field, distance, wavelengths, tolerance, places)[1]
-    found, _ = _weigh(lens, scene_of(lens, field, distance, wavelengths), rule)
+        trial = _converge(lens, field, distance, wavelengths, tolerance, places)
+        if concrete((lens, scene)):
+            return trial.moments
+        # The rays are known; what is left is to weigh and to differentiate them.
+        return _weigh_known(lens, scene, trial.used, trial.found)
+    found = _weigh(lens, scene, rule)[0]
     passed = known_values(found.passed)
     if passed is not None:
         _check_passed(passed, wavelengths)
@@ -135,11 +143,34 @@ def _moments(
 
 
 @jax.jit
-def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[FocusMoments, Array]:
-    """Moments, and whether any ray of the rule is clipped or fails."""
+def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[FocusMoments, Found, Array]:
+    """Moments, the rays on the live surfaces, and whether any is clipped or fails."""
     points, weights = rule.points(lens, scene)
-    bundle = trace_bundle(lens, scene, points)
-    return weigh(lens, rule, weights, bundle), jnp.any(bundle.status != Status.OK)
+    kept: list[Found] = []
+
+    def solver(system, target):
+        kept.append(solve(system, target))
+        return kept[0]
+
+    bundle = trace_bundle(lens, scene, points, solver)
+    failing = jnp.any(bundle.status != Status.OK)
+    return weigh(lens, rule, weights, bundle), kept[0], failing
+
+
+@jax.jit
+def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> FocusMoments:
+    """The moments of rays that are known, with their derivatives: nothing is searched for."""
+    return moments(lens, scene, rule, partial(reattach, found))
+
+
+class _Trial(NamedTuple):
+    """rule: that meets the tolerance. used: the same as it was evaluated. moments, found: its
+    moments and its rays."""
+
+    rule: PupilRule
+    used: PupilRule
+    moments: FocusMoments
+    found: Found
 
 
 def _converge(
@@ -149,8 +180,8 @@ def _converge(
     wavelengths: ArrayLike,
     tolerance: float,
     places: Callable,
-) -> tuple[PupilRule, PupilRule]:
-    """The rule that meets the tolerance, and the same as it was evaluated."""
+) -> _Trial:
+    """The rule that meets the tolerance, and what it found."""
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
     check_wavelengths(lens.glasses, wavelengths)
@@ -170,37 +201,40 @@ def _converge(
 
 def _try_orders(
     lens: Lens, scene: Scene, symmetry: Symmetry, tolerance: float, places: Callable
-) -> tuple[PupilRule, PupilRule]:
-    eps = float(jnp.finfo(lens.curvature.dtype).eps)
-    previous, before, clipped, order = None, None, False, 2
+) -> _Trial:
+    before: _Trial | None = None
+    clipped, order = False, 2
     while True:
-        rule: PupilRule = Clipped(order, symmetry) if clipped else _padded(order, symmetry)
-        found, failing = _weigh(lens, scene, rule)
+        rule = Clipped(order, symmetry) if clipped else Gauss(order, symmetry)
+        used = rule if clipped else _padded(order, symmetry)
+        found, rays, failing = _weigh(lens, scene, used)
         if bool(failing) and not clipped:
-            previous, clipped, order = None, True, _CLIPPED[0]
+            before, clipped, order = None, True, _CLIPPED[0]
             continue
         _check_passed(np.asarray(found.passed), scene.wavelengths)
-        spread = np.asarray(found.spread, float)
-        change = bound = np.inf
-        if previous is not None:
-            change = max(_change(spread, previous, d) for d in places(spread))
-            # Hits are rounded to some last digits of the length of the lens.
-            size = np.sqrt(np.min(np.sum(spread[0, :, :2], axis=-1)))
-            rounding = 4 * eps * abs(float(lens.sensor)) / max(size, _SMALLEST)
-            bound = max(tolerance, 100 * eps, rounding)
-            if change <= bound:
-                break
+        trial = _Trial(rule, used, found, rays)
+        change = np.inf
+        if before is not None:
+            change = _change(found, before.moments, places)
+            if change <= _bound(lens, found, tolerance):
+                return trial if clipped else before
         if order > _MAX_ORDER:
             warnings.warn(
-                f"the spot size has converged to {change:.1e} only, not to {bound:.1e}, with the "
-                f"order {order}; does the edge of the beam fail?",
+                f"the spot size has converged to {change:.1e} only, not to {tolerance:.1e}, with "
+                f"the order {order}; does the edge of the beam fail?",
                 stacklevel=4,
             )
-            break
-        previous, before, order = spread, rule, order + (_CLIPPED[1] if clipped else 1)
-    if clipped:
-        return rule, rule
-    return Gauss(order - 1, symmetry), before or rule
+            return trial
+        before, order = trial, order + (_CLIPPED[1] if clipped else 1)
+
+
+def _bound(lens: Lens, found: FocusMoments, tolerance: float) -> float:
+    """What a change of the covariance may be: hits are rounded to some last digits of the length
+    of the lens."""
+    eps = float(jnp.finfo(lens.curvature.dtype).eps)
+    size = np.sqrt(np.min(np.sum(np.asarray(found.spread)[0, :, :2], axis=-1)))
+    rounding = 4 * eps * abs(float(lens.sensor)) / max(size, _SMALLEST)
+    return max(tolerance, 100 * eps, rounding)
 
 
 def _padded(order: int, symmetry: Symmetry) -> Pattern:
@@ -218,12 +252,16 @@ def _padded(order: int, symmetry: Symmetry) -> Pattern:
     return Pattern(filled, np.pad(weights, (0, missing)), symmetry)
 
 
-def _change(spread: np.ndarray, previous: np.ndarray, d: np.ndarray) -> float:
-    """Largest change of the covariance relative to its trace, the sensor at `d` (W,) mm."""
-    d = d[:, None]
-    now, before = (s[0] + d * (s[1] + d * s[2]) for s in (spread, previous))
-    size = np.sum(now[:, :2], axis=-1, keepdims=True)
-    return float(np.max(np.abs(now - before) / np.maximum(size, _SMALLEST**2)))
+def _change(found: FocusMoments, before: FocusMoments, places: Callable) -> float:
+    """Largest change of the covariance relative to its trace, at the `places` of the sensor."""
+    spread, previous = np.asarray(found.spread, float), np.asarray(before.spread, float)
+    worst = 0.0
+    for place in places(spread):
+        d = place[:, None]
+        now, then = (s[0] + d * (s[1] + d * s[2]) for s in (spread, previous))
+        size = np.sum(now[:, :2], axis=-1, keepdims=True)
+        worst = max(worst, float(np.max(np.abs(now - then) / np.maximum(size, _SMALLEST**2))))
+    return worst
 
 
 def _check_passed(passed: np.ndarray, wavelengths: ArrayLike) -> None:
