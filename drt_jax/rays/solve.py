@@ -71,7 +71,9 @@ class BlockNewton(optx.AbstractRootFinder):
         finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
         moves = finite & ~solved
         change = tuple(jnp.where(moves, c, 0) for c in change)
-        size = self.norm(change) / (1 + self.rtol / self.atol * self.norm(y))
+        # Each relative to its own hit: a ray that runs off makes no other's correction small.
+        scale = self.rtol / self.atol
+        size = self.norm(tuple(c / (1 + scale * abs(a)) for a, c in zip(y, change, strict=True)))
         y = tuple(a - c for a, c in zip(y, change, strict=True))
         return y, _State(solved, size, state.step + 1), aux
 
@@ -283,7 +285,11 @@ def _moved(
 def solve(system: System, target: Vector) -> Found:
     """The rays through stop points `target`, D arrays (W, Q) in mm, differentiable in every mode
     and to any order; failed rays have zero derivatives."""
-    found = find_many(*jax.lax.stop_gradient((system, target)))
+    return reattach(find_many(*jax.lax.stop_gradient((system, target))), system, target)
+
+
+def reattach(found: Found, system: System, target: Vector) -> Found:
+    """Known rays through stop points `target` with the derivatives of `attach`."""
     return found._replace(hits=attach(system, target, found.hits, found.status == Status.OK))
 
 
