@@ -39,7 +39,8 @@ ALL = jnp.ones((len(COLOURS), RAYS), bool)
 
 def equations(hits, system):
     """F and the label."""
-    return fermat.residual(fermat.geometry(hits, system), system), fermat.label(hits, system)
+    path = fermat.geometry(hits, system)
+    return fermat.residual(path, system), fermat.label(hits, path, system)
 
 
 class Answers(NamedTuple):

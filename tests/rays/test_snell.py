@@ -195,8 +195,8 @@ def test_launch_and_stop_of_a_ray(stop):
     @jax.jit
     def there_and_back(system, launch, hits):
         first = tuple(h[0] for h in hits)
-        crossing = snell.shoot_to_stop(system, launch)
-        return crossing, fermat.label(hits, system), snell.launch_at(system, first)
+        label = fermat.label(hits, fermat.geometry(hits, system), system)
+        return snell.shoot_to_stop(system, launch), label, snell.launch_at(system, first)
 
     system, launch = scene_system(lens_with(stop, True)), launches()
     hits = shoot(system, launch).hits
