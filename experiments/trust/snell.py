@@ -149,6 +149,6 @@ def launch_paraxial(
     target = jnp.concatenate([radius * pupil, jnp.broadcast_to(place, (len(pupil), 1))], axis=1)
     one = jnp.ones_like(tangent)
     # From the object point (0, -tangent, -1) / v; the scale v keeps it finite.
-    direction = v * target + jnp.stack([0 * one, tangent, one])
+    direction = v * target + jnp.stack([0 * one, tangent, one])[None]
     points = target - direction * (place / direction[:, 2:])
     return points, direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
