@@ -64,15 +64,14 @@ def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[
         met = discriminant > 0
         # Where the conic is missed, an asphere is sought from the vertex plane.
         length = jnp.where(met, safe_divide(above, below), length)
-        if not shape.coefficients.shape[0]:
+        if _plain(form, shape):
             return length, met & (1 - (1 + k) * c * (p[-1] + length * d[-1]) > RIM**0.5)
     size = jnp.sqrt(dot(d, d))
     settled = max(_SETTLED, 16 * float(jnp.finfo(length.dtype).eps))
 
     def closer(state):
         count, length, _ = state
-        _, miss, rate = _gap(form, p, d, shape, length)
-        change = safe_divide(miss, rate)
+        change = -safe_divide(*_gap(form, p, d, shape, length))
         small = jnp.abs(change) * size <= settled * (1 + jnp.abs(length) * size)
         return count + 1, length + change, small
 
@@ -87,32 +86,37 @@ def _along(p: Vector, d: Vector, length: Array) -> Vector:
     return tuple(a + length * b for a, b in zip(p, d, strict=True))
 
 
-def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple:
-    """Slopes of the sag, how far above the ray the surface is, and how fast the ray closes in."""
+def _plain(form: str, shape: Shape) -> bool:
+    """Whether a surface is a conic without aspheric terms: a quadric."""
+    return form == "asphere" and not shape.coefficients.shape[0]
+
+
+def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple[Array, Array]:
+    """A function of the points p + s d that is 0 on the surface, and its derivative by s."""
     *across, z = _along(p, d, length)
+    if _plain(form, shape):
+        quadric = tuple(shape.curvature * a for a in (*across, (1 + shape.conic) * z))
+        return dot(quadric, (*across, z)) / 2 - z, dot(quadric, d) - d[-1]
     height, slope, _ = sag_derivatives(across, shape, form)
-    return slope, height - z, d[-1] - dot(slope, d[:-1])
+    return height - z, dot(slope, d[:-1]) - d[-1]
 
 
 @reach.defjvp
 def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
-    p, d, shape, going = primals
-    length, met = reach(form, p, d, shape, going)
-
-    def miss(p, d, shape):
-        *across, z = _along(p, d, length)
-        return surface_sag(across, shape, form) - z
-
-    _, change = jax.jvp(miss, (p, d, shape), tangents[:3])
-    _, _, rate = _gap(form, p, d, shape, length)
-    return (length, met), (safe_divide(change, rate), np.zeros(met.shape, jax.dtypes.float0))
+    length, met = reach(form, *primals)
+    gap = partial(_gap, form)
+    _, change = jax.jvp(
+        lambda p, d, shape: gap(p, d, shape, length)[0], (p, d, shape), tangents[:3]
+    )
+    moved = -safe_divide(change, gap(p, d, shape, length)[1])
+    return (length, met), (moved, np.zeros(met.shape, jax.dtypes.float0))
 
 
 def _meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:
     """Where rays meet a surface: the point, a normal of any length along z, whether, and s."""
     length, met = reach(form, p, d, shape, going)
     own = _along(p, d, length)
-    if form == "asphere" and not shape.coefficients.shape[0]:
+    if _plain(form, shape):
         c = shape.curvature
         normal = *(-c * a for a in own[:-1]), 1 - (1 + shape.conic) * c * own[-1]
     else:
