@@ -104,11 +104,9 @@ def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple[
 @reach.defjvp
 def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
     length, met = reach(form, *primals)
-    gap = partial(_gap, form)
-    _, change = jax.jvp(
-        lambda p, d, shape: gap(p, d, shape, length)[0], (p, d, shape), tangents[:3]
-    )
-    moved = -safe_divide(change, gap(p, d, shape, length)[1])
+    gap = partial(_gap, form, length=length)
+    _, change, rate = jax.jvp(gap, primals[:3], tangents[:3], has_aux=True)
+    moved = -safe_divide(change, rate)
     return (length, met), (moved, np.zeros(met.shape, jax.dtypes.float0))
 
 
