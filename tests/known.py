@@ -1,11 +1,12 @@
 """Rays searched for by one program and known to all others: a program that only differentiates
 rays need not hold the search for them, which is most of what there is to compile."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
-from drt_jax import Status
-from drt_jax.rays.solve import attach, find_many
+from drt_jax.rays.solve import find_many, reattach
 from drt_jax.rays.system import system_of
 
 
@@ -26,9 +27,4 @@ def search(lens, scene, points):
 
 def known(found):
     """A solver for `trace_bundle` and `moments` that has found its rays: all derivatives."""
-
-    def solver(system, target):
-        good = found.status == Status.OK
-        return found._replace(hits=attach(system, target, found.hits, good))
-
-    return solver
+    return functools.partial(reattach, found)
