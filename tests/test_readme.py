@@ -18,7 +18,7 @@ def test_notebook_lines_run(tmp_path, monkeypatch):
     names: dict = {}  # one notebook
     for block in blocks:
         exec(compile(block, "README.md", "exec"), names)
-    assert names["gradient"].curvature.shape == (11,)
+    assert names["gradient"].curvature.shape == (12,)  # the sensor is the last row
     assert names["wave"].opd.shape == (3, 3) and names["jacobian"].thickness.shape == (3, 2, 2, 10)
     assert (tmp_path / "psf.png").stat().st_size > 5000
 

@@ -1,0 +1,76 @@
+"""Moments over depth: interpolation against tracing, and the cheapest model for what is trained."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drt_jax import Gauss, depth_moments, focus_moments, load_lens, moments_model, psf_moments
+
+from ..conftest import RGB, assert_close
+
+LENS = load_lens("double_gauss_addon")
+NEAR, FAR = 1e4, 5e4
+
+
+@pytest.mark.parametrize("field", [0.0, pytest.param(0.05, marks=pytest.mark.slow)])
+def test_depth_interpolation_is_the_traced_moment(field):
+    depths = depth_moments(LENS, field, 5e3, 5e4, RGB, 1e-11)
+    for distance in (5e3, 6.1e3, 1.7e4, 3.3e4, 5e4):
+        wanted = focus_moments(LENS, field, distance, RGB, 1e-11)
+        ours = depths.at(distance)
+        size = np.max(np.asarray(wanted.spread), axis=(1, 2), keepdims=True)
+        np.testing.assert_allclose(ours.spread / size, wanted.spread / size, atol=1e-10)
+        np.testing.assert_allclose(ours.mean, wanted.mean, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_gradient_of_the_depth_interpolation_is_the_traced_one():
+    """By the distance and the sensor position, 1e-10 of the largest over the range."""
+    depths = depth_moments(LENS, 0.05, 5e3, 5e4, RGB[:2], 1e-13)
+    rule = Gauss(16, "half")
+
+    def interpolated(distance, sensor):
+        mean, variances = depths.at(1 / distance).at(sensor)
+        return mean[:, 1] * 1e-2, variances
+
+    def traced(distance, sensor):
+        moved = dataclasses.replace(LENS, sensor=sensor)
+        mean, covariance = psf_moments(moved, 0.05, 1 / distance, RGB[:2], rule=rule)
+        return mean[:, 1] * 1e-2, jnp.diagonal(covariance, 0, 1, 2)
+
+    ours, wanted = (
+        jax.jit(jax.vmap(jax.jacrev(f, argnums=(0, 1)), (0, None))) for f in (interpolated, traced)
+    )
+    scene = 1 / jnp.array([5.1e3, 7e3, 1.7e4, 4.9e4]), LENS.sensor
+    assert_close(ours(*scene), wanted(*scene), 1e-10, 1e-18)
+
+
+def test_cheapest_model_agrees_with_retracing():
+    values, cheap = moments_model(LENS, ("sensor",), 0.0, (NEAR, FAR), RGB, 1e-10)
+    everything, retrace = moments_model(LENS, ("sensor", "curvature"), 0.0, (NEAR, FAR), RGB, 1e-10)
+    assert set(values) == {"sensor"} and set(everything) == {"sensor", "curvature"}
+    retrace = jax.jit(retrace)
+    for distance in (1e4, 2.2e4, 5e4):
+        for a, b in zip(
+            cheap(values, distance), retrace(everything, jnp.asarray(distance)), strict=True
+        ):
+            np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-14)
+    # In the cheap one no ray is traced: no loop, no square root of a root-finder.
+    assert "while" not in str(jax.make_jaxpr(cheap)(values, 2e4))
+    assert "while" in str(jax.make_jaxpr(retrace)(everything, 2e4))
+
+
+def test_one_depth_is_a_polynomial_in_the_sensor():
+    values, cheap = moments_model(LENS, ("sensor",), 0.0, (FAR, FAR), RGB)
+    mean, variances, passed = cheap({"sensor": values["sensor"] + 1}, FAR)
+    wanted = focus_moments(LENS, 0.0, FAR, RGB)
+    assert_close((mean, variances), wanted.at(LENS.sensor + 1), 1e-12, 1e-18)
+    np.testing.assert_array_equal(passed, wanted.passed)
+
+
+def test_bad_requests():
+    with pytest.raises(ValueError, match="expected 0 < near < far"):
+        depth_moments(LENS, 0.0, 5e4, 1e4, RGB)
