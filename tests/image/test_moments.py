@@ -114,6 +114,7 @@ def slopes(lens, distance, found):
     return jax.value_and_grad(blur, (0, 1), has_aux=True)(lens, distance)
 
 
+@pytest.mark.slow
 def test_a_centred_lens_given_zero_tilts_and_decentres_is_the_same():
     """Moments and their gradients by everything that both have, 1e-10."""
     rows = LENS.count + 1

@@ -137,6 +137,7 @@ def test_derivatives_are_those_of_small_bundles(lens, points, found):
     assert_close(whole, joined(small), 1e-12)
 
 
+@pytest.mark.slow
 def test_rays_that_fail_are_told_apart(lens, points):
     """A field at which part of the beam is lost: the same rays as in small bundles, and the same
     verdicts, but for rays so close to an edge that rounding decides what is said of them."""

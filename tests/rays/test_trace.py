@@ -18,7 +18,7 @@ SINGLET = load_lens("singlet")
 HEIGHTS = np.stack([np.zeros(20), np.linspace(-1, 1, 20)], axis=1)
 
 
-LARGER = ("double_gauss_addon", "cooke_triplet")
+LARGER = ("double_gauss_addon", "cooke_triplet", "asphere")
 
 
 def entering(points, field, distance):
