@@ -120,14 +120,15 @@ def arrival(hits: Vector, system: System) -> Vector:
 def exact(hits: Vector, system: System, target: Vector) -> Array:
     """Whether paths cross the stop at their points `target`, D arrays (W, Q) in mm, to rounding:
     (W, Q), bool."""
+    width = _width(hits, system)
     hits, part = up_to(hits, system, system.before)
-    return _met(hits, geometry(hits, part), part, target)
+    return _met(label(hits, geometry(hits, part), part), target, width)
 
 
-def _met(hits: Vector, path: Path, system: System, target: Vector) -> Array:
-    eps = float(jnp.finfo(hits[0].dtype).eps)
-    miss = tuple(a - b for a, b in zip(label(hits, path, system), target, strict=True))
-    scale = jnp.max(_width(hits, system), axis=0) + jnp.sqrt(dot(target, target))
+def _met(crossing: Vector, target: Vector, width: Array) -> Array:
+    eps = float(jnp.finfo(width.dtype).eps)
+    miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
+    scale = jnp.max(width, axis=0) + jnp.sqrt(dot(target, target))
     return dot(miss, miss) <= (64 * eps * scale) ** 2
 
 
@@ -184,7 +185,7 @@ def stationary(hits: Vector, path: Path, system: System, target: Vector) -> Arra
     good = good & (_forward(path.after, slope) * senses[1:] > 0)
     exists = by_form(domain, hits, system.rows.wide, system.forms)
     exists = exists & (_forward(path.before, path.slope) * senses > 0)
-    met = _met(hits, path, system, target)
+    met = _met(label(hits, path, system), target, size)
     return jnp.all(good, axis=0) & jnp.all(exists, axis=0) & met
 
 
