@@ -109,7 +109,10 @@ def _traced(
     system = system_of(lens, scene, len(points))
     waves = scene.wavelengths.shape[0]
     radius = lens.semi_diameter[lens.stop]
-    target = tuple(jnp.broadcast_to(radius * p, (waves, p.shape[-1])) for p in points)
+    # A point that is not finite stays so, and has no derivative.
+    finite = [(jnp.isfinite(p), jnp.where(jnp.isfinite(p), p, 0)) for p in points]
+    scaled = (jnp.where(known, radius * p, jnp.inf) for known, p in finite)
+    target = tuple(jnp.broadcast_to(p, (waves, p.shape[-1])) for p in scaled)
     found = solver(system, target)
     known = known_index(lens.glasses, scene.wavelengths)[:, None]
     status = jnp.where(known, found.status, jnp.int32(Status.NO_INDEX))
