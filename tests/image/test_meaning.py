@@ -45,23 +45,17 @@ def test_inside_a_trace_a_rule_is_asked_for(singlet, how, call):
         function(jnp.zeros(2) if how is jax.vmap else 0.0)
 
 
-def test_a_tolerance_inside_an_eager_gradient(singlet):
-    """The numbers are known there: the same gradient as with the rule, to 1e-12."""
-    rule = drt_jax.converged_rule(singlet, *SCENE)
-
-    def total(lens, rule=None):
-        return jnp.sum(psf_moments(lens, *SCENE, rule=rule).covariance)
-
-    assert_close(jax.grad(total)(singlet), jax.grad(total)(singlet, rule), 1e-12)
-
-
 CLIPPED = pytest.param("double_gauss", np.radians(14), np.inf, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize("name, field, distance", [("singlet", 0.0, 1e4), CLIPPED])
 def test_eager_and_compiled_agree(name, field, distance):
-    """Moments to 1e-12 and the gradient of the variances to 1e-10, at the default tolerance."""
+    """Moments to 1e-12 and the gradient of the variances to 1e-10, at the default tolerance: an
+    eager gradient knows its numbers and needs no rule."""
     lens, colours = load_lens(name), (0.6, 0.48)
+    if name == "double_gauss":
+        edges = (0.8 * lens.semi_diameter).at[lens.stop].set(9.0)
+        lens = dataclasses.replace(lens, semi_diameter=edges)
     rule = drt_jax.converged_rule(lens, field, distance, colours)
 
     def total(lens, rule=None):
@@ -81,7 +75,7 @@ def test_eager_and_compiled_agree(name, field, distance):
 
 def test_a_lens_that_passes_no_ray(singlet):
     """An error outside; inside, a variance of inf, nothing passed and derivatives of 0."""
-    scene = (1.3, np.inf, (0.6, 0.48))
+    scene = (1.5, np.inf, (0.6, 0.48))  # all light passes beside the lens
     with pytest.raises(ValueError, match="no ray"):
         psf_moments(singlet, *scene)
     with pytest.raises(ValueError, match="no ray"):

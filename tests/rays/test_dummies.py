@@ -53,12 +53,13 @@ def test_steep_dummy_before_the_stop(radius, semi_diameter, field):
     assert np.all(points[~meets] == 0)
 
 
+@pytest.mark.slow
 def test_the_rays_behind_do_not_know_of_a_dummy():
     """Without the dummy: the same points, path and directions to 1e-12."""
     with_it = trace_rays(before_the_stop(10.0, 9.9), 0.6, np.inf, WAVELENGTHS, POINTS)
     lens = load_lens({"surfaces": [STOP, *PLATE]})
     without = trace_rays(lens, 0.6, np.inf, WAVELENGTHS, POINTS)
-    points = np.asarray(without.points) + [0, 0, 12.0]
+    points = np.asarray(without.points) + np.array([0, 0, 12.0])
     np.testing.assert_allclose(with_it.points[:, :, 1:], points, rtol=0, atol=1e-12)
     np.testing.assert_allclose(with_it.directions[:, :, 1:], without.directions, atol=1e-12)
     # The path is counted from the plane wave through the first vertex.
@@ -80,6 +81,7 @@ SCATTERED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", [[0.0, 0.0], [0.1, 0.3], [-0.2, -0.45]])
 def test_scattered_dummies_and_a_curved_stop(field):
     """Every crossing as the oracle has it, to 1e-10 mm; and what misses one is MISSED."""

@@ -74,15 +74,15 @@ def double_gauss_lens(cases):
     return load_lens({"surfaces": surfaces})
 
 
-@pytest.mark.parametrize("gap", [10.0, 0.0, -10.0])
+@pytest.mark.parametrize("gap", [10.0, 0.0, -3.0])
 def test_c01_marginal_ray(cases, gap):
     """x, z, slope and distance at each surface: half a unit of the sixth decimal; angles of
-    incidence: of the second, in degrees. The first surface bends back by 5.9 mm, so that it pokes
-    through a stop at its vertex."""
+    incidence: of the second, in degrees. The rim of the first surface lies 5.9 mm behind its
+    vertex, so that it pokes through a stop that is nearer."""
     lens = behind_stop(double_gauss(cases), gap, 25.0)
     rays = trace_rays(lens, 0.0, INF, [0.5876], on_y(1.0, 0.8, 0.6, 0.4))
     points = np.asarray(rays.points[0, 0, 1:])
-    d = directions(np.asarray(rays.points[0, 0]))
+    d = np.asarray(rays.directions[0, 0, 1:])
     vertex = np.asarray(lens.vertices[1:])
     reference = cases["C01"]["reference"]
     printed = np.array([row[1:] for row in reference["rows"]], float)
@@ -206,14 +206,14 @@ def test_c08_rays(cases, lsst, name):
 
 
 def test_c08_whole_pupil(cases, lsst):
-    """The plane of the entrance pupil lies 1 mm behind the rim of the first mirror: every ray of
-    the stop as the oracle has it, to 1e-8 mm of 12 m."""
+    """The plane of the entrance pupil touches the rim of the first mirror, within 1e-5 mm: every
+    ray of the stop as the oracle has it, to 1e-8 mm of 12 m."""
     field = np.radians([0.7, 1.2])
     points = hexapolar(4)
     wanted = truth(oracle.Scene.of(lsst, field, INF, [0.5]), points)
     assert np.all(wanted.exists)
     depth = wanted.points[0, :, 1, 2]
-    assert np.min(depth) < -1 and np.max(depth) > 1  # the mirror pokes through
+    assert -2e-5 < np.min(depth) < 0 and np.max(depth) > 400
     assert_same_rays(trace_rays(lsst, field, INF, [0.5], points), wanted, 1e-8)
 
 
@@ -444,8 +444,8 @@ def test_p01_first_order(cases, p01):
 
 
 def test_p01_wavefront(cases, p01):
-    """Zernike coefficients, root mean square and range to half a unit of the last digit, which is
-    1e-8 waves. The printed root mean square of a 64 x 64 grid is not the converged one."""
+    """Zernike coefficients and root mean square to half a unit of the last digit, which is 1e-8
+    waves; the range, which is that of a 64 x 64 grid, to 1e-6 waves."""
     reference = cases["P01"]["reference"]
     points, weights = pupil.disc(8, 9)
     edge = on_y(*np.linspace(0, 1, 401))
@@ -464,7 +464,7 @@ def test_p01_wavefront(cases, p01):
         np.testing.assert_allclose(ours, printed, rtol=0, atol=5.1e-9, err_msg=name)
     rms = drt_jax.rms_wavefront(wave, np.concatenate([weights, np.zeros(len(edge))]))
     np.testing.assert_allclose(rms, reference["rms_wave_converged"], rtol=0, atol=5.1e-9)
-    np.testing.assert_allclose(np.ptp(wave.opd), reference["pv_wave"], rtol=0, atol=5.1e-8)
+    np.testing.assert_allclose(np.ptp(wave.opd), reference["pv_wave"], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("gap", [None, 60.0, 0.0, -3.0])
