@@ -128,7 +128,7 @@ def _launched(lens: Lens, system: System, launch: Vector) -> _Rays:
     rows = tuple((c[0, lens.stop] / radius, c[1, lens.stop] / radius) for c in columns)
     one, none = jnp.ones_like(launch[0]), jnp.zeros_like(launch[0])
     aims = _solved(rows, (one, none)), _solved(rows, (none, one))
-    moves = tuple(tuple(c[0] * x[None] + c[1] * y[None] for c in columns) for x, y in aims)
+    moves: Any = tuple(tuple(c[0] * x[None] + c[1] * y[None] for c in columns) for x, y in aims)
     return _Rays(
         launch, tuple(h[lens.stop] / radius for h in hits), hits, aims, moves, status == Status.OK
     )
@@ -212,7 +212,7 @@ def _outside(lens: Lens, rays: _Rays, point: Vector) -> Array:
     semi-diameter; negative inside."""
     hits = _plus(rays.hits, rays.moves, _minus(point, rays.point))
     far = safe_sqrt(dot(hits, hits)) - lens.semi_diameter[:, None, None]
-    rate = safe_sqrt(sum(dot(m, m) for m in rays.moves) / 2)
+    rate = safe_sqrt((dot(rays.moves[0], rays.moves[0]) + dot(rays.moves[1], rays.moves[1])) / 2)
     return jnp.max(jnp.where(rate > 0, safe_divide(far, rate), -jnp.inf), axis=0)
 
 
@@ -409,8 +409,8 @@ class _Boundary:
     def ends(self, found: _Found) -> tuple:
         """To the ends of even spokes."""
         rays = jax.tree.map(lambda a: a[1], found.rays)
-        angle = self.spokes.low + self.spokes.gap * np.arange(self.spokes.count)
-        angle = jnp.broadcast_to(jnp.asarray(angle, rays.point[0].dtype), rays.good.shape)
+        even = self.spokes.low + self.spokes.gap * np.arange(self.spokes.count)
+        angle = jnp.broadcast_to(jnp.asarray(even, rays.point[0].dtype), rays.good.shape)
         return self._onward(rays, self._goal(rays.point, rays.point, _unit(angle)))
 
     def corners(self, found: _Found) -> tuple:
@@ -587,5 +587,5 @@ class Clipped(PupilRule):
         points = (
             c[..., None] + length * node * a for c, a in zip(plan.centre, (x, y), strict=True)
         )
-        points = tuple(p.reshape(len(p), -1) for p in points)
-        return (points[1:] if axial else points), weight.reshape(len(weight), -1)
+        flat = tuple(p.reshape(len(p), -1) for p in points)
+        return (flat[1:] if axial else flat), weight.reshape(len(weight), -1)
