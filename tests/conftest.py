@@ -65,3 +65,10 @@ def assert_close(ours, wanted, rtol, floor=0.0):
         assert a.shape == b.shape
         size = np.max(np.abs(b), initial=0)
         np.testing.assert_allclose(a, b, rtol=0, atol=rtol * size + floor)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def programs_of_one_module():
+    """Drops the compiled programs of a module after it: what a process may map has an end."""
+    yield
+    jax.clear_caches()
