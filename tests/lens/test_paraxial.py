@@ -118,7 +118,7 @@ def test_pupils_are_where_fermat_chief_rays_cross_the_axis():
     rays = trace_rays(lens, 1e-4, np.inf, RGB, [[0.0, 0.0]])
     points = np.asarray(rays.points[:, 0])
     first = points[:, 0, 1] / np.tan(1e-4)
-    vertex = float(lens.vertices[-1])
+    vertex = float(lens.vertices[-2])
     (y0, z0), (y1, z1) = points[:, -2, 1:].T, points[:, -1, 1:].T
     last = z0 - y0 * (z1 - z0) / (y1 - y0) - vertex
     np.testing.assert_allclose(-first, entrance(lens, COLOURS).position, rtol=1e-6)
@@ -257,7 +257,7 @@ def test_third_order_is_what_real_rays_show_near_the_axis(name):
     def errors(t, field):
         angle = jnp.arctan(jnp.tan(0.1) * t * field)
         rays = trace_rays(lens, angle, distance, GREEN, t * pupil)
-        return (rays.points[0, :, -1, :2] - jnp.array([0, t * field * ideal])) / t**3
+        return (rays.points[0, :, -1, :2] - jnp.array([[0, t * field * ideal]])) / t**3
 
     def limit(field):
         a, b = errors(0.1, field), errors(0.05, field)
