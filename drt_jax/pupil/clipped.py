@@ -24,8 +24,9 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import safe_divide, safe_sqrt
 from ..rays.aim import paraxial_launch
+from ..rays.fermat import arrival
 from ..rays.snell import shoot
-from ..rays.solve import attach
+from ..rays.solve import Found, reattach
 from ..rays.status import Status
 from ..rays.system import System, Vector, dot, system_of
 from ..rays.trace import _whole
@@ -490,9 +491,9 @@ def _excess(plan: _Plan, lens: Lens, scene: Scene, point: Vector) -> Array:
     """|h|^2 / R^2 - 1 of the apertures that end the rays, (2, W, K); `point` as in the plan."""
     target = tuple(lens.semi_diameter[lens.stop] * p for p in point)
     system = system_of(lens, scene)
-    hits = attach(system, target, plan.hits, plan.follows)
     status = jnp.where(plan.follows, Status.OK, Status.MISSED).astype(jnp.int32)
-    hits, _ = _whole(lens, system, hits, status)
+    known = Found(plan.hits, arrival(plan.hits, system), status, jnp.int32(0))
+    hits, _ = _whole(lens, system, reattach(known, system, target).hits, status, target)
     return jnp.stack([gap for gap, _ in _gaps(lens, hits, (), plan.pair)])
 
 

@@ -261,7 +261,7 @@ def trace_fan(system: System, fan: Fan, reach: Array) -> Fan:
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
     trace = shoot(system, flat)
     hits, part = up_to(trace.hits, system, system.before)
-    there = label(hits, geometry(hits, part), part)
+    there = label(geometry(hits, part), part)
     good = trace.fate == Status.OK
     return Fan(launch, tuple(jnp.where(good, a, jnp.inf).reshape(shape) for a in there))
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..lens.surface import by_form, domain, sag_derivatives, surface_sag
@@ -26,22 +27,24 @@ from .system import System, Vector, dot, turn
 class Path(NamedTuple):
     """A path drawn out: what its gradient, its differentials and its status are made of.
 
-    before: D + 1 arrays (R, W, Q), unit vectors in front of each row, along that row's axes.
-    after: D + 1 arrays (L, W, Q), unit vectors behind each live surface, along its axes.
-    length: (R, W, Q), of the segments in front of the rows, mm; void for the first.
+    hits: D arrays (R, W, Q), mm.
     height: (R, W, Q), the sag in mm.
-    spread: (W, Q), how fast the direction of the light turns over the first surface, 1/mm.
+    before, after: D + 1 arrays (R, W, Q), unit vectors in front of each row and behind it, along
+        that row's axes; behind the sensor light goes on as before.
     slope: D arrays (R, W, Q), derivatives of the sag.
     bend: D rows of D arrays (R, W, Q), second derivatives of the sag, 1/mm.
+    length: (R, W, Q), of the segments in front of the rows, mm; 0 for the first.
+    shrink: (W, Q), 1 / |vergence P_1 - source|, see `geometry`.
     """
 
+    hits: Vector
+    height: Array
     before: Vector
     after: Vector
-    length: Array
-    height: Array
-    spread: Array
     slope: Vector
     bend: tuple[Vector, ...]
+    length: Array
+    shrink: Array
 
 
 def _segments(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vector]:
@@ -64,23 +67,21 @@ def geometry(hits: Vector, system: System) -> Path:
     z, slope, bend = by_form(sag_derivatives, hits, system.rows.wide, system.forms)
     point, step = _segments(hits, z, system)
     first = (system.vergence * p - s for p, s in zip(point, system.source, strict=True))
-    segment = tuple(jnp.concatenate([f[None], s]) for f, s in zip(first, step, strict=True))
-    length = _length(segment)
+    chain = [jnp.concatenate([f[None], s, s[-1:]]) for f, s in zip(first, step, strict=True)]
+    length = _length(chain)
     shrink = _inverse(length)
-    direction = tuple(s * shrink for s in segment)
-    behind = tuple(d[1:] for d in direction)
-    before = turn(rotation, direction, back=True)
-    after = turn(None if rotation is None else rotation[:-1], behind, back=True)
-    return Path(before, after, length, z, system.vergence * shrink[0], slope, bend)
+    direction = tuple(s * shrink for s in chain)
+    before = turn(rotation, tuple(d[:-1] for d in direction), back=True)
+    after = turn(rotation, tuple(d[1:] for d in direction), back=True)
+    return Path(hits, z, before, after, slope, bend, length[:-1].at[0].set(0), shrink[0])
 
 
 def residual(path: Path, system: System) -> Vector:
-    """F = dOP/dw on every live surface, dimensionless, D arrays (L, W, Q) (paper Eq. 3)."""
-    index = system.index
-    *across, along = (
-        index[:-1] * b[:-1] - index[1:] * a for b, a in zip(path.before, path.after, strict=True)
-    )
-    return tuple(c + s[:-1] * along for c, s in zip(across, path.slope, strict=True))
+    """F = dOP/dw on every live surface, dimensionless (paper Eq. 3), and on the sensor, where it is
+    0 for any path: D arrays (R, W, Q)."""
+    index, behind = (jnp.broadcast_to(n, path.length.shape) for n in (system.index, system.behind))
+    *across, along = (index * b - behind * a for b, a in zip(path.before, path.after, strict=True))
+    return tuple(c + s * along for c, s in zip(across, path.slope, strict=True))
 
 
 def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
@@ -93,28 +94,27 @@ def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
     return tuple(h[some] for h in hits), part
 
 
-def ray_at(hits: Vector, path: Path, system: System, row: int) -> tuple[Vector, Vector]:
+def ray_at(path: Path, system: System, row: int) -> tuple[Vector, Vector]:
     """Points of one row and unit vectors in front of it, D + 1 arrays (W, Q) each, along the axes
     of the lens."""
     rotation = None if system.rows.rotation is None else system.rows.rotation[row]
-    origin = (a[row] for a in system.rows.origin(len(hits)))
-    own = turn(rotation, (*(h[row] for h in hits), path.height[row]))
+    origin = (a[row] for a in system.rows.origin(system.dim))
+    own = turn(rotation, (*(h[row] for h in path.hits), path.height[row]))
     point = tuple(o + p for o, p in zip(origin, own, strict=True))
     return point, turn(rotation, tuple(b[row] for b in path.before))
 
 
-def label(hits: Vector, path: Path, system: System) -> Vector:
-    """Where the paths through `hits`, D arrays (R, W, Q), cross the stop: D arrays (W, Q), mm
-    along its axes."""
+def label(path: Path, system: System) -> Vector:
+    """Where paths cross the stop: D arrays (W, Q), mm along its axes."""
     if system.stop is None:
-        return tuple(h[system.before] for h in hits)
-    return cross(*system.at_stop, *ray_at(hits, path, system, system.before))[0]
+        return tuple(h[system.before] for h in path.hits)
+    return cross(*system.at_stop, *ray_at(path, system, system.before))[0]
 
 
 def arrival(hits: Vector, system: System) -> Vector:
-    """Unit vectors, D + 1 arrays (W, Q), along the axes of the sensor, of the rays reaching it."""
-    path = geometry(*up_to(hits, system, len(system.forms) - 1))
-    return tuple(b[-1] for b in path.before)
+    """Unit vectors, D + 1 arrays (W, Q), along the axes of the lens, of the rays on the sensor."""
+    hits, part = up_to(hits, system, len(system.forms) - 1)
+    return ray_at(geometry(hits, part), part, -1)[1]
 
 
 def exact(hits: Vector, system: System, target: Vector) -> Array:
@@ -122,7 +122,7 @@ def exact(hits: Vector, system: System, target: Vector) -> Array:
     (W, Q), bool."""
     width = _width(hits, system)
     hits, part = up_to(hits, system, system.before)
-    return _met(label(hits, geometry(hits, part), part), target, width)
+    return _met(label(geometry(hits, part), part), target, width)
 
 
 def _met(crossing: Vector, target: Vector, width: Array) -> Array:
@@ -164,7 +164,7 @@ def optical_path(hits: Vector, system: System) -> Array:
     return jnp.sum(system.index * lengths, axis=0)
 
 
-def stationary(hits: Vector, path: Path, system: System, target: Vector) -> Array:
+def stationary(path: Path, system: System, target: Vector) -> Array:
     """Whether these paths are rays, (W, Q), bool: forward, on surfaces that exist, through their
     stop points `target`, D arrays (W, Q) in mm, and F = 0.
 
@@ -172,21 +172,21 @@ def stationary(hits: Vector, path: Path, system: System, target: Vector) -> Arra
     digit changes: for a camera in float64 some 1e-14 radians. Where that is more than 1e-6
     radians (2e-2 in float32), the hits determine no direction, and the path is not accepted.
     """
-    eps = float(jnp.finfo(hits[0].dtype).eps)
-    index, senses = system.index, system.senses[:, None, None]
-    size = _width(hits, system)
+    eps = float(jnp.finfo(path.length.dtype).eps)
+    senses = system.senses[:, None, None]
+    behind = senses * np.where([*system.mirrors, False], -1, 1)[:, None, None]
+    size = _width(path.hits, system)
     widest = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
-    near = _inverse(path.length).at[0].set(jnp.abs(path.spread))
-    shake = index * (1 + near * widest)
-    both = shake[:-1] + shake[1:]
-    gradient, slope = residual(path, system), tuple(s[:-1] for s in path.slope)
-    bound = 64 * eps * both * jnp.sqrt(1 + dot(slope, slope))
+    near = _inverse(path.length).at[0].set(jnp.abs(system.vergence) * path.shrink)
+    shake = system.index * (1 + near * widest)
+    both = shake + jnp.concatenate([shake[1:], shake[-1:]])
+    gradient = residual(path, system)
+    bound = 64 * eps * both * jnp.sqrt(1 + dot(path.slope, path.slope))
     good = (dot(gradient, gradient) <= bound**2) & (both <= 4 / eps**0.5)
-    good = good & (_forward(path.after, slope) * senses[1:] > 0)
-    exists = by_form(domain, hits, system.rows.wide, system.forms)
-    exists = exists & (_forward(path.before, path.slope) * senses > 0)
-    met = _met(label(hits, path, system), target, size)
-    return jnp.all(good, axis=0) & jnp.all(exists, axis=0) & met
+    good = good & by_form(domain, path.hits, system.rows.wide, system.forms)
+    good = good & (_forward(path.before, path.slope) * senses > 0)
+    good = good & (_forward(path.after, path.slope) * behind > 0)
+    return jnp.all(good, axis=0) & _met(label(path, system), target, size)
 
 
 def _forward(direction: Vector, slope: Vector) -> Array:

@@ -1,11 +1,11 @@
-"""The linear system of all derivatives: how a path answers to small forces on its equations.
+"""The linear system of all derivatives: how a path answers when it is pushed.
 
 The Jacobian of the Fermat equations and the label, dE/dw, is banded: each equation knows three
 neighbouring hits. It is solved by marching along the ray. Given the change dw_1 of the first hit,
 the equation of each surface yields the change of direction behind it, and that the next hit;
 the label then picks dw_1 among D + 1 such marches. So O(surfaces) a ray, nothing is divided by the
 length of a segment, and every derivative mode, transposition among them, is JAX's own: a march
-is linear in its forces.
+is linear in its pushes.
 """
 
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from .fermat import Path, ray_at
@@ -20,127 +21,129 @@ from .snell import cross
 from .system import System, Vector, dot, turn
 
 
+class Push(NamedTuple):
+    """What a path answers to.
+
+    force: D arrays (R, W, Q), change of the equations that hits have to make up for; of the
+        sensor's, which has none, 0.
+    point: D + 1 arrays (R, W, Q), how far surfaces move under fixed transverse coordinates, mm
+        along the axes of the lens.
+    swing: D + 1 arrays (W, Q), change of the direction in front of the first row at a fixed point.
+    label: D arrays (W, Q), change of the crossing of the stop that hits have to make, mm.
+    """
+
+    force: Vector
+    point: Vector
+    swing: Vector
+    label: Vector
+
+
 class _Row(NamedTuple):
-    """What a march needs of one live surface and the segment to the next row; see `Path`. ahead:
-    unit vector of the segment, slope_ahead: of the sag, along the axes of the next row."""
+    """What a march needs of one row: of a `Path`, and of a `System`. labels: whether the label is
+    made of its hit, or of the ray in front of it."""
 
     before: Vector
     after: Vector
     slope: Vector
     bend: tuple[Vector, ...]
+    length: Array
     index_before: Array
     index_behind: Array
     rotation: Array | None
-    length: Array
-    ahead: Vector
-    slope_ahead: Vector
-    rotation_ahead: Array | None
+    labels: Array
 
 
-def _rows(path: Path, system: System) -> _Row:
-    front = jax.tree.map(lambda a: a[:-1], (path.before, path.slope, path.bend))
-    rotation = system.rows.rotation
-    return _Row(
-        front[0],
-        path.after,
-        front[1],
-        front[2],
-        system.index[:-1],
-        system.index[1:],
-        None if rotation is None else rotation[:-1],
-        path.length[1:],
-        tuple(b[1:] for b in path.before),
-        tuple(s[1:] for s in path.slope),
-        None if rotation is None else rotation[1:],
-    )
+class _March(NamedTuple):
+    """Changes on the way: of a point on the ray, mm, and of the direction there, D + 1 arrays each,
+    along the axes of the lens; and what the label is made of, as far as that is known."""
+
+    point: Vector
+    swing: Vector
+    label: Vector
 
 
 def _step(
-    row: _Row, good: Array, moved: Vector, swung: Vector, force: Vector
-) -> tuple[Vector, Vector]:
-    """From one row to the next: changes of the hit, D arrays, and of the direction in front of it,
-    D + 1 arrays, along the axes of the row. force: D arrays, the change of its equation."""
+    row: _Row, live: bool, good: Array, march: _March, force: Vector, moved: Vector
+) -> tuple[_March, Vector]:
+    """Onto a row and through it: the changes behind it, and of its hit, D arrays; `live`: whether
+    the stop bends light."""
+    carried = (
+        p + row.length * s - m for p, s, m in zip(march.point, march.swing, moved, strict=True)
+    )
+    *across, depth = turn(row.rotation, tuple(carried), back=True)
+    *swung, along = turn(row.rotation, march.swing, back=True)
+    # Along the ray onto the tangent plane of the surface.
+    normal = jnp.where(good, row.before[-1] - dot(row.slope, row.before[:-1]), 1)
+    slide = (depth - dot(row.slope, across)) / normal
+    hit = tuple(c - slide * e for c, e in zip(across, row.before, strict=False))
+    here = turn(row.rotation, (*hit, dot(row.slope, hit)))
+    point = tuple(a + m for a, m in zip(here, moved, strict=True))
     jump = row.index_before * row.before[-1] - row.index_behind * row.after[-1]
     pull = tuple(
-        row.index_before * (v + s * swung[-1]) + jump * dot(bend, moved) - f
-        for v, s, bend, f in zip(swung, row.slope, row.bend, force, strict=False)
+        row.index_before * (v + s * along) + jump * dot(bend, hit) - f
+        for v, s, bend, f in zip(swung, row.slope, row.bend, force, strict=True)
     )
     # The change of direction behind: its product with the tangents is known, with itself 0.
     normal = jnp.where(good, row.after[-1] - dot(row.slope, row.after[:-1]), 1)
     along = -dot(row.after[:-1], pull) / (row.index_behind * normal)
-    behind = (
-        *(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True)),
-        along,
-    )
-    here = *moved, dot(row.slope, moved)
-    behind, here = (
-        turn(row.rotation_ahead, turn(row.rotation, a), back=True) for a in (behind, here)
-    )
-    carried = tuple(p + row.length * v for p, v in zip(here, behind, strict=True))
-    # Along the ray onto the tangent plane of the next surface.
-    normal = jnp.where(good, row.ahead[-1] - dot(row.slope_ahead, row.ahead[:-1]), 1)
-    slide = (carried[-1] - dot(row.slope_ahead, carried[:-1])) / normal
-    return tuple(c - slide * e for c, e in zip(carried[:-1], row.ahead, strict=False)), behind
+    behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
+    made = hit if live else (*point, *march.swing)
+    label = tuple(jnp.where(row.labels, a, b) for a, b in zip(made, march.label, strict=True))
+    return _March(point, turn(row.rotation, (*behind, along)), label), hit
 
 
-def _begin(path: Path, first: Vector) -> tuple[Vector, Vector]:
-    """Changes at the first row: of the hit, and of the direction in front of it."""
-    normal = tuple(b[0] for b in path.before)
-    moved = *first, dot(tuple(s[0] for s in path.slope), first)
-    along = dot(normal, moved)
-    return first, tuple(path.spread * (m - n * along) for m, n in zip(moved, normal, strict=True))
-
-
-def solve(
-    hits: Vector, path: Path, system: System, good: Array, forces: Vector, shift: Vector
-) -> Vector:
-    """dw, D arrays (R, W, Q), with dF dw = `forces`, D arrays (L, W, Q), and dC dw = `shift`, D
-    arrays (W, Q) in mm, at the path through `hits`; C is the label. Linear in both.
+def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, Vector]:
+    """How a path answers to a push: changes of the hits, D arrays (R, W, Q), and of the direction
+    at the sensor, D + 1 arrays (W, Q) along the axes of the lens. Linear in the push.
 
     good: (W, Q), the rays of interest: what comes out for the others is finite if they are.
     """
-    dim, zero = len(hits), jnp.zeros_like(hits[0][0])
-    none = (zero,) * dim
-    units = tuple(
-        jnp.stack([jnp.full_like(zero, float(d == k)) for k in range(dim)]) for d in range(dim)
-    )
-    start = jax.vmap(lambda first: _begin(path, first))(units), _begin(path, none)
+    dim, zero, live = len(push.label), jnp.zeros_like(push.label[0]), system.stop is None
+    at = np.arange(len(system.forms)) == system.before
+    rows = _Row(*path[2:7], system.index, system.behind, system.rows.rotation, at)
+    still, none = (zero,) * (dim + 1), (zero,) * dim
+    unknown = none if live else (*still, *still)
+    # A march from each unit change of the first hit, and one that the push makes.
+    units = [[jnp.full_like(zero, float(d == k)) for k in range(dim)] for d in range(dim)]
+    first = jax.vmap(lambda hit: _first(path, system, hit))(tuple(map(jnp.stack, units)))
+    free = _March(*first, jax.tree.map(lambda a: jnp.stack([a] * dim), unknown))
 
-    def step(state, given):
-        row, force = given
-        free = jax.vmap(lambda moved, swung: _step(row, good, moved, swung, none))(*state[0])
-        forced = _step(row, good, state[1][0], state[1][1], force)
-        return (free, forced), (free, forced)
+    def step(marches, given):
+        row, *pushed = given
+        free = jax.vmap(lambda march: _step(row, live, good, march, none, still))(marches[0])
+        forced = _step(row, live, good, marches[1], *pushed)
+        return (free[0], forced[0]), (free[1], forced[1])
 
-    # `dim` marches from unit changes of the first hit, and one that the forces make.
-    _, (free, forced) = jax.lax.scan(step, start, (_rows(path, system), forces))
-    marched = (free, forced)
-    free, forced = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, marched)
-    crossing = _crossing(hits, path, system)
-    columns = jax.vmap(crossing, 1)(free)
-    wanted = tuple(s - c for s, c in zip(shift, crossing(forced), strict=True))
+    start = free, _March(still, push.swing, unknown)
+    marched, hits = jax.lax.scan(step, start, (rows, push.force, push.point))
+    crossing = _crossing(path, system)
+    columns = jax.vmap(crossing)(marched[0].label)
+    wanted = tuple(s - c for s, c in zip(push.label, crossing(marched[1].label), strict=True))
     weights = _divide([[c[k] for k in range(dim)] for c in columns], wanted, good)
-    return tuple(
-        f + sum(weights[k][None] * u[:, k] for k in range(dim))
-        for f, u in zip(forced[0], free[0], strict=True)
-    )
+
+    def joined(free, forced):
+        return forced + sum(w * free[..., k, :, :] for k, w in enumerate(weights))
+
+    swing = jax.tree.map(joined, *(march.swing for march in marched))
+    return jax.tree.map(joined, *hits), swing
 
 
-def _crossing(hits: Vector, path: Path, system: System) -> Callable:
-    """The change of the label, D arrays (W, Q), as a function of those of hits and directions."""
-    row = system.before
+def _first(path: Path, system: System, hit: Vector) -> tuple[Vector, Vector]:
+    """Changes of the point and of the direction in front of it when the first hit moves."""
+    rotation = None if system.rows.rotation is None else system.rows.rotation[0]
+    moved = turn(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
+    first = ray_at(path, system, 0)[1]
+    along, spread = dot(first, moved), system.vergence * path.shrink
+    return moved, tuple(spread * (m - e * along) for m, e in zip(moved, first, strict=True))
+
+
+def _crossing(path: Path, system: System) -> Callable[[Vector], Vector]:
+    """The change of the label, D arrays (W, Q), as a function of what it is made of."""
     if system.stop is None:
-        return lambda marched: tuple(m[row] for m in marched[0])
-    rotation = None if system.rows.rotation is None else system.rows.rotation[row]
-    line = ray_at(hits, path, system, row)
-    _, push = jax.linearize(lambda *line: cross(*system.at_stop, *line)[0], *line)
-
-    def change(marched):
-        moved, swung = (tuple(a[row] for a in part) for part in marched)
-        point = *moved, dot(tuple(s[row] for s in path.slope), moved)
-        return push(turn(rotation, point), turn(rotation, swung))
-
-    return change
+        return lambda hit: hit
+    line = ray_at(path, system, system.before)
+    _, change = jax.linearize(lambda *line: cross(*system.at_stop, *line)[0], *line)
+    return lambda label: change(label[: len(line[0])], label[len(line[0]) :])
 
 
 def _divide(matrix: list[list[Array]], b: Vector, good: Array) -> Vector:

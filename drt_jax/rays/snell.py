@@ -171,14 +171,13 @@ def _refract(d: Vector, normal: Vector, ratio: Array, sense: Array, leaving: Arr
 def _follow(system: System, launch: Vector, count: int) -> tuple[Vector, Vector, Trace]:
     """Points and directions, along the axes of the lens, behind the first `count` rows."""
     kinds = sorted(set(system.forms))
-    index = jnp.concatenate([system.index, system.index[-1:]])
     senses = np.append(system.senses, system.senses[-1])
     some = slice(None, count)
     rows = (
         np.arange(count) == 0,
         jax.tree.map(lambda a: a[some], system.rows),
         np.array([kinds.index(form) for form in system.forms[some]], np.int32),
-        (index[:-1] / index[1:])[some],
+        (system.index / system.behind)[some],
         senses[:-1][some],
         senses[1:][some],
     )

@@ -12,13 +12,16 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 
+from ..lens.surface import by_form, sag_derivatives
 from . import fermat, linear
 from .aim import STARTS, Fan, aim, beam_size, no_fan, paraxial_launch, starts_of, trace_fan
 from .bundle import in_tiles, polynomial_launch, tiles_of
-from .snell import shoot
+from .fermat import Path
+from .snell import cross, shoot
 from .status import Status
-from .system import System, Vector, dot
+from .system import System, Vector, dot, turn
 
 _MAX_STEPS = 16
 
@@ -27,11 +30,14 @@ class Found(NamedTuple):
     """Rays of a bundle.
 
     hits: D arrays (R, W, Q) in mm on the live surfaces and the sensor; 0 for failed rays.
+    arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along the axes of the lens; void for
+        failed rays.
     status: (W, Q), int32, see `Status`.
     steps: (), int32, steps of Newton's method that the bundle took, aiming included.
     """
 
     hits: Vector
+    arrival: Vector
     status: Array
     steps: Array
 
@@ -65,9 +71,9 @@ class BlockNewton(optx.AbstractRootFinder):
     def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
         """One Newton step of every ray that is not stationary yet."""
         system, target, _ = args
-        (forces, shift, path), aux = fn(y, args)
-        solved = state.solved | fermat.stationary(y, path, system, target)
-        change = linear.solve(y, path, system, ~solved, forces, shift)
+        (push, path), aux = fn(y, args)
+        solved = state.solved | fermat.stationary(path, system, target)
+        change, _ = linear.solve(path, system, ~solved, push)
         finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
         moves = finite & ~solved
         change = tuple(jnp.where(moves, c, 0) for c in change)
@@ -94,8 +100,11 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
     def equations(hits, args):
         system, target, _ = args
         path = fermat.geometry(hits, system)
-        miss = (a - b for a, b in zip(fermat.label(hits, path, system), target, strict=True))
-        return (fermat.residual(path, system), tuple(miss), path), None
+        miss = (a - b for a, b in zip(fermat.label(path, system), target, strict=True))
+        still = tuple(jnp.zeros_like(a) for a in path.before)
+        first = tuple(a[0] for a in still)
+        push = linear.Push(fermat.residual(path, system), still, first, tuple(miss))
+        return (push, path), None
 
     eps = float(jnp.finfo(hits[0].dtype).eps)
     solution: optx.Solution = optx.root_find(
@@ -126,7 +135,8 @@ def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
     hits, solved, steps = _polish(system, target, hits, good & ~fermat.exact(hits, system, target))
     status = jnp.where(good & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
     hits = tuple(jnp.where(status == Status.OK, a, 0) for a in hits)
-    return Found(hits, status, (search.steps + steps).astype(jnp.int32))
+    steps = (search.steps + steps).astype(jnp.int32)
+    return Found(hits, fermat.arrival(hits, system), status, steps)
 
 
 class _Search(NamedTuple):
@@ -232,7 +242,7 @@ def _find_many(system: System, target: Vector) -> Found:
         launch = launch_of(target)
         hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
         solved = fermat.exact(hits, system, target) & (status == Status.OK)
-        start = Found(hits, status, jnp.int32(0)), ~jnp.all(solved)
+        start = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0)), ~jnp.all(solved)
 
         def turn(state):
             return find(system, target, launch), jnp.array(False)
@@ -245,41 +255,69 @@ def _find_many(system: System, target: Vector) -> Found:
 
 
 @jax.custom_jvp
-def attach(system: System, target: Vector, hits: Vector, good: Array) -> Vector:
-    """Known hits with their derivatives by the system and the stop points, in every mode.
-
-    target: D arrays (W, Q) in mm. hits: D arrays (R, W, Q) in mm of the rays through them. good:
-    (W, Q), bool, the rays that have derivatives.
+def attach(
+    system: System, target: Vector, hits: Vector, arrival: Vector, good: Array
+) -> tuple[Vector, Vector]:
+    """Known hits and arrivals, see `Found`, with their derivatives by the system and the stop
+    points `target`, D arrays (W, Q) in mm, in every mode; `good`: (W, Q), the rays that have any.
     """
-    return hits
+    return hits, arrival
 
 
-@attach.defjvp
-def _attach_jvp(primals: Any, tangents: Any) -> tuple[Vector, Vector]:
-    system, target, hits, good = primals
+def _attach_jvp(primals: Any, tangents: Any) -> tuple:
+    system, target, *known, good = primals
     # Through the function itself, so that the hits carry derivatives of their own.
-    hits = attach(system, target, hits, good)
+    hits, arrival = attach(system, target, *known, good)
+    # Only what moves costs anything.
+    moving, turning = (
+        [None if isinstance(t, SymbolicZero) else t for t in jax.tree.leaves(part)]
+        for part in tangents[:2]
+    )
 
-    def tangent(target, moved_target, hits, good):
-        return _moved(system, tangents[0], target, moved_target, hits, good)
-
-    return hits, in_tiles(tangent, target, tangents[1], hits, good)
-
-
-def _moved(
-    system: System, moving: System, target: Vector, moving_target: Vector, hits: Vector, good: Array
-) -> Vector:
-    """Tangents of the hits from those of the system and the stop points (paper Eq. 4)."""
-
-    def equations(system, target):
+    def tangent(hits, turning, good):
         path = fermat.geometry(hits, system)
-        miss = (a - b for a, b in zip(fermat.label(hits, path, system), target, strict=True))
-        return (fermat.residual(path, system), tuple(miss)), path
+        push = _push(path, system, moving)
+        label = (a if t is None else a + t for a, t in zip(push.label, turning, strict=True))
+        push = jax.tree.map(lambda a: jnp.where(good, a, 0), push._replace(label=tuple(label)))
+        moved = linear.solve(path, system, good, push)
+        return jax.tree.map(lambda a: jnp.where(good, a, 0), moved)
 
-    _, change, path = jax.jvp(equations, (system, target), (moving, moving_target), has_aux=True)
-    forces, shift = (tuple(jnp.where(good, -a, 0) for a in part) for part in change)
-    moved = linear.solve(hits, path, system, good, forces, shift)
-    return tuple(jnp.where(good, a, 0) for a in moved)
+    return (hits, arrival), in_tiles(tangent, hits, turning, good)
+
+
+attach.defjvp(_attach_jvp, symbolic_zeros=True)
+
+
+def _push(path: Path, system: System, moving: list[Array | None]) -> linear.Push:
+    """What a path has to make up for when leaves of its system move (paper Eq. 4)."""
+    leaves, structure = jax.tree.flatten(system)
+    some = [k for k, change in enumerate(moving) if change is not None]
+    directions = [turn(system.rows.rotation, a) for a in (path.before, path.after)]
+    first, line = (fermat.ray_at(path, system, row) for row in (0, system.before))
+
+    def held(changed):
+        """The equations with the hits and the directions held, these along the axes of the lens."""
+        new = dict(zip(some, changed, strict=True))
+        own = jax.tree.unflatten(structure, [new.get(k, a) for k, a in enumerate(leaves)])
+        rows = own.rows
+        height, slope, _ = by_form(sag_derivatives, path.hits, rows.on(path.length), own.forms)
+        before, after = (turn(rows.rotation, a, back=True) for a in directions)
+        force = fermat.residual(path._replace(before=before, after=after, slope=slope), own)
+        point = turn(rows.rotation, (*path.hits, height))
+        origin = (a[:, None, None] for a in rows.origin(own.dim))
+        point = tuple(p + o for p, o in zip(point, origin, strict=True))
+        toward = (own.vergence * p - s for p, s in zip(first[0], own.source, strict=True))
+        crossing = tuple(h[own.before] for h in path.hits)
+        if own.stop is not None:
+            crossing = cross(*own.at_stop, *line)[0]
+        return force, point, tuple(toward), crossing
+
+    given = ([a[k] for k in some] for a in (leaves, moving))
+    force, point, toward, label = jax.jvp(held, *((a,) for a in given))[1]
+    along = dot(first[1], toward)
+    swing = (path.shrink * (t - e * along) for t, e in zip(toward, first[1], strict=True))
+    force, label = (tuple(-a for a in part) for part in (force, label))
+    return linear.Push(force, point, tuple(swing), label)
 
 
 def solve(system: System, target: Vector) -> Found:
@@ -290,7 +328,8 @@ def solve(system: System, target: Vector) -> Found:
 
 def reattach(found: Found, system: System, target: Vector) -> Found:
     """Known rays through stop points `target` with the derivatives of `attach`."""
-    return found._replace(hits=attach(system, target, found.hits, found.status == Status.OK))
+    hits, arrival = attach(system, target, found.hits, found.arrival, found.status == Status.OK)
+    return found._replace(hits=hits, arrival=arrival)
 
 
 # What finds the rays of a system through stop points.
@@ -305,12 +344,17 @@ def solve_reverse(system: System, target: Vector) -> Found:
 
 def _forward(system: System, target: Vector) -> tuple[Found, tuple]:
     found = find_many(system, target)
-    return found, (system, target, found.hits, found.status == Status.OK)
+    return found, (found, system, target)
 
 
 def _backward(kept: tuple, cotangent: Found) -> tuple[System, Vector]:
-    _, pull_back = jax.vjp(lambda system, target: attach(system, target, *kept[2:]), *kept[:2])
-    return pull_back(cotangent.hits)
+    found, *arguments = kept
+
+    def attached(system, target):
+        new = reattach(found, system, target)
+        return new.hits, new.arrival
+
+    return jax.vjp(attached, *arguments)[1]((cotangent.hits, cotangent.arrival))
 
 
 solve_reverse.defvjp(_forward, _backward)

@@ -68,6 +68,10 @@ class Placed(NamedTuple):
         """The shape, to be broadcast against (surface, wavelength, ray)."""
         return Shape(*(a[..., None, None] for a in self.shape))
 
+    def on(self, like: Array) -> Shape:
+        """The shape, each number broadcast to all rays (surface, wavelength, ray) by itself."""
+        return jax.tree.map(lambda a: jnp.broadcast_to(a, (*a.shape[:-3], *like.shape)), self.wide)
+
     def origin(self, dim: int) -> Vector:
         """The vertices as vectors of `dim` + 1 components."""
         zero = jnp.zeros_like(self.vertex)
@@ -121,6 +125,11 @@ class System:
             return self.stop, self.stop_form
         row = self.before
         return jax.tree.map(lambda a: a[row], self.rows), self.forms[row]
+
+    @property
+    def behind(self) -> Array:
+        """Index (R, W, 1) of the medium behind each row; behind the sensor as before it."""
+        return jnp.concatenate([self.index[1:], self.index[-1:]])
 
     @property
     def senses(self) -> np.ndarray:

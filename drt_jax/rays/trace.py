@@ -56,39 +56,35 @@ class Rays(NamedTuple):
     newton_steps: Array
 
 
-def _point_and_direction(system: System, hits: Vector) -> tuple[Vector, Vector]:
-    """Hits on the rows, and unit vectors in front of them, D + 1 arrays (R, W, Q) each, along the
-    axes of the lens."""
-    heights = by_form(surface_sag, hits, system.rows.wide, system.forms)
-    own = turn(system.rows.rotation, (*hits, heights))
-    origin = system.rows.origin(system.dim)
-    point = tuple(p + o[:, None, None] for p, o in zip(own, origin, strict=True))
-    return point, turn(system.rows.rotation, fermat.geometry(hits, system).before)
-
-
 def _rows_behind(lens: Lens) -> list[int]:
     """The row of the system that each surface and the sensor is, or that lies behind it."""
     return [sum(j < i for j in lens.live) for i in range(lens.count + 1)]
 
 
-def _whole(lens: Lens, system: System, hits: Vector, status: Array) -> tuple[Vector, Array]:
+def _whole(
+    lens: Lens, system: System, hits: Vector, status: Array, stop: Vector | None = None
+) -> tuple[Vector, Array]:
     """Hits on all surfaces, those that bend no light included, and status: where the straight
-    ray, prolonged either way, does not meet such a surface, it is MISSED."""
-    if len(lens.live) == lens.count:
-        return hits, status
-    point, direction = _point_and_direction(system, hits)
-    rows: list[Vector] = []
-    for i, row in enumerate(_rows_behind(lens)):
-        if i in lens.live or i == lens.count:
-            rows.append(tuple(h[row] for h in hits))
+    ray, prolonged either way, does not meet such a surface, it is MISSED. stop: the hits on the
+    stop, if they are known."""
+    pieces, begin = [], 0
+    for i in range(lens.count):
+        if i in lens.live:
             continue
-        line = tuple(p[row] for p in point), tuple(d[row] for d in direction)
-        crossing, met = cross(placed(lens, i), lens.forms[i], *line)
-        missed = (status == Status.OK) & ~met
-        status = jnp.where(missed, Status.MISSED, status).astype(jnp.int32)
-        rows.append(crossing)
+        row = sum(j < i for j in lens.live)  # the first behind it
+        crossing = stop
+        if i != lens.stop or stop is None:
+            some, part = fermat.up_to(hits, system, row)
+            line = fermat.ray_at(fermat.geometry(some, part), part, -1)
+            crossing, met = cross(placed(lens, i), lens.forms[i], *line)
+            missed = (status == Status.OK) & ~met
+            status = jnp.where(missed, Status.MISSED, status).astype(jnp.int32)
+        pieces += [tuple(h[begin:row] for h in hits), tuple(c[None] for c in crossing)]
+        begin = row
+    pieces.append(tuple(h[begin:] for h in hits))
     whole = status == Status.OK
-    return tuple(jnp.where(whole, jnp.stack(a), 0) for a in zip(*rows, strict=True)), status
+    joined = (jnp.concatenate(part) for part in zip(*pieces, strict=True))
+    return tuple(jnp.where(whole, a, 0) for a in joined), status
 
 
 def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:
@@ -116,12 +112,14 @@ def _traced(
     found = solver(system, target)
     known = known_index(lens.glasses, scene.wavelengths)[:, None]
     status = jnp.where(known, found.status, jnp.int32(Status.NO_INDEX))
-    last, path = fermat.arrival(found.hits, system), fermat.optical_path(found.hits, system)
-    hits, status = _whole(lens, system, found.hits, status)
+    rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
+    arrival = turn(rotation, found.arrival, back=True)
+    path = fermat.optical_path(found.hits, system)
+    hits, status = _whole(lens, system, found.hits, status, target)
     edge = lens.semi_diameter.at[lens.stop].set(jnp.inf)[:, None, None]
     outside = jnp.any(dot(hits, hits) > edge**2, axis=0) & (status == Status.OK)
     status = jnp.where(outside, Status.CLIPPED, status).astype(jnp.int32)
-    return Bundle(hits, status, last, path, found.steps), system, found.hits
+    return Bundle(hits, status, arrival, path, found.steps), system, found.hits
 
 
 def trace_rays(
@@ -156,7 +154,7 @@ def _trace_rays(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
     own = turn(rows.rotation, (*bundle.hits, heights))
     points = (p + o[:, None, None] for p, o in zip(own, rows.origin(2), strict=True))
-    _, direction = _point_and_direction(system, hits)
+    direction = turn(system.rows.rotation, fermat.geometry(hits, system).before)
     behind = np.array(_rows_behind(lens))
 
     def stacked(vector):  # (3, S + 1, W, Q) -> (W, Q, S + 1, 3)
