@@ -25,7 +25,7 @@ from ..lens.scene import Scene
 from ..numerics import safe_divide, safe_sqrt
 from ..rays.aim import paraxial_launch
 from ..rays.fermat import arrival
-from ..rays.snell import shoot
+from ..rays.snell import apart, shoot
 from ..rays.solve import Found, reattach
 from ..rays.status import Status
 from ..rays.system import System, Vector, dot, system_of
@@ -118,7 +118,8 @@ def _units(like: Vector) -> Vector:
 def _launched(lens: Lens, system: System, launch: Vector) -> _Rays:
     def trace(launch):
         found = shoot(system, launch)
-        return _whole(lens, system, found.hits, found.fate)
+        hits, crossing = apart(system, found.hits)
+        return _whole(lens, system, hits, crossing, found.fate)
 
     def along(unit):
         (hits, status), (columns, _) = jax.jvp(trace, (launch,), (unit,))
@@ -493,7 +494,7 @@ def _excess(plan: _Plan, lens: Lens, scene: Scene, point: Vector) -> Array:
     system = system_of(lens, scene)
     status = jnp.where(plan.follows, Status.OK, Status.MISSED).astype(jnp.int32)
     known = Found(plan.hits, arrival(plan.hits, system), status, jnp.int32(0))
-    hits, _ = _whole(lens, system, reattach(known, system, target).hits, status, target)
+    hits, _ = _whole(lens, system, reattach(known, system, target).hits, target, status)
     return jnp.stack([gap for gap, _ in _gaps(lens, hits, (), plan.pair)])
 
 

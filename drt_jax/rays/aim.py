@@ -18,8 +18,7 @@ from jax import Array
 from ..lens.paraxial import trace_yu
 from ..lens.surface import Shape, vertex_curvature
 from ..numerics import safe_divide
-from .fermat import geometry, label, up_to
-from .snell import shoot, shoot_to_stop
+from .snell import apart, shoot, shoot_to_stop
 from .status import Status
 from .system import System, Vector, dot
 
@@ -260,8 +259,7 @@ def trace_fan(system: System, fan: Fan, reach: Array) -> Fan:
     shape = fan.there[0].shape
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
     trace = shoot(system, flat)
-    hits, part = up_to(trace.hits, system, system.before)
-    there = label(geometry(hits, part), part)
+    _, there = apart(system, trace.hits)
     good = trace.fate == Status.OK
     return Fan(launch, tuple(jnp.where(good, a, jnp.inf).reshape(shape) for a in there))
 

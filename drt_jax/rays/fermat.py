@@ -117,18 +117,12 @@ def arrival(hits: Vector, system: System) -> Vector:
     return ray_at(geometry(hits, part), part, -1)[1]
 
 
-def exact(hits: Vector, system: System, target: Vector) -> Array:
-    """Whether paths cross the stop at their points `target`, D arrays (W, Q) in mm, to rounding:
-    (W, Q), bool."""
-    width = _width(hits, system)
-    hits, part = up_to(hits, system, system.before)
-    return _met(label(geometry(hits, part), part), target, width)
-
-
-def _met(crossing: Vector, target: Vector, width: Array) -> Array:
-    eps = float(jnp.finfo(width.dtype).eps)
+def met(crossing: Vector, target: Vector, hits: Vector, system: System) -> Array:
+    """Whether rays that cross the stop at `crossing` go through `target` to rounding, D arrays
+    (W, Q) in mm: (W, Q), bool. hits: on the rows, to which rounding is relative."""
+    eps = float(jnp.finfo(hits[0].dtype).eps)
     miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
-    scale = jnp.max(width, axis=0) + jnp.sqrt(dot(target, target))
+    scale = jnp.max(_width(hits, system), axis=0) + jnp.sqrt(dot(target, target))
     return dot(miss, miss) <= (64 * eps * scale) ** 2
 
 
@@ -186,7 +180,7 @@ def stationary(path: Path, system: System, target: Vector) -> Array:
     good = good & by_form(domain, path.hits, system.rows.wide, system.forms)
     good = good & (_forward(path.before, path.slope) * senses > 0)
     good = good & (_forward(path.after, path.slope) * behind > 0)
-    return jnp.all(good, axis=0) & _met(label(path, system), target, size)
+    return jnp.all(good, axis=0) & met(label(path, system), target, path.hits, system)
 
 
 def _forward(direction: Vector, slope: Vector) -> Array:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.surface import RIM, Shape, domain, sag_derivatives, surface_sag
+from ..lens.surface import RIM, Shape, domain, sag_derivatives
 from ..numerics import safe_divide, safe_sqrt
 from .status import Status
 from .system import Placed, System, Vector, dot, turn
@@ -29,7 +29,8 @@ _FLATTEST = 1e-4
 class Trace(NamedTuple):
     """Rays traced one surface after the other.
 
-    hits: D arrays (R, ...), transverse coordinates on the rows in mm; void behind a failure.
+    hits: D arrays (R, ...), transverse coordinates on the rows in mm, and on a stop that is none
+        of them, which has its place among them: see `apart`. Void behind a failure.
     fate: (...), int32, OK, MISSED or TIR, see `Status`.
     shake: (...), the most that rounding the hits turns a segment by, in units of rounding.
     """
@@ -37,6 +38,15 @@ class Trace(NamedTuple):
     hits: Vector
     fate: Array
     shake: Array
+
+
+def apart(system: System, hits: Vector) -> tuple[Vector, Vector]:
+    """Traced hits as those on the rows of the system, D arrays (R, ...), and on the stop (...)."""
+    at = system.before
+    crossing = tuple(h[at] for h in hits)
+    if system.stop is None:
+        return hits, crossing
+    return tuple(jnp.concatenate([h[:at], h[at + 1 :]]) for h in hits), crossing
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -134,15 +144,6 @@ def cross(surface: Placed, form: str, point: Vector, direction: Vector) -> tuple
     return _along(p, d, length)[:-1], met
 
 
-def launch_at(system: System, w: Vector) -> Vector:
-    """Launch, D arrays in mm, of the rays that meet the first row at `w`, D arrays."""
-    first = jax.tree.map(lambda a: a[0], system.rows)
-    own = turn(first.rotation, (*w, surface_sag(w, first.shape, system.forms[0])))
-    point = tuple(a + o for a, o in zip(own, first.origin(len(w)), strict=True))
-    depth = own[-1] / _towards(system, point)[-1]
-    return tuple(a - d * depth for a, d in zip(point[:-1], _towards(system, point), strict=False))
-
-
 def _towards(system: System, point: Vector) -> Vector:
     """Direction, of any length, of the light at a point before the lens."""
     return tuple(system.vergence * p - s for p, s in zip(point, system.source, strict=True))
@@ -155,65 +156,112 @@ def _begin(system: System, launch: Vector) -> tuple[Vector, Vector]:
     return point, tuple(d * shrink for d in direction)
 
 
-def _refract(d: Vector, normal: Vector, ratio: Array, sense: Array, leaving: Array) -> tuple:
+def _refract(d: Vector, normal: Vector, row: "_Row") -> tuple[Vector, Array, Array]:
     """Direction behind a surface by Snell's law in vector form, whether the light comes from its
-    front, and whether it gets through. ratio: of the indices before and behind; sense, leaving:
-    1 or -1, along or against z before and behind."""
+    front, and whether it gets through."""
     along = dot(normal, d)
     shrink = 1 / jnp.sqrt(dot(normal, normal))
     cosine = along * shrink
-    square = 1 - ratio**2 * (1 - cosine**2)
-    bent = (leaving * safe_sqrt(square) - ratio * cosine) * shrink
-    front = (d[-1] * sense > _FLATTEST) & (along * sense > 0)
-    return tuple(ratio * a + bent * n for a, n in zip(d, normal, strict=True)), front, square > 0
+    square = 1 - row.ratio**2 * (1 - cosine**2)
+    bent = (row.leaving * safe_sqrt(square) - row.ratio * cosine) * shrink
+    front = (d[-1] * row.sense > _FLATTEST) & (along * row.sense > 0)
+    bent = tuple(row.ratio * a + bent * n for a, n in zip(d, normal, strict=True))
+    return bent, front, square > 0
 
 
-def _follow(system: System, launch: Vector, count: int) -> tuple[Vector, Vector, Trace]:
-    """Points and directions, along the axes of the lens, behind the first `count` rows."""
-    kinds = sorted(set(system.forms))
-    senses = np.append(system.senses, system.senses[-1])
-    some = slice(None, count)
-    rows = (
+class _Row(NamedTuple):
+    """One thing that a ray meets: a live surface, the stop, the sensor; or with a first axis some.
+
+    first: whether it is the first. bends: whether the ray goes on from here, or is only crossed by
+    it, prolonged either way. kind: of its form. ratio: of the indices before and behind. sense,
+    leaving: 1 or -1, light goes along or against z before it and behind.
+    """
+
+    first: Any
+    bends: Any
+    surface: Placed
+    kind: Any
+    ratio: Array
+    sense: Any
+    leaving: Any
+
+
+def _rows(system: System, kinds: list[str], to_stop: bool) -> _Row:
+    """All that rays meet, or what they meet up to the stop and the stop, which then is crossed."""
+    count, at = len(system.forms), system.before
+    leaving = system.senses * np.array([*(-1 if m else 1 for m in system.mirrors), 1])
+    forms = np.array([kinds.index(form) for form in system.forms])
+    rows = _Row(
         np.arange(count) == 0,
-        jax.tree.map(lambda a: a[some], system.rows),
-        np.array([kinds.index(form) for form in system.forms[some]], np.int32),
-        (system.index / system.behind)[some],
-        senses[:-1][some],
-        senses[1:][some],
+        np.ones(count, bool),
+        system.rows,
+        forms.astype(np.int32),
+        system.index / system.behind,
+        system.senses,
+        leaving.astype(system.senses.dtype),
     )
+    if system.stop is None and not to_stop:
+        return rows
+    stop, form = system.at_stop
+    around = jax.tree.map(lambda a: a[at], rows)
+    label = around._replace(bends=np.False_, surface=stop, kind=np.int32(kinds.index(form)))
+    ends = jax.tree.map(lambda a: a[at:at] if to_stop else a[at:], rows)
 
-    def step(carry, row):
-        point, direction, fate, shake, size = carry
-        first, surface, kind, ratio, sense, leaving = row
-        p, d = surface.local(point, direction)
-        each = [partial(_meet, kind) for kind in kinds]
-        meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, kind, each)
-        own, normal, met, length = meet(p, d, surface.shape, fate == Status.OK)
-        bent, front, through = _refract(d, normal, ratio, sense, leaving)
-        met = met & front & ((length > 0) | first)
-        here = jnp.where(met, jnp.where(through, Status.OK, Status.TIR), Status.MISSED)
-        fate = jnp.where(fate == Status.OK, here.astype(jnp.int32), fate)
-        wide = jnp.sqrt(dot(own[:-1], own[:-1]))
-        turned = safe_divide(jnp.maximum(wide, size), jnp.where(first, 0, length))
-        shake = jnp.maximum(shake, jnp.where(fate == Status.OK, turned, 0))
-        origin = surface.origin(len(own) - 1)
-        point = tuple(a + o for a, o in zip(turn(surface.rotation, own), origin, strict=True))
-        return (point, turn(surface.rotation, bent), fate, shake, wide), own[:-1]
+    def joined(front, row, back):
+        library = jnp if isinstance(front, Array) else np
+        return library.concatenate([front[:at], row[None], back])
+
+    return jax.tree.map(joined, rows, label, ends)
+
+
+class _State(NamedTuple):
+    """Rays behind a row: point, direction: D + 1 arrays (...), along the axes of the lens. hit: D
+    arrays, on that row. fate, shake: see `Trace`."""
+
+    point: Vector
+    direction: Vector
+    hit: Vector
+    fate: Array
+    shake: Array
+
+
+def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Vector | None]:
+    """Rays behind the last row; and unless that is the stop, the hits on all of them."""
+    kinds = sorted({*system.forms, system.at_stop[1]})
+    each = [partial(_meet, kind) for kind in kinds]
+
+    def step(state, row):
+        p, d = row.surface.local(state.point, state.direction)
+        meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
+        own, normal, met, length = meet(p, d, row.surface.shape, state.fate == Status.OK)
+        bent, front, through = _refract(d, normal, row)
+        met = met & (~row.bends | (front & ((length > 0) | row.first)))
+        here = jnp.where(met, jnp.where(through | ~row.bends, Status.OK, Status.TIR), Status.MISSED)
+        fate = jnp.where(state.fate == Status.OK, here.astype(jnp.int32), state.fate)
+        hit, before = own[:-1], state.hit
+        wide = jnp.sqrt(jnp.maximum(dot(hit, hit), dot(before, before)))
+        shake = jnp.where(fate == Status.OK, safe_divide(wide, jnp.where(row.first, 0, length)), 0)
+        origin = row.surface.origin(len(hit))
+        point = tuple(a + o for a, o in zip(turn(row.surface.rotation, own), origin, strict=True))
+        new = point, turn(row.surface.rotation, bent), hit, jnp.maximum(shake, state.shake)
+        if not to_stop:
+            kept = state.point, state.direction, before, state.shake
+            new = jax.tree.map(partial(jnp.where, row.bends), new, kept)
+        return _State(*new[:3], fate, new[3]), None if to_stop else hit
 
     zero = jnp.zeros_like(launch[0])
-    start = *_begin(system, launch), jnp.zeros(zero.shape, jnp.int32), zero, zero
-    (point, direction, fate, shake, _), hits = jax.lax.scan(step, start, rows)
-    return point, direction, Trace(hits, fate, shake)
+    none, start = jnp.zeros(zero.shape, jnp.int32), _begin(system, launch)
+    start = _State(*start, (zero,) * len(launch), none, zero)
+    return jax.lax.scan(step, start, _rows(system, kinds, to_stop))
 
 
 def shoot(system: System, launch: Vector) -> Trace:
     """Trace rays to the sensor; `launch` D arrays in mm on the vertex plane of the first row."""
-    return _follow(system, launch, len(system.forms))[2]
+    state, hits = _follow(system, launch, False)
+    return Trace(hits, state.fate, state.shake)
 
 
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:
     """Where rays cross the stop, D arrays in mm along its axes, and their fate so far (...)."""
-    point, direction, trace = _follow(system, launch, system.before)
-    crossing, met = cross(*system.at_stop, point, direction)
-    missed = jnp.where(met, Status.OK, Status.MISSED).astype(jnp.int32)
-    return crossing, jnp.where(trace.fate == Status.OK, missed, trace.fate)
+    state, _ = _follow(system, launch, True)
+    return state.hit, state.fate

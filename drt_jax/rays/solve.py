@@ -19,7 +19,7 @@ from . import fermat, linear
 from .aim import STARTS, Fan, aim, beam_size, no_fan, paraxial_launch, starts_of, trace_fan
 from .bundle import in_tiles, polynomial_launch, tiles_of
 from .fermat import Path
-from .snell import cross, shoot
+from .snell import apart, cross, shoot
 from .status import Status
 from .system import System, Vector, dot, turn
 
@@ -131,8 +131,10 @@ def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
     launch = paraxial_launch(system, target, sizes[1]) if launch is None else launch
     search = _search(system, target, launch, sizes)
     good = search.status == Status.OK
-    hits = tuple(jnp.where(good, a, 0) for a in search.hits)
-    hits, solved, steps = _polish(system, target, hits, good & ~fermat.exact(hits, system, target))
+    hits, crossing = apart(system, search.hits)
+    hits = tuple(jnp.where(good, a, 0) for a in hits)
+    rough = good & ~fermat.met(crossing, target, hits, system)
+    hits, solved, steps = _polish(system, target, hits, rough)
     status = jnp.where(good & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
     hits = tuple(jnp.where(status == Status.OK, a, 0) for a in hits)
     steps = (search.steps + steps).astype(jnp.int32)
@@ -140,8 +142,8 @@ def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
 
 
 class _Search(NamedTuple):
-    """hits: D arrays (R, W, Q), mm. status: (W, Q). left: (W, Q), rays that failed and still are to
-    be sought in the fan. fan: as far as it is traced. turn, steps: ()."""
+    """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). left: (W, Q), rays that failed and
+    still are to be sought in the fan. fan: as far as it is traced. turn, steps: ()."""
 
     hits: Vector
     status: Array
@@ -205,7 +207,8 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
             state.steps + aimed.steps,
         )
 
-    zero = jnp.zeros((len(system.forms), waves, rays), target[0].dtype)
+    count = len(system.forms) + (system.stop is not None)
+    zero = jnp.zeros((count, waves, rays), target[0].dtype)
     status = jnp.zeros((waves, rays), jnp.int32)
     none = jnp.int32(0)
     start = _Search((zero,) * len(target), status, status > 0, no_fan(system, waves), none, none)
@@ -241,7 +244,8 @@ def _find_many(system: System, target: Vector) -> Found:
     def tile(target):
         launch = launch_of(target)
         hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
-        solved = fermat.exact(hits, system, target) & (status == Status.OK)
+        hits, crossing = apart(system, hits)
+        solved = fermat.met(crossing, target, hits, system) & (status == Status.OK)
         start = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0)), ~jnp.all(solved)
 
         def turn(state):

@@ -62,18 +62,18 @@ def _rows_behind(lens: Lens) -> list[int]:
 
 
 def _whole(
-    lens: Lens, system: System, hits: Vector, status: Array, stop: Vector | None = None
+    lens: Lens, system: System, hits: Vector, stop: Vector, status: Array
 ) -> tuple[Vector, Array]:
-    """Hits on all surfaces, those that bend no light included, and status: where the straight
-    ray, prolonged either way, does not meet such a surface, it is MISSED. stop: the hits on the
-    stop, if they are known."""
+    """Hits on all surfaces from those on the rows of the system and on the stop, and status:
+    where the straight ray, prolonged either way, does not meet a surface that bends no light, it
+    is MISSED."""
     pieces, begin = [], 0
     for i in range(lens.count):
         if i in lens.live:
             continue
         row = sum(j < i for j in lens.live)  # the first behind it
         crossing = stop
-        if i != lens.stop or stop is None:
+        if i != lens.stop:
             some, part = fermat.up_to(hits, system, row)
             line = fermat.ray_at(fermat.geometry(some, part), part, -1)
             crossing, met = cross(placed(lens, i), lens.forms[i], *line)
@@ -115,7 +115,7 @@ def _traced(
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = turn(rotation, found.arrival, back=True)
     path = fermat.optical_path(found.hits, system)
-    hits, status = _whole(lens, system, found.hits, status, target)
+    hits, status = _whole(lens, system, found.hits, target, status)
     edge = lens.semi_diameter.at[lens.stop].set(jnp.inf)[:, None, None]
     outside = jnp.any(dot(hits, hits) > edge**2, axis=0) & (status == Status.OK)
     status = jnp.where(outside, Status.CLIPPED, status).astype(jnp.int32)

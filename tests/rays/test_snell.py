@@ -189,8 +189,8 @@ def test_a_trace_against_the_yardstick(lens, distance):
 
 @pytest.mark.parametrize("stop", ["in front", "live"])
 def test_launch_and_stop_of_a_ray(stop):
-    """The trace to the stop crosses it where the label of the whole ray says; and the first hit of
-    a ray leads back to its launch."""
+    """The trace to the stop crosses it where the label of the whole ray says; and at
+    once where the whole trace does."""
 
     @jax.jit
     def there_and_back(system, launch, hits):
