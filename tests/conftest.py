@@ -9,7 +9,9 @@ from collections.abc import Iterator
 
 # Most of the time of a test is compilation, and machine code that is not optimised compiles three
 # times faster; what it computes is the same. Read when JAX starts.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+)
 
 import jax
 import numpy as np

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.typing import ArrayLike
 
 from ..lens.glass import check_wavelengths
@@ -21,7 +20,7 @@ from ..lens.scene import Scene, scene_of
 from ..numerics import concrete, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
-from ..rays.solve import Found, reattach, solve
+from ..rays.solve import Found, Solver, reattach, solve, solve_aimed
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
 from .moments import FocusMoments, Moments, moments, weigh
@@ -135,26 +134,27 @@ def _moments(
             return trial.moments
         # The rays are known; what is left is to weigh and to differentiate them.
         return _weigh_known(lens, scene, trial.used, trial.found)
-    found = _weigh(lens, scene, rule)[0]
+    found = _weigh(lens, scene, rule, solve)[0]
     passed = known_values(found.passed)
     if passed is not None:
         _check_passed(passed, wavelengths)
     return found
 
 
-@jax.jit
-def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[FocusMoments, Found, Array]:
-    """Moments, the rays on the live surfaces, and whether any is clipped or fails."""
+@partial(jax.jit, static_argnames="solver")
+def _weigh(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> tuple:
+    """Moments, the rays on the live surfaces, and whether any fails and whether any is clipped."""
     points, weights = rule.points(lens, scene)
     kept: list[Found] = []
 
-    def solver(system, target):
-        kept.append(solve(system, target))
+    def keep(system, target):
+        kept.append(solver(system, target))
         return kept[0]
 
-    bundle = trace_bundle(lens, scene, points, solver)
-    failing = jnp.any(bundle.status != Status.OK)
-    return weigh(lens, rule, weights, bundle), kept[0], failing
+    bundle = trace_bundle(lens, scene, points, keep)
+    clipped = bundle.status == Status.CLIPPED
+    failing = jnp.any((bundle.status != Status.OK) & ~clipped)
+    return weigh(lens, rule, weights, bundle), kept[0], failing, jnp.any(clipped)
 
 
 @jax.jit
@@ -203,12 +203,15 @@ def _try_orders(
     lens: Lens, scene: Scene, symmetry: Symmetry, tolerance: float, places: Callable
 ) -> _Trial:
     before: _Trial | None = None
-    clipped, order = False, 2
+    clipped, order, solver = False, 2, solve_aimed
     while True:
         rule = Clipped(order, symmetry) if clipped else Gauss(order, symmetry)
         used = rule if clipped else _padded(order, symmetry)
-        found, rays, failing = _weigh(lens, scene, used)
-        if bool(failing) and not clipped:
+        found, rays, failing, cut = _weigh(lens, scene, used, solver)
+        if failing and solver is solve_aimed:
+            solver = solve  # some rays must be sought
+            continue
+        if (failing or cut) and not clipped:
             before, clipped, order = None, True, _CLIPPED[0]
             continue
         _check_passed(np.asarray(found.passed), scene.wavelengths)

@@ -72,11 +72,7 @@ class FocusMoments:
 
     def full(self, sensor: ArrayLike) -> Moments:
         """The same as `Moments`, the covariance always (W, 2, 2)."""
-        mean, covariance = self.at(sensor)
-        if covariance.ndim == 2:
-            xx, yy = covariance[:, 0], covariance[:, 1]
-            covariance = _matrix(xx, yy, jnp.zeros_like(xx))
-        return Moments(mean, covariance, self.passed)
+        return _full(self, jnp.asarray(sensor, self.reference.dtype))
 
 
 @jax.jit
@@ -90,6 +86,15 @@ def _at(moments: FocusMoments, sensor: Array) -> tuple[Array, Array]:
     if spread.shape[-1] == 2:
         return mean, diagonal
     return mean, _matrix(diagonal[:, 0], diagonal[:, 1], spread[:, 2])
+
+
+@jax.jit
+def _full(moments: FocusMoments, sensor: Array) -> Moments:
+    mean, covariance = _at(moments, sensor)
+    if covariance.ndim == 2:
+        xx, yy = covariance[:, 0], covariance[:, 1]
+        covariance = _matrix(xx, yy, jnp.zeros_like(xx))
+    return Moments(mean, covariance, moments.passed)
 
 
 def _matrix(xx: Array, yy: Array, xy: Array) -> Array:

@@ -67,7 +67,8 @@ def geometry(hits: Vector, system: System) -> Path:
     z, slope, bend = by_form(sag_derivatives, hits, system.rows.wide, system.forms)
     point, step = _segments(hits, z, system)
     first = (system.vergence * p - s for p, s in zip(point, system.source, strict=True))
-    chain = [jnp.concatenate([f[None], s, s[-1:]]) for f, s in zip(first, step, strict=True)]
+    front = (jnp.concatenate([f[None], s]) for f, s in zip(first, step, strict=True))
+    chain = tuple(jnp.concatenate([s, s[-1:]]) for s in front)
     length = _length(chain)
     shrink = _inverse(length)
     direction = tuple(s * shrink for s in chain)
@@ -168,7 +169,7 @@ def stationary(path: Path, system: System, target: Vector) -> Array:
     """
     eps = float(jnp.finfo(path.length.dtype).eps)
     senses = system.senses[:, None, None]
-    behind = senses * np.where([*system.mirrors, False], -1, 1)[:, None, None]
+    behind = np.where(np.append(system.mirrors, False)[:, None, None], -senses, senses)
     size = _width(path.hits, system)
     widest = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
     near = _inverse(path.length).at[0].set(jnp.abs(system.vergence) * path.shrink)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from .fermat import Path, ray_at
+from .fermat import Path, label, ray_at, residual
 from .snell import cross
 from .system import System, Vector, dot, turn
 
@@ -36,6 +36,14 @@ class Push(NamedTuple):
     point: Vector
     swing: Vector
     label: Vector
+
+
+def shortfall(path: Path, system: System, target: Vector) -> Push:
+    """What a path that is no ray through `target`, D arrays (W, Q) in mm, falls short by: its hits
+    less the answer to this are one step of Newton's method."""
+    miss = (a - b for a, b in zip(label(path, system), target, strict=True))
+    still = tuple(jnp.zeros_like(a) for a in path.before)
+    return Push(residual(path, system), still, tuple(a[0] for a in still), tuple(miss))
 
 
 class _Row(NamedTuple):
@@ -88,8 +96,8 @@ def _step(
     along = -dot(row.after[:-1], pull) / (row.index_behind * normal)
     behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
     made = hit if live else (*point, *march.swing)
-    label = tuple(jnp.where(row.labels, a, b) for a, b in zip(made, march.label, strict=True))
-    return _March(point, turn(row.rotation, (*behind, along)), label), hit
+    made = tuple(jnp.where(row.labels, a, b) for a, b in zip(made, march.label, strict=True))
+    return _March(point, turn(row.rotation, (*behind, along)), made), hit
 
 
 def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, Vector]:
@@ -122,7 +130,9 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
     weights = _divide([[c[k] for k in range(dim)] for c in columns], wanted, good)
 
     def joined(free, forced):
-        return forced + sum(w * free[..., k, :, :] for k, w in enumerate(weights))
+        columns = (free[..., k, :, :] for k in range(dim))
+        products = (jnp.broadcast_to(w, forced.shape) * c for w, c in zip(weights, columns))
+        return sum(products, forced)
 
     swing = jax.tree.map(joined, *(march.swing for march in marched))
     return jax.tree.map(joined, *hits), swing

@@ -189,7 +189,7 @@ class _Row(NamedTuple):
 def _rows(system: System, kinds: list[str], to_stop: bool) -> _Row:
     """All that rays meet, or what they meet up to the stop and the stop, which then is crossed."""
     count, at = len(system.forms), system.before
-    leaving = system.senses * np.array([*(-1 if m else 1 for m in system.mirrors), 1])
+    senses = system.senses
     forms = np.array([kinds.index(form) for form in system.forms])
     rows = _Row(
         np.arange(count) == 0,
@@ -197,8 +197,8 @@ def _rows(system: System, kinds: list[str], to_stop: bool) -> _Row:
         system.rows,
         forms.astype(np.int32),
         system.index / system.behind,
-        system.senses,
-        leaving.astype(system.senses.dtype),
+        senses,
+        np.where([*system.mirrors, False], -senses, senses),
     )
     if system.stop is None and not to_stop:
         return rows
@@ -225,7 +225,7 @@ class _State(NamedTuple):
     shake: Array
 
 
-def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Vector | None]:
+def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Any]:
     """Rays behind the last row; and unless that is the stop, the hits on all of them."""
     kinds = sorted({*system.forms, system.at_stop[1]})
     each = [partial(_meet, kind) for kind in kinds]
@@ -243,15 +243,16 @@ def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Vect
         shake = jnp.where(fate == Status.OK, safe_divide(wide, jnp.where(row.first, 0, length)), 0)
         origin = row.surface.origin(len(hit))
         point = tuple(a + o for a, o in zip(turn(row.surface.rotation, own), origin, strict=True))
-        new = point, turn(row.surface.rotation, bent), hit, jnp.maximum(shake, state.shake)
-        if not to_stop:
-            kept = state.point, state.direction, before, state.shake
-            new = jax.tree.map(partial(jnp.where, row.bends), new, kept)
-        return _State(*new[:3], fate, new[3]), None if to_stop else hit
+        shake = jnp.maximum(shake, state.shake)
+        new = _State(point, turn(row.surface.rotation, bent), hit, fate, shake)
+        if to_stop:
+            return new, None
+        kept = state._replace(fate=fate)
+        return jax.tree.map(partial(jnp.where, row.bends), new, kept), hit
 
     zero = jnp.zeros_like(launch[0])
-    none, start = jnp.zeros(zero.shape, jnp.int32), _begin(system, launch)
-    start = _State(*start, (zero,) * len(launch), none, zero)
+    none, begin = jnp.zeros(zero.shape, jnp.int32), _begin(system, launch)
+    start = _State(*begin, (zero,) * len(launch), none, zero)
     return jax.lax.scan(step, start, _rows(system, kinds, to_stop))
 
 

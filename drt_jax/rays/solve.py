@@ -100,11 +100,7 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
     def equations(hits, args):
         system, target, _ = args
         path = fermat.geometry(hits, system)
-        miss = (a - b for a, b in zip(fermat.label(path, system), target, strict=True))
-        still = tuple(jnp.zeros_like(a) for a in path.before)
-        first = tuple(a[0] for a in still)
-        push = linear.Push(fermat.residual(path, system), still, first, tuple(miss))
-        return (push, path), None
+        return (linear.shortfall(path, system, target), path), None
 
     eps = float(jnp.finfo(hits[0].dtype).eps)
     solution: optx.Solution = optx.root_find(
@@ -141,6 +137,19 @@ def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
     return Found(hits, fermat.arrival(hits, system), status, steps)
 
 
+def find_aimed(system: System, target: Vector) -> Found:
+    """The rays that aiming alone brings through their stop points to rounding; all others are
+    UNCONVERGED, whether there is such a ray or not. A small program, where that is all it takes."""
+    sizes = beam_size(system, target)
+    launch = paraxial_launch(system, target, sizes[1])
+    traced, _ = _aimed(system, target, launch, sizes, system.rows.rotation is None)
+    hits, crossing = apart(system, traced.hits)
+    good = (traced.status == Status.OK) & fermat.met(crossing, target, hits, system)
+    hits = tuple(jnp.where(good, a, 0) for a in hits)
+    status = jnp.where(good, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
+    return Found(hits, fermat.arrival(hits, system), status, traced.steps)
+
+
 class _Search(NamedTuple):
     """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). left: (W, Q), rays that failed and
     still are to be sought in the fan. fan: as far as it is traced. turn, steps: ()."""
@@ -161,6 +170,7 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
     starts = min(STARTS, rays)
     few, rounds = rays // starts, -(-STARTS // starts)
     wide = jnp.maximum(2 * sizes[1], 1.6 * jnp.sqrt(jnp.max(dot(launch, launch))))
+    ray = jnp.arange(rays, dtype=jnp.int32)
 
     def places(a):  # (W, few, starts or 1) -> (W, Q)
         a = jnp.broadcast_to(a, (waves, few, starts)).reshape(waves, -1)
@@ -173,7 +183,10 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
             lambda s: (trace_fan(system, s[0], wide), jnp.array(False)),
             (state.fan, state.turn == 1),
         )
-        rows = jax.vmap(lambda left: jnp.nonzero(left, size=few, fill_value=rays)[0])(state.left)
+        # The first few that are left have `starts` places each.
+        rank = jnp.cumsum(state.left, axis=-1, dtype=jnp.int32) - 1
+        mine = state.left & (rank < few)
+        rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
         wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
         begin = starts_of(fan, wanted, tried * starts + jnp.arange(starts, dtype=jnp.int32))
         own = tuple(
@@ -181,31 +194,23 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
         )
         begin = tuple(jnp.where(first, a, places(b)) for a, b in zip(launch, begin, strict=True))
         reach = jnp.where(first, sizes[1], sizes[1] / 8)
-        aimed = aim(system, own, begin, (sizes[0], reach), first & (system.rows.rotation is None))
-        hits, status = _verdict(system, aimed.launch, aimed.status)
+        upright = first & (system.rows.rotation is None)
+        new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
 
-        good, folded = (
-            a[:, : few * starts].reshape(waves, few, starts)
-            for a in (status == Status.OK, aimed.folded)
-        )
-        best = jnp.argmax(jnp.where(good, 2 - folded.astype(jnp.int32), 0), axis=-1)
-        best = jnp.arange(few)[None] * starts + best  # (W, few)
-        found = jnp.where(jnp.any(good, axis=-1), rows, rays)
-        put = jax.vmap(lambda a, r, new: a.at[r].set(new, mode="drop"))
-        some = jax.vmap(put, (0, None, 0))
-        chosen = (jnp.take_along_axis(h, best[None], axis=-1) for h in hits)
-        sought = tuple(some(a, found, c) for a, c in zip(state.hits, chosen, strict=True))
-        ok = jnp.full(found.shape, Status.OK, jnp.int32)
-        over = jnp.where(tried == rounds - 1, rows, found)
-        left = put(state.left, over, jnp.zeros(over.shape, bool))
-        return _Search(
-            tuple(jnp.where(first, a, b) for a, b in zip(hits, sought, strict=True)),
-            jnp.where(first, status, put(state.status, found, ok)),
-            jnp.where(first, status != Status.OK, left),
-            fan,
-            state.turn + 1,
-            state.steps + aimed.steps,
-        )
+        worth = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
+        worth = worth[:, : few * starts].reshape(waves, few, starts)
+        best = jnp.argmax(worth, axis=-1).astype(jnp.int32)
+        slot = jnp.clip(rank, 0, few - 1)
+        place = slot * starts + jnp.take_along_axis(best, slot, axis=-1)
+        found = jnp.take_along_axis(jnp.any(worth > 0, axis=-1), slot, axis=-1) & mine
+        place, found = jnp.where(first, ray, place), first | found
+        status = jnp.take_along_axis(new.status, place, axis=-1)
+        status = jnp.where(found, status, state.status)
+        taken = (jnp.take_along_axis(h, place[None], axis=-1) for h in new.hits)
+        hits = tuple(jnp.where(found, a, b) for a, b in zip(taken, state.hits, strict=True))
+        left = state.left & ~found & ~(mine & (tried == rounds - 1))
+        left = jnp.where(first, status != Status.OK, left)
+        return _Search(hits, status, left, fan, state.turn + 1, state.steps + new.steps)
 
     count = len(system.forms) + (system.stop is not None)
     zero = jnp.zeros((count, waves, rays), target[0].dtype)
@@ -213,6 +218,23 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
     none = jnp.int32(0)
     start = _Search((zero,) * len(target), status, status > 0, no_fan(system, waves), none, none)
     return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left), turn, start)
+
+
+class _Traced(NamedTuple):
+    """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). steps: ()."""
+
+    hits: Vector
+    status: Array
+    steps: Array
+
+
+def _aimed(
+    system: System, target: Vector, launch: Vector, sizes: tuple, upright: Array | bool
+) -> tuple[_Traced, Array]:
+    """Rays aimed, see `aim`, and traced; and whether they are folded."""
+    aimed = aim(system, target, launch, sizes, upright)
+    hits, status = _verdict(system, aimed.launch, aimed.status)
+    return _Traced(hits, status, aimed.steps), aimed.folded
 
 
 def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Array]:
@@ -313,11 +335,11 @@ def _push(path: Path, system: System, moving: list[Array | None]) -> linear.Push
         toward = (own.vergence * p - s for p, s in zip(first[0], own.source, strict=True))
         crossing = tuple(h[own.before] for h in path.hits)
         if own.stop is not None:
-            crossing = cross(*own.at_stop, *line)[0]
+            crossing, _ = cross(own.stop, own.stop_form, *line)
         return force, point, tuple(toward), crossing
 
-    given = ([a[k] for k in some] for a in (leaves, moving))
-    force, point, toward, label = jax.jvp(held, *((a,) for a in given))[1]
+    now, change = ([a[k] for k in some] for a in (leaves, moving))
+    force, point, toward, label = jax.jvp(held, (now,), (change,))[1]
     along = dot(first[1], toward)
     swing = (path.shrink * (t - e * along) for t, e in zip(toward, first[1], strict=True))
     force, label = (tuple(-a for a in part) for part in (force, label))
@@ -328,6 +350,11 @@ def solve(system: System, target: Vector) -> Found:
     """The rays through stop points `target`, D arrays (W, Q) in mm, differentiable in every mode
     and to any order; failed rays have zero derivatives."""
     return reattach(find_many(*jax.lax.stop_gradient((system, target))), system, target)
+
+
+def solve_aimed(system: System, target: Vector) -> Found:
+    """`solve` of `find_aimed`."""
+    return reattach(find_aimed(*jax.lax.stop_gradient((system, target))), system, target)
 
 
 def reattach(found: Found, system: System, target: Vector) -> Found:
@@ -348,17 +375,17 @@ def solve_reverse(system: System, target: Vector) -> Found:
 
 def _forward(system: System, target: Vector) -> tuple[Found, tuple]:
     found = find_many(system, target)
-    return found, (found, system, target)
+    return found, (system, target, found.hits, found.status == Status.OK)
 
 
 def _backward(kept: tuple, cotangent: Found) -> tuple[System, Vector]:
-    found, *arguments = kept
+    system, target, hits, good = kept
+    void = jax.tree.map(jnp.zeros_like, cotangent.arrival)  # only its derivatives are asked for
 
     def attached(system, target):
-        new = reattach(found, system, target)
-        return new.hits, new.arrival
+        return attach(system, target, hits, void, good)
 
-    return jax.vjp(attached, *arguments)[1]((cotangent.hits, cotangent.arrival))
+    return jax.vjp(attached, system, target)[1]((cotangent.hits, cotangent.arrival))
 
 
 solve_reverse.defvjp(_forward, _backward)

@@ -42,12 +42,13 @@ def parts_of(tree):
     return [jax.tree.map(lambda a, i=i: a[..., i : i + PART], tree) for i in range(0, RAYS, PART)]
 
 
+def found_in_parts(found):
+    parts = zip(*map(parts_of, (found.hits, found.arrival, found.status)))
+    return [solve.Found(*some, found.steps) for some in parts]
+
+
 def joined(parts):
     return jax.tree.map(lambda *a: np.concatenate(a, axis=-1), *parts)
-
-
-def hits_and_status(found):
-    return found.hits, found.status
 
 
 def test_sizes():
@@ -120,8 +121,8 @@ def test_derivatives_are_those_of_small_bundles(lens, points, found):
     weights = random_like((found.hits[0][0], found.hits[0][0]))
     whole = gradient(*at, points, found, weights)
     small = [
-        gradient(*at, p, found._replace(hits=h, status=s), w)
-        for p, h, s, w in zip(*(map(parts_of, (points, *hits_and_status(found), weights))))
+        gradient(*at, p, some, w)
+        for p, some, w in zip(parts_of(points), found_in_parts(found), parts_of(weights))
     ]
     total = jax.tree.map(lambda *a: sum(a), *(one[:2] for one in small))
     assert_close(whole[:2], total, 1e-9)
@@ -131,8 +132,8 @@ def test_derivatives_are_those_of_small_bundles(lens, points, found):
     moved = random_like(points)
     whole = tangent(*at, points, found, (*way, moved))
     small = [
-        tangent(*at, p, found._replace(hits=h, status=s), (*way, m))
-        for p, h, s, m in zip(*(map(parts_of, (points, *hits_and_status(found), moved))))
+        tangent(*at, p, some, (*way, m))
+        for p, some, m in zip(parts_of(points), found_in_parts(found), parts_of(moved))
     ]
     assert_close(whole, joined(small), 1e-12)
 
@@ -165,7 +166,7 @@ def test_memory_a_ray_keeps_for_the_backward_pass(lens, solver, monkeypatch):
     def at_once(system, target):
         zero, rows = jnp.zeros_like(target[0]), len(system.forms)
         hits = (jnp.broadcast_to(zero, (rows, *zero.shape)),) * 2
-        return solve.Found(hits, zero.astype(jnp.int32), jnp.int32(0))
+        return solve.Found(hits, (zero,) * 3, zero.astype(jnp.int32), jnp.int32(0))
 
     monkeypatch.setattr(solve, "find_many", at_once)
 
