@@ -206,13 +206,14 @@ def _try_orders(
     clipped, order, solver = False, 2, solve_aimed
     while True:
         rule = Clipped(order, symmetry) if clipped else Gauss(order, symmetry)
-        used = rule if clipped else _padded(order, symmetry)
+        used = Clipped(order, symmetry, _size(order)) if clipped else _padded(order, symmetry)
         found, rays, failing, cut = _weigh(lens, scene, used, solver)
-        if failing and solver is solve_aimed:
-            solver = solve  # some rays must be sought
-            continue
-        if (failing or cut) and not clipped:
+        sought = solver is solve
+        if not clipped and (cut or (failing and sought)):
             before, clipped, order = None, True, _CLIPPED[0]
+            continue
+        if failing and not sought:  # some rays must be
+            solver = solve
             continue
         _check_passed(np.asarray(found.passed), scene.wavelengths)
         trial = _Trial(rule, used, found, rays)
@@ -238,6 +239,11 @@ def _bound(lens: Lens, found: FocusMoments, tolerance: float) -> float:
     size = np.sqrt(np.min(np.sum(np.asarray(found.spread)[0, :, :2], axis=-1)))
     rounding = 4 * eps * abs(float(lens.sensor)) / max(size, _SMALLEST)
     return max(tolerance, 100 * eps, rounding)
+
+
+def _size(order: int) -> int:
+    """The order up to which those about `order` fill up, to share a compiled program."""
+    return next(size for size in (10, 20, _MAX_ORDER + 2) if size >= order)
 
 
 def _padded(order: int, symmetry: Symmetry) -> Pattern:

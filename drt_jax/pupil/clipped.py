@@ -6,9 +6,11 @@ smooth but for the corners where one aperture takes over from another. Gauss rul
 corners and along the radii converge as on an open stop.
 
 Every aperture, the stop's rim among them, is a circle: a ray passes if its hit h on that surface
-has |h| <= R. Rays are launched, not aimed: a trace with its derivatives tells how the hits move
-with the point on the stop, on this model every aperture ends a straight line on the stop at a
-root of a quadratic, and the next ray is launched there: Newton's method, one trace a step.
+has |h| <= R. Rays are launched, not aimed: a trace tells how the hits move with the point on the
+stop; on this model, every aperture ends a half-line on the stop at the root of a quadratic; the
+next ray is launched there. So each ray of the boundary takes a few steps of Newton's method.
+
+Vectors are arrays with their 2 components first, and B rays a colour last.
 """
 
 import dataclasses
@@ -34,32 +36,30 @@ from .rules import PupilRule, Symmetry, check_order
 
 __all__ = ["Clipped"]
 
-# Corners that have a panel of their own; half-lines on half a pupil along which they are sought,
-# at least, and what each gap between them is divided into.
-_CORNERS, _SPOKES, _PARTS = 8, 33, 16
-# A panel gets spokes by its width in half turns, and this.
-_EXTRA = 0.15
-# Rounds of the search for the middle; steps of the search for each of the stages, see `_STAGES`.
-_ZOOMS, _STEPS = 10, (1, 48, 48, 16, 48)
+# Corners that have a panel of their own, and what each gap between two of the even half-lines on
+# which they are sought is divided into. A panel gets nodes by its width in half turns and `_EXTRA`.
+_CORNERS, _PARTS, _EXTRA = 8, 32, 0.15
+# Steps of each stage of the search, and rounds of that for the middle.
+_STEPS, _ZOOMS = (1, 48, 48, 16, 48), 10
 
 
 class _Rays(NamedTuple):
     """Launched rays, and how they move with their points on the stop.
 
-    launch: 2 arrays (W, B), mm. point: 2 arrays (W, B) in units of the stop's semi-diameter.
-    hits: 2 arrays (S + 1, W, B), mm. aims, moves: derivatives of `launch` and `hits` by the two
-    components of `point`. good: (W, B), whether they reach the sensor.
+    launch: (2, W, B), mm. point: (2, W, B) in units of the stop's semi-diameter. hits: (2, S + 1,
+    W, B), mm. aims, moves: (2, ...), derivatives of `launch` and `hits` by `point`.
+    good: (W, B), whether they reach the sensor.
     """
 
-    launch: Vector
-    point: Vector
-    hits: Vector
-    aims: tuple[Vector, Vector]
-    moves: tuple[Vector, Vector]
+    launch: Array
+    point: Array
+    hits: Array
+    aims: Array
+    moves: Array
     good: Array
 
     def at(self, index: Array) -> "_Rays":
-        """Those at `index` (W, any number)."""
+        """Those at `index` (W, B)."""
 
         def take(a):
             return jnp.take_along_axis(a, index.reshape(*[1] * (a.ndim - 2), *index.shape), axis=-1)
@@ -70,17 +70,17 @@ class _Rays(NamedTuple):
 class _Goal(NamedTuple):
     """Where rays are to go: to the end of a half-line, or to a corner.
 
-    centre, toward: 2 arrays (W, B), start and direction of the half-line; 0: to the centre itself.
+    centre, toward: (2, W, B), start and direction of the half-line; 0: to the centre itself.
     pair: (2, W, B), the surfaces whose apertures meet in a corner; equal for none.
     """
 
-    centre: Vector
-    toward: Vector
+    centre: Array
+    toward: Array
     pair: Array
 
 
 class _Found(NamedTuple):
-    """Rays at their goals. surface: (W, B), that ends the half-line. settled: (W, B), whether the
+    """Rays and their goals. surface: (W, B), that ends the half-line. settled: (W, B), whether the
     goal is met; else the ray is the last one before others fail."""
 
     rays: _Rays
@@ -89,37 +89,34 @@ class _Found(NamedTuple):
     settled: Array
 
 
-def _plus(vector: Vector, rates: tuple[Vector, Vector], change: Vector) -> Vector:
-    """A vector that moves with the point on the stop, after a change of that."""
-    x, y = (c.reshape(*[1] * (vector[0].ndim - c.ndim), *c.shape) for c in change)
-    return tuple(v + a * x + b * y for v, a, b in zip(vector, *rates, strict=True))
+def _moved(rates: Array, change: Array) -> Array:
+    """How far something moves with the point on the stop; `rates` (2, ..., W, B)."""
+    x, y = change.reshape(2, *[1] * (rates.ndim - 3), *change.shape[1:])
+    return rates[0] * x + rates[1] * y
 
 
-def _minus(a: Vector, b: Vector) -> Vector:
-    return tuple(x - y for x, y in zip(a, b, strict=True))
+def _inverse(matrix: Array) -> Array:
+    """Of matrices (2, 2, W, B); 0 for those that have none."""
+    (p, q), (r, s) = matrix
+    return safe_divide(jnp.array([[s, -q], [-r, p]]), (p * s - q * r)[None, None])
 
 
-def _chosen(condition: Array, a: Any, b: Any) -> Any:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+def _picked(values: Array, surface: Array) -> Array:
+    """Of `values` (..., S + 1, W, B) those on a few surfaces (N, W, B)."""
+    index = surface.reshape(*[1] * (values.ndim - 3), *surface.shape)
+    return jnp.take_along_axis(values, index, axis=-3)
 
 
-def _solved(rows: Any, values: Vector) -> Vector:
-    """x with rows x = values, 2 x 2; 0 where that has no answer."""
-    ((p, q), (r, s)), (f, g) = rows, values
-    determinant = p * s - q * r
-    return safe_divide(s * f - q * g, determinant), safe_divide(p * g - r * f, determinant)
+def _units(like: Array) -> Array:
+    """The vectors (1, 0) and (0, 1), (2, 2, W, B)."""
+    return jnp.broadcast_to(jnp.eye(2, dtype=like.dtype)[..., None, None], (2, *like.shape))
 
 
-def _units(like: Vector) -> Vector:
-    one, none = jnp.ones_like(like[0]), jnp.zeros_like(like[0])
-    return jnp.stack([one, none]), jnp.stack([none, one])
-
-
-def _launched(lens: Lens, system: System, launch: Vector) -> _Rays:
+def _launched(lens: Lens, system: System, launch: Array) -> _Rays:
     def trace(launch):
-        found = shoot(system, launch)
-        hits, crossing = apart(system, found.hits)
-        return _whole(lens, system, hits, crossing, found.fate)
+        found = shoot(system, tuple(launch))
+        hits, status = _whole(lens, system, *apart(system, found.hits), found.fate)
+        return jnp.stack(hits), status
 
     def along(unit):
         (hits, status), (columns, _) = jax.jvp(trace, (launch,), (unit,))
@@ -127,38 +124,29 @@ def _launched(lens: Lens, system: System, launch: Vector) -> _Rays:
 
     hits, columns, status = jax.vmap(along, out_axes=(None, 0, None))(_units(launch))
     radius = lens.semi_diameter[lens.stop]
-    rows = tuple((c[0, lens.stop] / radius, c[1, lens.stop] / radius) for c in columns)
-    one, none = jnp.ones_like(launch[0]), jnp.zeros_like(launch[0])
-    aims = _solved(rows, (one, none)), _solved(rows, (none, one))
-    moves: Any = tuple(tuple(c[0] * x[None] + c[1] * y[None] for c in columns) for x, y in aims)
-    return _Rays(
-        launch, tuple(h[lens.stop] / radius for h in hits), hits, aims, moves, status == Status.OK
-    )
+    aims = _inverse(columns[:, :, lens.stop] / radius)
+    moves = jnp.stack([_moved(columns, a) for a in aims])
+    return _Rays(launch, hits[:, lens.stop] / radius, hits, aims, moves, status == Status.OK)
 
 
-def _picked(values: Array, surface: Array) -> Array:
-    """Of `values` (S + 1, W, B) those on `surface` (W, B)."""
-    return jnp.take_along_axis(values, surface[None], axis=0)[0]
+def _gaps(lens: Lens, hits: Array, pair: Array) -> Array:
+    """(2, W, B): |h|^2 / R^2 - 1 of the apertures of two surfaces; 0 on their edges."""
+    hit = _picked(hits, pair)
+    return dot(hit, hit) / lens.semi_diameter[pair] ** 2 - 1
 
 
-def _gaps(lens: Lens, hits: Vector, moves: Any, pair: Array) -> list[tuple[Array, Vector]]:
-    """|h|^2 / R^2 - 1 of two apertures, (W, B), and its derivatives by the point on the stop."""
-    gaps = []
-    for surface in pair:
-        square = lens.semi_diameter[surface] ** 2
-        hit = tuple(_picked(h, surface) for h in hits)
-        rates = (tuple(_picked(m, surface) for m in move) for move in moves)
-        gaps.append((dot(hit, hit) / square - 1, tuple(2 * dot(hit, a) / square for a in rates)))
-    return gaps
+def _rates(lens: Lens, rays: _Rays, pair: Array) -> Array:
+    """Derivatives (2, 2, W, B) of `_gaps` by the point on the stop."""
+    hit, moves = _picked(rays.hits, pair), _picked(rays.moves, pair)
+    return jnp.stack([2 * dot(hit, m) / lens.semi_diameter[pair] ** 2 for m in moves])
 
 
 def _ends(lens: Lens, rays: _Rays, goal: _Goal) -> Array:
     """Where each aperture ends a half-line, (S + 1, W, B) in units of the stop's semi-diameter,
-    hits moving in proportion to it; inf for one that never does."""
-    scale = 1 / lens.semi_diameter[:, None, None]
-    base = tuple(scale * a for a in _plus(rays.hits, rays.moves, _minus(goal.centre, rays.point)))
-    u, v = (a[None] for a in goal.toward)
-    rate = tuple(scale * (a * u + b * v) for a, b in zip(*rays.moves, strict=True))
+    if hits move in proportion to it; inf for one that never does."""
+    scale = 1 / lens.semi_diameter[None, :, None, None]
+    base = scale * (rays.hits + _moved(rays.moves, goal.centre - rays.point))
+    rate = scale * _moved(rays.moves, goal.toward)
     square, linear, constant = dot(rate, rate), dot(base, rate), dot(base, base) - 1
     root = safe_sqrt(linear**2 - square * constant)
     out = linear > 0  # of the two ways to write a root, the one that does not subtract
@@ -166,69 +154,71 @@ def _ends(lens: Lens, rays: _Rays, goal: _Goal) -> Array:
     return jnp.where(square > 0, safe_divide(above, jnp.where(out, linear + root, square)), jnp.inf)
 
 
-def _next(lens: Lens, rays: _Rays, goal: _Goal) -> tuple[Vector, Array]:
-    """The point to go to, and the surface (W, B) that ends a half-line."""
+def _ahead(lens: Lens, rays: _Rays, goal: _Goal) -> tuple[Array, Array]:
+    """How far (2, W, B) it is to the goal, and the surface (W, B) that ends the half-line."""
     ends = _ends(lens, rays, goal)
     length = jnp.where(dot(goal.toward, goal.toward) > 0, jnp.min(ends, axis=0), 0)
-    (f, row), (g, other) = _gaps(lens, rays.hits, rays.moves, goal.pair)
-    corner = _minus(rays.point, _solved((row, other), (f, g)))
-    end = tuple(c + length * u for c, u in zip(goal.centre, goal.toward, strict=True))
-    point = _chosen(goal.pair[0] != goal.pair[1], corner, end)
-    return point, jnp.argmin(ends, axis=0).astype(jnp.int32)
+    inverse = _inverse(_rates(lens, rays, goal.pair))
+    corner = -_moved(inverse, _gaps(lens, rays.hits, goal.pair))
+    line = goal.centre + length[None] * goal.toward - rays.point
+    change = jnp.where(goal.pair[:1] != goal.pair[1:], corner, line)
+    return change, jnp.argmin(ends, axis=0).astype(jnp.int32)
 
 
-def _search(
-    lens: Lens, system: System, start: _Rays, launch: Vector, goal: _Goal, steps: Array
-) -> _Found:
-    """Newton's method from `launch`; `start` are the rays to go back to where one fails."""
-    tiny = float(jnp.finfo(launch[0].dtype).eps) ** 0.5
+def _shifted(rays: _Rays, change: Array) -> _Rays:
+    """Rays through points (2, W, B) farther, by their model."""
+    return rays._replace(
+        launch=rays.launch + _moved(rays.aims, change),
+        point=rays.point + change,
+        hits=rays.hits + _moved(rays.moves, change),
+    )
+
+
+def _search(lens: Lens, system: System, start: _Rays, goal: _Goal, steps: Array) -> _Found:
+    """Newton's method from rays, to which it goes back half the way where one fails."""
+    tiny = float(jnp.finfo(start.launch.dtype).eps) ** 0.5
 
     def step(state):
         count, rays, launch, done, _, _, _ = state
         new = _launched(lens, system, launch)
-        rays = _chosen(new.good & ~done, new, rays)
-        point, surface = _next(lens, rays, goal)
-        change, gap = _minus(point, rays.point), _minus(launch, rays.launch)
+        rays = jax.tree.map(lambda a, b: jnp.where(new.good & ~done, a, b), new, rays)
+        change, surface = _ahead(lens, rays, goal)
+        back = rays.launch - launch
         settled = rays.good & (dot(change, change) <= tiny**2)
-        lost = ~new.good & (dot(gap, gap) <= tiny**2 * (1 + dot(launch, launch)))
-        half = tuple((a + b) / 2 for a, b in zip(launch, rays.launch, strict=True))
-        launch = _chosen(new.good, _plus(rays.launch, rays.aims, change), half)
+        lost = ~new.good & (dot(back, back) <= tiny**2 * (1 + dot(launch, launch)))
+        ahead = rays.launch + _moved(rays.aims, change)
+        launch = jnp.where(new.good[None], ahead, launch + back / 2)
         return count + 1, rays, launch, done | settled | lost, change, surface, settled
 
-    no = jnp.zeros(launch[0].shape, bool)
-    state = (0, start, launch, no, start.point, no.astype(jnp.int32), no)
+    change, surface = _ahead(lens, start, goal)
+    launch, no = start.launch + _moved(start.aims, change), jnp.zeros(surface.shape, bool)
+    state = (0, start, launch, no, change, surface, no)
     state = jax.lax.while_loop(lambda s: (s[0] < steps) & ~jnp.all(s[3]), step, state)
     _, rays, _, _, change, surface, settled = state
     # The last step, which is small, on the model: right to its square.
-    change = tuple(jnp.where(settled, a, 0) for a in change)
-    rays = rays._replace(
-        launch=_plus(rays.launch, rays.aims, change),
-        point=tuple(a + b for a, b in zip(rays.point, change, strict=True)),
-        hits=_plus(rays.hits, rays.moves, change),
-    )
-    return _Found(rays, goal, surface, settled)
+    return _Found(_shifted(rays, jnp.where(settled[None], change, 0)), goal, surface, settled)
 
 
-def _outside(lens: Lens, rays: _Rays, point: Vector) -> Array:
+def _outside(lens: Lens, rays: _Rays, point: Array) -> Array:
     """How far points are outside of the apertures that rays model, (W, B) in units of the stop's
     semi-diameter; negative inside."""
-    hits = _plus(rays.hits, rays.moves, _minus(point, rays.point))
+    hits = rays.hits + _moved(rays.moves, point - rays.point)
     far = safe_sqrt(dot(hits, hits)) - lens.semi_diameter[:, None, None]
     rate = safe_sqrt((dot(rays.moves[0], rays.moves[0]) + dot(rays.moves[1], rays.moves[1])) / 2)
     return jnp.max(jnp.where(rate > 0, safe_divide(far, rate), -jnp.inf), axis=0)
 
 
-def _middle(lens: Lens, rays: _Rays, grid: np.ndarray) -> Vector:
-    """The point deepest inside all apertures by the model of one ray, 2 arrays (W, 1)."""
+def _middle(lens: Lens, rays: _Rays, scouts: Array) -> Array:
+    """The point (2, W, 1) deepest inside all apertures by the model of one ray a colour."""
 
     def zoom(_, state):
         best, span = state
-        points = tuple(b + span * jnp.asarray(g, span.dtype)[None] for b, g in zip(best, grid))
-        index = jnp.argmin(_outside(lens, rays, points), axis=-1)[:, None]
-        return tuple(jnp.take_along_axis(p, index, axis=-1) for p in points), 0.4 * span
+        points = best + span * scouts[:, None]
+        index = jnp.argmin(_outside(lens, rays, points), axis=-1)
+        return jnp.take_along_axis(points, index[None, :, None], axis=-1), 0.4 * span
 
-    zero = jnp.zeros_like(rays.point[0])
-    return jax.lax.fori_loop(0, _ZOOMS, zoom, ((zero, zero), jnp.ones_like(zero)))[0]
+    start = jnp.zeros_like(rays.point), jnp.ones((), scouts.dtype)
+    return jax.lax.fori_loop(0, _ZOOMS, zoom, start)[0]
 
 
 @functools.cache
@@ -239,28 +229,21 @@ def _taps() -> np.ndarray:
     return np.array([np.prod((t - others) / (knot - others), axis=0) for knot, others in rows])
 
 
-def _changes(ends: Array, half: bool) -> tuple[Array, Array]:
+def _changes(ends: Array, disc: bool) -> tuple[Array, Array]:
     """Where one aperture takes over from another, from their `ends` (S + 1, W, B) of even spokes:
-    places (W, C) in gaps between spokes, and the two surfaces (2, W, C), equal where there is no
-    corner."""
-    waves, spokes = ends.shape[1:]
-    index = np.arange(spokes - half)[:, None] + np.arange(-2, 4)
-    index = (spokes - 1) - abs((spokes - 1) - abs(index)) if half else index % spokes
+    places (W, C) in gaps between spokes, and the two surfaces (2, W, C), equal for no corner."""
+    last = ends.shape[-1] - 1
+    index = np.arange(last)[:, None] + np.arange(-2, 4)
+    index = index % last if disc else last - abs(last - abs(index))
     # Beyond 4 it ends nothing.
     ends = jnp.clip(ends, 0, 4)[..., index] @ jnp.asarray(_taps(), ends.dtype)
-    first = jnp.argmin(ends, axis=0).astype(jnp.int32)
-    sides = [slice(None, -1), slice(1, None)]
-    before, after = (first[..., s].reshape(waves, -1) for s in sides)
-    find = functools.partial(jnp.nonzero, size=min(_CORNERS, before.shape[1]), fill_value=0)
-    place = jax.vmap(lambda change: find(change)[0])(before != after)
-    pair = jnp.stack([jnp.take_along_axis(a, place, axis=-1) for a in (before, after)])
-
-    def excess(side):  # by how far the aperture behind is beyond the one before
-        own = ends[..., side].reshape(len(ends), waves, -1)
-        own = jnp.take_along_axis(own, place[None], axis=-1)
-        return _picked(own, pair[1]) - _picked(own, pair[0])
-
-    start, end = map(excess, sides)
+    ends = jnp.stack([ends[..., :-1], ends[..., 1:]]).reshape(2, *ends.shape[:2], -1)
+    first = jnp.argmin(ends, axis=1).astype(jnp.int32)
+    find = functools.partial(jnp.nonzero, size=_CORNERS, fill_value=0)
+    place = jax.vmap(lambda change: find(change)[0])(first[0] != first[1])
+    pair = jnp.take_along_axis(first, place[None], axis=-1)
+    near = _picked(jnp.take_along_axis(ends, place[None, None], axis=-1), pair)
+    start, end = near[:, 1] - near[:, 0]  # by how far the second aperture is beyond the first
     part = jnp.clip(safe_divide(start, start - end), 0, 1)
     return (place.astype(part.dtype) + part) / _PARTS, pair
 
@@ -275,280 +258,229 @@ def _gauss(most: int) -> np.ndarray:
     return table
 
 
-def _unit(angle: Array) -> Vector:
-    return jnp.cos(angle), jnp.sin(angle)
+def _unit(angle: Array) -> Array:
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
 @dataclasses.dataclass(frozen=True)
 class _Spokes:
-    """Half-lines about a centre: B places for them, of which `used` count (may be traced)."""
+    """Half-lines about a point: `count` places for them, B."""
 
     symmetry: Symmetry
     count: int
-    used: Any
-
-    @property
-    def low(self) -> float:
-        """The first azimuth, radians."""
-        return np.pi / 2 if self.symmetry == "meridian" else -np.pi / 2
 
     @property
     def turn(self) -> float:
-        """The azimuths there are, radians."""
+        """The azimuths there are, radians from -pi/2."""
         return 2 * np.pi if self.symmetry == "disc" else np.pi
 
     @property
-    def gap(self) -> float:
-        """Between even spokes: on half a pupil, the first and the last lie on the axis."""
-        return self.turn / max(self.count - (self.symmetry != "disc"), 1)
-
-    def scouts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points (2, B) on the stop from which the middle is sought, and offsets (2, G) to try."""
-        if self.symmetry == "meridian":
-            return np.zeros((2, 1)), np.zeros((2, 1))
-        side = np.linspace(-1, 1, 9)
-        if self.symmetry == "half":
-            line = np.linspace(-1.2, 1.2, self.count)
-            return np.stack([0 * line, line]), np.stack([0 * side, side])
-        k = np.arange(self.count) + 0.5
-        radius, angle = 1.2 * np.sqrt(k / self.count), np.pi * (1 + 5**0.5) * k
-        grid = np.stack(np.meshgrid(side, side)).reshape(2, -1)
-        return radius * np.stack([np.cos(angle), np.sin(angle)]), grid
+    def even(self) -> np.ndarray:
+        """Azimuths (B,) of even spokes, ends included; the meridian's is y > 0."""
+        axial = self.symmetry == "meridian"
+        return np.linspace(-np.pi / 2 + axial * np.pi, self.turn - np.pi / 2, self.count)
 
     def nearest(self, angle: Array) -> Array:
-        """The even spoke that is nearest to an azimuth."""
-        index = jnp.round((angle - self.low) / self.gap).astype(jnp.int32)
-        if self.symmetry == "disc":
-            return index % self.count
-        return jnp.clip(index, 0, self.count - 1)
+        """Which of the even spokes is nearest to an azimuth."""
+        index = jnp.round((angle + np.pi / 2) * ((self.count - 1) / self.turn))
+        return jnp.clip(index.astype(jnp.int32), 0, self.count - 1)
 
-    def nodes(self, centre: Vector, corner: Vector, exists: Array) -> tuple[Array, Array]:
-        """Azimuths (W, B) and their weights, which add up to 1: Gauss nodes between the corners, 2
-        arrays (W, C), that exist; more in a wide gap."""
-        low = jnp.full_like(centre[0], self.low)
+    def scouts(self) -> np.ndarray:
+        """Points (2, B) all over the stop, and a little beyond its rim."""
+        k = np.arange(self.count) + 0.5
+        if self.symmetry == "disc":
+            angle = np.pi * (1 + 5**0.5) * k
+            return 1.2 * np.sqrt(k / self.count) * np.stack([np.cos(angle), np.sin(angle)])
+        return np.stack([0 * k, 1.2 * (2 * k / self.count - 1)])
+
+    def nodes(
+        self, used: Array, centre: Array, corner: Array, exists: Array
+    ) -> tuple[Array, Array]:
+        """Azimuths (W, B) and their weights, which add up to 1: `used` Gauss nodes between the
+        corners (2, W, C) that exist, about a centre (2, W, 1); more in a wide gap."""
+        low, turn = -np.pi / 2, self.turn
         if self.symmetry == "meridian":
-            return low, jnp.ones_like(low)
-        x, y = (jnp.where(exists, a, 1) for a in _minus(corner, centre))
-        angle, disc = jnp.arctan2(y, x), self.symmetry == "disc"
-        angle = low + (angle - low) % self.turn if disc else jnp.clip(angle, low, low + self.turn)
-        angle = jnp.sort(jnp.where(exists, angle, jnp.inf), axis=-1)
-        first = jnp.where(disc & jnp.any(exists, -1, keepdims=True), angle[:, :1], low)
-        ends = jnp.concatenate([first, angle, first + self.turn], axis=-1)
-        ends = jnp.minimum(ends, first + self.turn)
-        width = ends[:, 1:] - ends[:, :-1]
+            return jnp.full_like(centre[0], np.pi / 2), jnp.ones_like(centre[0])
+        x, y = jnp.where(exists[None], corner - centre, 1)
+        angle = jnp.where(exists, (jnp.arctan2(y, x) - low) % (2 * np.pi), turn)
+        angle = jnp.sort(jnp.clip(angle, 0, turn), axis=-1)
+        ends = jnp.pad(angle, ((0, 0), (1, 1)), constant_values=((0, 0), (0, turn)))
+        width = jnp.diff(ends, axis=-1)
         need = jax.lax.stop_gradient(jnp.where(width > 0, width / np.pi + _EXTRA, 0))
-        total = jnp.cumsum(need, axis=-1)
-        last = jnp.round(self.used * total / total[:, -1:]).astype(jnp.int32)
-        slot = jnp.arange(self.count, dtype=jnp.int32)
-        panel = jnp.sum(slot[None, :, None] >= last[:, None], axis=-1, dtype=jnp.int32)
+        need = jnp.cumsum(need, axis=-1)
+        last = jnp.round(used.astype(need.dtype) * need / need[:, -1:]).astype(jnp.int32)
+        slot = jnp.arange(self.count, dtype=jnp.int32)[None]
+        panel = jnp.sum(slot[..., None] >= last[:, None], axis=-1, dtype=jnp.int32)
         # Behind the last panel there are no nodes, and no weight.
         last = jnp.pad(last, ((0, 0), (1, 1)))
         begin, end = (jnp.take_along_axis(last, panel + k, axis=-1) for k in (0, 1))
         table = jnp.asarray(_gauss(self.count), width.dtype)
-        node, weight = table[:, jnp.maximum(end - begin, 0), slot[None] - begin]
+        node, weight = table[:, jnp.maximum(end - begin, 0), slot - begin]
         panel = jnp.minimum(panel, width.shape[-1] - 1)
         start, wide = (jnp.take_along_axis(a, panel, axis=-1) for a in (ends, width))
-        return start + wide * node, wide * weight / self.turn
+        return low + start + wide * node, wide * weight / turn
 
 
-@dataclasses.dataclass(frozen=True)
-class _Boundary:
-    """The search for the boundary. A stage takes what is found so far, a first axis for the stages,
-    and tells the rays from which to start, where to launch the first, and their goals."""
+def _stages(lens: Lens, system: System, spokes: _Spokes, used: Array) -> list:
+    """The stages of the search: each takes what they found, the stages along a first axis, and
+    tells the rays to start from and their goals."""
+    like = jnp.zeros((2, system.index.shape[1], spokes.count), system.index.dtype)
+    of = lambda found, stage: jax.tree.map(lambda a: a[stage], found)  # noqa: E731
+    scouts = jnp.asarray(spokes.scouts(), like.dtype)
 
-    lens: Lens
-    system: System
-    spokes: _Spokes
+    def goal(centre, toward=None, pair=None):
+        toward = like if toward is None else toward
+        return _Goal(like + centre, toward, like.astype(jnp.int32) if pair is None else pair)
 
-    def find(self) -> _Found:
-        """What the stages find, one after the other."""
-        stages = [self.scout, self.middle, self.ends, self.corners, self.nodes]
-        stages = stages[: 3 if self.spokes.symmetry == "meridian" else 5]
+    def scout(found):  # all over the stop, to where paraxial optics puts them
+        radius = lens.semi_diameter[lens.stop]
+        launch = paraxial_launch(system, tuple(like + radius * scouts[:, None]), 4 * radius)
+        return of(found.rays, 0)._replace(launch=jnp.stack(launch)), goal(like)
 
-        def run(stage, found):
-            start, launch, goal = jax.lax.switch(stage, stages, found)
-            new = _search(self.lens, self.system, start, launch, goal, jnp.asarray(_STEPS)[stage])
-            return jax.tree.map(lambda a, b: a.at[stage].set(b), found, new)
-
-        def several(shape, dtype=self.system.index.dtype):
-            waves, count = self.system.index.shape[1], self.spokes.count
-            return jnp.zeros((len(stages), *shape, waves, count), dtype)
-
-        point, hits = (several(()),) * 2, (several((self.lens.count + 1,)),) * 2
-        no, none = several((), bool), several((), jnp.int32)
-        rays = _Rays(point, point, hits, (point,) * 2, (hits,) * 2, no)
-        found = _Found(rays, _Goal(point, point, jnp.stack([none, none], 1)), none, no)
-        return jax.lax.fori_loop(0, len(stages), run, found)
-
-    def _goal(self, like, centre, toward=None, pair=None) -> _Goal:
-        zero = jnp.zeros_like(like[0])
-        toward = (zero, zero) if toward is None else toward
-        pair = jnp.zeros((2, *zero.shape), jnp.int32) if pair is None else pair
-        return _Goal(tuple(zero + c for c in centre), toward, pair)
-
-    def _onward(self, rays: _Rays, goal: _Goal) -> tuple:
-        point, _ = _next(self.lens, rays, goal)
-        return rays, _plus(rays.launch, rays.aims, _minus(point, rays.point)), goal
-
-    def scout(self, found: _Found) -> tuple:
-        """Rays all over the stop, to where paraxial optics puts them."""
-        rays = jax.tree.map(lambda a: a[0], found.rays)
-        radius = self.lens.semi_diameter[self.lens.stop]
-        points = (jnp.asarray(s, radius.dtype)[None] * radius for s in self.spokes.scouts()[0])
-        target = tuple(p + zero for p, zero in zip(points, rays.point, strict=True))
-        launch = paraxial_launch(self.system, target, 4 * radius)
-        return rays, launch, self._goal(rays.point, rays.point)
-
-    def middle(self, found: _Found) -> tuple:
-        """All to the point deepest inside, by the model of the best scout."""
-        rays = jax.tree.map(lambda a: a[0], found.rays)
-        far = jnp.where(rays.good, _outside(self.lens, rays, rays.point), jnp.inf)
+    def middle(found):  # all to the point deepest inside, by the model of the best scout
+        rays = of(found.rays, 0)
+        far = jnp.where(rays.good, _outside(lens, rays, rays.point), jnp.inf)
         best = jnp.argmin(far, axis=-1)[:, None]
-        centre = _middle(self.lens, rays.at(best), self.spokes.scouts()[1])
-        rays = rays.at(jnp.broadcast_to(best, far.shape))
-        return self._onward(rays, self._goal(rays.point, centre))
+        rays = rays.at(best)
+        return rays.at(like[0].astype(jnp.int32)), goal(_middle(lens, rays, scouts))
 
-    def ends(self, found: _Found) -> tuple:
-        """To the ends of even spokes."""
-        rays = jax.tree.map(lambda a: a[1], found.rays)
-        even = self.spokes.low + self.spokes.gap * np.arange(self.spokes.count)
-        angle = jnp.broadcast_to(jnp.asarray(even, rays.point[0].dtype), rays.good.shape)
-        return self._onward(rays, self._goal(rays.point, rays.point, _unit(angle)))
+    def ends(found):  # to the ends of even spokes
+        rays = of(found.rays, 1)
+        return rays, goal(rays.point, like + _unit(jnp.asarray(spokes.even, like.dtype))[:, None])
 
-    def corners(self, found: _Found) -> tuple:
-        """To the corners, the first of the rays."""
-        spokes = jax.tree.map(lambda a: a[2], found)
-        ends = _ends(self.lens, spokes.rays, spokes.goal)
-        place, pair = _changes(ends, self.spokes.symmetry == "half")
-        more = (0, self.spokes.count - place.shape[-1])
+    def corners(found):  # to the corners, in the first places
+        even = of(found, 2)
+        place, pair = _changes(_ends(lens, even.rays, even.goal), spokes.symmetry == "disc")
+        more = (0, spokes.count - _CORNERS)
         place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
-        rays = spokes.rays.at(self.spokes.nearest(self.spokes.low + self.spokes.gap * place))
-        return self._onward(rays, self._goal(rays.point, spokes.goal.centre, None, pair))
+        rays = even.rays.at(jnp.round(place).astype(jnp.int32))
+        angle = place * (spokes.turn / (spokes.count - 1)) - np.pi / 2
+        line = _ahead(lens, rays, goal(even.goal.centre, _unit(angle)))[0]
+        return _shifted(rays, line), goal(even.goal.centre, None, pair)
 
-    def nodes(self, found: _Found) -> tuple:
-        """To the ends of the spokes of the rule."""
-        corners, rays = (
-            jax.tree.map(lambda a: a[3], found),
-            jax.tree.map(lambda a: a[2], found.rays),
-        )
-        centre = tuple(a[:, :1] for a in corners.goal.centre)
-        there = tuple(a[:, :_CORNERS] for a in corners.rays.point)
-        angle, _ = self.spokes.nodes(centre, there, _exists(self.lens, corners)[:, :_CORNERS])
-        rays = rays.at(self.spokes.nearest(angle))
-        return self._onward(rays, self._goal(rays.point, centre, _unit(angle)))
+    def nodes(found):  # to the ends of the spokes of the rule
+        rays, found = of(found.rays, 2), of(found, 3)
+        corner, exists = found.rays.point[..., :_CORNERS], _exists(lens, found)[:, :_CORNERS]
+        angle, _ = spokes.nodes(used, found.goal.centre[..., :1], corner, exists)
+        return rays.at(spokes.nearest(angle)), goal(found.goal.centre, _unit(angle))
+
+    return [scout, middle, ends, corners, nodes][: 3 if spokes.symmetry == "meridian" else 5]
 
 
-def _exists(lens: Lens, corners: _Found) -> Array:
-    """Whether rays (W, B) lie in corners of the boundary."""
-    eps = float(jnp.finfo(corners.rays.point[0].dtype).eps)
-    rays, pair = corners.rays, corners.goal.pair
-    inside = _outside(lens, rays, rays.point) < 100 * eps**0.5
-    return corners.settled & inside & (pair[0] != pair[1])
+def _exists(lens: Lens, found: _Found) -> Array:
+    """Whether rays (W, B) lie in corners of the boundary, or near it."""
+    inside = _outside(lens, found.rays, found.rays.point) < 0.01
+    return found.settled & inside & (found.goal.pair[0] != found.goal.pair[1])
+
+
+def _find(lens: Lens, system: System, spokes: _Spokes, used: Array) -> _Found:
+    """What the stages find, one after the other, along a first axis."""
+    stages = _stages(lens, system, spokes, used)
+
+    def several(shape, dtype=system.index.dtype):
+        return jnp.zeros((len(stages), *shape, system.index.shape[1], spokes.count), dtype)
+
+    point, rates, rows = several((2,)), several((2, 2)), lens.count + 1
+    hits, moves, no = several((2, rows)), several((2, 2, rows)), several((), bool)
+    goal = _Goal(point, point, several((2,), jnp.int32))
+    rays = _Rays(point, point, hits, rates, moves, no)
+
+    def run(stage, found):
+        start, goal = jax.lax.switch(stage, stages, found)
+        new = _search(lens, system, start, goal, jnp.array(_STEPS, jnp.int32)[stage])
+        return jax.tree.map(lambda a, b: a.at[stage].set(b), found, new)
+
+    start = _Found(rays, goal, several((), jnp.int32), no)
+    return jax.lax.fori_loop(0, len(stages), run, start)
 
 
 class _Plan(NamedTuple):
     """The boundary without derivatives: C corners and B spokes, K = C + B rays.
 
-    centre: 2 arrays (W, 1). point: 2 arrays (W, K) in units of the stop's semi-diameter. hits: 2
-    arrays (R, W, K) on the rows of a system, mm. pair: (2, W, K), the apertures that end a ray,
-    for a spoke both the same. rates: of the gaps of both by the two components of `point`, (2, 2,
-    W, K). follows: (W, K), whether the ray follows the lens. passes: (W, 1), whether light does.
+    centre: (2, W, 1). point: (2, W, K) in units of the stop's semi-diameter. hits: 2 arrays (R, W,
+    K) on the rows of a system, mm. pair: (2, W, K), the apertures that end a ray, for a spoke both
+    the same. rates: (2, 2, W, K), see `_rates`. follows: (W, K), whether a ray follows the lens.
+    passes: (W, 1), whether light passes. used: (), how many spokes count.
     """
 
-    centre: Vector
-    point: Vector
+    centre: Array
+    point: Array
     hits: Vector
     pair: Array
     rates: Array
     follows: Array
     passes: Array
-
-    @property
-    def corners(self) -> int:
-        """C."""
-        return self.pair.shape[-1]
+    used: Array
 
 
-def _plan(lens: Lens, scene: Scene, spokes: _Spokes) -> _Plan:
-    found = _Boundary(lens, system_of(lens, scene), spokes).find()
+def _plan(lens: Lens, scene: Scene, spokes: _Spokes, used: Array) -> _Plan:
+    found = _find(lens, system_of(lens, scene), spokes, used)
     middle, nodes = (jax.tree.map(lambda a: a[k], found) for k in (1, -1))
-    centre = tuple(a[:, :1] for a in middle.rays.point)
-    inside = _outside(lens, middle.rays, middle.rays.point) < 0
-    passes = (middle.settled & inside)[:, :1]
+    passes = middle.settled & (_outside(lens, middle.rays, middle.rays.point) < 0)
     rays, pair, follows = nodes.rays, jnp.stack([nodes.surface] * 2), nodes.settled
     if spokes.symmetry != "meridian":
         corners = jax.tree.map(lambda a: a[3, ..., :_CORNERS], found)
         join = lambda a, b: jnp.concatenate([a, b], axis=-1)  # noqa: E731
-        follows = join(_exists(lens, corners), follows)
         rays, pair = jax.tree.map(join, corners.rays, rays), join(corners.goal.pair, pair)
-    follows = follows & passes
-    rates = jnp.stack([jnp.stack(r) for _, r in _gaps(lens, rays.hits, rays.moves, pair)], 1)
-    rows = np.array([*lens.live, lens.count])
-    hits = tuple(jnp.where(follows, h[rows], 0) for h in rays.hits)
-    return _Plan(centre, rays.point, hits, pair, rates, follows, passes)
+        follows = join(_exists(lens, corners), follows)
+    follows = follows & passes[:, :1]
+    hits = jnp.where(follows, rays.hits[:, np.array([*lens.live, lens.count])], 0)
+    centre, rates = middle.rays.point[..., :1], _rates(lens, rays, pair)
+    return _Plan(centre, rays.point, tuple(hits), pair, rates, follows, passes[:, :1], used)
 
 
-def _excess(plan: _Plan, lens: Lens, scene: Scene, point: Vector) -> Array:
-    """|h|^2 / R^2 - 1 of the apertures that end the rays, (2, W, K); `point` as in the plan."""
-    target = tuple(lens.semi_diameter[lens.stop] * p for p in point)
+def _followed(plan: _Plan, lens: Lens, scene: Scene, point: Array) -> Array:
+    """`_gaps` of the rays of a plan through points (2, W, K)."""
     system = system_of(lens, scene)
+    target = tuple(lens.semi_diameter[lens.stop] * point)
     status = jnp.where(plan.follows, Status.OK, Status.MISSED).astype(jnp.int32)
     known = Found(plan.hits, arrival(plan.hits, system), status, jnp.int32(0))
-    hits, _ = _whole(lens, system, reattach(known, system, target).hits, target, status)
-    return jnp.stack([gap for gap, _ in _gaps(lens, hits, (), plan.pair)])
+    hits = reattach(known, system, target).hits
+    return _gaps(lens, jnp.stack(_whole(lens, system, hits, target, status)[0]), plan.pair)
 
 
 @jax.custom_jvp
-def _rates(lens: Lens, scene: Scene, point: Vector, plan: _Plan) -> Array:
-    """Derivatives of `_excess` by the two components of the point: known numbers, and only their
-    own derivatives cost anything."""
+def _known_rates(lens: Lens, scene: Scene, point: Array, plan: _Plan) -> Array:
+    """Derivatives of `_followed` by the point: known numbers, only theirs cost anything."""
     return plan.rates
 
 
-@_rates.defjvp
-def _rates_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    plan = primals[3]
-
+@_known_rates.defjvp
+def _known_rates_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     def rates(lens, scene, point):
-        excess = functools.partial(_excess, plan, lens, scene)
-        return jax.vmap(lambda unit: jax.jvp(excess, (point,), (unit,))[1])(_units(point))
+        gaps = functools.partial(_followed, primals[3], lens, scene)
+        return jax.vmap(lambda unit: jax.jvp(gaps, (point,), (unit,))[1])(_units(point))
 
     return jax.jvp(rates, primals[:3], tangents[:3])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _follow(spokes: _Spokes, lens: Lens, scene: Scene, plan: _Plan) -> Vector:
+def _follow(spokes: _Spokes, lens: Lens, scene: Scene, plan: _Plan) -> Array:
     """The points of a plan with their derivatives by the lens and the scene, in every mode."""
     return plan.point
 
 
 @_follow.defjvp
-def _follow_jvp(spokes: _Spokes, primals: Any, tangents: Any) -> tuple[Vector, Vector]:
+def _follow_jvp(spokes: _Spokes, primals: Any, tangents: Any) -> tuple[Array, Array]:
     lens, scene, plan = primals
     # Through the function itself, so that the points carry derivatives of their own.
     point = _follow(spokes, lens, scene, plan)
-    count = plan.point[0].shape[-1] - spokes.count
-    first, others = slice(None, count), slice(count, None)
-    rates = _rates(lens, scene, point, plan)
-    excess = functools.partial(_excess, plan)
-    _, change = jax.jvp(lambda a, b: excess(a, b, point), (lens, scene), tangents[:2])
+    rates = _known_rates(lens, scene, point, plan)
+    gaps = lambda lens, scene: _followed(plan, lens, scene, point)  # noqa: E731
+    _, change = jax.jvp(gaps, (lens, scene), tangents[:2])
+    corners, ends = (slice(None, -spokes.count), slice(-spokes.count, None))
     # A corner stays on both apertures.
-    rows = tuple(tuple(rates[:, k, :, first]) for k in (0, 1))
-    corner = _solved(rows, tuple(-change[..., first]))
-    corner = tuple(jnp.where(plan.follows[:, first], a, 0) for a in corner)
-    # A spoke turns with the corners, and stays on its aperture.
-    ends = functools.partial(spokes.nodes, plan.centre)
-    there = tuple(p[:, first] for p in point)
-    nodes = lambda there: ends(there, plan.follows[:, first])[0]  # noqa: E731
-    angle, turned = jax.jvp(nodes, (there,), (corner,))
-    x, y = _unit(angle)
-    u, v = (p[:, others] - c for p, c in zip(point, plan.centre, strict=True))
-    side = -v * turned, u * turned
-    p, q = rates[:, 0, :, others]
-    longer = -safe_divide(change[0][:, others] + p * side[0] + q * side[1], p * x + q * y)
-    longer = jnp.where(plan.follows[:, others], longer, 0)
-    end = side[0] + longer * x, side[1] + longer * y
-    return point, tuple(jnp.concatenate([a, b], -1) for a, b in zip(corner, end, strict=True))
+    corner = -_moved(_inverse(rates[..., corners]), change[..., corners])
+    corner = jnp.where(plan.follows[:, corners], corner, 0)
+    # A spoke turns with the corners, and ends on its aperture.
+    nodes = lambda corner: spokes.nodes(plan.used, plan.centre, corner, plan.follows[:, corners])[0]  # noqa: E731
+    angle, turned = jax.jvp(nodes, (point[..., corners],), (corner,))
+    line, toward = point[..., ends] - plan.centre, _unit(angle)
+    side = jnp.stack([-line[1] * turned, line[0] * turned])
+    rate = rates[:, 0, :, ends]
+    longer = -safe_divide(change[0, :, ends] + dot(rate, side), dot(rate, toward))
+    longer = jnp.where(plan.follows[:, ends], longer, 0)
+    return point, jnp.concatenate([corner, side + longer[None] * toward], axis=-1)
 
 
 @jax.tree_util.register_dataclass
@@ -558,36 +490,36 @@ class Clipped(PupilRule):
 
     order: nodes along a radius.
     symmetry: see `symmetry_of`.
+    size: the order up to which weightless rays fill up, so that orders share a compiled program.
     """
 
-    order: int = dataclasses.field(metadata={"static": True})
+    order: int
     symmetry: Symmetry = dataclasses.field(metadata={"static": True})
+    size: int = dataclasses.field(metadata={"static": True}, default=0)
 
     def __post_init__(self) -> None:
-        check_order(self.order)
+        if not self.size:
+            check_order(self.order)
+            object.__setattr__(self, "size", self.order)
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """Points and weights, which follow the lens."""
         axial = self.symmetry == "meridian"
-        used = {"meridian": 1, "half": 3 * (self.order + 2), "disc": 6 * (self.order + 2)}[
-            self.symmetry
-        ]
-        least = {"meridian": 1, "half": _SPOKES, "disc": 2 * _SPOKES - 2}[self.symmetry]
-        spokes = _Spokes(self.symmetry, max(used, least), used)
-        plan = jax.lax.stop_gradient(_plan(*jax.lax.stop_gradient((lens, scene)), spokes))
+        part = {"meridian": 0, "half": 1, "disc": 2}[self.symmetry]
+        used, most = (part * (2 * n + 6) for n in (self.order, self.size))
+        spokes = _Spokes(self.symmetry, max(most, 32 * part) + 1)
+        given = *jax.lax.stop_gradient((lens, scene)), spokes, jnp.asarray(used, jnp.int32)
+        plan = jax.lax.stop_gradient(_plan(*given))
         point = _follow(spokes, lens, scene, plan)
-        count = point[0].shape[-1] - spokes.count
-        corner = tuple(p[:, :count] for p in point)
-        angle, weight = spokes.nodes(plan.centre, corner, plan.follows[:, :count])
-        x, y = (a[..., None] for a in _unit(angle))
-        u, v = (p[:, count:, None] - c[..., None] for p, c in zip(point, plan.centre, strict=True))
-        length = x * u + y * v
-        node, part = jnp.asarray(_gauss(self.order)[:, self.order], x.dtype)[:, None, None]
+        corner, end = point[..., : -spokes.count], point[..., -spokes.count :]
+        follows = plan.follows[:, : -spokes.count]
+        angle, share = spokes.nodes(plan.used, plan.centre, corner, follows)
+        toward = _unit(angle)
+        length = dot(toward, end - plan.centre)
+        node, weight = jnp.asarray(_gauss(self.size), length.dtype)[:, self.order, None, None]
         # On the axis r^2 is the variable, as without clipping.
-        node, part = (jnp.sqrt(node), part) if axial else (node, 2 * node * part)
-        weight = jnp.where(plan.passes, weight, 0)[..., None] * length**2 * part
-        points = (
-            c[..., None] + length * node * a for c, a in zip(plan.centre, (x, y), strict=True)
-        )
-        flat = tuple(p.reshape(len(p), -1) for p in points)
-        return (flat[1:] if axial else flat), weight.reshape(len(weight), -1)
+        node, weight = (jnp.sqrt(node), weight) if axial else (node, 2 * node * weight)
+        weight = jnp.where(plan.passes, share * length**2, 0)[..., None] * weight
+        points = plan.centre[..., None] + (length[..., None] * node)[None] * toward[..., None]
+        points = points.reshape(2, len(length), -1)
+        return tuple(points[1:] if axial else points), weight.reshape(len(length), -1)
