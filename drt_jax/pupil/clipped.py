@@ -5,11 +5,6 @@ Here the boundary is found: in polar coordinates about a point inside, the dista
 smooth but for the corners where one aperture takes over from another. Gauss rules between the
 corners and along the radii converge as on an open stop.
 
-Every aperture, the stop's rim among them, is a circle: a ray passes if its hit h on that surface
-has |h| <= R. Rays are launched, not aimed: a trace tells how the hits move with the point on the
-stop; on this model, every aperture ends a half-line on the stop at the root of a quadratic; the
-next ray is launched there. So each ray of the boundary takes a few steps of Newton's method.
-
 Vectors are arrays with their 2 components first, and B rays a colour last.
 """
 
@@ -24,14 +19,14 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import safe_divide
 from ..rays.aim import paraxial_launch
 from ..rays.fermat import arrival
-from ..rays.snell import apart, shoot
 from ..rays.solve import Found, reattach
 from ..rays.status import Status
 from ..rays.system import System, Vector, dot, system_of
-from ..rays.trace import _whole
+from ..rays.trace import on_all_surfaces
+from . import boundary
 from .rules import PupilRule, Symmetry, check_order
 
 __all__ = ["Clipped"]
@@ -39,186 +34,8 @@ __all__ = ["Clipped"]
 # Corners that have a panel of their own, and what each gap between two of the even half-lines on
 # which they are sought is divided into. A panel gets nodes by its width in half turns and `_EXTRA`.
 _CORNERS, _PARTS, _EXTRA = 8, 32, 0.15
-# Steps of each stage of the search, and rounds of that for the middle.
-_STEPS, _ZOOMS = (1, 48, 48, 16, 48), 10
-
-
-class _Rays(NamedTuple):
-    """Launched rays, and how they move with their points on the stop.
-
-    launch: (2, W, B), mm. point: (2, W, B) in units of the stop's semi-diameter. hits: (2, S + 1,
-    W, B), mm. aims, moves: (2, ...), derivatives of `launch` and `hits` by `point`.
-    good: (W, B), whether they reach the sensor.
-    """
-
-    launch: Array
-    point: Array
-    hits: Array
-    aims: Array
-    moves: Array
-    good: Array
-
-    def at(self, index: Array) -> "_Rays":
-        """Those at `index` (W, B)."""
-
-        def take(a):
-            return jnp.take_along_axis(a, index.reshape(*[1] * (a.ndim - 2), *index.shape), axis=-1)
-
-        return jax.tree.map(take, self)
-
-
-class _Goal(NamedTuple):
-    """Where rays are to go: to the end of a half-line, or to a corner.
-
-    centre, toward: (2, W, B), start and direction of the half-line; 0: to the centre itself.
-    pair: (2, W, B), the surfaces whose apertures meet in a corner; equal for none.
-    """
-
-    centre: Array
-    toward: Array
-    pair: Array
-
-
-class _Found(NamedTuple):
-    """Rays and their goals. surface: (W, B), that ends the half-line. settled: (W, B), whether the
-    goal is met; else the ray is the last one before others fail."""
-
-    rays: _Rays
-    goal: _Goal
-    surface: Array
-    settled: Array
-
-
-def _moved(rates: Array, change: Array) -> Array:
-    """How far something moves with the point on the stop; `rates` (2, ..., W, B)."""
-    x, y = change.reshape(2, *[1] * (rates.ndim - 3), *change.shape[1:])
-    return rates[0] * x + rates[1] * y
-
-
-def _inverse(matrix: Array) -> Array:
-    """Of matrices (2, 2, W, B); 0 for those that have none."""
-    (p, q), (r, s) = matrix
-    return safe_divide(jnp.array([[s, -q], [-r, p]]), (p * s - q * r)[None, None])
-
-
-def _picked(values: Array, surface: Array) -> Array:
-    """Of `values` (..., S + 1, W, B) those on a few surfaces (N, W, B)."""
-    index = surface.reshape(*[1] * (values.ndim - 3), *surface.shape)
-    return jnp.take_along_axis(values, index, axis=-3)
-
-
-def _units(like: Array) -> Array:
-    """The vectors (1, 0) and (0, 1), (2, 2, W, B)."""
-    return jnp.broadcast_to(jnp.eye(2, dtype=like.dtype)[..., None, None], (2, *like.shape))
-
-
-def _launched(lens: Lens, system: System, launch: Array) -> _Rays:
-    def trace(launch):
-        found = shoot(system, tuple(launch))
-        hits, status = _whole(lens, system, *apart(system, found.hits), found.fate)
-        return jnp.stack(hits), status
-
-    def along(unit):
-        (hits, status), (columns, _) = jax.jvp(trace, (launch,), (unit,))
-        return hits, columns, status
-
-    hits, columns, status = jax.vmap(along, out_axes=(None, 0, None))(_units(launch))
-    radius = lens.semi_diameter[lens.stop]
-    aims = _inverse(columns[:, :, lens.stop] / radius)
-    moves = jnp.stack([_moved(columns, a) for a in aims])
-    return _Rays(launch, hits[:, lens.stop] / radius, hits, aims, moves, status == Status.OK)
-
-
-def _gaps(lens: Lens, hits: Array, pair: Array) -> Array:
-    """(2, W, B): |h|^2 / R^2 - 1 of the apertures of two surfaces; 0 on their edges."""
-    hit = _picked(hits, pair)
-    return dot(hit, hit) / lens.semi_diameter[pair] ** 2 - 1
-
-
-def _rates(lens: Lens, rays: _Rays, pair: Array) -> Array:
-    """Derivatives (2, 2, W, B) of `_gaps` by the point on the stop."""
-    hit, moves = _picked(rays.hits, pair), _picked(rays.moves, pair)
-    return jnp.stack([2 * dot(hit, m) / lens.semi_diameter[pair] ** 2 for m in moves])
-
-
-def _ends(lens: Lens, rays: _Rays, goal: _Goal) -> Array:
-    """Where each aperture ends a half-line, (S + 1, W, B) in units of the stop's semi-diameter,
-    if hits move in proportion to it; inf for one that never does."""
-    scale = 1 / lens.semi_diameter[None, :, None, None]
-    base = scale * (rays.hits + _moved(rays.moves, goal.centre - rays.point))
-    rate = scale * _moved(rays.moves, goal.toward)
-    square, linear, constant = dot(rate, rate), dot(base, rate), dot(base, base) - 1
-    root = safe_sqrt(linear**2 - square * constant)
-    out = linear > 0  # of the two ways to write a root, the one that does not subtract
-    above = jnp.where(out, -constant, root - linear)
-    return jnp.where(square > 0, safe_divide(above, jnp.where(out, linear + root, square)), jnp.inf)
-
-
-def _ahead(lens: Lens, rays: _Rays, goal: _Goal) -> tuple[Array, Array]:
-    """How far (2, W, B) it is to the goal, and the surface (W, B) that ends the half-line."""
-    ends = _ends(lens, rays, goal)
-    length = jnp.where(dot(goal.toward, goal.toward) > 0, jnp.min(ends, axis=0), 0)
-    inverse = _inverse(_rates(lens, rays, goal.pair))
-    corner = -_moved(inverse, _gaps(lens, rays.hits, goal.pair))
-    line = goal.centre + length[None] * goal.toward - rays.point
-    change = jnp.where(goal.pair[:1] != goal.pair[1:], corner, line)
-    return change, jnp.argmin(ends, axis=0).astype(jnp.int32)
-
-
-def _shifted(rays: _Rays, change: Array) -> _Rays:
-    """Rays through points (2, W, B) farther, by their model."""
-    return rays._replace(
-        launch=rays.launch + _moved(rays.aims, change),
-        point=rays.point + change,
-        hits=rays.hits + _moved(rays.moves, change),
-    )
-
-
-def _search(lens: Lens, system: System, start: _Rays, goal: _Goal, steps: Array) -> _Found:
-    """Newton's method from rays, to which it goes back half the way where one fails."""
-    tiny = float(jnp.finfo(start.launch.dtype).eps) ** 0.5
-
-    def step(state):
-        count, rays, launch, done, _, _, _ = state
-        new = _launched(lens, system, launch)
-        rays = jax.tree.map(lambda a, b: jnp.where(new.good & ~done, a, b), new, rays)
-        change, surface = _ahead(lens, rays, goal)
-        back = rays.launch - launch
-        settled = rays.good & (dot(change, change) <= tiny**2)
-        lost = ~new.good & (dot(back, back) <= tiny**2 * (1 + dot(launch, launch)))
-        ahead = rays.launch + _moved(rays.aims, change)
-        launch = jnp.where(new.good[None], ahead, launch + back / 2)
-        return count + 1, rays, launch, done | settled | lost, change, surface, settled
-
-    change, surface = _ahead(lens, start, goal)
-    launch, no = start.launch + _moved(start.aims, change), jnp.zeros(surface.shape, bool)
-    state = (0, start, launch, no, change, surface, no)
-    state = jax.lax.while_loop(lambda s: (s[0] < steps) & ~jnp.all(s[3]), step, state)
-    _, rays, _, _, change, surface, settled = state
-    # The last step, which is small, on the model: right to its square.
-    return _Found(_shifted(rays, jnp.where(settled[None], change, 0)), goal, surface, settled)
-
-
-def _outside(lens: Lens, rays: _Rays, point: Array) -> Array:
-    """How far points are outside of the apertures that rays model, (W, B) in units of the stop's
-    semi-diameter; negative inside."""
-    hits = rays.hits + _moved(rays.moves, point - rays.point)
-    far = safe_sqrt(dot(hits, hits)) - lens.semi_diameter[:, None, None]
-    rate = safe_sqrt((dot(rays.moves[0], rays.moves[0]) + dot(rays.moves[1], rays.moves[1])) / 2)
-    return jnp.max(jnp.where(rate > 0, safe_divide(far, rate), -jnp.inf), axis=0)
-
-
-def _middle(lens: Lens, rays: _Rays, scouts: Array) -> Array:
-    """The point (2, W, 1) deepest inside all apertures by the model of one ray a colour."""
-
-    def zoom(_, state):
-        best, span = state
-        points = best + span * scouts[:, None]
-        index = jnp.argmin(_outside(lens, rays, points), axis=-1)
-        return jnp.take_along_axis(points, index[None, :, None], axis=-1), 0.4 * span
-
-    start = jnp.zeros_like(rays.point), jnp.ones((), scouts.dtype)
-    return jax.lax.fori_loop(0, _ZOOMS, zoom, start)[0]
+# Steps of each stage of the search.
+_STEPS = 1, 48, 48, 16, 48
 
 
 @functools.cache
@@ -242,7 +59,7 @@ def _changes(ends: Array, disc: bool) -> tuple[Array, Array]:
     find = functools.partial(jnp.nonzero, size=_CORNERS, fill_value=0)
     place = jax.vmap(lambda change: find(change)[0])(first[0] != first[1])
     pair = jnp.take_along_axis(first, place[None], axis=-1)
-    near = _picked(jnp.take_along_axis(ends, place[None, None], axis=-1), pair)
+    near = boundary.picked(jnp.take_along_axis(ends, place[None, None], axis=-1), pair)
     start, end = near[:, 1] - near[:, 0]  # by how far the second aperture is beyond the first
     part = jnp.clip(safe_divide(start, start - end), 0, 1)
     return (place.astype(part.dtype) + part) / _PARTS, pair
@@ -330,7 +147,8 @@ def _stages(lens: Lens, system: System, spokes: _Spokes, used: Array) -> list:
 
     def goal(centre, toward=None, pair=None):
         toward = like if toward is None else toward
-        return _Goal(like + centre, toward, like.astype(jnp.int32) if pair is None else pair)
+        pair = like.astype(jnp.int32) if pair is None else pair
+        return boundary.Goal(like + centre, toward, pair)
 
     def scout(found):  # all over the stop, to where paraxial optics puts them
         radius = lens.semi_diameter[lens.stop]
@@ -339,10 +157,10 @@ def _stages(lens: Lens, system: System, spokes: _Spokes, used: Array) -> list:
 
     def middle(found):  # all to the point deepest inside, by the model of the best scout
         rays = of(found.rays, 0)
-        far = jnp.where(rays.good, _outside(lens, rays, rays.point), jnp.inf)
+        far = jnp.where(rays.good, boundary.outside(lens, rays, rays.point), jnp.inf)
         best = jnp.argmin(far, axis=-1)[:, None]
         rays = rays.at(best)
-        return rays.at(like[0].astype(jnp.int32)), goal(_middle(lens, rays, scouts))
+        return rays.at(like[0].astype(jnp.int32)), goal(boundary.middle(lens, rays, scouts))
 
     def ends(found):  # to the ends of even spokes
         rays = of(found.rays, 1)
@@ -350,13 +168,13 @@ def _stages(lens: Lens, system: System, spokes: _Spokes, used: Array) -> list:
 
     def corners(found):  # to the corners, in the first places
         even = of(found, 2)
-        place, pair = _changes(_ends(lens, even.rays, even.goal), spokes.symmetry == "disc")
+        place, pair = _changes(boundary.ends(lens, even.rays, even.goal), spokes.symmetry == "disc")
         more = (0, spokes.count - _CORNERS)
         place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
         rays = even.rays.at(jnp.round(place).astype(jnp.int32))
         angle = place * (spokes.turn / (spokes.count - 1)) - np.pi / 2
-        line = _ahead(lens, rays, goal(even.goal.centre, _unit(angle)))[0]
-        return _shifted(rays, line), goal(even.goal.centre, None, pair)
+        line = boundary.ahead(lens, rays, goal(even.goal.centre, _unit(angle)))[0]
+        return boundary.shifted(rays, line), goal(even.goal.centre, None, pair)
 
     def nodes(found):  # to the ends of the spokes of the rule
         rays, found = of(found.rays, 2), of(found, 3)
@@ -367,13 +185,13 @@ def _stages(lens: Lens, system: System, spokes: _Spokes, used: Array) -> list:
     return [scout, middle, ends, corners, nodes][: 3 if spokes.symmetry == "meridian" else 5]
 
 
-def _exists(lens: Lens, found: _Found) -> Array:
+def _exists(lens: Lens, found: boundary.Reached) -> Array:
     """Whether rays (W, B) lie in corners of the boundary, or near it."""
-    inside = _outside(lens, found.rays, found.rays.point) < 0.01
+    inside = boundary.outside(lens, found.rays, found.rays.point) < 0.01
     return found.settled & inside & (found.goal.pair[0] != found.goal.pair[1])
 
 
-def _find(lens: Lens, system: System, spokes: _Spokes, used: Array) -> _Found:
+def _find(lens: Lens, system: System, spokes: _Spokes, used: Array) -> boundary.Reached:
     """What the stages find, one after the other, along a first axis."""
     stages = _stages(lens, system, spokes, used)
 
@@ -382,15 +200,15 @@ def _find(lens: Lens, system: System, spokes: _Spokes, used: Array) -> _Found:
 
     point, rates, rows = several((2,)), several((2, 2)), lens.count + 1
     hits, moves, no = several((2, rows)), several((2, 2, rows)), several((), bool)
-    goal = _Goal(point, point, several((2,), jnp.int32))
-    rays = _Rays(point, point, hits, rates, moves, no)
+    goal = boundary.Goal(point, point, several((2,), jnp.int32))
+    rays = boundary.Rays(point, point, hits, rates, moves, no)
 
     def run(stage, found):
         start, goal = jax.lax.switch(stage, stages, found)
-        new = _search(lens, system, start, goal, jnp.array(_STEPS, jnp.int32)[stage])
+        new = boundary.search(lens, system, start, goal, jnp.array(_STEPS, jnp.int32)[stage])
         return jax.tree.map(lambda a, b: a.at[stage].set(b), found, new)
 
-    start = _Found(rays, goal, several((), jnp.int32), no)
+    start = boundary.Reached(rays, goal, several((), jnp.int32), no)
     return jax.lax.fori_loop(0, len(stages), run, start)
 
 
@@ -399,8 +217,8 @@ class _Plan(NamedTuple):
 
     centre: (2, W, 1). point: (2, W, K) in units of the stop's semi-diameter. hits: 2 arrays (R, W,
     K) on the rows of a system, mm. pair: (2, W, K), the apertures that end a ray, for a spoke both
-    the same. rates: (2, 2, W, K), see `_rates`. follows: (W, K), whether a ray follows the lens.
-    passes: (W, 1), whether light passes. used: (), how many spokes count.
+    the same. rates: (2, 2, W, K), see `boundary.rates`. follows: (W, K), whether a ray follows the
+    lens. passes: (W, 1), whether light passes. used: (), how many spokes count.
     """
 
     centre: Array
@@ -416,7 +234,7 @@ class _Plan(NamedTuple):
 def _plan(lens: Lens, scene: Scene, spokes: _Spokes, used: Array) -> _Plan:
     found = _find(lens, system_of(lens, scene), spokes, used)
     middle, nodes = (jax.tree.map(lambda a: a[k], found) for k in (1, -1))
-    passes = middle.settled & (_outside(lens, middle.rays, middle.rays.point) < 0)
+    passes = middle.settled & (boundary.outside(lens, middle.rays, middle.rays.point) < 0)
     rays, pair, follows = nodes.rays, jnp.stack([nodes.surface] * 2), nodes.settled
     if spokes.symmetry != "meridian":
         corners = jax.tree.map(lambda a: a[3, ..., :_CORNERS], found)
@@ -425,18 +243,20 @@ def _plan(lens: Lens, scene: Scene, spokes: _Spokes, used: Array) -> _Plan:
         follows = join(_exists(lens, corners), follows)
     follows = follows & passes[:, :1]
     hits = jnp.where(follows, rays.hits[:, np.array([*lens.live, lens.count])], 0)
-    centre, rates = middle.rays.point[..., :1], _rates(lens, rays, pair)
+    centre, rates = middle.rays.point[..., :1], boundary.rates(lens, rays, pair)
     return _Plan(centre, rays.point, tuple(hits), pair, rates, follows, passes[:, :1], used)
 
 
 def _followed(plan: _Plan, lens: Lens, scene: Scene, point: Array) -> Array:
-    """`_gaps` of the rays of a plan through points (2, W, K)."""
+    """`boundary.gaps` of the rays of a plan through points (2, W, K)."""
     system = system_of(lens, scene)
     target = tuple(lens.semi_diameter[lens.stop] * point)
     status = jnp.where(plan.follows, Status.OK, Status.MISSED).astype(jnp.int32)
     known = Found(plan.hits, arrival(plan.hits, system), status, jnp.int32(0))
     hits = reattach(known, system, target).hits
-    return _gaps(lens, jnp.stack(_whole(lens, system, hits, target, status)[0]), plan.pair)
+    return boundary.gaps(
+        lens, jnp.stack(on_all_surfaces(lens, system, hits, target, status)[0]), plan.pair
+    )
 
 
 @jax.custom_jvp
@@ -449,7 +269,7 @@ def _known_rates(lens: Lens, scene: Scene, point: Array, plan: _Plan) -> Array:
 def _known_rates_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     def rates(lens, scene, point):
         gaps = functools.partial(_followed, primals[3], lens, scene)
-        return jax.vmap(lambda unit: jax.jvp(gaps, (point,), (unit,))[1])(_units(point))
+        return jax.vmap(lambda unit: jax.jvp(gaps, (point,), (unit,))[1])(boundary.units(point))
 
     return jax.jvp(rates, primals[:3], tangents[:3])
 
@@ -470,7 +290,7 @@ def _follow_jvp(spokes: _Spokes, primals: Any, tangents: Any) -> tuple[Array, Ar
     _, change = jax.jvp(gaps, (lens, scene), tangents[:2])
     corners, ends = (slice(None, -spokes.count), slice(-spokes.count, None))
     # A corner stays on both apertures.
-    corner = -_moved(_inverse(rates[..., corners]), change[..., corners])
+    corner = -boundary.moved(boundary.inverse(rates[..., corners]), change[..., corners])
     corner = jnp.where(plan.follows[:, corners], corner, 0)
     # A spoke turns with the corners, and ends on its aperture.
     nodes = lambda corner: spokes.nodes(plan.used, plan.centre, corner, plan.follows[:, corners])[0]  # noqa: E731

@@ -61,7 +61,7 @@ def _rows_behind(lens: Lens) -> list[int]:
     return [sum(j < i for j in lens.live) for i in range(lens.count + 1)]
 
 
-def _whole(
+def on_all_surfaces(
     lens: Lens, system: System, hits: Vector, stop: Vector, status: Array
 ) -> tuple[Vector, Array]:
     """Hits on all surfaces from those on the rows of the system and on the stop, and status:
@@ -115,7 +115,7 @@ def _traced(
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = turn(rotation, found.arrival, back=True)
     path = fermat.optical_path(found.hits, system)
-    hits, status = _whole(lens, system, found.hits, target, status)
+    hits, status = on_all_surfaces(lens, system, found.hits, target, status)
     edge = lens.semi_diameter.at[lens.stop].set(jnp.inf)[:, None, None]
     outside = jnp.any(dot(hits, hits) > edge**2, axis=0) & (status == Status.OK)
     status = jnp.where(outside, Status.CLIPPED, status).astype(jnp.int32)
