@@ -6,7 +6,8 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from drt_jax.rays.solve import find_many, reattach
+from drt_jax.rays.find import find_many
+from drt_jax.rays.solve import reattach
 from drt_jax.rays.system import system_of
 
 
@@ -21,7 +22,7 @@ def aims(lens, scene, points):
 
 @jax.jit
 def search(lens, scene, points):
-    """The rays of a bundle, see `solve.Found`."""
+    """The rays of a bundle, see `find.Found`."""
     return find_many(*aims(lens, scene, points))
 
 

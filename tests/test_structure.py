@@ -39,7 +39,7 @@ ALLOWED_ALL = {"show.layout"}
 HOUSE = 9_760
 # Outside packages that belong to some modules or floors alone.
 ONLY = {
-    "optimistix": {"rays.aim", "rays.solve", "image.field"},
+    "optimistix": {"rays.aim", "rays.find", "image.field"},
     "matplotlib": {"show"},
     "skimage": {"learn.data", "learn.train"},
     "yaml": {"files", "lens.glass", "runs.config"},

@@ -20,7 +20,8 @@ from ..lens.scene import Scene, scene_of
 from ..numerics import concrete, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
-from ..rays.solve import Found, Solver, reattach, solve, solve_aimed
+from ..rays.find import Found
+from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
 from .moments import FocusMoments, Moments, moments, weigh

@@ -22,7 +22,8 @@ from ..lens.scene import Scene
 from ..numerics import safe_divide
 from ..rays.aim import paraxial_launch
 from ..rays.fermat import arrival
-from ..rays.solve import Found, reattach
+from ..rays.find import Found
+from ..rays.solve import reattach
 from ..rays.status import Status
 from ..rays.system import System, Vector, dot, system_of
 from ..rays.trace import on_all_surfaces

@@ -7,7 +7,7 @@ import pytest
 from experiments.snell import trace_snell
 
 from drt_jax import Status, load_lens, pupil, scene_of
-from drt_jax.rays import solve
+from drt_jax.rays import find, solve
 from drt_jax.rays.bundle import tiles_of
 from drt_jax.rays.trace import trace_bundle
 
@@ -44,7 +44,7 @@ def parts_of(tree):
 
 def found_in_parts(found):
     parts = zip(*map(parts_of, (found.hits, found.arrival, found.status)))
-    return [solve.Found(*some, found.steps) for some in parts]
+    return [find.Found(*some, found.steps) for some in parts]
 
 
 def joined(parts):
@@ -166,7 +166,7 @@ def test_memory_a_ray_keeps_for_the_backward_pass(lens, solver, monkeypatch):
     def at_once(system, target):
         zero, rows = jnp.zeros_like(target[0]), len(system.forms)
         hits = (jnp.broadcast_to(zero, (rows, *zero.shape)),) * 2
-        return solve.Found(hits, (zero,) * 3, zero.astype(jnp.int32), jnp.int32(0))
+        return find.Found(hits, (zero,) * 3, zero.astype(jnp.int32), jnp.int32(0))
 
     monkeypatch.setattr(solve, "find_many", at_once)
 

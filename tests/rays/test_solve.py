@@ -11,7 +11,7 @@ import optimistix as optx
 import pytest
 
 from drt_jax import Status, scene_of
-from drt_jax.rays import aim, fermat, linear, solve
+from drt_jax.rays import aim, fermat, find, linear, solve
 
 from ..conftest import assert_close
 from ..known import aims, known, search
@@ -347,7 +347,7 @@ def polished(lens, scene, points, hits, active):
         return (linear.shortfall(path, system, target), path), None
 
     eps = float(jnp.finfo(hits[0].dtype).eps)
-    newton = solve.BlockNewton(rtol=2 * eps, atol=2 * eps)
+    newton = find.BlockNewton(rtol=2 * eps, atol=2 * eps)
     args = system, target, active
     found = optx.root_find(function, newton, hits, args, has_aux=True, max_steps=16, throw=False)
     successful = found.result == optx.RESULTS.successful

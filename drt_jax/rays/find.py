@@ -1,0 +1,276 @@
+"""Finding rays: a root of the Fermat equations and the label for every point of the stop.
+
+Rays are aimed, traced, and where that does not end on a path to rounding, polished; those that
+are missing are sought in a fan. Nothing here is differentiated: see `solve`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax import Array
+
+from . import fermat, linear
+from .aim import STARTS, Fan, aim, beam_size, no_fan, paraxial_launch, starts_of, trace_fan
+from .bundle import in_tiles, polynomial_launch, tiles_of
+from .snell import apart, shoot
+from .status import Status
+from .system import System, Vector, dot
+
+_MAX_STEPS = 16
+
+
+class Found(NamedTuple):
+    """Rays of a bundle.
+
+    hits: D arrays (R, W, Q) in mm on the live surfaces and the sensor; 0 for failed rays.
+    arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along the axes of the lens; void for
+        failed rays.
+    status: (W, Q), int32, see `Status`.
+    steps: (), int32, steps of Newton's method that the bundle took, aiming included.
+    """
+
+    hits: Vector
+    arrival: Vector
+    status: Array
+    steps: Array
+
+
+class _State(NamedTuple):
+    """solved: (W, Q). change: (), largest correction of the last step, mm. step: ()."""
+
+    solved: Array
+    change: Array
+    step: Array
+
+
+class BlockNewton(optx.AbstractRootFinder):
+    """Newton's method for a bundle of Fermat paths, with the march of `linear` as its solve.
+
+    Its arguments are (system, target, which rays are to move (W, Q)). These step together; one
+    whose correction is not finite stays where it is, so that it cannot spoil the others. Ends
+    when all of them are stationary to rounding (see `fermat.stationary`), or when none moves by
+    more than `atol` + `rtol` of its hits any more: then RESULTS.nonlinear_divergence, and the state
+    tells which are solved.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
+        """The state before the first step; no step is taken if no ray is to move."""
+        return _State(~args[2], jnp.full((), jnp.inf, y[0].dtype), jnp.zeros((), jnp.int32))
+
+    def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
+        """One Newton step of every ray that is not stationary yet."""
+        system, target, _ = args
+        (push, path), aux = fn(y, args)
+        solved = state.solved | fermat.stationary(path, system, target)
+        change, _ = linear.solve(path, system, ~solved, push)
+        finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
+        moves = finite & ~solved
+        change = tuple(jnp.where(moves, c, 0) for c in change)
+        # Each relative to its own hit: a ray that runs off makes no other's correction small.
+        scale = self.rtol / self.atol
+        size = self.norm(tuple(c / (1 + scale * abs(a)) for a, c in zip(y, change, strict=True)))
+        y = tuple(a - c for a, c in zip(y, change, strict=True))
+        return y, _State(solved, size, state.step + 1), aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
+        """Whether all rays are stationary, or none moves any more."""
+        done, still = jnp.all(state.solved), state.change <= self.atol
+        results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        return done | still, optx.RESULTS.where(still & ~done, *results)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Nothing to add."""
+        return y, aux, {}
+
+
+def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tuple:
+    """Hits of the `active` rays (W, Q) made stationary; which rays are solved, and the steps."""
+
+    def equations(hits, args):
+        system, target, _ = args
+        path = fermat.geometry(hits, system)
+        return (linear.shortfall(path, system, target), path), None
+
+    eps = float(jnp.finfo(hits[0].dtype).eps)
+    solution: optx.Solution = optx.root_find(
+        equations,
+        BlockNewton(rtol=2 * eps, atol=2 * eps),
+        hits,
+        args=(system, target, active),
+        has_aux=True,
+        max_steps=_MAX_STEPS,
+        throw=False,
+    )
+    all_solved = solution.result == optx.RESULTS.successful
+    return solution.value, all_solved | solution.state.solved, solution.stats["num_steps"]
+
+
+def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
+    """The rays through stop points `target`, D arrays (W, Q) in mm; not differentiable.
+
+    launch: D arrays (W, Q) in mm, where to start instead of at the paraxial entrance pupil.
+    Rays that are not found at once are sought again in a fan; those that miss their stop points by
+    more than rounding are polished on the Fermat system.
+    """
+    sizes = beam_size(system, target)
+    launch = paraxial_launch(system, target, sizes[1]) if launch is None else launch
+    search = _search(system, target, launch, sizes)
+    good = search.status == Status.OK
+    hits, crossing = apart(system, search.hits)
+    hits = tuple(jnp.where(good, a, 0) for a in hits)
+    rough = good & ~fermat.met(crossing, target, hits, system)
+    hits, solved, steps = _polish(system, target, hits, rough)
+    status = jnp.where(good & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
+    hits = tuple(jnp.where(status == Status.OK, a, 0) for a in hits)
+    steps = (search.steps + steps).astype(jnp.int32)
+    return Found(hits, fermat.arrival(hits, system), status, steps)
+
+
+def find_aimed(system: System, target: Vector) -> Found:
+    """The rays that aiming alone brings through their stop points to rounding; all others are
+    UNCONVERGED, whether there is such a ray or not. A small program, where that is all it takes."""
+    sizes = beam_size(system, target)
+    launch = paraxial_launch(system, target, sizes[1])
+    traced, _ = _aimed(system, target, launch, sizes, system.rows.rotation is None)
+    hits, crossing = apart(system, traced.hits)
+    good = (traced.status == Status.OK) & fermat.met(crossing, target, hits, system)
+    hits = tuple(jnp.where(good, a, 0) for a in hits)
+    status = jnp.where(good, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
+    return Found(hits, fermat.arrival(hits, system), status, traced.steps)
+
+
+class _Search(NamedTuple):
+    """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). left: (W, Q), rays that failed and
+    still are to be sought in the fan. fan: as far as it is traced. turn, steps: ()."""
+
+    hits: Vector
+    status: Array
+    left: Array
+    fan: Fan
+    turn: Array
+    steps: Array
+
+
+def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Search:
+    """First all rays from their first launch; then those that failed, a few a turn, each from
+    several rays of a fan. One loop with as many places as there are rays, so that under `vmap` too
+    the fan costs nothing while no ray is missing."""
+    waves, rays = target[0].shape
+    starts = min(STARTS, rays)
+    few, rounds = rays // starts, -(-STARTS // starts)
+    wide = jnp.maximum(2 * sizes[1], 1.6 * jnp.sqrt(jnp.max(dot(launch, launch))))
+    ray = jnp.arange(rays, dtype=jnp.int32)
+
+    def places(a):  # (W, few, starts or 1) -> (W, Q)
+        a = jnp.broadcast_to(a, (waves, few, starts)).reshape(waves, -1)
+        return jnp.pad(a, ((0, 0), (0, rays - few * starts)), mode="edge")
+
+    def turn(state):
+        first, tried = state.turn == 0, jnp.maximum(state.turn - 1, 0) % rounds
+        fan, _ = jax.lax.while_loop(
+            lambda s: s[1],
+            lambda s: (trace_fan(system, s[0], wide), jnp.array(False)),
+            (state.fan, state.turn == 1),
+        )
+        # The first few that are left have `starts` places each.
+        rank = jnp.cumsum(state.left, axis=-1, dtype=jnp.int32) - 1
+        mine = state.left & (rank < few)
+        rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
+        wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
+        begin = starts_of(fan, wanted, tried * starts + jnp.arange(starts, dtype=jnp.int32))
+        own = tuple(
+            jnp.where(first, a, places(b[..., None])) for a, b in zip(target, wanted, strict=True)
+        )
+        begin = tuple(jnp.where(first, a, places(b)) for a, b in zip(launch, begin, strict=True))
+        reach = jnp.where(first, sizes[1], sizes[1] / 8)
+        upright = first & (system.rows.rotation is None)
+        new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
+
+        worth = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
+        worth = worth[:, : few * starts].reshape(waves, few, starts)
+        best = jnp.argmax(worth, axis=-1).astype(jnp.int32)
+        slot = jnp.clip(rank, 0, few - 1)
+        place = slot * starts + jnp.take_along_axis(best, slot, axis=-1)
+        found = jnp.take_along_axis(jnp.any(worth > 0, axis=-1), slot, axis=-1) & mine
+        place, found = jnp.where(first, ray, place), first | found
+        status = jnp.take_along_axis(new.status, place, axis=-1)
+        status = jnp.where(found, status, state.status)
+        taken = (jnp.take_along_axis(h, place[None], axis=-1) for h in new.hits)
+        hits = tuple(jnp.where(found, a, b) for a, b in zip(taken, state.hits, strict=True))
+        left = state.left & ~found & ~(mine & (tried == rounds - 1))
+        left = jnp.where(first, status != Status.OK, left)
+        return _Search(hits, status, left, fan, state.turn + 1, state.steps + new.steps)
+
+    count = len(system.forms) + (system.stop is not None)
+    zero = jnp.zeros((count, waves, rays), target[0].dtype)
+    status = jnp.zeros((waves, rays), jnp.int32)
+    none = jnp.int32(0)
+    start = _Search((zero,) * len(target), status, status > 0, no_fan(system, waves), none, none)
+    return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left), turn, start)
+
+
+class _Traced(NamedTuple):
+    """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). steps: ()."""
+
+    hits: Vector
+    status: Array
+    steps: Array
+
+
+def _aimed(
+    system: System, target: Vector, launch: Vector, sizes: tuple, upright: Array | bool
+) -> tuple[_Traced, Array]:
+    """Rays aimed, see `aim`, and traced; and whether they are folded."""
+    aimed = aim(system, target, launch, sizes, upright)
+    hits, status = _verdict(system, aimed.launch, aimed.status)
+    return _Traced(hits, status, aimed.steps), aimed.folded
+
+
+def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Array]:
+    """Hits of rays, and their status where that of aiming them is OK. A ray that turns by more
+    than 1e-6 (float32: 2e-2) when its hits are rounded determines no path."""
+    trace = shoot(system, launch)
+    eps = float(jnp.finfo(launch[0].dtype).eps)
+    drowned = (trace.fate == Status.OK) & (trace.shake > 4 / eps**0.5)
+    fate = jnp.where(drowned, jnp.int32(Status.UNCONVERGED), trace.fate)
+    return trace.hits, jnp.where(status == Status.OK, fate, status)
+
+
+def find_many(system: System, target: Vector) -> Found:
+    """`find`; a large bundle in tiles, its rays launched by polynomials and searched for only
+    where these miss. A stop point that is not finite is MISSED and changes no other ray."""
+    known = jnp.all(jnp.isfinite(jnp.stack(target)), axis=0)
+    found = _find_many(system, tuple(jnp.where(known, a, 0) for a in target))
+    return found._replace(
+        hits=tuple(jnp.where(known, a, 0) for a in found.hits),
+        status=jnp.where(known, found.status, jnp.int32(Status.MISSED)),
+    )
+
+
+def _find_many(system: System, target: Vector) -> Found:
+    if len(target) == 1 or tiles_of(target[0].shape[1], target[0].shape[0])[0] == 1:
+        return find(system, target)
+    launch_of = polynomial_launch(system, target)
+
+    def tile(target):
+        launch = launch_of(target)
+        hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
+        hits, crossing = apart(system, hits)
+        solved = fermat.met(crossing, target, hits, system) & (status == Status.OK)
+        start = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0)), ~jnp.all(solved)
+
+        def turn(state):
+            return find(system, target, launch), jnp.array(False)
+
+        found, _ = jax.lax.while_loop(lambda state: state[1], turn, start)
+        return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
+
+    found = in_tiles(tile, target)
+    return found._replace(steps=jnp.max(found.steps))
