@@ -7,7 +7,6 @@ import pathlib
 import sys
 import time
 import traceback
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,26 +20,17 @@ from . import _common
 # Errors raised in these folders are about the input; others are faults to be shown whole.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
 
-# run(config, run) -> results; report(results, folder of figures) -> text.
-Measure = Callable[[Any, Run], dict[str, Any]]
-Report = Callable[[dict[str, Any], pathlib.Path], str]
 
-
-def main(
-    name: str,
-    kind: type,
-    columns: tuple[str, ...],
-    run: Measure,
-    report: Report,
-    argv: list[str] | None = None,
-) -> None:
+def main(experiment: Any, argv: list[str] | None = None) -> None:
     """Run an experiment, or with --report only draw and print the results of a run again.
 
-    name: of the experiment. kind: the dataclass of its settings. columns: of metrics.csv. run:
-    measures, and returns results for `_common.write_results`. report: draws figures from these
-    results into a folder, and returns what is printed. argv: of the command line.
+    experiment: a module with `Config`, the dataclass of its settings; `COLUMNS` of metrics.csv;
+        `run(config, run)`, which measures and returns results for `_common.write_results`;
+        `tables(results)`, printed; and `draw(results, folder)` of figures.
+    argv: of the command line.
     """
-    options = _parser(name, kind, sys.modules[run.__module__].__doc__ or "").parse_args(argv)
+    name = experiment.__spec__.name.split(".")[-1]
+    options = _parser(name, experiment).parse_args(argv)
     # The caller, not the library, chooses the precision: optics in float64.
     jax.config.update("jax_enable_x64", True)
     _keep_programs()
@@ -49,34 +39,40 @@ def main(
     try:
         folder = _folder(name, options)
         if not options.report:
-            config = _config(name, kind, options, folder)
-            opened = Run(folder, config, columns, options.resume)
+            config = _config(name, experiment.Config, options, folder)
+            run = Run(folder, config, experiment.COLUMNS, options.resume)
             print(f"{name}: run folder {folder}")
-            _common.write_results(opened, run(config, opened))
-        _show(folder, report)
+            _common.write_results(run, experiment.run(config, run))
+        results, figures = _common.read_results(folder), folder / "figures"
+        figures.mkdir(exist_ok=True)
+        print("\n\n".join(experiment.tables(results).values()))
+        experiment.draw(results, figures)
+        print(f"results in {folder / 'results.json'}, figures in {figures}")
+        print(f"done in {time.perf_counter() - started:.0f} s")
+        return
     except KeyboardInterrupt:
-        where = f"; go on with --resume --out {folder}" if folder else ""
-        raise SystemExit(_say(f"stopped{where}", 130)) from None
+        code, message = 130, f"stopped; go on with --resume --out {folder}" if folder else "stopped"
     except OSError as error:
-        what = f"{error.filename or folder}: {error.strerror or error}"
         remedy = "mend this and start again"
         if folder and (folder / "metrics.csv").exists():
-            remedy = (
-                f"the last checkpoint is whole: mend this, then go on with --resume --out {folder}"
-            )
-        raise SystemExit(_say(f"{what}; {remedy}", 1)) from error
+            go_on = f"mend this, then go on with --resume --out {folder}"
+            remedy = f"the last checkpoint is whole: {go_on}"
+        what = f"{error.filename or folder}: {error.strerror or error}"
+        code, message = 1, f"error: {what}; {remedy}"
     except ValueError as error:
-        if not _ours(error):
+        raised = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+        if not any(raised.is_relative_to(ours) for ours in _OURS):
             raise
-        raise SystemExit(_say(str(error), 2)) from None
-    print(f"done in {time.perf_counter() - started:.0f} s")
+        code, message = 2, f"error: {error}"
+    print(message, file=sys.stderr)
+    raise SystemExit(code)
 
 
-def _parser(name: str, kind: type, description: str) -> argparse.ArgumentParser:
+def _parser(name: str, experiment: Any) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f"python -m experiments.{name}",
-        description=description.strip(),
-        epilog="settings:\n  " + "\n  ".join(configs.describe(kind)),
+        description=experiment.__doc__.strip(),
+        epilog="settings:\n  " + "\n  ".join(configs.describe(experiment.Config)),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
@@ -114,26 +110,9 @@ def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:
     return folders[-1]
 
 
-def _show(folder: pathlib.Path, report: Report) -> None:
-    results, figures = _common.read_results(folder), folder / "figures"
-    figures.mkdir(exist_ok=True)
-    print(report(results, figures))
-    print(f"results in {folder / 'results.json'}, figures in {figures}")
-
-
 def _keep_programs() -> None:
     """Keep compiled programs for the next run, in JAX_COMPILATION_CACHE_DIR or the user's cache."""
     if not jax.config.jax_compilation_cache_dir:
         home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
         jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "drt_jax"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-
-
-def _say(message: str, code: int) -> int:
-    print(f"error: {message}" if code != 130 else message, file=sys.stderr)
-    return code
-
-
-def _ours(error: ValueError) -> bool:
-    raised = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)
-    return any(raised.is_relative_to(folder) for folder in _OURS)

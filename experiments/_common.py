@@ -9,7 +9,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from tqdm import tqdm
 
+from drt_jax import show
 from drt_jax.runs.config import ConfigError
 from drt_jax.runs.folder import Run
 
@@ -30,12 +32,6 @@ def require_list(name: str, values: tuple[float, ...], low: float = 0.0) -> None
     require(len(set(values)) == len(values), f"{name}: an item stands twice")
     for value in values:
         require(low < value < math.inf, f"{name}: expected numbers above {low:g}, got {value!r}")
-
-
-def require_noise(name: str, *values: float) -> None:
-    """ConfigError unless all values are usable as standard deviations."""
-    for value in values:
-        require(0 <= value < math.inf, f"{name}: expected 0 or more, got {value!r}")
 
 
 def require_known(name: str, values: tuple[str, ...], known: Iterable[str]) -> None:
@@ -63,13 +59,16 @@ def read_results(folder: pathlib.Path) -> dict[str, Any]:
     return results
 
 
-def remembered(run: Run, job: str, measure: Callable[[], Any]) -> Any:
-    """What `measure` returns, written as JSON; from the checkpoint of the job if there is one."""
-    done, text = run.load(job, np.zeros(0, np.uint8), (job,))
-    if done:
-        return json.loads(np.asarray(text).tobytes())
-    found = measure()
-    run.save(job, 1, np.frombuffer(json.dumps(found).encode(), np.uint8))
+def measured(run: Run, unit: str, jobs: dict[str, Callable[[], Any]]) -> list[Any]:
+    """What each job returns, as JSON reads it back; from its checkpoint if there is one."""
+    found = []
+    for job in (bar := tqdm(jobs, unit=unit, dynamic_ncols=True)):
+        bar.set_description(job)
+        done, text = run.load(job, np.zeros(0, np.uint8), (job,))
+        if not done:
+            text = np.frombuffer(json.dumps(jobs[job]()).encode(), np.uint8)
+            run.save(job, 1, text)
+        found.append(json.loads(np.asarray(text).tobytes()))
     return found
 
 
@@ -96,13 +95,22 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join(lines)
 
 
+def panels(count: int, width: float, height: float) -> tuple[Any, Any]:
+    """A figure of so many panels in two columns, and their axes."""
+    columns = min(2, count)
+    figure, axes = show.new(-(-count // columns), columns, width, height)
+    for spare in np.ravel(axes)[count:]:
+        spare.set_visible(False)
+    return figure, np.ravel(axes)
+
+
 def duration(seconds: float | None) -> str:
     """A time in the unit that suits it."""
     if seconds is None:
         return ""
-    if seconds >= 1:
-        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
-    return f"{1e3 * seconds:.3g} ms"
+    if seconds < 1:
+        return f"{1e3 * seconds:.3g} ms"
+    return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
 
 
 def medians(calls: Sequence[Callable[[], Any]], repeats: int) -> list[float]:

@@ -1,6 +1,7 @@
 """What the paper's experiments share: settings, trained jobs, tables and pictures of them."""
 
 import dataclasses
+import functools
 import math
 import pathlib
 import sys
@@ -13,11 +14,12 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import show
+from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
 from drt_jax.learn.data import DataConfig, batches, load_patches
 from drt_jax.runs.folder import Run, deferred_interrupt
 
-from ._common import require, require_list, require_noise
+from ._common import require, require_list
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,9 +40,8 @@ class Scene:
 
     def blur(self, near: float, far: float) -> Callable:
         """The blur by the sensor's position and the distance, from `near` to `far` mm."""
-        lens, span = drt_jax.load_lens(self.lens), (near, far)
-        waves, tolerance = self.wavelengths_um, self.tolerance
-        return drt_jax.moments_model(lens, ("sensor",), 0.0, span, waves, tolerance)[1]
+        scene = 0.0, (near, far), self.wavelengths_um, self.tolerance
+        return drt_jax.moments_model(drt_jax.load_lens(self.lens), ("sensor",), *scene)[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +71,8 @@ class Training:
     @property
     def rates(self) -> dict[str, float]:
         """Learning rates of the groups of parameters."""
-        return {"optics": self.optics_rate}
+        rates = {name: rate for name, rate in vars(self).items() if name.endswith("_rate")}
+        return {name.removesuffix("_rate"): rate for name, rate in rates.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,11 +80,6 @@ class JointTraining(Training):
     """network_rate: Adam's learning rate of the network; the rest as in `Training`."""
 
     network_rate: float = 1e-3
-
-    @property
-    def rates(self) -> dict[str, float]:
-        """Learning rates of the groups of parameters."""
-        return {"optics": self.optics_rate, "network": self.network_rate}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +113,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         require_list("starts_mm", self.starts_mm)
-        require_noise("noise", self.noise)
+        require(0 <= self.noise < math.inf, f"noise: expected 0 or more, got {self.noise!r}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -134,15 +131,17 @@ class JointSettings(Settings):
 class Jobs:
     """The training jobs of a run.
 
-    test: patches to measure on. weights, restore, parameters: of the network, the first at its
-    start, if the settings have one.
+    scenes, test: patches to train with, and to measure on.
+    restore, parameters: the network if the settings have one, and the number of its weights.
     """
 
     def __init__(self, run: Run, config: Settings, near: float, far: float) -> None:
         """near, far: of the objects in training, mm."""
         self._run, self._config, self._depths = run, config, (near, far)
+        self._network: dict[str, Any] = {}
+        self.restore = None
         side = config.train.patch + config.camera.kernel - 1
-        reading = lambda work: tqdm(work, desc="reading images", leave=False)  # noqa: E731
+        reading = functools.partial(tqdm, desc="reading images", leave=False)
         patches = load_patches(config.data, side, config.seed, reading)
         for line in patches.skipped:
             print(f"skipped {line}", file=sys.stderr)
@@ -152,51 +151,58 @@ class Jobs:
         if isinstance(config, JointSettings):
             self.test = thinned(patches.test, config.test_patches)
             init, self.restore = drt_jax.red_net(**dataclasses.asdict(config.network))
-            self.weights = init(jax.random.key(config.seed))
-            self.parameters = network.count_parameters(self.weights)
+            self._network["network"] = weights = init(jax.random.key(config.seed))
+            self.parameters = network.count_parameters(weights)
             print(f"RED-Net with {self.parameters} parameters")
 
-    def step(self, imager: Callable, several: bool = False) -> tuple[Callable, Callable]:
-        """(init, step) for an imager, of several jobs at once or of one."""
-        rates, seed = self._config.train.rates, self._config.seed
-        return train.make_step(imager, rates, self._depths, seed, vectorised=several)
+    def steps(
+        self, blur: Callable, several: bool = False, convolve: Callable = convolve
+    ) -> tuple[Callable, tuple[Callable, Callable]]:
+        """The imager through a blur, and (init, step) for it, of several jobs at once or of one."""
+        config = self._config
+        imager = train.make_imager(blur, self.restore, config.camera, convolve)
+        rates = config.train.rates
+        step = train.make_step(imager, rates, self._depths, config.seed, vectorised=several)
+        return jax.jit(imager), step
 
     def train(
         self,
         job: str,
-        functions: tuple[Callable, Callable],
-        parameters: dict[str, Any],
-        noise: float | None = None,
+        steps: tuple[Callable, Callable],
+        optics: dict[str, Any],
+        noise: float,
         labels: tuple[str, ...] = (),
     ) -> dict[str, Any]:
         """Train one job, or several at once with a label each, from its last checkpoint on.
 
-        functions: of `step`. parameters: to start from. noise: if not that of the settings.
+        steps: of `steps`. optics: its parameters at the start.
         Returns the trained parameters. KeyboardInterrupt, after a checkpoint, if the user asked to
         stop.
         """
-        run, setting = self._run, self._config.train
-        noise = self._config.noise if noise is None else noise
-        init, step = functions
-        first, state = run.load(job, init(parameters), labels or (job,))
+        run, setting, labels = self._run, self._config.train, labels or (job,)
+        init, step = steps
+        first, state = run.load(job, init({"optics": optics} | self._network), labels)
         saved, total = first, setting.batches
         bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
 
         def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
             nonlocal saved
             done = start + len(metrics["loss"])
-            for k, label in enumerate(labels or (job,)):
-                run.log(label, start, {n: v[:, k] if labels else v for n, v in metrics.items()})
+            for k, label in enumerate(labels):
+                run.log(label, start, {n: v.reshape(len(v), -1)[:, k] for n, v in metrics.items()})
             bar.update(len(metrics["loss"]))
             bar.set_postfix_str(f"loss={np.array2string(metrics['loss'][-1], precision=3)}")
             if asked() or done == total or done - saved >= setting.checkpoint_every:
                 run.save(job, done, state)
                 saved = done
 
+        def stopping() -> None:
+            print("\nstopping after this step; once more stops at once", file=sys.stderr)
+
         stream = batches(self.scenes, setting.batch, self._config.seed, first)
         # Each report waits for the device: rarely where a step takes milliseconds.
         every = 10 if jax.default_backend() == "cpu" else 113
-        with bar, deferred_interrupt(_stopping) as asked:
+        with bar, deferred_interrupt(stopping) as asked:
             state = train.fit(step, state, stream, noise, first, total, every, report, asked)
             if asked():
                 raise KeyboardInterrupt
@@ -217,10 +223,6 @@ class Jobs:
             "seconds": self._run.seconds,
             **{column: np.stack([trace[column] for trace in traces]) for column in columns},
         }
-
-
-def _stopping() -> None:
-    print("\nstopping after this step; once more stops at once", file=sys.stderr)
 
 
 def start_label(start: float) -> str:
@@ -260,10 +262,12 @@ def draw_lens(name: str, distance: float, path: pathlib.Path) -> None:
 _IMAGES = ("truth", "sensor", "restored")
 
 
-def images(imager: Callable, parameters: Any, scenes: np.ndarray, *rest: Any) -> dict:
+def images(
+    imager: Callable, parameters: Any, scenes: np.ndarray, distance: float, noise: float, seed: int
+) -> dict[str, np.ndarray]:
     """Truth, sensor and restored images of patches, for `draw_patches`."""
-    found = zip(_IMAGES, imager(parameters, scenes, *rest))
-    return {name: np.asarray(image, np.float16) for name, image in found}
+    found = imager(parameters, scenes, distance, np.float32(noise), jax.random.key(seed))
+    return {name: np.asarray(image, np.float16) for name, image in zip(_IMAGES, found)}
 
 
 def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path) -> None:

@@ -9,6 +9,7 @@ and 7, and writes table 2.
 import dataclasses
 import functools
 import pathlib
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,8 @@ from drt_jax.numerics import safe_sqrt
 from drt_jax.runs.folder import Run
 
 from . import _command, _common, _training
-from ._training import Scene
+
+COLUMNS = ("loss", "sensor_mm", "sigma_um", "depth_mm")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,22 +41,18 @@ class Config(_training.JointSettings):
     depth_m: tuple[float, ...] = (10.0, 50.0)
     table_depth_m: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0)
     patch_depth_m: tuple[float, ...] = (10.0, 20.0, 30.0, 40.0, 50.0)
-    scene: Scene = Scene(lens="double_gauss_addon")
+    scene: _training.Scene = _training.Scene(lens="double_gauss_addon")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("depth_m", "table_depth_m", "patch_depth_m"):
             _common.require_list(name, getattr(self, name))
-        _common.require(
-            len(self.depth_m) == 2 and self.depth_m[0] < self.depth_m[1],
-            "depth_m: expected the nearest and the farthest distance in m",
-        )
-        _common.require(
-            any(map(self.trained_at, self.table_depth_m)), "table_depth_m: none lies within depth_m"
-        )
-        _common.require(
-            self.fixed_mm in self.starts_mm, f"fixed_mm: {self.fixed_mm} must be one of starts_mm"
-        )
+        ends = len(self.depth_m) == 2 and self.depth_m[0] < self.depth_m[1]
+        _common.require(ends, "depth_m: expected the nearest and the farthest distance in m")
+        some = any(map(self.trained_at, self.table_depth_m))
+        _common.require(some, "table_depth_m: none lies within depth_m")
+        start = self.fixed_mm in self.starts_mm
+        _common.require(start, f"fixed_mm: {self.fixed_mm} must be one of starts_mm")
 
     def trained_at(self, depth: float) -> bool:
         """Whether a depth in m lies within those of training."""
@@ -67,22 +65,20 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     blur = config.scene.blur(1e3 * min(depths), 1e3 * max(depths))
     near, far = (1e3 * depth for depth in config.depth_m)
     jobs = _training.Jobs(run, config, near, far)
-    imager = train.make_imager(blur, jobs.restore, config.camera)
-    functions, joint = jobs.step(imager), {}
+    imager, steps = jobs.steps(blur)
+    joint = {}
     for start in config.starts_mm:
-        parameters = {"optics": {"sensor": jnp.asarray(start)}, "network": jobs.weights}
-        joint[start] = jobs.train(_training.start_label(start), functions, parameters)
+        optics = {"sensor": jnp.asarray(start)}
+        joint[start] = jobs.train(_training.start_label(start), steps, optics, config.noise)
     place = {"sensor": jnp.asarray(config.fixed_mm)}
-    still = train.make_imager(lambda _, depth: blur(place, depth), jobs.restore, config.camera)
-    parameters = {"optics": {}, "network": jobs.weights}
-    fixed = jobs.train(f"fixed {config.fixed_mm}", jobs.step(still), parameters)
+    still, steps = jobs.steps(lambda _, depth: blur(place, depth))
+    fixed = jobs.train(f"fixed {config.fixed_mm}", steps, {}, config.noise)
     best = joint[config.fixed_mm]
-    models = {"fixed": (jax.jit(still), fixed), "joint": (jax.jit(imager), best)}
     results = jobs.results("sensor_mm")
     final = results["final_mm"][config.starts_mm.index(config.fixed_mm)]
     return {
         **results,
-        **tested(config, models, jobs.test),
+        **tested(config, {"fixed": (still, fixed), "joint": (imager, best)}, jobs.test),
         **blur_over_depth(blur, (config.fixed_mm, final), near, far),
         "joint_sensor_mm": float(best["optics"]["sensor"]),
         "depth_m": list(config.depth_m),
@@ -93,16 +89,15 @@ def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[s
     """Errors of both models over depth, and patches of the joint one."""
     noise, rows, parts = config.noise, [], []
     for depth in config.table_depth_m:
-        errors = {
-            name: train.evaluate(*model, test, 1e3 * depth, noise, config.seed)
-            for name, model in models.items()
-        }
-        rows.append({"depth_m": depth, **errors})
+        row: dict[str, Any] = {"depth_m": depth}
+        for name, model in models.items():
+            row[name] = train.evaluate(*model, test, 1e3 * depth, noise, config.seed)
+        rows.append(row)
     inside = [row for row in rows if config.trained_at(row["depth_m"])]
     chosen = _training.textured(test, len(config.patch_depth_m))
     for k, depth in enumerate(config.patch_depth_m):
-        some, rest = chosen[k % len(chosen)][None], (np.float32(noise), jax.random.key(k))
-        parts.append(_training.images(*models["joint"], some, 1e3 * depth, *rest))
+        some = chosen[k % len(chosen)][None]
+        parts.append(_training.images(*models["joint"], some, 1e3 * depth, noise, k))
     return {
         **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
         "patch_depth_m": list(config.patch_depth_m),
@@ -117,26 +112,19 @@ def blur_over_depth(blur: Callable, sensors: tuple, near: float, far: float) -> 
     """Blur in um along y of each colour, by depth in m, at sensor positions in mm."""
     grid = np.linspace(near, far, 121)
     sigma = jax.vmap(lambda d, s: safe_sqrt(blur({"sensor": s}, d)[1][:, 0]), in_axes=(0, None))
-    curves = [1e3 * np.asarray(sigma(jnp.asarray(grid), sensor)) for sensor in sensors]
-    return {
-        "blur_sensor_mm": list(sensors),
-        "blur_depth_m": grid / 1e3,
-        "blur_um": np.stack(curves),
-    }
+    curves = np.stack([1e3 * np.asarray(sigma(jnp.asarray(grid), sensor)) for sensor in sensors])
+    return {"blur_sensor_mm": list(sensors), "blur_depth_m": grid / 1e3, "blur_um": curves}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Beside the paper, and table 2."""
     mean, rows = results["mean_mae"], results["table"]
-    better = [r["depth_m"] for r in rows if r["fixed"]["mae"] < r["joint"]["mae"]]
+    better = [f"{r['depth_m']:g}" for r in rows if r["fixed"]["mae"] < r["joint"]["mae"]]
+    means = f"mean MAE over training depths {mean['joint']:.4f} against {mean['fixed']:.4f}"
+    against = f"{means}; fixed better at {', '.join(better) or 'no'} m"
     beside = [
         ("plane that all starts reach", "145.29 mm", _training.reached(results)),
-        (
-            "joint against fixed sensor",
-            "joint better, but for 15 to 20 m",
-            f"mean MAE over training depths {mean['joint']:.4f} against {mean['fixed']:.4f}; "
-            f"fixed better at {', '.join(f'{depth:g}' for depth in better) or 'no'} m",
-        ),
+        ("joint against fixed sensor", "joint better, but for 15 to 20 m", against),
     ]
     errors = [(m.upper() + " " + n, n, m) for n in ("fixed", "joint") for m in ("mae", "rmse")]
     lines = [(title, *(f"{row[n][m]:.4f}" for row in rows)) for title, n, m in errors]
@@ -147,7 +135,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def report(results: dict[str, Any], figures: pathlib.Path) -> str:
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw the lens and figures 6a, 6b and 7."""
     far = 1e3 * results["depth_m"][1]
     _training.draw_lens(results["lens"], far, figures / "lens.png")
@@ -158,12 +146,9 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
     figure.savefig(figures / "figure_6b.png")
     titles = [f"{depth:g} m" for depth in results["patch_depth_m"]]
     _training.draw_patches(results, titles, figures / "figure_7.png")
-    return "\n\n".join(tables(results).values())
 
 
-main = functools.partial(
-    _command.main, "edof", Config, ("loss", "sensor_mm", "sigma_um", "depth_mm"), run, report
-)
+main = functools.partial(_command.main, sys.modules[__name__])
 
 if __name__ == "__main__":
     main()

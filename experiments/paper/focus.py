@@ -8,6 +8,7 @@ figures 4a and 4b.
 import dataclasses
 import functools
 import pathlib
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -17,10 +18,11 @@ import numpy as np
 
 from drt_jax import show
 from drt_jax.image.sensor import convolve_taps
-from drt_jax.learn import train
 from drt_jax.runs.folder import Run
 
 from . import _command, _common, _training
+
+COLUMNS = ("loss", "sensor_mm", "sigma_um")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,12 +52,12 @@ def best_focus(loss: Callable, scenes: np.ndarray, low: float, high: float) -> f
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Train all starts together, and find the best focus independently."""
     distance = 1e3 * config.distance_m
-    blur = config.scene.blur(distance, distance)
-    imager = train.make_imager(blur, None, config.camera, convolve_taps)
     jobs = _training.Jobs(run, config, distance, distance)
+    blur = config.scene.blur(distance, distance)
+    imager, steps = jobs.steps(blur, several=True, convolve=convolve_taps)
     labels = tuple(map(_training.start_label, config.starts_mm))
-    starts = {"optics": {"sensor": jnp.asarray(config.starts_mm)}}
-    jobs.train("all starts", jobs.step(imager, several=True), starts, labels=labels)
+    starts = {"sensor": jnp.asarray(config.starts_mm)}
+    jobs.train("all starts", steps, starts, config.noise, labels)
     results = jobs.results("sensor_mm", "sigma_um")
 
     def loss(sensor, scenes):
@@ -72,25 +74,18 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Beside the paper, and each start."""
-    best = f"{results['best_focus_mm']:.3f}"
-    starts, first = results["starts_mm"], results["batches_to_focus"]
+    search = f" (dense search on the same loss: {results['best_focus_mm']:.3f})"
+    starts = ", ".join(f"{start:g}" for start in results["starts_mm"])
+    first = ", ".join(map(str, results["batches_to_focus"]))
     beside = [
-        (
-            "plane that all starts reach",
-            "133.35 mm",
-            f"{_training.reached(results)} (dense search on the same loss: {best})",
-        ),
-        (
-            f"batches until within 0.1 mm, starts {', '.join(f'{s:g}' for s in starts)} mm",
-            '"within the first 60"',
-            ", ".join(map(str, first)),
-        ),
+        ("plane that all starts reach", "133.35 mm", _training.reached(results) + search),
+        (f"batches until within 0.1 mm, starts {starts} mm", '"within the first 60"', first),
         ("training of all starts", "", _common.duration(results["seconds"])),
     ]
     return {"focus": _common.table(("", "paper", "here"), beside)}
 
 
-def report(results: dict[str, Any], figures: pathlib.Path) -> str:
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw the lens and figures 4a and 4b."""
     _training.draw_lens(results["lens"], results["distance_mm"], figures / "lens.png")
     best = results["best_focus_mm"]
@@ -103,12 +98,9 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
         show.convergence(right, _training.start_lines(results, column, 100), label, level)
         right.set_title("the first 100 batches", fontsize=9)
         figure.savefig(figures / f"{name}.png")
-    return tables(results)["focus"]
 
 
-main = functools.partial(
-    _command.main, "focus", Config, ("loss", "sensor_mm", "sigma_um"), run, report
-)
+main = functools.partial(_command.main, sys.modules[__name__])
 
 if __name__ == "__main__":
     main()

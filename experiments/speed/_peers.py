@@ -4,31 +4,14 @@ A peer is given the lens as numbers and samples the pupil as its users would: he
 hold about as many rays as asked for. Differences in definition are its error.
 """
 
-import importlib
-import importlib.metadata
 import itertools
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 import drt_jax
 from drt_jax import pupil
-
-__all__ = ["PEERS", "Missing", "batoid_rays", "network_step", "spot"]
-
-PEERS = ("optiland", "batoid", "torch")
-
-
-class Missing(Exception):
-    """A peer that is not installed; the message says which and how to install it."""
-
-
-def load(name: str):
-    """The module of a peer and its version."""
-    try:
-        return importlib.import_module(name), importlib.metadata.version(name)
-    except ImportError as error:
-        raise Missing(f"{name} is not installed: pip install -e '.[peers]'") from error
 
 
 class Lens:
@@ -50,25 +33,19 @@ def _rings(rays: int) -> int:
     return int((np.sqrt(12 * rays - 3) - 3) / 6)
 
 
-def spot(name: str, lens: Lens, rays: int) -> tuple[Callable, Callable, str]:
-    """(value, gradient, version) of the RMS spot radius sigma: value() -> (W,) in mm;
-    gradient() -> (W,), (W, 2 S), the latter by curvatures, thicknesses and the sensor position, NaN
-    where the peer has none."""
-    module, version = load(name)
-    return (*{"optiland": _optiland, "batoid": _batoid}[name](module, lens, rays), version)
-
-
 def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
     """An Optiland lens for one wavelength, indices (S + 1,)."""
-    optic = importlib.import_module("optiland.optic").Optic()
-    material = importlib.import_module("optiland.materials").IdealMaterial
+    from optiland.materials import IdealMaterial
+    from optiland.optic import Optic
+
+    optic = Optic()
     optic.add_surface(index=0, thickness=lens.distance)
     for i, (c, gap) in enumerate(zip(lens.curvature, lens.gaps)):
         optic.add_surface(
             index=i + 1,
             radius=1 / c if c else np.inf,
             thickness=gap,
-            material=material(n=float(index[i + 1])),
+            material=IdealMaterial(n=float(index[i + 1])),
             is_stop=i == lens.stop,
         )
     optic.add_surface(index=len(lens.gaps) + 1)
@@ -79,9 +56,13 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
     return optic
 
 
-def _optiland(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
-    torch, _ = load("torch")
-    backend = importlib.import_module("optiland.backend")
+def optiland_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
+    """(value, gradient) of the RMS spot radius sigma: value() -> ((W,),) in mm; gradient() -> (W,),
+    (W, 2 S), the latter by curvatures, thicknesses and the sensor position, NaN where there is
+    none."""
+    import torch
+    from optiland import backend
+
     backend.set_backend("torch")
     backend.set_precision("float64")
     backend.grad_mode.enable()
@@ -101,7 +82,7 @@ def _optiland(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
         with torch.no_grad():
             sigma = [float(one(*system)) for system in systems]
         backend.grad_mode.enable()
-        return np.array(sigma)
+        return (np.array(sigma),)
 
     def gradient():
         values, rows = [], []
@@ -122,19 +103,30 @@ def _optiland(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
     return value, gradient
 
 
-def _batoid_optic(module, curvature, gaps, index):
-    media = [module.ConstMedium(float(n)) for n in index]
+def _batoid_optic(curvature, gaps, index):
+    import batoid
+
+    media = [batoid.ConstMedium(float(n)) for n in index]
     items = []
     for i, (c, place) in enumerate(zip([*curvature, 0], np.append(0, np.cumsum(gaps)))):
-        kind = module.RefractiveInterface if i < len(curvature) else module.Detector
-        shape = module.Sphere(1 / c) if c else module.Plane()
-        where = module.CoordSys(origin=[0, 0, place])
+        kind = batoid.RefractiveInterface if i < len(curvature) else batoid.Detector
+        shape = batoid.Sphere(1 / c) if c else batoid.Plane()
+        where = batoid.CoordSys(origin=[0, 0, place])
         around = {"inMedium": media[i], "outMedium": media[min(i + 1, len(media) - 1)]}
         items.append(kind(shape, name=f"s{i}", coordSys=where, **around))
-    return module.CompoundOptic(items, name="lens", inMedium=media[0], outMedium=media[-1])
+    return batoid.CompoundOptic(items, name="lens", inMedium=media[0], outMedium=media[-1])
 
 
-def _batoid(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
+def _batoid_hits(optic, points, velocities):
+    import batoid
+
+    hits = batoid.RayVector(*points.T.copy(), *velocities.T.copy(), wavelength=1e-6)
+    optic.trace(hits)
+    return np.stack([hits.x, hits.y], axis=1)
+
+
+def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
+    """As `optiland_spot`; the gradient by finite differences."""
     points = pupil.hexapolar(_rings(rays))[0]
     place, radius = lens.pupil
     source = np.array([0.0, -lens.distance * np.tan(lens.field), -lens.distance])
@@ -144,50 +136,40 @@ def _batoid(module, lens: Lens, rays: int) -> tuple[Callable, Callable]:
     # Onto a plane before the first vertex.
     start = through + direction * ((-10.0 - place) / direction[:, 2:])
 
-    def trace(curvature, gaps, k):
-        optic = _batoid_optic(module, curvature, gaps, lens.index[:, k])
-        speed = direction / lens.index[0, k]
-        hits = module.RayVector(*start.T.copy(), *speed.T.copy(), wavelength=1e-6)
-        optic.trace(hits)
-        return np.sqrt(np.var(hits.x) + np.var(hits.y))
+    def sigma(curvature, gaps, k):
+        velocity = direction / lens.index[0, k]
+        optic = _batoid_optic(curvature, gaps, lens.index[:, k])
+        return np.sqrt(np.sum(np.var(_batoid_hits(optic, start, velocity), axis=0)))
 
     def value(curvature=lens.curvature, gaps=lens.gaps):
-        return np.array([trace(curvature, gaps, k) for k in range(len(lens.wavelengths))])
+        return (np.array([sigma(curvature, gaps, k) for k in range(len(lens.wavelengths))]),)
 
     count = len(lens.gaps)
     shift = np.eye(count)
     shift[:-1, -1] = -1  # a thickness does not move the sensor
 
     def gradient():
-        base, h = value(), 1e-7 * np.eye(count)
-        moved = [value(curvature=lens.curvature + row) for row in h]
-        slopes = [(found - base) / 1e-7 for found in moved]
-        moved = [value(gaps=lens.gaps + 1e-6 * row) for row in shift]
-        slopes += [(found - base) / 1e-6 for found in moved]
-        return base, np.array(slopes).T
+        (base,), h = value(), 1e-7 * np.eye(count)
+        bent = [value(curvature=lens.curvature + row)[0] for row in h]
+        moved = [value(gaps=lens.gaps + 1e-6 * row)[0] for row in shift]
+        slopes = np.concatenate([(bent - base) / 1e-7, (moved - base) / 1e-6])
+        return base, slopes.T
 
     return value, gradient
 
 
-def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> tuple[Callable, str]:
-    """(trace, version): sensor hits (Q, 2) of rays through `points` (Q, 3) in front of the lens,
-    unit `directions` (Q, 3), at the first wavelength."""
-    module, version = load("batoid")
-    optic = _batoid_optic(module, lens.curvature, lens.gaps, lens.index[:, 0])
-
-    def trace():
-        hits = module.RayVector(*points.T.copy(), *directions.T.copy(), wavelength=1e-6)
-        optic.trace(hits)
-        return np.stack([hits.x, hits.y], axis=1)
-
-    return trace, version
+def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Callable:
+    """trace(): sensor hits (Q, 2) of rays through `points` (Q, 3) in front of the lens, unit
+    `directions` (Q, 3), at the first wavelength."""
+    optic = _batoid_optic(lens.curvature, lens.gaps, lens.index[:, 0])
+    return partial(_batoid_hits, optic, points, directions)
 
 
-def network_step(batch: int, patch: int, rate: float) -> tuple[Callable, str]:
-    """(step, version): one Adam step of the same RED-Net in PyTorch, channels last, on the mean
+def network_step(batch: int, patch: int, rate: float) -> Callable:
+    """step(): one Adam step of the same RED-Net in PyTorch, channels last, on the mean
     absolute error of random images."""
-    torch, version = load("torch")
-    nn = torch.nn
+    import torch
+    from torch import nn
 
     class RedNet(nn.Module):
         def __init__(self):
@@ -222,4 +204,4 @@ def network_step(batch: int, patch: int, rate: float) -> tuple[Callable, str]:
         adam.step()
         return float(loss)
 
-    return step, version
+    return step

@@ -8,11 +8,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
+from importlib.metadata import version
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import drt_jax
 from drt_jax import Lens, pupil
@@ -37,22 +41,15 @@ print(time.perf_counter() - start)
 _SPREAD = """
 import jax; jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", {devices})
-import numpy as np
-import drt_jax
-from drt_jax import pupil
-from experiments._common import medians
-from jax.sharding import AxisType, NamedSharding, PartitionSpec
-lens = drt_jax.load_lens({lens!r})
-def trace(points):
-    rays = drt_jax.trace_rays(lens, {field}, {distance}, [{wave}], points)
-    return rays.points[0, :, -1, :2], rays.status[0]
-mesh = jax.make_mesh(({devices},), ("rays",), axis_types=(AxisType.Auto,))
-rays = PartitionSpec("rays")
-trace = jax.jit(jax.shard_map(trace, mesh=mesh, in_specs=rays, out_specs=rays, check_vma=False))
-points = jax.device_put(pupil.random_disc({count}, {seed})[0].T, NamedSharding(mesh, rays))
-assert not np.any(np.asarray(trace(points)[1]))
-print(medians([lambda: trace(points)], {repeats})[0])
+from experiments import _work, benchmark
+print(_work.bundle_seconds(benchmark.{config!r}))
 """
+
+
+def hits(lens: Lens, field: Any, distance: Any, waves: Array, points: Array) -> tuple[Array, Array]:
+    """(W, Q, 2) on the sensor in mm, and status (W, Q), of rays through points (Q, 2)."""
+    rays = drt_jax.trace_rays(lens, field, distance, waves, points)
+    return rays.points[:, :, -1, :2], rays.status
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,13 +65,10 @@ class Ours:
     measured: dict[str, float]
 
 
-def compiled(function: Callable, *arguments: Any, **options: Any) -> Ours:
-    """`function` compiled for its arguments, tracing included."""
-    return loaded(jax.jit(function, **options), *arguments)
-
-
-def loaded(function: Callable, *arguments: Any) -> Ours:
-    """The same of a jitted function. Arguments that it donates, it is given as copies."""
+def compiled(function: Callable, *arguments: Any) -> Ours:
+    """A function, jitted or not, compiled for its arguments, tracing included; arguments that it
+    donates, it is given as copies."""
+    function = function if hasattr(function, "lower") else jax.jit(function)
     start = time.perf_counter()
     lowered = function.lower(*arguments)
     program = lowered.compile()
@@ -92,6 +86,14 @@ def loaded(function: Callable, *arguments: Any) -> Ours:
     return Ours(call, dict(zip(MEASURED, (seconds, held / 2**20, kernels))))
 
 
+def peer(name: str, make: Callable[[], tuple], how: str = "") -> dict[str, tuple | str]:
+    """(call, error) of a peer by its name and version, or how to install it by its name."""
+    try:
+        return {f"{name} {version(name)}{how}": make()}
+    except ImportError as missing:
+        return {name: f"{missing.name} is not installed: pip install -e '.[peers]'"}
+
+
 def row(task: str, seconds: float, **known: Any) -> Row:
     """A row of results.json; what is not known is None."""
     unknown = dict.fromkeys(("ours_error", *MEASURED, "peer_s", "ratio", "peer_error"))
@@ -107,11 +109,10 @@ def rows_of(
     seconds, *others = _common.medians(calls, repeats)
     found, rows = dict(zip(ready, others)), []
     for name, peer in peers.items():
+        known: Row = {"note": peer}
         if name in found:
             ratio = found[name] / seconds
             known = {"peer_s": found[name], "ratio": ratio, "peer_error": peer[1]}
-        else:
-            known = {"note": peer}
         rows.append(row(task, seconds, ours_error=error, peer=name, **ours.measured, **known))
     return rows
 
@@ -119,13 +120,8 @@ def rows_of(
 def in_a_new_process(code: str, environment: dict[str, str]) -> float:
     """The number that Python code prints last, run without a cache but for `environment`."""
     clean = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        env=clean | environment,
-        cwd=_common.ROOT,
-    )
+    options = {"env": clean | environment, "cwd": _common.ROOT}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
     _common.require(done.returncode == 0, f"lens: a new process failed: {done.stderr[-500:]}")
     return float(done.stdout.split()[-1])
 
@@ -134,30 +130,27 @@ def first_seconds(lens: str, field: float, distance: float) -> list[float]:
     """Seconds from the start of a process to a first gradient: anew, and with programs kept."""
     code = _FIRST.format(lens=lens, field=field, distance=distance)
     with tempfile.TemporaryDirectory() as folder:
-        kept = {
-            "JAX_COMPILATION_CACHE_DIR": folder,
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        }
+        kept = {"JAX_COMPILATION_CACHE_DIR": folder}
+        kept["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
         in_a_new_process(code, kept)
         times = [[in_a_new_process(code, extra) for _ in range(3)] for extra in ({}, kept)]
     return [float(np.median(some)) for some in times]
 
 
 def spread_over_devices(config: Any, devices: int) -> float:
-    """Seconds to trace the bundle of `benchmark` shared among so many CPU devices, in a process of
-    its own: JAX fixes their number when it starts."""
-    _, field, distance = config.scene
-    code = _SPREAD.format(
-        lens=config.lens,
-        field=field,
-        distance=distance,
-        wave=config.wavelengths_um[0],
-        count=config.bundle,
-        seed=config.seed,
-        repeats=config.repeats,
-        devices=devices,
-    )
-    return in_a_new_process(code, {})
+    """`bundle_seconds` with so many CPU devices: JAX fixes their number when it starts."""
+    return in_a_new_process(_SPREAD.format(config=config, devices=devices), {})
+
+
+def bundle_seconds(config: Any) -> float:
+    """Seconds to trace the bundle of `benchmark` shared among the devices of this process."""
+    mesh = jax.make_mesh((jax.device_count(),), ("rays",), axis_types=(AxisType.Auto,))
+    trace, points = config.bundle_trace
+    ends = {"in_specs": PartitionSpec("rays"), "out_specs": PartitionSpec(None, "rays")}
+    trace = jax.jit(jax.shard_map(trace, mesh=mesh, check_vma=False, **ends))
+    points = jax.device_put(points, NamedSharding(mesh, ends["in_specs"]))
+    assert not np.any(np.asarray(trace(points)[1]))
+    return _common.medians([lambda: trace(points)], config.repeats)[0]
 
 
 def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[str, int]:
@@ -176,22 +169,16 @@ def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[
         kind = convolve_taps if len(trained) == 1 else convolve
         imager = train.make_imager(blur, None, train.Camera(), kind)
         init, step = train.make_step(imager, {"optics": 1e-3}, depths, 0)
-        state = init({"optics": values})
-        program = step.trace(state, scenes, np.float32(0), np.int32(0)).jaxpr
-        found[name] = str(program).count("name=attach")
+        step = step.trace(init({"optics": values}), scenes, np.float32(0), np.int32(0))
+        found[name] = str(step.jaxpr).count("name=attach")
     return found
 
 
 def _plates(count: int) -> Lens:
     """`count` surfaces of thin, weak lenses, the stop in the middle."""
+    plate = {"thickness": 0.1, "semi_diameter": 50.0}
     surfaces = [
-        {
-            "radius": 1e5 * (-1) ** i,
-            "thickness": 0.1,
-            "index": 1.0 if i % 2 else 1.5,
-            "semi_diameter": 50.0,
-        }
-        for i in range(count)
+        {"radius": 1e5 * (-1) ** i, "index": 1.0 if i % 2 else 1.5} | plate for i in range(count)
     ]
     surfaces[-1]["index"] = 1.0
     surfaces[count // 2] |= {"stop": True, "semi_diameter": 5.0}
@@ -204,22 +191,15 @@ def growth(lens: Lens, field: float, distance: float, repeats: int) -> dict[str,
 
     def seconds(lens, rays, waves, angle=field):
         points = jnp.asarray(pupil.random_disc(rays, 0)[0].T)
-
-        def trace(points):
-            traced = drt_jax.trace_rays(lens, angle, distance, waves, points)
-            return traced.points[:, :, -1], traced.status
-
-        program = compiled(trace, points)
+        program = compiled(partial(hits, lens, angle, distance, waves), points)
         if jnp.any(program.call()[1] != drt_jax.Status.OK):
             raise RuntimeError(f"{lens.name}: rays of the measurement fail")
         return _common.medians([program.call], repeats)[0]
 
-    green = jnp.array([0.53])
-    decades = [(n, jnp.linspace(0.45, 0.65, n)) for n in (1, 3, 10, 30, 100, 300, 1000)]
+    green, surfaces = jnp.array([0.53]), (3, 10, 30, 100, 300, 1000, 3000)
+    waves = {n: jnp.linspace(0.45, 0.65, n) for n in (1, 3, 10, 30, 100, 300, 1000)}
     return {
         "rays": [(n, seconds(lens, n, green)) for n in (256, 1024, 4096, 16384, 65536, 262144)],
-        "surfaces": [
-            (n, seconds(_plates(n), 256, green, 0.001)) for n in (3, 10, 30, 100, 300, 1000, 3000)
-        ],
-        "wavelengths": [(n, seconds(lens, 64, waves)) for n, waves in decades],
+        "surfaces": [(n, seconds(_plates(n), 256, green, 0.001)) for n in surfaces],
+        "wavelengths": [(n, seconds(lens, 64, some)) for n, some in waves.items()],
     }

@@ -14,12 +14,14 @@ import functools
 import math
 import os
 import pathlib
+import sys
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
+from jax import Array
 
 import drt_jax
 from drt_jax import Lens, Status, pupil, show
@@ -28,11 +30,11 @@ from drt_jax.learn.adam import adam, apply_updates
 from drt_jax.runs.folder import Run
 
 from . import _command, _common, _peers, _work
-from ._reference import Moments, reference
-from ._work import Row, compiled, loaded, rows_of
+from ._reference import Moments, changed, flatten, gradient_error, reference
+from ._work import Row, compiled, peer, rows_of
 from .snell import trace_snell
 
-_COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", *_work.MEASURED)
+COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", *_work.MEASURED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,30 +74,27 @@ class Config:
         return lens, math.radians(self.field_deg), 1e3 * self.distance_m
 
     @property
+    def bundle_trace(self) -> tuple[Callable, Array]:
+        """What traces the task of many rays at one wavelength, and their points on the stop."""
+        points = jnp.asarray(pupil.random_disc(self.bundle, self.seed)[0].T)
+        waves = jnp.asarray(self.wavelengths_um[:1])
+        return functools.partial(_work.hits, *self.scene, waves), points
+
+    @property
     def where(self) -> str:
         """The field in words."""
         return f"{self.field_deg:g} degrees"
 
 
-def _parts(lens: Lens) -> dict:
-    return {"curvature": lens.curvature, "thickness": lens.thickness, "sensor": lens.sensor}
-
-
 def spot_error(truth: list[Moments], count: int, values: Any, slopes: Any = None) -> float:
-    """The worst relative error of sigmas (W,), and of their derivatives (W, P) if they are given:
-    norm over norm, the worse of those by `count` curvatures and by distances, those known."""
+    """The worst relative error of sigmas (W,), and if they are given of their derivatives (W, P),
+    as `gradient_error` of those known."""
     exact = np.array([moments.sigma for moments in truth])
     worst = float(np.max(np.abs(np.asarray(values) / exact - 1)))
     if slopes is None:
         return worst
-    exact = np.array([moments.gradient[0] for moments in truth])
-    slopes = np.asarray(slopes, float)
-    for group in (slice(0, count), slice(count, None)):
-        known = np.isfinite(slopes[:, group])
-        wrong = np.where(known, slopes[:, group] - exact[:, group], 0)
-        size = np.linalg.norm(np.where(known, exact[:, group], 0))
-        worst = max(worst, float(np.linalg.norm(wrong) / size))
-    return worst
+    exact, slopes = np.array([m.gradient[0] for m in truth]), np.asarray(slopes, float)
+    return max(worst, gradient_error(exact, slopes, count, np.isfinite(slopes)))
 
 
 def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
@@ -106,75 +105,62 @@ def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
     rule = drt_jax.converged_rule(lens, field, distance, waves, 1e-9 if axial else 1e-6)
     truth, count = reference(lens, field, distance, config.wavelengths_um), lens.count
 
-    def sigma(parts):
-        changed = dataclasses.replace(lens, **parts)
-        covariance = drt_jax.psf_moments(changed, field, distance, waves, rule=rule)[1]
-        return jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+    def sigma(values):
+        lens_now = changed(lens, values)
+        covariance = drt_jax.psf_moments(lens_now, field, distance, waves, rule=rule)[1]
+        return (jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]),)
 
-    def jacobian(parts):
-        values, back = jax.vjp(sigma, parts)
-        return values, jax.vmap(lambda row: back(row)[0])(jnp.eye(waves.size))
+    def jacobian(values):
+        found, back = jax.vjp(lambda values: sigma(values)[0], values)
+        return found, jax.vmap(lambda row: back(row)[0])(jnp.eye(waves.size))
 
-    ours = compiled(jacobian if gradient else sigma, _parts(lens))
-    if gradient:
-        values, found = ours.call()
-        distances = found["thickness"], found["sensor"][:, None]
-        slopes = np.concatenate([found["curvature"][:, :count], *distances], axis=1)
-        error = spot_error(truth, count, values, slopes)
-    else:
-        error = spot_error(truth, count, ours.call())
-    numbers, peers = _peers.Lens(lens, field, distance, config.wavelengths_um), {}
-    for name in ("optiland", "batoid"):
-        try:
-            value, slope, version = _peers.spot(name, numbers, config.rays)
-        except _peers.Missing as missing:
-            peers[name] = str(missing)
-            continue
-        call = slope if gradient else value
-        found = call() if gradient else (call(),)
-        peers[f"{name} {version}"] = (call, spot_error(truth, count, *found))
+    def beside(spot):
+        call = spot(numbers, config.rays)[int(gradient)]
+        return call, spot_error(truth, count, *call())
+
+    ours = compiled(jacobian if gradient else sigma, flatten(lens))
+    numbers = _peers.Lens(lens, field, distance, config.wavelengths_um)
+    peers = peer("optiland", lambda: beside(_peers.optiland_spot))
+    peers |= peer("batoid", lambda: beside(_peers.batoid_spot))
     where = "on axis" if axial else config.where
     task = f"sigma{' and Jacobian' if gradient else ''}, {where}"
-    return rows_of(task, ours, error, peers, config.repeats)
+    return rows_of(task, ours, spot_error(truth, count, *ours.call()), peers, config.repeats)
 
 
 def bundle_task(config: Config) -> list[Row]:
     """Skew rays through random points of the stop, one wavelength, to the sensor."""
     lens, field, distance = config.scene
     waves = jnp.asarray(config.wavelengths_um[:1])
-    points = jnp.asarray(pupil.random_disc(config.bundle, config.seed)[0].T)
-
-    def trace(points, lens=lens):
-        rays = drt_jax.trace_rays(lens, field, distance, waves, points)
-        return rays.points[0, :, -1, :2], rays.status[0]
-
+    trace, points = config.bundle_trace
     ours = compiled(trace, points)
-    hits, status = ours.call()
+    spot, status = (found[0] for found in ours.call())
     _common.require(bool(jnp.all(status == Status.OK)), "lens: rays of the bundle fail")
     rays = jax.jit(drt_jax.trace_rays)(lens, field, distance, waves, points)
     first, direction = rays.points[0, :, 0], rays.directions[0, :, 0]
-    again, ok = jax.vmap(trace_snell, (None, None, 0, 0))(
-        lens, waves[0], first[:1000], direction[:1000]
-    )
+    snell = jax.vmap(trace_snell, (None, None, 0, 0))
+    again, ok = snell(lens, waves[0], first[:1000], direction[:1000])
     _common.require(bool(jnp.all(ok)), "lens: rays of the bundle fail")
-    error = float(jnp.max(jnp.abs(again[:, -1, :2] - hits[:1000])))
-    peers: dict[str, tuple | str] = {}
-    try:
+    error = float(jnp.max(jnp.abs(again[:, -1, :2] - spot[:1000])))
+
+    def batoid():
         numbers = _peers.Lens(lens, field, distance, config.wavelengths_um[:1])
         start, along = (np.asarray(a) for a in (first - 15 * direction, direction))
-        call, version = _peers.batoid_rays(numbers, start, along)
-        wrong = float(np.max(np.abs(call() - np.asarray(hits))))
-        peers[f"batoid {version}, launched at our first hits"] = (call, wrong)
-    except _peers.Missing as missing:
-        peers["batoid"] = str(missing)
+        call = _peers.batoid_rays(numbers, start, along)
+        return call, float(np.max(np.abs(call() - np.asarray(spot))))
+
+    peers = peer("batoid", batoid, ", launched at our first hits")
     task = f"{config.bundle} skew rays"
     rows = rows_of(task, ours, error, peers, config.repeats)
     devices = os.cpu_count() or 1
     shared = _work.spread_over_devices(config, devices)
-    peer = {key: rows[0][key] for key in ("peer", "peer_s", "peer_error", "note", "ours_error")}
-    peer["ratio"] = peer["peer_s"] and peer["peer_s"] / shared
-    rows.append(_work.row(f"{task}, {devices} CPU devices", shared, **peer))
-    square = compiled(jax.grad(lambda lens: jnp.mean(trace(points, lens)[0] ** 2)), lens)
+    same = {key: rows[0][key] for key in ("peer", "peer_s", "peer_error", "note", "ours_error")}
+    same["ratio"] = same["peer_s"] and same["peer_s"] / shared
+    rows.append(_work.row(f"{task}, {devices} CPU devices", shared, **same))
+
+    def square(lens):
+        return jnp.mean(_work.hits(lens, field, distance, waves, points)[0] ** 2)
+
+    square = compiled(jax.grad(square), lens)
     back = _common.medians([square.call], 3)[0]
     rows.append(_work.row(f"{task} and their gradient", back, **square.measured))
     for row in rows:
@@ -198,7 +184,7 @@ def network_task(config: Config) -> list[Row]:
     imager = train.make_imager(blur, apply, camera)
     start, step = train.make_step(imager, rates, depths, config.seed)
     state = start({"optics": values, "network": weights})
-    joint = loaded(step, state, scenes, np.float32(0.01), np.int32(0))
+    joint = compiled(step, state, scenes, np.float32(0.01), np.int32(0))
     shape = (config.batch, config.patch, config.patch, 3)
     images, truth = (jnp.asarray(rng.random(shape), jnp.float32) for _ in range(2))
     begin, update = adam(rates)
@@ -210,8 +196,9 @@ def network_task(config: Config) -> list[Row]:
         updates, moments = update(jax.grad(loss)(parameters), moments)
         return apply_updates(parameters, updates), moments
 
-    parameters, options = {"network": weights}, {"compiler_options": train.compiler_options()}
-    only = compiled(alone, parameters, begin(parameters), images, truth, **options)
+    options, parameters = train.compiler_options(), {"network": weights}
+    arguments = parameters, begin(parameters), images, truth
+    only = compiled(jax.jit(alone, compiler_options=options), *arguments)
     sensor = train.make_imager(blur, None, camera)
 
     def front(values, scenes, noise, key):
@@ -222,13 +209,13 @@ def network_task(config: Config) -> list[Row]:
         return value, back(truth)
 
     key = jax.random.key(config.seed)
-    rest = compiled(front, values, jnp.asarray(scenes), np.float32(0.01), key, **options)
-    peers: dict[str, tuple | str] = {}
-    try:
-        call, version = _peers.network_step(config.batch, config.patch, 1e-3)
-        peers[f"torch {version}, network alone, channels last"] = (call, None)
-    except _peers.Missing as missing:
-        peers["torch"] = str(missing)
+    arguments = values, jnp.asarray(scenes), np.float32(0.01), key
+    rest = compiled(jax.jit(front, compiler_options=options), *arguments)
+
+    def torch():
+        return _peers.network_step(config.batch, config.patch, 1e-3), None
+
+    peers = peer("torch", torch, ", network alone, channels last")
     peers["ours, network alone"] = (only.call, None)
     peers["ours, optics, noise and sensor layer alone"] = (rest.call, None)
     task = f"joint step with RED-Net, {config.batch} of {config.patch}x{config.patch}"
@@ -238,11 +225,11 @@ def network_task(config: Config) -> list[Row]:
 def first_task(config: Config) -> list[Row]:
     """A new process: import, load a lens, trace, gradient; and the same once more, with the
     compiled programs kept in a folder."""
-    lens, (_, field, distance) = config.lens, config.scene
+    _, field, distance = config.scene
     rows = []
     for angle, where in ((0.0, "on axis"), (field, config.where)):
         task = f"first sigma and gradient in a new process, {where}"
-        anew, kept = _work.first_seconds(lens, angle, distance)
+        anew, kept = _work.first_seconds(config.lens, angle, distance)
         rows += [_work.row(task, anew), _work.row(f"{task}, programs kept", kept)]
     return rows
 
@@ -262,15 +249,16 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Run the tasks one by one."""
     # Programs kept from another run would hide what compiling takes.
     jax.config.update("jax_enable_compilation_cache", False)
-    rows: list[Row] = []
-    with tqdm(config.tasks or TASKS, unit="task", dynamic_ncols=True) as bar:
-        for name in bar:
-            bar.set_description(name)
-            found = TASKS[name](config)
-            for k, row in enumerate(found):
-                columns = {c: np.array([float(row[c])]) for c in _COLUMNS if row[c] is not None}
-                run.log(name, k, columns)
-            rows += found
+
+    def measure(name: str) -> list[Row]:
+        rows = TASKS[name](config)
+        for k, row in enumerate(rows):
+            known = {c: np.array([float(row[c])]) for c in COLUMNS if row[c] is not None}
+            run.log(name, k, known)
+        return rows
+
+    jobs = {name: functools.partial(measure, name) for name in config.tasks or TASKS}
+    rows = sum(_common.measured(run, "task", jobs), [])
     lens, field, distance = config.scene
     results = {"rows": rows, "counts": _work.counts(lens, distance, config.wavelengths_um)}
     if config.growth:
@@ -286,12 +274,14 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
     lines, before = [], None
     for row in results["rows"]:
-        ours = (row["task"], _common.duration(row["ours_s"]), error(row["ours_error"]))
-        ours += (_common.duration(row["compile_s"]),)
-        peer = _common.duration(row["peer_s"]), error(row["peer_error"])
+        seconds, compiling, theirs = (
+            _common.duration(row[key]) for key in ("ours_s", "compile_s", "peer_s")
+        )
+        ours = row["task"], seconds, error(row["ours_error"]), compiling
+        peer = row["note"] or row["peer"], theirs, error(row["peer_error"])
         ratio = row["ratio"] and f"{row['ratio']:.3g}"
-        same, before = row["task"] == before, row["task"]
-        lines.append((*(("",) * 4 if same else ours), row["note"] or row["peer"], *peer, ratio))
+        lines.append((*(("",) * 4 if row["task"] == before else ours), *peer, ratio))
+        before = row["task"]
     header = "work", "drt_jax", "error", "to compile", "peer", "its time", "error", "ratio"
     counts = "what a training step trains", "solves for rays"
     return {
@@ -300,7 +290,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def report(results: dict[str, Any], figures: pathlib.Path) -> str:
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw run time against error, and how it grows."""
     if "work" in results:
         figure, axes = show.new(1, 1, 5.5, 4)
@@ -309,18 +299,16 @@ def report(results: dict[str, Any], figures: pathlib.Path) -> str:
     spots = [row for row in results["rows"] if row["task"].startswith("sigma")]
     if spots:
         tasks = _common.grouped(spots, "task")
-        across = min(2, len(tasks))
-        figure, axes = show.new(-(-len(tasks) // across), across, 4.5, 3.2)
-        for axis, ((task,), rows) in zip(np.ravel(axes), tasks.items()):
+        figure, axes = _common.panels(len(tasks), 4.5, 3.2)
+        for ax, ((task,), rows) in zip(axes, tasks.items()):
             marks = {"drt_jax": [(1e3 * rows[0]["ours_s"], rows[0]["ours_error"])]}
             peers = [row for row in rows if row["peer_s"]]
             marks |= {row["peer"]: [(1e3 * row["peer_s"], row["peer_error"])] for row in peers}
-            show.programs(axis, marks, task)
+            show.programs(ax, marks, task)
         figure.savefig(figures / "peers.png")
-    return "\n\n".join(tables(results).values())
 
 
-main = functools.partial(_command.main, "benchmark", Config, _COLUMNS, run, report)
+main = functools.partial(_command.main, sys.modules[__name__])
 
 if __name__ == "__main__":
     main()

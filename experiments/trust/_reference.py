@@ -9,6 +9,7 @@ Derivatives are those of the plain trace by automatic differentiation, the edge 
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -52,7 +53,7 @@ def flatten(lens: Lens) -> Array:
     return jnp.concatenate([lens.curvature[:-1], lens.thickness, lens.sensor[None]])
 
 
-def _moved(lens: Lens, values: Array) -> Lens:
+def changed(lens: Lens, values: Array) -> Lens:
     """The lens with `values` (P,) as in `flatten`."""
     curvature = lens.curvature.at[:-1].set(values[: lens.count])
     return dataclasses.replace(
@@ -166,7 +167,7 @@ def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Arra
     width = (half * w[None]).ravel()
 
     def values(parameters):
-        moved = _moved(lens, parameters)
+        moved = changed(lens, parameters)
         spot, area = jax.vmap(lambda angle: pupil.line(angle, moved))(azimuth)
         area = area * width[:, None]
         area = area / jnp.sum(area)
@@ -201,3 +202,14 @@ def reference(
         change = float(jnp.linalg.norm(others[0] - slopes[0]) / jnp.linalg.norm(slopes[0]))
         results.append(Moments(*map(float, value), np.asarray(slopes), error, change))
     return results
+
+
+def gradient_error(
+    exact: np.ndarray, slopes: np.ndarray, surfaces: int, known: np.ndarray | bool = True
+) -> float:
+    """Norm of the error of known slopes (..., P) over that of the truth, the worse of those by
+    curvatures of so many surfaces and by distances; NaN if the truth is 0."""
+    wrong, truth = np.where(known, slopes - exact, 0), np.where(known, exact, 0)
+    groups = slice(0, surfaces), slice(surfaces, None)
+    norms = [(np.linalg.norm(wrong[..., g]), np.linalg.norm(truth[..., g])) for g in groups]
+    return float(max((error / size for error, size in norms if size), default=math.nan))

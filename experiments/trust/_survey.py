@@ -1,5 +1,6 @@
 """What is measured on a batch of random scenes: finite numbers, Snell's law, rays not found."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,8 +16,6 @@ from drt_jax.numerics import safe_sqrt
 from ._scenes import WAVELENGTH, Scenes
 from .snell import trace_snell
 
-__all__ = ["survey"]
-
 _BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
 _BOTH = 4  # one scene of so many of a float64 family is traced in float32 too
 _RULE = Gauss(2, "disc")  # whose moments are differentiated
@@ -25,6 +24,25 @@ _GRID = 41  # launch points along each side of the search for a ray that was not
 _STARTS = 4  # candidates refined for each such ray
 _REFINE = 25
 _STOP_MISS = 1e-9  # mm
+
+
+# Few scenes, many programs: what takes long is to compile them.
+_QUICK = {"xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
+
+
+def _over_scenes(function: Callable) -> Callable:
+    """A function of one scene over any number, in batches of one size; NumPy arrays."""
+    program = jax.jit(jax.vmap(function), compiler_options=_QUICK)
+
+    def run(*arguments):
+        count, parts = len(jax.tree.leaves(arguments)[0]), []
+        for first in range(0, count, _BATCH):
+            rows = np.minimum(np.arange(first, first + _BATCH), count - 1)
+            part = program(*jax.tree.map(lambda a: a[rows], arguments))
+            parts.append(jax.tree.map(lambda a: np.asarray(a)[: count - first], part))
+        return jax.tree.map(lambda *a: np.concatenate(a), *parts)
+
+    return run
 
 
 def _sum(a):
@@ -76,6 +94,7 @@ def _residual(lens, field, distance, pupil, points):
     return error / (_ROUNDINGS / 5 * rounding)
 
 
+@_over_scenes
 def _rays(lens, field, distance, pupil):
     """Rays, the derivatives of a sum of them by everything, and their residuals."""
     colour = jnp.full(1, WAVELENGTH, pupil.dtype)
@@ -89,6 +108,7 @@ def _rays(lens, field, distance, pupil):
     return rays, slope, residual(lens, field, distance, pupil, rays.points[0])
 
 
+@_over_scenes
 def _moments(lens, field, distance):
     """Moments and the derivatives of a sum of them by everything; 0 for the infinite covariance of
     a colour of which no light passes."""
@@ -104,6 +124,7 @@ def _moments(lens, field, distance):
     return jax.grad(scalar, argnums=(0, 1, 2), has_aux=True)(lens, field, distance)
 
 
+@_over_scenes
 def _plain(lens, field, distance, pupil):
     rays = drt_jax.trace_rays(lens, field, distance, jnp.full(1, WAVELENGTH, pupil.dtype), pupil)
     return rays.points, rays.status
@@ -116,6 +137,7 @@ def _shoot(lens, field, distance, point):
     return trace_snell(lens, wavelength, point, direction / jnp.linalg.norm(direction))
 
 
+@_over_scenes
 def _retrace(lens, field, distance, points):
     """How far the sequential trace through the first of the points (RAYS, S + 1, 3) of each ray
     ends from the others, over their size and what the lens makes of a shift of the start; and
@@ -132,6 +154,7 @@ def _retrace(lens, field, distance, points):
     return jax.vmap(one)(points)
 
 
+@_over_scenes
 def _search(lens, field, distance, pupil):
     """Whether Snell's law carries a ray to each stop point (RAYS,).
 
@@ -176,59 +199,40 @@ def _search(lens, field, distance, pupil):
     return jax.vmap(found)(height * pupil)
 
 
-# Few scenes, many programs: what takes long is to compile them.
-_QUICK = {"xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
-_compiled = {
-    function.__name__[1:]: jax.jit(jax.vmap(function), compiler_options=_QUICK)
-    for function in (_rays, _moments, _plain, _retrace, _search)
-}
-
-
-def _run(name: str, *arguments: Any) -> Any:
-    """A function over any number of scenes, in batches of one size; NumPy arrays."""
-    count = len(jax.tree.leaves(arguments)[0])
-    parts = []
-    for first in range(0, count, _BATCH):
-        rows = np.minimum(np.arange(first, first + _BATCH), count - 1)
-        part = _compiled[name](*jax.tree.map(lambda a: a[rows], arguments))
-        parts.append(jax.tree.map(lambda a: np.asarray(a)[: count - first], part))
-    return jax.tree.map(lambda *a: np.concatenate(a), *parts)
-
-
-def _infinite(tree: Any) -> int:
-    return int(sum(np.sum(~np.isfinite(leaf)) for leaf in jax.tree.leaves(tree)))
+def _infinite(*found: Any) -> np.ndarray:
+    return np.array([np.sum(~np.isfinite(leaf)) for leaf in jax.tree.leaves(found)])
 
 
 def _as(scenes: Scenes, dtype: str) -> Scenes:
     return jax.tree.map(lambda a: a.astype(dtype), scenes)
 
 
-def survey(scenes: Scenes) -> dict[str, np.ndarray | int]:
-    """Everything counted on some scenes: arrays over scenes (and rays), numbers."""
+def survey(scenes: Scenes) -> dict[str, np.ndarray]:
+    """Everything counted on some scenes: arrays over scenes (and rays), and numbers to be added."""
     dtype = scenes.distance.dtype
-    rays, slope, residual = _run("rays", *scenes)
-    moments_slope, moments = _run("moments", *scenes[:3])
+    rays, slope, residual = _rays(*scenes)
+    moments_slope, moments = _moments(*scenes[:3])
     status = rays.status[:, 0]
     exact = _as(scenes, "float64")
     good = (status == Status.OK) | (status == Status.CLIPPED)
-    off, denied = _run("retrace", *exact[:3], rays.points[:, 0].astype(float))
+    off, denied = _retrace(*exact[:3], rays.points[:, 0].astype(float))
     ratio = off / np.finfo(dtype).eps
     # Scenes rounded to float32, in both precisions.
     if dtype == np.float32:
         rough, single, reached = scenes, rays.points, rays.status
     else:
         rough = jax.tree.map(lambda a: a[::_BOTH], _as(scenes, "float32"))
-        single, reached = _run("plain", *rough)
-    double = _run("rays", *_as(rough, "float64"))[0]
+        single, reached = _plain(*rough)
+    double = _rays(*_as(rough, "float64"))[0]
     both = (reached == Status.OK) & (double.status == Status.OK)
     some, lost = np.flatnonzero(~good.all(axis=1)), np.zeros(good.shape, bool)
     if some.size:
-        lost[some] = ~good[some] & _run("search", *jax.tree.map(lambda a: a[some], exact))
+        lost[some] = ~good[some] & _search(*jax.tree.map(lambda a: a[some], exact))
     return {
         "status": status,
         "steps": np.max(rays.newton_steps.reshape(len(status), -1), axis=1),
-        "nan_values": _infinite((rays.points, rays.path, moments)),
-        "nan_gradients": _infinite((slope, moments_slope)),
+        "nan_values": _infinite(rays.points, rays.path, moments),
+        "nan_gradients": _infinite(slope, moments_slope),
         "disagree": good & (denied | (ratio > _ROUNDINGS) | (residual > 1)),
         "ratio": np.where(good, ratio, 0),
         "residual": np.where(good, residual, 0),

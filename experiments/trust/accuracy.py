@@ -16,6 +16,7 @@ import dataclasses
 import functools
 import math
 import pathlib
+import sys
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -23,7 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from tqdm import tqdm
 
 import drt_jax
 from drt_jax import Lens, PupilRule, pupil, show
@@ -31,10 +31,10 @@ from drt_jax.runs.folder import Run
 
 from . import _command, _common
 from ._common import grouped
-from ._reference import Moments, flatten, reference
+from ._reference import Moments, flatten, gradient_error, reference
 
 _QUADRATURE = "quadrature"
-_COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")
+COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")
 # What the table shows: the default tolerance, and patterns of so many rays.
 _DEFAULT, _RANDOM, _MANY = 1e-6, 256, 16384
 
@@ -69,36 +69,35 @@ class AccuracyScene:
         _common.require(self.field_deg >= 0, "scenes.field_deg: must be 0 or more")
 
     @property
-    def axial(self) -> bool:
-        """Whether the object is on the axis."""
-        return self.field_deg == 0
-
-    @property
     def vignetted(self) -> bool:
         """Whether apertures other than the stop are meant to limit the beam."""
         return self.front_mm > 0 or self.rear_mm > 0
 
     @property
+    def kind(self) -> tuple:
+        """Scenes of a kind, which stand together, share programs."""
+        return self.lens, self.dtype, self.vignetted
+
+    @property
     def panel(self) -> str:
         """The panel of the figures that the scene belongs to."""
-        if self.dtype == "float32":
-            return "float32"
-        return "vignetted" if self.vignetted else "on axis" if self.axial else "off axis"
+        if self.dtype == "float32" or self.vignetted:
+            return "vignetted" if self.dtype == "float64" else self.dtype
+        return "off axis" if self.field_deg else "on axis"
 
     @property
     def label(self) -> str:
         """A name of its own for results and progress."""
         far = "inf" if math.isinf(self.distance_m) else f"{self.distance_m:g} m"
         words = [pathlib.Path(self.lens).stem, f"{self.field_deg:g} deg", far]
-        words.append(f"{self.defocus_mm:+g} mm")
-        if self.vignetted:
-            words.append(f"clear {self.front_mm:g} {self.rear_mm:g} mm")
-        return ", ".join([*words, *(["float32"] if self.dtype == "float32" else [])])
+        words += [f"{self.defocus_mm:+g} mm"]
+        words += [f"clear {self.front_mm:g} {self.rear_mm:g} mm"] * self.vignetted
+        return ", ".join(words + ["float32"] * (self.dtype == "float32"))
 
     def rule(self, order: int) -> PupilRule:
         """The rule of an order that `converged_rule` would try."""
         kind = drt_jax.Clipped if self.vignetted else drt_jax.Gauss
-        return kind(order, "meridian" if self.axial else "half")
+        return kind(order, "half" if self.field_deg else "meridian")
 
     @property
     def about(self) -> dict[str, str]:
@@ -137,8 +136,7 @@ class Config:
 
 @jax.jit
 def spot(*arguments: Any) -> tuple[Array, Array]:
-    """sigmas (W,) and centroids (W, 2) of the colours in mm; the arguments of psf_moments, with a
-    rule."""
+    """sigmas (W,) and centroids (W, 2) in mm, by the arguments of psf_moments and a rule."""
     *scene, rule = arguments
     mean, covariance = drt_jax.psf_moments(*scene, rule=rule)
     return jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]), mean
@@ -181,36 +179,27 @@ def patterns(rays: int, seeds: int, dtype: Any) -> dict[str, list[PupilRule]]:
 
 def spot_errors(truth: list[Moments], sigma: Array, mean: Array) -> tuple[float, float]:
     """relative_error and centroid_error."""
-    exact = np.array([moments.sigma for moments in truth])
-    centroid = np.array([moments.centroid for moments in truth])
+    exact, centroid = np.array([(moments.sigma, moments.centroid) for moments in truth]).T
     x, y = np.asarray(mean, float).T
     shift = np.hypot(x, y - centroid) / exact
     return float(np.max(np.abs(np.asarray(sigma, float) / exact - 1))), float(np.max(shift))
 
 
-def gradient_error(exact: np.ndarray, slopes: np.ndarray, surfaces: int) -> float:
-    """Norm of the error over that of the truth (P,), the worse of both groups; NaN if that is 0."""
-    groups = slice(0, surfaces), slice(surfaces, None)
-    norms = [(np.linalg.norm(slopes[g] - exact[g]), np.linalg.norm(exact[g])) for g in groups]
-    return max((wrong / size for wrong, size in norms if size), default=math.nan)
-
-
-def measured(arguments: tuple, truth: list[Moments], rules: Sequence[PupilRule]) -> dict:
+def row_of(arguments: tuple, truth: list[Moments], rules: Sequence[PupilRule]) -> dict:
     """Columns of `curves` for rules of a kind and size: the median error, the time of the first."""
     exact = np.mean([moments.gradient for moments in truth], axis=0)
-    rows = []
+    found = []
     for rule in rules:
-        found, slopes = spot_and_gradients(*arguments, rule)
+        values, slopes = spot_and_gradients(*arguments, rule)
         pairs = zip(exact, np.asarray(slopes, float))
         wrong = [gradient_error(a, b, arguments[0].count) for a, b in pairs]
-        rows.append([*spot_errors(truth, *found), *wrong])
+        found.append([*spot_errors(truth, *values), *wrong])
     names = ("relative_error", "centroid_error", "gradient_error", "centroid_gradient_error")
-    values = [None if math.isnan(value) else float(value) for value in np.median(rows, axis=0)]
-    first = rules[0]
-    calls = [lambda: spot(*arguments, first), lambda: spot_and_gradients(*arguments, first)]
-    seconds = _common.medians(calls, 2)
-    rays = {"rays": count_rays(arguments, first), **dict(zip(names, values))}
-    return rays | dict(zip(("seconds", "gradient_seconds"), seconds))
+    errors = [None if math.isnan(error) else float(error) for error in np.median(found, axis=0)]
+    calls = [functools.partial(f, *arguments, rules[0]) for f in (spot, spot_and_gradients)]
+    seconds, gradient_seconds = _common.medians(calls, 2)
+    row = {"rays": count_rays(arguments, rules[0]), **dict(zip(names, errors))}
+    return row | {"seconds": seconds, "gradient_seconds": gradient_seconds}
 
 
 def count_rays(arguments: tuple, rule: PupilRule) -> int:
@@ -231,7 +220,7 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
         semi = semi.at[row].set(aperture or semi[row])
     lens = dataclasses.replace(lens, sensor=jnp.asarray(sensor, semi.dtype), semi_diameter=semi)
     truth = reference(lens, field, distance, wavelengths)
-    if scene.axial:  # by symmetry; what the integral leaves is rounding
+    if not scene.field_deg:  # by symmetry; what the integral leaves is rounding
         flat = np.array([[1.0], [0.0]])
         truth = [m._replace(centroid=0.0, gradient=flat * m.gradient) for m in truth]
     arguments = lens, field, distance, np.array(wavelengths)
@@ -240,18 +229,20 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
 
 def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[dict]]:
     """Rows of results.json for one scene; logs its curves."""
+    if next(other for other in config.scenes if other.kind == scene.kind) is scene:
+        jax.clear_caches()  # thousands of kernels exhaust what a process may map
     arguments, truth = prepare(scene, config.wavelengths_um)
     kinds = [(_QUADRATURE, n, [scene.rule(n)]) for n in scene.orders or config.orders]
     for size in (n for n in config.rays if n <= scene.most_rays):
         found = patterns(size, config.seeds, scene.dtype)
         kinds += [(name, size, rules) for name, rules in found.items()]
     curves = [
-        scene.about | {"method": name, "size": size} | measured(arguments, truth, rules)
+        scene.about | {"method": name, "size": size} | row_of(arguments, truth, rules)
         for name, size, rules in kinds
     ]
-    run.log(scene.label, 0, {c: np.array([row[c] for row in curves], float) for c in _COLUMNS})
+    run.log(scene.label, 0, {c: np.array([row[c] for row in curves], float) for c in COLUMNS})
     # A rule follows from known numbers: on axis, those of the field.
-    known = arguments[0], 0.0 if scene.axial else arguments[1], *arguments[2:]
+    known = arguments[0], arguments[1] if scene.field_deg else 0.0, *arguments[2:]
     kept = []
     for tolerance in config.tolerances:
         rule = drt_jax.converged_rule(*known, tolerance)
@@ -268,17 +259,9 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Measure all scenes, one after the other."""
-    results: dict[str, list] = {"curves": [], "tolerances": [], "truth": []}
-    kind: tuple = ()
-    bar = tqdm(config.scenes, unit="scene", dynamic_ncols=True)
-    for scene in bar:
-        bar.set_description(scene.label)
-        kind, before = (scene.lens, scene.dtype, scene.vignetted), kind
-        if kind != before:  # thousands of kernels exhaust what a process may map
-            jax.clear_caches()
-        found = _common.remembered(run, scene.label, lambda: measure(config, scene, run))
-        for key, rows in found.items():
-            results[key] += rows
+    jobs = {s.label: functools.partial(measure, config, s, run) for s in config.scenes}
+    found = _common.measured(run, "scene", jobs)
+    results = {key: sum((rows[key] for rows in found), []) for key in found[0]}
     return results | {"seconds": run.seconds}
 
 
@@ -322,27 +305,23 @@ def shown(groups: dict[tuple, list[dict]]) -> list[tuple[str, list[dict]]]:
     return [(kind[0], groups[kind]) for kind in chosen]
 
 
-def report(results: dict[str, Any], figures: pathlib.Path) -> str:
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw error over time and over rays, a panel for each group of scenes; median and range."""
-    panels = grouped(results["curves"], "panel")
-    columns = min(2, len(panels))
+    groups = grouped(results["curves"], "panel")
     for name, x, y, xlabel, ylabel in (
         ("time_error", "seconds", "relative_error", "time of a call (ms)", "σ"),
         ("rays_error", "rays", "relative_error", "rays a colour", "σ"),
         ("gradient_error", "rays", "gradient_error", "rays a colour", "dσ"),
     ):
-        figure, axes = show.new(-(-len(panels) // columns), columns, 5.2, 3.9)
-        for ax in np.ravel(axes)[len(panels) :]:
-            ax.set_visible(False)
-        for ax, ((panel,), rows) in zip(np.ravel(axes), panels.items()):
+        figure, axes = _common.panels(len(groups), 5.2, 3.9)
+        for ax, ((panel,), rows) in zip(axes, groups.items()):
             draw_panel(ax, rows, x, y, (xlabel, f"error of {ylabel}, relative"))
             count = len(grouped(rows, "scene"))
             ax.set_title(f"{panel}, {count} scene{'s' * (count != 1)}", fontsize=10)
         figure.savefig(figures / f"{name}.png")
     keys = "reference_error", "reference_gradient_error"
     error, slope = (max(row[key] for row in results["truth"]) for key in keys)
-    truth = f"errors of the reference, at most: values {error:.0e}, gradients {slope:.0e}"
-    return "\n\n".join([*tables(results).values(), truth])
+    print(f"\nerrors of the reference, at most: values {error:.0e}, gradients {slope:.0e}")
 
 
 def draw_panel(axes: Any, rows: list[dict], x: str, y: str, labels: tuple[str, str]) -> None:
@@ -361,7 +340,7 @@ def draw_panel(axes: Any, rows: list[dict], x: str, y: str, labels: tuple[str, s
     show.error_curves(axes, curves, *labels, note)
 
 
-main = functools.partial(_command.main, "accuracy", Config, _COLUMNS, run, report)
+main = functools.partial(_command.main, sys.modules[__name__])
 
 if __name__ == "__main__":
     main()

@@ -283,12 +283,12 @@ def test_help_lists_the_settings(name, capsys):
 
 def test_benchmark_without_peers(tmp_path, capsys, monkeypatch):
     """One task: a row for each peer, which is measured or says what is missing, and the counts."""
-    from experiments import _peers, benchmark
+    from experiments import _work, benchmark
 
-    def missing(*_):
-        raise _peers.Missing("not installed")
+    def missing(name):
+        raise ModuleNotFoundError(name=name)
 
-    monkeypatch.setattr(_peers, "spot", missing)
+    monkeypatch.setattr(_work, "version", missing)
     options = ["tasks=[axial]", "growth=false", "repeats=1"]
     try:
         benchmark.main(["--out", str(tmp_path / "run"), "--set", *options])
@@ -296,8 +296,8 @@ def test_benchmark_without_peers(tmp_path, capsys, monkeypatch):
         jax.config.update("jax_enable_compilation_cache", True)
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     assert [(row["peer"], row["peer_s"], row["note"]) for row in results["rows"]] == [
-        ("optiland", None, "not installed"),
-        ("batoid", None, "not installed"),
+        (name, None, f"{name} is not installed: pip install -e '.[peers]'")
+        for name in ("optiland", "batoid")
     ]
     assert all(row["ours_s"] > 0 and row["ours_error"] < 1e-8 for row in results["rows"])
     solves = list(results["counts"].values())
