@@ -9,8 +9,98 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
+from drt_jax.lens.glass import Dispersion
 
-from ._scenes import WAVELENGTH, Scenes, fields, lens_of, pupil_points, scenes_of, two_elements
+RAYS = 8  # of each scene: the chief ray, three on the rim, the rest at random
+WAVELENGTH = 0.55
+_FAR = (np.inf, 1e3, 200.0)
+
+
+class Scenes(NamedTuple):
+    """N scenes of one static structure: a lens whose leaves have a leading axis N, fields (N, 2)
+    in radians, distances (N,) in mm, pupil points (N, RAYS, 2) in the unit disc."""
+
+    lens: drt_jax.Lens
+    field: np.ndarray
+    distance: np.ndarray
+    pupil: np.ndarray
+
+
+def _lens(parts, h, stop, media=None, **static):
+    """A batch of lenses.
+
+    parts: arrays (N, ...) of S surfaces, to which the sensor is added; conic and coefficients may
+        be missing.
+    h: (N,), semi-diameter of the stop in mm; other surfaces have none.
+    media: (N, S + 1), constant indices, by default 1; static: other fields of the lens.
+    """
+    count, surfaces = parts["curvature"].shape
+    zero, none = np.zeros((count, surfaces)), np.zeros((count, surfaces, 0))
+    parts = {"conic": zero, "coefficients": none} | parts
+    for name in ("curvature", "conic", "coefficients"):
+        parts[name] = np.insert(parts[name], surfaces, 0, axis=1)
+    parts["semi_diameter"] = np.full((count, surfaces + 1), np.inf)
+    parts["semi_diameter"][:, stop] = h
+    schott = np.zeros((count, surfaces + 1, 6))
+    schott[..., 0] = 1 if media is None else media**2
+    none = jnp.zeros((count, surfaces + 1, 3))
+    names = {"glasses": tuple(f"medium {i}" for i in range(surfaces + 1))}
+    arrays = {name: jnp.asarray(value, float) for name, value in parts.items()}
+    constants = Dispersion(none, none, jnp.asarray(schott))
+    return drt_jax.Lens(dispersion=constants, stop=stop, **names | static, **arrays)
+
+
+def _pupil_points(rng, count):
+    radius, angle = np.sqrt(rng.random((count, RAYS))), 2 * np.pi * rng.random((count, RAYS))
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    points[:, :4] = [[0, 0], [0, 1], [0, -1], [1, 0]]
+    return points
+
+
+def _fields(rng, count, low, high):
+    """Angles of `low` to `high` degrees in any direction; a third along y, as users ask for."""
+    size, turn = rng.uniform(low, high, count), 2 * np.pi * rng.random(count)
+    turn = np.where(rng.random(count) < 1 / 3, np.pi / 2, turn)
+    slope = np.tan(np.radians(size))
+    return np.arctan(np.stack([slope * np.cos(turn), slope * np.sin(turn)], axis=-1))
+
+
+def _two_elements(rng, count, stop, f_number=(1.4, 16)):
+    """Two elements, or three cemented ones, of about the f-number, the stop at surface `stop`:
+    a plane in air or a refracting surface. Returns parts of `_lens`, h and media."""
+    h = np.exp(rng.uniform(np.log(1), np.log(20), count))
+    number = np.exp(rng.uniform(*np.log(f_number), count))
+    n = rng.uniform(1.4, 1.95, (count, 3))
+    one = np.ones(count)
+    apart = np.stack([one, n[:, 0], one, n[:, 1], one], 1)
+    apart = np.insert(apart, stop, 1, axis=1)  # a plane in air
+    cemented = np.stack([one, n[:, 0], n[:, 1], one, n[:, 2], one], 1)
+    alone = rng.random(count) < 0.5
+    index = np.where(alone[:, None], apart, cemented)
+    curvature = rng.uniform(-1, 1, (count, 5))
+    curvature[:, stop] = np.where(alone, 0, curvature[:, stop])
+    # One linear step towards the wanted power, positive or negative.
+    power = np.sum(curvature * np.diff(index, axis=1), axis=1)
+    factor = rng.choice([1, 1, 1, -1], count) / (2 * h * number * power)
+    curvature = curvature * factor[:, None]
+    steepest = np.max(np.abs(curvature), axis=1) * h
+    curvature = curvature * np.minimum(1, 0.9 / steepest)[:, None]
+    thickness = h[:, None] * rng.uniform(0.1, 0.9, (count, 4)) + 0.5
+    sensor = np.sum(thickness, axis=1) + h * rng.uniform(1, 8, count)
+    parts = {"curvature": curvature, "thickness": thickness, "sensor": sensor}
+    parts |= {"conic": np.zeros((count, 5)), "coefficients": np.zeros((count, 5, 2))}
+    return parts, h, index
+
+
+def _scenes(rng, parts, h, stop, media=None, angles=(0, 15), distances=_FAR, **static):
+    """Scenes of `_lens`, fields from and to so many degrees, a tenth of them 0, and distances
+    from a list in mm."""
+    count = len(h)
+    field = _fields(rng, count, *angles)
+    field[rng.random(count) < 0.1] = 0
+    lens = _lens(parts, h, stop, media, **static)
+    return Scenes(lens, field, rng.choice(distances, count), _pupil_points(rng, count))
+
 
 _FREEFORM = ("biconic", "toroid", "odd_asphere", "polynomial_xy", "asphere", "asphere")
 _PLASTICS = (1.535, 1.544, 1.614, 1.661)
@@ -34,14 +124,14 @@ class Family(NamedTuple):
 
 
 def elements(change: Callable | None = None, f_number: tuple = (1.4, 16), **scenes: Any) -> Make:
-    """`two_elements`, changed in place by change(generator, parts, h, media); the rest as of
-    `scenes_of`. A variant is the index of the stop."""
+    """`_two_elements`, changed in place by change(generator, parts, h, media); the rest as of
+    `_scenes`. A variant is the index of the stop."""
 
     def make(rng, count, stop):
-        parts, h, media = two_elements(rng, count, stop, f_number)
+        parts, h, media = _two_elements(rng, count, stop, f_number)
         if change:
             change(rng, parts, h, media)
-        return scenes_of(rng, parts, h, stop, media, **scenes)
+        return _scenes(rng, parts, h, stop, media, **scenes)
 
     return make
 
@@ -52,8 +142,8 @@ def curvature(rng, parts, h, media):
     tiny = rng.choice([0.0, -0.0, 1e-300, -1e-16, 1e-12, -1e-9, 1e-6], shape)
     steep = rng.choice([-1, 1], shape) * rng.uniform(0.8, 1.02, shape) / h[:, None]
     pick = rng.random(shape)
-    change = np.where(pick < 0.3, tiny, np.where(pick > 0.85, steep, parts["curvature"]))
-    parts["curvature"] = change
+    bent = np.where(pick > 0.85, steep, parts["curvature"])
+    parts["curvature"] = np.where(pick < 0.3, tiny, bent)
 
 
 def conic(rng, parts, h, media):
@@ -128,8 +218,8 @@ def freeform(rng, parts, h, media):
 
 def focus(rng, count, stop):
     """The sensor exactly at the paraxial focus; and stigmatic ellipsoids, whose spot is 0."""
-    parts, h, media = two_elements(rng, count, stop, (1, 16))
-    scenes = scenes_of(rng, parts, h, stop, media, (0, 5))
+    parts, h, media = _two_elements(rng, count, stop, (1, 16))
+    scenes = _scenes(rng, parts, h, stop, media, (0, 5))
     image = jax.vmap(lambda lens, d: drt_jax.image_distance(lens, d, jnp.array([WAVELENGTH]))[0])
     last = np.sum(parts["thickness"], axis=1)
     sensor = np.asarray(jax.jit(image)(scenes.lens, jnp.asarray(scenes.distance)))
@@ -138,7 +228,6 @@ def focus(rng, count, stop):
     n, c = media[:, 1], rng.uniform(0.05, 0.6, count) / h
     media = np.where(ideal[:, None], n[:, None], media)
     media[:, 0] = 1
-    n = media[:, 1]
     glass = ideal & (n > 1)
     bend, k = parts["curvature"], parts["conic"]
     bend[:, 0], k[:, 0] = np.where(glass, c, bend[:, 0]), np.where(glass, -1 / n**2, 0)
@@ -147,7 +236,7 @@ def focus(rng, count, stop):
     parts["sensor"] = np.maximum(sensor, last + 0.1)
     field = np.where(ideal[:, None], 0, scenes.field)
     far = np.where(ideal, np.inf, scenes.distance)
-    return Scenes(lens_of(parts, h, stop, media), field, far, scenes.pupil)
+    return Scenes(_lens(parts, h, stop, media), field, far, scenes.pupil)
 
 
 def mirror(rng, count, stop):
@@ -155,14 +244,10 @@ def mirror(rng, count, stop):
     h = rng.uniform(5, 50, count)
     gap = h * rng.uniform(1.5, 6, count)
     first, second = -rng.uniform(0.05, 0.7, count) / h, -rng.uniform(-0.5, 1.2, count) / h
-    parts = {
-        "curvature": np.stack([first, second], 1),
-        "conic": rng.uniform(-4, 0.5, (count, 2)),
-        "thickness": -gap[:, None],
-        "sensor": h * rng.uniform(-1, 3, count),
-    }
+    parts = {"curvature": np.stack([first, second], 1), "conic": rng.uniform(-4, 0.5, (count, 2))}
+    parts |= {"thickness": -gap[:, None], "sensor": h * rng.uniform(-1, 3, count)}
     far = (np.inf, 1e6, 1e4)
-    return scenes_of(rng, parts, 0.4 * h, stop, None, (0, 3), far, mirrors=(True, True))
+    return _scenes(rng, parts, 0.4 * h, stop, None, (0, 3), far, mirrors=(True, True))
 
 
 def folded(rng, count, stop):
@@ -170,19 +255,15 @@ def folded(rng, count, stop):
     h, reach = rng.uniform(2, 6, count), rng.uniform(20, 60, count)
     zero = np.zeros(count)
     c = rng.choice([0.0, 1e-3, -1e-3], (count, 2))
-    z = np.stack([zero, zero + 20, zero + 20, zero + 40, zero + 70], 1)
+    z = np.tile([0.0, 20.0, 20.0, 40.0, 70.0], (count, 1))
     y = np.stack([zero, zero, reach, reach, reach], 1)
     tilt = np.zeros((count, 5, 3))
     tilt[:, 1:3, 0] = np.radians(45) + np.radians(rng.uniform(-2, 2, (count, 2)))
     tilt[:, 3] = np.radians(rng.uniform(-3, 3, (count, 3)))
-    parts = {
-        "curvature": np.stack([zero, c[:, 0], c[:, 1], zero], 1),
-        "thickness": np.diff(z, axis=1)[:, :3],
-        "sensor": z[:, 4],
-        "tilt": tilt,
-        "decentre": np.stack([0 * y, y], -1),
-    }
-    return scenes_of(rng, parts, h, stop, None, (0, 5), mirrors=(False, True, True, False))
+    parts = {"curvature": np.stack([zero, c[:, 0], c[:, 1], zero], 1)}
+    parts |= {"thickness": np.diff(z, axis=1)[:, :3], "sensor": z[:, 4]}
+    parts |= {"tilt": tilt, "decentre": np.stack([0 * y, y], -1)}
+    return _scenes(rng, parts, h, stop, None, (0, 5), mirrors=(False, True, True, False))
 
 
 def phone(rng, count, elements):
@@ -212,7 +293,7 @@ def phone(rng, count, elements):
     parts["thickness"] = thickness
     parts["sensor"] = np.sum(thickness, axis=1) + rng.uniform(0.5, 1.5, count)
     glasses = "air", *(f"medium {i}" if i % 2 else "air" for i in range(surfaces + 1))
-    return scenes_of(rng, parts, h, 0, media, (0, 40), glasses=glasses)
+    return _scenes(rng, parts, h, 0, media, (0, 40), glasses=glasses)
 
 
 def offaxis(rng, count, stop):
@@ -238,16 +319,15 @@ def offaxis(rng, count, stop):
     if stop != "itself":
         gap = h * rng.choice([0.0, 0.0, 0.1, -0.1, 0.3, -0.3], count)
         plane = tilt[:, row] * rng.choice([0.0, 0.5, 1.0], (count, 1))
-        tilt, decentre = (
-            np.insert(a, row, b, 1) for a, b in ((tilt, plane), (decentre, decentre[:, row]))
-        )
+        tilt = np.insert(tilt, row, plane, axis=1)
+        decentre = np.insert(decentre, row, decentre[:, row], axis=1)
         z = np.insert(z, row, z[:, row] - gap, axis=1)
         parts = {name: np.insert(a, row, 0, axis=1) for name, a in parts.items()}
         mirrors.insert(row, False)
     parts |= {"thickness": np.diff(z, axis=1)[:, :-1], "sensor": z[:, -1] - z[:, 0]}
     parts |= {"tilt": tilt, "decentre": decentre}
     static = {"glasses": ("air",) * (len(mirrors) + 1), "mirrors": tuple(mirrors)}
-    return scenes_of(rng, parts, h, row, None, (0, 3), (np.inf, 1e6, 1e4), **static)
+    return _scenes(rng, parts, h, row, None, (0, 3), (np.inf, 1e6, 1e4), **static)
 
 
 def camera(rng, count, name):
@@ -257,27 +337,24 @@ def camera(rng, count, name):
     batch = jax.tree.map(lambda a: np.broadcast_to(a, (count, *a.shape)), lens)
 
     def vary(a, size=0.03):
-        return jnp.asarray(a * (1 + size * rng.uniform(-1, 1, a.shape)))
+        return a * (1 + size * rng.uniform(-1, 1, a.shape))
 
     rim = float(lens.semi_diameter[lens.stop])
     conic, terms = np.zeros((count, surfaces + 1)), np.zeros((count, surfaces + 1, 2))
     terms[:, :-1, 1] = rng.uniform(-5e-3, 5e-3, (count, surfaces)) / rim**4
     conic[:, :-1] = rng.uniform(-0.2, 0.2, (count, surfaces))
-    batch = dataclasses.replace(
-        jax.tree.map(jnp.asarray, batch),
-        curvature=vary(batch.curvature),
-        thickness=vary(batch.thickness),
-        conic=jnp.asarray(conic),
-        coefficients=jnp.asarray(terms),
-        sensor=vary(batch.sensor, 0.003),
-    )
+    parts = {"curvature": vary(batch.curvature), "thickness": vary(batch.thickness)}
+    parts |= {"conic": conic, "coefficients": terms, "sensor": vary(batch.sensor, 0.003)}
+    batch = jax.tree.map(jnp.asarray, dataclasses.replace(batch, **parts))
     widest = {"singlet": 5.0, "double_gauss": 14.0}.get(name, 20.0) * 1.2
     far = rng.choice([300.0, 1e3, 25e3, 1e9, np.inf], count)
-    return Scenes(batch, fields(rng, count, 0, widest), far, pupil_points(rng, count))
+    return Scenes(batch, _fields(rng, count, 0, widest), far, _pupil_points(rng, count))
 
 
 _CAMERAS = ("double_gauss", "cooke_triplet", "singlet")
+_WIDE = elements(f_number=(2, 16), angles=(20, 45))
 _EVERYWHERE = (10.0, 20.0, 50.0, 1e5, 1e9, 1e15, np.inf)
+_FREE = "biconic, toroid, odd powers, XY polynomial"
 _NEAR = "gaps of 1e-6 to 1e-2 mm, stop and sensor included"
 _MIRRORS = "three tilted, decentred mirrors, the stop at one: a plane through it, or itself"
 _PHONE = "3 to 5 aspheres to r^12, f/1.6 to f/2.4, to 40 degrees, stop -0.6 to 0.6 mm behind vertex"
@@ -292,20 +369,16 @@ FAMILIES = {
     "touching": Family("gaps of 0, 1e-17 and 1e-8 mm", elements(gaps(0.0, 1e-17, 1e-8)), (2,), 0.2),
     "distance": Family("10 mm to infinity", elements(angles=(0, 20), distances=_EVERYWHERE)),
     "focus": Family("sensor at the paraxial focus; stigmatic ellipsoids", focus),
-    "field": Family("20 to 45 degrees", elements(f_number=(2, 16), angles=(20, 45))),
+    "field": Family("20 to 45 degrees", _WIDE),
     "tilted": Family("by 10 degrees, decentred by a tenth", elements(tilted, (2, 16)), (4,)),
     "mirror": Family("two conic mirrors facing each other", mirror, (1,)),
     "folded": Family("a periscope", folded, (3,), 0.5),
-    "freeform": Family(
-        "biconic, toroid, odd powers, XY polynomial", elements(freeform, forms=_FREEFORM), (2,), 0.5
-    ),
+    "freeform": Family(_FREE, elements(freeform, forms=_FREEFORM), (2,), 0.5),
     "camera": Family("three bundled lenses off by 3 %", camera, _CAMERAS),
     "camera, float32": Family("the same", camera, _CAMERAS, 1.0, "float32"),
     "aperture, float32": Family("as aperture", elements(f_number=(0.7, 32)), (2,), 0.5, "float32"),
     "asphere, float32": Family("as asphere", elements(asphere), (2,), 0.5, "float32"),
-    "field, float32": Family(
-        "as field", elements(f_number=(2, 16), angles=(20, 45)), (2,), 0.5, "float32"
-    ),
+    "field, float32": Family("as field", _WIDE, (2,), 0.5, "float32"),
     "phone": Family(_PHONE, phone, (3, 4, 5), 0.5),
     "offaxis": Family(_MIRRORS, offaxis, ("first", "second", "itself"), 0.5),
 }
@@ -315,7 +388,7 @@ def draw(name: str, count: int, seed: int, variants: tuple | None = None) -> Ite
     """The scenes of a family, one batch for each variant, always the same for a seed."""
     family = FAMILIES[name]
     number = list(FAMILIES).index(name)
-    variants = family.variants if variants is None else variants
+    variants = variants or family.variants
     each = -(-max(1, round(count * family.share)) // len(variants))
     for k, variant in enumerate(variants):
         rng = np.random.default_rng((seed, number, k))

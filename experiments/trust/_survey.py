@@ -13,7 +13,7 @@ from drt_jax.lens.lens import rotation_matrix
 from drt_jax.lens.surface import Shape, sag_derivatives
 from drt_jax.numerics import safe_sqrt
 
-from ._scenes import WAVELENGTH, Scenes
+from ._families import WAVELENGTH, Scenes
 from .snell import trace_snell
 
 _BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
