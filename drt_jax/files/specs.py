@@ -4,7 +4,7 @@ import difflib
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jax import Array
 
 from ..lens.glass import Dispersion, Glass, find_glass
 from ..lens.lens import Lens
-from ..lens.surface import FORMS, Shape, by_form, powers_xy, surface_sag
+from ..lens.surface import FORMS, Shape, powers_xy, surface_sag
 
 _TOP_KEYS = ("name", "source", "object", "surfaces", "sensor", "sensor_tilt", "sensor_decentre")
 _MEDIUM_KEYS = ("glass", "index")
@@ -37,14 +37,14 @@ _ROUND = ("asphere", "odd_asphere", "polynomial_xy")
 _TOUCH = 1e-4
 # The direction of a ray between vertices closer than this (mm) drowns in rounding.
 _CLOSEST = 1e-6
-_by_form = jax.jit(by_form, static_argnums=(0, 3))
+_sag = jax.jit(surface_sag, static_argnums=2)
 
 
 class LensError(ValueError):
     """A prescription that cannot be used; the message names the file, the key and the remedy."""
 
 
-class _Entry:
+class _Entry(dict[Any, Any]):
     """A mapping in a prescription, and what its place is called in messages.
 
     values: the mapping.
@@ -57,30 +57,26 @@ class _Entry:
         known = ", ".join(map(str, keys[:20])) + (", ..." if len(keys) > 20 else "")
         if not isinstance(values, dict):
             raise self.error("", f"expected a mapping with the keys {known}")
-        self.values: dict[Any, Any] = values
-        for key in values:
+        super().__init__(values)
+        for key in self:
             if key not in keys:
                 near = difflib.get_close_matches(str(key), map(str, keys), n=1, cutoff=0.7)
                 hint = f"did you mean {near[0]!r}? " if near else ""
                 raise self.error("", f"unknown key {key!r}; {hint}known: {known}")
 
-    def __contains__(self, key: object) -> bool:
-        return key in self.values
-
     def name(self, key: object) -> str:
-        """What the entry `key` is called in messages."""
-        return f"{self.place}.{key}" if self.place else str(key)
+        """What the entry `key` or, if that is empty, the mapping is called in messages."""
+        return ".".join(filter(None, (self.place, str(key))))
 
     def error(self, key: object, message: str) -> LensError:
         """An error of the entry `key` or, if that is empty, of the mapping."""
-        name = self.place if key == "" else self.name(key)
-        return LensError(f"{name}: {message}" if name else message)
+        return LensError(": ".join(filter(None, (self.name(key), message))))
 
     def number(self, key: object, default: float | None = None, finite: bool = True) -> float:
         """A number, given as such or as text: YAML 1.1 reads 1e-3 and inf as text."""
-        value = self.values.get(key, default)
+        value: Any = self.get(key, default)
         try:
-            number = math.nan if isinstance(value, bool) or value is None else float(value)
+            number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError):
             number = math.nan
         if math.isnan(number):
@@ -91,7 +87,7 @@ class _Entry:
 
     def vector(self, key: str, length: int) -> list[float]:
         """A list of `length` numbers; empty if there is none."""
-        values = self.values.get(key)
+        values = self.get(key)
         if values is None:
             return []
         if not isinstance(values, list | tuple) or len(values) != length:
@@ -101,7 +97,7 @@ class _Entry:
 
     def flag(self, key: str) -> bool:
         """True or false; false if it is not given."""
-        value = self.values.get(key, False)
+        value = self.get(key, False)
         if not isinstance(value, bool):
             raise self.error(key, "expected true or false")
         return value
@@ -119,22 +115,6 @@ class _Entry:
         return 1 / value
 
 
-class _Row(NamedTuple):
-    """One row of a lens, a surface or the sensor.
-
-    form, curvature, conic, coefficients, semi_diameter: as in `Lens`.
-    decentre, tilt: mm and degrees, empty if they are not given.
-    """
-
-    form: str = "asphere"
-    curvature: float = 0.0
-    conic: float = 0.0
-    coefficients: tuple[float, ...] = ()
-    semi_diameter: float = math.inf
-    decentre: Sequence[float] = ()
-    tilt: Sequence[float] = ()
-
-
 def _medium(entry: _Entry) -> Glass:
     if "glass" in entry and "index" in entry:
         raise entry.error("", "give either glass or index, not both")
@@ -146,72 +126,59 @@ def _medium(entry: _Entry) -> Glass:
             return find_glass("air")
         return Glass(f"index {value!r}", schott=(value**2, 0.0, 0.0, 0.0, 0.0, 0.0))
     try:
-        return find_glass(str(entry.values.get("glass", "air")))
+        return find_glass(str(entry.get("glass", "air")))
     except ValueError as error:
         raise entry.error("glass", str(error)) from error
 
 
 def _media(top: _Entry, surfaces: list[_Entry]) -> list[Glass]:
     """The medium in front of the lens, and that behind each surface."""
-    media = [_medium(_Entry(top.values.get("object", {}), "object", _MEDIUM_KEYS))]
+    media = [_medium(_Entry(top.get("object", {}), "object", _MEDIUM_KEYS))]
     for surface in surfaces:
-        if surface.flag("mirror"):
-            for key in _MEDIUM_KEYS:
-                if key in surface:
-                    raise surface.error(key, "behind a mirror is the medium before it")
-            media.append(media[-1])
-        else:
-            media.append(_medium(surface))
+        mirror = surface.flag("mirror")
+        for key in _MEDIUM_KEYS:
+            if mirror and key in surface:
+                raise surface.error(key, "behind a mirror is the medium before it")
+        media.append(media[-1] if mirror else _medium(surface))
     return media
 
 
-def _coefficients(surface: _Entry, form: str) -> tuple[float, ...]:
+def _form(surface: _Entry) -> str:
+    form = surface.get("form", "asphere")
+    if form not in FORMS:
+        raise surface.error("form", f"unknown form {form!r}; known: {', '.join(FORMS)}")
+    return form
+
+
+def _coefficients(surface: _Entry) -> list[float]:
+    form = _form(surface)
     first, powers = _COLUMNS[form]
     for key in ("radius_x", "curvature_x", "conic_x"):
         if key in surface and key.replace("radius", "curvature") not in first:
             raise surface.error(key, f"a surface of the form {form} has none")
-    given = _Entry(surface.values.get("coefficients", {}), surface.name("coefficients"), powers)
-    columns = {len(first) + powers.index(power): given.number(power) for power in given.values}
+    given = _Entry(surface.get("coefficients", {}), surface.name("coefficients"), powers)
+    columns = {len(first) + powers.index(power): given.number(power) for power in given}
     if "curvature_x" in first:
         columns[0] = surface.curvature("_x")
     if "conic_x" in first:
         columns[1] = surface.number("conic_x", 0.0)
-    return tuple(columns.get(k, 0.0) for k in range(max(columns, default=-1) + 1))
+    return [columns.get(k, 0.0) for k in range(max(columns, default=-1) + 1)]
 
 
-def _row(surface: _Entry) -> _Row:
-    form = surface.values.get("form", "asphere")
-    if form not in FORMS:
-        raise surface.error("form", f"unknown form {form!r}; known: {', '.join(FORMS)}")
-    row = _Row(
-        form=form,
-        curvature=surface.curvature(),
-        conic=surface.number("conic", 0.0),
-        coefficients=_coefficients(surface, form),
-        semi_diameter=surface.number("semi_diameter", math.inf, finite=False),
-        decentre=surface.vector("decentre", 2),
-        tilt=surface.vector("tilt", 3),
-    )
-    if row.semi_diameter <= 0:
+def _semi_diameter(surface: _Entry) -> float:
+    """The clear aperture, mm, which lies on the surface; of the stop it is finite."""
+    semi = surface.number("semi_diameter", math.inf, finite=False)
+    if semi <= 0:
         raise surface.error("semi_diameter", "must be positive")
-    bent = (1 + row.conic) * row.curvature**2
-    if math.isfinite(row.semi_diameter) and form in _ROUND and bent * row.semi_diameter**2 >= 1:
-        raise surface.error(
-            "semi_diameter",
-            f"{row.semi_diameter:g} mm reaches beyond the surface, which ends at "
-            f"{bent**-0.5:g} mm; lower it, or the curvature",
-        )
-    return row
-
-
-def _stop(surfaces: list[_Entry], rows: list[_Row]) -> int:
-    """The index of the stop."""
-    stops = [i for i, surface in enumerate(surfaces) if surface.flag("stop")]
-    if len(stops) != 1:
-        raise LensError(f"surfaces: {len(stops)} have stop: true, exactly one must")
-    if math.isinf(rows[stops[0]].semi_diameter):
-        raise surfaces[stops[0]].error("semi_diameter", "the stop needs one")
-    return stops[0]
+    if math.isinf(semi):
+        if surface.flag("stop"):
+            raise surface.error("semi_diameter", "the stop needs one")
+        return semi
+    bent = (1 + surface.number("conic", 0.0)) * surface.curvature() ** 2
+    if _form(surface) in _ROUND and bent * semi**2 >= 1:
+        reach = f"{semi:g} mm reaches beyond the surface, which ends at {bent**-0.5:g} mm"
+        raise surface.error("semi_diameter", f"{reach}; lower it, or the curvature")
+    return semi
 
 
 def _gaps(top: _Entry, surfaces: list[_Entry]) -> list[float]:
@@ -238,34 +205,36 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     name: of the lens, where the mapping gives none.
     """
     top = _Entry(values, "", _TOP_KEYS)
-    entries = top.values.get("surfaces")
+    entries = top.get("surfaces")
     if not isinstance(entries, list) or not entries:
         raise LensError("surfaces: expected a list of at least one surface")
     surfaces = [_Entry(e, f"surfaces[{i}]", _SURFACE_KEYS) for i, e in enumerate(entries)]
-    rows = [*map(_row, surfaces)]
-    rows += [_Row(decentre=top.vector("sensor_decentre", 2), tilt=top.vector("sensor_tilt", 3))]
+    stops = [i for i, surface in enumerate(surfaces) if surface.flag("stop")]
+    if len(stops) != 1:
+        raise LensError(f"surfaces: {len(stops)} have stop: true, exactly one must")
+    # The last row of each is the sensor.
+    coefficients = [*map(_coefficients, surfaces), []]
+    decentre = [*(s.vector("decentre", 2) for s in surfaces), top.vector("sensor_decentre", 2)]
+    tilt = [*(s.vector("tilt", 3) for s in surfaces), top.vector("sensor_tilt", 3)]
+    moved = any(decentre) or any(tilt)
     media, gaps = _media(top, surfaces), _gaps(top, surfaces)
-    columns = max(len(row.coefficients) for row in rows)
-    moved = any(row.decentre or row.tilt for row in rows)
     lens = Lens(
-        curvature=_array([row.curvature for row in rows]),
-        conic=_array([row.conic for row in rows]),
-        coefficients=_table([row.coefficients for row in rows], columns),
+        curvature=_array([*(surface.curvature() for surface in surfaces), 0.0]),
+        conic=_array([*(surface.number("conic", 0.0) for surface in surfaces), 0.0]),
+        coefficients=_table(coefficients, max(map(len, coefficients))),
         thickness=_array(gaps[:-1]),
-        semi_diameter=_array([row.semi_diameter for row in rows]),
+        semi_diameter=_array([*map(_semi_diameter, surfaces), math.inf]),
         sensor=_array(top.number("sensor", sum(gaps))),
         dispersion=Dispersion.of(media),
-        decentre=_table([row.decentre for row in rows], 2) if moved else None,
-        tilt=jnp.radians(_table([row.tilt for row in rows], 3)) if moved else None,
-        stop=_stop(surfaces, rows),
+        decentre=_table(decentre, 2) if moved else None,
+        tilt=jnp.radians(_table(tilt, 3)) if moved else None,
+        stop=stops[0],
         glasses=tuple(medium.name for medium in media),
-        forms=tuple(row.form for row in rows),
+        forms=(*map(_form, surfaces), "asphere"),
         mirrors=tuple(surface.flag("mirror") for surface in surfaces),
-        name=str(top.values.get("name", name)),
+        name=str(top.get("name", name)),
     )
-    pairs = _pairs(lens, rows, gaps)
-    _check_order(lens, pairs)
-    _check_crossing(lens, pairs)
+    _check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
     return lens
 
 
@@ -274,47 +243,30 @@ def _array(values: object) -> Array:
     return jax.device_put(np.asarray(values, jnp.result_type(float)))
 
 
-def _table(rows: Sequence[Sequence[float]], width: int) -> Array:
+def _table(rows: list[list[float]], width: int) -> Array:
     """Rows of numbers as an array (rows, `width`), zeros behind what they lack."""
     return _array([[*row, *[0.0] * (width - len(row))] for row in rows])
 
 
-class _Pair(NamedTuple):
-    """Rows `i` and `j` that light on the axis meets one right after the other.
+def _check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
+    """LensError where light would go backwards, or neighbours overlap in both their apertures.
 
-    distance: mm from the vertex of `i` to that of `j`, along the z axis.
-    sense: 1 where light travels along that axis, -1 where a mirror has turned it.
+    Neighbours are the surfaces that bend light, and the sensor behind the last. The straight ray
+    between two of them may cross a stop that bends none before the first or behind the second, so
+    that it may lie anywhere. A pair of which one is tilted or decentred is left out: away from the
+    axis, or at an angle to it, it may lie before its neighbour there and behind it where the light
+    goes.
+
+    gaps: mm from each surface to the next and from the last to the sensor.
+    moved: of each surface and the sensor.
     """
-
-    i: int
-    j: int
-    distance: float
-    sense: int
-
-
-def _pairs(lens: Lens, rows: list[_Row], gaps: list[float]) -> list[_Pair]:
-    """Neighbours among the surfaces that bend light; of the last pair, one is the sensor.
-
-    The straight ray between two of them may cross a stop that bends none before the first or
-    behind the second, so that it may lie anywhere. A pair of which one is tilted or decentred is
-    left out: away from the axis, or at an angle to it, it may lie before its neighbour there and
-    behind it where the light goes.
-    """
-    off = [any(row.decentre) or any(row.tilt) for row in rows]
     chain = itertools.pairwise([*(lens.live or (lens.stop,)), lens.count])
-    return [
-        _Pair(i, j, sum(gaps[i:j]), int(lens.senses[i + 1]))
-        for i, j in chain
-        if not off[i] and not off[j]
-    ]
-
-
-def _check_order(lens: Lens, pairs: list[_Pair]) -> None:
-    """LensError where light would have to go backwards from a surface to the next or the sensor."""
-    for i, j, distance, sense in pairs:
-        if sense * distance >= _CLOSEST:
+    pairs = [(i, j, sum(gaps[i:j])) for i, j in chain if not moved[i] and not moved[j]]
+    for i, j, distance in pairs:
+        forwards = lens.senses[i + 1] > 0
+        turned = "" if forwards else ", as a mirror has turned the light"
+        if (distance if forwards else -distance) >= _CLOSEST:
             continue
-        turned = "" if sense > 0 else ", as a mirror has turned the light"
         if j == lens.count:
             raise LensError(
                 f"sensor: {float(lens.sensor):g} mm lies before the vertex of surface {i} at "
@@ -322,33 +274,24 @@ def _check_order(lens: Lens, pairs: list[_Pair]) -> None:
             )
         reach = "" if j == i + 1 else f" up to surface {j}, in sum"
         raise LensError(
-            f"surfaces[{i}].thickness{reach}: must be {'positive' if sense > 0 else 'negative'}"
+            f"surfaces[{i}].thickness{reach}: must be {'positive' if forwards else 'negative'}"
             f"{turned}, at least {_CLOSEST} mm; leave out one of two surfaces that touch"
         )
-
-
-def _check_crossing(lens: Lens, pairs: list[_Pair]) -> None:
-    """LensError where neighbours overlap inside both their clear apertures."""
-    pairs = [pair for pair in pairs if pair.j < lens.count]
-    if not pairs:
-        return
     semi = np.asarray(lens.semi_diameter)
-    common = np.array([min(semi[pair.i], semi[pair.j]) for pair in pairs])
-    radius = np.where(np.isfinite(common), common, 0)[:, None] * np.linspace(0, 1, 17)
-    rows = [*(pair.i for pair in pairs), *(pair.j for pair in pairs)]
-    y = np.concatenate([radius, radius]).astype(semi.dtype)
-    shape = jax.tree.map(
-        lambda a: np.asarray(a)[rows].T[..., None],
-        Shape(lens.curvature, lens.conic, lens.coefficients),
-    )
-    z = _by_form(surface_sag, (np.zeros_like(y), y), shape, tuple(lens.forms[i] for i in rows))
-    front, back = np.split(np.asarray(z), 2)
-    for k, (i, j, distance, sense) in enumerate(pairs):
-        overlap = sense * (front[k] - back[k] - distance)
-        if np.any(overlap > _TOUCH):
-            where = radius[k, np.argmax(overlap > _TOUCH)]
+    shape = [np.asarray(a) for a in (lens.curvature, lens.conic, lens.coefficients)]
+    for i, j, distance in pairs:
+        rim = min(semi[i], semi[j])
+        if j == lens.count or math.isinf(rim):
+            continue
+        y = np.linspace(0, rim, 17, dtype=semi.dtype)
+        front, back = (
+            np.asarray(_sag((0 * y, y), Shape(*(a[k] for a in shape)), lens.forms[k]))
+            for k in (i, j)
+        )
+        crossed = lens.senses[i + 1] * (front - back - distance) > _TOUCH
+        if np.any(crossed):
             raise LensError(
                 f"surfaces[{i}].thickness: {distance:g} mm makes surfaces {i} and {j} cross at "
-                f"{where:.3g} mm from the axis, within their semi-diameters of {semi[i]:g} and "
-                f"{semi[j]:g} mm; raise the thickness or lower a semi-diameter"
+                f"{y[np.argmax(crossed)]:.3g} mm from the axis, within their semi-diameters of "
+                f"{semi[i]:g} and {semi[j]:g} mm; raise the thickness or lower a semi-diameter"
             )

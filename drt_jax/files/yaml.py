@@ -29,30 +29,19 @@ def load_lens(source: str | pathlib.Path | Mapping) -> Lens:
     with jax.core.eval_context():  # a lens loaded inside a jitted function is a constant
         if isinstance(source, Mapping):
             return build_lens(dict(source))
-        path = _path(source)
+        path = pathlib.Path(source)
+        if path.suffix not in (".yaml", ".yml"):
+            path = _BUNDLED / f"{source}.yaml"
+            if not path.is_file():
+                raise LensError(
+                    f"no bundled lens {str(source)!r}; bundled: {', '.join(lens_names())}; "
+                    "for a file of your own give a path that ends in .yaml"
+                )
         try:
-            return build_lens(_read(path), path.stem)
+            return build_lens(yaml.safe_load(path.read_text()), path.stem)
+        except OSError as error:
+            raise LensError(f"{path}: cannot be read: {error.strerror}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise LensError(f"{path}: not a YAML file: {error}") from error
         except LensError as error:
             raise LensError(f"{path}: {error}") from None
-
-
-def _path(source: str | pathlib.Path) -> pathlib.Path:
-    path = pathlib.Path(source)
-    if path.suffix in (".yaml", ".yml"):
-        return path
-    path = _BUNDLED / f"{source}.yaml"
-    if path.is_file():
-        return path
-    raise LensError(
-        f"no bundled lens {str(source)!r}; bundled: {', '.join(lens_names())}; "
-        "for a file of your own give a path that ends in .yaml"
-    )
-
-
-def _read(path: pathlib.Path) -> object:
-    try:
-        return yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise LensError(f"cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise LensError(f"not a YAML file: {error}") from error

@@ -49,11 +49,8 @@ def adam(
 
             return jax.tree.map(leaf, first, second)
 
-        if isinstance(rates, Mapping):
-            updates = {group: scaled(rates[group], first[group], second[group]) for group in first}
-        else:
-            updates = scaled(rates, first, second)
-        return updates, AdamState(steps, first, second)
+        groups = {group: rates[group] for group in first} if isinstance(rates, Mapping) else rates
+        return jax.tree.map(scaled, groups, first, second), AdamState(steps, first, second)
 
     return init, update
 

@@ -5,34 +5,21 @@ the sensor layer sees true context on all sides. Nothing is downloaded.
 """
 
 import dataclasses
-import functools
 import pathlib
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from skimage import color, data, io, util
 
 # Colour and texture photographs that lie inside the scikit-image wheel.
 _BUNDLED = (
-    "astronaut",
-    "brick",
-    "chelsea",
-    "coffee",
-    "grass",
-    "gravel",
-    "hubble_deep_field",
-    "immunohistochemistry",
-    "retina",
-    "rocket",
-    "stereo_motorcycle",
+    *("astronaut", "brick", "chelsea", "coffee", "grass", "gravel", "hubble_deep_field"),
+    *("immunohistochemistry", "retina", "rocket", "stereo_motorcycle"),
 )
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
-
-
-# A name, and a function that reads the image.
-Source = tuple[str, Callable[[], np.ndarray]]
 
 
 class DataError(ValueError):
@@ -56,8 +43,7 @@ class DataConfig:
     memory_map: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
-class Patches:
+class Patches(NamedTuple):
     """train, test: uint8 (N, P, P, 3), in memory or memory-mapped.
     skipped: what was left out, a line for each file with the reason."""
 
@@ -120,9 +106,10 @@ def _collect(crops: Iterator[np.ndarray], side: int, folder: str) -> np.ndarray:
         raise DataError(f"data.memory_map: {folder}: {error.strerror}") from error
 
 
-def _sources(root: str) -> list[Source]:
+def _sources(root: str) -> Sequence[str | pathlib.Path]:
+    """Names of bundled photographs, or paths."""
     if root == "bundled":
-        return [(name, functools.partial(_bundled, name)) for name in _BUNDLED]
+        return _BUNDLED
     folder = pathlib.Path(root).expanduser()
     if not folder.is_dir():
         raise DataError(f"data.root: {root} is not a folder; give one with images, or bundled")
@@ -130,29 +117,23 @@ def _sources(root: str) -> list[Source]:
     if not paths:
         kinds = ", ".join(_SUFFIXES)
         raise DataError(f"data.root: {root} holds no image ({kinds}), nor do its subfolders")
-    return [(str(path), functools.partial(io.imread, path)) for path in paths]
-
-
-def _bundled(name: str) -> np.ndarray:
-    image = getattr(data, name)()
-    return image[0] if isinstance(image, tuple) else image  # a stereo pair: one scene
+    return paths
 
 
 def _crops(
-    source: Source, count: int, side: int, seed: list[int], skipped: list[str]
+    source: str | pathlib.Path, count: int, side: int, seed: list[int], skipped: list[str]
 ) -> list[np.ndarray]:
-    name, read = source
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            image = _rgb(read())
+            image = _image(source)
     except Exception as error:  # an image reader may raise anything on a damaged file
         reason = str(error).strip().splitlines()
-        skipped.append(f"{name}: unreadable ({reason[0] if reason else type(error).__name__})")
+        skipped.append(f"{source}: unreadable ({reason[0] if reason else type(error).__name__})")
         return []
     height, width = image.shape[:2]
     if min(height, width) < side:
-        skipped.append(f"{name}: {width} x {height} pixels, smaller than {side}")
+        skipped.append(f"{source}: {width} x {height} pixels, smaller than {side}")
         return []
     generator = np.random.default_rng(seed)
     tops = generator.integers(0, height - side + 1, count)
@@ -161,8 +142,11 @@ def _crops(
     return [image[y : y + side, x : x + side].copy() for y, x in zip(tops, lefts)]
 
 
-def _rgb(image: np.ndarray) -> np.ndarray:
+def _image(source: str | pathlib.Path) -> np.ndarray:
     """Any image as uint8 (H, W, 3): grey is repeated, alpha dropped, pages beyond one too."""
+    image = getattr(data, source)() if isinstance(source, str) else io.imread(source)
+    if isinstance(image, tuple):  # a stereo pair: one scene
+        image = image[0]
     if image.ndim > 3:
         image = image[0]
     if image.ndim == 2:

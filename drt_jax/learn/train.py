@@ -15,6 +15,7 @@ from ..image.kernel import Form, gaussian_psf
 from ..image.sensor import Convolve, convolve, sensor_layer
 from ..numerics import safe_divide, safe_sqrt
 from .adam import adam, apply_updates
+from .network import count_parameters
 
 Blur = Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]
 Restore = Callable[[Any, Array], Array]
@@ -102,13 +103,12 @@ def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, A
     In forward mode where a single number is trained, such as the sensor position: it takes two
     thirds of the time, and turns no images over (paper section 3 says when either mode pays).
     """
-    leaves, structure = jax.tree.flatten(parameters)
-    if sum(leaf.size for leaf in leaves) > 1:
+    if count_parameters(parameters) > 1:
         return jax.value_and_grad(loss, has_aux=True)(parameters)
     ones = jax.tree.map(jnp.ones_like, parameters)
     value, slope, extras = jax.jvp(loss, (parameters,), (ones,), has_aux=True)
-    gradients = [slope.astype(leaf.dtype).reshape(leaf.shape) for leaf in leaves]
-    return (value, extras), jax.tree.unflatten(structure, gradients)
+    gradient = jax.tree.map(lambda p: slope.astype(p.dtype).reshape(p.shape), parameters)
+    return (value, extras), gradient
 
 
 def make_step(
@@ -226,19 +226,18 @@ def evaluate(
         key = jax.random.fold_in(jax.random.key(seed), start)
         images = imager(parameters, filled, distance, np.float32(noise), key)[:3]
         for truth, sensor, restored in zip(*(np.asarray(a)[: len(part)] for a in images)):
-            before = {f"sensor_{k}": v for k, v in _quality(truth, sensor).items()}
-            rows.append(_quality(truth, restored) | before)
+            rows.append(_quality(truth, restored, "") | _quality(truth, sensor, "sensor_"))
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     for prefix in ("", "sensor_"):
         means[prefix + "rmse"] = means.pop(prefix + "mse") ** 0.5
     return means
 
 
-def _quality(truth: np.ndarray, image: np.ndarray) -> dict[str, float]:
+def _quality(truth: np.ndarray, image: np.ndarray, prefix: str) -> dict[str, float]:
     similarity = metrics.structural_similarity(truth, image, data_range=1, channel_axis=-1)
     return {
-        "mae": float(np.mean(np.abs(truth - image))),
-        "mse": metrics.mean_squared_error(truth, image),
-        "psnr": metrics.peak_signal_noise_ratio(truth, image, data_range=1),
-        "ssim": similarity,
+        prefix + "mae": float(np.mean(np.abs(truth - image))),
+        prefix + "mse": metrics.mean_squared_error(truth, image),
+        prefix + "psnr": metrics.peak_signal_noise_ratio(truth, image, data_range=1),
+        prefix + "ssim": similarity,
     }

@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import functools
+import itertools
 import pathlib
 
 import jax
@@ -16,7 +17,6 @@ from ..numerics import concrete
 
 # The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_SCHOTT_POWERS = (0, 2, -2, -4, -6, -8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,9 +60,9 @@ class Dispersion:
         halves = [np.asarray(m.sellmeier, float).reshape(2, -1) for m in media]
         terms = max(3, *(half.shape[1] for half in halves))
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
-        parts = padded[:, 0], padded[:, 1], np.asarray([m.schott for m in media])
+        parts = padded[:, 0], padded[:, 1], [m.schott for m in media]
         dtype = jnp.result_type(float)
-        return cls(*(jax.device_put(part.astype(dtype)) for part in parts))
+        return cls(*(jax.device_put(np.asarray(part, dtype)) for part in parts))
 
 
 @functools.cache
@@ -70,8 +70,7 @@ def _catalogue() -> dict[str, Glass]:
     text = (pathlib.Path(__file__).parent / "catalogue" / "glasses.yaml").read_text()
     glasses = {"air": Glass("air")}
     for name, entry in yaml.load(text, _Loader).items():
-        constants = {key: tuple(entry[key]) for key in ("sellmeier", "schott") if key in entry}
-        glasses[name] = Glass(name, range=tuple(entry["range"]), **constants)
+        glasses[name] = Glass(name, **{key: tuple(values) for key, values in entry.items()})
     return glasses
 
 
@@ -101,13 +100,8 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     b, c = dispersion.strength[..., None], dispersion.resonance[..., None]
     square = (wavelengths**2)[None, None]
     sellmeier = jnp.sum(b * square / (square - c), axis=1)
-    powers = jnp.stack([wavelengths**p for p in _SCHOTT_POWERS])
+    powers = jnp.stack([wavelengths**p for p in (0, 2, -2, -4, -6, -8)])
     return jnp.sqrt(sellmeier + dispersion.schott @ powers)
-
-
-def _range(name: str) -> tuple[float, float]:
-    """Wavelengths in um for which the constants of a medium hold."""
-    return _catalogue().get(name, Glass(name)).range
 
 
 def common_range(names: tuple[str, ...]) -> tuple[float, float]:
@@ -116,7 +110,7 @@ def common_range(names: tuple[str, ...]) -> tuple[float, float]:
     names: of media; one that is not in the catalogue has a constant index. The first number is the
     larger one if there is no such wavelength.
     """
-    low, high = zip(*map(_range, names))
+    low, high = zip(*(_catalogue().get(name, Glass(name)).range for name in names))
     return max(low), min(high)
 
 
@@ -140,11 +134,8 @@ def check_wavelengths(names: tuple[str, ...], wavelengths: ArrayLike) -> None:
     """
     if not concrete(wavelengths):
         return
-    for name in names:
-        low, high = _range(name)
-        for value in np.ravel(np.asarray(wavelengths)):
-            if not low <= value <= high:
-                bounds = f"{low:g} to {high:g} um"
-                raise ValueError(
-                    f"wavelength {value:g} um is outside the range of {name}, {bounds}"
-                )
+    for name, value in itertools.product(names, np.ravel(wavelengths)):
+        low, high = common_range((name,))
+        if not low <= value <= high:
+            bounds = f"{low:g} to {high:g} um"
+            raise ValueError(f"wavelength {value:g} um is outside the range of {name}, {bounds}")

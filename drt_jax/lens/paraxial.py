@@ -224,11 +224,9 @@ def first_order(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Firs
 
 
 def focal_length(lens: Lens, wavelengths: ArrayLike) -> Array:
-    """Effective focal length (W,), mm; inf for an afocal lens. `wavelengths` (W,) in um.
-
-    From the rear principal plane to the focus, along z: in water longer by its index than in
-    air, and negative for a concave mirror, whose focus lies before it.
-    """
+    """Effective focal length (W,), mm; inf for an afocal lens. `wavelengths` (W,) in um. From the
+    rear principal plane to the focus, along z: in water longer by its index than in air, and
+    negative for a concave mirror, whose focus lies before it."""
     slope = trace_ray(paraxial_system(lens, wavelengths), 1.0, 0.0).behind[-1]
     return _quotient(-jnp.ones_like(slope), slope)
 
@@ -254,26 +252,20 @@ def image_distance(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> A
 
 def numerical_aperture(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
     """Paraxial n u of the marginal ray at the image (W,), positive; 0 for an image at infinity.
-
-    `distance` from the object to the first vertex in mm, inf allowed; `wavelengths` (W,), um.
-    """
+    `distance` from the object to the first vertex in mm, inf allowed; `wavelengths` (W,), um."""
     return first_order(lens, distance, wavelengths).numerical_aperture
 
 
 def f_number(lens: Lens, wavelengths: ArrayLike, distance: ArrayLike = jnp.inf) -> Array:
-    """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity.
-
-    For an infinitely far object, focal length over diameter of the entrance pupil; else the
-    working f-number. `wavelengths` (W,) in um, `distance` in mm.
-    """
+    """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity. For an
+    infinitely far object, focal length over diameter of the entrance pupil; else the working
+    f-number. `wavelengths` (W,) in um, `distance` in mm."""
     return first_order(lens, distance, wavelengths).f_number
 
 
 def lateral_magnification(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
     """Image height over object height (W,), negative where the image is upside down.
-
-    `distance` from the object to the first vertex in mm; inf gives 0. `wavelengths` (W,), um.
-    """
+    `distance` from the object to the first vertex in mm; inf gives 0. `wavelengths` (W,), um."""
     return first_order(lens, distance, wavelengths).magnification
 
 

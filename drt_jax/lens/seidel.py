@@ -66,14 +66,6 @@ def _fourth_order(lens: Lens, vertex: Array) -> Array:
     return fourth + ((1 + k) * c**3 - vertex**3) / 8
 
 
-def _field_ray(system: ParaxialSystem, vergence: Array, tangent: Array) -> ParaxialRay:
-    """The chief ray from the edge of the field, the tangent of whose angle is given."""
-    height, slope = chief_ray(system, front=True)
-    # Scaled to the field, the slope of the line from the object point to the first vertex.
-    scale = safe_divide(tangent, slope - vergence * height)
-    return trace_ray(system, height * scale, slope * scale)
-
-
 def _seidel(
     system: ParaxialSystem, figure: Array, marginal: ParaxialRay, chief: ParaxialRay
 ) -> tuple[Array, Array, Array, Array, Array]:
@@ -116,7 +108,10 @@ def third_order(
     vergence = 1 / jnp.asarray(distance, lens.curvature.dtype)
     n, c = system.index, system.curvature[:, None]
     marginal = marginal_ray(system, vergence)
-    chief = _field_ray(system, vergence, jnp.tan(jnp.asarray(field, n.dtype)))
+    height, slope = chief_ray(system, front=True)
+    # Scaled to the field, the slope of the line from the object point to the first vertex.
+    scale = safe_divide(jnp.tan(jnp.asarray(field, n.dtype)), slope - vergence * height)
+    chief = trace_ray(system, height * scale, slope * scale)
     figure = _fourth_order(lens, system.curvature)
     s1, s2, s3, s4, s5 = _seidel(system, figure, marginal, chief)
 

@@ -55,9 +55,10 @@ def _conic(r2: Array, c: Array, k: Array) -> tuple[Array, Array]:
 
 def _horner(x: Array, coefficients: Array | list[Array]) -> Array:
     """sum_j a_j x^j; 0 without coefficients."""
-    total = jnp.zeros_like(x)
-    for j in reversed(range(len(coefficients))):
-        total = coefficients[j] + x * total if j < len(coefficients) - 1 else coefficients[j]
+    count = len(coefficients)
+    total = coefficients[count - 1] if count else jnp.zeros_like(x)
+    for j in reversed(range(count - 1)):
+        total = coefficients[j] + x * total
     return total
 
 
@@ -124,14 +125,11 @@ def polynomial_xy(w: Point, shape: Shape) -> tuple[Array, Array]:
     z, argument = _conic(_square(w), shape.curvature, shape.conic)
     pairs = powers_xy(len(shape.coefficients))
     degree = max((i + j for i, j in pairs), default=0)
-    rows = []  # a polynomial in y for each power of x
-    for i in range(degree + 1):
-        row = [jnp.zeros_like(shape.curvature)] * (degree - i + 1)
-        for k, (p, q) in enumerate(pairs):
-            if p == i:
-                row[q] = shape.coefficients[k]
-        rows.append(_horner(w[1], row))
-    return z + _horner(w[0], rows), argument
+    zero = jnp.zeros_like(shape.curvature)
+    given = {pair: shape.coefficients[k] for k, pair in enumerate(pairs)}
+    # A polynomial in y for each power of x.
+    rows = [[given.get((i, j), zero) for j in range(degree - i + 1)] for i in range(degree + 1)]
+    return z + _horner(w[0], [_horner(w[1], row) for row in rows]), argument
 
 
 class Form(NamedTuple):

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import difflib
+import json
 import pathlib
 import typing
 from collections.abc import Sequence
@@ -118,10 +119,5 @@ def describe(cls: Any, prefix: str = "") -> list[str]:
 
 def dump_config(config: Any) -> str:
     """The resolved configuration as YAML that `load_config` reads back."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(item) for key, item in value.items()}
-        return [plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-    return yaml.safe_dump(plain(dataclasses.asdict(config)), sort_keys=False)
+    plain = json.loads(json.dumps(dataclasses.asdict(config)))  # tuples as lists
+    return yaml.safe_dump(plain, sort_keys=False)

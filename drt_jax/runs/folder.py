@@ -15,7 +15,7 @@ import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from typing import Any, BinaryIO
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,7 @@ class Run:
         """
         self.folder = folder
         self.figures = folder / "figures"
+        self._metrics = folder / "metrics.csv"
         self._columns = ("job", "step", *columns)
         self._earlier, self._opened = 0.0, time.perf_counter()
         saved = folder / "config.yaml"
@@ -58,11 +59,7 @@ class Run:
             )
         self.figures.mkdir(parents=True, exist_ok=True)
         if not resume:
-            self._replace("config.yaml", lambda file: file.write(dump_config(config).encode()))
-
-    @property
-    def _metrics(self) -> pathlib.Path:
-        return self.folder / "metrics.csv"
+            self._replace("config.yaml", dump_config(config).encode())
 
     @property
     def seconds(self) -> float:
@@ -75,17 +72,13 @@ class Run:
         step: the first of them.
         rows: (N,) values of N steps by column; a column that is not among them stays empty.
         """
-        count = max(len(values) for values in rows.values())
-        columns = [
-            [repr(float(v)) for v in rows[c]] if c in rows else [""] * count
-            for c in self._columns[2:]
-        ]
-        new = not self._metrics.exists()
         with open(self._metrics, "a", newline="") as file:
-            writer = csv.writer(file)
-            if new:
-                writer.writerow(self._columns)
-            writer.writerows((job, step + i, *row) for i, row in enumerate(zip(*columns)))
+            writer = csv.DictWriter(file, self._columns, extrasaction="ignore")
+            if not file.tell():
+                writer.writeheader()
+            for i, values in enumerate(zip(*rows.values())):
+                row = zip(rows, map(float, values))
+                writer.writerow({"job": job, "step": step + i, **dict(row)})
 
     def metrics(self, job: str) -> dict[str, np.ndarray]:
         """The logged metrics of one job, arrays by column (with `step`); NaN where empty."""
@@ -97,7 +90,9 @@ class Run:
         """Checkpoint: the state `tree` of `job` after `step` steps."""
         arrays: dict[str, Any] = {f"leaf{i}": a for i, a in enumerate(jax.tree.leaves(tree))}
         arrays |= {"step": step, "seconds": self.seconds}
-        self._replace(f"checkpoints/{job}.npz", lambda file: np.savez(file, **arrays))
+        file = io.BytesIO()
+        np.savez(file, **arrays)
+        self._replace(f"checkpoints/{job}.npz", file.getvalue())
 
     def load(self, job: str, tree: Any, logged: tuple[str, ...]) -> tuple[int, Any]:
         """The last checkpoint of `job` as (step, state); (0, tree) if there is none.
@@ -111,14 +106,14 @@ class Run:
             leaves, structure = jax.tree.flatten(tree)
             try:
                 with open(path, "rb") as file, np.load(file) as saved:
-                    stored = [saved[f"leaf{i}"] for i in range(len(leaves))]
+                    stored = [jnp.asarray(saved[f"leaf{i}"]) for i in range(len(leaves))]
                     step = int(saved["step"])
                     self._earlier = max(self._earlier, float(saved["seconds"]))
             except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
                 raise ConfigError(
                     f"{path}: not a checkpoint of this run; delete it to start the job anew"
                 ) from error
-            tree = jax.tree.unflatten(structure, [jnp.asarray(leaf) for leaf in stored])
+            tree = jax.tree.unflatten(structure, stored)
         self._truncate(logged, step)
         return step, tree
 
@@ -129,30 +124,24 @@ class Run:
             header, *rows = list(csv.reader(file)) or [list(self._columns)]
         whole = [row for row in rows if len(row) == len(self._columns)]
         kept = [row for row in whole if row[0] not in jobs or int(row[1]) < step]
-        if len(kept) == len(rows):
-            return
-
-        def write(file: BinaryIO) -> None:
+        if len(kept) < len(rows):
             text = io.StringIO(newline="")
             csv.writer(text).writerows([header, *kept])
-            file.write(text.getvalue().encode())
-
-        self._replace("metrics.csv", write)
+            self._replace("metrics.csv", text.getvalue().encode())
 
     def finish(self, results: dict[str, Any]) -> pathlib.Path:
         """Write results.json and return its path."""
-        text = json.dumps(results, indent=2) + "\n"
-        self._replace("results.json", lambda file: file.write(text.encode()))
+        self._replace("results.json", (json.dumps(results, indent=2) + "\n").encode())
         return self.folder / "results.json"
 
-    def _replace(self, name: str, write: Callable[[BinaryIO], Any]) -> None:
+    def _replace(self, name: str, content: bytes) -> None:
         """Write a file whole or not at all."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = path.with_name(path.name + ".partial")
         try:
             with open(scratch, "wb") as file:
-                write(file)
+                file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(scratch, path)
@@ -172,8 +161,8 @@ def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Ca
     asked = False
     # Only the main thread may handle signals; None: a handler from outside Python.
     main = threading.current_thread() is threading.main_thread()
-    handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM) if main}
-    previous = {n: h for n, h in handlers.items() if h not in (None, signal.SIG_IGN)}
+    numbers = (signal.SIGINT, signal.SIGTERM) if main else ()
+    previous = {n: h for n in numbers if (h := signal.getsignal(n)) not in (None, signal.SIG_IGN)}
 
     def ask(number: int, frame: Any) -> None:
         nonlocal asked

@@ -25,7 +25,8 @@ def new(
     return figure, figure.subplots(rows, columns)
 
 
-def _finished(axes: Axes, columns: int = 1) -> Axes:
+def _finished(axes: Axes, xlabel: str, ylabel: str, columns: int = 1) -> Axes:
+    axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, ncols=columns)
     return axes
@@ -46,8 +47,7 @@ def convergence(
         axes.plot(x, y, linewidth=1.1, label=label)
     if level is not None:
         axes.axhline(level[0], color="black", linestyle=":", linewidth=1, label=level[1])
-    axes.set(xlabel="training batch", ylabel=ylabel)
-    return _finished(axes)
+    return _finished(axes, "training batch", ylabel)
 
 
 def error_curves(
@@ -66,30 +66,24 @@ def error_curves(
     """
     for k, (label, (x, errors)) in enumerate(curves.items()):
         known = [(a, [e for e in row if e]) for a, row in zip(x, errors)]
-        known = [(a, row) for a, row in known if row]
-        if not known:
+        bands = [(a, min(row), np.median(row), max(row)) for a, row in known if row]
+        if not bands:
             continue
-        across = [a for a, _ in known]
-        low, middle, high = np.array([(min(r), np.median(r), max(r)) for _, r in known]).T
+        across, low, middle, high = np.array(bands).T
         axes.fill_between(across, low, high, color=f"C{k}", alpha=0.12, linewidth=0)
         (line,) = axes.plot(across, middle, color=f"C{k}", linewidth=1.2, zorder=2, label=label)
         line.set(marker="osD^v"[k % 5], markersize=4)
         if k == 0:
             line.set(linewidth=2.2, zorder=3)
     if note is not None:
-        axes.annotate(
-            note[2],
-            note[:2],
-            xytext=(0, 22),
-            textcoords="offset points",
-            fontsize=8,
-            ha="center",
-            arrowprops={"arrowstyle": "-", "linewidth": 0.7},
-        )
-    axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+        point, text = note[:2], note[2]
+        arrow = {"arrowstyle": "-", "linewidth": 0.7}
+        above = axes.annotate(text, point, (0, 22), textcoords="offset points", arrowprops=arrow)
+        above.set(fontsize=8, ha="center")
+    axes.set(xscale="log", yscale="log")
     # Over less than a decade or so, labels between the powers of ten would overlap.
     axes.xaxis.set_minor_locator(ticker.LogLocator(subs=(2, 5)))
-    return _finished(axes)
+    return _finished(axes, xlabel, ylabel)
 
 
 def programs(axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], title: str) -> Axes:
@@ -100,8 +94,7 @@ def programs(axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], tit
     for name, points in marks.items():
         axes.plot(*zip(*points), marker="o", linestyle="none", markersize=8, label=name)
     axes.set(xscale="log", yscale="log", title=title)
-    axes.set(xlabel="time of a call (ms)", ylabel="error, relative")
-    return _finished(axes)
+    return _finished(axes, "time of a call (ms)", "error, relative")
 
 
 def sigma_over_depth(axes: Axes, depths: np.ndarray, curves: Mapping[str, np.ndarray]) -> Axes:
@@ -116,8 +109,8 @@ def sigma_over_depth(axes: Axes, depths: np.ndarray, curves: Mapping[str, np.nda
             (line,) = axes.plot(depths, sigma[:, channel], color=colour, label=name)
             if k == 0:
                 line.set(linestyle=":", alpha=0.6)
-    axes.set(xlabel="object distance (m)", ylabel=r"blur $\sigma$ (µm)", ylim=(0, None))
-    return _finished(axes, len(curves))
+    axes.set_ylim(0, None)
+    return _finished(axes, "object distance (m)", r"blur $\sigma$ (µm)", len(curves))
 
 
 def patch_grid(
@@ -131,9 +124,8 @@ def patch_grid(
     titles: of the columns.
     notes: texts for the corners of the images, by the label of their row.
     """
-    size = 1.7 * len(titles), 1.75 * len(rows) + 0.3
-    figure = Figure(figsize=size, layout="constrained", dpi=150)
-    axes = figure.subplots(len(rows), len(titles), squeeze=False)
+    figure, axes = new(len(rows), len(titles), 1.7, 1.75 + 0.3 / len(rows))
+    axes = np.reshape(axes, (len(rows), len(titles)))
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1.2}
     for line, (name, images) in zip(axes, rows.items()):
         line[0].set_ylabel(name)
@@ -172,8 +164,8 @@ def growth(axes: Axes, series: Mapping[str, Sequence[tuple[float, float]]]) -> A
     line = np.array(axes.get_xlim())
     slope = 1e3 * seconds[-1] / number[-1]
     axes.plot(line, slope * line, color="grey", linestyle=":", label="linear")
-    axes.set(xlabel="number", ylabel="run time (ms)", xlim=tuple(line))
-    return _finished(axes)
+    axes.set_xlim(*line)
+    return _finished(axes, "number", "run time (ms)")
 
 
 def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bool = False) -> Axes:

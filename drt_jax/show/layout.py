@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 
 from ..lens.lens import Lens, rotation_matrix, sag
@@ -66,7 +67,8 @@ def draw(
     ]
     semi = np.asarray(lens.semi_diameter)
     semi = np.where(np.isfinite(semi), semi, 1.1 * reach)
-    faces = [_profile(lens, i, semi[i]) for i in range(lens.count)]
+    profiles = np.linspace(-semi[:-1], semi[:-1], _POINTS, axis=-1)
+    faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
     glass = [
         np.concatenate([faces[i], faces[j][::-1], faces[i][:1]])
         for i, j in itertools.pairwise(lens.live)
@@ -95,18 +97,13 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
     return axes
 
 
-def _placed(lens: Lens, i: int, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _placed(lens: Lens, i: int, y: np.ndarray, z: ArrayLike) -> np.ndarray:
     """(z, y) along the axes of the lens of points on surface i (or the sensor)."""
     points = np.stack([np.zeros_like(y), y, z], axis=-1)
     if lens.tilt is not None:
         points = points @ np.asarray(rotation_matrix(lens.tilt[i])).T
     up = 0.0 if lens.decentre is None else float(lens.decentre[i, 1])
     return points[:, :0:-1] + np.array([float(lens.vertices[i]), up])
-
-
-def _profile(lens: Lens, i: int, semi: float) -> np.ndarray:
-    y = np.linspace(-semi, semi, _POINTS)
-    return _placed(lens, i, y, np.asarray(sag(lens, i, 0.0, y)))
 
 
 def _path(corners: np.ndarray, start: float, angle: float, distance: float) -> np.ndarray:
