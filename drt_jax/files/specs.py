@@ -189,9 +189,8 @@ def _gaps(top: _Entry, surfaces: list[_Entry]) -> list[float]:
             "give either sensor (mm from the first vertex) or the last surface's thickness "
             "(its distance to the sensor)"
         )
-    if "sensor" in top:
-        return [*gaps, top.number("sensor") - sum(gaps)]
-    return [*gaps, surfaces[-1].number("thickness")]
+    end = top.number("sensor") - sum(gaps) if "sensor" in top else surfaces[-1].number("thickness")
+    return [*gaps, end]
 
 
 def build_lens(values: object, name: str = "lens") -> Lens:

@@ -163,14 +163,10 @@ def by_form(function: Callable, w: Point, shape: Shape, forms: tuple[str, ...]) 
     if len(kinds) <= 1:
         return function(w, shape, *(kinds or ["asphere"]))
     rows = {kind: np.flatnonzero([form == kind for form in forms]) for kind in kinds}
-    parts = [
-        function(
-            tuple(a[r] for a in w),
-            Shape(shape.curvature[r], shape.conic[r], shape.coefficients[:, r]),
-            kind,
-        )
-        for kind, r in rows.items()
-    ]
+    parts = []
+    for kind, r in rows.items():
+        own = Shape(shape.curvature[r], shape.conic[r], shape.coefficients[:, r])
+        parts.append(function(tuple(a[r] for a in w), own, kind))
     order = np.argsort(np.concatenate(list(rows.values())))
     return jax.tree.map(lambda *values: jnp.concatenate(values)[order], *parts)
 

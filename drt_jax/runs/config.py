@@ -108,12 +108,11 @@ def _say(kind: Any) -> str:
 def describe(cls: Any, prefix: str = "") -> list[str]:
     """A line "key: type" for each setting, for --help."""
     lines = []
-    for field in dataclasses.fields(cls):
-        kind = typing.get_type_hints(cls)[field.name]
+    for name, kind in typing.get_type_hints(cls).items():
         if dataclasses.is_dataclass(kind):
-            lines += describe(kind, f"{prefix}{field.name}.")
+            lines += describe(kind, f"{prefix}{name}.")
         else:
-            lines.append(f"{prefix}{field.name}: {_say(kind)}")
+            lines.append(f"{prefix}{name}: {_say(kind)}")
     return lines
 
 

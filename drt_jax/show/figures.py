@@ -8,8 +8,6 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-_COLOURS = ("tab:red", "tab:green", "tab:blue")
-
 
 def new(
     rows: int = 1, columns: int = 1, width: float = 6.0, height: float = 4.0
@@ -104,9 +102,9 @@ def sigma_over_depth(axes: Axes, depths: np.ndarray, curves: Mapping[str, np.nda
     curves: blur (N, 3) in um of R, G, B, by label.
     """
     for k, (label, sigma) in enumerate(curves.items()):
-        for channel, colour in enumerate(_COLOURS):
-            name = f"{'RGB'[channel]}, {label}"
-            (line,) = axes.plot(depths, sigma[:, channel], color=colour, label=name)
+        for channel, colour in enumerate(("red", "green", "blue")):
+            name = f"{colour[0].upper()}, {label}"
+            (line,) = axes.plot(depths, sigma[:, channel], color=f"tab:{colour}", label=name)
             if k == 0:
                 line.set(linestyle=":", alpha=0.6)
     axes.set_ylim(0, None)
