@@ -95,6 +95,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join(lines)
 
 
+def rings(rays: int) -> int:
+    """How many hexapolar rings hold at most so many rays."""
+    return int((math.sqrt(12 * rays - 3) - 3) / 6)
+
+
 def panels(count: int, width: float, height: float) -> tuple[Any, Any]:
     """A figure of so many panels in two columns, and their axes."""
     columns = min(2, count)

@@ -26,9 +26,8 @@ from ._common import require, require_list
 class Scene:
     """What is photographed, and through which lens.
 
-    lens: bundled name or YAML path.
-    wavelengths_um: of the three channels, R, G, B.
-    tolerance: relative error of the blur that fixes the number of rays.
+    lens: bundled name or YAML path. wavelengths_um: of the three channels, R, G, B. tolerance:
+    relative error of the blur that fixes the number of rays.
     """
 
     lens: str = "double_gauss"
@@ -48,11 +47,8 @@ class Scene:
 class Training:
     """How long, and how fast.
 
-    batches: steps of each job.
-    batch: patches in one.
-    patch: their side in pixels.
-    optics_rate: Adam's learning rate in mm.
-    checkpoint_every: in batches, or when metrics are next written.
+    batches: steps of each job. batch: patches in one. patch: their side in pixels. optics_rate:
+    Adam's learning rate in mm. checkpoint_every: in batches, or when metrics are next written.
     """
 
     batches: int
@@ -84,11 +80,7 @@ class JointTraining(Training):
 
 @dataclasses.dataclass(frozen=True)
 class Net:
-    """Skips of RED-Net.
-
-    skip_every: every so many pairs of layers are joined.
-    input_skip: whether the input is added to the output.
-    """
+    """RED-Net joins every `skip_every` pairs of layers; input_skip: whether also its ends."""
 
     skip_every: int = 2
     input_skip: bool = True
@@ -98,9 +90,8 @@ class Net:
 class Settings:
     """Settings of all three experiments.
 
-    starts_mm: sensor positions from which training starts.
-    noise: standard deviation of the sensor's, for values from 0 to 1.
-    seed: of the patches, the noise and the network.
+    starts_mm: sensor positions from which training starts. noise: standard deviation of the
+    sensor's, for values from 0 to 1. seed: of the patches, the noise and the network.
     """
 
     starts_mm: tuple[float, ...]
@@ -118,10 +109,7 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JointSettings(Settings):
-    """Settings of the experiments with a network.
-
-    test_patches: how many of the test patches are used (0: all).
-    """
+    """Settings with a network; test_patches: how many of the test patches are used (0: all)."""
 
     train: JointTraining
     test_patches: int = 0

@@ -13,6 +13,8 @@ import numpy as np
 import drt_jax
 from drt_jax import pupil
 
+from ._common import rings
+
 
 class Lens:
     """A centred lens of spheres and planes as NumPy arrays, and a scene: gaps (S,), the last to
@@ -27,10 +29,6 @@ class Lens:
         self.field, self.distance, self.wavelengths = field, distance, tuple(wavelengths)
         first = drt_jax.first_order(lens, distance, np.asarray(wavelengths))
         self.pupil = tuple(float(a[0]) for a in first.entrance_pupil)
-
-
-def _rings(rays: int) -> int:
-    return int((np.sqrt(12 * rays - 3) - 3) / 6)
 
 
 def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
@@ -70,7 +68,7 @@ def optiland_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
     systems = [(_optiland_system(lens, index, wave), wave) for index, wave in pairs]
 
     def one(optic, wavelength):
-        hits = optic.trace(0, 1 if lens.field else 0, wavelength, _rings(rays), "hexapolar")
+        hits = optic.trace(0, 1 if lens.field else 0, wavelength, rings(rays), "hexapolar")
         return torch.sqrt(hits.x.var(unbiased=False) + hits.y.var(unbiased=False))
 
     def slopes(leaves, otherwise):
@@ -127,7 +125,7 @@ def _batoid_hits(optic, points, velocities):
 
 def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
     """As `optiland_spot`; the gradient by finite differences."""
-    points = pupil.hexapolar(_rings(rays))[0]
+    points = pupil.hexapolar(rings(rays))[0]
     place, radius = lens.pupil
     source = np.array([0.0, -lens.distance * np.tan(lens.field), -lens.distance])
     through = np.stack([*(radius * points), np.full(points.shape[1], place)], axis=-1)

@@ -1,6 +1,5 @@
 """What `benchmark` measures with: compiled programs, rows, other processes, growing scenes."""
 
-import dataclasses
 import os
 import re
 import subprocess
@@ -26,7 +25,7 @@ from drt_jax.learn import train
 from . import _common
 
 Row = dict[str, Any]
-# What is known of a program that was compiled, see `Ours`.
+# What is known of a program that was `compiled`.
 MEASURED = ("compile_s", "peak_mb", "kernels")
 
 _FIRST = """
@@ -38,7 +37,7 @@ sigma = lambda lens: drt_jax.psf_moments(lens, {field}, {distance}, [0.53])[1][0
 jax.block_until_ready(jax.value_and_grad(sigma)(lens))
 print(time.perf_counter() - start)
 """
-_SPREAD = """
+SPREAD = """
 import jax; jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", {devices})
 from experiments import _work, benchmark
@@ -52,22 +51,10 @@ def hits(lens: Lens, field: Any, distance: Any, waves: Array, points: Array) -> 
     return rays.points[:, :, -1, :2], rays.status
 
 
-@dataclasses.dataclass(frozen=True)
-class Ours:
-    """A compiled program of ours.
-
-    call: what it is called with no more.
-    measured: seconds that compiling took, MiB that it holds, and of how many kernels it consists
-        (those in a loop once).
-    """
-
-    call: Callable
-    measured: dict[str, float]
-
-
-def compiled(function: Callable, *arguments: Any) -> Ours:
-    """A function, jitted or not, compiled for its arguments, tracing included; arguments that it
-    donates, it is given as copies."""
+def compiled(function: Callable, *arguments: Any) -> tuple[Callable, dict[str, float]]:
+    """A function, jitted or not, compiled for its arguments and called with no more; and what is
+    MEASURED: seconds that compiling took, tracing included, MiB that it holds, and of how many
+    kernels it consists (those in a loop once). What it donates, it is given as copies."""
     function = function if hasattr(function, "lower") else jax.jit(function)
     start = time.perf_counter()
     lowered = function.lower(*arguments)
@@ -83,7 +70,7 @@ def compiled(function: Callable, *arguments: Any) -> Ours:
         given = [jnp.array(a) if gone else a for a, gone in zip(leaves, donated)]
         return jax.block_until_ready(program(*jax.tree.unflatten(structure, given)))
 
-    return Ours(call, dict(zip(MEASURED, (seconds, held / 2**20, kernels))))
+    return call, dict(zip(MEASURED, (seconds, held / 2**20, kernels)))
 
 
 def peer(name: str, make: Callable[[], tuple], how: str = "") -> dict[str, tuple | str]:
@@ -101,11 +88,12 @@ def row(task: str, seconds: float, **known: Any) -> Row:
 
 
 def rows_of(
-    task: str, ours: Ours, error: float | None, peers: dict[str, tuple | str], repeats: int
+    task: str, ours: tuple, error: float | None, peers: dict[str, tuple | str], repeats: int
 ) -> list[Row]:
-    """Rows of one task: `peers` by name, (call, error) or why there is none."""
+    """Rows of one task. ours: as `compiled` returns it. peers: as `peer` does."""
     ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
-    calls = [ours.call, *(call for call, _ in ready.values())]
+    call, measured = ours
+    calls = [call, *(call for call, _ in ready.values())]
     seconds, *others = _common.medians(calls, repeats)
     found, rows = dict(zip(ready, others)), []
     for name, peer in peers.items():
@@ -113,7 +101,7 @@ def rows_of(
         if name in found:
             ratio = found[name] / seconds
             known = {"peer_s": found[name], "ratio": ratio, "peer_error": peer[1]}
-        rows.append(row(task, seconds, ours_error=error, peer=name, **ours.measured, **known))
+        rows.append(row(task, seconds, ours_error=error, peer=name, **measured, **known))
     return rows
 
 
@@ -137,13 +125,9 @@ def first_seconds(lens: str, field: float, distance: float) -> list[float]:
     return [float(np.median(some)) for some in times]
 
 
-def spread_over_devices(config: Any, devices: int) -> float:
-    """`bundle_seconds` with so many CPU devices: JAX fixes their number when it starts."""
-    return in_a_new_process(_SPREAD.format(config=config, devices=devices), {})
-
-
 def bundle_seconds(config: Any) -> float:
-    """Seconds to trace the bundle of `benchmark` shared among the devices of this process."""
+    """Seconds to trace the bundle of `benchmark` shared among the devices of this process, whose
+    number JAX fixes when it starts: see SPREAD."""
     mesh = jax.make_mesh((jax.device_count(),), ("rays",), axis_types=(AxisType.Auto,))
     trace, points = config.bundle_trace
     ends = {"in_specs": PartitionSpec("rays"), "out_specs": PartitionSpec(None, "rays")}
@@ -191,10 +175,10 @@ def growth(lens: Lens, field: float, distance: float, repeats: int) -> dict[str,
 
     def seconds(lens, rays, waves, angle=field):
         points = jnp.asarray(pupil.random_disc(rays, 0)[0].T)
-        program = compiled(partial(hits, lens, angle, distance, waves), points)
-        if jnp.any(program.call()[1] != drt_jax.Status.OK):
+        call, _ = compiled(partial(hits, lens, angle, distance, waves), points)
+        if jnp.any(call()[1] != drt_jax.Status.OK):
             raise RuntimeError(f"{lens.name}: rays of the measurement fail")
-        return _common.medians([program.call], repeats)[0]
+        return _common.medians([call], repeats)[0]
 
     green, surfaces = jnp.array([0.53]), (3, 10, 30, 100, 300, 1000, 3000)
     waves = {n: jnp.linspace(0.45, 0.65, n) for n in (1, 3, 10, 30, 100, 300, 1000)}

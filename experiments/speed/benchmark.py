@@ -26,7 +26,6 @@ from jax import Array
 import drt_jax
 from drt_jax import Lens, Status, pupil, show
 from drt_jax.learn import network, train
-from drt_jax.learn.adam import adam, apply_updates
 from drt_jax.runs.folder import Run
 
 from . import _command, _common, _peers, _work
@@ -80,11 +79,6 @@ class Config:
         waves = jnp.asarray(self.wavelengths_um[:1])
         return functools.partial(_work.hits, *self.scene, waves), points
 
-    @property
-    def where(self) -> str:
-        """The field in words."""
-        return f"{self.field_deg:g} degrees"
-
 
 def spot_error(truth: list[Moments], count: int, values: Any, slopes: Any = None) -> float:
     """The worst relative error of sigmas (W,), and if they are given of their derivatives (W, P),
@@ -122,9 +116,9 @@ def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
     numbers = _peers.Lens(lens, field, distance, config.wavelengths_um)
     peers = peer("optiland", lambda: beside(_peers.optiland_spot))
     peers |= peer("batoid", lambda: beside(_peers.batoid_spot))
-    where = "on axis" if axial else config.where
-    task = f"sigma{' and Jacobian' if gradient else ''}, {where}"
-    return rows_of(task, ours, spot_error(truth, count, *ours.call()), peers, config.repeats)
+    task = "sigma and Jacobian" if gradient else "sigma"
+    task += ", on axis" if axial else f", {config.field_deg:g} degrees"
+    return rows_of(task, ours, spot_error(truth, count, *ours[0]()), peers, config.repeats)
 
 
 def bundle_task(config: Config) -> list[Row]:
@@ -133,7 +127,7 @@ def bundle_task(config: Config) -> list[Row]:
     waves = jnp.asarray(config.wavelengths_um[:1])
     trace, points = config.bundle_trace
     ours = compiled(trace, points)
-    spot, status = (found[0] for found in ours.call())
+    spot, status = (found[0] for found in ours[0]())
     _common.require(bool(jnp.all(status == Status.OK)), "lens: rays of the bundle fail")
     rays = jax.jit(drt_jax.trace_rays)(lens, field, distance, waves, points)
     first, direction = rays.points[0, :, 0], rays.directions[0, :, 0]
@@ -152,7 +146,7 @@ def bundle_task(config: Config) -> list[Row]:
     task = f"{config.bundle} skew rays"
     rows = rows_of(task, ours, error, peers, config.repeats)
     devices = os.cpu_count() or 1
-    shared = _work.spread_over_devices(config, devices)
+    shared = _work.in_a_new_process(_work.SPREAD.format(config=config, devices=devices), {})
     same = {key: rows[0][key] for key in ("peer", "peer_s", "peer_error", "note", "ours_error")}
     same["ratio"] = same["peer_s"] and same["peer_s"] / shared
     rows.append(_work.row(f"{task}, {devices} CPU devices", shared, **same))
@@ -160,9 +154,9 @@ def bundle_task(config: Config) -> list[Row]:
     def square(lens):
         return jnp.mean(_work.hits(lens, field, distance, waves, points)[0] ** 2)
 
-    square = compiled(jax.grad(square), lens)
-    back = _common.medians([square.call], 3)[0]
-    rows.append(_work.row(f"{task} and their gradient", back, **square.measured))
+    call, measured = compiled(jax.grad(square), lens)
+    back = _common.medians([call], 3)[0]
+    rows.append(_work.row(f"{task} and their gradient", back, **measured))
     for row in rows:
         row["ours_rays_per_s"] = config.bundle / row["ours_s"]
         if row["peak_mb"] is not None:
@@ -181,24 +175,20 @@ def network_task(config: Config) -> list[Row]:
     values, blur = drt_jax.moments_model(lens, ("sensor",), 0.0, depths, config.wavelengths_um)
     side = config.patch + camera.kernel - 1
     scenes = rng.integers(0, 256, (config.batch, side, side, 3)).astype(np.uint8)
+
+    def adam_step(imager, parameters):
+        start, step = train.make_step(imager, rates, depths, config.seed)
+        return compiled(step, start(parameters), scenes, np.float32(0.01), np.int32(0))
+
     imager = train.make_imager(blur, apply, camera)
-    start, step = train.make_step(imager, rates, depths, config.seed)
-    state = start({"optics": values, "network": weights})
-    joint = compiled(step, state, scenes, np.float32(0.01), np.int32(0))
+    joint = adam_step(imager, {"optics": values, "network": weights})
     shape = (config.batch, config.patch, config.patch, 3)
     images, truth = (jnp.asarray(rng.random(shape), jnp.float32) for _ in range(2))
-    begin, update = adam(rates)
 
-    def alone(parameters, moments, images, truth):
-        def loss(parameters):
-            return jnp.mean(jnp.abs(apply(parameters["network"], images) - truth))
+    def network_alone(parameters, *_):
+        return truth, images, apply(parameters["network"], images), jnp.zeros(3)
 
-        updates, moments = update(jax.grad(loss)(parameters), moments)
-        return apply_updates(parameters, updates), moments
-
-    options, parameters = train.compiler_options(), {"network": weights}
-    arguments = parameters, begin(parameters), images, truth
-    only = compiled(jax.jit(alone, compiler_options=options), *arguments)
+    only, _ = adam_step(network_alone, {"optics": {}, "network": weights})
     sensor = train.make_imager(blur, None, camera)
 
     def front(values, scenes, noise, key):
@@ -209,15 +199,15 @@ def network_task(config: Config) -> list[Row]:
         return value, back(truth)
 
     key = jax.random.key(config.seed)
-    arguments = values, jnp.asarray(scenes), np.float32(0.01), key
-    rest = compiled(jax.jit(front, compiler_options=options), *arguments)
+    front = jax.jit(front, compiler_options=train.compiler_options())
+    rest, _ = compiled(front, values, jnp.asarray(scenes), np.float32(0.01), key)
 
     def torch():
         return _peers.network_step(config.batch, config.patch, 1e-3), None
 
     peers = peer("torch", torch, ", network alone, channels last")
-    peers["ours, network alone"] = (only.call, None)
-    peers["ours, optics, noise and sensor layer alone"] = (rest.call, None)
+    peers["ours, network alone"] = (only, None)
+    peers["ours, optics, noise and sensor layer alone"] = (rest, None)
     task = f"joint step with RED-Net, {config.batch} of {config.patch}x{config.patch}"
     return rows_of(task, joint, None, peers, min(config.repeats, 9))
 
@@ -227,7 +217,7 @@ def first_task(config: Config) -> list[Row]:
     compiled programs kept in a folder."""
     _, field, distance = config.scene
     rows = []
-    for angle, where in ((0.0, "on axis"), (field, config.where)):
+    for angle, where in ((0.0, "on axis"), (field, f"{config.field_deg:g} degrees")):
         task = f"first sigma and gradient in a new process, {where}"
         anew, kept = _work.first_seconds(config.lens, angle, distance)
         rows += [_work.row(task, anew), _work.row(f"{task}, programs kept", kept)]

@@ -34,11 +34,9 @@ _SCAN, _SEARCH = 1152, 121
 class Moments(NamedTuple):
     """Of one colour, with derivatives by (curvatures, thicknesses and the sensor).
 
-    sigma: RMS spot radius, mm.
-    centroid: its y, mm.
-    gradient: (2, P) of both.
-    error: change of both values, relative to sigma, when every node moves.
-    gradient_error: change of sigma's gradient, relative to its norm, likewise.
+    sigma: RMS spot radius, mm. centroid: its y, mm. gradient: (2, P) of both. error: change of
+    both values, relative to sigma, when every node moves. gradient_error: that of sigma's gradient,
+    relative to its norm.
     """
 
     sigma: float
@@ -55,10 +53,9 @@ def flatten(lens: Lens) -> Array:
 
 def changed(lens: Lens, values: Array) -> Lens:
     """The lens with `values` (P,) as in `flatten`."""
-    curvature = lens.curvature.at[:-1].set(values[: lens.count])
-    return dataclasses.replace(
-        lens, curvature=curvature, thickness=values[lens.count : -1], sensor=values[-1]
-    )
+    curvature, thickness, sensor = jnp.split(values, [lens.count, len(values) - 1])
+    curvature = lens.curvature.at[:-1].set(curvature)
+    return dataclasses.replace(lens, curvature=curvature, thickness=thickness, sensor=sensor[0])
 
 
 def _trace(lens: Lens, scene: Array, q: Array) -> tuple[Array, Array]:
@@ -151,10 +148,8 @@ def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Arra
     heights = jnp.linspace(-reach, reach, _SCAN)
     diameter = jnp.stack([jnp.zeros_like(heights), heights], axis=1)
     inside = jnp.all(jax.vmap(partial(_excess, lens, scene))(diameter) <= 0, axis=1)
-    low, high = (
-        jnp.min(jnp.where(inside, heights, reach)),
-        jnp.max(jnp.where(inside, heights, -reach)),
-    )
+    low = jnp.min(jnp.where(inside, heights, reach))
+    high = jnp.max(jnp.where(inside, heights, -reach))
     pupil = _Pupil(lens, scene, low + part * (high - low), reach)
     # Panels end at the corners; where there are fewer, some are empty.
     corners, changes = pupil.corners()

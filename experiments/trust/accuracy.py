@@ -43,14 +43,10 @@ _DEFAULT, _RANDOM, _MANY = 1e-6, 256, 16384
 class AccuracyScene:
     """What is measured.
 
-    lens: bundled name or YAML path.
-    field_deg: angle of the object point.
-    distance_m: to the object (.inf: infinity).
-    defocus_mm: of the sensor, from the best focus on axis of an object at distance_m.
-    front_mm, rear_mm: semi-diameters of the first and last surface, 0 for the lens's own.
-    dtype: of everything.
-    orders: of the quadrature, instead of the run's.
-    most_rays: the largest pattern of this scene.
+    lens: bundled name or YAML path. field_deg: angle of the object point. distance_m: to the
+    object (.inf: infinity). defocus_mm: of the sensor, from the best focus on axis of an object
+    there. front_mm, rear_mm: semi-diameters of the first and last surface, 0 for the lens's own.
+    dtype: of everything. orders: instead of the run's. most_rays: the largest pattern.
     """
 
     lens: str = "double_gauss"
@@ -81,18 +77,19 @@ class AccuracyScene:
     @property
     def panel(self) -> str:
         """The panel of the figures that the scene belongs to."""
-        if self.dtype == "float32" or self.vignetted:
-            return "vignetted" if self.dtype == "float64" else self.dtype
-        return "off axis" if self.field_deg else "on axis"
+        if self.dtype == "float32":
+            return "float32"
+        return "vignetted" if self.vignetted else "off axis" if self.field_deg else "on axis"
 
     @property
     def label(self) -> str:
         """A name of its own for results and progress."""
         far = "inf" if math.isinf(self.distance_m) else f"{self.distance_m:g} m"
         words = [pathlib.Path(self.lens).stem, f"{self.field_deg:g} deg", far]
-        words += [f"{self.defocus_mm:+g} mm"]
-        words += [f"clear {self.front_mm:g} {self.rear_mm:g} mm"] * self.vignetted
-        return ", ".join(words + ["float32"] * (self.dtype == "float32"))
+        words.append(f"{self.defocus_mm:+g} mm")
+        if self.vignetted:
+            words.append(f"clear {self.front_mm:g} {self.rear_mm:g} mm")
+        return ", ".join([*words, "float32"] if self.dtype == "float32" else words)
 
     def rule(self, order: int) -> PupilRule:
         """The rule of an order that `converged_rule` would try."""
@@ -161,7 +158,6 @@ def patterns(rays: int, seeds: int, dtype: Any) -> dict[str, list[PupilRule]]:
     ones, so that all of one size share a program; of `random`, several."""
     sides = range(2 * math.isqrt(rays), 0, -1)
     side = next(n for n in sides if pupil.square_grid(n)[1].size <= rays)
-    rings = int((math.sqrt(12 * rays - 3) - 3) / 6)
 
     def padded(pattern):
         points, weights = pattern
@@ -172,7 +168,7 @@ def patterns(rays: int, seeds: int, dtype: Any) -> dict[str, list[PupilRule]]:
     return {
         "random": [padded(pupil.random_disc(rays, seed)) for seed in range(seeds)],
         "square grid": [padded(pupil.square_grid(side))],
-        "hexapolar": [padded(pupil.hexapolar(rings))],
+        "hexapolar": [padded(pupil.hexapolar(_common.rings(rays)))],
         "Sobol": [padded(pupil.sobol_disc(rays))],
     }
 

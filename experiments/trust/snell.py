@@ -16,8 +16,6 @@ from drt_jax import Lens, entrance_pupil
 from drt_jax.lens.lens import rotation_matrix
 from drt_jax.lens.surface import Shape, domain, sag_derivatives
 
-__all__ = ["launch_paraxial", "trace_snell"]
-
 _NEWTON_STEPS = 40  # a ray that all but grazes an asphere halves its distance in each
 
 
@@ -50,11 +48,10 @@ def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Arra
 class _Row(NamedTuple):
     """A surface or the sensor, or with a first axis all of them.
 
-    shape, form: what `_intersect` takes, the form by its place among those of the lens.
-    origin, axes: of the vertex, mm; from the surface's axes to those of the lens.
-    live: whether light bends here; the sensor counts as live.
-    mirror, sense: whether it reflects; 1 or -1, light goes along or against its z axis.
-    ratio: the index in front by that behind.
+    shape, form: what `_intersect` takes, the form by its place among those of the lens. origin,
+    axes: of the vertex, mm; from the surface's axes to those of the lens. live: whether light bends
+    here; the sensor counts as live. mirror: whether it reflects. sense: 1 or -1, light goes along
+    or against its z axis. ratio: the index in front by that behind.
     """
 
     shape: Shape
@@ -101,9 +98,8 @@ def trace_snell(
     A surface that bends no light is crossed by the straight line through the point before it,
     forwards or backwards, and the ray goes on from that point.
 
-    wavelength: () in um.
-    point: (3,) in mm, anywhere on the ray before the lens.
-    direction: (3,), a unit vector.
+    wavelength: () in um. point: (3,) in mm, anywhere on the ray before the lens. direction: (3,), a
+    unit vector.
     Returns the hits (S + 1, 3) in mm along the axes of the lens, z from the first vertex, and
     whether the ray met every surface, went forwards from each that bends light to the next, and
     was refracted or reflected there, bool.
@@ -130,15 +126,11 @@ def trace_snell(
 def launch_paraxial(
     lens: Lens, field: ArrayLike, distance: ArrayLike, wavelength: ArrayLike, pupil: Array
 ) -> tuple[Array, Array]:
-    """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming.
+    """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming: unlike
+    the Fermat tracer, which aims at the real stop. The pupil must not be infinitely far away.
 
-    The Fermat tracer aims at the real stop instead; the difference is the aberration of the
-    pupil, which must not be infinitely far away.
-
-    field: radians along y.
-    distance: mm from the object plane to the first vertex, inf allowed.
-    wavelength: () in um.
-    pupil: (Q, 2) in units of the pupil's semi-diameter.
+    field: radians along y. distance: mm from the object plane to the first vertex, inf allowed.
+    wavelength: () in um. pupil: (Q, 2) in units of the pupil's semi-diameter.
     Returns points (Q, 3) in mm on the first vertex plane and unit directions (Q, 3), for
     `trace_snell`.
     """
