@@ -7,7 +7,6 @@ and 7, and writes table 2.
 """
 
 import dataclasses
-import functools
 import pathlib
 import sys
 from collections.abc import Callable
@@ -31,10 +30,8 @@ COLUMNS = ("loss", "sensor_mm", "sigma_um", "depth_mm")
 class Config(_training.JointSettings):
     """Settings of the experiment; see configs/edof.yaml.
 
-    fixed_mm: the start that is also trained with the sensor fixed; one of starts_mm.
-    depth_m: nearest and farthest object in training.
-    table_depth_m: depths of table 2.
-    patch_depth_m: depths of figure 7.
+    fixed_mm: the start that is also trained with the sensor fixed; one of starts_mm. depth_m:
+    nearest and farthest object in training. table_depth_m, patch_depth_m: of table 2, figure 7.
     """
 
     fixed_mm: float
@@ -148,7 +145,5 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     _training.draw_patches(results, titles, figures / "figure_7.png")
 
 
-main = functools.partial(_command.main, sys.modules[__name__])
-
 if __name__ == "__main__":
-    main()
+    _command.main(sys.modules[__name__])

@@ -6,7 +6,6 @@ figures 4a and 4b.
 """
 
 import dataclasses
-import functools
 import pathlib
 import sys
 from collections.abc import Callable
@@ -100,7 +99,5 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         figure.savefig(figures / f"{name}.png")
 
 
-main = functools.partial(_command.main, sys.modules[__name__])
-
 if __name__ == "__main__":
-    main()
+    _command.main(sys.modules[__name__])

@@ -5,7 +5,6 @@ more network for each level. Draws figure 5a and restored patches, and writes ta
 """
 
 import dataclasses
-import functools
 import pathlib
 import sys
 from typing import Any
@@ -22,11 +21,8 @@ COLUMNS = ("loss", "sensor_mm", "sigma_um")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config(_training.JointSettings):
-    """Settings of the experiment; see configs/restore.yaml.
-
-    starts_mm: trained at `noise`.
-    table_starts_mm: trained at each of table_noise.
-    """
+    """Settings of the experiment; see configs/restore.yaml. starts_mm are trained at `noise`,
+    table_starts_mm at each of table_noise."""
 
     table_starts_mm: tuple[float, ...]
     table_noise: tuple[float, ...]
@@ -94,7 +90,5 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     _training.draw_patches(results, [""] * len(results["truth"]), figures / "restored.png")
 
 
-main = functools.partial(_command.main, sys.modules[__name__])
-
 if __name__ == "__main__":
-    main()
+    _command.main(sys.modules[__name__])

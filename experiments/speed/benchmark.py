@@ -298,7 +298,5 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         figure.savefig(figures / "peers.png")
 
 
-main = functools.partial(_command.main, sys.modules[__name__])
-
 if __name__ == "__main__":
-    main()
+    _command.main(sys.modules[__name__])

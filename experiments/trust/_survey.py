@@ -94,13 +94,19 @@ def _residual(lens, field, distance, pupil, points):
     return error / (_ROUNDINGS / 5 * rounding)
 
 
+def _trace(lens, field, distance, pupil):
+    return drt_jax.trace_rays(lens, field, distance, jnp.full(1, WAVELENGTH, pupil.dtype), pupil)
+
+
+_plain = _over_scenes(_trace)
+
+
 @_over_scenes
 def _rays(lens, field, distance, pupil):
     """Rays, the derivatives of a sum of them by everything, and their residuals."""
-    colour = jnp.full(1, WAVELENGTH, pupil.dtype)
 
     def scalar(lens, field, distance):
-        rays = drt_jax.trace_rays(lens, field, distance, colour, pupil)
+        rays = _trace(lens, field, distance, pupil)
         return _sum(rays.points) + _sum(rays.path), rays
 
     slope, rays = jax.grad(scalar, argnums=(0, 1, 2), has_aux=True)(lens, field, distance)
@@ -122,12 +128,6 @@ def _moments(lens, field, distance):
         return value, (found.mean, covariance, found.passed)
 
     return jax.grad(scalar, argnums=(0, 1, 2), has_aux=True)(lens, field, distance)
-
-
-@_over_scenes
-def _plain(lens, field, distance, pupil):
-    rays = drt_jax.trace_rays(lens, field, distance, jnp.full(1, WAVELENGTH, pupil.dtype), pupil)
-    return rays.points, rays.status
 
 
 def _shoot(lens, field, distance, point):
@@ -203,28 +203,23 @@ def _infinite(*found: Any) -> np.ndarray:
     return np.array([np.sum(~np.isfinite(leaf)) for leaf in jax.tree.leaves(found)])
 
 
-def _as(scenes: Scenes, dtype: str) -> Scenes:
-    return jax.tree.map(lambda a: a.astype(dtype), scenes)
-
-
 def survey(scenes: Scenes) -> dict[str, np.ndarray]:
     """Everything counted on some scenes: arrays over scenes (and rays), and numbers to be added."""
     dtype = scenes.distance.dtype
     rays, slope, residual = _rays(*scenes)
     moments_slope, moments = _moments(*scenes[:3])
     status = rays.status[:, 0]
-    exact = _as(scenes, "float64")
+    exact = jax.tree.map(np.float64, scenes)
     good = (status == Status.OK) | (status == Status.CLIPPED)
     off, denied = _retrace(*exact[:3], rays.points[:, 0].astype(float))
     ratio = off / np.finfo(dtype).eps
     # Scenes rounded to float32, in both precisions.
-    if dtype == np.float32:
-        rough, single, reached = scenes, rays.points, rays.status
-    else:
-        rough = jax.tree.map(lambda a: a[::_BOTH], _as(scenes, "float32"))
-        single, reached = _plain(*rough)
-    double = _rays(*_as(rough, "float64"))[0]
-    both = (reached == Status.OK) & (double.status == Status.OK)
+    rough, single = scenes, rays
+    if dtype != np.float32:
+        rough = jax.tree.map(lambda a: np.float32(a[::_BOTH]), scenes)
+        single = _plain(*rough)
+    double = _rays(*jax.tree.map(np.float64, rough))[0]
+    both = (single.status == Status.OK) & (double.status == Status.OK)
     some, lost = np.flatnonzero(~good.all(axis=1)), np.zeros(good.shape, bool)
     if some.size:
         lost[some] = ~good[some] & _search(*jax.tree.map(lambda a: a[some], exact))
@@ -237,5 +232,5 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray]:
         "ratio": np.where(good, ratio, 0),
         "residual": np.where(good, residual, 0),
         "lost": lost,
-        "float32_error": np.max(np.abs(single - double.points), axis=(-1, -2))[both],
+        "float32_error": np.max(np.abs(single.points - double.points), axis=(-1, -2))[both],
     }

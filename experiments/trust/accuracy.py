@@ -96,11 +96,6 @@ class AccuracyScene:
         kind = drt_jax.Clipped if self.vignetted else drt_jax.Gauss
         return kind(order, "half" if self.field_deg else "meridian")
 
-    @property
-    def about(self) -> dict[str, str]:
-        """What the rows of results.json say about the scene."""
-        return {"scene": self.label, "panel": self.panel, "dtype": self.dtype}
-
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -233,7 +228,7 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
         found = patterns(size, config.seeds, scene.dtype)
         kinds += [(name, size, rules) for name, rules in found.items()]
     curves = [
-        scene.about | {"method": name, "size": size} | row_of(arguments, truth, rules)
+        {"method": name, "size": size} | row_of(arguments, truth, rules)
         for name, size, rules in kinds
     ]
     run.log(scene.label, 0, {c: np.array([row[c] for row in curves], float) for c in COLUMNS})
@@ -244,13 +239,15 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
         rule = drt_jax.converged_rule(*known, tolerance)
         error = spot_errors(truth, *spot(*arguments, rule))[0]
         row = {"tolerance": tolerance, "order": rule.order, "rays": count_rays(arguments, rule)}
-        kept.append(scene.about | row | {"relative_error": error})
+        kept.append(row | {"relative_error": error})
     exact = []
     for colour, m in zip(config.wavelengths_um, truth):
         row = {"wavelength_um": colour, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
-        errors = {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
-        exact.append(scene.about | row | errors)
-    return {"curves": curves, "tolerances": kept, "truth": exact}
+        row |= {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
+        exact.append(row)
+    about = {"scene": scene.label, "panel": scene.panel, "dtype": scene.dtype}
+    found = {"curves": curves, "tolerances": kept, "truth": exact}
+    return {key: [about | row for row in rows] for key, rows in found.items()}
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -336,7 +333,5 @@ def draw_panel(axes: Any, rows: list[dict], x: str, y: str, labels: tuple[str, s
     show.error_curves(axes, curves, *labels, note)
 
 
-main = functools.partial(_command.main, sys.modules[__name__])
-
 if __name__ == "__main__":
-    main()
+    _command.main(sys.modules[__name__])

@@ -156,7 +156,5 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     figure.savefig(figures / "families.png")
 
 
-main = functools.partial(_command.main, sys.modules[__name__])
-
 if __name__ == "__main__":
-    main()
+    _command.main(sys.modules[__name__])

@@ -12,7 +12,7 @@ from experiments._reference import reference
 
 import drt_jax
 from drt_jax import load_lens, psf_moments, pupil
-from experiments import accuracy
+from experiments import _command, accuracy
 
 from ..conftest import RGB
 
@@ -133,7 +133,8 @@ def small_run(tmp_path_factory):
         "{surfaces: [{radius: 20.0, index: 1.5, semi_diameter: 4.0, stop: true}], sensor: 60.0}"
     )
     scenes = f"scenes=[{{lens: {path}, field_deg: 3, distance_m: .inf, defocus_mm: 0.5}}]"
-    accuracy.main(
+    _command.main(
+        accuracy,
         [
             "--out",
             str(folder / "run"),
@@ -143,7 +144,7 @@ def small_run(tmp_path_factory):
             "rays=[256]",
             "tolerances=[1e-3, 1e-6]",
             "seeds=2",
-        ]
+        ],
     )
     return folder / "run"
 
@@ -176,7 +177,7 @@ def test_small_run_of_the_experiment(small_run):
 @pytest.mark.slow
 def test_finished_run_resumes_to_the_same_numbers(small_run, capsys):
     before = json.loads((small_run / "results.json").read_text())
-    accuracy.main(["--resume", "--out", str(small_run)])
+    _command.main(accuracy, ["--resume", "--out", str(small_run)])
     after = json.loads((small_run / "results.json").read_text())
     assert before["curves"] == after["curves"] and before["tolerances"] == after["tolerances"]
     assert "most rays" in capsys.readouterr().out
@@ -194,5 +195,5 @@ def test_finished_run_resumes_to_the_same_numbers(small_run, capsys):
 )
 def test_bad_settings_get_one_clear_line(option, message, tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
-        accuracy.main(["--out", str(tmp_path / "run"), "--set", option])
+        _command.main(accuracy, ["--out", str(tmp_path / "run"), "--set", option])
     assert stopped.value.code == 2 and message in capsys.readouterr().err

@@ -17,7 +17,7 @@ from skimage import io
 from drt_jax.learn import train
 from drt_jax.runs.config import load_config
 from drt_jax.runs.folder import Run
-from experiments import _common, tables
+from experiments import _command, _common, tables
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
@@ -59,7 +59,7 @@ FIGURES = {
 
 
 def main(name, *argv):
-    importlib.import_module(f"experiments.{name}").main([*map(str, argv)])
+    _command.main(importlib.import_module(f"experiments.{name}"), [*map(str, argv)])
 
 
 def toy(name, folder):
@@ -283,7 +283,7 @@ def test_help_lists_the_settings(name, capsys):
 
 def test_benchmark_without_peers(tmp_path, capsys, monkeypatch):
     """One task: a row for each peer, which is measured or says what is missing, and the counts."""
-    from experiments import _work, benchmark
+    from experiments import _work
 
     def missing(name):
         raise ModuleNotFoundError(name=name)
@@ -291,7 +291,7 @@ def test_benchmark_without_peers(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(_work, "version", missing)
     options = ["tasks=[axial]", "growth=false", "repeats=1"]
     try:
-        benchmark.main(["--out", str(tmp_path / "run"), "--set", *options])
+        main("benchmark", "--out", tmp_path / "run", "--set", *options)
     finally:  # the benchmark compiles everything anew
         jax.config.update("jax_enable_compilation_cache", True)
     results = json.loads((tmp_path / "run" / "results.json").read_text())
