@@ -147,7 +147,7 @@ def _retrace(lens, field, distance, points):
         size = 1 + jnp.max(jnp.abs(points))
         shift = 1e-7 * size * jnp.eye(3, k=-1)  # not at all, in x, in y
         hits, ok = jax.vmap(lambda s: _shoot(lens, field, distance, points[0] + s))(shift)
-        grown = jnp.max(jnp.abs(hits[1:] - hits[0])) / (1e-7 * size)
+        grown = jnp.max(jnp.abs(hits[1:] - hits[:1])) / (1e-7 * size)
         off = jnp.max(jnp.abs(hits[0] - points))
         return off / (size * (1 + jnp.nan_to_num(grown))), ~ok[0] & ok[1] & ok[2]
 
@@ -172,10 +172,12 @@ def _search(lens, field, distance, pupil):
         def step(_, state):
             trial, best, last, found = state
             h = 1e-7 * (1 + jnp.max(jnp.abs(trial)))
-            at, ok = jax.vmap(crossing)(trial + h * jnp.eye(3, 2, k=-1))  # there, beside in x, in y
+            at, ok = jax.vmap(crossing)(
+                trial[None] + h * jnp.eye(3, 2, k=-1)
+            )  # there, beside in x, in y
             miss = jnp.linalg.norm(at[0] - target)
             better = ok[0] & (miss <= best)
-            newton = jnp.linalg.solve((at[1:] - at[0]).T / h, target - at[0])
+            newton = jnp.linalg.solve((at[1:] - at[:1]).T / h, target - at[0])
             whole = better & jnp.all(ok) & jnp.all(jnp.isfinite(newton))
             following = jnp.where(whole, newton, last / 2)
             aim = jnp.where(better, trial, trial - last)
@@ -192,7 +194,7 @@ def _search(lens, field, distance, pupil):
     there, ok = jax.vmap(crossing)(grid)
 
     def found(target):
-        far = jnp.where(ok, jnp.linalg.norm(there - target, axis=1), jnp.inf)
+        far = jnp.where(ok, jnp.linalg.norm(there - target[None], axis=1), jnp.inf)
         nearest = jax.lax.top_k(-far, _STARTS)[1]
         return jnp.any(jax.vmap(refined, (None, 0))(target, grid[nearest]))
 
