@@ -267,10 +267,11 @@ def trace_fan(system: System, fan: Fan, reach: Array) -> Fan:
 
 def starts_of(fan: Fan, target: Vector, ranks: Array) -> Vector:
     """Launches, D arrays (W, K, N), for stop points, D arrays (W, K): the rays of the fan that come
-    nearest, each the nearest of one tile, the tiles by rank; `ranks` (N,)."""
+    nearest, each the nearest of one tile, the tiles by rank; `ranks` (W, K, N)."""
     gaps = (a[:, :, None, None] - b[:, None] for a, b in zip(target, fan.there, strict=True))
     far = sum(g * g for g in gaps)  # (W, K, tiles, rays)
     near, which = jnp.min(far, axis=-1), jnp.argmin(far, axis=-1)
-    order = jax.lax.top_k(-near, min(STARTS, near.shape[-1]))[1][..., ranks]
+    order = jax.lax.top_k(-near, min(STARTS, near.shape[-1]))[1]
+    order = jnp.take_along_axis(order, ranks, axis=-1, mode="clip")
     chosen = jnp.take_along_axis(which, order, axis=-1)
     return tuple(a[order, chosen] for a in fan.launch)

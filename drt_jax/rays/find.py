@@ -147,8 +147,8 @@ def find_aimed(system: System, target: Vector) -> Found:
 
 
 class _Search(NamedTuple):
-    """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). left: (W, Q), rays that failed and
-    still are to be sought in the fan. fan: as far as it is traced. turn, steps: ()."""
+    """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). left: (W, Q), how many turns each ray
+    that failed is still to be sought. fan: as far as it is traced. turn, steps: ()."""
 
     hits: Vector
     status: Array
@@ -173,18 +173,19 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
         return jnp.pad(a, ((0, 0), (0, rays - few * starts)), mode="edge")
 
     def turn(state):
-        first, tried = state.turn == 0, jnp.maximum(state.turn - 1, 0) % rounds
+        first, sought = state.turn == 0, state.left > 0
         fan, _ = jax.lax.while_loop(
             lambda s: s[1],
             lambda s: (trace_fan(system, s[0], wide), jnp.array(False)),
             (state.fan, state.turn == 1),
         )
         # The first few that are left have `starts` places each.
-        rank = jnp.cumsum(state.left, axis=-1, dtype=jnp.int32) - 1
-        mine = state.left & (rank < few)
+        rank = jnp.cumsum(sought, axis=-1, dtype=jnp.int32) - 1
+        mine = sought & (rank < few)
         rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
         wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
-        begin = starts_of(fan, wanted, tried * starts + jnp.arange(starts, dtype=jnp.int32))
+        tried = rounds - jnp.take_along_axis(state.left, rows, 1, mode="clip")
+        begin = starts_of(fan, wanted, (tried * starts)[..., None] + ray[None, None, :starts])
         own = tuple(
             jnp.where(first, a, places(b[..., None])) for a, b in zip(target, wanted, strict=True)
         )
@@ -204,16 +205,16 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
         status = jnp.where(found, status, state.status)
         taken = (jnp.take_along_axis(h, place[None], axis=-1) for h in new.hits)
         hits = tuple(jnp.where(found, a, b) for a, b in zip(taken, state.hits, strict=True))
-        left = state.left & ~found & ~(mine & (tried == rounds - 1))
-        left = jnp.where(first, status != Status.OK, left)
+        left = jnp.where(first, rounds, state.left - mine.astype(jnp.int32))
+        left = jnp.where((found & ~first) | (status == Status.OK), 0, left)
         return _Search(hits, status, left, fan, state.turn + 1, state.steps + new.steps)
 
     count = len(system.forms) + (system.stop is not None)
     zero = jnp.zeros((count, waves, rays), target[0].dtype)
     status = jnp.zeros((waves, rays), jnp.int32)
     none = jnp.int32(0)
-    start = _Search((zero,) * len(target), status, status > 0, no_fan(system, waves), none, none)
-    return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left), turn, start)
+    start = _Search((zero,) * len(target), status, status, no_fan(system, waves), none, none)
+    return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left > 0), turn, start)
 
 
 class _Traced(NamedTuple):

@@ -172,12 +172,14 @@ def _refract(d: Vector, normal: Vector, row: "_Row") -> tuple[Vector, Array, Arr
 class _Row(NamedTuple):
     """One thing that a ray meets: a live surface, the stop, the sensor; or with a first axis some.
 
-    first: whether it is the first. bends: whether the ray goes on from here, or is only crossed by
-    it, prolonged either way. kind: of its form. ratio: of the indices before and behind. sense,
-    leaving: 1 or -1, light goes along or against z before it and behind.
+    first: whether it is the first. live: whether light must come to it from the front, or the ray,
+    prolonged either way, is a line that crosses it. bends: whether the ray goes on from here. kind:
+    of its form. ratio: of the indices before and behind. sense, leaving: 1 or -1, light goes along
+    or against z before it and behind.
     """
 
     first: Any
+    live: Any
     bends: Any
     surface: Placed
     kind: Any
@@ -194,6 +196,7 @@ def _rows(system: System, kinds: list[str], to_stop: bool) -> _Row:
     rows = _Row(
         np.arange(count) == 0,
         np.ones(count, bool),
+        np.ones(count, bool),
         system.rows,
         forms.astype(np.int32),
         system.index / system.behind,
@@ -204,7 +207,10 @@ def _rows(system: System, kinds: list[str], to_stop: bool) -> _Row:
         return rows
     stop, form = system.at_stop
     around = jax.tree.map(lambda a: a[at], rows)
-    label = around._replace(bends=np.False_, surface=stop, kind=np.int32(kinds.index(form)))
+    live = np.bool_(system.stop is None)
+    label = around._replace(
+        live=live, bends=np.False_, surface=stop, kind=np.int32(kinds.index(form))
+    )
     ends = jax.tree.map(lambda a: a[at:at] if to_stop else a[at:], rows)
 
     def joined(front, row, back):
@@ -235,7 +241,7 @@ def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Any]
         meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
         own, normal, met, length = meet(p, d, row.surface.shape, state.fate == Status.OK)
         bent, front, through = _refract(d, normal, row)
-        met = met & (~row.bends | (front & ((length > 0) | row.first)))
+        met = met & (~row.live | (front & ((length > 0) | row.first)))
         here = jnp.where(met, jnp.where(through | ~row.bends, Status.OK, Status.TIR), Status.MISSED)
         fate = jnp.where(state.fate == Status.OK, here.astype(jnp.int32), state.fate)
         hit, before = own[:-1], state.hit

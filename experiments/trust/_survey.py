@@ -27,7 +27,11 @@ _STOP_MISS = 1e-9  # mm
 
 
 # Few scenes, many programs: what takes long is to compile them.
-_QUICK = {"xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
+_QUICK = {
+    "xla_backend_optimization_level": 1,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_use_fusion_emitters": False,
+}
 
 
 def _over_scenes(function: Callable) -> Callable:
