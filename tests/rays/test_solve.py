@@ -10,7 +10,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from drt_jax import Status, scene_of
+from drt_jax import Status, load_lens, scene_of, trace_rays
 from drt_jax.rays import aim, fermat, find, linear, solve
 
 from ..conftest import assert_close
@@ -445,3 +445,15 @@ def test_float32_gradient_is_the_rounded_float64_one():
     for a, b in zip(jax.tree.leaves(exact), jax.tree.leaves(gradient(*single)), strict=True):
         assert b.dtype == jnp.float32
         np.testing.assert_allclose(b, a, rtol=0, atol=1e-4 * np.max(np.abs(a), initial=1e-9))
+
+
+def test_several_rays_that_are_sought():
+    """Two of a bundle that the first aim does not find: each from its own nearest starts."""
+    radius, gap = (-21.77, -9.051, 14.174, 9.3, "inf"), (2.219, 1.995, 6.392, 6.941, 22.718)
+    index = (1.804, 1, 1.402, 1, 1)
+    names = "radius", "thickness", "index"
+    rows = [dict(zip(names, row, strict=True)) for row in zip(radius, gap, index, strict=True)]
+    rows[-1] |= {"stop": True, "semi_diameter": 8.1456}
+    points = [[0, 0], [0, 1], [0, -1], [1, 0], [-0.113, 0.078], [0.866, 0.282], [0.648, -0.427]]
+    rays = trace_rays(load_lens({"surfaces": rows}), 0.23138, 1e3, [0.55], points)
+    assert np.all(rays.status == Status.OK)
