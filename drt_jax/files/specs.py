@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.glass import Dispersion, Glass, find_glass
+from ..lens.glass import Dispersion, Glass, find_glass, model_glass
 from ..lens.lens import Lens
 from ..lens.surface import FORMS, Shape, powers_xy, surface_sag
 
 _TOP_KEYS = ("name", "source", "object", "surfaces", "sensor", "sensor_tilt", "sensor_decentre")
-_MEDIUM_KEYS = ("glass", "index")
+_MEDIUM_KEYS = ("glass", "index", "nd", "vd")
 _SURFACE_KEYS = (
     *("form", "radius", "curvature", "conic", "radius_x", "curvature_x", "conic_x"),
     *("coefficients", "thickness", *_MEDIUM_KEYS, "mirror", "semi_diameter", "stop"),
@@ -116,8 +116,13 @@ class _Entry(dict[Any, Any]):
 
 
 def _medium(entry: _Entry) -> Glass:
-    if "glass" in entry and "index" in entry:
-        raise entry.error("", "give either glass or index, not both")
+    given = [key for key in ("glass", "index", "nd") if key in entry]
+    if len(given) > 1:
+        raise entry.error("", f"give either {' or '.join(given)}, not both")
+    if ("nd" in entry) != ("vd" in entry):
+        raise entry.error("", "nd and vd make a model glass together: give both or neither")
+    if "nd" in entry:
+        return _model_glass(entry, "nd", entry.number("nd"), entry.number("vd"))
     if "index" in entry:
         value = entry.number("index")
         if value < 1:
@@ -125,10 +130,20 @@ def _medium(entry: _Entry) -> Glass:
         if value == 1:  # the same medium as air, so that a surface between both bends no light
             return find_glass("air")
         return Glass(f"index {value!r}", schott=(value**2, 0.0, 0.0, 0.0, 0.0, 0.0))
+    name = str(entry.get("glass", "air"))
+    if len(name) == 6 and name.isdecimal():  # the code of a glass: (nd - 1) 1000 and 10 vd
+        return _model_glass(entry, "glass", 1 + int(name[:3]) / 1000, int(name[3:]) / 10)
     try:
-        return find_glass(str(entry.get("glass", "air")))
+        return find_glass(name)
     except ValueError as error:
         raise entry.error("glass", str(error)) from error
+
+
+def _model_glass(entry: _Entry, key: str, nd: float, vd: float) -> Glass:
+    try:
+        return model_glass(nd, vd)
+    except ValueError as error:
+        raise entry.error(key, str(error)) from error
 
 
 def _media(top: _Entry, surfaces: list[_Entry]) -> list[Glass]:

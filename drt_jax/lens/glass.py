@@ -17,6 +17,11 @@ from ..numerics import concrete
 
 # The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+# Of model glasses: the lines d, F, C, g in um, the powers of L in Conrady's formula, P_gF on
+# Schott's normal line as (constant, slope by vd), and the lines i to t, between which it is used.
+_LINES, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
+_NORMAL_LINE, _MODEL_RANGE, _MODEL = (0.6438, -0.001682), (0.365, 1.014), "model "
+_NO_MODEL = 1.0, 50.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,12 +35,14 @@ class Glass:
     sellmeier: (B1 .. BT, C1 .. CT), C in um^2, of any number of terms T.
     schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
     range: wavelengths in um for which they hold; of no glass, 0.1 nm to 1 m.
+    model: nd and vd of a model glass, see `model_glass`.
     """
 
     name: str
     sellmeier: tuple[float, ...] = (0.0,) * 6
     schott: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     range: tuple[float, float] = (1e-4, 1e6)
+    model: tuple[float, float] = _NO_MODEL
 
 
 @jax.tree_util.register_dataclass
@@ -48,11 +55,13 @@ class Dispersion:
     strength: (M, T), Sellmeier's B.
     resonance: (M, T), Sellmeier's C in um^2.
     schott: (M, 6), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
+    model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None if there is none.
     """
 
     strength: Array
     resonance: Array
     schott: Array
+    model: Array | None = None
 
     @classmethod
     def of(cls, media: list[Glass]) -> "Dispersion":
@@ -60,7 +69,9 @@ class Dispersion:
         halves = [np.asarray(m.sellmeier, float).reshape(2, -1) for m in media]
         terms = max(3, *(half.shape[1] for half in halves))
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
-        parts = padded[:, 0], padded[:, 1], [m.schott for m in media]
+        parts: list = [padded[:, 0], padded[:, 1], [m.schott for m in media]]
+        if any(m.model != _NO_MODEL for m in media):
+            parts.append([m.model for m in media])
         dtype = jnp.result_type(float)
         return cls(*(jax.device_put(np.asarray(part, dtype)) for part in parts))
 
@@ -89,6 +100,28 @@ def find_glass(name: str) -> Glass:
     raise ValueError(f"unknown glass {name!r}; {hint}")
 
 
+def model_glass(nd: float, vd: float) -> Glass:
+    """A glass of which only nd and the Abbe number vd = (nd - 1) / (nF - nC) are known.
+
+    n = A + B / L + C / L^3.5 (Conrady) through nd, nF - nC and ng - nF, the last as on Schott's
+    normal line: P_gF = 0.6438 - 0.001682 vd. ValueError unless 1 < nd <= 4 and 10 <= vd <= 120.
+    """
+    if not (1 < nd <= 4 and 10 <= vd <= 120):
+        raise ValueError(f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
+    return Glass(f"{_MODEL}{nd!r} {vd!r}", model=(nd, vd))
+
+
+def _model_index(model: Array, wavelengths: Array) -> Array:
+    """n - 1, (M, W), of model glasses (M, 2)."""
+    d, f, c, g = np.power.outer(_LINES, np.asarray(_CONRADY, float))
+    formula = np.linalg.inv(np.stack([d, f - c, g - f])).T
+    nd, vd = model[:, 0], model[:, 1]
+    mean = (nd - 1) / vd
+    known = jnp.stack([nd - 1, mean, (_NORMAL_LINE[0] + _NORMAL_LINE[1] * vd) * mean], axis=-1)
+    powers = jnp.stack([wavelengths**p for p in _CONRADY])
+    return known @ jnp.asarray(formula, known.dtype) @ powers
+
+
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     """Index of each medium at each wavelength, shape (M, W).
 
@@ -101,17 +134,26 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     square = (wavelengths**2)[None, None]
     sellmeier = jnp.sum(b * square / (square - c), axis=1)
     powers = jnp.stack([wavelengths**p for p in (0, 2, -2, -4, -6, -8)])
-    return jnp.sqrt(sellmeier + dispersion.schott @ powers)
+    index = jnp.sqrt(sellmeier + dispersion.schott @ powers)
+    if dispersion.model is None:
+        return index
+    return index + _model_index(dispersion.model, wavelengths)
 
 
 def common_range(names: tuple[str, ...]) -> tuple[float, float]:
     """The shortest and the longest wavelength, um, at which all media have a known index.
 
-    names: of media; one that is not in the catalogue has a constant index. The first number is the
-    larger one if there is no such wavelength.
+    names: of media; one that is not in the catalogue is a model glass or has a constant index. The
+    first number is the larger one if there is no such wavelength.
     """
-    low, high = zip(*(_catalogue().get(name, Glass(name)).range for name in names))
+    low, high = zip(*map(_range, names))
     return max(low), min(high)
+
+
+def _range(name: str) -> tuple[float, float]:
+    if name.startswith(_MODEL):
+        return _MODEL_RANGE
+    return _catalogue().get(name, Glass(name)).range
 
 
 def known_index(names: tuple[str, ...], wavelengths: Array) -> Array:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drt_jax import LensError, load_lens
+from drt_jax import LensError, first_order, load_lens
 
 GOOD = {
     "surfaces": [
@@ -43,6 +43,8 @@ BAD = {
         r"surfaces\[0\].glass: unknown glass 'N-BK8'.*N-BK7",
     ),
     "glass and index": (surface(0, index=1.5), "either glass or index"),
+    "nd without vd": (lambda e: (drop(0, "glass")(e), surface(0, nd=1.5)(e)), "give both"),
+    "glass code": (surface(0, glass="999001"), r"surfaces\[0\].glass: expected 1 < nd"),
     "index below 1": (lambda e: (drop(0, "glass")(e), surface(0, index=0.9)(e)), "below 1"),
     "zero radius": (surface(0, radius=0), r"surfaces\[0\].radius: 0 is no surface"),
     "no radius": (drop(0, "radius"), "either radius"),
@@ -332,3 +334,27 @@ def test_only_neighbours_of_a_moved_surface_are_not_checked(key, value):
     ):
         with pytest.raises(LensError, match="must be positive"):
             load_lens(lens)
+
+
+@pytest.mark.parametrize(
+    "entry", [{"nd": 1.835, "vd": 42.7}, {"glass": 835427}, {"glass": "835427"}]
+)
+def test_model_glasses(entry):
+    """As patents give them, and as a code; between two of the same, no light bends."""
+    rows = [
+        {"radius": 50.0, "thickness": 4.0, **entry},
+        {"radius": "inf", "thickness": 2.0, **entry},
+        {"radius": "inf", "thickness": 50.0, "stop": True, "semi_diameter": 5.0},
+    ]
+    lens = load_lens({"surfaces": rows})
+    assert lens.live == (0, 2)
+    np.testing.assert_allclose(lens.index([0.5875618])[1:3, 0], 1.835, rtol=1e-12)
+    with pytest.raises(ValueError, match="2 um is outside the range of model 1.835 42.7"):
+        lens.index([2.0])
+
+
+def test_the_patent_lens(shared):
+    """US 2021/0263286, example 1, as it stands: the focal length that the patent tells."""
+    lens = load_lens(shared / "patent_rf50.yaml")
+    focal = first_order(lens, np.inf, [0.5875618]).focal_length
+    np.testing.assert_allclose(focal, 49.565, atol=5e-3)

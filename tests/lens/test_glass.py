@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from drt_jax.lens.glass import (
     common_range,
     find_glass,
     known_index,
+    model_glass,
     refractive_index,
 )
 
@@ -94,3 +97,49 @@ def test_without_a_glass_any_wavelength_but_zero_will_do(dtype):
     media = Dispersion.of([Glass("n", schott=(2.25, 0, 0, 0, 0, 0))])
     n = refractive_index(jax.tree.map(lambda a: a.astype(dtype), media), w[1:])
     np.testing.assert_array_equal(n, [[1.5] * 3])
+
+
+LINES = 0.5875618, 0.4861327, 0.6562725, 0.4358343  # d, F, C, g
+BETWEEN = np.linspace(0.45, 0.65, 41)
+# Glasses of every family, and the largest error of n that the documentation tells.
+FAMILIES = {
+    **dict.fromkeys(("N-BAF4", "N-SSK5", "LLF1", "N-KF9"), 3e-5),
+    **dict.fromkeys(("N-BK7", "N-BAK4", "N-K5", "N-SK16", "F2", "N-PSK53A", "N-BASF2"), 7e-5),
+    **dict.fromkeys(("N-LAK9", "N-LAF2", "N-LASF31A"), 1.4e-4),
+    **dict.fromkeys(("N-PK51", "N-FK51A", "N-KZFS4"), 2.1e-4),
+    **dict.fromkeys(("N-SF11", "SF10", "P-SF68"), 1.05e-3),
+}
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_model_glass_beside_the_catalogue(name):
+    """The same nd and vd, exactly; n between 0.45 and 0.65 um within what is documented."""
+    d, f, c, _ = index(name, *LINES)
+    model = Dispersion.of([model_glass(float(d), float((d - 1) / (f - c))), find_glass(name)])
+    at = np.asarray(refractive_index(model, jnp.array(LINES)))
+    np.testing.assert_allclose(at[0, 0], d, rtol=1e-14)
+    np.testing.assert_allclose(at[0, 1] - at[0, 2], f - c, rtol=1e-11)
+    ours, wanted = np.asarray(refractive_index(model, jnp.array(BETWEEN)))
+    np.testing.assert_array_equal(wanted, index(name, *BETWEEN))  # beside a model, nothing changes
+    assert 1e-7 < np.max(np.abs(ours - wanted)) < FAMILIES[name]
+
+
+def test_derivatives_of_a_model_glass():
+    """By nd and vd, from differences; and the partial dispersion of the normal line."""
+    model = Dispersion.of([model_glass(1.83481, 42.7)])
+    _, f, c, g = np.asarray(refractive_index(model, jnp.array(LINES)))[0]
+    np.testing.assert_allclose((g - f) / (f - c), 0.6438 - 0.001682 * 42.7, rtol=1e-11)
+
+    def n(values):
+        return refractive_index(dataclasses.replace(model, model=values[None]), jnp.array([0.48]))
+
+    at = model.model[0]
+    for step, slope in zip(1e-4 * np.diag(at), np.asarray(jax.jacfwd(n)(at)).ravel()):
+        change = (n(at + step) - n(at - step)) / (2 * step.sum())
+        np.testing.assert_allclose(slope, change.ravel()[0], rtol=1e-7)
+
+
+@pytest.mark.parametrize("nd, vd", [(1.0, 50.0), (4.1, 50.0), (1.5, 5.0), (1.5, 200.0)])
+def test_impossible_model_glasses(nd, vd):
+    with pytest.raises(ValueError, match="expected 1 < nd"):
+        model_glass(nd, vd)
