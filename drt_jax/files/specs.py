@@ -3,6 +3,7 @@
 import difflib
 import itertools
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,8 +34,9 @@ _COLUMNS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
 }
 # Forms whose conic is one of r, so that it ends at a rim.
 _ROUND = ("asphere", "odd_asphere", "polynomial_xy")
-# Neighbours that overlap by less at their rims touch (mm).
-_TOUCH = 1e-4
+# Neighbours that overlap by less at their rims touch (mm); from this part of the smaller
+# semi-diameter on they may cross, as apertures of prescriptions are rounded.
+_TOUCH, _RIM = 1e-4, 0.9
 # The direction of a ray between vertices closer than this (mm) drowns in rounding.
 _CLOSEST = 1e-6
 _sag = jax.jit(surface_sag, static_argnums=2)
@@ -263,7 +265,8 @@ def _table(rows: list[list[float]], width: int) -> Array:
 
 
 def _check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
-    """LensError where light would go backwards, or neighbours overlap in both their apertures.
+    """LensError where light would go backwards, or neighbours overlap in both their apertures; only
+    a warning where they do so near the rim, where light then goes backwards and is lost.
 
     Neighbours are the surfaces that bend light, and the sensor behind the last. The straight ray
     between two of them may cross a stop that bends none before the first or behind the second, so
@@ -297,15 +300,20 @@ def _check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
         rim = min(semi[i], semi[j])
         if j == lens.count or math.isinf(rim):
             continue
-        y = np.linspace(0, rim, 17, dtype=semi.dtype)
+        y = np.linspace(0, rim, 257, dtype=semi.dtype)
         front, back = (
             np.asarray(_sag((0 * y, y), Shape(*(a[k] for a in shape)), lens.forms[k]))
             for k in (i, j)
         )
         crossed = lens.senses[i + 1] * (front - back - distance) > _TOUCH
-        if np.any(crossed):
-            raise LensError(
-                f"surfaces[{i}].thickness: {distance:g} mm makes surfaces {i} and {j} cross at "
-                f"{y[np.argmax(crossed)]:.3g} mm from the axis, within their semi-diameters of "
-                f"{semi[i]:g} and {semi[j]:g} mm; raise the thickness or lower a semi-diameter"
-            )
+        if not np.any(crossed):
+            continue
+        place = y[np.argmax(crossed)]
+        message = (
+            f"surfaces[{i}].thickness: {distance:g} mm makes surfaces {i} and {j} cross at "
+            f"{place:.3g} mm from the axis, within their semi-diameters of "
+            f"{semi[i]:g} and {semi[j]:g} mm; raise the thickness or lower a semi-diameter"
+        )
+        if place < _RIM * rim:
+            raise LensError(message)
+        warnings.warn(f"{message}; light that comes there is lost", stacklevel=4)

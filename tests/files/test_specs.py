@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drt_jax import LensError, first_order, load_lens
+from drt_jax import LensError, Status, first_order, load_lens, trace_rays
 
 GOOD = {
     "surfaces": [
@@ -358,3 +358,21 @@ def test_the_patent_lens(shared):
     lens = load_lens(shared / "patent_rf50.yaml")
     focal = first_order(lens, np.inf, [0.5875618]).focal_length
     np.testing.assert_allclose(focal, 49.565, atol=5e-3)
+
+
+def test_surfaces_that_cross_at_the_rim():
+    """A rounded aperture: the lens loads with a warning, and light that comes there is lost."""
+    rows = [
+        {"radius": 20.0, "thickness": 4.2, "index": 1.5, "semi_diameter": 9.0},
+        {"radius": -20.0, "thickness": 1.0, "semi_diameter": 9.0},
+        {"radius": "inf", "thickness": 15.0, "stop": True, "semi_diameter": 9.0},
+    ]
+    with pytest.warns(UserWarning, match="cross at 8.9. mm.*light that comes there is lost"):
+        lens = load_lens({"surfaces": rows})
+    heights = np.array([0.0, 4.0, 8.0, 8.5, 9.0])
+    rays = trace_rays(lens, 0.0, np.inf, [0.55], np.stack([0 * heights, heights / 9], axis=-1))
+    assert rays.status[0, :3].tolist() == [Status.OK] * 3 and rays.status[0, -1] != Status.OK
+    assert np.all(np.isfinite(rays.points))
+    rows[0]["thickness"] = 3.0
+    with pytest.raises(LensError, match="cross at"):
+        load_lens({"surfaces": rows})
