@@ -25,7 +25,7 @@ from .system import System, Vector, dot
 # A ray counts as aimed if it misses its stop point by less than `_NEAR` of the beam's radius: one
 # more step of Newton's method, which converges quadratically, then brings it there to rounding,
 # and the path needs no polish.
-_NEAR = 1e-8
+_NEAR = 1e-7
 # Steps of one search; it ends after `_PATIENCE` in a row that came no nearer.
 _STEPS, _PATIENCE = 48, 12
 # The fan has `_TILES` tiles a side of `_FAN` rays a side; a stop point takes the ray that comes
