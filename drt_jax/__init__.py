@@ -14,6 +14,7 @@ Conventions, everywhere in the package:
 """
 
 from .files.specs import LensError as LensError
+from .files.write import save_lens as save_lens
 from .files.yaml import lens_names as lens_names, load_lens as load_lens
 from .image.converged import (
     converged_focus_rule as converged_focus_rule,

@@ -25,7 +25,7 @@ _SURFACE_KEYS = (
 )
 _EVEN = tuple(range(2, 400, 2))
 # What the columns of a form's coefficients are: keys of a surface, and after them powers.
-_COLUMNS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
+COLUMNS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
     "asphere": ((), _EVEN),
     "odd_asphere": ((), tuple(range(1, 200))),
     "biconic": (("curvature_x", "conic_x"), _EVEN),
@@ -169,7 +169,7 @@ def _form(surface: _Entry) -> str:
 
 def _coefficients(surface: _Entry) -> list[float]:
     form = _form(surface)
-    first, powers = _COLUMNS[form]
+    first, powers = COLUMNS[form]
     for key in ("radius_x", "curvature_x", "conic_x"):
         if key in surface and key.replace("radius", "curvature") not in first:
             raise surface.error(key, f"a surface of the form {form} has none")

@@ -1,0 +1,99 @@
+"""A lens written as a prescription: what `specs` reads, backwards."""
+
+import math
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import yaml
+
+from ..lens.glass import Dispersion, find_glass
+from ..lens.lens import Lens
+from .specs import COLUMNS, LensError
+
+
+def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
+    """Write a lens as a YAML prescription; `load_lens` makes the same lens of it, to the last digit
+    (of tilts, which files hold in degrees, to the last but one).
+
+    path: of the file, which is replaced. LensError for what a prescription cannot hold: a curved
+    sensor, constants of a glass that are not those of the catalogue; or if the file cannot be
+    written.
+    """
+    if np.any([np.asarray(a)[-1] for a in (lens.curvature, lens.conic)]):
+        raise LensError("sensor: a prescription has none that is curved")
+    top: dict[str, Any] = {"name": lens.name} if lens.name else {}
+    before = _medium(lens, 0)
+    if before:
+        top["object"] = before
+    top["surfaces"] = [_surface(lens, i) for i in range(lens.count)]
+    top["sensor"] = float(lens.sensor)
+    top |= {f"sensor_{key}": value for key, value in _place(lens, lens.count).items()}
+    text = yaml.safe_dump(top, sort_keys=False, default_flow_style=None, width=1000)
+    try:
+        pathlib.Path(path).write_text(text)
+    except OSError as error:
+        raise LensError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _surface(lens: Lens, i: int) -> dict[str, Any]:
+    entry: dict[str, Any] = {"curvature": float(lens.curvature[i])}
+    if lens.conic[i] != 0:
+        entry["conic"] = float(lens.conic[i])
+    if lens.forms[i] != "asphere":
+        entry["form"] = lens.forms[i]
+    named, powers = COLUMNS[lens.forms[i]]
+    values = np.asarray(lens.coefficients[i]).tolist()
+    entry |= dict(zip(named, values, strict=False))
+    rest = dict(zip(powers, values[len(named) :], strict=False))
+    # Zeros of one surface keep the number of columns.
+    if rest and (any(rest.values()) or (i == 0 and not np.any(lens.coefficients))):
+        entry["coefficients"] = rest
+    if i < lens.count - 1:
+        entry["thickness"] = float(lens.thickness[i])
+    if lens.mirrors[i]:
+        entry["mirror"] = True
+    else:
+        entry |= _medium(lens, i + 1)
+    if math.isfinite(lens.semi_diameter[i]):
+        entry["semi_diameter"] = float(lens.semi_diameter[i])
+    if i == lens.stop:
+        entry["stop"] = True
+    return entry | _place(lens, i)
+
+
+def _medium(lens: Lens, i: int) -> dict[str, Any]:
+    """Keys of a medium; none for air."""
+    name, own = lens.glasses[i], jax.tree.map(lambda a: np.asarray(a[i]), lens.dispersion)
+    if own.model is not None and own.model[0] != 1:
+        nd, vd = own.model.tolist()
+        return {"nd": nd, "vd": vd}
+    if not np.any(own.strength) and not np.any(own.schott[1:]):
+        index = math.sqrt(own.schott[0])
+        return {} if index == 1 else {"index": index}
+    try:
+        known = Dispersion.of([find_glass(name)])
+    except ValueError as error:
+        raise LensError(f"glasses[{i}]: {error}") from error
+    pairs = zip((own.strength, own.resonance, own.schott), jax.tree.leaves(known), strict=True)
+    if any(np.any(a[: b.shape[-1]] != np.asarray(b[0])) for a, b in pairs):
+        raise LensError(f"glasses[{i}]: the constants are not those of {name}")
+    return {"glass": name}
+
+
+def _place(lens: Lens, i: int) -> dict[str, Any]:
+    """Decentre in mm and tilt in degrees of a surface or the sensor."""
+    place = {}
+    if lens.decentre is not None:
+        place["decentre"] = np.asarray(lens.decentre[i]).tolist()
+    if lens.tilt is not None:
+        place["tilt"] = [_degrees(angle) for angle in np.asarray(lens.tilt[i])]
+    return place
+
+
+def _degrees(angle: np.floating) -> float:
+    """The number of degrees that is read as this angle in radians, or the next to it."""
+    near = np.degrees(angle) + np.arange(-4, 5) * np.spacing(np.degrees(angle))
+    return float(near[np.argmin(np.abs(np.asarray(jnp.radians(near)) - angle))])

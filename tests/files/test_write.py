@@ -1,0 +1,87 @@
+"""Lenses written and read back."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drt_jax import LensError, lens_names, load_lens, save_lens
+
+ODD = {
+    "name": "odd",
+    "object": {"glass": "water"},
+    "surfaces": [
+        {"radius": 30.1, "thickness": 0.1, "nd": 1.8, "vd": 30.3, "conic": -0.7},
+        {"radius": -1 / 3, "thickness": 1 / 3, "glass": "F2", "coefficients": {4: 1e-300, 6: 0.1}},
+        {"curvature": 0, "thickness": 2.0, "stop": True, "semi_diameter": 0.3},
+        {"form": "biconic", "radius": 77.7, "radius_x": 55.5, "conic_x": 0.3, "thickness": 30.0},
+        {"form": "polynomial_xy", "radius": -9e9, "coefficients": {"x1y1": 1e-3}, "mirror": True}
+        | {"thickness": -12.0, "tilt": [0.1, 45, -7.7], "decentre": [0, 1 / 7]},
+    ],
+    "sensor_tilt": [1, 2, 3],
+}
+CASES = {
+    **{name: name for name in lens_names()},
+    "odd": ODD,
+    "index": {
+        "surfaces": [
+            {"radius": 50.0, "thickness": 4.0, "index": 1.1, "coefficients": {4: 0, 6: 0}},
+            {"radius": "inf", "thickness": 50.0, "stop": True, "semi_diameter": 5.0},
+        ]
+    },
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_lens_comes_back(name, tmp_path):
+    """Everything that is static, and every number but tilts to the last digit."""
+    lens = load_lens(CASES[name])
+    save_lens(lens, tmp_path / "lens.yaml")
+    again = load_lens(tmp_path / "lens.yaml")
+    again = again if lens.name else dataclasses.replace(again, name="")
+    assert jax.tree.structure(again) == jax.tree.structure(dataclasses.replace(lens))
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(lens), strict=True):
+        np.testing.assert_array_max_ulp(np.asarray(a), np.asarray(b), 1)
+    for field in ("curvature", "conic", "coefficients", "thickness", "sensor", "dispersion"):
+        pairs = zip(jax.tree.leaves(getattr(again, field)), jax.tree.leaves(getattr(lens, field)))
+        assert all(np.array_equal(a, b) for a, b in pairs), field
+
+
+def test_the_patent_lens_comes_back(shared, tmp_path):
+    lens = load_lens(shared / "patent_rf50.yaml")
+    save_lens(lens, tmp_path / "lens.yaml")
+    again = load_lens(tmp_path / "lens.yaml")
+    assert again.glasses == lens.glasses
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(lens), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_lens_that_an_optimiser_moved(tmp_path):
+    """Numbers that nobody typed; the Abbe number of a model glass among them."""
+    lens = load_lens(ODD)
+    change = np.random.default_rng(0).normal(size=100)
+    leaves, structure = jax.tree.flatten(lens)
+    moved = [leaves[k] * (1 + 1e-3 * change[k]) for k in range(len(leaves))]
+    found = jax.tree.unflatten(structure, moved)
+    found = dataclasses.replace(found, dispersion=lens.dispersion)
+    model = found.dispersion.model.at[1].mul(1.01)
+    found = dataclasses.replace(found, dispersion=dataclasses.replace(lens.dispersion, model=model))
+    save_lens(found, tmp_path / "lens.yaml")
+    again = load_lens(tmp_path / "lens.yaml")
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_max_ulp(np.asarray(a), np.asarray(b), 1)
+
+
+def test_what_a_prescription_cannot_hold(tmp_path):
+    lens = load_lens("singlet")
+    curved = dataclasses.replace(lens, curvature=lens.curvature.at[-1].set(0.01))
+    with pytest.raises(LensError, match="sensor"):
+        save_lens(curved, tmp_path / "lens.yaml")
+    melted = dataclasses.replace(lens.dispersion, strength=lens.dispersion.strength + 1e-6)
+    with pytest.raises(LensError, match=r"glasses\[\d\]: the constants are not those of"):
+        save_lens(dataclasses.replace(lens, dispersion=melted), tmp_path / "lens.yaml")
+    with pytest.raises(LensError, match="cannot be written"):
+        save_lens(lens, tmp_path / "nowhere" / "lens.yaml")
+    assert not any(tmp_path.iterdir()) and jnp.all(jnp.isfinite(lens.curvature))
