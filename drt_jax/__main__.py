@@ -10,7 +10,10 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
-from . import Lens, first_order, lens_names, load_lens, psf_moments
+from .files.yaml import lens_names, load_lens
+from .image.converged import psf_moments
+from .lens.lens import Lens
+from .lens.paraxial import first_order
 
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 
@@ -58,10 +61,13 @@ def field_lines(
     yield _row("deg", "mm", *("RMS um" for _ in spots), "%")
     for field in fields:
         try:
-            mean, squares, passed = _spot(lens, field, distance, wavelengths)
+            found = psf_moments(lens, math.radians(field), distance, np.array(wavelengths), 1e-3)
         except ValueError as error:
             yield _row(f"{field:.4g}", f"  ! {error}")
             continue
+        middle = len(wavelengths) // 2
+        mean, passed = float(found.mean[middle, 1]), float(found.passed[middle])
+        squares = np.trace(np.asarray(found.covariance), axis1=1, axis2=2)
         spots = [f"{1e3 * math.sqrt(square):.4g}" for square in squares]
         yield _row(f"{field:.4g}", f"{mean:.5g}", *spots, f"{100 * passed:.2f}")
         if field == 0 and passed < 0.999:
@@ -72,18 +78,10 @@ def _row(first: str, *cells: str) -> str:
     return f"{first:>6}" + "".join(f"{cell:>15}" for cell in cells)
 
 
-def _spot(
-    lens: Lens, field: float, distance: float, wavelengths: list[float]
-) -> tuple[float, np.ndarray, float]:
-    found = psf_moments(lens, math.radians(field), distance, np.array(wavelengths), 1e-3)
-    squares = np.trace(np.asarray(found.covariance), axis1=1, axis2=2)
-    middle = len(wavelengths) // 2
-    return float(found.mean[middle, 1]), squares, float(found.passed[middle])
-
-
 def show(options: argparse.Namespace) -> None:
     """Print what a lens is, and draw it."""
-    from . import show as pictures
+    from .show.figures import new
+    from .show.layout import draw, lens_drawing
 
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -93,9 +91,9 @@ def show(options: argparse.Namespace) -> None:
         lines += field_lines(lens, options.field, options.distance, waves)
     lines += [f"  ! {warning.message}" for warning in said]
     out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}.png")
-    figure, axes = pictures.new(width=9, height=4)
+    figure, axes = new(width=9, height=4)
     angles = [math.radians(field) for field in options.field]
-    pictures.lens_drawing(axes, pictures.draw(lens, angles, options.distance))
+    lens_drawing(axes, draw(lens, angles, options.distance))
     figure.savefig(out)
     sys.stdout.write("\n".join([*lines, f"drawn in {out}", ""]))
 

@@ -10,9 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
-from drt_jax import Lens, entrance_pupil
+from drt_jax import Lens
 from drt_jax.lens.lens import rotation_matrix
 from drt_jax.lens.surface import Shape, domain, sag_derivatives
 
@@ -121,26 +120,3 @@ def trace_snell(
     wavelength = jnp.asarray(wavelength, point.dtype)
     (*_, ok), hits = jax.lax.scan(cross, start, _rows(lens, wavelength, forms))
     return hits, ok
-
-
-def launch_paraxial(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelength: ArrayLike, pupil: Array
-) -> tuple[Array, Array]:
-    """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming: unlike
-    the Fermat tracer, which aims at the real stop. The pupil must not be infinitely far away.
-
-    field: radians along y. distance: mm from the object plane to the first vertex, inf allowed.
-    wavelength: () in um. pupil: (Q, 2) in units of the pupil's semi-diameter.
-    Returns points (Q, 3) in mm on the first vertex plane and unit directions (Q, 3), for
-    `trace_snell`.
-    """
-    image = entrance_pupil(lens, jnp.atleast_1d(jnp.asarray(wavelength, pupil.dtype)))
-    place, radius = image.position[0], image.semi_diameter[0]
-    v = 1 / jnp.asarray(distance, pupil.dtype)
-    tangent = jnp.tan(jnp.asarray(field, pupil.dtype))
-    target = jnp.concatenate([radius * pupil, jnp.broadcast_to(place, (len(pupil), 1))], axis=1)
-    one = jnp.ones_like(tangent)
-    # From the object point (0, -tangent, -1) / v; the scale v keeps it finite.
-    direction = v * target + jnp.stack([0 * one, tangent, one])[None]
-    points = target - direction * (place / direction[:, 2:])
-    return points, direction / jnp.linalg.norm(direction, axis=1, keepdims=True)

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from experiments.snell import launch_paraxial, trace_snell
+from experiments.snell import trace_snell
 
-from drt_jax import Status, load_lens, pupil, sag, trace_rays
+from drt_jax import Status, entrance_pupil, load_lens, pupil, sag, trace_rays
 
 from ..conftest import LENSES, RGB, assert_close
 
@@ -16,6 +16,19 @@ POINTS = pupil.half_disc(4, 5)[0].T
 SINGLET = load_lens("singlet")
 # Twenty rays of three colours in all tests of one lens: one program.
 HEIGHTS = np.stack([np.zeros(20), np.linspace(-1, 1, 20)], axis=1)
+
+
+def launch_paraxial(lens, field, distance, wavelength, points):
+    """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming: points
+    (Q, 3) on the first vertex plane and unit directions, for points (Q, 2) of the pupil."""
+    image = entrance_pupil(lens, jnp.array([wavelength]))
+    place, v, slope = image.position[0], 1 / distance, jnp.tan(field)
+    height = jnp.broadcast_to(place, (len(points), 1))
+    target = jnp.concatenate([image.semi_diameter[0] * points, height], axis=1)
+    # From the object point (0, -slope, -1) / v; the scale v keeps it finite.
+    direction = v * target + jnp.array([0.0, slope, 1.0])[None]
+    start = target - direction * (place / direction[:, 2:])
+    return start, direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
 
 
 LARGER = ("double_gauss_addon", "cooke_triplet", "asphere")
