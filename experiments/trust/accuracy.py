@@ -220,7 +220,8 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
 
 def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[dict]]:
     """Rows of results.json for one scene; logs its curves."""
-    if next(other for other in config.scenes if other.kind == scene.kind) is scene:
+    first = next(other for other in config.scenes if other.kind == scene.kind)
+    if scene.vignetted or scene is first:
         jax.clear_caches()  # thousands of kernels exhaust what a process may map
     arguments, truth = prepare(scene, config.wavelengths_um)
     kinds = [(_QUADRATURE, n, [scene.rule(n)]) for n in scene.orders or config.orders]
