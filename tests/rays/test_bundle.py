@@ -15,7 +15,7 @@ from ..conftest import assert_close
 from ..known import aims, known, search
 
 # Three tiles, the last one padded; small bundles are one without tiles.
-RAYS, PART, FIELD, WAVES = 1500, 500, 0.17, (0.6, 0.48)
+RAYS, PART, FIELD, WAVES = 2500, 500, 0.17, (0.6, 0.48)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def joined(parts):
 
 
 def test_sizes():
-    assert tiles_of(RAYS, len(WAVES)) == (3, 512) and tiles_of(PART, len(WAVES)) == (1, PART)
+    assert tiles_of(RAYS, len(WAVES)) == (3, 1024) and tiles_of(PART, len(WAVES)) == (1, PART)
 
 
 def test_no_newton_step_remains(found):
