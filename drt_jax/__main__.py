@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import pathlib
 import sys
 import warnings
@@ -98,9 +99,19 @@ def show(options: argparse.Namespace) -> None:
     sys.stdout.write("\n".join([*lines, f"drawn in {out}", ""]))
 
 
+def set_up() -> None:
+    """What a command line chooses, and a library does not: float64, and compiled programs kept in
+    JAX_COMPILATION_CACHE_DIR or the user's cache."""
+    jax.config.update("jax_enable_x64", True)
+    if not jax.config.values["jax_compilation_cache_dir"]:
+        home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "drt_jax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run the command line; errors are one line, and the exit status 2."""
-    jax.config.update("jax_enable_x64", True)
+    set_up()
     try:
         show(_options(argv))
     except ValueError as error:

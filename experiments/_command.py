@@ -2,16 +2,14 @@
 
 import argparse
 import datetime
-import os
 import pathlib
 import sys
 import time
 import traceback
 from typing import Any
 
-import jax
-
 import drt_jax
+from drt_jax.__main__ import set_up
 from drt_jax.runs import config as configs
 from drt_jax.runs.folder import Run
 
@@ -31,9 +29,7 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
     """
     name = experiment.__spec__.name.split(".")[-1]
     options = _parser(name, experiment).parse_args(argv)
-    # The caller, not the library, chooses the precision: optics in float64.
-    jax.config.update("jax_enable_x64", True)
-    _keep_programs()
+    set_up()
     started = time.perf_counter()
     folder = None
     try:
@@ -108,11 +104,3 @@ def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:
     remedy = "no unfinished run; name a run folder with --out"
     _common.require(bool(folders), f"nothing to resume in {parent}: {remedy}")
     return folders[-1]
-
-
-def _keep_programs() -> None:
-    """Keep compiled programs for the next run, in JAX_COMPILATION_CACHE_DIR or the user's cache."""
-    if not jax.config.jax_compilation_cache_dir:
-        home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "drt_jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)

@@ -167,8 +167,7 @@ def fit(
     state: Any,
     scenes: Iterator[np.ndarray],
     noise: float,
-    first: int,
-    last: int,
+    steps: range,
     every: int,
     report: Callable[[int, dict[str, np.ndarray], Any], None],
     stopped: Callable[[], bool] = lambda: False,
@@ -178,7 +177,7 @@ def fit(
     step, state: as `make_step` gives them.
     scenes: uint8 (B, P, P, C), a batch for each step.
     noise: standard deviation, of values from 0 to 1.
-    first, last: the steps `first` to `last` - 1 are run.
+    steps: those to run.
     every, report: after so many steps, and at the end, report(start, metrics, state) is called
         with the metrics since `start` stacked on the first axis; between, nothing waits for the
         device.
@@ -186,11 +185,11 @@ def fit(
     """
     strength = np.float32(noise)
     pending: list[dict[str, Array]] = []
-    for index in range(first, last):
+    for index in steps:
         state, metric = step(state, next(scenes), strength, np.int32(index))
         pending.append(metric)
         stop = stopped()
-        if stop or len(pending) == every or index == last - 1:
+        if stop or len(pending) == every or index == steps[-1]:
             stacked = {k: np.stack([np.asarray(m[k]) for m in pending]) for k in metric}
             start, pending = index + 1 - len(pending), []
             report(start, stacked, state)

@@ -94,6 +94,8 @@ def units(like: Array) -> Array:
 
 
 def launched(lens: Lens, system: System, launch: Array) -> Rays:
+    """Rays launched at points (2, W, B), mm on the vertex plane of the first row, and traced."""
+
     def trace(launch):
         found = shoot(system, tuple(launch))
         hits, status = on_all_surfaces(lens, system, *apart(system, found.hits), found.fate)

@@ -20,7 +20,7 @@ from ..lens.surface import Shape, vertex_curvature
 from ..numerics import safe_divide
 from .snell import apart, shoot, shoot_to_stop
 from .status import Status
-from .system import System, Vector, dot
+from .system import System, Vector, determinant, divide, dot
 
 # A ray counts as aimed if it misses its stop point by less than `_NEAR` of the beam's radius: one
 # more step of Newton's method, which converges quadratically, then brings it there to rounding,
@@ -69,11 +69,11 @@ class AimNewton(optx.AbstractRootFinder):
         """One trial."""
         trial = tuple(a + b for a, b in zip(y, state.move, strict=True))
         miss, columns, fate = _derivatives(lambda y: fn(y, args), trial)
-        folded = _determinant(columns) < 0
+        folded = determinant(columns) < 0
         counts = (fate == Status.OK) & ~(folded & options.get("upright", False))
         far = jnp.where(counts, self.norm(miss), jnp.inf)
         better = far < state.far
-        newton = tuple(-a for a in _divide(columns, miss))
+        newton = tuple(-a for a in divide(columns, miss))
         bound = jnp.where(jnp.isinf(state.far), options["reach"], 2 * self.norm(state.move))
         newton = tuple(a * jnp.minimum(1, safe_divide(bound, self.norm(newton))) for a in newton)
         move = tuple(jnp.where(better, a, b / 2) for a, b in zip(newton, state.move, strict=True))
@@ -105,24 +105,6 @@ def _derivatives(function: Callable, y: Vector) -> tuple[Vector, Vector, Any]:
         return jax.jvp(function, (y,), (unit,), has_aux=True)
 
     return jax.vmap(along, out_axes=(None, 0, None))(units)
-
-
-def _divide(columns: Vector, miss: Vector) -> Vector:
-    """x with J x = miss, where columns[i][k] = dmiss_i / dx_k; 0 where J is singular."""
-    if len(miss) == 1:
-        return (safe_divide(miss[0], columns[0][0]),)
-    (p, q), (r, s) = columns
-    determinant = _determinant(columns)
-    x, y = s * miss[0] - q * miss[1], p * miss[1] - r * miss[0]
-    return safe_divide(x, determinant), safe_divide(y, determinant)
-
-
-def _determinant(columns: Vector) -> Array:
-    """Of 2 x 2 derivatives; 1 for a single one, whose sign tells no fold."""
-    if len(columns) == 1:
-        return jnp.ones_like(columns[0][0])
-    (p, q), (r, s) = columns
-    return p * s - q * r
 
 
 class Aimed(NamedTuple):

@@ -18,7 +18,7 @@ from jax import Array
 
 from .fermat import Path, label, ray_at, residual
 from .snell import cross
-from .system import System, Vector, dot, turn
+from .system import System, Vector, divide, dot, turn
 
 
 class Push(NamedTuple):
@@ -108,7 +108,7 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
     """
     dim, zero, live = len(push.label), jnp.zeros_like(push.label[0]), system.stop is None
     at = np.arange(len(system.forms)) == system.before
-    rows = _Row(*path[2:7], system.index, system.behind, system.rows.rotation, at)
+    path_rows = _Row(*path[2:7], system.index, system.behind, system.rows.rotation, at)
     still, none = (zero,) * (dim + 1), (zero,) * dim
     unknown = none if live else (*still, *still)
     # A march from each unit change of the first hit, and one that the push makes.
@@ -123,11 +123,16 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
         return (free[0], forced[0]), (free[1], forced[1])
 
     start = free, _March(still, push.swing, unknown)
-    marched, hits = jax.lax.scan(step, start, (rows, push.force, push.point))
+    marched, hits = jax.lax.scan(step, start, (path_rows, push.force, push.point))
     crossing = _crossing(path, system)
     columns = jax.vmap(crossing)(marched[0].label)
     wanted = tuple(s - c for s, c in zip(push.label, crossing(marched[1].label), strict=True))
-    weights = _divide([[c[k] for k in range(dim)] for c in columns], wanted, good)
+    # Rays of no interest have a matrix that can be divided by.
+    rows = [
+        [jnp.where(good, c, float(i == k)) for k, c in enumerate(row)]
+        for i, row in enumerate(columns)
+    ]
+    weights = divide(rows, wanted)
 
     def joined(free, forced):
         columns = (free[..., k, :, :] for k in range(dim))
@@ -154,12 +159,3 @@ def _crossing(path: Path, system: System) -> Callable[[Vector], Vector]:
     line = ray_at(path, system, system.before)
     _, change = jax.linearize(lambda *line: cross(*system.at_stop, *line)[0], *line)
     return lambda label: change(label[: len(line[0])], label[len(line[0]) :])
-
-
-def _divide(matrix: list[list[Array]], b: Vector, good: Array) -> Vector:
-    """x with matrix x = b, for 1 x 1 or 2 x 2."""
-    if len(b) == 1:
-        return (b[0] / jnp.where(good, matrix[0][0], 1),)
-    (p, q), (r, s) = matrix
-    determinant = jnp.where(good, p * s - q * r, 1)
-    return (s * b[0] - q * b[1]) / determinant, (p * b[1] - r * b[0]) / determinant

@@ -17,6 +17,7 @@ from ..lens.glass import common_range
 from ..lens.lens import Lens, rotation_matrix
 from ..lens.scene import Scene
 from ..lens.surface import Shape
+from ..numerics import safe_divide
 
 Vector = tuple[Array, ...]
 
@@ -25,6 +26,24 @@ def dot(a: Any, b: Any) -> Array:
     """Sum of products of two vectors of the same number of components."""
     first, *others = (x * y for x, y in zip(a, b, strict=True))
     return sum(others, first)
+
+
+def determinant(rows: Any) -> Array:
+    """Of a 2 x 2 matrix; 1 for a single number, whose sign tells no fold."""
+    if len(rows) == 1:
+        return jnp.ones_like(rows[0][0])
+    (p, q), (r, s) = rows
+    return p * s - q * r
+
+
+def divide(rows: Any, b: Vector) -> Vector:
+    """x with rows x = b, of 1 or 2 unknowns; 0 where the matrix is singular."""
+    if len(b) == 1:
+        return (safe_divide(b[0], rows[0][0]),)
+    (p, q), (r, s) = rows
+    size = determinant(rows)
+    x, y = s * b[0] - q * b[1], p * b[1] - r * b[0]
+    return safe_divide(x, size), safe_divide(y, size)
 
 
 def turn(rotation: Array | None, vector: Vector, back: bool = False) -> Vector:

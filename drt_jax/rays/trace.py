@@ -67,12 +67,9 @@ def on_all_surfaces(
     """Hits on all surfaces from those on the rows of the system and on the stop, and status:
     where the straight ray, prolonged either way, does not meet a surface that bends no light, it
     is MISSED."""
-    pieces, begin = [], 0
-    for i in range(lens.count):
-        if i in lens.live:
-            continue
-        row = sum(j < i for j in lens.live)  # the first behind it
-        crossing = stop
+    pieces, begin, behind = [], 0, _rows_behind(lens)
+    for i in sorted({*range(lens.count)} - {*lens.live}):
+        row, crossing = behind[i], stop
         if i != lens.stop:
             some, part = fermat.up_to(hits, system, row)
             line = fermat.ray_at(fermat.geometry(some, part), part, -1)

@@ -191,7 +191,7 @@ class Jobs:
         # Each report waits for the device: rarely where a step takes milliseconds.
         every = 10 if jax.default_backend() == "cpu" else 113
         with bar, deferred_interrupt(stopping) as asked:
-            state = train.fit(step, state, stream, noise, first, total, every, report, asked)
+            state = train.fit(step, state, stream, noise, range(first, total), every, report, asked)
             if asked():
                 raise KeyboardInterrupt
         return state[0]

@@ -77,7 +77,7 @@ def test_training_moves_the_sensor_to_focus_and_compiles_once(start):
     def report(first, metrics, state):
         reports.append((first, metrics))
 
-    state = train.fit(step, state, itertools.repeat(scenes()), 0.01, 0, 40, 16, report)
+    state = train.fit(step, state, itertools.repeat(scenes()), 0.01, range(40), 16, report)
     assert [first for first, _ in reports] == [0, 16, 32]
     assert reports[-1][1]["loss"].shape == (8,)
     assert abs(float(state[0]["optics"]["sensor"]) - 133.39) < 0.15
@@ -94,8 +94,7 @@ def test_training_stops_when_asked_with_a_report():
         0,
         itertools.repeat(None),
         0.0,
-        3,
-        99,
+        range(3, 99),
         10,
         lambda start, metrics, state: seen.append((start, metrics["loss"].tolist(), state)),
         lambda: len(seen) == 1 and stop.pop(0),

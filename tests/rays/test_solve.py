@@ -1,5 +1,5 @@
 """Derivatives of rays: our rule as `attach`, `solve` and `solve_reverse` against each other, finite
-differences, optimistix's own implicit adjoint and the unrolled iteration; and the searches."""
+differences, optimistix's own implicit adjoint and the unrolled iteration."""
 
 import dataclasses
 import functools
@@ -10,16 +10,13 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from drt_jax import Status, load_lens, scene_of, trace_rays
-from drt_jax.rays import aim, fermat, find, linear, solve
+from drt_jax import Status
+from drt_jax.rays import fermat, linear, solve
 
 from ..conftest import assert_close
 from ..known import aims, known, search
-from .systems import COLOURS, lens_with
+from .problems import PROBLEMS, gradient, outcome, problem, random_like, weighed
 
-POINTS = tuple(jnp.asarray(p) for p in ([0.0, 0.5, -0.3, 0.8, -0.9], [0.1, 0.6, -0.8, -0.2, 0.1]))
-# A mirror and a stop that bends light, all tilted; meridional rays and one that bends none.
-PROBLEMS = {"tilted": ("live", True, 2), "meridional": ("between", False, 1)}
 GROUPS = (
     "curvature",
     "conic",
@@ -33,22 +30,6 @@ GROUPS = (
 )
 
 
-@functools.cache
-def problem(name):
-    """A lens, a scene, points and the rays through them."""
-    stop, tilted, dim = PROBLEMS[name]
-    lens, points = lens_with(stop, tilted), POINTS[2 - dim :]
-    scene = scene_of(lens, [0.03, -0.05] if dim == 2 else 0.08, 300.0, COLOURS)
-    found = search(lens, scene, points)
-    assert np.all(found.status == Status.OK)
-    return lens, scene, points, found
-
-
-def random_like(tree, seed=0):
-    generator = np.random.default_rng(seed)
-    return jax.tree.map(lambda a: jnp.asarray(generator.normal(size=a.shape)), tree)
-
-
 def each(a, b):
     """Pairs of the leaves of two trees."""
     return zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
@@ -57,21 +38,6 @@ def each(a, b):
 def dots(a, b):
     """Product of two trees."""
     return sum(float(np.vdot(x, y)) for x, y in each(a, b))
-
-
-def weighed(hits, weights):
-    """A scalar that is not linear in the hits."""
-    return sum(jnp.sum(w * h + 1e-2 * (w * h) ** 2) for w, h in zip(weights, hits, strict=True))
-
-
-def outcome(lens, scene, points, found, weights):
-    """The scalar of rays that are known."""
-    hits = known(found)(*aims(lens, scene, points)).hits
-    return weighed(hits, weights)
-
-
-gradient = jax.jit(jax.grad(outcome, (0, 1, 2)))
-crossings = jax.jit(lambda lens, scene, points: aims(lens, scene, points)[1])
 
 
 def direction(lens, group):
@@ -308,135 +274,6 @@ def test_failed_rays_have_no_derivatives_and_change_no_other():
             assert np.all(np.isfinite(tangent)) and np.all(np.asarray(tangent)[:, :, some] == 0)
 
 
-@jax.jit
-def aimed(lens, scene, points, off):
-    """What aiming finds that starts `off` mm from the paraxial launch."""
-    system, target = aims(lens, scene, points)
-    sizes = aim.beam_size(system, target)
-    launch = aim.paraxial_launch(system, target, sizes[1])
-    start = tuple(a + b for a, b in zip(launch, off, strict=True))
-    return aim.aim(system, target, start, sizes)
-
-
-ZERO = tuple(jnp.zeros((len(COLOURS), 5)) for _ in range(2))
-
-
-def test_aiming_from_crude_starts():
-    """The same launch from 3 mm around; what cannot be reached says so, and spoils no other."""
-    lens, scene, points, _ = problem("tilted")
-    exact = aimed(lens, scene, points, ZERO)
-    assert np.all(exact.status == Status.OK) and int(exact.steps) <= 6
-    off = tuple(3 * a for a in random_like(ZERO))
-    crude = aimed(lens, scene, points, off)
-    assert np.all(crude.status == Status.OK) and int(crude.steps) <= 12
-    # A step of Newton's method from a millionth of the beam leaves some 1e-12 of it.
-    assert_close(crude.launch, exact.launch, 1e-10)
-    far = tuple(p.at[3].set(30.0) for p in points)
-    status = np.asarray(aimed(lens, scene, far, ZERO).status)
-    assert np.all((status == Status.OK) == (np.arange(5) != 3))
-
-
-@jax.jit
-def polished(lens, scene, points, hits, active):
-    """What `BlockNewton` makes of hits."""
-    system, target = aims(lens, scene, points)
-
-    def function(hits, args):
-        system, target, _ = args
-        path = fermat.geometry(hits, system)
-        return (linear.shortfall(path, system, target), path), None
-
-    eps = float(jnp.finfo(hits[0].dtype).eps)
-    newton = find.BlockNewton(rtol=2 * eps, atol=2 * eps)
-    args = system, target, active
-    found = optx.root_find(function, newton, hits, args, has_aux=True, max_steps=16, throw=False)
-    successful = found.result == optx.RESULTS.successful
-    return found.value, found.state.solved, found.stats["num_steps"], successful
-
-
-def test_newton_from_the_crudest_start():
-    """Every hit at the stop point: all rays within 8 steps. Those that are not to move stay; one
-    that has no solution tells, stays finite and leaves the others alone."""
-    lens, scene, points, found = problem("tilted")
-    start = tuple(
-        jnp.broadcast_to(c, h.shape) for c, h in zip(crossings(lens, scene, points), found.hits)
-    )
-    every = jnp.ones(found.status.shape, bool)
-    hits, solved, steps, successful = polished(lens, scene, points, start, every)
-    assert np.all(solved) and successful and int(steps) <= 8
-    assert_close(hits, found.hits, 1e-13)
-    hits, solved, steps, successful = polished(lens, scene, points, start, ~every)
-    assert np.all(solved) and successful and int(steps) == 0
-    assert_close(hits, start, 0)
-    hard = np.arange(5) == 3
-    far = tuple(jnp.where(hard, 30.0, p) for p in points)
-    hits, solved, _, successful = polished(lens, scene, far, start, every)
-    assert np.all(np.asarray(solved) == ~hard) and not successful
-    for mine, wanted in zip(hits, found.hits, strict=True):
-        mine, wanted = np.asarray(mine), np.asarray(wanted)
-        assert np.all(np.isfinite(mine))
-        np.testing.assert_allclose(mine[:, :, ~hard], wanted[:, :, ~hard], rtol=0, atol=1e-12)
-
-
-def test_hits_that_rounding_would_turn_are_not_accepted():
-    """Two equal surfaces a nanometre of a nanometre apart: rays exist, their directions drown."""
-    lens, scene, points, _ = problem("meridional")
-    same = {k: getattr(lens, k).at[1].set(getattr(lens, k)[0]) for k in ("curvature", "conic")}
-    same["coefficients"] = lens.coefficients.at[1].set(lens.coefficients[0])
-    close = dataclasses.replace(lens, thickness=lens.thickness.at[0].set(1e-9), **same)
-    status = np.asarray(search(close, scene, points).status)
-    wide = np.abs(np.asarray(points[0])) > 0.2
-    assert np.all(status[:, wide] == Status.UNCONVERGED)
-    apart = dataclasses.replace(close, thickness=lens.thickness.at[0].set(1e-6))
-    assert np.all(search(apart, scene, points).status == Status.OK)
-
-
-def hostile(seed):
-    """A lens with the structure of the "tilted" one, and a scene, to break the search."""
-    generator = np.random.default_rng(seed)
-    lens, scene, *_ = problem("tilted")
-    bent = lens.curvature * generator.uniform(-4, 6, lens.curvature.shape)
-    wide = lens.semi_diameter.at[lens.stop].mul(generator.uniform(0.5, 2))
-    conic = lens.conic + generator.normal(size=lens.conic.shape)
-    lens = dataclasses.replace(lens, curvature=bent, conic=conic, semi_diameter=wide)
-    return lens, dataclasses.replace(scene, field=jnp.asarray(generator.uniform(-0.9, 0.9, 2)))
-
-
-def test_hostile_lenses():
-    """Nothing is ever not finite; what is found crosses the stop at its point; and the fan finds
-    rays that the first aim does not, beside those that it does."""
-    _, _, points, found = problem("tilted")
-    weights = random_like(found.hits)
-    saved = mixed = lost = 0
-    for seed in range(40):
-        lens, scene = hostile(seed)
-        found, first = search(lens, scene, points), aimed(lens, scene, points, ZERO)
-        good = np.asarray(found.status) == Status.OK
-        for hits, target in zip(found.hits, crossings(lens, scene, points), strict=True):
-            ours = np.asarray(hits)[2]  # the stop is the third live surface
-            np.testing.assert_allclose(ours[good], np.asarray(target)[good], rtol=0, atol=1e-12)
-        every = found.hits, gradient(lens, scene, points, found, weights)
-        assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(every))
-        late = good & (np.asarray(first.status) != Status.OK)
-        saved, lost = saved + np.sum(late), lost + np.sum(~good)
-        mixed += np.any(late) and np.any(good & ~late)
-    print(saved, mixed, lost)
-    assert saved >= 20 and mixed >= 2 and lost >= 20
-
-
-def test_the_fan_under_vmap():
-    """Scenes that need it and scenes that do not, side by side: each as alone."""
-    _, _, points, _ = problem("tilted")
-    scenes = [hostile(seed) for seed in range(8)]
-    alone = [search(*scene, points) for scene in scenes]
-    batch = jax.tree.map(lambda *a: jnp.stack(a), *scenes)
-    together = jax.jit(jax.vmap(search, (0, 0, None)))(*batch, points)
-    for i, one in enumerate(alone):
-        np.testing.assert_array_equal(together.status[i], one.status)
-        for mine, wanted in zip(together.hits, one.hits, strict=True):
-            np.testing.assert_allclose(mine[i], wanted, rtol=0, atol=1e-11)
-
-
 def test_float32_gradient_is_the_rounded_float64_one():
     lens, scene, points, found = problem("tilted")
     given = lens, scene, points, found, random_like(found.hits)
@@ -445,15 +282,3 @@ def test_float32_gradient_is_the_rounded_float64_one():
     for a, b in zip(jax.tree.leaves(exact), jax.tree.leaves(gradient(*single)), strict=True):
         assert b.dtype == jnp.float32
         np.testing.assert_allclose(b, a, rtol=0, atol=1e-4 * np.max(np.abs(a), initial=1e-9))
-
-
-def test_several_rays_that_are_sought():
-    """Two of a bundle that the first aim does not find: each from its own nearest starts."""
-    radius, gap = (-21.77, -9.051, 14.174, 9.3, "inf"), (2.219, 1.995, 6.392, 6.941, 22.718)
-    index = (1.804, 1, 1.402, 1, 1)
-    names = "radius", "thickness", "index"
-    rows = [dict(zip(names, row, strict=True)) for row in zip(radius, gap, index, strict=True)]
-    rows[-1] |= {"stop": True, "semi_diameter": 8.1456}
-    points = [[0, 0], [0, 1], [0, -1], [1, 0], [-0.113, 0.078], [0.866, 0.282], [0.648, -0.427]]
-    rays = trace_rays(load_lens({"surfaces": rows}), 0.23138, 1e3, [0.55], points)
-    assert np.all(rays.status == Status.OK)
