@@ -13,7 +13,7 @@ Conventions, everywhere in the package:
   before loading a lens; the library changes no global setting.
 """
 
-from .files.specs import LensError as LensError
+from .files.entry import LensError as LensError
 from .files.write import save_lens as save_lens
 from .files.yaml import lens_names as lens_names, load_lens as load_lens
 from .image.converged import (

@@ -11,7 +11,8 @@ import yaml
 
 from ..lens.glass import Dispersion, find_glass
 from ..lens.lens import Lens
-from .specs import COLUMNS, LensError
+from ..lens.surface import FORMS
+from .entry import LensError
 
 
 def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
@@ -44,10 +45,10 @@ def _surface(lens: Lens, i: int) -> dict[str, Any]:
         entry["conic"] = float(lens.conic[i])
     if lens.forms[i] != "asphere":
         entry["form"] = lens.forms[i]
-    named, powers = COLUMNS[lens.forms[i]]
+    form = FORMS[lens.forms[i]]
     values = np.asarray(lens.coefficients[i]).tolist()
-    entry |= dict(zip(named, values, strict=False))
-    rest = dict(zip(powers, values[len(named) :], strict=False))
+    entry |= dict(zip(form.named, values, strict=False))
+    rest = dict(zip(form.powers, values[len(form.named) :], strict=False))
     # Zeros of one surface keep the number of columns.
     if rest and (any(rest.values()) or (i == 0 and not np.any(lens.coefficients))):
         entry["coefficients"] = rest

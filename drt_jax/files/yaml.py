@@ -7,7 +7,8 @@ import jax
 import yaml
 
 from ..lens.lens import Lens
-from .specs import LensError, build_lens
+from .entry import LensError
+from .specs import build_lens
 
 _BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
 

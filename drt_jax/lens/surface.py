@@ -137,18 +137,26 @@ class Form(NamedTuple):
 
     function: (w, shape) -> (sag in mm, argument), as described at the top of this file.
     symmetry: "rotation" about the z axis, "plane" (x -> -x leaves it alone) or "none".
+    powers: what files call the coefficients, in their order.
+    named: files have keys of their own for the first coefficients.
+    round: whether the conic is one of r, so that the surface ends at a rim.
     """
 
     function: Callable[[Point, Shape], tuple[Array, Array]]
     symmetry: Literal["rotation", "plane", "none"]
+    powers: tuple[int | str, ...]
+    named: tuple[str, ...] = ()
+    round: bool = True
 
 
+_EVEN = tuple(range(2, 400, 2))
+_XY = tuple(f"x{i}y{j}" for i, j in powers_xy(230))
 FORMS: dict[str, Form] = {
-    "asphere": Form(asphere, "rotation"),
-    "odd_asphere": Form(odd_asphere, "rotation"),
-    "biconic": Form(biconic, "plane"),
-    "toroid": Form(toroid, "plane"),
-    "polynomial_xy": Form(polynomial_xy, "none"),
+    "asphere": Form(asphere, "rotation", _EVEN),
+    "odd_asphere": Form(odd_asphere, "rotation", tuple(range(1, 200))),
+    "biconic": Form(biconic, "plane", _EVEN, ("curvature_x", "conic_x"), round=False),
+    "toroid": Form(toroid, "plane", _EVEN, ("curvature_x",), round=False),
+    "polynomial_xy": Form(polynomial_xy, "none", _XY),
 }
 
 

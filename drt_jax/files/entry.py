@@ -1,0 +1,81 @@
+"""A mapping of a file, checked as it is read: every error names the place and the remedy."""
+
+import difflib
+import math
+from collections.abc import Sequence
+from typing import Any
+
+
+class LensError(ValueError):
+    """A prescription that cannot be used; the message names the file, the key and the remedy."""
+
+
+class Entry(dict[Any, Any]):
+    """A mapping in a prescription, and what its place is called in messages.
+
+    values: the mapping.
+    place: such as "surfaces[0]"; empty for the prescription itself.
+    keys: those that it may have.
+    """
+
+    def __init__(self, values: object, place: str, keys: Sequence[Any]):
+        self.place = place
+        known = ", ".join(map(str, keys[:20])) + (", ..." if len(keys) > 20 else "")
+        if not isinstance(values, dict):
+            raise self.error("", f"expected a mapping with the keys {known}")
+        super().__init__(values)
+        for key in self:
+            if key not in keys:
+                near = difflib.get_close_matches(str(key), map(str, keys), n=1, cutoff=0.7)
+                hint = f"did you mean {near[0]!r}? " if near else ""
+                raise self.error("", f"unknown key {key!r}; {hint}known: {known}")
+
+    def name(self, key: object) -> str:
+        """What the entry `key` or, if that is empty, the mapping is called in messages."""
+        return ".".join(filter(None, (self.place, str(key))))
+
+    def error(self, key: object, message: str) -> LensError:
+        """An error of the entry `key` or, if that is empty, of the mapping."""
+        return LensError(": ".join(filter(None, (self.name(key), message))))
+
+    def number(self, key: object, default: float | None = None, finite: bool = True) -> float:
+        """A number, given as such or as text: YAML 1.1 reads 1e-3 and inf as text."""
+        value: Any = self.get(key, default)
+        try:
+            number = math.nan if isinstance(value, bool) else float(value)
+        except (TypeError, ValueError):
+            number = math.nan
+        if math.isnan(number):
+            raise self.error(key, f"expected a number, got {value!r}")
+        if finite and math.isinf(number):
+            raise self.error(key, "must be finite")
+        return number
+
+    def vector(self, key: str, length: int) -> list[float]:
+        """A list of `length` numbers; empty if there is none."""
+        values = self.get(key)
+        if values is None:
+            return []
+        if not isinstance(values, list | tuple) or len(values) != length:
+            raise self.error(key, f"expected a list of {length} numbers, got {values!r}")
+        each = Entry(dict(enumerate(values)), self.name(key), range(length))
+        return [each.number(i) for i in range(length)]
+
+    def flag(self, key: str) -> bool:
+        """True or false; false if it is not given."""
+        value = self.get(key, False)
+        if not isinstance(value, bool):
+            raise self.error(key, "expected true or false")
+        return value
+
+    def curvature(self, suffix: str = "") -> float:
+        """The curvature (1/mm) that `radius` or `curvature`, followed by `suffix`, tells."""
+        radius, curvature = f"radius{suffix}", f"curvature{suffix}"
+        if (radius in self) == (curvature in self):
+            raise self.error("", f"give either {radius} (inf for a plane) or {curvature}")
+        if curvature in self:
+            return self.number(curvature)
+        value = self.number(radius, finite=False)
+        if value == 0:
+            raise self.error(radius, f"0 is no surface; a plane is {radius}: inf")
+        return 1 / value
