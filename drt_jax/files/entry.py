@@ -5,6 +5,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
 
 class LensError(ValueError):
     """A prescription that cannot be used; the message names the file, the key and the remedy."""
@@ -79,3 +84,13 @@ class Entry(dict[Any, Any]):
         if value == 0:
             raise self.error(radius, f"0 is no surface; a plane is {radius}: inf")
         return 1 / value
+
+
+def array(values: object) -> Array:
+    """Numbers as an array of the default floating dtype; in this way nothing is compiled."""
+    return jax.device_put(np.asarray(values, jnp.result_type(float)))
+
+
+def table(rows: list[list[float]], width: int) -> Array:
+    """Rows of numbers as an array (rows, `width`), zeros behind what they lack."""
+    return array([[*row, *[0.0] * (width - len(row))] for row in rows])

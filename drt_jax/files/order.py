@@ -25,15 +25,17 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
 
     Neighbours are the surfaces that bend light, and the sensor behind the last. The straight ray
     between two of them may cross a stop that bends none before the first or behind the second, so
-    that it may lie anywhere. A pair of which one is tilted or decentred is left out: away from the
-    axis, or at an angle to it, it may lie before its neighbour there and behind it where the light
-    goes.
+    that it may lie anywhere. A pair of which one is moved without the other is left out: away from
+    the axis, or at an angle to it, it may lie before its neighbour there and behind it where the
+    light goes.
 
     gaps: mm from each surface to the next and from the last to the sensor.
     moved: of each surface and the sensor.
     """
+    groups = () if lens.elements is None else lens.elements.spans
+    apart = lambda i, j: any((a <= i <= b) != (a <= j <= b) for a, b in groups)  # noqa: E731
     chain = itertools.pairwise([*(lens.live or (lens.stop,)), lens.count])
-    pairs = [(i, j, sum(gaps[i:j])) for i, j in chain if not moved[i] and not moved[j]]
+    pairs = [(i, j, sum(gaps[i:j])) for i, j in chain if not (moved[i] or moved[j] or apart(i, j))]
     for i, j, distance in pairs:
         forwards = lens.senses[i + 1] > 0
         turned = "" if forwards else ", as a mirror has turned the light"

@@ -2,46 +2,81 @@
 
 import math
 
-import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import Array
 
 from ..lens.glass import Dispersion
 from ..lens.lens import Lens
+from ..lens.phase import Phase
 from ..lens.surface import FORMS
-from .entry import Entry, LensError
+from .elements import elements_of
+from .entry import Entry, LensError, array, table
 from .media import MEDIUM_KEYS, media_of
 from .order import check_order
 
-_TOP_KEYS = ("name", "source", "object", "surfaces", "sensor", "sensor_tilt", "sensor_decentre")
+_TOP_KEYS = (
+    *("name", "source", "object", "surfaces", "elements"),
+    *("sensor", "sensor_tilt", "sensor_decentre"),
+)
 _SURFACE_KEYS = (
     *("form", "radius", "curvature", "conic", "radius_x", "curvature_x", "conic_x"),
     *("coefficients", "thickness", *MEDIUM_KEYS, "mirror", "semi_diameter", "stop"),
-    *("tilt", "decentre"),
+    *("tilt", "decentre", "phase"),
 )
 
 
-def _form(surface: Entry) -> str:
-    form = surface.get("form", "asphere")
+def _form(entry: Entry) -> str:
+    form = entry.get("form", "asphere")
     if form not in FORMS:
-        raise surface.error("form", f"unknown form {form!r}; known: {', '.join(FORMS)}")
+        raise entry.error("form", f"unknown form {form!r}; known: {', '.join(FORMS)}")
     return form
+
+
+def _columns(entry: Entry) -> dict[int, float]:
+    """Coefficients that have no key of their own, by their places."""
+    form = FORMS[_form(entry)]
+    given = Entry(entry.get("coefficients", {}), entry.name("coefficients"), form.powers)
+    return {len(form.named) + form.powers.index(power): given.number(power) for power in given}
 
 
 def _coefficients(surface: Entry) -> list[float]:
     form = _form(surface)
-    first, powers = FORMS[form].named, FORMS[form].powers
+    first = FORMS[form].named
     for key in ("radius_x", "curvature_x", "conic_x"):
         if key in surface and key.replace("radius", "curvature") not in first:
             raise surface.error(key, f"a surface of the form {form} has none")
-    given = Entry(surface.get("coefficients", {}), surface.name("coefficients"), powers)
-    columns = {len(first) + powers.index(power): given.number(power) for power in given}
+    columns = _columns(surface)
     if "curvature_x" in first:
         columns[0] = surface.curvature("_x")
     if "conic_x" in first:
         columns[1] = surface.number("conic_x", 0.0)
+    return _row(columns)
+
+
+def _row(columns: dict[int, float]) -> list[float]:
     return [columns.get(k, 0.0) for k in range(max(columns, default=-1) + 1)]
+
+
+def _phase(surfaces: list[Entry]) -> Phase | None:
+    """The diffractive structures, if any."""
+    keys = ("form", "order", "coefficients")
+    at = {i: s for i, s in enumerate(surfaces) if "phase" in s}
+    given = [Entry(s["phase"], s.name("phase"), keys) for s in at.values()]
+    if not given:
+        return None
+    for entry in given:
+        if FORMS[_form(entry)].named:
+            raise entry.error("form", "expected asphere, odd_asphere, polynomial_xy or linear")
+        if not entry.get("coefficients"):
+            raise entry.error("coefficients", "give at least one, in waves")
+        if entry.number("order", 1.0) % 1:
+            raise entry.error("order", "must be a whole number")
+    rows = [_row(_columns(entry)) for entry in given]
+    return Phase(
+        coefficients=table(rows, max(map(len, rows))),
+        order=array([entry.number("order", 1.0) for entry in given]),
+        surfaces=tuple(at),
+        forms=tuple(map(_form, given)),
+    )
 
 
 def _semi_diameter(surface: Entry) -> float:
@@ -96,16 +131,19 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     tilt = [*(s.vector("tilt", 3) for s in surfaces), top.vector("sensor_tilt", 3)]
     moved = any(decentre) or any(tilt)
     media, gaps = media_of(top, surfaces), _gaps(top, surfaces)
+    groups = elements_of(top, len(surfaces))
     lens = Lens(
-        curvature=_array([*(surface.curvature() for surface in surfaces), 0.0]),
-        conic=_array([*(surface.number("conic", 0.0) for surface in surfaces), 0.0]),
-        coefficients=_table(coefficients, max(map(len, coefficients))),
-        thickness=_array(gaps[:-1]),
-        semi_diameter=_array([*map(_semi_diameter, surfaces), math.inf]),
-        sensor=_array(top.number("sensor", sum(gaps))),
+        curvature=array([*(surface.curvature() for surface in surfaces), 0.0]),
+        conic=array([*(surface.number("conic", 0.0) for surface in surfaces), 0.0]),
+        coefficients=table(coefficients, max(map(len, coefficients))),
+        thickness=array(gaps[:-1]),
+        semi_diameter=array([*map(_semi_diameter, surfaces), math.inf]),
+        sensor=array(top.number("sensor", sum(gaps))),
         dispersion=Dispersion.of(media),
-        decentre=_table(decentre, 2) if moved else None,
-        tilt=jnp.radians(_table(tilt, 3)) if moved else None,
+        decentre=table(decentre, 2) if moved else None,
+        tilt=jnp.radians(table(tilt, 3)) if moved else None,
+        phase=_phase(surfaces),
+        elements=groups,
         stop=stops[0],
         glasses=tuple(medium.name for medium in media),
         forms=(*map(_form, surfaces), "asphere"),
@@ -114,13 +152,3 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     )
     check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
     return lens
-
-
-def _array(values: object) -> Array:
-    """Numbers as an array of the default floating dtype; in this way nothing is compiled."""
-    return jax.device_put(np.asarray(values, jnp.result_type(float)))
-
-
-def _table(rows: list[list[float]], width: int) -> Array:
-    """Rows of numbers as an array (rows, `width`), zeros behind what they lack."""
-    return _array([[*row, *[0.0] * (width - len(row))] for row in rows])

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from ..lens.elements import Elements
 from ..lens.glass import Dispersion, find_glass
 from ..lens.lens import Lens
 from ..lens.surface import FORMS
@@ -30,6 +31,8 @@ def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
     if before:
         top["object"] = before
     top["surfaces"] = [_surface(lens, i) for i in range(lens.count)]
+    if lens.elements is not None:
+        top["elements"] = [_element(lens.elements, g) for g in range(len(lens.elements.spans))]
     top["sensor"] = float(lens.sensor)
     top |= {f"sensor_{key}": value for key, value in _place(lens, lens.count).items()}
     text = yaml.safe_dump(top, sort_keys=False, default_flow_style=None, width=1000)
@@ -62,7 +65,28 @@ def _surface(lens: Lens, i: int) -> dict[str, Any]:
         entry["semi_diameter"] = float(lens.semi_diameter[i])
     if i == lens.stop:
         entry["stop"] = True
-    return entry | _place(lens, i)
+    return entry | _place(lens, i) | _phase(lens, i)
+
+
+def _element(elements: Elements, g: int) -> dict[str, Any]:
+    return {
+        "surfaces": list(elements.spans[g]),
+        "about": elements.about[g],
+        "pivot": float(elements.pivot[g]),
+        "shift": np.asarray(elements.shift[g]).tolist(),
+        "tilt": [_degrees(angle) for angle in np.asarray(elements.tilt[g])],
+    }
+
+
+def _phase(lens: Lens, i: int) -> dict[str, Any]:
+    """The key of a diffractive surface."""
+    if lens.phase is None or i not in lens.phase.surfaces:
+        return {}
+    row = lens.phase.surfaces.index(i)
+    form = lens.phase.forms[row]
+    values = np.asarray(lens.phase.coefficients[row]).tolist()
+    waves = dict(zip(FORMS[form].powers, values, strict=False))
+    return {"phase": {"form": form, "order": float(lens.phase.order[row]), "coefficients": waves}}
 
 
 def _medium(lens: Lens, i: int) -> dict[str, Any]:

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from ..lens.lens import Lens, rotation_matrix
+from ..lens.elements import rotation_matrix
+from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import safe_divide
 from ..pupil.rules import PupilRule

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from ..lens.elements import rotation_matrix
 from ..lens.glass import check_wavelengths, common_range
-from ..lens.lens import Lens, rotation_matrix
+from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray_at_image
 from ..lens.scene import Scene, scene_of
 from ..numerics import safe_divide, safe_sqrt

@@ -8,7 +8,9 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from .elements import Elements, rotation_matrix
 from .glass import Dispersion, check_wavelengths, refractive_index
+from .phase import Phase
 from .surface import Shape, surface_sag
 
 
@@ -34,6 +36,8 @@ class Lens:
         centred lens, which costs nothing.
     tilt: (S + 1, 3) in radians, about x, then the turned y, then the turned z, right-handed; None
         likewise.
+    phase: of diffractive surfaces; None if there is none, which costs nothing.
+    elements: groups of surfaces that move together; None likewise.
 
     Static:
     stop: the index of the stop surface.
@@ -52,6 +56,8 @@ class Lens:
     dispersion: Dispersion
     decentre: Array | None = None
     tilt: Array | None = None
+    phase: Phase | None = None
+    elements: Elements | None = None
     stop: int = dataclasses.field(metadata={"static": True}, kw_only=True)
     glasses: tuple[str, ...] = dataclasses.field(metadata={"static": True}, kw_only=True)
     forms: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
@@ -69,15 +75,39 @@ class Lens:
 
     @property
     def live(self) -> tuple[int, ...]:
-        """The surfaces that bend light: mirrors, and those between different media."""
-        media = self.glasses
-        return tuple(i for i in range(self.count) if self.mirrors[i] or media[i] != media[i + 1])
+        """The surfaces that bend light: mirrors, those between different media, and diffractive
+        ones."""
+        media, added = self.glasses, () if self.phase is None else self.phase.surfaces
+        bends = (m or a != b for m, a, b in zip(self.mirrors, media, media[1:]))
+        return tuple(i for i, does in enumerate(bends) if does or i in added)
 
     @property
     def vertices(self) -> Array:
-        """z of the S vertices and the sensor, shape (S + 1,), mm; the first is 0."""
+        """z of the S vertices and the sensor along the axis, as if nothing were moved, shape
+        (S + 1,), mm; the first is 0."""
         first = jnp.zeros_like(self.sensor)[None]
         return jnp.concatenate([first, jnp.cumsum(self.thickness), self.sensor[None]])
+
+    @property
+    def places(self) -> tuple[Array, Array | None, Array | None]:
+        """Where the S vertices and the sensor are: z (S + 1,) and x, y (S + 1, 2), None for 0, in
+        mm along the axes of the first surface's space, and the rotations (S + 1, 3, 3) from their
+        own axes to these, None for none."""
+        across, turned = self.decentre, None
+        if self.tilt is not None:
+            turned = jax.vmap(rotation_matrix)(self.tilt)
+        if self.elements is None:
+            return self.vertices, across, turned
+        z = self.vertices[:, None]
+        across = jnp.zeros((len(z), 2), z.dtype) if across is None else across
+        turned = (
+            jnp.broadcast_to(jnp.eye(3, dtype=z.dtype), (len(z), 3, 3))
+            if turned is None
+            else turned
+        )
+        point = jnp.concatenate([across, z], axis=1)
+        point, turned = self.elements.carry(self.vertices, point, turned)
+        return point[:, 2], point[:, :2], turned
 
     @property
     def shape(self) -> Shape:
@@ -98,16 +128,6 @@ class Lens:
         check_wavelengths(self.glasses, wavelengths)
         wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, self.curvature.dtype))
         return refractive_index(self.dispersion, wavelengths)
-
-
-def rotation_matrix(tilt: Array) -> Array:
-    """(3, 3) from the axes of a tilted surface to those of the lens; `tilt` (3,) in radians."""
-    (cx, cy, cz), (sx, sy, sz) = jnp.cos(tilt), jnp.sin(tilt)
-    one, zero = jnp.ones_like(cx), jnp.zeros_like(cx)
-    about_x = jnp.array([[one, zero, zero], [zero, cx, -sx], [zero, sx, cx]])
-    about_y = jnp.array([[cy, zero, sy], [zero, one, zero], [-sy, zero, cy]])
-    about_z = jnp.array([[cz, -sz, zero], [sz, cz, zero], [zero, zero, one]])
-    return about_x @ about_y @ about_z
 
 
 def sag(lens: Lens, surface: int, x: ArrayLike, y: ArrayLike) -> Array:

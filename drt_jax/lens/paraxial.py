@@ -2,8 +2,8 @@
 
 A paraxial ray is its height y in mm and its slope u = dy/dz, at each surface. After an odd
 number of mirrors, the index and the distances are negative. Tilts and decentres are left out,
-and a surface without an axis is taken in its (y, z) section. Source of the formulae: Welford,
-Aberrations of Optical Systems (1986), ch. 3, 6, 8, 10.
+and a surface or a phase without an axis is taken in its (y, z) section. Source of the formulae:
+Welford, Aberrations of Optical Systems (1986), ch. 3, 6, 8, 10.
 """
 
 import dataclasses
@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -65,33 +66,33 @@ def _quotient(numerator: Array, denominator: Array) -> Array:
 
 
 def trace_yu(
-    curvature: Array, gaps: Array, index: Array, height: Array, slope: Array
+    power: Array, gaps: Array, index: Array, height: Array, slope: Array
 ) -> tuple[Array, Array]:
     """Paraxial trace: heights on the S surfaces and slopes behind them, both (S, ...).
 
-    curvature: (S, ...) in 1/mm, at the vertices.
+    power: (S, ...) in 1/mm.
     gaps: (S - 1,) in mm, of any sign.
     index: (S + 1, ...) of the media, negative after an odd number of mirrors.
     height: (...) in mm at the first vertex.
     slope: (...) before it.
     """
-    shape = jnp.broadcast_shapes(height.shape, slope.shape, curvature.shape[1:], index.shape[1:])
+    shape = jnp.broadcast_shapes(height.shape, slope.shape, power.shape[1:], index.shape[1:])
 
     def wide(rows):
         return rows.reshape(len(rows), *(1,) * (len(shape) + 1 - rows.ndim), *rows.shape[1:])
 
     def step(ray, surface):
         height, slope = ray
-        gap, curvature, before, after = surface
+        gap, power, before, after = surface
         height = height + gap * slope
-        slope = (before * slope - height * curvature * (after - before)) / after
+        slope = (before * slope - height * power) / after
         return (height, slope), (height, slope)
 
     gaps = jnp.concatenate([jnp.zeros_like(gaps, shape=1), gaps])
-    curvature, index = wide(curvature), wide(index)
+    power, index = wide(power), wide(index)
     ray = jnp.broadcast_to(height, shape), jnp.broadcast_to(slope, shape)
     # A loop over the surfaces, not unrolled: these arrays are tiny, compiling them is what costs.
-    return jax.lax.scan(step, ray, (gaps, curvature, index[:-1], index[1:]))[1]
+    return jax.lax.scan(step, ray, (gaps, power, index[:-1], index[1:]))[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +100,7 @@ class ParaxialSystem:
     """What paraxial rays see of a lens.
 
     curvature: (S,) in 1/mm.
+    power: (S, W) in 1/mm, of a surface and its phase.
     gaps: (S - 1,) in mm.
     index: (S + 1, W), negative after an odd number of mirrors.
     aperture: (), the semi-diameter of the stop in mm.
@@ -106,6 +108,7 @@ class ParaxialSystem:
     """
 
     curvature: Array
+    power: Array
     gaps: Array
     index: Array
     aperture: Array
@@ -125,15 +128,20 @@ def paraxial_system(lens: Lens, wavelengths: ArrayLike) -> ParaxialSystem:
     index = lens.index(wavelengths)
     index = index * jnp.asarray(lens.senses[:, None], index.dtype)
     curvature = vertex_curvature(lens.shape, lens.forms, 1)[0][:-1]
+    power = curvature[:, None] * jnp.diff(index, axis=0)
+    if lens.phase is not None:
+        turned = vertex_curvature(lens.phase.shape, lens.phase.forms, 1)[0]
+        wave = 1e-3 * lens.phase.order[:, None] * jnp.asarray(wavelengths, index.dtype)[None]
+        power = power.at[np.array(lens.phase.surfaces)].add(-wave * turned[:, None])
     aperture = lens.semi_diameter[lens.stop]
-    return ParaxialSystem(curvature, lens.thickness, index, aperture, lens.stop)
+    return ParaxialSystem(curvature, power, lens.thickness, index, aperture, lens.stop)
 
 
 def trace_ray(system: ParaxialSystem, height: ArrayLike, slope: ArrayLike) -> ParaxialRay:
     """The ray of the given height (mm) and slope, () or (W,), at the first vertex, before it."""
     one = jnp.ones_like(system.index[0])
     start = one * height, one * slope
-    heights, behind = trace_yu(system.curvature, system.gaps, system.index, *start)
+    heights, behind = trace_yu(system.power, system.gaps, system.index, *start)
     return ParaxialRay(heights, jnp.concatenate([start[1][None], behind[:-1]]), behind)
 
 
@@ -142,16 +150,16 @@ def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
 
     `front`: at the first vertex, before it; else at the last vertex, behind it.
     """
-    curvature, gaps, index, stop = system.curvature, system.gaps, system.index, system.stop
+    power, gaps, index, stop = system.power, system.gaps, system.index, system.stop
     if front:  # backwards: the same lens seen from behind
-        curvature, gaps, index = -curvature[::-1], gaps[::-1], index[::-1]
-        stop = len(curvature) - 1 - stop
+        power, gaps, index = power[::-1], gaps[::-1], index[::-1]
+        stop = len(power) - 1 - stop
     slope = 1 / index[stop + 1]
     height = jnp.zeros_like(slope)
-    if stop + 1 < len(curvature):
+    if stop + 1 < len(power):
         behind = slice(stop + 1, None)
         heights, slopes = trace_yu(
-            curvature[behind], gaps[behind], index[behind], gaps[stop] * slope, slope
+            power[behind], gaps[behind], index[behind], gaps[stop] * slope, slope
         )
         height, slope = heights[-1], slopes[-1]
     return (-height, slope) if front else (height, slope)

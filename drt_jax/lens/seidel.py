@@ -104,6 +104,8 @@ def third_order(
     others = sorted({form for form in lens.forms if FORMS[form].symmetry != "rotation"})
     if others:
         raise ValueError(f"third order: no theory for surfaces of the form {', '.join(others)}")
+    if lens.phase is not None:
+        raise ValueError("third order: no theory for diffractive surfaces")
     system = paraxial_system(lens, wavelengths)
     vergence = 1 / jnp.asarray(distance, lens.curvature.dtype)
     n, c = system.index, system.curvature[:, None]

@@ -132,6 +132,12 @@ def polynomial_xy(w: Point, shape: Shape) -> tuple[Array, Array]:
     return z + _horner(w[0], [_horner(w[1], row) for row in rows]), argument
 
 
+def linear(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """Conic and a slope: ... + a_0 y. As a phase, a grating with lines along x."""
+    z, argument = _conic(_square(w), shape.curvature, shape.conic)
+    return z + shape.coefficients[0] * w[-1], argument
+
+
 class Form(NamedTuple):
     """A kind of surface.
 
@@ -157,6 +163,7 @@ FORMS: dict[str, Form] = {
     "biconic": Form(biconic, "plane", _EVEN, ("curvature_x", "conic_x"), round=False),
     "toroid": Form(toroid, "plane", _EVEN, ("curvature_x",), round=False),
     "polynomial_xy": Form(polynomial_xy, "none", _XY),
+    "linear": Form(linear, "plane", ("y",)),
 }
 
 

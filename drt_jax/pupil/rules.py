@@ -36,15 +36,18 @@ def symmetry_of(lens: Lens, field: ArrayLike) -> Symmetry:
     if x -> -x leaves the lens alone. ValueError inside a trace where the answer depends on values
     that are not known there.
     """
-    moves = (lens.decentre, lens.tilt)
+    group = lens.elements
+    shift, turned = (None, None) if group is None else (group.shift, group.tilt)
+    moves = (lens.decentre, lens.tilt, shift, turned)
     if not concrete((field, moves)):
         raise ValueError(
             "the symmetry of a pupil follows from known numbers: ask for it, or for a rule, "
             "outside of jax.jit and jax.vmap"
         )
-    kinds = {FORMS[form].symmetry for form in lens.forms}
+    forms = (*lens.forms, *(() if lens.phase is None else lens.phase.forms))
+    kinds = {FORMS[form].symmetry for form in forms}
     # Neither x, nor a turn about y or z, takes any surface out of the plane x = 0.
-    sideways = ((lens.decentre, [0]), (lens.tilt, [1, 2]))
+    sideways = zip(moves, ([0], [1, 2], [0], [1, 2]), strict=True)
     still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
     angles = np.asarray(field)
     if "none" in kinds or not still or (angles.ndim and angles[0] != 0):

@@ -5,10 +5,10 @@ puts it. Rays that this does not find, and only those, start again from a fan of
 first surface.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -134,9 +134,7 @@ def aim(
     beam, reach = sizes
     solver = AimNewton(rtol=0.0, atol=max(_NEAR, 64 * eps) * beam)
 
-    def one(index, target, launch):
-        own = eqx.tree_at(lambda s: s.index, system, index)
-
+    def one(own, target, launch):
         def miss(launch, target):
             crossing, fate = shoot_to_stop(own, launch)
             return tuple(a - b for a, b in zip(crossing, target, strict=True)), fate
@@ -156,8 +154,14 @@ def aim(
         status = jnp.where(found, Status.OK, lost).astype(jnp.int32)
         return solution.value, status, solution.state.folded, solution.stats["num_steps"]
 
-    bundle = jax.vmap(jax.vmap(one, (None, 0, 0)), (1, 0, 0))
-    launch, status, folded, steps = bundle(system.index[..., 0], target, launch)
+    def one_colour(index, wave, target, launch):
+        by = system.diffraction and dataclasses.replace(system.diffraction, wave=wave)
+        own = dataclasses.replace(system, index=index, diffraction=by)
+        return jax.vmap(one, (None, 0, 0))(own, target, launch)
+
+    wave = system.diffraction and system.diffraction.wave[..., 0]
+    bundle = jax.vmap(one_colour, (1, 1, 0, 0))
+    launch, status, folded, steps = bundle(system.index[..., 0], wave, target, launch)
     return Aimed(launch, status, folded, jnp.max(steps).astype(jnp.int32))
 
 
@@ -165,7 +169,7 @@ def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
     """Radius of the beam at the stop, and how wide it may be on the first surface, mm."""
     beam = jnp.sqrt(jnp.max(dot(target, target)))
     lean = jnp.sqrt(dot(system.source[:-1], system.source[:-1]))
-    depth = jnp.abs(system.at_stop[0].vertex - system.rows.vertex[0])
+    depth = jnp.abs(system.at_stop[0].axial - system.rows.axial[0])
     width = 2 * beam + lean * (depth + beam) + 0.02 * depth
     return jnp.where(beam > 0, beam, 0.1 * width), width
 
@@ -181,17 +185,25 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
     shape = Shape(*(a[..., :before] for a in (rows.curvature, rows.conic, rows.coefficients.T)))
     bent = jnp.stack(vertex_curvature(shape, system.forms[:before], dim), axis=-1)
     bent = jnp.concatenate([bent, jnp.zeros((1, dim), dtype)])[:, None, :, None]
-    gaps = jnp.diff(jnp.append(rows.vertex[:before], stop.vertex))
+    gaps = jnp.diff(jnp.append(rows.axial[:before], stop.axial))
     # In a mirrored space, distances and indices are both negative.
     index = system.index[: before + 1] * system.senses[: before + 1, None, None]
     index = jnp.moveaxis(jnp.concatenate([index, index[-1:]]), -1, 1)[:, None]
+    power = bent * jnp.diff(index, axis=0)
+    by = system.diffraction
+    if by is not None:
+        for d, turned in enumerate(vertex_curvature(by.phase, by.forms, dim)):
+            added = -by.wave[..., 0] * turned[:, None]
+            power = power.at[np.array(by.rows), 0, d].add(added, mode="drop")
     one = jnp.ones((2, dim, system.index.shape[1]), dtype)
-    first = rows.vertex[0] if before else stop.vertex
+    first = rows.axial[0] if before else stop.axial
     v = system.vergence
     # Two rays: from the object's point on the axis, and slanted.
     height = one * jnp.stack([1 + first * v, first])[:, None, None]
     slope = one * jnp.stack([v, jnp.ones_like(v)])[:, None, None]
-    (axial, tilted), _ = (jnp.moveaxis(a, 1, 0) for a in trace_yu(bent, gaps, index, height, slope))
+    (axial, tilted), _ = (
+        jnp.moveaxis(a, 1, 0) for a in trace_yu(power, gaps, index, height, slope)
+    )
     launch = []
     for d, wanted in enumerate(target):
         tangent = -system.source[d]

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.surface import by_form, domain, sag_derivatives, surface_sag
+from ..lens.surface import Shape, by_form, domain, sag_derivatives, surface_sag
 from ..numerics import safe_divide, safe_sqrt
 from .snell import cross
-from .system import System, Vector, dot, turn
+from .system import Diffraction, System, Vector, dot, turn
 
 
 class Path(NamedTuple):
@@ -32,7 +32,8 @@ class Path(NamedTuple):
     before, after: D + 1 arrays (R, W, Q), unit vectors in front of each row and behind it, along
         that row's axes; behind the sensor light goes on as before.
     slope: D arrays (R, W, Q), derivatives of the sag.
-    bend: D rows of D arrays (R, W, Q), second derivatives of the sag, 1/mm.
+    bend: D rows of D arrays (R, W, Q), second derivatives of the optical path by a hit while the
+        directions are held, 1/mm.
     length: (R, W, Q), of the segments in front of the rows, mm; 0 for the first.
     shrink: (W, Q), 1 / |vergence P_1 - source|, see `geometry`.
     """
@@ -74,7 +75,20 @@ def geometry(hits: Vector, system: System) -> Path:
     direction = tuple(s * shrink for s in chain)
     before = turn(rotation, tuple(d[:-1] for d in direction), back=True)
     after = turn(rotation, tuple(d[1:] for d in direction), back=True)
+    jump = system.index * before[-1] - system.behind * after[-1]
+    bend = tuple(tuple(jump * b for b in row) for row in bend)
+    if system.diffraction is not None:
+        rows, (_, _, more) = added(hits, system.diffraction)
+        bend = jax.tree.map(lambda a, b: a.at[rows].add(b), bend, more)
     return Path(hits, z, before, after, slope, bend, length[:-1].at[0].set(0), shrink[0])
+
+
+def added(hits: Vector, by: Diffraction) -> tuple[np.ndarray, tuple]:
+    """The diffractive rows, and what their phase adds to the optical path (N, W, Q) in mm, with its
+    derivatives by the hits, D arrays, and D rows of D arrays."""
+    rows, wide = np.array(by.rows), Shape(*(a[..., None, None] for a in by.phase))
+    waves = by_form(sag_derivatives, tuple(h[rows] for h in hits), wide, by.forms)
+    return rows, jax.tree.map(lambda a: by.wave * a, waves)
 
 
 def residual(path: Path, system: System) -> Vector:
@@ -82,7 +96,11 @@ def residual(path: Path, system: System) -> Vector:
     0 for any path: D arrays (R, W, Q)."""
     index, behind = (jnp.broadcast_to(n, path.length.shape) for n in (system.index, system.behind))
     *across, along = (index * b - behind * a for b, a in zip(path.before, path.after, strict=True))
-    return tuple(c + s * along for c, s in zip(across, path.slope, strict=True))
+    force = tuple(c + s * along for c, s in zip(across, path.slope, strict=True))
+    if system.diffraction is None:
+        return force
+    rows, (_, kick, _) = added(path.hits, system.diffraction)
+    return tuple(f.at[rows].add(k) for f, k in zip(force, kick, strict=True))
 
 
 def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
@@ -90,8 +108,14 @@ def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
     depends on."""
     some = slice(max(row - 1, 0), row + 1)
     rows = jax.tree.map(lambda a: a[some], system.rows)
-    forms, before = system.forms[some], min(system.before, 1)
-    part = dataclasses.replace(system, rows=rows, forms=forms, before=before)
+    part = dataclasses.replace(
+        system,
+        rows=rows,
+        index=system.index[some],
+        diffraction=None,
+        forms=system.forms[some],
+        before=min(system.before, 1),
+    )
     return tuple(h[some] for h in hits), part
 
 
@@ -156,7 +180,10 @@ def optical_path(hits: Vector, system: System) -> Array:
     far = _length(near) + _length(p)
     first = (system.vergence * dot(q, q) - 2 * dot(q, p)) / far
     lengths = jnp.concatenate([first[None], _length(step)])
-    return jnp.sum(system.index * lengths, axis=0)
+    path = jnp.sum(system.index * lengths, axis=0)
+    if system.diffraction is None:
+        return path
+    return path + jnp.sum(added(hits, system.diffraction)[1][0], axis=0)
 
 
 def stationary(path: Path, system: System, target: Vector) -> Array:

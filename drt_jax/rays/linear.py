@@ -86,9 +86,8 @@ def _step(
     hit = tuple(c - slide * e for c, e in zip(across, row.before, strict=False))
     here = turn(row.rotation, (*hit, dot(row.slope, hit)))
     point = tuple(a + m for a, m in zip(here, moved, strict=True))
-    jump = row.index_before * row.before[-1] - row.index_behind * row.after[-1]
     pull = tuple(
-        row.index_before * (v + s * along) + jump * dot(bend, hit) - f
+        row.index_before * (v + s * along) + dot(bend, hit) - f
         for v, s, bend, f in zip(swung, row.slope, row.bend, force, strict=True)
     )
     # The change of direction behind: its product with the tangents is known, with itself 0.

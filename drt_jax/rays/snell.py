@@ -156,17 +156,52 @@ def _begin(system: System, launch: Vector) -> tuple[Vector, Vector]:
     return point, tuple(d * shrink for d in direction)
 
 
-def _refract(d: Vector, normal: Vector, row: "_Row") -> tuple[Vector, Array, Array]:
+def _refract(d: Vector, normal: Vector, row: "_Row", kick: Vector) -> tuple[Vector, Array, Array]:
     """Direction behind a surface by Snell's law in vector form, whether the light comes from its
-    front, and whether it gets through."""
-    along = dot(normal, d)
+    front, and whether it gets through; `kick`: what a phase adds to it, D arrays or none."""
+    front = (d[-1] * row.sense > _FLATTEST) & (dot(normal, d) * row.sense > 0)
+    size, d = row.ratio**2, tuple(row.ratio * a for a in d)
+    if kick:
+        d = *(a + b for a, b in zip(d, kick, strict=False)), d[-1]
+        size = dot(d, d)
     shrink = 1 / jnp.sqrt(dot(normal, normal))
-    cosine = along * shrink
-    square = 1 - row.ratio**2 * (1 - cosine**2)
-    bent = (row.leaving * safe_sqrt(square) - row.ratio * cosine) * shrink
-    front = (d[-1] * row.sense > _FLATTEST) & (along * row.sense > 0)
-    bent = tuple(row.ratio * a + bent * n for a, n in zip(d, normal, strict=True))
-    return bent, front, square > 0
+    cosine = dot(normal, d) * shrink
+    square = 1 - (size - cosine**2)
+    bent = (row.leaving * safe_sqrt(square) - cosine) * shrink
+    return tuple(a + bent * n for a, n in zip(d, normal, strict=True)), front, square > 0
+
+
+class _Kick(NamedTuple):
+    """Of R rows, or one: kind: of the form of its phase, 0 for none. phase: its shape, (R,) and
+    (R, K). wave: (R, W, 1) or (R,), mm by which a wave of it turns light behind the row."""
+
+    kind: Any
+    phase: Shape
+    wave: Array
+
+
+def _kicks(system: System, kinds: list[str]) -> _Kick | None:
+    by = system.diffraction
+    if by is None:
+        return None
+    rows, kind = np.array(by.rows), np.zeros(len(system.forms), np.int32)
+    kind[rows] = [1 + kinds.index(form) for form in by.forms]
+
+    def spread(a):
+        return jnp.zeros((kind.size, *a.shape[1:]), a.dtype).at[rows].set(a)
+
+    phase = by.phase._replace(coefficients=by.phase.coefficients.T)
+    return _Kick(kind, Shape(*map(spread, phase)), spread(by.wave) / system.behind)
+
+
+def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
+    """The change of direction, D arrays; none without a phase."""
+    if row is None:
+        return ()
+    none = lambda hit, _: tuple(jnp.zeros_like(a) for a in hit)  # noqa: E731
+    each = [lambda hit, phase, kind=kind: sag_derivatives(hit, phase, kind)[1] for kind in kinds]
+    slope = jax.lax.switch(row.kind, [none, *each], hit, row.phase)
+    return tuple(row.wave * s for s in slope)
 
 
 class _Row(NamedTuple):
@@ -175,7 +210,7 @@ class _Row(NamedTuple):
     first: whether it is the first. live: whether light must come to it from the front, or the ray,
     prolonged either way, is a line that crosses it. bends: whether the ray goes on from here. kind:
     of its form. ratio: of the indices before and behind. sense, leaving: 1 or -1, light goes along
-    or against z before it and behind.
+    or against z before it and behind. kick: None for no phase at all.
     """
 
     first: Any
@@ -186,9 +221,10 @@ class _Row(NamedTuple):
     ratio: Array
     sense: Any
     leaving: Any
+    kick: _Kick | None
 
 
-def _rows(system: System, kinds: list[str], to_stop: bool) -> _Row:
+def _rows(system: System, kinds: list[str], phases: list[str], to_stop: bool) -> _Row:
     """All that rays meet, or what they meet up to the stop and the stop, which then is crossed."""
     count, at = len(system.forms), system.before
     senses = system.senses
@@ -202,6 +238,7 @@ def _rows(system: System, kinds: list[str], to_stop: bool) -> _Row:
         system.index / system.behind,
         senses,
         np.where([*system.mirrors, False], -senses, senses),
+        _kicks(system, phases),
     )
     if system.stop is None and not to_stop:
         return rows
@@ -235,12 +272,13 @@ def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Any]
     """Rays behind the last row; and unless that is the stop, the hits on all of them."""
     kinds = sorted({*system.forms, system.at_stop[1]})
     each = [partial(_meet, kind) for kind in kinds]
+    phases = [] if system.diffraction is None else sorted(set(system.diffraction.forms))
 
     def step(state, row):
         p, d = row.surface.local(state.point, state.direction)
         meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
         own, normal, met, length = meet(p, d, row.surface.shape, state.fate == Status.OK)
-        bent, front, through = _refract(d, normal, row)
+        bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
         met = met & (~row.live | (front & ((length > 0) | row.first)))
         here = jnp.where(met, jnp.where(through | ~row.bends, Status.OK, Status.TIR), Status.MISSED)
         fate = jnp.where(state.fate == Status.OK, here.astype(jnp.int32), state.fate)
@@ -259,7 +297,7 @@ def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Any]
     zero = jnp.zeros_like(launch[0])
     none, begin = jnp.zeros(zero.shape, jnp.int32), _begin(system, launch)
     start = _State(*begin, (zero,) * len(launch), none, zero)
-    return jax.lax.scan(step, start, _rows(system, kinds, to_stop))
+    return jax.lax.scan(step, start, _rows(system, kinds, phases, to_stop))
 
 
 def shoot(system: System, launch: Vector) -> Trace:

@@ -14,12 +14,14 @@ import numpy as np
 from jax import Array
 
 from ..lens.glass import common_range
-from ..lens.lens import Lens, rotation_matrix
+from ..lens.lens import Lens
+from ..lens.phase import Phase
 from ..lens.scene import Scene
 from ..lens.surface import Shape
 from ..numerics import safe_divide
 
 Vector = tuple[Array, ...]
+_MM = 1e-3  # of a micrometre
 
 
 def dot(a: Any, b: Any) -> Array:
@@ -68,6 +70,7 @@ class Placed(NamedTuple):
     coefficients: (R, K), see `lens.surface`.
     offset: (R, 2), x and y of the vertices in mm; None for none.
     rotation: (R, 3, 3) from the axes of the surfaces to those of the lens; None for none.
+    station: (R,), z of the vertices along an axis that turns with elements, mm; None: as `vertex`.
     """
 
     vertex: Array
@@ -76,6 +79,12 @@ class Placed(NamedTuple):
     coefficients: Array
     offset: Array | None
     rotation: Array | None
+    station: Array | None = None
+
+    @property
+    def axial(self) -> Array:
+        """z of the vertices (R,) along the axis, mm, what paraxial optics knows of them."""
+        return self.vertex if self.station is None else self.station
 
     @property
     def shape(self) -> Shape:
@@ -106,6 +115,25 @@ class Placed(NamedTuple):
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Diffraction:
+    """N rows that add phase.
+
+    phase: (N,) and (K, N), as the shape of a sag, in waves.
+    wave: (N, W, 1), what a wave adds to the optical path in the order used, mm; (N,) for one ray.
+
+    Static:
+    rows: which ones.
+    forms: of the phase.
+    """
+
+    phase: Shape
+    wave: Array
+    rows: tuple[int, ...] = dataclasses.field(metadata={"static": True})
+    forms: tuple[str, ...] = dataclasses.field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class System:
     """Everything that the path of a ray depends on; the differentiable arguments.
 
@@ -114,6 +142,7 @@ class System:
     index: (R, W, 1), of the medium in front of each row; (R,) for a single ray.
     source: (D + 1,), the object point divided by its distance; its last component is -1.
     vergence: (), 1/distance in 1/mm, 0 for infinity.
+    diffraction: None for none.
 
     Static:
     before: how many live surfaces lie before the stop.
@@ -127,6 +156,7 @@ class System:
     index: Array
     source: Array
     vergence: Array
+    diffraction: Diffraction | None
     before: int = dataclasses.field(metadata={"static": True})
     forms: tuple[str, ...] = dataclasses.field(metadata={"static": True})
     stop_form: str = dataclasses.field(metadata={"static": True})
@@ -160,17 +190,15 @@ class System:
 def placed(lens: Lens, rows: Any) -> Placed:
     """Surfaces of a lens by index: a list of them, or one."""
     rows = np.asarray(rows)
-    rotation = None
-    if lens.tilt is not None:
-        tilts = lens.tilt[rows]
-        rotation = (jax.vmap(rotation_matrix) if rows.ndim else rotation_matrix)(tilts)
+    vertex, offset, rotation = lens.places
     return Placed(
-        lens.vertices[rows],
+        vertex[rows],
         lens.curvature[rows],
         lens.conic[rows],
         lens.coefficients[rows],
-        None if lens.decentre is None else lens.decentre[rows],
-        rotation,
+        None if offset is None else offset[rows],
+        None if rotation is None else rotation[rows],
+        None if lens.elements is None else lens.vertices[rows],
     )
 
 
@@ -189,8 +217,14 @@ def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
         # Light with a positive field angle travels upwards: the object lies below the axis.
         source=jnp.concatenate([-jnp.tan(field), -jnp.ones_like(field[:1])]),
         vergence=1 / scene.distance,
+        diffraction=None if lens.phase is None else _diffraction(lens.phase, live, colours),
         before=sum(i < stop for i in live),
         forms=tuple(lens.forms[i] for i in rows),
         stop_form=lens.forms[stop],
         mirrors=tuple(lens.mirrors[i] for i in live),
     )
+
+
+def _diffraction(phase: Phase, live: tuple[int, ...], wavelengths: Array) -> Diffraction:
+    wave = _MM * phase.order[:, None, None] * wavelengths[None, :, None]
+    return Diffraction(phase.shape, wave, tuple(map(live.index, phase.surfaces)), phase.forms)

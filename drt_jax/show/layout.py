@@ -4,11 +4,12 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 
-from ..lens.lens import Lens, rotation_matrix, sag
+from ..lens.lens import Lens, sag
 from ..rays.status import Status
 from ..rays.trace import trace_rays
 
@@ -59,7 +60,7 @@ def draw(
         hits.append(np.asarray(fan.points[0])[arrived][:, corners, :0:-1])
     drawn = np.concatenate([np.zeros((1, 2)), *(hit.reshape(-1, 2) for hit in hits)])
     reach = float(np.max(np.abs(drawn[:, 1]))) or 1.0
-    z = np.concatenate([drawn[:, 0], np.asarray(lens.vertices)])
+    z = np.concatenate([drawn[:, 0], np.asarray(lens.places[0])])
     start = np.min(z) - 0.15 * np.ptp(z)
     paths = [
         [_path(ray, start, angle, distance) for ray in hit]
@@ -99,11 +100,11 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
 
 def _placed(lens: Lens, i: int, y: np.ndarray, z: ArrayLike) -> np.ndarray:
     """(z, y) along the axes of the lens of points on surface i (or the sensor)."""
+    vertex, across, turned = jax.tree.map(lambda a: np.asarray(a[i]), lens.places)
     points = np.stack([np.zeros_like(y), y, z], axis=-1)
-    if lens.tilt is not None:
-        points = points @ np.asarray(rotation_matrix(lens.tilt[i])).T
-    up = 0.0 if lens.decentre is None else float(lens.decentre[i, 1])
-    return points[:, :0:-1] + np.array([float(lens.vertices[i]), up])
+    if turned is not None:
+        points = points @ turned.T
+    return points[:, :0:-1] + np.array([vertex, 0.0 if across is None else across[1]])
 
 
 def _path(corners: np.ndarray, start: float, angle: float, distance: float) -> np.ndarray:

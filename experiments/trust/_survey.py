@@ -9,7 +9,7 @@ import numpy as np
 
 import drt_jax
 from drt_jax import Gauss, Status
-from drt_jax.lens.lens import rotation_matrix
+from drt_jax.lens.elements import rotation_matrix
 from drt_jax.lens.surface import Shape, sag_derivatives
 from drt_jax.numerics import safe_sqrt
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from drt_jax import Lens
-from drt_jax.lens.lens import rotation_matrix
+from drt_jax.lens.elements import rotation_matrix
 from drt_jax.lens.surface import Shape, domain, sag_derivatives
 
 _NEWTON_STEPS = 40  # a ray that all but grazes an asphere halves its distance in each

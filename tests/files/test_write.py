@@ -22,9 +22,22 @@ ODD = {
     ],
     "sensor_tilt": [1, 2, 3],
 }
+FOLDED = {
+    "surfaces": [
+        {"radius": 30.0, "thickness": 0.1, "glass": "F2", "stop": True, "semi_diameter": 1.0}
+        | {"phase": {"order": -2, "coefficients": {2: 1 / 3, 6: 0.1}}},
+        {"radius": "inf", "thickness": 1.0, "phase": {"form": "linear", "coefficients": {"y": 7}}},
+        {"radius": "inf", "mirror": True, "thickness": -3.0, "tilt": [45, 0, 0]},
+    ],
+    "elements": [
+        {"surfaces": ["sensor", "sensor"], "about": 2, "tilt": [90.0, 0, 0.1]},
+        {"surfaces": [0, 1], "shift": [0.1, 1 / 7, 0], "pivot": 0.3},
+    ],
+}
 CASES = {
     **{name: name for name in lens_names()},
     "odd": ODD,
+    "folded": FOLDED,
     "index": {
         "surfaces": [
             {"radius": 50.0, "thickness": 4.0, "index": 1.1, "coefficients": {4: 0, 6: 0}},

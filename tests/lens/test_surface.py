@@ -44,6 +44,10 @@ def exact_toroid(x, y, c, k, a):
     return 1 / cx - mpmath.sign(cx) * mpmath.sqrt((1 / cx - g) ** 2 - x**2)
 
 
+def exact_linear(x, y, c, k, a):
+    return exact_asphere(x, y, c, k, []) + a[0] * y
+
+
 def exact_polynomial_xy(x, y, c, k, a):
     terms = sum(v * x**i * y**j for v, (i, j) in zip(a, powers_xy(len(a))))
     return conic(x**2 + y**2, c, k) + terms
@@ -72,6 +76,7 @@ SHAPES = {
         -1.0,
         [1e-3, -2e-3, 1e-4, 3e-4, -2e-4, 1e-6, 2e-6, 3e-6, 4e-6],
     ),
+    "slope": ("linear", 1 / 70, -1.0, [2e-3]),
 }
 
 
