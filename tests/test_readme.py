@@ -5,6 +5,7 @@ import re
 
 import jax
 import pytest
+import yaml
 
 from drt_jax import load_lens
 
@@ -26,9 +27,13 @@ def test_notebook_lines_run(tmp_path, monkeypatch):
 
 
 def test_lens_of_your_own_loads(tmp_path):
-    (text,) = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
-    (tmp_path / "my_lens.yaml").write_text(text)
+    lens, elements = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
+    (tmp_path / "my_lens.yaml").write_text(lens)
     assert load_lens(tmp_path / "my_lens.yaml").stop == 2
+    planes = [{"radius": float("inf"), "thickness": 9.0} for _ in range(7)]
+    planes[0] |= {"stop": True, "semi_diameter": 1.0}
+    folded = load_lens({"surfaces": planes} | yaml.safe_load(elements))
+    assert folded.elements.spans == ((2, 4), (6, 7)) and folded.elements.about == (2, 5)
 
 
 @pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#:]+)\)", TEXT))))
