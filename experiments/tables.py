@@ -10,7 +10,7 @@ import re
 
 from . import _common
 
-_NAMES = ("focus", "restore", "edof", "accuracy", "stability", "benchmark")
+_NAMES = ("focus", "restore", "edof", "accuracy", "stability", "benchmark", "lenses")
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 

@@ -10,6 +10,7 @@ figure.savefig("lens.png")
 from .figures import (
     by_family as by_family,
     convergence as convergence,
+    curves as curves,
     error_curves as error_curves,
     growth as growth,
     kernels as kernels,

@@ -48,6 +48,15 @@ def convergence(
     return _finished(axes, "training batch", ylabel)
 
 
+def curves(
+    axes: Axes, series: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, ylabel: str
+) -> Axes:
+    """Lines: (x (N,), y (N,)) by label."""
+    for k, (label, (x, y)) in enumerate(series.items()):
+        axes.plot(x, y, linewidth=1.1, linestyle="-" if k < 10 else "--", label=label)
+    return _finished(axes, xlabel, ylabel)
+
+
 def error_curves(
     axes: Axes,
     curves: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float | None]]]],

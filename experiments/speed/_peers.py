@@ -17,11 +17,16 @@ from ._common import rings
 
 
 class Lens:
-    """A centred lens of spheres and planes as NumPy arrays, and a scene: gaps (S,), the last to
-    the sensor, indices (S + 1, W), field in radians, object distance."""
+    """A centred lens of aspheres as NumPy arrays, without its clear apertures, and a scene: gaps
+    (S,), the last to the sensor, indices (S + 1, W), field in radians, object distance. ValueError
+    for another form."""
 
     def __init__(self, lens: drt_jax.Lens, field: float, distance: float, wavelengths) -> None:
+        if set(lens.forms) != {"asphere"} or lens.phase or lens.elements or lens.tilt is not None:
+            raise ValueError("no centred lens of aspheres")
         self.curvature = np.asarray(lens.curvature, float)[:-1]
+        self.conic = np.asarray(lens.conic, float)[:-1]
+        self.coefficients, self.mirrors = np.asarray(lens.coefficients, float)[:-1], lens.mirrors
         thickness = np.asarray(lens.thickness, float)
         self.gaps = np.append(thickness, float(lens.sensor) - np.sum(thickness))
         self.index = np.asarray(lens.index(np.asarray(wavelengths)), float)
@@ -39,17 +44,24 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
     optic = Optic()
     optic.add_surface(index=0, thickness=lens.distance)
     for i, (c, gap) in enumerate(zip(lens.curvature, lens.gaps)):
+        shape = {"radius": 1 / c if c else np.inf, "conic": lens.conic[i]}
+        if np.any(lens.coefficients[i]):
+            shape |= {"surface_type": "even_asphere", "coefficients": lens.coefficients[i].tolist()}
         optic.add_surface(
             index=i + 1,
-            radius=1 / c if c else np.inf,
             thickness=gap,
-            material=IdealMaterial(n=float(index[i + 1])),
+            material="mirror" if lens.mirrors[i] else IdealMaterial(n=float(index[i + 1])),
             is_stop=i == lens.stop,
+            **shape,
         )
     optic.add_surface(index=len(lens.gaps) + 1)
     optic.set_aperture("float_by_stop_size", 2 * lens.semi)
-    optic.set_field_type("object_height")
-    optic.add_field(y=-lens.distance * np.tan(lens.field))
+    if np.isinf(lens.distance):
+        optic.set_field_type("angle")
+        optic.add_field(y=np.degrees(lens.field))
+    else:
+        optic.set_field_type("object_height")
+        optic.add_field(y=-lens.distance * np.tan(lens.field))
     optic.add_wavelength(wavelength, is_primary=True)
     return optic
 
@@ -101,14 +113,26 @@ def optiland_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
     return value, gradient
 
 
-def _batoid_optic(curvature, gaps, index):
+def _batoid_shape(lens: Lens, i: int, c: float):
     import batoid
 
+    if np.any(lens.coefficients[i, 1:]):
+        return batoid.Asphere(1 / c, lens.conic[i], lens.coefficients[i, 1:])
+    return batoid.Quadric(1 / c, lens.conic[i]) if c else batoid.Plane()
+
+
+def _batoid_optic(lens: Lens, curvature, gaps, index):
+    import batoid
+
+    if np.any(lens.coefficients[:, :1]) or np.any((curvature == 0) & np.any(lens.coefficients, 1)):
+        raise ValueError("no terms of r^2, no aspheres of radius inf")
     media = [batoid.ConstMedium(float(n)) for n in index]
     items = []
     for i, (c, place) in enumerate(zip([*curvature, 0], np.append(0, np.cumsum(gaps)))):
-        kind = batoid.RefractiveInterface if i < len(curvature) else batoid.Detector
-        shape = batoid.Sphere(1 / c) if c else batoid.Plane()
+        last = i == len(curvature)
+        kind = batoid.Detector if last else batoid.RefractiveInterface
+        kind = batoid.Mirror if not last and lens.mirrors[i] else kind
+        shape = batoid.Plane() if last else _batoid_shape(lens, i, c)
         where = batoid.CoordSys(origin=[0, 0, place])
         around = {"inMedium": media[i], "outMedium": media[min(i + 1, len(media) - 1)]}
         items.append(kind(shape, name=f"s{i}", coordSys=where, **around))
@@ -127,16 +151,17 @@ def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
     """As `optiland_spot`; the gradient by finite differences."""
     points = pupil.hexapolar(rings(rays))[0]
     place, radius = lens.pupil
-    source = np.array([0.0, -lens.distance * np.tan(lens.field), -lens.distance])
+    toward = np.array([0.0, np.tan(lens.field), 1.0])
     through = np.stack([*(radius * points), np.full(points.shape[1], place)], axis=-1)
-    direction = through - source
+    # From the object point, or for an object at infinity along its direction.
+    direction = toward + through / lens.distance
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    # Onto a plane before the first vertex.
-    start = through + direction * ((-10.0 - place) / direction[:, 2:])
+    # Onto a plane before the first surface.
+    start = through + direction * ((-10.0 - radius - place) / direction[:, 2:])
 
     def sigma(curvature, gaps, k):
         velocity = direction / lens.index[0, k]
-        optic = _batoid_optic(curvature, gaps, lens.index[:, k])
+        optic = _batoid_optic(lens, curvature, gaps, lens.index[:, k])
         return np.sqrt(np.sum(np.var(_batoid_hits(optic, start, velocity), axis=0)))
 
     def value(curvature=lens.curvature, gaps=lens.gaps):
@@ -159,7 +184,7 @@ def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
 def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Callable:
     """trace(): sensor hits (Q, 2) of rays through `points` (Q, 3) in front of the lens, unit
     `directions` (Q, 3), at the first wavelength."""
-    optic = _batoid_optic(lens.curvature, lens.gaps, lens.index[:, 0])
+    optic = _batoid_optic(lens, lens.curvature, lens.gaps, lens.index[:, 0])
     return partial(_batoid_hits, optic, points, directions)
 
 

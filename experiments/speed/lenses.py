@@ -1,0 +1,302 @@
+"""Ordinary lenses in milliseconds: what the first and the next calls take, and if they are right.
+
+Each lens at the fields asked for, an object at infinity, its clear apertures in place. Errors are
+of the RMS spot radius sigma, relative, the worst colour, against an integral over a sequential
+trace by Snell's law. Optiland and batoid trace the same lens without its clear apertures, as their
+users would; their error is against the same truth. Writes results.json: `rows` hold `lens`,
+`field_deg`, `rays` a colour, `passed` (share of light), `first_s` (the first call to a tolerance of
+1e-3, compiling included), `loose_s` and `tight_s` (to 1e-3 and 1e-6, warm), their `loose_error` and
+`tight_error`, `value_s` and `gradient_s` (with the rule of 1e-6, compiled: sigma of all colours,
+and its gradient by every number of the lens), `compile_s`, `peers`; `copies` the seconds of
+perturbed copies x fields under vmap; `sweeps` the spot over many fields, and how even it is.
+"""
+
+import dataclasses
+import math
+import pathlib
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import drt_jax
+from drt_jax import Lens, show
+from drt_jax.runs.folder import Run
+
+from . import _command, _common, _peers, _work
+from ._reference import reference
+
+COLUMNS = ("first_s", "loose_s", "tight_s", "value_s", "gradient_s", "loose_error", "tight_error")
+_LOOSE, _TIGHT = 1e-3, 1e-6
+# Copies of a lens are perturbed by so much, relative.
+_SPREAD = 1e-4
+_SWEEP = "sigma", "centroid", "share of light"
+
+
+@dataclasses.dataclass(frozen=True)
+class LensFields:
+    """A lens and its widest field.
+
+    lens: bundled name or YAML path. field_deg: the edge of its field.
+    """
+
+    lens: str
+    field_deg: float
+
+    def __post_init__(self) -> None:
+        _common.require(0 < self.field_deg < 90, "lenses.field_deg: must be between 0 and 90")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment; see configs/lenses.yaml.
+
+    lenses: what is measured. parts: of the widest field. wavelengths_um: of the colours. copies,
+    fields: how many perturbed lenses and fields are traced at once. sweep: how many fields from
+    the axis to the widest one. rays: those a peer samples a pupil with. repeats: timed turns of
+    each program.
+    """
+
+    lenses: tuple[LensFields, ...]
+    parts: tuple[float, ...] = (0.0, 0.5, 1.0)
+    wavelengths_um: tuple[float, ...] = (0.6562725, 0.5875618, 0.4861327)
+    copies: int = 64
+    fields: int = 5
+    sweep: int = 200
+    rays: int = 271
+    repeats: int = 9
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _common.require(len(self.lenses) > 0, "lenses: needs at least one item")
+        _common.require_list("wavelengths_um", self.wavelengths_um)
+        inside = all(0 <= part <= 1 for part in self.parts)
+        _common.require(bool(self.parts) and inside, "parts: expected numbers from 0 to 1")
+        for name, least in (("copies", 1), ("fields", 1), ("sweep", 8), ("rays", 7)):
+            _common.require(getattr(self, name) >= least, f"{name}: must be at least {least}")
+
+
+def sigmas(lens: Lens, field: Any, waves: Array, rule: drt_jax.PupilRule) -> Array:
+    """RMS spot radii (W,), mm."""
+    covariance = drt_jax.psf_moments(lens, field, math.inf, waves, rule=rule).covariance
+    return jnp.sqrt(jnp.trace(covariance, axis1=1, axis2=2))
+
+
+def _timed(call: Callable) -> tuple[float, Any]:
+    start = time.perf_counter()
+    found = jax.block_until_ready(call())
+    return time.perf_counter() - start, found
+
+
+def _error(truth: np.ndarray, covariance: Array) -> float:
+    found = np.sqrt(np.trace(np.asarray(covariance), axis1=1, axis2=2))
+    return float(np.max(np.abs(found / truth - 1)))
+
+
+def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
+    """A row of one lens at one field in radians: everything compiled anew."""
+    waves = np.array(config.wavelengths_um)
+    converged = partial(drt_jax.psf_moments, lens, field, math.inf, waves)
+    jax.clear_caches()
+    first, loose = _timed(lambda: converged(_LOOSE))
+    tight = converged(_TIGHT)
+    calls = [lambda: converged(_LOOSE), lambda: converged(_TIGHT)]
+    seconds = _common.medians(calls, config.repeats)
+    rule = drt_jax.converged_rule(lens, field, math.inf, waves, _TIGHT)
+    value, measured = _work.compiled(
+        lambda lens: sigmas(lens, field, jnp.asarray(waves), rule), lens
+    )
+
+    def slopes(lens):
+        return jnp.sum(sigmas(lens, field, jnp.asarray(waves), rule))
+
+    gradient, more = _work.compiled(jax.value_and_grad(slopes), lens)
+    truth = np.array([m.sigma for m in reference(lens, field, math.inf, config.wavelengths_um)])
+    peers = _beside(config, lens, field, truth)
+    ready = [(name, call, error) for name, call, error, _ in peers if call]
+    timed = _common.medians([value, gradient, *(call for _, call, _ in ready)], config.repeats)
+    others = {name: (s, error) for (name, _, error), s in zip(ready, timed[2:])}
+    notes = {name: note for name, call, _, note in peers if not call}
+    points, _ = drt_jax.pupil_points(lens, field, math.inf, waves, rule)
+    return {
+        "rays": points.shape[1],
+        "passed": float(np.mean(loose.passed)),
+        "first_s": first,
+        "loose_s": seconds[0],
+        "tight_s": seconds[1],
+        "loose_error": _error(truth, loose.covariance),
+        "tight_error": _error(truth, tight.covariance),
+        "value_s": timed[0],
+        "gradient_s": timed[1],
+        "compile_s": [measured["compile_s"], more["compile_s"]],
+        "peers": others,
+        "notes": notes,
+    }
+
+
+def _beside(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list[tuple]:
+    """(name, call, error, note) of each peer; no call for one that is missing or fails."""
+    found = []
+    for name, spot in (("optiland", _peers.optiland_spot), ("batoid", _peers.batoid_spot)):
+        try:
+            numbers = _peers.Lens(lens, field, math.inf, config.wavelengths_um)
+            call = spot(numbers, config.rays)[0]
+            error = float(np.max(np.abs(call()[0] / truth - 1)))
+            found.append((name, call, error, ""))
+        except ImportError:
+            found.append((name, None, None, "not installed: pip install -e '.[peers]'"))
+        except (ValueError, RuntimeError) as failure:
+            found.append((name, None, None, str(failure)[:80]))
+    return found
+
+
+def perturbed(lens: Lens, count: int, seed: int) -> Lens:
+    """So many copies of a lens, curvatures, thicknesses and the sensor off by some 1e-4."""
+    rng = np.random.default_rng(seed)
+    vary = lambda a: a * (1 + _SPREAD * rng.normal(size=(count, *a.shape)))  # noqa: E731
+    parts = {"curvature": vary(lens.curvature), "thickness": vary(lens.thickness)}
+    batch = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), lens)
+    return dataclasses.replace(batch, **parts, sensor=vary(lens.sensor))
+
+
+def copies(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) -> dict[str, float]:
+    """Seconds of perturbed copies at several fields under `vmap`, and to compile it."""
+    waves = jnp.asarray(config.wavelengths_um)
+    fields = jnp.linspace(0.0, widest, config.fields)
+    batch = perturbed(lens, config.copies, config.seed)
+
+    def all_of(batch, fields):
+        one = lambda lens, field: sigmas(lens, field, waves, rule)  # noqa: E731
+        return jax.vmap(lambda lens: jax.vmap(partial(one, lens))(fields))(batch)
+
+    call, known = _work.compiled(all_of, batch, fields)
+    bad = int(jnp.sum(~jnp.isfinite(call())))
+    return {"s": _common.medians([call], 3)[0], "compile_s": known["compile_s"], "bad": bad}
+
+
+def sweep(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) -> dict[str, Any]:
+    """sigma in mm, the height of the centroid in mm and the share of light of one colour over the
+    fields in degrees, and how these change when curvatures and apertures grow alike."""
+    waves = jnp.asarray(config.wavelengths_um[len(config.wavelengths_um) // 2 :][:1])
+    fields = jnp.linspace(0.0, widest, config.sweep)
+
+    def spot(grown, field):
+        now = dataclasses.replace(
+            lens,
+            curvature=lens.curvature * (1 + grown),
+            semi_diameter=lens.semi_diameter * (1 + grown),
+        )
+        found = drt_jax.psf_moments(now, field, math.inf, waves, rule=rule)
+        sigma = jnp.sqrt(found.covariance[0, 0, 0] + found.covariance[0, 1, 1])
+        return jnp.stack([sigma, found.mean[0, 1], found.passed[0]])
+
+    def both(field):
+        return jax.jvp(lambda grown: spot(grown, field), (jnp.zeros(()),), (jnp.ones(()),))
+
+    values, slopes = jax.jit(jax.vmap(both))(fields)
+    rows = {"values": np.asarray(values.T), "slopes": np.asarray(slopes.T)}
+    known = {key: found.tolist() for key, found in rows.items()}
+    return (
+        {"field_deg": np.degrees(fields).tolist()}
+        | known
+        | {"steps": {key: [_roughness(row) for row in found] for key, found in rows.items()}}
+    )
+
+
+def _roughness(row: np.ndarray) -> float:
+    """By how much a value is off the parabola through its neighbours, of the range of all: of the
+    order of the step where there is one, and nearly 0 for a smooth function."""
+    third = np.abs(np.diff(row, 3)) / 3
+    return float(np.max(third) / max(np.ptp(row), np.finfo(float).tiny))
+
+
+def lens_rows(config: Config, of: LensFields) -> dict[str, Any]:
+    """Everything about one lens."""
+    lens = drt_jax.load_lens(of.lens)
+    widest = math.radians(of.field_deg)
+    rows = []
+    for part in config.parts:
+        found = measure(config, lens, part * widest)
+        rows.append({"lens": of.lens, "field_deg": part * of.field_deg} | found)
+    jax.clear_caches()
+    waves = np.array(config.wavelengths_um)
+    # One rule for all fields: the most nodes that any needs, of the kind that the edge needs.
+    rules = [
+        drt_jax.converged_rule(lens, part * widest, math.inf, waves, _LOOSE) for part in (0.5, 1)
+    ]
+    clipped = [rule for rule in rules if isinstance(rule, drt_jax.Clipped)]
+    kind, among = (drt_jax.Clipped, clipped) if clipped else (drt_jax.Gauss, rules)
+    rule = kind(max(int(rule.order) for rule in among), rules[0].symmetry)
+    group = {"lens": of.lens} | copies(config, lens, widest, rule)
+    return {
+        "rows": rows,
+        "copies": group,
+        "sweep": {"lens": of.lens} | sweep(config, lens, widest, rule),
+    }
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Measure the lenses one by one."""
+    # Programs kept from another run would hide what compiling takes.
+    jax.config.update("jax_enable_compilation_cache", False)
+
+    def one(of: LensFields) -> dict[str, Any]:
+        found = lens_rows(config, of)
+        for k, row in enumerate(found["rows"]):
+            run.log(of.lens, k, {c: np.array([float(row[c])]) for c in COLUMNS})
+        return found
+
+    found = _common.measured(run, "lens", {of.lens: partial(one, of) for of in config.lenses})
+    return {
+        "rows": sum((each["rows"] for each in found), []),
+        "copies": [each["copies"] for each in found],
+        "sweeps": [each["sweep"] for each in found],
+        "seconds": run.seconds,
+    }
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Every lens and field; copies under vmap, and steps over the field."""
+    lines = []
+    for row in results["rows"]:
+        times = (row[key] for key in ("first_s", "loose_s", "tight_s", "value_s", "gradient_s"))
+        peers = [row["peers"].get(name, (None, None)) for name in ("optiland", "batoid")]
+        theirs = [f"{_common.duration(s)}, {e:.0e}" if s else "" for s, e in peers]
+        errors = (f"{row[key]:.0e}" for key in ("loose_error", "tight_error"))
+        start = row["lens"], row["field_deg"], f"{100 * row['passed']:.0f} %", row["rays"]
+        lines.append((*start, *map(_common.duration, times), *errors, *theirs))
+    header = ("lens", "field, deg", "light", "rays", "first call", "rule to 1e-3", "to 1e-6")
+    header += ("sigma", "and gradient", "error at 1e-3", "at 1e-6", "Optiland", "batoid")
+    both = zip(results["copies"], results["sweeps"], strict=True)
+    more = []
+    for group, swept in both:
+        steps = (f"{max(swept['steps'][key]):.0e}" for key in ("values", "slopes"))
+        more.append((group["lens"], _common.duration(group["s"]), *steps))
+    columns = "lens", "64 copies x 5 fields", "largest step of a value", "of a gradient"
+    return {"lenses": _common.table(header, lines), "lenses, batches": _common.table(columns, more)}
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Draw the spot over the field."""
+    for key, what in (("values", ""), ("slopes", "change of ")):
+        figure, axes = show.new(1, 3, 4.5, 3.6)
+        for ax, name, row in zip(axes, _SWEEP, range(3)):
+            series = {
+                swept["lens"]: (
+                    np.array(swept["field_deg"]) / swept["field_deg"][-1],
+                    np.array(swept[key][row]) / max(np.max(np.abs(swept[key][row])), 1e-300),
+                )
+                for swept in results["sweeps"]
+            }
+            show.curves(ax, series, "field / widest field", f"{what}{name} / its largest")
+        figure.savefig(figures / f"fields_{key}.png")
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__])
