@@ -7,8 +7,9 @@ import warnings
 import jax
 import numpy as np
 
+from ..lens.forms import Shape
 from ..lens.lens import Lens
-from ..lens.surface import Shape, surface_sag
+from ..lens.surface import surface_sag
 from .entry import LensError
 
 # Neighbours that overlap by less at their rims touch (mm); from this part of the smaller

@@ -4,10 +4,10 @@ import math
 
 import jax.numpy as jnp
 
+from ..lens.forms import FORMS
 from ..lens.glass import Dispersion
 from ..lens.lens import Lens
 from ..lens.phase import Phase
-from ..lens.surface import FORMS
 from .elements import elements_of
 from .entry import Entry, LensError, array, table
 from .media import MEDIUM_KEYS, media_of
@@ -19,7 +19,7 @@ _TOP_KEYS = (
 )
 _SURFACE_KEYS = (
     *("form", "radius", "curvature", "conic", "radius_x", "curvature_x", "conic_x"),
-    *("coefficients", "thickness", *MEDIUM_KEYS, "mirror", "semi_diameter", "stop"),
+    *("norm_radius", "coefficients", "thickness", *MEDIUM_KEYS, "mirror", "semi_diameter", "stop"),
     *("tilt", "decentre", "phase"),
 )
 
@@ -31,46 +31,42 @@ def _form(entry: Entry) -> str:
     return form
 
 
-def _columns(entry: Entry) -> dict[int, float]:
-    """Coefficients that have no key of their own, by their places."""
-    form = FORMS[_form(entry)]
-    given = Entry(entry.get("coefficients", {}), entry.name("coefficients"), form.powers)
-    return {len(form.named) + form.powers.index(power): given.number(power) for power in given}
-
-
 def _coefficients(surface: Entry) -> list[float]:
+    """Those of a surface, or of its phase."""
     form = _form(surface)
-    first = FORMS[form].named
-    for key in ("radius_x", "curvature_x", "conic_x"):
-        if key in surface and key.replace("radius", "curvature") not in first:
+    first, powers = FORMS[form].named, FORMS[form].powers
+    for key in ("radius_x", "curvature_x", "conic_x", "norm_radius"):
+        if key in surface and key.replace("radius_x", "curvature_x") not in first:
             raise surface.error(key, f"a surface of the form {form} has none")
-    columns = _columns(surface)
+    given = Entry(surface.get("coefficients", {}), surface.name("coefficients"), powers)
+    columns = {len(first) + powers.index(power): given.number(power) for power in given}
     if "curvature_x" in first:
         columns[0] = surface.curvature("_x")
     if "conic_x" in first:
         columns[1] = surface.number("conic_x", 0.0)
-    return _row(columns)
-
-
-def _row(columns: dict[int, float]) -> list[float]:
+    if "norm_radius" in first:
+        columns[0] = surface.number("norm_radius")
+        if columns[0] <= 0:
+            raise surface.error("norm_radius", "must be positive")
     return [columns.get(k, 0.0) for k in range(max(columns, default=-1) + 1)]
 
 
 def _phase(surfaces: list[Entry]) -> Phase | None:
     """The diffractive structures, if any."""
-    keys = ("form", "order", "coefficients")
+    keys = ("form", "order", "norm_radius", "coefficients")
     at = {i: s for i, s in enumerate(surfaces) if "phase" in s}
     given = [Entry(s["phase"], s.name("phase"), keys) for s in at.values()]
     if not given:
         return None
     for entry in given:
-        if FORMS[_form(entry)].named:
-            raise entry.error("form", "expected asphere, odd_asphere, polynomial_xy or linear")
+        known = [name for name, form in FORMS.items() if form.round]
+        if _form(entry) not in known:
+            raise entry.error("form", f"expected one of {', '.join(known)}")
         if not entry.get("coefficients"):
             raise entry.error("coefficients", "give at least one, in waves")
         if entry.number("order", 1.0) % 1:
             raise entry.error("order", "must be a whole number")
-    rows = [_row(_columns(entry)) for entry in given]
+    rows = [*map(_coefficients, given)]
     return Phase(
         coefficients=table(rows, max(map(len, rows))),
         order=array([entry.number("order", 1.0) for entry in given]),

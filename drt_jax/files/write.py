@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import yaml
+from jax import Array
 
 from ..lens.elements import Elements
+from ..lens.forms import FORMS
 from ..lens.glass import Dispersion, find_glass
 from ..lens.lens import Lens
-from ..lens.surface import FORMS
 from .entry import LensError
 
 
@@ -48,10 +49,8 @@ def _surface(lens: Lens, i: int) -> dict[str, Any]:
         entry["conic"] = float(lens.conic[i])
     if lens.forms[i] != "asphere":
         entry["form"] = lens.forms[i]
-    form = FORMS[lens.forms[i]]
-    values = np.asarray(lens.coefficients[i]).tolist()
-    entry |= dict(zip(form.named, values, strict=False))
-    rest = dict(zip(form.powers, values[len(form.named) :], strict=False))
+    named, rest = _coefficients(lens.forms[i], lens.coefficients[i])
+    entry |= named
     # Zeros of one surface keep the number of columns.
     if rest and (any(rest.values()) or (i == 0 and not np.any(lens.coefficients))):
         entry["coefficients"] = rest
@@ -66,6 +65,13 @@ def _surface(lens: Lens, i: int) -> dict[str, Any]:
     if i == lens.stop:
         entry["stop"] = True
     return entry | _place(lens, i) | _phase(lens, i)
+
+
+def _coefficients(name: str, row: Array) -> tuple[dict, dict]:
+    """Those of a form that have keys of their own, and the others by what files call them."""
+    form, values = FORMS[name], np.asarray(row).tolist()
+    named = dict(zip(form.named, values, strict=False))
+    return named, dict(zip(form.powers, values[len(form.named) :], strict=False))
 
 
 def _element(elements: Elements, g: int) -> dict[str, Any]:
@@ -83,10 +89,9 @@ def _phase(lens: Lens, i: int) -> dict[str, Any]:
     if lens.phase is None or i not in lens.phase.surfaces:
         return {}
     row = lens.phase.surfaces.index(i)
-    form = lens.phase.forms[row]
-    values = np.asarray(lens.phase.coefficients[row]).tolist()
-    waves = dict(zip(FORMS[form].powers, values, strict=False))
-    return {"phase": {"form": form, "order": float(lens.phase.order[row]), "coefficients": waves}}
+    form, order = lens.phase.forms[row], float(lens.phase.order[row])
+    named, rest = _coefficients(form, lens.phase.coefficients[row])
+    return {"phase": {"form": form, "order": order} | named | {"coefficients": rest}}
 
 
 def _medium(lens: Lens, i: int) -> dict[str, Any]:

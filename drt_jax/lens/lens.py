@@ -9,9 +9,10 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from .elements import Elements, rotation_matrix
+from .forms import Shape
 from .glass import Dispersion, check_wavelengths, refractive_index
 from .phase import Phase
-from .surface import Shape, surface_sag
+from .surface import surface_sag
 
 
 @jax.tree_util.register_dataclass
@@ -24,7 +25,7 @@ class Lens:
 
     curvature: (S + 1,) in 1/mm.
     conic: (S + 1,), 0 a sphere, -1 a paraboloid.
-    coefficients: (S + 1, K), whose meaning is that of the surface's form (see `surface`;
+    coefficients: (S + 1, K), whose meaning is that of the surface's form (see `forms`;
         asphere: of r^2, r^4, ... in mm^-1, mm^-3, ...).
     thickness: (S - 1,) between the vertices of the surfaces, in mm; negative where a mirror has
         turned the light, and where a stop that bends no light lies behind a vertex in front of it.
@@ -42,7 +43,7 @@ class Lens:
     Static:
     stop: the index of the stop surface.
     glasses: the names of the S + 1 media.
-    forms: a name in `surface.FORMS` for each of the S + 1 rows (empty: all aspheres).
+    forms: a name in `forms.FORMS` for each of the S + 1 rows (empty: all aspheres).
     mirrors: whether each of the S surfaces reflects (empty: none does).
     name: of the lens.
     """

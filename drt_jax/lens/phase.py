@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .surface import Shape
+from .forms import Shape
 
 
 @jax.tree_util.register_dataclass

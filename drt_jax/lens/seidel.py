@@ -5,12 +5,13 @@ Source of the formulae: Welford, Aberrations of Optical Systems (1986), ch. 8, 1
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
 from ..numerics import safe_divide
+from .forms import FORMS
 from .lens import Lens
 from .paraxial import (
     ParaxialRay,
@@ -21,7 +22,7 @@ from .paraxial import (
     petzval_parts,
     trace_ray,
 )
-from .surface import FORMS
+from .surface import by_form, surface_sag
 
 
 class ThirdOrder(NamedTuple):
@@ -59,11 +60,16 @@ class ThirdOrder(NamedTuple):
 
 def _fourth_order(lens: Lens, vertex: Array) -> Array:
     """Coefficient (S,) of r^4 in the sag, beyond the sphere of curvature `vertex` (S,), mm^-3."""
-    c, k = lens.curvature[:-1], lens.conic[:-1]
-    columns = np.array([3 if form == "odd_asphere" else 1 for form in lens.forms[:-1]])
-    powers = jnp.pad(lens.coefficients[:-1], ((0, 0), (0, 4)))
-    fourth = powers[np.arange(lens.count), columns]
-    return fourth + ((1 + k) * c**3 - vertex**3) / 8
+
+    def height(y):
+        return by_form(surface_sag, (y,), lens.shape, lens.forms)
+
+    def slope_of(f):
+        return lambda y: jax.jvp(f, (y,), (jnp.ones_like(y),))[1]
+
+    for _ in range(4):
+        height = slope_of(height)
+    return height(jnp.zeros_like(lens.curvature))[:-1] / 24 - vertex**3 / 8
 
 
 def _seidel(

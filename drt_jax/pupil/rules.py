@@ -15,9 +15,9 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
-from ..lens.surface import FORMS
 from ..numerics import concrete, safe_sqrt
 from ..rays.status import Status
 from ..rays.system import Vector, dot

@@ -15,8 +15,9 @@ import numpy as np
 import optimistix as optx
 from jax import Array
 
+from ..lens.forms import Shape
 from ..lens.paraxial import trace_yu
-from ..lens.surface import Shape, vertex_curvature
+from ..lens.surface import vertex_curvature
 from ..numerics import safe_divide
 from .snell import apart, shoot, shoot_to_stop
 from .status import Status

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.surface import Shape, by_form, domain, sag_derivatives, surface_sag
+from ..lens.forms import Shape
+from ..lens.surface import by_form, domain, sag_derivatives, surface_sag
 from ..numerics import safe_divide, safe_sqrt
 from .snell import cross
 from .system import Diffraction, System, Vector, dot, turn

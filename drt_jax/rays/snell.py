@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.surface import RIM, Shape, domain, sag_derivatives
+from ..lens.forms import RIM, Shape
+from ..lens.surface import domain, sag_derivatives
 from ..numerics import safe_divide, safe_sqrt
 from .status import Status
 from .system import Placed, System, Vector, dot, turn

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..lens.forms import Shape
 from ..lens.glass import common_range
 from ..lens.lens import Lens
 from ..lens.phase import Phase
 from ..lens.scene import Scene
-from ..lens.surface import Shape
 from ..numerics import safe_divide
 
 Vector = tuple[Array, ...]
@@ -67,7 +67,7 @@ class Placed(NamedTuple):
     vertex: (R,), z along the lens in mm.
     curvature: (R,) in 1/mm.
     conic: (R,).
-    coefficients: (R, K), see `lens.surface`.
+    coefficients: (R, K), see `lens.forms`.
     offset: (R, 2), x and y of the vertices in mm; None for none.
     rotation: (R, 3, 3) from the axes of the surfaces to those of the lens; None for none.
     station: (R,), z of the vertices along an axis that turns with elements, mm; None: as `vertex`.

@@ -10,7 +10,8 @@ import numpy as np
 import drt_jax
 from drt_jax import Gauss, Status
 from drt_jax.lens.elements import rotation_matrix
-from drt_jax.lens.surface import Shape, sag_derivatives
+from drt_jax.lens.forms import Shape
+from drt_jax.lens.surface import sag_derivatives
 from drt_jax.numerics import safe_sqrt
 
 from ._families import WAVELENGTH, Scenes

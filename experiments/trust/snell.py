@@ -13,7 +13,8 @@ from jax import Array
 
 from drt_jax import Lens
 from drt_jax.lens.elements import rotation_matrix
-from drt_jax.lens.surface import Shape, domain, sag_derivatives
+from drt_jax.lens.forms import Shape
+from drt_jax.lens.surface import domain, sag_derivatives
 
 _NEWTON_STEPS = 40  # a ray that all but grazes an asphere halves its distance in each
 

@@ -78,8 +78,8 @@ BAD = {
         "must be finite",
     ),
     "unknown form": (
-        surface(0, form="zernike"),
-        r"surfaces\[0\].form: unknown form 'zernike'; known: asphere",
+        surface(0, form="spline"),
+        r"surfaces\[0\].form: unknown form 'spline'; known: asphere",
     ),
     "crossing": (
         lambda e: (
@@ -113,6 +113,19 @@ BAD = {
     "power of x": (
         surface(0, form="polynomial_xy", coefficients={"x2": 1.0}),
         "coefficients: unknown key 'x2'; known: x1y0, x0y1, x2y0, x1y1",
+    ),
+    "no norm radius": (surface(0, form="qbfs"), r"surfaces\[0\].norm_radius: expected a number"),
+    "norm radius 0": (
+        surface(0, form="zernike", norm_radius=0),
+        r"surfaces\[0\].norm_radius: must be positive",
+    ),
+    "norm radius": (
+        surface(0, norm_radius=3),
+        "norm_radius: a surface of the form asphere has none",
+    ),
+    "Zernike terms": (
+        surface(0, form="zernike", norm_radius=9, coefficients={92: 1e-6}),
+        "coefficients: unknown key 92; .*known: 1, 2, 3",
     ),
     "no mapping": (lambda e: e.update(object="water"), "object: expected a mapping with the keys"),
     "true": (surface(0, thickness=True), "thickness: expected a number, got True"),

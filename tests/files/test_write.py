@@ -19,6 +19,10 @@ ODD = {
         {"form": "biconic", "radius": 77.7, "radius_x": 55.5, "conic_x": 0.3, "thickness": 30.0},
         {"form": "polynomial_xy", "radius": -9e9, "coefficients": {"x1y1": 1e-3}, "mirror": True}
         | {"thickness": -12.0, "tilt": [0.1, 45, -7.7], "decentre": [0, 1 / 7]},
+        {"form": "qbfs", "radius": 99, "norm_radius": 7.1, "coefficients": {0: 0.1, 3: 1e-3}}
+        | {"thickness": -3.0},
+        {"form": "zernike", "radius": 99, "norm_radius": 6.7, "coefficients": {7: 1e-3}}
+        | {"thickness": -12.0, "index": 1.5},
     ],
     "sensor_tilt": [1, 2, 3],
 }

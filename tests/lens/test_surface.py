@@ -8,7 +8,9 @@ import pytest
 import yaml
 
 from drt_jax.lens import surface
-from drt_jax.lens.surface import FORMS, Shape, domain, powers_xy, surface_sag
+from drt_jax.lens.forms import FORMS, Shape, powers_xy
+from drt_jax.lens.surface import domain, surface_sag
+from drt_jax.pupil.patterns import disc
 
 by_form = jax.jit(surface.by_form, static_argnums=(0, 3))
 sag_derivatives = jax.jit(surface.sag_derivatives, static_argnames="form")
@@ -53,6 +55,42 @@ def exact_polynomial_xy(x, y, c, k, a):
     return conic(x**2 + y**2, c, k) + terms
 
 
+def exact_qbfs(x, y, c, k, a):
+    """The closed forms of Q_0 to Q_3 (Forbes 2007)."""
+    radius, *rest = a
+    r2 = x**2 + y**2
+    t = r2 / radius**2
+    q = [
+        1,
+        (13 - 16 * t) / mpmath.sqrt(19),
+        mpmath.sqrt(mpmath.mpf(2) / 95) * (29 - 4 * t * (25 - 19 * t)),
+        mpmath.sqrt(mpmath.mpf(2) / 2545) * (207 - 4 * t * (315 - t * (577 - 320 * t))),
+    ]
+    bump = t * (1 - t) / mpmath.sqrt(1 - c**2 * r2)
+    return conic(r2, c, k) + bump * sum(v * f for v, f in zip(rest, q))
+
+
+def exact_zernike(x, y, c, k, a):
+    """Z_1 to Z_11 as Noll (1976) lists them."""
+    radius, *rest = a
+    rho, theta = mpmath.sqrt(x**2 + y**2) / radius, mpmath.atan2(y, x)
+    root = mpmath.sqrt
+    z = [
+        1,
+        2 * rho * mpmath.cos(theta),
+        2 * rho * mpmath.sin(theta),
+        root(3) * (2 * rho**2 - 1),
+        root(6) * rho**2 * mpmath.sin(2 * theta),
+        root(6) * rho**2 * mpmath.cos(2 * theta),
+        root(8) * (3 * rho**3 - 2 * rho) * mpmath.sin(theta),
+        root(8) * (3 * rho**3 - 2 * rho) * mpmath.cos(theta),
+        root(8) * rho**3 * mpmath.sin(3 * theta),
+        root(8) * rho**3 * mpmath.cos(3 * theta),
+        root(5) * (6 * rho**4 - 6 * rho**2 + 1),
+    ]
+    return conic(x**2 + y**2, c, k) + sum(v * f for v, f in zip(rest, z))
+
+
 # form, curvature, conic, coefficients: one line for each shape that everything below runs over.
 SHAPES = {
     "plane": ("asphere", 0.0, 0.0, []),
@@ -77,6 +115,8 @@ SHAPES = {
         [1e-3, -2e-3, 1e-4, 3e-4, -2e-4, 1e-6, 2e-6, 3e-6, 4e-6],
     ),
     "slope": ("linear", 1 / 70, -1.0, [2e-3]),
+    "Forbes": ("qbfs", 1 / 60, -0.4, [12.0, 0.05, -0.02, 0.01, 0.003]),
+    "Zernike": ("zernike", -1 / 80, 0.3, [11.0, *(0.01 / np.arange(1.0, 12.0))]),
 }
 
 
@@ -136,7 +176,8 @@ def test_vertex_curvature_is_the_bend_at_the_vertex(name):
         exact = globals()[f"exact_{form}"]
         h = mpmath.mpf(10) ** -8
         wanted = [
-            (exact(i * h, j * h, c, k, mp) + exact(-i * h, -j * h, c, k, mp)) / h**2
+            sum(s * exact(t * i * h, t * j * h, c, k, mp) for s, t in ((1, 1), (-2, 0), (1, -1)))
+            / h**2
             for i, j in ((1, 0), (0, 1))
         ]
     np.testing.assert_allclose(ours, [float(v) for v in wanted], rtol=1e-6, atol=1e-9)
@@ -147,7 +188,17 @@ def jax_rows(shape):
 
 
 def test_forms_side_by_side_are_each_their_own():
-    names = ["polynomial", "sphere", "toroid", "even asphere", "odd asphere", "biconic", "plane"]
+    names = [
+        "Forbes",
+        "Zernike",
+        "polynomial",
+        "sphere",
+        "toroid",
+        "even asphere",
+        "odd asphere",
+        "biconic",
+        "plane",
+    ]
     widest = max(len(SHAPES[n][3]) for n in names)
     rows = [shape_of(n)[0] for n in names]
     shape = Shape(
@@ -181,6 +232,31 @@ def test_flagged_beyond_the_rim(dtype):
     w = heights, jnp.zeros_like(heights)
     assert all(jnp.all(jnp.isfinite(a)) for a in jax.tree.leaves(sag_derivatives(w, shape)))
     np.testing.assert_array_equal(domain(w, shape), heights < 9.9995)
+
+
+def test_slopes_of_forbes_polynomials_are_orthonormal():
+    """About a sphere, by the weight 1 / (u sqrt(1 - u^2)) over the disc (Forbes 2007, Eq. 11): the
+    slope along the normal of u^2 (1 - u^2) Q_m is orthonormal. 24 terms, by Gauss-Chebyshev."""
+    count, order = 24, 200
+    u = np.cos(np.pi * (2 * np.arange(order) + 1) / (4 * order))  # u > 0, weights pi / (2 order)
+    unit = Shape(*(jnp.zeros((count, 1)),) * 2, np.insert(np.eye(count), 0, 1, axis=0)[..., None])
+    w = (jnp.broadcast_to(u, (count, order)),)
+    slopes = np.asarray(sag_derivatives(w, unit, "qbfs")[1][0])
+    np.testing.assert_allclose(slopes @ slopes.T / order, np.eye(count), atol=1e-11)
+
+
+def test_zernike_polynomials_are_orthonormal():
+    """All 91 that files may give, over the disc, to the rounding of their polynomials in x, y."""
+    count = 91
+    points, weights = disc(14, 14)
+    unit = Shape(*(jnp.zeros((count, 1)),) * 2, np.insert(np.eye(count), 0, 1, axis=0)[..., None])
+    w = jnp.broadcast_to(points[:, None], (2, count, len(weights)))
+    z = np.asarray(jax.jit(surface_sag, static_argnums=2)(w, unit, "zernike"))
+    np.testing.assert_allclose(z * weights @ z.T, np.eye(count), atol=1e-11)
+    edge = jnp.stack([jnp.ones((count, 1)), jnp.zeros((count, 1))])  # Z_j(1, 0): n and m alone
+    n = np.repeat(np.arange(13), np.arange(1, 14))
+    z = np.asarray(surface_sag(edge, unit, "zernike"))[:, 0]
+    assert set(np.round(z**2 / (n + 1), 9)) == {0, 1, 2}
 
 
 def test_toroid_of_another_program(shared):

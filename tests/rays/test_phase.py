@@ -202,7 +202,7 @@ def test_a_phase_of_nothing_changes_nothing():
         ({"coefficients": {}}, r"surfaces\[1\].phase.coefficients: give at least one, in waves"),
         ({"coefficients": {3: 1}}, r"surfaces\[1\].phase.coefficients: unknown key 3"),
         ({"order": 0.5, "coefficients": {2: 1}}, r"phase.order: must be a whole number"),
-        ({"form": "toroid", "coefficients": {2: 1}}, r"phase.form: expected asphere, "),
+        ({"form": "toroid", "coefficients": {2: 1}}, r"phase.form: expected one of asphere, "),
         ({"form": "grating"}, r"phase.form: unknown form 'grating'"),
         ({"lines": 600}, r"phase: unknown key 'lines'"),
         (600, r"phase: expected a mapping"),

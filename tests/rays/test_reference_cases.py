@@ -15,8 +15,9 @@ import yaml
 
 import drt_jax
 from drt_jax import Status, load_lens, pupil, trace_rays
+from drt_jax.lens.forms import Shape
 from drt_jax.lens.paraxial import trace_yu
-from drt_jax.lens.surface import Shape, sag_derivatives, surface_sag
+from drt_jax.lens.surface import sag_derivatives, surface_sag
 
 from .. import oracle
 from .traced import assert_same_rays, hexapolar, truth

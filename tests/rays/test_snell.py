@@ -10,7 +10,8 @@ import pytest
 from experiments.snell import trace_snell
 
 from drt_jax import Status, load_lens
-from drt_jax.lens.surface import FORMS, Shape, domain, surface_sag
+from drt_jax.lens.forms import FORMS, Shape
+from drt_jax.lens.surface import domain, surface_sag
 from drt_jax.rays import fermat, snell
 
 from ..lens.test_surface import SHAPES

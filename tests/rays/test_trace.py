@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from experiments.snell import trace_snell
 
-from drt_jax import Status, entrance_pupil, load_lens, pupil, sag, trace_rays
+from drt_jax import Status, entrance_pupil, load_lens, pupil, sag, scene_of, trace_rays
+from drt_jax.lens.forms import FORMS
+from drt_jax.rays.trace import trace_bundle
 
 from ..conftest import LENSES, RGB, assert_close
+from ..known import known, search
 
 POINTS = pupil.half_disc(4, 5)[0].T
 SINGLET = load_lens("singlet")
@@ -85,6 +88,57 @@ def test_hits_agree_with_snell_to_1e_11_mm(name):
             rays = trace_rays(lens, field, distance, RGB, POINTS)
             assert np.all(rays.status == Status.OK)
             assert against_snell(lens, rays, field, distance, RGB) < 1e-11
+
+
+# Terms of a form, and how much of which power of r, or of x and y, each is, in units of the radius
+# of the norm: the closed forms of Forbes (2007) and Noll (1976).
+FORBES = {0: {2: 1.0, 4: -1.0}, 1: {2: 13 / 19**0.5, 4: -29 / 19**0.5, 6: 16 / 19**0.5}}
+NOLL = {
+    2: {"x1y0": 2.0},
+    5: {"x1y1": 2 * 6**0.5},
+    6: {"x2y0": 6**0.5, "x0y2": -(6**0.5)},
+    8: {"x3y0": 3 * 8**0.5, "x1y2": 3 * 8**0.5, "x1y0": -2 * 8**0.5},
+}
+SIZES = {"qbfs": {0: 0.03, 1: -0.02}, "zernike": {2: 0.004, 5: 0.01, 6: -0.02, 8: 0.01}}
+
+
+@pytest.mark.slow
+def test_forms_that_equal_others_have_the_same_gradients():
+    """Flat surfaces of Forbes and of Zernike terms, also as even asphere and XY polynomial."""
+    radius, rows, others, parts = 9.0, [], [], []
+    for form, other, terms in (("qbfs", "asphere", FORBES), ("zernike", "polynomial_xy", NOLL)):
+        powers = FORMS[other].powers[:12]
+        part = np.zeros((len(terms), 12))
+        for i, powers_of_term in enumerate(terms.values()):
+            for power, size in powers_of_term.items():
+                degree = power if form == "qbfs" else int(power[1]) + int(power[3])
+                part[i, powers.index(power)] = size / radius**degree
+        same = dict(zip(powers, list(SIZES[form].values()) @ part))
+        rows.append({"form": form, "norm_radius": radius, "coefficients": SIZES[form]})
+        others.append({"form": other, "coefficients": same})
+        parts.append(part)
+    front = {"radius": 40, "thickness": 5, "index": 1.5, "semi_diameter": 6, "stop": True}
+    media = ({"thickness": 3}, {"index": 1.7, "thickness": 4}, {"radius": -90, "thickness": 60})
+    lens, other = (
+        load_lens({"surfaces": [front, *({"radius": "inf"} | a | b for a, b in zip(media, forms))]})
+        for forms in ([*rows, {}], [*others, {}])
+    )
+    points, scene = tuple(POINTS.T), scene_of(lens, jnp.array([0.05, 0.1]), 500.0, RGB[:1])
+    found = search(lens, scene, points)
+    assert np.all(found.status == Status.OK)
+
+    def value(lens):
+        return jnp.sum(jnp.sin(jnp.stack(trace_bundle(lens, scene, points, known(found)).hits)))
+
+    ours, theirs = (jax.jit(jax.grad(value))(a) for a in (lens, other))
+    for i, (form, part) in enumerate(zip(SIZES, parts), start=1):
+        x, y = (a[i] for a in found.hits)
+        np.testing.assert_allclose(sag(lens, i, x, y), sag(other, i, x, y), atol=1e-15)
+        columns = [1 + FORMS[form].powers.index(term) for term in SIZES[form]]
+        by_terms = ours.coefficients[i][np.array(columns)]
+        np.testing.assert_allclose(by_terms, part @ theirs.coefficients[i], rtol=1e-9)
+    for name in ("curvature", "conic", "thickness", "semi_diameter", "sensor"):
+        assert_close(getattr(ours, name), getattr(theirs, name), 1e-9)
 
 
 def test_float32_hits_within_a_tenth_of_a_micrometre():

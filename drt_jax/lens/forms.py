@@ -1,0 +1,256 @@
+"""The forms of surfaces: one function and one record in `FORMS` each.
+
+A point on a surface is its transverse coordinates w (paper Eq. 1): one (height in the
+meridional plane, y) or two (x, y), as a tuple of arrays or an array with the component axis
+first; the functions are elementwise in the rest. Each is (w, shape) -> (sag, argument), the
+surface existing where `argument` > 0. Slopes, curvatures at the vertex and the derivative rules
+follow from it by automatic differentiation, see `surface`.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+# A square root is used up to the rim where the normal of a sphere leans within 0.57 degrees
+# (cos = 0.01) of 90 degrees. Beyond, it continues smoothly and stays positive, so that an
+# iteration which strays outside stays finite and can come back; a ray that ends there has
+# missed the surface.
+RIM = 1e-4
+# Nearer to the axis than this (mm^2) an odd power of r is flat: its derivative at 0 is none.
+_AXIS = 1e-16
+
+# Transverse coordinates: D arrays, x and y or y alone.
+Point = Sequence[Array] | Array
+
+
+class Shape(NamedTuple):
+    """Parameters of surfaces as arrays: curvature c (...) in 1/mm, conic k (...) and
+    coefficients (K, ...), whose meaning belongs to the form."""
+
+    curvature: Array
+    conic: Array
+    coefficients: Array
+
+
+def square(w: Point) -> Array:
+    return sum((a * a for a in w[1:]), w[0] * w[0])
+
+
+def root(argument: Array) -> Array:
+    inside = argument > RIM
+    beyond = RIM**0.5 / (1 + (1 - jnp.where(inside, RIM, argument) / RIM) / 2)
+    return jnp.where(inside, jnp.sqrt(jnp.where(inside, argument, 1)), beyond)
+
+
+def _conic(r2: Array, c: Array, k: Array) -> tuple[Array, Array]:
+    argument = 1 - (1 + k) * c**2 * r2
+    return c * r2 / (1 + root(argument)), argument
+
+
+def horner(x: Array, coefficients: Array | list[Array]) -> Array:
+    """sum_j a_j x^j; 0 without coefficients."""
+    count = len(coefficients)
+    total = coefficients[count - 1] if count else jnp.zeros_like(x)
+    for j in reversed(range(count - 1)):
+        total = coefficients[j] + x * total
+    return total
+
+
+def asphere(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """Plane, sphere, conic and even asphere.
+
+    z = c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + a_0 r^2 + a_1 r^4 + ...; paper Eq. 1 is k = 0
+    without coefficients.
+    """
+    r2 = square(w)
+    z, argument = _conic(r2, shape.curvature, shape.conic)
+    if shape.coefficients.shape[0]:
+        z = z + r2 * horner(r2, shape.coefficients)
+    return z, argument
+
+
+def odd_asphere(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """Conic and every power of r: ... + a_0 r + a_1 r^2 + a_2 r^3 + ..."""
+    r2 = square(w)
+    z, argument = _conic(r2, shape.curvature, shape.conic)
+    off = r2 > _AXIS
+    r = jnp.where(off, jnp.sqrt(jnp.where(off, r2, 1)), 0)
+    odd, even = horner(r2, shape.coefficients[::2]), horner(r2, shape.coefficients[1::2])
+    return z + r * odd + r2 * even, argument
+
+
+def biconic(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """Another conic in each direction: c and k hold for y, a_0 and a_1 are c and k for x.
+
+    z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2)), and then
+    a_2 r^2 + a_3 r^4 + ... Source: the biconic of Zemax and of batoid.
+    """
+    x2, y2 = w[0] * w[0], w[1] * w[1]
+    cy, ky, (cx, kx) = shape.curvature, shape.conic, shape.coefficients[:2]
+    argument = 1 - (1 + kx) * cx**2 * x2 - (1 + ky) * cy**2 * y2
+    z = (cx * x2 + cy * y2) / (1 + root(argument))
+    r2 = x2 + y2
+    return z + r2 * horner(r2, shape.coefficients[2:]), argument
+
+
+def toroid(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """A curve g(y) turned about an axis along y at the distance 1 / a_0 from the vertex.
+
+    g is the conic of c and k plus a_1 y^2 + a_2 y^4 + ...; a_0 is the curvature in x.
+    z = Rx - sign(Rx) sqrt((Rx - g)^2 - x^2) with Rx = 1 / a_0, written so that a_0 may be 0.
+    """
+    x2, y2 = w[0] * w[0], w[1] * w[1]
+    g, argument = _conic(y2, shape.curvature, shape.conic)
+    g = g + y2 * horner(y2, shape.coefficients[1:])
+    cx = shape.coefficients[0]
+    turned = (1 - cx * g) ** 2 - cx**2 * x2
+    z = (2 * g - cx * g * g + cx * x2) / (1 + root(turned))
+    return z, jnp.minimum(argument, turned)
+
+
+def powers_xy(count: int) -> list[tuple[int, int]]:
+    """The powers (i, j) of x^i y^j that `count` coefficients stand for: x, y, x^2, x y, y^2, ..."""
+    pairs = [(degree - j, j) for degree in range(1, count + 1) for j in range(degree + 1)]
+    return pairs[:count]
+
+
+def _polynomial(w: Point, terms: dict[tuple[int, int], Array]) -> Array:
+    """sum_ij a_ij x^i y^j of `terms`, a_ij by (i, j)."""
+    degree = max((i + j for i, j in terms), default=0)
+    zero = jnp.zeros_like(w[0])
+    # A polynomial in y for each power of x.
+    rows = [[terms.get((i, j), zero) for j in range(degree - i + 1)] for i in range(degree + 1)]
+    return horner(w[0], [horner(w[1], row) for row in rows])
+
+
+def polynomial_xy(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """Conic and a polynomial: ... + a_0 x + a_1 y + a_2 x^2 + a_3 x y + a_4 y^2 + a_5 x^3 + ..."""
+    z, argument = _conic(square(w), shape.curvature, shape.conic)
+    pairs = powers_xy(len(shape.coefficients))
+    return z + _polynomial(w, dict(zip(pairs, shape.coefficients, strict=True))), argument
+
+
+def linear(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """Conic and a slope: ... + a_0 y. As a phase, a grating with lines along x."""
+    z, argument = _conic(square(w), shape.curvature, shape.conic)
+    return z + shape.coefficients[0] * w[-1], argument
+
+
+@functools.cache
+def _noll(count: int) -> tuple[list[tuple[int, int]], np.ndarray]:
+    """Powers (i, j), and how much of x^i y^j is in each of the first `count` Zernike polynomials.
+
+    Noll's order and norm (J. Opt. Soc. Am. 66, 207 (1976)): the mean square over the disc is 1,
+    even numbers go with cos(m theta), odd ones with sin.
+    """
+    orders = sorted((n, abs(m)) for n in range(count) for m in range(-n, n + 1, 2))
+    pairs = [(0, 0), *powers_xy(sum(range(2, orders[count - 1][0] + 2)))]
+    table = np.zeros((len(pairs), count))
+    for k, (n, m) in enumerate(orders[:count]):
+        norm, sine = math.sqrt((n + 1) * (2 if m else 1)), m > 0 and k % 2 == 0
+        for s in range((n - m) // 2 + 1):
+            radial = (-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, (n - m) // 2 - s)
+            rest = (n - m) // 2 - s  # r^(n - 2 s) is (x^2 + y^2)^rest r^m
+            for p, q in itertools.product(range(rest + 1), range(m + 1)):
+                if q % 2 == sine:  # the terms of the real part of (x + i y)^m, or of the imaginary
+                    place = pairs.index((m - q + 2 * (rest - p), q + 2 * p))
+                    size = math.comb(rest, p) * math.comb(m, q) * (-1) ** (q // 2)
+                    table[place, k] += norm * radial * size
+    return pairs, table
+
+
+def zernike(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """Conic and Zernike polynomials: ... + sum_j a_j Z_j(x / R, y / R), a_0 being R, in mm.
+
+    Z_j in Noll's order and norm, theta from the x axis. As a polynomial in x and y it keeps 11 of
+    16 digits of a_j with the most terms that files may give, 91.
+    """
+    z, argument = _conic(square(w), shape.curvature, shape.conic)
+    if len(shape.coefficients) > 1:
+        pairs, table = _noll(len(shape.coefficients) - 1)
+        terms = jnp.tensordot(jnp.asarray(table, z.dtype), shape.coefficients[1:], 1)
+        inverse = _inverse(shape.coefficients[0])
+        z = z + _polynomial([a * inverse for a in w], dict(zip(pairs, terms, strict=True)))
+    return z, argument
+
+
+@functools.cache
+def _forbes(count: int) -> np.ndarray:
+    """(count, count), column m: Q_m as a sum of the auxiliary P_j, see `qbfs`."""
+    f, g, h = [2.0, math.sqrt(19) / 2], [-0.5], []
+    basis = np.eye(count)
+    for m in range(count):
+        if m > 1:
+            h.append(-m * (m - 1) / (2 * f[m - 2]))
+            g.append(-(1 + g[m - 2] * h[m - 2]) / f[m - 1])
+            f.append(math.sqrt(m * (m + 1) + 3 - g[m - 1] ** 2 - h[m - 2] ** 2))
+            basis[m] -= h[m - 2] * basis[m - 2]
+        if m > 0:
+            basis[m] -= g[m - 1] * basis[m - 1]
+        basis[m] /= f[m]
+    return basis.T
+
+
+def qbfs(w: Point, shape: Shape) -> tuple[Array, Array]:
+    """Conic and Forbes' polynomials Q_m, whose slopes beside a sphere are orthonormal.
+
+    z = ... + u^2 (1 - u^2) / sqrt(1 - c^2 r^2) sum_m a_(m + 1) Q_m(u^2), u = r / a_0, in mm; the
+    surface ends where either root does. Summed by Clenshaw's recurrence in P_0 = 2,
+    P_1 = 6 - 8 x, P_(m + 1) = (2 - 4 x) P_m - P_(m - 1), which has no large terms.
+    Source: Forbes, Opt. Express 15, 5218 (2007) and 18, 19700 (2010).
+    """
+    r2, c = square(w), shape.curvature
+    z, argument = _conic(r2, c, shape.conic)
+    if len(shape.coefficients) < 2:
+        return z, argument
+    inverse = _inverse(shape.coefficients[0])
+    x = r2 * inverse * inverse
+    basis = _forbes(len(shape.coefficients) - 1)
+    last, total = jnp.zeros_like(x), jnp.zeros_like(x)
+    for b in jnp.tensordot(jnp.asarray(basis, z.dtype), shape.coefficients[1:], 1)[::-1]:
+        last, total = total, b + (2 - 4 * x) * total - last
+    sphere = 1 - c**2 * r2
+    z = z + x * (1 - x) / root(sphere) * 2 * (total + last)
+    return z, jnp.minimum(argument, sphere)
+
+
+def _inverse(radius: Array) -> Array:
+    """1 / radius; 0 where there is none, in padded rows."""
+    return jnp.where(radius == 0, 0, 1 / jnp.where(radius == 0, 1, radius))
+
+
+class Form(NamedTuple):
+    """A kind of surface.
+
+    function: (w, shape) -> (sag in mm, argument), as described above.
+    symmetry: "rotation" about the z axis, "plane" (x -> -x leaves it alone) or "none".
+    powers: what files call the coefficients, in their order.
+    named: files have keys of their own for the first coefficients.
+    round: whether the conic is one of r, so that the surface ends at a rim.
+    """
+
+    function: Callable[[Point, Shape], tuple[Array, Array]]
+    symmetry: Literal["rotation", "plane", "none"]
+    powers: tuple[int | str, ...]
+    named: tuple[str, ...] = ()
+    round: bool = True
+
+
+_EVEN = tuple(range(2, 400, 2))
+_XY = tuple(f"x{i}y{j}" for i, j in powers_xy(230))
+FORMS: dict[str, Form] = {
+    "asphere": Form(asphere, "rotation", _EVEN),
+    "odd_asphere": Form(odd_asphere, "rotation", tuple(range(1, 200))),
+    "biconic": Form(biconic, "plane", _EVEN, ("curvature_x", "conic_x"), round=False),
+    "toroid": Form(toroid, "plane", _EVEN, ("curvature_x",), round=False),
+    "polynomial_xy": Form(polynomial_xy, "none", _XY),
+    "linear": Form(linear, "plane", ("y",)),
+    "zernike": Form(zernike, "none", tuple(range(1, 92)), ("norm_radius",)),
+    "qbfs": Form(qbfs, "rotation", tuple(range(100)), ("norm_radius",)),
+}
