@@ -1,12 +1,51 @@
-"""The media of a prescription: glasses by name, by index, by code, by nd and vd."""
+"""The media of a prescription: glasses by name, index, code, nd and vd, or constants."""
 
-from ..lens.glass import Glass, find_glass, model_glass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..lens.glass import VISIBLE, Dispersion, Glass, find_glass, model_glass, refractive_index
 from .entry import Entry
 
 MEDIUM_KEYS = ("glass", "index", "nd", "vd")
 
 
-def _medium(entry: Entry) -> Glass:
+def _own_glasses(top: Entry) -> dict[str, Glass]:
+    """The glasses that the prescription itself tells, by name."""
+    names = top.get("glasses", {})
+    entries = Entry(names, "glasses", list(names) if isinstance(names, dict) else ["NAME"])
+    keys = ("sellmeier", "schott", "range")
+    return {str(n): _own_glass(str(n), Entry(entries[n], entries.name(n), keys)) for n in entries}
+
+
+def _own_glass(name: str, entry: Entry) -> Glass:
+    if "sellmeier" not in entry and "schott" not in entry:
+        raise entry.error("", "give sellmeier, schott or both")
+    terms = entry.get("sellmeier", [0.0, 0.0])
+    if not isinstance(terms, list) or not terms or len(terms) % 2:
+        raise entry.error("sellmeier", f"expected a list, all B and then all C, got {terms!r}")
+    lengths = {"sellmeier": len(terms), "schott": 6}
+    constants: dict[str, Any] = {
+        key: tuple(entry.vector(key, n)) for key, n in lengths.items() if key in entry
+    }
+    low, high = entry.vector("range", 2) or VISIBLE
+    if not 0 < low < high:
+        raise entry.error("range", f"expected 0 < shortest < longest, got {low:g} and {high:g} um")
+    glass = Glass(name, range=(low, high), **constants)
+    strength, resonance = np.reshape(glass.sellmeier, (2, -1))
+    for c in resonance[strength != 0]:
+        if low**2 <= c <= high**2:
+            raise entry.error("sellmeier", f"C = {c:g} um^2 lies within the range; narrow it")
+    waves = np.linspace(low, high, 257)
+    index = np.asarray(refractive_index(Dispersion.of([glass]), jnp.asarray(waves)))[0]
+    if not np.all(index > 1):
+        wave = waves[np.argmin(index > 1)]
+        raise entry.error("", f"no index above 1 at {wave:g} um; mend the constants or the range")
+    return glass
+
+
+def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
     given = [key for key in ("glass", "index", "nd") if key in entry]
     if len(given) > 1:
         raise entry.error("", f"give either {' or '.join(given)}, not both")
@@ -21,7 +60,11 @@ def _medium(entry: Entry) -> Glass:
         if value == 1:  # the same medium as air, so that a surface between both bends no light
             return find_glass("air")
         return Glass(f"index {value!r}", schott=(value**2, 0.0, 0.0, 0.0, 0.0, 0.0))
-    name = str(entry.get("glass", "air"))
+    if "glass" not in entry:
+        return find_glass("air")
+    name = str(entry["glass"])
+    if name in own:
+        return own[name]
     if len(name) == 6 and name.isdecimal():  # the code of a glass: (nd - 1) 1000 and 10 vd
         return _model_glass(entry, "glass", 1 + int(name[:3]) / 1000, int(name[3:]) / 10)
     try:
@@ -39,11 +82,12 @@ def _model_glass(entry: Entry, key: str, nd: float, vd: float) -> Glass:
 
 def media_of(top: Entry, surfaces: list[Entry]) -> list[Glass]:
     """The medium in front of the lens, and that behind each surface."""
-    media = [_medium(Entry(top.get("object", {}), "object", MEDIUM_KEYS))]
+    own = _own_glasses(top)
+    media = [_medium(Entry(top.get("object", {}), "object", MEDIUM_KEYS), own)]
     for surface in surfaces:
         mirror = surface.flag("mirror")
         for key in MEDIUM_KEYS:
             if mirror and key in surface:
                 raise surface.error(key, "behind a mirror is the medium before it")
-        media.append(media[-1] if mirror else _medium(surface))
+        media.append(media[-1] if mirror else _medium(surface, own))
     return media

@@ -14,7 +14,7 @@ from .media import MEDIUM_KEYS, media_of
 from .order import check_order
 
 _TOP_KEYS = (
-    *("name", "source", "object", "surfaces", "elements"),
+    *("name", "source", "glasses", "object", "surfaces", "elements"),
     *("sensor", "sensor_tilt", "sensor_decentre"),
 )
 _SURFACE_KEYS = (

@@ -4,7 +4,6 @@ import math
 import pathlib
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import yaml
@@ -12,7 +11,7 @@ from jax import Array
 
 from ..lens.elements import Elements
 from ..lens.forms import FORMS
-from ..lens.glass import Dispersion, find_glass
+from ..lens.glass import ANY, Dispersion, find_glass
 from ..lens.lens import Lens
 from .entry import LensError
 
@@ -21,17 +20,19 @@ def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
     """Write a lens as a YAML prescription; `load_lens` makes the same lens of it, to the last digit
     (of tilts, which files hold in degrees, to the last but one).
 
-    path: of the file, which is replaced. LensError for what a prescription cannot hold: a curved
-    sensor, constants of a glass that are not those of the catalogue; or if the file cannot be
-    written.
+    Constants of a glass that are not those of the catalogue stand in the file, where a second
+    medium of the same name that has other constants is called name*.
+
+    path: of the file, which is replaced. LensError for what a prescription cannot hold, such as a
+    curved sensor, or if the file cannot be written.
     """
     if np.any([np.asarray(a)[-1] for a in (lens.curvature, lens.conic)]):
         raise LensError("sensor: a prescription has none that is curved")
     top: dict[str, Any] = {"name": lens.name} if lens.name else {}
-    before = _medium(lens, 0)
-    if before:
-        top["object"] = before
-    top["surfaces"] = [_surface(lens, i) for i in range(lens.count)]
+    media, glasses = _media(lens)
+    top |= {"glasses": glasses} if glasses else {}
+    top |= {"object": media[0]} if media[0] else {}
+    top["surfaces"] = [_surface(lens, i, media[i + 1]) for i in range(lens.count)]
     if lens.elements is not None:
         top["elements"] = [_element(lens.elements, g) for g in range(len(lens.elements.spans))]
     top["sensor"] = float(lens.sensor)
@@ -43,7 +44,7 @@ def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
         raise LensError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _surface(lens: Lens, i: int) -> dict[str, Any]:
+def _surface(lens: Lens, i: int, behind: dict[str, Any]) -> dict[str, Any]:
     entry: dict[str, Any] = {"curvature": float(lens.curvature[i])}
     if lens.conic[i] != 0:
         entry["conic"] = float(lens.conic[i])
@@ -59,7 +60,7 @@ def _surface(lens: Lens, i: int) -> dict[str, Any]:
     if lens.mirrors[i]:
         entry["mirror"] = True
     else:
-        entry |= _medium(lens, i + 1)
+        entry |= behind
     if math.isfinite(lens.semi_diameter[i]):
         entry["semi_diameter"] = float(lens.semi_diameter[i])
     if i == lens.stop:
@@ -94,23 +95,56 @@ def _phase(lens: Lens, i: int) -> dict[str, Any]:
     return {"phase": {"form": form, "order": order} | named | {"coefficients": rest}}
 
 
-def _medium(lens: Lens, i: int) -> dict[str, Any]:
-    """Keys of a medium; none for air."""
-    name, own = lens.glasses[i], jax.tree.map(lambda a: np.asarray(a[i]), lens.dispersion)
-    if own.model is not None and own.model[0] != 1:
-        nd, vd = own.model.tolist()
+def _media(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Keys of each medium, none for air, and the glasses whose constants the file has to tell."""
+    plain = [_plain_medium(lens, i) for i in range(lens.count + 1)]
+    told = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
+    media: list[dict[str, Any]] = []
+    glasses: dict[str, Any] = {}
+    for i, (name, keys) in enumerate(zip(lens.glasses, plain, strict=True)):
+        if i and name == lens.glasses[i - 1]:  # light keeps the constants of the medium in front
+            keys = media[-1]
+        elif keys is None or keys.get("glass") in told:
+            own = _constants(lens.dispersion, i)
+            while glasses.setdefault(name, own) != own:  # another medium of this name
+                name += "*"
+            keys = {"glass": name}
+        media.append(keys)
+    return media, glasses
+
+
+def _plain_medium(lens: Lens, i: int) -> dict[str, Any] | None:
+    """Keys of a medium; None if its constants are its own."""
+    own = _constants(lens.dispersion, i)
+    if lens.dispersion.model is not None and lens.dispersion.model[i, 0] != 1:
+        if own.keys() - {"range"}:
+            raise LensError(f"glasses[{i}]: a prescription has no constants beside nd and vd")
+        nd, vd = np.asarray(lens.dispersion.model[i]).tolist()
         return {"nd": nd, "vd": vd}
-    if not np.any(own.strength) and not np.any(own.schott[1:]):
-        index = math.sqrt(own.schott[0])
-        return {} if index == 1 else {"index": index}
+    if not own:
+        return {}
+    if own.keys() == {"schott"} and not any(own["schott"][1:]):
+        return {"index": math.sqrt(own["schott"][0])}
     try:
-        known = Dispersion.of([find_glass(name)])
-    except ValueError as error:
-        raise LensError(f"glasses[{i}]: {error}") from error
-    pairs = zip((own.strength, own.resonance, own.schott), jax.tree.leaves(known), strict=True)
-    if any(np.any(a[: b.shape[-1]] != np.asarray(b[0])) for a, b in pairs):
-        raise LensError(f"glasses[{i}]: the constants are not those of {name}")
-    return {"glass": name}
+        known = find_glass(lens.glasses[i])
+    except ValueError:
+        return None
+    return {"glass": known.name} if own == _constants(Dispersion.of([known]), 0) else None
+
+
+def _constants(dispersion: Dispersion, i: int) -> dict[str, Any]:
+    """What tells medium i among the glasses of a prescription; nothing for air."""
+    parts = (dispersion.strength, dispersion.resonance, dispersion.schott)
+    strength, resonance, schott = (np.asarray(part[i]).tolist() for part in parts)
+    terms = max((k + 1 for k, pair in enumerate(zip(strength, resonance)) if any(pair)), default=0)
+    constants: dict[str, Any] = {}
+    if terms:
+        constants["sellmeier"] = strength[:terms] + resonance[:terms]
+    if schott != [1, 0, 0, 0, 0, 0]:
+        constants["schott"] = schott
+    if dispersion.ranges and dispersion.ranges[i] != ANY:
+        constants["range"] = list(dispersion.ranges[i])
+    return constants
 
 
 def _place(lens: Lens, i: int) -> dict[str, Any]:

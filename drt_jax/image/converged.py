@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from ..lens.glass import check_wavelengths
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..numerics import concrete, known_values
@@ -127,7 +126,7 @@ def _moments(
     rule: PupilRule | None,
     places: Callable,
 ) -> FocusMoments:
-    check_wavelengths(lens.glasses, wavelengths)
+    lens.check_wavelengths(wavelengths)
     scene = scene_of(lens, field, distance, wavelengths)
     if rule is None:
         trial = _converge(lens, field, distance, wavelengths, tolerance, places)
@@ -185,7 +184,7 @@ def _converge(
     """The rule that meets the tolerance, and what it found."""
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
-    check_wavelengths(lens.glasses, wavelengths)
+    lens.check_wavelengths(wavelengths)
     known = known_values((lens, field, distance, wavelengths))
     if known is None:
         raise ValueError(

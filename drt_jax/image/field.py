@@ -6,7 +6,6 @@ import optimistix as optx
 from jax import Array
 from jax.typing import ArrayLike
 
-from ..lens.glass import check_wavelengths
 from ..lens.lens import Lens
 from ..lens.paraxial import image_height
 from ..lens.scene import Scene, scene_of
@@ -22,7 +21,7 @@ def image_point(lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: 
 
     The centroid of a spot is another point: see `psf_moments`.
     """
-    check_wavelengths(lens.glasses, wavelengths)
+    lens.check_wavelengths(wavelengths)
     return _image_point(lens, scene_of(lens, field, distance, wavelengths))
 
 
@@ -42,7 +41,7 @@ def field_of_image(
     um. Newton's method from the paraxial field; derivatives by the implicit function theorem. inf
     where no field was found.
     """
-    check_wavelengths(lens.glasses, wavelength)
+    lens.check_wavelengths(wavelength)
     dtype = lens.curvature.dtype
     wanted = jnp.asarray(point, dtype)
     if wanted.shape != (2,):

@@ -19,7 +19,6 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from ..lens.elements import rotation_matrix
-from ..lens.glass import check_wavelengths, common_range
 from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray_at_image
 from ..lens.scene import Scene, scene_of
@@ -76,7 +75,7 @@ def wavefront(
     Differentiable like `trace_rays`; the reference sphere moves with the lens. ValueError for a
     known wavelength outside the range of a glass.
     """
-    check_wavelengths(lens.glasses, wavelengths)
+    lens.check_wavelengths(wavelengths)
     points = jnp.asarray(pupil, lens.curvature.dtype)
     scene = scene_of(lens, field, distance, wavelengths)
     kappa = None if curvature is None else jnp.asarray(curvature, lens.curvature.dtype)
@@ -106,7 +105,7 @@ def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) 
     along = dot(e, bundle.arrival[:-1])
     x = along**2 - dot(e, e)
     to_sphere = along + kappa * x / (1 + safe_sqrt(1 + kappa**2 * x))
-    index = lens.index(jnp.clip(colours, *common_range(lens.glasses)))[-1][:, None]
+    index = lens.index(jnp.clip(colours, *lens.dispersion.range))[-1][:, None]
     path = bundle.path[:, :1] - bundle.path + index * to_sphere
     opd = jnp.where(good, path, 0) / (_MM * colours[:, None])
     status = jnp.where(chief_ok | ~whole, bundle.status, bundle.status[:, :1])

@@ -3,7 +3,6 @@
 import dataclasses
 import difflib
 import functools
-import itertools
 import pathlib
 
 import jax
@@ -11,17 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 from jax import Array
-from jax.typing import ArrayLike
-
-from ..numerics import concrete
 
 # The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # Of model glasses: the lines d, F, C, g in um, the powers of L in Conrady's formula, P_gF on
-# Schott's normal line as (constant, slope by vd), and the lines i to t, between which it is used.
+# Schott's normal line as (constant, slope by vd), and where they are used: from line i to line t.
 _LINES, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
-_NORMAL_LINE, _MODEL_RANGE, _MODEL = (0.6438, -0.001682), (0.365, 1.014), "model "
+_NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL = 1.0, 50.0
+# Wavelengths in um of a medium without a range: 0.1 nm to 1 m.
+ANY = 1e-4, 1e6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,14 +32,14 @@ class Glass:
     name: as in a prescription.
     sellmeier: (B1 .. BT, C1 .. CT), C in um^2, of any number of terms T.
     schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
-    range: wavelengths in um for which they hold; of no glass, 0.1 nm to 1 m.
+    range: wavelengths in um for which they hold.
     model: nd and vd of a model glass, see `model_glass`.
     """
 
     name: str
     sellmeier: tuple[float, ...] = (0.0,) * 6
     schott: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    range: tuple[float, float] = (1e-4, 1e6)
+    range: tuple[float, float] = ANY
     model: tuple[float, float] = _NO_MODEL
 
 
@@ -56,12 +54,31 @@ class Dispersion:
     resonance: (M, T), Sellmeier's C in um^2.
     schott: (M, 6), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
     model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None if there is none.
+
+    Static:
+    ranges: the shortest and the longest wavelength (um) for which each of the M media has known
+        constants (empty: as for air).
     """
 
     strength: Array
     resonance: Array
     schott: Array
     model: Array | None = None
+    ranges: tuple[tuple[float, float], ...] = dataclasses.field(
+        metadata={"static": True}, default=()
+    )
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The shortest and the longest wavelength, um, at which all media have a known index; the
+        first number is the larger one if there is none."""
+        low, high = zip(*(self.ranges or (ANY,)), strict=True)
+        return max(low), min(high)
+
+    def knows(self, wavelengths: Array) -> Array:
+        """Whether all media have a known index at each wavelength (um), bool; also in a trace."""
+        low, high = self.range
+        return (wavelengths >= low) & (wavelengths <= high)
 
     @classmethod
     def of(cls, media: list[Glass]) -> "Dispersion":
@@ -69,11 +86,18 @@ class Dispersion:
         halves = [np.asarray(m.sellmeier, float).reshape(2, -1) for m in media]
         terms = max(3, *(half.shape[1] for half in halves))
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
-        parts: list = [padded[:, 0], padded[:, 1], [m.schott for m in media]]
-        if any(m.model != _NO_MODEL for m in media):
-            parts.append([m.model for m in media])
-        dtype = jnp.result_type(float)
-        return cls(*(jax.device_put(np.asarray(part, dtype)) for part in parts))
+        models = [m.model for m in media]
+
+        def array(values):
+            return jax.device_put(np.asarray(values, jnp.result_type(float)))
+
+        return cls(
+            strength=array(padded[:, 0]),
+            resonance=array(padded[:, 1]),
+            schott=array([m.schott for m in media]),
+            model=array(models) if set(models) != {_NO_MODEL} else None,
+            ranges=tuple(m.range for m in media),
+        )
 
 
 @functools.cache
@@ -108,7 +132,7 @@ def model_glass(nd: float, vd: float) -> Glass:
     """
     if not (1 < nd <= 4 and 10 <= vd <= 120):
         raise ValueError(f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
-    return Glass(f"{_MODEL}{nd!r} {vd!r}", model=(nd, vd))
+    return Glass(f"model {nd!r} {vd!r}", range=VISIBLE, model=(nd, vd))
 
 
 def _model_index(model: Array, wavelengths: Array) -> Array:
@@ -138,46 +162,3 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     if dispersion.model is None:
         return index
     return index + _model_index(dispersion.model, wavelengths)
-
-
-def common_range(names: tuple[str, ...]) -> tuple[float, float]:
-    """The shortest and the longest wavelength, um, at which all media have a known index.
-
-    names: of media; one that is not in the catalogue is a model glass or has a constant index. The
-    first number is the larger one if there is no such wavelength.
-    """
-    low, high = zip(*map(_range, names))
-    return max(low), min(high)
-
-
-def _range(name: str) -> tuple[float, float]:
-    if name.startswith(_MODEL):
-        return _MODEL_RANGE
-    return _catalogue().get(name, Glass(name)).range
-
-
-def known_index(names: tuple[str, ...], wavelengths: Array) -> Array:
-    """Whether all media have a known index at each wavelength, bool (W,); also inside a trace.
-
-    names: of media.
-    wavelengths: (W,) in um.
-    """
-    low, high = common_range(names)
-    return (wavelengths >= low) & (wavelengths <= high)
-
-
-def check_wavelengths(names: tuple[str, ...], wavelengths: ArrayLike) -> None:
-    """ValueError if a known wavelength lies outside the range of a medium.
-
-    Inside a trace the values are not known and nothing is checked: see `known_index`.
-
-    names: of media.
-    wavelengths: (W,) or one, um.
-    """
-    if not concrete(wavelengths):
-        return
-    for name, value in itertools.product(names, np.ravel(wavelengths)):
-        low, high = common_range((name,))
-        if not low <= value <= high:
-            bounds = f"{low:g} to {high:g} um"
-            raise ValueError(f"wavelength {value:g} um is outside the range of {name}, {bounds}")

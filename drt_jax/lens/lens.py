@@ -8,9 +8,10 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from ..numerics import concrete
 from .elements import Elements, rotation_matrix
 from .forms import Shape
-from .glass import Dispersion, check_wavelengths, refractive_index
+from .glass import ANY, Dispersion, refractive_index
 from .phase import Phase
 from .surface import surface_sag
 
@@ -126,9 +127,23 @@ class Lens:
 
         ValueError, naming the range, for a known wavelength outside that of a glass.
         """
-        check_wavelengths(self.glasses, wavelengths)
+        self.check_wavelengths(wavelengths)
         wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, self.curvature.dtype))
         return refractive_index(self.dispersion, wavelengths)
+
+    def check_wavelengths(self, wavelengths: ArrayLike) -> None:
+        """ValueError if a known wavelength, (W,) or one in um, lies outside the range of a medium.
+
+        Inside a trace the values are not known and nothing is checked: see `Dispersion.knows`.
+        """
+        if not concrete(wavelengths):
+            return
+        ranges = self.dispersion.ranges or (ANY,) * len(self.glasses)
+        for name, (low, high) in zip(self.glasses, ranges, strict=True):
+            for value in np.ravel(wavelengths):
+                if not low <= value <= high:
+                    outside = f"wavelength {value:g} um is outside the range of {name}"
+                    raise ValueError(f"{outside}, {low:g} to {high:g} um")
 
 
 def sag(lens: Lens, surface: int, x: ArrayLike, y: ArrayLike) -> Array:

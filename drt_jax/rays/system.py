@@ -14,7 +14,6 @@ import numpy as np
 from jax import Array
 
 from ..lens.forms import Shape
-from ..lens.glass import common_range
 from ..lens.lens import Lens
 from ..lens.phase import Phase
 from ..lens.scene import Scene
@@ -207,7 +206,7 @@ def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
     rays of an axial object in a lens with rotational symmetry."""
     live, stop = lens.live, lens.stop
     # Wavelengths without an index have one that is finite; their rays fail, see `Status`.
-    colours = jnp.clip(scene.wavelengths, *common_range(lens.glasses))
+    colours = jnp.clip(scene.wavelengths, *lens.dispersion.range)
     rows = [*live, lens.count]
     field = scene.field[2 - dim :]
     return System(

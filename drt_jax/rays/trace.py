@@ -8,7 +8,6 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from ..lens.glass import check_wavelengths, known_index
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
@@ -107,7 +106,7 @@ def _traced(
     scaled = (jnp.where(known, radius * p, jnp.inf) for known, p in finite)
     target = tuple(jnp.broadcast_to(p, (waves, p.shape[-1])) for p in scaled)
     found = solver(system, target)
-    known = known_index(lens.glasses, scene.wavelengths)[:, None]
+    known = lens.dispersion.knows(scene.wavelengths)[:, None]
     status = jnp.where(known, found.status, jnp.int32(Status.NO_INDEX))
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = turn(rotation, found.arrival, back=True)
@@ -138,7 +137,7 @@ def trace_rays(
     status, in every mode and to any order. ValueError for a known wavelength outside the range of
     a glass; inside a trace its rays have the status NO_INDEX.
     """
-    check_wavelengths(lens.glasses, wavelengths)
+    lens.check_wavelengths(wavelengths)
     scene = scene_of(lens, field, distance, wavelengths)
     return _trace_rays(lens, scene, jnp.asarray(pupil, lens.curvature.dtype))
 

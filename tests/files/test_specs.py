@@ -127,6 +127,23 @@ BAD = {
         surface(0, form="zernike", norm_radius=9, coefficients={92: 1e-6}),
         "coefficients: unknown key 92; .*known: 1, 2, 3",
     ),
+    **{
+        f"glass {k}": (lambda e, g=glass: e.update(glasses={"mine": g}), f"glasses.mine{message}")
+        for k, (glass, message) in enumerate(
+            [
+                ({"range": [0.4, 0.7]}, ": give sellmeier, schott or both"),
+                ({"schott": [2.25]}, r".schott: expected a list of 6 numbers"),
+                ({"sellmeier": [1.0, 0.01, 2.0]}, r".sellmeier: expected a list, all B and then"),
+                ({"sellmeier": ["x", 0.01]}, r".sellmeier.0: expected a number"),
+                ({"sellmeier": [1.0, 0.25]}, r".sellmeier: C = 0.25 um\^2 lies within the range"),
+                ({"sellmeier": [-0.5, 0.01]}, ": no index above 1 at 0.365 um"),
+                ({"schott": [2, -1, 0, 0, 0, 0], "range": [1, 2]}, ": no index above 1 at "),
+                ({"sellmeier": [1.0, 0.01], "range": [0.7, 0.4]}, ".range: expected 0 < shortest"),
+                (3, ": expected a mapping"),
+            ]
+        )
+    },
+    "glasses": (lambda e: e.update(glasses=["SK16"]), "glasses: expected a mapping with the keys"),
     "no mapping": (lambda e: e.update(object="water"), "object: expected a mapping with the keys"),
     "true": (surface(0, thickness=True), "thickness: expected a number, got True"),
     "flag": (surface(2, stop="yes, please"), r"surfaces\[2\].stop: expected true or false"),
@@ -364,6 +381,27 @@ def test_model_glasses(entry):
     np.testing.assert_allclose(lens.index([0.5875618])[1:3, 0], 1.835, rtol=1e-12)
     with pytest.raises(ValueError, match="2 um is outside the range of model 1.835 42.7"):
         lens.index([2.0])
+
+
+def test_glasses_of_the_file():
+    """They win over the catalogue, have a range of their own, and n^2 is the sum of both forms."""
+    rows = [
+        {"radius": 50.0, "thickness": 4.0, "glass": "SK16"},
+        {"radius": "inf", "thickness": 50.0, "stop": True, "semi_diameter": 5.0},
+    ]
+    one = {"sellmeier": [1.1, 0.2, 0.01, 90.0], "schott": [1.3, 0, 0.02, 0, 0, 0]}
+    lens = load_lens({"glasses": {"SK16": one | {"range": [0.5, 0.6]}}, "surfaces": rows})
+    n2 = 1.3 + 0.02 / 0.55**2 + 1.1 * 0.55**2 / (0.55**2 - 0.01) + 0.2 * 0.55**2 / (0.55**2 - 90)
+    np.testing.assert_allclose(lens.index([0.55])[1, 0], n2**0.5, rtol=1e-14)
+    with pytest.raises(ValueError, match="0.45 um is outside the range of SK16, 0.5 to 0.6 um"):
+        lens.index([0.45])
+    plain = load_lens({"glasses": {"mine": one}, "surfaces": rows})
+    assert plain.glasses[1] == "SK16" and plain.dispersion.range == (0.4, 0.7)
+    rows[0]["glass"] = "mine"
+    assert load_lens({"glasses": {"mine": one}, "surfaces": rows}).dispersion.range == (
+        0.365,
+        1.014,
+    )
 
 
 def test_the_patent_lens(shared):

@@ -26,6 +26,7 @@ ODD = {
     ],
     "sensor_tilt": [1, 2, 3],
 }
+STOP = {"semi_diameter": 5.0, "stop": True}
 FOLDED = {
     "surfaces": [
         {"radius": 30.0, "thickness": 0.1, "glass": "F2", "stop": True, "semi_diameter": 1.0}
@@ -42,6 +43,19 @@ CASES = {
     **{name: name for name in lens_names()},
     "odd": ODD,
     "folded": FOLDED,
+    "glasses": {
+        "glasses": {
+            "SK16": {"schott": [2.6, -0.015, 0.01, 0.0016, 0, 0], "range": [0.4, 0.7]},
+            "mine": {"sellmeier": [1.2, 0.5, 0.01, 100.0], "schott": [1.1, 0, 0, 0, 0, 0]},
+            "constant": {"schott": [2.25, 0, 0, 0, 0, 0]},
+        },
+        "object": {"glass": "constant"},
+        "surfaces": [
+            {"radius": 50.0, "thickness": 4.0, "glass": "SK16"},
+            {"radius": 90.0, "thickness": 4.0, "glass": "mine"},
+            {"radius": "inf", "thickness": 50.0, "glass": "water", **STOP},
+        ],
+    },
     "index": {
         "surfaces": [
             {"radius": 50.0, "thickness": 4.0, "index": 1.1, "coefficients": {4: 0, 6: 0}},
@@ -91,14 +105,36 @@ def test_a_lens_that_an_optimiser_moved(tmp_path):
         np.testing.assert_array_max_ulp(np.asarray(a), np.asarray(b), 1)
 
 
+def test_glasses_that_an_optimiser_moved(tmp_path):
+    """Two elements of one glass, moved apart, beside one that stayed as it is in the catalogue."""
+    rows = [
+        {"radius": 50, "thickness": 4, "glass": "SK16"},
+        {"radius": -50, "thickness": 1, "glass": "F2"},
+        {"radius": 90, "thickness": 4, "glass": "SK16"},
+        {"radius": 70, "thickness": 90} | STOP,
+    ]
+    lens = load_lens({"surfaces": rows})
+    schott = lens.dispersion.schott.at[1, 0].add(1e-3).at[3, 1].add(1e-5)
+    moved = dataclasses.replace(
+        lens, dispersion=dataclasses.replace(lens.dispersion, schott=schott)
+    )
+    save_lens(moved, tmp_path / "lens.yaml")
+    again = load_lens(tmp_path / "lens.yaml")
+    assert again.glasses == ("air", "SK16", "F2", "SK16*", "air")
+    assert again.dispersion.ranges == lens.dispersion.ranges
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(moved), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_what_a_prescription_cannot_hold(tmp_path):
     lens = load_lens("singlet")
     curved = dataclasses.replace(lens, curvature=lens.curvature.at[-1].set(0.01))
     with pytest.raises(LensError, match="sensor"):
         save_lens(curved, tmp_path / "lens.yaml")
-    melted = dataclasses.replace(lens.dispersion, strength=lens.dispersion.strength + 1e-6)
-    with pytest.raises(LensError, match=r"glasses\[\d\]: the constants are not those of"):
-        save_lens(dataclasses.replace(lens, dispersion=melted), tmp_path / "lens.yaml")
+    patent = load_lens({"surfaces": [{"radius": 9, "nd": 1.5, "vd": 50, "thickness": 9} | STOP]})
+    melted = dataclasses.replace(patent.dispersion, strength=patent.dispersion.strength + 1e-6)
+    with pytest.raises(LensError, match=r"glasses\[1\]: a prescription has no constants beside nd"):
+        save_lens(dataclasses.replace(patent, dispersion=melted), tmp_path / "lens.yaml")
     with pytest.raises(LensError, match="cannot be written"):
         save_lens(lens, tmp_path / "nowhere" / "lens.yaml")
     assert not any(tmp_path.iterdir()) and jnp.all(jnp.isfinite(lens.curvature))

@@ -5,13 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drt_jax import load_lens
 from drt_jax.lens.glass import (
     Dispersion,
     Glass,
-    check_wavelengths,
-    common_range,
     find_glass,
-    known_index,
     model_glass,
     refractive_index,
 )
@@ -78,23 +76,25 @@ def test_unknown_glass_lists_near_names(name, near):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_range_of_the_glasses_is_known_inside_a_trace(dtype):
     """SK16: 0.4 to 0.7 um, its ends included in either precision; F2 begins at 0.32 um."""
-    names = ("air", "F2", "SK16", "index 1.5")
-    assert common_range(names) == (0.4, 0.7)
+    media = Dispersion.of([find_glass(name) for name in ("air", "F2", "SK16")])
+    assert media.range == (0.4, 0.7)
     w = jnp.array([0.1, 0.4, 0.55, 0.7, 0.71, jnp.nan, -0.5], dtype)
-    known = jax.jit(known_index, static_argnums=0)(names, w)
+    known = jax.jit(Dispersion.knows)(media, w)
     np.testing.assert_array_equal(known, [False, True, True, True, False, False, False])
-    check_wavelengths(names, w[1:4])
+    triplet = load_lens("cooke_triplet")
+    triplet.check_wavelengths(w[1:4])
     for wrong in (*w[:1], *w[4:]):
         with pytest.raises(ValueError, match="um is outside the range of"):
-            check_wavelengths(names, wrong)
+            triplet.check_wavelengths(wrong)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_without_a_glass_any_wavelength_but_zero_will_do(dtype):
-    low, high = common_range(("air", "index 1.5"))
-    w = jnp.array([0.0, low, 10.6, high], dtype)
-    np.testing.assert_array_equal(known_index(("air",), w), [False, True, True, True])
     media = Dispersion.of([Glass("n", schott=(2.25, 0, 0, 0, 0, 0))])
+    low, high = media.range
+    w = jnp.array([0.0, low, 10.6, high], dtype)
+    np.testing.assert_array_equal(media.knows(w), [False, True, True, True])
+    assert dataclasses.replace(media, ranges=()).range == (low, high)
     n = refractive_index(jax.tree.map(lambda a: a.astype(dtype), media), w[1:])
     np.testing.assert_array_equal(n, [[1.5] * 3])
 

@@ -174,6 +174,8 @@ def with_dummy(lens, gap, curvature):
     def insert(array, value):
         return jnp.concatenate([array[:i], jnp.full_like(array[:1], value), array[i:]])
 
+    dispersion = jax.tree.map(lambda a: jnp.insert(a, i, a[i], axis=0), lens.dispersion)
+    ranges = (*dispersion.ranges[:i], dispersion.ranges[i], *dispersion.ranges[i:])
     return dataclasses.replace(
         lens,
         curvature=insert(lens.curvature, curvature),
@@ -185,7 +187,7 @@ def with_dummy(lens, gap, curvature):
         thickness=jnp.concatenate(
             [lens.thickness[:gap], jnp.stack([half, half]), lens.thickness[gap + 1 :]]
         ),
-        dispersion=jax.tree.map(lambda a: jnp.insert(a, i, a[i], axis=0), lens.dispersion),
+        dispersion=dataclasses.replace(dispersion, ranges=ranges),
         glasses=(*lens.glasses[:i], lens.glasses[i], *lens.glasses[i:]),
         stop=lens.stop + (i <= lens.stop),
     )
