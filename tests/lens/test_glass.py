@@ -40,6 +40,34 @@ def test_indices_that_code_v_prints(name):
     np.testing.assert_allclose(index(name, 0.6563, 0.5876, 0.4861), CODE_V[name], atol=6e-7)
 
 
+# nd and vd: of the makers and handbooks, of the plastics in the catalogues of design programs; of
+# Optorez, as measured by Sultanova, Kasarova and Nikolov (2009), to 0.001 and 1.
+PUBLISHED = {
+    "silica": (1.45846, 67.82),
+    "CaF2": (1.43385, 95.0),
+    "PMMA": (1.49176, 57.44),
+    "polycarbonate": (1.58547, 29.91),
+    "polystyrene": (1.59048, 30.87),
+    "SAN": (1.56744, 34.81),
+    "COC": (1.53373, 56.23),
+    "E48R": (1.53117, 56.0),
+    "480R": (1.52530, 55.9),
+    "330R": (1.50942, 56.0),
+    "Optorez-1330": (1.509, 52.0),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_plastics_silica_and_fluorite(name):
+    d, f, c = index(name, *LINES[:3])
+    loose = name == "Optorez-1330"
+    np.testing.assert_allclose(d, PUBLISHED[name][0], atol=1e-3 if loose else 3e-5)
+    np.testing.assert_allclose((d - 1) / (f - c), PUBLISHED[name][1], atol=0.7 if loose else 0.15)
+    low, high = find_glass(name).range
+    n = index(name, *np.linspace(low, high, 101))
+    assert np.all(np.diff(n) < 0) and np.all(n > 1)
+
+
 def test_water_of_daimon_and_masumura():
     """Four Sellmeier terms; relative to vacuum, n_D = 1.33335 at 0.5893 um and 20 C, n_d = 1.3334
     and the range 0.182 to 1.129 um as refractiveindex.info has them."""
