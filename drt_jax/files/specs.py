@@ -8,6 +8,7 @@ from ..lens.forms import FORMS
 from ..lens.glass import Dispersion
 from ..lens.lens import Lens
 from ..lens.phase import Phase
+from .apertures import apertures_of, semi_diameter
 from .elements import elements_of
 from .entry import Entry, LensError, array, table
 from .media import MEDIUM_KEYS, media_of
@@ -20,7 +21,7 @@ _TOP_KEYS = (
 _SURFACE_KEYS = (
     *("form", "radius", "curvature", "conic", "radius_x", "curvature_x", "conic_x"),
     *("norm_radius", "coefficients", "thickness", *MEDIUM_KEYS, "mirror", "semi_diameter", "stop"),
-    *("tilt", "decentre", "phase"),
+    *("tilt", "decentre", "phase", "aperture", "obscuration"),
 )
 
 
@@ -75,22 +76,6 @@ def _phase(surfaces: list[Entry]) -> Phase | None:
     )
 
 
-def _semi_diameter(surface: Entry) -> float:
-    """The clear aperture, mm, which lies on the surface; of the stop it is finite."""
-    semi = surface.number("semi_diameter", math.inf, finite=False)
-    if semi <= 0:
-        raise surface.error("semi_diameter", "must be positive")
-    if math.isinf(semi):
-        if surface.flag("stop"):
-            raise surface.error("semi_diameter", "the stop needs one")
-        return semi
-    bent = (1 + surface.number("conic", 0.0)) * surface.curvature() ** 2
-    if FORMS[_form(surface)].round and bent * semi**2 >= 1:
-        reach = f"{semi:g} mm reaches beyond the surface, which ends at {bent**-0.5:g} mm"
-        raise surface.error("semi_diameter", f"{reach}; lower it, or the curvature")
-    return semi
-
-
 def _gaps(top: Entry, surfaces: list[Entry]) -> list[float]:
     """Distances from each surface to the next and from the last to the sensor, mm."""
     gaps = [surface.number("thickness") for surface in surfaces[:-1]]
@@ -133,13 +118,14 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         conic=array([*(surface.number("conic", 0.0) for surface in surfaces), 0.0]),
         coefficients=table(coefficients, max(map(len, coefficients))),
         thickness=array(gaps[:-1]),
-        semi_diameter=array([*map(_semi_diameter, surfaces), math.inf]),
+        semi_diameter=array([*map(semi_diameter, surfaces), math.inf]),
         sensor=array(top.number("sensor", sum(gaps))),
         dispersion=Dispersion.of(media),
         decentre=table(decentre, 2) if moved else None,
         tilt=jnp.radians(table(tilt, 3)) if moved else None,
         phase=_phase(surfaces),
         elements=groups,
+        apertures=apertures_of(surfaces),
         stop=stops[0],
         glasses=tuple(medium.name for medium in media),
         forms=(*map(_form, surfaces), "asphere"),

@@ -65,7 +65,7 @@ def _surface(lens: Lens, i: int, behind: dict[str, Any]) -> dict[str, Any]:
         entry["semi_diameter"] = float(lens.semi_diameter[i])
     if i == lens.stop:
         entry["stop"] = True
-    return entry | _place(lens, i) | _phase(lens, i)
+    return entry | _place(lens, i) | _phase(lens, i) | _apertures(lens, i)
 
 
 def _coefficients(name: str, row: Array) -> tuple[dict, dict]:
@@ -145,6 +145,20 @@ def _constants(dispersion: Dispersion, i: int) -> dict[str, Any]:
     if dispersion.ranges and dispersion.ranges[i] != ANY:
         constants["range"] = list(dispersion.ranges[i])
     return constants
+
+
+def _apertures(lens: Lens, i: int) -> dict[str, Any]:
+    """The apertures and obscurations of a surface."""
+    extra, found = lens.apertures, dict[str, Any]()
+    if extra is None:
+        return found
+    for k in np.flatnonzero(np.array(extra.surfaces) == i):
+        half = np.asarray(extra.half[k]).tolist()
+        own = {extra.kinds[k]: half[0] if extra.kinds[k] == "circle" else half}
+        if extra.centre is not None:
+            own["centre"] = np.asarray(extra.centre[k]).tolist()
+        found.setdefault("obscuration" if extra.blocks[k] else "aperture", []).append(own)
+    return found
 
 
 def _place(lens: Lens, i: int) -> dict[str, Any]:

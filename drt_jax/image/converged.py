@@ -203,7 +203,9 @@ def _try_orders(
     lens: Lens, scene: Scene, symmetry: Symmetry, tolerance: float, places: Callable
 ) -> _Trial:
     before: _Trial | None = None
-    clipped, order, solver = False, 2, solve_aimed
+    # A rule on the whole stop may step over an obscuration.
+    clipped = lens.apertures is not None and any(lens.apertures.blocks)
+    order, solver = _CLIPPED[0] if clipped else 2, solve_aimed
     while True:
         rule = Clipped(order, symmetry) if clipped else Gauss(order, symmetry)
         used = Clipped(order, symmetry, _size(order)) if clipped else _padded(order, symmetry)

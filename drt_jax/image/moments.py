@@ -122,7 +122,7 @@ def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusM
     if lens.tilt is not None:
         axis = rotation_matrix(lens.tilt[-1])[2]
         slope = tuple(s * axis[2] - axis[k] for k, s in enumerate(slope))
-    counts = weight > 0
+    counts = weight != 0
     hit = tuple(jnp.where(counts, h[-1], 0) for h in bundle.hits)
     slope = tuple(jnp.where(counts, s, 0) for s in slope)
     if rule.symmetry == "meridian":

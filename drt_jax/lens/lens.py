@@ -9,6 +9,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from ..numerics import concrete
+from .aperture import Apertures
 from .elements import Elements, rotation_matrix
 from .forms import Shape
 from .glass import ANY, Dispersion, refractive_index
@@ -40,6 +41,7 @@ class Lens:
         likewise.
     phase: of diffractive surfaces; None if there is none, which costs nothing.
     elements: groups of surfaces that move together; None likewise.
+    apertures: other than the circles of `semi_diameter`, and obscurations; None for none.
 
     Static:
     stop: the index of the stop surface.
@@ -60,6 +62,7 @@ class Lens:
     tilt: Array | None = None
     phase: Phase | None = None
     elements: Elements | None = None
+    apertures: Apertures | None = None
     stop: int = dataclasses.field(metadata={"static": True}, kw_only=True)
     glasses: tuple[str, ...] = dataclasses.field(metadata={"static": True}, kw_only=True)
     forms: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())

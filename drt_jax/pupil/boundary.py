@@ -1,9 +1,10 @@
 """Where clear apertures end the pupil: rays launched until they meet an aperture's edge.
 
-Every aperture, the stop's rim among them, is a circle: a ray passes if its hit h on that surface
-has |h| <= R. Rays are launched, not aimed: a trace tells how the hits move with the point on the
-stop; on this model, every aperture ends a half-line on the stop at the root of a quadratic; the
-next ray is launched there. So each ray of the boundary takes a few steps of Newton's method.
+Every edge, the stop's rim among them, is a quadric: a ray passes if its hit h on that surface has
+|q| <= 1, where q = scale (h - centre) along x and y; a rectangle is two edges, each with one scale
+of 0. Rays are launched, not aimed: a trace tells how the hits move with the point on the stop; on
+this model, every edge ends a half-line on the stop at the root of a quadratic; the next ray is
+launched there. So each ray of the boundary takes a few steps of Newton's method.
 
 Vectors are arrays with their 2 components first, and B rays a colour last.
 """
@@ -12,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
@@ -21,7 +23,7 @@ from ..rays.status import Status
 from ..rays.system import System, dot
 from ..rays.trace import on_all_surfaces
 
-_ZOOMS = 10  # rounds of the search for the middle
+_ZOOMS, _STEPS = 10, 20  # of the search for the middle: rounds, and steps of Newton's method
 
 
 class Rays(NamedTuple):
@@ -52,7 +54,7 @@ class Goal(NamedTuple):
     """Where rays are to go: to the end of a half-line, or to a corner.
 
     centre, toward: (2, W, B), start and direction of the half-line; 0: to the centre itself.
-    pair: (2, W, B), the surfaces whose apertures meet in a corner; equal for none.
+    pair: (2, W, B), the edges that meet in a corner; equal for none.
     """
 
     centre: Array
@@ -61,13 +63,50 @@ class Goal(NamedTuple):
 
 
 class Reached(NamedTuple):
-    """Rays and their goals. surface: (W, B), that ends the half-line. settled: (W, B), whether the
+    """Rays and their goals. edge: (W, B), that ends the half-line. settled: (W, B), whether the
     goal is met; else the ray is the last one before others fail."""
 
     rays: Rays
     goal: Goal
-    surface: Array
+    edge: Array
     settled: Array
+
+
+class Edges(NamedTuple):
+    """The E edges of a lens, obscurations taken for clear apertures.
+
+    scale: (2, E, 1, 1) in 1/mm. centre: (2, E, 1, 1) in mm; None: all 0. surfaces: (E,), known;
+    None: the semi-diameters of all surfaces alone.
+    """
+
+    scale: Array
+    centre: Array | None
+    surfaces: np.ndarray | None
+
+    def moves(self, moves: Array) -> Array:
+        """How q moves, (..., 2, E, W, B), with hits (..., 2, S + 1, W, B)."""
+        moves = moves if self.surfaces is None else moves[..., self.surfaces, :, :]
+        return self.scale.reshape(*[1] * (moves.ndim - 4), *self.scale.shape) * moves
+
+    def at(self, hits: Array) -> Array:
+        """q (2, E, W, B) of hits (2, S + 1, W, B)."""
+        q = self.moves(hits)
+        return q if self.centre is None else q - self.scale * self.centre
+
+
+def edges_of(lens: Lens) -> Edges:
+    """Those of the S + 1 semi-diameters, and behind them of all other apertures."""
+    scale, extra = jnp.stack([1 / lens.semi_diameter] * 2), lens.apertures
+    if extra is None:
+        return Edges(scale[..., None, None], None, None)
+    axes = [np.eye(2) if kind == "rectangle" else np.ones((1, 2)) for kind in extra.kinds]
+    own = np.repeat(np.arange(len(axes)), [len(rows) for rows in axes])
+    scales = jnp.asarray(np.concatenate(axes), scale.dtype) / extra.sizes[own]
+    scale, centre = jnp.concatenate([scale, scales.T], axis=1), None
+    if extra.centre is not None:
+        centre = jnp.pad(extra.centre[own].T, ((0, 0), (lens.count + 1, 0)))[..., None, None]
+    surfaces = np.array([*range(lens.count + 1), *np.array(extra.surfaces)[own]])
+    return Edges(scale[..., None, None], centre, surfaces)
 
 
 def moved(rates: Array, change: Array) -> Array:
@@ -82,9 +121,9 @@ def inverse(matrix: Array) -> Array:
     return safe_divide(jnp.array([[s, -q], [-r, p]]), (p * s - q * r)[None, None])
 
 
-def picked(values: Array, surface: Array) -> Array:
-    """Of `values` (..., S + 1, W, B) those on a few surfaces (N, W, B)."""
-    index = surface.reshape(*[1] * (values.ndim - 3), *surface.shape)
+def picked(values: Array, edge: Array) -> Array:
+    """Of `values` (..., E, W, B) those of a few edges (N, W, B)."""
+    index = edge.reshape(*[1] * (values.ndim - 3), *edge.shape)
     return jnp.take_along_axis(values, index, axis=-3)
 
 
@@ -113,23 +152,24 @@ def launched(lens: Lens, system: System, launch: Array) -> Rays:
 
 
 def gaps(lens: Lens, hits: Array, pair: Array) -> Array:
-    """(2, W, B): |h|^2 / R^2 - 1 of the apertures of two surfaces; 0 on their edges."""
-    hit = picked(hits, pair)
-    return dot(hit, hit) / lens.semi_diameter[pair] ** 2 - 1
+    """(2, W, B): |q|^2 - 1 of two edges; 0 on them."""
+    q = picked(edges_of(lens).at(hits), pair)
+    return dot(q, q) - 1
 
 
 def rates(lens: Lens, rays: Rays, pair: Array) -> Array:
     """Derivatives (2, 2, W, B) of `gaps` by the point on the stop."""
-    hit, moves = picked(rays.hits, pair), picked(rays.moves, pair)
-    return jnp.stack([2 * dot(hit, m) / lens.semi_diameter[pair] ** 2 for m in moves])
+    edges = edges_of(lens)
+    q, moves = picked(edges.at(rays.hits), pair), picked(edges.moves(rays.moves), pair)
+    return jnp.stack([2 * dot(q, m) for m in moves])
 
 
 def ends(lens: Lens, rays: Rays, goal: Goal) -> Array:
-    """Where each aperture ends a half-line, (S + 1, W, B) in units of the stop's semi-diameter,
-    if hits move in proportion to it; inf for one that never does."""
-    scale = 1 / lens.semi_diameter[None, :, None, None]
-    base = scale * (rays.hits + moved(rays.moves, goal.centre - rays.point))
-    rate = scale * moved(rays.moves, goal.toward)
+    """Where each edge ends a half-line, (E, W, B) in units of `goal.toward`, if hits move in
+    proportion to it; inf for one that never does."""
+    edges = edges_of(lens)
+    base = edges.at(rays.hits + moved(rays.moves, goal.centre - rays.point))
+    rate = edges.moves(moved(rays.moves, goal.toward))
     square, linear, constant = dot(rate, rate), dot(base, rate), dot(base, base) - 1
     root = safe_sqrt(linear**2 - square * constant)
     out = linear > 0  # of the two ways to write a root, the one that does not subtract
@@ -138,7 +178,7 @@ def ends(lens: Lens, rays: Rays, goal: Goal) -> Array:
 
 
 def ahead(lens: Lens, rays: Rays, goal: Goal) -> tuple[Array, Array]:
-    """How far (2, W, B) it is to the goal, and the surface (W, B) that ends the half-line."""
+    """How far (2, W, B) it is to the goal, and the edge (W, B) that ends the half-line."""
     far = ends(lens, rays, goal)
     length = jnp.where(dot(goal.toward, goal.toward) > 0, jnp.min(far, axis=0), 0)
     back = inverse(rates(lens, rays, goal.pair))
@@ -165,34 +205,62 @@ def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) ->
         count, rays, launch, done, _, _, _ = state
         new = launched(lens, system, launch)
         rays = jax.tree.map(lambda a, b: jnp.where(new.good & ~done, a, b), new, rays)
-        change, surface = ahead(lens, rays, goal)
+        change, edge = ahead(lens, rays, goal)
         back = rays.launch - launch
         settled = rays.good & (dot(change, change) <= tiny**2)
         lost = ~new.good & (dot(back, back) <= tiny**2 * (1 + dot(launch, launch)))
         onward = rays.launch + moved(rays.aims, change)
         launch = jnp.where(new.good[None], onward, launch + back / 2)
-        return count + 1, rays, launch, done | settled | lost, change, surface, settled
+        return count + 1, rays, launch, done | settled | lost, change, edge, settled
 
-    change, surface = ahead(lens, start, goal)
-    launch, no = start.launch + moved(start.aims, change), jnp.zeros(surface.shape, bool)
-    state = (0, start, launch, no, change, surface, no)
+    change, edge = ahead(lens, start, goal)
+    launch, no = start.launch + moved(start.aims, change), jnp.zeros(edge.shape, bool)
+    state = (0, start, launch, no, change, edge, no)
     state = jax.lax.while_loop(lambda s: (s[0] < steps) & ~jnp.all(s[3]), step, state)
-    _, rays, _, _, change, surface, settled = state
+    _, rays, _, _, change, edge, settled = state
     # The last step, which is small, on the model: right to its square.
-    return Reached(shifted(rays, jnp.where(settled[None], change, 0)), goal, surface, settled)
+    return Reached(shifted(rays, jnp.where(settled[None], change, 0)), goal, edge, settled)
 
 
 def outside(lens: Lens, rays: Rays, point: Array) -> Array:
-    """How far points are outside of the apertures that rays model, (W, B) in units of the stop's
+    """How far points are outside of the edges that rays model, (W, B) in units of the stop's
     semi-diameter; negative inside."""
-    hits = rays.hits + moved(rays.moves, point - rays.point)
-    far = safe_sqrt(dot(hits, hits)) - lens.semi_diameter[:, None, None]
-    rate = safe_sqrt((dot(rays.moves[0], rays.moves[0]) + dot(rays.moves[1], rays.moves[1])) / 2)
+    edges = edges_of(lens)
+    q = edges.at(rays.hits + moved(rays.moves, point - rays.point))
+    x, y = edges.moves(rays.moves)
+    far, rate = safe_sqrt(dot(q, q)) - 1, safe_sqrt((dot(x, x) + dot(y, y)) / 2)
     return jnp.max(jnp.where(rate > 0, safe_divide(far, rate), -jnp.inf), axis=0)
 
 
+def barrier(lens: Lens, rays: Rays, point: Array) -> tuple[Array, Array]:
+    """First (2, W, B) and second derivatives (2, 2, W, B), at points, of the sum over the edges
+    that rays model of -log(1 - |q|^2), which rises to infinity towards the boundary."""
+    edges = edges_of(lens)
+    q = edges.at(rays.hits + moved(rays.moves, point - rays.point))
+    moves = edges.moves(rays.moves)
+    room = jnp.maximum(1 - dot(q, q), jnp.finfo(q.dtype).eps)
+    slope = [2 * dot(q, m) / room for m in moves]
+    bend = [
+        [jnp.sum(2 * dot(moves[i], moves[j]) / room + slope[i] * slope[j], axis=0) for j in (0, 1)]
+        for i in (0, 1)
+    ]
+    return jnp.sum(jnp.stack(slope), axis=1), jnp.array(bend)
+
+
+def stretch(lens: Lens, rays: Rays) -> Array:
+    """Symmetric matrices (2, 2, W, B) that stretch a circle to about the shape of what the edges
+    leave around rays: 1 for a circle."""
+    (xx, xy), (_, yy) = barrier(lens, rays, rays.point)[1]
+    # The inverse with the trace 2, and its root.
+    square = safe_divide(2 * jnp.array([[yy, -xy], [-xy, xx]]), (xx + yy)[None, None])
+    size = safe_sqrt(square[0, 0] * square[1, 1] - square[0, 1] ** 2)
+    size = size[None, None]
+    return (square + size * jnp.eye(2, dtype=size.dtype)[..., None, None]) / jnp.sqrt(2 + 2 * size)
+
+
 def middle(lens: Lens, rays: Rays, scouts: Array) -> Array:
-    """The point (2, W, 1) deepest inside all apertures by the model of one ray a colour."""
+    """A point (2, W, 1) far from all edges by the model of one ray a colour: at first the deepest
+    of many, then the lowest of the barrier."""
 
     def zoom(_, state):
         best, span = state
@@ -200,5 +268,11 @@ def middle(lens: Lens, rays: Rays, scouts: Array) -> Array:
         index = jnp.argmin(outside(lens, rays, points), axis=-1)
         return jnp.take_along_axis(points, index[None, :, None], axis=-1), 0.4 * span
 
+    def lower(_, point):
+        slope, bend = barrier(lens, rays, point)
+        step = moved(inverse(bend), slope)
+        return point - step / (1 + safe_sqrt(dot(slope, step)))[None]
+
     start = jnp.zeros_like(rays.point), jnp.ones((), scouts.dtype)
-    return jax.lax.fori_loop(0, _ZOOMS, zoom, start)[0]
+    deepest = jax.lax.fori_loop(0, _ZOOMS, zoom, start)[0]
+    return jax.lax.fori_loop(0, _STEPS, lower, deepest)

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from ..lens.aperture import depths
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
@@ -33,12 +34,12 @@ def symmetry_of(lens: Lens, field: ArrayLike) -> Symmetry:
     """How much of the pupil must be traced for a field: an angle along y or (x, y), in radians.
 
     In a lens with an axis, a field known to be 0 needs one radius; one along y needs half a pupil,
-    if x -> -x leaves the lens alone. ValueError inside a trace where the answer depends on values
-    that are not known there.
+    if x -> -x leaves the lens and its apertures alone. ValueError inside a trace where the answer
+    depends on values that are not known there.
     """
-    group = lens.elements
+    group, extra = lens.elements, lens.apertures
     shift, turned = (None, None) if group is None else (group.shift, group.tilt)
-    moves = (lens.decentre, lens.tilt, shift, turned)
+    moves = (lens.decentre, lens.tilt, shift, turned, extra and extra.centre)
     if not concrete((field, moves)):
         raise ValueError(
             "the symmetry of a pupil follows from known numbers: ask for it, or for a rule, "
@@ -46,8 +47,10 @@ def symmetry_of(lens: Lens, field: ArrayLike) -> Symmetry:
         )
     forms = (*lens.forms, *(() if lens.phase is None else lens.phase.forms))
     kinds = {FORMS[form].symmetry for form in forms}
-    # Neither x, nor a turn about y or z, takes any surface out of the plane x = 0.
-    sideways = zip(moves, ([0], [1, 2], [0], [1, 2]), strict=True)
+    if extra is not None and {*extra.kinds} != {"circle"}:
+        kinds.add("plane")
+    # Neither x, nor a turn about y or z, takes anything out of the plane x = 0.
+    sideways = zip(moves, ([0], [1, 2], [0], [1, 2], [0]), strict=True)
     still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
     angles = np.asarray(field)
     if "none" in kinds or not still or (angles.ndim and angles[0] != 0):
@@ -127,14 +130,19 @@ class Soft(PupilRule):
         return Gauss(self.order, self.symmetry).points(lens, scene)
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """The product of the steps of all apertures but the stop."""
+        """The product of the steps of all apertures but the stop's circle, and obscurations."""
         whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
         radius = safe_sqrt(dot(bundle.hits, bundle.hits))
         edge = lens.semi_diameter[:, None, None]
         bounded = jnp.isfinite(edge).at[lens.stop].set(False)
         width = jnp.asarray(self.width, radius.dtype)
         within = jnp.where(bounded, (jnp.where(bounded, edge, 0) - radius) / width, jnp.inf)
-        return jnp.where(whole, jnp.prod(jax.nn.sigmoid(within), axis=0), 0)
+        steps = jnp.prod(jax.nn.sigmoid(within), axis=0)
+        if lens.apertures is not None:
+            sign = jnp.where(jnp.array(lens.apertures.blocks), -1, 1)[:, None, None]
+            within = sign.astype(width.dtype) * depths(lens.apertures, bundle.hits) / width
+            steps = steps * jnp.prod(jax.nn.sigmoid(within), axis=0)
+        return jnp.where(whole, steps, 0)
 
 
 @jax.tree_util.register_dataclass

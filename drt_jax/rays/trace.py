@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from ..lens.aperture import depths
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
@@ -113,8 +114,13 @@ def _traced(
     path = fermat.optical_path(found.hits, system)
     hits, status = on_all_surfaces(lens, system, found.hits, target, status)
     edge = lens.semi_diameter.at[lens.stop].set(jnp.inf)[:, None, None]
-    outside = jnp.any(dot(hits, hits) > edge**2, axis=0) & (status == Status.OK)
-    status = jnp.where(outside, Status.CLIPPED, status).astype(jnp.int32)
+    stopped = jnp.any(dot(hits, hits) > edge**2, axis=0)
+    if lens.apertures is not None:
+        blocks = np.array(lens.apertures.blocks)[:, None, None]
+        depth = depths(lens.apertures, hits)
+        stopped = stopped | jnp.any(jnp.where(blocks, depth > 0, depth < 0), axis=0)
+    stopped = stopped & (status == Status.OK)
+    status = jnp.where(stopped, Status.CLIPPED, status).astype(jnp.int32)
     return Bundle(hits, status, arrival, path, found.steps), system, found.hits
 
 

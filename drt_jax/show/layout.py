@@ -5,15 +5,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 
+from ..lens.aperture import depths
 from ..lens.lens import Lens, sag
 from ..rays.status import Status
 from ..rays.trace import trace_rays
 
-_POINTS = 41
+_POINTS = 161
 _FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 
 
@@ -21,7 +23,7 @@ class Drawing(NamedTuple):
     """Polylines (N, 2) of (z, y) in mm, the section x = 0.
 
     glass: closed outlines of the elements.
-    mirrors: their faces.
+    mirrors: their faces; NaN where an obscuration lies on one.
     stop: its two blades, also where it pokes through a surface.
     sensor: its face.
     rays: a list for each field.
@@ -66,19 +68,45 @@ def draw(
         [_path(ray, start, angle, distance) for ray in hit]
         for angle, hit in zip(angles, hits, strict=True)
     ]
-    semi = np.asarray(lens.semi_diameter)
-    semi = np.where(np.isfinite(semi), semi, 1.1 * reach)
-    profiles = np.linspace(-semi[:-1], semi[:-1], _POINTS, axis=-1)
+    profiles = np.linspace(*_extents(lens, 1.1 * reach), _POINTS, axis=-1)
     faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
     glass = [
         np.concatenate([faces[i], faces[j][::-1], faces[i][:1]])
         for i, j in itertools.pairwise(lens.live)
         if lens.glasses[i + 1] != lens.glasses[0]
     ]
-    mirrors = [face for face, mirror in zip(faces, lens.mirrors, strict=True) if mirror]
+    pierced = _pierced(lens, profiles)
+    mirrors = [
+        np.where(pierced[i, :, None], np.nan, faces[i]) for i in np.flatnonzero(lens.mirrors)
+    ]
     return Drawing(
         glass, mirrors, _blades(faces[lens.stop], reach), _sensor(lens, paths, reach), paths
     )
+
+
+def _extents(lens: Lens, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest y (S,) of the surfaces, mm: of their semi-diameters or, where there is
+    none, of their clear apertures; `reach` where there is none either."""
+    semi, extra = np.asarray(lens.semi_diameter)[:-1], lens.apertures
+    low, high = -semi, semi.copy()
+    if extra is not None:
+        half = np.asarray(extra.sizes)[:, 1]
+        centre = 0 * half if extra.centre is None else np.asarray(extra.centre)[:, 1]
+        for k, i in enumerate(extra.surfaces):
+            if np.isinf(semi[i]) and not extra.blocks[k]:
+                low[i] = max(low[i], centre[k] - half[k])
+                high[i] = min(high[i], centre[k] + half[k])
+    return np.where(np.isinf(low), -reach, low), np.where(np.isinf(high), reach, high)
+
+
+def _pierced(lens: Lens, y: np.ndarray) -> np.ndarray:
+    """Whether points (S, N) at x = 0 of all surfaces lie inside of an obscuration on them."""
+    found = np.zeros(y.shape, bool)
+    if lens.apertures is not None:
+        inside = np.asarray(depths(lens.apertures, (jnp.zeros(y.shape), jnp.asarray(y)))) > 0
+        for i, blocks, own in zip(lens.apertures.surfaces, lens.apertures.blocks, inside):
+            found[i] |= blocks & own
+    return found
 
 
 def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:

@@ -63,6 +63,27 @@ BAD = {
     ),
     "too wide": (surface(0, semi_diameter=60.0), r"60 mm reaches beyond the surface.* 50 mm"),
     "negative aperture": (surface(2, semi_diameter=-1.0), "must be positive"),
+    "two shapes": (
+        surface(1, aperture={"circle": 1, "ellipse": [1, 2]}),
+        r"surfaces\[1\].aperture: give one of circle, ellipse, rectangle",
+    ),
+    "no shape": (surface(1, aperture={"centre": [0, 1]}), "give one of circle"),
+    "flat aperture": (
+        surface(1, aperture=[{"circle": 1}, {"ellipse": [1, 0]}]),
+        r"surfaces\[1\].aperture\[1\].ellipse: must be positive",
+    ),
+    "negative obscuration": (
+        surface(0, obscuration={"circle": -1}),
+        r"surfaces\[0\].obscuration.circle: must be positive",
+    ),
+    "wide aperture": (
+        surface(0, aperture={"rectangle": [30, 10], "centre": [0, 35]}),
+        r"aperture.rectangle: 54.0833 mm reaches beyond the surface, which ends at 50 mm",
+    ),
+    "many obscurations": (
+        surface(0, obscuration=[{"circle": 1}] * 7),
+        r"surfaces\[0\].obscuration\[6\]: a lens has 6 obscurations at most",
+    ),
     "no stop": (surface(2, stop=False), "0 have stop: true"),
     "two stops": (surface(0, stop=True, semi_diameter=9.0), "2 have stop: true"),
     "open stop": (drop(2, "semi_diameter"), r"surfaces\[2\].semi_diameter: the stop needs one"),
@@ -168,6 +189,18 @@ def test_own_lens(tmp_path):
     np.testing.assert_array_equal(lens.semi_diameter, [np.inf, np.inf, 5, np.inf])
     np.testing.assert_array_equal(lens.vertices, [0, 4, 6, 90])
     assert lens.decentre is None and lens.tilt is None
+
+
+def test_a_stop_has_the_circle_round_its_aperture(tmp_path):
+    """About the vertex; and lists of apertures, in the order of the surfaces."""
+    shapes = {"aperture": [{"rectangle": [3.0, 4.0]}, {"circle": 9}], "semi_diameter": "inf"}
+    entry = surface(1, obscuration={"ellipse": [0.2, 0.1], "centre": [0, 1]})
+    lens = load_lens(write(tmp_path, lambda e: (entry(e), surface(2, **shapes)(e))))
+    assert lens.semi_diameter[2] == 5 and lens.apertures.surfaces == (1, 2, 2)
+    assert lens.apertures.kinds == ("ellipse", "rectangle", "circle")
+    assert lens.apertures.blocks == (True, False, False)
+    np.testing.assert_array_equal(lens.apertures.half, [[0.2, 0.1], [3, 4], [9, 9]])
+    np.testing.assert_array_equal(lens.apertures.centre, [[0, 1], [0, 0], [0, 0]])
     moved = load_lens(write(tmp_path, lambda e: (e.pop("sensor"), surface(2, thickness=84.0)(e))))
     assert moved.sensor == lens.sensor == 90
 

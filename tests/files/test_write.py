@@ -13,9 +13,11 @@ ODD = {
     "name": "odd",
     "object": {"glass": "water"},
     "surfaces": [
-        {"radius": 30.1, "thickness": 0.1, "nd": 1.8, "vd": 30.3, "conic": -0.7},
+        {"radius": 30.1, "thickness": 0.1, "nd": 1.8, "vd": 30.3, "conic": -0.7}
+        | {"obscuration": [{"circle": 1 / 3}, {"ellipse": [1 / 7, 3], "centre": [1 / 9, 0]}]},
         {"radius": -1 / 3, "thickness": 1 / 3, "glass": "F2", "coefficients": {4: 1e-300, 6: 0.1}},
-        {"curvature": 0, "thickness": 2.0, "stop": True, "semi_diameter": 0.3},
+        {"curvature": 0, "thickness": 2.0, "stop": True}
+        | {"aperture": {"rectangle": [0.3, 1 / 7]}, "obscuration": {"rectangle": [0.1, 5]}},
         {"form": "biconic", "radius": 77.7, "radius_x": 55.5, "conic_x": 0.3, "thickness": 30.0},
         {"form": "polynomial_xy", "radius": -9e9, "coefficients": {"x1y1": 1e-3}, "mirror": True}
         | {"thickness": -12.0, "tilt": [0.1, 45, -7.7], "decentre": [0, 1 / 7]},

@@ -60,6 +60,20 @@ def test_a_lens_without_apertures_is_drawn_to_its_rays():
     np.testing.assert_allclose(np.max(drawn.glass[0][:, 1]), 1.1 * reach)
 
 
+def test_a_lens_is_drawn_to_its_clear_apertures_and_a_mirror_with_its_hole():
+    faces = [{k: v for k, v in face.items() if k != "semi_diameter"} for face in FOLDED["surfaces"]]
+    faces[0]["semi_diameter"] = 8
+    faces[1]["aperture"] = {"rectangle": [5, 9], "centre": [0, 1]}
+    faces[3] |= {"aperture": {"circle": 18}, "obscuration": {"ellipse": [1, 3], "centre": [0, 2]}}
+    drawn = show.draw(load_lens(FOLDED | {"surfaces": faces}))
+    front = drawn.glass[0][: len(drawn.glass[0]) // 2]
+    np.testing.assert_allclose([front[:, 1].min(), front[:, 1].max()], [-8, 10])
+    along = drawn.mirrors[0][:, 1] * 2**0.5
+    gone = np.linspace(-18, 18, len(along))[np.isnan(along)]
+    np.testing.assert_allclose([gone[0], gone[-1]], [-1, 5], atol=0.25)
+    np.testing.assert_allclose(np.nanmax(abs(along)), 18)
+
+
 @pytest.mark.parametrize("distance", [np.inf, 40.0])
 def test_a_stop_that_pokes_through_a_surface_is_drawn_and_is_no_corner_of_a_ray(distance):
     drawn = show.draw(load_lens(PHONE), 0.1, distance)

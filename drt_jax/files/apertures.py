@@ -1,0 +1,92 @@
+"""What ends the light on a surface of a prescription: semi-diameter, apertures and obscurations."""
+
+import math
+from typing import NamedTuple
+
+from ..lens.aperture import Apertures
+from ..lens.forms import FORMS
+from .entry import Entry, array
+
+_KINDS = ("circle", "ellipse", "rectangle")
+_MOST = 6  # obscurations of a lens: n of them take 2^n times the rays
+
+
+class _Aperture(NamedTuple):
+    """One entry. half, centre: mm, along x and y; centre empty if it is not given."""
+
+    entry: Entry
+    kind: str
+    half: list[float]
+    centre: list[float]
+
+    @property
+    def reach(self) -> float:
+        """How far from the vertex it reaches at most, mm."""
+        x, y = (abs(c) for c in self.centre or (0.0, 0.0))
+        if self.kind == "rectangle":
+            return math.hypot(x + self.half[0], y + self.half[1])
+        return math.hypot(x, y) + max(self.half)
+
+
+def _read(surface: Entry, key: str) -> list[_Aperture]:
+    """Those that `aperture` or `obscuration` tells: a mapping or a list of them."""
+    given = surface.get(key, [])
+    many = isinstance(given, list)
+    found = []
+    for i, values in enumerate(given if many else [given]):
+        entry = Entry(values, surface.name(key) + f"[{i}]" * many, (*_KINDS, "centre"))
+        kinds = [kind for kind in _KINDS if kind in entry]
+        if len(kinds) != 1:
+            raise entry.error("", f"give one of {', '.join(_KINDS)}")
+        (kind,) = kinds
+        half = [entry.number(kind)] * 2 if kind == "circle" else entry.vector(kind, 2)
+        if not half or min(half) <= 0:
+            raise entry.error(kind, "must be positive, in mm")
+        found.append(_Aperture(entry, kind, half, entry.vector("centre", 2)))
+    return found
+
+
+def _check_reach(surface: Entry, entry: Entry, key: str, reach: float) -> None:
+    bent = (1 + surface.number("conic", 0.0)) * surface.curvature() ** 2
+    if FORMS[surface.get("form", "asphere")].round and bent * reach**2 >= 1:
+        beyond = f"{reach:g} mm reaches beyond the surface, which ends at {bent**-0.5:g} mm"
+        raise entry.error(key, f"{beyond}; lower it, or the curvature")
+
+
+def semi_diameter(surface: Entry) -> float:
+    """The clear aperture about the vertex, mm, which lies on the surface; of the stop it is finite:
+    where none is given, the circle round its apertures."""
+    semi = surface.number("semi_diameter", math.inf, finite=False)
+    if semi <= 0:
+        raise surface.error("semi_diameter", "must be positive")
+    if math.isinf(semi) and surface.flag("stop"):
+        semi = min((own.reach for own in _read(surface, "aperture")), default=math.inf)
+        if math.isinf(semi):
+            raise surface.error("semi_diameter", "the stop needs one, or an aperture")
+    if math.isfinite(semi):
+        _check_reach(surface, surface, "semi_diameter", semi)
+    return semi
+
+
+def apertures_of(surfaces: list[Entry]) -> Apertures | None:
+    """All apertures and obscurations; None if there are none."""
+    found = []
+    for i, surface in enumerate(surfaces):
+        for key in ("aperture", "obscuration"):
+            found += [(i, key == "obscuration", own) for own in _read(surface, key)]
+    for i, blocks, own in found:
+        if not blocks:
+            _check_reach(surfaces[i], own.entry, own.kind, own.reach)
+    blocked = [own.entry for _, blocks, own in found if blocks]
+    if len(blocked) > _MOST:
+        raise blocked[_MOST].error("", f"a lens has {_MOST} obscurations at most; join some")
+    if not found:
+        return None
+    centres = [own.centre for *_, own in found]
+    return Apertures(
+        array([own.half for *_, own in found]),
+        array([centre or [0.0, 0.0] for centre in centres]) if any(centres) else None,
+        surfaces=tuple(i for i, *_ in found),
+        kinds=tuple(own.kind for *_, own in found),
+        blocks=tuple(blocks for _, blocks, _ in found),
+    )

@@ -1,0 +1,46 @@
+"""Depths inside of apertures, against geometry."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drt_jax.lens.aperture import Apertures, depths
+
+HALF = jnp.array([[2.0, 9.0], [3.0, 0.8], [1.5, 0.4]])
+CENTRE = jnp.array([[0.3, -0.2], [0.5, 0.1], [-1.0, 2.0]])
+
+
+def three(centre):
+    kinds = ("circle", "ellipse", "rectangle")
+    return Apertures(HALF, centre, surfaces=(0, 2, 1), kinds=kinds, blocks=(False, True, False))
+
+
+def test_depth_is_the_distance_from_the_edge():
+    """Of points near to the edge; of an ellipse from the nearest of many points on it."""
+    angle = np.linspace(0, 2 * np.pi, 200001)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    side = np.linspace(-1, 1, 20001)
+    one = np.ones_like(side)
+    box = np.concatenate([[side, one], [side, -one], [one, side], [-one, side]], axis=1)
+    around = [
+        np.asarray(h)[:, None] * c + np.asarray(m)[:, None]
+        for h, c, m in zip(HALF.at[0, 1].set(2.0), (circle, circle, box), CENTRE, strict=True)
+    ]
+    generator = np.random.default_rng(0)
+    hits, wanted = np.zeros((2, 3, 60)), np.zeros((3, 60))
+    for k, (surface, edge) in enumerate(zip((0, 2, 1), around, strict=True)):
+        middle = np.asarray(CENTRE[k])[:, None]
+        share = 1 + 1e-3 * generator.uniform(-1, 1, 60)
+        point = middle + share * (edge[:, generator.integers(0, edge.shape[1], 60)] - middle)
+        far = np.array([np.min(np.hypot(*(edge - p[:, None]))) for p in point.T])
+        hits[:, surface], wanted[k] = point, far * np.sign(1 - share)
+    found = depths(three(CENTRE), tuple(jnp.asarray(hits)))
+    np.testing.assert_allclose(found, wanted, atol=2e-5)
+
+
+def test_on_the_meridian_and_in_the_middle():
+    hits = jnp.broadcast_to(jnp.array([[-0.3, 0.0, 2.5]]), (3, 3))
+    both = three(None)
+    np.testing.assert_allclose(depths(both, (hits,))[0], [1.7, 2.0, -0.5])
+    slope = jax.jacrev(lambda h: depths(both, (0 * h, h)))(hits)
+    assert np.all(np.isfinite(slope))

@@ -1,0 +1,215 @@
+"""Apertures of other shapes, and obscurations, against areas, geometry and sums of many rays."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import Clipped, Gauss, Pattern, Soft, Status, focus_moments, load_lens, trace_rays
+
+GREEN = (0.55,)
+R = 2.0
+
+
+def beam(**keys):
+    """A plane wave goes through a stop and on: the spot is the aperture."""
+    stop = {"radius": "inf", "semi_diameter": R, "stop": True, **keys}
+    return load_lens(
+        {"surfaces": [{"radius": "inf", "thickness": 2.0, "index": 1.5}, stop], "sensor": 4.0}
+    )
+
+
+# Area, mean and variances of each shape.
+CLEAR = {
+    "rectangle": ({"rectangle": [1.0, 0.7], "centre": [0.2, 0.5]}, 2.8, [1 / 3, 0.49 / 3]),
+    "slit": ({"rectangle": [1.0, 0.01], "centre": [0.2, 0.5]}, 0.04, [1 / 3, 1e-4 / 3]),
+    "ellipse": ({"ellipse": [1.5, 0.02], "centre": [0.1, -0.2]}, 0.03 * np.pi, [0.5625, 1e-4]),
+    "circle": ({"circle": 0.6, "centre": [0.3, -0.2]}, 0.36 * np.pi, [0.09, 0.09]),
+}
+
+
+@pytest.mark.parametrize("name", CLEAR)
+def test_light_and_spot_of_a_clear_aperture(name):
+    aperture, area, variances = CLEAR[name]
+    # One program for all: of the other shapes there are wide ones.
+    wide = {"rectangle": [9.0, 9.0]}, {"ellipse": [9.0, 9.0]}, {"circle": 9.0}
+    lens = beam(aperture=[aperture if {*w} < {*aperture} else w for w in wide])
+    found = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Clipped(16, "disc"))
+    np.testing.assert_allclose(found.passed, area / (np.pi * R**2), rtol=1e-12)
+    np.testing.assert_allclose(found.mean[0], aperture["centre"], atol=1e-11)
+    np.testing.assert_allclose(found.spread[0, 0], [*variances, 0], rtol=1e-10, atol=1e-12)
+
+
+def test_light_past_a_ring_and_a_bar():
+    """A hole and a bar across: area and variances of the disc less those of both, more those of
+    what they share; their integrals over x in closed form or by a dense rule."""
+    hole, bar = 0.66, 0.04
+    lens = beam(obscuration=[{"circle": hole}, {"rectangle": [bar, 3.0]}])
+    found = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Clipped(12, "half"))
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+
+    def part(radius, wide):  # |x| < wide inside of a circle: area and integrals of x^2 and y^2
+        t = np.arcsin(min(wide / radius, 1)) * nodes  # x = radius sin t
+        x, y = radius * np.sin(t), radius * np.cos(t)
+        step = np.arcsin(min(wide / radius, 1)) * weights * y * 2 * y
+        return np.array([step.sum(), step @ x**2, step @ y**2 / 3])
+
+    area, *squares = part(R, R) - part(hole, hole) - part(R, bar) + part(hole, bar)
+    np.testing.assert_allclose(found.passed, area / (np.pi * R**2), rtol=1e-11)
+    np.testing.assert_allclose(found.spread[0, 0], np.array(squares) / area, rtol=1e-10)
+
+
+def test_no_light_passes_an_obscuration_that_hides_the_stop():
+    lens = beam(obscuration=[{"circle": 2.5}, {"rectangle": [0.1, 0.1]}])
+    with pytest.raises(ValueError, match="no ray at"):
+        focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Clipped(12, "half"))
+
+
+# An ellipse before the lens, a bar and a disc on a stop behind it that bends no light.
+CUT = {
+    "surfaces": [
+        {
+            "radius": "inf",
+            "thickness": 6.0,
+            "aperture": {"ellipse": [2.5, 1.4], "centre": [0, 0.4]},
+        },
+        {"radius": 12.0, "conic": -0.5, "thickness": 2.0, "index": 1.5},
+        {"radius": "inf", "thickness": 3.0, "semi_diameter": R, "stop": True}
+        | {"obscuration": [{"rectangle": [0.5, 0.3], "centre": [0, 0.8]}, {"circle": 0.4}]},
+        {"radius": -30.0},
+    ],
+    "sensor": 20.0,
+}
+
+
+def blur(lens, field=0.08):
+    found = focus_moments(lens, field, jnp.inf, GREEN, rule=Clipped(12, "half"))
+    mean, spread = found.at(lens.sensor)
+    return jnp.concatenate([found.passed, mean[0, 1:], spread[0]])
+
+
+@pytest.fixture(scope="module")
+def cut():
+    return load_lens(CUT)
+
+
+def test_the_status_of_rays(cut):
+    points = np.random.default_rng(1).uniform(-1, 1, (400, 2))
+    rays = trace_rays(cut, (0.05, 0.08), 300.0, GREEN, points)
+    x, y = np.moveaxis(np.asarray(rays.points[0, :, :, :2]), -1, 0)
+    before = (x[:, 0] / 2.5) ** 2 + ((y[:, 0] - 0.4) / 1.4) ** 2 <= 1
+    bar = (np.abs(x[:, 2]) < 0.5) & (np.abs(y[:, 2] - 0.8) < 0.3)
+    open_ = before & ~bar & (np.hypot(x[:, 2], y[:, 2]) > 0.4)
+    assert 50 < np.sum(open_) < 350 and np.any(before & bar)
+    np.testing.assert_array_equal(rays.status[0], np.where(open_, Status.OK, Status.CLIPPED))
+
+
+@pytest.mark.slow
+def test_agrees_with_many_rays_that_drop_out(cut):
+    side = (np.arange(400) + 0.5) / 200 - 1
+    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    grid = grid[np.sum(grid**2, axis=1) <= 1]
+    rays = trace_rays(cut, 0.08, jnp.inf, GREEN, grid)
+    hits = np.asarray(rays.points[0, :, -1, :2])[np.asarray(rays.status[0]) == 0]
+    share, height, *spread = blur(cut)
+    np.testing.assert_allclose(share, len(hits) / len(grid), rtol=2e-3)
+    np.testing.assert_allclose(spread, hits.var(axis=0), rtol=3e-3)
+    np.testing.assert_allclose(height, hits.mean(axis=0)[1], atol=1e-3)
+
+
+def test_derivatives_by_sizes_and_centres(cut):
+    """Forward and reverse, in jit and vmap, against fourth-order differences."""
+    many = jax.jit(jax.vmap(blur))
+    of = lambda apertures: blur(dataclasses.replace(cut, apertures=apertures))  # noqa: E731
+    change = jax.tree.map(lambda a: jnp.cos(jnp.arange(a.size)).reshape(a.shape), cut.apertures)
+    forward = jax.jit(lambda a: jax.jvp(of, (a,), (change,))[1])(cut.apertures)
+    slopes = jax.jit(jax.jacrev(of))(cut.apertures)
+    both = zip(jax.tree.leaves(slopes), jax.tree.leaves(change), strict=True)
+    total = sum(jnp.tensordot(a, b, axes=2) for a, b in both)
+    np.testing.assert_allclose(forward, total, rtol=1e-9)
+    h = 1e-3
+    for leaf, places in (
+        ("half", [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]),
+        ("centre", [(0, 1), (1, 1)]),
+    ):
+        value = getattr(cut.apertures, leaf)
+        lenses = [
+            dataclasses.replace(
+                cut, apertures=dataclasses.replace(cut.apertures, **{leaf: value.at[k].add(s * h)})
+            )
+            for k in places
+            for s in (-2, -1, 1, 2)
+        ]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *lenses)
+        f = np.asarray(many(stacked)).reshape(len(places), 4, -1)
+        difference = (f[:, 0] - 8 * f[:, 1] + 8 * f[:, 2] - f[:, 3]) / (12 * h)
+        ours = np.stack([np.asarray(getattr(slopes, leaf))[:, *k] for k in places])
+        assert np.all(np.max(np.abs(ours), axis=1) > 1e-3)
+        np.testing.assert_allclose(ours, difference, rtol=1e-6, atol=1e-8)
+    assert np.all(np.asarray(slopes.half)[:, 2, 1] == 0)  # a circle has one size
+
+
+# Burrows 1990 and the manuals: focal length 57.6 m, the hole as wide as 0.33 of the mirror.
+HUBBLE = {
+    "surfaces": [
+        {"radius": -11040.0, "conic": -1.0022985, "mirror": True, "thickness": -4906.071}
+        | {"semi_diameter": 1200.0, "stop": True, "obscuration": {"circle": 0.33 * 1200}},
+        {"radius": -1358.0, "conic": -1.49686, "mirror": True, "thickness": 6406.2},
+    ],
+}
+
+
+def test_a_telescope_with_a_hole():
+    """On axis and 5 arc minutes beside it: light, focal length, and the spot of a rule on the ring
+    that knows where it is; the error falls with the order as on a disc."""
+    lens = load_lens(HUBBLE)
+    np.testing.assert_allclose(drt_jax.focal_length(lens, GREEN), 57600, rtol=1e-5)
+    assert drt_jax.symmetry_of(lens, 0.0) == "meridian"
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    square = 0.33**2 + (1 - 0.33**2) * (nodes + 1) / 2
+    angle = 2 * np.pi * np.arange(24) / 24
+    points = np.sqrt(square) * np.stack([np.cos(angle), np.sin(angle)])[..., None]
+    share = np.broadcast_to(weights / 2 / 24, (24, 12))
+    ring = Pattern(points.reshape(2, -1), share.ravel())
+    whole = dataclasses.replace(lens, apertures=None)
+    for field in (0.0, np.radians(5 / 60)):
+        wanted = drt_jax.psf_moments(whole, field, jnp.inf, GREEN, rule=ring)
+        for order, error in ((4, 1e-6), (6, 1e-8)):
+            rule = Clipped(order, "half", 10)
+            found = drt_jax.psf_moments(lens, field, jnp.inf, GREEN, rule=rule)
+            np.testing.assert_allclose(found.passed, 1 - 0.33**2, rtol=1e-12)
+            size = np.trace(wanted.covariance[0]) + 1e-8  # 0.1 um: the spot on axis is smaller
+            np.testing.assert_allclose(found.covariance, wanted.covariance, atol=error * size)
+            np.testing.assert_allclose(found.mean, wanted.mean, atol=1e-9)
+
+
+def test_a_rule_does_not_step_over_an_obscuration():
+    lens = beam(obscuration={"circle": 0.05})
+    assert isinstance(drt_jax.converged_rule(lens, 0.0, 1e4, GREEN, 1e-3), Clipped)
+    share = focus_moments(lens, 0.0, 1e4, GREEN, rule=Gauss(2, "meridian")).passed
+    np.testing.assert_allclose(share, 1)
+
+
+def test_soft_edges_tend_to_hard_ones():
+    lens = beam(obscuration={"rectangle": [0.5, 0.4]}, aperture={"ellipse": [1.2, 0.9]})
+    share = jax.jit(
+        lambda w: focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Soft(40, "half", w)).passed
+    )
+    errors = [abs(float(share(w)[0]) - (0.27 - 0.2 / np.pi)) for w in (0.05, 0.02)]
+    assert max(errors) < 1e-3
+
+
+def test_symmetry():
+    def of(field=0.0, **aperture):
+        return drt_jax.symmetry_of(beam(obscuration=aperture), field)
+
+    assert of(circle=1.0) == "meridian" and of(circle=1.0, centre=[0, 0]) == "half"
+    assert of(rectangle=[1.0, 1.0]) == of(ellipse=[1.0, 0.5], centre=[0, 1]) == "half"
+    assert of(circle=1.0, centre=[0.1, 0]) == "disc"
+    with pytest.raises(ValueError, match="symmetry"):
+        jax.jit(lambda lens: jnp.zeros(len(drt_jax.symmetry_of(lens, 0.0))))(
+            beam(aperture=CLEAR["slit"][0])
+        )
