@@ -23,7 +23,7 @@ from ..rays.status import Status
 from ..rays.system import System, dot
 from ..rays.trace import on_all_surfaces
 
-_ZOOMS, _STEPS = 10, 20  # of the search for the middle: rounds, and steps of Newton's method
+_ZOOMS, _STEPS = 10, 8  # of the search for the middle: rounds, and steps of Newton's method
 
 
 class Rays(NamedTuple):

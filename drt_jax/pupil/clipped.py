@@ -51,6 +51,9 @@ def _stages(lens: Lens, system: System, spokes: Spokes, used: Array) -> list:
         pair = like.astype(jnp.int32) if pair is None else pair
         return boundary.Goal(like + centre, toward, pair)
 
+    def shape(found):  # of what is left about the middle
+        return boundary.stretch(lens, jax.tree.map(lambda a: a[1, ..., :1], found.rays))
+
     def scout(found):  # all over the stop, to where paraxial optics puts them
         radius = lens.semi_diameter[lens.stop]
         launch = paraxial_launch(system, tuple(like + radius * scouts[:, None]), 4 * radius)
@@ -64,9 +67,8 @@ def _stages(lens: Lens, system: System, spokes: Spokes, used: Array) -> list:
         return rays.at(like[0].astype(jnp.int32)), goal(boundary.middle(lens, rays, scouts))
 
     def ends(found):  # to the ends of even spokes
-        rays, shape = of(found.rays, 1), boundary.stretch(lens, of(found.rays, 1))
-        toward = unit(jnp.asarray(spokes.even, like.dtype))[:, None]
-        return rays, goal(rays.point, boundary.moved(shape, toward))
+        rays, toward = of(found.rays, 1), unit(jnp.asarray(spokes.even, like.dtype))[:, None]
+        return rays, goal(rays.point, boundary.moved(shape(found), toward))
 
     def corners(found):  # to the corners, in the first places
         even = of(found, 2)
@@ -75,17 +77,17 @@ def _stages(lens: Lens, system: System, spokes: Spokes, used: Array) -> list:
         place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
         rays = even.rays.at(jnp.round(place).astype(jnp.int32))
         angle = place * (spokes.turn / (spokes.count - 1)) - np.pi / 2
-        toward = boundary.moved(boundary.stretch(lens, of(found.rays, 1)), unit(angle))
+        toward = boundary.moved(shape(found), unit(angle))
         line = boundary.ahead(lens, rays, goal(even.goal.centre, toward))[0]
         return boundary.shifted(rays, line), goal(even.goal.centre, None, pair)
 
     def nodes(found):  # to the ends of the spokes of the rule
-        shape = boundary.stretch(lens, of(found.rays, 1))
+        own = shape(found)
         rays, found = of(found.rays, 2), of(found, 3)
         corner = (found.rays.point - found.goal.centre)[..., :CORNERS]
-        corner = boundary.moved(boundary.inverse(shape)[..., :1], corner)
+        corner = boundary.moved(boundary.inverse(own), corner)
         angle, _ = spokes.nodes(used, corner, _exists(lens, found)[:, :CORNERS])
-        toward = boundary.moved(shape, unit(angle))
+        toward = boundary.moved(own, unit(angle))
         return rays.at(spokes.nearest(angle)), goal(found.goal.centre, toward)
 
     return [scout, middle, ends, corners, nodes][: 3 if spokes.symmetry == "meridian" else 5]
@@ -157,7 +159,8 @@ def _plan(lens: Lens, scene: Scene, spokes: Spokes, used: Array) -> _Plan:
         follows = join(_exists(lens, corners), follows)
     follows = follows & passes[:, :1]
     hits = jnp.where(follows, rays.hits[:, np.array([*lens.live, lens.count])], 0)
-    centre, shape = middle.rays.point[..., :1], boundary.stretch(lens, middle.rays)[..., :1]
+    first = jax.tree.map(lambda a: a[..., :1], middle.rays)
+    centre, shape = first.point, boundary.stretch(lens, first)
     rates = boundary.rates(lens, rays, pair)
     return _Plan(centre, shape, rays.point, tuple(hits), pair, rates, follows, passes[:, :1], used)
 
