@@ -24,6 +24,8 @@ from ..rays.system import System, dot
 from ..rays.trace import on_all_surfaces
 
 _ZOOMS, _STEPS = 10, 8  # of the search for the middle: rounds, and steps of Newton's method
+# A last step as short as this, in units of the stop's semi-diameter, is right to its square.
+_NEAR = 1e-6
 
 
 class Rays(NamedTuple):
@@ -200,6 +202,7 @@ def shifted(rays: Rays, change: Array) -> Rays:
 def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) -> Reached:
     """Newton's method from rays, to which it goes back half the way where one fails."""
     tiny = float(jnp.finfo(start.launch.dtype).eps) ** 0.5
+    near = max(tiny, _NEAR)
 
     def step(state):
         count, rays, launch, done, _, _, _ = state
@@ -207,7 +210,7 @@ def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) ->
         rays = jax.tree.map(lambda a, b: jnp.where(new.good & ~done, a, b), new, rays)
         change, edge = ahead(lens, rays, goal)
         back = rays.launch - launch
-        settled = rays.good & (dot(change, change) <= tiny**2)
+        settled = rays.good & (dot(change, change) <= near**2)
         lost = ~new.good & (dot(back, back) <= tiny**2 * (1 + dot(launch, launch)))
         onward = rays.launch + moved(rays.aims, change)
         launch = jnp.where(new.good[None], onward, launch + back / 2)
@@ -218,7 +221,7 @@ def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) ->
     state = (0, start, launch, no, change, edge, no)
     state = jax.lax.while_loop(lambda s: (s[0] < steps) & ~jnp.all(s[3]), step, state)
     _, rays, _, _, change, edge, settled = state
-    # The last step, which is small, on the model: right to its square.
+    # The last step, which is short, on the model.
     return Reached(shifted(rays, jnp.where(settled[None], change, 0)), goal, edge, settled)
 
 

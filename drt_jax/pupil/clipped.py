@@ -288,6 +288,8 @@ class Clipped(PupilRule):
         point = _follow(spokes, lens, scene, plan)
         corner, end = point[..., : -spokes.count], point[..., -spokes.count :]
         toward, share = plan.nodes(spokes, corner)
+        # The nodes have the first places; the others are of the search alone.
+        toward, share, end = (a[..., : max(most, 1)] for a in (toward, share, end))
         length = _along(end - plan.centre, toward)
         node, weight = jnp.asarray(gauss(self.size), length.dtype)[:, self.order, None, None]
         # On the axis r^2 is the variable, as without clipping.

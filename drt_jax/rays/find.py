@@ -174,22 +174,19 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
 
     def turn(state):
         first, sought = state.turn == 0, state.left > 0
-        fan, _ = jax.lax.while_loop(
-            lambda s: s[1],
-            lambda s: (trace_fan(system, s[0], wide), jnp.array(False)),
-            (state.fan, state.turn == 1),
-        )
         # The first few that are left have `starts` places each.
         rank = jnp.cumsum(sought, axis=-1, dtype=jnp.int32) - 1
         mine = sought & (rank < few)
-        rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
-        wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
-        tried = rounds - jnp.take_along_axis(state.left, rows, 1, mode="clip")
-        begin = starts_of(fan, wanted, (tried * starts)[..., None] + ray[None, None, :starts])
-        own = tuple(
-            jnp.where(first, a, places(b[..., None])) for a, b in zip(target, wanted, strict=True)
-        )
-        begin = tuple(jnp.where(first, a, places(b)) for a, b in zip(launch, begin, strict=True))
+
+        def seek(fan, *_):
+            fan = _if(state.turn == 1, lambda fan: trace_fan(system, fan, wide), fan)
+            rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
+            wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
+            tried = rounds - jnp.take_along_axis(state.left, rows, 1, mode="clip")
+            begin = starts_of(fan, wanted, (tried * starts)[..., None] + ray[None, None, :starts])
+            return fan, tuple(places(a[..., None]) for a in wanted), tuple(map(places, begin))
+
+        fan, own, begin = _if(~first, lambda given: seek(*given), (state.fan, target, launch))
         reach = jnp.where(first, sizes[1], sizes[1] / 8)
         upright = first & (system.rows.rotation is None)
         new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
@@ -215,6 +212,13 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
     none = jnp.int32(0)
     start = _Search((zero,) * len(target), status, status, no_fan(system, waves), none, none)
     return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left > 0), turn, start)
+
+
+def _if(condition: Array, function: Callable, value: Any) -> Any:
+    """`function(value)`, of the same structure, if the condition holds, else the value. A loop:
+    under `vmap` too it costs nothing where the condition holds nowhere."""
+    turn = lambda state: (function(state[0]), jnp.array(False))  # noqa: E731
+    return jax.lax.while_loop(lambda state: state[1], turn, (value, condition))[0]
 
 
 class _Traced(NamedTuple):
@@ -265,12 +269,8 @@ def _find_many(system: System, target: Vector) -> Found:
         hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
         hits, crossing = apart(system, hits)
         solved = fermat.met(crossing, target, hits, system) & (status == Status.OK)
-        start = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0)), ~jnp.all(solved)
-
-        def turn(state):
-            return find(system, target, launch), jnp.array(False)
-
-        found, _ = jax.lax.while_loop(lambda state: state[1], turn, start)
+        found = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0))
+        found = _if(~jnp.all(solved), lambda _: find(system, target, launch), found)
         return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
 
     found = in_tiles(tile, target)
