@@ -15,7 +15,11 @@ from .files.yaml import lens_names, load_lens
 from .image.converged import psf_moments
 from .lens.lens import Lens
 from .lens.paraxial import first_order
+from .pupil import hexapolar
+from .rays.status import Status
+from .rays.trace import trace_rays
 
+_RINGS = 10  # of the rays by which apertures are judged
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 
 
@@ -58,7 +62,7 @@ def field_lines(
 ) -> Iterator[str]:
     """A table of spots over fields in degrees, and what is odd about it."""
     spots = [f"spot at {colour:.3f}" for colour in wavelengths]
-    yield _row("field", "image height", *spots, "light")
+    yield _row("field", "image height", *spots, "light", "cut by surface")
     yield _row("deg", "mm", *("RMS um" for _ in spots), "%")
     for field in fields:
         try:
@@ -70,13 +74,44 @@ def field_lines(
         mean, passed = float(found.mean[middle, 1]), float(found.passed[middle])
         squares = np.trace(np.asarray(found.covariance), axis1=1, axis2=2)
         spots = [f"{1e3 * math.sqrt(square):.4g}" for square in squares]
-        yield _row(f"{field:.4g}", f"{mean:.5g}", *spots, f"{100 * passed:.2f}")
+        cut = stopping(lens, field, distance, wavelengths[middle])[1]
+        where = ", ".join(map(str, cut)) or "none"
+        yield _row(f"{field:.4g}", f"{mean:.5g}", *spots, f"{100 * passed:.2f}", where)
         if field == 0 and passed < 0.999:
             yield "  ! on the axis other apertures than the stop cut the beam"
 
 
+def stopping(
+    lens: Lens, field: float, distance: float, wavelength: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far (S + 1,) in mm from the vertices the light of a field in degrees comes that arrives,
+    and the surfaces whose apertures are the first to stop some; of rays that fill the stop.
+    """
+    from .show.layout import local_hits, outside
+
+    filling = hexapolar(_RINGS)[0].T
+    rays = trace_rays(lens, math.radians(field), distance, wavelength, filling)
+    points, status = np.asarray(rays.points[0]), np.asarray(rays.status[0])
+    clipped, arrived = (points[status == s] for s in (Status.CLIPPED, Status.OK))
+    wide = np.linalg.norm(local_hits(lens, arrived), axis=-1)
+    return np.max(wide, axis=0, initial=0.0), np.unique(np.argmax(outside(lens, clipped), axis=1))
+
+
+def aperture_lines(
+    lens: Lens, fields: list[float], distance: float, wavelength: float
+) -> Iterator[str]:
+    """Clear apertures that stop nothing, as wide as they are."""
+    needed = np.max([stopping(lens, f, distance, wavelength)[0] for f in fields], axis=0)
+    for i, semi in enumerate(np.asarray(lens.semi_diameter)[:-1]):
+        if math.isfinite(semi) and semi > 1.8 * needed[i] > 0:
+            yield (
+                f"  ! surface {i}: the light of these fields needs {needed[i]:.4g} mm of its "
+                f"semi_diameter of {semi:g} mm, which stops nothing: is it a diameter?"
+            )
+
+
 def _row(first: str, *cells: str) -> str:
-    return f"{first:>6}" + "".join(f"{cell:>15}" for cell in cells)
+    return f"{first:>6}" + "".join(f"{cell:>16}" for cell in cells)
 
 
 def show(options: argparse.Namespace) -> None:
@@ -90,6 +125,8 @@ def show(options: argparse.Namespace) -> None:
         waves = list(options.wavelengths)
         lines = [*first_lines(lens, options.distance, waves[len(waves) // 2]), ""]
         lines += field_lines(lens, options.field, options.distance, waves)
+        middle = waves[len(waves) // 2]
+        lines += aperture_lines(lens, options.field, options.distance, middle)
     lines += [f"  ! {warning.message}" for warning in said]
     out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}.png")
     figure, axes = new(width=9, height=4)

@@ -2,6 +2,7 @@
 
 import pytest
 
+from drt_jax import load_lens
 from drt_jax.__main__ import main
 
 
@@ -15,6 +16,7 @@ def test_a_lens_shows_itself(tmp_path, capsys):
     assert 45 < focal < 55
     table = [line.split() for line in lines if line.split()[:1] in (["0"], ["5"])]
     assert [row[0] for row in table] == ["0", "5"]
+    assert all(row[4] == "none" for row in table) and "stops nothing" not in "".join(lines)
     # f tan(5 degrees), less distortion
     assert abs(float(table[1][1]) / focal - 0.0875) < 1e-3 and float(table[0][3]) == 100
 
@@ -25,6 +27,28 @@ def test_what_looks_odd(tmp_path, capsys):
     main([*words, "--distance", "200", "--out", str(tmp_path / "lens.png")])
     said = capsys.readouterr().out
     assert "! the sensor is far from the focus" in said and "! no ray" in said
+
+
+def test_words_for_apertures_and_focal_length(tmp_path, capsys):
+    """A diameter for a semi-diameter; an aperture that cuts; a wrong sign."""
+    lens = """
+    focal_length: 100
+    surfaces:
+      - {radius: 51.68, thickness: 4, glass: N-BK7, semi_diameter: 12}
+      - {radius: inf, thickness: 1, semi_diameter: 4}
+      - {radius: inf, thickness: 95, semi_diameter: 5, stop: true}
+    """
+    (tmp_path / "mine.yaml").write_text(lens)
+    words = ["show", str(tmp_path / "mine.yaml"), "--field", "0", "--wavelengths", "0.55"]
+    main([*words, "--out", str(tmp_path / "lens.png")])
+    said = capsys.readouterr().out
+    (row,) = [line.split() for line in said.splitlines() if line.split()[:1] == ["0"]]
+    assert row[-1] == "1" and 62 < float(row[3]) < 66  # (4 / 5)^2
+    assert "! surface 0: the light of these fields needs 3.9" in said and "diameter?" in said
+    assert "! surface 1" not in said and "focal_length" not in said
+    (tmp_path / "mine.yaml").write_text(lens.replace("radius: 51.68", "radius: -51.68"))
+    with pytest.warns(UserWarning, match="focal_length: 100 mm is stated, but it is -100 mm at"):
+        load_lens(tmp_path / "mine.yaml")
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,14 @@
 """Prescriptions: a lens built from a mapping, its entries checked before anything is traced."""
 
 import math
+import warnings
 
 import jax.numpy as jnp
 
 from ..lens.forms import FORMS
 from ..lens.glass import Dispersion
 from ..lens.lens import Lens
+from ..lens.paraxial import focal_length
 from ..lens.phase import Phase
 from .apertures import apertures_of, semi_diameter
 from .elements import elements_of
@@ -14,8 +16,9 @@ from .entry import Entry, LensError, array, table
 from .media import MEDIUM_KEYS, media_of
 from .order import check_order
 
+_D_LINE = 0.5875618  # um
 _TOP_KEYS = (
-    *("name", "source", "glasses", "object", "surfaces", "elements"),
+    *("name", "source", "focal_length", "glasses", "object", "surfaces", "elements"),
     *("sensor", "sensor_tilt", "sensor_decentre"),
 )
 _SURFACE_KEYS = (
@@ -133,4 +136,19 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         name=str(top.get("name", name)),
     )
     check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
+    if "focal_length" in top:
+        _check_focal_length(lens, top.number("focal_length"))
     return lens
+
+
+def _check_focal_length(lens: Lens, stated: float) -> None:
+    """Warn where the lens has another at the d line, or in the middle of what its glasses know."""
+    low, high = lens.dispersion.range
+    wavelength = _D_LINE if low <= _D_LINE <= high else (low + high) / 2
+    found = float(focal_length(lens, wavelength)[0])
+    if not abs(found - stated) <= 0.02 * abs(stated):
+        warnings.warn(
+            f"focal_length: {stated:g} mm is stated, but it is {found:g} mm at {wavelength:g} um: "
+            "look for a wrong sign, unit or glass",
+            stacklevel=4,
+        )

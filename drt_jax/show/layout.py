@@ -27,6 +27,7 @@ class Drawing(NamedTuple):
     stop: its two blades, also where it pokes through a surface.
     sensor: its face.
     rays: a list for each field.
+    vignetted: rays that do not arrive, as far as the surface whose aperture stops them.
     """
 
     glass: list[np.ndarray]
@@ -34,6 +35,7 @@ class Drawing(NamedTuple):
     stop: list[np.ndarray]
     sensor: np.ndarray
     rays: list[list[np.ndarray]]
+    vignetted: list[np.ndarray]
 
 
 def draw(
@@ -48,18 +50,22 @@ def draw(
     fields: angles along y, radians.
     distance: from the object to the first vertex, mm.
     wavelength: um.
-    rays: how many for each field; those that do not arrive are left out.
+    rays: how many for each field; those that do not exist are left out.
     """
     angles = [float(angle) for angle in np.atleast_1d(fields)]
     heights = np.linspace(-1.0, 1.0, rays)
     pupil = np.stack([np.zeros_like(heights), heights], axis=-1)
     # A surface that bends no light is no corner of a ray, nor a face of glass.
     corners = [*lens.live, lens.count]
-    hits = []
+    hits, ends = [], []
     for angle in angles:
         fan = trace_rays(lens, angle, distance, wavelength, pupil)
-        arrived = np.asarray(fan.status[0]) == Status.OK
-        hits.append(np.asarray(fan.points[0])[arrived][:, corners, :0:-1])
+        points, status = np.asarray(fan.points[0]), np.asarray(fan.status[0])
+        hits.append(points[status == Status.OK][:, corners, :0:-1])
+        clipped = points[status == Status.CLIPPED]
+        for ray, stop in zip(clipped, np.argmax(outside(lens, clipped), axis=1)):
+            cut = [*(k for k in lens.live if k < stop), stop]
+            ends.append((ray[cut, :0:-1], angle))
     drawn = np.concatenate([np.zeros((1, 2)), *(hit.reshape(-1, 2) for hit in hits)])
     reach = float(np.max(np.abs(drawn[:, 1]))) or 1.0
     z = np.concatenate([drawn[:, 0], np.asarray(lens.places[0])])
@@ -68,6 +74,7 @@ def draw(
         [_path(ray, start, angle, distance) for ray in hit]
         for angle, hit in zip(angles, hits, strict=True)
     ]
+    vignetted = [_path(ray, start, angle, distance) for ray, angle in ends]
     profiles = np.linspace(*_extents(lens, 1.1 * reach), _POINTS, axis=-1)
     faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
     glass = [
@@ -79,9 +86,30 @@ def draw(
     mirrors = [
         np.where(pierced[i, :, None], np.nan, faces[i]) for i in np.flatnonzero(lens.mirrors)
     ]
-    return Drawing(
-        glass, mirrors, _blades(faces[lens.stop], reach), _sensor(lens, paths, reach), paths
-    )
+    blades, sensor = _blades(faces[lens.stop], reach), _sensor(lens, paths, reach)
+    return Drawing(glass, mirrors, blades, sensor, paths, vignetted)
+
+
+def outside(lens: Lens, points: np.ndarray) -> np.ndarray:
+    """Whether rays through points (Q, S + 1, 3), mm along the axes of the lens, are stopped by an
+    aperture of each surface, (Q, S + 1); the stop's rim stops none, as it is filled."""
+    hits = local_hits(lens, points)
+    semi = np.asarray(lens.semi_diameter.at[lens.stop].set(jnp.inf))
+    found = np.linalg.norm(hits, axis=-1) > semi
+    if lens.apertures is not None:
+        inside = depths(lens.apertures, tuple(jnp.asarray(a.T) for a in np.moveaxis(hits, -1, 0)))
+        for surface, blocks, depth in zip(lens.apertures.surfaces, lens.apertures.blocks, inside):
+            found[:, surface] |= (np.asarray(depth) > 0) == blocks
+    return found
+
+
+def local_hits(lens: Lens, points: np.ndarray) -> np.ndarray:
+    """x and y (Q, S + 1, 2), along the axes of the surfaces and from their vertices, of points
+    (Q, S + 1, 3) along the axes of the lens, mm."""
+    vertex, across, turned = jax.tree.map(np.asarray, lens.places)
+    across = np.zeros((len(vertex), 2)) if across is None else across
+    own = points - np.concatenate([across, vertex[:, None]], axis=1)
+    return (own if turned is None else np.einsum("qsi,sij->qsj", own, turned))[..., :2]
 
 
 def _extents(lens: Lens, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -118,6 +146,8 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
     for fan, colour in zip(drawing.rays, itertools.cycle(_FIELDS)):
         for ray in fan:
             axes.plot(*ray.T, color=colour, linewidth=0.6)
+    for ray in drawing.vignetted:
+        axes.plot(*ray.T, color="grey", linewidth=0.6, linestyle=":")
     for blade in drawing.stop:
         axes.plot(*blade.T, color="black", linewidth=2.5, solid_capstyle="butt", zorder=3)
     axes.plot(*drawing.sensor.T, color="black", linewidth=1.5)

@@ -9,98 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax.lens.glass import Dispersion
 
-RAYS = 8  # of each scene: the chief ray, three on the rim, the rest at random
-WAVELENGTH = 0.55
-_FAR = (np.inf, 1e3, 200.0)
-
-
-class Scenes(NamedTuple):
-    """N scenes of one static structure: a lens whose leaves have a leading axis N, fields (N, 2)
-    in radians, distances (N,) in mm, pupil points (N, RAYS, 2) in the unit disc."""
-
-    lens: drt_jax.Lens
-    field: np.ndarray
-    distance: np.ndarray
-    pupil: np.ndarray
-
-
-def _lens(parts, h, stop, media=None, **static):
-    """A batch of lenses.
-
-    parts: arrays (N, ...) of S surfaces, to which the sensor is added; conic and coefficients may
-        be missing.
-    h: (N,), semi-diameter of the stop in mm; other surfaces have none.
-    media: (N, S + 1), constant indices, by default 1; static: other fields of the lens.
-    """
-    count, surfaces = parts["curvature"].shape
-    zero, none = np.zeros((count, surfaces)), np.zeros((count, surfaces, 0))
-    parts = {"conic": zero, "coefficients": none} | parts
-    for name in ("curvature", "conic", "coefficients"):
-        parts[name] = np.insert(parts[name], surfaces, 0, axis=1)
-    parts["semi_diameter"] = np.full((count, surfaces + 1), np.inf)
-    parts["semi_diameter"][:, stop] = h
-    schott = np.zeros((count, surfaces + 1, 6))
-    schott[..., 0] = 1 if media is None else media**2
-    none = jnp.zeros((count, surfaces + 1, 3))
-    names = {"glasses": tuple(f"medium {i}" for i in range(surfaces + 1))}
-    arrays = {name: jnp.asarray(value, float) for name, value in parts.items()}
-    constants = Dispersion(none, none, jnp.asarray(schott))
-    return drt_jax.Lens(dispersion=constants, stop=stop, **names | static, **arrays)
-
-
-def _pupil_points(rng, count):
-    radius, angle = np.sqrt(rng.random((count, RAYS))), 2 * np.pi * rng.random((count, RAYS))
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
-    points[:, :4] = [[0, 0], [0, 1], [0, -1], [1, 0]]
-    return points
-
-
-def _fields(rng, count, low, high):
-    """Angles of `low` to `high` degrees in any direction; a third along y, as users ask for."""
-    size, turn = rng.uniform(low, high, count), 2 * np.pi * rng.random(count)
-    turn = np.where(rng.random(count) < 1 / 3, np.pi / 2, turn)
-    slope = np.tan(np.radians(size))
-    return np.arctan(np.stack([slope * np.cos(turn), slope * np.sin(turn)], axis=-1))
-
-
-def _two_elements(rng, count, stop, f_number=(1.4, 16)):
-    """Two elements, or three cemented ones, of about the f-number, the stop at surface `stop`:
-    a plane in air or a refracting surface. Returns parts of `_lens`, h and media."""
-    h = np.exp(rng.uniform(np.log(1), np.log(20), count))
-    number = np.exp(rng.uniform(*np.log(f_number), count))
-    n = rng.uniform(1.4, 1.95, (count, 3))
-    one = np.ones(count)
-    apart = np.stack([one, n[:, 0], one, n[:, 1], one], 1)
-    apart = np.insert(apart, stop, 1, axis=1)  # a plane in air
-    cemented = np.stack([one, n[:, 0], n[:, 1], one, n[:, 2], one], 1)
-    alone = rng.random(count) < 0.5
-    index = np.where(alone[:, None], apart, cemented)
-    curvature = rng.uniform(-1, 1, (count, 5))
-    curvature[:, stop] = np.where(alone, 0, curvature[:, stop])
-    # One linear step towards the wanted power, positive or negative.
-    power = np.sum(curvature * np.diff(index, axis=1), axis=1)
-    factor = rng.choice([1, 1, 1, -1], count) / (2 * h * number * power)
-    curvature = curvature * factor[:, None]
-    steepest = np.max(np.abs(curvature), axis=1) * h
-    curvature = curvature * np.minimum(1, 0.9 / steepest)[:, None]
-    thickness = h[:, None] * rng.uniform(0.1, 0.9, (count, 4)) + 0.5
-    sensor = np.sum(thickness, axis=1) + h * rng.uniform(1, 8, count)
-    parts = {"curvature": curvature, "thickness": thickness, "sensor": sensor}
-    parts |= {"conic": np.zeros((count, 5)), "coefficients": np.zeros((count, 5, 2))}
-    return parts, h, index
-
-
-def _scenes(rng, parts, h, stop, media=None, angles=(0, 15), distances=_FAR, **static):
-    """Scenes of `_lens`, fields from and to so many degrees, a tenth of them 0, and distances
-    from a list in mm."""
-    count = len(h)
-    field = _fields(rng, count, *angles)
-    field[rng.random(count) < 0.1] = 0
-    lens = _lens(parts, h, stop, media, **static)
-    return Scenes(lens, field, rng.choice(distances, count), _pupil_points(rng, count))
-
+from ._scenes import WAVELENGTH, Scenes, batch_of, fields, pupil_points, scenes_of, two_elements
 
 _FREEFORM = ("biconic", "toroid", "odd_asphere", "polynomial_xy", "asphere", "asphere")
 _PLASTICS = (1.535, 1.544, 1.614, 1.661)
@@ -124,14 +34,14 @@ class Family(NamedTuple):
 
 
 def elements(change: Callable | None = None, f_number: tuple = (1.4, 16), **scenes: Any) -> Make:
-    """`_two_elements`, changed in place by change(generator, parts, h, media); the rest as of
-    `_scenes`. A variant is the index of the stop."""
+    """`two_elements`, changed in place by change(generator, parts, h, media); the rest as of
+    `scenes_of`. A variant is the index of the stop."""
 
     def make(rng, count, stop):
-        parts, h, media = _two_elements(rng, count, stop, f_number)
+        parts, h, media = two_elements(rng, count, stop, f_number)
         if change:
             change(rng, parts, h, media)
-        return _scenes(rng, parts, h, stop, media, **scenes)
+        return scenes_of(rng, parts, h, stop, media, **scenes)
 
     return make
 
@@ -218,8 +128,8 @@ def freeform(rng, parts, h, media):
 
 def focus(rng, count, stop):
     """The sensor exactly at the paraxial focus; and stigmatic ellipsoids, whose spot is 0."""
-    parts, h, media = _two_elements(rng, count, stop, (1, 16))
-    scenes = _scenes(rng, parts, h, stop, media, (0, 5))
+    parts, h, media = two_elements(rng, count, stop, (1, 16))
+    scenes = scenes_of(rng, parts, h, stop, media, (0, 5))
     image = jax.vmap(lambda lens, d: drt_jax.image_distance(lens, d, jnp.array([WAVELENGTH]))[0])
     last = np.sum(parts["thickness"], axis=1)
     sensor = np.asarray(jax.jit(image)(scenes.lens, jnp.asarray(scenes.distance)))
@@ -236,7 +146,7 @@ def focus(rng, count, stop):
     parts["sensor"] = np.maximum(sensor, last + 0.1)
     field = np.where(ideal[:, None], 0, scenes.field)
     far = np.where(ideal, np.inf, scenes.distance)
-    return Scenes(_lens(parts, h, stop, media), field, far, scenes.pupil)
+    return Scenes(batch_of(parts, h, stop, media), field, far, scenes.pupil)
 
 
 def mirror(rng, count, stop):
@@ -247,7 +157,7 @@ def mirror(rng, count, stop):
     parts = {"curvature": np.stack([first, second], 1), "conic": rng.uniform(-4, 0.5, (count, 2))}
     parts |= {"thickness": -gap[:, None], "sensor": h * rng.uniform(-1, 3, count)}
     far = (np.inf, 1e6, 1e4)
-    return _scenes(rng, parts, 0.4 * h, stop, None, (0, 3), far, mirrors=(True, True))
+    return scenes_of(rng, parts, 0.4 * h, stop, None, (0, 3), far, mirrors=(True, True))
 
 
 def folded(rng, count, stop):
@@ -263,7 +173,7 @@ def folded(rng, count, stop):
     parts = {"curvature": np.stack([zero, c[:, 0], c[:, 1], zero], 1)}
     parts |= {"thickness": np.diff(z, axis=1)[:, :3], "sensor": z[:, 4]}
     parts |= {"tilt": tilt, "decentre": np.stack([0 * y, y], -1)}
-    return _scenes(rng, parts, h, stop, None, (0, 5), mirrors=(False, True, True, False))
+    return scenes_of(rng, parts, h, stop, None, (0, 5), mirrors=(False, True, True, False))
 
 
 def phone(rng, count, elements):
@@ -293,7 +203,7 @@ def phone(rng, count, elements):
     parts["thickness"] = thickness
     parts["sensor"] = np.sum(thickness, axis=1) + rng.uniform(0.5, 1.5, count)
     glasses = "air", *(f"medium {i}" if i % 2 else "air" for i in range(surfaces + 1))
-    return _scenes(rng, parts, h, 0, media, (0, 40), glasses=glasses)
+    return scenes_of(rng, parts, h, 0, media, (0, 40), glasses=glasses)
 
 
 def offaxis(rng, count, stop):
@@ -327,11 +237,11 @@ def offaxis(rng, count, stop):
     parts |= {"thickness": np.diff(z, axis=1)[:, :-1], "sensor": z[:, -1] - z[:, 0]}
     parts |= {"tilt": tilt, "decentre": decentre}
     static = {"glasses": ("air",) * (len(mirrors) + 1), "mirrors": tuple(mirrors)}
-    return _scenes(rng, parts, h, row, None, (0, 3), (np.inf, 1e6, 1e4), **static)
+    return scenes_of(rng, parts, h, row, None, (0, 3), (np.inf, 1e6, 1e4), **static)
 
 
 def camera(rng, count, name):
-    """A bundled lens off by 3 %, with aspheric terms of some um at the rim of the stop."""
+    """A bundled lens off by 3 %, with more aspheric terms of some um at the rim of the stop."""
     lens = drt_jax.load_lens(name)
     surfaces = lens.count
     batch = jax.tree.map(lambda a: np.broadcast_to(a, (count, *a.shape)), lens)
@@ -340,18 +250,21 @@ def camera(rng, count, name):
         return a * (1 + size * rng.uniform(-1, 1, a.shape))
 
     rim = float(lens.semi_diameter[lens.stop])
-    conic, terms = np.zeros((count, surfaces + 1)), np.zeros((count, surfaces + 1, 2))
-    terms[:, :-1, 1] = rng.uniform(-5e-3, 5e-3, (count, surfaces)) / rim**4
-    conic[:, :-1] = rng.uniform(-0.2, 0.2, (count, surfaces))
+    conic, terms = np.array(batch.conic), np.array(batch.coefficients)
+    terms = np.pad(terms, ((0, 0), (0, 0), (0, max(0, 2 - terms.shape[-1]))))
+    terms[:, :-1, 1] += rng.uniform(-5e-3, 5e-3, (count, surfaces)) / rim**4
+    conic[:, :-1] += rng.uniform(-0.2, 0.2, (count, surfaces))
     parts = {"curvature": vary(batch.curvature), "thickness": vary(batch.thickness)}
     parts |= {"conic": conic, "coefficients": terms, "sensor": vary(batch.sensor, 0.003)}
     batch = jax.tree.map(jnp.asarray, dataclasses.replace(batch, **parts))
-    widest = {"singlet": 5.0, "double_gauss": 14.0}.get(name, 20.0) * 1.2
+    widest = _WIDEST.get(name, 20.0) * 1.2
     far = rng.choice([300.0, 1e3, 25e3, 1e9, np.inf], count)
-    return Scenes(batch, _fields(rng, count, 0, widest), far, _pupil_points(rng, count))
+    return Scenes(batch, fields(rng, count, 0, widest), far, pupil_points(rng, count))
 
 
 _CAMERAS = ("double_gauss", "cooke_triplet", "singlet")
+_RIMS = ("camera_50mm", "phone", "telephoto_300mm")
+_WIDEST = {"singlet": 5.0, "double_gauss": 14.0, "phone": 32.0, "telephoto_300mm": 4.0}  # degrees
 _WIDE = elements(f_number=(2, 16), angles=(20, 45))
 _EVERYWHERE = (10.0, 20.0, 50.0, 1e5, 1e9, 1e15, np.inf)
 _FREE = "biconic, toroid, odd powers, XY polynomial"
@@ -381,6 +294,7 @@ FAMILIES = {
     "field, float32": Family("as field", _WIDE, (2,), 0.5, "float32"),
     "phone": Family(_PHONE, phone, (3, 4, 5), 0.5),
     "offaxis": Family(_MIRRORS, offaxis, ("first", "second", "itself"), 0.5),
+    "rims": Family("camera, phone and tele lenses off by 3 %, their rims failing", camera, _RIMS),
 }
 
 

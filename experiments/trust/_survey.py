@@ -14,7 +14,7 @@ from drt_jax.lens.forms import Shape
 from drt_jax.lens.surface import sag_derivatives
 from drt_jax.numerics import safe_sqrt
 
-from ._families import WAVELENGTH, Scenes
+from ._scenes import WAVELENGTH, Scenes
 from .snell import trace_snell
 
 _BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
