@@ -39,6 +39,7 @@ BUNDLED = {
     "double_gauss_addon": (99.5, None, 0.5875618, 14.0),
     "fisheye_8mm": (7.999497, 3.999748, 0.5875618, 85.0),
     "heliar_100mm": (100.019, 3.5, 0.5875618, 26.6),
+    "hubble": (57600.0, 24.0, 0.55, 0.1),
     "hypergon_100mm": (103.1537, 20.0, 0.5875618, 67.0),
     "microscope_objective": (4.518818, 0.7531364, 0.5875618, 2.0),
     "petzval_100mm": (99.97499, 2.2, 0.55, 8.0),
@@ -48,8 +49,8 @@ BUNDLED = {
     "singlet": (100.0, 10.0, 0.5875618, 10.0),
     "telephoto_300mm": (299.9918, 5.999836, 0.5875618, 4.0),
 }
-# Traced by other tests (the first four), or like another that is.
-TRACED = {"cooke_triplet", "double_gauss", "double_gauss_addon", "singlet"}
+# Traced by other tests (these), or like another that is.
+TRACED = {"cooke_triplet", "double_gauss", "double_gauss_addon", "singlet", "hubble"}
 LARGER = {"phone_tele", "heliar_100mm", "dagor_240mm", "telephoto_300mm"}
 # Down the stop along y, nearly to its edge (apertures of patents are rounded), and its side.
 POINTS = jnp.array([[0.0, 0.98], [0.0, 0.5], [0.0, 0.0], [0.0, -0.5], [0.98, 0.0]])
