@@ -86,9 +86,9 @@ def converged_rule(
 
     Arguments as of `psf_moments`, all known numbers. A Gauss rule on the stop or, where rays are
     clipped or fail, one fitted to what is left. Two orders are compared on the scene itself: their
-    difference in the covariance, relative to its trace, is twice the error of the first in the
-    spot size, and may be at most `tolerance`, which leaves a factor of two for the error of the
-    second. Warns if no order does. ValueError inside a trace, or if no ray arrives.
+    difference in the covariance, relative to its trace, is once or twice the error of the first in
+    the spot size, and may be at most `tolerance`. Warns if no order does. ValueError inside a
+    trace, or if no ray arrives.
     """
     return _converge(lens, field, distance, wavelengths, tolerance, at_sensor).rule
 
@@ -223,7 +223,7 @@ def _try_orders(
         if before is not None:
             change = _change(found, before.moments, places)
             if change <= _bound(lens, found, tolerance):
-                return trial if clipped else before
+                return before
         if order > _MAX_ORDER:
             warnings.warn(
                 f"the spot size has converged to {change:.1e} only, not to {tolerance:.1e}, with "

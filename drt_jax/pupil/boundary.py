@@ -17,7 +17,8 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import run_if, safe_divide, safe_sqrt
+from ..rays.aim import beam_size, nearest_start, no_fan, trace_fan
 from ..rays.snell import apart, shoot
 from ..rays.status import Status
 from ..rays.system import System, dot
@@ -151,6 +152,21 @@ def launched(lens: Lens, system: System, launch: Array) -> Rays:
     aims = inverse(columns[:, :, lens.stop] / radius)
     moves = jnp.stack([moved(columns, a) for a in aims])
     return Rays(launch, hits[:, lens.stop] / radius, hits, aims, moves, status == Status.OK)
+
+
+def arriving(system: System, launch: Array, radius: Array) -> Array:
+    """Launches (2, W, B) in mm; for a colour of which no ray reaches the sensor, that of the ray of
+    a fan which crosses the stop, of `radius` mm, nearest to its centre."""
+    dark = jnp.all(shoot(system, tuple(launch)).fate != Status.OK, axis=-1)
+    rim = (jnp.zeros_like(launch[0]), jnp.full_like(launch[0], radius))
+
+    def sought(launch):
+        empty = no_fan(system, len(dark))
+        fan = trace_fan(system, empty, 2 * beam_size(system, rim)[1])
+        best = nearest_start(fan, tuple(jnp.zeros_like(launch[:, :, :1])))
+        return jnp.where(dark[None, :, None], jnp.stack(best), launch)
+
+    return run_if(jnp.any(dark), sought, launch)
 
 
 def gaps(lens: Lens, hits: Array, pair: Array) -> Array:

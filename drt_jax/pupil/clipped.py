@@ -57,7 +57,8 @@ def _stages(lens: Lens, system: System, spokes: Spokes, used: Array) -> list:
     def scout(found):  # all over the stop, to where paraxial optics puts them
         radius = lens.semi_diameter[lens.stop]
         launch = paraxial_launch(system, tuple(like + radius * scouts[:, None]), 4 * radius)
-        return of(found.rays, 0)._replace(launch=jnp.stack(launch)), goal(like)
+        arriving = boundary.arriving(system, jnp.stack(launch), radius)
+        return of(found.rays, 0)._replace(launch=arriving), goal(like)
 
     def middle(found):  # all to the point deepest inside, by the model of the best scout
         rays = of(found.rays, 0)

@@ -260,6 +260,16 @@ def trace_fan(system: System, fan: Fan, reach: Array) -> Fan:
     return Fan(launch, tuple(jnp.where(good, a, jnp.inf).reshape(shape) for a in there))
 
 
+def nearest_start(fan: Fan, target: Vector) -> Vector:
+    """Launches, D arrays (W, Q), for stop points, D arrays (W, Q): of the ray of each tile that
+    crosses the stop nearest to its centre, the one that comes nearest."""
+    central = jnp.argmin(dot(fan.there, fan.there), axis=-1)  # (W, tiles)
+    there = (jnp.take_along_axis(a, central[..., None], axis=-1)[..., 0] for a in fan.there)
+    gaps = (a[..., None] - b[:, None] for a, b in zip(target, there, strict=True))
+    tile = jnp.argmin(sum(g * g for g in gaps), axis=-1)
+    return tuple(a[tile, jnp.take_along_axis(central, tile, axis=-1)] for a in fan.launch)
+
+
 def starts_of(fan: Fan, target: Vector, ranks: Array) -> Vector:
     """Launches, D arrays (W, K, N), for stop points, D arrays (W, K): the rays of the fan that come
     nearest, each the nearest of one tile, the tiles by rank; `ranks` (W, K, N)."""

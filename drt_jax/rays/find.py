@@ -12,8 +12,19 @@ import jax.numpy as jnp
 import optimistix as optx
 from jax import Array
 
+from ..numerics import run_if
 from . import fermat, linear
-from .aim import STARTS, Fan, aim, beam_size, no_fan, paraxial_launch, starts_of, trace_fan
+from .aim import (
+    STARTS,
+    Fan,
+    aim,
+    beam_size,
+    nearest_start,
+    no_fan,
+    paraxial_launch,
+    starts_of,
+    trace_fan,
+)
 from .bundle import in_tiles, polynomial_launch, tiles_of
 from .snell import apart, shoot
 from .status import Status
@@ -159,9 +170,9 @@ class _Search(NamedTuple):
 
 
 def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Search:
-    """First all rays from their first launch; then those that failed, a few a turn, each from
-    several rays of a fan. One loop with as many places as there are rays, so that under `vmap` too
-    the fan costs nothing while no ray is missing."""
+    """All rays from their first launch; then those that failed, each from the nearest of a fan;
+    then a few a turn, each from several of it. One loop with as many places as there are rays, so
+    that under `vmap` too the fan costs nothing while no ray is missing."""
     waves, rays = target[0].shape
     starts = min(STARTS, rays)
     few, rounds = rays // starts, -(-STARTS // starts)
@@ -173,37 +184,43 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
         return jnp.pad(a, ((0, 0), (0, rays - few * starts)), mode="edge")
 
     def turn(state):
-        first, sought = state.turn == 0, state.left > 0
+        whole, sought = state.turn < 2, state.left > 0
         # The first few that are left have `starts` places each.
         rank = jnp.cumsum(sought, axis=-1, dtype=jnp.int32) - 1
         mine = sought & (rank < few)
 
-        def seek(fan, *_):
-            fan = _if(state.turn == 1, lambda fan: trace_fan(system, fan, wide), fan)
+        def once(given):
+            fan = trace_fan(system, given[0], wide)
+            return fan, target, nearest_start(fan, target)
+
+        def several(given):
+            fan = given[0]
             rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
             wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
             tried = rounds - jnp.take_along_axis(state.left, rows, 1, mode="clip")
             begin = starts_of(fan, wanted, (tried * starts)[..., None] + ray[None, None, :starts])
             return fan, tuple(places(a[..., None]) for a in wanted), tuple(map(places, begin))
 
-        fan, own, begin = _if(~first, lambda given: seek(*given), (state.fan, target, launch))
-        reach = jnp.where(first, sizes[1], sizes[1] / 8)
-        upright = first & (system.rows.rotation is None)
+        given = run_if(state.turn == 1, once, (state.fan, target, launch))
+        fan, own, begin = run_if(~whole, several, given)
+        reach = jnp.where(state.turn == 0, sizes[1], sizes[1] / 8)
+        upright = whole & (system.rows.rotation is None)
         new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
 
         worth = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
-        worth = worth[:, : few * starts].reshape(waves, few, starts)
-        best = jnp.argmax(worth, axis=-1).astype(jnp.int32)
+        best = worth[:, : few * starts].reshape(waves, few, starts)
         slot = jnp.clip(rank, 0, few - 1)
-        place = slot * starts + jnp.take_along_axis(best, slot, axis=-1)
-        found = jnp.take_along_axis(jnp.any(worth > 0, axis=-1), slot, axis=-1) & mine
-        place, found = jnp.where(first, ray, place), first | found
+        choice = jnp.take_along_axis(jnp.argmax(best, axis=-1).astype(jnp.int32), slot, axis=-1)
+        found = jnp.take_along_axis(jnp.any(best > 0, axis=-1), slot, axis=-1) & mine
+        place = jnp.where(whole, ray, slot * starts + choice)
+        found = jnp.where(whole, (state.turn == 0) | (sought & (worth > 0)), found)
         status = jnp.take_along_axis(new.status, place, axis=-1)
         status = jnp.where(found, status, state.status)
         taken = (jnp.take_along_axis(h, place[None], axis=-1) for h in new.hits)
         hits = tuple(jnp.where(found, a, b) for a, b in zip(taken, state.hits, strict=True))
-        left = jnp.where(first, rounds, state.left - mine.astype(jnp.int32))
-        left = jnp.where((found & ~first) | (status == Status.OK), 0, left)
+        left = state.left - (mine & ~whole).astype(jnp.int32)
+        left = jnp.where(state.turn == 0, rounds, left)
+        left = jnp.where((found & (state.turn > 0)) | (status == Status.OK), 0, left)
         return _Search(hits, status, left, fan, state.turn + 1, state.steps + new.steps)
 
     count = len(system.forms) + (system.stop is not None)
@@ -212,13 +229,6 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
     none = jnp.int32(0)
     start = _Search((zero,) * len(target), status, status, no_fan(system, waves), none, none)
     return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left > 0), turn, start)
-
-
-def _if(condition: Array, function: Callable, value: Any) -> Any:
-    """`function(value)`, of the same structure, if the condition holds, else the value. A loop:
-    under `vmap` too it costs nothing where the condition holds nowhere."""
-    turn = lambda state: (function(state[0]), jnp.array(False))  # noqa: E731
-    return jax.lax.while_loop(lambda state: state[1], turn, (value, condition))[0]
 
 
 class _Traced(NamedTuple):
@@ -270,7 +280,7 @@ def _find_many(system: System, target: Vector) -> Found:
         hits, crossing = apart(system, hits)
         solved = fermat.met(crossing, target, hits, system) & (status == Status.OK)
         found = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0))
-        found = _if(~jnp.all(solved), lambda _: find(system, target, launch), found)
+        found = run_if(~jnp.all(solved), lambda _: find(system, target, launch), found)
         return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
 
     found = in_tiles(tile, target)
