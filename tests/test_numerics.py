@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax.numerics import known_values, safe_divide, safe_sqrt
+from drt_jax.numerics import known_values, run_if, safe_divide, safe_sqrt
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -24,6 +24,24 @@ def test_unbiased_elsewhere():
     np.testing.assert_allclose(
         jax.vmap(jax.grad(safe_sqrt))(x[1:3]), 0.5 / np.sqrt(x[1:3]), rtol=1e-15
     )
+
+
+def test_a_branch_that_runs_where_it_is_asked_for():
+    runs = []
+
+    def double(value):
+        jax.debug.callback(lambda: runs.append(1))
+        return 2 * value
+
+    some = jnp.array([False, True, False])
+    found = jax.vmap(lambda go, x: run_if(go, double, x))(some, jnp.arange(3.0))
+    np.testing.assert_array_equal(found, [0, 2, 2])
+    jax.effects_barrier()
+    before = len(runs)
+    none = jax.jit(jax.vmap(lambda go, x: run_if(go, double, x)))(some & False, jnp.arange(3.0))
+    jax.effects_barrier()
+    np.testing.assert_array_equal(none, [0, 1, 2])
+    assert before > 0 and len(runs) == before
 
 
 def test_values_are_known_while_they_are_differentiated_eagerly():

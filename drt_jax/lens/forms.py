@@ -139,7 +139,7 @@ def polynomial_xy(w: Point, shape: Shape) -> tuple[Array, Array]:
 def linear(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Conic and a slope: ... + a_0 y. As a phase, a grating with lines along x."""
     z, argument = _conic(square(w), shape.curvature, shape.conic)
-    return z + shape.coefficients[0] * w[-1], argument
+    return z + w[-1] * sum(shape.coefficients[:1], jnp.zeros_like(z)), argument
 
 
 @functools.cache

@@ -159,7 +159,7 @@ def _beside(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list
 def perturbed(lens: Lens, count: int, seed: int) -> Lens:
     """So many copies of a lens, curvatures, thicknesses and the sensor off by some 1e-4."""
     rng = np.random.default_rng(seed)
-    vary = lambda a: a * (1 + _SPREAD * rng.normal(size=(count, *a.shape)))  # noqa: E731
+    vary = lambda a: a[None] * (1 + _SPREAD * rng.normal(size=(count, *a.shape)))  # noqa: E731
     parts = {"curvature": vary(lens.curvature), "thickness": vary(lens.thickness)}
     batch = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), lens)
     return dataclasses.replace(batch, **parts, sensor=vary(lens.sensor))

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Clipped, Soft, focus_moments, load_lens, trace_rays
+from drt_jax import Clipped, Gauss, Soft, focus_moments, load_lens, psf_moments, trace_rays
+from drt_jax.pupil import hexapolar
 
 GREEN = (0.53,)
 FAR = 25000.0
@@ -155,3 +156,15 @@ def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
     np.testing.assert_allclose(slope[0], difference, rtol=1e-6)
     with pytest.raises(ValueError, match="width: expected a number above 0 mm, got 0"):
         Soft(4, "half", 0.0)
+
+
+def test_a_pupil_that_paraxial_optics_does_not_find():
+    """A fisheye at 85 degrees, its paraxial entrance pupil far from the real one: the nearest ray
+    of a fan leads all others, and the rule finds the stop, which nothing clips."""
+    lens, field, green = load_lens("fisheye_8mm"), np.radians(85.0), (0.55,)
+    ours = psf_moments(lens, field, jnp.inf, green, rule=Clipped(10, "half"))
+    theirs = psf_moments(lens, field, jnp.inf, green, rule=Gauss(14, "half"))
+    np.testing.assert_allclose(ours.passed, 1, rtol=1e-12)
+    np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-12)
+    rays = trace_rays(lens, field, jnp.inf, green, hexapolar(8)[0].T)
+    assert np.all(rays.status == 0) and rays.newton_steps < 20
