@@ -183,7 +183,8 @@ def reference(
     field: radians along y. distance: mm. wavelengths: um.
     """
     semi = np.asarray(lens.semi_diameter)
-    reach = 3 * float(np.max(semi[np.isfinite(semi)])) + 2 * _LEAD
+    # A steep beam crosses the plane far from where it meets the first surface.
+    reach = (3 * float(np.max(semi[np.isfinite(semi)])) + 2 * _LEAD) * (1 + math.tan(abs(field)))
     results = []
     for wavelength in wavelengths:
         scene = jnp.array([field, 1 / distance, wavelength])
