@@ -35,6 +35,7 @@ from .image.wavefront import (
 from .learn.adam import adam as adam, apply_updates as apply_updates
 from .learn.network import red_net as red_net
 from .lens.aperture import Apertures as Apertures
+from .lens.elements import Elements as Elements
 from .lens.glass import find_glass as find_glass, refractive_index as refractive_index
 from .lens.lens import Lens as Lens, sag as sag
 from .lens.paraxial import (
@@ -52,6 +53,7 @@ from .lens.paraxial import (
     lateral_magnification as lateral_magnification,
     numerical_aperture as numerical_aperture,
 )
+from .lens.phase import Phase as Phase
 from .lens.scene import Scene as Scene, field_of_height as field_of_height, scene_of as scene_of
 from .lens.seidel import ThirdOrder as ThirdOrder, third_order as third_order
 from .pupil.clipped import Clipped as Clipped
