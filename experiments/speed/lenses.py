@@ -36,6 +36,8 @@ COLUMNS = ("first_s", "loose_s", "tight_s", "value_s", "gradient_s", "loose_erro
 _LOOSE, _TIGHT = 1e-3, 1e-6
 # Copies of a lens are perturbed by so much, relative.
 _SPREAD = 1e-4
+# Values and slopes below this (mm, or of the light) are rounding.
+_NOTHING = 1e-9
 _SWEEP = "sigma", "centroid", "share of light"
 
 
@@ -210,10 +212,9 @@ def sweep(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) ->
 
 
 def _roughness(row: np.ndarray) -> float:
-    """By how much a value is off the parabola through its neighbours, of the range of all: of the
+    """By how much a value is off the parabola through its neighbours, of the largest of all: of the
     order of the step where there is one, and nearly 0 for a smooth function."""
-    third = np.abs(np.diff(row, 3)) / 3
-    return float(np.max(third) / max(np.ptp(row), np.finfo(float).tiny))
+    return float(np.max(np.abs(np.diff(row, 3))) / 3 / max(np.max(np.abs(row)), _NOTHING))
 
 
 def lens_rows(config: Config, of: LensFields) -> dict[str, Any]:
@@ -290,7 +291,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
             series = {
                 swept["lens"]: (
                     np.array(swept["field_deg"]) / swept["field_deg"][-1],
-                    np.array(swept[key][row]) / max(np.max(np.abs(swept[key][row])), 1e-300),
+                    np.array(swept[key][row]) / max(np.max(np.abs(swept[key][row])), _NOTHING),
                 )
                 for swept in results["sweeps"]
             }
