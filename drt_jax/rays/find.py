@@ -176,7 +176,6 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
     waves, rays = target[0].shape
     starts = min(STARTS, rays)
     few, rounds = rays // starts, -(-STARTS // starts)
-    wide = jnp.maximum(2 * sizes[1], 1.6 * jnp.sqrt(jnp.max(dot(launch, launch))))
     ray = jnp.arange(rays, dtype=jnp.int32)
 
     def places(a):  # (W, few, starts or 1) -> (W, Q)
@@ -190,8 +189,11 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
         mine = sought & (rank < few)
 
         def once(given):
-            fan = trace_fan(system, given[0], wide)
-            return fan, target, nearest_start(fan, target)
+            # From what the loop is given, or XLA would take the fan out of it, and always trace it.
+            fan, own, begin = given
+            wide = jnp.maximum(2 * sizes[1], 1.6 * jnp.sqrt(jnp.max(dot(begin, begin))))
+            fan = trace_fan(system, fan, wide)
+            return fan, own, nearest_start(fan, own)
 
         def several(given):
             fan = given[0]
