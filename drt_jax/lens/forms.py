@@ -39,10 +39,12 @@ class Shape(NamedTuple):
 
 
 def square(w: Point) -> Array:
+    """r^2 of points, the shape of `w[0]`, mm^2."""
     return sum((a * a for a in w[1:]), w[0] * w[0])
 
 
 def root(argument: Array) -> Array:
+    """Square root down to `RIM`; below, its smooth and positive continuation. Any shape."""
     inside = argument > RIM
     beyond = RIM**0.5 / (1 + (1 - jnp.where(inside, RIM, argument) / RIM) / 2)
     return jnp.where(inside, jnp.sqrt(jnp.where(inside, argument, 1)), beyond)

@@ -161,10 +161,8 @@ def arriving(system: System, launch: Array, radius: Array) -> Array:
     rim = (jnp.zeros_like(launch[0]), jnp.full_like(launch[0], radius))
 
     def sought(launch):
-        # From what the loop is given, or XLA would take the fan out of it, and always trace it.
-        wide = 1.6 * jnp.sqrt(jnp.max(dot(launch, launch)))
-        wide = jnp.maximum(2 * beam_size(system, rim)[1], wide)
-        fan = trace_fan(system, no_fan(system, len(dark)), wide)
+        width = beam_size(system, rim)[1]
+        fan = trace_fan(system, no_fan(system, len(dark)), tuple(launch), width)
         best = nearest_start(fan, tuple(jnp.zeros_like(launch[:, :, :1])))
         return jnp.where(dark[None, :, None], jnp.stack(best), launch)
 

@@ -59,6 +59,7 @@ def gauss(most: int) -> np.ndarray:
 
 
 def unit(angle: Array) -> Array:
+    """Vectors (2, ...) of length 1 at azimuths (...), radians from the x axis."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 

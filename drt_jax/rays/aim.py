@@ -249,8 +249,13 @@ def no_fan(system: System, waves: int) -> Fan:
     return Fan(tuple(points), (nowhere,) * system.dim)
 
 
-def trace_fan(system: System, fan: Fan, reach: Array) -> Fan:
-    """The fan of launches up to `reach` mm from the axis, traced."""
+def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
+    """The fan traced, over twice the `width` of the beam (mm) and beyond the launches `tried`.
+
+    In a loop that runs only where a ray is missing, these must be what that loop is given: from
+    what does not change in it XLA computes the whole fan beforehand, missing rays or not.
+    """
+    reach = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
     launch = tuple(reach * jnp.asarray(a, reach.dtype) for a in _fan(system.dim))
     shape = fan.there[0].shape
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)

@@ -169,53 +169,35 @@ class _Search(NamedTuple):
     steps: Array
 
 
+def _room(rays: int) -> tuple[int, int, int]:
+    """Of a bundle in which rays are sought again: how many starts each has in a turn, how many rays
+    that leaves room for, and how many turns it takes to try all `STARTS`."""
+    starts = min(STARTS, rays)
+    return starts, rays // starts, -(-STARTS // starts)
+
+
 def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Search:
     """All rays from their first launch; then those that failed, each from the nearest of a fan;
     then a few a turn, each from several of it. One loop with as many places as there are rays, so
     that under `vmap` too the fan costs nothing while no ray is missing."""
     waves, rays = target[0].shape
-    starts = min(STARTS, rays)
-    few, rounds = rays // starts, -(-STARTS // starts)
+    _, few, rounds = _room(rays)
     ray = jnp.arange(rays, dtype=jnp.int32)
-
-    def places(a):  # (W, few, starts or 1) -> (W, Q)
-        a = jnp.broadcast_to(a, (waves, few, starts)).reshape(waves, -1)
-        return jnp.pad(a, ((0, 0), (0, rays - few * starts)), mode="edge")
 
     def turn(state):
         whole, sought = state.turn < 2, state.left > 0
-        # The first few that are left have `starts` places each.
+        # The first few that are left have several places each.
         rank = jnp.cumsum(sought, axis=-1, dtype=jnp.int32) - 1
         mine = sought & (rank < few)
-
-        def once(given):
-            # From what the loop is given, or XLA would take the fan out of it, and always trace it.
-            fan, own, begin = given
-            wide = jnp.maximum(2 * sizes[1], 1.6 * jnp.sqrt(jnp.max(dot(begin, begin))))
-            fan = trace_fan(system, fan, wide)
-            return fan, own, nearest_start(fan, own)
-
-        def several(given):
-            fan = given[0]
-            rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
-            wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
-            tried = rounds - jnp.take_along_axis(state.left, rows, 1, mode="clip")
-            begin = starts_of(fan, wanted, (tried * starts)[..., None] + ray[None, None, :starts])
-            return fan, tuple(places(a[..., None]) for a in wanted), tuple(map(places, begin))
-
-        given = run_if(state.turn == 1, once, (state.fan, target, launch))
-        fan, own, begin = run_if(~whole, several, given)
+        fan, own, begin = _sought(system, state, mine, (state.fan, target, launch), sizes[1])
         reach = jnp.where(state.turn == 0, sizes[1], sizes[1] / 8)
         upright = whole & (system.rows.rotation is None)
         new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
 
         worth = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
-        best = worth[:, : few * starts].reshape(waves, few, starts)
-        slot = jnp.clip(rank, 0, few - 1)
-        choice = jnp.take_along_axis(jnp.argmax(best, axis=-1).astype(jnp.int32), slot, axis=-1)
-        found = jnp.take_along_axis(jnp.any(best > 0, axis=-1), slot, axis=-1) & mine
-        place = jnp.where(whole, ray, slot * starts + choice)
-        found = jnp.where(whole, (state.turn == 0) | (sought & (worth > 0)), found)
+        place, found = _best(worth, jnp.clip(rank, 0, few - 1))
+        place = jnp.where(whole, ray, place)
+        found = jnp.where(whole, (state.turn == 0) | (sought & (worth > 0)), found & mine)
         status = jnp.take_along_axis(new.status, place, axis=-1)
         status = jnp.where(found, status, state.status)
         taken = (jnp.take_along_axis(h, place[None], axis=-1) for h in new.hits)
@@ -231,6 +213,45 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
     none = jnp.int32(0)
     start = _Search((zero,) * len(target), status, status, no_fan(system, waves), none, none)
     return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left > 0), turn, start)
+
+
+def _sought(
+    system: System, state: _Search, mine: Array, given: tuple[Fan, Vector, Vector], width: Array
+) -> tuple[Fan, Vector, Vector]:
+    """Fan, stop points and launches of a turn: those `given` in the first; in the second, the
+    nearest launch of a fan for each ray; then several for each of the few rays that are `mine`."""
+    waves, rays = mine.shape
+    starts, few, rounds = _room(rays)
+    ray = jnp.arange(rays, dtype=jnp.int32)
+
+    def places(a):  # (W, few, starts or 1) -> (W, Q)
+        a = jnp.broadcast_to(a, (waves, few, starts)).reshape(waves, -1)
+        return jnp.pad(a, ((0, 0), (0, rays - few * starts)), mode="edge")
+
+    def once(given):
+        fan, target, launch = given
+        fan = trace_fan(system, fan, launch, width)
+        return fan, target, nearest_start(fan, target)
+
+    def several(given):
+        fan, target, _ = given
+        rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
+        wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
+        tried = rounds - jnp.take_along_axis(state.left, rows, 1, mode="clip")
+        begin = starts_of(fan, wanted, (tried * starts)[..., None] + ray[None, None, :starts])
+        return fan, tuple(places(a[..., None]) for a in wanted), tuple(map(places, begin))
+
+    return run_if(state.turn > 1, several, run_if(state.turn == 1, once, given))
+
+
+def _best(worth: Array, slot: Array) -> tuple[Array, Array]:
+    """The place of the best start (W, Q) of each ray, whose places have the number `slot`, and
+    whether it is worth anything."""
+    waves, rays = worth.shape
+    starts, few, _ = _room(rays)
+    each = worth[:, : few * starts].reshape(waves, few, starts)
+    choice = jnp.take_along_axis(jnp.argmax(each, axis=-1).astype(jnp.int32), slot, axis=-1)
+    return slot * starts + choice, jnp.take_along_axis(jnp.any(each > 0, axis=-1), slot, axis=-1)
 
 
 class _Traced(NamedTuple):

@@ -202,13 +202,10 @@ def sweep(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) ->
         return jax.jvp(lambda grown: spot(grown, field), (jnp.zeros(()),), (jnp.ones(()),))
 
     values, slopes = jax.jit(jax.vmap(both))(fields)
-    rows = {"values": np.asarray(values.T), "slopes": np.asarray(slopes.T)}
-    known = {key: found.tolist() for key, found in rows.items()}
-    return (
-        {"field_deg": np.degrees(fields).tolist()}
-        | known
-        | {"steps": {key: [_roughness(row) for row in found] for key, found in rows.items()}}
-    )
+    found = {"values": np.asarray(values.T), "slopes": np.asarray(slopes.T)}
+    steps = {key: [_roughness(row) for row in rows] for key, rows in found.items()}
+    known = {key: rows.tolist() for key, rows in found.items()}
+    return {"field_deg": np.degrees(fields).tolist(), **known, "steps": steps}
 
 
 def _roughness(row: np.ndarray) -> float:
@@ -234,12 +231,9 @@ def lens_rows(config: Config, of: LensFields) -> dict[str, Any]:
     clipped = [rule for rule in rules if isinstance(rule, drt_jax.Clipped)]
     kind, among = (drt_jax.Clipped, clipped) if clipped else (drt_jax.Gauss, rules)
     rule = kind(max(int(rule.order) for rule in among), rules[0].symmetry)
-    group = {"lens": of.lens} | copies(config, lens, widest, rule)
-    return {
-        "rows": rows,
-        "copies": group,
-        "sweep": {"lens": of.lens} | sweep(config, lens, widest, rule),
-    }
+    name = {"lens": of.lens}
+    parts = {"copies": copies, "sweep": sweep}
+    return {"rows": rows} | {key: name | f(config, lens, widest, rule) for key, f in parts.items()}
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
