@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .oracle_surfaces import cross, dot
+
 STEP = 1e-30
-# As in the package: a conic ends where the square of the cosine of its normal falls below this.
-RIM = 1e-4
 LENS = ("curvature", "conic", "coefficients", "thickness", "semi_diameter", "sensor")
 MOVES = ("decentre", "tilt")
 MEDIA = ("schott", "strength", "resonance")
@@ -67,69 +67,6 @@ class Scene:
         first = scenes[0]
         arrays = {k: np.stack([each.values[k] for each in scenes]) for k in first.values}
         return dataclasses.replace(first, values=arrays)
-
-
-def _powers(x, count):
-    """1, x, x^2, ... by multiplication: exact for an imaginary part of 1e-30."""
-    powers = [np.ones_like(x)]
-    for _ in range(count):
-        powers.append(powers[-1] * x)
-    return powers
-
-
-def _series(powers, first, step, a):
-    """sum_j a_j x^(first + j step), and its derivative by x."""
-    total, slope = 0 * powers[0], 0 * powers[0]
-    for j, coefficient in enumerate(a):
-        p = first + j * step
-        total = total + coefficient * powers[p]
-        slope = slope + p * coefficient * powers[p - 1]
-    return total, slope
-
-
-def surface(form, x, y, c, k, a):
-    """Sag and its slopes along x and y; `a` is a list of coefficients."""
-    if form == "biconic":
-        (cx, kx), rest = a[:2], a[2:]
-        root = np.sqrt(1 - (1 + kx) * cx**2 * x**2 - (1 + k) * c**2 * y**2)
-        top = cx * x**2 + c * y**2
-        z = top / (1 + root)
-        zx = 2 * cx * x / (1 + root) + top * (1 + kx) * cx**2 * x / (root * (1 + root) ** 2)
-        zy = 2 * c * y / (1 + root) + top * (1 + k) * c**2 * y / (root * (1 + root) ** 2)
-        r2 = x**2 + y**2
-        more, slope = _series(_powers(r2, len(rest) + 1), 1, 1, rest)
-        return z + more, zx + 2 * x * slope, zy + 2 * y * slope
-    if form == "toroid":
-        cx, rest = a[0], a[1:]
-        root = np.sqrt(1 - (1 + k) * c**2 * y**2)
-        more, slope = _series(_powers(y, 2 * len(rest) + 1), 2, 2, rest)
-        g, bent = c * y**2 / (1 + root) + more, c * y / root + slope
-        # The circle (z - 1/cx)^2 + x^2 = (1/cx - g)^2, without its cancellation.
-        z = (2 * g - cx * g**2 + cx * x**2) / (1 + np.sqrt((1 - cx * g) ** 2 - (cx * x) ** 2))
-        return z, cx * x / (1 - cx * z), bent * (1 - cx * g) / (1 - cx * z)
-    r2 = x**2 + y**2
-    root = np.sqrt(1 - (1 + k) * c**2 * r2)
-    z, zx, zy = c * r2 / (1 + root), c * x / root, c * y / root
-    if form == "asphere":
-        more, slope = _series(_powers(r2, len(a) + 1), 1, 1, a)
-        return z + more, zx + 2 * x * slope, zy + 2 * y * slope
-    if form == "odd_asphere":
-        r = np.sqrt(r2)
-        more, slope = _series(_powers(r, len(a) + 1), 1, 1, a)
-        return z + more, zx + slope * x / r, zy + slope * y / r
-    if form != "polynomial_xy":
-        raise ValueError(form)
-    xs, ys = _powers(x, len(a) + 1), _powers(y, len(a) + 1)
-    degree, j = 1, 0
-    for coefficient in a:  # x, y, x^2, x y, y^2, x^3, ...
-        i = degree - j
-        z = z + coefficient * xs[i] * ys[j]
-        if i:
-            zx = zx + i * coefficient * xs[i - 1] * ys[j]
-        if j:
-            zy = zy + j * coefficient * xs[i] * ys[j - 1]
-        degree, j = (degree, j + 1) if i else (degree + 1, 0)
-    return z, zx, zy
 
 
 def _wide(value):
@@ -184,64 +121,12 @@ class Trace(NamedTuple):
     good: np.ndarray
 
 
-def _dot(a, b):
-    return sum(x * y for x, y in zip(a, b))
-
-
-def _to_conic(p, d, c, k):
-    """Real distance along p + s d to the conic of c and k, where the ray crosses it from the
-    side where its vertex plane lies in front; to the vertex plane if it misses the conic."""
-    p, d, c, k = ([np.real(a) for a in p], [np.real(a) for a in d], np.real(c), np.real(k))
-    plane = -p[2] / d[2]
-    p = [p[0] + plane * d[0], p[1] + plane * d[1]]
-    # c (x^2 + y^2 + (1 + k) z^2) = 2 z: square s^2 - 2 linear s + constant = 0
-    square = c * (1 + k * d[2] ** 2)
-    linear, constant = d[2] - c * _dot(p, d[:2]), c * _dot(p, p)
-    discriminant = linear**2 - square * constant
-    root = np.sign(d[2]) * np.sqrt(np.maximum(discriminant, 0))
-    alike = linear * root < 0
-    above = np.where(alike, linear - root, constant)
-    below = np.where(alike, square, linear + root)
-    meets = (discriminant > 0) & (below != 0)
-    return plane + np.where(meets, above / np.where(meets, below, 1), 0)
-
-
-def _rim(form, x, y, c, k, a):
-    """What must stay above `RIM` on the surface."""
-    if form == "biconic":
-        return 1 - (1 + a[1]) * a[0] ** 2 * x**2 - (1 + k) * c**2 * y**2
-    if form == "toroid":
-        z = surface(form, 0 * y, y, c, k, a)[0]
-        return np.minimum(1 - (1 + k) * c**2 * y**2, (1 - a[0] * z) ** 2 - (a[0] * x) ** 2)
-    return 1 - (1 + k) * c**2 * (x**2 + y**2)
-
-
-def _cross(form, p, d, shape):
-    """Where p + s d crosses a surface: the point, the slopes there, s, and whether it does."""
-    conic = form in ("asphere", "odd_asphere", "polynomial_xy")
-    s = (_to_conic(p, d, *shape[:2]) if conic else -p[2] / d[2]) + 0j
-    for _ in range(14):
-        q = [a + b * s for a, b in zip(p, d)]
-        z, zx, zy = surface(form, q[0], q[1], *shape)
-        s = s + (z - q[2]) / (d[2] - zx * d[0] - zy * d[1])
-    q = [a + b * s for a, b in zip(p, d)]
-    z, zx, zy = surface(form, q[0], q[1], *shape)
-    z_miss, (c, k, a) = np.real(z - q[2]), shape
-    real = [np.real(v) for v in (q[0], q[1], c, k)]
-    met = _rim(form, *real, [np.real(v) for v in a]) > RIM
-    # A ray that misses ends anywhere, or circles, or meets the formula off the real numbers.
-    small = 1e-10 * (1 + np.abs(np.real(s)))
-    met &= (np.abs(z_miss) < small) & (np.abs(np.imag(s)) < small)
-    met &= np.real(d[2] - zx * d[0] - zy * d[1]) * np.real(d[2]) > 0
-    return [q[0], q[1], z], (zx, zy), s, met
-
-
 def _bend(d, slopes, ratio, mirror):
     """Direction behind a surface, the cosine of the incidence against its normal along z, and
     whether the light passes."""
     size = np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
     normal = [-slopes[0] / size, -slopes[1] / size, 1 / size]
-    along = _dot(normal, d)
+    along = dot(normal, d)
     sign = np.where(np.real(along) < 0, -1.0, 1.0)
     normal, cosine = [sign * a for a in normal], sign * along
     square = 1 - ratio**2 * (1 - cosine**2)
@@ -256,7 +141,7 @@ def _from_source(point, v, tangent):
     source = [-tangent[0], -tangent[1], -1.0]
     first = [v * a - b for a, b in zip(point, source)]
     top = sum(v * a**2 - 2 * a * b for a, b in zip(point, source))
-    return top / (np.sqrt(_dot(first, first)) + np.sqrt(_dot(source, source)))
+    return top / (np.sqrt(dot(first, first)) + np.sqrt(dot(source, source)))
 
 
 @np.errstate(all="ignore")  # of rays that are not good
@@ -272,7 +157,7 @@ def trace(scene, x, y, stop_only=False):
     tangent = [np.tan(_wide(values["field"][..., i])) for i in (0, 1)]
     point = [x + 0j, y + 0j, 0 * (x + y) + 0j]
     segment = [v * point[0] + tangent[0], v * point[1] + tangent[1], 1 + 0 * point[2]]
-    length = np.sqrt(_dot(segment, segment))
+    length = np.sqrt(dot(segment, segment))
     d = [s / length for s in segment]
     count, sense = len(scene.mirrors), 1
     own_hits, hits, path = [], [], None
@@ -286,7 +171,7 @@ def trace(scene, x, y, stop_only=False):
         a = values["coefficients"]
         shape = [_wide(values[name][..., i]) for name in ("curvature", "conic")]
         shape.append([_wide(a[..., i, j]) for j in range(a.shape[-1])])
-        q, slopes, s, met = _cross(scene.forms[i], p, own_d, shape)
+        q, slopes, s, met = cross(scene.forms[i], p, own_d, shape)
         good = good & met
         own_hits.append(q)
         if stop_only and i == scene.stop:

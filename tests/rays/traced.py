@@ -1,4 +1,5 @@
-"""One compiled program for rays and their derivatives, and the comparison with the oracle."""
+"""One compiled program for rays and their derivatives, the comparison with the oracle, and lenses
+whose rays are labelled in front of them."""
 
 import functools
 from typing import NamedTuple
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drt_jax import Status, trace_rays
+from drt_jax import Status, load_lens, trace_rays
 
 from .. import oracle
 
@@ -111,3 +112,19 @@ def assert_same_rays(rays, wanted, atol, where=""):
     assert error <= atol, f"{where}: points {error} mm off"
     error = np.max(np.abs(path - wanted.path[exists]), initial=0)
     assert error <= atol, f"{where}: path {error} mm off"
+
+
+def behind_stop(surfaces, gap, semi_diameter, **top):
+    """The lens of `surfaces` with a stop plane `gap` mm before its first vertex, listed first."""
+    plane = {"curvature": 0, "thickness": gap, "semi_diameter": semi_diameter, "stop": True}
+    return load_lens({"surfaces": [plane | top.get("object", {}), *surfaces], **top})
+
+
+def directions(points):
+    """Unit vectors (..., S, 3) between the successive points (..., S + 1, 3) of rays."""
+    step = np.diff(points, axis=-2)
+    return step / np.linalg.norm(step, axis=-1, keepdims=True)
+
+
+def on_y(*heights):
+    return np.stack([np.zeros(len(heights)), heights], axis=1)
