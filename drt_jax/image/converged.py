@@ -85,10 +85,10 @@ def converged_rule(
     """The rule that keeps the RMS spot size on the sensor within `tolerance` (relative).
 
     Arguments as of `psf_moments`, all known numbers. A Gauss rule on the stop or, where rays are
-    clipped or fail, one fitted to what is left. Two orders are compared on the scene itself: their
-    difference in the covariance, relative to its trace, is once or twice the error of the first in
-    the spot size, and may be at most `tolerance`. Warns if no order does. ValueError inside a
-    trace, or if no ray arrives.
+    clipped or fail, one fitted to what is left. Orders are compared on the scene itself: the first
+    whose covariance differs from those of the next two by at most `tolerance`, relative to its
+    trace, which is about twice the error in the spot size; two alone may agree by accident. Warns
+    if no order does. ValueError inside a trace, or if no ray arrives.
     """
     return _converge(lens, field, distance, wavelengths, tolerance, at_sensor).rule
 
@@ -202,7 +202,7 @@ def _converge(
 def _try_orders(
     lens: Lens, scene: Scene, symmetry: Symmetry, tolerance: float, places: Callable
 ) -> _Trial:
-    before: _Trial | None = None
+    trials: list[_Trial] = []
     # A rule on the whole stop may step over an obscuration.
     clipped = lens.apertures is not None and any(lens.apertures.blocks)
     order, solver = _CLIPPED[0] if clipped else 2, solve_aimed
@@ -212,26 +212,27 @@ def _try_orders(
         found, rays, failing, cut = _weigh(lens, scene, used, solver)
         sought = solver is solve
         if not clipped and (cut or (failing and sought)):
-            before, clipped, order = None, True, _CLIPPED[0]
+            trials, clipped, order = [], True, _CLIPPED[0]
             continue
         if failing and not sought:  # some rays must be
             solver = solve
             continue
         _check_passed(np.asarray(found.passed), scene.wavelengths)
-        trial = _Trial(rule, used, found, rays)
-        change = np.inf
-        if before is not None:
-            change = _change(found, before.moments, places)
-            if change <= _bound(lens, found, tolerance):
-                return before
+        trials = [*trials, _Trial(rule, used, found, rays)][-3:]
+        change = max(
+            (_change(later.moments, trials[0].moments, places) for later in trials[1:]),
+            default=np.inf,
+        )
+        if len(trials) == 3 and change <= _bound(lens, found, tolerance):
+            return trials[0]
         if order > _MAX_ORDER:
             warnings.warn(
                 f"the spot size has converged to {change:.1e} only, not to {tolerance:.1e}, with "
                 f"the order {order}; does the edge of the beam fail?",
                 stacklevel=4,
             )
-            return trial
-        before, order = trial, order + (_CLIPPED[1] if clipped else 1)
+            return trials[-1]
+        order += _CLIPPED[1] if clipped else 1
 
 
 def _bound(lens: Lens, found: FocusMoments, tolerance: float) -> float:
@@ -245,7 +246,7 @@ def _bound(lens: Lens, found: FocusMoments, tolerance: float) -> float:
 
 def _size(order: int) -> int:
     """The order up to which those about `order` fill up, to share a compiled program."""
-    return next(size for size in (10, 20, _MAX_ORDER + 2) if size >= order)
+    return 20 if order <= 20 else _MAX_ORDER + 2
 
 
 def _padded(order: int, symmetry: Symmetry) -> Pattern:

@@ -25,7 +25,7 @@ from .snell import trace_snell
 
 # The plane of q lies this far before the first vertex (mm).
 _LEAD = 5.0
-_PANELS, _CORNERS, _AZIMUTHS, _RADII = 6, 5, 12, 16
+_PANELS, _CORNERS, _AZIMUTHS, _RADII = 6, 5, 12, 24
 _BISECTIONS = 50
 # Points along a diameter, half-lines along which the edge is searched for corners.
 _SCAN, _SEARCH = 1152, 121
