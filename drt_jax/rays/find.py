@@ -25,7 +25,7 @@ from .aim import (
     starts_of,
     trace_fan,
 )
-from .bundle import in_tiles, polynomial_launch, tiles_of
+from .bundle import in_tiles, polynomial_launch, tile_of
 from .snell import apart, shoot
 from .status import Status
 from .system import System, Vector, dot
@@ -293,7 +293,9 @@ def find_many(system: System, target: Vector) -> Found:
 
 
 def _find_many(system: System, target: Vector) -> Found:
-    if len(target) == 1 or tiles_of(target[0].shape[1], target[0].shape[0])[0] == 1:
+    waves, rays = target[0].shape
+    size = tile_of(rays, waves)
+    if len(target) == 1 or size == rays:
         return find(system, target)
     launch_of = polynomial_launch(system, target)
 
@@ -306,5 +308,5 @@ def _find_many(system: System, target: Vector) -> Found:
         found = run_if(~jnp.all(solved), lambda _: find(system, target, launch), found)
         return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
 
-    found = in_tiles(tile, target)
+    found = in_tiles(tile, size, target)
     return found._replace(steps=jnp.max(found.steps))

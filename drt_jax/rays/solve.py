@@ -15,7 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from ..lens.surface import by_form, sag_derivatives
 from . import fermat, linear
-from .bundle import in_tiles
+from .bundle import held_tile, in_tiles
 from .fermat import Path
 from .find import Found, find_aimed, find_many
 from .snell import cross
@@ -51,7 +51,8 @@ def _attach_jvp(primals: Any, tangents: Any) -> tuple:
         moved = linear.solve(path, system, good, push)
         return jax.tree.map(lambda a: jnp.where(good, a, 0), moved)
 
-    return (hits, arrival), in_tiles(tangent, hits, turning, good)
+    tile = held_tile(len(good), len(system.forms))
+    return (hits, arrival), in_tiles(tangent, tile, hits, turning, good)
 
 
 attach.defjvp(_attach_jvp, symbolic_zeros=True)
