@@ -1,5 +1,6 @@
 """What the experiments share: checks of settings, results on disk, tables, measured time."""
 
+import io
 import json
 import math
 import pathlib
@@ -34,28 +35,39 @@ def require_list(name: str, values: tuple[float, ...], low: float = 0.0) -> None
         require(low < value < math.inf, f"{name}: expected numbers above {low:g}, got {value!r}")
 
 
+def require_within(prefix: str, settings: Any, **limits: tuple[float, float]) -> None:
+    """ConfigError unless the settings of these names, of lists every item, lie within their limits,
+    both included.
+
+    prefix: of the settings in messages, such as "train.".
+    """
+    for name, (low, high) in limits.items():
+        value = getattr(settings, name)
+        for item in value if isinstance(value, tuple) else (value,):
+            expected = f"{prefix}{name}: expected {low:g} to {high:g}"
+            require(low <= item <= high, f"{expected}, got {item!r}")
+
+
 def require_known(name: str, values: tuple[str, ...], known: Iterable[str]) -> None:
     """ConfigError unless all values are among the known ones."""
     for value in values:
         require(value in known, f"{name}: unknown {value!r}; known: {', '.join(known)}")
 
 
-def write_results(run: Run, results: dict[str, Any]) -> None:
-    """Results of a run: arrays as results.npz, all else as results.json."""
-    arrays = {key: value for key, value in results.items() if isinstance(value, np.ndarray)}
-    if arrays:
-        np.savez_compressed(run.folder / "results.npz", **arrays)
-    run.finish({key: value for key, value in results.items() if key not in arrays})
-
-
 def read_results(folder: pathlib.Path) -> dict[str, Any]:
-    """What `write_results` wrote into a run folder. ConfigError if the run is not finished."""
+    """What `Run.finish` wrote into a run folder. ConfigError if the run is not finished, or its
+    results are damaged."""
     path = folder / "results.json"
     require(path.is_file(), f"{folder}: no results.json in it: the run is not finished")
-    results = json.loads(path.read_text())
-    if (folder / "results.npz").is_file():
-        with np.load(folder / "results.npz") as arrays:
-            results |= dict(arrays)
+    results: dict[str, Any] = {}
+    for part in (path, *folder.glob("results.npz")):
+        content = part.read_bytes()
+        try:
+            whole = json.loads(content) if part == path else np.load(io.BytesIO(content))
+            results |= dict(whole)
+        except Exception as error:  # what reading a damaged archive can raise has no end
+            remedy = f"have it written again with --resume --out {folder}"
+            raise ConfigError(f"{part}: the file is damaged; {remedy}") from error
     return results
 
 
@@ -64,11 +76,9 @@ def measured(run: Run, unit: str, jobs: dict[str, Callable[[], Any]]) -> list[An
     found = []
     for job in (bar := tqdm(jobs, unit=unit, dynamic_ncols=True)):
         bar.set_description(job)
-        done, text = run.load(job, np.zeros(0, np.uint8), (job,))
-        if not done:
-            text = np.frombuffer(json.dumps(jobs[job]()).encode(), np.uint8)
-            run.save(job, 1, text)
-        found.append(json.loads(np.asarray(text).tobytes()))
+        if run.kept(job) is None:
+            run.keep(job, jobs[job]())
+        found.append(run.kept(job))
     return found
 
 
@@ -107,6 +117,11 @@ def panels(count: int, width: float, height: float) -> tuple[Any, Any]:
     for spare in np.ravel(axes)[count:]:
         spare.set_visible(False)
     return figure, np.ravel(axes)
+
+
+def number(value: float | None, form: str) -> str:
+    """A result in words; one that was not finite is None."""
+    return "not finite" if value is None else format(value, form)
 
 
 def duration(seconds: float | None) -> str:

@@ -9,6 +9,7 @@ from .entry import Entry, array
 
 _KINDS = ("circle", "ellipse", "rectangle")
 _MOST = 6  # obscurations of a lens: n of them take 2^n times the rays
+_MANY = 20  # apertures of a surface
 
 
 class _Aperture(NamedTuple):
@@ -32,6 +33,8 @@ def _read(surface: Entry, key: str) -> list[_Aperture]:
     """Those that `aperture` or `obscuration` tells: a mapping or a list of them."""
     given = surface.get(key, [])
     many = isinstance(given, list)
+    if many and len(given) > _MANY:
+        raise surface.error(key, f"{len(given)} are more than {_MANY}")
     found = []
     for i, values in enumerate(given if many else [given]):
         entry = Entry(values, surface.name(key) + f"[{i}]" * many, (*_KINDS, "centre"))

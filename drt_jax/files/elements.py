@@ -4,9 +4,11 @@ import itertools
 
 import jax.numpy as jnp
 
+from ..inputs import shown
 from ..lens.elements import Elements
 from .entry import Entry, array
 
+_MOST = 500
 _KEYS = ("surfaces", "about", "pivot", "shift", "tilt")
 
 
@@ -15,6 +17,8 @@ def elements_of(top: Entry, count: int) -> Elements | None:
     listed = top.get("elements", [])
     if not isinstance(listed, list):
         raise top.error("elements", "expected a list")
+    if len(listed) > _MOST:
+        raise top.error("elements", f"{len(listed)} are more than {_MOST}")
     entries = [Entry(entry, f"elements[{g}]", _KEYS) for g, entry in enumerate(listed)]
     # One that holds another comes first.
     spans = {id(entry): _span(entry, count) for entry in entries}
@@ -39,10 +43,10 @@ def elements_of(top: Entry, count: int) -> Elements | None:
 def _span(entry: Entry, count: int) -> tuple[int, int]:
     given = entry.get("surfaces")
     if not isinstance(given, list | tuple) or len(given) != 2:
-        raise entry.error("surfaces", f"expected [first, last], got {given!r}")
+        raise entry.error("surfaces", f"expected [first, last], got {shown(given)}")
     first, last = (_row(entry, "surfaces", end, count) for end in given)
     if first > last:
-        raise entry.error("surfaces", f"expected [first, last], got {given!r}")
+        raise entry.error("surfaces", f"expected [first, last], got {shown(given)}")
     return first, last
 
 
@@ -50,5 +54,7 @@ def _row(entry: Entry, key: str, value: object, count: int) -> int:
     """A surface by its index, or the sensor."""
     row = count if value == "sensor" else value
     if type(row) is not int or not 0 <= row <= count:
-        raise entry.error(key, f"expected a surface, 0 to {count - 1}, or sensor; got {value!r}")
+        raise entry.error(
+            key, f"expected a surface, 0 to {count - 1}, or sensor; got {shown(value)}"
+        )
     return row

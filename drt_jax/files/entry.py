@@ -10,8 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import InputError, shown
 
-class LensError(ValueError):
+# What numbers may be, beyond any lens and far from what overflows: lengths in mm and most others,
+# curvatures and conics, coefficients and radii.
+LONG, STEEP, WIDE = 1e9, 1e6, 1e30
+_LONGEST = 100  # characters of a name
+
+
+class LensError(InputError):
     """A prescription that cannot be used; the message names the file, the key and the remedy."""
 
 
@@ -31,9 +38,11 @@ class Entry(dict[Any, Any]):
         super().__init__(values)
         for key in self:
             if key not in keys:
-                near = difflib.get_close_matches(str(key), map(str, keys), n=1, cutoff=0.7)
+                word = str(key)[:_LONGEST]
+                near = difflib.get_close_matches(word, map(str, keys), n=1, cutoff=0.7)
                 hint = f"did you mean {near[0]!r}? " if near else ""
-                raise self.error("", f"unknown key {key!r}; {hint}known: {known}")
+                message = f"{self.place or 'top'}: unknown key {shown(key)}; {hint}known: {known}"
+                raise LensError(message.removeprefix("top: "), self.name(word))
 
     def name(self, key: object) -> str:
         """What the entry `key` or, if that is empty, the mapping is called in messages."""
@@ -41,20 +50,43 @@ class Entry(dict[Any, Any]):
 
     def error(self, key: object, message: str) -> LensError:
         """An error of the entry `key` or, if that is empty, of the mapping."""
-        return LensError(": ".join(filter(None, (self.name(key), message))))
+        name = self.name(key)
+        return LensError(": ".join(filter(None, (name, message))), name)
 
-    def number(self, key: object, default: float | None = None, finite: bool = True) -> float:
-        """A number, given as such or as text: YAML 1.1 reads 1e-3 and inf as text."""
+    def number(
+        self,
+        key: object,
+        default: float | None = None,
+        finite: bool = True,
+        most: float = LONG,
+    ) -> float:
+        """A number of at most this size, given as such or as text: YAML 1.1 reads 1e-3 and inf as
+        text."""
         value: Any = self.get(key, default)
         try:
             number = math.nan if isinstance(value, bool) else float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             number = math.nan
         if math.isnan(number):
-            raise self.error(key, f"expected a number, got {value!r}")
-        if finite and math.isinf(number):
+            raise self.error(key, f"expected a number, got {shown(value)}")
+        if math.isinf(number) and not finite:
+            return number
+        if math.isinf(number):
             raise self.error(key, "must be finite")
+        if abs(number) > most:
+            raise self.error(key, f"{number:g} is not between {-most:g} and {most:g}; which unit?")
         return number
+
+    def text(self, key: str, default: str) -> str:
+        """Text, or a whole number as such, of at most 100 characters."""
+        value = self.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, str | int):
+            raise self.error(key, f"expected text, got {shown(value)}")
+        if isinstance(value, int) and not 0 <= value < 10**_LONGEST:
+            raise self.error(key, f"expected text, got {shown(value)}")
+        if len(str(value)) > _LONGEST:
+            raise self.error(key, f"expected at most {_LONGEST} characters, got {shown(value)}")
+        return str(value)
 
     def vector(self, key: str, length: int) -> list[float]:
         """A list of `length` numbers; empty if there is none."""
@@ -62,7 +94,7 @@ class Entry(dict[Any, Any]):
         if values is None:
             return []
         if not isinstance(values, list | tuple) or len(values) != length:
-            raise self.error(key, f"expected a list of {length} numbers, got {values!r}")
+            raise self.error(key, f"expected a list of {length} numbers, got {shown(values)}")
         each = Entry(dict(enumerate(values)), self.name(key), range(length))
         return [each.number(i) for i in range(length)]
 
@@ -79,10 +111,10 @@ class Entry(dict[Any, Any]):
         if (radius in self) == (curvature in self):
             raise self.error("", f"give either {radius} (inf for a plane) or {curvature}")
         if curvature in self:
-            return self.number(curvature)
-        value = self.number(radius, finite=False)
-        if value == 0:
-            raise self.error(radius, f"0 is no surface; a plane is {radius}: inf")
+            return self.number(curvature, most=STEEP)
+        value = self.number(radius, finite=False, most=WIDE)
+        if abs(value) < 1 / STEEP:
+            raise self.error(radius, f"{value:g} is no surface; a plane is {radius}: inf")
         return 1 / value
 
 

@@ -5,9 +5,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..inputs import shown
 from ..lens.glass import VISIBLE, Dispersion, Glass, find_glass, model_glass, refractive_index
 from .entry import Entry
 
+_DENSEST = 10
 MEDIUM_KEYS = ("glass", "index", "nd", "vd")
 
 
@@ -24,7 +26,7 @@ def _own_glass(name: str, entry: Entry) -> Glass:
         raise entry.error("", "give sellmeier, schott or both")
     terms = entry.get("sellmeier", [0.0, 0.0])
     if not isinstance(terms, list) or not terms or len(terms) % 2:
-        raise entry.error("sellmeier", f"expected a list, all B and then all C, got {terms!r}")
+        raise entry.error("sellmeier", f"expected a list, all B and then all C, got {shown(terms)}")
     lengths = {"sellmeier": len(terms), "schott": 6}
     constants: dict[str, Any] = {
         key: tuple(entry.vector(key, n)) for key, n in lengths.items() if key in entry
@@ -55,14 +57,14 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
         return _model_glass(entry, "nd", entry.number("nd"), entry.number("vd"))
     if "index" in entry:
         value = entry.number("index")
-        if value < 1:
-            raise entry.error("index", f"{value:g} is below 1")
+        if not 1 <= value <= _DENSEST:
+            raise entry.error("index", f"{value:g} is not between 1 and {_DENSEST}")
         if value == 1:  # the same medium as air, so that a surface between both bends no light
             return find_glass("air")
         return Glass(f"index {value!r}", schott=(value**2, 0.0, 0.0, 0.0, 0.0, 0.0))
     if "glass" not in entry:
         return find_glass("air")
-    name = str(entry["glass"])
+    name = entry.text("glass", "air")
     if name in own:
         return own[name]
     if len(name) == 6 and name.isdecimal():  # the code of a glass: (nd - 1) 1000 and 10 vd

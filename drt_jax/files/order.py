@@ -45,12 +45,14 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
         if j == lens.count:
             raise LensError(
                 f"sensor: {float(lens.sensor):g} mm lies before the vertex of surface {i} at "
-                f"{float(lens.vertices[i]):g} mm{turned}"
+                f"{float(lens.vertices[i]):g} mm{turned}",
+                "sensor",
             )
         reach = "" if j == i + 1 else f" up to surface {j}, in sum"
         raise LensError(
             f"surfaces[{i}].thickness{reach}: must be {'positive' if forwards else 'negative'}"
-            f"{turned}, at least {_CLOSEST} mm; leave out one of two surfaces that touch"
+            f"{turned}, at least {_CLOSEST} mm; leave out one of two surfaces that touch",
+            f"surfaces[{i}].thickness",
         )
     semi = np.asarray(lens.semi_diameter)
     shape = [np.asarray(a) for a in (lens.curvature, lens.conic, lens.coefficients)]
@@ -63,6 +65,9 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
             np.asarray(_sag((0 * y, y), Shape(*(a[k] for a in shape)), lens.forms[k]))
             for k in (i, j)
         )
+        if not np.all(np.isfinite(front) & np.isfinite(back)):
+            at = f"surfaces[{i if not np.all(np.isfinite(front)) else j}]"
+            raise LensError(f"{at}: not finite within {rim:g} mm of the axis; which unit?", at)
         crossed = lens.senses[i + 1] * (front - back - distance) > _TOUCH
         if not np.any(crossed):
             continue
@@ -73,5 +78,5 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
             f"{semi[i]:g} and {semi[j]:g} mm; raise the thickness or lower a semi-diameter"
         )
         if place < _RIM * rim:
-            raise LensError(message)
+            raise LensError(message, f"surfaces[{i}].thickness")
         warnings.warn(f"{message}; light that comes there is lost", stacklevel=4)

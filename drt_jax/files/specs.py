@@ -5,6 +5,7 @@ import warnings
 
 import jax.numpy as jnp
 
+from ..inputs import shown
 from ..lens.forms import FORMS
 from ..lens.glass import Dispersion
 from ..lens.lens import Lens
@@ -12,11 +13,12 @@ from ..lens.paraxial import focal_length
 from ..lens.phase import Phase
 from .apertures import apertures_of, semi_diameter
 from .elements import elements_of
-from .entry import Entry, LensError, array, table
+from .entry import STEEP, WIDE, Entry, LensError, array, table
 from .media import MEDIUM_KEYS, media_of
 from .order import check_order
 
 _D_LINE = 0.5875618  # um
+_MOST = 5000  # surfaces
 _TOP_KEYS = (
     *("name", "source", "focal_length", "glasses", "object", "surfaces", "elements"),
     *("sensor", "sensor_tilt", "sensor_decentre"),
@@ -29,9 +31,9 @@ _SURFACE_KEYS = (
 
 
 def _form(entry: Entry) -> str:
-    form = entry.get("form", "asphere")
+    form = entry.text("form", "asphere")
     if form not in FORMS:
-        raise entry.error("form", f"unknown form {form!r}; known: {', '.join(FORMS)}")
+        raise entry.error("form", f"unknown form {shown(form)}; known: {', '.join(FORMS)}")
     return form
 
 
@@ -43,11 +45,11 @@ def _coefficients(surface: Entry) -> list[float]:
         if key in surface and key.replace("radius_x", "curvature_x") not in first:
             raise surface.error(key, f"a surface of the form {form} has none")
     given = Entry(surface.get("coefficients", {}), surface.name("coefficients"), powers)
-    columns = {len(first) + powers.index(power): given.number(power) for power in given}
+    columns = {len(first) + powers.index(power): given.number(power, most=WIDE) for power in given}
     if "curvature_x" in first:
         columns[0] = surface.curvature("_x")
     if "conic_x" in first:
-        columns[1] = surface.number("conic_x", 0.0)
+        columns[1] = surface.number("conic_x", 0.0, most=STEEP)
     if "norm_radius" in first:
         columns[0] = surface.number("norm_radius")
         if columns[0] <= 0:
@@ -85,7 +87,8 @@ def _gaps(top: Entry, surfaces: list[Entry]) -> list[float]:
     if ("sensor" in top) == ("thickness" in surfaces[-1]):
         raise LensError(
             "give either sensor (mm from the first vertex) or the last surface's thickness "
-            "(its distance to the sensor)"
+            "(its distance to the sensor)",
+            "sensor",
         )
     end = top.number("sensor") - sum(gaps) if "sensor" in top else surfaces[-1].number("thickness")
     return [*gaps, end]
@@ -104,11 +107,13 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     top = Entry(values, "", _TOP_KEYS)
     entries = top.get("surfaces")
     if not isinstance(entries, list) or not entries:
-        raise LensError("surfaces: expected a list of at least one surface")
+        raise LensError("surfaces: expected a list of at least one surface", "surfaces")
+    if len(entries) > _MOST:
+        raise LensError(f"surfaces: {len(entries)} are more than {_MOST}", "surfaces")
     surfaces = [Entry(e, f"surfaces[{i}]", _SURFACE_KEYS) for i, e in enumerate(entries)]
     stops = [i for i, surface in enumerate(surfaces) if surface.flag("stop")]
     if len(stops) != 1:
-        raise LensError(f"surfaces: {len(stops)} have stop: true, exactly one must")
+        raise LensError(f"surfaces: {len(stops)} have stop: true, exactly one must", "surfaces")
     # The last row of each is the sensor.
     coefficients = [*map(_coefficients, surfaces), []]
     decentre = [*(s.vector("decentre", 2) for s in surfaces), top.vector("sensor_decentre", 2)]
@@ -118,7 +123,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     groups = elements_of(top, len(surfaces))
     lens = Lens(
         curvature=array([*(surface.curvature() for surface in surfaces), 0.0]),
-        conic=array([*(surface.number("conic", 0.0) for surface in surfaces), 0.0]),
+        conic=array([*(surface.number("conic", 0.0, most=STEEP) for surface in surfaces), 0.0]),
         coefficients=table(coefficients, max(map(len, coefficients))),
         thickness=array(gaps[:-1]),
         semi_diameter=array([*map(semi_diameter, surfaces), math.inf]),
@@ -133,7 +138,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         glasses=tuple(medium.name for medium in media),
         forms=(*map(_form, surfaces), "asphere"),
         mirrors=tuple(surface.flag("mirror") for surface in surfaces),
-        name=str(top.get("name", name)),
+        name=top.text("name", name[:100]),
     )
     check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
     if "focal_length" in top:

@@ -4,8 +4,8 @@ import pathlib
 from collections.abc import Mapping
 
 import jax
-import yaml
 
+from ..inputs import InputError, read_yaml, shown
 from ..lens.lens import Lens
 from .entry import LensError
 from .specs import build_lens
@@ -22,27 +22,27 @@ def load_lens(source: str | pathlib.Path | Mapping) -> Lens:
     """Read a lens.
 
     The arrays have JAX's default floating dtype: float64 where the caller enabled it. LensError
-    for a missing file, an unknown key or glass, or numbers that make no lens.
+    for a missing file, an unknown key or glass, or numbers that make no lens, with the line.
 
-    source: a bundled name (see `lens_names`), the path of a YAML prescription, or a mapping with
-        the keys of one.
+    source: a bundled name (see `lens_names`), the path of a YAML prescription of at most 1 MB, or a
+        mapping with the keys of one.
     """
     with jax.core.eval_context():  # a lens loaded inside a jitted function is a constant
         if isinstance(source, Mapping):
             return build_lens(dict(source))
         path = pathlib.Path(source)
-        if path.suffix not in (".yaml", ".yml"):
-            path = _BUNDLED / f"{source}.yaml"
-            if not path.is_file():
+        if path.suffix.lower() not in (".yaml", ".yml"):
+            if str(source) not in lens_names():
                 raise LensError(
-                    f"no bundled lens {str(source)!r}; bundled: {', '.join(lens_names())}; "
+                    f"no bundled lens {shown(str(source))}; bundled: {', '.join(lens_names())}; "
                     "for a file of your own give a path that ends in .yaml"
                 )
+            path = _BUNDLED / f"{source}.yaml"
         try:
-            return build_lens(yaml.safe_load(path.read_text()), path.stem)
-        except OSError as error:
-            raise LensError(f"{path}: cannot be read: {error.strerror}") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise LensError(f"{path}: not a YAML file: {error}") from error
+            values, lines = read_yaml(path)
+        except InputError as error:
+            raise LensError(f"{path}: {error}") from error
+        try:
+            return build_lens(values, path.stem)
         except LensError as error:
-            raise LensError(f"{path}: {error}") from None
+            raise LensError(f"{path}{lines.of(error.key)}: {error}", error.key) from None

@@ -1,9 +1,9 @@
 """Strict configuration: YAML and overrides into a dataclass; nothing unknown, nothing guessed."""
 
-import contextlib
 import dataclasses
 import difflib
 import json
+import math
 import pathlib
 import typing
 from collections.abc import Sequence
@@ -11,11 +11,27 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
+from ..inputs import InputError, Lines, parse, read_yaml, shown
+
 T = TypeVar("T")
+# Of what is given: the largest whole number, the largest size of another that is finite, items of a
+# list, characters of a text.
+_MOST, _LARGEST, _ITEMS, _LONGEST = 2**31 - 1, 1e12, 1000, 1000
 
 
-class ConfigError(ValueError):
+class ConfigError(InputError):
     """A configuration that cannot be used; the message names the source, the key, the remedy."""
+
+
+class _Source:
+    """Where settings come from, as messages name it: a file with its lines, or an override."""
+
+    def __init__(self, name: str, lines: Lines):
+        self._name, self._lines = name, lines
+
+    def error(self, key: str, message: str) -> ConfigError:
+        """What is wrong at a key."""
+        return ConfigError(f"{self._name}{self._lines.of(key)}: {message}", key)
 
 
 def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str] = ()) -> T:
@@ -25,74 +41,101 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
     path: of the file.
     overrides: like "train.batch=8", applied afterwards.
 
-    ConfigError for a file that cannot be read, an unknown key (with the nearest known one) or a
-    value of the wrong type.
+    ConfigError, with the line, for a file that cannot be read, an unknown key (with the nearest
+    known one) or a value of the wrong type or beyond any use.
     """
-    path = pathlib.Path(path)
     try:
-        entry = yaml.safe_load(path.read_text()) or {}
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not a YAML file: {error}") from error
-    config = _build(cls, entry, str(path), "")
+        entry, lines = read_yaml(path)
+    except InputError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    config = _build(cls, {} if entry is None else entry, _Source(str(path), lines), "")
     for override in overrides:
+        name = f"--set {shown(override)[1:-1]}"
         key, equals, text = override.partition("=")
         if not equals:
-            raise ConfigError(f"--set {override}: expected key=value, such as train.batch=8")
+            raise ConfigError(f"{name}: expected key=value, such as train.batch=8")
         try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"--set {override}: {text!r} is not a YAML value") from error
-        for name in reversed(key.strip().split(".")):
-            value = {name: value}
-        config = _build(cls, value, f"--set {override}", "", config)
+            value, _ = parse(text)
+        except InputError as error:
+            raise ConfigError(f"{name}: {error}") from error
+        for part in reversed(key.strip().split(".")):
+            value = {part: value}
+        config = _build(cls, value, _Source(name, Lines()), "", config)
     return config
 
 
-def _build(cls: Any, entry: object, source: str, prefix: str, old: Any = None) -> Any:
+def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = None) -> Any:
     """The dataclass `cls` with the values of `entry`, the others those of `old` or defaults.
 
     source: what messages name. prefix: the keys that lead here, each with a dot behind.
     """
+    here = prefix.rstrip(".")
     if not isinstance(entry, dict):
-        where = prefix.rstrip(".") or "the file"
-        raise ConfigError(f"{source}: {where}: expected keys and values, got {entry!r}")
+        where = here or "the file"
+        raise source.error(here, f"{where}: expected keys and values, got {shown(entry)}")
     known = typing.get_type_hints(cls)
     values = {}
     for key, value in entry.items():
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+            word = str(key)[:_LONGEST]
+            near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
             hint = f"did you mean {prefix}{near[0]}? " if near else ""
-            listed = ", ".join(known)
-            raise ConfigError(f"{source}: unknown key {prefix}{key}; {hint}known here: {listed}")
+            unknown = f"unknown key {prefix}{shown(word)[1:-1]}; {hint}"
+            raise source.error(prefix + word, f"{unknown}known here: {', '.join(known)}")
         values[key] = _convert(known[key], value, source, prefix + key, getattr(old, key, None))
     needed = (f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING)
     missing = [prefix + name for name in needed if old is None and name not in values]
     if missing:
-        raise ConfigError(f"{source}: missing keys: {', '.join(missing)}")
+        raise source.error(here, f"missing keys: {', '.join(missing)}")
     try:
         return cls(**values) if old is None else dataclasses.replace(old, **values)
-    except ValueError as error:  # a dataclass that refuses its values
-        raise ConfigError(f"{source}: {error}") from error
+    except ValueError as error:  # a dataclass that refuses its values; it names the key first
+        raise source.error(str(error).partition(":")[0], str(error)) from error
 
 
-def _convert(kind: Any, value: object, source: str, key: str, old: Any = None) -> Any:
+def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = None) -> Any:
     """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...] or a Literal."""
     if dataclasses.is_dataclass(kind):
         return _build(kind, value, source, f"{key}.", old)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is tuple and isinstance(value, list | tuple):
+    if origin is tuple and isinstance(value, list | tuple) and len(value) <= _ITEMS:
         items = enumerate(value)
         return tuple(_convert(arguments[0], item, source, f"{key}[{i}]") for i, item in items)
-    if origin is Literal and value in arguments:
-        return value
+    # YAML 1.1 reads 1e-3 as text.
     if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
-        with contextlib.suppress(ValueError):
-            return float(value)  # YAML 1.1 reads 1e-3 as text
-    if kind in (bool, int, str) and type(value) is kind:
+        number = _number(value)
+        if abs(number) <= _LARGEST or math.isinf(number):
+            return number
+    if kind is int and type(value) is int and 0 <= value <= _MOST:
         return value
-    raise ConfigError(f"{source}: {key}: expected {_say(kind)}, got {value!r}")
+    if kind is str and type(value) is str and len(value) <= _LONGEST and "\0" not in value:
+        return value
+    if (kind is bool and type(value) is bool) or (origin is Literal and value in arguments):
+        return value
+    limit = _limit(kind, value)
+    raise source.error(key, f"{key}: expected {_say(kind)}{limit}, got {shown(value)}")
+
+
+def _limit(kind: Any, value: object) -> str:
+    """What a value of the right type had to keep within."""
+    if kind is int and type(value) is int:
+        return f" from 0 to {_MOST}"
+    some = isinstance(value, int | float | str) and not isinstance(value, bool)
+    if kind is float and some and not math.isnan(_number(value)):
+        return f" of at most {_LARGEST:g} in size"
+    if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
+        return f", at most {_ITEMS}"
+    return f" of at most {_LONGEST} characters" if kind is str and type(value) is str else ""
+
+
+def _number(value: int | float | str) -> float:
+    """NaN for what is none, and for a finite one that no float holds."""
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        return math.nan
+    written_so = isinstance(value, float) or "inf" in str(value).lower()
+    return math.nan if math.isinf(number) and not written_so else number
 
 
 def _say(kind: Any) -> str:

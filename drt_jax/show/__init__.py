@@ -17,6 +17,7 @@ from .figures import (
     new as new,
     patch_grid as patch_grid,
     programs as programs,
+    shares as shares,
     sigma_over_depth as sigma_over_depth,
 )
 from .layout import Drawing as Drawing, draw as draw, lens_drawing as lens_drawing

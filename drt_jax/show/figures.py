@@ -198,3 +198,15 @@ def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bo
     axes.set_xlabel(label)
     axes.grid(axis="x", alpha=0.3)
     return axes
+
+
+def shares(axes: Axes, rows: Mapping[str, Sequence[float]], names: Sequence[str]) -> Axes:
+    """Bars of what parts of each row come to: the numbers of `names` by label, as shares."""
+    labels = list(rows)
+    parts = np.array([rows[label] for label in labels], float)
+    ends = np.cumsum(parts / np.maximum(parts.sum(axis=1, keepdims=True), 1), axis=1)
+    for k, name in enumerate(names):
+        begin = ends[:, k - 1] if k else 0.0
+        axes.barh(labels, ends[:, k] - begin, left=begin, label=name)
+    axes.invert_yaxis()
+    return _finished(axes, "share", "", columns=len(names))

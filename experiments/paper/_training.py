@@ -17,9 +17,10 @@ from drt_jax import show
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
 from drt_jax.learn.data import DataConfig, batches, load_patches
-from drt_jax.runs.folder import Run, deferred_interrupt
+from drt_jax.runs.folder import Run
+from drt_jax.runs.interrupt import deferred_interrupt
 
-from ._common import require, require_list
+from ._common import require, require_list, require_within
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         require(len(self.wavelengths_um) == 3, "scene.wavelengths_um: expected three, for R, G, B")
+        require_within("scene.", self, wavelengths_um=(1e-4, 1e6), tolerance=(1e-14, 0.5))
 
     def blur(self, near: float, far: float) -> Callable:
         """The blur by the sensor's position and the distance, from `near` to `far` mm."""
@@ -58,11 +60,10 @@ class Training:
     checkpoint_every: int = 200
 
     def __post_init__(self) -> None:
-        for name in ("batches", "batch", "checkpoint_every"):
-            require(getattr(self, name) >= 1, f"train.{name}: must be at least 1")
-        require(self.patch >= 7, "train.patch: must be at least 7, the window of the SSIM")
-        for name, rate in self.rates.items():
-            require(0 <= rate < math.inf, f"train.{name}_rate: must be 0 or more")
+        # 7: the window of the SSIM.
+        sizes = {"batch": (1, 4096), "patch": (7, 4096), "checkpoint_every": (1, math.inf)}
+        rates = {f"{name}_rate": (0, 10) for name in self.rates}
+        require_within("train.", self, batches=(1, math.inf), **sizes, **rates)
 
     @property
     def rates(self) -> dict[str, float]:
@@ -85,6 +86,9 @@ class Net:
     skip_every: int = 2
     input_skip: bool = True
 
+    def __post_init__(self) -> None:
+        require_within("network.", self, skip_every=(0, 5))
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -104,7 +108,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         require_list("starts_mm", self.starts_mm)
-        require(0 <= self.noise < math.inf, f"noise: expected 0 or more, got {self.noise!r}")
+        require_within("", self, starts_mm=(1e-3, 1e6), noise=(0, 10))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -169,15 +173,18 @@ class Jobs:
         """
         run, setting, labels = self._run, self._config.train, labels or (job,)
         init, step = steps
-        first, state = run.load(job, init({"optics": optics} | self._network), labels)
-        saved, total = first, setting.batches
+        total = setting.batches
+        first, state = run.load(job, init({"optics": optics} | self._network), labels, total)
+        saved = first
         bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
 
         def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
             nonlocal saved
             done = start + len(metrics["loss"])
             for k, label in enumerate(labels):
-                run.log(label, start, {n: v.reshape(len(v), -1)[:, k] for n, v in metrics.items()})
+                rows = {n: v.reshape(len(v), -1)[:, k] for n, v in metrics.items()}
+                run.log(label, start, rows)
+                require_finite(label, start, rows["loss"])
             bar.update(len(metrics["loss"]))
             bar.set_postfix_str(f"loss={np.array2string(metrics['loss'][-1], precision=3)}")
             if asked() or done == total or done - saved >= setting.checkpoint_every:
@@ -213,6 +220,13 @@ class Jobs:
         }
 
 
+def require_finite(label: str, first: int, losses: np.ndarray) -> None:
+    """ConfigError, with the batch, unless all losses of a job are finite; `first`: their batch."""
+    lost = np.flatnonzero(~np.isfinite(losses))
+    what = f"{label}: the loss is not finite from batch {first + lost[:1].sum()} on"
+    require(not lost.size, f"{what}; leave this start out, or lower the learning rates")
+
+
 def start_label(start: float) -> str:
     """The job of a starting position of the sensor, mm."""
     return f"start {start}"
@@ -227,6 +241,8 @@ def start_lines(results: dict[str, Any], column: str, batches: int | None = None
 
 def reached(results: dict[str, Any]) -> str:
     """The planes at which the starts ended, in words."""
+    if None in results["final_mm"]:
+        return "not finite"
     low, high = (f"{end(results['final_mm']):.3f}" for end in (min, max))
     return f"{low} mm" if low == high else f"{low} to {high} mm"
 

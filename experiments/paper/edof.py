@@ -44,6 +44,7 @@ class Config(_training.JointSettings):
         super().__post_init__()
         for name in ("depth_m", "table_depth_m", "patch_depth_m"):
             _common.require_list(name, getattr(self, name))
+            _common.require_within("", self, **{name: (1e-3, 1e9)})
         ends = len(self.depth_m) == 2 and self.depth_m[0] < self.depth_m[1]
         _common.require(ends, "depth_m: expected the nearest and the farthest distance in m")
         some = any(map(self.trained_at, self.table_depth_m))
@@ -116,15 +117,17 @@ def blur_over_depth(blur: Callable, sensors: tuple, near: float, far: float) -> 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Beside the paper, and table 2."""
     mean, rows = results["mean_mae"], results["table"]
-    better = [f"{r['depth_m']:g}" for r in rows if r["fixed"]["mae"] < r["joint"]["mae"]]
-    means = f"mean MAE over training depths {mean['joint']:.4f} against {mean['fixed']:.4f}"
+    pairs = [(row["depth_m"], row["fixed"]["mae"], row["joint"]["mae"]) for row in rows]
+    better = [f"{d:g}" for d, a, b in pairs if None not in (a, b) and a < b]
+    joint, fixed = (_common.number(mean[name], ".4f") for name in ("joint", "fixed"))
+    means = f"mean MAE over training depths {joint} against {fixed}"
     against = f"{means}; fixed better at {', '.join(better) or 'no'} m"
     beside = [
         ("plane that all starts reach", "145.29 mm", _training.reached(results)),
         ("joint against fixed sensor", "joint better, but for 15 to 20 m", against),
     ]
     errors = [(m.upper() + " " + n, n, m) for n in ("fixed", "joint") for m in ("mae", "rmse")]
-    lines = [(title, *(f"{row[n][m]:.4f}" for row in rows)) for title, n, m in errors]
+    lines = [(title, *(_common.number(row[n][m], ".4f") for row in rows)) for title, n, m in errors]
     header = "depth m", *(f"{row['depth_m']:g}" for row in rows)
     return {
         "edof": _common.table(("", "paper", "here"), beside),

@@ -6,6 +6,7 @@ figures 4a and 4b.
 """
 
 import dataclasses
+import math
 import pathlib
 import sys
 from collections.abc import Callable
@@ -22,6 +23,8 @@ from drt_jax.runs.folder import Run
 from . import _command, _common, _training
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
+# Of the mean of many numbers in float32, relative, with some room.
+_ROUNDING = 1e-5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,18 +35,22 @@ class Config(_training.Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _common.require_list("distance_m", (self.distance_m,))
+        _common.require_within("", self, distance_m=(1e-3, 1e9))
 
 
 def best_focus(loss: Callable, scenes: np.ndarray, low: float, high: float) -> float:
     """Sensor position between `low` and `high` mm of least `loss` (sensor, scenes), to a ten
-    thousandth of the interval: a dense search, four times."""
+    thousandth of the interval: a dense search, four times. NaN if the loss has no minimum there:
+    if it is least at an end, nowhere less by more than rounding, or not finite somewhere."""
     losses = jax.jit(lambda grid, scenes: jax.lax.map(lambda s: loss(s, scenes), grid))
     batch = min(32, len(scenes))
     parts = [scenes[i : i + batch] for i in range(0, len(scenes) - batch + 1, batch)]
-    for _ in range(4):
+    for turn in range(4):
         grid = np.linspace(low, high, 41)
-        k = np.argmin(sum(np.asarray(losses(jnp.asarray(grid), part), float) for part in parts))
+        found = sum(np.asarray(losses(jnp.asarray(grid), part), float) for part in parts)
+        k = np.argmin(found)  # of a NaN if there is one
+        if not turn and not found[k] < (1 - _ROUNDING) * np.min(found[[0, -1]]):
+            return math.nan
         best, low, high = grid[k], grid[max(k - 2, 0)], grid[min(k + 2, 40)]
     return float(best)
 
@@ -65,7 +72,10 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         return jnp.mean(jnp.abs(image - truth))
 
     every = *config.starts_mm, *results["final_mm"]
-    best = best_focus(loss, _training.thinned(jobs.scenes, 512), min(every), max(every))
+    low, high = min(every), max(every)
+    reach = (high - low) / 2  # all starts may lie on one side
+    scenes = _training.thinned(jobs.scenes, 512)
+    best = best_focus(loss, scenes, low - reach, high + reach)
     near = [np.flatnonzero(np.abs(trace - best) <= 0.1) for trace in results["sensor_mm"]]
     first = [int(hits[0]) if hits.size else None for hits in near]
     return results | {"best_focus_mm": best, "batches_to_focus": first, "distance_mm": distance}
@@ -73,9 +83,11 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Beside the paper, and each start."""
-    search = f" (dense search on the same loss: {results['best_focus_mm']:.3f})"
+    best = results["best_focus_mm"]
+    found = "no minimum was found" if best is None else f"{best:.3f}"
+    search = f" (dense search on the same loss: {found})"
     starts = ", ".join(f"{start:g}" for start in results["starts_mm"])
-    first = ", ".join(map(str, results["batches_to_focus"]))
+    first = ", ".join("never" if n is None else str(n) for n in results["batches_to_focus"])
     beside = [
         ("plane that all starts reach", "133.35 mm", _training.reached(results) + search),
         (f"batches until within 0.1 mm, starts {starts} mm", '"within the first 60"', first),
@@ -88,8 +100,9 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw the lens and figures 4a and 4b."""
     _training.draw_lens(results["lens"], results["distance_mm"], figures / "lens.png")
     best = results["best_focus_mm"]
+    mark = None if best is None else (best, f"best focus {best:.2f}")
     for name, column, label, level in (
-        ("figure_4a", "sensor_mm", "sensor position (mm)", (best, f"best focus {best:.2f}")),
+        ("figure_4a", "sensor_mm", "sensor position (mm)", mark),
         ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)", None),
     ):
         figure, (left, right) = show.new(1, 2, 5.5, 4)

@@ -32,9 +32,8 @@ class Config(_training.JointSettings):
         super().__post_init__()
         _common.require_list("table_starts_mm", self.table_starts_mm)
         _common.require_list("table_noise", self.table_noise, -1.0)
-        least = min(self.table_noise)
-        _common.require(least >= 0, f"table_noise: expected 0 or more, got {least!r}")
-        _common.require_list("distance_m", (self.distance_m,))
+        limits = {"table_starts_mm": (1e-3, 1e6), "table_noise": (0.0, 10.0)}
+        _common.require_within("", self, distance_m=(1e-3, 1e9), **limits)
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -69,7 +68,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     """Beside the paper, and table 5b."""
     first = results["test"][0]
     test = f"test MAE at noise {first['noise']:g}, after and before the network"
-    errors = f"{first['mae']:.4f} and {first['sensor_mae']:.4f}"
+    errors = " and ".join(_common.number(first[name], ".4f") for name in ("mae", "sensor_mae"))
     beside = [
         ("plane that all starts reach", "133.35 mm", _training.reached(results)),
         (test, "0.02 and 0.03", errors),

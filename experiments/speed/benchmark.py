@@ -60,10 +60,10 @@ class Config:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _common.require(self.repeats >= 1, "repeats: must be at least 1")
-        _common.require(self.rays >= 7, "rays: must be at least 7, one hexapolar ring")
-        _common.require(self.bundle >= 1, "bundle: must be at least 1")
-        _common.require(0 < self.distance_m < math.inf, "distance_m: must be positive and finite")
+        # 7 rays: one hexapolar ring.
+        counts = {"repeats": (1, 1e4), "rays": (7, 1e6), "bundle": (1, 1e8), "batch": (1, 4096)}
+        numbers = {"distance_m": (1e-3, 1e9), "field_deg": (0, 89.9), "wavelengths_um": (1e-4, 1e6)}
+        _common.require_within("", self, patch=(7, 4096), **counts, **numbers)
         _common.require_known("tasks", self.tasks, TASKS)
 
     @property

@@ -60,9 +60,9 @@ class AccuracyScene:
     most_rays: int = 16384
 
     def __post_init__(self) -> None:
-        _common.require(self.distance_m > 0, "scenes.distance_m: must be positive")
-        _common.require(min(self.front_mm, self.rear_mm) >= 0, "scenes.front_mm: must be 0 or more")
-        _common.require(self.field_deg >= 0, "scenes.field_deg: must be 0 or more")
+        sizes = {"front_mm": (0, 1e6), "rear_mm": (0, 1e6), "defocus_mm": (-1e6, 1e6)}
+        far = {"distance_m": (1e-3, math.inf), "field_deg": (0, 89.9)}
+        _common.require_within("scenes.", self, most_rays=(7, 1e7), **sizes, **far)
 
     @property
     def vignetted(self) -> bool:
@@ -120,10 +120,11 @@ class Config:
         _common.require(len(self.scenes) > 0, "scenes: needs at least one item")
         labels = {scene.label for scene in self.scenes}
         _common.require(len(labels) == len(self.scenes), "scenes: an item stands twice")
-        _common.require(min(self.rays) >= 7, "rays: must be at least 7, one hexapolar ring")
+        # 7 rays: one hexapolar ring.
+        limits = {"rays": (7, 1e7), "seeds": (1, 1000), "tolerances": (1e-14, 0.5)}
+        _common.require_within("", self, wavelengths_um=(1e-4, 1e6), **limits)
         every = [*self.orders, *(order for scene in self.scenes for order in scene.orders)]
         _common.require(min(every) >= 1 and max(every) <= 40, "orders: expected 1 to 40")
-        _common.require(self.seeds >= 1, "seeds: must be at least 1")
 
 
 @jax.jit

@@ -42,7 +42,7 @@ class Config:
     families: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        _common.require(self.scenes >= 3, "scenes: must be at least 3")
+        _common.require_within("", self, scenes=(3, 1e5))
         _common.require_known("families", self.families, FAMILIES)
 
 

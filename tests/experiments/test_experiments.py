@@ -17,7 +17,7 @@ from skimage import io
 
 from drt_jax.learn import train
 from drt_jax.runs.config import load_config
-from drt_jax.runs.folder import Run
+from drt_jax.runs.folder import Run, begun
 from experiments import _command, _common, tables
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -154,7 +154,7 @@ def test_a_killed_run_resumes_to_the_same_numbers(unbroken, tmp_path):
         command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
     )
     deadline = time.monotonic() + 120
-    while not (folder / "metrics.csv").exists() and time.monotonic() < deadline:
+    while not begun(folder) and time.monotonic() < deadline:
         time.sleep(0.01)
     process.kill()
     process.wait()
@@ -233,14 +233,14 @@ FAILURES = {
     "unknown lens": (["--set", "scene.lens=triplet"], "no bundled lens 'triplet'"),
     "no images": (["--set", "data.root=nowhere"], "data.root: nowhere is not a folder"),
     "bad kernel": (["--set", "camera.kernel=8"], "camera.kernel: expected an odd number"),
-    "no batches": (["--set", "train.batches=0"], "train.batches: must be at least 1"),
+    "no batches": (["--set", "train.batches=0"], "train.batches: expected 1 to inf, got 0"),
     "too few": (["--set", "data.crops_per_image=1", "train.batch=500"], "do not fill a batch"),
     "wavelength": (["--set", "scene.wavelengths_um=[0.6,0.5,5.0]"], "outside the range of N-SK2"),
     "two colours": (["--set", "scene.wavelengths_um=[0.6,0.5]"], "expected three, for R, G, B"),
     "no starts": (["--set", "starts_mm=[]"], "starts_mm: needs at least one item"),
     "twice": (["--set", "starts_mm=[133,133]"], "starts_mm: an item stands twice"),
-    "distance": (["--set", "distance_m=-1"], "distance_m: expected numbers above 0, got -1.0"),
-    "noise": (["--set", "noise=.nan"], "noise: expected 0 or more, got nan"),
+    "distance": (["--set", "distance_m=-1"], "distance_m: expected 0.001 to 1e+09, got -1.0"),
+    "noise": (["--set", "noise=.nan"], "noise: expected a number, got nan"),
     "no network": (["--set", "train.network_rate=1"], "unknown key train.network_rate"),
     "nothing to resume": (["--resume"], "nothing to resume"),
     "nothing to report": (["--report"], "no results.json in it: the run is not finished"),

@@ -45,7 +45,7 @@ BAD = {
     "glass and index": (surface(0, index=1.5), "either glass or index"),
     "nd without vd": (lambda e: (drop(0, "glass")(e), surface(0, nd=1.5)(e)), "give both"),
     "glass code": (surface(0, glass="999001"), r"surfaces\[0\].glass: expected 1 < nd"),
-    "index below 1": (lambda e: (drop(0, "glass")(e), surface(0, index=0.9)(e)), "below 1"),
+    "index below 1": (lambda e: (drop(0, "glass")(e), surface(0, index=0.9)(e)), "not between"),
     "zero radius": (surface(0, radius=0), r"surfaces\[0\].radius: 0 is no surface"),
     "no radius": (drop(0, "radius"), "either radius"),
     "text": (surface(0, thickness="thick"), r"thickness: expected a number, got 'thick'"),
@@ -81,7 +81,7 @@ BAD = {
         r"aperture.rectangle: 54.0833 mm reaches beyond the surface, which ends at 50 mm",
     ),
     "many obscurations": (
-        surface(0, obscuration=[{"circle": 1}] * 7),
+        surface(0, obscuration=[{"circle": 1} for _ in range(7)]),
         r"surfaces\[0\].obscuration\[6\]: a lens has 6 obscurations at most",
     ),
     "no stop": (surface(2, stop=False), "0 have stop: true"),

@@ -15,7 +15,7 @@ def test_missing_and_broken_files(tmp_path):
     with pytest.raises(LensError, match=r"none.yaml: cannot be read: No such file"):
         load_lens(tmp_path / "none.yaml")
     (tmp_path / "broken.yaml").write_text("surfaces: [")
-    with pytest.raises(LensError, match=r"broken.yaml: not a YAML file"):
+    with pytest.raises(LensError, match=r"broken.yaml: line 2: not YAML"):
         load_lens(tmp_path / "broken.yaml")
     (tmp_path / "empty.yaml").write_text("")
     with pytest.raises(LensError, match=r"empty.yaml: expected a mapping with the keys name, "):

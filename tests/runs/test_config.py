@@ -53,7 +53,7 @@ BAD = {
     "train=3": "train: expected keys and values, got 3",
     "name.first=3": "name: expected text, got {'first': 3}",
     "train.batch": "expected key=value",
-    "name=[": "is not a YAML value",
+    "name=[": "--set name=.: line 2: not YAML",
 }
 
 
@@ -67,7 +67,7 @@ def test_bad_files_name_the_file(tmp_path):
     cases = {
         "starts: [1]\nsped: 3": "unknown key sped",
         "- 1": "expected keys",
-        "a: [": "not a YAML",
+        "a: [": "line 2: not YAML",
     }
     for text, message in cases.items():
         path = tmp_path / "bad.yaml"

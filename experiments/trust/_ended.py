@@ -1,0 +1,198 @@
+"""Runs that are killed, stopped or started twice, and go on: their results are those of an unbroken
+run, bit for bit."""
+
+import concurrent.futures
+import json
+import pathlib
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ._common import ROOT
+from ._outcomes import Tally, clear
+
+# A run that is as short as one can be that trains, writes metrics and checkpoints, and draws.
+_TOY = ("train.batches=40", "train.batch=2", "train.patch=16", "train.checkpoint_every=5")
+_TOY += ("camera.kernel=9", "data.crops_per_image=2", "starts_mm=[133.0, 134.0]")
+# Seconds after which a run hangs, and in which an unbroken one ends; files it touches.
+_PATIENCE, _WHOLE, _TOUCHES = 240.0, 8.0, 60
+_KILLS = 5  # of one run, before it may end
+_MODULE = "experiments.focus"
+
+
+class Ended:
+    """How a process ended: code, and what it said."""
+
+    def __init__(self, process: subprocess.Popen, seconds: float = _PATIENCE):
+        try:
+            self.text = process.communicate(timeout=seconds)[1].decode("utf-8", "replace")
+            self.hung = False
+        except subprocess.TimeoutExpired:
+            process.kill()
+            self.text = process.communicate()[1].decode("utf-8", "replace")
+            self.hung = True
+        self.code = process.returncode
+
+    @property
+    def message(self) -> str:
+        """The last line, which stands behind those of progress bars."""
+        lines = [line.strip() for line in re.split(r"[\r\n]+", self.text)]
+        return next((line for line in reversed(lines) if line), "")
+
+
+def start(folder: pathlib.Path, *options: str, dying: tuple[str, ...] = ()) -> subprocess.Popen:
+    """A process of the toy run in a folder; `dying`: arguments of `_dying`."""
+    module = ["experiments._dying", *dying, _MODULE] if dying else [_MODULE]
+    settings = () if "--resume" in options else ("--set", *_TOY)
+    command = [sys.executable, "-m", *module, "--out", str(folder), *options, *settings]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, cwd=ROOT, **pipes)
+
+
+def resumed(folder: pathlib.Path) -> Ended:
+    """Go on with the run in a folder, or begin it where nothing was begun."""
+    ended = Ended(start(folder, "--resume"))
+    return Ended(start(folder)) if "nothing to resume" in ended.message else ended
+
+
+def result(folder: pathlib.Path) -> Any:
+    """What a run found: all of its results but the seconds, and its metrics."""
+    results = json.loads((folder / "results.json").read_text())
+    return results | {"seconds": None}, (folder / "metrics.csv").read_text()
+
+
+def outcome(ended: Ended, folder: pathlib.Path, truth: Any) -> str:
+    """Of a run that was let to end: whether its result is the true one or it refused to go on."""
+    if ended.hung:
+        return "hang"
+    if "Traceback" in ended.text:
+        return "traceback"
+    if ended.code == 0:
+        return "survived" if result(folder) == truth else "wrong"
+    return "refused" if ended.code in (1, 2) and clear(ended.message) else "wrong"
+
+
+def side_by_side(kind: str, trials: list[Callable[[], list[tuple[str, str]]]]) -> dict[str, Any]:
+    """The row of a kind: what trials, two at a time, came to."""
+    tally = Tally(kind)
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        running = [pool.submit(trial) for trial in trials]
+        ready = concurrent.futures.as_completed(running)
+        for done in tqdm(ready, total=len(trials), unit="run", leave=False, dynamic_ncols=True):
+            for found, example in done.result():
+                tally.add(found, example)
+    return tally.row
+
+
+class Toy:
+    """The toy run, its true result, and folders to try it in."""
+
+    def __init__(self, folder: pathlib.Path):
+        self._folder = folder
+        self._count = 0
+        self.whole = self.new()
+        ended = Ended(start(self.whole))
+        if ended.code:
+            raise RuntimeError(f"the toy run failed: {ended.message}")
+        self.truth = result(self.whole)
+
+    def new(self) -> pathlib.Path:
+        """A folder of its own, which does not exist yet."""
+        self._count += 1
+        return self._folder / f"run {self._count}"
+
+    def ends(self, ways: list[Callable[[pathlib.Path], str]]) -> list[tuple[str, str]]:
+        """The outcome of each way in which one run is ended, each telling what went wrong at once
+        (empty: nothing); then the run goes on to its end."""
+        folder = self.new()
+        said = [way(folder) for way in ways]
+        ended = resumed(folder)
+        found = outcome(ended, folder, self.truth)
+        found = "wrong" if found == "refused" else found
+        shutil.rmtree(folder, ignore_errors=True)
+        return [("wrong", text) if text else (found, ended.message) for text in said]
+
+
+def _go_on(folder: pathlib.Path, **dying: Any) -> subprocess.Popen:
+    begun = (folder / "config.yaml").is_file()
+    return start(folder, *(("--resume",) if begun else ()), **dying)
+
+
+def _after(seconds: float, *signals: signal.Signals) -> Callable[[pathlib.Path], str]:
+    """A way to end a run: signals, one after the other."""
+
+    def end(folder: pathlib.Path) -> str:
+        process = _go_on(folder)
+        time.sleep(seconds)
+        for number in signals:
+            process.send_signal(number)
+            time.sleep(0.05)
+        ended = Ended(process)
+        if ended.hung:
+            return "hung"
+        if "Traceback" in ended.text:
+            return ended.text[-300:]
+        stopped = ended.code == 130 and "stopped" in ended.message and clear(ended.message)
+        if signals[0] == signal.SIGINT and ended.code and not stopped:
+            return f"code {ended.code}: {ended.message}"
+        return ""
+
+    return end
+
+
+def _at_touch(turn: int, seconds: float) -> Callable[[pathlib.Path], str]:
+    """A way to end a run: SIGKILL soon after it touched its folder so many times."""
+
+    def end(folder: pathlib.Path) -> str:
+        ended = Ended(_go_on(folder, dying=(str(turn), str(seconds))))
+        return "hung" if ended.hung else ended.text[-300:] * ("Traceback" in ended.text)
+
+    return end
+
+
+def _chained(toy: Toy, kind: str, ways: list[Callable[[pathlib.Path], str]]) -> dict[str, Any]:
+    chains = [ways[k : k + _KILLS] for k in range(0, len(ways), _KILLS)]
+    return side_by_side(kind, [lambda chain=chain: toy.ends(chain) for chain in chains])
+
+
+def killed(toy: Toy, count: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Runs killed at random moments, from the first import on."""
+    ways = [_after(rng.uniform(0, _WHOLE), signal.SIGKILL) for _ in range(count)]
+    return _chained(toy, "killed at a random moment", ways)
+
+
+def killed_at_writes(toy: Toy, count: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Runs killed while they write."""
+    ways = [_at_touch(int(rng.integers(1, _TOUCHES)), rng.exponential(1e-3)) for _ in range(count)]
+    return _chained(toy, "killed at a write", ways)
+
+
+def stopped(toy: Toy, count: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Runs stopped by Ctrl-C, by SIGTERM, and by two of them."""
+    kinds = ((signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT,) * 2)
+    ways = [_after(rng.uniform(0, _WHOLE), *kinds[k % 3]) for k in range(count)]
+    return _chained(toy, "stopped by a signal", ways)
+
+
+def two(toy: Toy, count: int) -> dict[str, Any]:
+    """Two processes in one folder: one does the run, the other refuses."""
+
+    def trial(k: int) -> list[tuple[str, str]]:
+        folder = toy.new()
+        first = start(folder)
+        time.sleep(0.7 * k)
+        both = [Ended(start(folder)), Ended(first)]
+        found = sorted(outcome(ended, folder, toy.truth) for ended in both)
+        good = found == ["refused", "survived"]
+        text = " / ".join(ended.message for ended in both)
+        return [("survived" if good else "wrong", f"{found}: {text}")]
+
+    return side_by_side("two in a folder", [lambda k=k: trial(k) for k in range(count)])

@@ -1,0 +1,104 @@
+"""Prescriptions and settings spoilt at random: refused in one line, or right."""
+
+import dataclasses
+import importlib
+import pathlib
+import tempfile
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+import drt_jax
+from drt_jax import Lens, Status
+from drt_jax.inputs import InputError, shown
+from drt_jax.runs import config as configs
+
+from ._common import ROOT
+from ._mutants import mutated
+from ._outcomes import Tally, judged
+
+_LENSES = pathlib.Path(drt_jax.__file__).parent / "lens" / "catalogue" / "lenses"
+# Programs of many structures exhaust what a process may map.
+_KEPT = 200
+
+
+def prescriptions(count: int, rng: np.random.Generator) -> tuple[dict[str, Any], list[Lens]]:
+    """A row of spoilt prescriptions: what loads is finite. And lenses that did load."""
+    texts = [path.read_text() for path in sorted(_LENSES.glob("*.yaml"))]
+    tally, loaded = Tally("prescriptions"), list[Lens]()
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "lens.yaml"
+        for k in tqdm(range(count), unit="lens", leave=False, dynamic_ncols=True):
+            if k % _KEPT == 0:
+                jax.clear_caches()
+            path.write_bytes(content := mutated(texts[rng.integers(len(texts))], rng))
+
+            def load() -> bool:
+                loaded.append(drt_jax.load_lens(path))
+                return _finite(loaded[-1])
+
+            tally.add((found := judged(load))[0], (found[1], content[:500]))
+    return tally.row, loaded
+
+
+def _finite(lens: Lens) -> bool:
+    """Whether all numbers of a lens are, but for apertures that are open."""
+    open_ones = dataclasses.replace(lens, semi_diameter=lens.curvature * 0)
+    if lens.apertures is not None:
+        half = dataclasses.replace(lens.apertures, half=lens.apertures.half * 0)
+        open_ones = dataclasses.replace(open_ones, apertures=half)
+    known = not np.any(np.isnan(lens.semi_diameter))
+    return known and all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(open_ones))
+
+
+def traced(lenses: list[Lens]) -> dict[str, Any]:
+    """A row of lenses that load: rays through them are finite, and tell what became of them."""
+    tally = Tally("lenses that load, traced")
+    pupil = np.array([[0.0, 0.0], [0.0, 0.9], [0.5, -0.5], [0.0, -1.0]])
+    for lens in tqdm(lenses, unit="lens", leave=False, dynamic_ncols=True):
+        jax.clear_caches()
+        wave = float(np.clip(np.mean(lens.dispersion.range), 0.4, 0.7))
+
+        def trace(lens: Lens = lens, wave: float = wave) -> bool:
+            try:
+                rays = drt_jax.trace_rays(lens, 0.05, np.inf, [wave], pupil)
+            except ValueError as error:
+                raise InputError(str(error)) from error
+            known = np.isin(rays.status, [*Status])
+            return bool(np.all(known) and np.all(np.isfinite(rays.points)))
+
+        tally.add((found := judged(trace, 120.0))[0], (found[1], lens.name, shown(lens.forms)))
+    return tally.row
+
+
+def settings(count: int, rng: np.random.Generator) -> dict[str, Any]:
+    """A row of spoilt settings of all experiments, half of them by --set: what is taken can be
+    written and read back."""
+    kinds = _settings_of()
+    tally = Tally("settings")
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "config.yaml"
+        for k in tqdm(range(count), unit="config", leave=False, dynamic_ncols=True):
+            source, kind = kinds[rng.integers(len(kinds))]
+            content, overrides = mutated(source.read_text(), rng), list[str]()
+            if k % 2:
+                lines = [line for line in content.decode("utf-8", "replace").splitlines() if line]
+                line = lines[rng.integers(len(lines))] if lines else ""
+                overrides, content = [line.replace(": ", "=", 1)], source.read_bytes()
+            path.write_bytes(content)
+
+            def load(kind: type = kind, overrides: list[str] = overrides) -> bool:
+                taken = configs.load_config(kind, path, overrides)
+                path.write_text(configs.dump_config(taken))
+                return configs.load_config(kind, path) == taken
+
+            tally.add((found := judged(load))[0], (found[1], overrides or content[:500]))
+    return tally.row
+
+
+def _settings_of() -> list[tuple[pathlib.Path, type]]:
+    """The files of settings of the experiments, and what they are read into."""
+    paths = sorted((ROOT / "configs").rglob("*.yaml"))
+    return [(p, importlib.import_module(f"experiments.{p.stem}").Config) for p in paths]

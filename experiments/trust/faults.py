@@ -1,0 +1,106 @@
+"""Hostile input and sudden ends: files spoilt at random, runs killed, folders damaged, odd images.
+
+Nothing may be used that cannot be trusted: what is spoilt is refused in one line of at most 300
+characters, or the result is right. Writes results.json: `rows` hold `kind`, `tried`, `refused`,
+`survived` (and right), `wrong` (a wrong result, or a message that is long or of several lines),
+`traceback`, `hang` (5 s for a file, minutes for a run), and `examples` of the last three.
+"""
+
+import dataclasses
+import pathlib
+import sys
+import tempfile
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from drt_jax import show
+from drt_jax.runs.folder import Run
+
+from . import _command, _common, _damage, _ended, _spoilt, _zoo
+from ._outcomes import OUTCOMES
+
+COLUMNS = ("tried", *OUTCOMES)
+PARTS = ("files", "kills", "folders", "images")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment; see configs/faults.yaml.
+
+    files: how many prescriptions and settings are spoilt. traced: how many of the lenses that load
+    are traced. kills: how many runs are ended. folders: how many run folders are damaged. parts:
+    the names of those to try (files, kills, folders, images), empty for all. seed: of all random
+    numbers.
+    """
+
+    files: int = 10_000
+    traced: int = 20
+    kills: int = 200
+    folders: int = 63
+    parts: tuple[str, ...] = ()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        limits = {"files": (2, 1e6), "traced": (0, 1e5), "kills": (3, 1e4), "folders": (1, 1e4)}
+        _common.require_within("", self, **limits)
+        _common.require_known("parts", self.parts, PARTS)
+
+
+def rows_of(config: Config, part: str) -> Iterator[dict[str, Any]]:
+    """The rows of a part."""
+    some = np.random.default_rng([config.seed, PARTS.index(part)]).spawn(3)
+    if part == "files":
+        row, loaded = _spoilt.prescriptions(config.files // 2, some[0])
+        yield row
+        yield _spoilt.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
+        yield _spoilt.settings(config.files - config.files // 2, some[1])
+    if part == "images":
+        yield _zoo.images()
+    if part not in ("kills", "folders"):
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        toy = _ended.Toy(pathlib.Path(folder))
+        if part == "folders":
+            yield _damage.damaged(toy, config.folders, some[0])
+            return
+        third = config.kills // 3
+        yield _ended.killed(toy, third, some[0])
+        yield _ended.killed_at_writes(toy, third, some[1])
+        yield _ended.stopped(toy, config.kills - 2 * third, some[2])
+        yield _ended.two(toy, 3)
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Try each part."""
+
+    def one(part: str) -> list[dict[str, Any]]:
+        rows = list(rows_of(config, part))
+        for row in rows:
+            run.log(row["kind"], 0, {c: np.array([float(row[c])]) for c in COLUMNS})
+        return rows
+
+    parts = config.parts or PARTS
+    found = _common.measured(run, "part", {part: lambda part=part: one(part) for part in parts})
+    return {"rows": sum(found, []), "seconds": run.seconds}
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """What became of each kind, and examples of faults."""
+    rows = [[row[key] for key in ("kind", *COLUMNS)] for row in results["rows"]]
+    found = {"faults": _common.table(("kind", *COLUMNS), rows)}
+    faults = [f"{row['kind']}: {text}" for row in results["rows"] for text in row["examples"]]
+    return found | ({"faults, examples": "\n".join(faults)} if faults else {})
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Draw what became of each kind."""
+    figure, axes = show.new(1, 1, 8, 3.6)
+    rows = {row["kind"]: [row[name] for name in OUTCOMES] for row in results["rows"]}
+    show.shares(axes, rows, OUTCOMES)
+    figure.savefig(figures / "faults.png")
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__])
