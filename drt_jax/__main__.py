@@ -147,10 +147,13 @@ def set_up() -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command line; errors are one line, and the exit status 2."""
-    set_up()
+    """Run the command line; errors are one line, and the exit status 2, or 130 after Ctrl-C."""
     try:
+        set_up()
         show(_options(argv))
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped\n")
+        raise SystemExit(130) from None
     except ValueError as error:
         sys.stderr.write(f"error: {error}\n")
         raise SystemExit(2) from None

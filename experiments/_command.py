@@ -11,50 +11,53 @@ from typing import Any
 import drt_jax
 from drt_jax.__main__ import set_up
 from drt_jax.runs import config as configs
-from drt_jax.runs.folder import Run
+from drt_jax.runs.folder import Run, begun
+from drt_jax.runs.interrupt import deferred_interrupt
 
-from . import _common
+from . import _common, imported
 
 # Errors raised in these folders are about the input; others are faults to be shown whole.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
+
+
+class _Place:
+    """Where a command works: the folder, once it is known, and whether the run in it is its own."""
+
+    folder: pathlib.Path | None = None
+    own = False
+
+    def left(self) -> tuple[str, str]:
+        """What is there if the command ends now, and how to go on with it, in words."""
+        if not (self.folder and self.own and (self.folder / "config.yaml").is_file()):
+            return "nothing was begun", ""
+        if (self.folder / "results.json").is_file():
+            return "the results are whole", f"draw them with --report --out {self.folder}"
+        return "what it wrote is whole", f"go on with --resume --out {self.folder}"
 
 
 def main(experiment: Any, argv: list[str] | None = None) -> None:
     """Run an experiment, or with --report only draw and print the results of a run again.
 
     experiment: a module with `Config`, the dataclass of its settings; `COLUMNS` of metrics.csv;
-        `run(config, run)`, which measures and returns results for `_common.write_results`;
+        `run(config, run)`, which measures and returns results for `Run.finish`;
         `tables(results)`, printed; and `draw(results, folder)` of figures.
     argv: of the command line.
     """
-    name = experiment.__spec__.name.split(".")[-1]
-    options = _parser(name, experiment).parse_args(argv)
-    set_up()
-    started = time.perf_counter()
-    folder = None
+    place = _Place()
     try:
-        folder = _folder(name, options)
-        if not options.report:
-            config = _config(name, experiment.Config, options, folder)
-            run = Run(folder, config, experiment.COLUMNS, options.resume)
-            print(f"{name}: run folder {folder}")
-            _common.write_results(run, experiment.run(config, run))
-        results, figures = _common.read_results(folder), folder / "figures"
-        figures.mkdir(exist_ok=True)
-        print("\n\n".join(experiment.tables(results).values()))
-        experiment.draw(results, figures)
-        print(f"results in {folder / 'results.json'}, figures in {figures}")
-        print(f"done in {time.perf_counter() - started:.0f} s")
-        return
+        imported()
+        bad = _do(experiment, argv, place)
+        if not bad:
+            return
+        others = f" and {len(bad) - 3} others" if len(bad) > 3 else ""
+        what = ", ".join(bad[:3]) + others
+        code, message = 1, f"error: not finite, null in {place.folder}/results.json: {what}"
     except KeyboardInterrupt:
-        code, message = 130, f"stopped; go on with --resume --out {folder}" if folder else "stopped"
+        code, message = 130, "; ".join(filter(None, ("stopped", *place.left())))
     except OSError as error:
-        remedy = "mend this and start again"
-        if folder and (folder / "metrics.csv").exists():
-            go_on = f"mend this, then go on with --resume --out {folder}"
-            remedy = f"the last checkpoint is whole: {go_on}"
-        what = f"{error.filename or folder}: {error.strerror or error}"
-        code, message = 1, f"error: {what}; {remedy}"
+        what, remedy = place.left()
+        wrong = f"{error.filename or place.folder}: {error.strerror or error}"
+        code, message = 1, f"error: {wrong}; {what}: mend this, then {remedy or 'start again'}"
     except ValueError as error:
         raised = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)
         if not any(raised.is_relative_to(ours) for ours in _OURS):
@@ -62,6 +65,33 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
         code, message = 2, f"error: {error}"
     print(message, file=sys.stderr)
     raise SystemExit(code)
+
+
+def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
+    """What `main` does, and the names of results that are not finite."""
+    name = experiment.__spec__.name.split(".")[-1]
+    options = _parser(name, experiment).parse_args(argv)
+    set_up()
+    started = time.perf_counter()
+    place.folder = folder = _folder(name, options)
+    place.own = options.resume or options.report
+    if not options.report:
+        config = _config(name, experiment.Config, options, folder)
+        with deferred_interrupt() as asked:  # between nothing and a run there is no stop
+            run = Run(folder, config, experiment.COLUMNS, options.resume)
+            place.own = True
+        with run:
+            if asked():
+                raise KeyboardInterrupt
+            print(f"{name}: run folder {folder}")
+            run.finish(experiment.run(config, run))
+    results, figures = _common.read_results(folder), folder / "figures"
+    figures.mkdir(exist_ok=True)
+    print("\n\n".join(experiment.tables(results).values()))
+    experiment.draw(results, figures)
+    print(f"results in {folder / 'results.json'}, figures in {figures}")
+    print(f"done in {time.perf_counter() - started:.0f} s")
+    return results.get("not_finite", [])
 
 
 def _parser(name: str, experiment: Any) -> argparse.ArgumentParser:
@@ -99,8 +129,8 @@ def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:
     parent = pathlib.Path("runs") / name
     if not options.resume:
         return parent / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    begun = sorted(path.parent for path in parent.glob("*/metrics.csv"))
-    folders = [path for path in begun if not (path / "results.json").is_file()]
+    held = [path.parent for path in parent.glob("*/config.yaml") if begun(path.parent)]
+    folders = sorted(path for path in held if not (path / "results.json").is_file())
     remedy = "no unfinished run; name a run folder with --out"
     _common.require(bool(folders), f"nothing to resume in {parent}: {remedy}")
     return folders[-1]

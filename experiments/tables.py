@@ -8,7 +8,7 @@ import importlib
 import pathlib
 import re
 
-from . import _common
+from . import _common, imported
 
 _NAMES = ("focus", "restore", "edof", "accuracy", "stability", "benchmark", "lenses")
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -37,6 +37,7 @@ def filled(text: str, tables: dict[str, str]) -> str:
 
 def main() -> None:
     """Command line."""
+    imported()
     tables = all_tables()
     for page in pages():
         text = filled(page.read_text(), tables)

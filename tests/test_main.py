@@ -1,5 +1,7 @@
 """`python -m drt_jax show`."""
 
+import signal
+
 import pytest
 
 from drt_jax import load_lens
@@ -49,6 +51,16 @@ def test_words_for_apertures_and_focal_length(tmp_path, capsys):
     (tmp_path / "mine.yaml").write_text(lens.replace("radius: 51.68", "radius: -51.68"))
     with pytest.warns(UserWarning, match="focal_length: 100 mm is stated, but it is -100 mm at"):
         load_lens(tmp_path / "mine.yaml")
+
+
+def test_ctrl_c_is_one_line(monkeypatch, capsys):
+    def stop(*args):
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("drt_jax.__main__.load_lens", stop)
+    with pytest.raises(SystemExit) as ended:
+        main(["show", "singlet"])
+    assert ended.value.code == 130 and capsys.readouterr().err == "stopped\n"
 
 
 @pytest.mark.parametrize(

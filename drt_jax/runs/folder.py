@@ -1,31 +1,46 @@
 """The folder of a run: resolved config, metrics as they come, checkpoints, results, figures.
 
-Everything is written so that a run killed at any moment can go on: a checkpoint replaces its
-predecessor in one step, and metrics that lie beyond it are dropped when the run resumes.
+Everything is written so that a run killed at any moment can go on: one process at a time works in
+the folder, a checkpoint replaces its predecessor in one step and is checked before it is used, and
+metrics that lie beyond it are dropped when the run resumes.
 """
 
-import contextlib
-import csv
+import dataclasses
+import hashlib
 import io
 import json
-import os
+import math
 import pathlib
-import signal
-import threading
 import time
-import zipfile
-from collections.abc import Callable, Iterator
+import urllib.parse
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .checkpoint import Checkpoint, unpacked
 from .config import ConfigError, dump_config, load_config
+from .lock import lock
+from .metrics import Metrics
+from .write import replace, sweep
+
+
+def begun(folder: pathlib.Path) -> bool:
+    """Whether a folder holds a run that has metrics, checkpoints or results."""
+    if any((folder / "checkpoints").glob("*.npz")) or (folder / "results.json").exists():
+        return True
+    metrics = folder / "metrics.csv"
+    return metrics.is_file() and len(metrics.read_bytes().splitlines()) > 1
 
 
 class Run:
-    """One run in one folder; several jobs (starting points, say) may share it."""
+    """One run in one folder; several jobs (starting points, say) may share it.
+
+    folder: of the run. figures: the folder of its pictures.
+
+    No other process may open the folder until `close`, or the end of a `with` block.
+    """
 
     def __init__(self, folder: pathlib.Path, config: Any, columns: tuple[str, ...], resume: bool):
         """Open the folder.
@@ -35,31 +50,57 @@ class Run:
         columns: of metrics.csv, after `job` and `step`.
         resume: whether to go on with the run that the folder holds.
 
-        ConfigError if it holds another run that has begun to train, or on resuming a run with
-        another configuration, or one that does not exist.
+        ConfigError if another process works in it, if it holds another run that has begun, or on
+        resuming a run with another configuration, damaged metrics, or one that does not exist.
         """
         self.folder = folder
         self.figures = folder / "figures"
-        self._metrics = folder / "metrics.csv"
-        self._columns = ("job", "step", *columns)
+        self._metrics = Metrics(folder / "metrics.csv", columns)
         self._earlier, self._opened = 0.0, time.perf_counter()
-        saved = folder / "config.yaml"
-        if resume:
-            if not saved.is_file():
-                raise ConfigError(f"{folder}: nothing to resume: no config.yaml in it")
-            if load_config(type(config), saved) != config:
-                raise ConfigError(
-                    f"{saved}: the run to resume was started with other settings; "
-                    "leave out --config and --set to take its own, or choose another --out"
-                )
-        elif self._metrics.exists():
+        settings = json.dumps(dataclasses.asdict(config), sort_keys=True)
+        self._settings = hashlib.sha256(settings.encode()).hexdigest()
+        if resume and not (folder / "config.yaml").is_file():
+            raise ConfigError(f"{folder}: nothing to resume: no config.yaml in it")
+        folder.mkdir(parents=True, exist_ok=True)
+        self._unlock = lock(folder)
+        try:
+            for part in (folder, folder / "checkpoints"):
+                sweep(part)
+            if resume:
+                self._go_on(config)
+            else:
+                self._begin(config)
+            self.figures.mkdir(exist_ok=True)
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self, config: Any) -> None:
+        if begun(self.folder):
+            remedy = "add --resume to go on with it, or choose another --out"
+            raise ConfigError(f"{self.folder}: holds a run already; {remedy}")
+        self._metrics.begin()
+        replace(self.folder / "config.yaml", dump_config(config).encode())
+
+    def _go_on(self, config: Any) -> None:
+        saved = self.folder / "config.yaml"
+        if load_config(type(config), saved) != config:
             raise ConfigError(
-                f"{folder}: holds a run already; add --resume to go on with it, "
-                "or choose another --out"
+                f"{saved}: the run to resume was started with other settings; "
+                "leave out --config and --set to take its own, or choose another --out"
             )
-        self.figures.mkdir(parents=True, exist_ok=True)
-        if not resume:
-            self._replace("config.yaml", dump_config(config).encode())
+        self._metrics.mend()
+
+    def close(self) -> None:
+        """Leave the folder to others; nothing more may be written."""
+        unlock, self._unlock = self._unlock, lambda: None
+        unlock()
+
+    def __enter__(self) -> "Run":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     @property
     def seconds(self) -> float:
@@ -69,111 +110,102 @@ class Run:
     def log(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
         """Append metrics of consecutive steps.
 
-        step: the first of them.
+        step: the first of them, 0 at the start of a job.
         rows: (N,) values of N steps by column; a column that is not among them stays empty.
         """
-        with open(self._metrics, "a", newline="") as file:
-            writer = csv.DictWriter(file, self._columns, extrasaction="ignore")
-            if not file.tell():
-                writer.writeheader()
-            for i, values in enumerate(zip(*rows.values())):
-                row = zip(rows, map(float, values))
-                writer.writerow({"job": job, "step": step + i, **dict(row)})
+        self._metrics.append(job, step, rows)
 
     def metrics(self, job: str) -> dict[str, np.ndarray]:
         """The logged metrics of one job, arrays by column (with `step`); NaN where empty."""
-        with open(self._metrics, newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row["job"] == job]
-        return {c: np.array([float(row[c] or "nan") for row in rows]) for c in self._columns[1:]}
+        return self._metrics.of(job)
 
     def save(self, job: str, step: int, tree: Any) -> None:
-        """Checkpoint: the state `tree` of `job` after `step` steps."""
-        arrays: dict[str, Any] = {f"leaf{i}": a for i, a in enumerate(jax.tree.leaves(tree))}
-        arrays |= {"step": step, "seconds": self.seconds}
-        file = io.BytesIO()
-        np.savez(file, **arrays)
-        self._replace(f"checkpoints/{job}.npz", file.getvalue())
+        """Checkpoint: the state `tree` of `job` after `step` steps, which have been logged.
 
-    def load(self, job: str, tree: Any, logged: tuple[str, ...]) -> tuple[int, Any]:
+        ConfigError if it is not finite; the checkpoint before it stays.
+        """
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+        now = Checkpoint(job, step, self.seconds, self._settings, leaves)
+        if not now.finite():
+            remedy = "lower the learning rates; the last checkpoint is of an earlier step"
+            raise ConfigError(f"{job}: numbers that are not finite after {step} steps; {remedy}")
+        self._metrics.sync()  # a checkpoint without its metrics would be of no use
+        replace(self._path(job), now.packed())
+
+    def load(self, job: str, tree: Any, logged: tuple[str, ...], most: int) -> tuple[int, Any]:
         """The last checkpoint of `job` as (step, state); (0, tree) if there is none.
 
-        tree: a state of the same structure.
+        tree: a state of the same structure, shapes and dtypes.
         logged: the names under which the job logs; their metrics beyond the checkpoint are dropped.
+        most: how many steps the job has.
+
+        ConfigError, with the remedy, for a checkpoint that is damaged or of something else, and if
+        metrics before it are missing.
         """
-        path = self.folder / "checkpoints" / f"{job}.npz"
-        step = 0
+        leaves, structure = jax.tree.flatten(tree)
+        forms = [(np.shape(leaf), np.dtype(jnp.result_type(leaf))) for leaf in leaves]
+        found = self._found(job, logged, most, forms)
+        if found is None:
+            return 0, tree
+        return found.step, jax.tree.unflatten(structure, map(jnp.asarray, found.leaves))
+
+    def keep(self, job: str, value: Any) -> None:
+        """Checkpoint of a job that is done: what it found, as JSON can hold it."""
+        text = np.frombuffer(json.dumps(value).encode(), np.uint8)
+        self.save(job, len(self.metrics(job)["step"]), text)
+
+    def kept(self, job: str) -> Any:
+        """What `keep` was given for a job; None, and its metrics dropped, if there is nothing.
+
+        ConfigError as by `load`.
+        """
+        found = self._found(job, (job,), math.inf, None)
+        return None if found is None else json.loads(found.leaves[0].tobytes())
+
+    def _found(
+        self, job: str, logged: tuple[str, ...], most: float, forms: list | None
+    ) -> Checkpoint | None:
+        """The checkpoint of a job, checked, and metrics that end where it does."""
+        path, found = self._path(job), None
         if path.is_file():
-            leaves, structure = jax.tree.flatten(tree)
             try:
-                with open(path, "rb") as file, np.load(file) as saved:
-                    stored = [jnp.asarray(saved[f"leaf{i}"]) for i in range(len(leaves))]
-                    step = int(saved["step"])
-                    self._earlier = max(self._earlier, float(saved["seconds"]))
-            except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-                raise ConfigError(
-                    f"{path}: not a checkpoint of this run; delete it to start the job anew"
-                ) from error
-            tree = jax.tree.unflatten(structure, stored)
-        self._truncate(logged, step)
-        return step, tree
+                found = unpacked(path.read_bytes())
+                found.check(job, self._settings, most, forms)
+            except ValueError as error:
+                raise ConfigError(f"{path}: {error}; delete it to begin this job anew") from error
+            self._earlier = max(self._earlier, found.seconds)
+        remedy = f"delete {path.relative_to(self.folder)} to begin this job anew"
+        self._metrics.cut(logged, found.step if found else 0, remedy)
+        return found
 
-    def _truncate(self, jobs: tuple[str, ...], step: int) -> None:
-        if not self._metrics.exists():
-            return
-        with open(self._metrics, newline="") as file:
-            header, *rows = list(csv.reader(file)) or [list(self._columns)]
-        whole = [row for row in rows if len(row) == len(self._columns)]
-        kept = [row for row in whole if row[0] not in jobs or int(row[1]) < step]
-        if len(kept) < len(rows):
-            text = io.StringIO(newline="")
-            csv.writer(text).writerows([header, *kept])
-            self._replace("metrics.csv", text.getvalue().encode())
+    def _path(self, job: str) -> pathlib.Path:
+        return self.folder / "checkpoints" / f"{urllib.parse.quote(job, safe=' ,')}.npz"
 
-    def finish(self, results: dict[str, Any]) -> pathlib.Path:
-        """Write results.json and return its path."""
-        self._replace("results.json", (json.dumps(results, indent=2) + "\n").encode())
-        return self.folder / "results.json"
+    def finish(self, results: dict[str, Any]) -> None:
+        """Write the results: arrays as results.npz, all else as results.json.
 
-    def _replace(self, name: str, content: bytes) -> None:
-        """Write a file whole or not at all."""
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = path.with_name(path.name + ".partial")
-        try:
-            with open(scratch, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(scratch, path)
-        finally:
-            scratch.unlink(missing_ok=True)
+        JSON knows no NaN and no infinity: they become null, and the names of what is not finite,
+        in either file, are listed under `not_finite`, which is there if there are any.
+        """
+        arrays = {name: value for name, value in results.items() if isinstance(value, np.ndarray)}
+        bad = [name for name, array in arrays.items() if not np.all(np.isfinite(array))]
+        plain = {n: _finite(value, n, bad) for n, value in results.items() if n not in arrays}
+        if arrays:
+            file = io.BytesIO()
+            np.savez_compressed(file, **arrays)
+            replace(self.folder / "results.npz", file.getvalue())
+        plain |= {"not_finite": bad} if bad else {}
+        text = json.dumps(plain, indent=2, allow_nan=False) + "\n"
+        replace(self.folder / "results.json", text.encode())
 
 
-@contextlib.contextmanager
-def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C (or SIGTERM) into a question: yields a function that says whether
-    one came, to be asked where stopping is safe. A second one acts at once.
-
-    notify: called when the first one comes.
-
-    A signal that is ignored, as SIGINT is under `nohup`, stays so.
-    """
-    asked = False
-    # Only the main thread may handle signals; None: a handler from outside Python.
-    main = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGINT, signal.SIGTERM) if main else ()
-    previous = {n: h for n in numbers if (h := signal.getsignal(n)) not in (None, signal.SIG_IGN)}
-
-    def ask(number: int, frame: Any) -> None:
-        nonlocal asked
-        asked = True
-        signal.signal(number, previous[signal.Signals(number)])
-        notify()
-
-    for number in previous:
-        signal.signal(number, ask)
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+def _finite(value: Any, name: str, bad: list[str]) -> Any:
+    """A value for JSON with None for numbers that are not finite, whose names `bad` takes up."""
+    if isinstance(value, dict):
+        return {key: _finite(item, f"{name}.{key}", bad) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item, f"{name}[{i}]", bad) for i, item in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        bad.append(name)
+        return None
+    return value

@@ -1,16 +1,16 @@
+"""The folder of a run: what is written comes back, and a run goes on where it was."""
+
 import dataclasses
+import json
+import math
 import os
-import signal
-import subprocess
-import sys
-import time
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from drt_jax.runs.config import ConfigError
-from drt_jax.runs.folder import Run, deferred_interrupt
+from drt_jax.runs.folder import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,125 +22,121 @@ def opened(tmp_path, resume=False, config=Config()):
     return Run(tmp_path / "run", config, ("loss", "sensor_mm"), resume)
 
 
+def rows(count):
+    return {"loss": np.arange(float(count)), "sensor_mm": np.ones(count)}
+
+
 def test_metrics_and_checkpoints_round_trip(tmp_path):
-    run = opened(tmp_path)
-    run.log("a", 0, {"loss": np.array([0.1, 1 / 3]), "sensor_mm": np.array([1.0, 2.0])})
-    run.log("b", 0, {"loss": np.array([5.0])})
-    read = run.metrics("a")
-    assert read["loss"][1] == 1 / 3 and read["step"].tolist() == [0, 1]
-    assert np.isnan(run.metrics("b")["sensor_mm"][0])
-    tree = {"x": jnp.array([1.0, jnp.pi]), "y": (jnp.ones((2, 2), jnp.float32), jnp.int32(3))}
-    run.save("a", 2, tree)
-    step, back = run.load("a", tree, ("a",))
-    assert step == 2 and back["x"][1] == jnp.pi and back["y"][0].dtype == jnp.float32
+    with opened(tmp_path) as run:
+        assert (run.folder / "metrics.csv").read_bytes() == b"job,step,loss,sensor_mm\r\n"
+        run.log("a", 0, {"loss": np.array([0.1, 1 / 3]), "sensor_mm": np.array([1.0, 2.0])})
+        run.log("b", 0, {"loss": np.array([5.0])})
+        read = run.metrics("a")
+        assert read["loss"][1] == 1 / 3 and read["step"].tolist() == [0, 1]
+        assert np.isnan(run.metrics("b")["sensor_mm"][0])
+        tree = {"x": jnp.array([1.0, jnp.pi]), "y": (jnp.ones((2, 2), jnp.float32), jnp.int32(3))}
+        run.save("a", 2, tree)
+        step, back = run.load("a", tree, ("a",), 10)
+        assert step == 2 and back["x"][1] == jnp.pi and back["y"][0].dtype == jnp.float32
 
 
 def test_metrics_beyond_the_checkpoint_are_dropped(tmp_path):
-    run = opened(tmp_path)
-    for start in (0, 2):
-        run.log("a", start, {"loss": np.ones(2), "sensor_mm": np.ones(2)})
-        run.log("b, 5 deg", start, {"loss": np.ones(2), "sensor_mm": np.ones(2)})
-    run.save("a", 2, jnp.ones(1))
+    with opened(tmp_path) as run:
+        for start in (0, 2):
+            run.log("a", start, rows(2))
+            run.log("b, 5 deg", start, rows(2))
+        run.save("a", 2, jnp.ones(1))
     with open(run.folder / "metrics.csv", "a") as file:
-        file.write("a,4,0.5")  # a line cut off by a kill
-    again = opened(tmp_path, resume=True)
-    assert again.load("a", jnp.ones(1), ("a",))[0] == 2
-    assert again.metrics("a")["step"].tolist() == [0, 1]
-    assert again.metrics("b, 5 deg")["step"].tolist() == [0, 1, 2, 3]
-    assert again.load("b, 5 deg", jnp.ones(1), ("b, 5 deg",))[0] == 0
-    assert again.metrics("b, 5 deg")["step"].tolist() == []
+        file.write("a,4,0.5,13")  # a line cut off by a kill
+    with opened(tmp_path, resume=True) as again:
+        assert again.load("a", jnp.ones(1), ("a",), 10)[0] == 2
+        assert again.metrics("a")["step"].tolist() == [0, 1]
+        assert again.metrics("b, 5 deg")["step"].tolist() == [0, 1, 2, 3]
+        assert again.load("b, 5 deg", jnp.ones(1), ("b, 5 deg",), 10)[0] == 0
+        assert again.metrics("b, 5 deg")["step"].tolist() == []
+
+
+def test_what_a_job_found_is_kept_with_its_metrics(tmp_path):
+    """Also under a name that is no name of a file; what was logged by one cut short is dropped."""
+    found = {"rows": [1, "x", None], "bad": float("inf")}
+    with opened(tmp_path) as run:
+        assert run.kept("../lens.yaml") is None
+        run.log("../lens.yaml", 0, rows(3))
+        run.keep("../lens.yaml", found)
+        run.log("b", 0, rows(3))
+    assert [path.name for path in run.folder.rglob("*.npz")] == ["..%2Flens.yaml.npz"]
+    with opened(tmp_path, resume=True) as run:
+        assert run.kept("../lens.yaml") == found and run.kept("b") is None
+        assert len(run.metrics("../lens.yaml")["step"]) == 3 and not len(run.metrics("b")["step"])
 
 
 def test_a_failed_write_leaves_the_old_checkpoint(tmp_path, monkeypatch):
-    run = opened(tmp_path)
-    run.save("a", 1, jnp.ones(3))
-
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(OSError, match="No space left"):
-        run.save("a", 2, jnp.zeros(3))
-    monkeypatch.undo()
-    assert run.load("a", jnp.zeros(3), ("a",))[0] == 1
+    with opened(tmp_path) as run:
+        run.log("a", 0, rows(2))
+        run.save("a", 1, jnp.ones(3))
+        for module, name in ((np, "savez"), (os, "fsync"), (os, "replace")):
+            monkeypatch.setattr(module, name, full)
+            with pytest.raises(OSError, match="No space left"):
+                run.save("a", 2, jnp.zeros(3))
+            monkeypatch.undo()
+        assert run.load("a", jnp.zeros(3), ("a",), 10)[0] == 1
     assert not list(run.folder.rglob("*.partial"))
 
 
 def test_seconds_go_on_after_a_resume(tmp_path):
-    run = opened(tmp_path)
-    run.log("a", 0, {"loss": np.ones(1)})
-    run._opened -= 1000.0  # an hour of work, say
-    run.save("a", 1, jnp.ones(1))
-    again = opened(tmp_path, resume=True)
-    again.load("a", jnp.ones(1), ("a",))
-    assert 1000 <= again.seconds < 1100
+    with opened(tmp_path) as run:
+        run.log("a", 0, rows(1))
+        run._opened -= 1000.0  # an hour of work, say
+        run.save("a", 1, jnp.ones(1))
+    with opened(tmp_path, resume=True) as again:
+        again.load("a", jnp.ones(1), ("a",), 10)
+        assert 1000 <= again.seconds < 1100
 
 
 def test_a_run_that_failed_before_its_first_step_leaves_the_folder_free(tmp_path):
-    opened(tmp_path)
-    opened(tmp_path, config=Config(11))
-    assert opened(tmp_path, resume=True, config=Config(11)).folder == tmp_path / "run"
+    opened(tmp_path).close()
+    opened(tmp_path, config=Config(11)).close()
+    with opened(tmp_path, resume=True, config=Config(11)) as run:
+        assert run.folder == tmp_path / "run"
 
 
 def test_clear_errors(tmp_path):
     with pytest.raises(ConfigError, match="nothing to resume"):
         opened(tmp_path, resume=True)
-    run = opened(tmp_path)
-    run.log("a", 0, {"loss": np.ones(1)})
+    assert not (tmp_path / "run").exists()
+    with opened(tmp_path) as run:
+        run.log("a", 0, rows(1))
     with pytest.raises(ConfigError, match="holds a run already; add --resume"):
         opened(tmp_path)
     with pytest.raises(ConfigError, match="started with other settings"):
         opened(tmp_path, resume=True, config=Config(11))
-    run.save("a", 1, jnp.ones(100))
-    path = run.folder / "checkpoints" / "a.npz"
-    for content in (b"garbage", path.read_bytes()[:200], b""):
-        path.write_bytes(content)
-        with pytest.raises(ConfigError, match="not a checkpoint of this run; delete it"):
-            run.load("a", jnp.ones(1), ("a",))
 
 
-def press_ctrl_c():
-    """KeyboardInterrupt where the handler raises it; a handler runs between two bytecodes."""
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(0.05)
-
-
-def test_first_interrupt_is_deferred_second_is_not():
-    with deferred_interrupt() as asked:
-        assert not asked()
-        press_ctrl_c()
-        assert asked()
-        with pytest.raises(KeyboardInterrupt):
-            press_ctrl_c()
-    with pytest.raises(KeyboardInterrupt):
-        press_ctrl_c()
-
-
-IGNORED = """
-import signal
-from drt_jax.runs.folder import deferred_interrupt
-
-handler = signal.getsignal(signal.SIGTERM)
-with deferred_interrupt() as asked:
-    signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN and not asked()
-    signal.raise_signal(signal.SIGTERM)
-    assert asked()
-assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-assert signal.getsignal(signal.SIGTERM) == handler
-"""
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        [sys.executable, "-c", IGNORED],
-        [*f"{sys.executable} -m pytest -n 0 -p no:cacheprovider -k deferred".split(), __file__],
-    ],
-    ids=["a run", "these tests"],
-)
-def test_an_ignored_interrupt_stays_ignored(command):
-    """As `nohup` starts a program: the run goes on, and the test above neither fails nor waits."""
-    started = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *command]
-    done = subprocess.run(started, timeout=100, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_results_are_json_always(tmp_path):
+    """null for what is not finite, which is named."""
+    found = {
+        "good": 1.5,
+        "none": None,
+        "best": math.nan,
+        "rows": [{"mae": 0.1, "psnr": np.float64(np.inf)}, {"mae": -math.inf}],
+        "curve": np.array([1.0, np.nan]),
+        "steps": np.arange(3),
+    }
+    with opened(tmp_path) as run:
+        run.finish(found)
+    text = (run.folder / "results.json").read_text()
+    assert "NaN" not in text and "Infinity" not in text
+    assert json.loads(text) == {
+        "good": 1.5,
+        "none": None,
+        "best": None,
+        "rows": [{"mae": 0.1, "psnr": None}, {"mae": None}],
+        "not_finite": ["curve", "best", "rows[0].psnr", "rows[1].mae"],
+    }
+    with np.load(run.folder / "results.npz") as arrays:
+        assert set(arrays.files) == {"curve", "steps"}
+    with pytest.raises(ConfigError, match="holds a run already"):
+        opened(tmp_path)

@@ -1,0 +1,37 @@
+"""Ctrl-C, heard where stopping is safe."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+
+@contextlib.contextmanager
+def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C (or SIGTERM) into a question: yields a function that says whether
+    one came, to be asked where stopping is safe. A second one acts at once.
+
+    notify: called when the first one comes.
+
+    A signal that is ignored, as SIGINT is under `nohup`, stays so.
+    """
+    asked = False
+    # Only the main thread may handle signals; None: a handler from outside Python.
+    main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if main else ()
+    previous = {n: h for n in numbers if (h := signal.getsignal(n)) not in (None, signal.SIG_IGN)}
+
+    def ask(number: int, frame: Any) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(number, previous[signal.Signals(number)])
+        notify()
+
+    for number in previous:
+        signal.signal(number, ask)
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

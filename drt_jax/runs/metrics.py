@@ -1,0 +1,115 @@
+"""metrics.csv: a row for each step of each job, appended as they come."""
+
+import csv
+import io
+import os
+import pathlib
+
+import numpy as np
+
+from .config import ConfigError
+from .write import replace
+
+
+class Metrics:
+    """The file, which has its header from the first moment on; rows come whole or not at all.
+
+    path: of the file. columns: after `job` and `step`.
+    """
+
+    def __init__(self, path: pathlib.Path, columns: tuple[str, ...]):
+        self.path = path
+        self.columns = ("job", "step", *columns)
+
+    def begin(self) -> None:
+        """Write the file anew, without rows."""
+        self._write([])
+
+    def mend(self) -> None:
+        """Make whole what a kill may leave: no file, or a piece of the header, becomes the header,
+        and a last line without its end is dropped. ConfigError for other damage."""
+        content = self.path.read_bytes() if self.path.exists() else b""
+        if self._text([]).startswith(content):
+            self.begin()
+        elif (whole := content[: content.rfind(b"\n") + 1]) and len(whole) < len(content):
+            replace(self.path, whole)
+        self._rows()
+
+    def append(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
+        """Add rows of consecutive steps.
+
+        job: that they are of. step: the first. rows: (N,) values of N steps by column; a column
+        that is not among them stays empty, one that the file has not is left out.
+        """
+        lines = []
+        for i, values in enumerate(zip(*rows.values())):
+            known = {name: float(value) for name, value in zip(rows, values)}
+            lines.append([job, step + i, *(known.get(name, "") for name in self.columns[2:])])
+        content = self._text(lines, header=False)
+        with open(self.path, "r+b", buffering=0) as file:
+            end = file.seek(0, os.SEEK_END)
+            try:
+                while content:  # once, but on a disk that fills
+                    content = content[file.write(content) :]
+            except OSError:
+                file.truncate(end)
+                raise
+
+    def of(self, job: str) -> dict[str, np.ndarray]:
+        """The rows of one job as arrays by column, `step` among them; NaN where empty."""
+        rows = [row for row in self._rows() if row[0] == job]
+        found = ([float(row[k] or "nan") for row in rows] for k in range(1, len(self.columns)))
+        return dict(zip(self.columns[1:], map(np.array, found)))
+
+    def cut(self, jobs: tuple[str, ...], step: int, remedy: str) -> None:
+        """Drop the rows of jobs from a step on.
+
+        ConfigError, with the remedy, unless each of them has the rows of all steps before it.
+        """
+        rows = self._rows()
+        kept = [row for row in rows if row[0] not in jobs or int(row[1]) < step]
+        for job in jobs:
+            if [int(row[1]) for row in kept if row[0] == job] != list(range(step)):
+                wrong = f"not one row of {job} for each of the {step} steps before its checkpoint"
+                raise ConfigError(f"{self.path}: {wrong}; put them back, or {remedy}")
+        if len(kept) < len(rows):
+            self._write(kept)
+
+    def sync(self) -> None:
+        """Have the rows on the disk."""
+        with open(self.path, "rb+") as file:
+            os.fsync(file.fileno())
+
+    def _rows(self) -> list[list[str]]:
+        """All rows as text. ConfigError, with the line, for one that is not of this file."""
+        content = self.path.read_bytes()
+        try:
+            text = content.decode()
+        except UnicodeDecodeError as error:
+            line = 1 + content.count(b"\n", 0, error.start)
+            raise self._damage(line, "bytes that are no UTF-8 text") from error
+        reader = csv.reader(io.StringIO(text, newline=""))
+        rows = []
+        try:
+            if tuple(next(reader, ())) != self.columns:
+                raise ValueError(f"expected the header {','.join(self.columns)}")
+            for row in reader:
+                if len(row) != len(self.columns):
+                    raise ValueError(f"expected {len(self.columns)} values, got {len(row)}")
+                _ = int(row[1]), [float(word) for word in row[2:] if word]
+                rows.append(row)
+        except (csv.Error, ValueError) as error:
+            raise self._damage(max(reader.line_num, 1), str(error)) from error
+        return rows
+
+    def _damage(self, line: int, what: str) -> ConfigError:
+        remedy = "mend it, or delete the file and the folder checkpoints to begin anew"
+        return ConfigError(f"{self.path}, line {line}: {what[:90]}; {remedy}")
+
+    def _write(self, rows: list[list[str]]) -> None:
+        replace(self.path, self._text(rows))
+
+    def _text(self, rows: list[list], header: bool = True) -> bytes:
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows([self.columns, *rows] if header else rows)
+        return text.getvalue().encode()
