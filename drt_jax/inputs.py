@@ -6,7 +6,6 @@ documents, keys given twice, of which other readers take the last.
 """
 
 import os
-import re
 import reprlib
 import stat
 from typing import Any
@@ -58,7 +57,7 @@ class Lines(dict[str, int]):
     def of(self, key: str) -> str:
         """ ", line 7" of a key or of what it is in; nothing where none is known."""
         while key and key not in self:
-            key = re.sub(r"(\.|^)[^.\[\]]*$|\[[^\[\]]*\]$", "", key)
+            key = key[: max(key.rfind("."), key.rfind("["), 0)]
         return f", line {self[key]}" if key else ""
 
 

@@ -182,6 +182,7 @@ def test_messages():
     value, lines = parse("a: [1, {b: 2}]\n4: ~\nyes: 1e-3\n")
     assert value == {"a": [1, {"b": 2}], 4: None, True: "1e-3"}
     assert lines.of("a[1].b.c[3]") == ", line 1" and lines.of("q") == ""
+    assert lines.of("q[[[") == lines.of("") == ""
 
 
 @pytest.mark.parametrize("seed", range(2))
