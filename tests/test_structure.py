@@ -44,7 +44,9 @@ HOUSE = 12_400
 ONLY = {
     "optimistix": {"rays.aim", "rays.find", "image.field"},
     "matplotlib": {"show"},
-    "skimage": {"learn.data", "learn.train"},
+    "skimage": {"learn.data", "learn.images", "learn.train"},
+    "PIL": {"learn.data", "learn.images"},
+    "tifffile": {"learn.images"},
     "yaml": {"inputs", "files", "lens.glass", "runs.config"},
     "tqdm": set(),
     "experiments": set(),

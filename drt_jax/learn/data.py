@@ -4,25 +4,37 @@ Patches are uint8 and larger than the image to be restored by the support of the
 the sensor layer sees true context on all sides. Nothing is downloaded.
 """
 
+import contextlib
 import dataclasses
+import io
+import os
 import pathlib
+import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import IO, NamedTuple, TypeVar
 
 import numpy as np
-from skimage import color, data, io, util
+from PIL import Image
+from skimage import data
+
+from ..inputs import InputError, one_line, shown
+from .images import SUFFIXES, Picture, find_images, look, read
 
 # Colour and texture photographs that lie inside the scikit-image wheel.
 _BUNDLED = (
     *("astronaut", "brick", "chelsea", "coffee", "grass", "gravel", "hubble_deep_field"),
     *("immunohistochemistry", "retina", "rocket", "stereo_motorcycle"),
 )
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+_MOST_CROPS = 100_000
+# Bytes of patches that are kept in memory: many times what the set of the paper takes.
+_MOST_MEMORY = 8 * 10**9
+_T = TypeVar("_T")
+_Source = str | pathlib.Path
 
 
-class DataError(ValueError):
+class DataError(InputError):
     """Images that cannot be used; the message names the folder or file and the remedy."""
 
 
@@ -34,7 +46,7 @@ class DataConfig:
     crops_per_image: random crops an image.
     test_fraction: share of the images, not of the crops, kept for testing.
     memory_map: a folder on a disk with room, for sets that should not lie in memory; empty: in
-        memory.
+        memory, which takes up to 8 GB.
     """
 
     root: str = "bundled"
@@ -42,10 +54,21 @@ class DataConfig:
     test_fraction: float = 0.2
     memory_map: str = ""
 
+    def __post_init__(self) -> None:
+        for key, is_right, expected in (
+            ("root", self.root, 'a folder with images, or "bundled"'),
+            ("crops_per_image", 1 <= self.crops_per_image <= _MOST_CROPS, f"1 to {_MOST_CROPS}"),
+            ("test_fraction", 0 < self.test_fraction < 1, "between 0 and 1"),
+        ):
+            if not is_right:
+                got = shown(getattr(self, key))
+                raise DataError(f"data.{key}: expected {expected}, got {got}")
+
 
 class Patches(NamedTuple):
     """train, test: uint8 (N, P, P, 3), in memory or memory-mapped.
-    skipped: what was left out, a line for each file with the reason."""
+    skipped: what was left out, a line for each file, folder, or other kind of image, with the
+    reason."""
 
     train: np.ndarray
     test: np.ndarray
@@ -60,100 +83,153 @@ def load_patches(
     config: where they come from.
     side: of a patch, in pixels.
     seed: the same `config`, `side` and `seed` give the same patches.
-    progress: wraps the loop over the images (tqdm).
+    progress: wraps the loops over the images (tqdm): one over headers, one over contents.
 
-    Damaged or too small files are skipped and named in the result. DataError for a folder that
-    does not exist, or without a usable image on either side.
+    The split is one of the usable images; the others are skipped and named in the result, see
+    `images.read`. One image at a time is decoded. DataError for a folder that does not exist or
+    has fewer than two usable images, and for patches that take more room than there is.
     """
-    if config.crops_per_image < 1 or not 0 < config.test_fraction < 1:
-        raise DataError("data: crops_per_image: at least 1; test_fraction: between 0 and 1")
-    sources = _sources(config.root)
-    order = np.random.default_rng([seed, 0]).permutation(len(sources)).tolist()
-    count = max(1, round(config.test_fraction * len(sources)))
-    skipped: list[str] = []
-
-    def collected(name: str, group: list[int]) -> np.ndarray:
-        crops = (
-            crop
-            for i in progress(sorted(group))
-            for crop in _crops(sources[i], config.crops_per_image, side, [seed, 1, i], skipped)
-        )
-        patches = _collect(crops, side, config.memory_map)
-        if not len(patches):
+    sources, skipped = _sources(config.root)
+    fitting = [i for i in progress([*range(len(sources))]) if _fits(sources[i], side, skipped)]
+    _check_room(config, len(fitting), side)
+    usable = 0
+    with contextlib.ExitStack() as open_files, _room(config.memory_map):
+        pool, kept = (_file(config.memory_map, open_files) for _ in range(2))
+        for i in progress(fitting):
+            picture = _tried(_picture, sources[i], skipped)
+            if picture is not None:
+                usable += 1
+                for crop in _crops(picture, config.crops_per_image, side, [seed, 1, i]):
+                    pool.write(crop.tobytes())
+        if usable < 2:
             raise DataError(
-                f"data.root: {config.root}: no usable {name} image; each must measure at least "
-                f"{side} x {side} pixels. " + " ".join(skipped[:3])
+                f"data.root: {config.root}: {usable} usable images; train and test need one each, "
+                f"of at least {side} x {side} pixels. " + " ".join(skipped[:3])
             )
-        return patches
+        order = np.random.default_rng([seed, 0]).permutation(usable)
+        count = min(max(1, round(config.test_fraction * usable)), usable - 1)
+        is_test = np.isin(np.arange(usable), order[:count]).repeat(config.crops_per_image)
+        _part(pool, kept, is_test, 3 * side**2)
+        return Patches(*(_array(file, side) for file in (pool, kept)), tuple(skipped))
 
-    train, test = collected("train", order[count:]), collected("test", order[:count])
-    return Patches(train, test, tuple(skipped))
+
+def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
+    """Names of bundled photographs, or paths; and a line for whatever is left out."""
+    if root == "bundled":
+        return _BUNDLED, []
+    folder = os.path.expanduser(root)
+    if not os.path.isdir(folder):
+        raise DataError(f"data.root: {root} is not a folder; give one with images, or bundled")
+    paths, left_out = find_images(folder)
+    left_out = [one_line(line) for line in left_out]
+    if not paths:
+        kinds = ", ".join(SUFFIXES)
+        raise DataError(
+            f"data.root: {root} holds no image ({kinds}), nor do its subfolders. "
+            + " ".join(left_out[:3])
+        )
+    return paths, left_out
 
 
-def _collect(crops: Iterator[np.ndarray], side: int, folder: str) -> np.ndarray:
-    """The crops as one array; in a file without a name, so that it vanishes with the process,
-    when a folder is given."""
-    if not folder:
-        return np.array(list(crops), np.uint8).reshape(-1, side, side, 3)
+def _picture(source: _Source) -> Picture:
+    if isinstance(source, pathlib.Path):
+        return read(source)
+    pixels = getattr(data, source)()
+    return Picture(Image.fromarray(pixels[0] if isinstance(pixels, tuple) else pixels))  # of a pair
+
+
+def _fits(source: _Source, side: int, skipped: list[str]) -> bool:
+    """Whether an image is large enough, as far as its header tells; else a line more of why not."""
+    measure = look if isinstance(source, pathlib.Path) else lambda name: _picture(name).size
+    size = _tried(measure, source, skipped)
+    if size and min(size) < side:
+        skipped.append(one_line(f"{source}: {size[0]} x {size[1]} pixels, smaller than {side}"))
+    return bool(size and min(size) >= side)
+
+
+def _tried(reader: Callable[..., _T], source: _Source, skipped: list[str]) -> _T | None:
+    """What a reader gives; where it raises, nothing, and a line more of why."""
     try:
-        with tempfile.TemporaryFile(dir=pathlib.Path(folder).expanduser()) as file:
-            count = sum(bool(file.write(crop.tobytes())) for crop in crops)
-            file.flush()
-            if not count:
-                return np.empty((0, side, side, 3), np.uint8)
-            return np.memmap(file, np.uint8, "r", shape=(count, side, side, 3))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return reader(source)
+    except Exception as error:  # an image reader may raise anything on a damaged file
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        skipped.append(one_line(f"{source}: unreadable ({reason})"))
+        return None
+
+
+def _crops(picture: Picture, count: int, side: int, seed: list[int]) -> Iterator[np.ndarray]:
+    width, height = picture.size
+    generator = np.random.default_rng(seed)
+    tops = generator.integers(0, height - side + 1, count)
+    lefts = generator.integers(0, width - side + 1, count)
+    return (picture.cut(int(top), int(left), side) for top, left in zip(tops, lefts))
+
+
+def _check_room(config: DataConfig, count: int, side: int) -> None:
+    """DataError where the patches of so many images take more room than there is."""
+    needed, folder = 3 * side**2 * config.crops_per_image * count, config.memory_map
+    what = f"{count} images x {config.crops_per_image} crops of {side} x {side} pixels"
+    if not folder and needed > _MOST_MEMORY:
+        raise DataError(
+            f"data.crops_per_image: {what} take {needed / 1e9:.1f} GB, of memory at most "
+            f"{_MOST_MEMORY / 1e9:.0f}; lower it, or give data.memory_map a folder on a large disk"
+        )
+    if folder:
+        needed = int(needed * (1 + config.test_fraction))  # those of the test are moved
+        with _room(folder):
+            free = shutil.disk_usage(os.path.expanduser(folder)).free
+        if needed > free:
+            raise DataError(
+                f"data.memory_map: {folder}: {what} take {needed / 1e9:.1f} GB, free are "
+                f"{free / 1e9:.1f}; lower data.crops_per_image, or give another folder"
+            )
+
+
+@contextlib.contextmanager
+def _room(folder: str) -> Iterator[None]:
+    """A DataError for what goes wrong where the patches are kept."""
+    try:
+        yield
+    except MemoryError as error:
+        raise DataError("the patches do not fit in memory; give data.memory_map") from error
     except OSError as error:
         raise DataError(f"data.memory_map: {folder}: {error.strerror}") from error
 
 
-def _sources(root: str) -> Sequence[str | pathlib.Path]:
-    """Names of bundled photographs, or paths."""
-    if root == "bundled":
-        return _BUNDLED
-    folder = pathlib.Path(root).expanduser()
-    if not folder.is_dir():
-        raise DataError(f"data.root: {root} is not a folder; give one with images, or bundled")
-    paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES)
-    if not paths:
-        kinds = ", ".join(_SUFFIXES)
-        raise DataError(f"data.root: {root} holds no image ({kinds}), nor do its subfolders")
-    return paths
+def _file(folder: str, open_files: contextlib.ExitStack) -> IO[bytes]:
+    """In memory; or, in a folder, without a name, so that it vanishes with the process."""
+    if not folder:
+        return io.BytesIO()
+    return open_files.enter_context(tempfile.TemporaryFile(dir=os.path.expanduser(folder)))
 
 
-def _crops(
-    source: str | pathlib.Path, count: int, side: int, seed: list[int], skipped: list[str]
-) -> list[np.ndarray]:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            image = _image(source)
-    except Exception as error:  # an image reader may raise anything on a damaged file
-        reason = str(error).strip().splitlines()
-        skipped.append(f"{source}: unreadable ({reason[0] if reason else type(error).__name__})")
-        return []
-    height, width = image.shape[:2]
-    if min(height, width) < side:
-        skipped.append(f"{source}: {width} x {height} pixels, smaller than {side}")
-        return []
-    generator = np.random.default_rng(seed)
-    tops = generator.integers(0, height - side + 1, count)
-    lefts = generator.integers(0, width - side + 1, count)
-    # Copies, because a view would keep the whole image in memory.
-    return [image[y : y + side, x : x + side].copy() for y, x in zip(tops, lefts)]
+def _part(pool: IO[bytes], kept: IO[bytes], is_test: np.ndarray, size: int) -> None:
+    """Move those of the crops in `pool` that are for the test to `kept`; the others close up.
+
+    Crop after crop, because both together may be larger than the memory. size: of a crop, bytes.
+    """
+    end = 0
+    for k, moves in enumerate(is_test):
+        pool.seek(k * size)
+        crop = pool.read(size)
+        if moves:
+            kept.write(crop)
+            continue
+        if end < k * size:
+            pool.seek(end)
+            pool.write(crop)
+        end += size
+    pool.truncate(end)
 
 
-def _image(source: str | pathlib.Path) -> np.ndarray:
-    """Any image as uint8 (H, W, 3): grey is repeated, alpha dropped, pages beyond one too."""
-    image = getattr(data, source)() if isinstance(source, str) else io.imread(source)
-    if isinstance(image, tuple):  # a stereo pair: one scene
-        image = image[0]
-    if image.ndim > 3:
-        image = image[0]
-    if image.ndim == 2:
-        image = color.gray2rgb(image)
-    if image.ndim != 3 or image.shape[-1] not in (3, 4):
-        raise ValueError(f"an array of shape {image.shape} is not an image")
-    return util.img_as_ubyte(image[..., :3])
+def _array(file: IO[bytes], side: int) -> np.ndarray:
+    """What a file of crops holds."""
+    if isinstance(file, io.BytesIO):
+        return np.frombuffer(file.getbuffer(), np.uint8).reshape(-1, side, side, 3)
+    file.flush()
+    return np.memmap(file, np.uint8, "r").reshape(-1, side, side, 3)
 
 
 def batches(patches: np.ndarray, size: int, seed: int, start: int = 0) -> Iterator[np.ndarray]:
