@@ -2,6 +2,7 @@
 run, bit for bit."""
 
 import concurrent.futures
+import itertools
 import json
 import pathlib
 import re
@@ -97,7 +98,7 @@ class Toy:
 
     def __init__(self, folder: pathlib.Path):
         self._folder = folder
-        self._count = 0
+        self._numbers = itertools.count()  # of two threads, each takes its own
         self.whole = self.new()
         ended = Ended(start(self.whole))
         if ended.code:
@@ -106,8 +107,7 @@ class Toy:
 
     def new(self) -> pathlib.Path:
         """A folder of its own, which does not exist yet."""
-        self._count += 1
-        return self._folder / f"run {self._count}"
+        return self._folder / f"run {next(self._numbers)}"
 
     def ends(self, ways: list[Callable[[pathlib.Path], str]]) -> list[tuple[str, str]]:
         """The outcome of each way in which one run is ended, each telling what went wrong at once
