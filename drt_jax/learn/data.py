@@ -110,7 +110,7 @@ def load_patches(
         count = min(max(1, round(config.test_fraction * usable)), usable - 1)
         is_test = np.isin(np.arange(usable), order[:count]).repeat(config.crops_per_image)
         _part(pool, kept, is_test, 3 * side**2)
-        return Patches(*(_array(file, side) for file in (pool, kept)), tuple(skipped))
+        return Patches(_array(pool, side), _array(kept, side), tuple(skipped))
 
 
 def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:

@@ -120,9 +120,8 @@ def _limit(kind: Any, value: object) -> str:
     """What a value of the right type had to keep within."""
     if kind is int and type(value) is int:
         return f" from 0 to {_MOST}"
-    some = isinstance(value, int | float | str) and not isinstance(value, bool)
-    if kind is float and some and not math.isnan(_number(value)):
-        return f" of at most {_LARGEST:g} in size"
+    if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
+        return "" if math.isnan(_number(value)) else f" of at most {_LARGEST:g} in size"
     if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
         return f", at most {_ITEMS}"
     return f" of at most {_LONGEST} characters" if kind is str and type(value) is str else ""
