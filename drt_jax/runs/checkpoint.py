@@ -5,6 +5,7 @@ import hashlib
 import io
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class Checkpoint:
     def packed(self) -> bytes:
         """The file: an .npz of the leaves, all else as JSON, and a checksum of both."""
         about = json.dumps({name: vars(self)[name] for name in _ABOUT})
-        entries = {f"leaf{i}": leaf for i, leaf in enumerate(self.leaves)}
+        entries: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(self.leaves)}
         checksum = _checksum(about, self.leaves)
         file = io.BytesIO()
         np.savez(file, about=np.array(about), checksum=np.array(checksum), **entries)

@@ -166,7 +166,8 @@ class Run:
         self, job: str, logged: tuple[str, ...], most: float, forms: list | None
     ) -> Checkpoint | None:
         """The checkpoint of a job, checked, and metrics that end where it does."""
-        path, found = self._path(job), None
+        path = self._path(job)
+        found: Checkpoint | None = None
         if path.is_file():
             try:
                 found = unpacked(path.read_bytes())
@@ -187,7 +188,7 @@ class Run:
         JSON knows no NaN and no infinity: they become null, and the names of what is not finite,
         in either file, are listed under `not_finite`, which is there if there are any.
         """
-        arrays = {name: value for name, value in results.items() if isinstance(value, np.ndarray)}
+        arrays: dict[str, Any] = {n: a for n, a in results.items() if isinstance(a, np.ndarray)}
         bad = [name for name, array in arrays.items() if not np.all(np.isfinite(array))]
         plain = {n: _finite(value, n, bad) for n, value in results.items() if n not in arrays}
         if arrays:
