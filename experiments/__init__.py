@@ -19,13 +19,14 @@ def _heard_early(number: int, frame: Any) -> None:
     os._exit(130)
 
 
-def imported() -> None:
-    """All is imported: from here on Ctrl-C is a KeyboardInterrupt."""
-    if signal.getsignal(signal.SIGINT) is _heard_early:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+def hear(handler: Any) -> None:
+    """Have Ctrl-C heard by another handler of signals, if this is the program that runs. A signal
+    that is ignored stays so."""
+    if _IS_PROGRAM:
+        signal.signal(signal.SIGINT, handler)
 
 
-# While `python -m` looks for the module to run, its name is not yet known. A signal that is ignored
-# stays so.
-if sys.argv[:1] == ["-m"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, _heard_early)
+# While `python -m` looks for the module to run, its name is not yet known.
+_IS_PROGRAM = sys.argv[:1] == ["-m"]
+_IS_PROGRAM &= signal.getsignal(signal.SIGINT) is signal.default_int_handler
+hear(_heard_early)

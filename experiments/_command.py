@@ -1,8 +1,11 @@
 """The command line of an experiment: settings, run folder, results, figures, errors."""
 
 import argparse
+import contextlib
 import datetime
+import os
 import pathlib
+import signal
 import sys
 import time
 import traceback
@@ -14,7 +17,7 @@ from drt_jax.runs import config as configs
 from drt_jax.runs.folder import Run, begun
 from drt_jax.runs.interrupt import deferred_interrupt
 
-from . import _common, imported
+from . import _common, hear
 
 # Errors raised in these folders are about the input; others are faults to be shown whole.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
@@ -34,6 +37,15 @@ class _Place:
             return "the results are whole", f"draw them with --report --out {self.folder}"
         return "what it wrote is whole", f"go on with --resume --out {self.folder}"
 
+    def stop(self, number: int, frame: Any) -> None:
+        """Ctrl-C: say what is left, and end. Not an exception, which gets lost where Python calls
+        back, in a finalizer say; all that is written is whole at any moment."""
+        message = "; ".join(filter(None, ("stopped", *self.left())))
+        with contextlib.suppress(Exception):
+            sys.stdout.flush()
+            os.write(2, f"\n{message}\n".encode())
+        os._exit(130)
+
 
 def main(experiment: Any, argv: list[str] | None = None) -> None:
     """Run an experiment, or with --report only draw and print the results of a run again.
@@ -45,8 +57,9 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
     """
     place = _Place()
     try:
-        imported()
+        hear(place.stop)
         bad = _do(experiment, argv, place)
+        hear(signal.SIG_IGN)  # nothing is left to stop
         if not bad:
             return
         others = f" and {len(bad) - 3} others" if len(bad) > 3 else ""

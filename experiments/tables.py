@@ -7,8 +7,9 @@ the experiments print it: `python -m experiments.tables`.
 import importlib
 import pathlib
 import re
+import signal
 
-from . import _common, imported
+from . import _common, hear
 
 _NAMES = ("focus", "restore", "edof", "accuracy", "stability", "benchmark", "lenses")
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -37,7 +38,7 @@ def filled(text: str, tables: dict[str, str]) -> str:
 
 def main() -> None:
     """Command line."""
-    imported()
+    hear(signal.default_int_handler)
     tables = all_tables()
     for page in pages():
         text = filled(page.read_text(), tables)

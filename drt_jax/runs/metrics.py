@@ -1,9 +1,10 @@
-"""metrics.csv: a row for each step of each job, appended as they come."""
+"""metrics.csv: a row for each step of each job, appended as they come, each with a checksum."""
 
 import csv
 import io
 import os
 import pathlib
+import zlib
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from .write import replace
 class Metrics:
     """The file, which has its header from the first moment on; rows come whole or not at all.
 
-    path: of the file. columns: after `job` and `step`.
+    path: of the file. columns: between `job` and `step` and, at the end, `check`.
     """
 
     def __init__(self, path: pathlib.Path, columns: tuple[str, ...]):
@@ -91,12 +92,15 @@ class Metrics:
         reader = csv.reader(io.StringIO(text, newline=""))
         rows = []
         try:
-            if tuple(next(reader, ())) != self.columns:
-                raise ValueError(f"expected the header {','.join(self.columns)}")
-            for row in reader:
+            header = (*self.columns, "check")
+            if tuple(next(reader, ())) != header:
+                raise ValueError(f"expected the header {','.join(header)}")
+            for *row, check in reader:
                 if len(row) != len(self.columns):
-                    raise ValueError(f"expected {len(self.columns)} values, got {len(row)}")
+                    raise ValueError(f"expected {len(header)} values, got {len(row) + 1}")
                 _ = int(row[1]), [float(word) for word in row[2:] if word]
+                if check != _check(row):
+                    raise ValueError("its checksum is another")
                 rows.append(row)
         except (csv.Error, ValueError) as error:
             raise self._damage(max(reader.line_num, 1), str(error)) from error
@@ -111,5 +115,11 @@ class Metrics:
 
     def _text(self, rows: list[list], header: bool = True) -> bytes:
         text = io.StringIO(newline="")
-        csv.writer(text).writerows([self.columns, *rows] if header else rows)
+        checked = [[*row, _check(row)] for row in rows]
+        csv.writer(text).writerows([[*self.columns, "check"], *checked] if header else checked)
         return text.getvalue().encode()
+
+
+def _check(row: list) -> str:
+    """The checksum of a row."""
+    return f"{zlib.crc32(','.join(map(str, row)).encode()):08x}"

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import experiments
 from drt_jax.runs.config import ConfigError
 from drt_jax.runs.folder import Run
 from experiments import _command, _common, focus
@@ -190,14 +189,28 @@ def test_ctrl_c_while_importing(name, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_ctrl_c_is_an_exception_again_once_all_is_imported(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(_command, "set_up", lambda: signal.raise_signal(signal.SIGINT))
-    before = signal.signal(signal.SIGINT, experiments._heard_early)
-    try:
-        assert begin(tmp_path / "run") == 130
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert capsys.readouterr().err == "stopped; nothing was begun\n"
+def test_ctrl_c_in_a_program_ends_it_wherever_it_is(tmp_path):
+    """Also where an exception would be lost, in a finalizer."""
+    code = """
+import os, signal, sys
+sys.argv[0] = "-m"
+from experiments import _command, hear
+
+class Late:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000):
+            pass
+
+place = _command._Place()
+hear(place.stop)
+print("said", end="")
+late = Late()
+del late
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 130
+    assert (done.stdout, done.stderr) == ("said", "\nstopped; nothing was begun\n")
 
 
 def test_a_live_run_keeps_others_out(tmp_path, capsys):

@@ -9,6 +9,7 @@ import resource
 import subprocess
 import sys
 import threading
+import zlib
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,7 @@ from drt_jax.runs.config import ConfigError
 from drt_jax.runs.folder import Run
 from drt_jax.runs.write import replace
 
-HEADER = b"job,step,loss\r\n"
+HEADER = b"job,step,loss,check\r\n"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,16 +96,17 @@ def test_metrics_without_rows_or_checkpoints_are_no_loss(tmp_path):
     [
         (b"a,1,1.0", b"a,x9,1.0", "line 3: invalid literal for int() with base 10: 'x9'"),
         (b"a,1,1.0", b"a,1,1.o", "line 3: could not convert string to float: '1.o'"),
-        (b"a,1,1.0", b"a,1", "line 3: expected 3 values, got 2"),
-        (b"a,1,1.0", b"a,1,1.0,", "line 3: expected 3 values, got 4"),
+        (b"a,1,1.0", b"a,1", "line 3: expected 4 values, got 3"),
+        (b"a,1,1.0", b"a,1,1.0,", "line 3: expected 4 values, got 5"),
+        (b"a,1,1.0", b"a,1,1.5", "line 3: its checksum is another"),
         (b"a,1,1.0", b"a,1,\xff\xfe", "line 3: bytes that are no UTF-8 text"),
         (b"a,1,1.0", b"a," + 5000 * b"1" + b",1.0", "line 3: "),
-        (b"a,1,1.0", b'"a,1,1.0', "line 11: expected 3 values"),
+        (b"a,1,1.0", b'"a,1,1.0', "line 11: expected 4 values"),
         (b"job,step,loss", b"job,loss,step", "line 1: expected the header job,step,loss"),
         (HEADER, b"", "line 1: expected the header"),
         (HEADER, b"\x00\x80", "line 1: bytes that are no"),
     ],
-    ids=range(10),
+    ids=range(11),
 )
 def test_damaged_metrics_are_named_with_their_line(folder, old, new, words):
     path = folder / "metrics.csv"
@@ -116,12 +118,15 @@ def test_damaged_metrics_are_named_with_their_line(folder, old, new, words):
 
 @pytest.mark.parametrize(
     "old, new",
-    [(b"a,2,2.0\r\n", b""), (b"a,2,", b"a,1,"), (b"a,0,", b"b,0,"), (b"a,3,", b"a,-3,")],
+    [("a,2,2.0", None), ("a,2,2.0", "a,1,1.0"), ("a,0,0.0", "b,0,0.0"), ("a,3,3.0", "a,-3,3.0")],
     ids=["missing", "doubled", "of another job", "negative"],
 )
 def test_rows_missing_before_the_checkpoint_are_said(folder, old, new):
     path = folder / "metrics.csv"
-    path.write_bytes(path.read_bytes().replace(old, new))
+    lines = path.read_text().splitlines()
+    own = [] if new is None else [f"{new},{zlib.crc32(new.encode()):08x}"]
+    k = next(k for k, line in enumerate(lines) if line.startswith(old))
+    path.write_bytes("".join(f"{line}\r\n" for line in lines[:k] + own + lines[k + 1 :]).encode())
     words = "not one row of a for each of the 4 steps before its checkpoint", "put them back, or"
     refused(lambda: resumed(folder), *words)
 

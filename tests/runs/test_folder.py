@@ -28,7 +28,7 @@ def rows(count):
 
 def test_metrics_and_checkpoints_round_trip(tmp_path):
     with opened(tmp_path) as run:
-        assert (run.folder / "metrics.csv").read_bytes() == b"job,step,loss,sensor_mm\r\n"
+        assert (run.folder / "metrics.csv").read_bytes() == b"job,step,loss,sensor_mm,check\r\n"
         run.log("a", 0, {"loss": np.array([0.1, 1 / 3]), "sensor_mm": np.array([1.0, 2.0])})
         run.log("b", 0, {"loss": np.array([5.0])})
         read = run.metrics("a")
