@@ -36,10 +36,11 @@ class Camera:
     form: Form = "integrated"
 
     def __post_init__(self) -> None:
-        if self.kernel < 1 or self.kernel % 2 == 0:
-            raise ValueError(f"camera.kernel: expected an odd number of pixels, got {self.kernel}")
-        if not self.pixel_um > 0:
-            raise ValueError(f"camera.pixel_um: expected a positive number, got {self.pixel_um}")
+        if not 1 <= self.kernel <= 999 or self.kernel % 2 == 0:
+            odd = "expected an odd number of pixels, 1 to 999"
+            raise ValueError(f"camera.kernel: {odd}, got {self.kernel}")
+        if not 1e-3 <= self.pixel_um <= 1e4:
+            raise ValueError(f"camera.pixel_um: expected 1e-3 to 1e4, got {self.pixel_um}")
 
 
 def make_imager(
