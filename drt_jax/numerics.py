@@ -5,12 +5,15 @@ argument, so neither its value nor its derivative can turn into NaN. Nothing is 
 denominator, so ordinary values are not biased.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 
 def safe_sqrt(x: Array) -> Array:
@@ -66,3 +69,25 @@ def known_values(tree: Any) -> Any:
     if not concrete(seen[-1]):
         return None
     return jax.tree.unflatten(structure, seen[-1])
+
+
+@functools.cache
+def _real(kind: Any) -> bool:
+    return jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)
+
+
+def real_array(what: str, value: ArrayLike, dtype: Any) -> Array:
+    """`value`, a number, a list of them or an array, as an array of a floating dtype.
+
+    ValueError, which begins with `what`, for text, truth values, complex numbers, none at all, and
+    lists that are no array.
+    """
+    leaves = jax.tree.leaves(value)
+    kinds: list[Any] = [getattr(leaf, "dtype", None) or type(leaf) for leaf in leaves]
+    if not kinds or not all(map(_real, kinds)):
+        raise ValueError(f"{what}: expected real numbers, got {value!r:.100}")
+    try:
+        with np.errstate(over="ignore"):  # a distance of 1e300 mm is inf in float32
+            return jnp.asarray(value, dtype)
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{what}: {error}") from error

@@ -15,7 +15,8 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
-from ..lens.scene import scene_of
+from ..lens.scene import distance_array, scene_of, vergence_of
+from ..numerics import concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import solve_reverse
@@ -23,6 +24,8 @@ from .converged import converged_focus_rule, focus_moments
 from .moments import FocusMoments, moments
 
 _MAX_NODES = 64
+# By this part a distance may lie outside of its range: 1 / (1 / far) is not always far.
+_ROUNDED = 1e-5
 
 
 @jax.tree_util.register_dataclass
@@ -39,9 +42,15 @@ class DepthMoments:
     series: FocusMoments
 
     def at(self, distance: ArrayLike) -> FocusMoments:
-        """The moments of an object at `distance` mm, within near and far."""
+        """The moments of an object at `distance` mm, within near and far. ValueError for a known
+        one that is not."""
+        far = distance_array(distance, self.far.dtype)
+        if concrete((distance, self.near, self.far)):
+            place, near, end = np.array([distance, self.near, self.far], float).tolist()
+            if not (1 - _ROUNDED) * near <= place <= (1 + _ROUNDED) * end:
+                raise ValueError(f"distance: {place:g} mm is not within {near:g} and {end:g} mm")
         low, high = 1 / self.far, 1 / self.near
-        x = (2 / jnp.asarray(distance, low.dtype) - high - low) / (high - low)
+        x = (2 * vergence_of(far) - high - low) / (high - low)
         count = self.series.mean.shape[0]
         terms = [jnp.ones_like(x), x]
         while len(terms) < count:
@@ -63,6 +72,8 @@ def depth_moments(
     As many Chebyshev nodes in 1/distance as bring the last coefficients of the moments below
     `tolerance` relative to the first; each node is traced with as many rays as it needs.
     """
+    if not concrete((near, far)):
+        raise ValueError("inside jax.jit or jax.vmap the nodes cannot follow: give near and far")
     if not 0 < near < far:
         raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
     low, high = 1 / far, 1 / near
@@ -114,6 +125,8 @@ def moments_model(
     1/distance when the depth varies. Anything else traces the rays anew.
     """
     near, far = distances
+    for distance in distances:
+        distance_array(distance, lens.curvature.dtype)
     values = {name: getattr(lens, name) for name in trained}
     if set(trained) <= {"sensor"}:
         if near == far:

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from ..lens.lens import Lens
 from ..lens.paraxial import image_height
 from ..lens.scene import Scene, scene_of
-from ..numerics import safe_divide
+from ..numerics import real_array, safe_divide
 from ..rays.trace import trace_bundle
 
 _STEPS = 20
@@ -21,7 +21,6 @@ def image_point(lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: 
 
     The centroid of a spot is another point: see `psf_moments`.
     """
-    lens.check_wavelengths(wavelengths)
     return _image_point(lens, scene_of(lens, field, distance, wavelengths))
 
 
@@ -41,12 +40,12 @@ def field_of_image(
     um. Newton's method from the paraxial field; derivatives by the implicit function theorem. inf
     where no field was found.
     """
-    lens.check_wavelengths(wavelength)
-    dtype = lens.curvature.dtype
-    wanted = jnp.asarray(point, dtype)
+    scene = scene_of(lens, 0.0, distance, wavelength)
+    wanted = real_array("point", point, lens.curvature.dtype)
     if wanted.shape != (2,):
         raise ValueError(f"point: expected x and y, got shape {wanted.shape}")
-    scene = scene_of(lens, jnp.zeros(2, dtype), distance, wavelength)
+    if scene.wavelengths.size > 1:
+        raise ValueError(f"wavelength: expected one, got {scene.wavelengths.size}")
     return _field_of_image(lens, scene, wanted)
 
 

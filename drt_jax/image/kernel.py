@@ -1,14 +1,16 @@
 """Kernels on the pixel grid from centroid and covariance (paper Eq. 5). From here on: pixels."""
 
-from typing import Literal, NamedTuple
+import warnings
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.scipy.special import erf
+from jax.typing import ArrayLike
 
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import concrete, real_array, safe_divide, safe_sqrt
 
 Form = Literal["integrated", "sampled"]
 
@@ -16,6 +18,12 @@ Form = Literal["integrated", "sampled"]
 _POINT = 1e-4
 _ANGLES, _ANGLE_WEIGHTS = np.polynomial.legendre.leggauss(24)
 _MAX_CORRELATION = 1 - 1e-6
+# A pixel larger than this (mm) is more likely given in um.
+_LARGE_PIXEL = 1.0
+# A centroid beyond `_FAR` pixels, a variance beyond `_WIDE` pixels^2, lights no grid or lights it
+# evenly; a Gaussian is dark beyond `_DARK` sigma; a pixel has between 1 / `_FAR` and `_FAR` mm.
+# The squares of all these are numbers, in float32, too.
+_FAR, _WIDE, _DARK = 1e9, 1e15, 60.0
 
 
 class SeparableKernel(NamedTuple):
@@ -30,27 +38,36 @@ class SeparableKernel(NamedTuple):
 
 
 def gaussian_psf(
-    mean: Array, covariance: Array, pixel: float, size: int = 21, form: Form = "integrated"
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    pixel: ArrayLike,
+    size: int = 21,
+    form: Form = "integrated",
 ) -> SeparableKernel | Array:
     """Gaussian kernels [channel, y, x] of C channels, in the dtype of `mean`.
 
     mean: (C, 2), x and y from the centre of the grid, mm.
     covariance: mm^2, (C, 2) for a diagonal one (the result is then separable), else (C, 2, 2).
-    pixel: the side of a pixel, mm.
+    pixel: the side of a pixel, mm; warns of one above 1 mm, which may be meant in um.
     size: pixels along a side of the grid.
     form: "integrated": each pixel collects what falls on its area, and the kernel is normalised
         to sum 1. "sampled": Eq. 5 as printed, the density at the pixel centres, not normalised:
         it sums to less than 1 for a wide blur and to anything for a narrow one.
 
     As the blur shrinks to a point, and as it grows beyond the grid, values and derivatives stay
-    finite. A channel of infinite covariance (no ray arrived) is black, its derivatives are 0.
+    finite. ValueError for other shapes, and for known values that are not finite or a pixel that is
+    not above 0. Inside a trace, where values are not known, a channel of infinite covariance (no
+    ray arrived), or of other numbers of that kind, is black, and its derivatives are 0.
     """
-    if form not in ("integrated", "sampled"):
-        raise ValueError(f"form: expected 'integrated' or 'sampled', got {form!r}")
-    infinite = jnp.isinf(covariance)
-    lost = jnp.any(infinite, axis=tuple(range(1, covariance.ndim)))
-    mean = mean / pixel
-    covariance = jnp.where(infinite, 0, covariance) / pixel**2
+    mean, covariance, side = _checked(mean, covariance, pixel, size, form)
+    usable = (side > 1 / _FAR) & (side < _FAR)
+    side = jnp.where(usable, side, 1)
+    known = jnp.isfinite(mean), jnp.isfinite(covariance)
+    lost = ~(jnp.all(known[0], axis=1) & jnp.all(known[1], axis=tuple(range(1, covariance.ndim))))
+    lost = lost | ~usable
+    far, wide = _FAR * side, _WIDE * side**2
+    mean = jnp.clip(jnp.where(known[0], mean, 0), -far, far) / side
+    covariance = jnp.clip(jnp.where(known[1], covariance, 0), -wide, wide) / side**2
     dtype = mean.dtype
     kernel: SeparableKernel | Array
     if form == "sampled":
@@ -60,6 +77,39 @@ def gaussian_psf(
         edges = jnp.arange(size + 1, dtype=dtype)[None, None] - size / 2
         kernel = _integrated(edges - mean[..., None], covariance)
     return jax.tree.map(lambda k: jnp.where(jnp.expand_dims(lost, range(1, k.ndim)), 0, k), kernel)
+
+
+def _checked(
+    mean: ArrayLike, covariance: ArrayLike, pixel: ArrayLike, size: int, form: Form
+) -> tuple[Array, Array, Array]:
+    """Centroids, covariances and pixel as arrays of one dtype, if the arguments of `gaussian_psf`
+    are what they must be."""
+    if form not in get_args(Form):
+        raise ValueError(f"form: expected 'integrated' or 'sampled', got {form!r}")
+    if not isinstance(size, int | np.integer) or size < 1:
+        raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
+    floating = jnp.issubdtype(getattr(mean, "dtype", int), jnp.floating)
+    dtype = jnp.result_type(mean) if floating else jnp.result_type(float)
+    given: dict[str, ArrayLike] = {"mean": mean, "covariance": covariance, "pixel": pixel}
+    arrays = [real_array(name, value, dtype) for name, value in given.items()]
+    channels = arrays[0].shape[:1]
+    shapes: list[list[tuple[int, ...]]] = [[(*channels, 2)], [(*channels, 2)], [()]]
+    shapes[1].append((*channels, 2, 2))
+    for name, array, wanted in zip(given, arrays, shapes, strict=True):
+        if array.shape not in wanted or array.size == 0:
+            text = "(C, 2), (C, 2) or (C, 2, 2), and one pixel"
+            raise ValueError(f"{name}: expected {text}, got shape {array.shape}")
+        if concrete(given[name]) and not np.all(np.isfinite(np.asarray(given[name], float))):
+            hint = "; no ray of that colour arrives" if name == "covariance" else ""
+            raise ValueError(f"{name}: must be finite{hint}")
+    if concrete(pixel):
+        side = np.asarray(pixel, float).item()
+        if not side > 0:
+            raise ValueError(f"pixel: must be above 0 mm, got {side:g}")
+        if side > _LARGE_PIXEL:
+            um = f"if it is {side:g} um, give {1e-3 * side:g}"
+            warnings.warn(f"pixel: {side:g} mm is a large one; {um}", stacklevel=3)
+    return arrays[0], arrays[1], arrays[2]
 
 
 def _normalised(kernel: Array, axes: tuple[int, ...]) -> Array:
@@ -98,7 +148,7 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
     rule = (_ANGLES, _ANGLE_WEIGHTS)
     nodes, weights = (jnp.asarray(a, ratio.dtype).reshape(-1, 1, 1, 1) for a in rule)
     angle = limit[None] * ((1 + nodes) / 2)
-    x, y = x[None, :, None, :], y[None, :, :, None]
+    x, y = (jnp.clip(a, -_DARK, _DARK) for a in (x[None, :, None, :], y[None, :, :, None]))
     exponent = (x * x - 2 * x * y * jnp.sin(angle) + y * y) / (2 * jnp.cos(angle) ** 2)
     correction = jnp.sum(weights * jnp.exp(-exponent), axis=0) * limit / (4 * jnp.pi)
     kernel = column[:, :, None] * row[:, None, :]
@@ -120,4 +170,5 @@ def _sampled(offset: Array, covariance: Array) -> SeparableKernel | Array:
     xy, wide = jnp.where(wide, xy, 0)[:, None, None], wide[:, None, None]
     x, y = offset[:, 0, None, :], offset[:, 1, :, None]
     exponent = (yy * x * x - 2 * xy * x * y + xx * y * y) / (2 * determinant)
+    exponent = jnp.maximum(exponent, 0)
     return jnp.where(wide, jnp.exp(-exponent) / (2 * jnp.pi * jnp.sqrt(determinant)), 0)

@@ -47,6 +47,26 @@ def _by_bands(scenes: Array, kernel: SeparableKernel) -> Array:
     return jnp.einsum("cxw,cbyw->byxc", across, half, precision=_EXACT)
 
 
+def _check(scenes: Array, kernel: SeparableKernel | Array) -> None:
+    """ValueError unless the kernel fits into the scenes, and these are floating numbers."""
+    shape, dtype = jnp.shape(scenes), jnp.result_type(scenes)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        remedy = "scenes.astype(jnp.float32) / 255" if dtype == jnp.uint8 else "floating numbers"
+        raise ValueError(f"scenes: values from 0 to 1 are expected, not {dtype}: give {remedy}")
+    parts = kernel if isinstance(kernel, SeparableKernel) else (kernel,)
+    sizes = {size for part in parts for size in jnp.shape(part)[1:]}
+    channels = {jnp.shape(part)[:1] for part in parts}
+    if len(shape) != 4 or channels != {shape[3:]}:
+        raise ValueError(
+            f"scenes: expected (B, H, W, C) with the C of the kernel, got {shape} and "
+            f"{[jnp.shape(part) for part in parts]}"
+        )
+    if min(shape[1:3]) < max(sizes):
+        raise ValueError(
+            f"scenes: {shape[1]} x {shape[2]} pixels are smaller than the kernel of {max(sizes)}"
+        )
+
+
 def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
     """'Valid' convolution of each channel with its own kernel.
 
@@ -54,7 +74,10 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
         (B, H, W, C) has no border artefacts.
     kernel: [channel, y, x]. A separable one is applied as two products with banded matrices,
         a dense one by 2D convolution.
+
+    ValueError for scenes that are no floating numbers, and for shapes that do not fit.
     """
+    _check(scenes, kernel)
     if isinstance(kernel, SeparableKernel):
         return _by_bands(scenes, kernel)
     return jax.lax.conv_general_dilated(
@@ -71,6 +94,7 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
 def convolve_taps(scenes: Array, kernel: SeparableKernel | Array) -> Array:
     """`convolve`, on a CPU with a separable kernel tap by tap: the faster form for values and
     forward mode, ten times slower in reverse. Arguments and result as there."""
+    _check(scenes, kernel)
     if not isinstance(kernel, SeparableKernel):
         return convolve(scenes, kernel)
     return jax.lax.platform_dependent(scenes, kernel, cpu=_by_taps, default=_by_bands)
@@ -90,7 +114,10 @@ def sensor_layer(
     noise: standard deviation, ().
     key: a PRNG key.
     convolve: `convolve` or `convolve_taps`.
+
+    ValueError as `convolve`.
     """
+    _check(scenes, kernel)
     images = convolve(scenes, jax.tree.map(lambda array: array.astype(scenes.dtype), kernel))
     white = jax.random.normal(key, images.shape, images.dtype)
     return images + jnp.asarray(noise, images.dtype) * white

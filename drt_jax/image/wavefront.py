@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -22,10 +23,10 @@ from ..lens.elements import rotation_matrix
 from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray_at_image
 from ..lens.scene import Scene, scene_of
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import concrete, real_array, safe_divide, safe_sqrt
 from ..rays.status import Status
 from ..rays.system import dot
-from ..rays.trace import trace_bundle
+from ..rays.trace import stop_points, trace_bundle
 
 _MM = 1e-3  # per um
 
@@ -72,27 +73,36 @@ def wavefront(
         `reference_curvature`; needed for a lens folded by tilted mirrors, whose exit pupil the
         paraxial trace cannot know.
 
-    Differentiable like `trace_rays`; the reference sphere moves with the lens. ValueError for a
-    known wavelength outside the range of a glass.
+    Differentiable like `trace_rays`; the reference sphere moves with the lens. ValueError as of
+    `trace_rays`, and for a known curvature that is not finite; inside a trace no ray has an opd
+    then, and those that are whole are UNCONVERGED.
     """
-    lens.check_wavelengths(wavelengths)
-    points = jnp.asarray(pupil, lens.curvature.dtype)
     scene = scene_of(lens, field, distance, wavelengths)
-    kappa = None if curvature is None else jnp.asarray(curvature, lens.curvature.dtype)
+    points = stop_points(lens, pupil)
+    kappa = None
+    if curvature is not None:
+        kappa = real_array("curvature", curvature, lens.curvature.dtype)
+        if kappa.shape not in ((), scene.wavelengths.shape):
+            raise ValueError(f"curvature: expected one or one a colour, got shape {kappa.shape}")
+        if concrete(curvature) and not np.all(np.isfinite(np.asarray(curvature, float))):
+            raise ValueError("curvature: must be finite; 0 for a telecentric exit pupil")
     return _wavefront(lens, scene, points, kappa)
 
 
 @jax.jit
 def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) -> Wavefront:
-    colours = scene.wavelengths
+    colours = jnp.clip(scene.wavelengths, *lens.dispersion.range)
     points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil])  # the chief ray first
     bundle = trace_bundle(lens, scene, (points[:, 0], points[:, 1]))
     whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     chief_ok = whole[:, :1]
-    good = chief_ok & (bundle.status == Status.OK)
 
     if curvature is None:
         curvature = reference_curvature(lens, colours)
+    finite = jnp.isfinite(curvature)
+    curvature = jnp.where(finite, curvature, 0)
+    sphere = chief_ok & jnp.broadcast_to(finite, colours.shape)[:, None]
+    good = sphere & (bundle.status == Status.OK)
     # cosine between the chief ray and the axis of the lens
     axis = jnp.array([0, 0, 1], points.dtype)
     axis = axis if lens.tilt is None else rotation_matrix(lens.tilt[-1])[2]
@@ -105,10 +115,11 @@ def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) 
     along = dot(e, bundle.arrival[:-1])
     x = along**2 - dot(e, e)
     to_sphere = along + kappa * x / (1 + safe_sqrt(1 + kappa**2 * x))
-    index = lens.index(jnp.clip(colours, *lens.dispersion.range))[-1][:, None]
+    index = lens.index(colours)[-1][:, None]
     path = bundle.path[:, :1] - bundle.path + index * to_sphere
     opd = jnp.where(good, path, 0) / (_MM * colours[:, None])
-    status = jnp.where(chief_ok | ~whole, bundle.status, bundle.status[:, :1])
+    without = jnp.where(chief_ok, jnp.int32(Status.UNCONVERGED), bundle.status[:, :1])
+    status = jnp.where(sphere | ~whole, bundle.status, without)
     return Wavefront(opd[:, 1:], status[:, 1:], jnp.concatenate(image, axis=-1))
 
 
@@ -116,10 +127,13 @@ def rms_wavefront(wave: Wavefront, weights: ArrayLike) -> Array:
     """Root mean square (W,) of the opd about its mean, in waves; 0 if no ray has one.
 
     `weights` (Q,) of the points, as from `pupil.disc`; failed and clipped rays count for
-    nothing. The tilt that the chief ray leaves is kept.
+    nothing. The tilt that the chief ray leaves is kept. ValueError for weights of another shape.
     """
+    share = real_array("weights", weights, wave.opd.dtype)
+    if share.shape != wave.opd.shape[1:]:
+        raise ValueError(f"weights: expected {wave.opd.shape[1:]}, got shape {share.shape}")
     good = wave.status == Status.OK
-    weight = jnp.where(good, jnp.asarray(weights, wave.opd.dtype), 0)
+    weight = jnp.where(good, share, 0)
     weight = safe_divide(weight, jnp.sum(weight, axis=1, keepdims=True))
     mean = jnp.sum(weight * wave.opd, axis=1, keepdims=True)
     return safe_sqrt(jnp.sum(weight * (wave.opd - mean) ** 2, axis=1))

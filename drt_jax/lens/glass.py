@@ -11,6 +11,8 @@ import numpy as np
 import yaml
 from jax import Array
 
+from ..numerics import safe_divide, safe_sqrt
+
 # The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # Of model glasses: the lines d, F, C, g in um, the powers of L in Conrady's formula, P_gF on
@@ -149,16 +151,18 @@ def _model_index(model: Array, wavelengths: Array) -> Array:
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     """Index of each medium at each wavelength, shape (M, W).
 
-    Relative to air, whose own index is taken as 1.
+    Relative to air, whose own index is taken as 1. Finite for any wavelength; 0 where the formula,
+    far outside its range, has no real root.
 
     dispersion: of M media.
     wavelengths: (W,) in um.
     """
+    wavelengths = jnp.clip(wavelengths, *ANY)
     b, c = dispersion.strength[..., None], dispersion.resonance[..., None]
     square = (wavelengths**2)[None, None]
-    sellmeier = jnp.sum(b * square / (square - c), axis=1)
+    sellmeier = jnp.sum(safe_divide(b * square, square - c), axis=1)
     powers = jnp.stack([wavelengths**p for p in (0, 2, -2, -4, -6, -8)])
-    index = jnp.sqrt(sellmeier + dispersion.schott @ powers)
+    index = safe_sqrt(sellmeier + dispersion.schott @ powers)
     if dispersion.model is None:
         return index
     return index + _model_index(dispersion.model, wavelengths)

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.dtypes import canonicalize_dtype
 from jax.typing import ArrayLike
 
-from ..numerics import concrete
+from ..numerics import concrete, real_array
 from .aperture import Apertures
 from .elements import Elements, rotation_matrix
 from .forms import Shape
@@ -128,11 +129,20 @@ class Lens:
     def index(self, wavelengths: ArrayLike) -> Array:
         """Refractive index (S + 1, W) of every medium at `wavelengths` (W,), um.
 
-        ValueError, naming the range, for a known wavelength outside that of a glass.
+        ValueError as `colours`.
         """
+        return refractive_index(self.dispersion, self.colours(wavelengths))
+
+    def colours(self, wavelengths: ArrayLike) -> Array:
+        """`wavelengths`, one or a list, in um, as an array (W,).
+
+        ValueError for none, for another shape, and as `check_wavelengths`.
+        """
+        found = jnp.atleast_1d(real_array("wavelengths", wavelengths, self.curvature.dtype))
+        if found.ndim != 1 or not found.size:
+            raise ValueError(f"wavelengths: expected one or a list, got shape {found.shape}")
         self.check_wavelengths(wavelengths)
-        wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths, self.curvature.dtype))
-        return refractive_index(self.dispersion, wavelengths)
+        return found
 
     def check_wavelengths(self, wavelengths: ArrayLike) -> None:
         """ValueError if a known wavelength, (W,) or one in um, lies outside the range of a medium.
@@ -147,6 +157,33 @@ class Lens:
                 if not low <= value <= high:
                     outside = f"wavelength {value:g} um is outside the range of {name}"
                     raise ValueError(f"{outside}, {low:g} to {high:g} um")
+
+    def check(self) -> None:
+        """ValueError, naming the array, unless those over surfaces have the shapes that stand above
+        and one floating dtype. In a trace, too; takes some microseconds."""
+        rows, terms = self.count + 1, np.shape(self.coefficients)[1:2] or (0,)
+        shapes: dict[str, tuple] = dict.fromkeys(("curvature", "conic", "semi_diameter"), (rows,))
+        shapes |= {"coefficients": (rows, *terms), "thickness": (rows - 2,), "sensor": ()}
+        shapes |= {"decentre": (rows, 2), "tilt": (rows, 3)}
+        dtype = getattr(self.curvature, "dtype", None)
+        if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(f"lens.curvature: expected a floating array, got {dtype}")
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array is None and name in ("decentre", "tilt"):
+                continue
+            what, found = f"lens.{name}: expected", np.shape(array)
+            if found != shape:
+                raise ValueError(f"{what} shape {shape} for {self.count} surfaces, got {found}")
+            kind = getattr(array, "dtype", dtype)
+            if kind != dtype and len({*map(canonicalize_dtype, (kind, dtype))}) > 1:
+                raise ValueError(f"{what} the dtype of curvature, {dtype}, got {kind}")
+        of_each = (("forms", self.forms), ("dispersion", self.dispersion.schott))
+        for name, values in of_each:
+            if len(values) != rows:
+                raise ValueError(f"lens.{name}: expected {rows} rows, got {len(values)}")
+        if not 0 <= self.stop < self.count:
+            raise ValueError(f"lens.stop: expected 0 to {self.count - 1}, got {self.stop}")
 
 
 def sag(lens: Lens, surface: int, x: ArrayLike, y: ArrayLike) -> Array:

@@ -4,10 +4,14 @@ A paraxial ray is its height y in mm and its slope u = dy/dz, at each surface. A
 number of mirrors, the index and the distances are negative. Tilts and decentres are left out,
 and a surface or a phase without an axis is taken in its (y, z) section. Source of the formulae:
 Welford, Aberrations of Optical Systems (1986), ch. 3, 6, 8, 10.
+
+ValueError for wavelengths, distances and fields as of `scene_of`. Inside a trace, where values are
+not known, the results for a wavelength outside the range of a glass, and for a distance that is
+not above 0, and heights for a field of 90 degrees and more, are inf.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +21,7 @@ from jax.typing import ArrayLike
 
 from ..numerics import safe_divide
 from .lens import Lens
+from .scene import ahead, apart, distance_array, field_array, vergence_of
 from .surface import vertex_curvature
 
 
@@ -104,6 +109,7 @@ class ParaxialSystem:
     gaps: (S - 1,) in mm.
     index: (S + 1, W), negative after an odd number of mirrors.
     aperture: (), the semi-diameter of the stop in mm.
+    known: (W,), bool, whether all media have an index.
     stop: its index.
     """
 
@@ -112,7 +118,18 @@ class ParaxialSystem:
     gaps: Array
     index: Array
     aperture: Array
+    known: Array
     stop: int
+
+    def told(self, results: Any, good: Array | bool = True) -> Any:
+        """Results (..., W); inf where an index is not known, or what came in is not `good`, bool
+        of a shape that broadcasts."""
+
+        def told(found):
+            sure = (jnp.broadcast_to(a, found.shape) for a in (self.known, good))
+            return jnp.where(jnp.logical_and(*sure), found, jnp.inf)
+
+        return jax.tree.map(told, results)
 
 
 class ParaxialRay(NamedTuple):
@@ -125,16 +142,19 @@ class ParaxialRay(NamedTuple):
 
 def paraxial_system(lens: Lens, wavelengths: ArrayLike) -> ParaxialSystem:
     """What paraxial rays of `wavelengths` (W,), um, see of a lens."""
-    index = lens.index(wavelengths)
+    lens.check()
+    colours = lens.colours(wavelengths)
+    index = lens.index(jnp.clip(colours, *lens.dispersion.range))
     index = index * jnp.asarray(lens.senses[:, None], index.dtype)
     curvature = vertex_curvature(lens.shape, lens.forms, 1)[0][:-1]
     power = curvature[:, None] * jnp.diff(index, axis=0)
     if lens.phase is not None:
         turned = vertex_curvature(lens.phase.shape, lens.phase.forms, 1)[0]
-        wave = 1e-3 * lens.phase.order[:, None] * jnp.asarray(wavelengths, index.dtype)[None]
+        wave = 1e-3 * lens.phase.order[:, None] * colours[None]
         power = power.at[np.array(lens.phase.surfaces)].add(-wave * turned[:, None])
     aperture = lens.semi_diameter[lens.stop]
-    return ParaxialSystem(curvature, power, lens.thickness, index, aperture, lens.stop)
+    known = lens.dispersion.knows(colours)
+    return ParaxialSystem(curvature, power, lens.thickness, index, aperture, known, lens.stop)
 
 
 def trace_ray(system: ParaxialSystem, height: ArrayLike, slope: ArrayLike) -> ParaxialRay:
@@ -175,7 +195,7 @@ def _pupil(system: ParaxialSystem, front: bool) -> Pupil:
     height, slope = chief_ray(system, front)
     # n u times the size of the pupil is the same in all media (Lagrange).
     bend = jnp.abs(system.index[0 if front else -1] * slope)
-    return Pupil(_quotient(-height, slope), _quotient(system.aperture, bend))
+    return system.told(Pupil(_quotient(-height, slope), _quotient(system.aperture, bend)))
 
 
 def entrance_pupil(lens: Lens, wavelengths: ArrayLike) -> Pupil:
@@ -210,14 +230,14 @@ def first_order(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Firs
     wavelengths: (W,) in um.
     """
     system = paraxial_system(lens, wavelengths)
-    vergence = 1 / jnp.asarray(distance, lens.curvature.dtype)
-    index = system.index
+    far = distance_array(distance, lens.curvature.dtype)
+    vergence, index = vergence_of(far), system.index
     level, slanted = trace_ray(system, 1.0, 0.0), trace_ray(system, 0.0, 1.0)
     axial = trace_ray(system, 1.0, vergence)
     u, axial_u = level.behind[-1], axial.behind[-1]
     marginal = marginal_ray(system, vergence).behind[-1]
     one = jnp.ones_like(u)
-    return FirstOrder(
+    found = FirstOrder(
         focal_length=_quotient(-one, u),
         back_focal_distance=_quotient(-level.height[-1], u),
         front_focal_distance=_quotient(slanted.behind[-1], u),
@@ -229,21 +249,24 @@ def first_order(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Firs
         exit_pupil=_pupil(system, front=False),
         petzval_radius=_quotient(-one, index[-1] * jnp.sum(petzval_parts(system), axis=0)),
     )
+    return system.told(found, apart(far))
 
 
 def focal_length(lens: Lens, wavelengths: ArrayLike) -> Array:
     """Effective focal length (W,), mm; inf for an afocal lens. `wavelengths` (W,) in um. From the
     rear principal plane to the focus, along z: in water longer by its index than in air, and
     negative for a concave mirror, whose focus lies before it."""
-    slope = trace_ray(paraxial_system(lens, wavelengths), 1.0, 0.0).behind[-1]
-    return _quotient(-jnp.ones_like(slope), slope)
+    system = paraxial_system(lens, wavelengths)
+    slope = trace_ray(system, 1.0, 0.0).behind[-1]
+    return system.told(_quotient(-jnp.ones_like(slope), slope))
 
 
 def back_focal_distance(lens: Lens, wavelengths: ArrayLike) -> Array:
     """Last vertex to the image of an infinitely far object (W,), mm; inf for an afocal lens.
     `wavelengths` (W,) in um."""
-    ray = trace_ray(paraxial_system(lens, wavelengths), 1.0, 0.0)
-    return _quotient(-ray.height[-1], ray.behind[-1])
+    system = paraxial_system(lens, wavelengths)
+    ray = trace_ray(system, 1.0, 0.0)
+    return system.told(_quotient(-ray.height[-1], ray.behind[-1]))
 
 
 def front_focal_distance(lens: Lens, wavelengths: ArrayLike) -> Array:
@@ -287,8 +310,11 @@ def image_height(
     `wavelengths` (W,) in um. inf for an image at infinity.
     """
     system = paraxial_system(lens, wavelengths)
-    slope = trace_ray(system, 1.0, 1 / jnp.asarray(distance, lens.curvature.dtype)).behind[-1]
-    tangent = jnp.tan(jnp.asarray(field, lens.curvature.dtype))[..., None]
+    far = distance_array(distance, lens.curvature.dtype)
+    slope = trace_ray(system, 1.0, vergence_of(far)).behind[-1]
+    angle = field_array(field, lens.curvature.dtype)[..., None]
+    forwards = ahead(angle)
+    tangent = jnp.tan(jnp.where(forwards, angle, 0))
     fields = tuple(range(tangent.ndim - 1))
     front, bend = (jnp.expand_dims(a, fields) for a in (system.index[0], system.index[-1] * slope))
-    return _quotient(-tangent * front, bend)
+    return system.told(_quotient(-tangent * front, bend), forwards & apart(far))

@@ -1,13 +1,20 @@
 """The scene: from where light of which wavelengths enters a lens."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from ..numerics import concrete, real_array
 from .lens import Lens
+
+_RIGHT = np.pi / 2
+# A distance is above 0 from here on, mm: the squares of 1 / distance are numbers, in float32, too.
+_NEAREST = 1e-6
 
 
 @jax.tree_util.register_dataclass
@@ -24,32 +31,101 @@ class Scene:
     distance: Array
     wavelengths: Array
 
+    @property
+    def possible(self) -> Array:
+        """Whether the object lies before the lens, () bool: angles below 90 degrees, and a distance
+        above 0. Known in a trace only when it runs; light from elsewhere then is MISSED."""
+        return jnp.all(ahead(self.field)) & apart(self.distance)
+
+    @property
+    def tangent(self) -> Array:
+        """Tangents (2,) of the field; 0 for an angle of 90 degrees and beyond."""
+        return jnp.tan(jnp.where(ahead(self.field), self.field, 0))
+
+    @property
+    def vergence(self) -> Array:
+        """1 / distance (), 1/mm; 0 for a distance that is not above 0."""
+        return vergence_of(self.distance)
+
+
+def ahead(angle: Array) -> Array:
+    """Whether light at an angle (...) in radians to the axis goes forwards, bool."""
+    return jnp.abs(angle) < _RIGHT
+
+
+def apart(distance: Array) -> Array:
+    """Whether an object at a distance (...) in mm lies before the lens, bool; inf does."""
+    return distance >= _NEAREST
+
+
+def vergence_of(distance: Array) -> Array:
+    """1 / `distance` (...), 1/mm, also of inf; 0 for a distance in mm that is not above 0."""
+    before = apart(distance)
+    return jnp.where(before, 1 / jnp.where(before, distance, 1), 0)
+
 
 def scene_of(lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike) -> Scene:
     """A scene in the dtype of the lens: one type for numbers, NumPy's and JAX's arrays.
 
     field: one angle (along y) or two (x, y) in radians. distance: mm, inf allowed. wavelengths:
-    (W,) or one, um. ValueError for other shapes.
+    (W,) or one, um.
+
+    ValueError for other shapes, for what is no real number, and, as far as values are known, for an
+    angle of 90 degrees and more, a distance not above 0 (1e-6 mm), a wavelength outside the range
+    of a glass; also for a lens whose arrays do not fit together. See `Scene.possible`.
     """
+    lens.check()
     dtype = lens.curvature.dtype
-    angles = jnp.asarray(field, dtype)
+    angles = field_array(field, dtype)
+    if angles.shape not in ((), (2,)):
+        raise ValueError(f"field: expected one angle or two, got shape {angles.shape}")
     if angles.ndim == 0:
         angles = jnp.stack([jnp.zeros_like(angles), angles])
-    if angles.shape != (2,):
-        raise ValueError(f"field: expected one angle or two, got shape {angles.shape}")
-    colours = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
-    if colours.ndim != 1 or not colours.size:
-        raise ValueError(f"wavelengths: expected one or a list, got shape {colours.shape}")
-    far = jnp.asarray(distance, dtype)
+    return Scene(angles, distance_array(distance, dtype), lens.colours(wavelengths))
+
+
+def field_array(field: ArrayLike, dtype: Any) -> Array:
+    """Angles in radians (...) as an array. ValueError for what is no angle, and for a known one of
+    90 degrees and more."""
+    angles = real_array("field", field, dtype)
+    for angle in _known(field):
+        if not abs(angle) < _RIGHT:
+            raise ValueError(
+                f"field: {angle:g} rad = {np.degrees(angle):.4g} degrees, must be below 90; angles "
+                f"are radians: np.radians({angle:g})"
+            )
+    return angles
+
+
+def distance_array(distance: ArrayLike, dtype: Any) -> Array:
+    """A distance in mm as an array (). ValueError for other shapes, for what is no number, and for
+    a known one that is not above 0."""
+    far = real_array("distance", distance, dtype)
     if far.ndim:
         raise ValueError(f"distance: expected one number, got shape {far.shape}")
-    return Scene(angles, far, colours)
+    for value in _known(distance):
+        if not value >= _NEAREST:
+            raise ValueError(
+                f"distance: must be above 0 mm, inf for an object at infinity; got {value:g}"
+            )
+    return far
+
+
+def _known(values: ArrayLike) -> list[float]:
+    """Those that are known."""
+    return np.ravel(np.asarray(values, float)).tolist() if concrete(values) else []
 
 
 def field_of_height(height: ArrayLike, distance: ArrayLike) -> Array:
-    """The field angle in radians of an object point `height` mm above the axis.
+    """The field angle in radians of an object point `height` mm (...) above the axis.
 
-    `distance` mm from the object plane to the first vertex, finite. Light from above the axis
-    travels downwards, so that the angle is negative.
+    `distance` () mm from the object plane to the first vertex, finite. Light from above the axis
+    travels downwards, so that the angle is negative. ValueError for a known distance that is not
+    above 0 or not finite; inside a trace the angle then is 90 degrees, from where no light comes.
     """
-    return -jnp.arctan(jnp.asarray(height, float) / jnp.asarray(distance, float))
+    heights = real_array("height", height, float)
+    far = distance_array(distance, float)
+    if np.inf in _known(distance):
+        raise ValueError("distance: at infinity an object has a field, but no height")
+    good = apart(far) & (far < jnp.inf)
+    return jnp.where(good, -jnp.arctan(heights / jnp.where(good, far, 1)), _RIGHT)

@@ -22,6 +22,7 @@ from .paraxial import (
     petzval_parts,
     trace_ray,
 )
+from .scene import ahead, apart, distance_array, field_array, vergence_of
 from .surface import by_form, surface_sag
 
 
@@ -101,7 +102,7 @@ def third_order(
 
     Conics and the r^2 and r^4 terms of aspheres count; odd powers of r have no place in this
     theory and are left out. Transverse aberrations are 0 for an image at infinity, colour is 0
-    for one wavelength. ValueError for a surface without rotational symmetry.
+    for one wavelength. ValueError for a surface without rotational symmetry, and as of `paraxial`.
 
     field: () in radians, the edge of the field.
     distance: from the object to the first vertex in mm, inf allowed.
@@ -113,21 +114,25 @@ def third_order(
     if lens.phase is not None:
         raise ValueError("third order: no theory for diffractive surfaces")
     system = paraxial_system(lens, wavelengths)
-    vergence = 1 / jnp.asarray(distance, lens.curvature.dtype)
+    far = distance_array(distance, lens.curvature.dtype)
+    angle = field_array(field, lens.curvature.dtype)
+    if angle.ndim:
+        raise ValueError(f"field: expected one angle, got shape {angle.shape}")
+    vergence, forwards = vergence_of(far), ahead(angle)
     n, c = system.index, system.curvature[:, None]
     marginal = marginal_ray(system, vergence)
     height, slope = chief_ray(system, front=True)
     # Scaled to the field, the slope of the line from the object point to the first vertex.
-    scale = safe_divide(jnp.tan(jnp.asarray(field, n.dtype)), slope - vergence * height)
+    scale = safe_divide(jnp.tan(jnp.where(forwards, angle, 0)), slope - vergence * height)
     chief = trace_ray(system, height * scale, slope * scale)
     figure = _fourth_order(lens, system.curvature)
     s1, s2, s3, s4, s5 = _seidel(system, figure, marginal, chief)
 
-    colours = jnp.atleast_1d(jnp.asarray(wavelengths, n.dtype))
+    colours = lens.colours(wavelengths)
     spread = (n[:, jnp.argmin(colours)] - n[:, jnp.argmax(colours)])[:, None] / n
     colour = n[:-1] * marginal.height * (spread[1:] - spread[:-1])
     half = safe_divide(jnp.ones_like(n[-1]), 2 * n[-1] * marginal.behind[-1])[None]
-    return ThirdOrder(
+    found = ThirdOrder(
         spherical=half * s1,
         tangential_coma=3 * half * s2,
         tangential_astigmatism=half * (3 * s3 + s4),
@@ -138,3 +143,4 @@ def third_order(
         lateral_colour=2 * half * colour * (chief.height * c + chief.before),
         petzval_curvature=-n[-1:] * petzval_parts(system),
     )
+    return system.told(found, forwards & apart(far))

@@ -30,7 +30,7 @@ from ..rays.status import Status
 from ..rays.system import System, Vector, determinant, dot, system_of
 from ..rays.trace import Bundle, on_all_surfaces
 from . import boundary
-from .rules import PupilRule, Symmetry, check_order
+from .rules import PupilRule, Symmetry, check_rule
 from .spokes import CORNERS, Spokes, changes, gauss, unit
 
 __all__ = ["Clipped"]
@@ -244,7 +244,7 @@ class Clipped(PupilRule):
 
     def __post_init__(self) -> None:
         if not self.size:
-            check_order(self.order)
+            check_rule(self.order, self.symmetry)
             object.__setattr__(self, "size", self.order)
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:

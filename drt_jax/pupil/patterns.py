@@ -3,7 +3,8 @@
 All rules integrate over the area of the disc with weights that sum to 1. The order n of a
 Gauss rule is its number of nodes in t = r^2, the variable in which a rotationally symmetric
 aberration is smooth. Source: Forbes, JOSA A 5, 1943 (1988). The moments use the Gauss rules;
-the patterns of equal weights are what other programs use, for comparison.
+the patterns of equal weights are what other programs use, for comparison. ValueError for an
+order or a number that is not whole or below 1.
 """
 
 import numpy as np
@@ -11,7 +12,13 @@ import numpy as np
 _SOBOL_BITS = 30
 
 
+def _count(what: str, value: int) -> None:
+    if not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{what}: expected at least 1, a whole number, got {value!r}")
+
+
 def _gauss(order: int) -> tuple[np.ndarray, np.ndarray]:
+    _count("order", order)
     nodes, weights = np.polynomial.legendre.leggauss(order)
     return np.sqrt((nodes + 1) / 2), weights / 2
 
@@ -28,6 +35,7 @@ def half_disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
     n Gauss nodes in r^2 times m uniform azimuths, the mirror half of a rule of 2 m.
     """
     radius, weights = _gauss(order)
+    _count("azimuths", azimuths)
     angle = np.pi * ((np.arange(azimuths) + 0.5) / azimuths - 0.5)
     points = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))])
     return points.reshape(2, -1), np.repeat(weights / azimuths, azimuths)
@@ -42,6 +50,7 @@ def disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
 
 def random_disc(rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Uniform random points (2, rays), as the paper's 256 rays, and equal weights."""
+    _count("rays", rays)
     generator = np.random.default_rng(seed)
     return _of_square(generator.random(rays), generator.random(rays))
 
@@ -53,16 +62,10 @@ def _of_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points, np.full(len(u), 1 / len(u))
 
 
-def _count(what: str, value: int) -> None:
-    if not value >= 1:
-        raise ValueError(f"{what}: expected at least 1, got {value!r}")
-
-
 def square_grid(side: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (2, Q) of a square grid inside the disc and equal weights.
 
     The centres of `side` x `side` cells of the square round the disc; those in the disc stay.
-    ValueError for a side below 1.
     """
     _count("side", side)
     line = (np.arange(side) + 0.5) / side * 2 - 1
@@ -76,7 +79,7 @@ def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
     Each ray stands for the same area of the disc: a ring of 6 k lies at the radius that halves
     the area of its annulus. (Lens design programs often put the outermost ring on the rim and
-    so count the rim twice.) ValueError for fewer than 1 ring.
+    so count the rim twice.)
     """
     _count("rings", rings)
     k = np.arange(1, rings + 1)
@@ -93,7 +96,7 @@ def sobol(count: int) -> np.ndarray:
     """The first points (2, count) of the Sobol sequence in the unit square, not scrambled.
 
     Direction numbers of the polynomials 1 and x + 1, Gray-code order: Antonov and Saleev, USSR
-    Comput. Math. Math. Phys. 19, 252 (1980). Best at powers of two. ValueError for a count below 1.
+    Comput. Math. Math. Phys. 19, 252 (1980). Best at powers of two.
     """
     _count("count", count)
     bits = np.arange(_SOBOL_BITS)

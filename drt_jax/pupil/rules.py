@@ -7,7 +7,7 @@ that fills the stop; what is missing is the light that is lost.
 
 import abc
 import dataclasses
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from ..lens.aperture import depths
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
-from ..numerics import concrete, safe_sqrt
+from ..numerics import concrete, real_array, safe_sqrt
 from ..rays.status import Status
 from ..rays.system import Vector, dot
 from ..rays.trace import Bundle
@@ -98,7 +98,7 @@ class Gauss(PupilRule):
     symmetry: Symmetry = dataclasses.field(metadata={"static": True})
 
     def __post_init__(self) -> None:
-        check_order(self.order)
+        check_rule(self.order, self.symmetry)
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """Points and weights of the order: constants."""
@@ -121,7 +121,7 @@ class Soft(PupilRule):
     width: ArrayLike
 
     def __post_init__(self) -> None:
-        check_order(self.order)
+        check_rule(self.order, self.symmetry)
         if isinstance(self.width, int | float) and not self.width > 0:
             raise ValueError(f"width: expected a number above 0 mm, got {self.width!r}")
 
@@ -159,15 +159,26 @@ class Pattern(PupilRule):
     symmetry: Symmetry = dataclasses.field(metadata={"static": True}, default="disc")
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """The points and weights as they are."""
+        """The points and weights as they are. ValueError for other shapes than these."""
         dtype = lens.curvature.dtype
-        return tuple(jnp.asarray(self.positions, dtype)), jnp.asarray(self.weights, dtype)[None]
+        positions = real_array("positions", self.positions, dtype)
+        weights = real_array("weights", self.weights, dtype)
+        rows = 1 if self.symmetry == "meridian" else 2
+        if weights.ndim != 1 or not weights.size or positions.shape != (rows, weights.size):
+            raise ValueError(
+                f"Pattern: expected positions ({rows}, Q) and weights (Q,), got {positions.shape} "
+                f"and {weights.shape}"
+            )
+        return tuple(positions), weights[None]
 
 
-def check_order(order: int) -> None:
-    """ValueError for an order that no rule has."""
-    if not isinstance(order, int) or not 1 <= order <= MAX_ORDER:
+def check_rule(order: int, symmetry: Symmetry) -> None:
+    """ValueError for an order or a symmetry that no rule has."""
+    whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
+    if not whole or not 1 <= order <= MAX_ORDER:
         raise ValueError(f"order: expected a whole number from 1 to {MAX_ORDER}, got {order!r}")
+    if symmetry not in (known := get_args(Symmetry)):
+        raise ValueError(f"symmetry: expected one of {', '.join(known)}, got {symmetry!r}")
 
 
 def pupil_points(

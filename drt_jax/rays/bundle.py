@@ -82,7 +82,8 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
     points = _nodes()
     radius = jnp.sqrt(jnp.max(dot(target, target)))
     waves = target[0].shape[0]
-    wanted = tuple(jnp.broadcast_to(radius * p, (waves, p.size)) for p in points)
+    scaled = radius * jnp.asarray(points, radius.dtype)
+    wanted = tuple(jnp.broadcast_to(p, (waves, p.size)) for p in scaled)
     sizes, upright = beam_size(system, wanted), system.rows.rotation is None
     aimed = aim(system, wanted, paraxial_launch(system, wanted, sizes[1]), sizes, upright)
     good = jnp.all(aimed.status == Status.OK)

@@ -6,6 +6,7 @@ Arrays have any shape: () for one ray, or (wavelength, ray) beside an index (wav
 Source: Welford, Aberrations of Optical Systems (1986), ch. 4.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -269,8 +270,15 @@ class _State(NamedTuple):
     shake: Array
 
 
-def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Any]:
-    """Rays behind the last row; and unless that is the stop, the hits on all of them."""
+def _hit(hit: Vector, fate: Array) -> Vector:
+    return hit
+
+
+def _follow(
+    system: System, launch: Vector, to_stop: bool, keep: Callable[[Vector, Array], Any] = _hit
+) -> tuple[_State, Any]:
+    """Rays behind the last row; and unless that is the stop, what is to `keep` of the hit and the
+    fate on each row."""
     kinds = sorted({*system.forms, system.at_stop[1]})
     each = [partial(_meet, kind) for kind in kinds]
     phases = [] if system.diffraction is None else sorted(set(system.diffraction.forms))
@@ -293,7 +301,7 @@ def _follow(system: System, launch: Vector, to_stop: bool) -> tuple[_State, Any]
         if to_stop:
             return new, None
         kept = state._replace(fate=fate)
-        return jax.tree.map(partial(jnp.where, row.bends), new, kept), hit
+        return jax.tree.map(partial(jnp.where, row.bends), new, kept), keep(hit, fate)
 
     zero = jnp.zeros_like(launch[0])
     none, begin = jnp.zeros(zero.shape, jnp.int32), _begin(system, launch)
@@ -305,6 +313,12 @@ def shoot(system: System, launch: Vector) -> Trace:
     """Trace rays to the sensor; `launch` D arrays in mm on the vertex plane of the first row."""
     state, hits = _follow(system, launch, False)
     return Trace(hits, state.fate, state.shake)
+
+
+def fates(system: System, launch: Vector) -> Array:
+    """What became of rays up to each row, and up to a stop that is none of them in its place among
+    these: (R, ...) or (R + 1, ...), int32, see `Trace`. `launch` as of `shoot`."""
+    return _follow(system, launch, False, lambda hit, fate: fate)[1]
 
 
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:

@@ -208,14 +208,14 @@ def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
     # Wavelengths without an index have one that is finite; their rays fail, see `Status`.
     colours = jnp.clip(scene.wavelengths, *lens.dispersion.range)
     rows = [*live, lens.count]
-    field = scene.field[2 - dim :]
+    tangent = scene.tangent[2 - dim :]
     return System(
         rows=placed(lens, rows),
         stop=None if stop in live else placed(lens, stop),
         index=lens.index(colours)[np.array([0, *(i + 1 for i in live)]), :, None],
         # Light with a positive field angle travels upwards: the object lies below the axis.
-        source=jnp.concatenate([-jnp.tan(field), -jnp.ones_like(field[:1])]),
-        vergence=1 / scene.distance,
+        source=jnp.concatenate([-tangent, -jnp.ones_like(tangent[:1])]),
+        vergence=scene.vergence,
         diffraction=None if lens.phase is None else _diffraction(lens.phase, live, colours),
         before=sum(i < stop for i in live),
         forms=tuple(lens.forms[i] for i in rows),

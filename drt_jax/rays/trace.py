@@ -12,6 +12,7 @@ from ..lens.aperture import depths
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
+from ..numerics import real_array
 from . import fermat
 from .snell import cross
 from .solve import Solver, solve
@@ -108,7 +109,8 @@ def _traced(
     target = tuple(jnp.broadcast_to(p, (waves, p.shape[-1])) for p in scaled)
     found = solver(system, target)
     known = lens.dispersion.knows(scene.wavelengths)[:, None]
-    status = jnp.where(known, found.status, jnp.int32(Status.NO_INDEX))
+    status = jnp.where(scene.possible, found.status, jnp.int32(Status.MISSED))
+    status = jnp.where(known, status, jnp.int32(Status.NO_INDEX))
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = turn(rotation, found.arrival, back=True)
     path = fermat.optical_path(found.hits, system)
@@ -140,12 +142,22 @@ def trace_rays(
     pupil: (Q, 2), x and y on the stop in units of its semi-diameter.
 
     Rays are aimed at the real stop, for every wavelength. Differentiable in everything but the
-    status, in every mode and to any order. ValueError for a known wavelength outside the range of
-    a glass; inside a trace its rays have the status NO_INDEX.
+    status, in every mode and to any order. ValueError as `scene_of`; inside a trace, where values
+    are not known, rays of a wavelength outside the range of a glass have the status NO_INDEX, those
+    of a field of 90 degrees and more or of a distance not above 0 are MISSED.
     """
-    lens.check_wavelengths(wavelengths)
     scene = scene_of(lens, field, distance, wavelengths)
-    return _trace_rays(lens, scene, jnp.asarray(pupil, lens.curvature.dtype))
+    return _trace_rays(lens, scene, stop_points(lens, pupil))
+
+
+def stop_points(lens: Lens, pupil: ArrayLike) -> Array:
+    """Points (Q, 2) of the stop as an array in the dtype of the lens. ValueError for none, and for
+    another shape."""
+    points = real_array("pupil", pupil, lens.curvature.dtype)
+    if points.ndim != 2 or points.shape[1] != 2 or not len(points):
+        hint = "; turn it, pupil.T" if points.ndim == 2 and points.shape[0] == 2 else ""
+        raise ValueError(f"pupil: expected x and y of points, (Q, 2), got {points.shape}{hint}")
+    return points
 
 
 @jax.jit

@@ -74,3 +74,12 @@ def test_one_depth_is_a_polynomial_in_the_sensor():
 def test_bad_requests():
     with pytest.raises(ValueError, match="expected 0 < near < far"):
         depth_moments(LENS, 0.0, 5e4, 1e4, RGB)
+    for wrong in (0.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="expected 0 < near < far"):
+            depth_moments(LENS, 0.0, wrong, 1e4, RGB)
+    with pytest.raises(ValueError, match="inside jax.jit"):
+        jax.jit(lambda far: depth_moments(LENS, 0.0, 5e3, far, RGB).near)(5e4)
+    depths = depth_moments(LENS, 0.0, NEAR, FAR, RGB, 1e-3)
+    for beyond in (0.9 * NEAR, 1.1 * FAR, np.inf):
+        with pytest.raises(ValueError, match="is not within 10000 and 50000 mm"):
+            depths.at(beyond)

@@ -142,6 +142,65 @@ def test_derivative_of_the_kernel():
     np.testing.assert_allclose(jax.grad(corner)(at), difference, rtol=1e-8)
 
 
-def test_unknown_form():
+ONE, WIDE = np.zeros((1, 2)), np.ones((1, 2))
+BAD = {
+    "NaN": (ONE, WIDE * np.nan, 1.0, "covariance: must be finite; no ray of that colour"),
+    "inf": (ONE, WIDE * np.inf, 1.0, "covariance: must be finite"),
+    "one NaN": (ONE, [[[1, np.nan], [0, 1]]], 1.0, "covariance: must be finite"),
+    "no centroid": (ONE * np.nan, WIDE, 1.0, "mean: must be finite"),
+    "no pixel": (ONE, WIDE, 0.0, "pixel: must be above 0 mm, got 0"),
+    "a negative pixel": (ONE, WIDE, -4.4e-3, "pixel: must be above 0 mm, got -0.0044"),
+    "a NaN pixel": (ONE, WIDE, np.nan, "pixel: must be finite"),
+    "an infinite pixel": (ONE, WIDE, np.inf, "pixel: must be finite"),
+    "two pixels": (ONE, WIDE, [1.0, 2.0], "pixel: expected"),
+    "one number": (0.0, WIDE, 1.0, "mean: expected"),
+    "a column": (ONE[0], WIDE, 1.0, "mean: expected"),
+    "no channel": (ONE[:0], WIDE[:0], 1.0, "mean: expected"),
+    "other channels": (ONE, np.ones((3, 2)), 1.0, "covariance: expected"),
+    "three numbers": (ONE, np.ones((1, 3)), 1.0, "covariance: expected"),
+    "text": (ONE, WIDE, "4.4 um", "pixel: expected real numbers"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_blur_is_refused(name):
+    *given, message = BAD[name]
+    with pytest.raises(ValueError, match=message):
+        kernels.gaussian_psf(*given)
+
+
+def test_other_bad_requests():
     with pytest.raises(ValueError, match="'integrated' or 'sampled', got 'gauss'"):
         gaussian_psf(jnp.zeros((1, 2)), jnp.ones((1, 2)), 1.0, 5, "gauss")
+    for size in (0, 2.5, -3, "21"):
+        with pytest.raises(ValueError, match="size: expected a whole number of pixels"):
+            kernels.gaussian_psf(ONE, WIDE, 1.0, size)
+
+
+def test_a_pixel_that_looks_like_micrometres_is_warned_of():
+    with pytest.warns(UserWarning, match="pixel: 4.4 mm .* if it is 4.4 um, give 0.0044"):
+        kernels.gaussian_psf(ONE, WIDE, 4.4, 3)
+
+
+@pytest.mark.parametrize("form", ["integrated", "sampled"])
+@pytest.mark.parametrize("dense", [False, True])
+def test_no_numbers_make_a_nan(form, dense):
+    """Inside a trace what is no number, or no pixel, is black, and all else finite: values and
+    derivatives, in float64 and float32."""
+
+    def kernel(mean, covariance, pixel):
+        result = kernels.gaussian_psf(mean, covariance, pixel, 3, form)
+        return jnp.stack([leaf.ravel() for leaf in jax.tree.leaves(result)])
+
+    both = jax.jit(lambda *a: (kernel(*a), jax.jacrev(kernel, argnums=range(3))(*a)))
+    shape = (1, 2, 2) if dense else (1, 2)
+    bad = [(0, np.nan, 1), (0, np.inf, 1), (np.nan, 1, 1), (0, 1, 0), (0, 1, np.nan), (0, 1, -1)]
+    for dtype in (jnp.float64, jnp.float32):
+        most = float(jnp.finfo(dtype).max)
+        odd = [(most, 1, 1), (0, most, 1), (0, 1e-30, 1), (0, 1, 1e-30), (1, 1, most), (0, -1, 1)]
+        for mean, variance, pixel in (*bad, *odd):
+            arrays = jnp.full((1, 2), mean, dtype), jnp.full(shape, variance, dtype)
+            value, slopes = both(*arrays, jnp.asarray(pixel, dtype))
+            assert all(np.all(np.isfinite(leaf)) for leaf in (value, *slopes))
+            if (mean, variance, pixel) in bad:
+                assert all(np.all(leaf == 0) for leaf in (value, *slopes))

@@ -76,9 +76,9 @@ def test_eager_and_compiled_agree(name, field, distance):
 def test_a_lens_that_passes_no_ray(singlet):
     """An error outside; inside, a variance of inf, nothing passed and derivatives of 0."""
     scene = (1.5, np.inf, (0.6, 0.48))  # all light passes beside the lens
-    with pytest.raises(ValueError, match="no ray"):
+    with pytest.raises(ValueError, match="no ray at .*: 100% misses surface 1"):
         psf_moments(singlet, *scene)
-    with pytest.raises(ValueError, match="no ray"):
+    with pytest.raises(ValueError, match="no ray at .*: 100% misses surface 1"):
         psf_moments(singlet, *scene, rule=RULE)
     gradient, spot = blur(singlet, *typed(*scene))
     assert np.all(np.isposinf(spot.covariance[:, [0, 1], [0, 1]]))

@@ -93,3 +93,26 @@ def test_kernel_of_one_pixel_changes_nothing():
     scenes = jnp.asarray(np.random.default_rng(0).random((1, 5, 6, 3)))
     kernel = SeparableKernel(jnp.ones((3, 1)), jnp.ones((3, 1)))
     np.testing.assert_array_equal(convolve(scenes, kernel), scenes)
+
+
+SCENES = jnp.zeros((1, 12, 12, 3))
+REFUSED = {
+    "uint8": (SCENES.astype(jnp.uint8), r"not uint8: give scenes\.astype\(jnp\.float32\) / 255"),
+    "whole numbers": (SCENES.astype(jnp.int32), "not int32: give floating numbers"),
+    "too low": (SCENES[:, :8], "8 x 12 pixels are smaller than the kernel of 9"),
+    "too narrow": (SCENES[:, :, :8], "12 x 8 pixels are smaller than the kernel of 9"),
+    "one image": (SCENES[0], "scenes: expected"),
+    "grey": (SCENES[..., :1], "scenes: expected"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("dense", [False, True])
+def test_scenes_that_do_not_fit_are_refused(name, dense):
+    scenes, message = REFUSED[name]
+    for call in (convolve, convolve_taps, sensor.convolve):
+        with pytest.raises(ValueError, match=message):
+            call(scenes, kernels(dense))
+    for call in (sensor_layer, sensor.sensor_layer):
+        with pytest.raises(ValueError, match=message):
+            call(scenes, kernels(dense), 0.0, jax.random.key(0))

@@ -78,5 +78,5 @@ def test_sobol_sequence_is_that_of_scipy(bits):
 
 @pytest.mark.parametrize("function", [pupil.square_grid, pupil.hexapolar, pupil.sobol])
 def test_patterns_refuse_to_be_empty(function):
-    with pytest.raises(ValueError, match="expected at least 1, got 0"):
+    with pytest.raises(ValueError, match="expected at least 1.*, got 0"):
         function(0)
