@@ -50,8 +50,8 @@ def psf_moments(
     field: angle along y, or (x, y), in radians.
     distance: mm from the object plane to the first vertex, inf allowed.
     wavelengths: (W,) in um.
-    tolerance: relative error of the RMS spot size; the rule follows from it. In float32 a
-        spot of 4 um and more is right to 1e-3, others to 2e-6 mm; warns that this is not tolerance.
+    tolerance: relative error of the RMS spot size; the rule follows from it. In float32
+        spots of cameras are right to about 1e-3 of 4 um or of themselves: warns if that is more.
     rule: of the pupil, instead of a tolerance; needed inside `jax.jit` and `jax.vmap`, where
         `converged_rule`, called outside, makes it.
 
@@ -251,8 +251,8 @@ def _eps(lens: Lens) -> float:
 
 def _rounding(lens: Lens, found: FocusMoments) -> float:
     """By what part of it the smallest spot may be wrong, as hits and lens are rounded to some last
-    digits of its length. In float32 over the bundled cameras it is a fifth of this, and at most
-    nine tenths."""
+    digits of its length. Measured in float32 over 54 scenes of bundled lenses: an eighth of this
+    in the median, 0.93 of it at most; Hubble, 6 m long with a spot of 10 nm, is beyond it."""
     size = np.sqrt(np.min(np.sum(np.asarray(found.spread)[0, :, :2], axis=-1)))
     return 2 * _eps(lens) * abs(float(lens.sensor)) / max(size, _SMALLEST)
 

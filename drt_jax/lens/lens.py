@@ -151,6 +151,9 @@ class Lens:
         """
         if not concrete(wavelengths):
             return
+        low, high = self.dispersion.range
+        if all(low <= value <= high for value in np.ravel(wavelengths).tolist()):
+            return
         ranges = self.dispersion.ranges or (ANY,) * len(self.glasses)
         for name, (low, high) in zip(self.glasses, ranges, strict=True):
             for value in np.ravel(wavelengths):
