@@ -3,14 +3,15 @@
 import dataclasses
 import time
 
-import jax
 import numpy as np
 import pytest
 import yaml
+from experiments._outcomes import judged
 
 from drt_jax import LensError, load_lens
 from drt_jax.inputs import InputError, one_line, parse, shown
 from drt_jax.runs.config import ConfigError, load_config
+from experiments import _mutants, _spoilt
 
 LENS = """\
 name: singlet
@@ -188,17 +189,9 @@ def test_messages():
 @pytest.mark.parametrize("seed", range(2))
 def test_random_mutants(seed, tmp_path):
     """A few of those of `experiments.faults`."""
-    from experiments import _mutants
-
     rng = np.random.default_rng(seed)
     path = tmp_path / "mine.yaml"
     for _ in range(40):
-        path.write_bytes(_mutants.mutated(LENS, rng))
-        try:
-            lens = load_lens(path)
-        except LensError as error:
-            assert len(str(error)) <= 300 and str(error).isprintable()
-        else:
-            semi = lens.semi_diameter  # inf: none
-            leaves = jax.tree.leaves(dataclasses.replace(lens, semi_diameter=semi * 0))
-            assert all(np.all(np.isfinite(a)) for a in leaves if a is not leaves[4])
+        path.write_bytes(content := _mutants.mutated(LENS, rng))
+        found, said = judged(lambda: _spoilt.finite(load_lens(path)))
+        assert found in ("refused", "survived"), (said, content)

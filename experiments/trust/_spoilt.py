@@ -37,13 +37,13 @@ def prescriptions(count: int, rng: np.random.Generator) -> tuple[dict[str, Any],
 
             def load() -> bool:
                 loaded.append(drt_jax.load_lens(path))
-                return _finite(loaded[-1])
+                return finite(loaded[-1])
 
             tally.add((found := judged(load))[0], (found[1], content[:500]))
     return tally.row, loaded
 
 
-def _finite(lens: Lens) -> bool:
+def finite(lens: Lens) -> bool:
     """Whether all numbers of a lens are, but for apertures that are open."""
     open_ones = dataclasses.replace(lens, semi_diameter=lens.curvature * 0)
     if lens.apertures is not None:

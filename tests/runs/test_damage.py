@@ -126,9 +126,11 @@ def test_rows_missing_before_the_checkpoint_are_said(folder, old, new):
     lines = path.read_text().splitlines()
     own = [] if new is None else [f"{new},{zlib.crc32(new.encode()):08x}"]
     k = next(k for k, line in enumerate(lines) if line.startswith(old))
-    path.write_bytes("".join(f"{line}\r\n" for line in lines[:k] + own + lines[k + 1 :]).encode())
+    content = "".join(f"{line}\r\n" for line in lines[:k] + own + lines[k + 1 :]).encode()
+    path.write_bytes(content)
     words = "not one row of a for each of the 4 steps before its checkpoint", "put them back, or"
     refused(lambda: resumed(folder), *words)
+    assert path.read_bytes() == content
 
 
 def test_rows_come_whole_or_not_at_all(folder):
@@ -207,8 +209,11 @@ def test_a_damaged_checkpoint_is_refused(folder):
     for content in (b"", b"garbage", whole[:200], whole[: len(whole) // 2], foreign.read_bytes()):
         path.write_bytes(content)
         refused(lambda: resumed(folder), f"{path}: is no checkpoint", "delete it to begin")
+        assert path.read_bytes() == content
     path.write_bytes((folder / "changed.npz").read_bytes())
     refused(lambda: resumed(folder), f"{path}: is damaged: its checksum is another", "delete it")
+    path.write_bytes(whole)
+    assert resumed(folder)[0] == 4
 
 
 def test_no_flipped_bit_of_a_checkpoint_passes(folder):
