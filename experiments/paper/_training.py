@@ -19,8 +19,12 @@ from drt_jax.learn import network, train
 from drt_jax.learn.data import DataConfig, batches, load_patches
 from drt_jax.runs.folder import Run
 from drt_jax.runs.interrupt import deferred_interrupt
+from drt_jax.runs.write import replace
 
 from ._common import require, require_list, require_within
+
+# So many files that were skipped are named on the terminal, all of more in the run's folder.
+_NAMED = 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,8 +139,12 @@ class Jobs:
         side = config.train.patch + config.camera.kernel - 1
         reading = functools.partial(tqdm, desc="reading images", leave=False)
         patches = load_patches(config.data, side, config.seed, reading)
-        for line in patches.skipped:
+        for line in patches.skipped[:_NAMED]:
             print(f"skipped {line}", file=sys.stderr)
+        if len(patches.skipped) > _NAMED:
+            listed = run.folder / "skipped.txt"
+            replace(listed, "".join(f"{line}\n" for line in patches.skipped).encode())
+            print(f"skipped {len(patches.skipped)} in all, named in {listed}", file=sys.stderr)
         counts = f"{len(patches.train)} training and {len(patches.test)} test patches"
         print(f"{counts} of {side} x {side}")
         self.scenes = patches.train

@@ -169,6 +169,23 @@ def test_finished_run_resumes_at_once(unbroken, capsys):
     assert "dense search on the same loss" in capsys.readouterr().out
 
 
+def test_of_many_skipped_files_a_few_are_named_and_all_are_listed(tmp_path, capsys):
+    generator = np.random.default_rng(0)
+    (tmp_path / "photographs").mkdir()
+    for k in range(33):
+        side = 64 if k < 3 else 8
+        pixels = generator.integers(0, 256, (side, side, 3), dtype=np.uint8)
+        path = tmp_path / "photographs" / f"{k}.png"
+        io.imsave(path, pixels, check_contrast=False)
+    folder = tmp_path / "run"
+    some = [*TOY["focus"], "train.batches=1", f"data.root={tmp_path / 'photographs'}"]
+    main("focus", "--out", folder, "--set", *some)
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("skipped ")]
+    assert len(said) == 21 and said[-1] == f"skipped 30 in all, named in {folder / 'skipped.txt'}"
+    listed = (folder / "skipped.txt").read_text().splitlines()
+    assert len(listed) == 30 and all("8 x 8 pixels, smaller than 24" in line for line in listed)
+
+
 @pytest.mark.parametrize("name", TOY)
 def test_pictures_are_drawn_again_without_the_run(name, unbroken, tmp_path, monkeypatch, capsys):
     """From the results alone: the same pictures to the last byte, and the same tables."""
