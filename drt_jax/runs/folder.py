@@ -186,8 +186,10 @@ class Run:
         """Write the results: arrays as results.npz, all else as results.json.
 
         JSON knows no NaN and no infinity: they become null, and the names of what is not finite,
-        in either file, are listed under `not_finite`, which is there if there are any.
+        in either file, are listed under `not_finite`, which is there if there are any. The metrics
+        are put in the order of their jobs and steps.
         """
+        self._metrics.order()
         arrays: dict[str, Any] = {n: a for n, a in results.items() if isinstance(a, np.ndarray)}
         bad = [name for name, array in arrays.items() if not np.all(np.isfinite(array))]
         plain = {n: _finite(value, n, bad) for n, value in results.items() if n not in arrays}

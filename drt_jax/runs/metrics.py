@@ -76,6 +76,13 @@ class Metrics:
         if len(kept) < len(rows):
             self._write(kept)
 
+    def order(self) -> None:
+        """Put the rows in the order of jobs, each by its steps: however often a run was stopped
+        between, the file is the same."""
+        rows = self._rows()
+        place = {job: k for k, job in enumerate(dict.fromkeys(row[0] for row in rows))}
+        self._write(sorted(rows, key=lambda row: (place[row[0]], int(row[1]))))
+
     def sync(self) -> None:
         """Have the rows on the disk."""
         with open(self.path, "rb+") as file:

@@ -24,8 +24,8 @@ from ._outcomes import Tally, clear
 _TOY = ("train.batches=40", "train.batch=2", "train.patch=16", "train.checkpoint_every=5")
 _TOY += ("camera.kernel=9", "data.crops_per_image=2", "starts_mm=[133.0, 134.0]")
 # Seconds after which a run hangs, and in which an unbroken one ends; files it touches.
-_PATIENCE, _WHOLE, _TOUCHES = 240.0, 8.0, 60
-_KILLS = 5  # of one run, before it may end
+_PATIENCE, _WHOLE, _TOUCHES = 240.0, 6.0, 60
+_KILLS = 8  # of one run, before it may end
 _MODULE = "experiments.focus"
 
 
@@ -68,6 +68,18 @@ def result(folder: pathlib.Path) -> Any:
     """What a run found: all of its results but the seconds, and its metrics."""
     results = json.loads((folder / "results.json").read_text())
     return results | {"seconds": None}, (folder / "metrics.csv").read_text()
+
+
+def difference(folder: pathlib.Path, truth: Any) -> str:
+    """The first thing in which what a run found differs from the truth; empty for none."""
+    (results, metrics), (true, wanted) = result(folder), truth
+    for key in sorted({*results, *true}):
+        if results.get(key) != true.get(key):
+            return f"{key} is {results.get(key)}, not {true.get(key)}"
+    for k, pair in enumerate(itertools.zip_longest(metrics.splitlines(), wanted.splitlines())):
+        if pair[0] != pair[1]:
+            return f"metrics.csv, line {k + 1} is {pair[0]!r}, not {pair[1]!r}"
+    return ""
 
 
 def outcome(ended: Ended, folder: pathlib.Path, truth: Any) -> str:
@@ -115,10 +127,12 @@ class Toy:
         folder = self.new()
         said = [way(folder) for way in ways]
         ended = resumed(folder)
-        found = outcome(ended, folder, self.truth)
+        found, told = outcome(ended, folder, self.truth), ended.message
+        if found == "wrong" and ended.code == 0:
+            told = difference(folder, self.truth)
         found = "wrong" if found == "refused" else found
         shutil.rmtree(folder, ignore_errors=True)
-        return [("wrong", text) if text else (found, ended.message) for text in said]
+        return [("wrong", text) if text else (found, told) for text in said]
 
 
 def _go_on(folder: pathlib.Path, **dying: Any) -> subprocess.Popen:

@@ -56,6 +56,20 @@ def test_metrics_beyond_the_checkpoint_are_dropped(tmp_path):
         assert again.metrics("b, 5 deg")["step"].tolist() == []
 
 
+def test_the_metrics_of_a_finished_run_do_not_tell_where_it_was_stopped(tmp_path):
+    """Jobs that are trained together are logged by turns, as many steps at once as it happened."""
+    kept = {name: np.arange(6.0) / 7 for name in ("loss", "sensor_mm")}
+    files = []
+    for ends in ((6,), (1, 4, 6)):
+        with opened(tmp_path / str(len(ends))) as run:
+            for start, end in zip((0, *ends), ends, strict=False):
+                for job in ("b", "a"):
+                    run.log(job, start, {name: column[start:end] for name, column in kept.items()})
+            run.finish({})
+        files.append((run.folder / "metrics.csv").read_bytes())
+    assert files[0] == files[1] and files[0].count(b"\n") == 13
+
+
 def test_what_a_job_found_is_kept_with_its_metrics(tmp_path):
     """Also under a name that is no name of a file; what was logged by one cut short is dropped."""
     found = {"rows": [1, "x", None], "bad": float("inf")}
