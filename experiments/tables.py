@@ -11,7 +11,7 @@ import signal
 
 from . import _common, hear
 
-_NAMES = ("focus", "restore", "edof", "accuracy", "stability", "benchmark", "lenses")
+_NAMES = ("focus", "restore", "edof", "accuracy", "stability", "benchmark", "lenses", "faults")
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 

@@ -209,4 +209,7 @@ def shares(axes: Axes, rows: Mapping[str, Sequence[float]], names: Sequence[str]
         begin = ends[:, k - 1] if k else 0.0
         axes.barh(labels, ends[:, k] - begin, left=begin, label=name)
     axes.invert_yaxis()
-    return _finished(axes, "share", "", columns=len(names))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, ncols=len(names), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    axes.set(xlabel="share")
+    return axes
