@@ -8,7 +8,9 @@ import sys
 from typing import Any
 
 # One name, `experiments.<name>`, whichever folder an experiment lies in.
-__path__ += [str(pathlib.Path(__file__).parent / name) for name in ("paper", "trust", "speed")]
+__path__ += [
+    str(pathlib.Path(__file__).parent / name) for name in ("paper", "trust", "speed", "designing")
+]
 
 
 def _heard_early(number: int, frame: Any) -> None:

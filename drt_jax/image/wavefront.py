@@ -26,7 +26,7 @@ from ..lens.scene import Scene, scene_of
 from ..numerics import concrete, real_array, safe_divide, safe_sqrt
 from ..rays.status import Status
 from ..rays.system import dot
-from ..rays.trace import stop_points, trace_bundle
+from ..rays.trace import Bundle, stop_points, trace_bundle
 
 _MM = 1e-3  # per um
 
@@ -91,9 +91,18 @@ def wavefront(
 
 @jax.jit
 def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) -> Wavefront:
-    colours = jnp.clip(scene.wavelengths, *lens.dispersion.range)
     points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil])  # the chief ray first
     bundle = trace_bundle(lens, scene, (points[:, 0], points[:, 1]))
+    opd, status, image = path_differences(lens, scene.wavelengths, bundle, curvature)
+    return Wavefront(opd[:, 1:], status[:, 1:], image)
+
+
+def path_differences(
+    lens: Lens, wavelengths: Array, bundle: Bundle, curvature: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Path differences (W, Q) in waves, status (W, Q) and image points (W, D) of traced rays, the
+    chief ray first; see `Wavefront` and `wavefront`."""
+    colours = jnp.clip(wavelengths, *lens.dispersion.range)
     whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     chief_ok = whole[:, :1]
 
@@ -104,9 +113,10 @@ def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) 
     sphere = chief_ok & jnp.broadcast_to(finite, colours.shape)[:, None]
     good = sphere & (bundle.status == Status.OK)
     # cosine between the chief ray and the axis of the lens
-    axis = jnp.array([0, 0, 1], points.dtype)
+    axis = jnp.array([0, 0, 1], bundle.path.dtype)
     axis = axis if lens.tilt is None else rotation_matrix(lens.tilt[-1])[2]
-    cosine = jnp.abs(dot(axis, tuple(a[:, 0] for a in bundle.arrival)))
+    arrival = tuple(a[:, 0] for a in bundle.arrival)
+    cosine = jnp.abs(dot(axis[-len(arrival) :], arrival))
     kappa = (curvature * cosine)[:, None]
 
     hit = tuple(h[-1] for h in bundle.hits)
@@ -120,7 +130,7 @@ def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) 
     opd = jnp.where(good, path, 0) / (_MM * colours[:, None])
     without = jnp.where(chief_ok, jnp.int32(Status.UNCONVERGED), bundle.status[:, :1])
     status = jnp.where(sphere | ~whole, bundle.status, without)
-    return Wavefront(opd[:, 1:], status[:, 1:], jnp.concatenate(image, axis=-1))
+    return opd, status, jnp.concatenate(image, axis=-1)
 
 
 def rms_wavefront(wave: Wavefront, weights: ArrayLike) -> Array:

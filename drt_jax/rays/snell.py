@@ -63,9 +63,7 @@ def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[
     if form == "asphere":
         # c (x^2 + y^2 + (1 + k) z^2) = 2 z at p + s d: square s^2 - 2 linear s + constant = 0
         c, k = shape.curvature, shape.conic
-        flat = *d[:-1], (1 + k) * d[-1]
-        square, linear = c * dot(flat, d), d[-1] - c * dot(flat, p)
-        constant = c * (dot(p[:-1], p[:-1]) + (1 + k) * p[-1] ** 2) - 2 * p[-1]
+        square, linear, constant = _quadratic(p, d, shape)
         discriminant = linear**2 - square * constant
         root = safe_sqrt(discriminant)
         root = jnp.where(d[-1] < 0, -root, root)
@@ -92,6 +90,14 @@ def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[
         lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, start
     )
     return length, met & domain(_along(p, d, length)[:-1], shape, form)
+
+
+def _quadratic(p: Vector, d: Vector, shape: Shape) -> Vector:
+    """Of square s^2 - 2 linear s + constant = 0, where p + s d meets a conic."""
+    c, k = shape.curvature, shape.conic
+    flat = *d[:-1], (1 + k) * d[-1]
+    square, linear = c * dot(flat, d), d[-1] - c * dot(flat, p)
+    return square, linear, c * (dot(p[:-1], p[:-1]) + (1 + k) * p[-1] ** 2) - 2 * p[-1]
 
 
 def _along(p: Vector, d: Vector, length: Array) -> Vector:
@@ -159,9 +165,9 @@ def _begin(system: System, launch: Vector) -> tuple[Vector, Vector]:
 
 
 def _refract(d: Vector, normal: Vector, row: "_Row", kick: Vector) -> tuple[Vector, Array, Array]:
-    """Direction behind a surface by Snell's law in vector form, whether the light comes from its
-    front, and whether it gets through; `kick`: what a phase adds to it, D arrays or none."""
-    front = (d[-1] * row.sense > _FLATTEST) & (dot(normal, d) * row.sense > 0)
+    """Direction behind a surface by Snell's law in vector form; and by how much light comes from
+    its front, and gets through, both above 0. `kick`: what a phase adds to it, D arrays or none."""
+    front = jnp.minimum(d[-1] * row.sense - _FLATTEST, dot(normal, d) * row.sense)
     size, d = row.ratio**2, tuple(row.ratio * a for a in d)
     if kick:
         d = *(a + b for a, b in zip(d, kick, strict=False)), d[-1]
@@ -170,7 +176,7 @@ def _refract(d: Vector, normal: Vector, row: "_Row", kick: Vector) -> tuple[Vect
     cosine = dot(normal, d) * shrink
     square = 1 - (size - cosine**2)
     bent = (row.leaving * safe_sqrt(square) - cosine) * shrink
-    return tuple(a + bent * n for a, n in zip(d, normal, strict=True)), front, square > 0
+    return tuple(a + bent * n for a, n in zip(d, normal, strict=True)), front, square
 
 
 class _Kick(NamedTuple):
@@ -270,15 +276,19 @@ class _State(NamedTuple):
     shake: Array
 
 
-def _hit(hit: Vector, fate: Array) -> Vector:
-    return hit
+class _Meeting(NamedTuple):
+    """Of rays with a row: `hit`, D arrays (...), and `fate` so far (...), see `Trace`. short: by
+    how much a ray misses the row, comes from behind, is bent too far; called where it is asked."""
+
+    hit: Vector
+    fate: Array
+    short: Callable[[], Array]
 
 
 def _follow(
-    system: System, launch: Vector, to_stop: bool, keep: Callable[[Vector, Array], Any] = _hit
+    system: System, launch: Vector, to_stop: bool, keep: Callable[[_Meeting], Any]
 ) -> tuple[_State, Any]:
-    """Rays behind the last row; and unless that is the stop, what is to `keep` of the hit and the
-    fate on each row."""
+    """Rays behind the last row; and unless that is the stop, what is to `keep` of each meeting."""
     kinds = sorted({*system.forms, system.at_stop[1]})
     each = [partial(_meet, kind) for kind in kinds]
     phases = [] if system.diffraction is None else sorted(set(system.diffraction.forms))
@@ -288,8 +298,9 @@ def _follow(
         meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
         own, normal, met, length = meet(p, d, row.surface.shape, state.fate == Status.OK)
         bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
-        met = met & (~row.live | (front & ((length > 0) | row.first)))
-        here = jnp.where(met, jnp.where(through | ~row.bends, Status.OK, Status.TIR), Status.MISSED)
+        met = met & (~row.live | ((front > 0) & ((length > 0) | row.first)))
+        passes = (through > 0) | ~row.bends
+        here = jnp.where(met, jnp.where(passes, Status.OK, Status.TIR), Status.MISSED)
         fate = jnp.where(state.fate == Status.OK, here.astype(jnp.int32), state.fate)
         hit, before = own[:-1], state.hit
         wide = jnp.sqrt(jnp.maximum(dot(hit, hit), dot(before, before)))
@@ -301,7 +312,16 @@ def _follow(
         if to_stop:
             return new, None
         kept = state._replace(fate=fate)
-        return jax.tree.map(partial(jnp.where, row.bends), new, kept), keep(hit, fate)
+
+        def short() -> Array:
+            square, linear, constant = _quadratic(p, d, row.surface.shape)
+            missed = jnp.maximum(square * constant - linear**2, 0)
+            behind = jnp.where(row.first, 0, jnp.maximum(-length, 0)) + jnp.maximum(-front, 0)
+            behind = jnp.where(row.live, behind, 0)
+            return missed + behind + jnp.where(row.bends, jnp.maximum(-through, 0), 0)
+
+        keeping = keep(_Meeting(hit, fate, short))
+        return jax.tree.map(partial(jnp.where, row.bends), new, kept), keeping
 
     zero = jnp.zeros_like(launch[0])
     none, begin = jnp.zeros(zero.shape, jnp.int32), _begin(system, launch)
@@ -311,17 +331,28 @@ def _follow(
 
 def shoot(system: System, launch: Vector) -> Trace:
     """Trace rays to the sensor; `launch` D arrays in mm on the vertex plane of the first row."""
-    state, hits = _follow(system, launch, False)
+    state, hits = _follow(system, launch, False, lambda meeting: meeting.hit)
     return Trace(hits, state.fate, state.shake)
 
 
 def fates(system: System, launch: Vector) -> Array:
     """What became of rays up to each row, and up to a stop that is none of them in its place among
     these: (R, ...) or (R + 1, ...), int32, see `Trace`. `launch` as of `shoot`."""
-    return _follow(system, launch, False, lambda hit, fate: fate)[1]
+    return _follow(system, launch, False, lambda meeting: meeting.fate)[1]
+
+
+def lack(system: System, launch: Vector) -> Array:
+    """By how much rays fail, (...): 0 for one that reaches the sensor; else the part of the rows
+    that it does not come to, and more the farther it is from getting past the first of these.
+    Finite, and differentiable by what pulls the ray through. `launch` as of `shoot`."""
+    each = _follow(system, launch, False, lambda meeting: (meeting.fate, meeting.short()))[1]
+    lost = each[0] != Status.OK
+    first = lost & ~jnp.concatenate([jnp.zeros_like(lost[:1]), lost[:-1]])
+    short = jnp.log1p(jnp.sum(jnp.where(first, each[1], 0), axis=0))
+    return jnp.mean(lost.astype(short.dtype), axis=0) + short
 
 
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:
     """Where rays cross the stop, D arrays in mm along its axes, and their fate so far (...)."""
-    state, _ = _follow(system, launch, True)
+    state, _ = _follow(system, launch, True, lambda meeting: None)
     return state.hit, state.fate

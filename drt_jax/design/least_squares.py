@@ -1,0 +1,135 @@
+"""Levenberg and Marquardt's method within bounds, on exact Jacobians.
+
+More, The Levenberg-Marquardt algorithm (1978): damping in units of the largest column norms seen;
+Nielsen, Damping parameter in Marquardt's method (1999): its size by the gain of each trial. Numbers
+that meet a bound are held there while the merit would fall beyond it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax import Array
+
+from ..numerics import run_if, safe_divide
+
+# XLA's newer fusions of CPUs take twice as long to compile what is large and runs no faster.
+COMPILE = {"xla_cpu_use_fusion_emitters": False}
+_DAMPING, _MOST_DAMPING = 1e-3, 1e16
+_HOLDS = 3  # how often numbers are added to those held at a bound, in one step
+
+
+class LMState(NamedTuple):
+    """residuals (M,), jacobian (M, N) and merit () at the best vector so far; broken: how much of it
+    is unphysical. scale: (N,), largest column norms. damping, growth: (). gain: what the model
+    promised of the last trial, relative to the merit. jacobians, trials: (), int32. fresh: nothing
+    is evaluated yet, or what is wanted has changed. kept: what else the function told there."""
+
+    residuals: Array
+    jacobian: Array
+    merit: Array
+    broken: Array
+    scale: Array
+    damping: Array
+    growth: Array
+    gain: Array
+    jacobians: Array
+    trials: Array
+    fresh: Array
+    kept: Any
+
+
+class BoundedLM(optx.AbstractLeastSquaresSolver):
+    """Least squares within bounds: `fn(y, args)` returns residuals (M,) and, as its auxiliary
+    output, by how much y is unphysical, (), and a tree of arrays to keep. A trial is taken if the merit falls and it is no more
+    unphysical than before. Options: "lower", "upper", (N,). Ends when the model promises less than
+    `rtol` of the merit or `atol`."""
+
+    rtol: float
+    atol: float
+    norm: Callable = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> LMState:
+        """Nothing is evaluated yet."""
+        one, count = jnp.ones((), y.dtype), jnp.zeros((), jnp.int32)
+        residuals = jnp.zeros(f_struct.shape, y.dtype)
+        infinite = jnp.inf * one
+        return LMState(
+            residuals,
+            jnp.zeros((residuals.size, y.size), y.dtype),
+            *(infinite, infinite, jnp.zeros_like(y), _DAMPING * one, 2 * one, infinite),
+            *(count, count, jnp.bool_(True)),
+            jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), aux_struct[1]),
+        )
+
+    def step(self, fn, y, args, options, state, tags) -> tuple[Array, LMState, Any]:
+        """One trial, and if it is taken, the Jacobian there."""
+        lower, upper = options["lower"], options["upper"]
+        move, promised = _proposal(y, state, lower, upper)
+        trial = jnp.where(state.fresh, y, jnp.clip(y + move, lower, upper))
+        residuals, push, aux = jax.linearize(lambda y: fn(y, args), trial, has_aux=True)
+        broken, told = aux
+        merit = jnp.sum(residuals**2)
+        finite = jnp.isfinite(merit) & jnp.isfinite(broken)
+        better = finite & (merit < state.merit) & (broken <= state.broken)
+        taken = state.fresh | better
+        ratio = safe_divide(state.merit - merit, promised)
+        units = jnp.eye(y.size, dtype=y.dtype)
+        jacobian = run_if(taken, lambda _: jax.vmap(push, out_axes=1)(units), state.jacobian)
+        jacobian = jnp.where(jnp.isfinite(jacobian), jacobian, 0)
+        kept = (residuals, merit, broken, jnp.sqrt(jnp.sum(jacobian**2, axis=0)))
+        old = state.residuals, state.merit, state.broken, state.scale
+        residuals, merit, broken, scale = (jnp.where(taken, a, b) for a, b in zip(kept, old))
+        shrink = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
+        damping = jnp.where(better, state.damping * shrink, state.damping * state.growth)
+        new = LMState(
+            residuals,
+            jacobian,
+            merit,
+            broken,
+            jnp.maximum(scale, state.scale),
+            jnp.where(state.fresh, state.damping, damping),
+            jnp.where(better | state.fresh, 2, 2 * state.growth),
+            jnp.where(state.fresh, jnp.inf, safe_divide(promised, state.merit)),
+            state.jacobians + taken.astype(jnp.int32),
+            state.trials + 1,
+            jnp.bool_(False),
+            jax.tree.map(lambda a, b: jnp.where(taken, a, b), told, state.kept),
+        )
+        return jnp.where(taken, trial, y), new, aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
+        """Whether nothing more is to be gained, or no trial is taken any more."""
+        small = (state.gain <= self.rtol) | (state.merit <= self.atol)
+        stuck = state.damping > _MOST_DAMPING
+        results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        return ~state.fresh & (small | stuck), optx.RESULTS.where(stuck & ~small, *results)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Nothing to add."""
+        return y, aux, {"num_jacobians": state.jacobians}
+
+
+def _proposal(y: Array, state: LMState, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """The damped step within the bounds, and by how much the model has the merit fall."""
+    gradient = state.jacobian.T @ state.residuals
+    square = state.jacobian.T @ state.jacobian
+    scale = jnp.where(state.scale > 0, state.scale, 1)
+    at_bound = ((y <= lower) & (gradient > 0)) | ((y >= upper) & (gradient < 0))
+    held, move = at_bound, jnp.zeros_like(y)
+    for _ in range(_HOLDS):
+        # In units of the columns' norms; what is held moves as far as it does already.
+        free = (~held).astype(y.dtype)
+        matrix = square / scale[:, None] / scale * free[:, None] * free
+        matrix = matrix + jnp.diag(state.damping * free + (1 - free))
+        right = -(gradient + square @ (move * (1 - free))) / scale * free
+        step = jax.scipy.linalg.solve(matrix, right, assume_a="pos") / scale
+        move = jnp.where(held, move, step)
+        beyond = (y + move < lower) | (y + move > upper)
+        move = jnp.clip(y + move, lower, upper) - y
+        held = held | beyond
+    move = jnp.where(jnp.isfinite(move), move, 0)
+    along = state.jacobian @ move
+    return move, -2 * jnp.sum(state.residuals * along) - jnp.sum(along**2)

@@ -1,0 +1,169 @@
+"""A problem's optimum: least squares, and limits that hold exactly in the end.
+
+Limits enter as residuals max(0, excess + shift), and each time that the merit has settled, the shift
+takes up what is left of the excess: the method of multipliers (Rockafellar 1973), which keeps limits
+without weights that would be stiff.
+"""
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..lens.lens import Lens
+from ..numerics import concrete
+from .least_squares import COMPILE, BoundedLM, LMState
+from .problem import Judged, Problem
+
+# A merit has settled when less than `_COARSE` of it is to be gained, while limits are still to be
+# met, and in the end `_FINE`. Limits are met to `_MET`, in their own units times the weight.
+_COARSE, _FINE, _MET = 1e-5, 1e-13, 1e-9
+_ROUNDS = 30
+
+
+class Search(NamedTuple):
+    """A search for an optimum, as far as it has come.
+
+    vector: (N,), the best so far. state: of the method. shift: (L,), of the limits. rounds: (), how
+    often limits were shifted. fine: (), whether limits are met and the last digits are sought.
+    done: (), whether nothing more is to be gained.
+    """
+
+    vector: Array
+    state: LMState
+    shift: Array
+    rounds: Array
+    fine: Array
+    done: Array
+
+    @property
+    def judged(self) -> Judged:
+        """The best vector judged."""
+        return self.state.kept
+
+    @property
+    def merit(self) -> Array:
+        """Sum of the squares of its residuals, ()."""
+        return jnp.sum(self.judged.residuals**2, axis=-1)
+
+    @property
+    def worst(self) -> Array:
+        """By how much the worst limit is exceeded, (); 0 or less where all are kept."""
+        return jnp.max(self.judged.excess, axis=-1, initial=0.0)
+
+
+def _wanted(vector: Array, args: tuple[Problem, Array]) -> tuple[Array, tuple]:
+    problem, shift = args
+    judged = problem.judge(vector)
+    limits = jnp.maximum(judged.excess + shift, 0)
+    return jnp.concatenate([judged.residuals, limits]), (judged.broken, judged)
+
+
+def begin(problem: Problem, vector: Array) -> Search:
+    """A search from a vector (N,) of its variables; nothing is evaluated yet."""
+    judged = jax.eval_shape(problem.judge, vector)
+    shift = jnp.zeros(judged.excess.shape, vector.dtype)
+    count = judged.residuals.size + shift.size
+    wanted = jax.ShapeDtypeStruct((count,), vector.dtype)
+    state = _METHOD.init(None, vector, None, {}, wanted, (None, judged), frozenset())
+    no = jnp.bool_(False)
+    return Search(vector, state, shift, jnp.zeros((), jnp.int32), no, no)
+
+
+_METHOD = BoundedLM(rtol=_FINE, atol=0.0)
+
+
+def turn(problem: Problem, search: Search) -> Search:
+    """One trial more, unless the search is done."""
+    variables = problem.variables
+    options = {"lower": variables.low, "upper": variables.high}
+    args = problem, search.shift
+    vector, state, _ = _METHOD.step(
+        _wanted, search.vector, args, options, search.state, frozenset()
+    )
+    ended, _ = _METHOD.terminate(_wanted, vector, args, options, state, frozenset())
+    excess = state.kept.excess
+    met = jnp.max(excess, initial=0.0) <= _MET
+    settled = ended | (~search.fine & ~state.fresh & (state.gain < _COARSE))
+    shifts = settled & ~met & (search.rounds < _ROUNDS)
+    shift = jnp.where(shifts, jnp.maximum(excess + search.shift, 0), search.shift)
+    state = state._replace(fresh=shifts)
+    fine = met & (search.fine | settled)
+    done = search.done | (ended & ~shifts)
+    new = Search(vector, state, shift, search.rounds + shifts.astype(jnp.int32), fine, done)
+    return jax.tree.map(lambda a, b: jnp.where(search.done, a, b), search, new)
+
+
+class Optimum(NamedTuple):
+    """What a search came to.
+
+    lens: the best one. vector: (N,). merit: sum of the squares of the residuals. worst: by how much
+    the worst limit is exceeded, times its weight. history: (T, 3), merit, worst and Jacobians so far
+    by trial. seconds: of all trials but the first; first: of that, with compilation if need be.
+    """
+
+    lens: Lens
+    vector: np.ndarray
+    merit: float
+    worst: float
+    history: np.ndarray
+    seconds: float
+    first: float
+
+    @property
+    def jacobians(self) -> int:
+        """How many were computed."""
+        return int(self.history[-1, 2])
+
+
+_begin = jax.jit(begin)
+_turn = jax.jit(turn, compiler_options=COMPILE)
+
+
+def optimise(
+    problem: Problem,
+    vector: Array | None = None,
+    trials: int = 500,
+    report: Callable[[Search], None] = lambda search: None,
+) -> Optimum:
+    """The optimum next to a vector (N,) of the problem's variables, that of its start by default.
+
+    trials: at most. report: called after each, to show how far it is.
+
+    One program is compiled for a problem, and serves all others of its kind. ValueError if the
+    start itself cannot be judged: a lens whose surfaces overlap or of which no number is finite.
+    """
+    if not concrete((problem, vector)):
+        raise ValueError("optimise: call it outside of jax.jit; inside, use begin and turn")
+    start = problem.variables.start if vector is None else jnp.asarray(vector)
+    low, high = problem.variables.low, problem.variables.high
+    search = _begin(problem, jnp.clip(start, low, high))
+    begun = time.perf_counter()
+    search = jax.block_until_ready(_turn(problem, search))
+    compiled = time.perf_counter()
+    history = [[search.merit, search.worst, search.state.jacobians]]
+    for _ in range(trials - 1):
+        search = _turn(problem, search)
+        history.append([search.merit, search.worst, search.state.jacobians])
+        report(search)
+        if bool(search.done):
+            break
+    if not bool(jnp.isfinite(search.state.broken)):
+        raise ValueError(
+            "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
+            "finite; begin with weaker curvatures or a smaller stop"
+        )
+    ended = time.perf_counter()
+    return Optimum(
+        problem.variables.lens_of(search.vector),
+        np.asarray(search.vector),
+        float(search.merit),
+        float(search.worst),
+        np.array(history, float),
+        ended - compiled,
+        compiled - begun,
+    )

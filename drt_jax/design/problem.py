@@ -1,0 +1,174 @@
+"""A design problem: variables, and what is wanted of the lens from all its fields."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..lens.lens import Lens
+from ..lens.paraxial import marginal_ray, paraxial_system
+from ..lens.scene import Scene, distance_array, field_array, vergence_of
+from ..pupil.rules import Gauss, PupilRule
+from ..rays.solve import Solver, solve_aimed
+from .operands import TRACED, Operand, gaps
+from .seen import EXTRAS, Seen, symmetry_by_structure
+from .variables import Variables
+
+# A ray that fails counts as one that misses by so many semi-diameters of the stop, and more.
+_FAILED = 4.0
+# The stop is at least so wide, as part of the light's width on any surface.
+_SLIMMEST = 0.1
+
+
+class Judged(NamedTuple):
+    """A lens judged.
+
+    residuals: (M,), whose squares add up to the merit.
+    excess: (L,), by how much values are beyond their limits, times their weights.
+    broken: (), by how much surfaces overlap within the light, mm; inf where anything is not finite.
+    """
+
+    residuals: Array
+    excess: Array
+    broken: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """What is varied, and what is wanted.
+
+    variables: see there.
+    fields: (F, 2), angles in radians. distances: (Z,), of the object in mm; every field is seen
+        from every distance. wavelengths: (W,) in um.
+    colour_weights: (W,), of their light, adding up to 1.
+    rule: of the pupil; the same for all fields.
+
+    Static:
+    operands: what is wanted.
+    solver: how rays are found. The default aims them, and counts as failed what is not found so;
+        a lens of which that is wanted needs no search.
+    """
+
+    variables: Variables
+    fields: Array
+    distances: Array
+    wavelengths: Array
+    colour_weights: Array
+    rule: PupilRule
+    operands: tuple[Operand, ...] = dataclasses.field(metadata={"static": True})
+    solver: Solver = dataclasses.field(metadata={"static": True}, default=solve_aimed)
+
+    @classmethod
+    def of(
+        cls,
+        variables: Variables,
+        operands: Sequence[Operand | str],
+        fields: ArrayLike = 0.0,
+        wavelengths: ArrayLike = 0.5875618,
+        distances: ArrayLike = np.inf,
+        rule: PupilRule | int = 6,
+        colour_weights: ArrayLike | None = None,
+        solver: Solver = solve_aimed,
+    ) -> "Problem":
+        """The problem of some variables.
+
+        operands: at least one; a word is one of a weight of 1. fields: (F,) along y or (F, 2), in
+        radians. wavelengths: (W,) or one, um. distances: (Z,) or one, mm. rule: of the pupil, or
+        the order of a Gauss rule. colour_weights: (W,), of any sum; None: equal.
+
+        ValueError, which names the argument, for what fits neither lens nor problem.
+        """
+        lens, wanted = (
+            variables.lens,
+            tuple(Operand(o) if isinstance(o, str) else o for o in operands),
+        )
+        if not wanted:
+            raise ValueError("operands: none; a merit needs at least one, such as spot")
+        dtype = lens.curvature.dtype
+        angles = jnp.atleast_1d(field_array(fields, dtype))
+        if angles.ndim == 1:
+            angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
+        if angles.ndim != 2 or angles.shape[1] != 2:
+            raise ValueError(f"fields: expected (F,) or (F, 2), got shape {np.shape(fields)}")
+        far = jnp.stack([distance_array(d, dtype) for d in np.ravel(distances)])
+        colours = lens.colours(wavelengths)
+        weights = np.ones(len(colours)) if colour_weights is None else np.asarray(colour_weights)
+        if weights.shape != colours.shape or not np.all(weights > 0):
+            raise ValueError(f"colour_weights: expected {len(colours)} numbers above 0")
+        if isinstance(rule, int):
+            across = not np.any(np.asarray(angles)[:, 0])
+            symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
+            rule = Gauss(rule, symmetry if across else "disc")
+        counts = {
+            "fields": len(angles), "wavelengths": len(colours), "distances": len(far),
+            "surfaces": lens.count,
+        }  # fmt: skip
+        for operand in wanted:
+            for name, count in counts.items():
+                for k in getattr(operand, name):
+                    if not 0 <= k < count:
+                        raise ValueError(
+                            f"operands: {operand.kind}: {name}: no number {k}; there are 0 to "
+                            f"{count - 1}"
+                        )
+            if operand.kind == "magnification" and np.any(np.isinf(np.asarray(far))):
+                raise ValueError("operands: magnification: the object is at infinity")
+        share = jnp.asarray(weights / weights.sum(), dtype)
+        return cls(variables, angles, far, colours, share, rule, wanted, solver)
+
+    def seen(self, lens: Lens) -> Seen:
+        """The lens from all fields and distances."""
+        views = Scene(
+            jnp.tile(self.fields, (len(self.distances), 1)),
+            jnp.repeat(self.distances, len(self.fields)),
+            self.wavelengths,
+        )
+        return Seen(lens, views, self.rule, self.solver, self.colour_weights, len(self.fields))
+
+    @property
+    def traces(self) -> bool:
+        """Whether any operand needs rays."""
+        return any(operand.kind in TRACED for operand in self.operands)
+
+    def judge(self, vector: Array) -> Judged:
+        """A vector (N,) of the variables judged; see `Judged`. Differentiable, in `jit` and `vmap`
+        too."""
+        lens = self.variables.lens_of(vector)
+        seen = self.seen(lens)
+        parts = [operand.residuals(seen) for operand in self.operands]
+        if self.traces:
+            parts.append(self._failures(seen))
+        residuals = jnp.concatenate(parts)
+        excess = jnp.concatenate([operand.excess(seen) for operand in self.operands])
+        extents = seen.extents if self.traces else jnp.zeros(lens.count, vector.dtype)
+        both = [gaps(lens, extents, glass) for glass in (True, False)]
+        overlap = sum(jnp.sum(jnp.maximum(-part, 0)) for pair in both for part in pair)
+        # A stop at a focus of the light would make any lens perfect: all rays are one.
+        system = paraxial_system(lens, self.wavelengths)
+        marginal = marginal_ray(system, vergence_of(self.distances[0])).height
+        slim = _SLIMMEST * jnp.max(jnp.abs(marginal)) - jnp.abs(system.aperture)
+        overlap = overlap + jnp.maximum(slim, 0)
+        finite = jnp.all(jnp.isfinite(residuals)) & jnp.all(jnp.isfinite(excess))
+        broken = jnp.where(finite & jnp.isfinite(overlap), overlap, jnp.inf)
+        return Judged(residuals, excess, jax.lax.stop_gradient(broken))
+
+    def _failures(self, seen: Seen) -> Array:
+        """A residual for each ray: 0 for one that passes, else its share of the light times a miss
+        of several beams."""
+        light = seen.rays.light[..., EXTRAS:] * self.colour_weights[:, None]
+        size = _FAILED * jax.lax.stop_gradient(seen.lens.semi_diameter[seen.lens.stop])
+        lacks = seen.lacks[..., EXTRAS:]
+        failed = ~seen.rays.whole[..., EXTRAS:] & (light > 0)
+        root = jnp.sqrt(jnp.where(failed, light, 1))
+        weight = max((o.weight for o in self.operands if not o.limits), default=1.0)
+        return jnp.ravel(jnp.where(failed, weight * size * root * (1 + lacks), 0))
+
+    def merit(self, vector: Array) -> Array:
+        """Sum () of the squares of the residuals; limits are not in it."""
+        return jnp.sum(self.judge(vector).residuals ** 2)

@@ -1,0 +1,183 @@
+"""Solves: numbers of a lens that follow from the others, so that a condition holds exactly."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..image.moments import moments
+from ..lens.lens import Lens
+from ..lens.paraxial import entrance_pupil, marginal_ray, paraxial_system, trace_ray
+from ..lens.scene import scene_of, vergence_of
+from ..numerics import safe_divide
+from ..pupil.rules import Gauss
+from .kinds import KINDS, back_distance
+from .seen import symmetry_by_structure
+
+_Name = Literal[
+    "focal_length", "image_angle", "paraxial_focus", "best_focus", "entrance_pupil", "f_number"
+]
+# Newton steps: every condition is linear in the number that meets it, the second mends rounding.
+_STEPS = 2
+_ORDER = 6  # of the rule of the best focus
+_HELD = 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class Solve:
+    """A condition and the number that is given up for it.
+
+    kind: "focal_length" in mm, or "image_angle", the paraxial slope of the marginal ray behind the
+        lens: the curvature of `surface` follows. "paraxial_focus", or "best_focus" where the spots
+        of `fields` are smallest (the root of their mean square): the distance of the sensor behind
+        the last vertex follows. "entrance_pupil", its diameter in mm, or "f_number": the
+        semi-diameter of the stop follows.
+    value: to keep; 0: that of the lens at the start; of a focus, mm from there to the sensor.
+    surface: whose curvature follows.
+    fields: of the best focus, radians along y.
+    distance: to the object, mm; wavelengths: um, whose mean counts.
+    """
+
+    kind: _Name
+    value: float = 0.0
+    surface: int = -1
+    fields: tuple[float, ...] = (0.0,)
+    distance: float = math.inf
+    wavelengths: tuple[float, ...] = (0.5875618,)
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(_Name):
+            known = ", ".join(get_args(_Name))
+            raise ValueError(f"solves: unknown {self.kind!r}; known: {known}")
+        if not math.isfinite(self.value):
+            raise ValueError(f"solves: {self.kind}: value: must be finite, got {self.value:g}")
+
+    @property
+    def focuses(self) -> bool:
+        """Whether the sensor follows."""
+        return self.kind in ("paraxial_focus", "best_focus")
+
+    def place(self, lens: Lens) -> tuple[str, int, int]:
+        """Kind, row and term of the number that follows.
+
+        ValueError if there is none, or if it does not determine the condition.
+        """
+        if self.focuses:
+            return "sensor", 0, 0
+        if self.kind in ("entrance_pupil", "f_number"):
+            return "semi_diameter", lens.stop, 0
+        live = ", ".join(map(str, lens.live))
+        if self.surface not in lens.live:
+            raise ValueError(
+                f"solves: {self.kind}: its curvature follows: give surface, one of {live}; "
+                f"got {self.surface}"
+            )
+        if self.kind == "image_angle" and self.surface < lens.stop:
+            raise ValueError(
+                f"solves: image_angle: surface {self.surface} lies before the stop, which is "
+                f"number {lens.stop}; give one at it or behind, of {live}"
+            )
+        return "curvature", self.surface, 0
+
+    def found(self, lens: Lens) -> "Solve":
+        """The solve with the value that it keeps. ValueError where that is none, or where the
+        number that follows does not change it."""
+        self.place(lens)
+        if self.focuses:
+            return self
+        condition, solve = _CONDITIONS[self.kind], self
+        if self.value == 0:
+            now = condition.value(float(condition.measure(lens, self)))
+            if now == 0 or not math.isfinite(now):
+                raise ValueError(f"solves: {self.kind}: the lens has none to keep; give its value")
+            solve = dataclasses.replace(self, value=now)
+        missed = float(condition.measure(solve.apply(lens), solve)) / condition.value(solve.value)
+        if not abs(missed - 1) < _HELD:
+            kind, row, _ = self.place(lens)
+            raise ValueError(
+                f"solves: {self.kind}: no {kind} of surface {row} gives {solve.value:g}; "
+                "is the beam in focus there? give another surface"
+            )
+        return solve
+
+    def apply(self, lens: Lens) -> Lens:
+        """The lens with the number that meets the condition; unchanged where none does."""
+        if self.focuses:
+            return _focused(lens, self)
+        kind, row, term = self.place(lens)
+        condition = _CONDITIONS[self.kind]
+
+        def with_number(number: Array) -> Lens:
+            return KINDS[kind].write(lens, KINDS[kind].read(lens).at[row, term].set(number))
+
+        def gap(number: Array) -> Array:
+            return condition.measure(with_number(number), self) - condition.value(self.value)
+
+        number = KINDS[kind].read(lens)[row, term]
+        for _ in range(_STEPS):
+            miss, rate = jax.jvp(gap, (number,), (jnp.ones_like(number),))
+            number = number - safe_divide(miss, rate)
+        return with_number(number)
+
+
+class _Condition(NamedTuple):
+    """measure: linear in the number that follows. value: what it is to be for what is kept, and
+    back."""
+
+    measure: Callable[[Lens, Solve], Array]
+    value: Callable[[float], float]
+
+
+def _power(lens: Lens, solve: Solve) -> Array:
+    """1 / focal length."""
+    ray = trace_ray(paraxial_system(lens, solve.wavelengths), 1.0, 0.0)
+    return -jnp.mean(ray.behind[-1])
+
+
+def _slope(lens: Lens, solve: Solve) -> Array:
+    """Of the marginal ray behind the lens."""
+    vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
+    return jnp.mean(marginal_ray(paraxial_system(lens, solve.wavelengths), vergence).behind[-1])
+
+
+def _pupil(lens: Lens, solve: Solve) -> Array:
+    """Diameter of the entrance pupil."""
+    return 2 * jnp.mean(entrance_pupil(lens, solve.wavelengths).semi_diameter)
+
+
+def _inverse(value: float) -> float:
+    return 1 / value if value else math.inf
+
+
+def _itself(value: float) -> float:
+    return value
+
+
+_CONDITIONS = {
+    "focal_length": _Condition(_power, _inverse),
+    "image_angle": _Condition(_slope, _itself),
+    "entrance_pupil": _Condition(_pupil, _itself),
+    "f_number": _Condition(lambda lens, solve: 2 * jnp.abs(_slope(lens, solve)), _inverse),
+}
+
+
+def _focused(lens: Lens, solve: Solve) -> Lens:
+    """The sensor `solve.value` mm behind the focus."""
+    if solve.kind == "paraxial_focus":
+        vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
+        ray = trace_ray(paraxial_system(lens, solve.wavelengths), 1.0, vergence)
+        back = jnp.mean(safe_divide(-ray.height[-1], ray.behind[-1]))
+        return KINDS["sensor"].write(lens, (back + solve.value)[None, None])
+    linear, square = [], []
+    for field in solve.fields:
+        scene = scene_of(lens, field, solve.distance, solve.wavelengths)
+        rule = Gauss(_ORDER, symmetry_by_structure(lens, field == 0))
+        spread = jnp.sum(moments(lens, scene, rule).spread[..., :2], axis=-1)
+        linear.append(jnp.mean(spread[1]))
+        square.append(jnp.mean(spread[2]))
+    shift = -safe_divide(sum(linear), 2 * sum(square))
+    return KINDS["sensor"].write(lens, (back_distance(lens) + shift + solve.value)[None, None])

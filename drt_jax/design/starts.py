@@ -1,0 +1,193 @@
+"""Many starts: searches side by side, the better half kept again and again, their minima ranked."""
+
+import concurrent.futures
+import os
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+from scipy.stats import qmc
+
+from .least_squares import COMPILE
+from .optimum import Search, begin, turn
+from .problem import Problem
+from .variables import Variables
+
+# Searches of one tile share a program and a core.
+_TILE = 16
+# Two minima are one if their merits differ by less than a part, and their numbers by less, in
+# units of their scales (root mean square).
+_SAME_MERIT, _SAME_PLACE = 1e-3, 1.0
+
+
+def around(variables: Variables, count: int, spread: float, seed: int = 0) -> np.ndarray:
+    """Starts (count, N): the lens at the start, the first, and others by normal deviates of `spread`
+    times the scales of the variables, within their bounds."""
+    moves = np.random.default_rng(seed).normal(size=(count, len(variables.places)))
+    moves[0] = 0
+    return np.clip(np.asarray(variables.start) + spread * moves, variables.low, variables.high)
+
+
+def within(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
+    """Starts (count, N), evenly spread within the bounds (Sobol's sequence, scrambled).
+
+    ValueError, which names it, for a variable without bounds.
+    """
+    low, high = np.asarray(variables.low), np.asarray(variables.high)
+    for name, ends in zip(variables.names, zip(low, high)):
+        if not np.all(np.isfinite(ends)):
+            raise ValueError(f"variables: {name}: starts within bounds need low and high")
+    power = int(np.ceil(np.log2(max(count, 2))))
+    points = qmc.Sobol(len(low), seed=seed).random_base2(power)[:count]
+    return low + points * (high - low)
+
+
+class Minimum(NamedTuple):
+    """One of the distinct minima.
+
+    vector: (N,). merit, worst: see `Optimum`. found: how many searches ended there. start: the
+    number of the one that came lowest.
+    """
+
+    vector: np.ndarray
+    merit: float
+    worst: float
+    found: int
+    start: int
+
+
+class Starts(NamedTuple):
+    """What many starts came to.
+
+    minima: the distinct ones, best first. trials, jacobians, rays: of all searches. seconds.
+    merits: (K,), of every start where its search was left, inf for one that never passed a ray.
+    """
+
+    minima: list[Minimum]
+    merits: np.ndarray
+    trials: int
+    jacobians: int
+    rays: int
+    seconds: float
+
+
+_begin = jax.jit(jax.vmap(begin, (None, 0)))
+
+
+@partial(jax.jit, compiler_options=COMPILE)
+def _advance(problem: Problem, searches: Search, turns: Array) -> Search:
+    """So many turns of a tile of searches, fewer if all are done."""
+    both = jax.vmap(turn, (None, 0))
+
+    def more(state: tuple[Array, Search]) -> Array:
+        return (state[0] < turns) & ~jnp.all(state[1].done)
+
+    step = lambda state: (state[0] + 1, both(problem, state[1]))  # noqa: E731
+    return jax.lax.while_loop(more, step, (jnp.int32(0), searches))[1]
+
+
+def score(search: Search) -> np.ndarray:
+    """What searches (K,) are ranked by: merit plus the squares of what exceeds limits; inf for a
+    lens that is unphysical."""
+    excess = np.maximum(np.asarray(search.judged.excess), 0)
+    found = np.asarray(search.merit) + np.sum(excess**2, axis=-1)
+    good = np.isfinite(found) & (np.asarray(search.state.broken) < np.inf)
+    return np.where(good, found, np.inf)
+
+
+def many_starts(
+    problem: Problem,
+    starts: ArrayLike,
+    turns: Sequence[int] = (12, 12, 24, 48, 200),
+    keep: float = 0.5,
+    report: Callable[[int, int, float], None] = lambda done, total, best: None,
+    threads: int | None = None,
+) -> Starts:
+    """Search from many starts (K, N), with successive halving (Jamieson and Talwalkar 2016).
+
+    turns: trials of every search in each stage. keep: the part that goes on to the next, at least
+    a tile of 16. report: called with the tiles done, all tiles, and the best merit so far. threads:
+    tiles at a time; None: one a core.
+
+    A search that fails stays where it is and is ranked last. The result depends on neither threads
+    nor tiles.
+    """
+    begun = time.perf_counter()
+    vectors = np.asarray(starts, float)
+    if vectors.ndim != 2 or vectors.shape[1] != len(problem.variables.places):
+        width = len(problem.variables.places)
+        raise ValueError(f"starts: expected (K, {width}), got shape {vectors.shape}")
+    count = len(vectors)
+    low, high = np.asarray(problem.variables.low), np.asarray(problem.variables.high)
+    fill = -count % _TILE
+    padded = np.concatenate([vectors, vectors[:1].repeat(fill, axis=0)])
+    searches = _begin(problem, jnp.asarray(np.clip(padded, low, high)))
+    alive = np.arange(count)
+    sizes = [count]
+    for _ in turns[1:]:
+        sizes.append(min(sizes[-1], max(_TILE, int(np.ceil(keep * sizes[-1])))))
+    tiles_in_all, done = sum(-(-size // _TILE) for size in sizes), 0
+    state = jax.tree.map(np.array, searches)
+    with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        for stage, (size, more) in enumerate(zip(sizes, turns)):
+            if stage:
+                alive = alive[np.argsort(score(_rows(state, alive)), kind="stable")[:size]]
+            tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
+
+            def run(rows: np.ndarray, more: int = more) -> tuple[np.ndarray, Search]:
+                whole = np.resize(rows, _TILE)  # a tile that is not full repeats its rows
+                return rows, _advance(problem, jax.tree.map(jnp.asarray, _rows(state, whole)), more)
+
+            for rows, new in pool.map(run, tiles):
+                jax.tree.map(
+                    lambda a, b, r=rows: a.__setitem__(r, np.asarray(b)[: len(r)]), state, new
+                )
+                done += 1
+                report(done, tiles_in_all, float(np.min(score(_rows(state, alive)))))
+    whole = _rows(state, np.arange(count))
+    trials, jacobians = (int(np.sum(a)) for a in (whole.state.trials, whole.state.jacobians))
+    return Starts(
+        distinct(_rows(state, alive), alive),
+        score(whole),
+        trials,
+        jacobians,
+        trials * rays_of(problem),
+        time.perf_counter() - begun,
+    )
+
+
+def _rows(tree: Search, rows: np.ndarray) -> Search:
+    return jax.tree.map(lambda a: a[rows], tree)
+
+
+def rays_of(problem: Problem) -> int:
+    """How many rays one judgement traces."""
+    if not problem.traces:
+        return 0
+    seen = jax.eval_shape(lambda p: p.seen(p.variables.lens).rays.light, problem)
+    return int(np.prod(seen.shape))
+
+
+def distinct(searches: Search, numbers: np.ndarray) -> list[Minimum]:
+    """The distinct minima that searches (K,) with their numbers of starts came to, best first."""
+    scores, vectors = score(searches), np.asarray(searches.vector)
+    worst = np.asarray(searches.worst)
+    found: list[Minimum] = []
+    for k in np.argsort(scores, kind="stable"):
+        if not np.isfinite(scores[k]):
+            continue
+        for m, other in enumerate(found):
+            near = np.sqrt(np.mean((vectors[k] - other.vector) ** 2)) < _SAME_PLACE
+            if near and scores[k] - other.merit < _SAME_MERIT * other.merit:
+                found[m] = other._replace(found=other.found + 1)
+                break
+        else:
+            merit = float(np.asarray(searches.merit)[k])
+            found.append(Minimum(vectors[k], merit, float(worst[k]), 1, int(numbers[k])))
+    return found
