@@ -101,6 +101,7 @@ def load_patches(
                 usable += 1
                 for crop in _crops(picture, config.crops_per_image, side, [seed, 1, i]):
                     pool.write(crop.tobytes())
+            del picture  # before the next is decoded
         if usable < 2:
             raise DataError(
                 f"data.root: {config.root}: {usable} usable images; train and test need one each, "
