@@ -22,7 +22,7 @@ _HOLDS = 3  # how often numbers are added to those held at a bound, in one step
 
 
 class LMState(NamedTuple):
-    """residuals (M,), jacobian (M, N) and merit () at the best vector so far; broken: how much of it
+    """residuals (M,), jacobian (M, N) and merit () at the best vector so far; broken: by how much it
     is unphysical. scale: (N,), largest column norms. damping, growth: (). gain: what the model
     promised of the last trial, relative to the merit. jacobians, trials: (), int32. fresh: nothing
     is evaluated yet, or what is wanted has changed. kept: what else the function told there."""
@@ -42,10 +42,14 @@ class LMState(NamedTuple):
 
 
 class BoundedLM(optx.AbstractLeastSquaresSolver):
-    """Least squares within bounds: `fn(y, args)` returns residuals (M,) and, as its auxiliary
-    output, by how much y is unphysical, (), and a tree of arrays to keep. A trial is taken if the merit falls and it is no more
-    unphysical than before. Options: "lower", "upper", (N,). Ends when the model promises less than
-    `rtol` of the merit or `atol`."""
+    """Least squares within bounds.
+
+    `fn(y, args)` returns residuals (M,) and, as its auxiliary output, by how much y (N,) is
+    unphysical, (), and a tree of arrays to keep. A trial is taken if the merit, the sum of the
+    squares, falls and y is no more unphysical than before. Options: "lower" and "upper", (N,). Ends
+    when the model promises less than `rtol` of the merit, when that is below `atol`, or when no
+    trial is taken any more (RESULTS.nonlinear_divergence).
+    """
 
     rtol: float
     atol: float

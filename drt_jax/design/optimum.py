@@ -1,8 +1,8 @@
 """A problem's optimum: least squares, and limits that hold exactly in the end.
 
-Limits enter as residuals max(0, excess + shift), and each time that the merit has settled, the shift
-takes up what is left of the excess: the method of multipliers (Rockafellar 1973), which keeps limits
-without weights that would be stiff.
+Limits enter as residuals max(0, excess + shift), and each time that the merit has settled, the
+shift takes up what is left of the excess: the method of multipliers (Rockafellar 1973), which keeps
+limits without weights that would be stiff.
 """
 
 import time
@@ -102,8 +102,8 @@ class Optimum(NamedTuple):
     """What a search came to.
 
     lens: the best one. vector: (N,). merit: sum of the squares of the residuals. worst: by how much
-    the worst limit is exceeded, times its weight. history: (T, 3), merit, worst and Jacobians so far
-    by trial. seconds: of all trials but the first; first: of that, with compilation if need be.
+    the worst limit is exceeded, times its weight. history: (T, 3), merit, worst and Jacobians so
+    far by trial. seconds: of all trials but the first; first: of that, with compilation if need be.
     """
 
     lens: Lens

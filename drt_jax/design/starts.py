@@ -1,9 +1,10 @@
 """Many starts: searches side by side, the better half kept again and again, their minima ranked."""
 
 import concurrent.futures
+import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -27,8 +28,8 @@ _SAME_MERIT, _SAME_PLACE = 1e-3, 1.0
 
 
 def around(variables: Variables, count: int, spread: float, seed: int = 0) -> np.ndarray:
-    """Starts (count, N): the lens at the start, the first, and others by normal deviates of `spread`
-    times the scales of the variables, within their bounds."""
+    """Starts (count, N) about the lens: the first is its own vector, the others differ by normal
+    deviates of `spread` times the scales of the variables, within their bounds."""
     moves = np.random.default_rng(seed).normal(size=(count, len(variables.places)))
     moves[0] = 0
     return np.clip(np.asarray(variables.start) + spread * moves, variables.low, variables.high)
@@ -107,59 +108,66 @@ def many_starts(
     turns: Sequence[int] = (12, 12, 24, 48, 200),
     keep: float = 0.5,
     report: Callable[[int, int, float], None] = lambda done, total, best: None,
+    kept: tuple[int, Search] | None = None,
+    save: Callable[[int, Search], None] = lambda stage, searches: None,
     threads: int | None = None,
 ) -> Starts:
     """Search from many starts (K, N), with successive halving (Jamieson and Talwalkar 2016).
 
     turns: trials of every search in each stage. keep: the part that goes on to the next, at least
-    a tile of 16. report: called with the tiles done, all tiles, and the best merit so far. threads:
-    tiles at a time; None: one a core.
+    a tile of 16. report: called with the tiles done, all tiles, and the best merit so far. save:
+    called after each stage with its number from 1 and all searches, (K, ...); kept: what it was
+    called with last, to go on from there. threads: tiles at a time; None: one a core.
 
     A search that fails stays where it is and is ranked last. The result depends on neither threads
     nor tiles.
     """
     begun = time.perf_counter()
     vectors = np.asarray(starts, float)
-    if vectors.ndim != 2 or vectors.shape[1] != len(problem.variables.places):
-        width = len(problem.variables.places)
+    width = len(problem.variables.places)
+    if vectors.ndim != 2 or vectors.shape[1] != width or not len(vectors):
         raise ValueError(f"starts: expected (K, {width}), got shape {vectors.shape}")
-    count = len(vectors)
-    low, high = np.asarray(problem.variables.low), np.asarray(problem.variables.high)
-    fill = -count % _TILE
-    padded = np.concatenate([vectors, vectors[:1].repeat(fill, axis=0)])
-    searches = _begin(problem, jnp.asarray(np.clip(padded, low, high)))
-    alive = np.arange(count)
-    sizes = [count]
-    for _ in turns[1:]:
-        sizes.append(min(sizes[-1], max(_TILE, int(np.ceil(keep * sizes[-1])))))
-    tiles_in_all, done = sum(-(-size // _TILE) for size in sizes), 0
+    vectors = np.clip(vectors, problem.variables.low, problem.variables.high)
+    first, searches = kept or (0, _begin(problem, jnp.asarray(vectors)))
     state = jax.tree.map(np.array, searches)
+    sizes = [len(vectors)]
+    for _ in turns[1:]:
+        sizes.append(min(sizes[-1], max(_TILE, math.ceil(keep * sizes[-1]))))
+    alive, done = np.arange(len(vectors)), 0
+    for stage, size in enumerate(sizes):
+        # What is left behind does not move any more: the same order as when it was left.
+        alive = alive[np.argsort(score(_rows(state, alive)), kind="stable")[:size]]
+        tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
+        for _ in _advanced(problem, state, tiles, turns[stage] * (stage >= first), threads):
+            done += 1
+            total = sum(-(-size // _TILE) for size in sizes)
+            report(done, total, float(np.min(score(_rows(state, alive)))))
+        if stage >= first:
+            save(stage + 1, state)
+    trials, jacobians = (int(np.sum(a)) for a in (state.state.trials, state.state.jacobians))
+    minima = distinct(_rows(state, alive), alive)
+    seconds = time.perf_counter() - begun
+    return Starts(minima, score(state), trials, jacobians, trials * rays_of(problem), seconds)
+
+
+def _advanced(
+    problem: Problem, state: Search, tiles: list[np.ndarray], turns: int, threads: int | None
+) -> Iterator[None]:
+    """Advance tiles of searches, the rows of `state`, in place; yields after each."""
+
+    def run(rows: np.ndarray) -> None:
+        whole = np.resize(rows, _TILE)  # a tile that is not full repeats its rows
+        new = _advance(problem, jax.tree.map(jnp.asarray, _rows(state, whole)), jnp.int32(turns))
+        for old, array in zip(jax.tree.leaves(state), jax.tree.leaves(new), strict=True):
+            old[rows] = np.asarray(array)[: len(rows)]
+
+    if not turns:
+        return
+    run(tiles[0])  # compiled once, not by all threads
+    yield
     with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        for stage, (size, more) in enumerate(zip(sizes, turns)):
-            if stage:
-                alive = alive[np.argsort(score(_rows(state, alive)), kind="stable")[:size]]
-            tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
-
-            def run(rows: np.ndarray, more: int = more) -> tuple[np.ndarray, Search]:
-                whole = np.resize(rows, _TILE)  # a tile that is not full repeats its rows
-                return rows, _advance(problem, jax.tree.map(jnp.asarray, _rows(state, whole)), more)
-
-            for rows, new in pool.map(run, tiles):
-                jax.tree.map(
-                    lambda a, b, r=rows: a.__setitem__(r, np.asarray(b)[: len(r)]), state, new
-                )
-                done += 1
-                report(done, tiles_in_all, float(np.min(score(_rows(state, alive)))))
-    whole = _rows(state, np.arange(count))
-    trials, jacobians = (int(np.sum(a)) for a in (whole.state.trials, whole.state.jacobians))
-    return Starts(
-        distinct(_rows(state, alive), alive),
-        score(whole),
-        trials,
-        jacobians,
-        trials * rays_of(problem),
-        time.perf_counter() - begun,
-    )
+        for _ in pool.map(run, tiles[1:]):
+            yield
 
 
 def _rows(tree: Search, rows: np.ndarray) -> Search:
