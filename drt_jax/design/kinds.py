@@ -1,14 +1,18 @@
 """The kinds of numbers of a lens that may change, each an array over rows and terms."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import shown
+from ..lens.forms import FORMS
 from ..lens.lens import Lens
+from ..lens.surface import surface_sag
 
 
 class Kind(NamedTuple):
@@ -19,7 +23,7 @@ class Kind(NamedTuple):
     terms: how many numbers a row has.
     read, write: the array (rows, terms) of a lens, and a lens with another.
     step: by how much a typical design moves one, from a length h (mm) across the beam: (power of h,
-        factor), of coefficients from one term to the next h^-2 less.
+        factor); of coefficients, by how much that moves the surface at h.
     limits: between which its values mean anything.
     """
 
@@ -30,6 +34,16 @@ class Kind(NamedTuple):
     write: Callable[[Lens, Array], Lens]
     step: tuple[float, float]
     limits: tuple[float, float] = (-np.inf, np.inf)
+
+
+def whole_numbers(what: str, given: Any) -> tuple[int, ...]:
+    """Numbers of surfaces and the like as a tuple. ValueError, which begins with `what`, for what
+    they are not."""
+    wanted = given if isinstance(given, Iterable) and not isinstance(given, str) else [None]
+    found = tuple(wanted)
+    if all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in found):
+        return tuple(map(int, found))
+    raise ValueError(f"{what}: expected whole numbers from 0, such as (0, 2), got {shown(given)}")
 
 
 def back_distance(lens: Lens) -> Array:
@@ -46,10 +60,32 @@ def _live(lens: Lens) -> list[int]:
 
 
 def _model(lens: Lens) -> list[int]:
-    """Surfaces with a model glass behind them."""
-    model = lens.dispersion.model
-    known = [] if model is None else np.asarray(model)[:, 0].tolist()
-    return [i for i in range(lens.count) if known and known[i + 1] > 1]
+    """Surfaces behind which a model glass begins."""
+    model, media = lens.dispersion.model, lens.glasses
+    if model is None:
+        return []
+    known = np.asarray(model)[:, 0] > 1
+    return [i for i in range(lens.count) if known[i + 1] and media[i] != media[i + 1]]
+
+
+def _begins(lens: Lens) -> np.ndarray:
+    """Where the medium behind each surface begins (S,): a mirror, or a stop inside a glass, goes on
+    with the one in front."""
+    found: list[int] = []
+    for i in range(lens.count):
+        same = i > 0 and lens.glasses[i] == lens.glasses[i + 1]
+        found.append(found[-1] if same else i)
+    return np.array(found)
+
+
+def _finite(lens: Lens) -> list[int]:
+    """Surfaces with a clear aperture."""
+    return np.flatnonzero(np.isfinite(np.asarray(lens.semi_diameter)[:-1])).tolist()
+
+
+def _placed(lens: Lens) -> list[int]:
+    """All surfaces and the sensor."""
+    return list(range(lens.count + 1))
 
 
 def _leaf(name: str) -> tuple[Callable, Callable]:
@@ -91,7 +127,7 @@ def _glass(column: int) -> tuple[Callable, Callable]:
 
     def write(lens: Lens, array: Array) -> Lens:
         model: Any = lens.dispersion.model
-        model = model.at[1:, column].set(array[:, 0])
+        model = model.at[1:, column].set(array[_begins(lens), 0])
         return dataclasses.replace(
             lens, dispersion=dataclasses.replace(lens.dispersion, model=model)
         )
@@ -114,8 +150,8 @@ def _terms(lens: Lens) -> int:
 KINDS: dict[str, Kind] = {
     "curvature": Kind(_live, _all, _one, *_leaf("curvature"), (-1, 0.02)),
     "conic": Kind(_live, _all, _one, *_leaf("conic"), (0, 0.1)),
-    "coefficients": Kind(_live, _all, _terms, *_leaf("coefficients"), (-1, 0.01)),
-    "thickness": Kind(_gaps, _gaps, _one, *_leaf("thickness")[:1], _write_thickness, (1, 0.05)),
+    "coefficients": Kind(_live, _all, _terms, *_leaf("coefficients"), (1, 0.01)),
+    "thickness": Kind(_gaps, _gaps, _one, _leaf("thickness")[0], _write_thickness, (1, 0.05)),
     "sensor": Kind(
         lambda lens: [0],
         lambda lens: [0],
@@ -126,25 +162,10 @@ KINDS: dict[str, Kind] = {
     ),
     "index": Kind(_model, _model, _one, *_glass(0), (0, 0.02), (1.3, 2.2)),
     "abbe": Kind(_model, _model, _one, *_glass(1), (0, 2.0), (15, 100)),
-    "tilt": Kind(
-        _live, lambda lens: list(range(lens.count + 1)), lambda lens: 3, *_leaf("tilt"), (0, 1e-3)
-    ),
-    "decentre": Kind(
-        _live,
-        lambda lens: list(range(lens.count + 1)),
-        lambda lens: 2,
-        *_leaf("decentre"),
-        (1, 1e-3),
-    ),
+    "tilt": Kind(_live, _placed, lambda lens: 3, *_leaf("tilt"), (0, 1e-3)),
+    "decentre": Kind(_live, _placed, lambda lens: 2, *_leaf("decentre"), (1, 1e-3)),
     "semi_diameter": Kind(
-        lambda lens: [
-            i for i in range(lens.count) if np.isfinite(np.asarray(lens.semi_diameter)[i])
-        ],
-        _all,
-        _one,
-        *_leaf("semi_diameter"),
-        (1, 0.05),
-        (1e-6, np.inf),
+        _finite, _finite, _one, *_leaf("semi_diameter"), (1, 0.05), (1e-6, np.inf)
     ),
 }
 
@@ -154,9 +175,34 @@ def beam(lens: Lens) -> float:
     return float(np.asarray(lens.semi_diameter)[lens.stop])
 
 
-def step_of(lens: Lens, kind: str, term: int) -> float:
+def step_of(lens: Lens, kind: str, row: int, term: int) -> float:
     """By how much a typical design moves a number of a lens."""
     power, factor = KINDS[kind].step
-    if kind == "coefficients":
-        power -= 2 * term
-    return factor * beam(lens) ** power
+    step = factor * beam(lens) ** power
+    return step / _lift(lens, row, term) if kind == "coefficients" else step
+
+
+def _lift(lens: Lens, row: int, term: int) -> float:
+    """By how much a coefficient lifts a surface a beam's semi-diameter from its axis, mm a unit."""
+    shape = jax.tree.map(lambda a: a[..., row, None], lens.shape)
+    angle, dtype = np.pi * np.arange(8) / 8, lens.curvature.dtype
+    points = tuple(jnp.asarray(beam(lens) * f(angle), dtype) for f in (np.cos, np.sin))
+
+    def height(coefficients: Array) -> Array:
+        return surface_sag(points, shape._replace(coefficients=coefficients), lens.forms[row])
+
+    old = shape.coefficients
+    _, lifted = jax.jvp(height, (old,), (jnp.zeros_like(old).at[term].set(1),))
+    return float(jnp.max(jnp.abs(lifted))) or 1.0
+
+
+def word_terms(lens: Lens, kind: str, row: int) -> list[int]:
+    """The terms of a row that a word for all of a kind means: of coefficients not those that its
+    curvature stands for, r^2, nor the radius that others are counted in."""
+    count = KINDS[kind].terms(lens)
+    if kind != "coefficients":
+        return list(range(count))
+    form = FORMS[lens.forms[row]]
+    left_out = "norm_radius" if "norm_radius" in form.named else 2
+    labels = (*form.named, *form.powers)[:count]
+    return [term for term, label in enumerate(labels) if label != left_out]

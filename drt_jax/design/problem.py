@@ -15,8 +15,9 @@ from ..lens.paraxial import marginal_ray, paraxial_system
 from ..lens.scene import Scene, distance_array, field_array, vergence_of
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve_aimed
-from .operands import TRACED, Operand, gaps
-from .seen import EXTRAS, Seen, symmetry_by_structure
+from .gaps import gaps
+from .operands import TRACED, Operand
+from .seen import Seen, symmetry_by_structure
 from .variables import Variables
 
 # A ray that fails counts as one that misses by so many semi-diameters of the stop, and more.
@@ -105,19 +106,11 @@ class Problem:
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
             rule = Gauss(rule, symmetry if across else "disc")
-        counts = {
-            "fields": len(angles), "wavelengths": len(colours), "distances": len(far),
-            "surfaces": lens.count,
-        }  # fmt: skip
+        counts = {"fields": len(angles), "wavelengths": len(colours), "distances": len(far)}
         for operand in wanted:
-            for name, count in counts.items():
-                for k in getattr(operand, name):
-                    if not 0 <= k < count:
-                        raise ValueError(
-                            f"operands: {operand.kind}: {name}: no number {k}; there are 0 to "
-                            f"{count - 1}"
-                        )
-            if operand.kind == "magnification" and np.any(np.isinf(np.asarray(far))):
+            operand.check(lens, counts)
+            named = np.asarray(far)[np.array(operand.distances or range(len(far)))]
+            if operand.kind == "magnification" and np.any(np.isinf(named)):
                 raise ValueError("operands: magnification: the object is at infinity")
         share = jnp.asarray(weights / weights.sum(), dtype)
         return cls(variables, angles, far, colours, share, rule, wanted, solver)
@@ -159,15 +152,11 @@ class Problem:
         return Judged(residuals, excess, jax.lax.stop_gradient(broken))
 
     def _failures(self, seen: Seen) -> Array:
-        """A residual for each ray: 0 for one that passes, else its share of the light times a miss
-        of several beams."""
-        light = seen.rays.light[..., EXTRAS:] * self.colour_weights[:, None]
+        """A residual for each ray: 0 for one that passes, else the root of its share of the light
+        times a miss of several beams."""
         size = _FAILED * jax.lax.stop_gradient(seen.lens.semi_diameter[seen.lens.stop])
-        lacks = seen.lacks[..., EXTRAS:]
-        failed = ~seen.rays.whole[..., EXTRAS:] & (light > 0)
-        root = jnp.sqrt(jnp.where(failed, light, 1))
         weight = max((o.weight for o in self.operands if not o.limits), default=1.0)
-        return jnp.ravel(jnp.where(failed, weight * size * root * (1 + lacks), 0))
+        return jnp.ravel(weight * size * seen.failures)
 
     def merit(self, vector: Array) -> Array:
         """Sum () of the squares of the residuals; limits are not in it."""

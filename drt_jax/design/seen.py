@@ -11,12 +11,14 @@ from jax import Array
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import safe_divide
+from ..numerics import safe_divide, safe_sqrt
+from ..pupil.clipped import Clipped
 from ..pupil.rules import PupilRule, Symmetry
+from ..rays import fermat
 from ..rays.aim import beam_size, paraxial_launch
-from ..rays.fermat import geometry
+from ..rays.find import Found
 from ..rays.snell import lack
-from ..rays.solve import Solver
+from ..rays.solve import Solver, reattach
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, dot, system_of
 from ..rays.trace import Bundle, trace_bundle
@@ -39,12 +41,15 @@ class Rays:
     run through the rim of the stop; they carry no light.
 
     bundle: arrays with a first axis (V,).
+    points: D arrays (V, W, Q), where they cross the stop, in units of its semi-diameter.
     light: (V, W, Q), what part of the light of a colour each ray stands for: of those that are
-        clipped none, of those that fail as much as if they passed; adds up to 1, where there is any.
+        clipped none, of those that fail as much as if they passed; adds up to 1, where there is
+        any.
     passed: (V, W), the share of the light through the stop that is not clipped.
     """
 
     bundle: Bundle
+    points: Vector
     light: Array
     passed: Array
 
@@ -76,6 +81,12 @@ class Seen:
         colour_weights: Array,
         fields: int,
     ):
+        extra = lens.apertures
+        if extra is not None and any(extra.blocks) and isinstance(rule, Clipped):
+            raise ValueError(
+                "rule: Clipped subtracts the light inside of obscurations, which has no residuals; "
+                "take Gauss or Soft"
+            )
         self.lens, self.views, self.rule, self._solver = lens, views, rule, solver
         self.colour_weights, self.fields = colour_weights, fields
         self.distances = len(views.distance) // fields
@@ -84,7 +95,7 @@ class Seen:
     def rays(self) -> Rays:
         """The rays of all views, traced together."""
 
-        def one(field: Array, distance: Array) -> tuple[Bundle, Array, Array]:
+        def one(field: Array, distance: Array) -> tuple[Bundle, Vector, Array, Array]:
             scene = Scene(field, distance, self.views.wavelengths)
             points, weights = self._points(scene)
             bundle = trace_bundle(self.lens, scene, points, self._solver)
@@ -92,9 +103,14 @@ class Seen:
             light = weights * jnp.where(failed, 1, self.rule.transmission(self.lens, bundle))
             passed = jnp.sum(light, axis=-1)
             part = safe_divide(light, jnp.broadcast_to(passed[:, None], light.shape))
-            return bundle, part, passed
+            return bundle, points, part, passed
 
         return Rays(*jax.vmap(one)(self.views.field, self.views.distance))
+
+    @property
+    def share(self) -> Array:
+        """What part of the light of a view each ray stands for, (V, W, Q)."""
+        return self.rays.light * self.colour_weights[None, :, None]
 
     def _points(self, scene: Scene) -> tuple[Vector, Array]:
         """Where rays cross the stop, D arrays (W, Q) in units of its semi-diameter, and their
@@ -112,76 +128,95 @@ class Seen:
     def extents(self) -> Array:
         """How far from the axis the light meets each surface (S,), mm: its semi-diameter or, where
         that is inf, as far as the rays go."""
-        hits = self.rays.bundle.hits
-        whole = jnp.moveaxis(self.rays.whole[None], 0, 1)
-        squares = sum(h**2 for h in hits)
-        reach = jnp.sqrt(jnp.max(jnp.where(whole, squares, 0), axis=(0, 2, 3)) + 1e-30)
+        whole = self.rays.whole[:, None]
+        squares = sum((h**2 for h in self.rays.bundle.hits), jnp.zeros(()))
+        reach = safe_sqrt(jnp.max(jnp.where(whole, squares, 0), axis=(0, 2, 3)))
         semi = self.lens.semi_diameter
         return jnp.where(jnp.isfinite(semi), semi, reach)[:-1]
+
+    @functools.cached_property
+    def failures(self) -> Array:
+        """By how much each ray (V, W, Q) spoils a merit, as a residual: 0 for one that passes, else
+        the root of the light it stands for times 1 and what it lacks, see `snell.lack`. A chief ray
+        that fails stands for all light of its colour; where all light is clipped, inf."""
+        chief = np.arange(self.rays.light.shape[-1]) == 0
+        light = jnp.where(chief[None, None], self.colour_weights[None, :, None], self.share)
+        failed = ~self.rays.whole & (light > 0)
+        root = jnp.sqrt(jnp.where(failed, light, 1))
+        dark = self.rays.passed[..., None] == 0
+        return jnp.where(dark, jnp.inf, jnp.where(failed, root * (1 + self.lacks), 0))
 
     @functools.cached_property
     def lacks(self) -> Array:
         """By how much each ray fails (V, W, Q): 0 for one that passes, see `snell.lack`."""
         failed = ~self.rays.whole
 
-        def of_view(field: Array, distance: Array) -> Array:
+        def of_view(field: Array, distance: Array, points: Vector) -> Array:
             scene = Scene(field, distance, self.views.wavelengths)
-            points, _ = self._points(scene)
             system = system_of(self.lens, scene, len(points))
             radius = self.lens.semi_diameter[self.lens.stop]
             target = tuple(radius * p for p in points)
-            launch = paraxial_launch(system, target, beam_size(system, target)[1])
-            # Light of another index for each colour, each traced by itself.
-            return lack(system, launch)
+            return lack(system, paraxial_launch(system, target, beam_size(system, target)[1]))
 
         def of_all(_: None) -> Array:
-            return jax.vmap(of_view)(self.views.field, self.views.distance)
+            return jax.vmap(of_view)(self.views.field, self.views.distance, self.rays.points)
 
-        found = jax.lax.cond(jnp.any(failed), of_all, lambda _: jnp.zeros(failed.shape), None)
+        none = jnp.zeros_like(self.rays.light)
+        found = jax.lax.cond(jnp.any(failed), of_all, lambda _: none, None)
         return jnp.where(failed, found, 0)
 
     @functools.cached_property
     def cosines(self) -> Array:
-        """Least cosine (L,) of the angles at which light falls on the live surfaces."""
+        """Cosines (V, L, W, Q) of the angles at which rays fall on the live surfaces; 1 for rays
+        that fail."""
         rows = np.array([*self.lens.live, self.lens.count])
 
         def one(field: Array, distance: Array, hits: Vector, whole: Array) -> Array:
             scene = Scene(field, distance, self.views.wavelengths)
             system = system_of(self.lens, scene, len(hits))
-            path = geometry(tuple(h[rows] for h in hits), system)
+            path = fermat.geometry(tuple(h[rows] for h in hits), system)
             normal = *(-s for s in path.slope), jnp.ones_like(path.slope[0])
             cosine = jnp.abs(dot(normal, path.before)) / jnp.sqrt(dot(normal, normal))
-            return jnp.min(jnp.where(whole, cosine, 1)[:-1], axis=(1, 2))
+            return jnp.where(whole[None], cosine, 1)[:-1]
 
         rays = self.rays
         views = self.views.field, self.views.distance, rays.bundle.hits, rays.whole
-        return jnp.min(jax.vmap(one)(*views), axis=0)
+        return jax.vmap(one)(*views)
 
     @functools.cached_property
     def illumination(self) -> Array:
-        """Light on the sensor (V,) of the middle colour relative to that of the first field: the
-        area of the directions it arrives from, each times its cosine with the axis (Slater's
-        projected solid angle; clipped light counts for nothing)."""
-        middle = self.views.wavelengths.shape[0] // 2
-        colour = self.views.wavelengths[middle : middle + 1]
+        """Light on the sensor (V,) of the middle colour relative to that of the first field at the
+        same distance: the area of the directions it arrives from, each times its cosine with the
+        axis of the sensor (Slater's projected solid angle; clipped light counts for nothing)."""
+        lens, rays = self.lens, self.rays
+        rows, middle = np.array([*lens.live, lens.count]), self.views.wavelengths.shape[0] // 2
+        colour = slice(middle, middle + 1)
 
-        def one(field: Array, distance: Array) -> Array:
-            scene = Scene(field, distance, colour)
-            points, weights = self.rule.points(self.lens, scene)
-            points = tuple(jnp.broadcast_to(p, (1, p.shape[-1])) for p in points)
+        def one(field: Array, distance: Array, bundle: Bundle, points: Vector) -> Array:
+            """How directions spread over the stop, (1, Q), by the derivatives of known rays."""
+            scene = Scene(field, distance, self.views.wavelengths[colour])
+            hits = jax.lax.stop_gradient(tuple(h[rows, colour] for h in bundle.hits))
+            arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
+            status = jnp.where(bundle.status == Status.CLIPPED, Status.OK, bundle.status)[colour]
+            known = functools.partial(
+                reattach, Found(hits, arrival, status.astype(jnp.int32), bundle.steps)
+            )
 
-            def directions(points: Vector) -> tuple[Vector, Bundle]:
-                bundle = trace_bundle(self.lens, scene, points, self._solver)
-                return bundle.arrival[:-1], bundle
+            def directions(points: Vector) -> Vector:
+                return trace_bundle(lens, scene, points, known).arrival[:-1]
 
-            columns = []
-            for k in range(len(points)):
-                unit = tuple(jnp.full_like(p, float(k == j)) for j, p in enumerate(points))
-                _, column, bundle = jax.jvp(directions, (points,), (unit,), has_aux=True)
-                columns.append(column)
-            area = columns[0][0] ** 2 if len(points) == 1 else determinant(columns)
-            light = weights * self.rule.transmission(self.lens, bundle)
-            return jnp.sum(light * jnp.abs(area))
+            points = tuple(p[colour] for p in points)
+            arriving, push = jax.linearize(directions, points)
+            units = np.eye(len(points))
+            columns = [
+                push(tuple(jnp.full_like(p, u) for p, u in zip(points, unit))) for unit in units
+            ]
+            if len(points) == 1:  # turned about the axis
+                return columns[0][0] * safe_divide(arriving[0], points[0])
+            return determinant(columns)
 
-        areas = jax.vmap(one)(self.views.field, self.views.distance)
-        return safe_divide(areas, jnp.broadcast_to(areas[:1], areas.shape))
+        areas = jax.vmap(one)(self.views.field, self.views.distance, rays.bundle, rays.points)
+        light = rays.light[:, colour] * rays.passed[:, colour, None]
+        light = jnp.where(rays.whole[:, colour], light, 0)
+        total = jnp.sum(light * jnp.abs(areas), axis=(1, 2)).reshape(self.distances, self.fields)
+        return jnp.ravel(safe_divide(total, jnp.broadcast_to(total[:, :1], total.shape)))

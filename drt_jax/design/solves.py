@@ -2,24 +2,28 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..image.moments import moments
+from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil, marginal_ray, paraxial_system, trace_ray
 from ..lens.scene import scene_of, vergence_of
 from ..numerics import safe_divide
 from ..pupil.rules import Gauss
+from ..rays.solve import solve_aimed
 from .kinds import KINDS, back_distance
 from .seen import symmetry_by_structure
 
+# In the order in which they are applied: none moves what one before it keeps, see `held`.
 _Name = Literal[
-    "focal_length", "image_angle", "paraxial_focus", "best_focus", "entrance_pupil", "f_number"
+    "focal_length", "entrance_pupil", "f_number", "image_angle", "paraxial_focus", "best_focus"
 ]
 # Newton steps: every condition is linear in the number that meets it, the second mends rounding.
 _STEPS = 2
@@ -32,14 +36,16 @@ class Solve:
     """A condition and the number that is given up for it.
 
     kind: "focal_length" in mm, or "image_angle", the paraxial slope of the marginal ray behind the
-        lens: the curvature of `surface` follows. "paraxial_focus", or "best_focus" where the spots
-        of `fields` are smallest (the root of their mean square): the distance of the sensor behind
-        the last vertex follows. "entrance_pupil", its diameter in mm, or "f_number": the
+        lens, negative where light converges: the curvature of `surface` follows. "paraxial_focus",
+        or "best_focus" where the spots of `fields`, each colour about its own centroid, are
+        smallest (the root of their mean square): the distance of the sensor behind the last vertex
+        follows. "entrance_pupil", its diameter in mm, or "f_number", the working one: the
         semi-diameter of the stop follows.
     value: to keep; 0: that of the lens at the start; of a focus, mm from there to the sensor.
     surface: whose curvature follows.
     fields: of the best focus, radians along y.
-    distance: to the object, mm; wavelengths: um, whose mean counts.
+    distance: to the object, mm; of a focus, image_angle and f_number.
+    wavelengths: um; a condition is one of their mean.
     """
 
     kind: _Name
@@ -52,14 +58,29 @@ class Solve:
     def __post_init__(self) -> None:
         if self.kind not in get_args(_Name):
             known = ", ".join(get_args(_Name))
-            raise ValueError(f"solves: unknown {self.kind!r}; known: {known}")
+            raise ValueError(f"solves: unknown kind {shown(self.kind)}; known: {known}")
         if not math.isfinite(self.value):
             raise ValueError(f"solves: {self.kind}: value: must be finite, got {self.value:g}")
+        if self.aperture and self.value < 0:
+            raise ValueError(
+                f"solves: {self.kind}: value: must be above 0, or 0 to keep that of the start, "
+                f"got {self.value:g}"
+            )
+        for name in ("fields", "wavelengths"):
+            numbers = tuple(float(number) for number in np.ravel(getattr(self, name)))
+            if not numbers:
+                raise ValueError(f"solves: {self.kind}: {name}: none; give one or leave it out")
+            object.__setattr__(self, name, numbers)
 
     @property
     def focuses(self) -> bool:
         """Whether the sensor follows."""
         return self.kind in ("paraxial_focus", "best_focus")
+
+    @property
+    def aperture(self) -> bool:
+        """Whether the stop follows."""
+        return self.kind in ("entrance_pupil", "f_number")
 
     def place(self, lens: Lens) -> tuple[str, int, int]:
         """Kind, row and term of the number that follows.
@@ -68,13 +89,13 @@ class Solve:
         """
         if self.focuses:
             return "sensor", 0, 0
-        if self.kind in ("entrance_pupil", "f_number"):
+        if self.aperture:
             return "semi_diameter", lens.stop, 0
         live = ", ".join(map(str, lens.live))
         if self.surface not in lens.live:
             raise ValueError(
                 f"solves: {self.kind}: its curvature follows: give surface, one of {live}; "
-                f"got {self.surface}"
+                f"got {shown(self.surface)}"
             )
         if self.kind == "image_angle" and self.surface < lens.stop:
             raise ValueError(
@@ -86,8 +107,13 @@ class Solve:
     def found(self, lens: Lens) -> "Solve":
         """The solve with the value that it keeps. ValueError where that is none, or where the
         number that follows does not change it."""
-        self.place(lens)
+        kind, row, _ = self.place(lens)
         if self.focuses:
+            if not float(_focus(lens, self)[1]) > 0:
+                raise ValueError(
+                    f"solves: {self.kind}: there is none: the light behind the lens is parallel, "
+                    "or none arrives; leave it out, or begin with another lens"
+                )
             return self
         condition, solve = _CONDITIONS[self.kind], self
         if self.value == 0:
@@ -96,32 +122,61 @@ class Solve:
                 raise ValueError(f"solves: {self.kind}: the lens has none to keep; give its value")
             solve = dataclasses.replace(self, value=now)
         missed = float(condition.measure(solve.apply(lens), solve)) / condition.value(solve.value)
-        if not abs(missed - 1) < _HELD:
-            kind, row, _ = self.place(lens)
+        if not abs(missed - 1) < _HELD or not float(jnp.abs(solve.rate(lens, solve))) > 0:
             raise ValueError(
                 f"solves: {self.kind}: no {kind} of surface {row} gives {solve.value:g}; "
                 "is the beam in focus there? give another surface"
             )
         return solve
 
+    def rate(self, lens: Lens, other: "Solve") -> Array:
+        """By how much what this one keeps changes with the number that follows from another."""
+        number, with_number = _number(lens, other)
+        measure = _CONDITIONS[self.kind].measure
+        one = jnp.ones_like(number)
+        return jax.jvp(lambda n: measure(with_number(n), self), (number,), (one,))[1]
+
     def apply(self, lens: Lens) -> Lens:
         """The lens with the number that meets the condition; unchanged where none does."""
+        number, with_number = _number(lens, self)
         if self.focuses:
-            return _focused(lens, self)
-        kind, row, term = self.place(lens)
+            return with_number(_focus(lens, self)[0])
         condition = _CONDITIONS[self.kind]
-
-        def with_number(number: Array) -> Lens:
-            return KINDS[kind].write(lens, KINDS[kind].read(lens).at[row, term].set(number))
 
         def gap(number: Array) -> Array:
             return condition.measure(with_number(number), self) - condition.value(self.value)
 
-        number = KINDS[kind].read(lens)[row, term]
         for _ in range(_STEPS):
             miss, rate = jax.jvp(gap, (number,), (jnp.ones_like(number),))
             number = number - safe_divide(miss, rate)
         return with_number(number)
+
+
+def held(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], Lens]:
+    """The solves with what they keep, in the order in which all hold, and the lens of which they
+    do. ValueError as of `Solve.found`, and where one changes what another keeps."""
+    found: list[Solve] = []
+    for solve in sorted(solves, key=lambda solve: get_args(_Name).index(solve.kind)):
+        for other in found:
+            if float(other.rate(lens, solve)) != 0:
+                raise ValueError(
+                    f"solves: {other.kind} and {solve.kind}: the second changes what the first "
+                    "keeps; leave one out"
+                )
+        found.append(solve.found(lens))
+        lens = found[-1].apply(lens)
+    return tuple(found), lens
+
+
+def _number(lens: Lens, solve: Solve) -> tuple[Array, Callable[[Array], Lens]]:
+    """The number () that follows, and the lens with another."""
+    kind, row, term = solve.place(lens)
+    array = KINDS[kind].read(lens)
+
+    def with_number(number: Array) -> Lens:
+        return KINDS[kind].write(lens, array.at[row, term].set(number))
+
+    return array[row, term], with_number
 
 
 class _Condition(NamedTuple):
@@ -134,19 +189,21 @@ class _Condition(NamedTuple):
 
 def _power(lens: Lens, solve: Solve) -> Array:
     """1 / focal length."""
-    ray = trace_ray(paraxial_system(lens, solve.wavelengths), 1.0, 0.0)
+    ray = trace_ray(paraxial_system(lens, np.array(solve.wavelengths)), 1.0, 0.0)
     return -jnp.mean(ray.behind[-1])
 
 
 def _slope(lens: Lens, solve: Solve) -> Array:
     """Of the marginal ray behind the lens."""
     vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
-    return jnp.mean(marginal_ray(paraxial_system(lens, solve.wavelengths), vergence).behind[-1])
+    return jnp.mean(
+        marginal_ray(paraxial_system(lens, np.array(solve.wavelengths)), vergence).behind[-1]
+    )
 
 
 def _pupil(lens: Lens, solve: Solve) -> Array:
     """Diameter of the entrance pupil."""
-    return 2 * jnp.mean(entrance_pupil(lens, solve.wavelengths).semi_diameter)
+    return 2 * jnp.mean(entrance_pupil(lens, np.array(solve.wavelengths)).semi_diameter)
 
 
 def _inverse(value: float) -> float:
@@ -165,19 +222,20 @@ _CONDITIONS = {
 }
 
 
-def _focused(lens: Lens, solve: Solve) -> Lens:
-    """The sensor `solve.value` mm behind the focus."""
+def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
+    """The distance () from the last vertex to `solve.value` mm behind the focus, mm, and how
+    sharply it is told, 0 where there is no focus."""
+    waves = np.array(solve.wavelengths)
     if solve.kind == "paraxial_focus":
         vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
-        ray = trace_ray(paraxial_system(lens, solve.wavelengths), 1.0, vergence)
+        ray = trace_ray(paraxial_system(lens, waves), 1.0, vergence)
         back = jnp.mean(safe_divide(-ray.height[-1], ray.behind[-1]))
-        return KINDS["sensor"].write(lens, (back + solve.value)[None, None])
-    linear, square = [], []
+        return back + solve.value, jnp.min(jnp.abs(ray.behind[-1]))
+    spreads = []
     for field in solve.fields:
-        scene = scene_of(lens, field, solve.distance, solve.wavelengths)
+        scene = scene_of(lens, field, solve.distance, waves)
         rule = Gauss(_ORDER, symmetry_by_structure(lens, field == 0))
-        spread = jnp.sum(moments(lens, scene, rule).spread[..., :2], axis=-1)
-        linear.append(jnp.mean(spread[1]))
-        square.append(jnp.mean(spread[2]))
-    shift = -safe_divide(sum(linear), 2 * sum(square))
-    return KINDS["sensor"].write(lens, (back_distance(lens) + shift + solve.value)[None, None])
+        spread = moments(lens, scene, rule, solve_aimed).spread
+        spreads.append(jnp.mean(jnp.sum(spread[..., :2], axis=-1), axis=-1))
+    _, linear, square = jnp.mean(jnp.stack(spreads), axis=0)
+    return back_distance(lens) - safe_divide(linear, 2 * square) + solve.value, square

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple, get_args
 
 import jax
@@ -10,13 +10,58 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import shown
 from ..lens.lens import Lens
-from .kinds import KINDS, step_of
-from .solves import Solve
+from .kinds import KINDS, step_of, whole_numbers, word_terms
+from .solves import Solve, held
 
 _How = Literal["equal", "opposite", "cemented"]
 # What neighbours that are cemented share.
 _SHAPE = ("curvature", "conic", "coefficients")
+_NONE = {
+    "coefficients": "the lens has none; write them into its prescription, zeros too",
+    "thickness": "the lens has one surface; its distance to the sensor is the kind sensor",
+    "index": "the lens has no model glass; write nd and vd into its prescription",
+    "abbe": "the lens has no model glass; write nd and vd into its prescription",
+}
+
+
+class Place(NamedTuple):
+    """One number of a lens."""
+
+    kind: str
+    row: int
+    term: int
+
+    def __str__(self) -> str:
+        term = f"[{self.term}]" if self.kind in ("coefficients", "tilt", "decentre") else ""
+        return self.kind if self.kind == "sensor" else f"{self.kind} {self.row}{term}"
+
+
+def _known_kind(what: str, kind: str) -> None:
+    if kind not in KINDS:
+        raise ValueError(f"{what}: unknown kind {shown(kind)}; known: {', '.join(KINDS)}")
+
+
+def _places(
+    what: str, lens: Lens, kind: str, surfaces: tuple[int, ...], terms: tuple[int, ...] = ()
+) -> list[Place]:
+    """Numbers of a kind. ValueError, which begins with `what` and lists those that exist, for one
+    that does not."""
+    known = KINDS[kind]
+    allowed, count = known.allowed(lens), known.terms(lens)
+    if not allowed or not count:
+        raise ValueError(f"{what}: {kind}: {_NONE.get(kind, 'the lens has none')}")
+    for name, given, there in (("surface", surfaces, allowed), ("term", terms, range(count))):
+        for number in given:
+            if number not in there:
+                some = ", ".join(map(str, there))
+                raise ValueError(f"{what}: {kind}: no {name} {number}; there are {some}")
+    return [
+        Place(kind, row, term)
+        for row in surfaces or known.rows(lens)
+        for term in terms or word_terms(lens, kind, row)
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,11 +70,11 @@ class Vary:
 
     kind: "curvature", "conic", "coefficients", "thickness" (behind a surface; the sensor keeps its
         distance from the last vertex), "sensor" (behind the last vertex), "index" and "abbe" of the
-        model glass behind a surface, "tilt", "decentre", "semi_diameter".
+        model glass that begins behind a surface, "tilt", "decentre", "semi_diameter".
     surfaces: which, from 0; empty: all that have one (curvature, conic, coefficients, tilt,
         decentre: those that bend light; semi_diameter: those that are finite).
-    terms: of coefficients, and the components of a tilt or decentre, from 0; empty: all (of an
-        asphere all but that of r^2, which is its curvature).
+    terms: of coefficients, and the components of a tilt or decentre, from 0; empty: all (but not
+        the coefficient of r^2, which the curvature stands for, nor a norm radius).
     low, high: bounds in the units of the lens.
     scale: a typical change; 0: chosen by the kind and the stop's semi-diameter.
     """
@@ -42,51 +87,33 @@ class Vary:
     scale: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"variables: unknown kind {self.kind!r}; known: {', '.join(KINDS)}")
-        low, high = KINDS[self.kind].limits
-        object.__setattr__(self, "low", max(self.low, low))
-        object.__setattr__(self, "high", min(self.high, high))
+        _known_kind("variables", self.kind)
+        for name in ("surfaces", "terms"):
+            numbers = whole_numbers(f"variables: {self.kind}: {name}", getattr(self, name))
+            object.__setattr__(self, name, numbers)
         if not self.low < self.high:
             raise ValueError(
-                f"variables: {self.kind}: low {self.low:g} is not below high {self.high:g}; within "
-                f"{low:g} and {high:g}, exchange them"
+                f"variables: {self.kind}: low {self.low:g} is not below high {self.high:g}; "
+                "exchange them"
             )
+        low, high = KINDS[self.kind].limits
+        if not max(self.low, low) < min(self.high, high):
+            raise ValueError(
+                f"variables: {self.kind}: {self.low:g} to {self.high:g} lies outside of {low:g} "
+                f"to {high:g}; widen it"
+            )
+        object.__setattr__(self, "low", max(self.low, low))
+        object.__setattr__(self, "high", min(self.high, high))
         if not 0 <= self.scale < np.inf:
-            raise ValueError(f"variables: {self.kind}: scale: must be above 0, got {self.scale:g}")
+            raise ValueError(
+                f"variables: {self.kind}: scale: must be above 0, or 0 to have it chosen, "
+                f"got {self.scale:g}"
+            )
 
-    def places(self, lens: Lens) -> "list[Place]":
+    def places(self, lens: Lens) -> list[Place]:
         """The numbers it stands for. ValueError, listing those that exist, for one that does
         not."""
-        kind = KINDS[self.kind]
-        allowed, count = kind.allowed(lens), kind.terms(lens)
-        if not allowed or not count:
-            raise ValueError(f"variables: {self.kind}: {_NONE.get(self.kind, 'the lens has none')}")
-        for what, given, known in (
-            ("surface", self.surfaces, allowed),
-            ("term", self.terms, range(count)),
-        ):
-            for number in given:
-                if number not in known:
-                    some = ", ".join(map(str, known))
-                    raise ValueError(
-                        f"variables: {self.kind}: no {what} {number}; there are {some}"
-                    )
-        return [
-            Place(self.kind, row, term)
-            for row in self.surfaces or kind.rows(lens)
-            for term in self.terms or range(self._first(lens, row), count)
-        ]
-
-    def _first(self, lens: Lens, row: int) -> int:
-        return int(self.kind == "coefficients" and lens.forms[row] == "asphere")
-
-
-_NONE = {
-    "coefficients": "the lens has none; write them into its prescription, zeros too",
-    "index": "the lens has no model glass; write nd and vd into its prescription",
-    "abbe": "the lens has no model glass; write nd and vd into its prescription",
-}
+        return _places("variables", lens, self.kind, self.surfaces, self.terms)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,37 +131,41 @@ class Tie:
 
     def __post_init__(self) -> None:
         if self.how not in get_args(_How):
-            raise ValueError(f"ties: unknown {self.how!r}; known: {', '.join(get_args(_How))}")
-        if len(set(self.surfaces)) < 2 or len(set(self.surfaces)) < len(self.surfaces):
-            raise ValueError(f"ties: expected two or more different surfaces, got {self.surfaces}")
-        if self.how == "cemented" and (
-            len(self.surfaces) != 2 or abs(self.surfaces[0] - self.surfaces[1]) != 1
-        ):
-            raise ValueError(f"ties: cemented: expected two neighbours, got {self.surfaces}")
+            known = ", ".join(get_args(_How))
+            raise ValueError(f"ties: unknown how {shown(self.how)}; known: {known}")
+        _known_kind("ties", self.kind)
+        numbers = whole_numbers("ties: surfaces", self.surfaces)
+        object.__setattr__(self, "surfaces", numbers)
+        if len(numbers) < 2 or len(set(numbers)) < len(numbers):
+            raise ValueError(f"ties: expected two or more different surfaces, got {numbers}")
+        if self.how == "cemented" and (len(numbers) != 2 or abs(numbers[0] - numbers[1]) != 1):
+            raise ValueError(f"ties: cemented: expected two neighbours, got {numbers}")
 
-    def pairs(self, lens: Lens) -> "list[tuple[Place, Place]]":
-        """Leaders and followers."""
+    @property
+    def sign(self) -> float:
+        """Of a follower, relative to its leader."""
+        return -1.0 if self.how == "opposite" else 1.0
+
+    def pairs(self, lens: Lens) -> list[tuple[Place, Place]]:
+        """Leaders and followers. ValueError as of `Vary.places`."""
         first, *others = self.surfaces
-        kinds = _SHAPE if self.how == "cemented" else (self.kind,)
+        kinds: tuple[str, ...] = (self.kind,)
+        if self.how == "cemented":
+            kinds = tuple(kind for kind in _SHAPE if KINDS[kind].terms(lens))
+            if lens.forms[first] != lens.forms[others[0]]:
+                raise ValueError(
+                    f"ties: cemented: surfaces {first} and {others[0]} are of the forms "
+                    f"{lens.forms[first]} and {lens.forms[others[0]]}; write both alike"
+                )
+        terms = {kind: tuple(range(KINDS[kind].terms(lens))) for kind in kinds}
+        rows = {kind: _places("ties", lens, kind, self.surfaces, terms[kind]) for kind in kinds}
         return [
-            (Place(kind, first, term), Place(kind, other, term))
-            for kind in kinds
-            if kind not in _SHAPE or KINDS[kind].terms(lens)
-            for other in others
-            for term in {p.term for p in Vary(kind, (first, other)).places(lens)}
+            (leader, follower)
+            for places in rows.values()
+            for leader in places
+            for follower in places
+            if leader.row == first and follower.row != first and leader.term == follower.term
         ]
-
-
-class Place(NamedTuple):
-    """One number of a lens."""
-
-    kind: str
-    row: int
-    term: int
-
-    def __str__(self) -> str:
-        term = f"[{self.term}]" if self.kind in ("coefficients", "tilt", "decentre") else ""
-        return self.kind if self.kind == "sensor" else f"{self.kind} {self.row}{term}"
 
 
 @jax.tree_util.register_dataclass
@@ -177,13 +208,18 @@ class Variables:
         """
         wanted = [Vary(v) if isinstance(v, str) else v for v in vary]
         found = [(place, v) for v in wanted for place in v.places(lens)]
-        following = [(p, f, t) for t in ties for p, f in t.pairs(lens)]
-        followers = [f for _, f, _ in following]
-        solved = [solve.place(lens) for solve in solves]
-        _refuse_twice("solves", [Place(*place) for place in solved], "is what two solves change")
-        _refuse_twice("ties", followers, "follows twice")
+        following = [(p, f, t.sign) for t in ties for p, f in t.pairs(lens)]
+        solved = [Place(*solve.place(lens)) for solve in solves]
+        taken = {*(f for _, f, _ in following), *solved}
+        _refuse_twice("solves", solved, "is what two of them change")
+        _refuse_twice("ties", [f for _, f, _ in following] + solved, "follows twice")
+        for leader, follower, _ in following:
+            if leader in taken:
+                raise ValueError(
+                    f"ties: {leader}, which {follower} follows, itself follows from a tie or a "
+                    "solve; begin with another surface"
+                )
         # A word for all of a kind leaves out what is tied or solved; a number that is named stays.
-        taken = {*followers, *(Place(*place) for place in solved)}
         for place, v in found:
             if place in taken and v.surfaces:
                 raise ValueError(
@@ -199,23 +235,19 @@ class Variables:
                 f"solves: {len(solves)} of them, but {len(found)} variables; leave some out"
             )
         index = {place: k for k, (place, _) in enumerate(found)}
-        for leader, _, tie in following:
-            if leader not in index:
-                raise ValueError(f"ties: {leader} is no variable; add it, or lead with another")
-        lens = _with_arrays(lens, {place.kind for place, _ in found})
+        # What follows a number that does not change stays as that is.
+        fixed = [(f, sign * _number(lens, p)) for p, f, sign in following if p not in index]
+        lens = _with_numbers(_with_arrays(lens, {place.kind for place, _ in found}), fixed)
         dtype = lens.curvature.dtype
-        scale = np.array([v.scale or step_of(lens, *place[::2]) for place, v in found])
+        scale = np.array([v.scale or step_of(lens, *place) for place, v in found])
         bounds = (np.array([getattr(v, side) for _, v in found]) for side in ("low", "high"))
         low, high = (jnp.asarray(bound / scale, dtype) for bound in bounds)
-        tied = tuple((index[p], f, -1.0 if t.how == "opposite" else 1.0) for p, f, t in following)
+        tied = tuple((index[p], f, sign) for p, f, sign in following if p in index)
         places = tuple(place for place, _ in found)
         made = cls(lens, low, high, jnp.asarray(scale, dtype), places, tied)
-        start = made.lens_of(jnp.clip(made.vector(lens), low, high))
-        held = []
-        for solve in solves:
-            held.append(solve.found(start))
-            start = held[-1].apply(start)
-        return dataclasses.replace(made, lens=start, solves=tuple(held))
+        start = made.lens_of(made.start)
+        kept, start = held(start, solves)
+        return dataclasses.replace(made, lens=start, solves=kept)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -229,35 +261,41 @@ class Variables:
 
     def vector(self, lens: Lens) -> Array:
         """The vector (N,) of a lens."""
-        numbers = [KINDS[p.kind].read(lens)[p.row, p.term] for p in self.places]
-        return jnp.stack(numbers) / self.scale
+        return jnp.stack([_number(lens, place) for place in self.places]) / self.scale
 
     def numbers(self, vector: Array) -> Array:
-        """The numbers (N,), in the units of the lens."""
+        """The numbers (N,) of a vector (N,), in the units of the lens."""
         return vector * self.scale
 
     def lens_of(self, vector: Array) -> Lens:
         """The lens of a vector (N,), its ties and solves kept. Differentiable, in `jit` and `vmap`
-        too; bounds are whoever's who makes the vector."""
-        numbers = vector * self.scale
-        tied = [(place, numbers[k] * sign) for k, place, sign in self.ties]
-        changes = [*((place, numbers[k]) for k, place in enumerate(self.places)), *tied]
-        lens = self.lens
-        # Thicknesses before the sensor, which is told from the last vertex.
-        for kind in KINDS:
-            own = [(place, number) for place, number in changes if place.kind == kind]
-            if own:
-                rows = np.array([place.row for place, _ in own])
-                terms = np.array([place.term for place, _ in own])
-                array = KINDS[kind].read(lens)
-                array = array.at[rows, terms].set(jnp.stack([number for _, number in own]))
-                lens = KINDS[kind].write(lens, array)
+        too; whoever makes the vector keeps its bounds."""
+        numbers = self.numbers(vector)
+        changes = [(place, numbers[k]) for k, place in enumerate(self.places)]
+        changes += [(place, sign * numbers[k]) for k, place, sign in self.ties]
+        lens = _with_numbers(self.lens, changes)
         for solve in self.solves:
             lens = solve.apply(lens)
         return lens
 
 
-def _refuse_twice(what: str, places: Sequence[Place], said: str) -> None:
+def _number(lens: Lens, place: Place) -> Array:
+    return KINDS[place.kind].read(lens)[place.row, place.term]
+
+
+def _with_numbers(lens: Lens, changes: Sequence[tuple[Place, Array]]) -> Lens:
+    """The lens with other numbers; thicknesses before the sensor, which is told from the last
+    vertex."""
+    for name, kind in KINDS.items():
+        own = [(place, number) for place, number in changes if place.kind == name]
+        if own:
+            rows, terms = (np.array([place[k] for place, _ in own]) for k in (1, 2))
+            numbers = jnp.stack([number for _, number in own])
+            lens = kind.write(lens, kind.read(lens).at[rows, terms].set(numbers))
+    return lens
+
+
+def _refuse_twice(what: str, places: Iterable[Place], said: str) -> None:
     for place, group in itertools.groupby(sorted(places)):
         if len(list(group)) > 1:
             raise ValueError(f"{what}: {place} {said}; leave one out")

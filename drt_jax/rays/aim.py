@@ -18,7 +18,7 @@ from jax import Array
 from ..lens.forms import Shape
 from ..lens.paraxial import trace_yu
 from ..lens.surface import vertex_curvature
-from ..numerics import safe_divide
+from ..numerics import safe_divide, safe_sqrt
 from .snell import apart, shoot, shoot_to_stop
 from .status import Status
 from .system import System, Vector, determinant, divide, dot
@@ -216,7 +216,7 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
     # The light at z = `first`, brought to the vertex plane of the first row.
     depth, near = rows.vertex[0] - first, 1 / (v * first + 1)
     launch = [a + depth * near * (v * a - s) for a, s in zip(launch, system.source, strict=False)]
-    far = jnp.sqrt(dot(launch, launch))
+    far = safe_sqrt(dot(launch, launch))
     shrink = jnp.minimum(1, 4 * width / jnp.maximum(far, width))
     return tuple(a * shrink for a in launch)
 

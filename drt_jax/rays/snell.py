@@ -298,12 +298,14 @@ def _follow(
         meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
         own, normal, met, length = meet(p, d, row.surface.shape, state.fate == Status.OK)
         bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
+        crosses = met
         met = met & (~row.live | ((front > 0) & ((length > 0) | row.first)))
         passes = (through > 0) | ~row.bends
         here = jnp.where(met, jnp.where(passes, Status.OK, Status.TIR), Status.MISSED)
         fate = jnp.where(state.fate == Status.OK, here.astype(jnp.int32), state.fate)
         hit, before = own[:-1], state.hit
         wide = jnp.sqrt(jnp.maximum(dot(hit, hit), dot(before, before)))
+        wide = jax.lax.stop_gradient(wide)  # its root has no derivative on the axis
         shake = jnp.where(fate == Status.OK, safe_divide(wide, jnp.where(row.first, 0, length)), 0)
         origin = row.surface.origin(len(hit))
         point = tuple(a + o for a, o in zip(turn(row.surface.rotation, own), origin, strict=True))
@@ -315,10 +317,11 @@ def _follow(
 
         def short() -> Array:
             square, linear, constant = _quadratic(p, d, row.surface.shape)
-            missed = jnp.maximum(square * constant - linear**2, 0)
             behind = jnp.where(row.first, 0, jnp.maximum(-length, 0)) + jnp.maximum(-front, 0)
             behind = jnp.where(row.live, behind, 0)
-            return missed + behind + jnp.where(row.bends, jnp.maximum(-through, 0), 0)
+            behind = behind + jnp.where(row.bends, jnp.maximum(-through, 0), 0)
+            # By how much a conic is missed; that tells nothing of where a line crosses it.
+            return jnp.where(crosses, behind, jnp.maximum(square * constant - linear**2, 0))
 
         keeping = keep(_Meeting(hit, fate, short))
         return jax.tree.map(partial(jnp.where, row.bends), new, kept), keeping

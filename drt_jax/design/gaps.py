@@ -1,0 +1,47 @@
+"""How thick a lens is between its surfaces, on the axis and towards the rim."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..lens.lens import Lens
+from ..lens.surface import by_form, surface_sag
+
+# Where edges are judged, in parts of the larger or smaller of two extents.
+_ZONES = np.array([0.5, 0.7, 0.85, 1.0])
+
+
+def between(lens: Lens, glass: bool) -> list[tuple[int, int]]:
+    """Neighbouring surfaces that bend light, with glass or with air between; what is before the
+    lens counts as air, too."""
+    air = lens.glasses[0], "air"
+    pairs = itertools.pairwise(lens.live)
+    return [(i, j) for i, j in pairs if (lens.glasses[i + 1] not in air) == glass]
+
+
+def gaps(
+    lens: Lens, extents: Array, glass: bool, surfaces: tuple[int, ...] = ()
+) -> tuple[Array, Array]:
+    """Thickness on the axis (G,) and at zones towards the rim (G, Z), mm along the light, of the
+    gaps between neighbouring surfaces that bend light, in glass or in air; of those behind some
+    surfaces alone, if any are named. In glass up to the larger of both extents (S,), in air to the
+    smaller."""
+    dtype = lens.curvature.dtype
+    pairs = [pair for pair in between(lens, glass) if not surfaces or pair[0] in surfaces]
+    if not pairs:
+        return jnp.zeros(0, dtype), jnp.zeros((0, _ZONES.size), dtype)
+    front, back = (np.array(rows) for rows in zip(*pairs))
+    sense = jnp.asarray(lens.senses[back], dtype)
+    vertices = lens.vertices
+    wide = jnp.maximum if glass else jnp.minimum
+    y = wide(extents[front], extents[back])[:, None] * jnp.asarray(_ZONES, dtype)[None]
+
+    def heights(rows: np.ndarray) -> Array:
+        shape = jax.tree.map(lambda a: a[..., rows, None], lens.shape)
+        return by_form(surface_sag, (0 * y, y), shape, tuple(lens.forms[i] for i in rows))
+
+    axis = sense * (vertices[back] - vertices[front])
+    return axis, axis[:, None] + sense[:, None] * (heights(back) - heights(front))
