@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,71 +14,109 @@ from jax import Array
 from ..lens.elements import Elements
 from ..lens.glass import Dispersion, refractive_index
 from ..lens.lens import Lens
+from ..lens.surface import by_form, surface_sag
 
-_Kind = Literal[
-    *("radius", "fringes", "thickness", "index", "abbe"),
-    *("shift", "tilt", "wedge", "irregularity"),
-]
-# Fringes are counted in green light, half a wave each; um.
-_GREEN = 0.5460740
+# A fringe is half a wave of green light (ISO 10110-5: 0.5460740 um), in mm.
+_FRINGE = 0.5460740e-3 / 2
 _LINES = (0.4861327, 0.5875618, 0.6562725)  # F, d, C
 _MINUTE = math.pi / 180 / 60
+
+
+class Kind(NamedTuple):
+    """A kind of error: of what, whether in x and y, in which unit, and how large it may be."""
+
+    whole: str
+    axes: int
+    unit: str
+    most: float = math.inf
+
+
+KINDS = {
+    "radius": Kind("surface", 1, "%", 100),
+    "fringes": Kind("surface", 1, "fringes"),
+    "irregularity": Kind("surface", 1, "fringes"),
+    "wedge": Kind("surface", 2, "arc min"),
+    "thickness": Kind("surface", 1, "mm"),
+    "index": Kind("surface", 1, ""),
+    "abbe": Kind("surface", 1, "%", 100),
+    "shift": Kind("element", 2, "mm"),
+    "tilt": Kind("element", 2, "arc min"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
     """By how much parts of a kind may be off, to either side.
 
-    kind: "radius" in per cent, "fringes" of it over the light's extent, "thickness" in mm, "index",
-        "abbe" in per cent; of elements "shift" across the axis in mm and "tilt" about their first
-        vertex in arc minutes, each in x and y; of surfaces "wedge", their tilt, in arc minutes,
-        in x and y, and "irregularity" in fringes of a cylinder (positive along y, negative along x).
+    kind: of surfaces "radius", that of the vertex, in per cent; "fringes", another curvature, told
+        by how far the rim of the light is off along the normal; "irregularity", a cylinder, in
+        fringes between both directions, half of them along y and minus half along x; "wedge", a
+        tilt, in arc minutes about x and y. Behind surfaces "thickness" in mm, "index" (of the line
+        d) and "abbe" in per cent. Of elements "shift" across the axis in mm, along x and y, and
+        "tilt" about their first vertex in arc minutes, about x and y. A fringe is half a wave of
+        546 nm.
     size: the largest error, in these units.
     which: surfaces or elements, from 0; empty: all that there are.
     """
 
-    kind: _Kind
+    kind: str
     size: float
     which: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(_Kind):
+        if self.kind not in KINDS:
+            raise ValueError(f"tolerances: unknown kind {self.kind!r}; known: {', '.join(KINDS)}")
+        most = KINDS[self.kind].most
+        if not 0 < self.size < most:
+            below = "" if math.isinf(most) else f" and below {most:g}"
             raise ValueError(
-                f"tolerances: unknown {self.kind!r}; known: {', '.join(get_args(_Kind))}"
+                f"tolerances: {self.kind}: size: must be above 0{below}, got {self.size:g}"
             )
-        if not 0 < self.size < math.inf:
-            raise ValueError(f"tolerances: {self.kind}: size: must be above 0, got {self.size:g}")
 
 
 class Error(NamedTuple):
-    """One number that may be off: what, where (a surface or an element), its component, and by how
-    much at most."""
+    """One number that may be off: what, where (a surface or an element), and its component."""
 
     kind: str
     place: int
     axis: int
-    size: float
 
     def __str__(self) -> str:
-        axis = f" {'xy'[self.axis]}" if self.kind in _TWO else ""
-        whole = "element" if self.kind in _OF_ELEMENTS else "surface"
-        return f"{self.kind} of {whole} {self.place}{axis}"
+        kind = KINDS[self.kind]
+        axis = f", {'xy'[self.axis]}" if kind.axes > 1 else ""
+        return f"{self.kind} of {kind.whole} {self.place}{axis}"
 
 
-_OF_ELEMENTS = ("shift", "tilt")
-_TWO = (*_OF_ELEMENTS, "wedge")
+def _solid(lens: Lens, medium: int) -> bool:
+    return lens.glasses[medium] not in ("air", lens.glasses[0])
 
 
 def elements_of(lens: Lens) -> tuple[tuple[int, int], ...]:
-    """First and last surface of each element: neighbours with glass between them, cemented ones
-    together; a mirror is one."""
-    media, spans = lens.glasses, []
+    """First and last surface of each element: neighbours that bend light, with glass between them,
+    cemented ones together; a mirror in air is one."""
+    spans: list[tuple[int, int]] = []
     for i in lens.live:
-        if spans and media[i] != media[0] and spans[-1][1] < i and not lens.mirrors[i]:
+        if spans and _solid(lens, i):
             spans[-1] = (spans[-1][0], i)
         else:
             spans.append((i, i))
     return tuple(spans)
+
+
+def _pieces(lens: Lens) -> dict[int, tuple[int, ...]]:
+    """The media that each piece of glass is, by the surface before it: several where a mirror sends
+    light back into it, or a surface in it bends none."""
+    pieces: dict[int, tuple[int, ...]] = {}
+    for i in range(lens.count):
+        inside = lens.mirrors[i] or i not in lens.live
+        if not _solid(lens, i + 1):
+            continue
+        if pieces and inside and _solid(lens, i):
+            first, media = pieces.popitem()
+            pieces[first] = (*media, i + 1)
+        else:
+            pieces[i] = (i + 1,)
+    return pieces
 
 
 @jax.tree_util.register_dataclass
@@ -86,152 +124,229 @@ def elements_of(lens: Lens) -> tuple[tuple[int, int], ...]:
 class Perturbed:
     """A lens with P errors.
 
-    lens: without any, in the form that errors need. extents: (S,), of the light on its surfaces, mm.
+    lens: without any, in the form that errors need. extents: (S,), of the light on its surfaces,
+    mm. sizes: (P,), the largest errors, in the units of `Tolerance`.
 
-    Static: errors, spans of the elements.
+    Static: errors; those in x and in y of one part are neighbours. spans: first and last surface of
+    the elements. groups: the place of each among `lens.elements`.
     """
 
     lens: Lens
     extents: Array
+    sizes: Array
     errors: tuple[Error, ...] = dataclasses.field(metadata={"static": True})
     spans: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
+    groups: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
 
     @classmethod
     def of(cls, lens: Lens, extents: Array, tolerances: Sequence[Tolerance]) -> "Perturbed":
         """The errors that some tolerances allow.
 
+        extents: (S,), how far from the axis light meets each surface, mm, such as `Seen.extents`.
+
         ValueError, which lists what there is, for a part that does not exist or stands twice.
         """
-        spans, errors = elements_of(lens), []
+        if np.shape(extents) != (lens.count,):
+            raise ValueError(f"extents: expected ({lens.count},), got shape {np.shape(extents)}")
+        spans, dtype = elements_of(lens), lens.curvature.dtype
+        sizes: dict[Error, float] = {}
         for tolerance in tolerances:
             kind = tolerance.kind
             there = _there(lens, spans, kind)
             if not there:
-                raise ValueError(f"tolerances: {kind}: the lens has none")
+                raise ValueError(f"tolerances: {kind}: {_NONE.get(kind, 'the lens has none')}")
             for place in tolerance.which:
                 if place not in there:
-                    known = ", ".join(map(str, there))
-                    raise ValueError(f"tolerances: {kind}: no number {place}; there are {known}")
-            axes = range(2 if kind in _TWO else 1)
+                    raise ValueError(
+                        f"tolerances: {kind}: no {KINDS[kind].whole} {place} that could be off; "
+                        f"there are {', '.join(map(str, there))}"
+                    )
+            axes = range(KINDS[kind].axes)
             for place, axis in itertools.product(tolerance.which or there, axes):
-                errors.append(Error(kind, place, axis, tolerance.size))
-        keys = [error[:3] for error in errors]
-        for error in errors:
-            if keys.count(error[:3]) > 1:
-                raise ValueError(f"tolerances: {error} stands twice; leave one out")
-        if not errors:
+                error = Error(kind, place, axis)
+                if error in sizes:
+                    raise ValueError(f"tolerances: {error} stands twice; leave one out")
+                sizes[error] = tolerance.size
+        if not sizes:
             raise ValueError("tolerances: none; name at least one")
-        return cls(_prepared(lens, spans, {e.kind for e in errors}), extents, tuple(errors), spans)
+        kinds = {error.kind for error in sizes}
+        lens, groups = _with_elements(lens, spans, kinds)
+        if "wedge" in kinds and lens.tilt is None:
+            lens = dataclasses.replace(lens, tilt=jnp.zeros((lens.count + 1, 3), dtype))
+        if "irregularity" in kinds:
+            lens = _with_cylinders(lens)
+        largest = jnp.asarray([*sizes.values()], dtype)
+        return cls(lens, jnp.asarray(extents, dtype), largest, tuple(sizes), spans, groups)
 
     def lens_of(self, off: Array) -> Lens:
-        """The lens with errors `off` (P,) in parts of their largest. Differentiable."""
+        """The lens with errors `off` (P,) in parts of their largest. Differentiable, in `jit` and
+        `vmap` too; small errors of several kinds add up in any order."""
         lens = self.lens
         found: dict[str, list[tuple[Error, Array]]] = {}
         for k, error in enumerate(self.errors):
-            found.setdefault(error.kind, []).append((error, off[k] * error.size))
+            found.setdefault(error.kind, []).append((error, off[k] * self.sizes[k]))
         for kind, some in found.items():
             places = np.array([error.place for error, _ in some])
             axes = np.array([error.axis for error, _ in some])
-            lens = self._off(lens, kind, places, axes, jnp.stack([size for _, size in some]))
+            lens = self._off(lens, kind, places, axes, jnp.stack([by for _, by in some]))
         return lens
 
     def _off(self, lens: Lens, kind: str, at: np.ndarray, axis: np.ndarray, by: Array) -> Lens:
-        replace = dataclasses.replace
+        replace, own = dataclasses.replace, self.lens
         if kind == "radius":
-            c = lens.curvature[at] / (1 + by / 100)
-            return _bent(lens, at, c - lens.curvature[at], 0)
+            part = 1 / (1 + by / 100) - 1
+            across = _across(own, at)
+            return _bent(lens, at, own.curvature[at] * part, across * part)
         if kind in ("fringes", "irregularity"):
-            # A curvature that is off by d raises the rim by d h^2 / 2.
-            bend = by * 1e-3 * _GREEN / self.extents[at] ** 2
-            return _bent(lens, at, bend, int(kind == "irregularity"))
+            bend = by * _FRINGE / _rise(own, at, self.extents)
+            both = (bend, bend) if kind == "fringes" else (bend / 2, -bend / 2)
+            return _bent(lens, at, *both)
         if kind == "thickness":
             gap = lens.thickness.at[at].add(by)
             return replace(lens, thickness=gap, sensor=lens.sensor + jnp.sum(by))
         if kind in ("index", "abbe"):
-            return replace(lens, dispersion=_medium(lens, kind, at, by))
+            pieces = _pieces(own)
+            media = np.concatenate([pieces[i] for i in at])
+            by = by[np.repeat(np.arange(len(at)), [len(pieces[i]) for i in at])]
+            return replace(lens, dispersion=_medium(lens, own.dispersion, kind, media, by))
         if kind == "wedge":
-            tilt = jnp.zeros((lens.count + 1, 3)) if lens.tilt is None else lens.tilt
-            return replace(lens, tilt=tilt.at[at, axis].add(by * _MINUTE))
-        groups = lens.elements
-        assert groups is not None
-        rows = at + len(groups.spans) - len(self.spans)
-        size, name = (by, "shift") if kind == "shift" else (by * _MINUTE, "tilt")
-        moved = getattr(groups, name).at[rows, axis].add(size)
-        return replace(lens, elements=replace(groups, **{name: moved}))
+            assert lens.tilt is not None
+            return replace(lens, tilt=lens.tilt.at[at, axis].add(by * _MINUTE))
+        elements = lens.elements
+        assert elements is not None
+        rows = np.array(self.groups)[at]
+        if kind == "shift":
+            moved = replace(elements, shift=elements.shift.at[rows, axis].add(by))
+        else:
+            moved = replace(elements, tilt=elements.tilt.at[rows, axis].add(by * _MINUTE))
+        return replace(lens, elements=moved)
+
+
+_NONE = {
+    "radius": "no surface is curved; of planes, tolerance fringes",
+    "irregularity": "no surface is a sphere, a conic, an even asphere or has one more curvature",
+    "thickness": "there is one surface; none has a thickness behind it",
+    "index": "the lens has no glass",
+    "abbe": "the lens has no glass",
+}
+# Forms whose first coefficient is the curvature along x.
+_WITH_X = ("biconic", "toroid")
 
 
 def _there(lens: Lens, spans: tuple[tuple[int, int], ...], kind: str) -> list[int]:
     """The numbers of the surfaces or elements that may be off."""
     live = list(lens.live)
-    if kind in _OF_ELEMENTS:
+    if KINDS[kind].whole == "element":
         return list(range(len(spans)))
     if kind == "thickness":
         return list(range(lens.count - 1))
     if kind in ("index", "abbe"):
-        return [i for i in range(lens.count) if lens.glasses[i + 1] not in (lens.glasses[0], "air")]
+        return list(_pieces(lens))
     if kind == "radius":
-        return [i for i in live if float(lens.curvature[i]) != 0]
+        curved = np.asarray(lens.curvature) != 0
+        curved[:-1] |= np.asarray(_across(lens, np.arange(lens.count))) != 0
+        return [i for i in live if curved[i]]
     if kind == "irregularity":
-        return [i for i in live if lens.forms[i] == "asphere"]
+        return [i for i in live if lens.forms[i] in ("asphere", *_WITH_X)]
     return live
 
 
-def _prepared(lens: Lens, spans: tuple[tuple[int, int], ...], kinds: set[str]) -> Lens:
-    """The lens in the form that errors of these kinds need; the same lens."""
-    dtype = lens.curvature.dtype
-    if kinds & {*_OF_ELEMENTS}:
-        old, count = lens.elements, len(spans)
-        zero = jnp.zeros((count, 3), dtype)
-        parts = [zero, zero, jnp.zeros(count, dtype)]
-        where, about = spans, tuple(first for first, _ in spans)
-        if old is not None:
-            arrays = (old.shift, old.tilt, old.pivot)
-            parts = [jnp.concatenate(pair) for pair in zip(arrays, parts)]
-            where, about = (*old.spans, *where), (*old.about, *about)
-        lens = dataclasses.replace(lens, elements=Elements(*parts, where, about))
-    if "irregularity" in kinds:
-        # A biconic with the same curvature and conic in both directions.
-        round_ = np.array([form == "asphere" for form in lens.forms])
-        own = jnp.stack([lens.curvature, lens.conic], axis=1)
-        wide = jnp.concatenate([own, lens.coefficients], axis=1)
-        kept = jnp.concatenate([lens.coefficients, jnp.zeros_like(own)], axis=1)
-        wide = jnp.where(round_[:, None], wide, kept)
-        forms = tuple("biconic" if r else form for r, form in zip(round_, lens.forms))
-        lens = dataclasses.replace(lens, coefficients=wide, forms=forms)
-    return lens
+def _with_elements(
+    lens: Lens, spans: tuple[tuple[int, int], ...], kinds: set[str]
+) -> tuple[Lens, tuple[int, ...]]:
+    """The same lens with a group for each element if any may move, and the groups' numbers; within
+    groups that it has already, and around those that are part of an element."""
+    if not any(KINDS[kind].whole == "element" for kind in kinds):
+        return lens, ()
+    zero = jnp.zeros((len(spans), 3), lens.curvature.dtype)
+    arrays = [(zero, zero, zero[:, 0])]
+    where, about, old = list(spans), [first for first, _ in spans], lens.elements
+    if old is not None:
+        for (a, b), (first, last) in itertools.product(old.spans, spans):
+            if a < first <= b < last or first < a <= last < b:
+                raise ValueError(
+                    f"tolerances: the element of surfaces {first} to {last} is cut by that of the "
+                    f"prescription, {a} to {b}; put one inside the other, or apart"
+                )
+        arrays.insert(0, (old.shift, old.tilt, old.pivot))
+        where, about = [*old.spans, *where], [*old.about, *about]
+    # One that holds another comes first.
+    order = sorted(range(len(where)), key=lambda g: (where[g][0], -where[g][1], g))
+    shift, tilt, pivot = (jnp.concatenate(parts)[np.array(order)] for parts in zip(*arrays))
+    elements = Elements(
+        shift, tilt, pivot, tuple(where[g] for g in order), tuple(about[g] for g in order)
+    )
+    new = range(len(where) - len(spans), len(where))
+    return dataclasses.replace(lens, elements=elements), tuple(order.index(g) for g in new)
 
 
-def _bent(lens: Lens, at: np.ndarray, by: Array, axis: int) -> Lens:
-    """Curvatures changed; `axis`: 0 in both directions alike, 1: more along y, less along x."""
-    lens_x = np.array([lens.forms[i] == "biconic" for i in at])
+def _with_cylinders(lens: Lens) -> Lens:
+    """The same lens with biconics in place of aspheres, curved alike in both directions."""
+    round_ = np.array([form == "asphere" for form in lens.forms])
+    own = jnp.stack([lens.curvature, lens.conic], axis=1)
+    wide = jnp.concatenate([own, lens.coefficients], axis=1)
+    kept = jnp.concatenate([lens.coefficients, jnp.zeros_like(own)], axis=1)
+    wide = jnp.where(round_[:, None], wide, kept)
+    forms = tuple("biconic" if r else form for r, form in zip(round_, lens.forms))
+    return dataclasses.replace(lens, coefficients=wide, forms=forms)
+
+
+def _across(lens: Lens, at: np.ndarray) -> Array:
+    """Curvatures along x of some surfaces, 1/mm, where they have one of their own; else 0."""
+    has = np.array([lens.forms[i] in _WITH_X for i in at])
+    if not has.any():
+        return jnp.zeros(len(at), lens.curvature.dtype)
+    return jnp.where(has, lens.coefficients[at, 0], 0)
+
+
+def _bent(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
+    """Curvatures changed, and those along x, where surfaces have one of their own."""
+    own = np.array([lens.forms[i] in _WITH_X for i in at])
     coefficients = lens.coefficients
-    if lens_x.any():
-        x = -by if axis else by
-        coefficients = coefficients.at[at[lens_x], 0].add(x[lens_x])
+    if own.any():
+        coefficients = coefficients.at[at[own], 0].add(across[own])
     bent = lens.curvature.at[at].add(by)
     return dataclasses.replace(lens, curvature=bent, coefficients=coefficients)
 
 
-def _medium(lens: Lens, kind: str, at: np.ndarray, by: Array) -> Dispersion:
-    """Dispersion with indices off by a constant, or with nF - nC off by per cent and nd kept."""
-    constants = lens.dispersion
-    model = constants.model
+def _rise(lens: Lens, at: np.ndarray, extents: Array) -> Array:
+    """By how far the rim of the light moves along the normal of some surfaces, mm, for a change of
+    their curvature along y of 1/mm."""
+    shape = jax.tree.map(lambda a: a[..., at], lens.shape)
+    forms, zero = tuple(lens.forms[i] for i in at), jnp.zeros(len(at), lens.curvature.dtype)
+
+    def height(y: Array, bend: Array) -> Array:
+        bent = shape._replace(curvature=shape.curvature + bend)
+        return by_form(surface_sag, (jnp.zeros_like(y), y), bent, forms)
+
+    rim = extents[at], zero
+    _, slope = jax.jvp(height, rim, (zero + 1, zero))
+    _, rise = jax.jvp(height, rim, (zero, zero + 1))
+    return rise / jnp.sqrt(1 + slope**2)
+
+
+def _medium(lens: Lens, nominal: Dispersion, kind: str, at: np.ndarray, by: Array) -> Dispersion:
+    """Dispersion with nd of some media off, or with vd off by per cent and nd kept.
+
+    Of a glass of which a formula is known, n^2 is changed by a constant or by a term in 1 / L^2, as
+    large as this takes at the lines d, or F and C.
+    """
+    constants, model = lens.dispersion, lens.dispersion.model
+    own = jnp.zeros(len(at), bool)
     if model is not None:
-        own = np.asarray(model)[at + 1, 0] > 1
-        rows, some = at[own] + 1, by[own]
+        own = model[at, 0] > 1
         if kind == "index":
-            model = model.at[rows, 0].add(some)
+            model = model.at[at, 0].add(jnp.where(own, by, 0))
         else:
-            model = model.at[rows, 1].multiply(1 + some / 100)
-        constants, at, by = dataclasses.replace(constants, model=model), at[~own], by[~own]
-    f, d, c = refractive_index(constants, jnp.asarray(_LINES, lens.curvature.dtype))[at + 1].T
+            model = model.at[at, 1].multiply(1 + jnp.where(own, by / 100, 0))
+    f, d, c = refractive_index(nominal, jnp.asarray(_LINES, lens.curvature.dtype))[at].T
     schott = constants.schott
     if kind == "index":
-        schott = schott.at[at + 1, 0].add(2 * d * by + by**2)
+        schott = schott.at[at, 0].add(jnp.where(own, 0, 2 * d * by + by**2))
     else:
-        # vd off by a part e: nF - nC becomes itself / (1 + e), by a term in 1 / L^2.
         change = (f - c) * (1 / (1 + by / 100) - 1)
-        inverse = 1 / np.square(_LINES)
-        strength = 2 * d * change / (inverse[0] - inverse[2])
-        schott = schott.at[at + 1, 2].add(strength).at[at + 1, 0].add(-strength * inverse[1])
-    return dataclasses.replace(constants, schott=schott)
+        inverse = [1 / line**2 for line in _LINES]
+        turn = (inverse[0] - inverse[1]) / (2 * f) + (inverse[1] - inverse[2]) / (2 * c)
+        strength = jnp.where(own, 0, change / turn)
+        schott = schott.at[at, 2].add(strength).at[at, 0].add(-strength * inverse[1])
+    return dataclasses.replace(constants, schott=schott, model=model)

@@ -1,6 +1,6 @@
 """Tolerances: what errors of the parts do to the spots, by derivatives and by Monte Carlo.
 
-The measure of a lens is the mean over its fields of the squared RMS radius of the polychromatic
+The measure q of a lens is the mean over its fields of the squared RMS radius of the polychromatic
 spot, after the compensators have done their best. Spots are quadratic in where the sensor is, so
 that this is a small linear system, solved for every lens.
 """
@@ -8,7 +8,7 @@ that this is a small linear system, solved for every lens.
 import concurrent.futures
 import os
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,128 +16,248 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..numerics import safe_divide
+from ..numerics import concrete, safe_divide
 from ..rays.status import Status
+from .least_squares import COMPILE
 from .perturbed import Perturbed
 from .problem import Problem
-from .seen import EXTRAS, Seen
+from .seen import EXTRAS, Seen, symmetry_by_structure
 
+# What is adjusted in every lens: the sensor's distance, or its tilts about x and y, too.
 Compensator = Literal["none", "focus", "focus and tilt"]
+Order = Literal["first", "rays", "second"]
 _TILE = 50  # lenses of a tile, in one program on one core
 _STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
+_SYMMETRIES = ("meridian", "half", "disc")  # from the least of the pupil to all of it
+_ASCENTS = 16  # from so many eigenvectors, either way
+_DEVIATION = 0.5  # of normal errors, in parts of the largest
 
 
 class Made(NamedTuple):
     """A lens as it is made, after compensation.
 
-    squares: (F,), squared RMS radii of the spots, mm^2; inf where no light passes. moves: (C,), of
-    the compensators: mm of the sensor, then its tilts about -x and y, radians. whole: (), whether all
-    rays passed.
+    squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
+    moves: (C,), of the compensators: mm of the sensor, then its tilts about x and -y, radians.
     """
 
     squares: Array
     moves: Array
-    whole: Array
+
+    @property
+    def spot(self) -> Array:
+        """The root of q, (), mm."""
+        return jnp.sqrt(jnp.mean(self.squares, axis=-1))
 
 
 def _spots(seen: Seen) -> tuple[Array, Array, Array]:
-    """Distances from the centroid and how they grow with the sensor's distance, (2, V, W Q) each in
-    mm and without unit, times the root of the light; and centroids (2, V), mm."""
+    """Distances from the centroid, mm, and how they grow with the sensor's distance, (D, V, W Q)
+    each, times the root of the light; and centroids (2, V), mm."""
     rays, waves = seen.rays, seen.colour_weights[:, None]
     light = (rays.light * waves)[..., EXTRAS:]
     good = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
     light = jnp.where(good, light, 0)
     arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
     both = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
+    dim = len(both)
     both += [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
-    total = jnp.sum(light, axis=(1, 2))
-    values = jnp.stack([jnp.where(good, b, 0) for b in both])
-    weight = safe_divide(light, jnp.broadcast_to(total[:, None, None], light.shape))
-    mean = jnp.sum(weight * values, axis=(2, 3))
+    values = jnp.where(good, jnp.stack(both), 0)
+    total = jnp.sum(light, axis=(1, 2), keepdims=True)
+    weight = safe_divide(light, jnp.broadcast_to(total, light.shape))
+    # Of half a pupil, the other half has the opposite x, of a meridian the opposite y.
+    across = {"meridian": [0], "half": [1], "disc": [1, 1]}[seen.rule.symmetry]
+    even = jnp.asarray(([0] * (dim - len(across)) + across) * 2, light.dtype)
+    mean = jnp.sum(weight * values, axis=(2, 3)) * even[:, None]
     apart = (values - mean[..., None, None]) * jnp.sqrt(jnp.where(good, weight, 1))
-    apart = jnp.where(good, apart, 0).reshape(4, len(light), -1)
-    return apart[:2], apart[2:], mean[:2]
+    apart = jnp.where(good, apart, 0).reshape(2 * dim, len(light), -1)
+    centre = jnp.concatenate([jnp.zeros_like(mean[: 2 - dim]), mean[:dim]])
+    return apart[:dim], apart[dim:], centre
 
 
-def made(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[Made, Array]:
-    """A lens after compensation, and its residuals (2, V, W Q): distances from the centroids, whose
-    squares add up to those of the RMS radii."""
+def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[Made, Array]:
+    """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
+    squares add up to those of the RMS radii, mm."""
     seen = problem.seen(lens)
-    apart, growth, centre = _spots(seen)
-    count = _STEPS[compensator]
-    # The sensor moves by d + a x + b y where a spot is.
-    levers = jnp.stack([jnp.ones_like(centre[0]), centre[1], centre[0]])[:count]
-    linear = jnp.sum(apart * growth, axis=(0, 2))
-    square = jnp.sum(growth**2, axis=(0, 2))
-    matrix = (levers * square) @ levers.T
-    moves = -jnp.linalg.solve(matrix, levers @ linear) if count else jnp.zeros(0)
-    apart = apart + growth * (moves @ levers if count else 0 * square)[:, None]
-    passed = jnp.all(seen.rays.passed > 0, axis=1)
-    squares = jnp.where(passed, jnp.sum(apart**2, axis=(0, 2)), jnp.inf)
-    return Made(squares, moves, jnp.all(seen.rays.whole[..., EXTRAS:])), apart
+    apart, growth, (x, y) = _spots(seen)
+    # The sensor moves by d + a y + b x where a spot is.
+    levers = jnp.stack([jnp.ones_like(x), y, x])[: _STEPS[compensator]]
+    moves = jnp.zeros(0, x.dtype)
+    if len(levers):
+        square = jnp.sum(growth**2, axis=(0, 2))
+        matrix = (levers * square[None]) @ levers.T
+        lit = matrix[0, 0] > 0
+        matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
+        moves = jnp.linalg.solve(matrix, -levers @ jnp.sum(apart * growth, axis=(0, 2)))
+        apart = apart + growth * (moves @ levers)[None, :, None]
+    light = seen.rays.light[..., EXTRAS:] > 0
+    failed = jnp.any(light & ~seen.rays.whole[..., EXTRAS:], axis=(1, 2))
+    good = ~failed & jnp.all(seen.rays.passed > 0, axis=1)
+    squares = jnp.where(good, jnp.sum(apart**2, axis=(0, 2)), jnp.inf)
+    return Made(squares, moves), apart
+
+
+def made(problem: Problem, lens: Lens, compensator: Compensator) -> Made:
+    """A lens seen from the fields of a problem, after compensation. Differentiable, in `jit` and
+    `vmap` too.
+
+    ValueError for a compensator that is unknown or that the fields do not determine, and for a rule
+    that leaves out part of the pupil of a lens that is not symmetric.
+    """
+    _check(problem, lens, compensator)
+    return _compensated(problem, lens, compensator)[0]
+
+
+def _check(problem: Problem, lens: Lens, compensator: str) -> None:
+    if compensator not in (known := get_args(Compensator)):
+        raise ValueError(f"compensator: unknown {compensator!r}; known: {', '.join(known)}")
+    has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
+    if _SYMMETRIES.index(has) < _SYMMETRIES.index(needs):
+        raise ValueError(
+            f'rule: "{has}" leaves out part of the pupil, but errors make the lens unsymmetric; '
+            f'take one of symmetry "{needs}", such as Gauss(6, "{needs}")'
+        )
+    if compensator == "focus and tilt" and concrete(problem.fields):
+        tangents = np.tan(np.asarray(problem.fields, float))
+        if np.linalg.matrix_rank(np.c_[np.ones(len(tangents)), tangents]) < 3:
+            raise ValueError(
+                "compensator: focus and tilt: the fields lie on a line, about which any tilt is "
+                "as good; add fields beside it"
+            )
 
 
 class Predicted(NamedTuple):
-    """The measure q = mean squared RMS radius as a function of errors in parts of their largest.
+    """q = mean squared RMS radius, mm^2, as a function of errors in parts of their largest.
 
     nominal: (), q without errors. gradient: (P,). gauss: (P, P), of the second derivatives the part
-    that follows from first derivatives of rays. hessian: (P, P), all of them.
+    that follows from first derivatives of rays. hessian: (P, P), all of them. moves: (C,), of the
+    compensators without errors, see `Made`; move_slopes: (P, C), their derivatives.
     """
 
     nominal: Array
     gradient: Array
     gauss: Array
     hessian: Array
+    moves: Array
+    move_slopes: Array
 
-    def at(self, off: Array, order: Literal["rays", "second"]) -> Array:
-        """q (K,) of errors (K, P), from the first derivatives of the rays or from the second
-        derivatives of q."""
-        matrix = self.gauss if order == "rays" else self.hessian
-        return self.nominal + off @ self.gradient + jnp.sum(off * (off @ matrix), axis=-1) / 2
+    def matrix(self, order: Order) -> Array:
+        """The second derivatives (P, P) that an order knows: none, those of first derivatives of
+        rays, or all."""
+        if order == "first":
+            return 0 * self.hessian
+        return self.gauss if order == "rays" else self.hessian
 
+    def at(self, off: Array | np.ndarray, order: Order) -> Array:
+        """q (K,) of errors (K, P); below 0 where the model fails."""
+        return (
+            self.nominal
+            + off @ self.gradient
+            + jnp.sum(off * (off @ self.matrix(order)), axis=-1) / 2
+        )
 
-def _measure(problem: Problem, perturbed: Perturbed, off: Array, compensator: Compensator) -> tuple:
-    found, apart = made(problem, perturbed.lens_of(off), compensator)
-    return jnp.mean(found.squares), apart / jnp.sqrt(len(found.squares))
+    def moments(self, variances: Array, order: Order) -> tuple[Array, Array]:
+        """Mean and standard deviation of q, (), for errors that are independent, with these
+        variances (P,). The first is that of the quadratic, the second adds up as of normal errors
+        (root sum of squares)."""
+        matrix = self.matrix(order)
+        mean = self.nominal + jnp.diag(matrix) @ variances / 2
+        pairs = variances @ matrix**2 @ variances / 2
+        return mean, jnp.sqrt(self.gradient**2 @ variances + pairs)
 
 
 def predict(problem: Problem, perturbed: Perturbed, compensator: Compensator) -> Predicted:
-    """What first and second derivatives say, each exact."""
+    """What first and second derivatives say, each exact. ValueError as `made`."""
+    _check(problem, perturbed.lens, compensator)
     return _predict(problem, perturbed, compensator)
 
 
 def _predict_all(problem: Problem, perturbed: Perturbed, compensator: Compensator) -> Predicted:
-    zero = jnp.zeros(len(perturbed.errors), perturbed.extents.dtype)
+    zero = jnp.zeros_like(perturbed.sizes)
     units = jnp.eye(len(zero), dtype=zero.dtype)
 
-    def rays(off: Array) -> Array:
-        return _measure(problem, perturbed, off, compensator)[1]
+    def rays(off: Array) -> tuple[Array, Array]:
+        found, apart = _compensated(problem, perturbed.lens_of(off), compensator)
+        return jnp.ravel(apart) / jnp.sqrt(len(found.squares)), found.moves
 
-    apart, push = jax.linearize(rays, zero)
-    moved = jax.lax.map(push, units).reshape(len(zero), -1)
-    gradient = 2 * moved @ apart.ravel()
+    def measure(off: Array) -> Array:
+        return jnp.mean(_compensated(problem, perturbed.lens_of(off), compensator)[0].squares)
 
-    def slope(off: Array) -> Array:
-        return jax.grad(lambda off: _measure(problem, perturbed, off, compensator)[0])(off)
+    (apart, moves), push = jax.linearize(rays, zero)
+    moved, slopes = jax.lax.map(push, units)
+    hessian = jax.lax.map(lambda unit: jax.jvp(jax.grad(measure), (zero,), (unit,))[1], units)
+    gradient, gauss = 2 * moved @ apart, 2 * moved @ moved.T
+    return Predicted(measure(zero), gradient, gauss, hessian, moves, slopes)
 
-    hessian = jax.lax.map(lambda unit: jax.jvp(slope, (zero,), (unit,))[1], units)
-    return Predicted(jnp.sum(apart**2), gradient, 2 * moved @ moved.T, hessian)
+
+# Second derivatives of a whole trace are large to compile and run once.
+_LARGE = {**COMPILE, "xla_backend_optimization_level": 0}
+_predict = jax.jit(_predict_all, static_argnums=2, compiler_options=_LARGE)
 
 
-_predict = jax.jit(_predict_all, static_argnums=2)
+def _parts(perturbed: Perturbed) -> list[list[int]]:
+    """The errors of each part: one, or those in x and y."""
+    parts: dict[tuple, list[int]] = {}
+    for k, error in enumerate(perturbed.errors):
+        parts.setdefault(error[:2], []).append(k)
+    return list(parts.values())
 
 
 def draw_errors(perturbed: Perturbed, count: int, seed: int, normal: bool = False) -> np.ndarray:
-    """Errors (count, P) in parts of their largest: uniform, or normal with a standard deviation of
-    a half, cut off at 1. Those in x and y of one part lie within a circle."""
+    """Errors (count, P) in parts of their largest, all alike up to 1, or normal with a standard
+    deviation of a half, cut off at 1. Those in x and y of one part lie within a circle."""
     rng = np.random.default_rng(seed)
-    shape = count, len(perturbed.errors)
-    if not normal:
-        off = rng.uniform(-1, 1, shape)
-    else:
-        off = rng.normal(0, 0.5, shape)
-        while np.any(beyond := np.abs(off) > 1):
-            off[beyond] = rng.normal(0, 0.5, int(beyond.sum()))
+    off = np.empty((count, len(perturbed.errors)))
+    for part in _parts(perturbed):
+        todo = np.arange(count)
+        while len(todo):
+            shape = len(todo), len(part)
+            some = rng.normal(0, _DEVIATION, shape) if normal else rng.uniform(-1, 1, shape)
+            off[todo[:, None], part] = some
+            todo = todo[np.linalg.norm(some, axis=1) > 1]
+    return off
+
+
+def variances(perturbed: Perturbed, normal: bool = False) -> np.ndarray:
+    """Variances (P,) of the errors that `draw_errors` draws."""
+    found = np.empty(len(perturbed.errors))
+    for part in _parts(perturbed):
+        count = len(part)
+        if not normal:
+            found[part] = 1 / (count + 2)  # of the ball of that dimension
+            continue
+        # Of the chi distribution cut off at 1, by the midpoint rule in r.
+        r = (np.arange(1000) + 0.5) / 1000
+        density = r ** (count - 1) * np.exp(-(r**2) / (2 * _DEVIATION**2))
+        found[part] = density @ r**2 / density.sum() / count
+    return found
+
+
+def worst_case(perturbed: Perturbed, predicted: Predicted, order: Order = "second") -> np.ndarray:
+    """Errors (P,), each as large as it may be, for which q is predicted to be largest: the best of
+    ascents from the gradient and the largest eigenvectors, which may not be the best of all."""
+    slope, matrix = np.asarray(predicted.gradient), np.asarray(predicted.matrix(order))
+    values, vectors = np.linalg.eigh(matrix)
+    # On the ends of all errors a multiple of the unit matrix changes nothing, but makes q convex,
+    # so that going as far as possible along its gradient never descends.
+    matrix = matrix + max(0.0, -values[0]) * np.eye(len(matrix))
+    largest = vectors[:, ::-1][:, :_ASCENTS].T
+    found: list[np.ndarray] = []
+    for start in (slope, *largest, *-largest):
+        off = _to_the_ends(perturbed, start)
+        for _ in range(100):
+            off, before = _to_the_ends(perturbed, slope + matrix @ off), off
+            if np.array_equal(off, before):
+                break
+        found.append(off)
+    sizes = np.asarray(predicted.at(np.array(found), order))
+    return found[int(np.argmax(sizes))]
+
+
+def _to_the_ends(perturbed: Perturbed, vector: np.ndarray) -> np.ndarray:
+    """The largest errors along a vector (P,): 1 for each part, in its direction across."""
+    off = np.zeros(len(vector))
+    for part in _parts(perturbed):
+        size = np.linalg.norm(vector[part])
+        off[part] = vector[part] / size if size > 0 else np.eye(len(part))[0]
     return off
 
 
@@ -149,26 +269,34 @@ def monte_carlo(
     report: Callable[[int], None] = lambda done: None,
     threads: int | None = None,
 ) -> Made:
-    """The lenses of errors (K, P), as many as `off` has rows, traced; arrays with a first axis (K,).
-    report: called with how many are done."""
-    count = len(off)
-    tiles = [off[k : k + _TILE] for k in range(0, count, _TILE)]
+    """The lenses of errors (K, P) in parts of their largest, traced; arrays (K, V) and (K, C).
+
+    report: called with how many are done. threads: tiles at a time; None: one a core. The result
+    depends on neither threads nor tiles. ValueError as `made`.
+    """
+    _check(problem, perturbed.lens, compensator)
+    width = len(perturbed.errors)
+    if np.ndim(off) != 2 or np.shape(off)[1] != width or not len(off):
+        raise ValueError(f"off: expected (K, {width}), got shape {np.shape(off)}")
+    tiles = [off[k : k + _TILE] for k in range(0, len(off), _TILE)]
 
     def run(rows: np.ndarray) -> Made:
-        whole = np.resize(rows, (_TILE, rows.shape[1]))
-        found = _many(problem, perturbed, jnp.asarray(whole), compensator)
+        whole = np.resize(rows, (_TILE, width))  # a tile that is not full repeats its rows
+        found = _many(problem, perturbed, jnp.asarray(whole, perturbed.sizes.dtype), compensator)
         return jax.tree.map(lambda a: np.asarray(a)[: len(rows)], found)
 
-    parts = []
+    parts, done = [run(tiles[0])], len(tiles[0])  # compiled once, not by all threads
+    report(done)
     with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        for part in pool.map(run, tiles):
+        for part in pool.map(run, tiles[1:]):
             parts.append(part)
-            report(sum(len(p.whole) for p in parts))
+            done += len(part.squares)
+            report(done)
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
 
 def _many_of(problem: Problem, perturbed: Perturbed, off: Array, compensator: Compensator) -> Made:
-    return jax.vmap(lambda one: made(problem, perturbed.lens_of(one), compensator)[0])(off)
+    return jax.vmap(lambda one: _compensated(problem, perturbed.lens_of(one), compensator)[0])(off)
 
 
-_many = jax.jit(_many_of, static_argnums=3)
+_many = jax.jit(_many_of, static_argnums=3, compiler_options=COMPILE)
