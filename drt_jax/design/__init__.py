@@ -22,5 +22,7 @@ from .tolerance import (
     made as made,
     monte_carlo as monte_carlo,
     predict as predict,
+    variances as variances,
+    worst_case as worst_case,
 )
 from .variables import Tie as Tie, Variables as Variables, Vary as Vary

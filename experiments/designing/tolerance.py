@@ -1,0 +1,341 @@
+"""What the errors of its parts do to a lens: sensitivities, predictions, Monte Carlo.
+
+Every lens is brought to focus, or what else compensates. A spot is the root of the mean over the
+fields of the squared RMS radius, of all colours about their centroid, in um. Writes results.json:
+`rows`, one for each error, with its `kind`, `place`, `size`, the change of the spot by it at minus
+and plus its size as predicted from second derivatives (`predicted_um`) and as traced (`traced_um`),
+and the `moves` of the compensators there (`predicted_moves`), mm and radians; `scales`, one for
+each scale of all sizes, with the spots of Monte Carlo and of each order of prediction; `worst`: the
+spot with all errors at their ends, where second derivatives have it largest. A lens of which a ray
+fails has no spot (null), and is as bad as can be.
+
+Orders of prediction, as functions of all errors: "first", q = spot^2 from its gradient; "rays",
+from first derivatives of all rays, whose squares are summed; "second", from all second derivatives.
+Their means and percentiles are those of many draws, which cost nothing.
+"""
+
+import dataclasses
+import functools
+import math
+import os
+import pathlib
+import sys
+import time
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+import drt_jax
+from drt_jax import design, show
+from drt_jax.design.perturbed import KINDS
+from drt_jax.runs.folder import Run
+
+from . import _command, _common
+
+COLUMNS = ("mean_um", "p90_um", "seconds")
+_ORDERS = ("first", "rays", "second")
+_SHOWN, _BINS = 14, 60
+_LEVELS = np.linspace(0, 1, 201)
+_WORDS = {
+    "traced": "traced",
+    "first": "gradient",
+    "rays": "rays' gradients",
+    "second": "second derivatives",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment; see configs/tolerance.yaml.
+
+    lens: bundled name or YAML path. tolerances: see drt_jax.design. fields_deg: pairs x, y.
+    distance_mm: to the object. wavelengths_um, colour_weights: of the light; no weights: all alike.
+    order: of the pupil's rule. compensator: adjusted in every lens. errors: uniform up to their
+    sizes, or normal with a deviation of half of them, cut off there. scales: of all sizes. count:
+    lenses of Monte Carlo, of each scale. draws: of the predictions. limits_um: of the spot, for the
+    yield.
+    """
+
+    lens: str
+    tolerances: tuple[design.Tolerance, ...]
+    fields_deg: tuple[tuple[float, ...], ...] = ((0.0, 0.0),)
+    distance_mm: float = math.inf
+    wavelengths_um: tuple[float, ...] = (0.5875618,)
+    colour_weights: tuple[float, ...] = ()
+    order: int = 4
+    compensator: Literal["none", "focus", "focus and tilt"] = "focus"
+    errors: Literal["uniform", "normal"] = "uniform"
+    scales: tuple[float, ...] = (1.0,)
+    count: int = 10000
+    draws: int = 100000
+    limits_um: tuple[float, ...] = ()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        limits = {"wavelengths_um": (1e-4, 1e6), "order": (1, 40), "scales": (1e-3, 1e3)}
+        limits |= {"count": (1, 1e7), "draws": (1, 1e7), "limits_um": (1e-6, 1e6)}
+        _common.require_within("", self, **limits)
+        for name in ("tolerances", "fields_deg", "wavelengths_um", "scales"):
+            _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")
+        _common.require_list("scales", self.scales)
+        for pair in self.fields_deg:
+            good = len(pair) == 2 and all(-89 <= angle <= 89 for angle in pair)
+            _common.require(good, f"fields_deg: expected pairs x, y from -89 to 89, got {pair}")
+
+
+def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.Perturbed]:
+    """What judges the lens, with another order of the rule if one is given; and its errors."""
+    lens = drt_jax.load_lens(config.lens)
+
+    def problem_of(lens: drt_jax.Lens) -> design.Problem:
+        return design.Problem.of(
+            design.Variables.of(lens, ["sensor"]),
+            ["spot"],
+            np.radians(config.fields_deg),
+            config.wavelengths_um,
+            config.distance_mm,
+            order or config.order,
+            config.colour_weights or None,
+        )
+
+    extents = jax.jit(lambda p: p.seen(p.variables.lens).extents)(problem_of(lens))
+    perturbed = design.Perturbed.of(lens, extents, config.tolerances)
+    return problem_of(perturbed.lens), perturbed
+
+
+def derivatives(config: Config) -> dict[str, Any]:
+    """The fields of `design.Predicted` as lists, times, and how far the rule is off."""
+    problem, perturbed = prepare(config)
+    spots = []
+    for order in (config.order, min(config.order + 4, 40)):
+        some, _ = prepare(config, order)
+        nominal = jax.jit(lambda p, lens: design.made(p, lens, config.compensator).spot)
+        spots.append(float(nominal(some, perturbed.lens)))
+    seconds = []
+    for _ in range(2):
+        begun = time.perf_counter()
+        found = jax.block_until_ready(design.predict(problem, perturbed, config.compensator))
+        seconds.append(time.perf_counter() - begun)
+    fields = {name: np.asarray(a).tolist() for name, a in found._asdict().items()}
+    about = {"seconds": seconds[1], "compile_s": seconds[0] - seconds[1]}
+    return {"fields": fields, "rule_error": abs(spots[0] / spots[1] - 1), **about}
+
+
+def predicted_of(found: dict[str, Any]) -> design.Predicted:
+    """The predictions of `derivatives`."""
+    return design.Predicted(**{name: jnp.asarray(a) for name, a in found["fields"].items()})
+
+
+def traced(
+    config: Config, off: np.ndarray, title: str, problem: design.Problem, perturbed: Any
+) -> design.Made:
+    """Monte Carlo with a progress bar."""
+    with tqdm(total=len(off), desc=title, unit="lens", dynamic_ncols=True) as bar:
+        return design.monte_carlo(
+            problem, perturbed, off, config.compensator, lambda done: bar.update(done - bar.n)
+        )
+
+
+def sensitivity(config: Config, found: dict[str, Any]) -> dict[str, Any]:
+    """Each error alone at both its ends, and all of them at their worst."""
+    problem, perturbed = prepare(config)
+    predicted, count = predicted_of(found), len(perturbed.errors)
+    worst = design.worst_case(perturbed, predicted)
+    off = np.concatenate([-np.eye(count), np.eye(count), np.zeros((1, count)), worst[None]])
+    made = traced(config, off, "one error", problem, perturbed)
+    spots, nominal = _um(made.spot), float(_um(made.spot[-2]))
+    foretold = _um(predicted.at(off, "second"), root=True) - float(_um(predicted.nominal, True))
+    moves = np.asarray(predicted.moves + off @ predicted.move_slopes)
+    variances = design.variances(perturbed, config.errors == "normal")
+    share = np.diag(np.asarray(predicted.hessian)) * variances / 2
+    rows = []
+    for k, error in enumerate(perturbed.errors):
+        ends = [k, count + k]
+        rows.append({
+            "error": str(error), "kind": error.kind, "place": error.place, "axis": error.axis,
+            "size": float(perturbed.sizes[k]), "unit": KINDS[error.kind].unit,
+            "predicted_um": foretold[ends].tolist(),
+            "traced_um": (spots[ends] - nominal).tolist(),
+            "predicted_moves": (moves[ends] - moves[-2]).tolist(),
+            "moves": (made.moves[ends] - made.moves[-2]).tolist(),
+            "growth_um2": 1e6 * float(share[k]),
+        })  # fmt: skip
+    ends = {order: float(_um(predicted.at(worst, order), True)) for order in _ORDERS}
+    return {"rows": rows, "nominal_um": nominal, "worst": {"traced": float(spots[-1]), **ends}}
+
+
+def _um(mm: Any, root: bool = False) -> np.ndarray:
+    """In um; `root`: of squares in mm^2, negative ones taken as 0."""
+    return 1e3 * (np.sqrt(np.maximum(mm, 0)) if root else np.asarray(mm))
+
+
+def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -> dict[str, Any]:
+    """Spots of all lenses at one scale of the sizes, and as predicted; logs them."""
+    problem, perturbed = prepare(config)
+    predicted, normal = predicted_of(found), config.errors == "normal"
+    off = scale * design.draw_errors(perturbed, config.count, config.seed, normal)
+    begun = time.perf_counter()
+    design.monte_carlo(problem, perturbed, off[:1], config.compensator)
+    warm = time.perf_counter()
+    made = traced(config, off, f"sizes x {scale:g}", problem, perturbed)
+    seconds = time.perf_counter() - warm
+    spots, good = _um(made.spot), np.isfinite(made.spot)
+    _common.require(bool(good.any()), f"scales: {scale:g}: light passes through no lens; take less")
+    draws = scale * design.draw_errors(perturbed, config.draws, config.seed + 1, normal)
+    samples = {"traced": spots}
+    samples |= {order: _um(predicted.at(draws, order), True) for order in _ORDERS}
+    ends = np.quantile(spots[good], [0, 0.999])
+    edges = np.linspace(0.98 * ends[0], 1.1 * ends[1], _BINS + 1)
+    variances = scale**2 * design.variances(perturbed, normal)
+    row: dict[str, Any] = {"scale": scale, "edges_um": edges.tolist(), "seconds": seconds}
+    row |= {"compile_s": warm - begun, "failed": int(np.sum(~good))}
+    row |= {"moves_deviation": np.std(made.moves[good], axis=0).tolist()}
+    row["rays"] = design.rays_of(problem) * len(off)
+    for name, values in samples.items():
+        whole = values[np.isfinite(values)]
+        ninth = np.quantile(values, 0.9, method="higher")
+        said: dict[str, Any] = {"mean_um": float(whole.mean()), "p90_um": float(ninth)}
+        said["yields"] = [float(np.mean(values <= limit)) for limit in config.limits_um]
+        said["quantiles_um"] = np.quantile(whole, _LEVELS).tolist()
+        said["counts"] = np.histogram(whole, edges)[0].tolist()
+        if name != "traced":
+            mean, deviation = predicted.moments(variances, name)
+            # Root sum of squares: q taken as normal.
+            said["rss_p90_um"] = float(_um(mean + 1.2815516 * deviation, True))
+        row[name] = said
+    parts = {"mean_um": row["traced"]["mean_um"], "p90_um": row["traced"]["p90_um"]}
+    run.log(
+        f"sizes x {scale:g}",
+        0,
+        {k: np.array([v]) for k, v in (parts | {"seconds": seconds}).items()},
+    )
+    return row
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Derivatives, then each error alone, then Monte Carlo at each scale."""
+    (found,) = _common.measured(run, "step", {"derivatives": lambda: derivatives(config)})
+    jobs: dict[str, Any] = {"one error": lambda: sensitivity(config, found)}
+    for scale in config.scales:
+        jobs[f"sizes x {scale:g}"] = functools.partial(monte_carlo, config, found, scale, run)
+    alone, *scales = _common.measured(run, "step", jobs)
+    about = {"derivatives_s": found["seconds"], "derivatives_compile_s": found["compile_s"]}
+    about |= {"rule_error": found["rule_error"], "threads": os.cpu_count(), "count": config.count}
+    about |= {"errors": config.errors, "limits_um": list(config.limits_um)}
+    return alone | about | {"scales": scales, "seconds": run.seconds}
+
+
+def main_scale(results: dict[str, Any]) -> dict[str, Any]:
+    """The row of the sizes as they are, or of the first scale."""
+    return next((row for row in results["scales"] if row["scale"] == 1), results["scales"][0])
+
+
+def known(spot: float | None) -> float:
+    """A spot, infinite where there is none."""
+    return math.inf if spot is None else spot
+
+
+def merged(results: dict[str, Any]) -> list[dict]:
+    """The worst of each kind and part: of x and y, of minus and plus, the larger; largest first."""
+    found = []
+    for (kind, place), some in _common.grouped(results["rows"], "kind", "place").items():
+        ends = [(known(end), row, k) for row in some for k, end in enumerate(row["traced_um"])]
+        change, worst, most = max(ends, key=lambda end: end[0])
+        name = f"{kind}, {KINDS[kind].whole} {place}"
+        row = {"name": name, "size": f"{worst['size']:g} {worst['unit']}".strip()}
+        row |= {"predicted_um": worst["predicted_um"][most], "traced_um": change}
+        row["move"] = max((abs(end[0]) for row in some for end in row["moves"] if end), default=0)
+        row["growth"] = sum(row["growth_um2"] for row in some)
+        found.append(row)
+    return sorted(found, key=lambda row: -row["traced_um"])
+
+
+def off_by(row: dict[str, Any], truth: float | None) -> list[str]:
+    """By how much the spots of all orders of prediction miss the traced one."""
+    if truth is None:
+        return [""] * len(_ORDERS)
+    return [f"{100 * (row[order] / truth - 1):+.1f} %" for order in _ORDERS]
+
+
+def table_of_scales(results: dict[str, Any]) -> str:
+    """Spots by scale, traced, and by how much each order of prediction is off."""
+    header = ["sizes times", "spot", "traced (µm)", *(f"{_WORDS[order]}" for order in _ORDERS)]
+    lines = []
+    for row in results["scales"]:
+        scale, true = f"{row['scale']:g}", row["traced"]
+        for key, of, words in (
+            ("mean_um", "mean_um", "mean"),
+            ("p90_um", "p90_um", "90 % are below"),
+            ("rss_p90_um", "p90_um", "the same by RSS"),
+        ):
+            some = {order: row[order][key] for order in _ORDERS}
+            lines.append((scale, words, _common.number(true[of], ".2f"), *off_by(some, true[of])))
+    worst = results["worst"]
+    lines.append(
+        ("1", "worst case", _common.number(worst["traced"], ".2f"), *off_by(worst, worst["traced"]))
+    )
+    return _common.table(header, lines)
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Spots by scale, traced and predicted; yields; the worst errors; shares of the kinds."""
+    row, limits = main_scale(results), results["limits_um"]
+    yields = [
+        (_WORDS[name], *(f"{100 * part:.1f} %" for part in row[name]["yields"])) for name in _WORDS
+    ]
+    worst = []
+    for some in merged(results)[:_SHOWN]:
+        changes = (f"{some[key]:+.3f}" for key in ("predicted_um", "traced_um"))
+        worst.append((some["name"], some["size"], *changes, f"{some['move']:.3f}"))
+    whole = sum(row["growth_um2"] for row in results["rows"])
+    kinds = [
+        (kind, len(some), f"{100 * sum(row['growth_um2'] for row in some) / whole:.1f} %")
+        for (kind,), some in _common.grouped(results["rows"], "kind").items()
+    ]
+    ends = ("as predicted (µm)", "as traced (µm)", "refocus (mm)")
+    return {
+        "tolerance": table_of_scales(results),
+        "tolerance, yield": _common.table(("spot at most", *(f"{x:g} µm" for x in limits)), yields),
+        "tolerance, worst": _common.table(("error", "at most", *ends), worst),
+        "tolerance, kinds": _common.table(("kind", "errors", "share of the mean growth"), kinds),
+    }
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Draw the yield by scale, the worst errors, and how the spots are spread."""
+    figure, axes = _common.panels(len(results["scales"]), 5.2, 3.7)
+    for ax, row in zip(axes, results["scales"]):
+        lines = {
+            "traced" if name == "traced" else _WORDS[name]: (
+                row[name]["quantiles_um"],
+                100 * _LEVELS,
+            )
+            for name in ("traced", *_ORDERS)
+        }
+        show.curves(ax, lines, "spot (µm)", "lenses at least so good (%)")
+        ax.set_title(f"sizes × {row['scale']:g}", fontsize=10)
+        ax.set_xlim(0, 1.05 * row["traced"]["quantiles_um"][-1])
+        ax.lines[0].set(linewidth=2.4, color="black", alpha=0.5)
+    figure.savefig(figures / "yield.png")
+    some = merged(results)[:_SHOWN]
+    figure, ax = show.new(1, 1, 7, 5)
+    bars = {name: np.array([m[f"{name}_um"] for m in some]) for name in ("traced", "predicted")}
+    show.offenders(ax, [f"{m['name']}: {m['size']}" for m in some], bars)
+    ax.set_xlabel("spot grows by (µm)")
+    figure.savefig(figures / "offenders.png")
+    row = main_scale(results)
+    figure, ax = show.new(1, 1, 6.5, 4)
+    counts = {"traced": row["traced"]["counts"]}
+    counts |= {_WORDS[order]: row[order]["counts"] for order in _ORDERS}
+    marks = {"nominal": results["nominal_um"], "mean": row["traced"]["mean_um"]}
+    if row["traced"]["p90_um"] is not None:
+        marks["90 %"] = row["traced"]["p90_um"]
+    show.histogram(ax, np.array(row["edges_um"]), counts, marks, "spot (µm)")
+    figure.savefig(figures / "histogram.png")
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__])
