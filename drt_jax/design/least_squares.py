@@ -18,7 +18,8 @@ from ..numerics import run_if, safe_divide
 # XLA's newer fusions of CPUs take twice as long to compile what is large and runs no faster.
 COMPILE = {"xla_cpu_use_fusion_emitters": False}
 _DAMPING, _MOST_DAMPING = 1e-3, 1e16
-_HOLDS = 3  # how often numbers are added to those held at a bound, in one step
+_PARTS = (1.0, 0.5, 0.25, 0.1, 0.03)
+_HOLDS = 5  # how often what is held at a bound, and which limits count, is asked in one step
 
 
 class LMState(NamedTuple):
@@ -45,14 +46,16 @@ class BoundedLM(optx.AbstractLeastSquaresSolver):
     """Least squares within bounds.
 
     `fn(y, args)` returns residuals (M,) and, as its auxiliary output, by how much y (N,) is
-    unphysical, (), and a tree of arrays to keep. A trial is taken if the merit, the sum of the
-    squares, falls and y is no more unphysical than before. Options: "lower" and "upper", (N,). Ends
+    unphysical, (), and a tree of arrays to keep. The last `limits` of the residuals are one-sided:
+    they count where they are above 0. A trial is taken if the merit, the sum of the squares of what
+    counts, falls and y is no more unphysical than before. Options: "lower" and "upper", (N,). Ends
     when the model promises less than `rtol` of the merit, when that is below `atol`, or when no
     trial is taken any more (RESULTS.nonlinear_divergence).
     """
 
     rtol: float
     atol: float
+    limits: int = 0
     norm: Callable = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> LMState:
@@ -71,11 +74,12 @@ class BoundedLM(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state, tags) -> tuple[Array, LMState, Any]:
         """One trial, and if it is taken, the Jacobian there."""
         lower, upper = options["lower"], options["upper"]
-        move, promised = _proposal(y, state, lower, upper)
+        sided = jnp.arange(state.residuals.size) >= state.residuals.size - self.limits
+        move, promised = _proposal(y, state, lower, upper, sided)
         trial = jnp.where(state.fresh, y, jnp.clip(y + move, lower, upper))
         residuals, push, aux = jax.linearize(lambda y: fn(y, args), trial, has_aux=True)
         broken, told = aux
-        merit = jnp.sum(residuals**2)
+        merit = jnp.sum(_counting(residuals, sided) ** 2)
         finite = jnp.isfinite(merit) & jnp.isfinite(broken)
         better = finite & (merit < state.merit) & (broken <= state.broken)
         taken = state.fresh | better
@@ -93,7 +97,7 @@ class BoundedLM(optx.AbstractLeastSquaresSolver):
             jacobian,
             merit,
             broken,
-            jnp.maximum(scale, state.scale),
+            scale,
             jnp.where(state.fresh, state.damping, damping),
             jnp.where(better | state.fresh, 2, 2 * state.growth),
             jnp.where(state.fresh, jnp.inf, safe_divide(promised, state.merit)),
@@ -106,7 +110,7 @@ class BoundedLM(optx.AbstractLeastSquaresSolver):
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
         """Whether nothing more is to be gained, or no trial is taken any more."""
-        small = (state.gain <= self.rtol) | (state.merit <= self.atol)
+        small = ((state.gain >= 0) & (state.gain <= self.rtol)) | (state.merit <= self.atol)
         stuck = state.damping > _MOST_DAMPING
         results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         return ~state.fresh & (small | stuck), optx.RESULTS.where(stuck & ~small, *results)
@@ -116,14 +120,25 @@ class BoundedLM(optx.AbstractLeastSquaresSolver):
         return y, aux, {"num_jacobians": state.jacobians}
 
 
-def _proposal(y: Array, state: LMState, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """The damped step within the bounds, and by how much the model has the merit fall."""
-    gradient = state.jacobian.T @ state.residuals
-    square = state.jacobian.T @ state.jacobian
+def _counting(residuals: Array, sided: Array) -> Array:
+    """The residuals (M,), 0 where they are one-sided and not above 0."""
+    return jnp.where(sided, jnp.maximum(residuals, 0), residuals)
+
+
+def _proposal(
+    y: Array, state: LMState, lower: Array, upper: Array, sided: Array
+) -> tuple[Array, Array]:
+    """The damped step within the bounds, and by how much the model has the merit fall. Which limits
+    count, and which numbers are held at a bound, follows from where the step leads."""
     scale = jnp.where(state.scale > 0, state.scale, 1)
-    at_bound = ((y <= lower) & (gradient > 0)) | ((y >= upper) & (gradient < 0))
-    held, move = at_bound, jnp.zeros_like(y)
-    for _ in range(_HOLDS):
+    move, held = jnp.zeros_like(y), jnp.zeros(y.shape, bool)
+    for turn in range(_HOLDS):
+        ahead = state.residuals + state.jacobian @ move
+        counts = (~sided | (ahead > 0)).astype(y.dtype)
+        gradient = state.jacobian.T @ (counts * state.residuals)
+        square = state.jacobian.T @ (counts[:, None] * state.jacobian)
+        if not turn:
+            held = ((y <= lower) & (gradient > 0)) | ((y >= upper) & (gradient < 0))
         # In units of the columns' norms; what is held moves as far as it does already.
         free = (~held).astype(y.dtype)
         matrix = square / scale[:, None] / scale * free[:, None] * free
@@ -131,9 +146,12 @@ def _proposal(y: Array, state: LMState, lower: Array, upper: Array) -> tuple[Arr
         right = -(gradient + square @ (move * (1 - free))) / scale * free
         step = jax.scipy.linalg.solve(matrix, right, assume_a="pos") / scale
         move = jnp.where(held, move, step)
-        beyond = (y + move < lower) | (y + move > upper)
+        held = held | (y + move < lower) | (y + move > upper)
         move = jnp.clip(y + move, lower, upper) - y
-        held = held | beyond
     move = jnp.where(jnp.isfinite(move), move, 0)
-    along = state.jacobian @ move
-    return move, -2 * jnp.sum(state.residuals * along) - jnp.sum(along**2)
+    # Where that goes round in circles, a part of the step is better than all of it.
+    parts = jnp.asarray(_PARTS, y.dtype)
+    ahead = state.residuals[:, None] + (state.jacobian @ move)[:, None] * parts
+    merits = jnp.sum(_counting(ahead, sided[:, None]) ** 2, axis=0)
+    best = jnp.argmin(merits)
+    return parts[best] * move, jnp.sum(_counting(state.residuals, sided) ** 2) - merits[best]

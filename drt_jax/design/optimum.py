@@ -59,8 +59,7 @@ class Search(NamedTuple):
 def _wanted(vector: Array, args: tuple[Problem, Array]) -> tuple[Array, tuple]:
     problem, shift = args
     judged = problem.judge(vector)
-    limits = jnp.maximum(judged.excess + shift, 0)
-    return jnp.concatenate([judged.residuals, limits]), (judged.broken, judged)
+    return jnp.concatenate([judged.residuals, judged.excess + shift]), (judged.broken, judged)
 
 
 def begin(problem: Problem, vector: Array) -> Search:
@@ -69,26 +68,25 @@ def begin(problem: Problem, vector: Array) -> Search:
     shift = jnp.zeros(judged.excess.shape, vector.dtype)
     count = judged.residuals.size + shift.size
     wanted = jax.ShapeDtypeStruct((count,), vector.dtype)
-    state = _METHOD.init(None, vector, None, {}, wanted, (None, judged), frozenset())
+    state = _method(shift.size).init(None, vector, None, {}, wanted, (None, judged), frozenset())
     no = jnp.bool_(False)
     return Search(vector, state, shift, jnp.zeros((), jnp.int32), no, no)
 
 
-_METHOD = BoundedLM(rtol=_FINE, atol=0.0)
+def _method(limits: int) -> BoundedLM:
+    return BoundedLM(rtol=_FINE, atol=0.0, limits=limits)
 
 
 def turn(problem: Problem, search: Search) -> Search:
     """One trial more, unless the search is done."""
     variables = problem.variables
     options = {"lower": variables.low, "upper": variables.high}
-    args = problem, search.shift
-    vector, state, _ = _METHOD.step(
-        _wanted, search.vector, args, options, search.state, frozenset()
-    )
-    ended, _ = _METHOD.terminate(_wanted, vector, args, options, state, frozenset())
+    args, method = (problem, search.shift), _method(search.shift.size)
+    vector, state, _ = method.step(_wanted, search.vector, args, options, search.state, frozenset())
+    ended, _ = method.terminate(_wanted, vector, args, options, state, frozenset())
     excess = state.kept.excess
     met = jnp.max(excess, initial=0.0) <= _MET
-    settled = ended | (~search.fine & ~state.fresh & (state.gain < _COARSE))
+    settled = ended | (~search.fine & ~state.fresh & (jnp.abs(state.gain) < _COARSE))
     shifts = settled & ~met & (search.rounds < _ROUNDS)
     shift = jnp.where(shifts, jnp.maximum(excess + search.shift, 0), search.shift)
     state = state._replace(fresh=shifts)
