@@ -21,4 +21,4 @@ from .figures import (
     sigma_over_depth as sigma_over_depth,
 )
 from .layout import Drawing as Drawing, draw as draw, lens_drawing as lens_drawing
-from .tolerances import histogram as histogram, offenders as offenders
+from .tolerances import histogram as histogram, offenders as offenders, yields as yields

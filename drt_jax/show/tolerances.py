@@ -23,24 +23,46 @@ def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]
     return axes
 
 
+# Lines that may lie on each other, below one broad line of what is true.
+_TRUE = {"color": "black", "alpha": 0.35, "linewidth": 4}
+_STYLES = ("-", "--", ":")
+
+
+def yields(
+    axes: Axes, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, ylabel: str
+) -> Axes:
+    """Shares of lenses, in per cent, over what they reach: the first curve broad, those that are
+    to be compared with it thin.
+
+    curves: (x (N,), shares (N,) in per cent) by label.
+    """
+    for k, (label, (x, share)) in enumerate(curves.items()):
+        style = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
+        axes.plot(x, share, label=label, **(style if k else _TRUE))
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return axes
+
+
 def histogram(
     axes: Axes,
     edges: np.ndarray,
-    counts: Mapping[str, np.ndarray],
+    shares: Mapping[str, np.ndarray],
     marks: Mapping[str, float],
     xlabel: str,
 ) -> Axes:
     """Shares of samples between edges, in per cent.
 
-    edges: (N + 1,). counts: (N,) by label, of any sum; the first filled, the others as lines.
-    marks: places of vertical lines, by label.
+    edges: (N + 1,). shares: (N,) by label; the first filled, the others as lines. marks: places of
+    vertical lines, by label.
     """
-    for k, (label, values) in enumerate(counts.items()):
-        part = 100 * np.asarray(values) / np.sum(values)
-        fill = {"color": "C0", "alpha": 0.35} if k == 0 else {"color": f"C{k}", "linewidth": 1.3}
-        axes.stairs(part, edges, fill=k == 0, label=label, **fill)
+    for k, (label, values) in enumerate(shares.items()):
+        line = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
+        fill = {"color": "black", "alpha": 0.2, "fill": True}
+        axes.stairs(values, edges, label=label, **(line if k else fill))
     for k, (label, place) in enumerate(marks.items()):
-        axes.axvline(place, color="black", linestyle=("-", "--", ":")[k % 3], linewidth=1)
+        axes.axvline(place, color="black", linestyle="-.", linewidth=0.8)
         axes.annotate(
             label, (place, 1), (3, -10 - 11 * k), xycoords=("data", "axes fraction"),
             textcoords="offset points", fontsize=8,

@@ -200,7 +200,7 @@ def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -
         said: dict[str, Any] = {"mean_um": float(whole.mean()), "p90_um": float(ninth)}
         said["yields"] = [float(np.mean(values <= limit)) for limit in config.limits_um]
         said["quantiles_um"] = np.quantile(whole, _LEVELS).tolist()
-        said["counts"] = np.histogram(whole, edges)[0].tolist()
+        said["shares"] = (100 / len(values) * np.histogram(whole, edges)[0]).tolist()
         if name != "traced":
             mean, deviation = predicted.moments(variances, name)
             # Root sum of squares: q taken as normal.
@@ -308,17 +308,12 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw the yield by scale, the worst errors, and how the spots are spread."""
     figure, axes = _common.panels(len(results["scales"]), 5.2, 3.7)
     for ax, row in zip(axes, results["scales"]):
-        lines = {
-            "traced" if name == "traced" else _WORDS[name]: (
-                row[name]["quantiles_um"],
-                100 * _LEVELS,
-            )
-            for name in ("traced", *_ORDERS)
-        }
-        show.curves(ax, lines, "spot (µm)", "lenses at least so good (%)")
+        parts = dict.fromkeys(_WORDS, 100 * _LEVELS)
+        parts["traced"] = parts["traced"] * (1 - row["failed"] / results["count"])
+        lines = {_WORDS[name]: (row[name]["quantiles_um"], parts[name]) for name in _WORDS}
+        show.yields(ax, lines, "spot (µm)", "lenses at least so good (%)")
         ax.set_title(f"sizes × {row['scale']:g}", fontsize=10)
         ax.set_xlim(0, 1.05 * row["traced"]["quantiles_um"][-1])
-        ax.lines[0].set(linewidth=2.4, color="black", alpha=0.5)
     figure.savefig(figures / "yield.png")
     some = merged(results)[:_SHOWN]
     figure, ax = show.new(1, 1, 7, 5)
@@ -328,12 +323,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     figure.savefig(figures / "offenders.png")
     row = main_scale(results)
     figure, ax = show.new(1, 1, 6.5, 4)
-    counts = {"traced": row["traced"]["counts"]}
-    counts |= {_WORDS[order]: row[order]["counts"] for order in _ORDERS}
+    shares = {words: np.array(row[name]["shares"]) for name, words in _WORDS.items()}
     marks = {"nominal": results["nominal_um"], "mean": row["traced"]["mean_um"]}
     if row["traced"]["p90_um"] is not None:
         marks["90 %"] = row["traced"]["p90_um"]
-    show.histogram(ax, np.array(row["edges_um"]), counts, marks, "spot (µm)")
+    show.histogram(ax, np.array(row["edges_um"]), shares, marks, "spot (µm)")
     figure.savefig(figures / "histogram.png")
 
 
