@@ -18,7 +18,7 @@ from ..lens.scene import scene_of, vergence_of
 from ..numerics import safe_divide
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
-from .kinds import KINDS, back_distance
+from .kinds import KINDS, back_distance, step_of
 from .seen import symmetry_by_structure
 
 # In the order in which they are applied: none moves what one before it keeps, see `held`.
@@ -28,6 +28,7 @@ _Name = Literal[
 # Newton steps: every condition is linear in the number that meets it, the second mends rounding.
 _STEPS = 2
 _ORDER = 6  # of the rule of the best focus
+# A value is met to this part; and a typical step of the number that follows changes it by more.
 _HELD = 1e-9
 
 
@@ -107,7 +108,7 @@ class Solve:
     def found(self, lens: Lens) -> "Solve":
         """The solve with the value that it keeps. ValueError where that is none, or where the
         number that follows does not change it."""
-        kind, row, _ = self.place(lens)
+        kind, row, term = self.place(lens)
         if self.focuses:
             if not float(_focus(lens, self)[1]) > 0:
                 raise ValueError(
@@ -122,7 +123,9 @@ class Solve:
                 raise ValueError(f"solves: {self.kind}: the lens has none to keep; give its value")
             solve = dataclasses.replace(self, value=now)
         missed = float(condition.measure(solve.apply(lens), solve)) / condition.value(solve.value)
-        if not abs(missed - 1) < _HELD or not float(jnp.abs(solve.rate(lens, solve))) > 0:
+        change = float(solve.rate(lens, solve)) * step_of(lens, kind, row, term)
+        weak = not abs(change) > _HELD * abs(condition.value(solve.value))
+        if weak or not abs(missed - 1) < _HELD:
             raise ValueError(
                 f"solves: {self.kind}: no {kind} of surface {row} gives {solve.value:g}; "
                 "is the beam in focus there? give another surface"

@@ -86,9 +86,11 @@ def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[
         return count + 1, length + change, small
 
     start = 0, length, jnp.zeros(length.shape, bool)
+    plane = length
     _, length, met = jax.lax.while_loop(
         lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, start
     )
+    length = jnp.where(met, length, plane)  # what does not settle may be anything
     return length, met & domain(_along(p, d, length)[:-1], shape, form)
 
 
@@ -295,6 +297,10 @@ def _follow(
 
     def step(state, row):
         p, d = row.surface.local(state.point, state.direction)
+        if not to_stop:  # a lost ray goes along the axis, so that its numbers stay finite
+            going, axis = state.fate == Status.OK, (*(0,) * (len(d) - 1), row.sense)
+            p = tuple(jnp.where(going, a, 0) for a in p)
+            d = tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
         meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
         own, normal, met, length = meet(p, d, row.surface.shape, state.fate == Status.OK)
         bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))

@@ -1,0 +1,272 @@
+"""Variables of a lens: named, bounded, tied; from vector to lens and back."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drt_jax import load_lens
+from drt_jax.design import Solve, Tie, Variables, Vary
+from drt_jax.design.kinds import KINDS
+
+MODEL = """
+surfaces:
+  - {radius: 20.0, thickness: 3.0, nd: 1.62, vd: 60.0, semi_diameter: 6.0}
+  - {radius: -400.0, thickness: 5.0}
+  - {radius: -21.0, thickness: 1.0, nd: 1.62, vd: 36.0, conic: 0.1,
+     coefficients: {4: 1.0e-5, 6: 2.0e-8}}
+  - {radius: 19.0, thickness: 2.5}
+  - {radius: inf, thickness: 2.5, stop: true, semi_diameter: 4.0}
+  - {radius: 75.0, thickness: 3.0, nd: 1.62, vd: 60.0}
+  - {radius: -17.0, thickness: 38.0}
+"""
+# Of each kind the numbers that its word means: (rows, terms).
+ALL = {
+    "curvature": ([0, 1, 2, 3, 5, 6], [0]),
+    "conic": ([0, 1, 2, 3, 5, 6], [0]),
+    "coefficients": ([0, 1, 2, 3, 5, 6], [1, 2]),
+    "thickness": ([0, 1, 2, 3, 4, 5], [0]),
+    "sensor": ([0], [0]),
+    "index": ([0, 2, 5], [0]),
+    "abbe": ([0, 2, 5], [0]),
+    "tilt": ([0, 1, 2, 3, 5, 6], [0, 1, 2]),
+    "decentre": ([0, 1, 2, 3, 5, 6], [0, 1]),
+    "semi_diameter": ([0, 4], [0]),
+}
+
+
+@pytest.fixture
+def lens(tmp_path):
+    """Three lenses of model glasses, one asphere, all but two apertures open."""
+    path = tmp_path / "model.yaml"
+    path.write_text(MODEL)
+    return load_lens(path)
+
+
+def changed(kind, lens, other):
+    """By how much numbers of a kind differ; inf from inf by 0."""
+    after, before = (np.asarray(KINDS[kind].read(each)) for each in (lens, other))
+    return np.where(after == before, 0, after) - np.where(after == before, 0, before)
+
+
+def test_all_kinds_are_here():
+    assert set(ALL) == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_a_word_is_all_of_a_kind(lens, kind):
+    rows, terms = ALL[kind]
+    places = Variables.of(lens, [kind]).places
+    assert [p[1:] for p in places] == [(row, term) for row in rows for term in terms]
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_each_number_moves_alone_and_by_itself(lens, kind):
+    variables = Variables.of(lens, [kind])
+    start = variables.start
+    for k, place in enumerate(variables.places):
+        moved = variables.lens_of(start.at[k].add(0.1))
+        change = changed(kind, moved, variables.lens)
+        assert abs(change[place.row, place.term] - 0.1 * variables.scale[k]) < 1e-14
+        change[place.row, place.term] = 0
+        if kind in ("index", "abbe"):  # of the media that go on behind
+            change[place.row + 1 :] = 0
+        np.testing.assert_allclose(change, 0, atol=1e-14)
+    others = set(KINDS) - {kind}
+    moved = variables.lens_of(start + 0.1)
+    for other in others:
+        np.testing.assert_allclose(changed(other, moved, variables.lens), 0, atol=1e-13)
+
+
+def test_from_vector_to_lens_and_back(lens):
+    every = Variables.of(lens, [*ALL])
+    rng = np.random.default_rng(0)
+    vector = jnp.asarray(rng.normal(size=len(every.places))) + every.start
+    np.testing.assert_allclose(every.vector(every.lens_of(vector)), vector, rtol=1e-13, atol=1e-13)
+    assert len(set(every.names)) == len(every.places)
+
+    # In one program, for many vectors, differentiable: each number of the lens by its own variable.
+    def back(vector):
+        return every.vector(every.lens_of(vector))
+
+    many = jnp.stack([vector, 2 * vector])
+    program = jax.jit(lambda v: (jax.vmap(back)(v), jax.jacfwd(back)(v[0]), jax.jacrev(back)(v[0])))
+    again, *jacobians = program(many)
+    np.testing.assert_allclose(again, many, rtol=1e-13, atol=1e-13)
+    for jacobian in jacobians:
+        np.testing.assert_allclose(jacobian, np.eye(len(vector)), atol=1e-12)
+
+
+def test_the_sensor_goes_along_with_thicknesses(lens):
+    variables = Variables.of(lens, ["thickness"])
+    longer = variables.lens_of(variables.start + 1)
+    grown = jnp.sum(longer.thickness) - jnp.sum(lens.thickness)
+    assert grown > 0.1 and abs(longer.sensor - lens.sensor - grown) < 1e-12
+
+
+def test_bounds_and_scales(lens):
+    vary = [
+        Vary("curvature", (0, 1), low=0.0, high=0.06, scale=0.01),
+        Vary("index", (0,), low=1.0, high=1.8),
+        "thickness",
+    ]
+    variables = Variables.of(lens, vary)
+    np.testing.assert_allclose(variables.low[:2], 0)
+    np.testing.assert_allclose(variables.high[:2], 6)
+    # Indices end where glasses do, the others nowhere; the start lies within.
+    assert abs(variables.numbers(variables.low)[2] - 1.3) < 1e-12
+    assert np.all(np.isinf(variables.low[3:])) and np.all(np.isinf(variables.high[3:]))
+    assert variables.start[1] == 0 and variables.lens.curvature[1] == 0
+    np.testing.assert_allclose(variables.start[0], 5)
+
+
+def test_scales_are_what_moves_the_light(lens):
+    """A step of any coefficient lifts its surface by the same at the beam's edge."""
+    variables = Variables.of(lens, [Vary("coefficients", (2,))])
+    np.testing.assert_allclose(variables.scale, [0.04 / 4.0**4, 0.04 / 4.0**6], rtol=1e-12)
+
+
+def test_norm_radii_are_no_variables(tmp_path):
+    path = tmp_path / "forbes.yaml"
+    path.write_text(
+        "surfaces:\n"
+        "  - {radius: 50, thickness: 5, glass: N-BK7, semi_diameter: 5, stop: true, form: qbfs,\n"
+        "     norm_radius: 6.0, coefficients: {0: 1.0e-3, 1: 1.0e-4}}\n"
+        "  - {radius: inf, thickness: 95, form: toroid, curvature_x: 0.001}\n"
+    )
+    names = Variables.of(load_lens(path), ["coefficients"]).names
+    # Of the toroid its curvature in x and y^4; that of y^2 is its curvature.
+    assert names == (
+        *("coefficients 0[1]", "coefficients 0[2]"),
+        *("coefficients 1[0]", "coefficients 1[2]"),
+    )
+
+
+def test_ties(lens):
+    ties = [Tie((0, 3)), Tie((1, 6), "opposite"), Tie((0, 5), kind="thickness")]
+    variables = Variables.of(lens, ["curvature", "thickness"], ties)
+    names = variables.names
+    assert "curvature 3" not in names and "curvature 6" not in names and "thickness 5" not in names
+    vector = variables.start + jnp.linspace(0.1, 1, len(names))
+    made = jax.jit(variables.lens_of)(vector)
+    assert made.curvature[3] == made.curvature[0] and made.curvature[6] == -made.curvature[1]
+    assert made.thickness[5] == made.thickness[0]
+    grown = jax.jacfwd(lambda v: variables.lens_of(v).curvature)(vector)
+    leader = names.index("curvature 1")
+    assert grown[6, leader] == -grown[1, leader] != 0
+
+
+def test_cemented_surfaces_have_one_shape(lens):
+    """Also where only some of the shape varies: what does not is made alike once."""
+    variables = Variables.of(lens, ["curvature", Vary("conic", (2,))], [Tie((2, 3), "cemented")])
+    assert variables.lens.coefficients[3, 1] == lens.coefficients[2, 1] != 0
+    made = variables.lens_of(variables.start + 1)
+    for name in ("curvature", "conic", "coefficients"):
+        array = np.asarray(getattr(made, name))
+        np.testing.assert_array_equal(array[2], array[3])
+    assert made.conic[2] != lens.conic[2]
+
+
+def test_what_follows_a_number_that_does_not_change(lens):
+    variables = Variables.of(lens, [Vary("thickness")], [Tie((0, 6), "opposite")])
+    assert variables.lens.curvature[6] == -lens.curvature[0]
+
+
+def test_media_go_on_behind_a_stop_and_a_mirror(tmp_path):
+    path = tmp_path / "mangin.yaml"
+    glass = "nd: 1.6, vd: 50.0"
+    path.write_text(
+        "surfaces:\n"
+        f"  - {{radius: -100, thickness: 2, {glass}, semi_diameter: 5}}\n"
+        f"  - {{radius: inf, thickness: 2, {glass}, semi_diameter: 5, stop: true}}\n"
+        "  - {radius: -150, thickness: -4, mirror: true, semi_diameter: 6}\n"
+        "  - {radius: -100, thickness: -60, semi_diameter: 6}\n"
+    )
+    variables = Variables.of(load_lens(path), ["index", "abbe"])
+    assert variables.names == ("index 0", "abbe 0")
+    made = variables.lens_of(variables.start + 1)
+    index = np.asarray(made.index(0.55))[:, 0]
+    assert index[0] == index[4] == 1 and index[1] == index[2] == index[3] > 1.61
+
+
+BAD = [
+    (dict(vary=["bend"]), "variables: unknown kind 'bend'; known: curvature, conic"),
+    (dict(vary=[Vary("curvature", (9,))]), "variables: curvature: no surface 9; there are 0, 1, 2"),
+    (dict(vary=[Vary("thickness", (6,))]), "no surface 6; there are 0, 1, 2, 3, 4, 5"),
+    (dict(vary=[Vary("index", (1,))]), "variables: index: no surface 1; there are 0, 2, 5"),
+    (dict(vary=[Vary("semi_diameter", (1,))]), "no surface 1; there are 0, 4"),
+    (dict(vary=[Vary("coefficients", (2,), (3,))]), "no term 3; there are 0, 1, 2"),
+    (dict(vary=["curvature", Vary("curvature", (2,))]), "variables: curvature 2 stands twice"),
+    (dict(vary=[]), "variables: none is left; name some"),
+    (
+        dict(vary=[Vary("curvature", (0, 3))], ties=[Tie((0, 3))]),
+        "variables: curvature 3 follows from a tie or a solve; leave it out",
+    ),
+    (
+        dict(vary=["curvature"], ties=[Tie((0, 3)), Tie((1, 3))]),
+        "ties: curvature 3 follows twice; leave one out",
+    ),
+    (
+        dict(vary=["curvature"], ties=[Tie((0, 3)), Tie((3, 5))]),
+        "ties: curvature 3, which curvature 5 follows, itself follows",
+    ),
+    (
+        dict(vary=["curvature"], ties=[Tie((6, 0))], solves=[Solve("focal_length", 50, 6)]),
+        "ties: curvature 6, which curvature 0 follows, itself follows",
+    ),
+    (
+        dict(vary=["curvature"], ties=[Tie((0, 6))], solves=[Solve("focal_length", 50, 6)]),
+        "ties: curvature 6 follows twice",
+    ),
+    (dict(vary=["curvature"], ties=[Tie((0, 9))]), "ties: curvature: no surface 9; there are 0"),
+    (
+        dict(vary=["sensor"], solves=[Solve("paraxial_focus")]),
+        "variables: none is left; fewer solves or more variables are needed",
+    ),
+]
+
+
+@pytest.mark.parametrize("k", range(len(BAD)))
+def test_what_does_not_fit_is_told_in_one_line(lens, k):
+    arguments, said = BAD[k]
+    with pytest.raises(ValueError) as told:
+        Variables.of(lens, **arguments)
+    assert said in str(told.value) and "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "make, said",
+    [
+        (lambda: Vary("curvature", low=1, high=-1), "variables: curvature: low 1 is not below"),
+        (lambda: Vary("curvature", low=np.nan), "variables: curvature: low nan is not below"),
+        (lambda: Vary("index", low=3.0), "variables: index: 3 to inf lies outside of 1.3 to 2.2"),
+        (lambda: Vary("curvature", scale=-1), "variables: curvature: scale: must be above 0"),
+        (lambda: Vary("curvature", 3), "variables: curvature: surfaces: expected whole numbers"),
+        (lambda: Vary("curvature", (1.5,)), "surfaces: expected whole numbers from 0"),
+        (lambda: Vary("tilt", terms="x"), "variables: tilt: terms: expected whole numbers"),
+        (lambda: Tie((0,)), "ties: expected two or more different surfaces"),
+        (lambda: Tie((0, 0)), "ties: expected two or more different surfaces"),
+        (lambda: Tie((0, 2), "cemented"), "ties: cemented: expected two neighbours"),
+        (lambda: Tie((0, 1), "alike"), "ties: unknown how 'alike'; known: equal, opposite"),
+        (lambda: Tie((0, 1), kind="bend"), "ties: unknown kind 'bend'; known: curvature"),
+    ],
+)
+def test_bad_words_and_numbers(make, said):
+    with pytest.raises(ValueError) as told:
+        make()
+    assert said in str(told.value) and "\n" not in str(told.value)
+
+
+def test_a_lens_without_any():
+    singlet = load_lens("singlet")
+    for kind, said in (("index", "write nd and vd"), ("coefficients", "zeros too")):
+        with pytest.raises(ValueError, match=said):
+            Variables.of(singlet, [kind])
+    assert Vary("curvature", [1]).surfaces == (1,) and hash(Vary("curvature", [1]))
+
+
+def test_float32_stays(lens):
+    small = jax.tree.map(lambda a: a.astype(jnp.float32), lens)
+    variables = Variables.of(small, [*ALL], solves=[Solve("focal_length", surface=6)])
+    made = variables.lens_of(variables.start)
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((made, variables.start)))
