@@ -338,7 +338,7 @@ def _medium(lens: Lens, nominal: Dispersion, kind: str, at: np.ndarray, by: Arra
         if kind == "index":
             model = model.at[at, 0].add(jnp.where(own, by, 0))
         else:
-            model = model.at[at, 1].multiply(1 + jnp.where(own, by / 100, 0))
+            model = model.at[at, 1].add(jnp.where(own, model[at, 1] * by / 100, 0))
     f, d, c = refractive_index(nominal, jnp.asarray(_LINES, lens.curvature.dtype))[at].T
     schott = constants.schott
     if kind == "index":
