@@ -52,7 +52,7 @@ class Made(NamedTuple):
 def _spots(seen: Seen) -> tuple[Array, Array, Array]:
     """Distances from the centroid, mm, and how they grow with the sensor's distance, (D, V, W Q)
     each, times the root of the light; and centroids (2, V), mm."""
-    rays, waves = seen.rays, seen.colour_weights[:, None]
+    rays, waves = seen.rays, seen.colour_weights[None, :, None]
     light = (rays.light * waves)[..., EXTRAS:]
     good = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
     light = jnp.where(good, light, 0)
@@ -60,15 +60,15 @@ def _spots(seen: Seen) -> tuple[Array, Array, Array]:
     both = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
     dim = len(both)
     both += [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
-    values = jnp.where(good, jnp.stack(both), 0)
+    values = jnp.where(good[None], jnp.stack(both), 0)
     total = jnp.sum(light, axis=(1, 2), keepdims=True)
     weight = safe_divide(light, jnp.broadcast_to(total, light.shape))
     # Of half a pupil, the other half has the opposite x, of a meridian the opposite y.
     across = {"meridian": [0], "half": [1], "disc": [1, 1]}[seen.rule.symmetry]
     even = jnp.asarray(([0] * (dim - len(across)) + across) * 2, light.dtype)
-    mean = jnp.sum(weight * values, axis=(2, 3)) * even[:, None]
-    apart = (values - mean[..., None, None]) * jnp.sqrt(jnp.where(good, weight, 1))
-    apart = jnp.where(good, apart, 0).reshape(2 * dim, len(light), -1)
+    mean = jnp.sum(weight[None] * values, axis=(2, 3)) * even[:, None]
+    apart = (values - mean[..., None, None]) * jnp.sqrt(jnp.where(good, weight, 1))[None]
+    apart = jnp.where(good[None], apart, 0).reshape(2 * dim, len(light), -1)
     centre = jnp.concatenate([jnp.zeros_like(mean[: 2 - dim]), mean[:dim]])
     return apart[:dim], apart[dim:], centre
 
@@ -174,18 +174,18 @@ def _predict_all(problem: Problem, perturbed: Perturbed, compensator: Compensato
     zero = jnp.zeros_like(perturbed.sizes)
     units = jnp.eye(len(zero), dtype=zero.dtype)
 
-    def rays(off: Array) -> tuple[Array, Array]:
+    def rays(off: Array) -> tuple[tuple[Array, Array], Array]:
         found, apart = _compensated(problem, perturbed.lens_of(off), compensator)
-        return jnp.ravel(apart) / jnp.sqrt(len(found.squares)), found.moves
+        return (jnp.ravel(apart) / jnp.sqrt(len(found.squares)), found.moves), found.squares
 
     def measure(off: Array) -> Array:
         return jnp.mean(_compensated(problem, perturbed.lens_of(off), compensator)[0].squares)
 
-    (apart, moves), push = jax.linearize(rays, zero)
+    (apart, moves), push, squares = jax.linearize(rays, zero, has_aux=True)
     moved, slopes = jax.lax.map(push, units)
     hessian = jax.lax.map(lambda unit: jax.jvp(jax.grad(measure), (zero,), (unit,))[1], units)
     gradient, gauss = 2 * moved @ apart, 2 * moved @ moved.T
-    return Predicted(measure(zero), gradient, gauss, hessian, moves, slopes)
+    return Predicted(jnp.mean(squares), gradient, gauss, hessian, moves, slopes)
 
 
 # Second derivatives of a whole trace are large to compile and run once.

@@ -148,7 +148,7 @@ def sensitivity(config: Config, found: dict[str, Any]) -> dict[str, Any]:
     made = traced(config, off, "one error", problem, perturbed)
     spots, nominal = _um(made.spot), float(_um(made.spot[-2]))
     foretold = _um(predicted.at(off, "second"), root=True) - float(_um(predicted.nominal, True))
-    moves = np.asarray(predicted.moves + off @ predicted.move_slopes)
+    moves = np.asarray(predicted.moves) + off @ np.asarray(predicted.move_slopes)
     variances = design.variances(perturbed, config.errors == "normal")
     share = np.diag(np.asarray(predicted.hessian)) * variances / 2
     rows = []

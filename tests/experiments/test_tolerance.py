@@ -1,0 +1,73 @@
+"""experiments.tolerance at toy size: rows, tables, pictures, resuming, bad settings."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import _command, tolerance as experiment
+
+SETTINGS = {
+    "lens": "singlet",
+    "tolerances": [{"kind": "radius", "size": 1.0}, {"kind": "thickness", "size": 0.3}],
+    "fields_deg": [[0, 0], [0, 3], [0, -3]],
+    "order": 2,
+    "scales": [1, 0.5],
+    "count": 60,
+    "draws": 2000,
+    "limits_um": [50, 100],
+}
+
+
+def main(*argv):
+    _command.main(experiment, [str(word) for word in argv])
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    """The settings as a file."""
+    path = tmp_path_factory.mktemp("tolerance") / "some.yaml"
+    path.write_text(json.dumps(SETTINGS))
+    return path
+
+
+def test_it_writes_rows_and_pictures_and_resumes(config, tmp_path, capsys):
+    folder = tmp_path / "run"
+    main("--config", config, "--out", folder)
+    assert "| radius, surface 1" in capsys.readouterr().out
+    results = json.loads((folder / "results.json").read_text())
+    assert [(row["kind"], row["place"]) for row in results["rows"]] == [
+        *(("radius", 1), ("thickness", 0), ("thickness", 1)),
+    ]
+    for row in results["rows"]:
+        assert len(row["traced_um"]) == len(row["predicted_um"]) == len(row["moves"]) == 2
+        np.testing.assert_allclose(row["traced_um"], row["predicted_um"], rtol=0.1, atol=0.02)
+        np.testing.assert_allclose(row["moves"], row["predicted_moves"], rtol=0.1, atol=1e-3)
+    first, second = results["scales"]
+    assert first["traced"]["mean_um"] == pytest.approx(first["second"]["mean_um"], rel=0.05)
+    assert first["traced"]["p90_um"] > second["traced"]["p90_um"] > 0
+    assert {path.stem for path in (folder / "figures").iterdir()} == {
+        *("yield", "offenders", "histogram"),
+    }
+    (folder / "results.json").unlink()
+    main("--resume", "--out", folder)
+    again = json.loads((folder / "results.json").read_text())
+    assert {**again, "seconds": 0} == {**results, "seconds": 0}
+
+
+@pytest.mark.parametrize(
+    "setting, said",
+    [
+        ("fields_deg=[[1]]", "fields_deg: expected pairs x, y from -89 to 89"),
+        ("scales=[]", "scales: needs at least one item"),
+        ("tolerances=[{kind: radii, size: 1}]", "tolerances: unknown kind 'radii'"),
+        ("tolerances=[{kind: tilt, size: 1, which: [3]}]", "tilt: no element 3"),
+        ("compensator=focus and tilt", "the fields lie on a line"),
+    ],
+)
+def test_bad_settings_are_refused_in_a_line(config, tmp_path, capsys, setting, said):
+    with pytest.raises(SystemExit) as stopped:
+        main("--config", config, "--out", tmp_path / "run", "--set", setting)
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said in error and len(error) < 300
