@@ -1,6 +1,7 @@
 """What tolerances do: bars of the worst, and how often lenses are how good."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -58,8 +59,8 @@ def histogram(
     vertical lines, by label.
     """
     for k, (label, values) in enumerate(shares.items()):
-        line = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
-        fill = {"color": "black", "alpha": 0.2, "fill": True}
+        line: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
+        fill: dict[str, Any] = {"color": "black", "alpha": 0.2, "fill": True}
         axes.stairs(values, edges, label=label, **(line if k else fill))
     for k, (label, place) in enumerate(marks.items()):
         axes.axvline(place, color="black", linestyle="-.", linewidth=0.8)
