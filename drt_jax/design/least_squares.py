@@ -23,8 +23,8 @@ _HOLDS = 5  # how often what is held at a bound, and which limits count, is aske
 
 
 class LMState(NamedTuple):
-    """residuals (M,), jacobian (M, N) and merit () at the best vector so far; broken: by how much it
-    is unphysical. scale: (N,), largest column norms. damping, growth: (). gain: what the model
+    """residuals (M,), jacobian (M, N) and merit () at the best vector so far; broken: by how much
+    it is unphysical. scale: (N,), largest column norms. damping, growth: (). gain: what the model
     promised of the last trial, relative to the merit. jacobians, trials: (), int32. fresh: nothing
     is evaluated yet, or what is wanted has changed. kept: what else the function told there."""
 

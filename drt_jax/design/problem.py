@@ -115,6 +115,10 @@ class Problem:
         share = jnp.asarray(weights / weights.sum(), dtype)
         return cls(variables, angles, far, colours, share, rule, wanted, solver)
 
+    def with_order(self, order: int) -> "Problem":
+        """The problem with a Gauss rule of another order."""
+        return dataclasses.replace(self, rule=Gauss(order, self.rule.symmetry))
+
     def seen(self, lens: Lens) -> Seen:
         """The lens from all fields and distances."""
         views = Scene(

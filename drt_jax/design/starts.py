@@ -108,16 +108,13 @@ def many_starts(
     turns: Sequence[int] = (12, 12, 24, 48, 200),
     keep: float = 0.5,
     report: Callable[[int, int, float], None] = lambda done, total, best: None,
-    kept: tuple[int, Search] | None = None,
-    save: Callable[[int, Search], None] = lambda stage, searches: None,
     threads: int | None = None,
 ) -> Starts:
     """Search from many starts (K, N), with successive halving (Jamieson and Talwalkar 2016).
 
     turns: trials of every search in each stage. keep: the part that goes on to the next, at least
-    a tile of 16. report: called with the tiles done, all tiles, and the best merit so far. save:
-    called after each stage with its number from 1 and all searches, (K, ...); kept: what it was
-    called with last, to go on from there. threads: tiles at a time; None: one a core.
+    a tile of 16. report: called with the tiles done, all tiles, and the best merit so far. threads:
+    tiles at a time; None: one a core.
 
     A search that fails stays where it is and is ranked last. The result depends on neither threads
     nor tiles.
@@ -128,22 +125,18 @@ def many_starts(
     if vectors.ndim != 2 or vectors.shape[1] != width or not len(vectors):
         raise ValueError(f"starts: expected (K, {width}), got shape {vectors.shape}")
     vectors = np.clip(vectors, problem.variables.low, problem.variables.high)
-    first, searches = kept or (0, _begin(problem, jnp.asarray(vectors)))
-    state = jax.tree.map(np.array, searches)
+    state = jax.tree.map(np.array, _begin(problem, jnp.asarray(vectors)))
     sizes = [len(vectors)]
     for _ in turns[1:]:
         sizes.append(min(sizes[-1], max(_TILE, math.ceil(keep * sizes[-1]))))
     alive, done = np.arange(len(vectors)), 0
-    for stage, size in enumerate(sizes):
-        # What is left behind does not move any more: the same order as when it was left.
+    for size, more in zip(sizes, turns):
         alive = alive[np.argsort(score(_rows(state, alive)), kind="stable")[:size]]
         tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
-        for _ in _advanced(problem, state, tiles, turns[stage] * (stage >= first), threads):
+        for _ in _advanced(problem, state, tiles, more, threads):
             done += 1
             total = sum(-(-size // _TILE) for size in sizes)
             report(done, total, float(np.min(score(_rows(state, alive)))))
-        if stage >= first:
-            save(stage + 1, state)
     trials, jacobians = (int(np.sum(a)) for a in (state.state.trials, state.state.jacobians))
     minima = distinct(_rows(state, alive), alive)
     seconds = time.perf_counter() - begun
@@ -161,8 +154,6 @@ def _advanced(
         for old, array in zip(jax.tree.leaves(state), jax.tree.leaves(new), strict=True):
             old[rows] = np.asarray(array)[: len(rows)]
 
-    if not turns:
-        return
     run(tiles[0])  # compiled once, not by all threads
     yield
     with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:

@@ -7,6 +7,8 @@ designed.yaml, which load_lens reads back, pictures before and after, and result
 
 import dataclasses
 import math
+import pathlib
+import sys
 import time
 from typing import Any, Literal
 
@@ -17,29 +19,35 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import design
 from drt_jax.design import Operand, Solve, Tie, Vary
+from drt_jax.runs.folder import Run
 
-from . import _common
+from . import _command, _common, _pictures
 
 COLUMNS = ("merit", "worst", "jacobians")
+_DRAWN = 6  # minima
 
 
 @dataclasses.dataclass(frozen=True)
 class Starts:
     """Where to start.
 
-    count: how many searches. how: "around" the lens by `spread` times the variables' scales, or
-    "within" their bounds. stages: trials of each search in each stage; after each the better half
-    goes on. seed: of the random numbers.
+    count: how many searches. how: "around" the lens by `spread` times the variables' scales,
+    "within" their bounds, or from lenses "made" with curvatures off by `per_cent` and thicknesses
+    off by `off_mm` (standard deviations). stages: trials of each search in each stage; keep: the
+    part that goes on to the next. seed: of the random numbers.
     """
 
     count: int = 1
-    how: Literal["around", "within"] = "around"
+    how: Literal["around", "within", "made"] = "around"
     spread: float = 1.0
+    per_cent: float = 1.0
+    off_mm: float = 0.1
     stages: tuple[int, ...] = (12, 12, 24, 48, 200)
+    keep: float = 0.7
     seed: int = 0
 
     def __post_init__(self) -> None:
-        limits = {"count": (1, 1e5), "spread": (0, 1e3), "stages": (1, 1e4)}
+        limits = {"count": (1, 1e5), "spread": (0, 1e3), "stages": (1, 1e4), "keep": (0, 1)}
         _common.require_within("starts.", self, **limits)
         _common.require(len(self.stages) > 0, "starts.stages: needs at least one item")
 
@@ -52,8 +60,8 @@ class Config:
     wavelengths_um, colour_weights: of the light; no weights: all alike. variables, ties, solves,
     operands: see drt_jax.design. order: of the pupil's rule while searching; the best lens is
     finished with as many rays as `tolerance`, relative, of its spots needs. growth: parts of the
-    fields and of the aperture to design for, one after the other, before the whole. trials: at most,
-    of the last search.
+    fields and of the aperture to design for, one after the other, before the whole. trials: at
+    most, of the last search.
     """
 
     lens: str
@@ -157,7 +165,7 @@ class _Progress:
         self._bar.close()
 
 
-def _grown(config: Config, lens: drt_jax.Lens) -> drt_jax.Lens:
+def grown(config: Config, lens: drt_jax.Lens) -> drt_jax.Lens:
     """The lens designed for parts of the fields and the aperture, one after the other."""
     for part in config.growth:
         problem = problem_of(config, lens, part)
@@ -168,59 +176,164 @@ def _grown(config: Config, lens: drt_jax.Lens) -> drt_jax.Lens:
     return lens
 
 
-def search(config: Config, start: drt_jax.Lens) -> dict[str, Any]:
-    """The vectors that many starts came to, best first, and what that took; of one start, its own
-    vector alone."""
-    problem = problem_of(config, _grown(config, start))
+def made_vectors(variables: design.Variables, some: Starts) -> np.ndarray:
+    """The vectors of lenses whose parts are off."""
+    rng, lens, vectors = np.random.default_rng(some.seed), variables.lens, []
+    for _ in range(some.count):
+        bend = 1 + 0.01 * some.per_cent * rng.normal(size=lens.count + 1)
+        gap = lens.thickness + some.off_mm * rng.normal(size=lens.count - 1)
+        off = dataclasses.replace(lens, curvature=lens.curvature * bend, thickness=gap)
+        vectors.append(np.asarray(variables.vector(off)))
+    return np.stack(vectors)
+
+
+def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
+    """The vectors that the starts came to, best first, and what that took."""
     variables, some = problem.variables, config.starts
+    start = {"vectors": [variables.start.tolist()], "merits": [], "trials": 0, "jacobians": 0}
     if some.count == 1:
-        return {"vectors": [variables.start.tolist()], "merits": [], "rays": 0, "seconds": 0.0}
-    if some.how == "around":
+        return start | {"seconds": 0.0}
+    if some.how == "made":
+        vectors = made_vectors(problem.variables, some)
+    elif some.how == "around":
         vectors = design.around(variables, some.count, some.spread, some.seed)
     else:
         vectors = design.within(variables, some.count, some.seed)
     with _Progress(f"{some.count} starts", 1) as bar:
-        found = design.many_starts(problem, vectors, some.stages, report=bar.tiles)
+        found = design.many_starts(problem, vectors, some.stages, some.keep, bar.tiles)
     _common.require(len(found.minima) > 0, "starts: no ray passes any of them; widen the bounds")
     return {
         "vectors": [minimum.vector.tolist() for minimum in found.minima],
         "merits": [minimum.merit for minimum in found.minima],
         "found": [minimum.found for minimum in found.minima],
-        "worst": [minimum.worst for minimum in found.minima],
         "passed": int(np.isfinite(found.merits).sum()),
         "trials": found.trials,
         "jacobians": found.jacobians,
-        "rays": found.rays,
         "seconds": found.seconds,
     }
 
 
-def finish(config: Config, start: drt_jax.Lens, found: dict[str, Any]) -> dict[str, Any]:
+def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> dict[str, Any]:
     """The best vector brought to the optimum with as many rays as it needs."""
-    lens = _grown(config, start) if not found["merits"] else start
-    problem = problem_of(config, lens)
-    vector = jnp.asarray(found["vectors"][0])
-    told = [float(problem.merit(problem.variables.start))]
     begun = time.perf_counter()
     with _Progress("least squares", config.trials) as bar:
-        best = design.optimise(problem, vector, config.trials, bar.searched)
-        order = order_of(config, best.lens)
-        history, seconds = best.history, best.seconds
+        vector = jnp.asarray(found["vectors"][0])
+        parts = [design.optimise(problem, vector, config.trials, bar.searched)]
+        order = order_of(config, parts[0].lens)
         if order > config.order:
-            finer = problem_of(config, lens, order=order)
-            best = design.optimise(finer, jnp.asarray(best.vector), config.trials, bar.searched)
-            later = best.history + [0, 0, history[-1, 2]]
-            history, seconds = np.concatenate([history, later]), seconds + best.seconds
-    trials = len(history)
+            rule = problem.with_order(order)
+            vector = jnp.asarray(parts[0].vector)
+            parts.append(design.optimise(rule, vector, config.trials, bar.searched))
+    history = parts[0].history
+    for part in parts[1:]:
+        before = np.array([0, 0, history[-1, 2]])
+        history = np.concatenate([history, part.history + before])
+    seconds = sum(part.seconds for part in parts)
     return {
-        "vector": best.vector.tolist(),
-        "merit_start": told[0],
-        "merit_end": best.merit,
-        "worst": best.worst,
-        "jacobians": int(history[-1, 2]),
-        "rays": trials * design.rays_of(problem),
-        "seconds": seconds,
-        "compile_s": time.perf_counter() - begun - seconds,
+        "vector": parts[-1].vector.tolist(),
+        "merit_start": float(problem.merit(problem.variables.start)),
+        "merit_end": parts[-1].merit,
+        "worst": parts[-1].worst,
         "order": order,
         "history": history.tolist(),
+        "seconds": seconds,
+        "compile_s": time.perf_counter() - begun - seconds,
     }
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Grow, search, finish; and write the lens."""
+    start = drt_jax.load_lens(config.lens)
+    if config.growth and run.kept("growth") is None:
+        drt_jax.save_lens(grown(config, start), run.folder / "grown.yaml")
+        run.keep("growth", "grown.yaml")
+    begin = drt_jax.load_lens(run.folder / "grown.yaml") if config.growth else start
+    problem = problem_of(config, begin)
+    if run.kept("starts") is None:
+        run.keep("starts", searched(config, problem))
+    found = run.kept("starts")
+    if run.kept("finish") is None:
+        run.keep("finish", finished(config, problem, found))
+    end = run.kept("finish")
+    history = np.array(end["history"])
+    run.log("least squares", 0, dict(zip(COLUMNS, history.T)))
+    variables = problem.variables
+    drt_jax.save_lens(variables.lens_of(jnp.asarray(end["vector"])), run.folder / "designed.yaml")
+    rays = design.rays_of(problem)
+    row = {
+        "problem": pathlib.Path(config.lens).stem,
+        "merit_start": end["merit_start"],
+        "merit_end": end["merit_end"],
+        "worst_limit": end["worst"],
+        "spots_um": spots_um(config, drt_jax.load_lens(run.folder / "designed.yaml")),
+        "jacobians": found["jacobians"] + int(history[-1, 2]),
+        "rays": rays * (found["trials"] + len(history)),
+        "seconds": found["seconds"] + end["seconds"],
+        "compile_s": end["compile_s"],
+    } | _beside(config, drt_jax.load_lens(run.folder / "designed.yaml"))
+    drawn = [start, *(variables.lens_of(jnp.asarray(v)) for v in (end["vector"], *_others(found)))]
+    return {
+        "rows": [row],
+        "lens": config.lens,
+        "fields_deg": list(config.fields_deg),
+        "wavelengths_um": list(config.wavelengths_um),
+        "starts": {key: value for key, value in found.items() if key != "vectors"},
+        "drawings": [_pictures.polylines(config, lens) for lens in drawn],
+        "spots": _pictures.spot_hits(config, drawn[1]),
+        "history": history.tolist(),
+    }
+
+
+def _others(found: dict[str, Any]) -> list[Any]:
+    """Of the minima but the best, those that are drawn."""
+    return found["vectors"][1:_DRAWN]
+
+
+def _beside(config: Config, lens: drt_jax.Lens) -> dict[str, Any]:
+    """Spots of the designed lens by Optiland's trace, where it is installed."""
+    try:
+        from . import _optiland
+
+        scene = config.fields_deg, config.wavelengths_um, config.distance_mm
+        return {"peer": "optiland's trace", "peer_spots_um": _optiland.spots_um(lens, *scene)}
+    except ImportError:
+        return {"peer": None, "peer_spots_um": None}
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """The design in a row for each field, and what it took."""
+    (row,), some = results["rows"], results["starts"]
+    fields = results["fields_deg"]
+    peers = row["peer_spots_um"] or [None] * len(fields)
+    spots = [[field, um, peer] for field, um, peer in zip(fields, row["spots_um"], peers)]
+    spots.append(["root of the sum of squares", *(_total(c) for c in (row["spots_um"], peers))])
+    took = [
+        ["merit, mm^2, start", row["merit_start"]],
+        ["merit, mm^2, end", row["merit_end"]],
+        ["worst limit exceeded by", row["worst_limit"]],
+        ["Jacobians", row["jacobians"]],
+        ["rays traced", row["rays"]],
+        ["seconds", row["seconds"]],
+        ["compilation, s", row["compile_s"]],
+    ]
+    if some["merits"]:
+        took += [["starts that pass light", some["passed"]], ["minima", len(some["merits"])]]
+        took += [["minima a minute", 60 * len(some["merits"]) / max(some["seconds"], 1e-9)]]
+    name = row["problem"]
+    return {
+        f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
+        f"design, {name}": _common.table(("what", "value"), took),
+    }
+
+
+def _total(sizes: list[float | None]) -> float | None:
+    return None if None in sizes else math.sqrt(sum(size**2 for size in sizes if size))
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Draw the lens before and after, its spots, the merit, and the minima."""
+    _pictures.draw(results, figures)
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__])
