@@ -15,7 +15,9 @@ def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]
     """
     places = np.arange(len(names))
     for k, (label, values) in enumerate(series.items()):
-        fill = {"color": "C0", "alpha": 0.7} if k == 0 else {"fill": False, "edgecolor": f"C{k}"}
+        fill: dict[str, Any] = {"fill": False, "edgecolor": f"C{k}"}
+        if k == 0:
+            fill = {"color": "C0", "alpha": 0.7}
         axes.barh(places, values, height=0.8 - 0.25 * k, label=label, linewidth=1.4, **fill)
     axes.set_yticks(places, list(names), fontsize=8)
     axes.invert_yaxis()
@@ -25,7 +27,7 @@ def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]
 
 
 # Lines that may lie on each other, below one broad line of what is true.
-_TRUE = {"color": "black", "alpha": 0.35, "linewidth": 4}
+_TRUE: dict[str, Any] = {"color": "black", "alpha": 0.35, "linewidth": 4}
 _STYLES = ("-", "--", ":")
 
 
@@ -38,7 +40,7 @@ def yields(
     curves: (x (N,), shares (N,) in per cent) by label.
     """
     for k, (label, (x, share)) in enumerate(curves.items()):
-        style = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
+        style: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
         axes.plot(x, share, label=label, **(style if k else _TRUE))
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3)
