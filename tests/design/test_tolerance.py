@@ -52,6 +52,17 @@ def some_lens(some, seed=5):
     return some.lens_of(jnp.asarray(design.draw_errors(some, 1, seed)[0]))
 
 
+def test_squares_are_those_of_the_moments(singlet):
+    """The spot of all colours about their centroid, from the moments of each."""
+    problem, some = singlet
+    lens = some_lens(some)
+    found = drt_jax.psf_moments(lens, FIELDS[4], np.inf, COLOURS, rule=problem.rule)
+    mean, spread = map(np.asarray, found)
+    apart = np.sum((mean - np.mean(mean, axis=0)) ** 2, axis=1)
+    wanted = np.mean(np.trace(spread, axis1=1, axis2=2) + apart)
+    assert float(_made(problem, lens, "none").squares[4]) == pytest.approx(wanted, rel=1e-9)
+
+
 def test_focus_is_where_a_scan_finds_it(singlet):
     problem, some = singlet
     lens = some_lens(some)
