@@ -141,7 +141,7 @@ def _proposal(
             held = ((y <= lower) & (gradient > 0)) | ((y >= upper) & (gradient < 0))
         # In units of the columns' norms; what is held moves as far as it does already.
         free = (~held).astype(y.dtype)
-        matrix = square / scale[:, None] / scale * free[:, None] * free
+        matrix = square / scale[:, None] / scale[None] * free[:, None] * free[None]
         matrix = matrix + jnp.diag(state.damping * free + (1 - free))
         right = -(gradient + square @ (move * (1 - free))) / scale * free
         step = jax.scipy.linalg.solve(matrix, right, assume_a="pos") / scale

@@ -20,7 +20,7 @@ from ..rays.find import Found
 from ..rays.snell import lack
 from ..rays.solve import Solver, reattach
 from ..rays.status import Status
-from ..rays.system import Vector, determinant, dot, system_of
+from ..rays.system import Vector, determinant, divide, dot, system_of
 from ..rays.trace import Bundle, trace_bundle
 
 
@@ -148,7 +148,8 @@ class Seen:
 
     @functools.cached_property
     def lacks(self) -> Array:
-        """By how much each ray fails (V, W, Q): 0 for one that passes, see `snell.lack`."""
+        """By how much each ray fails (V, W, Q), see `snell.lack`: 0 for one that passes, else what
+        its first guess lacks."""
         failed = ~self.rays.whole
 
         def of_view(field: Array, distance: Array, points: Vector) -> Array:
@@ -156,7 +157,8 @@ class Seen:
             system = system_of(self.lens, scene, len(points))
             radius = self.lens.semi_diameter[self.lens.stop]
             target = tuple(radius * p for p in points)
-            return lack(system, paraxial_launch(system, target, beam_size(system, target)[1]))
+            launch = paraxial_launch(system, target, beam_size(system, target)[1])
+            return lack(system, launch, target)
 
         def of_all(_: None) -> Array:
             return jax.vmap(of_view)(self.views.field, self.views.distance, self.rays.points)
@@ -186,14 +188,15 @@ class Seen:
     @functools.cached_property
     def illumination(self) -> Array:
         """Light on the sensor (V,) of the middle colour relative to that of the first field at the
-        same distance: the area of the directions it arrives from, each times its cosine with the
-        axis of the sensor (Slater's projected solid angle; clipped light counts for nothing)."""
+        same distance, of an object that is everywhere as bright: the area of the directions from
+        which it arrives at one point, each times its cosine with the axis of the sensor (Slater's
+        projected solid angle). Clipped light counts for nothing."""
         lens, rays = self.lens, self.rays
         rows, middle = np.array([*lens.live, lens.count]), self.views.wavelengths.shape[0] // 2
         colour = slice(middle, middle + 1)
 
         def one(field: Array, distance: Array, bundle: Bundle, points: Vector) -> Array:
-            """How directions spread over the stop, (1, Q), by the derivatives of known rays."""
+            """How far directions spread, (1, Q), by the derivatives of known rays."""
             scene = Scene(field, distance, self.views.wavelengths[colour])
             hits = jax.lax.stop_gradient(tuple(h[rows, colour] for h in bundle.hits))
             arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
@@ -202,17 +205,24 @@ class Seen:
                 reattach, Found(hits, arrival, status.astype(jnp.int32), bundle.steps)
             )
 
-            def directions(points: Vector) -> Vector:
-                return trace_bundle(lens, scene, points, known).arrival[:-1]
+            def arriving(points: Vector, field: Array) -> tuple[Vector, Vector]:
+                scene = Scene(field, distance, self.views.wavelengths[colour])
+                bundle = trace_bundle(lens, scene, points, known)
+                return tuple(h[-1] for h in bundle.hits), bundle.arrival[:-1]
 
             points = tuple(p[colour] for p in points)
-            arriving, push = jax.linearize(directions, points)
-            units = np.eye(len(points))
-            columns = [
-                push(tuple(jnp.full_like(p, u) for p, u in zip(points, unit))) for unit in units
-            ]
-            if len(points) == 1:  # turned about the axis
-                return columns[0][0] * safe_divide(arriving[0], points[0])
+            if len(points) == 1:  # on the axis, as the first field
+                return jnp.ones_like(points[0])
+            _, push = jax.linearize(arriving, points, field)
+            zero, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
+            by_field = [push(zero, unit) for unit in units]
+            columns = []
+            for k in range(2):  # by the stop point, the field going along so that the hit stays
+                unit = tuple(jnp.full_like(p, float(j == k)) for j, p in enumerate(points))
+                hit, line = push(unit, jnp.zeros_like(field))
+                back = divide(tuple(zip(*(moved for moved, _ in by_field))), hit)
+                turned = zip(line, *(swung for _, swung in by_field))
+                columns.append([a - back[0] * b - back[1] * c for a, b, c in turned])
             return determinant(columns)
 
         areas = jax.vmap(one)(self.views.field, self.views.distance, rays.bundle, rays.points)

@@ -350,15 +350,23 @@ def fates(system: System, launch: Vector) -> Array:
     return _follow(system, launch, False, lambda meeting: meeting.fate)[1]
 
 
-def lack(system: System, launch: Vector) -> Array:
-    """By how much rays fail, (...): 0 for one that reaches the sensor; else the part of the rows
-    that it does not come to, and more the farther it is from getting past the first of these.
-    Finite, and differentiable by what pulls the ray through. `launch` as of `shoot`."""
-    each = _follow(system, launch, False, lambda meeting: (meeting.fate, meeting.short()))[1]
-    lost = each[0] != Status.OK
+def lack(system: System, launch: Vector, target: Vector) -> Array:
+    """By how much rays fail to come through stop points, (...): the part of the rows that they do
+    not come to, and more the farther one is from getting past the first of these; for one that
+    reaches the sensor, more the farther from its stop point it crosses the stop. Finite, and
+    differentiable by what pulls the ray through. `launch` as of `shoot`; target: D arrays (...)
+    in mm, whose largest counts as far."""
+    fate, short, hits = _follow(
+        system, launch, False, lambda meeting: (meeting.fate, meeting.short(), meeting.hit)
+    )[1]
+    lost = fate != Status.OK
     first = lost & ~jnp.concatenate([jnp.zeros_like(lost[:1]), lost[:-1]])
-    short = jnp.log1p(jnp.sum(jnp.where(first, each[1], 0), axis=0))
-    return jnp.mean(lost.astype(short.dtype), axis=0) + short
+    _, crossing = apart(system, hits)
+    miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
+    off = safe_divide(safe_sqrt(dot(miss, miss)), jnp.sqrt(jnp.max(dot(target, target))))
+    short = jnp.sum(jnp.where(first, short, 0), axis=0)
+    part = jnp.mean(lost.astype(short.dtype), axis=0)
+    return part + jnp.log1p(jnp.where(lost[-1], short, off))
 
 
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:

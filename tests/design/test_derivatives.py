@@ -1,0 +1,143 @@
+"""Derivatives of operands by all kinds of variables, and of the merit of rays that fail: against
+central differences whose step is varied, in forward and reverse mode."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drt_jax import Clipped, Gauss, design, load_lens
+from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary
+from drt_jax.design.least_squares import COMPILE
+
+from .test_operands import COLOURS, model
+
+EVERY = [
+    *(Vary("curvature", (0, 6)), Vary("conic", (2,)), Vary("coefficients", (2,), (1,))),
+    *(Vary("thickness", (0, 3)), Vary("sensor"), Vary("index", (0,)), Vary("abbe", (2,))),
+    *(Vary("tilt", (2,)), Vary("decentre", (5,)), Vary("semi_diameter", (0, 4))),
+]
+STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
+
+
+def differences(value, x):
+    """Central differences of the leaves of a tree, for each step: (K, N) each."""
+    for h in STEPS:
+        pairs = [(value(x + h * e), value(x - h * e)) for e in np.eye(len(x))]
+        slopes = [jax.tree.map(lambda a, b, h=h: (a - b) / (2 * h), *pair) for pair in pairs]
+        yield jax.tree.map(lambda *columns: np.stack(columns, axis=-1), *slopes)
+
+
+def assert_derivatives(value, jacobian, x, rtol, floor=1e-2):
+    """Each kind by each number, against the best of the differences: within `rtol` of the largest
+    derivative by that number, plus a part `floor` of it by any."""
+    best = jax.tree.map(lambda a: np.full(a.shape, np.inf), jacobian)
+    for found in differences(value, x):
+        best = jax.tree.map(
+            lambda b, f, j: np.minimum(b, np.abs(f - np.asarray(j))), best, found, jacobian
+        )
+    for kind, j in jacobian.items():
+        assert np.all(np.isfinite(j)), kind
+        column = np.max(np.abs(j), axis=0, initial=0)
+        assert np.all(best[kind] <= rtol * (column + floor * np.max(column))), kind
+        assert np.max(column) > 0, kind
+
+
+@pytest.fixture(scope="module")
+def crooked(tmp_path_factory):
+    """A lens without symmetry, clipped in front, that some rays of the last field do not pass."""
+    variables = Variables.of(model(tmp_path_factory.mktemp("lens")), EVERY)
+    kinds = list(OPERANDS)
+    fields = [[0.02, 0.05], [0.01, 0.25], [0.03, 0.45]]
+    problem = Problem.of(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "disc"))
+    moves = np.random.default_rng(0).normal(size=len(variables.places))
+    return problem, kinds, variables.start + moves
+
+
+def test_every_derivative_by_every_kind_of_variable(crooked):
+    problem, kinds, x = crooked
+
+    def flat(x):
+        seen = problem.seen(problem.variables.lens_of(x))
+        told = {kind: Operand(kind).values(seen) for kind in kinds}
+        return told | {"failures": jnp.ravel(seen.failures)}, seen.rays.bundle.status
+
+    value = jax.jit(lambda x: flat(x)[0], compiler_options=COMPILE)
+    both = jax.jit(jax.jacfwd(flat, has_aux=True), compiler_options=COMPILE)
+    jacobian, status = both(x)
+    status = np.asarray(status)[..., 4:]
+    clipped, failed = status == 3, (status != 0) & (status != 3)
+    assert clipped.any() and failed[2].any() and not failed[2].all() and not failed[:2].any()
+    assert_derivatives(value, jacobian, x, 1e-6)
+    # The transpose: one product tells.
+    rng = np.random.default_rng(0)
+    weights = {k: jnp.asarray(rng.normal(size=len(a))) for k, a in jacobian.items()}
+    total = lambda x: sum(weights[k] @ a for k, a in flat(x)[0].items())  # noqa: E731
+    gradient = jax.jit(jax.grad(total), compiler_options=COMPILE)(x)
+    wanted = sum(weights[k] @ j for k, j in jacobian.items())
+    np.testing.assert_allclose(gradient, wanted, rtol=1e-8, atol=1e-9 * np.max(np.abs(wanted)))
+
+
+def test_derivatives_of_a_fitted_pupil():
+    """Where apertures cut, the points of the rule follow the lens."""
+    lens = load_lens("camera_50mm")
+    vary = [Vary("curvature", (0,)), Vary("index", (2,)), Vary("semi_diameter", (2, 8))]
+    kinds = ("rms_spot", "rms_wavefront", "centroid", "relative_illumination")
+    rule = Clipped(4, "half")
+    fields = np.radians([0.0, 20.0])
+    problem = Problem.of(Variables.of(lens, vary), kinds, fields, COLOURS[1], rule=rule)
+
+    def values(x):
+        seen = problem.seen(problem.variables.lens_of(x))
+        return {kind: Operand(kind).values(seen) for kind in kinds}
+
+    x = problem.variables.start
+    value = jax.jit(values, compiler_options=COMPILE)
+    jacobian = jax.jit(jax.jacfwd(values), compiler_options=COMPILE)(x)
+    # The derivatives are those of the light; the rule's own error moves by less than this.
+    assert_derivatives(value, jacobian, x, 1e-4, floor=1.0)
+
+
+@pytest.fixture(scope="module")
+def strong(tmp_path_factory):
+    """A problem and a vector of which the last surface is too strong for the outer rays."""
+    lens = model(tmp_path_factory.mktemp("lens"))
+    variables = Variables.of(lens, [Vary("curvature", (3, 5, 6)), "thickness"])
+    problem = Problem.of(variables, ["spot", "path_difference"], [0.0, 0.15], COLOURS[:2], rule=4)
+    return problem, variables.start.at[2].multiply(2.9)
+
+
+def test_rays_that_fail_have_a_smooth_merit(strong):
+    """Finite; its gradient, forward and reverse, agrees with differences."""
+    problem, x = strong
+    whole = jax.jit(lambda x: problem.seen(problem.variables.lens_of(x)).rays.whole)(x)
+    assert 0.02 < 1 - np.mean(whole) < 0.5
+    both = jax.jit(jax.value_and_grad(problem.merit), compiler_options=COMPILE)
+    merit, gradient = both(x)
+    assert 0 < merit < np.inf and np.all(np.isfinite(gradient))
+    found = jax.jit(jax.jacfwd(problem.merit), compiler_options=COMPILE)(x)
+    np.testing.assert_allclose(found, gradient, rtol=1e-8, atol=1e-9 * np.max(np.abs(gradient)))
+    best = np.inf
+    for h in (1e-2, 1e-3, 1e-4, 1e-5):
+        slopes = [(both(x + h * e)[0] - both(x - h * e)[0]) / (2 * h) for e in np.eye(len(x))]
+        best = np.minimum(best, np.abs(np.stack(slopes) - gradient))
+    assert np.max(best) < 1e-7 * np.max(np.abs(gradient))
+    # It pulls the surface back: weaker, it lets more light through.
+    assert gradient[2] * x[2] > 0
+
+
+def test_a_few_steps_bring_all_rays_through(strong):
+    problem, x = strong
+    found = design.optimise(problem, x, trials=12)
+    assert bool(jnp.all(problem.seen(found.lens).rays.whole))
+    assert found.merit < 1e-2 * found.history[0, 0]
+
+
+def test_random_lenses_are_never_nan(strong):
+    """However many rays fail, merit and gradients are numbers."""
+    problem, x = strong
+    both = jax.jit(jax.vmap(jax.value_and_grad(problem.merit)), compiler_options=COMPILE)
+    rng = np.random.default_rng(0)
+    sizes = 10 ** rng.uniform(-1, 1.5, (64, 1))
+    merits, gradients = both(x[None] + sizes * rng.normal(size=(64, len(x))))
+    assert not np.any(np.isnan(merits)) and np.all(np.isfinite(gradients))

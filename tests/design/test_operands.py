@@ -1,0 +1,311 @@
+"""Operands: their values by other routes, and what is said where they do not fit."""
+
+import dataclasses
+import pathlib
+from typing import get_args
+
+import jax
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import Clipped, Gauss, design, load_lens
+from drt_jax.design import OPERANDS, Operand, Problem, Solve, Variables, operands
+from drt_jax.design.kinds import KINDS
+from drt_jax.design.least_squares import COMPILE
+
+from .test_variables import MODEL
+
+COLOURS, WEIGHTS = (0.48, 0.55, 0.65), np.array([0.25, 0.5, 0.25])
+FIELDS, DISTANCES = np.radians([0.0, 14.0, 20.0]), (np.inf, 1000.0)
+VIEWS = [(field, distance) for distance in DISTANCES for field in FIELDS]
+
+
+def program(problem, kinds):
+    """The values of kinds, by name, as one function of the problem and the vector."""
+
+    def values(problem, vector):
+        seen = problem.seen(problem.variables.lens_of(vector))
+        return {kind: Operand(kind).values(seen) for kind in kinds}
+
+    return jax.jit(values, compiler_options=COMPILE)
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    """The Cooke triplet, what all operands say of it, and the rule of its rays."""
+    lens, rule = load_lens("cooke_triplet"), Gauss(4, "half")
+    variables = Variables.of(lens, ["curvature"])
+    kinds = [kind for kind in OPERANDS if kind != "magnification"]
+    given = FIELDS, COLOURS, DISTANCES, rule, WEIGHTS
+    problem = Problem.of(variables, kinds, *given)
+    return lens, rule, program(problem, kinds)(problem, variables.start)
+
+
+def test_spots(triplet):
+    """Sums of squares are traces of covariances, of colours apart or together."""
+    lens, rule, told = triplet
+    for k, (field, distance) in enumerate(VIEWS):
+        found = drt_jax.psf_moments(lens, field, distance, COLOURS, rule=rule)
+        mean, covariance = np.asarray(found.mean), np.asarray(found.covariance)
+        apart = WEIGHTS @ np.trace(covariance, axis1=1, axis2=2)
+        centroid = WEIGHTS @ mean
+        whole = apart + WEIGHTS @ np.sum((mean - centroid) ** 2, axis=1)
+        chief = np.asarray(drt_jax.image_point(lens, field, distance, COLOURS))[1]
+
+        def square(kind, k=k):  # of components, views, colours and rays
+            return np.sum(told[kind].reshape(2, len(VIEWS), -1)[:, k] ** 2)
+
+        assert abs(square("spot_of_colours") / apart - 1) < 1e-11
+        assert abs(square("spot") / whole - 1) < 1e-11
+        beside = np.sum((centroid - chief) ** 2)
+        assert abs(square("spot_chief") / (whole + beside) - 1) < 1e-11
+        assert abs(told["rms_spot"][k] / np.sqrt(whole) - 1) < 1e-11
+        assert abs(told["centroid"][k] - centroid[1]) < 1e-12
+
+
+def test_wavefronts(triplet):
+    lens, rule, told = triplet
+    points, weights = (
+        np.asarray(a)[0] for a in drt_jax.pupil_points(lens, 0.1, np.inf, COLOURS, rule)
+    )
+    for k, (field, distance) in enumerate(VIEWS):
+        wave = drt_jax.wavefront(lens, field, distance, COLOURS, points)
+        rms = np.sqrt(WEIGHTS @ np.square(drt_jax.rms_wavefront(wave, weights)))
+        assert abs(told["rms_wavefront"][k] / rms - 1) < 1e-9
+        square = np.sum(told["path_difference"].reshape(len(VIEWS), -1)[k] ** 2)
+        assert abs(square / rms**2 - 1) < 1e-9
+
+
+def test_first_order(triplet):
+    lens, _, told = triplet
+    found = [drt_jax.first_order(lens, distance, COLOURS) for distance in DISTANCES]
+    for kind in ("focal_length", "back_focal_distance"):
+        np.testing.assert_allclose(told[kind], getattr(found[0], kind)[1:2], rtol=1e-13)
+    wide = 2 * found[0].entrance_pupil.semi_diameter[1]
+    np.testing.assert_allclose(told["entrance_pupil"], [wide], rtol=1e-13)
+    np.testing.assert_allclose(told["f_number"], [f.f_number[1] for f in found], rtol=1e-13)
+    # The prescription: f/5, 10 mm; what is printed of it.
+    assert abs(told["f_number"][0] - 5) < 2e-3 and abs(told["entrance_pupil"][0] - 10) < 3e-3
+    ends = 3.25896 + 6.00755 + 0.99997 + 4.75041 + 2.95208
+    assert abs(told["length"][0] - ends) < 1e-12
+    assert abs(told["back_distance"][0] - 42.20778) < 1e-12
+    assert abs(told["total_track"][0] - ends - 42.20778) < 1e-12
+
+
+def test_chief_rays(triplet):
+    """Distortion and lateral colour by `image_point`, angles by the direction cosines."""
+    lens, _, told = triplet
+    focal = float(drt_jax.focal_length(lens, COLOURS[1])[0])
+    for k, (field, distance) in enumerate(VIEWS):
+        points = np.asarray(drt_jax.image_point(lens, field, distance, COLOURS))[:, 1]
+        lateral = told["lateral_colour"].reshape(len(VIEWS), 2)[k]
+        np.testing.assert_allclose(lateral, points[1:] - points[0], atol=1e-13)
+        if np.isinf(distance) and field:
+            wanted = points[1] / (focal * np.tan(field)) - 1
+            assert abs(told["distortion"][k] - wanted) < 1e-12
+        ideal = drt_jax.image_height(lens, field, distance, COLOURS)[1]
+        wanted = points[1] / ideal - 1 if field else 0
+        assert abs(told["distortion"][k] - wanted) < 1e-12
+        rays = drt_jax.trace_rays(lens, field, distance, COLOURS, [[0.0, 0.0]])
+        angles = np.arccos(np.minimum(np.asarray(rays.directions)[:, 0, -1, 2], 1))
+        np.testing.assert_allclose(
+            told["chief_ray_angle"].reshape(len(VIEWS), 3)[k], angles, atol=1e-7 / (1 + 1e7 * field)
+        )
+
+
+def test_incidence(triplet):
+    """The largest angle between directions and normals, these by differences of the sag."""
+    lens, rule, told = triplet
+    points = np.asarray(drt_jax.pupil_points(lens, 0.1, np.inf, COLOURS, rule)[0])[0]
+    points = np.concatenate([points, [[0, 0], [0, 1], [0, -1], [1, 0]]])
+    largest, h = np.zeros(lens.count), 1e-4
+    for field, distance in VIEWS:
+        rays = drt_jax.trace_rays(lens, field, distance, COLOURS, points)
+        for i in range(lens.count):
+            x, y, _ = np.moveaxis(np.asarray(rays.points)[:, :, i], -1, 0)
+            slopes = [
+                (drt_jax.sag(lens, i, x + a, y + b) - drt_jax.sag(lens, i, x - a, y - b)) / (2 * h)
+                for a, b in ((h, 0), (0, h))
+            ]
+            normal = np.stack([-slopes[0], -slopes[1], np.ones_like(x)], axis=-1)
+            normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+            cosine = np.sum(normal * np.asarray(rays.directions)[:, :, i], axis=-1)
+            largest[i] = max(largest[i], np.arccos(np.min(cosine)))
+    np.testing.assert_allclose(told["incidence_angle"], largest, atol=1e-7)
+
+
+def test_thickness_at_edges(triplet):
+    lens, _, told = triplet
+    semi, zones = np.asarray(lens.semi_diameter), np.array([0.5, 0.7, 0.85, 1.0])
+    for name, rows, wide in (("glass", (0, 2, 4), max), ("air", (1, 3), min)):
+        on_axis = np.asarray(lens.thickness)[list(rows)]
+        np.testing.assert_allclose(told[f"{name}_centre"], on_axis, rtol=1e-14)
+        for k, i in enumerate(rows):
+            y = wide(semi[i], semi[i + 1]) * zones
+            sags = [np.asarray(drt_jax.sag(lens, j, 0.0, y)) for j in (i, i + 1)]
+            found = told[f"{name}_edge"].reshape(len(rows), 4)[k]
+            np.testing.assert_allclose(found, on_axis[k] + sags[1] - sags[0], rtol=1e-13)
+
+
+def test_open_apertures_reach_as_far_as_the_rays(tmp_path):
+    lens = model(tmp_path)
+    problem = Problem.of(Variables.of(lens, ["thickness"]), ["air_edge"], [0.0, 0.2], rule=3)
+    seen = problem.seen(lens)
+    extents = np.asarray(seen.extents)
+    assert extents[0] == 6 and extents[4] == 4
+    rays = drt_jax.trace_rays(lens, 0.2, np.inf, 0.5875618, [[0, 1], [0, -1], [1, 0]])
+    reach = np.hypot(*np.moveaxis(np.asarray(rays.points)[0, :, :, :2], -1, 0)).max(axis=0)
+    np.testing.assert_allclose(extents[[1, 2, 3, 5, 6]], reach[[1, 2, 3, 5, 6]], rtol=1e-12)
+
+
+def flux(lens, field, count=400, h=1e-4):
+    """Light of a distant object on the sensor: the area of the beam on the plane z = 0, times the
+    solid angle, in direction cosines, that an area of the sensor sees."""
+    angle = 2 * np.pi * np.arange(count) / count
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rays = drt_jax.trace_rays(lens, field, np.inf, COLOURS[1], rim)
+    point, line = (np.asarray(a)[0, :, 0] for a in (rays.points, rays.directions))
+    x, y, _ = (point - line * (point[:, 2] / line[:, 2])[:, None]).T
+    area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+    columns = []
+    for step in np.eye(2) * h:
+        ends = [np.array([0, field]) + sign * step for sign in (1, -1)]
+        hits = [np.asarray(drt_jax.image_point(lens, e, np.inf, COLOURS[1]))[0] for e in ends]
+        lines = [np.tan(e) / np.sqrt(1 + np.sum(np.tan(e) ** 2)) for e in ends]
+        columns.append((hits[0] - hits[1], lines[0] - lines[1]))
+    moved, turned = (np.linalg.det(np.stack(part)) for part in zip(*columns))
+    return area * abs(turned / moved)
+
+
+def test_illumination_is_what_a_beam_brings(triplet):
+    lens, _, told = triplet
+    light = np.array([flux(lens, field) for field in FIELDS])
+    np.testing.assert_allclose(told["relative_illumination"][:3], light / light[0], rtol=5e-3)
+    assert told["relative_illumination"][3] == 1
+
+
+WEAK = """
+surfaces:
+  - {{radius: inf, thickness: 60, semi_diameter: {semi}}}
+  - {{radius: inf, thickness: 0.1, semi_diameter: 2, stop: true}}
+  - {{radius: 207.2, thickness: 0.1, index: 1.518}}
+  - {{radius: -207.2, thickness: 199.9}}
+"""
+
+
+@pytest.mark.parametrize("semi, rule", [(100, 4), (15, Clipped(6, "half"))])
+def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
+    """The fourth power of the cosine, times the light that passes a clear aperture far in front."""
+    path = tmp_path / "weak.yaml"
+    path.write_text(WEAK.format(semi=semi))
+    lens = load_lens(path)
+    fields = np.radians([0.0, 14.0])
+    problem = Problem.of(Variables.of(lens, ["thickness"]), ["spot"], fields, rule=rule)
+
+    @jax.jit
+    def told(lens):
+        seen = problem.seen(lens)
+        return seen.illumination, seen.rays.passed
+
+    found, passed = told(lens)
+    share = passed[1, 0] / passed[0, 0]
+    assert share == 1 if semi == 100 else 0.4 < share < 0.6
+    # What is left of the stop lies to one side of its middle.
+    near = 2e-3 if semi == 100 else 1e-2
+    assert abs(found[1] / (np.cos(fields[1]) ** 4 * share) - 1) < near
+
+
+def test_vignetted_spots():
+    """By a rule fitted to what is left of the pupil."""
+    lens, rule, field = load_lens("camera_50mm"), Clipped(4, "half"), np.radians(20)
+    problem = Problem.of(
+        Variables.of(lens, ["thickness"]), ["spot_of_colours"], [field], COLOURS[1], rule=rule
+    )
+
+    @jax.jit
+    def told(lens):
+        seen = problem.seen(lens)
+        return problem.operands[0].values(seen), seen.rays.passed
+
+    values, passed = told(lens)
+    found = drt_jax.psf_moments(lens, field, np.inf, COLOURS[1], rule=rule)
+    assert 0.3 < passed[0, 0] < 0.9 and abs(passed[0, 0] / found.passed[0] - 1) < 1e-11
+    trace = np.trace(np.asarray(found.covariance)[0])
+    assert abs(np.sum(values**2) / trace - 1) < 1e-10
+
+
+def model(tmp_path):
+    path = tmp_path / "model.yaml"
+    path.write_text(MODEL)
+    return load_lens(path)
+
+
+def test_a_dark_field_is_no_good_one(tmp_path):
+    lens = model(tmp_path)
+    lens = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[6].set(1e-3))
+    problem = Problem.of(Variables.of(lens, ["curvature"]), ["spot"], [0.3], rule=3)
+    merit, gradient = jax.jit(jax.value_and_grad(problem.merit))(problem.variables.start)
+    assert np.isinf(merit) and np.all(np.isfinite(gradient))
+    with pytest.raises(ValueError, match="the start cannot be judged"):
+        design.optimise(problem, trials=2)
+
+
+def test_obscurations_need_another_rule():
+    lens = load_lens("hubble")
+    problem = Problem.of(Variables.of(lens, ["sensor"]), ["spot"], rule=Clipped(3, "disc"))
+    if lens.apertures is not None and any(lens.apertures.blocks):
+        with pytest.raises(ValueError, match="rule: Clipped subtracts"):
+            problem.merit(problem.variables.start)
+
+
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (dict(kind="blur"), "operands: unknown kind 'blur'; known: spot,"),
+        (dict(kind="rms_spot", low=1, high=0), "operands: rms_spot: low 1 is not below high 0"),
+        (dict(kind="rms_spot", low=1, high=1), "both 1; give it as the target"),
+        (dict(kind="rms_spot", low=np.nan), "low nan is not below"),
+        (dict(kind="rms_spot", weight=0), "operands: rms_spot: weight: must be above 0, got 0"),
+        (dict(kind="centroid", target=np.inf), "operands: centroid: target: must be finite"),
+        (dict(kind="length", target=3, high=4), "has a target and limits; make two operands"),
+        (dict(kind="spot", high=0.1), "spot: takes no target and no limits; use rms_spot"),
+        (dict(kind="length", fields=(0,)), "length: fields: it has none; leave them out, it knows"),
+        (dict(kind="focal_length", distances=(0,)), "distances: it has none"),
+        (dict(kind="spot", fields=0), "operands: spot: fields: expected whole numbers"),
+        (dict(kind="spot", fields=("x",)), "operands: spot: fields: expected whole numbers"),
+    ],
+)
+def test_bad_words_and_numbers(arguments, said):
+    with pytest.raises(ValueError) as told:
+        Operand(**arguments)
+    assert said in str(told.value) and "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "operand, said",
+    [
+        (Operand("spot", fields=(2,)), "operands: spot: fields: no number 2; there are 0, 1"),
+        (Operand("spot", wavelengths=(-1,)), "wavelengths: no number -1; there are 0"),
+        (Operand("glass_edge", surfaces=(1,)), "glass_edge: surfaces: no number 1; there are 0, 2"),
+        (Operand("incidence_angle", surfaces=(4,)), "no number 4; there are 0, 1, 2, 3, 5, 6"),
+        (Operand("lateral_colour"), "lateral_colour: wavelengths: needs two or more; leave it out"),
+        (Operand("magnification"), "operands: magnification: the object is at infinity"),
+    ],
+)
+def test_what_neither_lens_nor_problem_has(tmp_path, operand, said):
+    variables = Variables.of(model(tmp_path), ["curvature"])
+    with pytest.raises(ValueError) as told:
+        Problem.of(variables, [operand], [0.0, 0.1])
+    assert said in str(told.value)
+    assert hash(Operand("spot", fields=[0]))
+
+
+def test_each_kind_is_told_where_a_user_reads():
+    page = (pathlib.Path(__file__).parents[2] / "docs" / "design.md").read_text()
+    for kind in OPERANDS:
+        assert f"`{kind}`" in page and kind in operands.__doc__
+    for kind in KINDS:
+        assert f"`{kind}`" in page
+    for kind in get_args(Solve.__annotations__["kind"]):
+        assert f"`{kind}`" in page
