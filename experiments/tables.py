@@ -11,7 +11,17 @@ import signal
 
 from . import _common, hear
 
-_NAMES = ("focus", "restore", "edof", "accuracy", "stability", "benchmark", "lenses", "faults")
+_NAMES = (
+    "focus",
+    "restore",
+    "edof",
+    "accuracy",
+    "stability",
+    "benchmark",
+    "lenses",
+    "faults",
+    "tolerance",
+)
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 

@@ -29,6 +29,7 @@ def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]
 # Lines that may lie on each other, below one broad line of what is true.
 _TRUE: dict[str, Any] = {"color": "black", "alpha": 0.35, "linewidth": 4}
 _STYLES = ("-", "--", ":")
+_DOTS = {"color": "black", "linewidth": 2.2, "zorder": 4}  # on top of what they agree with
 
 
 def yields(
@@ -41,6 +42,7 @@ def yields(
     """
     for k, (label, (x, share)) in enumerate(curves.items()):
         style: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
+        style |= _DOTS if k % 3 == 2 else {}
         axes.plot(x, share, label=label, **(style if k else _TRUE))
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3)
@@ -62,6 +64,7 @@ def histogram(
     """
     for k, (label, values) in enumerate(shares.items()):
         line: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
+        line |= _DOTS if k % 3 == 2 else {}
         fill: dict[str, Any] = {"color": "black", "alpha": 0.2, "fill": True}
         axes.stairs(values, edges, label=label, **(line if k else fill))
     for k, (label, place) in enumerate(marks.items()):

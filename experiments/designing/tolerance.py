@@ -225,7 +225,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     about = {"derivatives_s": found["seconds"], "derivatives_compile_s": found["compile_s"]}
     about |= {"rule_error": found["rule_error"], "threads": os.cpu_count(), "count": config.count}
     about |= {"errors": config.errors, "limits_um": list(config.limits_um)}
-    return alone | about | {"scales": scales, "seconds": run.seconds}
+    return alone | about | {"scales": scales}
 
 
 def main_scale(results: dict[str, Any]) -> dict[str, Any]:

@@ -51,8 +51,7 @@ def test_it_writes_rows_and_pictures_and_resumes(config, tmp_path, capsys):
     }
     (folder / "results.json").unlink()
     main("--resume", "--out", folder)
-    again = json.loads((folder / "results.json").read_text())
-    assert {**again, "seconds": 0} == {**results, "seconds": 0}
+    assert json.loads((folder / "results.json").read_text()) == results
 
 
 @pytest.mark.parametrize(
