@@ -151,7 +151,7 @@ def _proposal(
     move = jnp.where(jnp.isfinite(move), move, 0)
     # Where that goes round in circles, a part of the step is better than all of it.
     parts = jnp.asarray(_PARTS, y.dtype)
-    ahead = state.residuals[:, None] + (state.jacobian @ move)[:, None] * parts
+    ahead = state.residuals[:, None] + (state.jacobian @ move)[:, None] * parts[None]
     merits = jnp.sum(_counting(ahead, sided[:, None]) ** 2, axis=0)
     best = jnp.argmin(merits)
     return parts[best] * move, jnp.sum(_counting(state.residuals, sided) ** 2) - merits[best]

@@ -157,7 +157,8 @@ class Value(NamedTuple):
 
     function: its values, of any shape. names: what an operand of it may name. places: the surfaces
     that have one, None if it is none of surfaces. traced: whether it needs rays. squared: for
-    residuals that only mean something as squares, the kind of their sum.
+    residuals that only mean something as squares, the kind of their sum. per_mm: by how much a ray
+    that misses by 1 mm changes it, as what weighs a ray that fails.
     """
 
     function: Callable[[Operand, Seen], Array]
@@ -165,6 +166,7 @@ class Value(NamedTuple):
     places: Callable[[Lens], list[int]] | None = None
     traced: bool = True
     squared: str = ""
+    per_mm: float = 1.0
 
 
 def _views(operand: Operand, seen: Seen) -> np.ndarray:
@@ -336,6 +338,7 @@ def _incidence(operand: Operand, seen: Seen) -> Array:
 
 _RAYS = ("fields", "wavelengths", "distances")
 _COLOURS = ("wavelengths",)
+_WAVES_PER_MM = 200.0  # green light at f/5
 _SCALES = ("wavelengths", "distances")
 OPERANDS: dict[str, Value] = {
     "spot": Value(_spot, _RAYS, squared="rms_spot"),
@@ -343,8 +346,10 @@ OPERANDS: dict[str, Value] = {
     "spot_chief": Value(_spot_chief, _RAYS, squared="rms_spot"),
     "rms_spot": Value(_rms_spot, _RAYS),
     "centroid": Value(_centroid, _RAYS),
-    "path_difference": Value(_path_difference, _RAYS, squared="rms_wavefront"),
-    "rms_wavefront": Value(_rms_wavefront, _RAYS),
+    "path_difference": Value(
+        _path_difference, _RAYS, squared="rms_wavefront", per_mm=_WAVES_PER_MM
+    ),
+    "rms_wavefront": Value(_rms_wavefront, _RAYS, per_mm=_WAVES_PER_MM),
     "focal_length": Value(_lens_alone(lambda a: a.focal_length), _COLOURS, traced=False),
     "back_focal_distance": Value(
         _lens_alone(lambda a: a.back_focal_distance), _COLOURS, traced=False

@@ -16,7 +16,7 @@ from ..lens.scene import Scene, distance_array, field_array, vergence_of
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve_aimed
 from .gaps import gaps
-from .operands import TRACED, Operand
+from .operands import OPERANDS, TRACED, Operand
 from .seen import Seen, symmetry_by_structure
 from .variables import Variables
 
@@ -159,7 +159,8 @@ class Problem:
         """A residual for each ray: 0 for one that passes, else the root of its share of the light
         times a miss of several beams."""
         size = _FAILED * jax.lax.stop_gradient(seen.lens.semi_diameter[seen.lens.stop])
-        weight = max((o.weight for o in self.operands if not o.limits), default=1.0)
+        wanted = [o.weight * OPERANDS[o.kind].per_mm for o in self.operands if not o.limits]
+        weight = max(wanted, default=1.0)
         return jnp.ravel(weight * size * seen.failures)
 
     def merit(self, vector: Array) -> Array:

@@ -326,8 +326,10 @@ def _follow(
             behind = jnp.where(row.first, 0, jnp.maximum(-length, 0)) + jnp.maximum(-front, 0)
             behind = jnp.where(row.live, behind, 0)
             behind = behind + jnp.where(row.bends, jnp.maximum(-through, 0), 0)
-            # By how much a conic is missed; that tells nothing of where a line crosses it.
-            return jnp.where(crosses, behind, jnp.maximum(square * constant - linear**2, 0))
+            # By how much a conic is missed, on from the total reflection of rays that graze it.
+            missed = jnp.maximum(square * constant - linear**2, 0)
+            missed = missed + jnp.where(row.bends, jnp.maximum(row.ratio**2 - 1, 0), 0)
+            return jnp.where(crosses, behind, missed)
 
         keeping = keep(_Meeting(hit, fate, short))
         return jax.tree.map(partial(jnp.where, row.bends), new, kept), keeping
