@@ -38,11 +38,11 @@ ALLOWED = {
 }
 ALLOWED_ALL = {"show.layout"}
 # Of 8,200 that were the aim before apertures, phases and elements came, 11,200 before what comes
-# from outside was checked throughout.
-HOUSE = 14_000
+# from outside was checked throughout, 13,900 before whole lenses are designed and toleranced.
+HOUSE = 17_600
 # Outside packages that belong to some modules or floors alone.
 ONLY = {
-    "optimistix": {"rays.aim", "rays.find", "image.field"},
+    "optimistix": {"rays.aim", "rays.find", "image.field", "design.least_squares"},
     "matplotlib": {"show"},
     "skimage": {"learn.data", "learn.images", "learn.train"},
     "PIL": {"learn.data", "learn.images"},

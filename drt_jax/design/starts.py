@@ -66,7 +66,8 @@ class Minimum(NamedTuple):
 class Starts(NamedTuple):
     """What many starts came to.
 
-    minima: the distinct ones, best first. trials, jacobians, rays: of all searches. seconds.
+    minima: the distinct ones, best first. trials, jacobians, rays: of all searches. seconds: of all
+    of it; compile_s: of these, before anything was evaluated. best: the best score after each tile.
     merits: (K,), of every start where its search was left, inf for one that never passed a ray.
     """
 
@@ -76,6 +77,8 @@ class Starts(NamedTuple):
     jacobians: int
     rays: int
     seconds: float
+    compile_s: float
+    best: list[float]
 
 
 _begin = jax.jit(jax.vmap(begin, (None, 0)))
@@ -129,18 +132,28 @@ def many_starts(
     sizes = [len(vectors)]
     for _ in turns[1:]:
         sizes.append(min(sizes[-1], max(_TILE, math.ceil(keep * sizes[-1]))))
-    alive, done = np.arange(len(vectors)), 0
+    alive, best = np.arange(len(vectors)), list[float]()
+    total = sum(-(-size // _TILE) for size in sizes)
+    for _ in _advanced(problem, state, [np.resize(alive, _TILE)], 0, threads):
+        compiled = time.perf_counter() - begun
     for size, more in zip(sizes, turns):
         alive = alive[np.argsort(score(_rows(state, alive)), kind="stable")[:size]]
         tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
         for _ in _advanced(problem, state, tiles, more, threads):
-            done += 1
-            total = sum(-(-size // _TILE) for size in sizes)
-            report(done, total, float(np.min(score(_rows(state, alive)))))
+            best.append(float(np.min(score(_rows(state, alive)))))
+            report(len(best), total, best[-1])
     trials, jacobians = (int(np.sum(a)) for a in (state.state.trials, state.state.jacobians))
     minima = distinct(_rows(state, alive), alive)
-    seconds = time.perf_counter() - begun
-    return Starts(minima, score(state), trials, jacobians, trials * rays_of(problem), seconds)
+    return Starts(
+        minima,
+        score(state),
+        trials,
+        jacobians,
+        trials * rays_of(problem),
+        time.perf_counter() - begun,
+        compiled,
+        best,
+    )
 
 
 def _advanced(

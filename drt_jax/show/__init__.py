@@ -7,7 +7,12 @@ show.lens_drawing(axes, show.draw(lens))
 figure.savefig("lens.png")
 """
 
-from .designs import merits as merits, ranks as ranks, spots as spots
+from .designs import (
+    merits as merits,
+    ranks as ranks,
+    searching as searching,
+    spots as spots,
+)
 from .figures import (
     by_family as by_family,
     convergence as convergence,

@@ -38,6 +38,15 @@ def merits(axes: Axes, history: np.ndarray) -> Axes:
     return axes
 
 
+def searching(axes: Axes, best: np.ndarray) -> Axes:
+    """How the root of the best merit (um) of many starts fell; best (T,): in mm^2, after each tile
+    of searches."""
+    axes.semilogy(np.arange(1, len(best) + 1), 1e3 * np.sqrt(best), color="tab:blue")
+    axes.set(xlabel="tiles of 16 searches, by stages", ylabel="root of the best merit (um)")
+    axes.grid(alpha=0.3, which="both")
+    return axes
+
+
 def ranks(axes: Axes, sizes: Sequence[float], found: Sequence[int]) -> Axes:
     """The distinct minima: the root of the merit (um) of each, and how often it was found."""
     axes.bar(range(1, len(sizes) + 1), sizes, color="tab:blue")

@@ -63,7 +63,10 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     np.ravel(axes)[0].set(xlabel="um", ylabel="um")
     figure.savefig(figures / "spots.png")
     figure, ax = show.new(1, 1, 6, 3.6)
-    show.merits(ax, np.array(results["history"]))
+    if results["starts"]["merits"]:
+        show.searching(ax, np.array(results["starts"]["best"]))
+    else:
+        show.merits(ax, np.array(results["history"]))
     figure.savefig(figures / "merit.png")
     if results["starts"]["merits"]:
         _draw_minima(results, drawings[1:], figures)

@@ -9,82 +9,22 @@ import dataclasses
 import math
 import pathlib
 import sys
-import time
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import design
-from drt_jax.design import Operand, Solve, Tie, Vary
+from drt_jax import Pattern, design
 from drt_jax.runs.folder import Run
 
 from . import _command, _common, _pictures
+from ._wanted import SHORTEST, Config as Config, Starts
 
 COLUMNS = ("merit", "worst", "jacobians")
-_DRAWN = 6  # minima
-
-
-@dataclasses.dataclass(frozen=True)
-class Starts:
-    """Where to start.
-
-    count: how many searches. how: "around" the lens by `spread` times the variables' scales,
-    "within" their bounds, or from lenses "made" with curvatures off by `per_cent` and thicknesses
-    off by `off_mm` (standard deviations). stages: trials of each search in each stage; keep: the
-    part that goes on to the next. seed: of the random numbers.
-    """
-
-    count: int = 1
-    how: Literal["around", "within", "made"] = "around"
-    spread: float = 1.0
-    per_cent: float = 1.0
-    off_mm: float = 0.1
-    stages: tuple[int, ...] = (12, 12, 24, 48, 200)
-    keep: float = 0.7
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        limits = {"count": (1, 1e5), "spread": (0, 1e3), "stages": (1, 1e4), "keep": (0, 1)}
-        _common.require_within("starts.", self, **limits)
-        _common.require(len(self.stages) > 0, "starts.stages: needs at least one item")
-
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """Settings of the experiment; see configs/design/.
-
-    lens: the start, a bundled name or a YAML path. fields_deg: along y. distance_mm: to the object.
-    wavelengths_um, colour_weights: of the light; no weights: all alike. variables, ties, solves,
-    operands: see drt_jax.design. order: of the pupil's rule while searching; the best lens is
-    finished with as many rays as `tolerance`, relative, of its spots needs. growth: parts of the
-    fields and of the aperture to design for, one after the other, before the whole. trials: at
-    most, of the last search.
-    """
-
-    lens: str
-    variables: tuple[Vary, ...]
-    operands: tuple[Operand, ...]
-    fields_deg: tuple[float, ...] = (0.0,)
-    wavelengths_um: tuple[float, ...] = (0.5875618,)
-    colour_weights: tuple[float, ...] = ()
-    distance_mm: float = math.inf
-    ties: tuple[Tie, ...] = ()
-    solves: tuple[Solve, ...] = ()
-    order: int = 4
-    tolerance: float = 1e-6
-    growth: tuple[float, ...] = ()
-    trials: int = 500
-    starts: Starts = Starts()
-
-    def __post_init__(self) -> None:
-        limits = {"fields_deg": (-89, 89), "wavelengths_um": (1e-4, 1e6), "order": (1, 40)}
-        limits |= {"tolerance": (1e-12, 0.5), "growth": (0.01, 1), "trials": (1, 1e5)}
-        _common.require_within("", self, **limits)
-        for name in ("variables", "operands", "fields_deg", "wavelengths_um"):
-            _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")
+# Minima that are drawn. Clear apertures are so much wider than the light.
+_DRAWN, _WIDER = 6, 1.01
 
 
 def problem_of(
@@ -111,9 +51,19 @@ def problem_of(
         np.radians(config.fields_deg) * part,
         config.wavelengths_um,
         config.distance_mm,
-        config.order if order is None else order,
+        _grid(config.rings) if config.rings else (order or config.order),
         config.colour_weights or None,
     )
+
+
+def _grid(rings: int) -> Pattern:
+    """Rays of equal weight on rings of equal distances, 6 k on the k-th, and one in the centre."""
+    points = [np.zeros((2, 1))]
+    for k in range(1, rings + 1):
+        angle = 2 * np.pi * np.arange(6 * k) / (6 * k)
+        points.append(k / rings * np.stack([np.cos(angle), np.sin(angle)]))
+    positions = np.concatenate(points, axis=1)
+    return Pattern(positions, np.full(positions.shape[1], 1 / positions.shape[1]), "disc")
 
 
 def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:
@@ -167,12 +117,21 @@ class _Progress:
 
 def grown(config: Config, lens: drt_jax.Lens) -> drt_jax.Lens:
     """The lens designed for parts of the fields and the aperture, one after the other."""
-    for part in config.growth:
+    growth, own = config.growth, lens.semi_diameter[lens.stop]
+    good = len(config.fields_deg) * (1e-3 * growth.good_um) ** 2
+    done, step, part = 0.0, growth.step, growth.first
+    while done < 1:
         problem = problem_of(config, lens, part)
-        with _Progress(f"{part:.0%} of field and aperture", config.trials) as bar:
-            found = design.optimise(problem, trials=config.trials, report=bar.searched)
-        kept = found.lens.semi_diameter.at[lens.stop].set(lens.semi_diameter[lens.stop])
-        lens = dataclasses.replace(found.lens, semi_diameter=kept)
+        with _Progress(f"{part:.1%} of field and aperture", growth.trials) as bar:
+            found = design.optimise(problem, None, growth.trials, bar.searched)
+        if found.merit <= good:
+            kept = found.lens.semi_diameter.at[lens.stop].set(own)
+            lens, done, step = dataclasses.replace(found.lens, semi_diameter=kept), part, 1.2 * step
+        else:
+            step /= 2
+            told = f"growth: stops at {done:.1%} of field and aperture, where no step leads to"
+            _common.require(step >= SHORTEST, f"{told} {growth.good_um:g} um; change the start")
+        part = min(done + step, 1.0) if done else part / 2
     return lens
 
 
@@ -190,9 +149,15 @@ def made_vectors(variables: design.Variables, some: Starts) -> np.ndarray:
 def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
     """The vectors that the starts came to, best first, and what that took."""
     variables, some = problem.variables, config.starts
-    start = {"vectors": [variables.start.tolist()], "merits": [], "trials": 0, "jacobians": 0}
+    start = {
+        "vectors": [variables.start.tolist()],
+        "merits": [],
+        "trials": 0,
+        "jacobians": 0,
+        "no_worse": None,
+    }
     if some.count == 1:
-        return start | {"seconds": 0.0}
+        return start | {"seconds": 0.0, "compile_s": 0.0}
     if some.how == "made":
         vectors = made_vectors(problem.variables, some)
     elif some.how == "around":
@@ -205,22 +170,25 @@ def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
     return {
         "vectors": [minimum.vector.tolist() for minimum in found.minima],
         "merits": [minimum.merit for minimum in found.minima],
+        "no_worse": int(np.sum(found.merits <= float(problem.merit(variables.start)))),
+        "count": some.count,
         "found": [minimum.found for minimum in found.minima],
         "passed": int(np.isfinite(found.merits).sum()),
         "trials": found.trials,
         "jacobians": found.jacobians,
-        "seconds": found.seconds,
+        "seconds": found.seconds - found.compile_s,
+        "compile_s": found.compile_s,
+        "best": found.best,
     }
 
 
 def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> dict[str, Any]:
     """The best vector brought to the optimum with as many rays as it needs."""
-    begun = time.perf_counter()
     with _Progress("least squares", config.trials) as bar:
         vector = jnp.asarray(found["vectors"][0])
         parts = [design.optimise(problem, vector, config.trials, bar.searched)]
         order = order_of(config, parts[0].lens)
-        if order > config.order:
+        if order > config.order and not config.rings:
             rule = problem.with_order(order)
             vector = jnp.asarray(parts[0].vector)
             parts.append(design.optimise(rule, vector, config.trials, bar.searched))
@@ -237,17 +205,21 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
         "order": order,
         "history": history.tolist(),
         "seconds": seconds,
-        "compile_s": time.perf_counter() - begun - seconds,
+        "compile_s": sum(part.first for part in parts),
     }
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Grow, search, finish; and write the lens."""
     start = drt_jax.load_lens(config.lens)
-    if config.growth and run.kept("growth") is None:
+    if config.floating:
+        free = jnp.full_like(start.semi_diameter, jnp.inf)
+        own = start.semi_diameter[start.stop]
+        start = dataclasses.replace(start, semi_diameter=free.at[start.stop].set(own))
+    if config.growth.first < 1 and run.kept("growth") is None:
         drt_jax.save_lens(grown(config, start), run.folder / "grown.yaml")
         run.keep("growth", "grown.yaml")
-    begin = drt_jax.load_lens(run.folder / "grown.yaml") if config.growth else start
+    begin = drt_jax.load_lens(run.folder / "grown.yaml") if config.growth.first < 1 else start
     problem = problem_of(config, begin)
     if run.kept("starts") is None:
         run.keep("starts", searched(config, problem))
@@ -258,7 +230,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     history = np.array(end["history"])
     run.log("least squares", 0, dict(zip(COLUMNS, history.T)))
     variables = problem.variables
-    drt_jax.save_lens(variables.lens_of(jnp.asarray(end["vector"])), run.folder / "designed.yaml")
+    designed = _bounded(config, problem, variables.lens_of(jnp.asarray(end["vector"])))
+    drt_jax.save_lens(designed, run.folder / "designed.yaml")
     rays = design.rays_of(problem)
     row = {
         "problem": pathlib.Path(config.lens).stem,
@@ -269,9 +242,11 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "jacobians": found["jacobians"] + int(history[-1, 2]),
         "rays": rays * (found["trials"] + len(history)),
         "seconds": found["seconds"] + end["seconds"],
-        "compile_s": end["compile_s"],
+        "compile_s": found["compile_s"] + end["compile_s"],
     } | _beside(config, drt_jax.load_lens(run.folder / "designed.yaml"))
-    drawn = [start, *(variables.lens_of(jnp.asarray(v)) for v in (end["vector"], *_others(found)))]
+    others = (variables.lens_of(jnp.asarray(vector)) for vector in _others(found))
+    drawn = [designed, *(_bounded(config, problem, lens) for lens in others)]
+    drawn = [_bounded(config, problem, start), *drawn]
     return {
         "rows": [row],
         "lens": config.lens,
@@ -282,6 +257,15 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "spots": _pictures.spot_hits(config, drawn[1]),
         "history": history.tolist(),
     }
+
+
+def _bounded(config: Config, problem: design.Problem, lens: drt_jax.Lens) -> drt_jax.Lens:
+    """The lens with clear apertures as wide as its light, where they float."""
+    if not config.floating:
+        return lens
+    wide = _WIDER * problem.seen(lens).extents
+    wide = jnp.append(wide, jnp.inf).at[lens.stop].set(lens.semi_diameter[lens.stop])
+    return dataclasses.replace(lens, semi_diameter=wide)
 
 
 def _others(found: dict[str, Any]) -> list[Any]:
@@ -319,6 +303,8 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     if some["merits"]:
         took += [["starts that pass light", some["passed"]], ["minima", len(some["merits"])]]
         took += [["minima a minute", 60 * len(some["merits"]) / max(some["seconds"], 1e-9)]]
+    if some["no_worse"] is not None:
+        took.append(["starts no worse than the lens", f"{some['no_worse']} of {some['count']}"])
     name = row["problem"]
     return {
         f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
