@@ -9,7 +9,7 @@ import pathlib
 import re
 import signal
 
-from . import _common, hear
+from . import _common, design, hear
 
 _NAMES = (
     "focus",
@@ -36,6 +36,8 @@ def all_tables() -> dict[str, str]:
     for name in _NAMES:
         experiment = importlib.import_module(f"experiments.{name}")
         found |= experiment.tables(_common.read_results(_common.ROOT / "results" / name))
+    for path in sorted((_common.ROOT / "results" / "design").glob("*/results.json")):
+        found |= design.tables(_common.read_results(path.parent))
     return found
 
 

@@ -15,7 +15,7 @@ def spots(
     """A spot: hits (N, 2) in um about the centroid by colour, and the ellipse of one standard
     deviation of `covariance` (2, 2), um^2. side: of the square shown, um."""
     for (label, points), colour in zip(hits.items(), _COLOURS * len(hits)):
-        axes.scatter(*points.T, s=2, color=colour, label=label)
+        axes.plot(points[:, 0], points[:, 1], ".", markersize=2, color=colour, label=label)
     sizes, turned = np.linalg.eigh(covariance)
     width, height = 2 * np.sqrt(np.maximum(sizes, 0))
     angle = np.degrees(np.arctan2(turned[1, 0], turned[0, 0]))

@@ -59,6 +59,7 @@ class Growth:
 class Config:
     """Settings of the experiment; see configs/design/.
 
+    name: of the problem.
     lens: the start, a bundled name or a YAML path. fields_deg: along y. distance_mm: to the object.
     floating: whether clear apertures but the stop's follow the light, instead of vignetting.
     wavelengths_um, colour_weights: of the light; no weights: all alike. variables, ties, solves,
@@ -68,6 +69,7 @@ class Config:
     of the last search.
     """
 
+    name: str
     lens: str
     variables: tuple[Vary, ...]
     operands: tuple[Operand, ...]

@@ -234,7 +234,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     drt_jax.save_lens(designed, run.folder / "designed.yaml")
     rays = design.rays_of(problem)
     row = {
-        "problem": pathlib.Path(config.lens).stem,
+        "problem": config.name,
         "merit_start": end["merit_start"],
         "merit_end": end["merit_end"],
         "worst_limit": end["worst"],
