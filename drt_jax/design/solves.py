@@ -30,6 +30,7 @@ _STEPS = 2
 _ORDER = 6  # of the rule of the best focus
 # A value is met to this part; and a typical step of the number that follows changes it by more.
 _HELD = 1e-9
+_NO_SURFACE = 5000  # prescriptions have at most so many, settings no negative numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Solve:
         follows. "entrance_pupil", its diameter in mm, or "f_number", the working one: the
         semi-diameter of the stop follows.
     value: to keep; 0: that of the lens at the start; of a focus, mm from there to the sensor.
-    surface: whose curvature follows.
+    surface: whose curvature follows, from 0.
     fields: of the best focus, radians along y.
     distance: to the object, mm; of a focus, image_angle and f_number.
     wavelengths: um; a condition is one of their mean.
@@ -51,7 +52,7 @@ class Solve:
 
     kind: _Name
     value: float = 0.0
-    surface: int = -1
+    surface: int = _NO_SURFACE
     fields: tuple[float, ...] = (0.0,)
     distance: float = math.inf
     wavelengths: tuple[float, ...] = (0.5875618,)
@@ -95,8 +96,7 @@ class Solve:
         live = ", ".join(map(str, lens.live))
         if self.surface not in lens.live:
             raise ValueError(
-                f"solves: {self.kind}: its curvature follows: give surface, one of {live}; "
-                f"got {shown(self.surface)}"
+                f"solves: {self.kind}: its curvature follows: give surface, one of {live}"
             )
         if self.kind == "image_angle" and self.surface < lens.stop:
             raise ValueError(

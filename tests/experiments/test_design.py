@@ -1,0 +1,73 @@
+"""experiments.design at toy size: what it writes, that it resumes, how it refuses."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+import drt_jax
+from experiments import _command, design
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+NAMED = {"problem", "merit_start", "merit_end", "spots_um", "jacobians", "rays", "seconds"}
+FEW = ["starts.count=3", "starts.stages=[2,2]", "order=2", "tolerance=0.1", "trials=3"]
+FEW += ["fields_deg=[0,14]", "wavelengths_um=[0.5876]"]
+
+
+def main(config, folder, *settings, options=()):
+    path = ROOT / "configs" / "design" / f"{config}.yaml"
+    given = ["--set", *settings] if settings else []
+    _command.main(design, ["--config", str(path), "--out", str(folder), *options, *given])
+
+
+def test_a_lens_is_designed_from_several_starts(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    main("triplet", tmp_path / "run", *FEW)
+    said = capsys.readouterr().out
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    (row,) = results["rows"]
+    assert set(row) >= NAMED and row["merit_end"] < row["merit_start"] and "RMS um" in said
+    lens = drt_jax.load_lens(tmp_path / "run" / "designed.yaml")
+    np.testing.assert_allclose(drt_jax.focal_length(lens, (0.5876,)), 50, rtol=1e-12)
+    moments = drt_jax.psf_moments(lens, 0.0, np.inf, (0.5876,), 0.1)
+    spot = 1e3 * np.sqrt(np.trace(moments.covariance[0]))
+    np.testing.assert_allclose(spot, row["spots_um"][0], rtol=1e-9)
+    figures = {path.stem for path in (tmp_path / "run" / "figures").glob("*.png")}
+    assert figures == {"lens", "spots", "merit", "minima", "minima_drawn"}
+    # What is finished is not searched for again.
+    (tmp_path / "run" / "results.json").unlink()
+    monkeypatch.setattr(design.design, "many_starts", None)
+    monkeypatch.setattr(design.design, "optimise", None)
+    _command.main(design, ["--out", str(tmp_path / "run"), "--resume"])
+    again = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert again["rows"] == results["rows"]
+
+
+@pytest.mark.parametrize(
+    "setting, said",
+    [
+        ("variables=[{kind: curvture}]", "unknown kind 'curvture'"),
+        ("variables=[{kind: curvature, low: 1, high: 0}]", "is not below high"),
+        ("variables=[{kind: curvature, surfaces: [9]}]", "no surface 9"),
+        ("variables=[{kind: sensor}, {kind: sensor}]", "twice"),
+        ("solves=[{kind: focal_length, value: 50}]", "give surface"),
+        ("operands=[]", "operands: needs at least one item"),
+        ("operands=[{kind: blur}]", "unknown kind 'blur'"),
+        ("starts.how=anywhere", "one of around, within, made"),
+        ("lens=nowhere.yaml", "nowhere.yaml"),
+        ("growth.first=2", "growth.first: expected"),
+    ],
+)
+def test_bad_settings_get_one_line(setting, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    with pytest.raises(SystemExit) as caught:
+        main("triplet", tmp_path / "run", setting)
+    message = capsys.readouterr().err.strip()
+    assert caught.value.code == 2 and said in message and "\n" not in message
+    assert len(message.removeprefix("error: ")) <= 300
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs" / "design" / "lenses").glob("*.yaml")))
+def test_starts_load(path):
+    assert drt_jax.load_lens(path).count > 1
