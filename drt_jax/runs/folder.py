@@ -57,6 +57,7 @@ class Run:
         self.figures = folder / "figures"
         self._metrics = Metrics(folder / "metrics.csv", columns)
         self._earlier, self._opened = 0.0, time.perf_counter()
+        self._saved: set[str] = set()  # the jobs with a checkpoint of this process
         settings = json.dumps(dataclasses.asdict(config), sort_keys=True)
         self._settings = hashlib.sha256(settings.encode()).hexdigest()
         if resume and not (folder / "config.yaml").is_file():
@@ -131,6 +132,7 @@ class Run:
             raise ConfigError(f"{job}: numbers that are not finite after {step} steps; {remedy}")
         self._metrics.sync()  # a checkpoint without its metrics would be of no use
         replace(self._path(job), now.packed())
+        self._saved.add(job)
 
     def load(self, job: str, tree: Any, logged: tuple[str, ...], most: int) -> tuple[int, Any]:
         """The last checkpoint of `job` as (step, state); (0, tree) if there is none.
@@ -174,7 +176,8 @@ class Run:
                 found.check(job, self._settings, most, forms)
             except ValueError as error:
                 raise ConfigError(f"{path}: {error}; delete it to begin this job anew") from error
-            self._earlier = max(self._earlier, found.seconds)
+            if job not in self._saved:
+                self._earlier = max(self._earlier, found.seconds)
         remedy = f"delete {path.relative_to(self.folder)} to begin this job anew"
         self._metrics.cut(logged, found.step if found else 0, remedy)
         return found

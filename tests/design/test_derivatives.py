@@ -54,6 +54,7 @@ def crooked(tmp_path_factory):
     return problem, kinds, variables.start + moves
 
 
+@pytest.mark.slow
 def test_every_derivative_by_every_kind_of_variable(crooked):
     problem, kinds, x = crooked
 
@@ -78,6 +79,7 @@ def test_every_derivative_by_every_kind_of_variable(crooked):
     np.testing.assert_allclose(gradient, wanted, rtol=1e-8, atol=1e-9 * np.max(np.abs(wanted)))
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_fitted_pupil():
     """Where apertures cut, the points of the rule follow the lens."""
     lens = load_lens("camera_50mm")

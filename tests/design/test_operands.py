@@ -216,6 +216,7 @@ def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
     assert abs(found[1] / (np.cos(fields[1]) ** 4 * share) - 1) < near
 
 
+@pytest.mark.slow
 def test_vignetted_spots():
     """By a rule fitted to what is left of the pupil."""
     lens, rule, field = load_lens("camera_50mm"), Clipped(4, "half"), np.radians(20)

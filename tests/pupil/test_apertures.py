@@ -120,6 +120,7 @@ def test_agrees_with_many_rays_that_drop_out(cut):
     np.testing.assert_allclose(height, hits.mean(axis=0)[1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_by_sizes_and_centres(cut):
     """Forward and reverse, in jit and vmap, against fourth-order differences."""
     many = jax.jit(jax.vmap(blur))

@@ -70,6 +70,20 @@ def test_the_metrics_of_a_finished_run_do_not_tell_where_it_was_stopped(tmp_path
     assert files[0] == files[1] and files[0].count(b"\n") == 13
 
 
+def test_seconds_are_counted_once(tmp_path, monkeypatch):
+    """A job read back by the process that kept it adds nothing; one of an earlier process does."""
+    clock = iter(range(0, 1000, 10))
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(clock)))
+    with opened(tmp_path) as run:
+        for job in "abc":
+            run.keep(job, 1)
+            assert run.kept(job) == 1
+        assert run.seconds == 40
+    with opened(tmp_path, resume=True) as again:
+        assert again.kept("c") == 1
+        assert again.seconds == 30 + 10
+
+
 def test_what_a_job_found_is_kept_with_its_metrics(tmp_path):
     """Also under a name that is no name of a file; what was logged by one cut short is dropped."""
     found = {"rows": [1, "x", None], "bad": float("inf")}
