@@ -148,6 +148,7 @@ def test_thickness_at_edges(triplet):
             np.testing.assert_allclose(found, on_axis[k] + sags[1] - sags[0], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_open_apertures_reach_as_far_as_the_rays(tmp_path):
     lens = model(tmp_path)
     problem = Problem.of(Variables.of(lens, ["thickness"]), ["air_edge"], [0.0, 0.2], rule=3)
@@ -242,6 +243,7 @@ def model(tmp_path):
     return load_lens(path)
 
 
+@pytest.mark.slow
 def test_a_dark_field_is_no_good_one(tmp_path):
     lens = model(tmp_path)
     lens = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[6].set(1e-3))

@@ -70,6 +70,7 @@ def test_conditions_hold_whatever_varies(solve):
         np.testing.assert_allclose(variables.vector(lens), vector, rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_all_together_in_any_order():
     """Given in the order in which they would spoil one another."""
     solves = [

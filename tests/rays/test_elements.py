@@ -143,6 +143,7 @@ def test_the_chief_ray_of_a_grating_spectrometer_goes_where_another_program_foun
     assert abs(sensor[0] - sensor[2]) > 20  # mm between 450 and 650 nm
 
 
+@pytest.mark.slow
 def test_derivatives_by_every_move():
     """Of the centroid and covariance, against differences; about a centred lens too."""
     for move in (MOVE, {}):

@@ -131,9 +131,9 @@ def hybrid(form, base, stop):
     ("form", "base", "stop"),
     [
         ("asphere", "asphere", 0),
-        ("odd_asphere", "mirror", 3),
-        ("linear", "plane", 2),
-        ("polynomial_xy", "mirror", 2),
+        pytest.param("odd_asphere", "mirror", 3, marks=pytest.mark.slow),
+        pytest.param("linear", "plane", 2, marks=pytest.mark.slow),
+        pytest.param("polynomial_xy", "mirror", 2, marks=pytest.mark.slow),
         ("polynomial_xy", "asphere", 3),
     ],
 )
