@@ -128,6 +128,7 @@ def test_rays_that_fail_have_a_smooth_merit(strong):
     assert gradient[3] * x[3] > 0
 
 
+@pytest.mark.slow
 def test_a_few_steps_bring_all_rays_through(strong):
     problem, x = strong
     found = design.optimise(problem, x, trials=15)

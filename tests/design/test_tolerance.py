@@ -109,6 +109,7 @@ def measures(singlet, off):
     return np.mean(design.monte_carlo(*singlet, np.asarray(off), "focus", threads=1).squares, 1)
 
 
+@pytest.mark.slow
 def test_gradient_and_hessian_are_those_of_differences(singlet, predicted):
     """Central differences: at some step they agree to six digits, and before it the error falls
     with the square of the step."""

@@ -75,7 +75,7 @@ def test_spot_size_keeps_its_tolerance_against_snells_law(degrees, distance):
 @pytest.mark.parametrize(
     ("degrees", "distance", "front", "rear"),
     [
-        (0.0, 25e3, 12.0, 20.0),
+        pytest.param(0.0, 25e3, 12.0, 20.0, marks=pytest.mark.slow),
         pytest.param(10.0, 25e3, 16.0, 12.0, marks=pytest.mark.slow),
         pytest.param(14.0, math.inf, 20.0, 14.0, marks=pytest.mark.slow),
     ],

@@ -21,6 +21,7 @@ def main(config, folder, *settings, options=()):
     _command.main(design, ["--config", str(path), "--out", str(folder), *options, *given])
 
 
+@pytest.mark.slow
 def test_a_lens_is_designed_from_several_starts(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     main("triplet", tmp_path / "run", *FEW)

@@ -134,7 +134,7 @@ def hybrid(form, base, stop):
         pytest.param("odd_asphere", "mirror", 3, marks=pytest.mark.slow),
         pytest.param("linear", "plane", 2, marks=pytest.mark.slow),
         pytest.param("polynomial_xy", "mirror", 2, marks=pytest.mark.slow),
-        ("polynomial_xy", "asphere", 3),
+        pytest.param("polynomial_xy", "asphere", 3, marks=pytest.mark.slow),
     ],
 )
 def test_rays_are_stationary_and_their_derivatives_right(form, base, stop):
