@@ -21,7 +21,7 @@ from jax import Array
 from ..lens.forms import Shape
 from ..lens.surface import by_form, domain, sag_derivatives, surface_sag
 from ..numerics import safe_divide, safe_sqrt
-from .snell import cross
+from .meet import cross
 from .system import Diffraction, System, Vector, dot, turn
 
 

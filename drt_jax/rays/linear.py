@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from .fermat import Path, label, ray_at, residual
-from .snell import cross
+from .meet import cross
 from .system import System, Vector, divide, dot, turn
 
 

@@ -1,4 +1,4 @@
-"""The sequential trace by Snell's law: what rays are aimed with, and the one intersection routine.
+"""The sequential trace by Snell's law: what rays are aimed with.
 
 Its rays are labelled by where they cross the vertex plane of the first surface, their `launch`.
 Arrays have any shape: () for one ray, or (wavelength, ray) beside an index (wavelength, 1).
@@ -15,15 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.forms import RIM, Shape
-from ..lens.surface import domain, sag_derivatives
+from ..lens.forms import Shape
+from ..lens.surface import sag_derivatives
 from ..numerics import safe_divide, safe_sqrt
+from .meet import meet, quadratic
 from .status import Status
 from .system import Placed, System, Vector, dot, turn
 
-# Newton steps along a ray to a surface that is no conic; the last must be shorter than `_SETTLED`
-# of the ray's length or of 1 mm.
-_STEPS, _SETTLED = 20, 1e-7
 # A ray that leans more than this (cosine with the axis) is not followed.
 _FLATTEST = 1e-4
 
@@ -49,109 +47,6 @@ def apart(system: System, hits: Vector) -> tuple[Vector, Vector]:
     if system.stop is None:
         return hits, crossing
     return tuple(jnp.concatenate([h[:at], h[at + 1 :]]) for h in hits), crossing
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[Array, Array]:
-    """Length s at which p + s d meets a surface of a form at the origin, and whether it does.
-
-    p, d: D + 1 components along the axes of the surface; d of any length, s counts in it.
-    shape: of the surface. going: bool, rays that must settle; others may come out wrong.
-    Differentiable in p, d and shape by the implicit function theorem.
-    """
-    length, met = -safe_divide(p[-1], d[-1]), jnp.ones(p[0].shape, bool)  # to the vertex plane
-    if form == "asphere":
-        # c (x^2 + y^2 + (1 + k) z^2) = 2 z at p + s d: square s^2 - 2 linear s + constant = 0
-        c, k = shape.curvature, shape.conic
-        square, linear, constant = _quadratic(p, d, shape)
-        discriminant = linear**2 - square * constant
-        root = safe_sqrt(discriminant)
-        root = jnp.where(d[-1] < 0, -root, root)
-        # Of the two ways to write a root, the one that does not subtract what is alike.
-        alike = linear * root < 0
-        above = jnp.where(alike, linear - root, constant)
-        below = jnp.where(alike, square, linear + root)
-        met = discriminant > 0
-        # Where the conic is missed, an asphere is sought from the vertex plane.
-        length = jnp.where(met, safe_divide(above, below), length)
-        if _plain(form, shape):
-            return length, met & (1 - (1 + k) * c * (p[-1] + length * d[-1]) > RIM**0.5)
-    size = jnp.sqrt(dot(d, d))
-    settled = max(_SETTLED, 16 * float(jnp.finfo(length.dtype).eps))
-
-    def closer(state):
-        count, length, _ = state
-        change = -safe_divide(*_gap(form, p, d, shape, length))
-        small = jnp.abs(change) * size <= settled * (1 + jnp.abs(length) * size)
-        return count + 1, length + change, small
-
-    start = 0, length, jnp.zeros(length.shape, bool)
-    plane = length
-    _, length, met = jax.lax.while_loop(
-        lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, start
-    )
-    length = jnp.where(met, length, plane)  # what does not settle may be anything
-    return length, met & domain(_along(p, d, length)[:-1], shape, form)
-
-
-def _quadratic(p: Vector, d: Vector, shape: Shape) -> Vector:
-    """Of square s^2 - 2 linear s + constant = 0, where p + s d meets a conic."""
-    c, k = shape.curvature, shape.conic
-    flat = *d[:-1], (1 + k) * d[-1]
-    square, linear = c * dot(flat, d), d[-1] - c * dot(flat, p)
-    return square, linear, c * (dot(p[:-1], p[:-1]) + (1 + k) * p[-1] ** 2) - 2 * p[-1]
-
-
-def _along(p: Vector, d: Vector, length: Array) -> Vector:
-    return tuple(a + length * b for a, b in zip(p, d, strict=True))
-
-
-def _plain(form: str, shape: Shape) -> bool:
-    """Whether a surface is a conic without aspheric terms: a quadric."""
-    return form == "asphere" and not shape.coefficients.shape[0]
-
-
-def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple[Array, Array]:
-    """A function of the points p + s d that is 0 on the surface, and its derivative by s."""
-    *across, z = _along(p, d, length)
-    if _plain(form, shape):
-        quadric = tuple(shape.curvature * a for a in (*across, (1 + shape.conic) * z))
-        return dot(quadric, (*across, z)) / 2 - z, dot(quadric, d) - d[-1]
-    height, slope, _ = sag_derivatives(across, shape, form)
-    return height - z, dot(slope, d[:-1]) - d[-1]
-
-
-@reach.defjvp
-def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
-    length, met = reach(form, *primals)
-    gap = partial(_gap, form, length=length)
-    _, change, rate = jax.jvp(gap, primals[:3], tangents[:3], has_aux=True)
-    moved = -safe_divide(change, rate)
-    return (length, met), (moved, np.zeros(met.shape, jax.dtypes.float0))
-
-
-def _meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:
-    """Where rays meet a surface: the point, a normal of any length along z, whether, and s."""
-    length, met = reach(form, p, d, shape, going)
-    own = _along(p, d, length)
-    if _plain(form, shape):
-        c = shape.curvature
-        normal = *(-c * a for a in own[:-1]), 1 - (1 + shape.conic) * c * own[-1]
-    else:
-        _, slope, _ = sag_derivatives(own[:-1], shape, form)
-        normal = *(-a for a in slope), jnp.ones_like(own[-1])
-    return own, normal, met, length
-
-
-def cross(surface: Placed, form: str, point: Vector, direction: Vector) -> tuple[Vector, Array]:
-    """Where straight lines, prolonged either way, cross one surface: D arrays, mm along its axes,
-    and whether they do.
-
-    point, direction: D + 1 arrays along the axes of the lens.
-    """
-    p, d = surface.local(point, direction)
-    length, met = reach(form, p, d, surface.shape, jnp.ones(p[0].shape, bool))
-    return _along(p, d, length)[:-1], met
 
 
 def _towards(system: System, point: Vector) -> Vector:
@@ -292,7 +187,7 @@ def _follow(
 ) -> tuple[_State, Any]:
     """Rays behind the last row; and unless that is the stop, what is to `keep` of each meeting."""
     kinds = sorted({*system.forms, system.at_stop[1]})
-    each = [partial(_meet, kind) for kind in kinds]
+    each = [partial(meet, kind) for kind in kinds]
     phases = [] if system.diffraction is None else sorted(set(system.diffraction.forms))
 
     def step(state, row):
@@ -301,8 +196,8 @@ def _follow(
             going, axis = state.fate == Status.OK, (*(0,) * (len(d) - 1), row.sense)
             p = tuple(jnp.where(going, a, 0) for a in p)
             d = tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
-        meet = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
-        own, normal, met, length = meet(p, d, row.surface.shape, state.fate == Status.OK)
+        encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
+        own, normal, met, length = encounter(p, d, row.surface.shape, state.fate == Status.OK)
         bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
         crosses = met
         met = met & (~row.live | ((front > 0) & ((length > 0) | row.first)))
@@ -322,7 +217,7 @@ def _follow(
         kept = state._replace(fate=fate)
 
         def short() -> Array:
-            square, linear, constant = _quadratic(p, d, row.surface.shape)
+            square, linear, constant = quadratic(p, d, row.surface.shape)
             behind = jnp.where(row.first, 0, jnp.maximum(-length, 0)) + jnp.maximum(-front, 0)
             behind = jnp.where(row.live, behind, 0)
             behind = behind + jnp.where(row.bends, jnp.maximum(-through, 0), 0)

@@ -18,7 +18,7 @@ from . import fermat, linear
 from .bundle import held_tile, in_tiles
 from .fermat import Path
 from .find import Found, find_aimed, find_many
-from .snell import cross
+from .meet import cross
 from .status import Status
 from .system import System, Vector, dot, turn
 

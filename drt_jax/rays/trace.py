@@ -14,7 +14,7 @@ from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
 from ..numerics import real_array
 from . import fermat
-from .snell import cross
+from .meet import cross
 from .solve import Solver, solve
 from .status import Status
 from .system import System, Vector, dot, placed, system_of, turn

@@ -12,7 +12,7 @@ from experiments.snell import trace_snell
 from drt_jax import Status, load_lens
 from drt_jax.lens.forms import FORMS, Shape
 from drt_jax.lens.surface import domain, surface_sag
-from drt_jax.rays import fermat, snell
+from drt_jax.rays import fermat, meet, snell
 
 from ..lens.test_surface import SHAPES
 from .systems import COLOURS, DISTANCE, corners, freeform, lens_with, meridional, scene_system
@@ -66,7 +66,7 @@ def along_a_way(form, p, d, shape, way, places):
 
     def at(h):
         moved = jax.tree.map(lambda a, v: a + h * v, (p, d, shape), way)
-        return snell.reach(form, *moved, going)[0]
+        return meet.reach(form, *moved, going)[0]
 
     def slope(h):
         value, first = jax.jvp(at, (h,), (jnp.ones_like(h),))
@@ -76,7 +76,7 @@ def along_a_way(form, p, d, shape, way, places):
         first, second, value = jax.jvp(slope, (h,), (jnp.ones_like(h),), has_aux=True)
         return value, first, second
 
-    length, met = snell.reach(form, p, d, shape, going)
+    length, met = meet.reach(form, p, d, shape, going)
     *across, z = (a + length * b for a, b in zip(p, d, strict=True))
     miss = surface_sag(across, shape, form) - z
     return Met(*jax.vmap(both)(places), met, miss, domain(across, shape, form))
@@ -143,7 +143,7 @@ def test_derivatives_of_the_length(case):
 
 def test_lines_that_meet_nothing():
     """Beside a sphere of R = 10, beyond its rim, along a plane."""
-    reach = jax.jit(snell.reach, static_argnums=0)
+    reach = jax.jit(meet.reach, static_argnums=0)
     shape = Shape(np.array([0.1, 0.1, 0.0]), np.zeros(3), np.zeros((0, 3)))
     p = tuple(np.array(a) for a in ([0.0, 0.0, 0.0], [10.5, 9.9999, 1.0], [-5.0, -5.0, -5.0]))
     d = tuple(np.array(a) for a in ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0]))
