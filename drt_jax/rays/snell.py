@@ -182,20 +182,34 @@ class _Meeting(NamedTuple):
     short: Callable[[], Array]
 
 
+def _as_it_is(going: Array, sense: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
+    """A lost ray goes on as it came: its numbers are void."""
+    return p, d
+
+
+def _along_the_axis(going: Array, sense: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
+    """A lost ray goes on along the axis, so that its numbers and their derivatives are finite."""
+    axis: Vector = (*(jnp.zeros_like(a) for a in d[:-1]), sense)
+    p = tuple(jnp.where(going, a, 0) for a in p)
+    return p, tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
+
+
 def _follow(
-    system: System, launch: Vector, to_stop: bool, keep: Callable[[_Meeting], Any]
+    system: System,
+    launch: Vector,
+    to_stop: bool,
+    keep: Callable[[_Meeting], Any],
+    lost: Callable[..., tuple[Vector, Vector]] = _as_it_is,
 ) -> tuple[_State, Any]:
-    """Rays behind the last row; and unless that is the stop, what is to `keep` of each meeting."""
+    """Rays behind the last row; and unless that is the stop, what is to `keep` of each meeting.
+    lost: how a ray that failed goes on."""
     kinds = sorted({*system.forms, system.at_stop[1]})
     each = [partial(meet, kind) for kind in kinds]
     phases = [] if system.diffraction is None else sorted(set(system.diffraction.forms))
 
     def step(state, row):
         p, d = row.surface.local(state.point, state.direction)
-        if not to_stop:  # a lost ray goes along the axis, so that its numbers stay finite
-            going, axis = state.fate == Status.OK, (*(0,) * (len(d) - 1), row.sense)
-            p = tuple(jnp.where(going, a, 0) for a in p)
-            d = tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
+        p, d = lost(state.fate == Status.OK, row.sense, p, d)
         encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
         own, normal, met, length = encounter(p, d, row.surface.shape, state.fate == Status.OK)
         bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
@@ -254,7 +268,11 @@ def lack(system: System, launch: Vector, target: Vector) -> Array:
     differentiable by what pulls the ray through. `launch` as of `shoot`; target: D arrays (...)
     in mm, whose largest counts as far."""
     fate, short, hits = _follow(
-        system, launch, False, lambda meeting: (meeting.fate, meeting.short(), meeting.hit)
+        system,
+        launch,
+        False,
+        lambda meeting: (meeting.fate, meeting.short(), meeting.hit),
+        _along_the_axis,
     )[1]
     lost = fate != Status.OK
     first = lost & ~jnp.concatenate([jnp.zeros_like(lost[:1]), lost[:-1]])
