@@ -122,6 +122,10 @@ def test_elements_move_within_those_of_the_prescription():
 
 def test_wedge_is_the_tilt_of_a_surface():
     some = perturbed(lens_of({1: {"tilt": [0.2, 0, 0]}}), Tolerance("wedge", 3, (1, 5)))
+    assert list(map(str, some.errors)) == [
+        *("wedge of surface 1, x", "wedge of surface 1, y"),
+        *("wedge of surface 5, x", "wedge of surface 5, y"),
+    ]
     by_hand = lens_of({1: {"tilt": [0.25, 0, 0]}, 5: {"tilt": [0, -0.05, 0]}})
     same(some.lens_of(jnp.array([1.0, 0, 0, -1])), by_hand)
 
