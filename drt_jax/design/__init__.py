@@ -1,7 +1,7 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
 from .least_squares import BoundedLM as BoundedLM
-from .operands import OPERANDS as OPERANDS, Operand as Operand
+from .operands import Operand as Operand
 from .optimum import Optimum as Optimum, Search as Search, optimise as optimise
 from .perturbed import Perturbed as Perturbed, Tolerance as Tolerance, elements_of as elements_of
 from .problem import Judged as Judged, Problem as Problem
@@ -25,4 +25,5 @@ from .tolerance import (
     variances as variances,
     worst_case as worst_case,
 )
+from .values import OPERANDS as OPERANDS
 from .variables import Tie as Tie, Variables as Variables, Vary as Vary

@@ -1,72 +1,23 @@
-"""Operands: what a design is judged by, as vectors of residuals and limits.
-
-Lengths in mm, angles in radians. Each kind has one value for each of what stands in brackets; of
-these an operand may name some: fields, wavelengths, distances, surfaces. "Middle": the middle
-colour, unless wavelengths are named.
-
-residuals to be squared, which take neither a target nor limits
-    spot: each ray from the centroid of all colours, times the root of the light it stands for: the
-        squares of a field add up to the mean square radius of its spot, mm^2
-    spot_of_colours: the same from the centroid of its own colour
-    spot_chief: the same from where the chief ray of the middle colour falls
-    path_difference: of each ray less the mean of its colour, waves, times the same root: the
-        squares add up to the mean square wavefront error of the colours
-
-of spots and wavefronts [distance, field]
-    rms_spot: mm, the root of what the squares of spot add up to
-    rms_wavefront: waves, of path_difference
-    centroid: y on the sensor, mm, of all colours
-    relative_illumination: by projected solid angles (with clipped light that of the middle colour),
-        of that of the first field
-
-of chief rays, through the middle of the stop
-    distortion [distance, field, colour: middle]: how much farther out than where the paraxial image
-        is, as a part of that; 0 on the axis
-    lateral_colour [distance, field, colour but the first]: y on the sensor less that of the first
-        colour, mm; x, too, where the pupil rule is one of the whole disc
-    chief_ray_angle [distance, field, colour]: with the normal of the sensor's vertex, from 0
-
-of first order
-    focal_length, back_focal_distance [colour: middle]: mm
-    entrance_pupil [colour: middle]: its diameter, mm
-    f_number, magnification [distance, colour: middle]: working f-number; image over object height
-    total_track, length, back_distance: first vertex to sensor, to the last vertex, and from that to
-        the sensor, mm
-
-of gaps between neighbours that bend light, by the surface in front of them
-    glass_centre, air_centre [surface]: thickness along the light on the axis, mm
-    glass_edge, air_edge [surface, zone]: at 0.5, 0.7, 0.85 and 1 of how far the light goes, in y;
-        in glass of the larger of both extents, in air of the smaller; see `Seen.extents`
-    incidence_angle [surface]: the largest, of all rays, with the normal
-"""
+"""Operands: what a design is judged by, as vectors of residuals and limits."""
 
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from ..image.wavefront import path_differences
 from ..inputs import shown
 from ..lens.lens import Lens
-from ..lens.paraxial import FirstOrder, first_order, image_height
-from ..numerics import safe_divide, safe_sqrt
-from .gaps import between, gaps
-from .kinds import back_distance, whole_numbers
-from .seen import EXTRAS, Seen
-
-_NAMES = ("fields", "wavelengths", "distances", "surfaces")
+from .kinds import whole_numbers
+from .seen import Seen
+from .values import OPERANDS, Which
 
 
 @dataclasses.dataclass(frozen=True)
 class Operand:
     """One thing that is wanted of a lens: a target, or limits that are kept.
 
-    kind: one of `OPERANDS`; values and units stand at the top of this module.
+    kind: one of `OPERANDS`; what each is, in which unit, stands at the top of values.py.
     target: of the values. low, high: limits instead of a target; kept exactly in the end.
     weight: the residual is weight times the difference, in the units of the values.
     fields, wavelengths, distances, surfaces: which of the problem's, or of the lens', from 0;
@@ -88,7 +39,7 @@ class Operand:
             some = ", ".join(OPERANDS)
             raise ValueError(f"operands: unknown kind {shown(self.kind)}; known: {some}")
         what, known = f"operands: {self.kind}", OPERANDS[self.kind]
-        for name in _NAMES:
+        for name in Which._fields:
             numbers = whole_numbers(f"{what}: {name}", getattr(self, name))
             object.__setattr__(self, name, numbers)
             if numbers and name not in known.names:
@@ -121,7 +72,7 @@ class Operand:
         places = OPERANDS[self.kind].places
         there = {name: list(range(count)) for name, count in counts.items()}
         there["surfaces"] = [] if places is None else places(lens)
-        for name in _NAMES:
+        for name in Which._fields:
             for k in getattr(self, name):
                 if k not in there[name]:
                     some = ", ".join(map(str, there[name])) or "none"
@@ -133,7 +84,8 @@ class Operand:
 
     def values(self, seen: Seen) -> Array:
         """The values (K,) of a lens, of which the target is taken or which the limits bound."""
-        return jnp.ravel(OPERANDS[self.kind].function(self, seen))
+        which = Which(self.fields, self.wavelengths, self.distances, self.surfaces)
+        return jnp.ravel(OPERANDS[self.kind].function(which, seen))
 
     def residuals(self, seen: Seen) -> Array:
         """(K,), the squares of which add up in the merit; none for limits."""
@@ -150,227 +102,3 @@ class Operand:
         sides = [self.low - values] * math.isfinite(self.low)
         sides += [values - self.high] * math.isfinite(self.high)
         return self.weight * jnp.concatenate(sides)
-
-
-class Value(NamedTuple):
-    """What an operand judges.
-
-    function: its values, of any shape. names: what an operand of it may name. places: the surfaces
-    that have one, None if it is none of surfaces. traced: whether it needs rays. squared: for
-    residuals that only mean something as squares, the kind of their sum. per_mm: by how much a ray
-    that misses by 1 mm changes it, as what weighs a ray that fails.
-    """
-
-    function: Callable[[Operand, Seen], Array]
-    names: tuple[str, ...]
-    places: Callable[[Lens], list[int]] | None = None
-    traced: bool = True
-    squared: str = ""
-    per_mm: float = 1.0
-
-
-def _views(operand: Operand, seen: Seen) -> np.ndarray:
-    """Which views are meant: all fields at the first distance, then at the next."""
-    fields = operand.fields or range(seen.fields)
-    distances = operand.distances or range(seen.distances)
-    return np.array([d * seen.fields + f for d in distances for f in fields])
-
-
-def _colours(operand: Operand, seen: Seen) -> np.ndarray:
-    return np.array(operand.wavelengths or range(seen.views.wavelengths.shape[0]))
-
-
-def _middle(operand: Operand, seen: Seen) -> np.ndarray:
-    return np.array(operand.wavelengths or (seen.views.wavelengths.shape[0] // 2,))
-
-
-def _hits(operand: Operand, seen: Seen) -> tuple[Array, Array]:
-    """Hits on the sensor (D, V, W, Q), mm, of the rays that carry light, 0 for others; and the
-    part (V, W, Q) of the light of all colours of a view."""
-    views, colours = _views(operand, seen), _colours(operand, seen)
-    rays = seen.rays
-    light = jnp.where(rays.whole, seen.share, 0)[views][:, colours, EXTRAS:]
-    light = light / jnp.sum(seen.colour_weights[colours])
-    hits = jnp.stack([h[views, -1][:, colours, EXTRAS:] for h in rays.bundle.hits])
-    return jnp.where(light[None] > 0, hits, 0), light
-
-
-def _centred(values: Array, light: Array, axes: tuple[int, ...]) -> Array:
-    """Values (V, W, Q) less their mean over axes."""
-    total, mean = (jnp.sum(a, axis=axes, keepdims=True) for a in (light, light * values))
-    return values - safe_divide(mean, total)
-
-
-def _spread(operand: Operand, seen: Seen, axes: tuple[int, ...]) -> Array:
-    """Distances of rays from the centroid over `axes`, times the root of their light, mm, (D, V, W,
-    Q)."""
-    hits, light = _hits(operand, seen)
-    parts = []
-    for k, hit in enumerate(hits):
-        across = len(hits) == 1 or (k == 0 and seen.rule.symmetry == "half")
-        parts.append(hit if across else _centred(hit, light, axes))  # else it averages to 0
-    return jnp.stack(parts) * safe_sqrt(light)[None]
-
-
-def _spot(operand: Operand, seen: Seen) -> Array:
-    return _spread(operand, seen, (-2, -1))
-
-
-def _spot_of_colours(operand: Operand, seen: Seen) -> Array:
-    return _spread(operand, seen, (-1,))
-
-
-def _chief(operand: Operand, seen: Seen, colours: np.ndarray) -> Array:
-    """Where chief rays meet the sensor, (D, V, W), mm."""
-    views = _views(operand, seen)
-    return jnp.stack([h[views, -1][:, colours, 0] for h in seen.rays.bundle.hits])
-
-
-def _spot_chief(operand: Operand, seen: Seen) -> Array:
-    hits, light = _hits(operand, seen)
-    chief = _chief(operand, seen, _colours(operand, seen))
-    middle = chief[..., chief.shape[-1] // 2, None, None]
-    return jnp.where(light[None] > 0, hits - middle, 0) * safe_sqrt(light)[None]
-
-
-def _rms_spot(operand: Operand, seen: Seen) -> Array:
-    return safe_sqrt(jnp.sum(_spot(operand, seen) ** 2, axis=(0, 2, 3)))
-
-
-def _centroid(operand: Operand, seen: Seen) -> Array:
-    hits, light = _hits(operand, seen)
-    return safe_divide(jnp.sum(light * hits[-1], (-2, -1)), jnp.sum(light, (-2, -1)))
-
-
-def _path_difference(operand: Operand, seen: Seen) -> Array:
-    views, colours = _views(operand, seen), _colours(operand, seen)
-    own = seen.views.wavelengths
-
-    def one(bundle: Any) -> Array:
-        return path_differences(seen.lens, own, bundle, None)[0]
-
-    waves = jax.vmap(one)(seen.rays.bundle)[views][:, colours, EXTRAS:]
-    _, light = _hits(operand, seen)
-    return _centred(waves, light, (-1,)) * safe_sqrt(light)
-
-
-def _rms_wavefront(operand: Operand, seen: Seen) -> Array:
-    return safe_sqrt(jnp.sum(_path_difference(operand, seen) ** 2, axis=(1, 2)))
-
-
-def _first_order(get: Callable[[FirstOrder], Array]) -> Callable[[Operand, Seen], Array]:
-    """Of distances and colours (Z, W)."""
-
-    def values(operand: Operand, seen: Seen) -> Array:
-        far = seen.views.distance[:: seen.fields]
-        far = far[np.array(operand.distances or range(seen.distances))]
-        waves = seen.views.wavelengths
-        found = jax.vmap(lambda distance: get(first_order(seen.lens, distance, waves)))(far)
-        return found[:, _middle(operand, seen)]
-
-    return values
-
-
-def _lens_alone(get: Callable[[FirstOrder], Array]) -> Callable[[Operand, Seen], Array]:
-    """Of colours (W,)."""
-
-    def values(operand: Operand, seen: Seen) -> Array:
-        found = first_order(seen.lens, jnp.inf, seen.views.wavelengths)
-        return get(found)[_middle(operand, seen)]
-
-    return values
-
-
-def _back_distance(operand: Operand, seen: Seen) -> Array:
-    return float(seen.lens.senses[-1]) * back_distance(seen.lens)
-
-
-def _distortion(operand: Operand, seen: Seen) -> Array:
-    views, colours = _views(operand, seen), _middle(operand, seen)
-    waves = seen.views.wavelengths
-
-    def ideal_of(field: Array, distance: Array) -> Array:
-        return image_height(seen.lens, field, distance, waves)
-
-    real = _chief(operand, seen, colours)
-    ideal = jax.vmap(ideal_of)(seen.views.field[views], seen.views.distance[views])
-    ideal = jnp.moveaxis(ideal, 1, 0)[-len(real) :, :, colours]
-    size = jnp.sum(ideal**2, axis=0)
-    return safe_divide(jnp.sum(real * ideal, axis=0) - size, size)
-
-
-def _lateral_colour(operand: Operand, seen: Seen) -> Array:
-    points = _chief(operand, seen, _colours(operand, seen))
-    points = points if seen.rule.symmetry == "disc" else points[-1:]
-    return points[..., 1:] - points[..., :1]
-
-
-def _chief_ray_angle(operand: Operand, seen: Seen) -> Array:
-    views, colours = _views(operand, seen), _colours(operand, seen)
-    whole, arrival = seen.rays.whole, seen.rays.bundle.arrival
-    *across, along = (jnp.where(whole, a, 0)[views][:, colours, 0] for a in arrival)
-    sine = safe_sqrt(sum((a**2 for a in across), jnp.zeros_like(along)))
-    return jnp.arctan2(sine, jnp.where(sine + along**2 > 0, jnp.abs(along), 1))
-
-
-def _illumination(operand: Operand, seen: Seen) -> Array:
-    return seen.illumination[_views(operand, seen)]
-
-
-def _gap(glass: bool, edge: bool) -> Value:
-    def values(operand: Operand, seen: Seen) -> Array:
-        lens = seen.lens
-        extents = seen.extents if edge else jnp.zeros_like(lens.semi_diameter[:-1])
-        return gaps(lens, extents, glass, operand.surfaces)[int(edge)]
-
-    def places(lens: Lens) -> list[int]:
-        return [front for front, _ in between(lens, glass)]
-
-    return Value(values, ("surfaces",), places, traced=edge)
-
-
-def _incidence(operand: Operand, seen: Seen) -> Array:
-    live = [k for k, i in enumerate(seen.lens.live) if i in (operand.surfaces or seen.lens.live)]
-    cosines = seen.cosines[_views(operand, seen)][:, np.array(live)]
-    least = jnp.min(cosines[:, :, _colours(operand, seen)], axis=(0, 2, 3))
-    return jnp.arctan2(safe_sqrt((1 - least) * (1 + least)), least)
-
-
-_RAYS = ("fields", "wavelengths", "distances")
-_COLOURS = ("wavelengths",)
-_WAVES_PER_MM = 200.0  # green light at f/5
-_SCALES = ("wavelengths", "distances")
-OPERANDS: dict[str, Value] = {
-    "spot": Value(_spot, _RAYS, squared="rms_spot"),
-    "spot_of_colours": Value(_spot_of_colours, _RAYS, squared="rms_spot"),
-    "spot_chief": Value(_spot_chief, _RAYS, squared="rms_spot"),
-    "rms_spot": Value(_rms_spot, _RAYS),
-    "centroid": Value(_centroid, _RAYS),
-    "path_difference": Value(
-        _path_difference, _RAYS, squared="rms_wavefront", per_mm=_WAVES_PER_MM
-    ),
-    "rms_wavefront": Value(_rms_wavefront, _RAYS, per_mm=_WAVES_PER_MM),
-    "focal_length": Value(_lens_alone(lambda a: a.focal_length), _COLOURS, traced=False),
-    "back_focal_distance": Value(
-        _lens_alone(lambda a: a.back_focal_distance), _COLOURS, traced=False
-    ),
-    "entrance_pupil": Value(
-        _lens_alone(lambda a: 2 * a.entrance_pupil.semi_diameter), _COLOURS, traced=False
-    ),
-    "f_number": Value(_first_order(lambda a: a.f_number), _SCALES, traced=False),
-    "magnification": Value(_first_order(lambda a: a.magnification), _SCALES, traced=False),
-    "total_track": Value(lambda operand, seen: seen.lens.sensor, (), traced=False),
-    "length": Value(lambda operand, seen: jnp.sum(seen.lens.thickness), (), traced=False),
-    "back_distance": Value(_back_distance, (), traced=False),
-    "distortion": Value(_distortion, _RAYS),
-    "lateral_colour": Value(_lateral_colour, _RAYS),
-    "chief_ray_angle": Value(_chief_ray_angle, _RAYS),
-    "relative_illumination": Value(_illumination, ("fields", "distances")),
-    "glass_centre": _gap(True, False),
-    "glass_edge": _gap(True, True),
-    "air_centre": _gap(False, False),
-    "air_edge": _gap(False, True),
-    "incidence_angle": Value(_incidence, (*_RAYS, "surfaces"), lambda lens: [*lens.live]),
-}
-# Those that need rays.
-TRACED = frozenset(kind for kind, value in OPERANDS.items() if value.traced)

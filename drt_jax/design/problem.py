@@ -16,8 +16,9 @@ from ..lens.scene import Scene, distance_array, field_array, vergence_of
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve_aimed
 from .gaps import gaps
-from .operands import OPERANDS, TRACED, Operand
+from .operands import Operand
 from .seen import Seen, symmetry_by_structure
+from .values import OPERANDS
 from .variables import Variables
 
 # A ray that fails counts as one that misses by so many semi-diameters of the stop, and more.
@@ -131,7 +132,7 @@ class Problem:
     @property
     def traces(self) -> bool:
         """Whether any operand needs rays."""
-        return any(operand.kind in TRACED for operand in self.operands)
+        return any(OPERANDS[operand.kind].traced for operand in self.operands)
 
     def judge(self, vector: Array) -> Judged:
         """A vector (N,) of the variables judged; see `Judged`. Differentiable, in `jit` and `vmap`

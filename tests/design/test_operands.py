@@ -10,7 +10,7 @@ import pytest
 
 import drt_jax
 from drt_jax import Clipped, Gauss, design, load_lens
-from drt_jax.design import OPERANDS, Operand, Problem, Solve, Variables, operands
+from drt_jax.design import OPERANDS, Operand, Problem, Solve, Variables, values
 from drt_jax.design.kinds import KINDS
 from drt_jax.design.least_squares import COMPILE
 
@@ -307,7 +307,7 @@ def test_what_neither_lens_nor_problem_has(tmp_path, operand, said):
 def test_each_kind_is_told_where_a_user_reads():
     page = (pathlib.Path(__file__).parents[2] / "docs" / "design.md").read_text()
     for kind in OPERANDS:
-        assert f"`{kind}`" in page and kind in operands.__doc__
+        assert f"`{kind}`" in page and kind in values.__doc__
     for kind in KINDS:
         assert f"`{kind}`" in page
     for kind in get_args(Solve.__annotations__["kind"]):
