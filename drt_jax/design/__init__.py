@@ -1,9 +1,10 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
+from .errors import Tolerance as Tolerance, elements_of as elements_of
 from .least_squares import BoundedLM as BoundedLM
 from .operands import Operand as Operand
 from .optimum import Optimum as Optimum, Search as Search, optimise as optimise
-from .perturbed import Perturbed as Perturbed, Tolerance as Tolerance, elements_of as elements_of
+from .perturbed import Perturbed as Perturbed
 from .problem import Judged as Judged, Problem as Problem
 from .seen import Seen as Seen
 from .solves import Solve as Solve

@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,108 +14,21 @@ from ..lens.elements import Elements
 from ..lens.glass import Dispersion, refractive_index
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
+from .errors import (
+    KINDS,
+    WITH_X,
+    Error,
+    Tolerance,
+    curvature_across,
+    elements_of,
+    errors_of,
+    pieces_of,
+)
 
 # A fringe is half a wave of green light (ISO 10110-5: 0.5460740 um), in mm.
 _FRINGE = 0.5460740e-3 / 2
 _LINES = (0.4861327, 0.5875618, 0.6562725)  # F, d, C
 _MINUTE = math.pi / 180 / 60
-
-
-class Kind(NamedTuple):
-    """A kind of error: of what, whether in x and y, in which unit, and how large it may be."""
-
-    whole: str
-    axes: int
-    unit: str
-    most: float = math.inf
-
-
-KINDS = {
-    "radius": Kind("surface", 1, "%", 100),
-    "fringes": Kind("surface", 1, "fringes"),
-    "irregularity": Kind("surface", 1, "fringes"),
-    "wedge": Kind("surface", 2, "arc min"),
-    "thickness": Kind("surface", 1, "mm"),
-    "index": Kind("surface", 1, ""),
-    "abbe": Kind("surface", 1, "%", 100),
-    "shift": Kind("element", 2, "mm"),
-    "tilt": Kind("element", 2, "arc min"),
-}
-
-
-@dataclasses.dataclass(frozen=True)
-class Tolerance:
-    """By how much parts of a kind may be off, to either side.
-
-    kind: of surfaces "radius", that of the vertex, in per cent; "fringes", another curvature, told
-        by how far the rim of the light is off along the normal; "irregularity", a cylinder, in
-        fringes between both directions, half of them along y and minus half along x; "wedge", a
-        tilt, in arc minutes about x and y. Behind surfaces "thickness" in mm, "index" (of the line
-        d) and "abbe" in per cent. Of elements "shift" across the axis in mm, along x and y, and
-        "tilt" about their first vertex in arc minutes, about x and y. A fringe is half a wave of
-        546 nm.
-    size: the largest error, in these units.
-    which: surfaces or elements, from 0; empty: all that there are.
-    """
-
-    kind: str
-    size: float
-    which: tuple[int, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"tolerances: unknown kind {self.kind!r}; known: {', '.join(KINDS)}")
-        most = KINDS[self.kind].most
-        if not 0 < self.size < most:
-            below = "" if math.isinf(most) else f" and below {most:g}"
-            raise ValueError(
-                f"tolerances: {self.kind}: size: must be above 0{below}, got {self.size:g}"
-            )
-
-
-class Error(NamedTuple):
-    """One number that may be off: what, where (a surface or an element), and its component."""
-
-    kind: str
-    place: int
-    axis: int
-
-    def __str__(self) -> str:
-        kind = KINDS[self.kind]
-        axis = f", {'xy'[self.axis]}" if kind.axes > 1 else ""
-        return f"{self.kind} of {kind.whole} {self.place}{axis}"
-
-
-def _solid(lens: Lens, medium: int) -> bool:
-    return lens.glasses[medium] not in ("air", lens.glasses[0])
-
-
-def elements_of(lens: Lens) -> tuple[tuple[int, int], ...]:
-    """First and last surface of each element: neighbours that bend light, with glass between them,
-    cemented ones together; a mirror in air is one."""
-    spans: list[tuple[int, int]] = []
-    for i in lens.live:
-        if spans and _solid(lens, i):
-            spans[-1] = (spans[-1][0], i)
-        else:
-            spans.append((i, i))
-    return tuple(spans)
-
-
-def _pieces(lens: Lens) -> dict[int, tuple[int, ...]]:
-    """The media that each piece of glass is, by the surface before it: several where a mirror sends
-    light back into it, or a surface in it bends none."""
-    pieces: dict[int, tuple[int, ...]] = {}
-    for i in range(lens.count):
-        inside = lens.mirrors[i] or i not in lens.live
-        if not _solid(lens, i + 1):
-            continue
-        if pieces and inside and _solid(lens, i):
-            first, media = pieces.popitem()
-            pieces[first] = (*media, i + 1)
-        else:
-            pieces[i] = (i + 1,)
-    return pieces
 
 
 @jax.tree_util.register_dataclass
@@ -149,26 +61,7 @@ class Perturbed:
         if np.shape(extents) != (lens.count,):
             raise ValueError(f"extents: expected ({lens.count},), got shape {np.shape(extents)}")
         spans, dtype = elements_of(lens), lens.curvature.dtype
-        sizes: dict[Error, float] = {}
-        for tolerance in tolerances:
-            kind = tolerance.kind
-            there = _there(lens, spans, kind)
-            if not there:
-                raise ValueError(f"tolerances: {kind}: {_NONE.get(kind, 'the lens has none')}")
-            for place in tolerance.which:
-                if place not in there:
-                    raise ValueError(
-                        f"tolerances: {kind}: no {KINDS[kind].whole} {place} that could be off; "
-                        f"there are {', '.join(map(str, there))}"
-                    )
-            axes = range(KINDS[kind].axes)
-            for place, axis in itertools.product(tolerance.which or there, axes):
-                error = Error(kind, place, axis)
-                if error in sizes:
-                    raise ValueError(f"tolerances: {error} stands twice; leave one out")
-                sizes[error] = tolerance.size
-        if not sizes:
-            raise ValueError("tolerances: none; name at least one")
+        sizes = errors_of(lens, tolerances)
         kinds = {error.kind for error in sizes}
         lens, groups = _with_elements(lens, spans, kinds)
         if "wedge" in kinds and lens.tilt is None:
@@ -195,8 +88,7 @@ class Perturbed:
         replace, own = dataclasses.replace, self.lens
         if kind == "radius":
             part = 1 / (1 + by / 100) - 1
-            across = _across(own, at)
-            return _bent(lens, at, own.curvature[at] * part, across * part)
+            return _bent(lens, at, own.curvature[at] * part, curvature_across(own, at) * part)
         if kind in ("fringes", "irregularity"):
             bend = by * _FRINGE / _rise(own, at, self.extents)
             both = (bend, bend) if kind == "fringes" else (bend / 2, -bend / 2)
@@ -205,7 +97,7 @@ class Perturbed:
             gap = lens.thickness.at[at].add(by)
             return replace(lens, thickness=gap, sensor=lens.sensor + jnp.sum(by))
         if kind in ("index", "abbe"):
-            pieces = _pieces(own)
+            pieces = pieces_of(own)
             media = np.concatenate([pieces[i] for i in at])
             by = by[np.repeat(np.arange(len(at)), [len(pieces[i]) for i in at])]
             return replace(lens, dispersion=_medium(lens, own.dispersion, kind, media, by))
@@ -220,35 +112,6 @@ class Perturbed:
         else:
             moved = replace(elements, tilt=elements.tilt.at[rows, axis].add(by * _MINUTE))
         return replace(lens, elements=moved)
-
-
-_NONE = {
-    "radius": "no surface is curved; of planes, tolerance fringes",
-    "irregularity": "no surface is a sphere, a conic, an even asphere or has one more curvature",
-    "thickness": "there is one surface; none has a thickness behind it",
-    "index": "the lens has no glass",
-    "abbe": "the lens has no glass",
-}
-# Forms whose first coefficient is the curvature along x.
-_WITH_X = ("biconic", "toroid")
-
-
-def _there(lens: Lens, spans: tuple[tuple[int, int], ...], kind: str) -> list[int]:
-    """The numbers of the surfaces or elements that may be off."""
-    live = list(lens.live)
-    if KINDS[kind].whole == "element":
-        return list(range(len(spans)))
-    if kind == "thickness":
-        return list(range(lens.count - 1))
-    if kind in ("index", "abbe"):
-        return list(_pieces(lens))
-    if kind == "radius":
-        curved = np.asarray(lens.curvature) != 0
-        curved[:-1] |= np.asarray(_across(lens, np.arange(lens.count))) != 0
-        return [i for i in live if curved[i]]
-    if kind == "irregularity":
-        return [i for i in live if lens.forms[i] in ("asphere", *_WITH_X)]
-    return live
 
 
 def _with_elements(
@@ -291,17 +154,9 @@ def _with_cylinders(lens: Lens) -> Lens:
     return dataclasses.replace(lens, coefficients=wide, forms=forms)
 
 
-def _across(lens: Lens, at: np.ndarray) -> Array:
-    """Curvatures along x of some surfaces, 1/mm, where they have one of their own; else 0."""
-    has = np.array([lens.forms[i] in _WITH_X for i in at])
-    if not has.any():
-        return jnp.zeros(len(at), lens.curvature.dtype)
-    return jnp.where(has, lens.coefficients[at, 0], 0)
-
-
 def _bent(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
     """Curvatures changed, and those along x, where surfaces have one of their own."""
-    own = np.array([lens.forms[i] in _WITH_X for i in at])
+    own = np.array([lens.forms[i] in WITH_X for i in at])
     coefficients = lens.coefficients
     if own.any():
         coefficients = coefficients.at[at[own], 0].add(across[own])

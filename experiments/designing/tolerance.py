@@ -30,7 +30,7 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import design, show
-from drt_jax.design.perturbed import KINDS
+from drt_jax.design.errors import KINDS
 from drt_jax.runs.folder import Run
 
 from . import _command, _common

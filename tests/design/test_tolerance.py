@@ -12,7 +12,7 @@ from scipy import optimize
 import drt_jax
 from drt_jax import design
 from drt_jax.design import Perturbed, Problem, Tolerance, Variables, tolerance
-from drt_jax.design.perturbed import KINDS
+from drt_jax.design.errors import KINDS
 from drt_jax.pupil.rules import Gauss
 
 SINGLET = drt_jax.load_lens("singlet")
