@@ -1,4 +1,5 @@
-"""Every experiment at toy size: what it writes, that it resumes, how it fails."""
+"""The paper's experiments at toy size: what they write, that they resume, how they fail; and the
+settings and tables of all."""
 
 import importlib
 import json
@@ -9,7 +10,6 @@ import subprocess
 import sys
 import time
 
-import jax
 import numpy as np
 import pytest
 import yaml
@@ -302,56 +302,3 @@ def test_help_lists_the_settings(name, capsys):
         main(name, "--help")
     text = capsys.readouterr().out
     assert stopped.value.code == 0 and "train.optics_rate: a number" in text and "Section 6" in text
-
-
-def test_benchmark_without_peers(tmp_path, capsys, monkeypatch):
-    """One task: a row for each peer, which is measured or says what is missing, and the counts."""
-    from experiments import _work
-
-    def missing(name):
-        raise ModuleNotFoundError(name=name)
-
-    monkeypatch.setattr(_work, "version", missing)
-    options = ["tasks=[axial]", "growth=false", "repeats=1"]
-    try:
-        main("benchmark", "--out", tmp_path / "run", "--set", *options)
-    finally:  # the benchmark compiles everything anew
-        jax.config.update("jax_enable_compilation_cache", True)
-    results = json.loads((tmp_path / "run" / "results.json").read_text())
-    assert [(row["peer"], row["peer_s"], row["note"]) for row in results["rows"]] == [
-        (name, None, f"{name} is not installed: pip install -e '.[peers]'")
-        for name in ("optiland", "batoid")
-    ]
-    assert all(row["ours_s"] > 0 and row["ours_error"] < 1e-8 for row in results["rows"])
-    solves = list(results["counts"].values())
-    assert solves[:2] == [0, 0] and solves[2] > 0
-
-
-@pytest.mark.slow
-def test_lenses_measures_a_lens(tmp_path, capsys, monkeypatch):
-    """One lens on the axis, copies of it and a sweep; peers that fail have their reason."""
-    from experiments import _peers
-
-    def fails(lens, rays):
-        raise ValueError("no lens of this kind")
-
-    for name in ("optiland_spot", "batoid_spot"):
-        monkeypatch.setattr(_peers, name, fails)
-    options = ["lenses=[{lens: singlet, field_deg: 3}]", "parts=[0]", "copies=2", "fields=2"]
-    try:
-        main("lenses", "--out", tmp_path / "run", "--set", *options, "sweep=8", "repeats=1")
-    finally:
-        jax.config.update("jax_enable_compilation_cache", True)
-    results = json.loads((tmp_path / "run" / "results.json").read_text())
-    (row,), (group,), (swept,) = (results[key] for key in ("rows", "copies", "sweeps"))
-    assert row["tight_error"] < 1e-6 and row["loose_error"] < 1e-3 and row["passed"] == 1
-    assert set(row["notes"].values()) == {"no lens of this kind"} and not row["peers"]
-    assert group["bad"] == 0 and max(swept["steps"]["values"]) < 0.1
-    assert "singlet" in capsys.readouterr().out
-
-
-def test_a_step_is_seen():
-    from experiments.lenses import _roughness
-
-    smooth = np.sin(np.linspace(0, 1, 200))
-    assert _roughness(smooth) < 1e-6 < 0.3 < _roughness(smooth + (np.arange(200) > 90))
