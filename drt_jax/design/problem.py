@@ -54,7 +54,7 @@ class Problem:
     Static:
     operands: what is wanted.
     solver: how rays are found. The default aims them, and counts as failed what is not found so;
-        a lens of which that is wanted needs no search.
+        a lens of which that is wanted needs no search. `dataclasses.replace` puts another here.
     """
 
     variables: Variables
@@ -76,7 +76,6 @@ class Problem:
         distances: ArrayLike = np.inf,
         rule: PupilRule | int = 6,
         colour_weights: ArrayLike | None = None,
-        solver: Solver = solve_aimed,
     ) -> "Problem":
         """The problem of some variables.
 
@@ -86,10 +85,8 @@ class Problem:
 
         ValueError, which names the argument, for what fits neither lens nor problem.
         """
-        lens, wanted = (
-            variables.lens,
-            tuple(Operand(o) if isinstance(o, str) else o for o in operands),
-        )
+        lens = variables.lens
+        wanted = tuple(Operand(o) if isinstance(o, str) else o for o in operands)
         if not wanted:
             raise ValueError("operands: none; a merit needs at least one, such as spot")
         dtype = lens.curvature.dtype
@@ -114,7 +111,7 @@ class Problem:
             if operand.kind == "magnification" and np.any(np.isinf(named)):
                 raise ValueError("operands: magnification: the object is at infinity")
         share = jnp.asarray(weights / weights.sum(), dtype)
-        return cls(variables, angles, far, colours, share, rule, wanted, solver)
+        return cls(variables, angles, far, colours, share, rule, wanted)
 
     def with_order(self, order: int) -> "Problem":
         """The problem with a Gauss rule of another order."""
