@@ -113,7 +113,7 @@ def pieces_of(lens: Lens) -> dict[int, tuple[int, ...]]:
     return pieces
 
 
-def curvature_across(lens: Lens, at: np.ndarray) -> Array:
+def x_curvatures(lens: Lens, at: np.ndarray) -> Array:
     """Curvatures along x of some surfaces, 1/mm, where they have one of their own; else 0."""
     has = np.array([lens.forms[i] in WITH_X for i in at])
     if not has.any():
@@ -171,7 +171,7 @@ def _there(lens: Lens, kind: str) -> list[int]:
         return list(pieces_of(lens))
     if kind == "radius":
         curved = np.asarray(lens.curvature) != 0
-        curved[:-1] |= np.asarray(curvature_across(lens, np.arange(lens.count))) != 0
+        curved[:-1] |= np.asarray(x_curvatures(lens, np.arange(lens.count))) != 0
         return [i for i in live if curved[i]]
     if kind == "irregularity":
         return [i for i in live if lens.forms[i] in ("asphere", *WITH_X)]

@@ -14,16 +14,7 @@ from ..lens.elements import Elements
 from ..lens.glass import Dispersion, refractive_index
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
-from .errors import (
-    KINDS,
-    WITH_X,
-    Error,
-    Tolerance,
-    curvature_across,
-    elements_of,
-    errors_of,
-    pieces_of,
-)
+from .errors import KINDS, WITH_X, Error, Tolerance, elements_of, errors_of, pieces_of, x_curvatures
 
 # A fringe is half a wave of green light (ISO 10110-5: 0.5460740 um), in mm.
 _FRINGE = 0.5460740e-3 / 2
@@ -88,7 +79,7 @@ class Perturbed:
         replace, own = dataclasses.replace, self.lens
         if kind == "radius":
             part = 1 / (1 + by / 100) - 1
-            return _bent(lens, at, own.curvature[at] * part, curvature_across(own, at) * part)
+            return _bent(lens, at, own.curvature[at] * part, x_curvatures(own, at) * part)
         if kind in ("fringes", "irregularity"):
             bend = by * _FRINGE / _rise(own, at, self.extents)
             both = (bend, bend) if kind == "fringes" else (bend / 2, -bend / 2)
