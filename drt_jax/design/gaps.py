@@ -15,10 +15,10 @@ _ZONES = np.array([0.5, 0.7, 0.85, 1.0])
 
 
 def between(lens: Lens, glass: bool) -> list[tuple[int, int]]:
-    """Neighbouring surfaces that bend light, with glass or with air between; what is before the
-    lens counts as air, too."""
+    """Neighbouring surfaces that bend light, and the last of them and the sensor, with glass or
+    with air between; what is before the lens counts as air, too."""
     air = lens.glasses[0], "air"
-    pairs = itertools.pairwise(lens.live)
+    pairs = itertools.pairwise([*lens.live, lens.count])
     return [(i, j) for i, j in pairs if (lens.glasses[i + 1] not in air) == glass]
 
 
@@ -26,9 +26,9 @@ def gaps(
     lens: Lens, extents: Array, glass: bool, surfaces: tuple[int, ...] = ()
 ) -> tuple[Array, Array]:
     """Thickness on the axis (G,) and at zones towards the rim (G, Z), mm along the light, of the
-    gaps between neighbouring surfaces that bend light, in glass or in air; of those behind some
-    surfaces alone, if any are named. In glass up to the larger of both extents (S,), in air to the
-    smaller."""
+    gaps that `between` tells, in glass or in air; of those behind some surfaces alone, if any are
+    named. In glass up to the larger of both extents (S,), in air to the smaller; before the sensor
+    to that of the last surface."""
     dtype = lens.curvature.dtype
     pairs = [pair for pair in between(lens, glass) if not surfaces or pair[0] in surfaces]
     if not pairs:
@@ -36,6 +36,7 @@ def gaps(
     front, back = (np.array(rows) for rows in zip(*pairs))
     sense = jnp.asarray(lens.senses[back], dtype)
     vertices = lens.vertices
+    extents = jnp.append(extents, extents[lens.live[-1]])
     wide = jnp.maximum if glass else jnp.minimum
     y = wide(extents[front], extents[back])[:, None] * jnp.asarray(_ZONES, dtype)[None]
 

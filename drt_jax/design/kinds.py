@@ -179,14 +179,14 @@ def step_of(lens: Lens, kind: str, row: int, term: int) -> float:
     """By how much a typical design moves a number of a lens."""
     power, factor = KINDS[kind].step
     step = factor * beam(lens) ** power
-    return step / _lift(lens, row, term) if kind == "coefficients" else step
+    return step / lift_of(lens, row, term, beam(lens)) if kind == "coefficients" else step
 
 
-def _lift(lens: Lens, row: int, term: int) -> float:
-    """By how much a coefficient lifts a surface a beam's semi-diameter from its axis, mm a unit."""
+def lift_of(lens: Lens, row: int, term: int, away: float) -> float:
+    """By how much a coefficient lifts a surface, mm a unit, at `away` mm from its axis."""
     shape = jax.tree.map(lambda a: a[..., row, None], lens.shape)
     angle, dtype = np.pi * np.arange(8) / 8, lens.curvature.dtype
-    points = tuple(jnp.asarray(beam(lens) * f(angle), dtype) for f in (np.cos, np.sin))
+    points = tuple(jnp.asarray(away * f(angle), dtype) for f in (np.cos, np.sin))
 
     def height(coefficients: Array) -> Array:
         return surface_sag(points, shape._replace(coefficients=coefficients), lens.forms[row])

@@ -55,6 +55,13 @@ class Search(NamedTuple):
         """By how much the worst limit is exceeded, (); 0 or less where all are kept."""
         return jnp.max(self.judged.excess, axis=-1, initial=0.0)
 
+    @property
+    def score(self) -> Array:
+        """Merit plus the squares of what exceeds limits, (); inf for a lens that is unphysical."""
+        found = self.merit + jnp.sum(jnp.maximum(self.judged.excess, 0) ** 2, axis=-1)
+        good = jnp.isfinite(found) & jnp.isfinite(self.state.broken)
+        return jnp.where(good, found, jnp.inf)
+
 
 def _wanted(vector: Array, args: tuple[Problem, Array]) -> tuple[Array, tuple]:
     problem, shift = args
@@ -99,14 +106,16 @@ def turn(problem: Problem, search: Search) -> Search:
 class Optimum(NamedTuple):
     """What a search came to.
 
-    lens: the best one. vector: (N,). merit: sum of the squares of the residuals. worst: by how much
-    the worst limit is exceeded, times its weight. history: (T, 3), merit, worst and Jacobians so
-    far by trial. seconds: of all trials but the first; first: of that, with compilation if need be.
+    lens: the best one. vector: (N,). merit: sum of the squares of the residuals; score: with those
+    of what exceeds limits. worst: by how much the worst limit is exceeded, times its weight.
+    history: (T, 3), merit, worst and Jacobians so far by trial. seconds: of all trials but the
+    first; first: of that, with compilation if need be.
     """
 
     lens: Lens
     vector: np.ndarray
     merit: float
+    score: float
     worst: float
     history: np.ndarray
     seconds: float
@@ -127,10 +136,12 @@ def optimise(
     vector: Array | None = None,
     trials: int = 500,
     report: Callable[[Search], None] = lambda search: None,
+    good: float = 0.0,
 ) -> Optimum:
     """The optimum next to a vector (N,) of the problem's variables, that of its start by default.
 
-    trials: at most. report: called after each, to show how far it is.
+    trials: at most. report: called after each, to show how far it is. good: the search ends as soon
+    as its merit plus the squares of what exceeds limits is no more; 0: at the optimum.
 
     One program is compiled for a problem, and serves all others of its kind. ValueError if the
     start itself cannot be judged: a lens whose surfaces overlap or of which no number is finite.
@@ -148,7 +159,7 @@ def optimise(
         search = _turn(problem, search)
         history.append([search.merit, search.worst, search.state.jacobians])
         report(search)
-        if bool(search.done):
+        if bool(search.done) or float(search.score) <= good:
             break
     if not bool(jnp.isfinite(search.state.broken)):
         raise ValueError(
@@ -160,6 +171,7 @@ def optimise(
         problem.variables.lens_of(search.vector),
         np.asarray(search.vector),
         float(search.merit),
+        float(search.score),
         float(search.worst),
         np.array(history, float),
         ended - compiled,

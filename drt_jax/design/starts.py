@@ -96,15 +96,6 @@ def _advance(problem: Problem, searches: Search, turns: Array) -> Search:
     return jax.lax.while_loop(more, step, (jnp.int32(0), searches))[1]
 
 
-def score(search: Search) -> np.ndarray:
-    """What searches (K,) are ranked by: merit plus the squares of what exceeds limits; inf for a
-    lens that is unphysical."""
-    excess = np.maximum(np.asarray(search.judged.excess), 0)
-    found = np.asarray(search.merit) + np.sum(excess**2, axis=-1)
-    good = np.isfinite(found) & (np.asarray(search.state.broken) < np.inf)
-    return np.where(good, found, np.inf)
-
-
 def many_starts(
     problem: Problem,
     starts: ArrayLike,
@@ -137,16 +128,16 @@ def many_starts(
     for _ in _advanced(problem, state, [np.resize(alive, _TILE)], 0, threads):
         compiled = time.perf_counter() - begun
     for size, more in zip(sizes, turns):
-        alive = alive[np.argsort(score(_rows(state, alive)), kind="stable")[:size]]
+        alive = alive[np.argsort(_score(state, alive), kind="stable")[:size]]
         tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
         for _ in _advanced(problem, state, tiles, more, threads):
-            best.append(float(np.min(score(_rows(state, alive)))))
+            best.append(float(np.min(_score(state, alive))))
             report(len(best), total, best[-1])
     trials, jacobians = (int(np.sum(a)) for a in (state.state.trials, state.state.jacobians))
     minima = distinct(_rows(state, alive), alive)
     return Starts(
         minima,
-        score(state),
+        _score(state, np.arange(len(vectors))),
         trials,
         jacobians,
         trials * rays_of(problem),
@@ -174,6 +165,10 @@ def _advanced(
             yield
 
 
+def _score(state: Search, rows: np.ndarray) -> np.ndarray:
+    return np.asarray(_rows(state, rows).score)
+
+
 def _rows(tree: Search, rows: np.ndarray) -> Search:
     return jax.tree.map(lambda a: a[rows], tree)
 
@@ -188,7 +183,7 @@ def rays_of(problem: Problem) -> int:
 
 def distinct(searches: Search, numbers: np.ndarray) -> list[Minimum]:
     """The distinct minima that searches (K,) with their numbers of starts came to, best first."""
-    scores, vectors = score(searches), np.asarray(searches.vector)
+    scores, vectors = np.asarray(searches.score), np.asarray(searches.vector)
     worst = np.asarray(searches.worst)
     found: list[Minimum] = []
     for k in np.argsort(scores, kind="stable"):

@@ -33,7 +33,7 @@ of first order
     total_track, length, back_distance: first vertex to sensor, to the last vertex, and from that to
         the sensor, mm
 
-of gaps between neighbours that bend light, by the surface in front of them
+of gaps between neighbours that bend light, and before the sensor, by the surface in front of them
     glass_centre, air_centre [surface]: thickness along the light on the axis, mm
     glass_edge, air_edge [surface, zone]: at 0.5, 0.7, 0.85 and 1 of how far the light goes, in y;
         in glass of the larger of both extents, in air of the smaller; see `Seen.extents`

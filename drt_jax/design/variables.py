@@ -12,10 +12,12 @@ from jax import Array
 
 from ..inputs import shown
 from ..lens.lens import Lens
-from .kinds import KINDS, step_of, whole_numbers, word_terms
+from .kinds import KINDS, lift_of, step_of, whole_numbers, word_terms
 from .solves import Solve, held
 
 _How = Literal["equal", "opposite", "cemented"]
+# A typical change of a coefficient, as part of the most.
+_STEP_OF_SAG = 0.03
 # What neighbours that are cemented share.
 _SHAPE = ("curvature", "conic", "coefficients")
 _NONE = {
@@ -76,7 +78,10 @@ class Vary:
     terms: of coefficients, and the components of a tilt or decentre, from 0; empty: all (but not
         the coefficient of r^2, which the curvature stands for, nor a norm radius).
     low, high: bounds in the units of the lens.
-    scale: a typical change; 0: chosen by the kind and the stop's semi-diameter.
+    sag, semi_diameter: of coefficients, mm, instead of bounds: each adds at most `sag` to the
+        surface, up or down, at `semi_diameter` from the axis, where the light of the whole design
+        will reach. What only low powers bend then stays free, and high ones cannot run off.
+    scale: a typical change; 0: chosen by the kind and the stop's semi-diameter, or `sag`.
     """
 
     kind: str
@@ -85,9 +90,12 @@ class Vary:
     low: float = -np.inf
     high: float = np.inf
     scale: float = 0.0
+    sag: float = 0.0
+    semi_diameter: float = 0.0
 
     def __post_init__(self) -> None:
         _known_kind("variables", self.kind)
+        self._check_sag()
         for name in ("surfaces", "terms"):
             numbers = whole_numbers(f"variables: {self.kind}: {name}", getattr(self, name))
             object.__setattr__(self, name, numbers)
@@ -109,6 +117,25 @@ class Vary:
                 f"variables: {self.kind}: scale: must be above 0, or 0 to have it chosen, "
                 f"got {self.scale:g}"
             )
+
+    def _check_sag(self) -> None:
+        given = self.sag, self.semi_diameter
+        if given == (0, 0):
+            return
+        what = "variables: sag and semi_diameter"
+        if self.kind != "coefficients":
+            raise ValueError(f"{what}: are of coefficients, not of {self.kind}; give low and high")
+        if not all(0 < number < np.inf for number in given):
+            raise ValueError(f"{what}: give both, above 0 mm, got {given[0]:g} and {given[1]:g}")
+        if (self.low, self.high) != (-np.inf, np.inf):
+            raise ValueError(f"{what}: stand instead of low and high; leave these out")
+
+    def bounds(self, lens: Lens, place: Place) -> tuple[float, float, float]:
+        """Low, high and scale of one of its numbers, in the units of the lens."""
+        if not self.sag:
+            return self.low, self.high, self.scale or step_of(lens, *place)
+        most = self.sag / lift_of(lens, place.row, place.term, self.semi_diameter)
+        return -most, most, self.scale or _STEP_OF_SAG * most
 
     def places(self, lens: Lens) -> list[Place]:
         """The numbers it stands for. ValueError, listing those that exist, for one that does
@@ -239,12 +266,11 @@ class Variables:
         fixed = [(f, sign * _number(lens, p)) for p, f, sign in following if p not in index]
         lens = _with_numbers(_with_arrays(lens, {place.kind for place, _ in found}), fixed)
         dtype = lens.curvature.dtype
-        scale = np.array([v.scale or step_of(lens, *place) for place, v in found])
-        bounds = (np.array([getattr(v, side) for _, v in found]) for side in ("low", "high"))
-        low, high = (jnp.asarray(bound / scale, dtype) for bound in bounds)
+        ends, scale = np.split(np.array([v.bounds(lens, place) for place, v in found]), [2], axis=1)
+        low, high = jnp.asarray(ends / scale, dtype).T
         tied = tuple((index[p], f, sign) for p, f, sign in following if p in index)
         places = tuple(place for place, _ in found)
-        made = cls(lens, low, high, jnp.asarray(scale, dtype), places, tied)
+        made = cls(lens, low, high, jnp.asarray(scale[:, 0], dtype), places, tied)
         start = made.lens_of(made.start)
         kept, start = held(start, solves)
         return dataclasses.replace(made, lens=start, solves=kept)

@@ -40,9 +40,9 @@ class Starts:
 class Growth:
     """Design for a part of the fields and of the aperture first, then for more and more.
 
-    first: part to begin with; 1: the whole at once. step: to the next part. trials: at each part.
-    good_um: root of the mean squared RMS radius with which the next is tried; a step that does not
-    reach it is halved.
+    first: part to begin with; 1: the whole at once. step: to the next part. good_um: root of the
+    mean squared RMS radius with which the next is tried at once, as a lens that is perfect for a
+    part is spoilt for more. trials: at most at each part; a step that is not good then is halved.
     """
 
     first: float = 1.0

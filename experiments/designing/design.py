@@ -115,24 +115,29 @@ class _Progress:
         self._bar.close()
 
 
-def grown(config: Config, lens: drt_jax.Lens) -> drt_jax.Lens:
+def grown(config: Config, lens: drt_jax.Lens, run: Run) -> drt_jax.Lens:
     """The lens designed for parts of the fields and the aperture, one after the other."""
-    growth, own = config.growth, lens.semi_diameter[lens.stop]
+    growth = config.growth
     good = len(config.fields_deg) * (1e-3 * growth.good_um) ** 2
-    done, step, part = 0.0, growth.step, growth.first
-    while done < 1:
+    whole = problem_of(config, lens).variables
+    begin = {"done": 0.0, "part": growth.first, "step": growth.step}
+    state = run.kept("growth") or begin | {"numbers": whole.numbers(whole.start).tolist()}
+    while state["done"] < 1:
+        part, done, step = state["part"], state["done"], state["step"]
         problem = problem_of(config, lens, part)
+        vector = jnp.array(state["numbers"]) / problem.variables.scale
         with _Progress(f"{part:.1%} of field and aperture", growth.trials) as bar:
-            found = design.optimise(problem, None, growth.trials, bar.searched)
-        if found.merit <= good:
-            kept = found.lens.semi_diameter.at[lens.stop].set(own)
-            lens, done, step = dataclasses.replace(found.lens, semi_diameter=kept), part, 1.2 * step
+            found = design.optimise(problem, vector, growth.trials, bar.searched, good)
+        if found.score <= good:
+            done, step = part, 1.2 * step
+            state["numbers"] = problem.variables.numbers(found.vector).tolist()
         else:
             step /= 2
             told = f"growth: stops at {done:.1%} of field and aperture, where no step leads to"
             _common.require(step >= SHORTEST, f"{told} {growth.good_um:g} um; change the start")
-        part = min(done + step, 1.0) if done else part / 2
-    return lens
+        state |= {"done": done, "step": step, "part": min(done + step, 1.0) if done else part / 2}
+        run.keep("growth", state)
+    return whole.lens_of(jnp.array(state["numbers"]) / whole.scale)
 
 
 def made_vectors(variables: design.Variables, some: Starts) -> np.ndarray:
@@ -216,10 +221,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         free = jnp.full_like(start.semi_diameter, jnp.inf)
         own = start.semi_diameter[start.stop]
         start = dataclasses.replace(start, semi_diameter=free.at[start.stop].set(own))
-    if config.growth.first < 1 and run.kept("growth") is None:
-        drt_jax.save_lens(grown(config, start), run.folder / "grown.yaml")
-        run.keep("growth", "grown.yaml")
-    begin = drt_jax.load_lens(run.folder / "grown.yaml") if config.growth.first < 1 else start
+    begin = grown(config, start, run) if config.growth.first < 1 else start
     problem = problem_of(config, begin)
     if run.kept("starts") is None:
         run.keep("starts", searched(config, problem))

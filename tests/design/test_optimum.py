@@ -119,6 +119,19 @@ def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
         np.testing.assert_allclose(after, before, rtol=1e-12)
 
 
+def test_a_search_ends_as_soon_as_it_is_good(triplet):
+    """By its merit and its limits together, at the first trial of which that is true."""
+    whole = design.optimise(triplet, trials=40)
+    good = float(whole.history[10, 0])
+    found = design.optimise(triplet, trials=40, good=good)
+    assert found.score <= good and found.merit <= found.score
+    count = len(found.history)
+    assert 3 <= count < 40
+    np.testing.assert_array_equal(found.history, whole.history[:count])
+    earlier = design.optimise(triplet, trials=count - 1)
+    assert earlier.score > good
+
+
 def test_many_starts_do_not_depend_on_threads(triplet):
     """Two tiles, one of them not full, and a start that no light passes."""
     starts = design.around(triplet.variables, 18, 2.0, 3)

@@ -8,6 +8,7 @@ import pytest
 from drt_jax import load_lens
 from drt_jax.design import Solve, Tie, Variables, Vary
 from drt_jax.design.kinds import KINDS
+from drt_jax.lens.surface import surface_sag
 
 MODEL = """
 surfaces:
@@ -124,6 +125,45 @@ def test_scales_are_what_moves_the_light(lens):
     """A step of any coefficient lifts its surface by the same at the beam's edge."""
     variables = Variables.of(lens, [Vary("coefficients", (2,))])
     np.testing.assert_allclose(variables.scale, [0.04 / 4.0**4, 0.04 / 4.0**6], rtol=1e-12)
+
+
+@pytest.mark.parametrize("form", ["asphere", "zernike", "qbfs"])
+def test_coefficients_bounded_by_what_they_add_to_the_sag(form):
+    """Each at its bound moves the surface by 0.2 mm, at its highest, 3 mm from the axis."""
+    terms = {"asphere": {4: 0, 6: 0}, "qbfs": {0: 0, 2: 0}, "zernike": {4: 0, 7: 0}}[form]
+    own = {"form": form, "coefficients": terms}
+    own |= {} if form == "asphere" else {"norm_radius": 5.0}
+    front = {"radius": 20, "thickness": 2, "glass": "N-BK7", "semi_diameter": 2.5, "stop": True}
+    bent = load_lens({"surfaces": [front, {"radius": -40, **own}], "sensor": 30.0})
+    vary = Vary("coefficients", (1,), sag=0.2, semi_diameter=3.0)
+    variables = Variables.of(bent, [vary])
+    assert len(variables.places) >= 2
+    angle = np.linspace(0, 2 * np.pi, 721)
+
+    def sag(lens):
+        shape = jax.tree.map(lambda a: a[..., 1, None], lens.shape)
+        return surface_sag((3 * jnp.cos(angle), 3 * jnp.sin(angle)), shape, form)
+
+    for k in range(len(variables.places)):
+        for bound in (variables.low, variables.high):
+            moved = variables.lens_of(variables.start.at[k].set(bound[k]))
+            lifted = np.max(np.abs(sag(moved) - sag(bent)))
+            assert abs(lifted - 0.2) < 0.002  # the angles at which a mode is highest are sampled
+    np.testing.assert_allclose(variables.high, 1 / 0.03)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"kind": "conic", "sag": 0.1, "semi_diameter": 3}, "are of coefficients, not of conic"),
+        ({"sag": 0.1}, "give both, above 0 mm, got 0.1 and 0"),
+        ({"sag": -0.1, "semi_diameter": 1}, "give both, above 0 mm"),
+        ({"sag": 0.1, "semi_diameter": 1, "low": 0.0}, "stand instead of low and high"),
+    ],
+)
+def test_bounds_by_sag_that_mean_nothing(given, said):
+    with pytest.raises(ValueError, match=f"variables: sag and semi_diameter: {said}"):
+        Vary(**({"kind": "coefficients"} | given))
 
 
 def test_norm_radii_are_no_variables(tmp_path):

@@ -45,6 +45,45 @@ def test_a_lens_is_designed_from_several_starts(tmp_path, monkeypatch, capsys):
     assert again["rows"] == results["rows"]
 
 
+def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
+    """Half of the beam first, then more, each until it is good; or it says how far it came."""
+    monkeypatch.chdir(ROOT)
+    growth = ["growth.first=0.5", "growth.step=0.3", "growth.trials=20"]
+    searched = []
+    optimise = design.design.optimise
+
+    def watched(problem, *given):
+        found = optimise(problem, *given)
+        searched.append((float(problem.variables.lens.semi_diameter[0]), found.score))
+        return found
+
+    monkeypatch.setattr(design.design, "optimise", watched)
+    main("singlet", tmp_path / "run", *growth, "growth.good_um=100")
+    semis, scores = zip(*searched[:-1])
+    np.testing.assert_allclose(semis, [3.75, 6.45, 7.5])
+    assert np.all(np.array(scores) <= 0.1**2)
+    (row,) = json.loads((tmp_path / "run" / "results.json").read_text())["rows"]
+    np.testing.assert_allclose(row["merit_end"], 0.00172898452577, rtol=1e-9)
+    with pytest.raises(SystemExit) as caught:
+        main("singlet", tmp_path / "other", *growth, "growth.good_um=10", "growth.trials=4")
+    assert caught.value.code == 2
+    assert "of field and aperture, where no step leads to 10 um" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_phone_lens_from_a_crude_start(tmp_path, monkeypatch):
+    """Five aspheres, f/2 and 35 degrees: below 3 um on all fields, all limits kept."""
+    monkeypatch.chdir(ROOT)
+    main("phone", tmp_path / "run", "trials=120", "tolerance=1e-3")
+    (row,) = json.loads((tmp_path / "run" / "results.json").read_text())["rows"]
+    assert max(row["spots_um"]) < 3 and row["worst_limit"] < 1e-3
+    lens = drt_jax.load_lens(tmp_path / "run" / "designed.yaml")
+    np.testing.assert_allclose(drt_jax.focal_length(lens, (0.5876,)), 4, rtol=1e-9)
+    assert (
+        5 <= lens.sensor <= 6 and abs(drt_jax.first_order(lens, np.inf, 0.5876).f_number - 2) < 0.01
+    )
+
+
 @pytest.mark.parametrize(
     "setting, said",
     [
