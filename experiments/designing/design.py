@@ -192,8 +192,8 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
     with _Progress("least squares", config.trials) as bar:
         vector = jnp.asarray(found["vectors"][0])
         parts = [design.optimise(problem, vector, config.trials, bar.searched)]
-        order = order_of(config, parts[0].lens)
-        if order > config.order and not config.rings:
+        order = config.order if config.rings else order_of(config, parts[0].lens)
+        if order > config.order:
             rule = problem.with_order(order)
             vector = jnp.asarray(parts[0].vector)
             parts.append(design.optimise(rule, vector, config.trials, bar.searched))

@@ -46,24 +46,41 @@ def test_a_lens_is_designed_from_several_starts(tmp_path, monkeypatch, capsys):
 
 
 def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
-    """Half of the beam first, then more, each until it is good; or it says how far it came."""
+    """Half of the beam first, then more, each until it is good; a run that is stopped goes on where
+    it was; or it says how far it came."""
     monkeypatch.chdir(ROOT)
-    growth = ["growth.first=0.5", "growth.step=0.3", "growth.trials=20"]
+    growth = ["growth.first=0.5", "growth.step=0.3", "growth.trials=20", "tolerance=0.1"]
     searched = []
     optimise = design.design.optimise
+    monkeypatch.setattr(design, "draw", lambda *_: None)
 
     def watched(problem, *given):
+        if len(searched) == 2:
+            searched.append(None)
+            raise KeyboardInterrupt
         found = optimise(problem, *given)
         searched.append((float(problem.variables.lens.semi_diameter[0]), found.score))
         return found
 
     monkeypatch.setattr(design.design, "optimise", watched)
-    main("singlet", tmp_path / "run", *growth, "growth.good_um=100")
-    semis, scores = zip(*searched[:-1])
+    growth.append("growth.good_um=100")
+    with pytest.raises(SystemExit) as caught:
+        main("singlet", tmp_path / "run", *growth)
+    assert caught.value.code == 130
+    _command.main(design, ["--out", str(tmp_path / "run"), "--resume"])
+    main("singlet", tmp_path / "unbroken", *growth)
+    parts = [part for part in searched if part]
+    semis, scores = zip(*parts[:3])
     np.testing.assert_allclose(semis, [3.75, 6.45, 7.5])
     assert np.all(np.array(scores) <= 0.1**2)
-    (row,) = json.loads((tmp_path / "run" / "results.json").read_text())["rows"]
+    assert parts[:4] == parts[4:]
+    (row,), (other,) = (
+        json.loads((tmp_path / name / "results.json").read_text())["rows"]
+        for name in ("run", "unbroken")
+    )
     np.testing.assert_allclose(row["merit_end"], 0.00172898452577, rtol=1e-9)
+    for name in ("merit_start", "merit_end", "spots_um", "jacobians", "rays"):
+        assert row[name] == other[name]
     with pytest.raises(SystemExit) as caught:
         main("singlet", tmp_path / "other", *growth, "growth.good_um=10", "growth.trials=4")
     assert caught.value.code == 2
