@@ -161,6 +161,12 @@ class Problem:
         weight = max(wanted, default=1.0)
         return jnp.ravel(weight * size * seen.failures)
 
+    @jax.jit
+    def extents(self, lens: Lens) -> Array:
+        """How far from the axis the light meets each surface (S,) of a lens; see `Seen.extents`."""
+        return self.seen(lens).extents
+
+    @jax.jit
     def merit(self, vector: Array) -> Array:
         """Sum () of the squares of the residuals; limits are not in it."""
         return jnp.sum(self.judge(vector).residuals ** 2)

@@ -101,7 +101,7 @@ def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.Pert
             config.colour_weights or None,
         )
 
-    extents = jax.jit(lambda p: p.seen(p.variables.lens).extents)(problem_of(lens))
+    extents = problem_of(lens).extents(lens)
     perturbed = design.Perturbed.of(lens, extents, config.tolerances)
     return problem_of(perturbed.lens), perturbed
 
