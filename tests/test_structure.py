@@ -24,7 +24,6 @@ FLOORS = (
     "learn",
     "files",
     "show",
-    "parallel",
     "runs",
     "__main__",
 )
