@@ -24,7 +24,7 @@ from . import _peers
 Numbers = Sequence[float]
 COLOURS = (0.4861, 0.5876, 0.6563)
 # Of `singlet`: optimiser, variable, limits on the size of radii in mm, settings.
-_SETTINGS: dict[str, tuple[str, str, tuple, dict]] = {
+SETTINGS: dict[str, tuple[str, str, tuple, dict]] = {
     "OptimizerGeneric": ("OptimizerGeneric", "radius", (), {}),
     "LeastSquares": ("LeastSquares", "radius", (), {"method_choice": "trf"}),
     "DualAnnealing": ("DualAnnealing", "radius", (10, 1000), {"maxiter": 1000}),
@@ -97,17 +97,26 @@ def _system(
 
 def _tracer(fields: np.ndarray, wavelengths: Numbers, rings: int) -> Callable:
     """trace(optic) -> (W, 2, F, Q) in mm, rays about the centroids of all colours at Optiland's
-    Gaussian quadrature of the pupil; sums of squares are squares of the spots' RMS radii."""
+    Gaussian quadrature of the pupil; sums of squares are squares of the spots' RMS radii. Makes the
+    semi-apertures of the surfaces what these rays and those through the rim need."""
     from optiland.distribution import GaussianQuadrature
 
     points, along = GaussianQuadrature(), np.zeros_like(fields)
     points.generate_points(rings)
+    weights, count = points.weights, len(points.weights)
+    points.x, points.y = np.append(points.x, [0, 0, 1]), np.append(points.y, [1, -1, 0])
 
     def trace(optic: Any) -> np.ndarray:
-        rays = [optic.trace(along, fields, wave, None, points) for wave in wavelengths]
-        hits = np.reshape([[ray.x, ray.y] for ray in rays], (len(rays), 2, len(fields), -1))
-        apart = hits - np.mean(hits @ points.weights, axis=0)[..., None]
-        return apart * np.sqrt(points.weights / len(hits))
+        hits, reach = [], []
+        for wave in wavelengths:
+            rays = optic.trace(along, fields, wave, None, points)
+            hits.append(np.reshape([rays.x, rays.y], (2, len(fields), -1))[..., :count])
+            reach.append(np.max(np.hypot(optic.surfaces.x, optic.surfaces.y), axis=1))
+        for surface, semi in zip(optic.surfaces, np.max(reach, axis=0)):
+            surface.set_semi_aperture(semi)
+        apart = np.array(hits)
+        apart = apart - np.mean(apart @ weights, axis=0)[..., None]
+        return apart * np.sqrt(weights / len(hits))
 
     return trace
 
@@ -145,30 +154,37 @@ def _singlet(first: float = 1000.0, second: float = -1000.0) -> drt_jax.Lens:
 def singlet_merit(first: float, second: float) -> float:
     """The singlet's mean squared distance from the centroid, mm^2, by our trace of 91 rays: the
     centre and 6 i points at i / 5 of the pupil's radius."""
+    return _merit(_singlet(first, second))
+
+
+def _merit(lens: drt_jax.Lens) -> float:
     ring = ((i, np.pi * j / (3 * i)) for i in range(1, 6) for j in range(6 * i))
     points = np.array([0, *(i / 5 * np.exp(1j * angle) for i, angle in ring)])
     rule = Pattern(np.stack([points.real, points.imag]), np.full(91, 1 / 91))
-    found = drt_jax.psf_moments(_singlet(first, second), 0.0, math.inf, np.array([0.55]), rule=rule)
+    found = drt_jax.psf_moments(lens, 0.0, math.inf, np.array([0.55]), rule=rule)
     return float(np.trace(np.asarray(found.covariance)[0]))
 
 
 @_optional
-def singlet(names: Sequence[str] = tuple(_SETTINGS)) -> dict[str, dict[str, Any]]:
+def singlet(
+    names: Sequence[str] = tuple(SETTINGS), lens: drt_jax.Lens | None = None
+) -> dict[str, dict[str, Any]]:
     """Optiland's optimisers of both radii of the singlet: N-SF11, +-1000 mm, 7 mm thick, beam
     15 mm, sensor 30 mm behind it, 0.55 um; its operand rms_spot_size of 5 hexapolar rings.
 
-    By their name: `merit` as `singlet_merit`, `seconds`, `radii`.
+    lens: another start, with its own beam and thicknesses.
+    By their name: `merit` as `singlet_merit`, `seconds`, `radii`, `lens`.
     """
     from optiland import backend, optimization
 
-    found = {}
+    start, found = _singlet() if lens is None else lens, {}
     for name in names:
-        kind, variable, limits, settings = _SETTINGS[name]
+        kind, variable, limits, settings = SETTINGS[name]
         backend.set_backend("torch" if "Torch" in kind else "numpy")
         if "Torch" in kind:
             backend.set_precision("float64")
-        optic, _ = _system(_singlet(), (0,), (0.55,))
-        optic.set_aperture("EPD", 15)
+        optic, _ = _system(start, (0,), (0.55,))
+        optic.set_aperture("EPD", 2 * float(start.semi_diameter[0]))
         problem = optimization.OptimizationProblem()
         spot = {"Hx": 0, "Hy": 0, "wavelength": 0.55, "surface_number": -1, "optic": optic}
         spot |= {"num_rays": 5, "distribution": "hexapolar"}
@@ -179,7 +195,9 @@ def singlet(names: Sequence[str] = tuple(_SETTINGS)) -> dict[str, dict[str, Any]
         since = time.perf_counter()
         getattr(optimization, kind)(problem).optimize(disp=False, **settings)
         seconds, radii = time.perf_counter() - since, [float(r) for r in optic.surfaces.radii[1:3]]
-        found[name] = {"merit": singlet_merit(*radii), "seconds": seconds, "radii": radii}
+        bent = start.curvature.at[:2].set(1 / np.array(radii))
+        end = dataclasses.replace(start, curvature=bent)
+        found[name] = {"merit": _merit(end), "seconds": seconds, "radii": radii, "lens": end}
     backend.set_backend("numpy")
     return found
 
@@ -187,21 +205,25 @@ def singlet(names: Sequence[str] = tuple(_SETTINGS)) -> dict[str, dict[str, Any]
 @_optional
 def recover(
     start: drt_jax.Lens,
-    curvature_surfaces: Sequence[int],
-    thickness_surfaces: Sequence[int],
-    focal_length: float,
+    bends: dict[int, tuple[float, float]],
+    gaps: dict[int, tuple[float, float]],
+    focal_length: float = 0.0,
     fields_deg: Numbers = (0.0, 10.0, 14.0),
     wavelengths_um: Numbers = COLOURS,
-    limits: Sequence[tuple[float, float]] = (),
+    distance_mm: float = math.inf,
+    pupil_mm: float = 0.0,
+    edges: Sequence[tuple[int, float, float]] = (),
     seconds: float = 60.0,
 ) -> dict[str, Any]:
-    """Optiland's least squares on the spots of a lens, an object at infinity, within `seconds`.
+    """Optiland's least squares on the spots of a lens within `seconds`.
 
-    curvature_surfaces, thickness_surfaces: which, from 0, vary; a thickness is that behind its
-    surface, behind the last one that to the sensor. focal_length: in mm, held in the middle colour
-    by an operand. limits: (low, high) in mm of each thickness; none: free.
+    bends, gaps: by surface, from 0, limits (low, high) of curvatures, 1/mm, and of thicknesses
+    behind them, mm, behind the last one to the sensor, that vary. focal_length: in mm, held in the
+    middle colour by an operand; 0: free. distance_mm: to the object. pupil_mm: diameter of the
+    entrance pupil; 0: the stop keeps its own. edges: (surface, low, high), limits of its operand
+    edge_thickness, mm, as far out as the light of either surface; what exceeds them is a residual.
     Returns `spots_um` as the function, `merit` (the sum of their squares), `seconds` of the search,
-    `focal_length` and the `lens`.
+    `focal_length`, the `lens`, and `lenses`, the start and that after each iteration.
 
     TRF with x_scale="jac", tol=1e-10, 1 / radius, and a registered operand for each coordinate of 4
     rings of 20 rays. Tried with all thicknesses free, 30 iterations, 3 rings of 12; the root of the
@@ -210,8 +232,43 @@ def recover(
     """
     from optiland import optimization
 
-    optic, fields = _system(start, fields_deg, wavelengths_um)
-    trace = _tracer(fields, wavelengths_um, 4)
+    optic, fields = _system(start, fields_deg, wavelengths_um, distance_mm)
+    if pupil_mm:
+        optic.set_aperture("EPD", pupil_mm)
+    problem = _recovery(optic, _tracer(fields, wavelengths_um, 4))
+    for kind, varied in (("reciprocal_radius", bends), ("thickness", gaps)):
+        for surface, ends in varied.items():
+            problem.add_variable(optic, kind, surface_number=surface + 1, **_bounds(ends))
+    if focal_length:
+        problem.add_operand("f2", target=focal_length, weight=1, input_data={"optic": optic})
+    for surface, *ends in edges:
+        place = {"optic": optic, "surface_number": surface + 1}
+        problem.add_operand("edge_thickness", weight=1, input_data=place, **_bounds(ends))
+    vectors, since = list[np.ndarray](), time.perf_counter()
+
+    def in_time(vector: np.ndarray) -> None:
+        vectors.append(vector)
+        if time.perf_counter() - since > seconds:
+            raise StopIteration
+
+    search = optimization.LeastSquares(problem)
+    ended = search.optimize(tol=1e-10, method_choice="trf", x_scale="jac", callback=in_time)
+    seconds = time.perf_counter() - since
+    lenses = [start]
+    for vector in (*vectors, ended.x):
+        for variable, number in zip(problem.variables, vector):
+            variable.update(number)
+        lenses.append(_taken(start, optic))
+    spots = spots_um(lenses[-1], fields_deg, wavelengths_um, distance_mm)
+    found = {"spots_um": spots, "merit": float(np.sum(np.square(spots))), "seconds": seconds}
+    found |= {"focal_length": float(np.ravel(optic.paraxial.f2())[0]), "lenses": lenses[:-1]}
+    return found | {"lens": lenses[-1]}
+
+
+def _recovery(optic: Any, trace: Callable) -> Any:
+    """Optiland's problem with an operand for each of the deviations that `trace` gives."""
+    from optiland import optimization
+
     found = [trace(optic).ravel()]
 
     def deviation(optic: Any, index: int) -> float:
@@ -221,27 +278,19 @@ def recover(
 
     optimization.operand.operand_registry.register("deviation", deviation, overwrite=True)
     problem = optimization.OptimizationProblem()
-    for surface in curvature_surfaces:
-        problem.add_variable(optic, "reciprocal_radius", surface_number=surface + 1)
-    for i, surface in enumerate(thickness_surfaces):
-        bounds = dict(zip(("min_val", "max_val"), limits[i])) if limits else {}
-        problem.add_variable(optic, "thickness", surface_number=surface + 1, **bounds)
     for index in range(found[0].size):
         problem.add_operand("deviation", target=0, input_data={"optic": optic, "index": index})
-    problem.add_operand("f2", target=focal_length, weight=1, input_data={"optic": optic})
-    since = time.perf_counter()
+    return problem
 
-    def in_time(*_: Any, **__: Any) -> None:
-        if time.perf_counter() - since > seconds:
-            raise StopIteration
 
-    search = optimization.LeastSquares(problem)
-    search.optimize(tol=1e-10, method_choice="trf", x_scale="jac", callback=in_time)
-    seconds = time.perf_counter() - since
+def _bounds(ends: Numbers) -> dict[str, float]:
+    """Those of low and high that are finite, as Optiland names them."""
+    return {name: x for name, x in zip(("min_val", "max_val"), ends) if math.isfinite(x)}
+
+
+def _taken(start: drt_jax.Lens, optic: Any) -> drt_jax.Lens:
+    """The lens with the curvatures and thicknesses that Optiland has."""
     radii = np.array([float(radius) for radius in optic.surfaces.radii[1:]])
     places = np.array([float(place) for place in np.ravel(optic.surfaces.positions)[1:]])
     bent, gaps, sensor = map(jnp.asarray, (1 / radii, np.diff(places[:-1]), places[-1]))
-    lens = dataclasses.replace(start, curvature=bent, thickness=gaps, sensor=sensor)
-    spots = spots_um(lens, fields_deg, wavelengths_um)
-    ended = {"spots_um": spots, "merit": float(np.sum(np.square(spots))), "seconds": seconds}
-    return ended | {"focal_length": float(np.ravel(optic.paraxial.f2())[0]), "lens": lens}
+    return dataclasses.replace(start, curvature=bent, thickness=gaps, sensor=sensor)

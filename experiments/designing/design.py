@@ -2,7 +2,9 @@
 
 Reads what varies, what is wanted and where to start from the settings; writes the designed lens as
 designed.yaml, which load_lens reads back, pictures before and after, and results.json: `rows` with
-`problem`, `merit_start`, `merit_end`, `spots_um`, `jacobians`, `rays`, `seconds`, `compile_s`.
+`problem`, `merit_start`, `merit_end`, `spots_um`, `jacobians`, `rays`, `seconds`, `compile_s`, and
+of those of Optiland's optimisers that ran beside, the one with the best lens: `peer`, its name,
+`peer_merit`, the best of its starts, `peer_s`, of all its starts; `beside` has all that ran.
 """
 
 import dataclasses
@@ -19,7 +21,7 @@ import drt_jax
 from drt_jax import Pattern, design
 from drt_jax.runs.folder import Run
 
-from . import _command, _common, _pictures
+from . import _beside, _command, _common, _optiland, _pictures
 from ._wanted import SHORTEST, Config as Config, Starts
 
 COLUMNS = ("merit", "worst", "jacobians")
@@ -151,6 +153,17 @@ def made_vectors(variables: design.Variables, some: Starts) -> np.ndarray:
     return np.stack(vectors)
 
 
+def starts_of(variables: design.Variables, some: Starts) -> np.ndarray:
+    """The vectors (K, N) to begin with."""
+    if some.count == 1:
+        return np.asarray(variables.start)[None]
+    if some.how == "made":
+        return made_vectors(variables, some)
+    if some.how == "around":
+        return design.around(variables, some.count, some.spread, some.seed)
+    return design.within(variables, some.count, some.seed)
+
+
 def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
     """The vectors that the starts came to, best first, and what that took."""
     variables, some = problem.variables, config.starts
@@ -163,12 +176,7 @@ def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
     }
     if some.count == 1:
         return start | {"seconds": 0.0, "compile_s": 0.0}
-    if some.how == "made":
-        vectors = made_vectors(problem.variables, some)
-    elif some.how == "around":
-        vectors = design.around(variables, some.count, some.spread, some.seed)
-    else:
-        vectors = design.within(variables, some.count, some.seed)
+    vectors = starts_of(variables, some)
     with _Progress(f"{some.count} starts", 1) as bar:
         found = design.many_starts(problem, vectors, some.stages, some.keep, bar.tiles)
     _common.require(len(found.minima) > 0, "starts: no ray passes any of them; widen the bounds")
@@ -245,12 +253,17 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "rays": rays * (found["trials"] + len(history)),
         "seconds": found["seconds"] + end["seconds"],
         "compile_s": found["compile_s"] + end["compile_s"],
-    } | _beside(config, drt_jax.load_lens(run.folder / "designed.yaml"))
+    }
+    scene = config.fields_deg, config.wavelengths_um, config.distance_mm
+    read = drt_jax.load_lens(run.folder / "designed.yaml")
+    rows = _beside.beside(config, problem, starts_of(variables, config.starts), end, run)
+    row |= _beside.peer(rows) | {"peer_spots_um": _optiland.spots_um(read, *scene)}
     others = (variables.lens_of(jnp.asarray(vector)) for vector in _others(found))
     drawn = [designed, *(_bounded(config, problem, lens) for lens in others)]
     drawn = [_bounded(config, problem, start), *drawn]
     return {
         "rows": [row],
+        "beside": rows,
         "lens": config.lens,
         "how": config.starts.how,
         "fields_deg": list(config.fields_deg),
@@ -276,17 +289,6 @@ def _others(found: dict[str, Any]) -> list[Any]:
     return found["vectors"][1:_DRAWN]
 
 
-def _beside(config: Config, lens: drt_jax.Lens) -> dict[str, Any]:
-    """Spots of the designed lens by Optiland's trace, where it is installed."""
-    try:
-        from . import _optiland
-
-        scene = config.fields_deg, config.wavelengths_um, config.distance_mm
-        return {"peer": "optiland's trace", "peer_spots_um": _optiland.spots_um(lens, *scene)}
-    except ImportError:
-        return {"peer": None, "peer_spots_um": None}
-
-
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """The design in a row for each field, and what it took."""
     (row,), some = results["rows"], results["starts"]
@@ -309,10 +311,13 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     if results["how"] == "made":
         took.append(["starts no worse than the lens", f"{some['no_worse']} of {some['count']}"])
     name = row["problem"]
-    return {
+    found = {
         f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
         f"design, {name}": _common.table(("what", "value"), took),
     }
+    if results.get("beside"):
+        found[f"design, {name}: beside"] = _beside.table(results["beside"], results["how"])
+    return found
 
 
 def _total(sizes: list[float | None]) -> float | None:

@@ -50,6 +50,7 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
     it was; or it says how far it came."""
     monkeypatch.chdir(ROOT)
     growth = ["growth.first=0.5", "growth.step=0.3", "growth.trials=20", "tolerance=0.1"]
+    growth.append("beside.peers=[]")
     searched = []
     optimise = design.design.optimise
     monkeypatch.setattr(design, "draw", lambda *_: None)
