@@ -31,6 +31,7 @@ def test_what_looks_odd(tmp_path, capsys):
     assert "! the sensor is far from the focus" in said and "! no ray" in said
 
 
+@pytest.mark.slow
 def test_words_for_apertures_and_focal_length(tmp_path, capsys):
     """A diameter for a semi-diameter; an aperture that cuts; a wrong sign."""
     lens = """

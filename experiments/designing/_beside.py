@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -172,23 +171,31 @@ def _marquardt(
     shape = jax.eval_shape(lambda y: _squares(y, problem), vector)
     scene = problem, {}
     state = method.init(function, vector, *scene, shape, None, frozenset())
-    _, static = eqx.partition(state, eqx.is_array)
+    leaves, form = jax.tree.flatten(state)
+    static = [None if hasattr(leaf, "dtype") else leaf for leaf in leaves]
+
+    def arrays(state: Any) -> list[Array]:
+        return [leaf for leaf in jax.tree.leaves(state) if hasattr(leaf, "dtype")]
+
+    def whole(arrays: list[Array]) -> Any:
+        those = iter(arrays)
+        return form.unflatten([next(those) if leaf is None else leaf for leaf in static])
 
     def more(now: tuple) -> Array:
         k, y, state, _ = now
-        state = eqx.combine(state, static)
+        state = whole(state)
         done, result = method.terminate(function, y, *scene, state, frozenset())
         return (k < trials) & ~done & (result == optx.RESULTS.successful)
 
     def step(now: tuple) -> tuple:
         k, y, state, merits = now
-        state = eqx.combine(state, static)
+        state = whole(state)
         y, state, _ = method.step(function, y, *scene, state, frozenset())
         merits = merits.at[k].set(jnp.sum(state.f_info.residual**2))
-        return k + 1, y, eqx.filter(state, eqx.is_array), merits
+        return k + 1, y, arrays(state), merits
 
     merits = jnp.full_like(vector, jnp.inf, shape=most)
-    begin = jnp.int32(0), vector, eqx.filter(state, eqx.is_array), merits
+    begin = jnp.int32(0), vector, arrays(state), merits
     count, vector, _, merits = jax.lax.while_loop(more, step, begin)
     return vector, merits, count
 

@@ -139,6 +139,7 @@ def test_gradient_and_hessian_are_those_of_differences(singlet, predicted):
     np.testing.assert_allclose(hessian, hessian.T, atol=1e-12 * np.abs(hessian).max())
 
 
+@pytest.mark.slow
 def test_what_rays_know_of_second_derivatives_are_their_products(singlet, predicted):
     problem, some = singlet
     residuals = jax.jit(lambda off: tolerance._compensated(problem, some.lens_of(off), "focus")[1])
@@ -149,6 +150,7 @@ def test_what_rays_know_of_second_derivatives_are_their_products(singlet, predic
     assert np.linalg.eigvalsh(predicted.gauss)[0] > -1e-12 * products.max()
 
 
+@pytest.mark.slow
 def test_predictions_are_monte_carlo(singlet, predicted):
     """The quadratic of all second derivatives, with errors so small that it holds."""
     off = 0.1 * design.draw_errors(singlet[1], 200, 3)
@@ -169,6 +171,7 @@ def test_predictions_are_monte_carlo(singlet, predicted):
     np.testing.assert_allclose(moves, linear, atol=0.02 * np.std(moves))
 
 
+@pytest.mark.slow
 def test_nothing_drawn_is_worse_than_the_worst_case(singlet, predicted):
     some = singlet[1]
     many = np.asarray(predicted.at(design.draw_errors(some, 20_000, 1), "second"))

@@ -73,6 +73,7 @@ def test_eager_and_compiled_agree(name, field, distance):
         assert isinstance(rule, drt_jax.Clipped) and np.all(inside.passed < 0.9)
 
 
+@pytest.mark.slow
 def test_a_lens_that_passes_no_ray(singlet):
     """An error outside; inside, a variance of inf, nothing passed and derivatives of 0."""
     scene = (1.5, np.inf, (0.6, 0.48))  # all light passes beside the lens

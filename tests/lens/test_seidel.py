@@ -35,8 +35,11 @@ THIRD = {
 }
 
 
+LONG = ("immersed", "mangin")
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "immersed" else n for n in THIRD]
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in THIRD]
 )
 def test_third_order_is_what_real_rays_show_near_the_axis(name):
     """Errors in the paraxial image plane of real rays, whose aperture and field shrink together

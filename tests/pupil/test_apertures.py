@@ -43,6 +43,7 @@ def test_light_and_spot_of_a_clear_aperture(name):
     np.testing.assert_allclose(found.spread[0, 0], [*variances, 0], rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_light_past_a_ring_and_a_bar():
     """A hole and a bar across: area and variances of the disc less those of both, more those of
     what they share; their integrals over x in closed form or by a dense rule."""

@@ -70,13 +70,8 @@ def test_overlap_of_two_discs():
     np.testing.assert_allclose(mean[0, 1] - np.tan(tilt) * 1.0, half, rtol=1e-11)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "front and rear",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in SCENES if "and" not in n),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_converges_like_an_open_pupil(name):
     exact = found(name, 20)
     assert np.min(exact.passed) > 0.3 and np.max(exact.passed) < 0.95

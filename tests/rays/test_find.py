@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import pytest
 
 from drt_jax import Status, load_lens, trace_rays
 from drt_jax.rays import aim, fermat, find, linear
@@ -132,6 +133,7 @@ def test_hostile_lenses():
     assert saved >= 20 and mixed >= 2 and lost >= 20
 
 
+@pytest.mark.slow
 def test_the_fan_under_vmap():
     """Scenes that need it and scenes that do not, side by side: each as alone."""
     _, _, points, _ = problem("tilted")

@@ -57,7 +57,9 @@ def direction(lens, group):
     return jax.tree_util.tree_map_with_path(fill, lens)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "tilted" else n for n in PROBLEMS]
+)
 def test_against_finite_differences_of_second_order(name):
     """Central differences of rays found anew over a swept step: the error falls with slope 2 until
     rounding, and our derivative is where it points to."""
