@@ -128,8 +128,9 @@ def spots_um(
     wavelengths_um: Numbers = COLOURS,
     distance_mm: float = math.inf,
     rings: int = 12,
-) -> list[float]:
-    """RMS radii of the spots about the centroid of all colours, alike in weight, by Optiland.
+) -> list[float | None]:
+    """RMS radii of the spots about the centroid of all colours, alike in weight, by Optiland; None
+    for a field of which it loses a ray.
 
     Its Gaussian quadrature, `rings` rings of 4 (rings + 1) rays: uniform over the paraxial entrance
     pupil, whose diameter lets the real ray on axis meet the stop's rim. Nothing is clipped. Of the
@@ -142,7 +143,8 @@ def spots_um(
         optic.trace_generic(0.0, 0.0, 0.0, 1.0, optic.primary_wavelength)
         diameter *= semi / abs(float(np.ravel(optic.surfaces.y[lens.stop + 1])[0]))
     hits = _tracer(fields, wavelengths_um, rings)(optic)
-    return [1e3 * float(a) for a in np.sqrt(np.sum(hits**2, axis=(0, 1, 3)))]
+    sizes = 1e3 * np.sqrt(np.sum(hits**2, axis=(0, 1, 3)))
+    return [float(size) if np.isfinite(size) else None for size in sizes]
 
 
 def _singlet(first: float = 1000.0, second: float = -1000.0) -> drt_jax.Lens:
@@ -260,7 +262,8 @@ def recover(
             variable.update(number)
         lenses.append(_taken(start, optic))
     spots = spots_um(lenses[-1], fields_deg, wavelengths_um, distance_mm)
-    found = {"spots_um": spots, "merit": float(np.sum(np.square(spots))), "seconds": seconds}
+    merit = float(np.sum(np.array(spots, float) ** 2))
+    found = {"spots_um": spots, "merit": merit, "seconds": seconds}
     found |= {"focal_length": float(np.ravel(optic.paraxial.f2())[0]), "lenses": lenses[:-1]}
     return found | {"lens": lenses[-1]}
 

@@ -27,6 +27,8 @@ from ._wanted import SHORTEST, Config as Config, Starts
 COLUMNS = ("merit", "worst", "jacobians")
 # Minima that are drawn. Clear apertures are so much wider than the light.
 _DRAWN, _WIDER = 6, 1.01
+# What a search took that was none.
+_NOTHING = {"trials": 0, "jacobians": 0, "seconds": 0.0, "compile_s": 0.0}
 
 
 def problem_of(
@@ -122,7 +124,7 @@ def grown(config: Config, lens: drt_jax.Lens, run: Run) -> drt_jax.Lens:
     growth = config.growth
     good = len(config.fields_deg) * (1e-3 * growth.good_um) ** 2
     whole = problem_of(config, lens).variables
-    begin = {"done": 0.0, "part": growth.first, "step": growth.step}
+    begin = {"done": 0.0, "part": growth.first, "step": growth.step} | _NOTHING
     state = run.kept("growth") or begin | {"numbers": whole.numbers(whole.start).tolist()}
     while state["done"] < 1:
         part, done, step = state["part"], state["done"], state["step"]
@@ -137,6 +139,9 @@ def grown(config: Config, lens: drt_jax.Lens, run: Run) -> drt_jax.Lens:
             step /= 2
             told = f"growth: stops at {done:.1%} of field and aperture, where no step leads to"
             _common.require(step >= SHORTEST, f"{told} {growth.good_um:g} um; change the start")
+        took = {"trials": len(found.history), "jacobians": found.jacobians}
+        took |= {"seconds": found.seconds, "compile_s": found.first}
+        state |= {name: state[name] + number for name, number in took.items()}
         state |= {"done": done, "step": step, "part": min(done + step, 1.0) if done else part / 2}
         run.keep("growth", state)
     return whole.lens_of(jnp.array(state["numbers"]) / whole.scale)
@@ -170,12 +175,10 @@ def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
     start = {
         "vectors": [variables.start.tolist()],
         "merits": [],
-        "trials": 0,
-        "jacobians": 0,
         "no_worse": None,
     }
     if some.count == 1:
-        return start | {"seconds": 0.0, "compile_s": 0.0}
+        return start | _NOTHING
     vectors = starts_of(variables, some)
     with _Progress(f"{some.count} starts", 1) as bar:
         found = design.many_starts(problem, vectors, some.stages, some.keep, bar.tiles)
@@ -243,16 +246,17 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     designed = _bounded(config, problem, variables.lens_of(jnp.asarray(end["vector"])))
     drt_jax.save_lens(designed, run.folder / "designed.yaml")
     rays = design.rays_of(problem)
+    first, before = problem_of(config, start), run.kept("growth") or _NOTHING
     row = {
         "problem": config.name,
-        "merit_start": end["merit_start"],
+        "merit_start": float(first.merit(first.variables.start)),
         "merit_end": end["merit_end"],
         "worst_limit": end["worst"],
         "spots_um": spots_um(config, drt_jax.load_lens(run.folder / "designed.yaml")),
-        "jacobians": found["jacobians"] + int(history[-1, 2]),
-        "rays": rays * (found["trials"] + len(history)),
-        "seconds": found["seconds"] + end["seconds"],
-        "compile_s": found["compile_s"] + end["compile_s"],
+        "jacobians": before["jacobians"] + found["jacobians"] + int(history[-1, 2]),
+        "rays": rays * (before["trials"] + found["trials"] + len(history)),
+        "seconds": before["seconds"] + found["seconds"] + end["seconds"],
+        "compile_s": before["compile_s"] + found["compile_s"] + end["compile_s"],
     }
     scene = config.fields_deg, config.wavelengths_um, config.distance_mm
     read = drt_jax.load_lens(run.folder / "designed.yaml")

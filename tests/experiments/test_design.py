@@ -60,7 +60,8 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
             searched.append(None)
             raise KeyboardInterrupt
         found = optimise(problem, *given)
-        searched.append((float(problem.variables.lens.semi_diameter[0]), found.score))
+        size = float(problem.variables.lens.semi_diameter[0])
+        searched.append((size, found.score, found.jacobians))
         return found
 
     monkeypatch.setattr(design.design, "optimise", watched)
@@ -71,8 +72,8 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
     _command.main(design, ["--out", str(tmp_path / "run"), "--resume"])
     main("singlet", tmp_path / "unbroken", *growth)
     parts = [part for part in searched if part]
-    semis, scores = zip(*parts[:3])
-    np.testing.assert_allclose(semis, [3.75, 6.45, 7.5])
+    semis, scores, jacobians = zip(*parts[:4])
+    np.testing.assert_allclose(semis, [3.75, 6.45, 7.5, 7.5])
     assert np.all(np.array(scores) <= 0.1**2)
     assert parts[:4] == parts[4:]
     (row,), (other,) = (
@@ -80,6 +81,8 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
         for name in ("run", "unbroken")
     )
     np.testing.assert_allclose(row["merit_end"], 0.00172898452577, rtol=1e-9)
+    np.testing.assert_allclose(row["merit_start"], 30.0924206902, rtol=1e-9)
+    assert row["jacobians"] == sum(jacobians) and row["rays"] > 91 * sum(jacobians)
     for name in ("merit_start", "merit_end", "spots_um", "jacobians", "rays"):
         assert row[name] == other[name]
     with pytest.raises(SystemExit) as caught:
