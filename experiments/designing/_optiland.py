@@ -224,8 +224,8 @@ def recover(
     middle colour by an operand; 0: free. distance_mm: to the object. pupil_mm: diameter of the
     entrance pupil; 0: the stop keeps its own. edges: (surface, low, high), limits of its operand
     edge_thickness, mm, as far out as the light of either surface; what exceeds them is a residual.
-    Returns `spots_um` as the function, `merit` (the sum of their squares), `seconds` of the search,
-    `focal_length`, the `lens`, and `lenses`, the start and that after each iteration.
+    Returns `spots_um` as the function, `seconds` of the search, `focal_length`, the `lens`, and
+    `lenses`, the start and that after each iteration.
 
     TRF with x_scale="jac", tol=1e-10, 1 / radius, and a registered operand for each coordinate of 4
     rings of 20 rays. Tried with all thicknesses free, 30 iterations, 3 rings of 12; the root of the
@@ -262,8 +262,7 @@ def recover(
             variable.update(number)
         lenses.append(_taken(start, optic))
     spots = spots_um(lenses[-1], fields_deg, wavelengths_um, distance_mm)
-    merit = float(np.sum(np.array(spots, float) ** 2))
-    found = {"spots_um": spots, "merit": merit, "seconds": seconds}
+    found = {"spots_um": spots, "seconds": seconds}
     found |= {"focal_length": float(np.ravel(optic.paraxial.f2())[0]), "lenses": lenses[:-1]}
     return found | {"lens": lenses[-1]}
 
