@@ -28,6 +28,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
+LONGEST = ("test_readme.py", "test_experiments.py", "test_derivatives.py")
 RGB = (0.6, 0.53, 0.48)
 LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
 
@@ -35,6 +36,11 @@ LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
 def pytest_addoption(parser):
     """Adds --write-tables: the tests that make a table of `results` write it there."""
     parser.addoption("--write-tables", action="store_true", help="rewrite the tables in results/")
+
+
+def pytest_collection_modifyitems(items):
+    """Files with long tests first: none is left for one worker alone at the end."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
 
 
 @pytest.fixture

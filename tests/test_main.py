@@ -23,6 +23,7 @@ def test_a_lens_shows_itself(tmp_path, capsys):
     assert abs(float(table[1][1]) / focal - 0.0875) < 1e-3 and float(table[0][3]) == 100
 
 
+@pytest.mark.slow
 def test_what_looks_odd(tmp_path, capsys):
     """A near object, out of focus; a field from which no light comes."""
     words = ["show", "singlet", "--field", "0", "80", "--wavelengths", "0.55"]

@@ -198,7 +198,9 @@ surfaces:
 """
 
 
-@pytest.mark.parametrize("semi, rule", [(100, 4), (15, Clipped(6, "half"))])
+@pytest.mark.parametrize(
+    "semi, rule", [(100, 4), pytest.param(15, Clipped(6, "half"), marks=pytest.mark.slow)]
+)
 def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
     """The fourth power of the cosine, times the light that passes a clear aperture far in front."""
     path = tmp_path / "weak.yaml"

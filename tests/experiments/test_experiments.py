@@ -113,7 +113,9 @@ def test_a_run_explains_itself(name, unbroken):
         assert {"mae", "rmse"} <= set(results["table"][0]["fixed"])
 
 
-@pytest.mark.parametrize("name", TOY)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "edof" else n for n in TOY]
+)
 def test_an_interrupted_run_resumes_to_the_same_numbers(
     name, unbroken, tmp_path, monkeypatch, capsys
 ):

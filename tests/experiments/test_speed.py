@@ -16,6 +16,7 @@ def main(experiment, *argv):
         jax.config.update("jax_enable_compilation_cache", True)
 
 
+@pytest.mark.slow
 def test_benchmark_without_peers(tmp_path, capsys, monkeypatch):
     """One task: a row for each peer, which is measured or says what is missing, and the counts."""
 

@@ -31,6 +31,7 @@ def config(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_it_writes_rows_and_pictures_and_resumes(config, tmp_path, capsys):
     folder = tmp_path / "run"
     main("--config", config, "--out", folder)

@@ -63,6 +63,7 @@ def test_light_past_a_ring_and_a_bar():
     np.testing.assert_allclose(found.spread[0, 0], np.array(squares) / area, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_no_light_passes_an_obscuration_that_hides_the_stop():
     lens = beam(obscuration=[{"circle": 2.5}, {"rectangle": [0.1, 0.1]}])
     with pytest.raises(ValueError, match="no ray at"):
@@ -154,6 +155,7 @@ def test_derivatives_by_sizes_and_centres(cut):
     assert np.all(np.asarray(slopes.half)[:, 2, 1] == 0)  # a circle has one size
 
 
+@pytest.mark.slow
 def test_a_telescope_with_a_hole():
     """On axis and 5 arc minutes beside it: light, focal length, and the spot of a rule on the ring
     that knows where it is; the error falls with the order as on a disc."""

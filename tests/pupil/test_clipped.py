@@ -153,6 +153,7 @@ def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
         Soft(4, "half", 0.0)
 
 
+@pytest.mark.slow
 def test_a_pupil_that_paraxial_optics_does_not_find():
     """A fisheye at 85 degrees, its paraxial entrance pupil far from the real one: the nearest ray
     of a fan leads all others, and the rule finds the stop, which nothing clips."""

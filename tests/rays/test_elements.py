@@ -34,6 +34,7 @@ def rotation(degrees):
     return about_x @ about_y @ np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
 
 
+@pytest.mark.slow
 def test_one_surface_about_its_vertex_is_its_own_tilt_and_decentre():
     tilt, shift = [0.3, -0.5, 0.2], [0.1, 0.2]
     group = lens_with({"surfaces": [3, 3], "tilt": tilt, "shift": [*shift, 0.0]})
@@ -45,6 +46,7 @@ def test_one_surface_about_its_vertex_is_its_own_tilt_and_decentre():
     np.testing.assert_allclose(ours.path, theirs.path, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_the_whole_lens_turned_is_the_light_turned():
     turned = lens_with({"surfaces": [0, "sensor"]} | MOVE)
     back = rotation(MOVE["tilt"]).T

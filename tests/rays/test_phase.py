@@ -45,6 +45,7 @@ def test_the_grating_equation_in_and_out_of_plane(order, mirror):
     assert np.all(after[..., 2] < 0 if mirror else after[..., 2] > 0)
 
 
+@pytest.mark.slow
 def test_an_evanescent_order_is_totally_reflected():
     phase = {"form": "linear", "coefficients": {"y": 1700.0}}
     lens = load_lens({"surfaces": [STOP, {"radius": INF, "phase": phase, "thickness": 10.0}]})

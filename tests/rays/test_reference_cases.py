@@ -198,6 +198,7 @@ def test_c08_whole_pupil(cases, lsst):
 # C13: a toroid, Zemax through Optiland's tests.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [2.0, 0.0, -2.0])
 def test_c13_toroid(cases, gap):
     """Rays and sag to 1e-11, wherever the stop is that labels them."""
