@@ -102,7 +102,7 @@ def optiland(task: Task, vector: Array) -> Way | None:
     variables, config = task.problem.variables, task.config
     found = _optiland.recover(
         variables.lens_of(vector),
-        **told(task.problem),
+        told(task.problem),
         fields_deg=config.fields_deg,
         wavelengths_um=config.wavelengths_um,
         distance_mm=config.distance_mm,
@@ -126,8 +126,8 @@ def of_radii(name: str, task: Task, vector: Array) -> Way | None:
     return Way(end, none, none, found[name]["seconds"])
 
 
-def told(problem: design.Problem) -> dict[str, Any]:
-    """Of a problem, what `_optiland.recover` takes."""
+def told(problem: design.Problem) -> _optiland.Told:
+    """Of a problem, what `_optiland.recover` is told."""
     variables, lens = problem.variables, problem.variables.lens
     bends, gaps = dict[int, tuple[float, float]](), dict[int, tuple[float, float]]()
     ends = np.stack([variables.low, variables.high], axis=1) * np.asarray(variables.scale)[:, None]
@@ -149,9 +149,7 @@ def told(problem: design.Problem) -> dict[str, Any]:
             elif front in gaps:
                 low, high = gaps[front]
                 gaps[front] = max(low, operand.low), min(high, operand.high)
-    focal_length, pupil_mm = held.values()
-    lengths = {"focal_length": focal_length, "pupil_mm": pupil_mm}
-    return {"bends": bends, "gaps": gaps, "edges": edges} | lengths
+    return _optiland.Told(bends, gaps, *held.values(), edges)
 
 
 def _squares(vector: Array, problem: design.Problem) -> Array:

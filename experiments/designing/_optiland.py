@@ -11,7 +11,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -204,26 +204,34 @@ def singlet(
     return found
 
 
+class Told(NamedTuple):
+    """What Optiland's least squares is told of a problem, as far as it knows such things.
+
+    bends, gaps: by surface, from 0, limits (low, high) of the curvatures, 1/mm, and thicknesses
+    behind them, mm, that vary; behind the last surface to the sensor. focal_length: mm, held in the
+    middle colour by an operand; 0: free. pupil_mm: diameter of the entrance pupil; 0: the stop
+    keeps its own. edges: (surface, low, high), limits of its operand edge_thickness, mm, as far out
+    as the light of either surface; what exceeds them is a residual.
+    """
+
+    bends: dict[int, tuple[float, float]]
+    gaps: dict[int, tuple[float, float]]
+    focal_length: float = 0.0
+    pupil_mm: float = 0.0
+    edges: Sequence[tuple[int, float, float]] = ()
+
+
 @_optional
 def recover(
     start: drt_jax.Lens,
-    bends: dict[int, tuple[float, float]],
-    gaps: dict[int, tuple[float, float]],
-    focal_length: float = 0.0,
+    told: Told,
     fields_deg: Numbers = (0.0, 10.0, 14.0),
     wavelengths_um: Numbers = COLOURS,
     distance_mm: float = math.inf,
-    pupil_mm: float = 0.0,
-    edges: Sequence[tuple[int, float, float]] = (),
     seconds: float = 60.0,
 ) -> dict[str, Any]:
-    """Optiland's least squares on the spots of a lens within `seconds`.
+    """Optiland's least squares on the spots of a lens, its object at `distance_mm`, for `seconds`.
 
-    bends, gaps: by surface, from 0, limits (low, high) of curvatures, 1/mm, and of thicknesses
-    behind them, mm, behind the last one to the sensor, that vary. focal_length: in mm, held in the
-    middle colour by an operand; 0: free. distance_mm: to the object. pupil_mm: diameter of the
-    entrance pupil; 0: the stop keeps its own. edges: (surface, low, high), limits of its operand
-    edge_thickness, mm, as far out as the light of either surface; what exceeds them is a residual.
     Returns `spots_um` as the function, `seconds` of the search, `focal_length`, the `lens`, and
     `lenses`, the start and that after each iteration.
 
@@ -232,20 +240,43 @@ def recover(
     merit: 6.6 um in 36 s, "lm" 6.5 um in 36 to 44 s; LeastSquares on rms_spot_size of each field
     138 um in 50 s, OptimizerGeneric on the same 11.5 um in 87 s.
     """
-    from optiland import optimization
-
     optic, fields = _system(start, fields_deg, wavelengths_um, distance_mm)
-    if pupil_mm:
-        optic.set_aperture("EPD", pupil_mm)
-    problem = _recovery(optic, _tracer(fields, wavelengths_um, 4))
-    for kind, varied in (("reciprocal_radius", bends), ("thickness", gaps)):
+    if told.pupil_mm:
+        optic.set_aperture("EPD", told.pupil_mm)
+    problem = _deviations(optic, _tracer(fields, wavelengths_um, 4))
+    _tell(problem, optic, told)
+    since = time.perf_counter()
+    vectors = _searched(problem, seconds)
+    seconds, lenses = time.perf_counter() - since, [start]
+    for vector in vectors:
+        for variable, number in zip(problem.variables, vector):
+            variable.update(number)
+        lenses.append(_taken(start, optic))
+    return {
+        "spots_um": spots_um(lenses[-1], fields_deg, wavelengths_um, distance_mm),
+        "seconds": seconds,
+        "focal_length": float(np.ravel(optic.paraxial.f2())[0]),
+        "lens": lenses[-1],
+        "lenses": lenses[:-1],
+    }
+
+
+def _tell(problem: Any, optic: Any, told: Told) -> None:
+    """Variables, their bounds, and the operands beside the deviations."""
+    for kind, varied in (("reciprocal_radius", told.bends), ("thickness", told.gaps)):
         for surface, ends in varied.items():
             problem.add_variable(optic, kind, surface_number=surface + 1, **_bounds(ends))
-    if focal_length:
-        problem.add_operand("f2", target=focal_length, weight=1, input_data={"optic": optic})
-    for surface, *ends in edges:
+    if told.focal_length:
+        problem.add_operand("f2", target=told.focal_length, weight=1, input_data={"optic": optic})
+    for surface, *ends in told.edges:
         place = {"optic": optic, "surface_number": surface + 1}
         problem.add_operand("edge_thickness", weight=1, input_data=place, **_bounds(ends))
+
+
+def _searched(problem: Any, seconds: float) -> list[np.ndarray]:
+    """Optiland's variables after each iteration of its least squares, and at the end."""
+    from optiland import optimization
+
     vectors, since = list[np.ndarray](), time.perf_counter()
 
     def in_time(vector: np.ndarray) -> None:
@@ -255,19 +286,10 @@ def recover(
 
     search = optimization.LeastSquares(problem)
     ended = search.optimize(tol=1e-10, method_choice="trf", x_scale="jac", callback=in_time)
-    seconds = time.perf_counter() - since
-    lenses = [start]
-    for vector in (*vectors, ended.x):
-        for variable, number in zip(problem.variables, vector):
-            variable.update(number)
-        lenses.append(_taken(start, optic))
-    spots = spots_um(lenses[-1], fields_deg, wavelengths_um, distance_mm)
-    found = {"spots_um": spots, "seconds": seconds}
-    found |= {"focal_length": float(np.ravel(optic.paraxial.f2())[0]), "lenses": lenses[:-1]}
-    return found | {"lens": lenses[-1]}
+    return [*vectors, ended.x]
 
 
-def _recovery(optic: Any, trace: Callable) -> Any:
+def _deviations(optic: Any, trace: Callable) -> Any:
     """Optiland's problem with an operand for each of the deviations that `trace` gives."""
     from optiland import optimization
 

@@ -131,17 +131,17 @@ def test_what_lies_beyond_the_bounds_is_brought_back():
 def test_optiland_is_told_the_problem():
     _, problem, _ = recovery()
     told = _beside.told(problem)
-    assert set(told["bends"]) == {0, 1, 2, 4, 6, 8, 9, 10}
+    assert set(told.bends) == {0, 1, 2, 4, 6, 8, 9, 10}
     thick = {i: (2.0, 20.0) for i in (0, 2, 3, 6, 7, 9)}
     gaps = {i: pytest.approx((0.3, 20.0)) for i in range(10)} | {10: pytest.approx((20.0, 100.0))}
-    assert told["gaps"] == gaps | {i: pytest.approx(ends) for i, ends in thick.items()}
+    assert told.gaps == gaps | {i: pytest.approx(ends) for i, ends in thick.items()}
     glass, air = ([(i, low, math.inf) for i in some] for some, low in _EDGES)
-    assert told["edges"] == glass + air
+    assert told.edges == glass + air
     lens = problem.variables.lens
     middle = np.array([0.5876])
     focal = float(drt_jax.focal_length(lens, middle)[0])
     pupil = 2 * float(drt_jax.entrance_pupil(lens, middle).semi_diameter[0])
-    assert (told["focal_length"], told["pupil_mm"]) == pytest.approx((focal, pupil), 1e-12)
+    assert (told.focal_length, told.pupil_mm) == pytest.approx((focal, pupil), 1e-12)
 
 
 # Surfaces and limits; the air that holds the stop is behind the fourth, the last is the sensor's.

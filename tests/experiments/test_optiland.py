@@ -28,7 +28,7 @@ def test_without_optiland_there_is_none(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert _optiland.spots_um(LENS, (0.0,)) is None
     assert _optiland.singlet() is None
-    assert _optiland.recover(LENS, {0: FREE}, {10: FREE}, 99.5) is None
+    assert _optiland.recover(LENS, _optiland.Told({0: FREE}, {10: FREE}, 99.5)) is None
 
 
 def test_the_best_singlet_by_our_rays():
@@ -59,7 +59,7 @@ def test_a_disturbed_lens_is_sharp_again():
     start = dataclasses.replace(LENS, curvature=jnp.asarray(bent))
     focal = float(drt_jax.focal_length(LENS, np.array([0.5876]))[0])
     curved = {i: FREE for i in range(11) if float(LENS.curvature[i])}
-    found = _optiland.recover(start, curved, {10: FREE}, focal)
+    found = _optiland.recover(start, _optiland.Told(curved, {10: FREE}, focal))
     assert found["focal_length"] == pytest.approx(focal, abs=1e-5)
     assert np.max(found["spots_um"]) < 8
     np.testing.assert_allclose(found["lens"].thickness, LENS.thickness, rtol=1e-12)
