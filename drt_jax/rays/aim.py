@@ -1,8 +1,8 @@
 """Aiming: from where to launch a ray so that it crosses the stop at a wanted point.
 
 Newton's method in the launch point of one ray, mapped over a bundle, from where paraxial optics
-puts it. Rays that this does not find, and only those, start again from a fan of rays over the
-first surface.
+puts it. Rays that this does not find, and only those, start again from the nearest rays that were
+found, and from a fan of rays over the first surface.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from jax import Array
 from ..lens.forms import Shape
 from ..lens.paraxial import trace_yu
 from ..lens.surface import vertex_curvature
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import run_if, safe_divide, safe_sqrt
 from .snell import apart, shoot, shoot_to_stop
 from .status import Status
 from .system import System, Vector, determinant, divide, dot
@@ -32,6 +32,9 @@ _STEPS, _PATIENCE = 48, 12
 # The fan has `_TILES` tiles a side of `_FAN` rays a side; a stop point takes the ray that comes
 # nearest of each of its `STARTS` nearest tiles.
 _TILES, _FAN, STARTS = 15, 5, 24
+# How often at most a bundle is aimed again from the rays that were found. Bundled lenses at twice
+# their apertures and fields take 3.
+_ROUNDS = 8
 
 
 class _State(NamedTuple):
@@ -166,6 +169,62 @@ def aim(
     return Aimed(launch, status, folded, jnp.max(steps).astype(jnp.int32))
 
 
+class _Growth(NamedTuple):
+    """A bundle aimed so far: aimed, and whether another round may find more."""
+
+    aimed: Aimed
+    more: Array
+    rounds: Array
+
+
+def aim_outwards(system: System, target: Vector) -> Aimed:
+    """Aim rays at stop points `target`, D arrays (W, Q) in mm, from the paraxial launch; then those
+    that fail from the nearest ray, of any wavelength, that was found, as long as that finds more.
+    Where no ray was found at all, they begin at the nearest ray of a coarse fan.
+    """
+    beam, reach = beam_size(system, target)
+    upright = system.rows.rotation is None
+    waves = target[0].shape[0]
+
+    def again(state: _Growth) -> _Growth:
+        aimed, first = state.aimed, state.rounds == 0
+        good = aimed.status == Status.OK
+        begin = nearest_found(aimed.launch, good, target)
+
+        def from_fan(launch: Vector) -> Vector:
+            fan = trace_fan(system, no_fan(system, waves, 1), launch, reach)
+            return nearest_start(fan, target)
+
+        begin = run_if(~first & ~jnp.any(good), from_fan, begin)
+        begin = tuple(jnp.where(first | good, a, b) for a, b in zip(aimed.launch, begin))
+        step = jnp.where(first, reach, reach / 8)
+        new = aim(system, target, begin, (beam, step), upright)
+        found = ~good & (new.status == Status.OK)
+        taken = found | first
+        launch = tuple(jnp.where(taken, a, b) for a, b in zip(new.launch, aimed.launch))
+        status = jnp.where(taken, new.status, aimed.status)
+        folded = jnp.where(taken, new.folded, aimed.folded)
+        more = (first | jnp.any(found)) & jnp.any(status != Status.OK)
+        both = Aimed(launch, status, folded, aimed.steps + new.steps)
+        return _Growth(both, more & (state.rounds < _ROUNDS), state.rounds + 1)
+
+    launch = paraxial_launch(system, target, reach)
+    none = jnp.full(target[0].shape, Status.UNCONVERGED, jnp.int32)
+    start = Aimed(launch, none, jnp.zeros(none.shape, bool), jnp.int32(0))
+    begun = _Growth(start, jnp.bool_(True), jnp.int32(0))
+    return jax.lax.while_loop(lambda state: state.more, again, begun).aimed
+
+
+def nearest_found(launch: Vector, good: Array, target: Vector) -> Vector:
+    """Launches, D arrays (W, Q), for stop points: that of the `good` ray (W, Q), of any wavelength,
+    that crosses the stop nearest; void where none is good."""
+    every = [a.reshape(-1) for a in target]
+    gaps = (a[..., None] - b[None, None] for a, b in zip(target, every, strict=True))
+    far = jnp.where(good.reshape(-1)[None, None], sum(g * g for g in gaps), jnp.inf)
+    nearest = jnp.argmin(far, axis=-1)
+    return tuple(a.reshape(-1)[nearest] for a in launch)
+
+
 def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
     """Radius of the beam at the stop, and how wide it may be on the first surface, mm."""
     beam = jnp.sqrt(jnp.max(dot(target, target)))
@@ -221,14 +280,15 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
     return tuple(a * shrink for a in launch)
 
 
-def _fan(dim: int) -> np.ndarray:
-    """Launch points (D, tiles, rays of a tile) between -1 and 1, denser in the middle."""
-    side = np.linspace(-1, 1, _TILES * _FAN)
-    side = (side * (0.3 + 0.7 * side**2)).reshape(_TILES, _FAN)
+def _fan(dim: int, rays: int) -> np.ndarray:
+    """Launch points (D, tiles, rays of a tile) between -1 and 1, denser in the middle; `rays` a
+    side of each tile."""
+    side = np.linspace(-1, 1, _TILES * rays)
+    side = (side * (0.3 + 0.7 * side**2)).reshape(_TILES, rays)
     places = np.meshgrid(*[np.arange(side.size)] * dim, indexing="ij")
-    points = side.ravel()[np.stack(places)].reshape(dim, *(_TILES, _FAN) * dim)
+    points = side.ravel()[np.stack(places)].reshape(dim, *(_TILES, rays) * dim)
     tiles = (0, *range(1, 2 * dim, 2), *range(2, 2 * dim + 1, 2))
-    return points.transpose(tiles).reshape(dim, _TILES**dim, _FAN**dim)
+    return points.transpose(tiles).reshape(dim, _TILES**dim, rays**dim)
 
 
 class Fan(NamedTuple):
@@ -242,9 +302,9 @@ class Fan(NamedTuple):
     there: Vector
 
 
-def no_fan(system: System, waves: int) -> Fan:
-    """A fan before it is traced."""
-    points = jnp.asarray(_fan(system.dim), system.index.dtype)
+def no_fan(system: System, waves: int, rays: int = _FAN) -> Fan:
+    """A fan before it is traced: the points of launch between -1 and 1, `rays` a side of a tile."""
+    points = jnp.asarray(_fan(system.dim, rays), system.index.dtype)
     nowhere = jnp.full((waves, *points.shape[1:]), jnp.inf, points.dtype)
     return Fan(tuple(points), (nowhere,) * system.dim)
 
@@ -256,7 +316,7 @@ def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
     what does not change in it XLA computes the whole fan beforehand, missing rays or not.
     """
     reach = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
-    launch = tuple(reach * jnp.asarray(a, reach.dtype) for a in _fan(system.dim))
+    launch = tuple(reach * a for a in fan.launch)
     shape = fan.there[0].shape
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
     trace = shoot(system, flat)
