@@ -5,6 +5,7 @@ shift takes up what is left of the excess: the method of multipliers (Rockafella
 limits without weights that would be stiff.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..numerics import concrete
+from ..rays.solve import solve_aimed
 from .least_squares import COMPILE, BoundedLM, LMState
 from .problem import Judged, Problem
 
@@ -131,6 +133,21 @@ _begin = jax.jit(begin)
 _turn = jax.jit(turn, compiler_options=COMPILE)
 
 
+def quick(problem: Problem) -> Problem:
+    """The problem with the smaller program: rays are aimed, not searched for."""
+    return dataclasses.replace(problem, solver=solve_aimed)
+
+
+def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem, Search]:
+    """What to go on with: `tried`, which aims rays, or where the full search of the `problem` finds
+    more of them at the best vector, the problem itself, evaluated anew."""
+    failed = int(search.judged.failed)
+    if tried.solver is problem.solver or not failed or int(problem.failed(search.vector)) == failed:
+        return tried, search
+    state = search.state._replace(fresh=jnp.bool_(True))
+    return problem, _turn(problem, search._replace(state=state, done=jnp.bool_(False)))
+
+
 def optimise(
     problem: Problem,
     vector: Array | None = None,
@@ -150,15 +167,19 @@ def optimise(
         raise ValueError("optimise: call it outside of jax.jit; inside, use begin and turn")
     start = problem.variables.start if vector is None else jnp.asarray(vector)
     low, high = problem.variables.low, problem.variables.high
-    search = _begin(problem, jnp.clip(start, low, high))
+    tried = quick(problem)
+    search = _begin(tried, jnp.clip(start, low, high))
     begun = time.perf_counter()
-    search = jax.block_until_ready(_turn(problem, search))
+    search = jax.block_until_ready(_turn(tried, search))
     compiled = time.perf_counter()
     history = [[search.merit, search.worst, search.state.jacobians]]
+    tried, search = _searched(problem, tried, search)
     for _ in range(trials - 1):
-        search = _turn(problem, search)
+        search = _turn(tried, search)
         history.append([search.merit, search.worst, search.state.jacobians])
         report(search)
+        if search.state.jacobians > history[-2][2]:  # a better lens
+            tried, search = _searched(problem, tried, search)
         if bool(search.done) or float(search.score) <= good:
             break
     if not bool(jnp.isfinite(search.state.broken)):

@@ -14,7 +14,7 @@ from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
 from ..lens.scene import Scene, distance_array, field_array, vergence_of
 from ..pupil.rules import Gauss, PupilRule
-from ..rays.solve import Solver, solve_aimed
+from ..rays.solve import Solver, solve
 from .gaps import gaps
 from .operands import Operand
 from .seen import Seen, symmetry_by_structure
@@ -33,11 +33,13 @@ class Judged(NamedTuple):
     residuals: (M,), whose squares add up to the merit.
     excess: (L,), by how much values are beyond their limits, times their weights.
     broken: (), by how much surfaces overlap within the light, mm; inf where anything is not finite.
+    failed: (), int32, how many rays fail.
     """
 
     residuals: Array
     excess: Array
     broken: Array
+    failed: Array
 
 
 @jax.tree_util.register_dataclass
@@ -53,8 +55,9 @@ class Problem:
 
     Static:
     operands: what is wanted.
-    solver: how rays are found. The default aims them, and counts as failed what is not found so;
-        a lens of which that is wanted needs no search. `dataclasses.replace` puts another here.
+    solver: how rays are found: by the full search, so that no ray counts as failed that exists.
+        `optimise`, `many_starts` and `monte_carlo` try with `solve_aimed`, the smaller program, and
+        ask the full search where that misses a ray.
     """
 
     variables: Variables
@@ -64,7 +67,7 @@ class Problem:
     colour_weights: Array
     rule: PupilRule
     operands: tuple[Operand, ...] = dataclasses.field(metadata={"static": True})
-    solver: Solver = dataclasses.field(metadata={"static": True}, default=solve_aimed)
+    solver: Solver = dataclasses.field(metadata={"static": True}, default=solve)
 
     @classmethod
     def of(
@@ -151,7 +154,8 @@ class Problem:
         overlap = overlap + jnp.maximum(slim, 0)
         finite = jnp.all(jnp.isfinite(residuals)) & jnp.all(jnp.isfinite(excess))
         broken = jnp.where(finite & jnp.isfinite(overlap), overlap, jnp.inf)
-        return Judged(residuals, excess, jax.lax.stop_gradient(broken))
+        failed = jnp.sum(~seen.rays.whole, dtype=jnp.int32) if self.traces else jnp.int32(0)
+        return Judged(residuals, excess, jax.lax.stop_gradient(broken), failed)
 
     def _failures(self, seen: Seen) -> Array:
         """A residual for each ray: 0 for one that passes, else the root of its share of the light
@@ -165,6 +169,11 @@ class Problem:
     def extents(self, lens: Lens) -> Array:
         """How far from the axis the light meets each surface (S,) of a lens; see `Seen.extents`."""
         return self.seen(lens).extents
+
+    @jax.jit
+    def failed(self, vector: Array) -> Array:
+        """How many rays fail, (), int32; see `Judged`."""
+        return self.judge(vector).failed
 
     @jax.jit
     def merit(self, vector: Array) -> Array:

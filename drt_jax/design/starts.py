@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from scipy.stats import qmc
 
 from .least_squares import COMPILE
-from .optimum import Search, begin, turn
+from .optimum import Search, begin, quick, turn
 from .problem import Problem
 from .variables import Variables
 
@@ -119,20 +119,22 @@ def many_starts(
     if vectors.ndim != 2 or vectors.shape[1] != width or not len(vectors):
         raise ValueError(f"starts: expected (K, {width}), got shape {vectors.shape}")
     vectors = np.clip(vectors, problem.variables.low, problem.variables.high)
-    state = jax.tree.map(np.array, _begin(problem, jnp.asarray(vectors)))
+    state = jax.tree.map(np.array, _begin(quick(problem), jnp.asarray(vectors)))
     sizes = [len(vectors)]
     for _ in turns[1:]:
         sizes.append(min(sizes[-1], max(_TILE, math.ceil(keep * sizes[-1]))))
-    alive, best = np.arange(len(vectors)), list[float]()
+    alive, best, tried = np.arange(len(vectors)), list[float](), quick(problem)
     total = sum(-(-size // _TILE) for size in sizes)
-    for _ in _advanced(problem, state, [np.resize(alive, _TILE)], 0, threads):
+    for _ in _advanced(tried, state, [np.resize(alive, _TILE)], 0, threads):
         compiled = time.perf_counter() - begun
     for size, more in zip(sizes, turns):
         alive = alive[np.argsort(_score(state, alive), kind="stable")[:size]]
         tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
-        for _ in _advanced(problem, state, tiles, more, threads):
+        for _ in _advanced(tried, state, tiles, more, threads):
             best.append(float(np.min(_score(state, alive))))
             report(len(best), total, best[-1])
+    for _ in _searched(problem, state, alive, turns[-1], threads):
+        best.append(float(np.min(_score(state, alive))))
     trials, jacobians = (int(np.sum(a)) for a in (state.state.trials, state.state.jacobians))
     minima = distinct(_rows(state, alive), alive)
     return Starts(
@@ -145,6 +147,23 @@ def many_starts(
         compiled,
         best,
     )
+
+
+def _searched(
+    problem: Problem, state: Search, alive: np.ndarray, turns: int, threads: int | None
+) -> Iterator[None]:
+    """Go on, as `_advanced`, with those of which the full search of the problem finds rays that
+    aiming did not."""
+    failed = np.asarray(state.judged.failed)[alive]
+    missed = [
+        row
+        for row, count in zip(alive[failed > 0], failed[failed > 0])
+        if int(problem.failed(jnp.asarray(state.vector[row]))) < count
+    ]
+    if missed:
+        state.state.fresh[missed], state.done[missed] = True, False
+        tiles = [np.array(missed[k : k + _TILE]) for k in range(0, len(missed), _TILE)]
+        yield from _advanced(problem, state, tiles, turns, threads)
 
 
 def _advanced(

@@ -6,6 +6,7 @@ that this is a small linear system, solved for every lens.
 """
 
 import concurrent.futures
+import dataclasses
 import os
 from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
@@ -17,6 +18,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..numerics import concrete, safe_divide
+from ..rays.solve import solve, solve_aimed
 from ..rays.status import Status
 from .least_squares import COMPILE
 from .perturbed import Perturbed
@@ -272,13 +274,36 @@ def monte_carlo(
     """The lenses of errors (K, P) in parts of their largest, traced; arrays (K, V) and (K, C).
 
     report: called with how many are done. threads: tiles at a time; None: one a core. The result
-    depends on neither threads nor tiles. ValueError as `made`.
+    depends on neither threads nor tiles. A lens of which aiming misses a ray is searched in full:
+    inf means that there is none. ValueError as `made`.
     """
     _check(problem, perturbed.lens, compensator)
     width = len(perturbed.errors)
     if np.ndim(off) != 2 or np.shape(off)[1] != width or not len(off):
         raise ValueError(f"off: expected (K, {width}), got shape {np.shape(off)}")
+    fast = dataclasses.replace(problem, solver=solve_aimed)
+    found = _in_tiles(fast, perturbed, off, compensator, report, threads)
+    # What aiming does not find, the full search may.
+    failed = np.flatnonzero(~np.all(np.isfinite(found.squares), axis=1))
+    if len(failed):
+        whole = dataclasses.replace(problem, solver=solve)
+        again = _in_tiles(whole, perturbed, off[failed], compensator, lambda done: None, threads)
+        for array, rows in zip(found, again):
+            array[failed] = rows
+    return found
+
+
+def _in_tiles(
+    problem: Problem,
+    perturbed: Perturbed,
+    off: np.ndarray,
+    compensator: Compensator,
+    report: Callable[[int], None],
+    threads: int | None,
+) -> Made:
+    """`monte_carlo` with the solver of the problem."""
     tiles = [off[k : k + _TILE] for k in range(0, len(off), _TILE)]
+    width = off.shape[1]
 
     def run(rows: np.ndarray) -> Made:
         whole = np.resize(rows, (_TILE, width))  # a tile that is not full repeats its rows

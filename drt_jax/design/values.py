@@ -106,8 +106,11 @@ def _hits(which: Which, seen: Seen) -> tuple[Array, Array]:
     part (V, W, Q) of the light of all colours of a view."""
     views, colours = _views(which, seen), _colours(which, seen)
     rays = seen.rays
-    light = jnp.where(rays.whole, seen.share, 0)[views][:, colours, EXTRAS:]
-    light = light / jnp.sum(seen.colour_weights[colours])
+    light = jnp.where(rays.whole, rays.light, 0)[views][:, colours, EXTRAS:]
+    # Of each wavelength the light that arrives, as in `psf_moments`.
+    light = safe_divide(light, jnp.sum(light, axis=-1, keepdims=True))
+    weights = seen.colour_weights[colours]
+    light = light * (weights / jnp.sum(weights))[None, :, None]
     hits = jnp.stack([h[views, -1][:, colours, EXTRAS:] for h in rays.bundle.hits])
     return jnp.where(light[None] > 0, hits, 0), light
 

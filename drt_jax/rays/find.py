@@ -147,7 +147,8 @@ def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
 
 def find_aimed(system: System, target: Vector) -> Found:
     """The rays that aiming alone brings through their stop points to rounding, see `aim_outwards`;
-    all others are UNCONVERGED, whether there is such a ray or not. A third of the program of `find`,
+    all others are UNCONVERGED, whether there is such a ray or not. A third of the program that
+    `find` is,
     and a tenth of its time where rays fail."""
     aimed = aim_outwards(system, target)
     hits, status = _verdict(system, aimed.launch, aimed.status)
