@@ -16,6 +16,7 @@ ROOT = PACKAGE.parent
 FLOORS = (
     "inputs",
     "numerics",
+    "compilation",
     "lens",
     "rays",
     "pupil",
@@ -30,7 +31,7 @@ FLOORS = (
 # Floors that know no ray, and but for `files` no optics formula: all that they may import of the
 # package.
 ALLOWED = {
-    "learn": {"inputs", "numerics", "image.kernel", "image.sensor"},
+    "learn": {"inputs", "numerics", "compilation", "image.kernel", "image.sensor"},
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
     "runs": {"inputs"},
