@@ -8,10 +8,10 @@ bounds of pyproject.toml name or, where that has no wheel for this Python, the n
 has no interpreter is skipped, and the end says so.
 """
 
+import contextlib
 import os
 import pathlib
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -42,11 +42,10 @@ def interpreter(version: str) -> str | None:
     """A Python of this version that starts, by its name or from pyenv."""
     pyenv = pathlib.Path(os.environ.get("PYENV_ROOT", "~/.pyenv")).expanduser()
     name = f"python{version}"
-    for found in (shutil.which(name), *sorted(pyenv.glob(f"versions/{version}.*/bin/{name}"))):
-        if (
-            found
-            and not subprocess.run([found, "-c", "import ssl"], capture_output=True).returncode
-        ):
+    for found in (name, *sorted(pyenv.glob(f"versions/{version}.*/bin/{name}"))):
+        # A shim of pyenv may be there and fail.
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            subprocess.run([found, "-c", "import ssl"], capture_output=True, check=True)
             return str(found)
     return None
 
@@ -105,7 +104,8 @@ def tried(way: str) -> str:
     if not (base := interpreter(version)):
         return f"skipped: no Python {version}"
     python = environment(way, base)
-    cache = {"JAX_COMPILATION_CACHE_DIR": str(python.parent.parent / "compiled")}
+    # Programs may be shared: that of another release is another program.
+    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(python.parent.parent / "compiled"))
     names = "import jax, numpy; print('JAX', jax.__version__, 'NumPy', numpy.__version__)"
     said = subprocess.run([python, "-c", names], capture_output=True, text=True).stdout.strip()
     print(f"{way}: {said}", flush=True)
@@ -113,7 +113,7 @@ def tried(way: str) -> str:
     command = [python, "-m", "pytest", "--durations=5", *TESTS]
     if way.endswith("oldest"):  # what old packages call in new ones is not ours to mend
         command[3:3] = ["-W", "default::DeprecationWarning"]
-    done = subprocess.run(command, cwd=ROOT, env=os.environ | cache)
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | {"JAX_COMPILATION_CACHE_DIR": cache})
     word = "FAILED" if done.returncode else "passed"
     return f"{word}, {said}, {time.monotonic() - start:.0f} s"
 
