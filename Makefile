@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 OUT := runs/demo-$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: install demo check test test-all
+.PHONY: install demo check test test-slow test-all test-versions
 install: .venv/installed
 
 .venv/installed: pyproject.toml
@@ -23,9 +23,19 @@ check: install
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+# Programs that one run of the tests has compiled serve the next.
+test test-slow test-all test-versions: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.compiled
+
 test: install
 	$(BIN)/python -m pytest
 
-# The larger scenes as well: half an hour.
+# The larger scenes.
+test-slow: install
+	$(BIN)/python -m pytest -m slow
+
 test-all: install
 	$(BIN)/python -m pytest -m ""
+
+# A part of the tests with other releases of Python and JAX, where there are such Pythons.
+test-versions: install
+	$(BIN)/python .ci/versions.py

@@ -49,26 +49,10 @@ def known_values(tree: Any) -> Any:
     is to fill in.
 
     What follows from a scene, such as how many rays it needs, is not differentiated itself but
-    must be decided in an eager `jax.grad`, too. The rule of a custom_jvp is handed the values.
+    must be decided in an eager `jax.grad`, too: there `stop_gradient` leaves the values.
     """
-    if concrete(tree):
-        return tree
-    seen: list[tuple] = []
-
-    @jax.custom_jvp
-    def look(*leaves):
-        seen.append(leaves)
-        return jnp.zeros(())
-
-    @look.defjvp
-    def _(primals, tangents):
-        return look(*primals), jnp.zeros(())
-
-    leaves, structure = jax.tree.flatten(tree)
-    look(*leaves)
-    if not concrete(seen[-1]):
-        return None
-    return jax.tree.unflatten(structure, seen[-1])
+    values = tree if concrete(tree) else jax.lax.stop_gradient(tree)
+    return values if concrete(values) else None
 
 
 @functools.cache

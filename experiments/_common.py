@@ -1,5 +1,6 @@
 """What the experiments share: checks of settings, results on disk, tables, measured time."""
 
+import importlib.util
 import io
 import json
 import math
@@ -19,6 +20,14 @@ from drt_jax.runs.folder import Run
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 # A turn of `medians` lasts at least so many seconds.
 _TURN = 0.05
+
+
+def settings_files() -> list[tuple[pathlib.Path, str]]:
+    """The files of settings in `configs`, and the experiment of each: that of its name, or else of
+    its folder's. What lies in a folder `lenses` is none."""
+    paths = [p for p in sorted((ROOT / "configs").rglob("*.yaml")) if p.parent.name != "lenses"]
+    known = importlib.util.find_spec
+    return [(p, p.stem if known(f"experiments.{p.stem}") else p.parent.name) for p in paths]
 
 
 def require(condition: bool, message: str) -> None:

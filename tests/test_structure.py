@@ -3,8 +3,10 @@
 import ast
 import graphlib
 import pathlib
+import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
 
@@ -16,6 +18,7 @@ ROOT = PACKAGE.parent
 FLOORS = (
     "inputs",
     "numerics",
+    "compilation",
     "lens",
     "rays",
     "pupil",
@@ -30,7 +33,7 @@ FLOORS = (
 # Floors that know no ray, and but for `files` no optics formula: all that they may import of the
 # package.
 ALLOWED = {
-    "learn": {"inputs", "numerics", "image.kernel", "image.sensor"},
+    "learn": {"inputs", "numerics", "compilation", "image.kernel", "image.sensor"},
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
     "runs": {"inputs"},
@@ -52,6 +55,8 @@ ONLY = {
     "experiments": set(),
     "tests": set(),
 }
+# Where a package is installed by another name.
+NAMED = {"skimage": "scikit-image", "PIL": "pillow", "yaml": "pyyaml"}
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
     for path in sorted(PACKAGE.rglob("*.py"))
@@ -106,6 +111,15 @@ def test_the_library_is_silent_and_changes_no_global_setting(name):
     calls = [n.func for n in ast.walk(ast.parse(MODULES[name].read_text())) if type(n) is ast.Call]
     for call in map(ast.unparse, calls):
         assert call != "print" and not call.endswith("config.update")
+
+
+def test_what_is_imported_is_declared():
+    """The packages of pyproject.toml are those that the package imports, and one of experiments."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {re.split("[<>=]", line)[0] for line in project["dependencies"]}
+    outside = set().union(*(imports(path)[1] for path in MODULES.values()))
+    named = {NAMED.get(name, name) for name in outside - sys.stdlib_module_names}
+    assert named == declared - {"tqdm"}
 
 
 def test_importing_the_package_draws_nothing_in():

@@ -15,8 +15,6 @@ from jax import Array
 
 from ..numerics import run_if, safe_divide
 
-# XLA's newer fusions of CPUs take twice as long to compile what is large and runs no faster.
-COMPILE = {"xla_cpu_use_fusion_emitters": False}
 _DAMPING, _MOST_DAMPING = 1e-3, 1e16
 _PARTS = (1.0, 0.5, 0.25, 0.1, 0.03)
 _HOLDS = 5  # how often what is held at a bound, and which limits count, is asked in one step

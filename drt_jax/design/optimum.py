@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..numerics import concrete
 from ..rays.solve import solve_aimed
-from .least_squares import COMPILE, BoundedLM, LMState
+from .least_squares import BoundedLM, LMState
 from .problem import Judged, Problem
 
 # A merit has settled when less than `_COARSE` of it is to be gained, while limits are still to be
@@ -130,7 +131,7 @@ class Optimum(NamedTuple):
 
 
 _begin = jax.jit(begin)
-_turn = jax.jit(turn, compiler_options=COMPILE)
+_turn = jit(turn, LARGE)
 
 
 def quick(problem: Problem) -> Problem:

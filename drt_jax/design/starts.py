@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from scipy.stats import qmc
 
-from .least_squares import COMPILE
+from ..compilation import LARGE, jit
 from .optimum import Search, begin, quick, turn
 from .problem import Problem
 from .variables import Variables
@@ -84,7 +84,7 @@ class Starts(NamedTuple):
 _begin = jax.jit(jax.vmap(begin, (None, 0)))
 
 
-@partial(jax.jit, compiler_options=COMPILE)
+@partial(jit, wanted=LARGE)
 def _advance(problem: Problem, searches: Search, turns: Array) -> Search:
     """So many turns of a tile of searches, fewer if all are done."""
     both = jax.vmap(turn, (None, 0))

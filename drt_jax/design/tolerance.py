@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import LARGE, ONCE, jit
 from ..lens.lens import Lens
 from ..numerics import concrete, safe_divide
 from ..rays.solve import solve, solve_aimed
 from ..rays.status import Status
-from .least_squares import COMPILE
 from .perturbed import Perturbed
 from .problem import Problem
 from .seen import EXTRAS, Seen, symmetry_by_structure
@@ -191,8 +191,7 @@ def _predict_all(problem: Problem, perturbed: Perturbed, compensator: Compensato
 
 
 # Second derivatives of a whole trace are large to compile and run once.
-_LARGE = {**COMPILE, "xla_backend_optimization_level": 0}
-_predict = jax.jit(_predict_all, static_argnums=2, compiler_options=_LARGE)
+_predict = jit(_predict_all, ONCE, static_argnums=2)
 
 
 def _parts(perturbed: Perturbed) -> list[list[int]]:
@@ -324,4 +323,4 @@ def _many_of(problem: Problem, perturbed: Perturbed, off: Array, compensator: Co
     return jax.vmap(lambda one: _compensated(problem, perturbed.lens_of(one), compensator)[0])(off)
 
 
-_many = jax.jit(_many_of, static_argnums=3, compiler_options=COMPILE)
+_many = jit(_many_of, LARGE, static_argnums=3)

@@ -11,6 +11,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from skimage import metrics
 
+from ..compilation import NETWORK, known_options
 from ..image.kernel import Form, gaussian_psf
 from ..image.sensor import Convolve, convolve, sensor_layer
 from ..numerics import safe_divide, safe_sqrt
@@ -83,19 +84,6 @@ def make_imager(
     return imager
 
 
-def compiler_options() -> dict[str, str] | None:
-    """XLA options for a training step: on a CPU, a choice of passes with which a RED-Net step takes
-    a tenth less time (see docs/performance.md). Set for each compilation, never globally."""
-    if jax.default_backend() != "cpu":
-        return None
-    options = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_FAST_COMPILE"}
-    try:  # a release of jaxlib may not know it
-        jax.jit(lambda x: x + 1, compiler_options=options).lower(0.0).compile()
-    except Exception:
-        return None
-    return options
-
-
 def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:
     """((value, extras), gradient) of a loss.
 
@@ -160,7 +148,7 @@ def make_step(
 
     if vectorised:
         step = jax.vmap(step, in_axes=(0, None, None, None))
-    return init, jax.jit(step, donate_argnums=0, compiler_options=compiler_options())
+    return init, jax.jit(step, donate_argnums=0, compiler_options=known_options(NETWORK))
 
 
 def fit(

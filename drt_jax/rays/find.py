@@ -148,8 +148,7 @@ def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
 def find_aimed(system: System, target: Vector) -> Found:
     """The rays that aiming alone brings through their stop points to rounding, see `aim_outwards`;
     all others are UNCONVERGED, whether there is such a ray or not. A third of the program that
-    `find` is,
-    and a tenth of its time where rays fail."""
+    `find` is, and a tenth of its time where rays fail."""
     aimed = aim_outwards(system, target)
     hits, status = _verdict(system, aimed.launch, aimed.status)
     hits, crossing = apart(system, hits)

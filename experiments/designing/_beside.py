@@ -19,8 +19,8 @@ from jax import Array
 
 import drt_jax
 from drt_jax import design
+from drt_jax.compilation import LARGE, jit
 from drt_jax.design.gaps import between
-from drt_jax.design.least_squares import COMPILE
 from drt_jax.runs.folder import Run
 
 from . import _common, _optiland
@@ -159,7 +159,7 @@ def _squares(vector: Array, problem: design.Problem) -> Array:
     return jnp.concatenate([found.residuals, jnp.maximum(jnp.append(found.excess, beyond), 0)])
 
 
-@functools.partial(jax.jit, static_argnames="most", compiler_options=COMPILE)
+@functools.partial(jit, wanted=LARGE, static_argnames="most")
 def _marquardt(
     problem: design.Problem, vector: Array, trials: Array, most: int
 ) -> tuple[Array, Array, Array]:
@@ -198,7 +198,7 @@ def _marquardt(
     return vector, merits, count
 
 
-@functools.partial(jax.jit, static_argnames="most", compiler_options=COMPILE)
+@functools.partial(jit, wanted=LARGE, static_argnames="most")
 def _adam(
     problem: design.Problem, vector: Array, steps: Array, most: int, rate: float
 ) -> tuple[Array, Array]:
@@ -229,7 +229,7 @@ def _timed(run: Callable[[Array], Any], steps: int) -> tuple[Any, float, float]:
     return found, time.perf_counter() - compiled, compiled - begun
 
 
-_judge = jax.jit(lambda problem, vector: problem.judge(vector), compiler_options=COMPILE)
+_judge = jit(lambda problem, vector: problem.judge(vector), LARGE)
 
 
 def judged(problem: design.Problem, vector: Array) -> tuple[float, float]:

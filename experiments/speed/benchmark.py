@@ -25,6 +25,7 @@ from jax import Array
 
 import drt_jax
 from drt_jax import Lens, Status, pupil, show
+from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
 from drt_jax.runs.folder import Run
 
@@ -199,7 +200,7 @@ def network_task(config: Config) -> list[Row]:
         return value, back(truth)
 
     key = jax.random.key(config.seed)
-    front = jax.jit(front, compiler_options=train.compiler_options())
+    front = jax.jit(front, compiler_options=known_options(NETWORK))
     rest, _ = compiled(front, values, jnp.asarray(scenes), np.float32(0.01), key)
 
     def torch():

@@ -15,7 +15,7 @@ from drt_jax import Lens, Status
 from drt_jax.inputs import InputError, shown
 from drt_jax.runs import config as configs
 
-from ._common import ROOT
+from ._common import settings_files
 from ._mutants import mutated
 from ._outcomes import Tally, judged
 
@@ -76,12 +76,13 @@ def traced(lenses: list[Lens]) -> dict[str, Any]:
 def settings(count: int, rng: np.random.Generator) -> dict[str, Any]:
     """A row of spoilt settings of all experiments, half of them by --set: what is taken can be
     written and read back."""
-    kinds = _settings_of()
+    kinds = settings_files()
     tally = Tally("settings")
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "config.yaml"
         for k in tqdm(range(count), unit="config", leave=False, dynamic_ncols=True):
-            source, kind = kinds[rng.integers(len(kinds))]
+            source, name = kinds[rng.integers(len(kinds))]
+            kind = importlib.import_module(f"experiments.{name}").Config
             content, overrides = mutated(source.read_text(), rng), list[str]()
             if k % 2:
                 lines = [line for line in content.decode("utf-8", "replace").splitlines() if line]
@@ -96,9 +97,3 @@ def settings(count: int, rng: np.random.Generator) -> dict[str, Any]:
 
             tally.add((found := judged(load))[0], (found[1], overrides or content[:500]))
     return tally.row
-
-
-def _settings_of() -> list[tuple[pathlib.Path, type]]:
-    """The files of settings of the experiments, and what they are read into."""
-    paths = sorted((ROOT / "configs").rglob("*.yaml"))
-    return [(p, importlib.import_module(f"experiments.{p.stem}").Config) for p in paths]

@@ -9,6 +9,7 @@ import numpy as np
 
 import drt_jax
 from drt_jax import Gauss, Status
+from drt_jax.compilation import LARGE, jit
 from drt_jax.lens.elements import rotation_matrix
 from drt_jax.lens.forms import Shape
 from drt_jax.lens.surface import sag_derivatives
@@ -29,15 +30,15 @@ _STOP_MISS = 1e-9  # mm
 
 # Few scenes, many programs: what takes long is to compile them.
 _QUICK = {
+    **LARGE,
     "xla_backend_optimization_level": 1,
     "xla_llvm_disable_expensive_passes": True,
-    "xla_cpu_use_fusion_emitters": False,
 }
 
 
 def _over_scenes(function: Callable) -> Callable:
     """A function of one scene over any number, in batches of one size; NumPy arrays."""
-    program = jax.jit(jax.vmap(function), compiler_options=_QUICK)
+    program = jit(jax.vmap(function), _QUICK)
 
     def run(*arguments):
         count, parts = len(jax.tree.leaves(arguments)[0]), []

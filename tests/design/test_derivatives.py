@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from drt_jax import Clipped, Gauss, design, load_lens
+from drt_jax.compilation import LARGE, jit
 from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary
-from drt_jax.design.least_squares import COMPILE
 
 from .test_operands import COLOURS, model
 
@@ -63,8 +63,8 @@ def test_every_derivative_by_every_kind_of_variable(crooked):
         told = {kind: Operand(kind).values(seen) for kind in kinds}
         return told | {"failures": jnp.ravel(seen.failures)}, seen.rays.bundle.status
 
-    value = jax.jit(lambda x: flat(x)[0], compiler_options=COMPILE)
-    both = jax.jit(jax.jacfwd(flat, has_aux=True), compiler_options=COMPILE)
+    value = jit(lambda x: flat(x)[0], LARGE)
+    both = jit(jax.jacfwd(flat, has_aux=True), LARGE)
     jacobian, status = both(x)
     status = np.asarray(status)[..., 4:]
     clipped, failed = status == 3, (status != 0) & (status != 3)
@@ -74,7 +74,7 @@ def test_every_derivative_by_every_kind_of_variable(crooked):
     rng = np.random.default_rng(0)
     weights = {k: jnp.asarray(rng.normal(size=len(a))) for k, a in jacobian.items()}
     total = lambda x: sum(weights[k] @ a for k, a in flat(x)[0].items())  # noqa: E731
-    gradient = jax.jit(jax.grad(total), compiler_options=COMPILE)(x)
+    gradient = jit(jax.grad(total), LARGE)(x)
     wanted = sum(weights[k] @ j for k, j in jacobian.items())
     np.testing.assert_allclose(gradient, wanted, rtol=1e-8, atol=1e-9 * np.max(np.abs(wanted)))
 
@@ -94,8 +94,8 @@ def test_derivatives_of_a_fitted_pupil():
         return {kind: Operand(kind).values(seen) for kind in kinds}
 
     x = problem.variables.start
-    value = jax.jit(values, compiler_options=COMPILE)
-    jacobian = jax.jit(jax.jacfwd(values), compiler_options=COMPILE)(x)
+    value = jit(values, LARGE)
+    jacobian = jit(jax.jacfwd(values), LARGE)(x)
     # The derivatives are those of the light; the rule's own error moves by less than this.
     assert_derivatives(value, jacobian, x, 1e-4, floor=1.0)
 
@@ -114,10 +114,10 @@ def test_rays_that_fail_have_a_smooth_merit(strong):
     problem, x = strong
     whole = jax.jit(lambda x: problem.seen(problem.variables.lens_of(x)).rays.whole)(x)
     assert 0.02 < 1 - np.mean(whole) < 0.5
-    both = jax.jit(jax.value_and_grad(problem.merit), compiler_options=COMPILE)
+    both = jit(jax.value_and_grad(problem.merit), LARGE)
     merit, gradient = both(x)
     assert 0 < merit < np.inf and np.all(np.isfinite(gradient))
-    found = jax.jit(jax.jacfwd(problem.merit), compiler_options=COMPILE)(x)
+    found = jit(jax.jacfwd(problem.merit), LARGE)(x)
     np.testing.assert_allclose(found, gradient, rtol=1e-8, atol=1e-9 * np.max(np.abs(gradient)))
     best = np.inf
     for h in (1e-2, 1e-3, 1e-4, 1e-5):
@@ -139,7 +139,7 @@ def test_a_few_steps_bring_all_rays_through(strong):
 def test_random_lenses_are_never_nan(strong):
     """However many rays fail, merit and gradients are numbers."""
     problem, x = strong
-    both = jax.jit(jax.vmap(jax.value_and_grad(problem.merit)), compiler_options=COMPILE)
+    both = jit(jax.vmap(jax.value_and_grad(problem.merit)), LARGE)
     rng = np.random.default_rng(0)
     sizes = 10 ** rng.uniform(-1, 1.5, (64, 1))
     merits, gradients = both(x[None] + sizes * rng.normal(size=(64, len(x))))

@@ -10,9 +10,9 @@ import pytest
 
 import drt_jax
 from drt_jax import Clipped, Gauss, design, load_lens
+from drt_jax.compilation import LARGE, jit
 from drt_jax.design import OPERANDS, Operand, Problem, Solve, Variables, values
 from drt_jax.design.kinds import KINDS
-from drt_jax.design.least_squares import COMPILE
 
 from .test_variables import MODEL
 
@@ -28,7 +28,7 @@ def program(problem, kinds):
         seen = problem.seen(problem.variables.lens_of(vector))
         return {kind: Operand(kind).values(seen) for kind in kinds}
 
-    return jax.jit(values, compiler_options=COMPILE)
+    return jit(values, LARGE)
 
 
 @pytest.fixture(scope="module")

@@ -21,10 +21,7 @@ from drt_jax.runs.folder import Run, begun
 from experiments import _command, _common, tables
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-DESIGNS = sorted((ROOT / "configs" / "design").glob("*.yaml"))
-CONFIGS = sorted(
-    {*(ROOT / "configs").rglob("*.yaml")} - {*(ROOT / "configs").rglob("lenses/*.yaml")}
-)
+CONFIGS = dict(_common.settings_files())
 SMALL = [
     "train.batch=2",
     "train.patch=16",
@@ -86,7 +83,7 @@ def unbroken(tmp_path_factory):
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_config_loads_strictly(path):
-    name = "design" if path in DESIGNS else path.stem
+    name = CONFIGS[path]
     seed = "starts.seed" if name == "design" else "seed"
     kind = importlib.import_module(f"experiments.{name}").Config
     assert load_config(kind, path) != load_config(kind, path, [f"{seed}=99"])

@@ -1,0 +1,55 @@
+"""Options of XLA for programs that are slow to compile, each where the backend at hand knows it.
+
+XLA refuses an option that its release does not know, and drops old ones, as jaxlib 0.12 did with
+`xla_cpu_use_fusion_emitters`. So each is tried once, on a trivial program, when it is needed.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .numerics import concrete
+
+# XLA's newer fusions of CPUs take twice as long to compile what is large and runs no faster.
+LARGE = {"xla_cpu_use_fusion_emitters": False}
+# For what is large to compile and runs once.
+ONCE = {**LARGE, "xla_backend_optimization_level": 0}
+# A choice of passes with which a RED-Net step takes a tenth less time (docs/performance.md).
+NETWORK = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_FAST_COMPILE"}
+
+
+def known_options(wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the options, as `jax.jit(compiler_options=...)` takes them, that the default backend
+    knows; none unless it is a CPU, on which alone they were measured. Starts the backend."""
+    if jax.default_backend() != "cpu":
+        return {}
+    return {name: value for name, value in wanted.items() if _known(name, value)}
+
+
+@functools.cache
+def _known(name: str, value: Any) -> bool:
+    try:
+        jax.jit(lambda x: x + 1, compiler_options={name: value}).lower(0.0).compile()
+    except RuntimeError:  # INVALID_ARGUMENT: no such option, or no such value
+        return False
+    return True
+
+
+def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
+    """`jax.jit(function, **keywords)` with the options that the backend knows, asked at the first
+    call. Without any inside of another program or of a derivative, where JAX takes none."""
+
+    @functools.cache
+    def program(outside: bool) -> Callable:
+        options = known_options(wanted) if outside else None
+        return jax.jit(function, compiler_options=options, **keywords)
+
+    @functools.wraps(function)
+    def run(*args: Any, **named: Any) -> Any:
+        # Inside `jax.jit` a new array is a tracer, too.
+        return program(concrete((args, named, jnp.zeros(()))))(*args, **named)
+
+    return run
