@@ -24,7 +24,7 @@ from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
 from .lost import check_order, crossed, reasons
-from .moments import FocusMoments, Moments, moments, weigh
+from .moments import FocusMoments, Moments, check_sensor, weigh
 
 _MAX_ORDER = 40
 # A spot below 1 nm is a point: relative to it, rounding would never converge.
@@ -76,8 +76,10 @@ def focus_moments(
     `FocusMoments`. The sensor is flat.
 
     Arguments as of `psf_moments`; the tolerance holds at any sensor position, and a rule for it
-    comes from `converged_focus_rule`.
+    comes from `converged_focus_rule`. ValueError for an element that turns surfaces about the
+    sensor.
     """
+    check_sensor(lens)
     return _moments(lens, field, distance, wavelengths, tolerance, rule, best_focus)
 
 
@@ -107,7 +109,8 @@ def converged_focus_rule(
     tolerance: float = 1e-6,
 ) -> PupilRule:
     """`converged_rule` for any sensor position: where the spot is smallest, it may be far smaller
-    than on the sensor, and the tolerance is relative to it."""
+    than on the sensor, and the tolerance is relative to it. ValueError as of `focus_moments`."""
+    check_sensor(lens)
     return _converge(lens, field, distance, wavelengths, tolerance, best_focus).rule
 
 
@@ -165,7 +168,9 @@ def _weigh(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> tuple:
 @jax.jit
 def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> FocusMoments:
     """The moments of rays that are known, with their derivatives: nothing is searched for."""
-    return moments(lens, scene, rule, partial(reattach, found))
+    points, weights = rule.points(lens, scene)
+    bundle = trace_bundle(lens, scene, points, partial(reattach, found))
+    return weigh(lens, rule, weights, bundle)
 
 
 class _Trial(NamedTuple):

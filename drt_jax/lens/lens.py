@@ -116,6 +116,21 @@ class Lens:
         return point[:, 2], point[:, :2], turned
 
     @property
+    def sensor_motion(self) -> Array | None:
+        """How the vertex of the sensor moves with `sensor`, (3,) along the sensor's own axes, in mm
+        a mm; None for (0, 0, 1), where nothing turns it."""
+        rotation = self.places[2]
+        if rotation is None:
+            return None
+
+        def vertex(sensor: Array) -> Array:
+            z, across, _ = dataclasses.replace(self, sensor=sensor).places
+            across = jnp.zeros((len(z), 2), z.dtype) if across is None else across
+            return jnp.append(across[-1], z[-1])
+
+        return jax.jvp(vertex, (self.sensor,), (jnp.ones_like(self.sensor),))[1] @ rotation[-1]
+
+    @property
     def shape(self) -> Shape:
         """Curvature (S + 1,), conic (S + 1,) and coefficients (K, S + 1)."""
         return Shape(self.curvature, self.conic, self.coefficients.T)
