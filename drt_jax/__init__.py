@@ -42,6 +42,7 @@ from .lens.paraxial import (
     FirstOrder as FirstOrder,
     Pupil as Pupil,
     back_focal_distance as back_focal_distance,
+    effective_focal_length as effective_focal_length,
     entrance_pupil as entrance_pupil,
     exit_pupil as exit_pupil,
     f_number as f_number,
