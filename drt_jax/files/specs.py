@@ -1,5 +1,6 @@
 """Prescriptions: a lens built from a mapping, its entries checked before anything is traced."""
 
+import dataclasses
 import math
 import warnings
 
@@ -140,6 +141,9 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         mirrors=tuple(surface.flag("mirror") for surface in surfaces),
         name=top.text("name", name[:100]),
     )
+    bent = (surface.curvature() or any(row) for surface, row in zip(surfaces, coefficients))
+    curved = tuple(i for i, does in enumerate(bent) if does and i not in lens.live)
+    lens = dataclasses.replace(lens, curved=curved)
     check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
     if "focal_length" in top:
         _check_focal_length(lens, top.number("focal_length"))

@@ -202,8 +202,8 @@ def _forbes(count: int) -> np.ndarray:
 def qbfs(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Conic and Forbes' polynomials Q_m along its normal, whose slopes are orthonormal on a sphere.
 
-    z = ... + u^2 (1 - u^2) sqrt(1 - k c^2 r^2) / sqrt(1 - (1 + k) c^2 r^2) sum_m a_(m + 1) Q_m(u^2),
-    u = r / a_0, in mm; the roots are 1 / cosine of the conic's slope. Summed by Clenshaw's
+    z = ... + u^2 (1 - u^2) s sum_m a_(m + 1) Q_m(u^2), u = r / a_0, a_0 in mm, and s, 1 / cosine of
+    the conic's slope, sqrt(1 - k c^2 r^2) / sqrt(1 - (1 + k) c^2 r^2). Summed by Clenshaw's
     recurrence in P_0 = 2, P_1 = 6 - 8 x, P_(m + 1) = (2 - 4 x) P_m - P_(m - 1), which has no large
     terms. Source: Forbes, Opt. Express 15, 5218 (2007) and 18, 19700 (2010), as in Zemax.
     """

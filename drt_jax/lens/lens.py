@@ -49,6 +49,9 @@ class Lens:
     glasses: the names of the S + 1 media.
     forms: a name in `forms.FORMS` for each of the S + 1 rows (empty: all aspheres).
     mirrors: whether each of the S surfaces reflects (empty: none does).
+    curved: rows that bend no light but may be curved, S for the sensor; all others are planes of
+        which derivatives by curvature, conic and coefficients are 0. `load_lens` names those that a
+        prescription curves.
     name: of the lens.
     """
 
@@ -68,6 +71,7 @@ class Lens:
     glasses: tuple[str, ...] = dataclasses.field(metadata={"static": True}, kw_only=True)
     forms: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
     mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True}, default=())
+    curved: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
     name: str = dataclasses.field(metadata={"static": True}, default="")
 
     def __post_init__(self) -> None:
@@ -200,6 +204,8 @@ class Lens:
         for name, values in of_each:
             if len(values) != rows:
                 raise ValueError(f"lens.{name}: expected {rows} rows, got {len(values)}")
+        if not {*self.curved} <= {*range(rows)}:
+            raise ValueError(f"lens.curved: expected rows 0 to {rows - 1}, got {self.curved}")
         if not 0 <= self.stop < self.count:
             raise ValueError(f"lens.stop: expected 0 to {self.count - 1}, got {self.stop}")
 

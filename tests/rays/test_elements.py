@@ -145,11 +145,13 @@ def test_the_chief_ray_of_a_grating_spectrometer_goes_where_another_program_foun
     assert abs(sensor[0] - sensor[2]) > 20  # mm between 450 and 650 nm
 
 
-# How elements may hold the sensor: alone, as the tilt of it; about another surface and a pivot; with
-# a surface, tilted itself; about itself, within an element about something else.
+# How elements may hold the sensor: alone, as the tilt of it; about another surface and a pivot;
+# with a surface, tilted itself; about itself, within an element about something else.
 HELD = {
     "alone": [{"surfaces": ["sensor", "sensor"], "tilt": [10.0, 0, 0]}],
-    "about a surface": [{"surfaces": ["sensor", "sensor"], "about": 1} | MOVE | {"tilt": [9, -6, 3]}],
+    "about a surface": [
+        {"surfaces": ["sensor", "sensor"], "about": 1} | MOVE | {"tilt": [9, -6, 3]}
+    ],
     "with a surface": [
         {"surfaces": [4, "sensor"]} | MOVE | {"tilt": [4, 5, 0]},
         {"surfaces": ["sensor", "sensor"], "about": "sensor", "pivot": 3.0, "tilt": [3, -7, 0]},
@@ -162,7 +164,9 @@ def test_a_held_sensor_moves_as_its_elements_turn_it(name):
     """The polynomials in the sensor position, beside the lens with its sensor really moved."""
     lens = lens_with(*HELD[name])
     if name == "with a surface":
-        lens = dataclasses.replace(lens, tilt=jnp.zeros((6, 3)).at[-1].set(jnp.array([0.1, 0.2, 1])))
+        lens = dataclasses.replace(
+            lens, tilt=jnp.zeros((6, 3)).at[-1].set(jnp.array([0.1, 0.2, 1]))
+        )
 
     def focus(sensor):
         moved = dataclasses.replace(lens, sensor=jnp.asarray(sensor))
@@ -177,7 +181,9 @@ def test_a_held_sensor_moves_as_its_elements_turn_it(name):
 def test_a_sensor_turned_by_an_element_is_one_that_is_tilted():
     lens = lens_with(*HELD["alone"])
     tilted = load_lens({"surfaces": SURFACES, "sensor_tilt": [10.0, 0, 0]})
-    ours, theirs = (focus_moments(a, 0.06, INF, 0.55, rule=Gauss(4, "disc")) for a in (lens, tilted))
+    ours, theirs = (
+        focus_moments(a, 0.06, INF, 0.55, rule=Gauss(4, "disc")) for a in (lens, tilted)
+    )
     np.testing.assert_allclose(ours.slope, theirs.slope, atol=1e-14)
     np.testing.assert_allclose(ours.spread, theirs.spread, rtol=1e-11, atol=1e-15)
     np.testing.assert_allclose(
