@@ -36,12 +36,14 @@ from .learn.adam import adam as adam, apply_updates as apply_updates
 from .learn.network import red_net as red_net
 from .lens.aperture import Apertures as Apertures
 from .lens.elements import Elements as Elements
+from .lens.entrance import with_paraxial_pupil as with_paraxial_pupil
 from .lens.glass import find_glass as find_glass, refractive_index as refractive_index
 from .lens.lens import Lens as Lens, sag as sag
 from .lens.paraxial import (
     FirstOrder as FirstOrder,
     Pupil as Pupil,
     back_focal_distance as back_focal_distance,
+    effective_focal_length as effective_focal_length,
     entrance_pupil as entrance_pupil,
     exit_pupil as exit_pupil,
     f_number as f_number,

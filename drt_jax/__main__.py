@@ -47,7 +47,9 @@ def first_lines(lens: Lens, distance: float, wavelength: float) -> Iterator[str]
     image, sensor = found.image_distance, float(lens.sensor)
     yield f"{lens.name}: {lens.count} surfaces, the stop is number {lens.stop}"
     yield f"  wavelength           {wavelength:g} um"
-    yield f"  focal length         {found.focal_length:.6g} mm, f/{found.f_number:.4g}"
+    air = found.effective_focal_length
+    air = "" if math.isclose(air, abs(found.focal_length)) else f" ({air:.6g} mm in air)"
+    yield f"  focal length         {found.focal_length:.6g} mm{air}, f/{found.f_number:.4g}"
     yield f"  back focal distance  {found.back_focal_distance:.6g} mm"
     for name, image_of in (("entrance", found.entrance_pupil), ("exit    ", found.exit_pupil)):
         width = 2 * image_of.semi_diameter

@@ -1,6 +1,7 @@
 """Rays searched for by one program and known to all others: a program that only differentiates
 rays need not hold the search for them, which is most of what there is to compile."""
 
+import dataclasses
 import functools
 
 import jax
@@ -9,6 +10,11 @@ import jax.numpy as jnp
 from drt_jax.rays.find import find_many
 from drt_jax.rays.solve import reattach
 from drt_jax.rays.system import system_of
+
+
+def bendable(lens):
+    """The lens, every row of which may be curved: derivatives by all shapes."""
+    return dataclasses.replace(lens, curved=tuple(range(lens.count + 1)))
 
 
 def aims(lens, scene, points):

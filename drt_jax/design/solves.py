@@ -23,7 +23,13 @@ from .seen import symmetry_by_structure
 
 # In the order in which they are applied: none moves what one before it keeps, see `held`.
 _Name = Literal[
-    "focal_length", "entrance_pupil", "f_number", "image_angle", "paraxial_focus", "best_focus"
+    "focal_length",
+    "effective_focal_length",
+    "entrance_pupil",
+    "f_number",
+    "image_angle",
+    "paraxial_focus",
+    "best_focus",
 ]
 # Newton steps: every condition is linear in the number that meets it, the second mends rounding.
 _STEPS = 2
@@ -37,8 +43,9 @@ _NO_SURFACE = 5000  # prescriptions have at most so many, settings no negative n
 class Solve:
     """A condition and the number that is given up for it.
 
-    kind: "focal_length" in mm, or "image_angle", the paraxial slope of the marginal ray behind the
-        lens, negative where light converges: the curvature of `surface` follows. "paraxial_focus",
+    kind: "focal_length" in image space or "effective_focal_length" in air, in mm, or "image_angle",
+        the paraxial slope of the marginal ray behind the lens, negative where light converges: the
+        curvature of `surface` follows. "paraxial_focus",
         or "best_focus" where the spots of `fields`, each colour about its own centroid, are
         smallest (the root of their mean square): the distance of the sensor behind the last vertex
         follows. "entrance_pupil", its diameter in mm, or "f_number", the working one: the
@@ -191,9 +198,10 @@ class _Condition(NamedTuple):
 
 
 def _power(lens: Lens, solve: Solve) -> Array:
-    """1 / focal length."""
-    ray = trace_ray(paraxial_system(lens, np.array(solve.wavelengths)), 1.0, 0.0)
-    return -jnp.mean(ray.behind[-1])
+    """1 / focal length, in image space or in air."""
+    system = paraxial_system(lens, np.array(solve.wavelengths))
+    slope = trace_ray(system, 1.0, 0.0).behind[-1]
+    return -jnp.mean(slope if solve.kind == "focal_length" else system.index[-1] * slope)
 
 
 def _slope(lens: Lens, solve: Solve) -> Array:
@@ -219,6 +227,7 @@ def _itself(value: float) -> float:
 
 _CONDITIONS = {
     "focal_length": _Condition(_power, _inverse),
+    "effective_focal_length": _Condition(_power, _inverse),
     "image_angle": _Condition(_slope, _itself),
     "entrance_pupil": _Condition(_pupil, _itself),
     "f_number": _Condition(lambda lens, solve: 2 * jnp.abs(_slope(lens, solve)), _inverse),

@@ -80,8 +80,10 @@ def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tupl
     squares add up to those of the RMS radii, mm."""
     seen = problem.seen(lens)
     apart, growth, (x, y) = _spots(seen)
-    # The sensor moves by d + a y + b x where a spot is.
-    levers = jnp.stack([jnp.ones_like(x), y, x])[: _STEPS[compensator]]
+    # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
+    motion = lens.sensor_motion
+    normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
+    levers = jnp.stack([normal, y, x])[: _STEPS[compensator]]
     moves = jnp.zeros(0, x.dtype)
     if len(levers):
         square = jnp.sum(growth**2, axis=(0, 2))

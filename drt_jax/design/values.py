@@ -26,8 +26,12 @@ of chief rays, through the middle of the stop
         colour, mm; x, too, where the pupil rule is one of the whole disc
     chief_ray_angle [distance, field, colour]: with the normal of the sensor's vertex, from 0
 
+    numerical_aperture [distance, field, colour: middle]: index times sine of the angle between the
+        chief ray and those through the rim of the stop, root of the mean square, at the sensor
+
 of first order
-    focal_length, back_focal_distance [colour: middle]: mm
+    focal_length, effective_focal_length, back_focal_distance [colour: middle]: mm; the first in
+        image space, n' over power, the second in air, 1 over power
     entrance_pupil [colour: middle]: its diameter, mm
     f_number, magnification [distance, colour: middle]: working f-number; image over object height
     total_track, length, back_distance: first vertex to sensor, to the last vertex, and from that to
@@ -233,6 +237,18 @@ def _chief_ray_angle(which: Which, seen: Seen) -> Array:
     return jnp.arctan2(sine, jnp.where(sine + along**2 > 0, jnp.abs(along), 1))
 
 
+def _numerical_aperture(which: Which, seen: Seen) -> Array:
+    views, colours = _views(which, seen), _middle(which, seen)
+    whole, arrival = seen.rays.whole, seen.rays.bundle.arrival
+    lines = jnp.stack([jnp.where(whole, a, 0)[views][:, colours, :EXTRAS] for a in arrival])
+    square = jnp.sum((lines[..., 1:] - lines[..., :1]) ** 2, axis=0)
+    sines = square * (1 - square / 4)
+    top, bottom, side = jnp.moveaxis(sines, -1, 0)
+    side = side if len(arrival) == 3 else top  # the meridian stands for all azimuths
+    index = seen.lens.index(seen.views.wavelengths)[-1, colours]
+    return index[None] * safe_sqrt((top + bottom + 2 * side) / 4)
+
+
 def _illumination(which: Which, seen: Seen) -> Array:
     return seen.illumination[_views(which, seen)]
 
@@ -271,6 +287,9 @@ OPERANDS: dict[str, Value] = {
     ),
     "rms_wavefront": Value(_rms_wavefront, _RAYS, per_mm=_WAVES_PER_MM),
     "focal_length": Value(_lens_alone(lambda a: a.focal_length), _COLOURS, traced=False),
+    "effective_focal_length": Value(
+        _lens_alone(lambda a: a.effective_focal_length), _COLOURS, traced=False
+    ),
     "back_focal_distance": Value(
         _lens_alone(lambda a: a.back_focal_distance), _COLOURS, traced=False
     ),
@@ -285,6 +304,7 @@ OPERANDS: dict[str, Value] = {
     "distortion": Value(_distortion, _RAYS),
     "lateral_colour": Value(_lateral_colour, _RAYS),
     "chief_ray_angle": Value(_chief_ray_angle, _RAYS),
+    "numerical_aperture": Value(_numerical_aperture, _RAYS),
     "relative_illumination": Value(_illumination, ("fields", "distances")),
     "glass_centre": _gap(True, False),
     "glass_edge": _gap(True, True),

@@ -1,15 +1,17 @@
 """Prescriptions: a lens built from a mapping, its entries checked before anything is traced."""
 
+import dataclasses
 import math
 import warnings
 
 import jax.numpy as jnp
 
 from ..inputs import shown
+from ..lens.entrance import with_paraxial_pupil
 from ..lens.forms import FORMS
 from ..lens.glass import Dispersion
 from ..lens.lens import Lens
-from ..lens.paraxial import focal_length
+from ..lens.paraxial import effective_focal_length, focal_length
 from ..lens.phase import Phase
 from .apertures import apertures_of, semi_diameter
 from .elements import elements_of
@@ -21,7 +23,7 @@ _D_LINE = 0.5875618  # um
 _MOST = 5000  # surfaces
 _TOP_KEYS = (
     *("name", "source", "focal_length", "glasses", "object", "surfaces", "elements"),
-    *("sensor", "sensor_tilt", "sensor_decentre"),
+    *("sensor", "sensor_tilt", "sensor_decentre", "pupil"),
 )
 _SURFACE_KEYS = (
     *("form", "radius", "curvature", "conic", "radius_x", "curvature_x", "conic_x"),
@@ -140,18 +142,25 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         mirrors=tuple(surface.flag("mirror") for surface in surfaces),
         name=top.text("name", name[:100]),
     )
+    bent = (surface.curvature() or any(row) for surface, row in zip(surfaces, coefficients))
+    curved = tuple(i for i, does in enumerate(bent) if does and i not in lens.live)
+    lens = dataclasses.replace(lens, curved=curved)
     check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
-    if "focal_length" in top:
-        _check_focal_length(lens, top.number("focal_length"))
-    return lens
-
-
-def _check_focal_length(lens: Lens, stated: float) -> None:
-    """Warn where the lens has another at the d line, or in the middle of what its glasses know."""
     low, high = lens.dispersion.range
-    wavelength = _D_LINE if low <= _D_LINE <= high else (low + high) / 2
+    line = _D_LINE if low <= _D_LINE <= high else (low + high) / 2
+    if "focal_length" in top:
+        _check_focal_length(lens, top.number("focal_length"), line)
+    pupil = top.text("pupil", "stop")
+    if pupil not in ("stop", "paraxial"):
+        raise top.error("pupil", f"expected stop or paraxial, got {shown(pupil)}")
+    return with_paraxial_pupil(lens, line) if pupil == "paraxial" else lens
+
+
+def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:
+    """Warn where the lens has another, in image space or in air."""
     found = float(focal_length(lens, wavelength)[0])
-    if not abs(found - stated) <= 0.02 * abs(stated):
+    air = float(effective_focal_length(lens, wavelength)[0])
+    if not min(abs(found - stated), abs(air - stated)) <= 0.02 * abs(stated):
         warnings.warn(
             f"focal_length: {stated:g} mm is stated, but it is {found:g} mm at {wavelength:g} um: "
             "look for a wrong sign, unit or glass",

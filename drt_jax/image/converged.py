@@ -4,10 +4,11 @@ What must know numbers is here. Inside `jax.jit` and `jax.vmap` the number of ra
 from values: `psf_moments` and `focus_moments` then take the rule, made outside.
 """
 
+import itertools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
 from .lost import check_order, crossed, reasons
-from .moments import FocusMoments, Moments, moments, weigh
+from .moments import FocusMoments, Moments, check_sensor, weigh
 
 _MAX_ORDER = 40
 # A spot below 1 nm is a point: relative to it, rounding would never converge.
@@ -76,8 +77,10 @@ def focus_moments(
     `FocusMoments`. The sensor is flat.
 
     Arguments as of `psf_moments`; the tolerance holds at any sensor position, and a rule for it
-    comes from `converged_focus_rule`.
+    comes from `converged_focus_rule`. ValueError for an element that turns surfaces about the
+    sensor.
     """
+    check_sensor(lens)
     return _moments(lens, field, distance, wavelengths, tolerance, rule, best_focus)
 
 
@@ -90,11 +93,15 @@ def converged_rule(
 ) -> PupilRule:
     """The rule that keeps the RMS spot size on the sensor within `tolerance` (relative).
 
-    Arguments as of `psf_moments`, all known numbers. A Gauss rule on the stop or, where rays are
-    clipped or fail, one fitted to what is left. Orders are compared on the scene itself: the first
-    whose covariance differs from those of the next two by at most `tolerance`, relative to its
-    trace, which is about twice the error in the spot size; two alone may agree by accident. Warns
-    if no order does. ValueError inside a trace, or if no ray arrives.
+    field: angle along y, or (x, y), in radians, or many pairs (F, 2). distance: mm, one or (Z,).
+    Other arguments as of `psf_moments`; all are known numbers. The one rule serves every field at
+    every distance, with the symmetry of them all.
+
+    A Gauss rule on the stop or, where rays are clipped or fail, one fitted to what is left. Orders
+    are compared on the scenes themselves: the first whose covariance differs from those of the next
+    two by at most `tolerance`, relative to its trace, which is about twice the error in the spot
+    size; two alone may agree by accident. Warns if no order does. ValueError inside a trace, or if
+    no ray arrives.
     """
     return _converge(lens, field, distance, wavelengths, tolerance, at_sensor).rule
 
@@ -107,7 +114,8 @@ def converged_focus_rule(
     tolerance: float = 1e-6,
 ) -> PupilRule:
     """`converged_rule` for any sensor position: where the spot is smallest, it may be far smaller
-    than on the sensor, and the tolerance is relative to it."""
+    than on the sensor, and the tolerance is relative to it. ValueError as of `focus_moments`."""
+    check_sensor(lens)
     return _converge(lens, field, distance, wavelengths, tolerance, best_focus).rule
 
 
@@ -136,9 +144,9 @@ def _moments(
     if rule is None:
         trial = _converge(lens, field, distance, wavelengths, tolerance, places)
         if concrete((lens, scene)):
-            return trial.moments
+            return trial.moments[0]
         # The rays are known; what is left is to weigh and to differentiate them.
-        return _weigh_known(lens, scene, trial.used, trial.found)
+        return _weigh_known(lens, scene, trial.used, trial.found[0])
     found = _weigh(lens, scene, rule, solve)[0]
     passed = known_values(found.passed)
     if passed is not None and not np.all(np.asarray(passed) > 0):
@@ -165,17 +173,19 @@ def _weigh(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> tuple:
 @jax.jit
 def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> FocusMoments:
     """The moments of rays that are known, with their derivatives: nothing is searched for."""
-    return moments(lens, scene, rule, partial(reattach, found))
+    points, weights = rule.points(lens, scene)
+    bundle = trace_bundle(lens, scene, points, partial(reattach, found))
+    return weigh(lens, rule, weights, bundle)
 
 
 class _Trial(NamedTuple):
     """rule: that meets the tolerance. used: the same as it was evaluated. moments, found: its
-    moments and its rays."""
+    moments and its rays, of each scene."""
 
     rule: PupilRule
     used: PupilRule
-    moments: FocusMoments
-    found: Found
+    moments: tuple[FocusMoments, ...]
+    found: tuple[Found, ...]
 
 
 def _converge(
@@ -199,12 +209,18 @@ def _converge(
     # Outside of any trace, also where this is called inside one: what follows is all known.
     with jax.core.eval_context():
         lens, field, distance, wavelengths = known
-        scene = scene_of(lens, field, distance, wavelengths)
-        return _try_orders(lens, scene, symmetry_of(lens, field), tolerance, places)
+        pairs = itertools.product(_each(field, 2), _each(distance, 1))
+        scenes = [scene_of(lens, one, far, wavelengths) for one, far in pairs]
+        return _try_orders(lens, scenes, symmetry_of(lens, field), tolerance, places)
+
+
+def _each(values: Any, rank: int) -> Any:
+    """The rows of an array of a rank; one row for any other."""
+    return values if np.ndim(values) == rank and np.size(values) else [values]
 
 
 def _try_orders(
-    lens: Lens, scene: Scene, symmetry: Symmetry, tolerance: float, places: Callable
+    lens: Lens, scenes: Sequence[Scene], symmetry: Symmetry, tolerance: float, places: Callable
 ) -> _Trial:
     trials: list[_Trial] = []
     # A rule on the whole stop may step over an obscuration.
@@ -213,8 +229,9 @@ def _try_orders(
     while True:
         rule = Clipped(order, symmetry) if clipped else Gauss(order, symmetry)
         used = Clipped(order, symmetry, _size(order)) if clipped else _padded(order, symmetry)
-        found, rays, failing, cut = _weigh(lens, scene, used, solver)
-        sought = solver is solve
+        parts = (_weigh(lens, scene, used, solver) for scene in scenes)
+        found, rays, failed, cuts = zip(*parts, strict=True)
+        failing, cut, sought = any(failed), any(cuts), solver is solve
         if failing and sought:
             check_order(lens)
         if not clipped and (cut or (failing and sought)):
@@ -223,14 +240,19 @@ def _try_orders(
         if failing and not sought:  # some rays must be
             solver = solve
             continue
-        if not np.all(np.asarray(found.passed) > 0):
-            _say_why(lens, scene, symmetry, found.passed)
+        for scene, of_scene in zip(scenes, found, strict=True):
+            if not np.all(np.asarray(of_scene.passed) > 0):
+                _say_why(lens, scene, symmetry, of_scene.passed)
         trials = [*trials, _Trial(rule, used, found, rays)][-3:]
         change = max(
-            (_change(later.moments, trials[0].moments, places) for later in trials[1:]),
+            (
+                _change(*both, places)
+                for later in trials[1:]
+                for both in zip(later.moments, trials[0].moments, strict=True)
+            ),
             default=np.inf,
         )
-        rough = _rounding(lens, found)
+        rough = max(_rounding(lens, of_scene) for of_scene in found)
         if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
             _warn_of_rounding(lens, rough, tolerance)
             # Where rounding hides how far they are apart, the last is right to it.

@@ -17,8 +17,6 @@ from jax.typing import ArrayLike
 from ..lens.lens import Lens
 from ..lens.scene import distance_array, scene_of, vergence_of
 from ..numerics import concrete
-from ..pupil.clipped import Clipped
-from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
 from .moments import FocusMoments, moments
@@ -140,11 +138,8 @@ def moments_model(
             return *moments.at(values.get("sensor", lens.sensor)), moments.passed
 
         return values, from_plane
-    rules = [
-        converged_focus_rule(lens, field, distance, wavelengths, tolerance)
-        for distance in {near, far}
-    ]
-    rule = max(rules, key=_cost)
+    ends = np.unique([near, far])
+    rule = converged_focus_rule(lens, field, ends, wavelengths, tolerance)
 
     def retrace(values, distance):
         moved = dataclasses.replace(lens, **values)
@@ -153,8 +148,3 @@ def moments_model(
         return *found.at(moved.sensor), found.passed
 
     return values, retrace
-
-
-def _cost(rule: PupilRule) -> tuple[bool, int]:
-    """Of two rules that were found for one lens, the greater serves both scenes."""
-    return isinstance(rule, Clipped), rule.order if isinstance(rule, Gauss | Clipped) else 0

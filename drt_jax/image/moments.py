@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from ..lens.elements import rotation_matrix
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import safe_divide
@@ -106,10 +105,25 @@ def moments(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver = solve) -
     """Moments of the rays of a rule as functions of the sensor position, about `lens.sensor`.
 
     Weights are normalised over the light that arrives. Differentiable in everything but the
-    status of rays, in the modes of the `solver`. Paper section 4.3.
+    status of rays, in the modes of the `solver`. Paper section 4.3. ValueError as of
+    `check_sensor`.
     """
+    check_sensor(lens)
     points, weights = rule.points(lens, scene)
     return weigh(lens, rule, weights, trace_bundle(lens, scene, points, solver))
+
+
+def check_sensor(lens: Lens) -> None:
+    """ValueError for an element that turns surfaces about the sensor: they move where it moves, and
+    moments are no polynomials in its position."""
+    if lens.elements is None:
+        return
+    for g, ((first, _), about) in enumerate(zip(lens.elements.spans, lens.elements.about)):
+        if about == lens.count and first < lens.count:
+            raise ValueError(
+                f"elements[{g}]: turns surfaces about the sensor, so that they move with it: turn "
+                "them about another surface with the same pivot, or take psf_moments"
+            )
 
 
 def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusMoments:
@@ -117,11 +131,11 @@ def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusM
     weight = weights * rule.transmission(lens, bundle)
     passed = jnp.sum(weight, axis=-1)
     weight = safe_divide(weight, jnp.broadcast_to(passed[:, None], weight.shape))
-    # How the hits move with the sensor, which goes along the axis of the lens.
+    # How the hits move with the sensor.
     slope = tuple(safe_divide(a, bundle.arrival[-1]) for a in bundle.arrival[:-1])
-    if lens.tilt is not None:
-        axis = rotation_matrix(lens.tilt[-1])[2]
-        slope = tuple(s * axis[2] - axis[k] for k, s in enumerate(slope))
+    motion = lens.sensor_motion
+    if motion is not None:
+        slope = tuple(s * motion[2] - motion[k] for k, s in enumerate(slope))
     counts = weight != 0
     hit = tuple(jnp.where(counts, h[-1], 0) for h in bundle.hits)
     slope = tuple(jnp.where(counts, s, 0) for s in slope)

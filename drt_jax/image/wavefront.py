@@ -19,7 +19,6 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from ..lens.elements import rotation_matrix
 from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray_at_image
 from ..lens.scene import Scene, scene_of
@@ -112,9 +111,9 @@ def path_differences(
     curvature = jnp.where(finite, curvature, 0)
     sphere = chief_ok & jnp.broadcast_to(finite, colours.shape)[:, None]
     good = sphere & (bundle.status == Status.OK)
-    # cosine between the chief ray and the axis of the lens
-    axis = jnp.array([0, 0, 1], bundle.path.dtype)
-    axis = axis if lens.tilt is None else rotation_matrix(lens.tilt[-1])[2]
+    # cosine between the chief ray and the axis, along which the sensor moves
+    axis = lens.sensor_motion
+    axis = jnp.array([0, 0, 1], bundle.path.dtype) if axis is None else axis
     arrival = tuple(a[:, 0] for a in bundle.arrival)
     cosine = jnp.abs(dot(axis[-len(arrival) :], arrival))
     kappa = (curvature * cosine)[:, None]

@@ -200,15 +200,15 @@ def _forbes(count: int) -> np.ndarray:
 
 
 def qbfs(w: Point, shape: Shape) -> tuple[Array, Array]:
-    """Conic and Forbes' polynomials Q_m, whose slopes beside a sphere are orthonormal.
+    """Conic and Forbes' polynomials Q_m along its normal, whose slopes are orthonormal on a sphere.
 
-    z = ... + u^2 (1 - u^2) / sqrt(1 - c^2 r^2) sum_m a_(m + 1) Q_m(u^2), u = r / a_0, in mm; the
-    surface ends where either root does. Summed by Clenshaw's recurrence in P_0 = 2,
-    P_1 = 6 - 8 x, P_(m + 1) = (2 - 4 x) P_m - P_(m - 1), which has no large terms.
-    Source: Forbes, Opt. Express 15, 5218 (2007) and 18, 19700 (2010).
+    z = ... + u^2 (1 - u^2) s sum_m a_(m + 1) Q_m(u^2), u = r / a_0, a_0 in mm, and s, 1 / cosine of
+    the conic's slope, sqrt(1 - k c^2 r^2) / sqrt(1 - (1 + k) c^2 r^2). Summed by Clenshaw's
+    recurrence in P_0 = 2, P_1 = 6 - 8 x, P_(m + 1) = (2 - 4 x) P_m - P_(m - 1), which has no large
+    terms. Source: Forbes, Opt. Express 15, 5218 (2007) and 18, 19700 (2010), as in Zemax.
     """
-    r2, c = square(w), shape.curvature
-    z, argument = _conic(r2, c, shape.conic)
+    r2 = square(w)
+    z, argument = _conic(r2, shape.curvature, shape.conic)
     if len(shape.coefficients) < 2:
         return z, argument
     inverse = _inverse(shape.coefficients[0])
@@ -217,9 +217,8 @@ def qbfs(w: Point, shape: Shape) -> tuple[Array, Array]:
     last, total = jnp.zeros_like(x), jnp.zeros_like(x)
     for b in jnp.tensordot(jnp.asarray(basis, z.dtype), shape.coefficients[1:], 1)[::-1]:
         last, total = total, b + (2 - 4 * x) * total - last
-    sphere = 1 - c**2 * r2
-    z = z + x * (1 - x) / root(sphere) * 2 * (total + last)
-    return z, jnp.minimum(argument, sphere)
+    steep = root(argument + shape.curvature**2 * r2) / root(argument)
+    return z + x * (1 - x) * steep * 2 * (total + last), argument
 
 
 def _inverse(radius: Array) -> Array:

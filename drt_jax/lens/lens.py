@@ -49,6 +49,9 @@ class Lens:
     glasses: the names of the S + 1 media.
     forms: a name in `forms.FORMS` for each of the S + 1 rows (empty: all aspheres).
     mirrors: whether each of the S surfaces reflects (empty: none does).
+    curved: rows that bend no light but may be curved, S for the sensor; all others are planes of
+        which derivatives by curvature, conic and coefficients are 0. `load_lens` names those that a
+        prescription curves.
     name: of the lens.
     """
 
@@ -68,6 +71,7 @@ class Lens:
     glasses: tuple[str, ...] = dataclasses.field(metadata={"static": True}, kw_only=True)
     forms: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
     mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True}, default=())
+    curved: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
     name: str = dataclasses.field(metadata={"static": True}, default="")
 
     def __post_init__(self) -> None:
@@ -114,6 +118,21 @@ class Lens:
         point = jnp.concatenate([across, z], axis=1)
         point, turned = self.elements.carry(self.vertices, point, turned)
         return point[:, 2], point[:, :2], turned
+
+    @property
+    def sensor_motion(self) -> Array | None:
+        """How the vertex of the sensor moves with `sensor`, (3,) along the sensor's own axes, in mm
+        a mm; None for (0, 0, 1), where nothing turns it."""
+        rotation = self.places[2]
+        if rotation is None:
+            return None
+
+        def vertex(sensor: Array) -> Array:
+            z, across, _ = dataclasses.replace(self, sensor=sensor).places
+            across = jnp.zeros((len(z), 2), z.dtype) if across is None else across
+            return jnp.append(across[-1], z[-1])
+
+        return jax.jvp(vertex, (self.sensor,), (jnp.ones_like(self.sensor),))[1] @ rotation[-1]
 
     @property
     def shape(self) -> Shape:
@@ -185,6 +204,8 @@ class Lens:
         for name, values in of_each:
             if len(values) != rows:
                 raise ValueError(f"lens.{name}: expected {rows} rows, got {len(values)}")
+        if not {*self.curved} <= {*range(rows)}:
+            raise ValueError(f"lens.curved: expected rows 0 to {rows - 1}, got {self.curved}")
         if not 0 <= self.stop < self.count:
             raise ValueError(f"lens.stop: expected 0 to {self.count - 1}, got {self.stop}")
 

@@ -40,7 +40,7 @@ class Pupil(NamedTuple):
 class FirstOrder(NamedTuple):
     """What a design program lists first.
 
-    focal_length: (W,) in mm, as `focal_length`.
+    focal_length: (W,) in mm, in image space, as `focal_length`.
     back_focal_distance: (W,) in mm, as `back_focal_distance`.
     front_focal_distance: (W,) in mm, as `front_focal_distance`.
     image_distance: (W,) in mm, as `image_distance`.
@@ -51,6 +51,7 @@ class FirstOrder(NamedTuple):
     exit_pupil: the stop as seen from the image.
     petzval_radius: (W,) in mm, of the surface on which a flat object is imaged without
         astigmatism; inf for none.
+    effective_focal_length: (W,) in mm, in air, as `effective_focal_length`.
     """
 
     focal_length: Array
@@ -63,6 +64,7 @@ class FirstOrder(NamedTuple):
     entrance_pupil: Pupil
     exit_pupil: Pupil
     petzval_radius: Array
+    effective_focal_length: Array
 
 
 def _quotient(numerator: Array, denominator: Array) -> Array:
@@ -248,17 +250,25 @@ def first_order(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Firs
         entrance_pupil=_pupil(system, front=True),
         exit_pupil=_pupil(system, front=False),
         petzval_radius=_quotient(-one, index[-1] * jnp.sum(petzval_parts(system), axis=0)),
+        effective_focal_length=_quotient(-one, index[-1] * u),
     )
     return system.told(found, apart(far))
 
 
 def focal_length(lens: Lens, wavelengths: ArrayLike) -> Array:
-    """Effective focal length (W,), mm; inf for an afocal lens. `wavelengths` (W,) in um. From the
-    rear principal plane to the focus, along z: in water longer by its index than in air, and
-    negative for a concave mirror, whose focus lies before it."""
+    """Focal length in image space (W,), n' over power, mm; inf for an afocal lens. `wavelengths`
+    (W,) in um. From the rear principal plane to the focus, along z: in water longer by its index
+    than `effective_focal_length`, and negative for a concave mirror, whose focus lies before it."""
     system = paraxial_system(lens, wavelengths)
     slope = trace_ray(system, 1.0, 0.0).behind[-1]
     return system.told(_quotient(-jnp.ones_like(slope), slope))
+
+
+def effective_focal_length(lens: Lens, wavelengths: ArrayLike) -> Array:
+    """Effective focal length in air (W,), 1 over power, mm, whatever the medium of the image; inf
+    for an afocal lens. `wavelengths` (W,) in um. The EFL of design programs; positive for lenses
+    and mirrors that converge."""
+    return first_order(lens, jnp.inf, wavelengths).effective_focal_length
 
 
 def back_focal_distance(lens: Lens, wavelengths: ArrayLike) -> Array:

@@ -22,7 +22,8 @@ _NEAREST = 1e-6
 class Scene:
     """An object point and its colours, arrays of one floating dtype.
 
-    field: (2,) angles in radians along x and y; positive light travels upwards.
+    field: (2,) angles in radians along x and y, whose tangents add: light goes along (tan x, tan y,
+        1); positive light travels upwards.
     distance: () from the object plane to the first vertex in mm, inf allowed.
     wavelengths: (W,) in um.
     """
@@ -67,8 +68,8 @@ def vergence_of(distance: Array) -> Array:
 def scene_of(lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike) -> Scene:
     """A scene in the dtype of the lens: one type for numbers, NumPy's and JAX's arrays.
 
-    field: one angle (along y) or two (x, y) in radians. distance: mm, inf allowed. wavelengths:
-    (W,) or one, um.
+    field: one angle (along y) or two (x, y) in radians: light goes along (tan x, tan y, 1).
+    distance: mm, inf allowed. wavelengths: (W,) or one, um.
 
     ValueError for other shapes, for what is no real number, and, as far as values are known, for an
     angle of 90 degrees and more, a distance not above 0 (1e-6 mm), a wavelength outside the range

@@ -31,7 +31,8 @@ MAX_ORDER = 42
 
 
 def symmetry_of(lens: Lens, field: ArrayLike) -> Symmetry:
-    """How much of the pupil must be traced for a field: an angle along y or (x, y), in radians.
+    """How much of the pupil must be traced for a field: an angle along y or (x, y), in radians, or
+    many (F, 2).
 
     In a lens with an axis, a field known to be 0 needs one radius; one along y needs half a pupil,
     if x -> -x leaves the lens and its apertures alone. ValueError inside a trace where the answer
@@ -53,7 +54,7 @@ def symmetry_of(lens: Lens, field: ArrayLike) -> Symmetry:
     sideways = zip(moves, ([0], [1, 2], [0], [1, 2], [0]), strict=True)
     still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
     angles = np.asarray(field)
-    if "none" in kinds or not still or (angles.ndim and angles[0] != 0):
+    if "none" in kinds or not still or (angles.ndim and np.any(angles[..., 0])):
         return "disc"
     axial = kinds == {"rotation"} and all(a is None for a in moves) and not np.any(angles)
     return "meridian" if axial else "half"

@@ -187,14 +187,22 @@ class System:
 
 
 def placed(lens: Lens, rows: Any) -> Placed:
-    """Surfaces of a lens by index: a list of them, or one."""
+    """Surfaces of a lens by index: a list of them, or one. Those that bend no light do not bend
+    themselves, but where `Lens.curved` has them."""
     rows = np.asarray(rows)
     vertex, offset, rotation = lens.places
+    bends = np.isin(rows, [*lens.live, *lens.curved])
+
+    def shape(array: Array) -> Array:
+        own = array[rows]
+        kept = bends.reshape(bends.shape + (1,) * (own.ndim - bends.ndim))
+        return own if bends.all() else jnp.where(kept, own, jax.lax.stop_gradient(own))
+
     return Placed(
         vertex[rows],
-        lens.curvature[rows],
-        lens.conic[rows],
-        lens.coefficients[rows],
+        shape(lens.curvature),
+        shape(lens.conic),
+        shape(lens.coefficients),
         None if offset is None else offset[rows],
         None if rotation is None else rotation[rows],
         None if lens.elements is None else lens.vertices[rows],

@@ -135,8 +135,8 @@ def trace_rays(
 ) -> Rays:
     """Trace the rays that cross the stop at given points.
 
-    field: angle in radians along y, or (x, y); positive light travels upwards (for a height in
-        mm, see `field_of_height`).
+    field: angle in radians along y, or (x, y), light along (tan x, tan y, 1); positive light
+        travels upwards (for a height in mm, see `field_of_height`).
     distance: mm from the object plane to the first vertex, inf allowed.
     wavelengths: (W,) in um.
     pupil: (Q, 2), x and y on the stop in units of its semi-diameter.

@@ -88,9 +88,9 @@ def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:
 
 def order_of(config: Config, lens: drt_jax.Lens) -> int:
     """The order of the pupil's rule that the spots of a lens need."""
-    scene = config.distance_mm, config.wavelengths_um, config.tolerance
-    rules = (drt_jax.converged_rule(lens, f, *scene) for f in np.radians(config.fields_deg))
-    return max(getattr(rule, "order", config.order) for rule in rules)
+    fields = np.radians([[0.0, field] for field in config.fields_deg])
+    scene = fields, config.distance_mm, config.wavelengths_um, config.tolerance
+    return getattr(drt_jax.converged_rule(lens, *scene), "order", config.order)
 
 
 class _Progress:

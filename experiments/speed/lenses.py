@@ -225,13 +225,8 @@ def lens_rows(config: Config, of: LensFields) -> dict[str, Any]:
         rows.append({"lens": of.lens, "field_deg": part * of.field_deg} | found)
     jax.clear_caches()
     waves = np.array(config.wavelengths_um)
-    # One rule for all fields: the most nodes that any needs, of the kind that the edge needs.
-    rules = [
-        drt_jax.converged_rule(lens, part * widest, math.inf, waves, _LOOSE) for part in (0.5, 1)
-    ]
-    clipped = [rule for rule in rules if isinstance(rule, drt_jax.Clipped)]
-    kind, among = (drt_jax.Clipped, clipped) if clipped else (drt_jax.Gauss, rules)
-    rule = kind(max(int(rule.order) for rule in among), rules[0].symmetry)
+    fields = [[0.0, part * widest] for part in (0.5, 1)]
+    rule = drt_jax.converged_rule(lens, fields, math.inf, waves, _LOOSE)
     name = {"lens": of.lens}
     parts = {"copies": copies, "sweep": sweep}
     return {"rows": rows} | {key: name | f(config, lens, widest, rule) for key, f in parts.items()}

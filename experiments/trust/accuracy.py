@@ -211,6 +211,7 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
     for row, aperture in ((0, scene.front_mm), (-2, scene.rear_mm)):
         semi = semi.at[row].set(aperture or semi[row])
     lens = dataclasses.replace(lens, sensor=jnp.asarray(sensor, semi.dtype), semi_diameter=semi)
+    lens = dataclasses.replace(lens, curved=(lens.stop,))  # gradients by every curvature
     truth = reference(lens, field, distance, wavelengths)
     if not scene.field_deg:  # by symmetry; what the integral leaves is rounding
         flat = np.array([[1.0], [0.0]])

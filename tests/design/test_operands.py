@@ -80,7 +80,7 @@ def test_wavefronts(triplet):
 def test_first_order(triplet):
     lens, _, told = triplet
     found = [drt_jax.first_order(lens, distance, COLOURS) for distance in DISTANCES]
-    for kind in ("focal_length", "back_focal_distance"):
+    for kind in ("focal_length", "effective_focal_length", "back_focal_distance"):
         np.testing.assert_allclose(told[kind], getattr(found[0], kind)[1:2], rtol=1e-13)
     wide = 2 * found[0].entrance_pupil.semi_diameter[1]
     np.testing.assert_allclose(told["entrance_pupil"], [wide], rtol=1e-13)
@@ -112,6 +112,22 @@ def test_chief_rays(triplet):
         np.testing.assert_allclose(
             told["chief_ray_angle"].reshape(len(VIEWS), 3)[k], angles, atol=1e-7 / (1 + 1e7 * field)
         )
+
+
+def test_numerical_apertures(triplet):
+    """n sin of the angle between the chief ray and those through the rim, by the direction cosines;
+    on the axis near the paraxial one."""
+    lens, _, told = triplet
+    rim = [[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]]
+    for k, (field, distance) in enumerate(VIEWS):
+        ends = np.asarray(drt_jax.trace_rays(lens, field, distance, COLOURS, rim).directions)[
+            1, :, -1
+        ]
+        sines = np.linalg.norm(np.cross(ends[0], ends[1:]), axis=-1)
+        wanted = np.sqrt(np.mean(sines**2))
+        assert abs(told["numerical_aperture"][k] / wanted - 1) < 1e-9
+    paraxial = drt_jax.numerical_aperture(lens, np.inf, COLOURS[1])[0]
+    assert abs(told["numerical_aperture"][0] / paraxial - 1) < 1e-2
 
 
 def test_incidence(triplet):

@@ -24,6 +24,7 @@ def held(lens, solve):
     slope = -1 / (2 * first.f_number)
     kinds = {
         "focal_length": 1 / jnp.mean(1 / first.focal_length),
+        "effective_focal_length": 1 / jnp.mean(1 / first.effective_focal_length),
         "image_angle": jnp.mean(slope),
         "entrance_pupil": 2 * jnp.mean(first.entrance_pupil.semi_diameter),
         "f_number": 1 / jnp.mean(1 / first.f_number),
@@ -42,6 +43,7 @@ CASES = [
     Solve("focal_length", 48.0, 5),
     Solve("focal_length", surface=0),
     Solve("focal_length", surface=2, wavelengths=COLOURS),
+    Solve("effective_focal_length", 48.0, 5),
     Solve("image_angle", surface=5),
     Solve("image_angle", -0.11, 5, distance=500.0),
     Solve("entrance_pupil"),
@@ -68,6 +70,16 @@ def test_conditions_hold_whatever_varies(solve):
         assert abs(held(lens, solve) / wanted - 1) < EXACT
         # All variables are what the vector says.
         np.testing.assert_allclose(variables.vector(lens), vector, rtol=1e-13, atol=1e-13)
+
+
+def test_a_focal_length_in_air_is_kept_in_front_of_water():
+    rows = [{"radius": 30, "glass": "N-BK7", "thickness": 6.0, "semi_diameter": 8.0, "stop": True}]
+    lens = load_lens({"surfaces": [*rows, {"radius": -40, "glass": "water", "thickness": 70.0}]})
+    water = float(lens.index(0.5875618)[-1, 0])
+    for kind, power in (("focal_length", water / 90), ("effective_focal_length", 1 / 90)):
+        kept = Variables.of(lens, ["thickness"], solves=[Solve(kind, 90.0, 1)]).lens
+        found = drt_jax.effective_focal_length(kept, 0.5875618)[0]
+        assert abs(found * power - 1) < EXACT
 
 
 @pytest.mark.slow

@@ -105,6 +105,19 @@ def test_tilt_of_the_sensor_is_where_a_scan_finds_it(singlet):
     assert best.fun == pytest.approx(1e3 * float(found.spot), rel=1e-3)
 
 
+def test_a_sensor_that_stands_oblique_is_focused_along_the_axis(singlet):
+    """Compensated lenses with their sensors really moved need no more compensation; the spots are
+    the same."""
+    problem, some = singlet
+    tilt = some_lens(some).tilt.at[-1].set(jnp.array([0.5, -0.4, 0.3]))
+    lens = dataclasses.replace(some_lens(some), tilt=tilt)
+    found = _made(problem, lens, "focus")
+    moved = dataclasses.replace(lens, sensor=lens.sensor + found.moves[0])
+    assert float(_made(problem, moved, "focus").moves[0]) == pytest.approx(0, abs=1e-12)
+    wanted = _made(problem, moved, "none").squares
+    np.testing.assert_allclose(found.squares, wanted, rtol=1e-12)
+
+
 def measures(singlet, off):
     return np.mean(design.monte_carlo(*singlet, np.asarray(off), "focus", threads=1).squares, 1)
 

@@ -200,6 +200,24 @@ def test_a_rule_keeps_the_promised_tolerance(degrees):
         before = order
 
 
+def test_one_rule_serves_many_fields_and_distances():
+    """It keeps the tolerance of each, has the order that the hardest needs, and the symmetry of
+    all."""
+    fields, distances = [[0.0, 0.0], [0.0, np.radians(10)]], (FAR, 5000.0)
+    rule = converged_rule(LENS, fields, distances, RGB, 1e-6)
+    assert rule.symmetry == "half" and drt_jax.symmetry_of(LENS, [*fields, [0.1, 0.0]]) == "disc"
+    alone = [converged_rule(LENS, fields[1], far, RGB, 1e-6) for far in distances]
+    assert rule == max(alone, key=lambda one: one.order)
+    for field in fields:
+        for far in distances:
+            exact = psf_moments(LENS, field, far, RGB, 1e-11)[1]
+            got = psf_moments(LENS, field, far, RGB, rule=rule)[1]
+            size, found = (np.sqrt(np.trace(a, axis1=1, axis2=2)) for a in (exact, got))
+            np.testing.assert_allclose(found, size, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"field: expected one angle or two, got shape \(3,\)"):
+        converged_rule(LENS, [0.0, 0.1, 0.2], FAR, RGB)
+
+
 def test_tolerance_holds_at_any_sensor_position():
     """Rays traced with the sensor 3 mm out of focus, where the spot is 30 times larger."""
     lens = at(130.0)

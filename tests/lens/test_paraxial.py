@@ -231,6 +231,8 @@ def test_image_space_in_water():
     focal = water / power
     data = first_order(lens, np.inf, COLOURS)
     np.testing.assert_allclose(data.focal_length, focal, rtol=1e-13)
+    np.testing.assert_allclose(data.effective_focal_length, 1 / power, rtol=1e-13)
+    np.testing.assert_allclose(drt_jax.effective_focal_length(lens, COLOURS), 1 / power, rtol=1e-13)
     back = focal * (1 - 6 / n * first)
     np.testing.assert_allclose(data.back_focal_distance, back, rtol=1e-13)
     front = -(1 - 6 / n * second) / power

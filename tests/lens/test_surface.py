@@ -66,7 +66,8 @@ def exact_qbfs(x, y, c, k, a):
         mpmath.sqrt(mpmath.mpf(2) / 95) * (29 - 4 * t * (25 - 19 * t)),
         mpmath.sqrt(mpmath.mpf(2) / 2545) * (207 - 4 * t * (315 - t * (577 - 320 * t))),
     ]
-    bump = t * (1 - t) / mpmath.sqrt(1 - c**2 * r2)
+    steep = mpmath.sqrt((1 - k * c**2 * r2) / (1 - (1 + k) * c**2 * r2))  # 1 / cos of the conic
+    bump = t * (1 - t) * steep
     return conic(r2, c, k) + bump * sum(v * f for v, f in zip(rest, q))
 
 
@@ -116,6 +117,7 @@ SHAPES = {
     ),
     "slope": ("linear", 1 / 70, -1.0, [2e-3]),
     "Forbes": ("qbfs", 1 / 60, -0.4, [12.0, 0.05, -0.02, 0.01, 0.003]),
+    "Forbes, steep": ("qbfs", 1 / 11, -4.0, [12.0, 0.05, -0.02]),
     "Zernike": ("zernike", -1 / 80, 0.3, [11.0, *(0.01 / np.arange(1.0, 12.0))]),
 }
 
@@ -232,6 +234,14 @@ def test_flagged_beyond_the_rim(dtype):
     w = heights, jnp.zeros_like(heights)
     assert all(jnp.all(jnp.isfinite(a)) for a in jax.tree.leaves(sag_derivatives(w, shape)))
     np.testing.assert_array_equal(domain(w, shape), heights < 9.9995)
+
+
+def test_forbes_polynomials_on_a_hyperboloid_are_those_of_another_program():
+    """Sags of a Qbfs surface, as Zemax prints them."""
+    a = [6.336, 1.614, 0.348, 0.15, 0.033, 0.03]
+    shape = Shape(jnp.asarray(1 / 21.723), jnp.asarray(-4.428), jnp.asarray(a))
+    z = surface_sag((jnp.zeros(2), jnp.array([0.75, 1.86])), shape, "qbfs")
+    np.testing.assert_allclose(z, [0.06264589454579239, 0.3307314239746402], atol=1e-12)
 
 
 def test_slopes_of_forbes_polynomials_are_orthonormal():

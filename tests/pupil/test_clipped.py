@@ -135,6 +135,17 @@ def test_the_rule_that_a_clipped_scene_needs():
     assert isinstance(drt_jax.converged_rule(lens, field, FAR, GREEN, 1e-4), Clipped)
 
 
+@pytest.mark.slow
+def test_one_rule_for_a_clipped_field_and_the_axis():
+    """A clipped one, also where nothing is clipped."""
+    field, lens = SCENES["front"]
+    rule = drt_jax.converged_rule(lens, [[0.0, 0.0], [0.0, field]], FAR, GREEN, 1e-4)
+    assert isinstance(rule, Clipped)
+    for angle in (0.0, field):
+        ours, exact = (psf_moments(lens, angle, FAR, GREEN, 1e-6, rule=r) for r in (rule, None))
+        np.testing.assert_allclose(ours.covariance, exact.covariance, rtol=2e-4, atol=1e-12)
+
+
 def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
     @jax.jit
     def passed(lens, width):

@@ -8,7 +8,7 @@ import numpy as np
 
 from drt_jax import Status, scene_of
 
-from ..known import aims, known, search
+from ..known import aims, bendable, known, search
 from .systems import COLOURS, lens_with
 
 POINTS = tuple(jnp.asarray(p) for p in ([0.0, 0.5, -0.3, 0.8, -0.9], [0.1, 0.6, -0.8, -0.2, 0.1]))
@@ -20,7 +20,7 @@ PROBLEMS = {"tilted": ("live", True, 2), "meridional": ("between", False, 1)}
 def problem(name):
     """A lens, a scene, points and the rays through them."""
     stop, tilted, dim = PROBLEMS[name]
-    lens, points = lens_with(stop, tilted), POINTS[2 - dim :]
+    lens, points = bendable(lens_with(stop, tilted)), POINTS[2 - dim :]
     scene = scene_of(lens, [0.03, -0.05] if dim == 2 else 0.08, 300.0, COLOURS)
     found = search(lens, scene, points)
     assert np.all(found.status == Status.OK)

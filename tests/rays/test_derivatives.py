@@ -14,6 +14,7 @@ from drt_jax import load_lens, psf_moments, pupil, trace_rays
 from drt_jax.pupil.rules import Gauss
 
 from .. import oracle
+from ..known import bendable
 
 WAVELENGTHS = (0.6, 0.48)
 ORDER = 3
@@ -194,8 +195,8 @@ and decentres include the sensor's).
 
 
 def load(name):
-    """The lens of a scene; the freeform has a curved sensor."""
-    lens = load_lens(SCENES[name][0])
+    """The lens of a scene, every row of which may be curved; the freeform has a curved sensor."""
+    lens = bendable(load_lens(SCENES[name][0]))
     if name != "freeform":
         return lens
     curvature, conic = lens.curvature.at[-1].set(-1 / 150), lens.conic.at[-1].set(0.4)

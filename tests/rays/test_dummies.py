@@ -1,9 +1,13 @@
 """Surfaces that bend no light are crossed by the straight ray, and every crossing is checked."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import Status, load_lens, trace_rays
+from drt_jax import Gauss, Status, load_lens, psf_moments, trace_rays
 
 from .. import oracle
 from .traced import WAVELENGTHS, assert_same_rays, hexapolar, truth
@@ -96,3 +100,37 @@ def test_scattered_dummies_and_a_curved_stop(field):
     missed = ~wanted.exists
     assert np.all(np.isin(rays.status[missed], (Status.MISSED, Status.TIR)))
     assert_same_rays(rays, wanted._replace(exists=wanted.exists & ~clipped), 1e-10)
+
+
+SHAPE = ("curvature", "conic", "coefficients")
+
+
+@jax.jit
+@jax.grad
+def by_the_lens(lens):
+    return jnp.sum(psf_moments(lens, 0.1, 200.0, 0.55, rule=Gauss(3, "half")).covariance)
+
+
+def test_sensor_and_plane_stop_do_not_bend():
+    """They have no derivatives by curvature, conic and coefficients, unless asked for by name."""
+    lens = load_lens({"surfaces": [STOP, PLATE[0], PLATE[1] | {"coefficients": {4: 1e-6}}]})
+    gradient = by_the_lens(lens)
+    assert not any(np.any(getattr(gradient, name)[np.array([0, 3])]) for name in SHAPE)
+    assert all(np.all(getattr(gradient, name)[1:3] != 0) for name in SHAPE)
+    asked = by_the_lens(dataclasses.replace(lens, curved=(0, 3)))
+    assert np.all(asked.curvature != 0)
+    for name in ("thickness", "sensor", "semi_diameter"):
+        np.testing.assert_allclose(getattr(asked, name), getattr(gradient, name), rtol=1e-13)
+
+
+def test_what_a_file_bends_may_be_bent():
+    """A curved stop that bends no light has its derivatives."""
+    lens = load_lens({"surfaces": [STOP | {"radius": 40.0}, *PLATE]})
+    assert lens.curved == (0,)
+    gradient = by_the_lens(lens)
+    assert gradient.curvature[0] != 0 and gradient.curvature[-1] == 0
+
+
+def test_rows_that_may_be_bent_exist():
+    with pytest.raises(ValueError, match=r"lens.curved: expected rows 0 to 4, got \(5,\)"):
+        dataclasses.replace(before_the_stop(10.0, 9.9), curved=(5,)).check()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import Gauss, load_lens, psf_moments, trace_rays
+from drt_jax import Gauss, focus_moments, load_lens, psf_moments, trace_rays, wavefront
 
 INF = float("inf")
 PUPIL = np.array([[0, 0], [0.5, 0], [-0.3, 0.8], [0.1, -0.9]])
@@ -143,6 +143,61 @@ def test_the_chief_ray_of_a_grating_spectrometer_goes_where_another_program_foun
     np.testing.assert_allclose(heights, np.cumsum(steps)[1:], rtol=1e-12)
     sensor = np.asarray(rays.points[:, 0, 3, 1])
     assert abs(sensor[0] - sensor[2]) > 20  # mm between 450 and 650 nm
+
+
+# How elements may hold the sensor: alone, as the tilt of it; about another surface and a pivot;
+# with a surface, tilted itself; about itself, within an element about something else.
+HELD = {
+    "alone": [{"surfaces": ["sensor", "sensor"], "tilt": [10.0, 0, 0]}],
+    "about a surface": [
+        {"surfaces": ["sensor", "sensor"], "about": 1} | MOVE | {"tilt": [9, -6, 3]}
+    ],
+    "with a surface": [
+        {"surfaces": [4, "sensor"]} | MOVE | {"tilt": [4, 5, 0]},
+        {"surfaces": ["sensor", "sensor"], "about": "sensor", "pivot": 3.0, "tilt": [3, -7, 0]},
+    ],
+}
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_a_held_sensor_moves_as_its_elements_turn_it(name):
+    """The polynomials in the sensor position, beside the lens with its sensor really moved."""
+    lens = lens_with(*HELD[name])
+    if name == "with a surface":
+        lens = dataclasses.replace(
+            lens, tilt=jnp.zeros((6, 3)).at[-1].set(jnp.array([0.1, 0.2, 1]))
+        )
+
+    def focus(sensor):
+        moved = dataclasses.replace(lens, sensor=jnp.asarray(sensor))
+        return focus_moments(moved, (0.02, 0.06), INF, 0.55, rule=Gauss(4, "disc"))
+
+    ours = focus(lens.sensor).full(lens.sensor + 1.5)
+    wanted = focus(lens.sensor + 1.5).full(lens.sensor + 1.5)
+    np.testing.assert_allclose(ours.mean, wanted.mean, atol=1e-12)
+    np.testing.assert_allclose(ours.covariance, wanted.covariance, rtol=1e-12, atol=1e-15)
+
+
+def test_a_sensor_turned_by_an_element_is_one_that_is_tilted():
+    lens = lens_with(*HELD["alone"])
+    tilted = load_lens({"surfaces": SURFACES, "sensor_tilt": [10.0, 0, 0]})
+    ours, theirs = (
+        focus_moments(a, 0.06, INF, 0.55, rule=Gauss(4, "disc")) for a in (lens, tilted)
+    )
+    np.testing.assert_allclose(ours.slope, theirs.slope, atol=1e-14)
+    np.testing.assert_allclose(ours.spread, theirs.spread, rtol=1e-11, atol=1e-15)
+    np.testing.assert_allclose(
+        wavefront(lens, 0.06, INF, 0.55, PUPIL).opd,
+        wavefront(tilted, 0.06, INF, 0.55, PUPIL).opd,
+        atol=1e-9,
+    )
+
+
+def test_elements_that_move_with_the_sensor_have_no_polynomials():
+    """Surfaces turned about the sensor move where it moves."""
+    turned = lens_with({"surfaces": [3, 4], "about": "sensor", "tilt": [1.0, 0, 0]})
+    with pytest.raises(ValueError, match=r"elements\[0\]: .* about the sensor"):
+        focus_moments(turned, 0.0, INF, 0.55, rule=Gauss(2, "disc"))
 
 
 @pytest.mark.slow

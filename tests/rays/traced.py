@@ -11,6 +11,7 @@ import numpy as np
 from drt_jax import Status, load_lens, trace_rays
 
 from .. import oracle
+from ..known import bendable
 
 WAVELENGTHS = (0.55,)
 ROWS = (*oracle.LENS, *oracle.MOVES, *oracle.MEDIA)
@@ -31,7 +32,7 @@ def rays_and_derivatives(lens, field, distance, pupil, chosen):
     those numbered `chosen`: a lens and a field with a leading axis (chosen, x, y and path)."""
 
     def outputs(lens, field):
-        rays = trace_rays(lens, field, distance, WAVELENGTHS, pupil)
+        rays = trace_rays(bendable(lens), field, distance, WAVELENGTHS, pupil)
         picked = jnp.array(chosen)
         at = rays.points[0, picked, -1, :2]
         return jnp.concatenate([at, rays.path[0, picked, None]], axis=1).ravel(), rays

@@ -1,0 +1,66 @@
+"""Rays through the paraxial entrance pupil, as design programs launch them without ray aiming."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from ..numerics import concrete
+from .lens import Lens
+from .paraxial import entrance_pupil
+
+
+def with_paraxial_pupil(lens: Lens, wavelength: ArrayLike = 0.5875618) -> Lens:
+    """The lens with its paraxial entrance pupil as the stop.
+
+    Two planes that bend no light come first, surfaces 0 and 1: one at the first vertex, from where
+    z and distances are counted as before, and the pupil, in object space. At every field and colour
+    rays fill that pupil's plane uniformly, and the chief ray goes through its centre. The real stop
+    is a surface like others, without a rim: of its own apertures only `Lens.apertures` clip.
+
+    wavelength: of the paraxial rays, the primary one, () in um.
+
+    Differentiable: the pupil follows the lens. Tilts and decentres are left out. ValueError for a
+    pupil at infinity; inside a trace all rays fail then.
+    """
+    pupil = entrance_pupil(lens, wavelength)
+    place, radius = pupil.position[0], pupil.semi_diameter[0]
+    known = jnp.isfinite(place)
+    if concrete(known) and not known:
+        raise ValueError("pupil: the paraxial entrance pupil is at infinity: take the real stop")
+    place = jnp.where(known, place, 0)
+
+    def behind(array: Array, first: float | Array = 0.0) -> Array:
+        return jnp.concatenate([jnp.full_like(array, first, shape=(2, *array.shape[1:])), array])
+
+    def later(surfaces: tuple[int, ...]) -> tuple[int, ...]:
+        return tuple(i + 2 for i in surfaces)
+
+    rim = behind(lens.semi_diameter.at[lens.stop].set(jnp.inf), jnp.inf)
+    phase, elements, extra = lens.phase, lens.elements, lens.apertures
+    replace = dataclasses.replace
+    return replace(
+        lens,
+        curvature=behind(lens.curvature),
+        conic=behind(lens.conic),
+        coefficients=behind(lens.coefficients),
+        thickness=jnp.concatenate([jnp.stack([place, -place]), lens.thickness]),
+        semi_diameter=rim.at[1].set(jnp.where(known, radius, jnp.inf)),
+        dispersion=replace(
+            jax.tree.map(lambda a: behind(a, a[:1]), lens.dispersion),
+            ranges=lens.dispersion.ranges[:1] * 2 + lens.dispersion.ranges,
+        ),
+        decentre=lens.decentre if lens.decentre is None else behind(lens.decentre),
+        tilt=lens.tilt if lens.tilt is None else behind(lens.tilt),
+        phase=phase and replace(phase, surfaces=later(phase.surfaces)),
+        elements=elements
+        and replace(elements, spans=tuple(map(later, elements.spans)), about=later(elements.about)),
+        apertures=extra and replace(extra, surfaces=later(extra.surfaces)),
+        stop=1,
+        glasses=lens.glasses[:1] * 2 + lens.glasses,
+        forms=("asphere", "asphere", *lens.forms),
+        mirrors=(False, False, *lens.mirrors),
+        curved=later(lens.curved),
+    )
