@@ -221,7 +221,7 @@ def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) ->
     near = max(tiny, _NEAR)
 
     def step(state):
-        count, rays, launch, done, _, _, _ = state
+        count, rays, launch, done, _, _, before = state
         new = launched(lens, system, launch)
         rays = jax.tree.map(lambda a, b: jnp.where(new.good & ~done, a, b), new, rays)
         change, edge = ahead(lens, rays, goal)
@@ -230,7 +230,8 @@ def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) ->
         lost = ~new.good & (dot(back, back) <= tiny**2 * (1 + dot(launch, launch)))
         onward = rays.launch + moved(rays.aims, change)
         launch = jnp.where(new.good[None], onward, launch + back / 2)
-        return count + 1, rays, launch, done | settled | lost, change, edge, settled
+        # Once more from there, so that the derivatives are those of the last ray too.
+        return count + 1, rays, launch, done | (settled & before) | lost, change, edge, settled
 
     change, edge = ahead(lens, start, goal)
     launch, no = start.launch + moved(start.aims, change), jnp.zeros(edge.shape, bool)

@@ -282,7 +282,10 @@ class Clipped(PupilRule):
         """Points and weights of what is inside of all apertures and obscurations."""
         axial = self.symmetry == "meridian"
         part = {"meridian": 0, "half": 1, "disc": 2}[self.symmetry]
-        used, most = (part * (2 * n + 6) for n in (self.order, self.size))
+        # Apertures of all shapes make corners; the narrow panels between them need spokes too.
+        kinds = () if lens.apertures is None else lens.apertures.kinds
+        edges = sum(2 if kind == "rectangle" else 1 for kind in kinds)
+        used, most = (part * (2 * n + 6 + 2 * edges) for n in (self.order, self.size))
         spokes = Spokes(self.symmetry, max(most, 32 * part) + 1)
         given = *jax.lax.stop_gradient((lens, scene)), spokes, jnp.asarray(used, jnp.int32)
         plan = jax.lax.stop_gradient(_plan(*given))

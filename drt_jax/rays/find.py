@@ -51,10 +51,10 @@ class Found(NamedTuple):
 
 
 class _State(NamedTuple):
-    """solved: (W, Q). change: (), largest correction of the last step, mm. step: ()."""
+    """solved: (W, Q). still: (), how many steps in a row moved no ray. step: ()."""
 
     solved: Array
-    change: Array
+    still: Array
     step: Array
 
 
@@ -63,9 +63,9 @@ class BlockNewton(optx.AbstractRootFinder):
 
     Its arguments are (system, target, which rays are to move (W, Q)). These step together; one
     whose correction is not finite stays where it is, so that it cannot spoil the others. Ends
-    when all of them are stationary to rounding (see `fermat.stationary`), or when none moves by
-    more than `atol` + `rtol` of its hits any more: then RESULTS.nonlinear_divergence, and the state
-    tells which are solved.
+    when all of them are stationary to rounding (see `fermat.stationary`), or when two steps move
+    none by more than `atol` + `rtol` of its hits (after one, it is not seen where that ends): then
+    RESULTS.nonlinear_divergence, and the state tells which are solved.
     """
 
     rtol: float
@@ -74,7 +74,7 @@ class BlockNewton(optx.AbstractRootFinder):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """The state before the first step; no step is taken if no ray is to move."""
-        return _State(~args[2], jnp.full((), jnp.inf, y[0].dtype), jnp.zeros((), jnp.int32))
+        return _State(~args[2], jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
     def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
         """One Newton step of every ray that is not stationary yet."""
@@ -89,11 +89,12 @@ class BlockNewton(optx.AbstractRootFinder):
         scale = self.rtol / self.atol
         size = self.norm(tuple(c / (1 + scale * abs(a)) for a, c in zip(y, change, strict=True)))
         y = tuple(a - c for a, c in zip(y, change, strict=True))
-        return y, _State(solved, size, state.step + 1), aux
+        still = jnp.where(size <= self.atol, state.still + 1, 0)
+        return y, _State(solved, still, state.step + 1), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
         """Whether all rays are stationary, or none moves any more."""
-        done, still = jnp.all(state.solved), state.change <= self.atol
+        done, still = jnp.all(state.solved), state.still > 1
         results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         return done | still, optx.RESULTS.where(still & ~done, *results)
 

@@ -166,7 +166,9 @@ def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Arra
         spot, area = jax.vmap(lambda angle: pupil.line(angle, moved))(azimuth)
         area = area * width[:, None]
         area = area / jnp.sum(area)
-        mean = jnp.sum(area * spot[..., 1])  # x -> -x: the other half is the mirror image
+        # x -> -x: the other half is the mirror image. A sum of small numbers, for its rounding.
+        height = jax.lax.stop_gradient(spot[0, 0, 1])
+        mean = height + jnp.sum(area * (spot[..., 1] - height))
         square = spot[..., 0] ** 2 + (spot[..., 1] - mean) ** 2
         found = jnp.stack([jnp.sqrt(jnp.sum(area * square)), mean])
         return found, found

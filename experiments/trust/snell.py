@@ -31,7 +31,10 @@ def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Arra
         discriminant = linear**2 - quadratic * constant
         root = jnp.sign(d[2]) * jnp.sqrt(jnp.maximum(discriminant, 0))
         met = discriminant >= 0
-        q = q + d * (constant / (linear + root))
+        ahead = constant / (linear + root)
+        if shape.coefficients.shape[0]:  # a ray that misses the conic may meet the asphere
+            ahead, met = jnp.where(met, ahead, 0), jnp.array(True)
+        q = q + d * ahead
     if shape.coefficients.shape[0]:
 
         def closer(_, q):

@@ -57,3 +57,19 @@ def test_light_does_not_go_backwards_between_surfaces_that_bend_it():
     crossed = dataclasses.replace(lens, thickness=-lens.thickness)
     for each, forwards in ((lens, True), (crossed, False)):
         assert np.all(trace(each, WAVE, HEIGHTS, ALONG)[1] == forwards)
+
+
+def test_an_asphere_whose_conic_is_missed():
+    """A paraboloid that a term in r^2 makes flatter is a flatter one: a slanted ray meets it, and
+    misses the steep one."""
+    plane = {"radius": "inf", "thickness": 1.0, "stop": True, "semi_diameter": 3.0}
+    steep = {"radius": 1 / 0.15, "conic": -1.0, "index": 1.5}
+    flat = steep | {"radius": 1 / 0.03}
+    direction = jnp.array([0.0, 0.9777, 0.21]) / jnp.hypot(0.9777, 0.21)
+    start = jnp.array([[0.1, 1.84, 1.0]]) - 3 * direction[None]
+    trials = []
+    for surface in (steep | {"coefficients": {2: -0.06}}, flat, steep):
+        lens = load_lens({"surfaces": [plane, surface], "sensor": 4.0})
+        trials.append(trace(lens, WAVE, start, direction))
+    assert np.all(trials[0][1]) and np.all(trials[1][1]) and not np.any(trials[2][1])
+    np.testing.assert_allclose(trials[0][0], trials[1][0], atol=1e-13)

@@ -100,6 +100,19 @@ def test_hits_that_rounding_would_turn_are_not_accepted():
     assert np.all(search(apart, scene, points).status == Status.OK)
 
 
+def test_a_polish_that_takes_one_step_shorter_than_rounding_of_a_mm():
+    """All surfaces within 0.2 um, in the stop's middle: hits of 1e-5 mm, of which 7e-17 is much."""
+    bent = [{"radius": -61.193, "index": n, "thickness": t} for n, t in ((1.93, 1e-4), (1.9, 1e-6))]
+    bent.append({"radius": -61.193, "thickness": 1e-4, "semi_diameter": 12.5, "stop": True})
+    bent += [{"radius": "inf", "index": 1.92, "thickness": 1e-6}, {"radius": "inf"}]
+    lens = load_lens({"surfaces": bent, "sensor": 1.0})
+    lens = dataclasses.replace(lens, sensor=jnp.asarray(2.03e-4))
+    field = (-0.20932616, 0.06755307)
+    rays = trace_rays(lens, field, 200.0, (0.55,), np.array([[0, 0], [0.5, 0], [0.1, 0.2]]))
+    assert np.all(rays.status == Status.OK)
+    np.testing.assert_allclose(rays.points[0, 0, 2, :2], 0, atol=1e-18)
+
+
 def hostile(seed):
     """A lens with the structure of the "tilted" one, and a scene, to break the search."""
     generator = np.random.default_rng(seed)
