@@ -5,6 +5,7 @@ import difflib
 import json
 import math
 import pathlib
+import types
 import typing
 from collections.abc import Sequence
 from typing import Any, Literal, TypeVar
@@ -94,10 +95,13 @@ def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = Non
 
 
 def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = None) -> Any:
-    """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...] or a Literal."""
+    """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...], X | tuple[X, ...] or a
+    Literal."""
     if dataclasses.is_dataclass(kind):
         return _build(kind, value, source, f"{key}.", old)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:  # of one value and of a list
+        return _convert(arguments[isinstance(value, list | tuple)], value, source, key)
     if origin is tuple and isinstance(value, list | tuple) and len(value) <= _ITEMS:
         items = enumerate(value)
         return tuple(_convert(arguments[0], item, source, f"{key}[{i}]") for i, item in items)
@@ -141,6 +145,8 @@ def _say(kind: Any) -> str:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
         return f"a list, each item {_say(arguments[0])}"
+    if origin is types.UnionType:
+        return " or ".join(map(_say, arguments))
     if origin is Literal:
         return "one of " + ", ".join(map(str, arguments))
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
