@@ -13,8 +13,11 @@ from jax import Array
 
 import drt_jax
 from drt_jax import design
+from drt_jax.design.kinds import step_of
 from drt_jax.pupil import hexapolar
+from drt_jax.rays.solve import solve_aimed
 from drt_jax.rays.status import Status
+from drt_jax.rays.trace import trace_bundle
 from drt_jax.runs.config import ConfigError
 
 from ._common import require, require_known, require_within
@@ -141,20 +144,24 @@ class Trained:
         return blur if places else model
 
     def scale(self, scene: Scene, distance: float) -> dict[str, float]:
-        """By name: the change that moves the rays on the sensor about their centroid as far as they
-        go when the sensor moves by 1 mm; root of the mean square over pupil and colours, to first
-        order, at the start. 0 for a sensor that is not trained.
+        """By name: the change, in the unit of the lens, that counts as 1 mm of the sensor. 0 for a
+        sensor that is not trained.
 
-        So one rate in mm serves numbers of all units, and none is nearer to spoiling the focus than
-        another.
+        That which moves the rays on the sensor about their centroid as far as the sensor's does,
+        root of the mean square over pupil and colours, to first order, at the start; so one rate
+        in mm serves all units, and none spoils the focus faster than another. At most as many
+        typical steps of a design as 1 mm is of the sensor's: a conic of a nearly flat surface
+        would have to change by thousands.
         """
-        pupil = np.asarray(hexapolar(_RINGS)[0]).T
+        pupil = tuple(jnp.asarray(hexapolar(_RINGS)[0], self.lens.curvature.dtype))
 
         def hits(values: dict[str, Array]) -> tuple[Array, Array]:
-            rays = drt_jax.trace_rays(self.lens_of(values), *scene.seen(distance), pupil)
-            return rays.points[:, :, -1, :2], rays.status
+            lens = self.lens_of(values)
+            given = drt_jax.scene_of(lens, *scene.seen(distance))
+            bundle = trace_bundle(lens, given, pupil, solve_aimed)
+            return jnp.stack([hit[-1] for hit in bundle.hits], axis=-1), bundle.status
 
-        slopes, status = jax.jacfwd(hits, has_aux=True)(self.start(self.lens.sensor))
+        slopes, status = jax.jit(jax.jacfwd(hits, has_aux=True))(self.start(self.lens.sensor))
         good = np.asarray(status == Status.OK)[..., None]
         wide = {}
         for name, slope in slopes.items():
@@ -162,5 +169,8 @@ class Trained:
             middle = np.sum(moved, axis=1, where=good) / np.sum(good, axis=1)
             wide[name] = float(np.sqrt(np.mean((moved - middle[:, None]) ** 2, where=good)))
             require(wide[name] > 0, f"train.variables: {name} moves no ray; leave it out")
-        found = {name: wide["sensor"] / size for name, size in wide.items()}
-        return found | {"sensor": float(self.moves)}
+        found = {"sensor": float(self.moves)}
+        for name, place in zip(self.names, self.variables.places if self.variables else ()):
+            steps = step_of(self.lens, *place) / step_of(self.lens, "sensor", 0, 0)
+            found[name] = min(wide["sensor"] / wide[name], steps)
+        return found

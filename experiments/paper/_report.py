@@ -82,10 +82,10 @@ def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
     figure, axes = panels(len(labels), 6, 4)
     for ax, label, changes in zip(axes, labels, results["changes_mm"]):
         lines = {n: (np.arange(len(row)), row) for n, row in zip(trained.names, changes)}
-        show.convergence(ax, lines, "change, as a shift of the sensor (mm)")
+        show.convergence(ax, lines, "change, as mm of the sensor")
         ax.set_title(label, fontsize=9)
     figure.savefig(folder / "numbers.png")
-    figure, axes = show.new(2, 1, 8, 4)
+    figure, axes = show.new(2, 1, 8, 3)
     titles = labels[0], f"{labels[0]}, trained"
     for ax, values, title in zip(axes, results["numbers"][0], titles):
         _draw(ax, trained.lens_of(values), results, results["spot_mm"])

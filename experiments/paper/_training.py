@@ -37,7 +37,7 @@ class Training:
     batches: steps of each job. batch: patches in one. patch: their side in pixels. variables: the
     numbers of the lens that are trained, by kind, or kind and surface such as "curvature 0".
     optics_rate: Adam's learning rate of the sensor's position in mm; that of another number moves
-    the rays on the sensor as much. checkpoint_every: in batches, or when metrics are next written.
+    the rays on the sensor as far, see `Trained.scale`. checkpoint_every: in batches, or when metrics are next written.
     """
 
     batches: int
@@ -234,7 +234,7 @@ class Jobs:
         try:
             require_finite(label, first, rows["loss"])
             require_finite(label, first, rows["sigma_um"], "blur")
-            wrong = crossed(self.lens.lens_of(values)) if self.lens.names else ""
+            wrong = crossed(self.lens.lens_of(values)) if values and self.lens.names else ""
             what = f"{label}: after batch {first + len(rows['loss']) - 1}{wrong}"
             require(not wrong, f"{what}; leave this start out, or lower train.optics_rate")
         except ConfigError as error:
@@ -274,19 +274,18 @@ class Jobs:
 
     def _numbers(self, traces: list[dict[str, np.ndarray]], window: int) -> dict[str, Any]:
         """What became of the lens: its numbers, loss and spot at each start and end, and the
-        changes (starts, numbers, batches) as shifts of the sensor in mm that move rays as far."""
+        changes (starts, numbers, batches) in units of `Trained.scale`, mm."""
         config, distance = self._config, middle(*self._depths)
         rows, changes = [], []
         for start, trace in zip(config.starts_mm, traces):
             ends = [self.lens.start(start), self._good[start_label(start)]]
-            losses = [float(np.mean(part)) for part in np.split(trace["loss"], [window, -window])]
+            losses = trace["loss"][:window], trace["loss"][-window:]
             columns = [{name: float(number) for name, number in end.items()} for end in ends]
-            for column, end, loss in zip(columns, ends, (losses[0], losses[-1])):
-                spot = spot_of(config.scene, self.lens.lens_of(end), distance)
-                column |= spot | {"loss": loss}
+            for column, end, loss in zip(columns, ends, losses):
+                column |= spot_of(config.scene, self.lens.lens_of(end), distance)
+                column["loss"] = float(np.mean(loss))
             rows.append(columns)
-            lines = [(trace[n] - trace[n][0]) / self._scale[n] for n in self.lens.names]
-            changes.append(lines)
+            changes.append([(trace[n] - trace[n][0]) / self._scale[n] for n in self.lens.names])
         return {"numbers": rows, "changes_mm": np.array(changes), "spot_mm": distance}
 
 
