@@ -37,7 +37,8 @@ class Training:
     batches: steps of each job. batch: patches in one. patch: their side in pixels. variables: the
     numbers of the lens that are trained, by kind, or kind and surface such as "curvature 0".
     optics_rate: Adam's learning rate of the sensor's position in mm; that of another number moves
-    the rays on the sensor as far, see `Trained.scale`. checkpoint_every: in batches, or when metrics are next written.
+    the rays on the sensor as far, see `Trained.scale`. checkpoint_every: in batches, or when
+    metrics are next written.
     """
 
     batches: int
