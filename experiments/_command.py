@@ -50,7 +50,8 @@ class _Place:
 def main(experiment: Any, argv: list[str] | None = None) -> None:
     """Run an experiment, or with --report only draw and print the results of a run again.
 
-    experiment: a module with `Config`, the dataclass of its settings; `COLUMNS` of metrics.csv;
+    experiment: a module with `Config`, the dataclass of its settings; `COLUMNS` of metrics.csv,
+        to which `columns` of the settings add, if they have some;
         `run(config, run)`, which measures and returns results for `Run.finish`;
         `tables(results)`, printed; and `draw(results, folder)` of figures.
     argv: of the command line.
@@ -90,8 +91,9 @@ def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
     place.own = options.resume or options.report
     if not options.report:
         config = _config(name, experiment.Config, options, folder)
+        columns = (*experiment.COLUMNS, *getattr(config, "columns", ()))
         with deferred_interrupt() as asked:  # between nothing and a run there is no stop
-            run = Run(folder, config, experiment.COLUMNS, options.resume)
+            run = Run(folder, config, columns, options.resume)
             place.own = True
         with run:
             if asked():

@@ -19,12 +19,13 @@ class AdamState(NamedTuple):
 
 
 def adam(
-    rates: float | Mapping[str, float], b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8
+    rates: float | Mapping[str, Any], b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8
 ) -> tuple[Callable[[Any], AdamState], Callable[[Any, AdamState], tuple[Any, AdamState]]]:
     """The optimiser as (init, update).
 
     rates: one learning rate, or one for each top-level key of the parameters, such as
-        {"optics": 1e-2, "network": 1e-3}. KeyError, in `update`, if a group has none.
+        {"optics": 1e-2, "network": 1e-3}, and for each key below it where that is a mapping too.
+        KeyError, in `update`, if a group has none.
     b1, b2: how much of the first and second moment is kept in each step.
     eps: added to the root of the second moment.
 
@@ -41,7 +42,10 @@ def adam(
         first = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.first, gradients)
         second = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.second, gradients)
 
-        def scaled(rate: float, first: Any, second: Any) -> Any:
+        def scaled(rate: Any, first: Any, second: Any) -> Any:
+            if isinstance(rate, Mapping):
+                return {name: scaled(rate[name], first[name], second[name]) for name in first}
+
             def leaf(m: Array, v: Array) -> Array:
                 # 1 - b^steps, without the cancellation that costs float32 five digits
                 kept = [-jnp.expm1(steps.astype(m.dtype) * math.log(b)) for b in (b1, b2)]
@@ -49,8 +53,7 @@ def adam(
 
             return jax.tree.map(leaf, first, second)
 
-        groups = {group: rates[group] for group in first} if isinstance(rates, Mapping) else rates
-        return jax.tree.map(scaled, groups, first, second), AdamState(steps, first, second)
+        return scaled(rates, first, second), AdamState(steps, first, second)
 
     return init, update
 

@@ -102,7 +102,7 @@ def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, A
 
 def make_step(
     imager: Imager,
-    rates: dict[str, float],
+    rates: dict[str, Any],
     depths: tuple[float, float],
     seed: int,
     vectorised: bool = False,
@@ -110,14 +110,15 @@ def make_step(
     """Adam on the mean absolute error as (init, step).
 
     imager: as `make_imager` returns it.
-    rates: learning rates of the groups "optics" (mm for the sensor) and "network".
+    rates: learning rates of the groups "optics" (mm for the sensor; or by its numbers, each in its
+        unit) and "network".
     depths: the object distance of each step is uniform between them, mm.
     seed: noise and depth are functions of it and of the step index.
     vectorised: over the first axis of all parameters, of N jobs.
 
     init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the
-    state donated. metrics: loss, sensor_mm, sigma_um (mean over the colours), depth_mm, each ()
-    or, vectorised, (N,).
+    state donated. metrics: loss, sigma_um (mean over the colours), depth_mm, and the optics'
+    parameters by name, that of "sensor" as sensor_mm, each () or, vectorised, (N,).
     """
     init_adam, update = adam(rates)
     near, far = depths
@@ -142,8 +143,8 @@ def make_step(
         (error, sigma), gradients = _value_and_gradient(loss, parameters)
         updates, moments = update(gradients, moments)
         report = {"loss": error, "sigma_um": 1e3 * sigma, "depth_mm": distance}
-        if "sensor" in parameters["optics"]:
-            report["sensor_mm"] = parameters["optics"]["sensor"]
+        for name, value in parameters["optics"].items():
+            report["sensor_mm" if name == "sensor" else name] = value
         return (apply_updates(parameters, updates), moments), report
 
     if vectorised:

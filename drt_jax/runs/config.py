@@ -5,6 +5,7 @@ import difflib
 import json
 import math
 import pathlib
+import types
 import typing
 from collections.abc import Sequence
 from typing import Any, Literal, TypeVar
@@ -24,14 +25,17 @@ class ConfigError(InputError):
 
 
 class _Source:
-    """Where settings come from, as messages name it: a file with its lines, or an override."""
+    """Where settings come from, as messages name it: a file with its lines, or overrides by key."""
 
-    def __init__(self, name: str, lines: Lines):
-        self._name, self._lines = name, lines
+    def __init__(self, name: str, lines: Lines, overrides: dict[str, str] | None = None):
+        self._name, self._lines, self._overrides = name, lines, overrides or {}
 
     def error(self, key: str, message: str) -> ConfigError:
         """What is wrong at a key."""
-        return ConfigError(f"{self._name}{self._lines.of(key)}: {message}", key)
+        inside = ((name, f"{given}.") for given, name in self._overrides.items())
+        found = [name for name, given in inside if f"{key}.".startswith(given)]
+        name = found[-1] if found else self._name
+        return ConfigError(f"{name}{self._lines.of(key)}: {message}", key)
 
 
 def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str] = ()) -> T:
@@ -39,7 +43,7 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
 
     cls: the dataclass; keys left out of the file keep its defaults.
     path: of the file.
-    overrides: like "train.batch=8", applied afterwards.
+    overrides: like "train.batch=8", applied afterwards, all at once.
 
     ConfigError, with the line, for a file that cannot be read, an unknown key (with the nearest
     known one) or a value of the wrong type or beyond any use.
@@ -49,6 +53,8 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
     except InputError as error:
         raise ConfigError(f"{path}: {error}") from error
     config = _build(cls, {} if entry is None else entry, _Source(str(path), lines), "")
+    changes: object = {}
+    names: dict[str, str] = {}
     for override in overrides:
         name = f"--set {shown(override)[1:-1]}"
         key, equals, text = override.partition("=")
@@ -58,10 +64,19 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
             value, _ = parse(text)
         except InputError as error:
             raise ConfigError(f"{name}: {error}") from error
+        names[key.strip()] = name
         for part in reversed(key.strip().split(".")):
             value = {part: value}
-        config = _build(cls, value, _Source(name, Lines()), "", config)
-    return config
+        changes = _merged(changes, value)
+    source = _Source(" ".join(names.values()), Lines(), names)
+    return _build(cls, changes, source, "", config) if names else config
+
+
+def _merged(old: object, new: object) -> object:
+    """Nested keys and values, of which the new ones count."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return new
+    return old | {key: _merged(old.get(key), value) for key, value in new.items()}
 
 
 def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = None) -> Any:
@@ -94,10 +109,13 @@ def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = Non
 
 
 def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = None) -> Any:
-    """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...] or a Literal."""
+    """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...], X | tuple[X, ...] or a
+    Literal."""
     if dataclasses.is_dataclass(kind):
         return _build(kind, value, source, f"{key}.", old)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:  # of one value and of a list
+        return _convert(arguments[isinstance(value, list | tuple)], value, source, key)
     if origin is tuple and isinstance(value, list | tuple) and len(value) <= _ITEMS:
         items = enumerate(value)
         return tuple(_convert(arguments[0], item, source, f"{key}[{i}]") for i, item in items)
@@ -141,6 +159,8 @@ def _say(kind: Any) -> str:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
         return f"a list, each item {_say(arguments[0])}"
+    if origin is types.UnionType:
+        return " or ".join(map(_say, arguments))
     if origin is Literal:
         return "one of " + ", ".join(map(str, arguments))
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}

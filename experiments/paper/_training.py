@@ -1,4 +1,4 @@
-"""What the paper's experiments share: settings, trained jobs, tables and pictures of them."""
+"""What the paper's experiments share: settings, and trained jobs."""
 
 import dataclasses
 import functools
@@ -13,53 +13,38 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import show
+from drt_jax.image.lost import crossed
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
 from drt_jax.learn.data import DataConfig, batches, load_patches
+from drt_jax.runs.config import ConfigError
 from drt_jax.runs.folder import Run
 from drt_jax.runs.interrupt import deferred_interrupt
 from drt_jax.runs.write import replace
 
 from ._common import require, require_list, require_within
+from ._optics import Scene, Trained, check_variables, middle, spot_of
+from ._report import IMAGES, start_label
 
 # So many files that were skipped are named on the terminal, all of more in the run's folder.
 _NAMED = 20
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
-    """What is photographed, and through which lens.
-
-    lens: bundled name or YAML path. wavelengths_um: of the three channels, R, G, B. tolerance:
-    relative error of the blur that fixes the number of rays.
-    """
-
-    lens: str = "double_gauss"
-    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
-    tolerance: float = 1e-9
-
-    def __post_init__(self) -> None:
-        require(len(self.wavelengths_um) == 3, "scene.wavelengths_um: expected three, for R, G, B")
-        require_within("scene.", self, wavelengths_um=(1e-4, 1e6), tolerance=(1e-14, 0.5))
-
-    def blur(self, near: float, far: float) -> Callable:
-        """The blur by the sensor's position and the distance, from `near` to `far` mm."""
-        scene = 0.0, (near, far), self.wavelengths_um, self.tolerance
-        return drt_jax.moments_model(drt_jax.load_lens(self.lens), ("sensor",), *scene)[1]
-
-
-@dataclasses.dataclass(frozen=True)
 class Training:
     """How long, and how fast.
 
-    batches: steps of each job. batch: patches in one. patch: their side in pixels. optics_rate:
-    Adam's learning rate in mm. checkpoint_every: in batches, or when metrics are next written.
+    batches: steps of each job. batch: patches in one. patch: their side in pixels. variables: the
+    numbers of the lens that are trained, by kind, or kind and surface such as "curvature 0".
+    optics_rate: Adam's learning rate of the sensor's position in mm; that of another number moves
+    the rays on the sensor as far, see `Trained.scale`. checkpoint_every: in batches, or when
+    metrics are next written.
     """
 
     batches: int
     batch: int = 16
     patch: int = 64
+    variables: tuple[str, ...] = ("sensor",)
     optics_rate: float = 1e-3
     checkpoint_every: int = 200
 
@@ -68,6 +53,7 @@ class Training:
         sizes = {"batch": (1, 4096), "patch": (7, 4096), "checkpoint_every": (1, math.inf)}
         rates = {f"{name}_rate": (0, 10) for name in self.rates}
         require_within("train.", self, batches=(1, math.inf), **sizes, **rates)
+        check_variables(self.variables)
 
     @property
     def rates(self) -> dict[str, float]:
@@ -114,6 +100,20 @@ class Settings:
         require_list("starts_mm", self.starts_mm)
         require_within("", self, starts_mm=(1e-3, 1e6), noise=(0, 10))
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Of metrics.csv, beside those of the experiment: the trained numbers of the lens."""
+        return Trained.of(self.scene.lens, self.train.variables).names
+
+    @property
+    def paper(self) -> bool:
+        """Whether the paper has numbers for this: its lens, colours and distances, and the sensor
+        alone that moves."""
+        usual = {field.name: field.default for field in dataclasses.fields(self)}
+        here = vars(self) | {"scene": dataclasses.replace(self.scene, tolerance=Scene.tolerance)}
+        same = all(here[n] == usual[n] for n in ("scene", "distance_m", "depth_m") if n in usual)
+        return same and self.train.variables == ("sensor",)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JointSettings(Settings):
@@ -127,13 +127,18 @@ class JointSettings(Settings):
 class Jobs:
     """The training jobs of a run.
 
+    lens: with the numbers that are trained. blur: its moments by them and the distance.
     scenes, test: patches to train with, and to measure on.
     restore, parameters: the network if the settings have one, and the number of its weights.
     """
 
-    def __init__(self, run: Run, config: Settings, near: float, far: float) -> None:
-        """near, far: of the objects in training, mm."""
+    def __init__(self, run: Run, config: Settings, near: float, far: float, *more: float) -> None:
+        """near, far: of the objects in training, mm; more: other distances at which to measure."""
         self._run, self._config, self._depths = run, config, (near, far)
+        self.lens = Trained.of(config.scene.lens, config.train.variables)
+        self.blur = self.lens.blur(config.scene, min([near, *more]), max([far, *more]))
+        # The last values of each job that were found good.
+        self._good: dict[str, dict[str, float]] = {}
         self._network: dict[str, Any] = {}
         self.restore = None
         side = config.train.patch + config.camera.kernel - 1
@@ -155,13 +160,21 @@ class Jobs:
             self.parameters = network.count_parameters(weights)
             print(f"RED-Net with {self.parameters} parameters")
 
+    @functools.cached_property
+    def _scale(self) -> dict[str, float]:
+        """`Trained.scale` in the middle of the distances; none of the sensor alone."""
+        names, distance = self.lens.names, middle(*self._depths)
+        return self.lens.scale(self._config.scene, distance) if names else {}
+
     def steps(
         self, blur: Callable, several: bool = False, convolve: Callable = convolve
     ) -> tuple[Callable, tuple[Callable, Callable]]:
         """The imager through a blur, and (init, step) for it, of several jobs at once or of one."""
         config = self._config
         imager = train.make_imager(blur, self.restore, config.camera, convolve)
-        rates = config.train.rates
+        rates: dict[str, Any] = dict(config.train.rates)
+        if self._scale:
+            rates["optics"] = {n: rates["optics"] * size for n, size in self._scale.items()}
         step = train.make_step(imager, rates, self._depths, config.seed, vectorised=several)
         return jax.jit(imager), step
 
@@ -192,7 +205,7 @@ class Jobs:
             for k, label in enumerate(labels):
                 rows = {n: v.reshape(len(v), -1)[:, k] for n, v in metrics.items()}
                 run.log(label, start, rows)
-                require_finite(label, start, rows["loss"])
+                self._check(label, start, rows, values_of(state[0], k))
             bar.update(len(metrics["loss"]))
             bar.set_postfix_str(f"loss={np.array2string(metrics['loss'][-1], precision=3)}")
             if asked() or done == total or done - saved >= setting.checkpoint_every:
@@ -209,7 +222,35 @@ class Jobs:
             state = train.fit(step, state, stream, noise, range(first, total), every, report, asked)
             if asked():
                 raise KeyboardInterrupt
+        for k, label in enumerate(labels):
+            self._good[label] = values_of(state[0], k)
+            self._save_lens(label)
         return state[0]
+
+    def _check(
+        self, label: str, first: int, rows: dict[str, np.ndarray], values: dict[str, float]
+    ) -> None:
+        """ConfigError for numbers that are not finite, and for a lens whose surfaces cross; the one
+        of the last report, which had none of this, is saved then."""
+        try:
+            require_finite(label, first, rows["loss"])
+            require_finite(label, first, rows["sigma_um"], "blur")
+            wrong = crossed(self.lens.lens_of(values)) if values and self.lens.names else ""
+            what = f"{label}: after batch {first + len(rows['loss']) - 1}{wrong}"
+            require(not wrong, f"{what}; leave this start out, or lower train.optics_rate")
+        except ConfigError as error:
+            if label not in self._good:
+                raise
+            raise ConfigError(f"{error}; the lens before is {self._save_lens(label)}") from error
+        self._good[label] = values
+
+    def _save_lens(self, label: str) -> pathlib.Path:
+        """Write the lens that a job has come to."""
+        path = self._run.folder / "designed" / f"{label}.yaml"
+        path.parent.mkdir(exist_ok=True)
+        if self._good[label]:
+            drt_jax.save_lens(self.lens.lens_of(self._good[label]), path)
+        return path
 
     def results(self, *columns: str) -> dict[str, Any]:
         """What is kept of the training of all starts, which log as `start_label`: their final
@@ -218,60 +259,47 @@ class Jobs:
         config = self._config
         window = min(config.train.batches, max(20, config.train.batches // 10))
         traces = [self._run.metrics(start_label(start)) for start in config.starts_mm]
+        numbers = self._numbers(traces, window) if self.lens.names else {}
         return {
             "lens": config.scene.lens,
+            "field": config.scene.field,
+            "paper": config.paper,
+            "variables": list(config.train.variables),
             "starts_mm": list(config.starts_mm),
             "final_mm": [float(np.mean(trace["sensor_mm"][-window:])) for trace in traces],
             "final_window_batches": window,
             "seconds": self._run.seconds,
             **{column: np.stack([trace[column] for trace in traces]) for column in columns},
+            **numbers,
         }
 
+    def _numbers(self, traces: list[dict[str, np.ndarray]], window: int) -> dict[str, Any]:
+        """What became of the lens: its numbers, loss and spot at each start and end, and the
+        changes (starts, numbers, batches) in units of `Trained.scale`, mm."""
+        config, distance = self._config, middle(*self._depths)
+        rows, changes = [], []
+        for start, trace in zip(config.starts_mm, traces):
+            ends = [self.lens.start(start), self._good[start_label(start)]]
+            losses = trace["loss"][:window], trace["loss"][-window:]
+            columns = [{name: float(number) for name, number in end.items()} for end in ends]
+            for column, end, loss in zip(columns, ends, losses):
+                column |= spot_of(config.scene, self.lens.lens_of(end), distance)
+                column["loss"] = float(np.mean(loss))
+            rows.append(columns)
+            changes.append([(trace[n] - trace[n][0]) / self._scale[n] for n in self.lens.names])
+        return {"numbers": rows, "changes_mm": np.array(changes), "spot_mm": distance}
 
-def require_finite(label: str, first: int, losses: np.ndarray) -> None:
+
+def values_of(parameters: dict[str, Any], k: int) -> dict[str, float]:
+    """The numbers of the lens of job k."""
+    return {name: float(np.ravel(value)[k]) for name, value in parameters["optics"].items()}
+
+
+def require_finite(label: str, first: int, losses: np.ndarray, what: str = "loss") -> None:
     """ConfigError, with the batch, unless all losses of a job are finite; `first`: their batch."""
     lost = np.flatnonzero(~np.isfinite(losses))
-    what = f"{label}: the loss is not finite from batch {first + lost[:1].sum()} on"
+    what = f"{label}: the {what} is not finite from batch {first + lost[:1].sum()} on"
     require(not lost.size, f"{what}; leave this start out, or lower the learning rates")
-
-
-def start_label(start: float) -> str:
-    """The job of a starting position of the sensor, mm."""
-    return f"start {start}"
-
-
-def start_lines(results: dict[str, Any], column: str, batches: int | None = None) -> dict:
-    """(batch, value) by start, for `show.convergence`, of the first `batches`."""
-    rows = [values[:batches] for values in results[column]]
-    labels = map(start_label, results["starts_mm"])
-    return {label: (np.arange(len(row)), row) for label, row in zip(labels, rows)}
-
-
-def reached(results: dict[str, Any]) -> str:
-    """The planes at which the starts ended, in words."""
-    if None in results["final_mm"]:
-        return "not finite"
-    low, high = (f"{end(results['final_mm']):.3f}" for end in (min, max))
-    return f"{low} mm" if low == high else f"{low} to {high} mm"
-
-
-def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
-    """Picture of the sensor position of all starts over training."""
-    figure, axes = show.new(width=7, height=4.5)
-    show.convergence(axes, start_lines(results, "sensor_mm"), "sensor position (mm)")
-    figure.savefig(path)
-
-
-def draw_lens(name: str, distance: float, path: pathlib.Path) -> None:
-    """Picture of a lens with its axial beam from `distance` mm."""
-    lens = drt_jax.load_lens(name)
-    figure, axes = show.new(width=8, height=4)
-    show.lens_drawing(axes, show.draw(lens, 0.0, distance))
-    axes.set_title(lens.name)
-    figure.savefig(path)
-
-
-_IMAGES = ("truth", "sensor", "restored")
 
 
 def images(
@@ -279,15 +307,7 @@ def images(
 ) -> dict[str, np.ndarray]:
     """Truth, sensor and restored images of patches, for `draw_patches`."""
     found = imager(parameters, scenes, distance, np.float32(noise), jax.random.key(seed))
-    return {name: np.asarray(image, np.float16) for name, image in zip(_IMAGES, found)}
-
-
-def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path) -> None:
-    """Picture of the `images`, each but the truth with its RMSE."""
-    rows = {name: np.float32(results[name]) for name in _IMAGES}
-    errors = {name: rows[name] - rows["truth"] for name in _IMAGES[1:]}
-    notes = {n: [f"{np.sqrt(np.mean(e**2)):.3f}" for e in some] for n, some in errors.items()}
-    show.patch_grid(rows, titles, notes).savefig(path)
+    return {name: np.asarray(image, np.float16) for name, image in zip(IMAGES, found)}
 
 
 def thinned(patches: np.ndarray, count: int) -> np.ndarray:

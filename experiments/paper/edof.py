@@ -21,7 +21,7 @@ from drt_jax.learn import train
 from drt_jax.numerics import safe_sqrt
 from drt_jax.runs.folder import Run
 
-from . import _command, _common, _training
+from . import _command, _common, _report, _training
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um", "depth_mm")
 
@@ -59,25 +59,27 @@ class Config(_training.JointSettings):
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Train jointly and with the sensor fixed, and test over depth."""
-    depths = *config.depth_m, *config.table_depth_m, *config.patch_depth_m
-    blur = config.scene.blur(1e3 * min(depths), 1e3 * max(depths))
     near, far = (1e3 * depth for depth in config.depth_m)
-    jobs = _training.Jobs(run, config, near, far)
+    more = (1e3 * depth for depth in (*config.table_depth_m, *config.patch_depth_m))
+    jobs = _training.Jobs(run, config, near, far, *more)
+    blur = jobs.blur
     imager, steps = jobs.steps(blur)
     joint = {}
     for start in config.starts_mm:
-        optics = {"sensor": jnp.asarray(start)}
-        joint[start] = jobs.train(_training.start_label(start), steps, optics, config.noise)
-    place = {"sensor": jnp.asarray(config.fixed_mm)}
+        optics = jobs.lens.start(start)
+        joint[start] = jobs.train(_report.start_label(start), steps, optics, config.noise)
+    place = jobs.lens.start(config.fixed_mm)
     still, steps = jobs.steps(lambda _, depth: blur(place, depth))
     fixed = jobs.train(f"fixed {config.fixed_mm}", steps, {}, config.noise)
     best = joint[config.fixed_mm]
     results = jobs.results("sensor_mm")
-    final = results["final_mm"][config.starts_mm.index(config.fixed_mm)]
+    final = best["optics"]
+    if not jobs.lens.names:
+        final = {"sensor": results["final_mm"][config.starts_mm.index(config.fixed_mm)]}
     return {
         **results,
         **tested(config, {"fixed": (still, fixed), "joint": (imager, best)}, jobs.test),
-        **blur_over_depth(blur, (config.fixed_mm, final), near, far),
+        **blur_over_depth(blur, (place, final), near, far),
         "joint_sensor_mm": float(best["optics"]["sensor"]),
         "depth_m": list(config.depth_m),
     }
@@ -106,12 +108,13 @@ def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[s
     }
 
 
-def blur_over_depth(blur: Callable, sensors: tuple, near: float, far: float) -> dict[str, Any]:
-    """Blur in um along y of each colour, by depth in m, at sensor positions in mm."""
+def blur_over_depth(blur: Callable, lenses: tuple, near: float, far: float) -> dict[str, Any]:
+    """Blur in um along y of each colour, by depth in m, of lenses by their trained numbers."""
     grid = np.linspace(near, far, 121)
-    sigma = jax.vmap(lambda d, s: safe_sqrt(blur({"sensor": s}, d)[1][:, 0]), in_axes=(0, None))
-    curves = np.stack([1e3 * np.asarray(sigma(jnp.asarray(grid), sensor)) for sensor in sensors])
-    return {"blur_sensor_mm": list(sensors), "blur_depth_m": grid / 1e3, "blur_um": curves}
+    sigma = jax.vmap(lambda d, v: safe_sqrt(blur(v, d)[1][:, 0]), in_axes=(0, None))
+    curves = np.stack([1e3 * np.asarray(sigma(jnp.asarray(grid), values)) for values in lenses])
+    sensors = [float(values["sensor"]) for values in lenses]
+    return {"blur_sensor_mm": sensors, "blur_depth_m": grid / 1e3, "blur_um": curves}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -123,29 +126,31 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     means = f"mean MAE over training depths {joint} against {fixed}"
     against = f"{means}; fixed better at {', '.join(better) or 'no'} m"
     beside = [
-        ("plane that all starts reach", "145.29 mm", _training.reached(results)),
+        *_report.planes(results, "145.29 mm"),
         ("joint against fixed sensor", "joint better, but for 15 to 20 m", against),
     ]
     errors = [(m.upper() + " " + n, n, m) for n in ("fixed", "joint") for m in ("mae", "rmse")]
     lines = [(title, *(_common.number(row[n][m], ".4f") for row in rows)) for title, n, m in errors]
     header = "depth m", *(f"{row['depth_m']:g}" for row in rows)
     return {
-        "edof": _common.table(("", "paper", "here"), beside),
+        "edof": _report.beside(results, beside),
         "edof, table 2": _common.table(header, lines),
+        **_report.numbers_tables("edof, lens", results),
     }
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw the lens and figures 6a, 6b and 7."""
     far = 1e3 * results["depth_m"][1]
-    _training.draw_lens(results["lens"], far, figures / "lens.png")
-    _training.draw_sensor(results, figures / "figure_6a.png")
+    _report.draw_lens(results, far, figures / "lens.png")
+    _report.draw_numbers(results, figures)
+    _report.draw_sensor(results, figures / "figure_6a.png")
     figure, axes = show.new(width=7, height=4.5)
     labels = [f"{sensor:.2f} mm" for sensor in results["blur_sensor_mm"]]
     show.sigma_over_depth(axes, results["blur_depth_m"], dict(zip(labels, results["blur_um"])))
     figure.savefig(figures / "figure_6b.png")
     titles = [f"{depth:g} m" for depth in results["patch_depth_m"]]
-    _training.draw_patches(results, titles, figures / "figure_7.png")
+    _report.draw_patches(results, titles, figures / "figure_7.png")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from drt_jax import show
 from drt_jax.image.sensor import convolve_taps
 from drt_jax.runs.folder import Run
 
-from . import _command, _common, _training
+from . import _command, _common, _report, _training
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
 # Of the mean of many numbers in float32, relative, with some room.
@@ -59,12 +59,13 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Train all starts together, and find the best focus independently."""
     distance = 1e3 * config.distance_m
     jobs = _training.Jobs(run, config, distance, distance)
-    blur = config.scene.blur(distance, distance)
-    imager, steps = jobs.steps(blur, several=True, convolve=convolve_taps)
-    labels = tuple(map(_training.start_label, config.starts_mm))
-    starts = {"sensor": jnp.asarray(config.starts_mm)}
+    imager, steps = jobs.steps(jobs.blur, several=True, convolve=convolve_taps)
+    labels = tuple(map(_report.start_label, config.starts_mm))
+    starts = jobs.lens.start(config.starts_mm)
     jobs.train("all starts", steps, starts, config.noise, labels)
-    results = jobs.results("sensor_mm", "sigma_um")
+    results = jobs.results("sensor_mm", "sigma_um") | {"distance_mm": distance}
+    if jobs.lens.names:  # there is no best focus of a lens that changes
+        return results
 
     def loss(sensor, scenes):
         key, noise = jax.random.key(0), np.float32(config.noise)
@@ -78,36 +79,39 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     best = best_focus(loss, scenes, low - reach, high + reach)
     near = [np.flatnonzero(np.abs(trace - best) <= 0.1) for trace in results["sensor_mm"]]
     first = [int(hits[0]) if hits.size else None for hits in near]
-    return results | {"best_focus_mm": best, "batches_to_focus": first, "distance_mm": distance}
+    return results | {"best_focus_mm": best, "batches_to_focus": first}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Beside the paper, and each start."""
-    best = results["best_focus_mm"]
-    found = "no minimum was found" if best is None else f"{best:.3f}"
-    search = f" (dense search on the same loss: {found})"
-    starts = ", ".join(f"{start:g}" for start in results["starts_mm"])
-    first = ", ".join("never" if n is None else str(n) for n in results["batches_to_focus"])
-    beside = [
-        ("plane that all starts reach", "133.35 mm", _training.reached(results) + search),
-        (f"batches until within 0.1 mm, starts {starts} mm", '"within the first 60"', first),
-        ("training of all starts", "", _common.duration(results["seconds"])),
-    ]
-    return {"focus": _common.table(("", "paper", "here"), beside)}
+    search, firsts = "", []
+    if "best_focus_mm" in results:
+        best = results["best_focus_mm"]
+        found = "no minimum was found" if best is None else f"{best:.3f}"
+        search = f" (dense search on the same loss: {found})"
+        starts = ", ".join(f"{start:g}" for start in results["starts_mm"])
+        first = ", ".join("never" if n is None else str(n) for n in results["batches_to_focus"])
+        what = f"batches until within 0.1 mm, starts {starts} mm"
+        firsts = [(what, '"within the first 60"', first)]
+    took = ("training of all starts", "", _common.duration(results["seconds"]))
+    rows = [*_report.planes(results, "133.35 mm", search), *firsts, took]
+    more = _report.numbers_tables("focus, lens", results)
+    return {"focus": _report.beside(results, rows)} | more
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw the lens and figures 4a and 4b."""
-    _training.draw_lens(results["lens"], results["distance_mm"], figures / "lens.png")
-    best = results["best_focus_mm"]
+    """Draw the lens and figures 4a and 4b; 4a if the sensor is trained."""
+    _report.draw_lens(results, results["distance_mm"], figures / "lens.png")
+    _report.draw_numbers(results, figures)
+    best = results.get("best_focus_mm")
     mark = None if best is None else (best, f"best focus {best:.2f}")
     for name, column, label, level in (
         ("figure_4a", "sensor_mm", "sensor position (mm)", mark),
         ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)", None),
-    ):
+    )[0 if _report.planes(results, "") else 1 :]:
         figure, (left, right) = show.new(1, 2, 5.5, 4)
-        show.convergence(left, _training.start_lines(results, column), label, level)
-        show.convergence(right, _training.start_lines(results, column, 100), label, level)
+        show.convergence(left, _report.start_lines(results, column), label, level)
+        show.convergence(right, _report.start_lines(results, column, 100), label, level)
         right.set_title("the first 100 batches", fontsize=9)
         figure.savefig(figures / f"{name}.png")
 

@@ -9,12 +9,10 @@ import pathlib
 import sys
 from typing import Any
 
-import jax.numpy as jnp
-
 from drt_jax.learn import train
 from drt_jax.runs.folder import Run
 
-from . import _command, _common, _training
+from . import _command, _common, _report, _training
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
 
@@ -40,13 +38,13 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Train every start and noise level, and test."""
     distance = 1e3 * config.distance_m
     jobs = _training.Jobs(run, config, distance, distance)
-    imager, steps = jobs.steps(config.scene.blur(distance, distance))
-    names = {(start, config.noise): _training.start_label(start) for start in config.starts_mm}
+    imager, steps = jobs.steps(jobs.blur)
+    names = {(start, config.noise): _report.start_label(start) for start in config.starts_mm}
     table = [(start, noise) for noise in config.table_noise for start in config.table_starts_mm]
     for start, noise in table:
-        names.setdefault((start, noise), f"{_training.start_label(start)} noise {noise}")
+        names.setdefault((start, noise), f"{_report.start_label(start)} noise {noise}")
     trained = {
-        (start, noise): jobs.train(job, steps, {"sensor": jnp.asarray(start)}, noise)
+        (start, noise): jobs.train(job, steps, jobs.lens.start(start), noise)
         for (start, noise), job in names.items()
     }
     rows = []
@@ -69,24 +67,23 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     first = results["test"][0]
     test = f"test MAE at noise {first['noise']:g}, after and before the network"
     errors = " and ".join(_common.number(first[name], ".4f") for name in ("mae", "sensor_mae"))
-    beside = [
-        ("plane that all starts reach", "133.35 mm", _training.reached(results)),
-        (test, "0.02 and 0.03", errors),
-    ]
+    rows = [*_report.planes(results, "133.35 mm"), (test, "0.02 and 0.03", errors)]
     measures = ["RMSE", "PSNR dB", "SSIM"]
     header = ["noise", "start mm", "MAE", *measures, "sensor MAE", *measures]
     columns = [a + b for a in ("", "sensor_") for b in ("mae", "rmse", "psnr", "ssim")]
-    rows = [[row[column] for column in ("noise", "start_mm", *columns)] for row in results["test"]]
+    errors = [[row[name] for name in ("noise", "start_mm", *columns)] for row in results["test"]]
     return {
-        "restore": _common.table(("", "paper", "here"), beside),
-        "restore, table 5b": _common.table(header, rows),
+        "restore": _report.beside(results, rows),
+        "restore, table 5b": _common.table(header, errors),
+        **_report.numbers_tables("restore, lens", results),
     }
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw figure 5a and restored patches."""
-    _training.draw_sensor(results, figures / "figure_5a.png")
-    _training.draw_patches(results, [""] * len(results["truth"]), figures / "restored.png")
+    _report.draw_numbers(results, figures)
+    _report.draw_sensor(results, figures / "figure_5a.png")
+    _report.draw_patches(results, [""] * len(results["truth"]), figures / "restored.png")
 
 
 if __name__ == "__main__":

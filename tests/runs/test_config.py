@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 from typing import Literal
 
 import pytest
@@ -61,6 +62,41 @@ BAD = {
 def test_bad_overrides_name_the_key(path, override):
     with pytest.raises(ConfigError, match=BAD[override]):
         load_config(Config, path, [override])
+
+
+@dataclasses.dataclass(frozen=True)
+class Ends:
+    low: float = 1.0
+    high: float = 2.0
+    field: float | tuple[float, ...] = 0.0
+
+    def __post_init__(self):
+        if not self.low < self.high:
+            raise ValueError(f"high: {self.high:g} is not above low")
+
+
+def test_overrides_count_all_at_once(tmp_path):
+    """Settings that are right only together, in any order; of a key given twice the last."""
+    (tmp_path / "ends.yaml").write_text("")
+    load = functools.partial(load_config, Ends, tmp_path / "ends.yaml")
+    assert load(["low=5", "high=4", "high=6"]) == load(["high=6", "low=5"]) == Ends(5.0, 6.0)
+    with pytest.raises(ConfigError, match="^--set high=0: high: 0 is not above low"):
+        load(["field=3", "high=0"])
+    with pytest.raises(ConfigError, match="^--set low=5 --set field=3: high: 2 is not above low"):
+        load(["low=5", "field=3"])
+
+
+def test_one_value_or_a_list(tmp_path):
+    (tmp_path / "ends.yaml").write_text("field: [1, 2.5]")
+    found = load_config(Ends, tmp_path / "ends.yaml")
+    assert found.field == (1.0, 2.5)
+    (tmp_path / "again.yaml").write_text(dump_config(found))
+    assert load_config(Ends, tmp_path / "again.yaml") == found
+    assert load_config(Ends, tmp_path / "again.yaml", ["field=7"]).field == 7.0
+    for wrong, message in (("x", "expected a number, got 'x'"), ("[x]", "expected a number")):
+        with pytest.raises(ConfigError, match=message):
+            load_config(Ends, tmp_path / "again.yaml", [f"field={wrong}"])
+    assert describe(Ends)[2] == "field: a number or a list, each item a number"
 
 
 def test_bad_files_name_the_file(tmp_path):

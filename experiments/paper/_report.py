@@ -1,0 +1,115 @@
+"""Tables and pictures of the paper's experiments, from their results alone."""
+
+import pathlib
+from typing import Any
+
+import numpy as np
+
+import drt_jax
+from drt_jax import show
+
+from ._common import number, panels, table
+from ._optics import Trained
+
+# Images of patches, in the order in which an imager returns them.
+IMAGES = ("truth", "sensor", "restored")
+_UNITS = {"sensor": "mm", "thickness": "mm", "curvature": "1/mm"}
+
+
+def start_label(start: float) -> str:
+    """The job of a starting position of the sensor, mm."""
+    return f"start {start}"
+
+
+def start_lines(results: dict[str, Any], column: str, batches: int | None = None) -> dict:
+    """(batch, value) by start, for `show.convergence`, of the first `batches`."""
+    rows = [values[:batches] for values in results[column]]
+    labels = map(start_label, results["starts_mm"])
+    return {label: (np.arange(len(row)), row) for label, row in zip(labels, rows)}
+
+
+def reached(results: dict[str, Any]) -> str:
+    """The planes at which the starts ended, in words."""
+    if None in results["final_mm"]:
+        return "not finite"
+    low, high = (f"{end(results['final_mm']):.3f}" for end in (min, max))
+    return f"{low} mm" if low == high else f"{low} to {high} mm"
+
+
+def planes(results: dict[str, Any], paper: str, more: str = "") -> list[tuple[str, str, str]]:
+    """The row of a table about the plane that all starts reach, if the sensor is trained."""
+    moves = "sensor" in results.get("variables", ["sensor"])
+    return [("plane that all starts reach", paper, reached(results) + more)] if moves else []
+
+
+def beside(results: dict[str, Any], rows: list[tuple[str, str, str]]) -> str:
+    """A table of (what, the paper's, ours), without the paper's of what it does not have."""
+    if results.get("paper", True):
+        return table(("", "paper", "here"), rows)
+    return table(("", "here"), [(what, here) for what, _, here in rows])
+
+
+def numbers_tables(name: str, results: dict[str, Any]) -> dict[str, str]:
+    """The table `name` of what became of the lens; none if the sensor alone is trained."""
+    if "numbers" not in results:
+        return {}
+    told = {"rms_um": f"RMS radius um at {results['spot_mm'] / 1e3:.4g} m"}
+    told |= {"light": "least share of light", "loss": "mean loss, first and last batches"}
+    runs = results["numbers"]
+    rows = []
+    for key in runs[0][0]:
+        title = told.get(key, f"{key} {_UNITS.get(key.split()[0], '')}".strip())
+        ends = [[number(column[key], ".6g") for column in columns] for columns in runs]
+        rows.append((title, *(" to ".join(pair) for pair in ends)))
+    return {name: table(("", *map(start_label, results["starts_mm"])), rows)}
+
+
+def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
+    """Picture of the sensor position of all starts over training, if it is trained."""
+    if planes(results, ""):
+        figure, axes = show.new(width=7, height=4.5)
+        show.convergence(axes, start_lines(results, "sensor_mm"), "sensor position (mm)")
+        figure.savefig(path)
+
+
+def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
+    """Pictures numbers.png, of what is trained beside the sensor, and designed.png, of the lens of
+    the first start before and after; none if that is nothing."""
+    if "numbers" not in results:
+        return
+    trained = Trained.of(results["lens"], tuple(results["variables"]))
+    labels = list(map(start_label, results["starts_mm"]))
+    figure, axes = panels(len(labels), 6, 4)
+    for ax, label, changes in zip(axes, labels, results["changes_mm"]):
+        lines = {n: (np.arange(len(row)), row) for n, row in zip(trained.names, changes)}
+        show.convergence(ax, lines, "change, as mm of the sensor")
+        ax.set_title(label, fontsize=9)
+    figure.savefig(folder / "numbers.png")
+    figure, axes = show.new(2, 1, 8, 3)
+    titles = labels[0], f"{labels[0]}, trained"
+    for ax, values, title in zip(axes, results["numbers"][0], titles):
+        _draw(ax, trained.lens_of(values), results, results["spot_mm"])
+        ax.set_title(title, fontsize=9)
+    figure.savefig(folder / "designed.png")
+
+
+def _draw(axes: Any, lens: drt_jax.Lens, results: dict[str, Any], distance: float) -> None:
+    field = np.radians(np.ravel(results.get("field", 0.0))[-1])
+    show.lens_drawing(axes, show.draw(lens, field, distance))
+
+
+def draw_lens(results: dict[str, Any], distance: float, path: pathlib.Path) -> None:
+    """Picture of the lens with its beam from `distance` mm, at the angle of the field along y."""
+    lens = drt_jax.load_lens(results["lens"])
+    figure, axes = show.new(width=8, height=4)
+    _draw(axes, lens, results, distance)
+    axes.set_title(lens.name)
+    figure.savefig(path)
+
+
+def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path) -> None:
+    """Picture of the `images`, each but the truth with its RMSE."""
+    rows = {name: np.float32(results[name]) for name in IMAGES}
+    errors = {name: rows[name] - rows["truth"] for name in IMAGES[1:]}
+    notes = {n: [f"{np.sqrt(np.mean(e**2)):.3f}" for e in some] for n, some in errors.items()}
+    show.patch_grid(rows, titles, notes).savefig(path)
