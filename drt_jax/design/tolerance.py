@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, ONCE, jit
+from ..inputs import shown
 from ..lens.lens import Lens
 from ..numerics import concrete, safe_divide
 from ..rays.solve import solve, solve_aimed
@@ -27,6 +28,7 @@ from .seen import EXTRAS, Seen, symmetry_by_structure
 
 # What is adjusted in every lens: the sensor's distance, or its tilts about x and y, too.
 Compensator = Literal["none", "focus", "focus and tilt"]
+# Of a prediction: q from its gradient, from first derivatives of rays, from all second derivatives.
 Order = Literal["first", "rays", "second"]
 _TILE = 50  # lenses of a tile, in one program on one core
 _STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
@@ -110,9 +112,13 @@ def made(problem: Problem, lens: Lens, compensator: Compensator) -> Made:
     return _compensated(problem, lens, compensator)[0]
 
 
+def _require_known(what: str, word: object, known: tuple[str, ...]) -> None:
+    if word not in known:
+        raise ValueError(f"{what}: unknown {shown(word)}; known: {', '.join(known)}")
+
+
 def _check(problem: Problem, lens: Lens, compensator: str) -> None:
-    if compensator not in (known := get_args(Compensator)):
-        raise ValueError(f"compensator: unknown {compensator!r}; known: {', '.join(known)}")
+    _require_known("compensator", compensator, get_args(Compensator))
     has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
     if _SYMMETRIES.index(has) < _SYMMETRIES.index(needs):
         raise ValueError(
@@ -145,13 +151,14 @@ class Predicted(NamedTuple):
 
     def matrix(self, order: Order) -> Array:
         """The second derivatives (P, P) that an order knows: none, those of first derivatives of
-        rays, or all."""
+        rays, or all. ValueError for another order."""
+        _require_known("order", order, get_args(Order))
         if order == "first":
             return 0 * self.hessian
         return self.gauss if order == "rays" else self.hessian
 
     def at(self, off: Array | np.ndarray, order: Order) -> Array:
-        """q (K,) of errors (K, P); below 0 where the model fails."""
+        """q (K,) of errors (K, P); below 0 where the model fails. ValueError as `matrix`."""
         return (
             self.nominal
             + off @ self.gradient
@@ -161,7 +168,7 @@ class Predicted(NamedTuple):
     def moments(self, variances: Array, order: Order) -> tuple[Array, Array]:
         """Mean and standard deviation of q, (), for errors that are independent, with these
         variances (P,). The first is that of the quadratic, the second adds up as of normal errors
-        (root sum of squares)."""
+        (root sum of squares). ValueError as `matrix`."""
         matrix = self.matrix(order)
         mean = self.nominal + jnp.diag(matrix) @ variances / 2
         pairs = variances @ matrix**2 @ variances / 2
@@ -236,7 +243,8 @@ def variances(perturbed: Perturbed, normal: bool = False) -> np.ndarray:
 
 def worst_case(perturbed: Perturbed, predicted: Predicted, order: Order = "second") -> np.ndarray:
     """Errors (P,), each as large as it may be, for which q is predicted to be largest: the best of
-    ascents from the gradient and the largest eigenvectors, which may not be the best of all."""
+    ascents from the gradient and the largest eigenvectors, which may not be the best of all.
+    ValueError for an unknown order."""
     slope, matrix = np.asarray(predicted.gradient), np.asarray(predicted.matrix(order))
     values, vectors = np.linalg.eigh(matrix)
     # On the ends of all errors a multiple of the unit matrix changes nothing, but makes q convex,

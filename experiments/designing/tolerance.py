@@ -21,7 +21,7 @@ import os
 import pathlib
 import sys
 import time
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -31,20 +31,16 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import design, show
 from drt_jax.design.errors import KINDS
+from drt_jax.design.tolerance import Order
 from drt_jax.runs.folder import Run
 
 from . import _command, _common
 
 COLUMNS = ("mean_um", "p90_um", "seconds")
-_ORDERS = ("first", "rays", "second")
+_ORDERS = get_args(Order)
+_SAMPLES = ("traced", *_ORDERS)
 _SHOWN, _BINS = 14, 60
 _LEVELS = np.linspace(0, 1, 201)
-_WORDS = {
-    "traced": "traced",
-    "first": "gradient",
-    "rays": "rays' gradients",
-    "second": "second derivatives",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,7 +258,7 @@ def off_by(row: dict[str, Any], truth: float | None) -> list[str]:
 
 def table_of_scales(results: dict[str, Any]) -> str:
     """Spots by scale, traced, and by how much each order of prediction is off."""
-    header = ["sizes times", "spot", "traced (µm)", *(f"{_WORDS[order]}" for order in _ORDERS)]
+    header = ["sizes times", "spot", "traced (µm)", *_ORDERS]
     lines = []
     for row in results["scales"]:
         scale, true = f"{row['scale']:g}", row["traced"]
@@ -283,9 +279,7 @@ def table_of_scales(results: dict[str, Any]) -> str:
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Spots by scale, traced and predicted; yields; the worst errors; shares of the kinds."""
     row, limits = main_scale(results), results["limits_um"]
-    yields = [
-        (_WORDS[name], *(f"{100 * part:.1f} %" for part in row[name]["yields"])) for name in _WORDS
-    ]
+    yields = [(name, *(f"{100 * part:.1f} %" for part in row[name]["yields"])) for name in _SAMPLES]
     worst = []
     for some in merged(results)[:_SHOWN]:
         changes = (f"{some[key]:+.3f}" for key in ("predicted_um", "traced_um"))
@@ -308,9 +302,9 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw the yield by scale, the worst errors, and how the spots are spread."""
     figure, axes = _common.panels(len(results["scales"]), 5.2, 3.7)
     for ax, row in zip(axes, results["scales"]):
-        parts = dict.fromkeys(_WORDS, 100 * _LEVELS)
+        parts = dict.fromkeys(_SAMPLES, 100 * _LEVELS)
         parts["traced"] = parts["traced"] * (1 - row["failed"] / results["count"])
-        lines = {_WORDS[name]: (row[name]["quantiles_um"], parts[name]) for name in _WORDS}
+        lines = {name: (row[name]["quantiles_um"], parts[name]) for name in _SAMPLES}
         show.yields(ax, lines, "spot (µm)", "lenses at least so good (%)")
         ax.set_title(f"sizes × {row['scale']:g}", fontsize=10)
         ax.set_xlim(0, 1.05 * row["traced"]["quantiles_um"][-1])
@@ -323,7 +317,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     figure.savefig(figures / "offenders.png")
     row = main_scale(results)
     figure, ax = show.new(1, 1, 6.5, 4)
-    shares = {words: np.array(row[name]["shares"]) for name, words in _WORDS.items()}
+    shares = {name: np.array(row[name]["shares"]) for name in _SAMPLES}
     marks = {"nominal": results["nominal_um"], "mean": row["traced"]["mean_um"]}
     if row["traced"]["p90_um"] is not None:
         marks["90 %"] = row["traced"]["p90_um"]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -182,6 +183,27 @@ def test_predictions_are_monte_carlo(singlet, predicted):
     moves = design.monte_carlo(*singlet, off, "focus").moves
     linear = np.asarray(predicted.moves) + off @ np.asarray(predicted.move_slopes)
     np.testing.assert_allclose(moves, linear, atol=0.02 * np.std(moves))
+
+
+@pytest.mark.parametrize("word", ["gradient", "second derivatives", "", 2, None])
+def test_orders_that_are_unknown_are_refused(word):
+    """They silently gave the second one."""
+    whole = np.eye(2)
+    some = design.Predicted(1.0, np.ones(2), 2 * whole, 6 * whole, np.zeros(1), np.zeros((2, 1)))
+    off = np.array([[1.0, -1.0], [0.5, 0.5]])
+    values = {"first": [1, 2], "rays": [3, 2.5], "second": [7, 3.5]}
+    assert set(values) == set(get_args(tolerance.Order))
+    for order, q in values.items():
+        np.testing.assert_allclose(some.at(off, order), q)
+    ways = (
+        lambda: some.at(off, word),
+        lambda: some.matrix(word),
+        lambda: some.moments(np.ones(2), word),
+        lambda: design.worst_case(perturbed(Tolerance("radius", 1.0)), some, word),
+    )
+    for way in ways:
+        with pytest.raises(ValueError, match="order: unknown .*; known: first, rays, second"):
+            way()
 
 
 @pytest.mark.slow

@@ -1,10 +1,12 @@
 """experiments.tolerance at toy size: rows, tables, pictures, resuming, bad settings."""
 
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from drt_jax.design.tolerance import Order
 from experiments import _command, tolerance as experiment
 
 SETTINGS = {
@@ -35,7 +37,9 @@ def config(tmp_path_factory):
 def test_it_writes_rows_and_pictures_and_resumes(config, tmp_path, capsys):
     folder = tmp_path / "run"
     main("--config", config, "--out", folder)
-    assert "| radius, surface 1" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "| radius, surface 1" in said
+    assert all(f"| {order} " in said for order in get_args(Order))  # the words of `Predicted.at`
     results = json.loads((folder / "results.json").read_text())
     assert [(row["kind"], row["place"]) for row in results["rows"]] == [
         *(("radius", 1), ("thickness", 0), ("thickness", 1)),
