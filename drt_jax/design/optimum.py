@@ -5,7 +5,6 @@ shift takes up what is left of the excess: the method of multipliers (Rockafella
 limits without weights that would be stiff.
 """
 
-import dataclasses
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,9 +17,8 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..numerics import concrete
-from ..rays.solve import solve_aimed
 from .least_squares import BoundedLM, LMState
-from .problem import Judged, Problem
+from .problem import Judged, Problem, quick
 
 # A merit has settled when less than `_COARSE` of it is to be gained, while limits are still to be
 # met, and in the end `_FINE`. Limits are met to `_MET`, in their own units times the weight.
@@ -132,11 +130,6 @@ class Optimum(NamedTuple):
 
 _begin = jax.jit(begin)
 _turn = jit(turn, LARGE)
-
-
-def quick(problem: Problem) -> Problem:
-    """The problem with the smaller program: rays are aimed, not searched for."""
-    return dataclasses.replace(problem, solver=solve_aimed)
 
 
 def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem, Search]:

@@ -14,7 +14,7 @@ from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
 from ..lens.scene import Scene, distance_array, field_array, vergence_of
 from ..pupil.rules import Gauss, PupilRule
-from ..rays.solve import Solver, solve
+from ..rays.solve import Solver, solve, solve_aimed
 from .gaps import gaps
 from .operands import Operand
 from .seen import Seen, symmetry_by_structure
@@ -179,3 +179,8 @@ class Problem:
     def merit(self, vector: Array) -> Array:
         """Sum () of the squares of the residuals; limits are not in it."""
         return jnp.sum(self.judge(vector).residuals ** 2)
+
+
+def quick(problem: Problem) -> Problem:
+    """The problem with the smaller program: rays are aimed, not searched for."""
+    return dataclasses.replace(problem, solver=solve_aimed)

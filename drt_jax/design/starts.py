@@ -16,8 +16,8 @@ from jax.typing import ArrayLike
 from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
-from .optimum import Search, begin, quick, turn
-from .problem import Problem
+from .optimum import Search, begin, turn
+from .problem import Problem, quick
 from .variables import Variables
 
 # Searches of one tile share a program and a core.

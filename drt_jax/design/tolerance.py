@@ -6,7 +6,6 @@ that this is a small linear system, solved for every lens.
 """
 
 import concurrent.futures
-import dataclasses
 import os
 from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
@@ -20,10 +19,9 @@ from ..compilation import LARGE, ONCE, jit
 from ..inputs import shown
 from ..lens.lens import Lens
 from ..numerics import concrete, safe_divide
-from ..rays.solve import solve, solve_aimed
 from ..rays.status import Status
 from .perturbed import Perturbed
-from .problem import Problem
+from .problem import Problem, quick
 from .seen import EXTRAS, Seen, symmetry_by_structure
 
 # What is adjusted in every lens: the sensor's distance, or its tilts about x and y, too.
@@ -178,7 +176,11 @@ class Predicted(NamedTuple):
 def predict(problem: Problem, perturbed: Perturbed, compensator: Compensator) -> Predicted:
     """What first and second derivatives say, each exact. ValueError as `made`."""
     _check(problem, perturbed.lens, compensator)
-    return _predict(problem, perturbed, compensator)
+    if not concrete((problem, perturbed)):
+        return _predict(problem, perturbed, compensator)
+    found = _predict(quick(problem), perturbed, compensator)
+    # What aiming does not find, the full search may.
+    return found if bool(jnp.isfinite(found.nominal)) else _predict(problem, perturbed, compensator)
 
 
 def _predict_all(problem: Problem, perturbed: Perturbed, compensator: Compensator) -> Predicted:
@@ -290,13 +292,11 @@ def monte_carlo(
     width = len(perturbed.errors)
     if np.ndim(off) != 2 or np.shape(off)[1] != width or not len(off):
         raise ValueError(f"off: expected (K, {width}), got shape {np.shape(off)}")
-    fast = dataclasses.replace(problem, solver=solve_aimed)
-    found = _in_tiles(fast, perturbed, off, compensator, report, threads)
+    found = _in_tiles(quick(problem), perturbed, off, compensator, report, threads)
     # What aiming does not find, the full search may.
     failed = np.flatnonzero(~np.all(np.isfinite(found.squares), axis=1))
     if len(failed):
-        whole = dataclasses.replace(problem, solver=solve)
-        again = _in_tiles(whole, perturbed, off[failed], compensator, lambda done: None, threads)
+        again = _in_tiles(problem, perturbed, off[failed], compensator, lambda done: None, threads)
         for array, rows in zip(found, again):
             array[failed] = rows
     return found
