@@ -48,6 +48,7 @@ class Plane:
 
     low: jax.Array
     high: jax.Array
+    solver: object = dataclasses.field(metadata={"static": True}, default=None)
 
     @property
     def variables(self):
@@ -58,7 +59,8 @@ class Plane:
 
     def judge(self, vector):
         miss = 0.01 * (vector - jnp.asarray([2.0, 3.0]))
-        return lenses.Judged(miss, vector[:1] - 1.5, jnp.where(vector[0] > 10, jnp.inf, 0.0))
+        broken = jnp.where(vector[0] > 10, jnp.inf, 0.0)
+        return lenses.Judged(miss, vector[:1] - 1.5, broken, jnp.int32(0))
 
 
 PLANE = Plane(jnp.asarray([-jnp.inf, -jnp.inf]), jnp.asarray([jnp.inf, 1.0]))
