@@ -1,8 +1,5 @@
-"""Options of XLA for programs that are slow to compile, each where the backend at hand knows it.
-
-XLA refuses an option that its release does not know, and drops old ones, as jaxlib 0.12 did with
-`xla_cpu_use_fusion_emitters`. So each is tried once, on a trivial program, when it is needed.
-"""
+"""Options of XLA for programs that are slow to compile. XLA refuses an option that its release does
+not know, and drops old ones, so each is tried once on a trivial program when it is needed."""
 
 import functools
 from collections.abc import Callable, Mapping

@@ -22,12 +22,17 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 _TURN = 0.05
 
 
-def settings_files() -> list[tuple[pathlib.Path, str]]:
-    """The files of settings in `configs`, and the experiment of each: that of its name, or else of
-    its folder's. What lies in a folder `lenses` is none."""
-    paths = [p for p in sorted((ROOT / "configs").rglob("*.yaml")) if p.parent.name != "lenses"]
-    known = importlib.util.find_spec
-    return [(p, p.stem if known(f"experiments.{p.stem}") else p.parent.name) for p in paths]
+def experiment(*names: str) -> Any:
+    """The module of the first of these names that is one's."""
+    known = (f"experiments.{name}" for name in names)
+    return importlib.import_module(next(filter(importlib.util.find_spec, known)))
+
+
+def settings_files() -> list[tuple[pathlib.Path, Any]]:
+    """The files of settings, and the experiment of each: that of its name, or else of its folder's.
+    What lies in a folder `lenses` is none."""
+    paths = sorted((ROOT / "configs").rglob("*.yaml"))
+    return [(p, experiment(p.stem, p.parent.name)) for p in paths if p.parent.name != "lenses"]
 
 
 def require(condition: bool, message: str) -> None:

@@ -4,24 +4,12 @@ A block between `<!-- table: NAME -->` and `<!-- end -->` is replaced by the tab
 the experiments print it: `python -m experiments.tables`.
 """
 
-import importlib
 import pathlib
 import re
 import signal
 
-from . import _common, design, hear
+from . import _common, hear
 
-_NAMES = (
-    "focus",
-    "restore",
-    "edof",
-    "accuracy",
-    "stability",
-    "benchmark",
-    "lenses",
-    "faults",
-    "tolerance",
-)
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -33,11 +21,9 @@ def pages() -> list[pathlib.Path]:
 def all_tables() -> dict[str, str]:
     """The tables of all experiments by name, from their committed results."""
     found = {}
-    for name in _NAMES:
-        experiment = importlib.import_module(f"experiments.{name}")
-        found |= experiment.tables(_common.read_results(_common.ROOT / "results" / name))
-    for path in sorted((_common.ROOT / "results" / "design").glob("*/results.json")):
-        found |= design.tables(_common.read_results(path.parent))
+    for path in sorted((_common.ROOT / "results").rglob("results.json")):
+        experiment = _common.experiment(path.parent.name, path.parents[1].name)
+        found |= experiment.tables(_common.read_results(path.parent))
     return found
 
 

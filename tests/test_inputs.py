@@ -100,7 +100,7 @@ def test_lens_files(case, tmp_path):
 def test_paths(tmp_path):
     (tmp_path / "folder.yaml").mkdir()
     cases = {
-        "a\0b.yaml": "null byte",
+        "a\0b.yaml": "embedded null",
         "x" * 5000 + ".yaml": "File name too long",
         "x" * 5000: "no bundled lens",
         "none.yaml": "cannot be read: No such file",

@@ -1,7 +1,6 @@
 """Prescriptions and settings spoilt at random: refused in one line, or right."""
 
 import dataclasses
-import importlib
 import pathlib
 import tempfile
 from typing import Any
@@ -81,8 +80,7 @@ def settings(count: int, rng: np.random.Generator) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "config.yaml"
         for k in tqdm(range(count), unit="config", leave=False, dynamic_ncols=True):
-            source, name = kinds[rng.integers(len(kinds))]
-            kind = importlib.import_module(f"experiments.{name}").Config
+            source, experiment = kinds[rng.integers(len(kinds))]
             content, overrides = mutated(source.read_text(), rng), list[str]()
             if k % 2:
                 lines = [line for line in content.decode("utf-8", "replace").splitlines() if line]
@@ -90,7 +88,7 @@ def settings(count: int, rng: np.random.Generator) -> dict[str, Any]:
                 overrides, content = [line.replace(": ", "=", 1)], source.read_bytes()
             path.write_bytes(content)
 
-            def load(kind: type = kind, overrides: list[str] = overrides) -> bool:
+            def load(kind: type = experiment.Config, overrides: list[str] = overrides) -> bool:
                 taken = configs.load_config(kind, path, overrides)
                 path.write_text(configs.dump_config(taken))
                 return configs.load_config(kind, path) == taken

@@ -6,10 +6,11 @@ import pathlib
 import pkgutil
 
 import jax
+import numpy as np
 import pytest
 
 import experiments
-from experiments import _command, tables
+from experiments import _command, _peers, _work, tables
 
 from .test_experiments import TOY
 
@@ -17,7 +18,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 AXIAL = ["wavelengths_um=[0.55]", "distance_mm=.inf", "order=2"]
 STARTS = {
     "accuracy": ["scenes=[{lens: singlet}]", "orders=[2]", "rays=[7]", "tolerances=[1e-2]"],
-    "stability": ["families=[curvature]", "scenes=3"],
+    "stability": ["families=[mirror]", "scenes=3"],
     "faults": ["parts=[files, images]", "files=24", "traced=1"],
     "benchmark": ["tasks=[axial]", "growth=false", "repeats=1", "lens=singlet"],
     "lenses": [
@@ -30,11 +31,13 @@ STARTS = {
         *(*AXIAL, "count=16", "draws=10", "limits_um=[50]"),
     ],
 }
+# Programs of many kinds, for a survey of as little as one scene.
+LONG = ("stability",)
 
 
 def runnable():
-    """Names of what `python -m experiments.NAME` runs."""
-    names = [module.name for module in pkgutil.iter_modules(experiments.__path__)]
+    """Names of what `python -m experiments.NAME` runs; those that begin with _ are parts."""
+    names = [m.name for m in pkgutil.iter_modules(experiments.__path__) if m.name[0] != "_"]
     files = {name: importlib.util.find_spec(f"experiments.{name}").origin for name in names}
     main = '\nif __name__ == "__main__":'
     return {name for name, path in files.items() if main in pathlib.Path(path).read_text()}
@@ -45,15 +48,69 @@ def test_each_experiment_is_started_somewhere():
     assert runnable() == {*STARTS, *TOY, "tables"}
 
 
-@pytest.mark.parametrize("name", STARTS)
+def checked_accuracy(results):
+    assert results["curves"][0]["rays"] < 7 and results["tolerances"][0]["relative_error"] < 1e-2
+
+
+def checked_stability(results):
+    (row,) = results["families"]
+    assert row["ok"] > 0 == row["nan_values"] + row["nan_gradients"] + row["disagree_with_snell"]
+
+
+def checked_faults(results):
+    assert not any(row["wrong"] + row["traceback"] + row["hang"] for row in results["rows"])
+    assert sum(row["refused"] for row in results["rows"]) > 20
+
+
+def checked_benchmark(results):
+    """A row for each peer, which is measured or says what is missing, and the counts."""
+    assert [(row["peer"], row["peer_s"], row["note"]) for row in results["rows"]] == [
+        (name, None, f"{name} is not installed: pip install -e '.[peers]'")
+        for name in ("optiland", "batoid")
+    ]
+    assert all(row["ours_s"] > 0 and row["ours_error"] < 1e-8 for row in results["rows"])
+    solves = list(results["counts"].values())
+    assert solves[:2] == [0, 0] and solves[2] > 0
+
+
+def checked_lenses(results):
+    """A lens on the axis, copies of it and a sweep; peers that fail have their reason."""
+    (row,), (group,), (swept,) = (results[key] for key in ("rows", "copies", "sweeps"))
+    assert row["tight_error"] < 1e-6 and row["loose_error"] < 1e-3 and row["passed"] == 1
+    assert set(row["notes"].values()) == {"no lens of this kind"} and not row["peers"]
+    assert group["bad"] == 0 and max(swept["steps"]["values"]) < 0.1
+
+
+def checked_design(results):
+    (row,) = results["rows"]
+    assert row["merit_end"] < row["merit_start"]
+
+
+def checked_tolerance(results):
+    (row,) = results["rows"]
+    np.testing.assert_allclose(row["traced_um"], row["predicted_um"], rtol=0.1, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in STARTS]
+)
 def test_it_ends_with_results_tables_and_pictures(name, tmp_path, monkeypatch, capsys):
+    def missing(name):
+        raise ModuleNotFoundError(name=name)
+
+    def fails(lens, rays):
+        raise ValueError("no lens of this kind")
+
     monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(_work, "version", missing)
+    for peer in ("optiland_spot", "batoid_spot"):
+        monkeypatch.setattr(_peers, peer, fails)
     experiment = importlib.import_module(f"experiments.{name}")
     try:
         _command.main(experiment, ["--out", str(tmp_path), "--set", *STARTS[name]])
     finally:  # those on speed compile everything anew
         jax.config.update("jax_enable_compilation_cache", True)
-    assert json.loads((tmp_path / "results.json").read_text())
+    globals()[f"checked_{name}"](json.loads((tmp_path / "results.json").read_text()))
     assert "done in" in capsys.readouterr().out
     assert all(p.stat().st_size > 3000 for p in (tmp_path / "figures").iterdir())
 
