@@ -197,6 +197,7 @@ class Jobs:
         total = setting.batches
         first, state = run.load(job, init({"optics": optics} | self._network), labels, total)
         saved = first
+        self._good |= {label: values_of(state[0], k) for k, label in enumerate(labels)}
         bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
 
         def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:

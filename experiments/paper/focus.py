@@ -108,7 +108,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     for name, column, label, level in (
         ("figure_4a", "sensor_mm", "sensor position (mm)", mark),
         ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)", None),
-    )[0 if _report.planes(results, "") else 1 :]:
+    )[not _report.moves(results) :]:
         figure, (left, right) = show.new(1, 2, 5.5, 4)
         show.convergence(left, _report.start_lines(results, column), label, level)
         show.convergence(right, _report.start_lines(results, column, 100), label, level)
