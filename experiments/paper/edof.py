@@ -4,6 +4,9 @@ The object distance is random in each batch. Every starting position of the sens
 jointly with its network; one start also with the sensor fixed, for comparison. No ray is
 traced in the loop: the moments are interpolated in 1/distance. Draws the lens and figures 6a, 6b
 and 7, and writes table 2.
+
+train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
+"curvature 0", of one. scene.field: degrees along y, or [x, y].
 """
 
 import dataclasses

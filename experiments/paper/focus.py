@@ -3,6 +3,9 @@
 Several starting positions of the sensor are trained together, without a network. No ray is
 traced in the loop: the moments are polynomials in the sensor position. Draws the lens and
 figures 4a and 4b.
+
+train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
+"curvature 0", of one. scene.field: degrees along y, or [x, y].
 """
 
 import dataclasses
