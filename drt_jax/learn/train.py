@@ -57,7 +57,7 @@ def make_imager(
 
     The result maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
     distance mm, noise, key) to (truth, sensor image, restored image), float32 (B, H, W, C), and
-    the standard deviations (C,) of the blur along y in mm. The kernel is centred on the mean
+    the `deviation` (C,) of the blur in mm. The kernel is centred on the mean
     centroid of the colours that arrive: patches are registered. A colour that loses rays is
     darker by what it loses, and black without any.
     """
@@ -78,10 +78,16 @@ def make_imager(
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin
         truth = scenes[:, margin : end[0], margin : end[1]]
-        variance = covariance[:, 1] if covariance.ndim == 2 else covariance[:, 1, 1]
-        return truth, image, restored, safe_sqrt(variance)
+        return truth, image, restored, blur_width(covariance)
 
     return imager
+
+
+def blur_width(covariance: Array) -> Array:
+    """Standard deviation (C,) of a blur, root of the mean of the variances along x and y, from its
+    covariance (C, 2) or (C, 2, 2) as `moments_model` gives it."""
+    diagonal = covariance if covariance.ndim == 2 else jnp.diagonal(covariance, 0, 1, 2)
+    return safe_sqrt(jnp.mean(diagonal, axis=1))
 
 
 def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:

@@ -59,10 +59,12 @@ def check_variables(names: tuple[str, ...]) -> None:
     what = "train.variables"
     require(len(names) > 0, f"{what}: needs at least one item")
     require(len(set(names)) == len(names), f"{what}: an item stands twice")
-    for kind, _, row in (name.partition(" ") for name in names):
+    for name in names:
+        kind, _, row = name.partition(" ")
         require_known(what, (kind,), KINDS)
-        good = row.isdecimal() and kind != "sensor" if row else True
-        require(good, f"{what}: expected a kind, or one and a surface, such as curvature 0")
+        good = kind == name or (row.isdecimal() and kind != "sensor")
+        expected = f"{what}: expected a kind, or one and a surface, such as curvature 0"
+        require(good, f"{expected}, got {name!r}")
 
 
 def middle(near: float, far: float) -> float:

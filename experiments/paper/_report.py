@@ -36,10 +36,15 @@ def reached(results: dict[str, Any]) -> str:
     return f"{low} mm" if low == high else f"{low} to {high} mm"
 
 
+def moves(results: dict[str, Any]) -> bool:
+    """Whether the sensor is trained."""
+    return "sensor" in results.get("variables", ["sensor"])
+
+
 def planes(results: dict[str, Any], paper: str, more: str = "") -> list[tuple[str, str, str]]:
-    """The row of a table about the plane that all starts reach, if the sensor is trained."""
-    moves = "sensor" in results.get("variables", ["sensor"])
-    return [("plane that all starts reach", paper, reached(results) + more)] if moves else []
+    """The row of a table about the plane that all starts reach, if the sensor alone moves."""
+    row = "plane that all starts reach", paper, reached(results) + more
+    return [] if "numbers" in results else [row]
 
 
 def beside(results: dict[str, Any], rows: list[tuple[str, str, str]]) -> str:
@@ -66,7 +71,7 @@ def numbers_tables(name: str, results: dict[str, Any]) -> dict[str, str]:
 
 def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
     """Picture of the sensor position of all starts over training, if it is trained."""
-    if planes(results, ""):
+    if moves(results):
         figure, axes = show.new(width=7, height=4.5)
         show.convergence(axes, start_lines(results, "sensor_mm"), "sensor position (mm)")
         figure.savefig(path)

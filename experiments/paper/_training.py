@@ -197,6 +197,7 @@ class Jobs:
         total = setting.batches
         first, state = run.load(job, init({"optics": optics} | self._network), labels, total)
         saved = first
+        self._good |= {label: values_of(state[0], k) for k, label in enumerate(labels)}
         bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
 
         def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
@@ -235,11 +236,13 @@ class Jobs:
         try:
             require_finite(label, first, rows["loss"])
             require_finite(label, first, rows["sigma_um"], "blur")
-            wrong = crossed(self.lens.lens_of(values)) if values and self.lens.names else ""
+            wrong = "" if np.all(np.isfinite([*values.values()])) else "; the lens is not finite"
+            if values and self.lens.names and not wrong:
+                wrong = crossed(self.lens.lens_of(values))
             what = f"{label}: after batch {first + len(rows['loss']) - 1}{wrong}"
             require(not wrong, f"{what}; leave this start out, or lower train.optics_rate")
         except ConfigError as error:
-            if label not in self._good:
+            if not self._good[label]:
                 raise
             raise ConfigError(f"{error}; the lens before is {self._save_lens(label)}") from error
         self._good[label] = values

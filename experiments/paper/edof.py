@@ -4,6 +4,9 @@ The object distance is random in each batch. Every starting position of the sens
 jointly with its network; one start also with the sensor fixed, for comparison. No ray is
 traced in the loop: the moments are interpolated in 1/distance. Draws the lens and figures 6a, 6b
 and 7, and writes table 2.
+
+train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
+"curvature 0", of one. scene.field: degrees along y, or [x, y].
 """
 
 import dataclasses
@@ -18,7 +21,6 @@ import numpy as np
 
 from drt_jax import show
 from drt_jax.learn import train
-from drt_jax.numerics import safe_sqrt
 from drt_jax.runs.folder import Run
 
 from . import _command, _common, _report, _training
@@ -111,7 +113,7 @@ def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[s
 def blur_over_depth(blur: Callable, lenses: tuple, near: float, far: float) -> dict[str, Any]:
     """Blur in um along y of each colour, by depth in m, of lenses by their trained numbers."""
     grid = np.linspace(near, far, 121)
-    sigma = jax.vmap(lambda d, v: safe_sqrt(blur(v, d)[1][:, 0]), in_axes=(0, None))
+    sigma = jax.vmap(lambda d, v: train.blur_width(blur(v, d)[1]), in_axes=(0, None))
     curves = np.stack([1e3 * np.asarray(sigma(jnp.asarray(grid), values)) for values in lenses])
     sensors = [float(values["sensor"]) for values in lenses]
     return {"blur_sensor_mm": sensors, "blur_depth_m": grid / 1e3, "blur_um": curves}
@@ -147,6 +149,8 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     _report.draw_sensor(results, figures / "figure_6a.png")
     figure, axes = show.new(width=7, height=4.5)
     labels = [f"{sensor:.2f} mm" for sensor in results["blur_sensor_mm"]]
+    if "numbers" in results or len(set(labels)) < len(labels):
+        labels = [f"{label}, {name}" for label, name in zip(labels, ("fixed", "trained"))]
     show.sigma_over_depth(axes, results["blur_depth_m"], dict(zip(labels, results["blur_um"])))
     figure.savefig(figures / "figure_6b.png")
     titles = [f"{depth:g} m" for depth in results["patch_depth_m"]]

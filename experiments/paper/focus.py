@@ -3,6 +3,9 @@
 Several starting positions of the sensor are trained together, without a network. No ray is
 traced in the loop: the moments are polynomials in the sensor position. Draws the lens and
 figures 4a and 4b.
+
+train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
+"curvature 0", of one. scene.field: degrees along y, or [x, y].
 """
 
 import dataclasses
@@ -108,7 +111,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     for name, column, label, level in (
         ("figure_4a", "sensor_mm", "sensor position (mm)", mark),
         ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)", None),
-    )[0 if _report.planes(results, "") else 1 :]:
+    )[not _report.moves(results) :]:
         figure, (left, right) = show.new(1, 2, 5.5, 4)
         show.convergence(left, _report.start_lines(results, column), label, level)
         show.convergence(right, _report.start_lines(results, column, 100), label, level)

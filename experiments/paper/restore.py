@@ -2,6 +2,9 @@
 
 Each starting position of the sensor trains its own network; for the table of noise levels one
 more network for each level. Draws figure 5a and restored patches, and writes table 5b.
+
+train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
+"curvature 0", of one. scene.field: degrees along y, or [x, y].
 """
 
 import dataclasses
