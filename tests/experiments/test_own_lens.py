@@ -113,7 +113,9 @@ def test_focus_without_its_sensor_and_how_a_lens_goes_bad(tmp_path, capsys):
     main("focus", "--out", tmp_path / "good", "--set", *FOCUS, "train.optics_rate=0.01")
     results, said = read(tmp_path / "good"), capsys.readouterr().out
     assert results["final_mm"] == pytest.approx([60.1, 60.6]) and "best_focus_mm" not in results
-    assert [end["rms_um"] < start["rms_um"] for start, end in results["numbers"]] == [True, True]
+    # The first start is out of focus; the second is in it, where the least L1 is not the least RMS.
+    (start, end), _ = results["numbers"]
+    assert end["rms_um"] < start["rms_um"] / 2
     assert "plane that all starts reach" not in said and "paper" not in said
     figures = {path.stem for path in (tmp_path / "good" / "figures").glob("*.png")}
     assert figures == {"lens", "figure_4b", "numbers", "designed"}
