@@ -238,7 +238,8 @@ class Jobs:
             require_finite(label, first, rows["sigma_um"], "blur")
             wrong = "" if np.all(np.isfinite([*values.values()])) else "; the lens is not finite"
             if values and self.lens.names and not wrong:
-                wrong = crossed(self.lens.lens_of(values))
+                pair, _, _ = crossed(self.lens.lens_of(values))[1:].partition(";")
+                wrong = pair and f";{pair}"  # a line has room for one pair
             what = f"{label}: after batch {first + len(rows['loss']) - 1}{wrong}"
             require(not wrong, f"{what}; leave this start out, or lower train.optics_rate")
         except ConfigError as error:
