@@ -2,6 +2,7 @@
 
 from .errors import Tolerance as Tolerance, elements_of as elements_of
 from .least_squares import BoundedLM as BoundedLM
+from .limits import Limit as Limit
 from .operands import Operand as Operand
 from .optimum import Optimum as Optimum, Search as Search, optimise as optimise
 from .perturbed import Perturbed as Perturbed

@@ -11,7 +11,7 @@ from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
 
 # Where edges are judged, in parts of the larger or smaller of two extents.
-_ZONES = np.array([0.5, 0.7, 0.85, 1.0])
+ZONES = np.array([0.5, 0.7, 0.85, 1.0])
 
 
 def between(lens: Lens, glass: bool) -> list[tuple[int, int]]:
@@ -32,13 +32,13 @@ def gaps(
     dtype = lens.curvature.dtype
     pairs = [pair for pair in between(lens, glass) if not surfaces or pair[0] in surfaces]
     if not pairs:
-        return jnp.zeros(0, dtype), jnp.zeros((0, _ZONES.size), dtype)
+        return jnp.zeros(0, dtype), jnp.zeros((0, ZONES.size), dtype)
     front, back = (np.array(rows) for rows in zip(*pairs))
     sense = jnp.asarray(lens.senses[back], dtype)
     vertices = lens.vertices
     extents = jnp.append(extents, extents[lens.live[-1]])
     wide = jnp.maximum if glass else jnp.minimum
-    y = wide(extents[front], extents[back])[:, None] * jnp.asarray(_ZONES, dtype)[None]
+    y = wide(extents[front], extents[back])[:, None] * jnp.asarray(ZONES, dtype)[None]
 
     def heights(rows: np.ndarray) -> Array:
         shape = jax.tree.map(lambda a: a[..., rows, None], lens.shape)

@@ -153,3 +153,12 @@ def _proposal(
     merits = jnp.sum(_counting(ahead, sided[:, None]) ** 2, axis=0)
     best = jnp.argmin(merits)
     return parts[best] * move, jnp.sum(_counting(state.residuals, sided) ** 2) - merits[best]
+
+
+def promise(y: Array, state: LMState, lower: Array, upper: Array, limits: int) -> Array:
+    """What part of the merit, (), a step from y that is hardly damped is promised to gain; the last
+    `limits` of the residuals are one-sided."""
+    sided = jnp.arange(state.residuals.size) >= state.residuals.size - limits
+    state = state._replace(damping=jnp.full_like(state.damping, _DAMPING))
+    gain = _proposal(y, state, lower, upper, sided)[1]
+    return safe_divide(jnp.abs(gain), state.merit)

@@ -4,13 +4,18 @@ import dataclasses
 import math
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..inputs import shown
 from ..lens.lens import Lens
+from ..numerics import safe_sqrt
 from .kinds import whole_numbers
 from .seen import Seen
 from .values import OPERANDS, Which
+
+# What an operand may name.
+_NUMBERS = ("fields", "wavelengths", "distances", "surfaces")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,9 +24,12 @@ class Operand:
 
     kind: one of `OPERANDS`; what each is, in which unit, stands at the top of values.py.
     target: of the values. low, high: limits instead of a target; kept exactly in the end.
-    weight: the residual is weight times the difference, in the units of the values.
+    weight: the residual is weight times the difference, in the units of the values; 0: the operand
+        is off.
     fields, wavelengths, distances, surfaces: which of the problem's, or of the lens', from 0;
         empty: all.
+    vignetting: of spots and wavefronts, False counts the rays that clear apertures clip as if they
+        passed, so that cutting light gains nothing.
     """
 
     kind: str
@@ -33,13 +41,14 @@ class Operand:
     wavelengths: tuple[int, ...] = ()
     distances: tuple[int, ...] = ()
     surfaces: tuple[int, ...] = ()
+    vignetting: bool = True
 
     def __post_init__(self) -> None:
         if self.kind not in OPERANDS:
             some = ", ".join(OPERANDS)
             raise ValueError(f"operands: unknown kind {shown(self.kind)}; known: {some}")
         what, known = f"operands: {self.kind}", OPERANDS[self.kind]
-        for name in Which._fields:
+        for name in _NUMBERS:
             numbers = whole_numbers(f"{what}: {name}", getattr(self, name))
             object.__setattr__(self, name, numbers)
             if numbers and name not in known.names:
@@ -51,8 +60,13 @@ class Operand:
             raise ValueError(
                 f"{what}: low {self.low:g} is not below high {self.high:g}; exchange them"
             )
-        if not 0 < self.weight < math.inf:
-            raise ValueError(f"{what}: weight: must be above 0, got {self.weight:g}")
+        if not 0 <= self.weight < math.inf:
+            raise ValueError(
+                f"{what}: weight: must be above 0, or 0 to leave it out, got {self.weight:g}"
+            )
+        if not self.vignetting and not known.of_spots:
+            some = ", ".join(kind for kind, value in OPERANDS.items() if value.of_spots)
+            raise ValueError(f"{what}: vignetting: is of {some}; leave it out")
         if not math.isfinite(self.target):
             raise ValueError(f"{what}: target: must be finite, got {self.target:g}")
         if self.target and self.limits:
@@ -72,7 +86,7 @@ class Operand:
         places = OPERANDS[self.kind].places
         there = {name: list(range(count)) for name, count in counts.items()}
         there["surfaces"] = [] if places is None else places(lens)
-        for name in Which._fields:
+        for name in _NUMBERS:
             for k in getattr(self, name):
                 if k not in there[name]:
                     some = ", ".join(map(str, there[name])) or "none"
@@ -84,14 +98,26 @@ class Operand:
 
     def values(self, seen: Seen) -> Array:
         """The values (K,) of a lens, of which the target is taken or which the limits bound."""
-        which = Which(self.fields, self.wavelengths, self.distances, self.surfaces)
-        return jnp.ravel(OPERANDS[self.kind].function(which, seen))
+        return jnp.ravel(self._values(seen))
 
-    def residuals(self, seen: Seen) -> Array:
-        """(K,), the squares of which add up in the merit; none for limits."""
+    def _values(self, seen: Seen) -> Array:
+        which = Which(self.fields, self.wavelengths, self.distances, self.surfaces, self.vignetting)
+        return OPERANDS[self.kind].function(which, seen)
+
+    def residuals(self, seen: Seen, field_weights: Array | None = None) -> Array:
+        """(K,), the squares of which add up in the merit; none for limits. field_weights: (F,), of
+        the squares; None: 1."""
         if self.limits:
             return jnp.zeros(0, seen.lens.curvature.dtype)
-        return self.weight * (self.values(seen) - self.target)
+        values, axes = self._values(seen), OPERANDS[self.kind].axes
+        found = self.weight * (values - self.target)
+        if field_weights is not None and "fields" in axes:
+            roots = safe_sqrt(field_weights)[np.array(self.fields or range(seen.fields))]
+            roots = jnp.tile(roots, len(self.distances or range(seen.distances)))
+            inner = len(axes) - 1 - axes.index("fields")
+            shape = (-1, *(1,) * inner)
+            found = found * jnp.broadcast_to(jnp.reshape(roots, shape), found.shape)
+        return jnp.ravel(found)
 
     def excess(self, seen: Seen) -> Array:
         """By how much each value is beyond each limit, times the weight, negative within; none for

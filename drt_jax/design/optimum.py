@@ -7,7 +7,7 @@ limits without weights that would be stiff.
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,26 +17,36 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..numerics import concrete
-from .least_squares import BoundedLM, LMState
+from .least_squares import BoundedLM, LMState, promise
+from .limits import Limit
 from .problem import Judged, Problem, quick
 
 # A merit has settled when less than `_COARSE` of it is to be gained, while limits are still to be
-# met, and in the end `_FINE`. Limits are met to `_MET`, in their own units times the weight.
-_COARSE, _FINE, _MET = 1e-5, 1e-13, 1e-9
+# met, and in the end `_FINE`. A search aims `_WITHIN` inside of its limits, in their own units
+# times the weight, so that they are kept where it comes as near as that.
+_COARSE, _FINE, _WITHIN = 1e-5, 1e-13, 1e-9
 _ROUNDS = 30
+# What is left of limits when the trials are used up, if it is less than `_NEAR`, is made good in at
+# most `_MENDING` trials in which they count so many times more.
+_NEAR, _MENDING, _STIFF = 1e-3, 20, 1e4
+# Converged is a search if a step that is hardly damped promises less of the merit.
+_LEFT = 1e-6
+# In its scales no variable goes farther than that.
+_FAR = 1e6
 
 
 class Search(NamedTuple):
     """A search for an optimum, as far as it has come.
 
-    vector: (N,), the best so far. state: of the method. shift: (L,), of the limits. rounds: (), how
-    often limits were shifted. fine: (), whether limits are met and the last digits are sought.
-    done: (), whether nothing more is to be gained.
+    vector: (N,), the best so far. state: of the method. shift: (L,), of the limits; stiffness: (),
+    how much they count. rounds: (), how often limits were shifted. fine: (), whether limits are met
+    and the last digits are sought. done: (), whether nothing more is to be gained.
     """
 
     vector: Array
     state: LMState
     shift: Array
+    stiffness: Array
     rounds: Array
     fine: Array
     done: Array
@@ -64,10 +74,11 @@ class Search(NamedTuple):
         return jnp.where(good, found, jnp.inf)
 
 
-def _wanted(vector: Array, args: tuple[Problem, Array]) -> tuple[Array, tuple]:
-    problem, shift = args
+def _wanted(vector: Array, args: tuple[Problem, Array, Array]) -> tuple[Array, tuple]:
+    problem, shift, stiffness = args
     judged = problem.judge(vector)
-    return jnp.concatenate([judged.residuals, judged.excess + shift]), (judged.broken, judged)
+    limits = stiffness * (judged.excess + _WITHIN + shift)
+    return jnp.concatenate([judged.residuals, limits]), (judged.broken, judged)
 
 
 def begin(problem: Problem, vector: Array) -> Search:
@@ -78,7 +89,8 @@ def begin(problem: Problem, vector: Array) -> Search:
     wanted = jax.ShapeDtypeStruct((count,), vector.dtype)
     state = _method(shift.size).init(None, vector, None, {}, wanted, (None, judged), frozenset())
     no = jnp.bool_(False)
-    return Search(vector, state, shift, jnp.zeros((), jnp.int32), no, no)
+    one = jnp.ones((), vector.dtype)
+    return Search(vector, state, shift, one, jnp.zeros((), jnp.int32), no, no)
 
 
 def _method(limits: int) -> BoundedLM:
@@ -89,19 +101,24 @@ def turn(problem: Problem, search: Search) -> Search:
     """One trial more, unless the search is done."""
     variables = problem.variables
     options = {"lower": variables.low, "upper": variables.high}
-    args, method = (problem, search.shift), _method(search.shift.size)
+    args = problem, search.shift, search.stiffness
+    method = _method(search.shift.size)
     vector, state, _ = method.step(_wanted, search.vector, args, options, search.state, frozenset())
     ended, _ = method.terminate(_wanted, vector, args, options, state, frozenset())
     excess = state.kept.excess
-    met = jnp.max(excess, initial=0.0) <= _MET
+    met = jnp.max(excess, initial=0.0) <= 0
     settled = ended | (~search.fine & ~state.fresh & (jnp.abs(state.gain) < _COARSE))
     shifts = settled & ~met & (search.rounds < _ROUNDS)
-    shift = jnp.where(shifts, jnp.maximum(excess + search.shift, 0), search.shift)
+    shift = jnp.where(shifts, jnp.maximum(excess + _WITHIN + search.shift, 0), search.shift)
     state = state._replace(fresh=shifts)
     fine = met & (search.fine | settled)
     done = search.done | (ended & ~shifts)
-    new = Search(vector, state, shift, search.rounds + shifts.astype(jnp.int32), fine, done)
+    rounds = search.rounds + shifts.astype(jnp.int32)
+    new = Search(vector, state, shift, search.stiffness, rounds, fine, done)
     return jax.tree.map(lambda a, b: jnp.where(search.done, a, b), search, new)
+
+
+Ended = Literal["converged", "good", "trials", "limits", "stuck"]
 
 
 class Optimum(NamedTuple):
@@ -109,6 +126,10 @@ class Optimum(NamedTuple):
 
     lens: the best one. vector: (N,). merit: sum of the squares of the residuals; score: with those
     of what exceeds limits. worst: by how much the worst limit is exceeded, times its weight.
+    limits: all of them by name, the worst first, each in its own unit. ended: why: "converged", all
+    limits are kept and next to nothing is to be gained; "good", as it was asked to; "trials", that
+    are used up; "limits", that cannot be kept together; "stuck", no trial is better any more, as
+    where surfaces touch, which a limit such as air_edge keeps apart.
     history: (T, 3), merit, worst and Jacobians so far by trial. seconds: of all trials but the
     first; first: of that, with compilation if need be.
     """
@@ -118,9 +139,21 @@ class Optimum(NamedTuple):
     merit: float
     score: float
     worst: float
+    limits: list[Limit]
+    ended: Ended
     history: np.ndarray
     seconds: float
     first: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether it is an optimum: nothing more is to be gained, and all limits are kept."""
+        return self.ended == "converged"
+
+    @property
+    def worst_limit(self) -> Limit | None:
+        """The limit that is exceeded most or, if none is, the nearest; None without limits."""
+        return self.limits[0] if self.limits else None
 
     @property
     def jacobians(self) -> int:
@@ -142,6 +175,47 @@ def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem
     return problem, _turn(problem, search._replace(state=state, done=jnp.bool_(False)))
 
 
+@jax.jit
+def _left(problem: Problem, search: Search) -> Array:
+    """What part of the merit a step that is hardly damped promises."""
+    bounds = problem.variables.low, problem.variables.high
+    return promise(search.vector, search.state, *bounds, search.shift.size)
+
+
+def _mended(problem: Problem, search: Search) -> Search:
+    """A search whose limits are kept, next to one that comes near."""
+    stiff = search._replace(
+        state=search.state._replace(fresh=jnp.bool_(True)),
+        shift=jnp.zeros_like(search.shift),
+        stiffness=jnp.full_like(search.stiffness, _STIFF),
+        done=jnp.bool_(False),
+    )
+    for _ in range(_MENDING):
+        stiff = _turn(problem, stiff)
+        if float(stiff.worst) <= 0 or bool(stiff.done):
+            break
+    return stiff if float(stiff.worst) <= 0 else search
+
+
+def _refuse_fixed(problem: Problem, search: Search) -> None:
+    """ValueError for a limit that the start exceeds and no variable moves."""
+    excess = np.asarray(search.judged.excess)
+    slopes = np.asarray(search.state.jacobian)[-len(excess) or len(search.state.jacobian) :]
+    if np.any((excess > 0) & (np.max(np.abs(slopes), axis=1, initial=0) * _FAR < excess)):
+        beside = _turn(problem, _begin(problem, problem.elsewhere(search.vector)))
+        problem.refuse_fixed(excess, beside.judged.excess)
+
+
+def _why(problem: Problem, search: Search, good: float) -> Ended:
+    if good and float(search.score) <= good:
+        return "good"
+    if not bool(search.done):
+        return "trials"
+    if float(search.worst) > 0:
+        return "limits"
+    return "converged" if float(_left(problem, search)) <= _LEFT else "stuck"
+
+
 def optimise(
     problem: Problem,
     vector: Array | None = None,
@@ -152,10 +226,16 @@ def optimise(
     """The optimum next to a vector (N,) of the problem's variables, that of its start by default.
 
     trials: at most. report: called after each, to show how far it is. good: the search ends as soon
-    as its merit plus the squares of what exceeds limits is no more; 0: at the optimum.
+    as its merit plus the squares of what exceeds limits is no more; 0: at the optimum. For a part
+    of a field or an aperture that shall grow, some 16 times the merit that the whole is to have: a
+    lens that is perfect for a part is spoilt for more.
+
+    `Optimum.converged` tells whether it is an optimum, `Optimum.ended` why it is none. If trials
+    are used up, limits that are almost kept are made good by some more.
 
     One program is compiled for a problem, and serves all others of its kind. ValueError if the
-    start itself cannot be judged: a lens whose surfaces overlap or of which no number is finite.
+    start itself cannot be judged: a lens whose surfaces overlap or of which no number is finite;
+    and for a limit that it exceeds and no variable moves.
     """
     if not concrete((problem, vector)):
         raise ValueError("optimise: call it outside of jax.jit; inside, use begin and turn")
@@ -166,6 +246,7 @@ def optimise(
     begun = time.perf_counter()
     search = jax.block_until_ready(_turn(tried, search))
     compiled = time.perf_counter()
+    _refuse_fixed(tried, search)
     history = [[search.merit, search.worst, search.state.jacobians]]
     tried, search = _searched(problem, tried, search)
     for _ in range(trials - 1):
@@ -181,13 +262,19 @@ def optimise(
             "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
             "finite; begin with weaker curvatures or a smaller stop"
         )
+    why = _why(tried, search, good)
+    if why != "good" and 0 < float(search.worst) <= _NEAR:
+        search = _mended(tried, search)
     ended = time.perf_counter()
+    limits = problem.limits(search.judged.excess)
     return Optimum(
         problem.variables.lens_of(search.vector),
         np.asarray(search.vector),
         float(search.merit),
         float(search.score),
         float(search.worst),
+        sorted(limits, key=lambda limit: -limit.excess),
+        why,
         np.array(history, float),
         ended - compiled,
         compiled - begun,

@@ -13,9 +13,12 @@ from jax.typing import ArrayLike
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
 from ..lens.scene import Scene, distance_array, field_array, vergence_of
+from ..numerics import concrete
+from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve, solve_aimed
 from .gaps import gaps
+from .limits import Limit, limits_of
 from .operands import Operand
 from .seen import Seen, symmetry_by_structure
 from .values import OPERANDS
@@ -23,6 +26,9 @@ from .variables import Variables
 
 # A ray that fails counts as one that misses by so many semi-diameters of the stop, and more.
 _FAILED = 4.0
+# A limit that is as far exceeded, to a part, by numbers that differ by up to so many scales, is one
+# that no variable moves.
+_BESIDE, _STILL = 0.3, 1e-9
 # The stop is at least so wide, as part of the light's width on any surface.
 _SLIMMEST = 0.1
 
@@ -42,6 +48,15 @@ class Judged(NamedTuple):
     failed: Array
 
 
+def _weights(what: str, given: ArrayLike, count: int) -> np.ndarray:
+    """Weights (count,), 1 on the average. ValueError for what they are not."""
+    found = np.asarray(given, float)
+    good = found.shape == (count,) and np.all(np.isfinite(found) & (found >= 0))
+    if not good or not np.any(found):
+        raise ValueError(f"{what}: expected {count} numbers of 0 or above, not all 0")
+    return found / found.mean()
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Problem:
@@ -52,6 +67,7 @@ class Problem:
         from every distance. wavelengths: (W,) in um.
     colour_weights: (W,), of their light, adding up to 1.
     rule: of the pupil; the same for all fields.
+    field_weights: (F,), of the squares of the residuals of each field, 1 on the average; None: 1.
 
     Static:
     operands: what is wanted.
@@ -68,6 +84,7 @@ class Problem:
     rule: PupilRule
     operands: tuple[Operand, ...] = dataclasses.field(metadata={"static": True})
     solver: Solver = dataclasses.field(metadata={"static": True}, default=solve)
+    field_weights: Array | None = None
 
     @classmethod
     def of(
@@ -79,16 +96,21 @@ class Problem:
         distances: ArrayLike = np.inf,
         rule: PupilRule | int = 6,
         colour_weights: ArrayLike | None = None,
+        field_weights: ArrayLike | None = None,
     ) -> "Problem":
         """The problem of some variables.
 
-        operands: at least one; a word is one of a weight of 1. fields: (F,) along y or (F, 2), in
-        radians. wavelengths: (W,) or one, um. distances: (Z,) or one, mm. rule: of the pupil, or
-        the order of a Gauss rule. colour_weights: (W,), of any sum; None: equal.
+        operands: at least one that is not off; a word is one of a weight of 1. fields: (F,) along y
+        or (F, 2), in radians. wavelengths: (W,) or one, um. distances: (Z,) or one, mm. rule: of
+        the pupil, or the order of a Gauss rule. colour_weights: (W,), field_weights: (F,), of any
+        sum; None: equal. Limits hold for all fields, whatever their weights.
 
-        ValueError, which names the argument, for what fits neither lens nor problem.
+        ValueError, which names the argument, for what fits neither lens nor problem, and for a
+        limit that the lens exceeds and no variable moves (of limits that need rays, `optimise`
+        says so).
         """
         lens = variables.lens
+        lens.check()
         wanted = tuple(Operand(o) if isinstance(o, str) else o for o in operands)
         if not wanted:
             raise ValueError("operands: none; a merit needs at least one, such as spot")
@@ -100,9 +122,6 @@ class Problem:
             raise ValueError(f"fields: expected (F,) or (F, 2), got shape {np.shape(fields)}")
         far = jnp.stack([distance_array(d, dtype) for d in np.ravel(distances)])
         colours = lens.colours(wavelengths)
-        weights = np.ones(len(colours)) if colour_weights is None else np.asarray(colour_weights)
-        if weights.shape != colours.shape or not np.all(weights > 0):
-            raise ValueError(f"colour_weights: expected {len(colours)} numbers above 0")
         if isinstance(rule, int):
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
@@ -113,8 +132,22 @@ class Problem:
             named = np.asarray(far)[np.array(operand.distances or range(len(far)))]
             if operand.kind == "magnification" and np.any(np.isinf(named)):
                 raise ValueError("operands: magnification: the object is at infinity")
-        share = jnp.asarray(weights / weights.sum(), dtype)
-        return cls(variables, angles, far, colours, share, rule, wanted)
+            if not operand.vignetting and isinstance(rule, Clipped):
+                raise ValueError(
+                    f"operands: {operand.kind}: vignetting: Clipped traces only what passes; take "
+                    "Gauss or Soft"
+                )
+        on = tuple(operand for operand in wanted if operand.weight)
+        if not on:
+            raise ValueError("operands: all have the weight 0; a merit needs at least one")
+        equal = np.ones(len(colours)) if colour_weights is None else colour_weights
+        share = _weights("colour_weights", equal, len(colours)) / len(colours)
+        made = cls(variables, angles, far, colours, jnp.asarray(share, dtype), rule, on)
+        if field_weights is not None:
+            own = jnp.asarray(_weights("field_weights", field_weights, len(angles)), dtype)
+            made = dataclasses.replace(made, field_weights=own)
+        made._refuse_fixed()
+        return made
 
     def with_order(self, order: int) -> "Problem":
         """The problem with a Gauss rule of another order."""
@@ -139,7 +172,7 @@ class Problem:
         too."""
         lens = self.variables.lens_of(vector)
         seen = self.seen(lens)
-        parts = [operand.residuals(seen) for operand in self.operands]
+        parts = [operand.residuals(seen, self.field_weights) for operand in self.operands]
         if self.traces:
             parts.append(self._failures(seen))
         residuals = jnp.concatenate(parts)
@@ -164,6 +197,45 @@ class Problem:
         wanted = [o.weight * OPERANDS[o.kind].per_mm for o in self.operands if not o.limits]
         weight = max(wanted, default=1.0)
         return jnp.ravel(weight * size * seen.failures)
+
+    def limits(self, excess: ArrayLike) -> list[Limit]:
+        """The limits by name, in the order of `Judged.excess` (L,)."""
+        counts = {"fields": len(self.fields), "distances": len(self.distances)}
+        counts |= {"wavelengths": len(self.wavelengths)}
+        counts |= {"xy": 2 if self.rule.symmetry == "disc" else 1}
+        return limits_of(self.operands, self.variables.lens, counts, np.asarray(excess))
+
+    def elsewhere(self, vector: Array) -> Array:
+        """A vector (N,) beside another, within the bounds, of which no number is the same."""
+        low, high = self.variables.low, self.variables.high
+        move = _BESIDE * jnp.cos(1 + 2 * jnp.arange(vector.size, dtype=vector.dtype))
+        move = jnp.where((vector + move < low) | (vector + move > high), -move, move)
+        return jnp.clip(vector + move, low, high)
+
+    def refuse_fixed(self, excess: ArrayLike, beside: ArrayLike) -> None:
+        """ValueError, which names it, for a limit that is exceeded (L,) and by as much beside."""
+        one, two = np.asarray(excess), np.asarray(beside)
+        for limit, there in zip(self.limits(one), self.limits(two)):
+            still = abs(there.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
+            if limit.excess > 0 and still:
+                raise ValueError(
+                    f"operands: {limit}, and no variable moves it; leave this limit out, widen it, "
+                    "or vary what it depends on"
+                )
+
+    @jax.jit
+    def _excess(self, vector: Array) -> Array:
+        """Of limits that need no rays: by how much they are exceeded."""
+        seen = self.seen(self.variables.lens_of(vector))
+        return jnp.concatenate([operand.excess(seen) for operand in self.operands])
+
+    def _refuse_fixed(self) -> None:
+        """The same for the limits that need no rays."""
+        some = tuple(o for o in self.operands if o.limits and not OPERANDS[o.kind].traced)
+        if some and concrete(self):
+            part = dataclasses.replace(self, operands=some)
+            start = self.variables.start
+            part.refuse_fixed(part._excess(start), part._excess(self.elsewhere(start)))
 
     @jax.jit
     def extents(self, lens: Lens) -> Array:

@@ -16,6 +16,8 @@ of spots and wavefronts [distance, field]
     rms_spot: mm, the root of what the squares of spot add up to
     rms_wavefront: waves, of path_difference
     centroid: y on the sensor, mm, of all colours
+    throughput: part of the light through the stop that clear apertures let pass; has derivatives
+        with the rules Soft and Clipped, while Gauss drops rays one by one
     relative_illumination: by projected solid angles (with clipped light that of the middle colour),
         of that of the first field
 
@@ -45,7 +47,7 @@ of gaps between neighbours that bend light, and before the sensor, by the surfac
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,6 +58,8 @@ from ..image.wavefront import path_differences
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..numerics import safe_divide, safe_sqrt
+from ..rays.status import Status
+from ..rays.trace import Bundle
 from .gaps import between, gaps
 from .kinds import back_distance
 from .seen import EXTRAS, Seen
@@ -64,13 +68,15 @@ from .seen import EXTRAS, Seen
 class Which(NamedTuple):
     """What an operand names, counted from 0; empty: all.
 
-    fields, wavelengths, distances: of the problem's. surfaces: of the lens'.
+    fields, wavelengths, distances: of the problem's. surfaces: of the lens'. vignetting: whether
+    rays that clear apertures clip are left out.
     """
 
     fields: tuple[int, ...]
     wavelengths: tuple[int, ...]
     distances: tuple[int, ...]
     surfaces: tuple[int, ...]
+    vignetting: bool = True
 
 
 class Value(NamedTuple):
@@ -79,7 +85,8 @@ class Value(NamedTuple):
     function: its values, of any shape. names: what an operand of it may name. places: the surfaces
     that have one, None if it is none of surfaces. traced: whether it needs rays. squared: for
     residuals that only mean something as squares, the kind of their sum. per_mm: by how much a ray
-    that misses by 1 mm changes it, as what weighs a ray that fails.
+    that misses by 1 mm changes it, as what weighs a ray that fails. order: the axes of its values,
+    see `axes`; of those of rays, the last ones.
     """
 
     function: Callable[[Which, Seen], Array]
@@ -88,6 +95,20 @@ class Value(NamedTuple):
     traced: bool = True
     squared: str = ""
     per_mm: float = 1.0
+    order: tuple[str, ...] = ()
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """What stands behind each other in its values: "xy", "distances", "fields" (these two as
+        one axis), "wavelengths", "middle" (wavelengths, the middle one if none is named), "later"
+        (all but the first), "surfaces", "zones", "rays"."""
+        ours = [name for name in ("distances", "fields", "surfaces") if name in self.names]
+        return self.order or (*ours, *["middle"] * ("wavelengths" in self.names))
+
+    @property
+    def of_spots(self) -> bool:
+        """Whether it takes the light of whole fields, with or without what is clipped."""
+        return self.squared != "" or self.function in (_rms_spot, _rms_wavefront, _centroid)
 
 
 def _views(which: Which, seen: Seen) -> np.ndarray:
@@ -107,14 +128,19 @@ def _middle(which: Which, seen: Seen) -> np.ndarray:
 
 def _hits(which: Which, seen: Seen) -> tuple[Array, Array]:
     """Hits on the sensor (D, V, W, Q), mm, of the rays that carry light, 0 for others; and the
-    part (V, W, Q) of the light of all colours of a view."""
+    part (V, W, Q) of the light of all colours of a view: of that which passes the clear apertures
+    or, without vignetting, the stop."""
     views, colours = _views(which, seen), _colours(which, seen)
     rays = seen.rays
-    light = jnp.where(rays.whole, rays.light, 0)[views][:, colours, EXTRAS:]
+    light = rays.light
+    if not which.vignetting:
+        weights = seen.rule.points(seen.lens, seen.views)[1]
+        light = jnp.broadcast_to(jnp.pad(weights, ((0, 0), (EXTRAS, 0)))[None], light.shape)
+    light = jnp.where(rays.whole, light, 0)[views][:, colours, EXTRAS:]
     # Of each wavelength the light that arrives, as in `psf_moments`.
     light = safe_divide(light, jnp.sum(light, axis=-1, keepdims=True))
-    weights = seen.colour_weights[colours]
-    light = light * (weights / jnp.sum(weights))[None, :, None]
+    shares = seen.colour_weights[colours]
+    light = light * (shares / jnp.sum(shares))[None, :, None]
     hits = jnp.stack([h[views, -1][:, colours, EXTRAS:] for h in rays.bundle.hits])
     return jnp.where(light[None] > 0, hits, 0), light
 
@@ -170,7 +196,10 @@ def _path_difference(which: Which, seen: Seen) -> Array:
     views, colours = _views(which, seen), _colours(which, seen)
     own = seen.views.wavelengths
 
-    def one(bundle: Any) -> Array:
+    def one(bundle: Bundle) -> Array:
+        if not which.vignetting:
+            clipped = bundle.status == Status.CLIPPED
+            bundle = bundle._replace(status=jnp.where(clipped, Status.OK, bundle.status))
         return path_differences(seen.lens, own, bundle, None)[0]
 
     waves = jax.vmap(one)(seen.rays.bundle)[views][:, colours, EXTRAS:]
@@ -180,6 +209,12 @@ def _path_difference(which: Which, seen: Seen) -> Array:
 
 def _rms_wavefront(which: Which, seen: Seen) -> Array:
     return safe_sqrt(jnp.sum(_path_difference(which, seen) ** 2, axis=(1, 2)))
+
+
+def _throughput(which: Which, seen: Seen) -> Array:
+    colours, views = _colours(which, seen), _views(which, seen)
+    weights = seen.colour_weights[colours]
+    return seen.rays.passed[views][:, colours] @ weights / jnp.sum(weights)
 
 
 def _first_order(get: Callable[[FirstOrder], Array]) -> Callable[[Which, Seen], Array]:
@@ -262,7 +297,8 @@ def _gap(glass: bool, edge: bool) -> Value:
     def places(lens: Lens) -> list[int]:
         return [front for front, _ in between(lens, glass)]
 
-    return Value(values, ("surfaces",), places, traced=edge)
+    order = ("surfaces", "zones") if edge else ("surfaces",)
+    return Value(values, ("surfaces",), places, traced=edge, order=order)
 
 
 def _incidence(which: Which, seen: Seen) -> Array:
@@ -273,19 +309,21 @@ def _incidence(which: Which, seen: Seen) -> Array:
 
 
 _RAYS = ("fields", "wavelengths", "distances")
+_VIEWS = ("distances", "fields")
+_OF_RAYS = (*_VIEWS, "wavelengths", "rays")
 _COLOURS = ("wavelengths",)
 _WAVES_PER_MM = 200.0  # green light at f/5
 _SCALES = ("wavelengths", "distances")
 OPERANDS: dict[str, Value] = {
-    "spot": Value(_spot, _RAYS, squared="rms_spot"),
-    "spot_of_colours": Value(_spot_of_colours, _RAYS, squared="rms_spot"),
-    "spot_chief": Value(_spot_chief, _RAYS, squared="rms_spot"),
-    "rms_spot": Value(_rms_spot, _RAYS),
-    "centroid": Value(_centroid, _RAYS),
+    "spot": Value(_spot, _RAYS, squared="rms_spot", order=_OF_RAYS),
+    "spot_of_colours": Value(_spot_of_colours, _RAYS, squared="rms_spot", order=_OF_RAYS),
+    "spot_chief": Value(_spot_chief, _RAYS, squared="rms_spot", order=_OF_RAYS),
+    "rms_spot": Value(_rms_spot, _RAYS, order=_VIEWS),
+    "centroid": Value(_centroid, _RAYS, order=_VIEWS),
     "path_difference": Value(
-        _path_difference, _RAYS, squared="rms_wavefront", per_mm=_WAVES_PER_MM
+        _path_difference, _RAYS, None, True, "rms_wavefront", _WAVES_PER_MM, _OF_RAYS
     ),
-    "rms_wavefront": Value(_rms_wavefront, _RAYS, per_mm=_WAVES_PER_MM),
+    "rms_wavefront": Value(_rms_wavefront, _RAYS, per_mm=_WAVES_PER_MM, order=_VIEWS),
     "focal_length": Value(_lens_alone(lambda a: a.focal_length), _COLOURS, traced=False),
     "effective_focal_length": Value(
         _lens_alone(lambda a: a.effective_focal_length), _COLOURS, traced=False
@@ -302,13 +340,16 @@ OPERANDS: dict[str, Value] = {
     "length": Value(lambda which, seen: jnp.sum(seen.lens.thickness), (), traced=False),
     "back_distance": Value(_back_distance, (), traced=False),
     "distortion": Value(_distortion, _RAYS),
-    "lateral_colour": Value(_lateral_colour, _RAYS),
-    "chief_ray_angle": Value(_chief_ray_angle, _RAYS),
+    "lateral_colour": Value(_lateral_colour, _RAYS, order=("xy", *_VIEWS, "later")),
+    "chief_ray_angle": Value(_chief_ray_angle, _RAYS, order=(*_VIEWS, "wavelengths")),
     "numerical_aperture": Value(_numerical_aperture, _RAYS),
     "relative_illumination": Value(_illumination, ("fields", "distances")),
+    "throughput": Value(_throughput, _RAYS, order=_VIEWS),
     "glass_centre": _gap(True, False),
     "glass_edge": _gap(True, True),
     "air_centre": _gap(False, False),
     "air_edge": _gap(False, True),
-    "incidence_angle": Value(_incidence, (*_RAYS, "surfaces"), lambda lens: [*lens.live]),
+    "incidence_angle": Value(
+        _incidence, (*_RAYS, "surfaces"), lambda lens: [*lens.live], order=("surfaces",)
+    ),
 }

@@ -290,7 +290,11 @@ def test_obscurations_need_another_rule():
         (dict(kind="rms_spot", low=1, high=0), "operands: rms_spot: low 1 is not below high 0"),
         (dict(kind="rms_spot", low=1, high=1), "both 1; give it as the target"),
         (dict(kind="rms_spot", low=np.nan), "low nan is not below"),
-        (dict(kind="rms_spot", weight=0), "operands: rms_spot: weight: must be above 0, got 0"),
+        (
+            dict(kind="rms_spot", weight=-1),
+            "rms_spot: weight: must be above 0, or 0 to leave it out",
+        ),
+        (dict(kind="length", vignetting=False), "length: vignetting: is of spot, spot_of_colours,"),
         (dict(kind="centroid", target=np.inf), "operands: centroid: target: must be finite"),
         (dict(kind="length", target=3, high=4), "has a target and limits; make two operands"),
         (dict(kind="spot", high=0.1), "spot: takes no target and no limits; use rms_spot"),

@@ -128,8 +128,89 @@ def test_a_search_ends_as_soon_as_it_is_good(triplet):
     count = len(found.history)
     assert 3 <= count < 40
     np.testing.assert_array_equal(found.history, whole.history[:count])
-    earlier = design.optimise(triplet, trials=count - 1)
-    assert earlier.score > good
+    merit, worst, _ = design.optimise(triplet, trials=count - 1).history[-1]
+    assert merit + worst**2 > good and found.ended == "good" and not found.converged
+
+
+def test_limits_are_kept_where_trials_are_used_up(triplet):
+    """A search that is left before its multipliers have settled is mended by some more trials."""
+    found = design.optimise(triplet, trials=10)
+    assert found.history[-1, 1] > 1e-9 and found.worst == 0 and found.ended == "trials"
+    assert float(found.lens.sensor) <= 55 and found.merit < 2 * found.history[-1, 0]
+
+
+def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
+    """Of limits that cannot be kept together, the worst one by kind, surface, zone and amount."""
+    # Without a limit for air the search ends where surfaces touch, which is no optimum.
+    assert design.optimise(triplet).ended == "stuck"
+    args = np.radians([0.0, 14.0]), 0.5876
+    apart = *triplet.operands, Operand("air_edge", low=0.1)
+    found = design.optimise(design.Problem.of(triplet.variables, apart, *args, rule=3))
+    assert found.converged and found.worst == 0 and len(found.limits) == 6 * 4 + 1
+    track = next(limit for limit in found.limits if limit.kind == "total_track")
+    assert track.side == "high" and abs(track.value - float(found.lens.sensor)) < 1e-12
+    assert all(a.excess >= b.excess for a, b in zip(found.limits, found.limits[1:]))
+    wanted = "spot", Operand("glass_edge", low=7.0, surfaces=(2,)), Operand("length", high=8.0)
+    both = design.Problem.of(triplet.variables, [*wanted, Operand("spot", weight=0)], *args, rule=3)
+    assert len(both.operands) == 3
+    found = design.optimise(both)
+    worst = found.worst_limit
+    assert found.ended == "limits" and worst.excess == found.worst > 0.01
+    if worst.kind == "glass_edge":
+        assert str(worst).startswith("glass_edge of surface 2, zone ")
+    assert f"beyond by {worst.excess:.3g}" in str(worst)
+
+
+def test_each_limit_has_the_name_of_its_value(triplet):
+    """Of each kind, the names of its values are those of their places in the arrays."""
+    kinds = [kind for kind, value in design.OPERANDS.items() if not value.squared]
+    kinds = [kind for kind in kinds if kind not in ("magnification", "glass_map")]
+    lens, lows = triplet.variables.lens, -1e9
+    for symmetry in ("half", "disc"):
+        problem = design.Problem.of(
+            triplet.variables,
+            [Operand(kind, low=lows, weight=2.0) for kind in kinds],
+            *([0.0, 0.2, 0.3], (0.48, 0.55, 0.65), (np.inf, 900.0), drt_jax.Gauss(2, symmetry)),
+        )
+        sizes = jax.eval_shape(
+            lambda p: [operand.excess(p.seen(lens)) for operand in p.operands], problem
+        )
+        count = sum(size.size for size in sizes)
+        limits = problem.limits(-2.0 * np.arange(count))
+        assert len(limits) == count and len({limit[:2] for limit in limits}) == count
+        assert limits[5].excess == -5
+        own = [limit.where for limit in limits if limit.kind == "chief_ray_angle"]
+        assert own[4] == "distance 0, field 1, wavelength 1"
+
+
+def test_a_limit_that_nothing_moves_is_refused(triplet):
+    """Where it is exceeded: of those that need no rays with the problem, else with the search."""
+    lens = triplet.variables.lens
+    bent = Variables.of(lens, [Vary("curvature", (4,))], solves=[Solve("focal_length", surface=5)])
+    some = ["spot", Operand("total_track", high=55.0), Operand("glass_edge", low=1.5)]
+    with pytest.raises(ValueError, match="total_track: 60.1.*high 55.*no variable moves it"):
+        design.Problem.of(bent, some, 0.0, 0.5876)
+    design.Problem.of(bent, ["spot", Operand("total_track", high=61.0)], 0.0, 0.5876)
+    problem = design.Problem.of(bent, [some[0], some[2]], 0.0, 0.5876, rule=2)
+    with pytest.raises(ValueError, match="glass_edge of surface 2, zone .*no variable moves it"):
+        design.optimise(problem, trials=3)
+
+
+def test_weights_of_fields(triplet):
+    """They weigh squares, 1 on the average; 0 leaves a field out."""
+    start = triplet.variables.start
+
+    def merit(fields, **given):
+        of = design.Problem.of(
+            triplet.variables, ["spot", "rms_spot"], fields, 0.5876, (np.inf, 900.0), 3, **given
+        )
+        return float(of.merit(start))
+
+    one, two = merit([0.0]), merit([0.2])
+    both = [0.0, 0.2]
+    assert abs(merit(both, field_weights=[1, 3]) / (0.5 * one + 1.5 * two) - 1) < 1e-12
+    assert abs(merit(both, field_weights=[0, 1]) / (2 * two) - 1) < 1e-12
+    assert abs(merit(both, field_weights=[2, 2]) / merit(both) - 1) < 1e-14
 
 
 def test_many_starts_do_not_depend_on_threads(triplet):
@@ -155,6 +236,14 @@ def test_many_starts_do_not_depend_on_threads(triplet):
         (
             lambda p: design.Problem.of(p.variables, ["spot"], colour_weights=[0.0]),
             "colour_weights",
+        ),
+        (
+            lambda p: design.Problem.of(p.variables, ["spot"], [0, 0.1], field_weights=[1]),
+            "field_weights: expected 2 numbers",
+        ),
+        (
+            lambda p: design.Problem.of(p.variables, [Operand("spot", weight=0)]),
+            "all have the weight 0",
         ),
         (lambda p: design.Problem.of(p.variables, ["magnification"]), "object is at infinity"),
         (lambda p: design.Problem.of(p.variables, [Operand("spot", fields=(3,))]), "no number 3"),
