@@ -206,6 +206,15 @@ def _refuse_fixed(problem: Problem, search: Search) -> None:
         problem.refuse_fixed(excess, beside.judged.excess)
 
 
+def _refuse_unjudged(search: Search) -> None:
+    """ValueError for a search that found no lens that can be judged."""
+    if not bool(jnp.isfinite(search.state.broken)):
+        raise ValueError(
+            "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
+            "finite; begin with weaker curvatures or a smaller stop"
+        )
+
+
 def _why(problem: Problem, search: Search, good: float) -> Ended:
     if good and float(search.score) <= good:
         return "good"
@@ -257,23 +266,19 @@ def optimise(
             tried, search = _searched(problem, tried, search)
         if bool(search.done) or float(search.score) <= good:
             break
-    if not bool(jnp.isfinite(search.state.broken)):
-        raise ValueError(
-            "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
-            "finite; begin with weaker curvatures or a smaller stop"
-        )
+    _refuse_unjudged(search)
     why = _why(tried, search, good)
     if why != "good" and 0 < float(search.worst) <= _NEAR:
         search = _mended(tried, search)
     ended = time.perf_counter()
-    limits = problem.limits(search.judged.excess)
+    limits = sorted(problem.limits(search.judged.excess), key=lambda limit: -limit.excess)
     return Optimum(
         problem.variables.lens_of(search.vector),
         np.asarray(search.vector),
         float(search.merit),
         float(search.score),
         float(search.worst),
-        sorted(limits, key=lambda limit: -limit.excess),
+        limits,
         why,
         np.array(history, float),
         ended - compiled,

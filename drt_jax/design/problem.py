@@ -48,6 +48,11 @@ class Judged(NamedTuple):
     failed: Array
 
 
+def _check_pairs(angles: Array, fields: ArrayLike) -> None:
+    if angles.ndim != 2 or angles.shape[1] != 2:
+        raise ValueError(f"fields: expected (F,) or (F, 2), got shape {np.shape(fields)}")
+
+
 def _weights(what: str, given: ArrayLike, count: int) -> np.ndarray:
     """Weights (count,), 1 on the average. ValueError for what they are not."""
     found = np.asarray(given, float)
@@ -118,8 +123,7 @@ class Problem:
         angles = jnp.atleast_1d(field_array(fields, dtype))
         if angles.ndim == 1:
             angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
-        if angles.ndim != 2 or angles.shape[1] != 2:
-            raise ValueError(f"fields: expected (F,) or (F, 2), got shape {np.shape(fields)}")
+        _check_pairs(angles, fields)
         far = jnp.stack([distance_array(d, dtype) for d in np.ravel(distances)])
         colours = lens.colours(wavelengths)
         if isinstance(rule, int):
@@ -137,9 +141,9 @@ class Problem:
                     f"operands: {operand.kind}: vignetting: Clipped traces only what passes; take "
                     "Gauss or Soft"
                 )
-        on = tuple(operand for operand in wanted if operand.weight)
-        if not on:
+        if not any(operand.weight for operand in wanted):
             raise ValueError("operands: all have the weight 0; a merit needs at least one")
+        on = tuple(operand for operand in wanted if operand.weight)
         equal = np.ones(len(colours)) if colour_weights is None else colour_weights
         share = _weights("colour_weights", equal, len(colours)) / len(colours)
         made = cls(variables, angles, far, colours, jnp.asarray(share, dtype), rule, on)

@@ -62,6 +62,9 @@ class Plane:
         broken = jnp.where(vector[0] > 10, jnp.inf, 0.0)
         return lenses.Judged(miss, vector[:1] - 1.5, broken, jnp.int32(0))
 
+    def limits(self, excess):
+        return []
+
 
 PLANE = Plane(jnp.asarray([-jnp.inf, -jnp.inf]), jnp.asarray([jnp.inf, 1.0]))
 NEAREST = 1e-4 * (0.5**2 + 2**2)
