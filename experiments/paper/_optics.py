@@ -22,8 +22,8 @@ from drt_jax.runs.config import ConfigError
 
 from ._common import require, require_known, require_within
 
-# Kinds of numbers that may be trained. Others would cost a lens its symmetry, for which the rays
-# are chosen, or be best at an aperture of nothing.
+# Kinds of numbers that may be trained. Tilts and decentres would break the symmetry for which the
+# rays are chosen; semi-diameters would shrink to nothing, as that costs an image no light here.
 KINDS = ("sensor", "curvature", "conic", "coefficients", "thickness")
 _RINGS = 4  # of the rays by which numbers are compared
 
