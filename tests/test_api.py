@@ -73,7 +73,7 @@ def test_distances_that_are_not_above_0_are_refused(name):
         assert "must be above 0 mm, inf for" in refused(name, 0.05, distance, GREEN, POINTS)
     for distance in ("far", None, 1j):
         assert refused(name, 0.05, distance, GREEN, POINTS).startswith("distance: ")
-    assert "one number" in refused(name, 0.05, [1.0, 2.0], GREEN, POINTS)
+    assert "one number" in refused(name, 0.05, [[1.0, 2.0]], GREEN, POINTS)
 
 
 @pytest.mark.parametrize("name", CALLS)

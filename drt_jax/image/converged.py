@@ -8,16 +8,17 @@ import itertools
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
-from ..lens.scene import Scene, scene_of
-from ..numerics import concrete, known_values
+from ..lens.scene import Scene, field_array, scene_of
+from ..numerics import concrete, known_values, real_array
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
 from ..rays.find import Found
@@ -209,14 +210,18 @@ def _converge(
     # Outside of any trace, also where this is called inside one: what follows is all known.
     with jax.core.eval_context():
         lens, field, distance, wavelengths = known
-        pairs = itertools.product(_each(field, 2), _each(distance, 1))
+        lens.check()
+        dtype = lens.curvature.dtype
+        fields = _each(field_array(field, dtype), 2)
+        distances = _each(real_array("distance", distance, dtype), 1)
+        pairs = itertools.product(fields, distances)
         scenes = [scene_of(lens, one, far, wavelengths) for one, far in pairs]
         return _try_orders(lens, scenes, symmetry_of(lens, field), tolerance, places)
 
 
-def _each(values: Any, rank: int) -> Any:
+def _each(values: Array, rank: int) -> list[Array]:
     """The rows of an array of a rank; one row for any other."""
-    return values if np.ndim(values) == rank and np.size(values) else [values]
+    return [*values] if values.ndim == rank and values.size else [values]
 
 
 def _try_orders(
