@@ -134,7 +134,7 @@ class Problem:
                     f"operands: {operand.kind}: vignetting: Clipped traces only what passes; take "
                     "Gauss or Soft"
                 )
-        on = tuple(operand for operand in wanted if operand.weight)
+        on = tuple(operand.placed(lens) for operand in wanted if operand.weight)
         if not on:
             raise ValueError("operands: all have the weight 0; a merit needs at least one")
         equal = np.ones(len(colours)) if colour_weights is None else colour_weights
