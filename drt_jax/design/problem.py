@@ -103,11 +103,10 @@ class Problem:
         sum; None: equal. Limits hold for all fields, whatever their weights.
 
         ValueError, which names the argument, for what fits neither lens nor problem, and for a
-        limit that the lens exceeds and no variable moves (of limits that need rays, `optimise`
+        limit that the lens exceeds and no variable moves (of edges, which need rays, `optimise`
         says so).
         """
         lens = variables.lens
-        lens.check()
         wanted = tuple(Operand(o) if isinstance(o, str) else o for o in operands)
         if not wanted:
             raise ValueError("operands: none; a merit needs at least one, such as spot")
@@ -209,9 +208,12 @@ class Problem:
         return jnp.clip(vector + move, low, high)
 
     def refuse_fixed(self, excess: ArrayLike, beside: ArrayLike) -> None:
-        """ValueError, which names it, for a limit that is exceeded (L,) and by as much beside."""
+        """ValueError, which names it, for a limit that is exceeded (L,) and by as much beside.
+        Not of rays: those that fail have no derivative until they pass."""
         one, two = np.asarray(excess), np.asarray(beside)
         for limit, there in zip(self.limits(one), self.limits(two)):
+            if "fields" in OPERANDS[limit.kind].names:
+                continue
             still = abs(there.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
             if limit.excess > 0 and still:
                 raise ValueError(

@@ -217,7 +217,7 @@ class Variables:
     low, high: (N,), bounds of the vector; scale: (N,), in the units of the lens.
 
     Static:
-    places: which numbers. ties: (leader, follower, (factor, shift)). solves: applied in their order.
+    places: which numbers. ties: (leader, follower, (factor, shift)). solves: applied in order.
     """
 
     lens: Lens
@@ -244,8 +244,9 @@ class Variables:
         stays tied to what does not change. solves: conditions that hold exactly.
 
         ValueError, which begins with the list that is wrong, for a number that does not exist,
-        stands twice, or is both a variable and what a solve determines.
+        stands twice, or is both a variable and what a solve determines; and as `Lens.check`.
         """
+        lens.check()
         wanted = [Vary(v) if isinstance(v, str) else v for v in vary]
         found = [(place, v) for v in wanted for place in v.places(lens)]
         following = [(p, f, t.line) for t in ties for p, f in t.pairs(lens)]

@@ -20,8 +20,8 @@ _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _LINES, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
 _NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL = 1.0, 50.0
-# In the plane of nd and vd a difference of 100 of vd counts as one of 1 of nd, as in the weights that
-# Zemax has by default where it replaces model glasses (1 and 1e-4, of squares).
+# In the plane of nd and vd a difference of 100 of vd counts as one of 1 of nd: the weights, 1 and
+# 1e-4 of squares, that Zemax has by default where it replaces model glasses.
 _PER_VD = 0.01
 # Wavelengths in um of a medium without a range: 0.1 nm to 1 m.
 ANY = 1e-4, 1e6
@@ -149,8 +149,8 @@ def nd_and_vd(dispersion: Dispersion) -> Array:
 
 @functools.cache
 def _glass_map() -> tuple[np.ndarray, np.ndarray]:
-    """The edges of the convex hull of the catalogue but for air and water, in nd and scaled vd: their
-    normals (E, 2), outwards, and how far they are from the origin (E,)."""
+    """The edges of the convex hull of the catalogue but for air and water, in nd and scaled vd:
+    their normals (E, 2), outwards, and how far they are from the origin (E,)."""
     square = np.square(_LINES[:3])
     powers = np.power.outer(square, (0, 1, -1, -2, -3, -4))
     points: list[tuple[float, float]] = []

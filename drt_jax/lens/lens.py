@@ -193,8 +193,8 @@ class Lens:
             semi = float(np.asarray(self.semi_diameter)[self.stop])
             if semi == 0 or not np.isfinite(semi):
                 raise ValueError(
-                    f"lens.semi_diameter: that of the stop, surface {self.stop}, must be above 0 mm "
-                    f"and finite, got {semi:g}"
+                    f"lens.semi_diameter: that of the stop, surface {self.stop}, must be above 0 "
+                    f"mm and finite, got {semi:g}"
                 )
 
 
@@ -227,9 +227,9 @@ def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
         end = next((k for k in range(i + 1, len(media)) if media[k] != media[i + 1]), len(media))
         rows[i + 1 : end] = True
     if concrete(lens.dispersion):
-        for name, (_, vd) in zip(np.array(media)[rows], np.asarray(nd_and_vd(lens.dispersion))[rows].tolist()):
-            if not 10 <= vd <= 120:
-                raise ValueError(f"glasses: {name} has no vd of 10 to 120; leave its surface out")
+        abbe = np.asarray(nd_and_vd(lens.dispersion))[:, 1]
+        for name in np.array(media)[rows & ~((abbe >= 10) & (abbe <= 120))]:
+            raise ValueError(f"glasses: {name} has no vd of 10 to 120; leave its surface out")
     names = (f"model {name.removeprefix('model ')}" for name in media)
     return dataclasses.replace(
         lens,

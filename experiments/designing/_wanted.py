@@ -49,7 +49,8 @@ class Growth:
 
     first: part to begin with; 1: the whole at once. step: to the next part. good_um: root of the
     mean squared RMS radius with which the next is tried at once, some four times that of the whole
-    in the end: a lens that is perfect for a part is spoilt for more, see docs/design.md. trials: at most at each part; a step that is not good then is halved.
+    in the end: a lens that is perfect for a part is spoilt for more, see docs/design.md.
+    trials: at most at each part; a step that is not good then is halved.
     """
 
     first: float = 1.0

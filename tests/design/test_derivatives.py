@@ -51,12 +51,12 @@ def crooked(tmp_path_factory):
     fields = [[0.02, 0.05], [0.01, 0.25], [0.03, 0.45]]
     problem = Problem.of(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "disc"))
     moves = np.random.default_rng(0).normal(size=len(variables.places))
-    return problem, kinds, variables.start + moves
+    return problem, variables.start + moves
 
 
 @pytest.mark.slow
 def test_every_derivative_by_every_kind_of_variable(crooked):
-    problem, kinds, x = crooked
+    problem, x = crooked
 
     def flat(x):
         seen = problem.seen(problem.variables.lens_of(x))

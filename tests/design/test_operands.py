@@ -288,7 +288,7 @@ def test_spots_without_vignetting():
 
 @pytest.mark.slow
 def test_apertures_as_variables_do_not_vignette():
-    """With spots of what arrives they close as far as they may; with those of the stop they stay."""
+    """With spots of what arrives they close, with those of the whole stop they stay."""
     lens, rule = load_lens("petzval_100mm"), Soft(5, "half", 1.0)
     vary = ["sensor", design.Vary("curvature", (5,))]
     vary.append(design.Vary("semi_diameter", (3, 4, 5), low=10.0, high=25.0))
@@ -303,7 +303,7 @@ def test_apertures_as_variables_do_not_vignette():
 
 
 def test_glasses_stay_on_the_map():
-    """A doublet whose glasses vary: without the limit they end where no glass is, with it within."""
+    """A doublet whose glasses vary: without the limit they end where no glass is."""
     lens = drt_jax.with_model_glass(load_lens(DOUBLET))
     free = ["curvature", "index", "abbe", "sensor"]
     variables = Variables.of(lens, free, solves=[Solve("focal_length", 100.0, surface=2)])

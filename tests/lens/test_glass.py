@@ -223,7 +223,8 @@ def test_catalogue_glasses_made_model_glasses(tmp_path):
     drt_jax.save_lens(model, tmp_path / "model.yaml")
     again = drt_jax.load_lens(tmp_path / "model.yaml")
     np.testing.assert_array_equal(again.index(LINES[:3]), model.index(LINES[:3]))
-    np.testing.assert_array_equal(jax.jit(drt_jax.with_model_glass)(lens).index(LINES), model.index(LINES))
+    jitted = jax.jit(drt_jax.with_model_glass)(lens)
+    np.testing.assert_allclose(jitted.index(LINES), model.index(LINES), rtol=1e-14)
 
 
 def test_some_glasses_made_model_glasses(tmp_path):
@@ -231,10 +232,13 @@ def test_some_glasses_made_model_glasses(tmp_path):
     lens = drt_jax.load_lens("cooke_triplet")
     one = drt_jax.with_model_glass(lens, (2,))
     assert [name.startswith("model ") for name in one.glasses] == [i == 3 for i in range(7)]
-    np.testing.assert_array_equal(one.index(0.6)[[1, 5]], lens.index(0.6)[[1, 5]])
+    ours, own = (np.asarray(each.index(0.6))[[1, 5]] for each in (one, lens))
+    np.testing.assert_array_equal(ours, own)
     with pytest.raises(ValueError, match="no glass begins behind surface 1; there are 0, 2, 4"):
         drt_jax.with_model_glass(lens, (1,))
     path = tmp_path / "index.yaml"
-    path.write_text("surfaces: [{radius: 9, thickness: 90, index: 1.5, semi_diameter: 1, stop: true}]")
+    path.write_text(
+        "surfaces: [{radius: 9, thickness: 90, index: 1.5, semi_diameter: 1, stop: true}]"
+    )
     with pytest.raises(ValueError, match="index 1.5 has no vd of 10 to 120"):
         drt_jax.with_model_glass(drt_jax.load_lens(path))
