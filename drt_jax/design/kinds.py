@@ -59,7 +59,7 @@ def _live(lens: Lens) -> list[int]:
     return list(lens.live)
 
 
-def _model(lens: Lens) -> list[int]:
+def model_glasses(lens: Lens) -> list[int]:
     """Surfaces behind which a model glass begins."""
     model, media = lens.dispersion.model, lens.glasses
     if model is None:
@@ -160,8 +160,8 @@ KINDS: dict[str, Kind] = {
         _write_sensor,
         (1, 0.01),
     ),
-    "index": Kind(_model, _model, _one, *_glass(0), (0, 0.02), (1.3, 2.2)),
-    "abbe": Kind(_model, _model, _one, *_glass(1), (0, 2.0), (15, 100)),
+    "index": Kind(model_glasses, model_glasses, _one, *_glass(0), (0, 0.02), (1.3, 2.2)),
+    "abbe": Kind(model_glasses, model_glasses, _one, *_glass(1), (0, 2.0), (15, 100)),
     "tilt": Kind(_live, _placed, lambda lens: 3, *_leaf("tilt"), (0, 1e-3)),
     "decentre": Kind(_live, _placed, lambda lens: 2, *_leaf("decentre"), (1, 1e-3)),
     "semi_diameter": Kind(

@@ -96,6 +96,13 @@ class Operand:
         if self.kind == "lateral_colour" and len(self.wavelengths or there["wavelengths"]) < 2:
             raise ValueError(f"{what}: wavelengths: needs two or more; leave it out")
 
+    def placed(self, lens: Lens) -> "Operand":
+        """The operand with the surfaces named that follow from numbers of the lens."""
+        if self.kind != "glass_map" or self.surfaces:
+            return self
+        places = OPERANDS[self.kind].places
+        return dataclasses.replace(self, surfaces=tuple(places(lens)) if places else ())
+
     def values(self, seen: Seen) -> Array:
         """The values (K,) of a lens, of which the target is taken or which the limits bound."""
         return jnp.ravel(self._values(seen))

@@ -244,7 +244,7 @@ def optimise(
 
     One program is compiled for a problem, and serves all others of its kind. ValueError if the
     start itself cannot be judged: a lens whose surfaces overlap or of which no number is finite;
-    and for a limit that it exceeds and no variable moves.
+    and for a limit of an edge that it exceeds and no variable moves.
     """
     if not concrete((problem, vector)):
         raise ValueError("optimise: call it outside of jax.jit; inside, use begin and turn")

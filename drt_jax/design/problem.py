@@ -111,11 +111,10 @@ class Problem:
         sum; None: equal. Limits hold for all fields, whatever their weights.
 
         ValueError, which names the argument, for what fits neither lens nor problem, and for a
-        limit that the lens exceeds and no variable moves (of limits that need rays, `optimise`
+        limit that the lens exceeds and no variable moves (of edges, which need rays, `optimise`
         says so).
         """
         lens = variables.lens
-        lens.check()
         wanted = tuple(Operand(o) if isinstance(o, str) else o for o in operands)
         if not wanted:
             raise ValueError("operands: none; a merit needs at least one, such as spot")
@@ -143,7 +142,7 @@ class Problem:
                 )
         if not any(operand.weight for operand in wanted):
             raise ValueError("operands: all have the weight 0; a merit needs at least one")
-        on = tuple(operand for operand in wanted if operand.weight)
+        on = tuple(operand.placed(lens) for operand in wanted if operand.weight)
         equal = np.ones(len(colours)) if colour_weights is None else colour_weights
         share = _weights("colour_weights", equal, len(colours)) / len(colours)
         made = cls(variables, angles, far, colours, jnp.asarray(share, dtype), rule, on)
@@ -217,9 +216,12 @@ class Problem:
         return jnp.clip(vector + move, low, high)
 
     def refuse_fixed(self, excess: ArrayLike, beside: ArrayLike) -> None:
-        """ValueError, which names it, for a limit that is exceeded (L,) and by as much beside."""
+        """ValueError, which names it, for a limit that is exceeded (L,) and by as much beside.
+        Not of rays: those that fail have no derivative until they pass."""
         one, two = np.asarray(excess), np.asarray(beside)
         for limit, there in zip(self.limits(one), self.limits(two)):
+            if "fields" in OPERANDS[limit.kind].names:
+                continue
             still = abs(there.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
             if limit.excess > 0 and still:
                 raise ValueError(

@@ -6,7 +6,9 @@ colour, unless wavelengths are named.
 
 residuals to be squared, which take neither a target nor limits
     spot: each ray from the centroid of all colours, times the root of the light it stands for: the
-        squares of a field add up to the mean square radius of its spot, mm^2
+        squares of a field add up to the mean square radius of its spot, mm^2. Of the light that
+        arrives, so that cutting the worst rays gains: vignetting=False, of this and all that
+        follow up to centroid, counts rays that clear apertures clip as if they passed
     spot_of_colours: the same from the centroid of its own colour
     spot_chief: the same from where the chief ray of the middle colour falls
     path_difference: of each ray less the mean of its colour, waves, times the same root: the
@@ -44,6 +46,10 @@ of gaps between neighbours that bend light, and before the sensor, by the surfac
     glass_edge, air_edge [surface, zone]: at 0.5, 0.7, 0.85 and 1 of how far the light goes, in y;
         in glass of the larger of both extents, in air of the smaller; see `Seen.extents`
     incidence_angle [surface]: the largest, of all rays, with the normal
+
+of model glasses, by the surface where they begin
+    glass_map [surface]: how far nd and vd lie outside of the convex hull of the catalogue, negative
+        within, in units of nd, a vd of 100 being as far as an nd of 1; high=0 keeps them within
 """
 
 from collections.abc import Callable
@@ -55,13 +61,14 @@ import numpy as np
 from jax import Array
 
 from ..image.wavefront import path_differences
+from ..lens.glass import glass_map_distance
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..numerics import safe_divide, safe_sqrt
 from ..rays.status import Status
 from ..rays.trace import Bundle
 from .gaps import between, gaps
-from .kinds import back_distance
+from .kinds import back_distance, model_glasses
 from .seen import EXTRAS, Seen
 
 
@@ -308,6 +315,12 @@ def _incidence(which: Which, seen: Seen) -> Array:
     return jnp.arctan2(safe_sqrt((1 - least) * (1 + least)), least)
 
 
+def _glass_map(which: Which, seen: Seen) -> Array:
+    model = seen.lens.dispersion.model
+    assert model is not None, "Operand.check refuses it"
+    return glass_map_distance(model[np.array(sorted(which.surfaces), int) + 1])
+
+
 _RAYS = ("fields", "wavelengths", "distances")
 _VIEWS = ("distances", "fields")
 _OF_RAYS = (*_VIEWS, "wavelengths", "rays")
@@ -349,6 +362,7 @@ OPERANDS: dict[str, Value] = {
     "glass_edge": _gap(True, True),
     "air_centre": _gap(False, False),
     "air_edge": _gap(False, True),
+    "glass_map": Value(_glass_map, ("surfaces",), model_glasses, traced=False),
     "incidence_angle": Value(
         _incidence, (*_RAYS, "surfaces"), lambda lens: [*lens.live], order=("surfaces",)
     ),

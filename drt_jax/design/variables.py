@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple, get_args
 
@@ -145,16 +146,21 @@ class Vary:
 
 @dataclasses.dataclass(frozen=True)
 class Tie:
-    """Numbers that follow the first of them.
+    """Numbers that follow the first of them: scale x the first + shift.
 
     surfaces: two or more; the others follow the first.
-    how: "equal", "opposite", or "cemented": two neighbours of one shape.
+    how: "equal", "opposite" (the same with the other sign), or "cemented": two neighbours of one
+        shape.
     kind: of the numbers, see `Vary`; of "cemented", all of the shape.
+    scale: of the followers, 1; not 0. shift: added to them, in the unit of the kind. Neither is of
+        "cemented".
     """
 
     surfaces: tuple[int, ...]
     how: _How = "equal"
     kind: str = "curvature"
+    scale: float = 1.0
+    shift: float = 0.0
 
     def __post_init__(self) -> None:
         if self.how not in get_args(_How):
@@ -167,11 +173,18 @@ class Tie:
             raise ValueError(f"ties: expected two or more different surfaces, got {numbers}")
         if self.how == "cemented" and (len(numbers) != 2 or abs(numbers[0] - numbers[1]) != 1):
             raise ValueError(f"ties: cemented: expected two neighbours, got {numbers}")
+        if self.how == "cemented" and (self.scale, self.shift) != (1, 0):
+            raise ValueError("ties: cemented: takes neither scale nor shift; leave them out")
+        if not (math.isfinite(self.scale) and self.scale and math.isfinite(self.shift)):
+            raise ValueError(
+                f"ties: expected a scale that is not 0 and a shift, got {self.scale:g} and "
+                f"{self.shift:g}"
+            )
 
     @property
-    def sign(self) -> float:
-        """Of a follower, relative to its leader."""
-        return -1.0 if self.how == "opposite" else 1.0
+    def line(self) -> tuple[float, float]:
+        """Factor of the leader and what is added, of a follower."""
+        return (-self.scale if self.how == "opposite" else self.scale), self.shift
 
     def pairs(self, lens: Lens) -> list[tuple[Place, Place]]:
         """Leaders and followers. ValueError as of `Vary.places`."""
@@ -204,7 +217,7 @@ class Variables:
     low, high: (N,), bounds of the vector; scale: (N,), in the units of the lens.
 
     Static:
-    places: which numbers. ties: (leader, follower, sign). solves: applied in their order.
+    places: which numbers. ties: (leader, follower, (factor, shift)). solves: applied in order.
     """
 
     lens: Lens
@@ -212,7 +225,7 @@ class Variables:
     high: Array
     scale: Array
     places: tuple[Place, ...] = dataclasses.field(metadata={"static": True})
-    ties: tuple[tuple[int, Place, float], ...] = dataclasses.field(
+    ties: tuple[tuple[int, Place, tuple[float, float]], ...] = dataclasses.field(
         metadata={"static": True}, default=()
     )
     solves: tuple[Solve, ...] = dataclasses.field(metadata={"static": True}, default=())
@@ -231,11 +244,12 @@ class Variables:
         stays tied to what does not change. solves: conditions that hold exactly.
 
         ValueError, which begins with the list that is wrong, for a number that does not exist,
-        stands twice, or is both a variable and what a solve determines.
+        stands twice, or is both a variable and what a solve determines; and as `Lens.check`.
         """
+        lens.check()
         wanted = [Vary(v) if isinstance(v, str) else v for v in vary]
         found = [(place, v) for v in wanted for place in v.places(lens)]
-        following = [(p, f, t.sign) for t in ties for p, f in t.pairs(lens)]
+        following = [(p, f, t.line) for t in ties for p, f in t.pairs(lens)]
         solved = [Place(*solve.place(lens)) for solve in solves]
         taken = {*(f for _, f, _ in following), *solved}
         _refuse_twice("solves", solved, "is what two of them change")
@@ -263,12 +277,12 @@ class Variables:
             )
         index = {place: k for k, (place, _) in enumerate(found)}
         # What follows a number that does not change stays as that is.
-        fixed = [(f, sign * _number(lens, p)) for p, f, sign in following if p not in index]
+        fixed = [(f, a * _number(lens, p) + b) for p, f, (a, b) in following if p not in index]
         lens = _with_numbers(_with_arrays(lens, {place.kind for place, _ in found}), fixed)
         dtype = lens.curvature.dtype
         ends, scale = np.split(np.array([v.bounds(lens, place) for place, v in found]), [2], axis=1)
         low, high = jnp.asarray(ends / scale, dtype).T
-        tied = tuple((index[p], f, sign) for p, f, sign in following if p in index)
+        tied = tuple((index[p], f, line) for p, f, line in following if p in index)
         places = tuple(place for place, _ in found)
         made = cls(lens, low, high, jnp.asarray(scale[:, 0], dtype), places, tied)
         start = made.lens_of(made.start)
@@ -298,7 +312,7 @@ class Variables:
         too; whoever makes the vector keeps its bounds."""
         numbers = self.numbers(vector)
         changes = [(place, numbers[k]) for k, place in enumerate(self.places)]
-        changes += [(place, sign * numbers[k]) for k, place, sign in self.ties]
+        changes += [(place, a * numbers[k] + b) for k, place, (a, b) in self.ties]
         lens = _with_numbers(self.lens, changes)
         for solve in self.solves:
             lens = solve.apply(lens)

@@ -20,6 +20,9 @@ _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _LINES, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
 _NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL = 1.0, 50.0
+# In the plane of nd and vd a difference of 100 of vd counts as one of 1 of nd: the weights, 1 and
+# 1e-4 of squares, that Zemax has by default where it replaces model glasses.
+_PER_VD = 0.01
 # Wavelengths in um of a medium without a range: 0.1 nm to 1 m.
 ANY = 1e-4, 1e6
 
@@ -135,6 +138,67 @@ def model_glass(nd: float, vd: float) -> Glass:
     if not (1 < nd <= 4 and 10 <= vd <= 120):
         raise ValueError(f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
     return Glass(f"model {nd!r} {vd!r}", range=VISIBLE, model=(nd, vd))
+
+
+def nd_and_vd(dispersion: Dispersion) -> Array:
+    """nd and the Abbe number vd (M, 2) of all media; vd 0 where there is no dispersion."""
+    lines = jnp.asarray(_LINES[:3], dispersion.schott.dtype)
+    nd, f, c = refractive_index(dispersion, lines).T
+    return jnp.stack([nd, safe_divide(nd - 1, f - c)], axis=-1)
+
+
+@functools.cache
+def _glass_map() -> tuple[np.ndarray, np.ndarray]:
+    """The edges of the convex hull of the catalogue but for air and water, in nd and scaled vd:
+    their normals (E, 2), outwards, and how far they are from the origin (E,)."""
+    square = np.square(_LINES[:3])
+    powers = np.power.outer(square, (0, 1, -1, -2, -3, -4))
+    points: list[tuple[float, float]] = []
+    for glass in (glass for name, glass in _catalogue().items() if name not in ("air", "water")):
+        b, c = np.reshape(glass.sellmeier, (2, -1, 1))
+        terms = np.sum(b * square / (square - c), axis=0)
+        nd, f, c = np.sqrt(terms + powers @ np.asarray(glass.schott, float))
+        points.append((nd, _PER_VD * (nd - 1) / (f - c)))
+    corners: list[tuple[float, float]] = []
+    for ordered in (sorted(points), sorted(points, reverse=True)):  # below, then above
+        half: list[tuple[float, float]] = []
+        for x, y in ordered:
+            while len(half) > 1 and _left_of(half[-2], half[-1], (x, y)) <= 0:
+                half.pop()
+            half.append((x, y))
+        corners += half[:-1]
+    edges = np.roll(corners, -1, axis=0) - corners
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals, np.sum(normals * corners, axis=1)
+
+
+def _left_of(a: tuple[float, float], b: tuple[float, float], point: tuple[float, float]) -> float:
+    """Above 0 for a point to the left of the way from a to b."""
+    return (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])
+
+
+def glass_map_distance(model: Array) -> Array:
+    """How far glasses of nd and vd (G, 2) lie outside of the convex hull of the catalogue but for
+    air and water, (G,), from its farthest edge, negative within: in units of nd, 100 of vd as one.
+    """
+    normals, away = (jnp.asarray(a, model.dtype) for a in _glass_map())
+    scaled = model * jnp.array([[1, _PER_VD]], model.dtype)
+    return jnp.max(scaled @ normals.T - away[None], axis=1)
+
+
+def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
+    """The dispersion with model glasses of the same nd and vd in place of some media, bool (M,)."""
+    mask, found = jnp.asarray(rows)[:, None], nd_and_vd(dispersion)
+    none = jnp.asarray([_NO_MODEL], found.dtype)
+    ranges = dispersion.ranges or (ANY,) * len(rows)
+    return Dispersion(
+        jnp.where(mask, 0, dispersion.strength),
+        jnp.where(mask, 0, dispersion.resonance),
+        jnp.where(mask, jnp.asarray([Glass.schott], found.dtype), dispersion.schott),
+        jnp.where(mask, found, none if dispersion.model is None else dispersion.model),
+        tuple(VISIBLE if row else own for row, own in zip(rows, ranges, strict=True)),
+    )
 
 
 def _model_index(model: Array, wavelengths: Array) -> Array:

@@ -1,6 +1,7 @@
 """The lens: a frozen pytree of arrays over surfaces."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from ..numerics import concrete, real_array
 from .aperture import Apertures
 from .elements import Elements, rotation_matrix
 from .forms import Shape
-from .glass import ANY, Dispersion, refractive_index
+from .glass import ANY, Dispersion, nd_and_vd, refractive_index, with_models
 from .phase import Phase
 from .surface import surface_sag
 
@@ -182,7 +183,8 @@ class Lens:
 
     def check(self) -> None:
         """ValueError, naming the array, unless those over surfaces have the shapes that stand above
-        and one floating dtype. In a trace, too; takes some microseconds."""
+        and one floating dtype, and, where numbers are known, for a stop without a size. In a trace,
+        too; takes some microseconds."""
         rows, terms = self.count + 1, np.shape(self.coefficients)[1:2] or (0,)
         shapes: dict[str, tuple] = dict.fromkeys(("curvature", "conic", "semi_diameter"), (rows,))
         shapes |= {"coefficients": (rows, *terms), "thickness": (rows - 2,), "sensor": ()}
@@ -208,6 +210,13 @@ class Lens:
             raise ValueError(f"lens.curved: expected rows 0 to {rows - 1}, got {self.curved}")
         if not 0 <= self.stop < self.count:
             raise ValueError(f"lens.stop: expected 0 to {self.count - 1}, got {self.stop}")
+        if concrete(self.semi_diameter):
+            semi = float(np.asarray(self.semi_diameter)[self.stop])
+            if semi == 0 or not np.isfinite(semi):
+                raise ValueError(
+                    f"lens.semi_diameter: that of the stop, surface {self.stop}, must be above 0 "
+                    f"mm and finite, got {semi:g}"
+                )
 
 
 def sag(lens: Lens, surface: int, x: ArrayLike, y: ArrayLike) -> Array:
@@ -218,3 +227,33 @@ def sag(lens: Lens, surface: int, x: ArrayLike, y: ArrayLike) -> Array:
     x, y = jnp.broadcast_arrays(*(jnp.asarray(a, lens.curvature.dtype) for a in (x, y)))
     row = jax.tree.map(lambda a: a[..., surface], lens.shape)
     return surface_sag((x, y), row, lens.forms[surface])
+
+
+def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
+    """The lens with model glasses in place of others: their nd and vd are leaves, to be varied.
+
+    surfaces: behind which they begin, from 0; none: all. Indices at the lines d, and F less C, stay
+    as they are; what else changes is the error of a model glass, see docs/limits.md.
+
+    ValueError, which lists those that exist, for a surface behind which no glass begins; also, as
+    far as numbers are known, for a glass without dispersion.
+    """
+    media = lens.glasses
+    there = [i for i in range(lens.count) if media[i + 1] not in ("air", media[i])]
+    rows = np.zeros(len(media), bool)
+    for i in surfaces or there:
+        if i not in there:
+            some = ", ".join(map(str, there)) or "none"
+            raise ValueError(f"surfaces: no glass begins behind surface {i}; there are {some}")
+        end = next((k for k in range(i + 1, len(media)) if media[k] != media[i + 1]), len(media))
+        rows[i + 1 : end] = True
+    if concrete(lens.dispersion):
+        abbe = np.asarray(nd_and_vd(lens.dispersion))[:, 1]
+        for name in np.array(media)[rows & ~((abbe >= 10) & (abbe <= 120))]:
+            raise ValueError(f"glasses: {name} has no vd of 10 to 120; leave its surface out")
+    names = (f"model {name.removeprefix('model ')}" for name in media)
+    return dataclasses.replace(
+        lens,
+        dispersion=with_models(lens.dispersion, rows),
+        glasses=tuple(new if row else old for new, old, row in zip(names, media, rows)),
+    )

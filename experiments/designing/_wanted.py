@@ -48,8 +48,9 @@ class Growth:
     """Design for a part of the fields and of the aperture first, then for more and more.
 
     first: part to begin with; 1: the whole at once. step: to the next part. good_um: root of the
-    mean squared RMS radius with which the next is tried at once, as a lens that is perfect for a
-    part is spoilt for more. trials: at most at each part; a step that is not good then is halved.
+    mean squared RMS radius with which the next is tried at once, some four times that of the whole
+    in the end: a lens that is perfect for a part is spoilt for more, see docs/design.md.
+    trials: at most at each part; a step that is not good then is halved.
     """
 
     first: float = 1.0
@@ -92,11 +93,11 @@ class Config:
     name: of the problem.
     lens: the start, a bundled name or a YAML path. fields_deg: along y. distance_mm: to the object.
     floating: whether clear apertures but the stop's follow the light, instead of vignetting.
-    wavelengths_um, colour_weights: of the light; no weights: all alike. variables, ties, solves,
-    operands: see drt_jax.design. order: of the pupil's rule while searching; the best lens is
-    finished with as many rays as `tolerance`, relative, of its spots needs. rings: above 0, a
-    hexapolar grid of so many in place of both, as other programs sum. trials: at most,
-    of the last search. beside: other optimisers.
+    wavelengths_um, colour_weights: of the light, field_weights: of the squares; none: all alike.
+    variables, ties, solves, operands: see drt_jax.design. order: of the pupil's rule while
+    searching; the best lens is finished with as many rays as `tolerance`, relative, of its spots
+    needs. rings: above 0, a hexapolar grid of so many in place of both, as other programs sum.
+    trials: at most, of the last search. beside: other optimisers.
     """
 
     name: str
@@ -106,6 +107,7 @@ class Config:
     fields_deg: tuple[float, ...] = (0.0,)
     wavelengths_um: tuple[float, ...] = (0.5875618,)
     colour_weights: tuple[float, ...] = ()
+    field_weights: tuple[float, ...] = ()
     distance_mm: float = math.inf
     floating: bool = True
     ties: tuple[Tie, ...] = ()
@@ -137,7 +139,7 @@ class Config:
         spots = [operand for operand in self.operands if not operand.limits] == [Operand("spot")]
         lens = spots and kinds <= {"curvature", "thickness", "sensor"} and limits <= _GAPS
         lens = lens and solves <= {"focal_length", "entrance_pupil"} and self.floating
-        lens = lens and not self.ties and not self.colour_weights
+        lens = lens and not (self.ties or self.colour_weights or self.field_weights)
         scene = self.fields_deg, self.wavelengths_um, self.rings, self.starts.count
         radii = lens and kinds == {"curvature"} and scene == ((0.0,), (0.55,), 5, 1)
         radii = radii and not limits and not solves

@@ -57,6 +57,7 @@ def problem_of(
         config.distance_mm,
         _grid(config.rings) if config.rings else (order or config.order),
         config.colour_weights or None,
+        config.field_weights or None,
     )
 
 
@@ -137,14 +138,23 @@ def grown(config: Config, lens: drt_jax.Lens, run: Run) -> drt_jax.Lens:
             state["numbers"] = problem.variables.numbers(found.vector).tolist()
         else:
             step /= 2
-            told = f"growth: stops at {done:.1%} of field and aperture, where no step leads to"
-            _common.require(step >= SHORTEST, f"{told} {growth.good_um:g} um; change the start")
+            told = f"growth: stops at {done:.1%} of field and aperture, where no step leads to "
+            told += f"{growth.good_um:g} um: {_in_the_way(config, found)}"
+            _common.require(step >= SHORTEST, told)
         took = {"trials": len(found.history), "jacobians": found.jacobians}
         took |= {"seconds": found.seconds, "compile_s": found.first}
         state |= {name: state[name] + number for name, number in took.items()}
         state |= {"done": done, "step": step, "part": min(done + step, 1.0) if done else part / 2}
         run.keep("growth", state)
     return whole.lens_of(jnp.array(state["numbers"]) / whole.scale)
+
+
+def _in_the_way(config: Config, found: design.Optimum) -> str:
+    """What keeps a part from being good, and the remedy."""
+    size = 1e3 * math.sqrt(found.merit / len(config.fields_deg))
+    if size > config.growth.good_um:
+        return f"the next comes to {size:.3g}; raise growth.good_um or growth.trials"
+    return f"{found.worst_limit} is in the way; widen this limit or change the start"
 
 
 def made_vectors(variables: design.Variables, some: Starts) -> np.ndarray:

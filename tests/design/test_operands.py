@@ -5,14 +5,16 @@ import pathlib
 from typing import get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Clipped, Gauss, design, load_lens
+from drt_jax import Clipped, Gauss, Soft, design, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import OPERANDS, Operand, Problem, Solve, Variables, values
 from drt_jax.design.kinds import KINDS
+from drt_jax.lens.glass import glass_map_distance
 
 from .test_variables import MODEL
 
@@ -36,7 +38,7 @@ def triplet():
     """The Cooke triplet, what all operands say of it, and the rule of its rays."""
     lens, rule = load_lens("cooke_triplet"), Gauss(4, "half")
     variables = Variables.of(lens, ["curvature"])
-    kinds = [kind for kind in OPERANDS if kind != "magnification"]
+    kinds = [kind for kind in OPERANDS if kind not in ("magnification", "glass_map")]
     given = FIELDS, COLOURS, DISTANCES, rule, WEIGHTS
     problem = Problem.of(variables, kinds, *given)
     return lens, rule, program(problem, kinds)(problem, variables.start)
@@ -205,6 +207,13 @@ def test_illumination_is_what_a_beam_brings(triplet):
     assert told["relative_illumination"][3] == 1
 
 
+DOUBLET = {
+    "surfaces": [
+        {"radius": 61.0, "thickness": 6, "glass": "N-BK7", "semi_diameter": 12, "stop": True},
+        {"radius": -44.0, "thickness": 2.5, "glass": "F2"},
+        {"radius": -129.0, "thickness": 96.0},
+    ]
+}
 WEAK = """
 surfaces:
   - {{radius: inf, thickness: 60, semi_diameter: {semi}}}
@@ -256,6 +265,76 @@ def test_vignetted_spots():
     assert 0.3 < passed[0, 0] < 0.9 and abs(passed[0, 0] / found.passed[0] - 1) < 1e-11
     trace = np.trace(np.asarray(found.covariance)[0])
     assert abs(np.sum(values**2) / trace - 1) < 1e-10
+
+
+def beam(lens, vary, rule, **given):
+    """A problem of the Petzval lens from two fields, of which clear apertures cut the second."""
+    fields = np.radians([0.0, 8.0])
+    kinds = ("spot", "rms_spot", "rms_wavefront", "centroid")
+    wanted = [*(Operand(kind, **given) for kind in kinds), "throughput"]
+    return Problem.of(Variables.of(lens, vary), wanted, fields, COLOURS, rule=rule)
+
+
+@jax.jit
+def judged(problem, lens):
+    seen = problem.seen(lens)
+    return [operand.values(seen) for operand in problem.operands]
+
+
+def test_spots_without_vignetting():
+    """As if no clear aperture were there: narrower ones cut light and spots, these stay."""
+    lens, rule = load_lens("petzval_100mm"), Gauss(6, "half")
+    narrow = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[5].set(13.0))
+    free = jnp.full_like(lens.semi_diameter, jnp.inf)
+    free = free.at[lens.stop].set(lens.semi_diameter[lens.stop])
+    free = dataclasses.replace(lens, semi_diameter=free)
+    usual, whole = (
+        [judged(beam(lens, ["sensor"], rule, **given), each) for each in (lens, narrow, free)]
+        for given in ({}, {"vignetting": False})
+    )
+    assert usual[0][4][1] > usual[1][4][1] + 0.1 and np.all(usual[2][4] == 1)
+    assert usual[1][1][1] < 0.9 * usual[0][1][1] < 0.9 * usual[2][1][1]
+    for one, two, three, wanted in zip(*(found[:4] for found in whole), usual[2]):
+        np.testing.assert_array_equal(one, two)
+        np.testing.assert_allclose(one, wanted, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(three, wanted, rtol=1e-12, atol=1e-15)
+    with pytest.raises(ValueError, match="vignetting: Clipped traces only what passes"):
+        beam(lens, ["sensor"], Clipped(3, "half"), vignetting=False)
+
+
+@pytest.mark.slow
+def test_apertures_as_variables_do_not_vignette():
+    """With spots of what arrives they close, with those of the whole stop they stay."""
+    lens, rule = load_lens("petzval_100mm"), Soft(5, "half", 1.0)
+    vary = ["sensor", design.Vary("curvature", (5,))]
+    vary.append(design.Vary("semi_diameter", (3, 4, 5), low=10.0, high=25.0))
+    args = np.radians([0.0, 5.0, 8.0]), COLOURS
+    light = []
+    for operand in (Operand("spot"), Operand("spot", vignetting=False)):
+        problem = Problem.of(Variables.of(lens, vary), [operand], *args, rule=rule)
+        before = problem.seen(problem.variables.lens).rays.passed
+        after = problem.seen(design.optimise(problem).lens).rays.passed
+        light.append(float(np.mean(after[2]) / np.mean(before[2])))
+    assert light[0] < 0.8 and abs(light[1] - 1) < 0.01
+
+
+def test_glasses_stay_on_the_map():
+    """A doublet whose glasses vary: without the limit they end where no glass is."""
+    lens = drt_jax.with_model_glass(load_lens(DOUBLET))
+    free = ["curvature", "index", "abbe", "sensor"]
+    variables = Variables.of(lens, free, solves=[Solve("focal_length", 100.0, surface=2)])
+    ends = []
+    for limits in ([], [Operand("glass_map", high=0.0)]):
+        problem = Problem.of(variables, ["spot", *limits], [0.0, 0.02], COLOURS, rule=3)
+        found = design.optimise(problem, trials=60)
+        model = found.lens.dispersion.model[jnp.array([1, 2])]
+        ends.append(np.asarray(glass_map_distance(model)))
+        if limits:
+            assert found.worst == 0 and {limit.where for limit in found.limits} == {
+                "surface 0",
+                "surface 1",
+            }
+    assert np.max(ends[0]) > 0.01 and np.max(ends[1]) <= 1e-12
 
 
 def model(tmp_path):

@@ -194,6 +194,9 @@ def test_a_limit_that_nothing_moves_is_refused(triplet):
     problem = design.Problem.of(bent, [some[0], some[2]], 0.0, 0.5876, rule=2)
     with pytest.raises(ValueError, match="glass_edge of surface 2, zone .*no variable moves it"):
         design.optimise(problem, trials=3)
+    # Those of rays that fail stay where they are until they pass.
+    bounded = design.Problem.of(bent, ["spot", Operand("distortion", low=-0.05)], 0.3, 0.5876)
+    bounded.refuse_fixed([0.95], [0.95])
 
 
 def test_weights_of_fields(triplet):

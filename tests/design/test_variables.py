@@ -196,6 +196,35 @@ def test_ties(lens):
     assert grown[6, leader] == -grown[1, leader] != 0
 
 
+def test_scaled_and_shifted_ties(lens):
+    """A follower is scale x leader + shift, also of what does not vary, and moves by the scale."""
+    ties = [Tie((0, 3), scale=-0.5), Tie((1, 6), "opposite", scale=2.0, shift=0.01)]
+    ties.append(Tie((0, 5), kind="thickness", scale=0.25, shift=2.0))
+    variables = Variables.of(lens, ["curvature"], ties)
+    assert variables.lens.thickness[5] == 0.25 * lens.thickness[0] + 2
+    vector = variables.start + jnp.linspace(0.1, 1, len(variables.names))
+    made = variables.lens_of(vector)
+    assert made.curvature[3] == -0.5 * made.curvature[0] != 0
+    assert made.curvature[6] == -2 * made.curvature[1] + 0.01
+    grown = jax.jacfwd(lambda v: variables.lens_of(v).curvature)(vector)
+    np.testing.assert_array_equal(grown[6], -2 * grown[1])
+    assert np.any(grown[1])
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        ({"scale": 0.0}, "a scale that is not 0 and a shift, got 0 and 0"),
+        ({"scale": np.nan}, "got nan and 0"),
+        ({"shift": np.inf}, "got 1 and inf"),
+        ({"how": "cemented", "shift": 1.0}, "cemented: takes neither scale nor shift"),
+    ],
+)
+def test_ties_that_mean_nothing(given, said):
+    with pytest.raises(ValueError, match=f"ties: .*{said}"):
+        Tie((2, 3), **given)
+
+
 def test_cemented_surfaces_have_one_shape(lens):
     """Also where only some of the shape varies: what does not is made alike once."""
     variables = Variables.of(lens, ["curvature", Vary("conic", (2,))], [Tie((2, 3), "cemented")])

@@ -88,7 +88,9 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as caught:
         main("singlet", tmp_path / "other", *growth, "growth.good_um=10", "growth.trials=4")
     assert caught.value.code == 2
-    assert "of field and aperture, where no step leads to 10 um" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "of field and aperture, where no step leads to 10 um: the next comes to " in said
+    assert "raise growth.good_um or growth.trials" in said
 
 
 @pytest.mark.slow

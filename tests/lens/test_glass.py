@@ -4,12 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
-from drt_jax import load_lens
+import drt_jax
+from drt_jax import Gauss, load_lens
 from drt_jax.lens.glass import (
     Dispersion,
     Glass,
+    _catalogue,
     find_glass,
+    glass_map_distance,
     model_glass,
     refractive_index,
 )
@@ -171,3 +175,70 @@ def test_derivatives_of_a_model_glass():
 def test_impossible_model_glasses(nd, vd):
     with pytest.raises(ValueError, match="expected 1 < nd"):
         model_glass(nd, vd)
+
+
+def solids():
+    """nd and vd of the catalogue but for air and water, by `index`."""
+    names = [name for name in _catalogue() if name not in ("air", "water")]
+    lines = np.array([index(name, *LINES[:3]) for name in names])
+    return np.stack([lines[:, 0], (lines[:, 0] - 1) / (lines[:, 1] - lines[:, 2])], axis=1)
+
+
+def test_distance_to_the_glass_map():
+    """That of the hull by SciPy: 0 or less for all glasses, above 0 where no glass is."""
+    glasses = solids()
+    hull = ConvexHull(glasses * [1, 0.01]).equations
+    corners = np.array([[1.85, 70.0], [1.45, 40.0], [1.6, 50.0], [2.1, 25.0]])
+    points = np.concatenate([glasses, corners])
+    wanted = np.max((points * [1, 0.01]) @ hull[:, :2].T + hull[:, 2], axis=1)
+    found = glass_map_distance(jnp.asarray(points))
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    assert np.max(found[: len(glasses)]) < 1e-12 and np.sum(np.abs(found) < 1e-12) > 5
+    assert found[-4] > 0.1 and found[-3] > 0.05 and found[-2] < -0.05 and found[-1] > 0.05
+
+
+def test_catalogue_glasses_made_model_glasses(tmp_path):
+    """nd and nF - nC, so focal lengths at d, F - C stay; spots change by what a model glass is off;
+    their nd and vd are leaves."""
+    lens = drt_jax.load_lens("double_gauss")
+    model = drt_jax.with_model_glass(lens)
+    before, after = (np.asarray(each.index(LINES[:3])) for each in (lens, model))
+    np.testing.assert_allclose(after[:, 0], before[:, 0], rtol=1e-14)
+    np.testing.assert_allclose(after[:, 1] - after[:, 2], before[:, 1] - before[:, 2], atol=1e-14)
+    ours, own = (float(drt_jax.focal_length(each, LINES[0])[0]) for each in (model, lens))
+    assert abs(ours / own - 1) < 1e-12 and model.live == lens.live
+    spots = [
+        np.trace(drt_jax.psf_moments(each, 0.0, np.inf, (0.48, 0.6), rule=Gauss(6, "meridian"))
+        .covariance, axis1=1, axis2=2) for each in (model, lens)
+    ]  # fmt: skip
+    np.testing.assert_allclose(*spots, rtol=0.1)
+
+    @jax.jit
+    def power(nd):
+        moved = dataclasses.replace(model.dispersion, model=model.dispersion.model.at[1, 0].set(nd))
+        moved = dataclasses.replace(model, dispersion=moved)
+        return 1 / drt_jax.first_order(moved, jnp.inf, jnp.array([LINES[0]])).focal_length[0]
+
+    assert abs(float(jax.grad(power)(before[1, 0]))) > 1e-3
+    drt_jax.save_lens(model, tmp_path / "model.yaml")
+    again = drt_jax.load_lens(tmp_path / "model.yaml")
+    np.testing.assert_array_equal(again.index(LINES[:3]), model.index(LINES[:3]))
+    jitted = jax.jit(drt_jax.with_model_glass)(lens)
+    np.testing.assert_allclose(jitted.index(LINES), model.index(LINES), rtol=1e-14)
+
+
+def test_some_glasses_made_model_glasses(tmp_path):
+    """Of a stop inside a glass both sides; the others stay as they are."""
+    lens = drt_jax.load_lens("cooke_triplet")
+    one = drt_jax.with_model_glass(lens, (2,))
+    assert [name.startswith("model ") for name in one.glasses] == [i == 3 for i in range(7)]
+    ours, own = (np.asarray(each.index(0.6))[[1, 5]] for each in (one, lens))
+    np.testing.assert_array_equal(ours, own)
+    with pytest.raises(ValueError, match="no glass begins behind surface 1; there are 0, 2, 4"):
+        drt_jax.with_model_glass(lens, (1,))
+    path = tmp_path / "index.yaml"
+    path.write_text(
+        "surfaces: [{radius: 9, thickness: 90, index: 1.5, semi_diameter: 1, stop: true}]"
+    )
+    with pytest.raises(ValueError, match="index 1.5 has no vd of 10 to 120"):
+        drt_jax.with_model_glass(drt_jax.load_lens(path))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Lens, load_lens
+from drt_jax import Lens, design, load_lens
 
 
 def test_the_sensor_is_the_last_row():
@@ -62,6 +62,19 @@ def test_one_compilation_serves_lenses_of_one_shape():
     power(lens)
     power(dataclasses.replace(lens, curvature=2 * lens.curvature))
     assert len(traced) == 1
+
+
+@pytest.mark.parametrize("semi", [0.0, np.inf, np.nan])
+def test_a_stop_without_a_size_gets_one_line(semi):
+    lens = load_lens("cooke_triplet")
+    lens = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[lens.stop].set(semi))
+    for call in (
+        lambda: drt_jax.psf_moments(lens, 0.0, np.inf, 0.55),
+        lambda: drt_jax.first_order(lens, np.inf, 0.55),
+        lambda: design.Problem.of(design.Variables.of(lens, ["thickness"]), ["spot"]),
+    ):
+        with pytest.raises(ValueError, match=f"stop, surface {lens.stop}, must be above 0 mm"):
+            call()
 
 
 def test_sag_of_a_surface_and_of_the_sensor():
