@@ -2,7 +2,9 @@
 
 Every edge, the stop's rim among them, is a quadric: a ray passes if its hit h on that surface has
 |q| <= 1, where q = scale (h - centre) along x and y; a rectangle is two edges, each with one scale
-of 0. Rays are launched, not aimed: a trace tells how the hits move with the point on the stop; on
+of 0. Where neighbouring surfaces cross, the way from one to the other is 0: an edge too, of a way
+between 0 and more than there is. Rays are launched, not aimed: a trace tells how the hits move with
+the point on the stop, also beyond all edges, where they step back to a surface; on
 this model, every edge ends a half-line on the stop at the root of a quadratic; the next ray is
 launched there. So each ray of the boundary takes a few steps of Newton's method.
 
@@ -19,7 +21,7 @@ from jax import Array
 from ..lens.lens import Lens
 from ..numerics import run_if, safe_divide, safe_sqrt
 from ..rays.aim import beam_size, nearest_start, no_fan, trace_fan
-from ..rays.snell import apart, shoot
+from ..rays.snell import apart, shoot, shoot_anyway
 from ..rays.status import Status
 from ..rays.system import System, dot
 from ..rays.trace import on_all_surfaces
@@ -27,13 +29,15 @@ from ..rays.trace import on_all_surfaces
 _ZOOMS, _STEPS = 10, 8  # of the search for the middle: rounds, and steps of Newton's method
 # A last step as short as this, in units of the stop's semi-diameter, is right to its square.
 _NEAR = 1e-6
+# No ray is longer between two surfaces than so many times the lens.
+_LONGEST = 100.0
 
 
 class Rays(NamedTuple):
     """Launched rays, and how they move with their points on the stop.
 
-    launch: (2, W, B), mm. point: (2, W, B) in units of the stop's semi-diameter. hits: (2, S + 1,
-    W, B), mm. aims, moves: (2, ...), derivatives of `launch` and `hits` by `point`.
+    launch: (2, W, B), mm. point: (2, W, B) in units of the stop's semi-diameter. hits: (2, H, W,
+    B), mm, see `traced`. aims, moves: (2, ...), derivatives of `launch` and `hits` by `point`.
     good: (W, B), whether they reach the sensor.
     """
 
@@ -78,38 +82,43 @@ class Reached(NamedTuple):
 class Edges(NamedTuple):
     """The E edges of a lens, obscurations taken for clear apertures.
 
-    scale: (2, E, 1, 1) in 1/mm. centre: (2, E, 1, 1) in mm; None: all 0. surfaces: (E,), known;
-    None: the semi-diameters of all surfaces alone.
+    scale: (2, E, 1, 1) in 1/mm. centre: (2, E, 1, 1) in mm. rows: (E,), of the hits, known.
     """
 
     scale: Array
-    centre: Array | None
-    surfaces: np.ndarray | None
+    centre: Array
+    rows: np.ndarray
 
     def moves(self, moves: Array) -> Array:
-        """How q moves, (..., 2, E, W, B), with hits (..., 2, S + 1, W, B)."""
-        moves = moves if self.surfaces is None else moves[..., self.surfaces, :, :]
+        """How q moves, (..., 2, E, W, B), with hits (..., 2, H, W, B)."""
+        moves = moves[..., self.rows, :, :]
         return self.scale.reshape(*[1] * (moves.ndim - 4), *self.scale.shape) * moves
 
     def at(self, hits: Array) -> Array:
-        """q (2, E, W, B) of hits (2, S + 1, W, B)."""
-        q = self.moves(hits)
-        return q if self.centre is None else q - self.scale * self.centre
+        """q (2, E, W, B) of hits (2, H, W, B)."""
+        return self.moves(hits) - self.scale * self.centre
 
 
 def edges_of(lens: Lens) -> Edges:
-    """Those of the S + 1 semi-diameters, and behind them of all other apertures."""
+    """Those of the S + 1 semi-diameters, of the ways from live surface to live surface and to the
+    sensor, and behind them of all other apertures."""
     scale, extra = jnp.stack([1 / lens.semi_diameter] * 2), lens.apertures
+    span = jnp.sum(abs(lens.thickness)) + abs(lens.sensor) + lens.semi_diameter[lens.stop]
+    longest = jnp.broadcast_to(_LONGEST * span, (1, len(lens.live)))
+    centre = jnp.pad(longest, ((0, 1), (lens.count + 1, 0)))
+    scale = jnp.concatenate([scale, jnp.pad(1 / longest, ((0, 1), (0, 0)))], axis=1)
+    rows = np.arange(centre.shape[1])
     if extra is None:
-        return Edges(scale[..., None, None], None, None)
+        return Edges(scale[..., None, None], centre[..., None, None], rows)
     axes = [np.eye(2) if kind == "rectangle" else np.ones((1, 2)) for kind in extra.kinds]
     own = np.repeat(np.arange(len(axes)), [len(rows) for rows in axes])
     scales = jnp.asarray(np.concatenate(axes), scale.dtype) / extra.sizes[own]
-    scale, centre = jnp.concatenate([scale, scales.T], axis=1), None
-    if extra.centre is not None:
-        centre = jnp.pad(extra.centre[own].T, ((0, 0), (lens.count + 1, 0)))[..., None, None]
-    surfaces = np.array([*range(lens.count + 1), *np.array(extra.surfaces)[own]])
-    return Edges(scale[..., None, None], centre, surfaces)
+    at = jnp.zeros_like(scales) if extra.centre is None else extra.centre[own]
+    scale, centre = (
+        jnp.concatenate([a, b.T], axis=1)[..., None, None]
+        for a, b in ((scale, scales), (centre, at))
+    )
+    return Edges(scale, centre, np.append(rows, np.array(extra.surfaces)[own]))
 
 
 def moved(rates: Array, change: Array) -> Array:
@@ -135,23 +144,29 @@ def units(like: Array) -> Array:
     return jnp.broadcast_to(jnp.eye(2, dtype=like.dtype)[..., None, None], (2, *like.shape))
 
 
+def traced(lens: Lens, system: System, launch: Array) -> tuple[Array, Array]:
+    """Hits (2, H, W, B), mm, and whether rays reach the sensor, (W, B): on the S surfaces and the
+    sensor, and behind these as x, with y = 0, the ways to each live surface from the one before it
+    and to the sensor, H = S + 1 + L. Launched as of `launched`; a way may be below 0."""
+    hits, ways, fate = shoot_anyway(system, tuple(launch))
+    (x, y), status = on_all_surfaces(lens, system, *apart(system, hits), fate)
+    found = jnp.concatenate([x, ways]), jnp.concatenate([y, 0 * ways])
+    return jnp.stack(found), status == Status.OK
+
+
 def launched(lens: Lens, system: System, launch: Array) -> Rays:
     """Rays launched at points (2, W, B), mm on the vertex plane of the first row, and traced."""
 
-    def trace(launch):
-        found = shoot(system, tuple(launch))
-        hits, status = on_all_surfaces(lens, system, *apart(system, found.hits), found.fate)
-        return jnp.stack(hits), status
-
     def along(unit):
-        (hits, status), (columns, _) = jax.jvp(trace, (launch,), (unit,))
-        return hits, columns, status
+        trace = lambda launch: traced(lens, system, launch)  # noqa: E731
+        hits, columns, good = jax.jvp(trace, (launch,), (unit,), has_aux=True)
+        return hits, columns, good
 
-    hits, columns, status = jax.vmap(along, out_axes=(None, 0, None))(units(launch))
+    hits, columns, good = jax.vmap(along, out_axes=(None, 0, None))(units(launch))
     radius = lens.semi_diameter[lens.stop]
     aims = inverse(columns[:, :, lens.stop] / radius)
     moves = jnp.stack([moved(columns, a) for a in aims])
-    return Rays(launch, hits[:, lens.stop] / radius, hits, aims, moves, status == Status.OK)
+    return Rays(launch, hits[:, lens.stop] / radius, hits, aims, moves, good)
 
 
 def arriving(system: System, launch: Array, radius: Array) -> Array:

@@ -23,12 +23,9 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import safe_divide
 from ..rays.aim import paraxial_launch
-from ..rays.fermat import arrival
-from ..rays.find import Found
-from ..rays.solve import reattach
 from ..rays.status import Status
 from ..rays.system import System, Vector, determinant, dot, system_of
-from ..rays.trace import Bundle, on_all_surfaces
+from ..rays.trace import Bundle
 from . import boundary
 from .rules import PupilRule, Symmetry, check_rule
 from .spokes import CORNERS, Spokes, changes, gauss, unit
@@ -107,7 +104,7 @@ def _find(lens: Lens, system: System, spokes: Spokes, used: Array) -> boundary.R
     def several(shape, dtype=system.index.dtype):
         return jnp.zeros((len(stages), *shape, system.index.shape[1], spokes.count), dtype)
 
-    point, rates, rows = several((2,)), several((2, 2)), lens.count + 1
+    point, rates, rows = several((2,)), several((2, 2)), lens.count + 1 + len(lens.live)
     hits, moves, no = several((2, rows)), several((2, 2, rows)), several((), bool)
     goal = boundary.Goal(point, point, several((2,), jnp.int32))
     rays = boundary.Rays(point, point, hits, rates, moves, no)
@@ -125,8 +122,9 @@ class _Plan(NamedTuple):
     """The boundary without derivatives: C corners and B spokes, K = C + B rays.
 
     centre: (2, W, 1). shape: (2, 2, W, 1), see `boundary.stretch`. point: (2, W, K) in units of
-    the stop's semi-diameter. hits: 2 arrays (R, W, K) on the rows of a system, mm. pair: (2, W, K),
-    the edges that end a ray, for a spoke both the same. rates: (2, 2, W, K), see `boundary.rates`.
+    the stop's semi-diameter. launch: (2, W, K), mm, and aims: (2, 2, W, K), see `boundary.Rays`.
+    pair: (2, W, K), the edges that end a ray, for a spoke both the same. rates: (2, 2, W, K), see
+    `boundary.rates`.
     follows: (W, K), whether a ray follows the lens. passes: (W, 1), whether light passes. used: (),
     how many spokes count.
     """
@@ -134,7 +132,8 @@ class _Plan(NamedTuple):
     centre: Array
     shape: Array
     point: Array
-    hits: Vector
+    launch: Array
+    aims: Array
     pair: Array
     rates: Array
     follows: Array
@@ -159,54 +158,55 @@ def _plan(lens: Lens, scene: Scene, spokes: Spokes, used: Array) -> _Plan:
         rays, pair = jax.tree.map(join, corners.rays, rays), join(corners.goal.pair, pair)
         follows = join(_exists(lens, corners), follows)
     follows = follows & passes[:, :1]
-    hits = jnp.where(follows, rays.hits[:, np.array([*lens.live, lens.count])], 0)
     first = jax.tree.map(lambda a: a[..., :1], middle.rays)
     centre, shape = first.point, boundary.stretch(lens, first)
     rates = boundary.rates(lens, rays, pair)
-    return _Plan(centre, shape, rays.point, tuple(hits), pair, rates, follows, passes[:, :1], used)
+    known = rays.point, rays.launch, rays.aims, pair, rates
+    return _Plan(centre, shape, *known, follows, passes[:, :1], used)
 
 
-def _followed(plan: _Plan, lens: Lens, scene: Scene, point: Array) -> Array:
-    """`boundary.gaps` of the rays of a plan through points (2, W, K)."""
-    system = system_of(lens, scene)
-    target = tuple(lens.semi_diameter[lens.stop] * point)
-    status = jnp.where(plan.follows, Status.OK, Status.MISSED).astype(jnp.int32)
-    known = Found(plan.hits, arrival(plan.hits, system), status, jnp.int32(0))
-    hits = reattach(known, system, target).hits
-    return boundary.gaps(
-        lens, jnp.stack(on_all_surfaces(lens, system, hits, target, status)[0]), plan.pair
-    )
+def _followed(plan: _Plan, lens: Lens, scene: Scene, launch: Array) -> tuple[Array, Array]:
+    """Points (2, W, K) and `boundary.gaps` of the rays of a plan launched at (2, W, K)."""
+    hits, _ = boundary.traced(lens, system_of(lens, scene), launch)
+    point = hits[:, lens.stop] / lens.semi_diameter[lens.stop]
+    return point, boundary.gaps(lens, hits, plan.pair)
 
 
 @jax.custom_jvp
-def _known_rates(lens: Lens, scene: Scene, point: Array, plan: _Plan) -> Array:
-    """Derivatives of `_followed` by the point: known numbers, only theirs cost anything."""
-    return plan.rates
+def _known_rates(lens: Lens, scene: Scene, launch: Array, plan: _Plan) -> tuple[Array, Array]:
+    """Derivatives by the point, of the launch and of the gaps of `_followed`: known numbers, only
+    theirs cost anything."""
+    return plan.aims, plan.rates
 
 
 @_known_rates.defjvp
-def _known_rates_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    def rates(lens, scene, point):
-        gaps = functools.partial(_followed, primals[3], lens, scene)
-        return jax.vmap(lambda unit: jax.jvp(gaps, (point,), (unit,))[1])(boundary.units(point))
+def _known_rates_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    def rates(lens, scene, launch):
+        follow = functools.partial(_followed, primals[3], lens, scene)
+        columns = jax.vmap(lambda unit: jax.jvp(follow, (launch,), (unit,))[1])
+        points, gaps = columns(boundary.units(launch))
+        aims = boundary.inverse(points)
+        return aims, jnp.stack([boundary.moved(gaps, a) for a in aims])
 
     return jax.jvp(rates, primals[:3], tangents[:3])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _follow(spokes: Spokes, lens: Lens, scene: Scene, plan: _Plan) -> Array:
-    """The points of a plan with their derivatives by the lens and the scene, in every mode."""
-    return plan.point
+def _follow(spokes: Spokes, lens: Lens, scene: Scene, plan: _Plan) -> tuple[Array, Array]:
+    """The points of a plan, and where their rays are launched, with their derivatives by the lens
+    and the scene, in every mode."""
+    return plan.point, plan.launch
 
 
 @_follow.defjvp
-def _follow_jvp(spokes: Spokes, primals: Any, tangents: Any) -> tuple[Array, Array]:
+def _follow_jvp(spokes: Spokes, primals: Any, tangents: Any) -> tuple[Any, Any]:
     lens, scene, plan = primals
     # Through the function itself, so that the points carry derivatives of their own.
-    point = _follow(spokes, lens, scene, plan)
-    rates = _known_rates(lens, scene, point, plan)
-    gaps = lambda lens, scene: _followed(plan, lens, scene, point)  # noqa: E731
-    _, change = jax.jvp(gaps, (lens, scene), tangents[:2])
+    point, launch = _follow(spokes, lens, scene, plan)
+    aims, rates = _known_rates(lens, scene, launch, plan)
+    held = lambda lens, scene: _followed(plan, lens, scene, launch)  # noqa: E731
+    _, (slid, change) = jax.jvp(held, (lens, scene), tangents[:2])
+    change = change - boundary.moved(rates, slid)  # of rays through fixed points
     corners, ends = (slice(None, -spokes.count), slice(-spokes.count, None))
     # A corner stays on both edges.
     corner = -boundary.moved(boundary.inverse(rates[..., corners]), change[..., corners])
@@ -218,7 +218,8 @@ def _follow_jvp(spokes: Spokes, primals: Any, tangents: Any) -> tuple[Array, Arr
     rate = rates[:, 0, :, ends]
     longer = -safe_divide(change[0, :, ends] + dot(rate, side), dot(rate, toward))
     longer = jnp.where(plan.follows[:, ends], longer, 0)
-    return point, jnp.concatenate([corner, side + longer[None] * toward], axis=-1)
+    moved = jnp.concatenate([corner, side + longer[None] * toward], axis=-1)
+    return (point, launch), (moved, jnp.where(plan.follows, boundary.moved(aims, moved - slid), 0))
 
 
 def _along(line: Array, toward: Array) -> Array:
@@ -289,7 +290,7 @@ class Clipped(PupilRule):
         spokes = Spokes(self.symmetry, max(most, 32 * part) + 1)
         given = *jax.lax.stop_gradient((lens, scene)), spokes, jnp.asarray(used, jnp.int32)
         plan = jax.lax.stop_gradient(_plan(*given))
-        point = _follow(spokes, lens, scene, plan)
+        point, _ = _follow(spokes, lens, scene, plan)
         corner, end = point[..., : -spokes.count], point[..., -spokes.count :]
         toward, share = plan.nodes(spokes, corner)
         # The nodes have the first places; the others are of the search alone.

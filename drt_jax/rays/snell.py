@@ -174,10 +174,12 @@ class _State(NamedTuple):
 
 
 class _Meeting(NamedTuple):
-    """Of rays with a row: `hit`, D arrays (...), and `fate` so far (...), see `Trace`. short: by
-    how much a ray misses the row, comes from behind, is bent too far; called where it is asked."""
+    """Of rays with a row: `hit`, D arrays (...), and `fate` so far (...), see `Trace`. length:
+    (...), mm from the live surface before it, below 0 for a step back. short: by how much a ray
+    misses the row, comes from behind, is bent too far; called where it is asked."""
 
     hit: Vector
+    length: Array
     fate: Array
     short: Callable[[], Array]
 
@@ -200,9 +202,10 @@ def _follow(
     to_stop: bool,
     keep: Callable[[_Meeting], Any],
     lost: Callable[..., tuple[Vector, Vector]] = _as_it_is,
+    forward: bool = True,
 ) -> tuple[_State, Any]:
     """Rays behind the last row; and unless that is the stop, what is to `keep` of each meeting.
-    lost: how a ray that failed goes on."""
+    lost: how a ray that failed goes on. forward: whether a ray fails that steps back to a row."""
     kinds = sorted({*system.forms, system.at_stop[1]})
     each = [partial(meet, kind) for kind in kinds]
     phases = [] if system.diffraction is None else sorted(set(system.diffraction.forms))
@@ -214,7 +217,8 @@ def _follow(
         own, normal, met, length = encounter(p, d, row.surface.shape, state.fate == Status.OK)
         bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
         crosses = met
-        met = met & (~row.live | ((front > 0) & ((length > 0) | row.first)))
+        ahead = (length > 0) | row.first | (not forward)
+        met = met & (~row.live | ((front > 0) & ahead))
         passes = (through > 0) | ~row.bends
         here = jnp.where(met, jnp.where(passes, Status.OK, Status.TIR), Status.MISSED)
         fate = jnp.where(state.fate == Status.OK, here.astype(jnp.int32), state.fate)
@@ -240,7 +244,7 @@ def _follow(
             missed = missed + jnp.where(row.bends, jnp.maximum(row.ratio**2 - 1, 0), 0)
             return jnp.where(crosses, behind, missed)
 
-        keeping = keep(_Meeting(hit, fate, short))
+        keeping = keep(_Meeting(hit, length, fate, short))
         return jax.tree.map(partial(jnp.where, row.bends), new, kept), keeping
 
     zero = jnp.zeros_like(launch[0])
@@ -253,6 +257,21 @@ def shoot(system: System, launch: Vector) -> Trace:
     """Trace rays to the sensor; `launch` D arrays in mm on the vertex plane of the first row."""
     state, hits = _follow(system, launch, False, lambda meeting: meeting.hit)
     return Trace(hits, state.fate, state.shake)
+
+
+def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
+    """`hits` and `fate` of `Trace`, and between them the lengths (R - 1, ...) of the segments from
+    each live surface to the next and to the sensor, mm: a ray may step back, where neighbours
+    cross, by a length below 0. Differentiable; void rays are finite."""
+    state, (hits, lengths) = _follow(
+        system,
+        launch,
+        False,
+        lambda meeting: (meeting.hit, meeting.length),
+        _along_the_axis,
+        forward=False,
+    )
+    return hits, apart(system, (lengths,))[0][0][1:], state.fate
 
 
 def fates(system: System, launch: Vector) -> Array:
