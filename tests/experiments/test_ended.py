@@ -276,7 +276,7 @@ def test_a_minimum_is_found_or_not(case):
 
 
 def test_a_focus_that_was_not_found_is_said_and_drawn(tmp_path, monkeypatch):
-    monkeypatch.setattr(focus._training, "draw_lens", lambda *args: None)
+    monkeypatch.setattr(focus._report, "draw_lens", lambda *args: None)
     rows = {"sensor_mm": np.ones((2, 30)), "sigma_um": np.full((2, 30), np.nan)}
     known = {"lens": "singlet", "starts_mm": [1.0, 2.0], "distance_mm": 1e4, "seconds": 1.0}
     found = {"best_focus_mm": None, "batches_to_focus": [None, 3], "final_mm": [None, 1.5]}
