@@ -236,11 +236,10 @@ class Jobs:
         try:
             require_finite(label, first, rows["loss"])
             require_finite(label, first, rows["sigma_um"], "blur")
-            wrong = "" if np.all(np.isfinite([*values.values()])) else "; the lens is not finite"
+            wrong = "" if np.all(np.isfinite([*values.values()])) else "the lens is not finite"
             if values and self.lens.names and not wrong:
-                pair, _, _ = crossed(self.lens.lens_of(values))[1:].partition(";")
-                wrong = pair and f";{pair}"  # a line has room for one pair
-            what = f"{label}: after batch {first + len(rows['loss']) - 1}{wrong}"
+                wrong = "".join(crossed(self.lens.lens_of(values)).split("; ")[1:2])
+            what = f"{label}: after batch {first + len(rows['loss']) - 1} {wrong}"
             require(not wrong, f"{what}; leave this start out, or lower train.optics_rate")
         except ConfigError as error:
             if not self._good[label]:

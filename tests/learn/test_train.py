@@ -176,6 +176,12 @@ def test_metrics_of_known_images():
     assert result["mae"] == result["rmse"] == 0 and result["ssim"] == 1
 
 
+def test_width_of_a_blur_is_that_of_both_axes():
+    whole = jnp.array([[[9.0, 2.0], [2.0, 7.0]], [[jnp.inf, 0.0], [0.0, jnp.inf]]])
+    np.testing.assert_allclose(train.blur_width(whole), [8**0.5, np.inf])
+    np.testing.assert_allclose(train.blur_width(jnp.array([[9.0, 7.0], [4.0, 4.0]])), [8**0.5, 2])
+
+
 def test_bad_camera():
     with pytest.raises(ValueError, match="camera.kernel: expected an odd number"):
         train.Camera(kernel=20)
