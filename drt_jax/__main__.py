@@ -6,21 +6,28 @@ import os
 import pathlib
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import partial
+from typing import get_args
 
 import jax
 import numpy as np
 
 from .files.yaml import lens_names, load_lens
 from .image.converged import psf_moments
+from .image.moments import Moments
 from .lens.lens import Lens
-from .lens.paraxial import first_order
-from .pupil import hexapolar
-from .rays.status import Status
-from .rays.trace import trace_rays
+from .lens.paraxial import FirstOrder, first_order
+from .lens.scene import Scene, scene_of
+from .pupil.clipped import Clipped
+from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
+from .show.figures import new
+from .show.layout import ONCE, Beam, beam_of, draw, lens_drawing
 
-_RINGS = 10  # of the rays by which apertures are judged
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
+# Of the rules for the spots; by how much of their size these may differ between both.
+_ORDERS, _TOLERANCE = (14, 20), 1e-3
+_DEFOCUS = 3.0  # times the smallest spot is out of focus
 
 
 def _options(argv: list[str] | None) -> argparse.Namespace:
@@ -41,69 +48,95 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     return options
 
 
-def first_lines(lens: Lens, distance: float, wavelength: float) -> Iterator[str]:
-    """First-order data of a lens at one wavelength in um, and what is odd about them."""
-    found = jax.tree.map(lambda a: float(a[0]), first_order(lens, distance, np.array([wavelength])))
-    image, sensor = found.image_distance, float(lens.sensor)
+def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[str]:
+    """First-order data of a lens at one wavelength in um."""
     yield f"{lens.name}: {lens.count} surfaces, the stop is number {lens.stop}"
     yield f"  wavelength           {wavelength:g} um"
     air = found.effective_focal_length
     air = "" if math.isclose(air, abs(found.focal_length)) else f" ({air:.6g} mm in air)"
     yield f"  focal length         {found.focal_length:.6g} mm{air}, f/{found.f_number:.4g}"
     yield f"  back focal distance  {found.back_focal_distance:.6g} mm"
-    for name, image_of in (("entrance", found.entrance_pupil), ("exit    ", found.exit_pupil)):
-        width = 2 * image_of.semi_diameter
-        yield f"  {name} pupil       {width:.5g} mm wide, at {image_of.position:.5g} mm"
-    yield f"  sensor               {sensor:.6g} mm from the first vertex, focus at {image:.6g} mm"
-    if abs(image - sensor) > 0.05 * abs(found.focal_length):
-        yield "  ! the sensor is far from the focus; is this the distance of the object?"
+    for name, image_of, end in (
+        ("entrance", found.entrance_pupil, "first"),
+        ("exit    ", found.exit_pupil, "last"),
+    ):
+        place = f"at {image_of.position:.5g} mm from the {end} vertex"
+        yield f"  {name} pupil       {2 * image_of.semi_diameter:.5g} mm wide, {place}"
+    yield f"  sensor               {float(lens.sensor):.6g} mm from the first vertex"
+    yield f"  paraxial focus       {found.image_distance:.6g} mm from the first vertex"
+
+
+def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[str]:
+    """What is odd about the spot on the axis: a sensor that is not in focus."""
+    airy = 1.22e-3 * wavelength * float(found.f_number)
+    if axial.spot > max(_DEFOCUS * axial.best, airy):
+        way = "further" if axial.shift > 0 else "nearer"
+        yield (
+            f"  ! out of focus on the axis: the spot of {1e3 * axial.spot:.2g} um is "
+            f"{1e3 * axial.best:.2g} um with the sensor {abs(axial.shift):.2g} mm {way}; check the "
+            "sensor and --distance"
+        )
 
 
 def field_lines(
-    lens: Lens, fields: list[float], distance: float, wavelengths: list[float]
+    lens: Lens, fields: list[float], distance: float, wavelengths: list[float], beams: list[Beam]
 ) -> Iterator[str]:
     """A table of spots over fields in degrees, and what is odd about it."""
     spots = [f"spot at {colour:.3f}" for colour in wavelengths]
-    yield _row("field", "image height", *spots, "light", "cut by surface")
-    yield _row("deg", "mm", *("RMS um" for _ in spots), "%")
-    for field in fields:
-        try:
-            found = psf_moments(lens, math.radians(field), distance, np.array(wavelengths), 1e-3)
-        except ValueError as error:
-            yield _row(f"{field:.4g}", f"  ! {error}")
+    yield _row("field", "image height", *spots, "light", "surfaces that clip")
+    yield _row("deg", "mm", *("RMS um" for _ in spots), "%", "")
+    angles, middle = [math.radians(field) for field in fields], len(wavelengths) // 2
+    symmetry = max((symmetry_of(lens, a) for a in angles), key=get_args(Symmetry).index)
+    whole = not any(beam.clipping or beam.ends for beam in beams)
+    for field, angle, beam in zip(fields, angles, beams):
+        scene = scene_of(lens, angle, distance, np.array(wavelengths))
+        rough, found = (_moments(lens, scene, _rule(n, symmetry, whole)) for n in _ORDERS)
+        light = 100 * float(found.passed[middle])
+        if not light > 0:
+            yield _row(f"{field:.4g}", f"! {_why(lens, scene, Gauss(8, symmetry))}")
             continue
-        middle = len(wavelengths) // 2
-        mean, passed = float(found.mean[middle, 1]), float(found.passed[middle])
-        squares = np.trace(np.asarray(found.covariance), axis1=1, axis2=2)
-        spots = [f"{1e3 * math.sqrt(square):.4g}" for square in squares]
-        cut = stopping(lens, field, distance, wavelengths[middle])[1]
-        where = ", ".join(map(str, cut)) or "none"
-        yield _row(f"{field:.4g}", f"{mean:.5g}", *spots, f"{100 * passed:.2f}", where)
-        if field == 0 and passed < 0.999:
-            yield "  ! on the axis other apertures than the stop cut the beam"
+        cut = "; ".join(filter(None, (", ".join(map(str, beam.clipping)), *beam.ends))) or "none"
+        squares = [np.trace(np.asarray(m.covariance), axis1=1, axis2=2) for m in (found, rough)]
+        sizes = [f"{1e3 * math.sqrt(square):.4g}" for square in squares[0]]
+        height = round(float(found.mean[middle, 1]), 9) + 0.0  # no -0
+        yield _row(f"{field:.4g}", f"{height:.5g}", *sizes, f"{light:.2f}", cut)
+        change = np.max(np.abs(squares[1] / squares[0] - 1)) / 2
+        if change > _TOLERANCE:
+            yield f"  ! these spots are known to {change:.1g} of their size only"
+        if field == 0 and f"{light:.2f}" != "100.00":
+            share = f"{100 - light:.2g} % of the light that fills the stop"
+            yield f"  ! on the axis {share} does not arrive; surfaces that clip: {cut}"
 
 
-def stopping(
-    lens: Lens, field: float, distance: float, wavelength: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """How far (S + 1,) in mm from the vertices the light of a field in degrees comes that arrives,
-    and the surfaces whose apertures are the first to stop some; of rays that fill the stop.
-    """
-    from .show.layout import local_hits, outside
-
-    filling = hexapolar(_RINGS)[0].T
-    rays = trace_rays(lens, math.radians(field), distance, wavelength, filling)
-    points, status = np.asarray(rays.points[0]), np.asarray(rays.status[0])
-    clipped, arrived = (points[status == s] for s in (Status.CLIPPED, Status.OK))
-    wide = np.linalg.norm(local_hits(lens, arrived), axis=-1)
-    return np.max(wide, axis=0, initial=0.0), np.unique(np.argmax(outside(lens, clipped), axis=1))
+@partial(jax.jit, compiler_options=ONCE)
+def _moments(lens: Lens, scene: Scene, rule: PupilRule) -> Moments:
+    return psf_moments(lens, scene.field, scene.distance, scene.wavelengths, rule=rule)
 
 
-def aperture_lines(
-    lens: Lens, fields: list[float], distance: float, wavelength: float
-) -> Iterator[str]:
+_first_order = jax.jit(first_order, compiler_options=ONCE)
+
+
+def _why(lens: Lens, scene: Scene, rule: PupilRule) -> str:
+    """Why no light of a scene arrives."""
+    try:
+        psf_moments(lens, scene.field, scene.distance, scene.wavelengths, rule=rule)
+    except ValueError as error:
+        return str(error)
+    return "no light arrives"
+
+
+def _rule(order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
+    """A rule for a beam that fills the stop, or not; those of all orders share a program."""
+    if not whole:
+        return Clipped(order, symmetry, _ORDERS[-1])
+    points, weights = gauss_points(order, symmetry)
+    more = gauss_points(_ORDERS[-1], symmetry)[1].size - weights.size
+    return Pattern(np.pad(points, ((0, 0), (0, more))), np.pad(weights, (0, more)), symmetry)
+
+
+def aperture_lines(lens: Lens, beams: list[Beam]) -> Iterator[str]:
     """Clear apertures that stop nothing, as wide as they are."""
-    needed = np.max([stopping(lens, f, distance, wavelength)[0] for f in fields], axis=0)
+    needed = np.max([beam.wide for beam in beams], axis=0)
     for i, semi in enumerate(np.asarray(lens.semi_diameter)[:-1]):
         if math.isfinite(semi) and semi > 1.8 * needed[i] > 0:
             yield (
@@ -113,29 +146,46 @@ def aperture_lines(
 
 
 def _row(first: str, *cells: str) -> str:
-    return f"{first:>6}" + "".join(f"{cell:>16}" for cell in cells)
+    *numbers, last = cells
+    return f"{first:>6}" + "".join(f"{cell:>15}" for cell in numbers) + f"   {last}".rstrip()
+
+
+def _say(lines: Iterable[str]) -> None:
+    """Lines on stdout, each as soon as it is known."""
+    for line in lines:
+        _wait("")
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
+
+
+def _wait(what: str) -> None:
+    """What is being done, on the last line of a terminal; nothing elsewhere."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r\033[K{what}")
+        sys.stderr.flush()
 
 
 def show(options: argparse.Namespace) -> None:
-    """Print what a lens is, and draw it."""
-    from .show.figures import new
-    from .show.layout import draw, lens_drawing
-
-    with warnings.catch_warnings(record=True) as said:
+    """Print what a lens is, as it becomes known, and draw it."""
+    distance, waves, fields = options.distance, list(options.wavelengths), options.field
+    middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
+    with warnings.catch_warnings():
         warnings.simplefilter("always")
+        warnings.showwarning = lambda message, *_, **__: _say([f"  ! {message}"])
         lens = load_lens(options.lens)
-        waves = list(options.wavelengths)
-        lines = [*first_lines(lens, options.distance, waves[len(waves) // 2]), ""]
-        lines += field_lines(lens, options.field, options.distance, waves)
-        middle = waves[len(waves) // 2]
-        lines += aperture_lines(lens, options.field, options.distance, middle)
-    lines += [f"  ! {warning.message}" for warning in said]
-    out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}.png")
-    figure, axes = new(width=9, height=4)
-    angles = [math.radians(field) for field in options.field]
-    lens_drawing(axes, draw(lens, angles, options.distance))
-    figure.savefig(out)
-    sys.stdout.write("\n".join([*lines, f"drawn in {out}", ""]))
+        scene_of(lens, 0.0, distance, np.array(waves))  # refuses what is no scene
+        found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
+        _say(first_lines(lens, found, middle))
+        _wait("tracing; another kind of lens is compiled first, for half a minute or less")
+        axial, *beams = (beam_of(lens, angle, distance, middle) for angle in (0.0, *angles))
+        _say([*focus_lines(found, middle, axial), ""])
+        _say(field_lines(lens, fields, distance, waves, beams))
+        _say(aperture_lines(lens, beams))
+        out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}.png")
+        figure, axes = new(width=9, height=4)
+        lens_drawing(axes, draw(lens, angles, distance, middle))
+        figure.savefig(out)
+    _say([f"drawn in {out}"])
 
 
 def set_up() -> None:

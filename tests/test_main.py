@@ -1,10 +1,12 @@
 """`python -m drt_jax show`."""
 
+import re
 import signal
 
+import numpy as np
 import pytest
 
-from drt_jax import load_lens
+from drt_jax import load_lens, psf_moments
 from drt_jax.__main__ import main
 
 
@@ -18,9 +20,52 @@ def test_a_lens_shows_itself(tmp_path, capsys):
     assert 45 < focal < 55
     table = [line.split() for line in lines if line.split()[:1] in (["0"], ["5"])]
     assert [row[0] for row in table] == ["0", "5"]
-    assert all(row[4] == "none" for row in table) and "stops nothing" not in "".join(lines)
+    assert all(row[4] == "none" for row in table)
+    assert "stops nothing" not in "".join(lines) and "!" not in "".join(lines)
+    (pupil,) = (line for line in lines if line.startswith("  exit     pupil"))
+    assert pupil.endswith(" mm from the last vertex")
     # f tan(5 degrees), less distortion
     assert abs(float(table[1][1]) / focal - 0.0875) < 1e-3 and float(table[0][3]) == 100
+
+
+RIM = """
+surfaces:
+  - {radius: 51.68, thickness: 4, glass: N-BK7, semi_diameter: 12}
+  - {radius: inf, thickness: 1, semi_diameter: 4.98}
+  - {radius: inf, thickness: 95, semi_diameter: 5, stop: true}
+"""
+
+
+def test_a_rim_that_shaves_the_axial_beam_is_named_wherever_it_matters(tmp_path, capsys):
+    """0.8 % were cut by "none", and a warning said that apertures cut. Spots are those of
+    `psf_moments`, cells do not run together, and what is far from focus is said."""
+    (tmp_path / "mine.yaml").write_text(RIM)
+    words = ["show", str(tmp_path / "mine.yaml"), "--field", "0", "9", "--wavelengths", "0.55"]
+    main([*words, "--out", str(tmp_path / "lens.png")])
+    said = capsys.readouterr().out
+    rows = [re.split(r" {2,}", line.strip()) for line in said.splitlines() if " 1" in line]
+    axial, oblique = (row for row in rows if row[0] in ("0", "9"))
+    lens = load_lens(tmp_path / "mine.yaml")
+    for row, field in ((axial, 0.0), (oblique, np.radians(9))):
+        found = psf_moments(lens, field, np.inf, 0.55)
+        spot = 1e3 * float(np.trace(found.covariance[0])) ** 0.5
+        assert len(row) == 5 and float(row[2]) == pytest.approx(spot, rel=2e-4)
+        assert float(row[3]) == pytest.approx(100 * float(found.passed[0]), abs=0.02)
+    share = 100 * (4.98 / 5) ** 2  # but for what the sphere bends between both
+    assert axial[-1] == "1" and float(axial[3]) == pytest.approx(share, abs=0.2)
+    assert "! on the axis 0." in said and said.count("surfaces that clip: 1\n") == 1
+    assert "! out of focus on the axis: the spot of " in said and "mm nearer" in said
+
+
+def test_what_is_known_is_said_before_the_rays_are_traced(monkeypatch, tmp_path, capsys):
+    def stop(*args):
+        assert "focal length" in capsys.readouterr().out
+        raise ValueError("reached")
+
+    monkeypatch.setattr("drt_jax.__main__.beam_of", stop)
+    with pytest.raises(SystemExit):
+        main(["show", "singlet", "--out", str(tmp_path / "lens.png")])
+    assert capsys.readouterr().err == "error: reached\n"
 
 
 @pytest.mark.slow
@@ -29,7 +74,7 @@ def test_what_looks_odd(tmp_path, capsys):
     words = ["show", "singlet", "--field", "0", "80", "--wavelengths", "0.55"]
     main([*words, "--distance", "200", "--out", str(tmp_path / "lens.png")])
     said = capsys.readouterr().out
-    assert "! the sensor is far from the focus" in said and "! no ray" in said
+    assert "! out of focus on the axis" in said and "mm further" in said and "! no ray" in said
 
 
 @pytest.mark.slow

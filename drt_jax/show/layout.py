@@ -1,7 +1,11 @@
-"""A lens in section: its outlines and rays as polylines in the (z, y) plane, and their picture."""
+"""A lens in section: its outlines and rays as polylines in the (z, y) plane, and their picture;
+and what its apertures do to the beam of a field.
+"""
 
 import itertools
+import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -12,10 +16,24 @@ from matplotlib.axes import Axes
 
 from ..lens.aperture import depths
 from ..lens.lens import Lens, sag
+from ..lens.scene import Scene, scene_of
+from ..pupil.patterns import hexapolar
 from ..rays.status import Status
 from ..rays.trace import trace_rays
 
+# XLA's options for what runs once: not optimised, it compiles in half the time.
+ONCE = {"xla_backend_optimization_level": 0}
 _POINTS = 161
+_RAYS = 600  # are traced at a time, so that all traces share one program
+_RINGS, _RIM = 10, 240  # of the rays that fill the stop, and how many more lie on its rim
+_SCANS = 3  # of the meridian for the edges of a beam, each between the edges of the last
+# How rays end that do not come to the sensor, but for those that an aperture clips.
+_ENDS = {
+    Status.MISSED: "some miss",
+    Status.TIR: "total reflection",
+    Status.UNCONVERGED: "no path",
+    Status.NO_INDEX: "no index",
+}
 _FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 
 
@@ -26,8 +44,10 @@ class Drawing(NamedTuple):
     mirrors: their faces; NaN where an obscuration lies on one.
     stop: its two blades, also where it pokes through a surface.
     sensor: its face.
-    rays: a list for each field.
-    vignetted: rays that do not arrive, as far as the surface whose aperture stops them.
+    rays: a list for each field: of an even fan of the stop, from rim to rim, those that arrive, and
+        where a beam is vignetted, the rays at its edges.
+    vignetted: rays of the fans that do not arrive, as far as the surface that clips them.
+    fields: the angles of the fields, radians.
     """
 
     glass: list[np.ndarray]
@@ -36,6 +56,7 @@ class Drawing(NamedTuple):
     sensor: np.ndarray
     rays: list[list[np.ndarray]]
     vignetted: list[np.ndarray]
+    fields: Sequence[float] = ()
 
 
 def draw(
@@ -53,14 +74,12 @@ def draw(
     rays: how many for each field; those that do not exist are left out.
     """
     angles = [float(angle) for angle in np.atleast_1d(fields)]
-    heights = np.linspace(-1.0, 1.0, rays)
-    pupil = np.stack([np.zeros_like(heights), heights], axis=-1)
     # A surface that bends no light is no corner of a ray, nor a face of glass.
     corners = [*lens.live, lens.count]
     hits, ends = [], []
     for angle in angles:
-        fan = trace_rays(lens, angle, distance, wavelength, pupil)
-        points, status = np.asarray(fan.points[0]), np.asarray(fan.status[0])
+        scene = scene_of(lens, angle, distance, wavelength)
+        points, status = _fan(lens, scene, rays)
         hits.append(points[status == Status.OK][:, corners, :0:-1])
         clipped = points[status == Status.CLIPPED]
         for ray, stop in zip(clipped, np.argmax(outside(lens, clipped), axis=1)):
@@ -87,7 +106,85 @@ def draw(
         np.where(pierced[i, :, None], np.nan, faces[i]) for i in np.flatnonzero(lens.mirrors)
     ]
     blades, sensor = _blades(faces[lens.stop], reach), _sensor(lens, paths, reach)
-    return Drawing(glass, mirrors, blades, sensor, paths, vignetted)
+    return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles)
+
+
+@partial(jax.jit, compiler_options=ONCE)
+def _trace(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
+    rays = trace_rays(lens, scene.field, scene.distance, scene.wavelengths, pupil)
+    return rays.points[0], rays.directions[0, :, -1], rays.status[0]
+
+
+def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Hits (Q, S + 1, 3), directions at the sensor (Q, 3) and status (Q,) of rays of one
+    wavelength through points (Q, 2) of the stop, of its radius."""
+    filled = np.resize(pupil, (-(-len(pupil) // _RAYS) * _RAYS, 2))
+    found = _trace(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
+    return tuple(np.asarray(a)[: len(pupil)] for a in found)
+
+
+def _fan(lens: Lens, scene: Scene, rays: int) -> tuple[np.ndarray, np.ndarray]:
+    """Hits (N, S + 1, 3) and status (N,) of an even fan of meridional rays, and then of those at
+    the edges of what passes, where the stop's rim is not the edge."""
+
+    def traced(heights):
+        points, _, status = _traced(lens, scene, np.stack([0 * heights, heights], axis=-1))
+        return points, status
+
+    points, status = traced(np.linspace(-1.0, 1.0, rays))
+    heights = np.linspace(-1.0, 1.0, _RAYS)
+    for _ in range(_SCANS):
+        found, ends = traced(heights)
+        good = ends == Status.OK
+        (last,) = np.nonzero(good[1:] != good[:-1])
+        if not len(last):
+            return points, status
+        edges = last + good[last + 1]
+        pairs = zip(heights[last], heights[last + 1])
+        heights = np.concatenate([np.linspace(*pair, _RAYS // len(last)) for pair in pairs])
+    return np.concatenate([points, found[edges]]), np.concatenate([status, ends[edges]])
+
+
+class Beam(NamedTuple):
+    """What becomes of the light of one field and wavelength that fills the stop.
+
+    clipping: the surfaces whose apertures are the first to stop some of it.
+    ends: how else some of it ends, in words.
+    wide: (S + 1,), how far from the vertices light comes that arrives, mm; 0 if none does.
+    spot: RMS radius on the sensor, mm; nan if no light arrives. best, shift: the least that any
+        distance of the sensor gives, and how far that is behind it, mm.
+    """
+
+    clipping: list[int]
+    ends: list[str]
+    wide: np.ndarray
+    spot: float
+    best: float
+    shift: float
+
+
+def beam_of(lens: Lens, field: float, distance: float, wavelength: float) -> Beam:
+    """The beam of a field in radians from a distance in mm, of a wavelength in um."""
+    rim = np.linspace(0, 2 * np.pi, _RIM)
+    pupil = np.concatenate([hexapolar(_RINGS)[0].T, np.stack([np.sin(rim), np.cos(rim)], axis=-1)])
+    scene = scene_of(lens, field, distance, wavelength)
+    points, directions, status = _traced(lens, scene, pupil)
+    clipped, arrived = points[status == Status.CLIPPED], points[status == Status.OK]
+    clipping = np.unique(np.argmax(outside(lens, clipped), axis=1)).tolist()
+    ends = [words for end, words in _ENDS.items() if np.any(status == end)]
+    wide = np.max(np.linalg.norm(local_hits(lens, arrived), axis=-1), axis=0, initial=0.0)
+    inside = (status == Status.OK) & (np.arange(len(pupil)) < len(pupil) - _RIM)
+    if not np.any(inside):
+        return Beam(clipping, ends, wide, math.nan, math.nan, math.nan)
+    hits, slopes = local_hits(lens, points[inside])[:, -1], directions[inside]
+    turned = lens.places[2]
+    if turned is not None:
+        slopes = slopes @ np.asarray(turned)[-1]
+    hits, slopes = (a - a.mean(axis=0) for a in (hits, slopes[:, :2] / slopes[:, 2:]))
+    size, growth = np.mean(np.sum(hits**2, axis=1)), np.mean(np.sum(slopes**2, axis=1))
+    shift = -np.mean(np.sum(hits * slopes, axis=1)) / growth if growth > 0 else 0.0
+    best = math.sqrt(max(size - growth * shift**2, 0.0))
+    return Beam(clipping, ends, wide, math.sqrt(size), best, float(shift))
 
 
 def outside(lens: Lens, points: np.ndarray) -> np.ndarray:
@@ -146,6 +243,12 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
     for fan, colour in zip(drawing.rays, itertools.cycle(_FIELDS)):
         for ray in fan:
             axes.plot(*ray.T, color=colour, linewidth=0.6)
+    if len(drawing.fields) > 1:
+        for field, colour in zip(drawing.fields, itertools.cycle(_FIELDS)):
+            axes.plot([], [], color=colour, label=f"{math.degrees(field):.4g}°")
+        axes.legend(
+            title="field", fontsize=8, title_fontsize=8, loc="upper left", bbox_to_anchor=(1, 1)
+        )
     for ray in drawing.vignetted:
         axes.plot(*ray.T, color="grey", linewidth=0.6, linestyle=":")
     for blade in drawing.stop:
@@ -166,10 +269,12 @@ def _placed(lens: Lens, i: int, y: np.ndarray, z: ArrayLike) -> np.ndarray:
 
 
 def _path(corners: np.ndarray, start: float, angle: float, distance: float) -> np.ndarray:
-    """(z, y) of a ray from the plane `start` before the lens through its corners."""
+    """(z, y) of a ray from the plane `start` before the lens, or from where steep ones have come
+    twice as far, through its corners."""
     z, y = corners[0]
     slope = (y / distance + np.tan(angle)) / (z / distance + 1)
-    return np.concatenate([[[start, y - slope * (z - start)]], corners])
+    step = (z - start) * min(1.0, 2 / math.hypot(1.0, slope))
+    return np.concatenate([[[z - step, y - slope * step]], corners])
 
 
 def _blades(face: np.ndarray, reach: float) -> list[np.ndarray]:

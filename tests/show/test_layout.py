@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import load_lens, show
+from drt_jax import f_number, image_distance, load_lens, show
+from drt_jax.show import layout
 
 FOLDED = {
     "surfaces": [
@@ -89,8 +90,78 @@ def test_a_stop_that_pokes_through_a_surface_is_drawn_and_is_no_corner_of_a_ray(
     np.testing.assert_allclose(crossed, np.linspace(-1, 1, 7), atol=1e-9)
 
 
-def test_the_picture_holds_every_line(folded):
+def test_the_picture_holds_every_line_and_says_which_field_has_which_colour(folded):
     figure, axes = show.new()
     show.lens_drawing(axes, folded)
-    assert len(axes.lines) == 1 + 14 + 2 + 1 and len(axes.patches) == 1
+    labels = axes.get_legend().get_texts()
+    assert [text.get_text() for text in labels] == ["0°", "2.865°"]
+    lines = [line for line in axes.lines if len(line.get_xdata())]
+    assert len(lines) == 1 + 14 + 2 + 1 and len(axes.patches) == 1
+    colours = [line.get_color() for line in axes.get_legend().get_lines()]
+    assert colours == [lines[1].get_color(), lines[8].get_color()] and colours[0] != colours[1]
     assert figure.axes == [axes]
+
+
+# Its beam at 0.1 rad is cut by the rims of both faces, at 0 by none; the planes bend no light, so
+# that the edges of the beam are known.
+RIMS = {
+    "surfaces": [
+        {"radius": "inf", "semi_diameter": 5.0, "thickness": 10},
+        {"radius": "inf", "semi_diameter": 5.0, "thickness": 10, "stop": True},
+        {"radius": -500.0, "semi_diameter": 5.5, "glass": "N-BK7", "thickness": 2},
+        {"radius": "inf", "semi_diameter": 9.0},
+    ],
+    "sensor": 60.0,
+}
+
+
+def test_the_edges_of_a_vignetted_beam_are_drawn():
+    """Its lower edge ray passes at the rim of the plane before the stop, its upper one at that of
+    the surface behind it; both are rays more than the fan has."""
+    lens = load_lens(RIMS)
+    axial, oblique = show.draw(lens, [0.0, 0.1]).rays
+    assert len(axial) == 7
+    heights = [path[1:, 1] for path in axial]
+    reach = np.max(np.abs([height[0] for height in heights]))
+    np.testing.assert_allclose(reach, 5.0, atol=0.02)  # the marginal ray, parallel to the axis
+    lower, upper = oblique[-2:]
+    slope = np.tan(0.1)
+    z, y = lower[1]  # where it meets the glass
+    np.testing.assert_allclose(y - slope * z, -5.0, atol=1e-6)
+    np.testing.assert_allclose(upper[1, 1], 5.5, atol=1e-6)
+    for path in oblique[:-2]:
+        assert lower[1, 1] < path[1, 1] < upper[1, 1]
+
+
+def test_the_light_between_an_obscuration_and_the_rim_has_four_edges():
+    faces = [dict(face) for face in RIMS["surfaces"]]
+    faces[0]["obscuration"] = {"circle": 2.0}
+    (fan,) = show.draw(load_lens(RIMS | {"surfaces": faces}), 0.0, rays=3).rays
+    ends = sorted(path[1, 1] for path in fan)
+    np.testing.assert_allclose(ends, [-5.0, -2.0, 2.0, 5.0], atol=1e-6)
+
+
+def test_a_steep_ray_does_not_leave_the_picture():
+    lens = load_lens(PHONE | {"surfaces": [dict(PHONE["surfaces"][0], thickness=1.0),
+                                            *PHONE["surfaces"][1:]]})  # fmt: skip
+    (fan,) = show.draw(lens, 1.2, rays=1).rays
+    begin, corner = fan[0][:2]
+    assert np.tan(1.2) == pytest.approx((corner[1] - begin[1]) / (corner[0] - begin[0]))
+    assert np.hypot(*(corner - begin)) < 3 * (corner[0] + 1)
+
+
+@pytest.mark.parametrize("tilted", [False, True])
+def test_a_beam_tells_who_clips_it_and_where_it_is_sharp(tilted):
+    more = {"sensor_tilt": [0, 0, 0]} if tilted else {}
+    beam = layout.beam_of(load_lens(RIMS | more), 0.1, np.inf, 0.55)
+    assert beam.clipping == [0, 2] and not beam.ends
+    lens = load_lens({"surfaces": [{"radius": 50, "glass": "N-BK7", "semi_diameter": 1,
+                                    "stop": True, "thickness": 2}, {"radius": "inf"}],
+                      "sensor": 60} | more)  # fmt: skip
+    focus = float(image_distance(lens, np.inf, 0.55)[0])
+    beam = layout.beam_of(lens, 0.0, np.inf, 0.55)
+    assert beam.clipping == beam.ends == []
+    assert 60 + beam.shift == pytest.approx(focus, abs=0.05) and beam.best < 1e-4
+    # A cone of f/N has an RMS radius of defocus / (2 N) / sqrt(2).
+    cone = abs(beam.shift) / (2 * float(f_number(lens, 0.55)[0])) / 2**0.5
+    assert beam.spot == pytest.approx(cone, rel=0.01)
