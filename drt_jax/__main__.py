@@ -7,12 +7,12 @@ import pathlib
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
-from functools import partial
 from typing import get_args
 
 import jax
 import numpy as np
 
+from .compilation import ONCE, jit
 from .files.yaml import lens_names, load_lens
 from .image.converged import psf_moments
 from .image.moments import Moments
@@ -22,7 +22,7 @@ from .lens.scene import Scene, scene_of
 from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
 from .show.figures import new
-from .show.layout import ONCE, Beam, beam_of, draw, lens_drawing
+from .show.layout import Beam, beam_of, draw, lens_drawing
 
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 # Of the rules for the spots; by how much of their size these may differ between both.
@@ -108,12 +108,11 @@ def field_lines(
             yield f"  ! on the axis {share} does not arrive; surfaces that clip: {cut}"
 
 
-@partial(jax.jit, compiler_options=ONCE)
-def _moments(lens: Lens, scene: Scene, rule: PupilRule) -> Moments:
+def _moments_of(lens: Lens, scene: Scene, rule: PupilRule) -> Moments:
     return psf_moments(lens, scene.field, scene.distance, scene.wavelengths, rule=rule)
 
 
-_first_order = jax.jit(first_order, compiler_options=ONCE)
+_moments, _first_order = jit(_moments_of, ONCE), jit(first_order, ONCE)
 
 
 def _why(lens: Lens, scene: Scene, rule: PupilRule) -> str:

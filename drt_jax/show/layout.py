@@ -5,7 +5,6 @@ and what its apertures do to the beam of a field.
 import itertools
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 
+from ..compilation import ONCE, jit
 from ..lens.aperture import depths
 from ..lens.lens import Lens, sag
 from ..lens.scene import Scene, scene_of
@@ -21,8 +21,6 @@ from ..pupil.patterns import hexapolar
 from ..rays.status import Status
 from ..rays.trace import trace_rays
 
-# XLA's options for what runs once: not optimised, it compiles in half the time.
-ONCE = {"xla_backend_optimization_level": 0}
 _POINTS = 161
 _RAYS = 600  # are traced at a time, so that all traces share one program
 _RINGS, _RIM = 10, 240  # of the rays that fill the stop, and how many more lie on its rim
@@ -109,10 +107,12 @@ def draw(
     return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles)
 
 
-@partial(jax.jit, compiler_options=ONCE)
-def _trace(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
+def _rays(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
     rays = trace_rays(lens, scene.field, scene.distance, scene.wavelengths, pupil)
     return rays.points[0], rays.directions[0, :, -1], rays.status[0]
+
+
+_trace = jit(_rays, ONCE)
 
 
 def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> tuple[np.ndarray, ...]:
