@@ -52,9 +52,9 @@ def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[st
     """First-order data of a lens at one wavelength in um."""
     yield f"{lens.name}: {lens.count} surfaces, the stop is number {lens.stop}"
     yield f"  wavelength           {wavelength:g} um"
-    air = found.effective_focal_length
-    air = "" if math.isclose(air, abs(found.focal_length)) else f" ({air:.6g} mm in air)"
-    yield f"  focal length         {found.focal_length:.6g} mm{air}, f/{found.f_number:.4g}"
+    air = float(found.effective_focal_length)
+    both = "" if math.isclose(air, abs(found.focal_length)) else f" ({air:.6g} mm in air)"
+    yield f"  focal length         {found.focal_length:.6g} mm{both}, f/{found.f_number:.4g}"
     yield f"  back focal distance  {found.back_focal_distance:.6g} mm"
     for name, image_of, end in (
         ("entrance", found.entrance_pupil, "first"),
