@@ -115,6 +115,10 @@ def test_a_pupil_at_infinity_is_none():
     lens = load_lens({"surfaces": [{"radius": 50} | glass, stop]})
     with pytest.raises(ValueError, match="entrance pupil is at infinity: take the real stop"):
         with_paraxial_pupil(lens, WAVE)
-    aimed = jax.jit(with_paraxial_pupil)(lens, WAVE)
-    rays = trace_rays(aimed, 0.0, INF, WAVE, [[0.0, 0.0], [0.0, 0.5]])
+
+    @jax.jit
+    def aimed(lens):
+        return trace_rays(with_paraxial_pupil(lens, WAVE), 0.0, INF, WAVE, [[0.0, 0.0], [0.0, 0.5]])
+
+    rays = aimed(lens)
     assert np.all(rays.status != 0) and np.all(np.isfinite(rays.points))
