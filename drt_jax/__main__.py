@@ -60,7 +60,7 @@ def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[st
         ("entrance", found.entrance_pupil, "first"),
         ("exit    ", found.exit_pupil, "last"),
     ):
-        place = f"at {image_of.position:.5g} mm from the {end} vertex"
+        place = f"at {image_of.position + 0.0:.5g} mm from the {end} vertex"
         yield f"  {name} pupil       {2 * image_of.semi_diameter:.5g} mm wide, {place}"
     yield f"  sensor               {float(lens.sensor):.6g} mm from the first vertex"
     yield f"  paraxial focus       {found.image_distance:.6g} mm from the first vertex"
