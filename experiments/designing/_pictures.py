@@ -76,10 +76,11 @@ def _drawing(parts: dict[str, Any]) -> layout.Drawing:
     lines = {
         name: [np.reshape(line, (-1, 2)) for line in some]
         for name, some in parts.items()
-        if name not in ("sensor", "rays")
+        if name not in ("sensor", "rays", "fields")
     }
     rays = [[np.reshape(ray, (-1, 2)) for ray in fan] for fan in parts["rays"]]
-    return layout.Drawing(**lines, sensor=np.array(parts["sensor"]), rays=rays)
+    fields = parts.get("fields", ())  # older results have none
+    return layout.Drawing(**lines, sensor=np.array(parts["sensor"]), rays=rays, fields=fields)
 
 
 def _draw_minima(
