@@ -24,7 +24,11 @@ from .image.converged import (
 )
 from .image.depth import depth_moments as depth_moments, moments_model as moments_model
 from .image.field import field_of_image as field_of_image, image_point as image_point
-from .image.kernel import SeparableKernel as SeparableKernel, gaussian_psf as gaussian_psf
+from .image.kernel import (
+    SeparableKernel as SeparableKernel,
+    gaussian_psf as gaussian_psf,
+    separable_psf as separable_psf,
+)
 from .image.moments import FocusMoments as FocusMoments, Moments as Moments, moments as moments
 from .image.sensor import convolve as convolve, sensor_layer as sensor_layer
 from .image.wavefront import (

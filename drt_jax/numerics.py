@@ -6,7 +6,7 @@ denominator, so ordinary values are not biased.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -14,6 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
+
+# What public functions take for numbers: an array, or numbers in lists and tuples, which JAX's
+# own alias leaves out.
+Numbers = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
 
 
 def safe_sqrt(x: Array) -> Array:
@@ -60,7 +64,7 @@ def _real(kind: Any) -> bool:
     return jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)
 
 
-def real_array(what: str, value: ArrayLike, dtype: Any) -> Array:
+def real_array(what: str, value: Numbers, dtype: Any) -> Array:
     """`value`, a number, a list of them or an array, as an array of a floating dtype.
 
     ValueError, which begins with `what`, for text, truth values, complex numbers, none at all, and

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +25,11 @@ class Kind(NamedTuple):
     most: float = math.inf
 
 
+# As the keys of `KINDS`, which a test compares.
+ToleranceKind = Literal[
+    "radius", "fringes", "irregularity", "wedge", "thickness", "index", "abbe", "shift",
+    "tilt"
+]  # fmt: skip
 KINDS = {
     "radius": Kind("surface", 1, "%", 100),
     "fringes": Kind("surface", 1, "fringes"),
@@ -53,7 +58,7 @@ class Tolerance:
     which: surfaces or elements, from 0; empty: all that there are.
     """
 
-    kind: str
+    kind: ToleranceKind
     size: float
     which: tuple[int, ...] = ()
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -147,6 +147,11 @@ def _terms(lens: Lens) -> int:
     return lens.coefficients.shape[1]
 
 
+# As the keys of `KINDS`, which a test compares.
+VariableKind = Literal[
+    "curvature", "conic", "coefficients", "thickness", "sensor", "index", "abbe", "tilt",
+    "decentre", "semi_diameter"
+]  # fmt: skip
 KINDS: dict[str, Kind] = {
     "curvature": Kind(_live, _all, _one, *_leaf("curvature"), (-1, 0.02)),
     "conic": Kind(_live, _all, _one, *_leaf("conic"), (0, 0.1)),

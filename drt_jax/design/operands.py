@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,16 @@ from .values import OPERANDS, Which
 
 # What an operand may name.
 _NUMBERS = ("fields", "wavelengths", "distances", "surfaces")
+
+# As the keys of `OPERANDS`, which a test compares.
+OperandKind = Literal[
+    "spot", "spot_of_colours", "spot_chief", "rms_spot", "centroid", "path_difference",
+    "rms_wavefront", "focal_length", "effective_focal_length", "back_focal_distance",
+    "entrance_pupil", "f_number", "magnification", "total_track", "length", "back_distance",
+    "distortion", "lateral_colour", "chief_ray_angle", "numerical_aperture",
+    "relative_illumination", "throughput", "glass_centre", "glass_edge", "air_centre",
+    "air_edge", "glass_map", "incidence_angle"
+]  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +43,7 @@ class Operand:
         passed, so that cutting light gains nothing.
     """
 
-    kind: str
+    kind: OperandKind
     target: float = 0.0
     low: float = -math.inf
     high: float = math.inf

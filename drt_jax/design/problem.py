@@ -8,18 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
 from ..lens.scene import Scene, distance_array, field_array, vergence_of
-from ..numerics import concrete
+from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve, solve_aimed
 from .gaps import gaps
 from .limits import Limit, limits_of
-from .operands import Operand
+from .operands import Operand, OperandKind
 from .seen import Seen, symmetry_by_structure
 from .values import OPERANDS
 from .variables import Variables
@@ -48,12 +47,12 @@ class Judged(NamedTuple):
     failed: Array
 
 
-def _check_pairs(angles: Array, fields: ArrayLike) -> None:
+def _check_pairs(angles: Array) -> None:
     if angles.ndim != 2 or angles.shape[1] != 2:
-        raise ValueError(f"fields: expected (F,) or (F, 2), got shape {np.shape(fields)}")
+        raise ValueError(f"fields: expected (F,) or (F, 2), got shape {angles.shape}")
 
 
-def _weights(what: str, given: ArrayLike, count: int) -> np.ndarray:
+def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
     """Weights (count,), 1 on the average. ValueError for what they are not."""
     found = np.asarray(given, float)
     good = found.shape == (count,) and np.all(np.isfinite(found) & (found >= 0))
@@ -95,13 +94,13 @@ class Problem:
     def of(
         cls,
         variables: Variables,
-        operands: Sequence[Operand | str],
-        fields: ArrayLike = 0.0,
-        wavelengths: ArrayLike = 0.5875618,
-        distances: ArrayLike = np.inf,
+        operands: Sequence[Operand | OperandKind],
+        fields: Numbers = 0.0,
+        wavelengths: Numbers = 0.5875618,
+        distances: Numbers = np.inf,
         rule: PupilRule | int = 6,
-        colour_weights: ArrayLike | None = None,
-        field_weights: ArrayLike | None = None,
+        colour_weights: Numbers | None = None,
+        field_weights: Numbers | None = None,
     ) -> "Problem":
         """The problem of some variables.
 
@@ -122,8 +121,8 @@ class Problem:
         angles = jnp.atleast_1d(field_array(fields, dtype))
         if angles.ndim == 1:
             angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
-        _check_pairs(angles, fields)
-        far = jnp.stack([distance_array(d, dtype) for d in np.ravel(distances)])
+        _check_pairs(angles)
+        far = jnp.stack([distance_array(d, dtype) for d in np.ravel(np.asarray(distances, float))])
         colours = lens.colours(wavelengths)
         if isinstance(rule, int):
             across = not np.any(np.asarray(angles)[:, 0])
@@ -201,7 +200,7 @@ class Problem:
         weight = max(wanted, default=1.0)
         return jnp.ravel(weight * size * seen.failures)
 
-    def limits(self, excess: ArrayLike) -> list[Limit]:
+    def limits(self, excess: Numbers) -> list[Limit]:
         """The limits by name, in the order of `Judged.excess` (L,)."""
         counts = {"fields": len(self.fields), "distances": len(self.distances)}
         counts |= {"wavelengths": len(self.wavelengths)}
@@ -215,7 +214,7 @@ class Problem:
         move = jnp.where((vector + move < low) | (vector + move > high), -move, move)
         return jnp.clip(vector + move, low, high)
 
-    def refuse_fixed(self, excess: ArrayLike, beside: ArrayLike) -> None:
+    def refuse_fixed(self, excess: Numbers, beside: Numbers) -> None:
         """ValueError, which names it, for a limit that is exceeded (L,) and by as much beside.
         Not of rays: those that fail have no derivative until they pass."""
         one, two = np.asarray(excess), np.asarray(beside)

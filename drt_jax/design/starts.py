@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
+from ..numerics import Numbers
 from .optimum import Search, begin, turn
 from .problem import Problem, quick
 from .variables import Variables
@@ -98,7 +98,7 @@ def _advance(problem: Problem, searches: Search, turns: Array) -> Search:
 
 def many_starts(
     problem: Problem,
-    starts: ArrayLike,
+    starts: Numbers,
     turns: Sequence[int] = (12, 12, 24, 48, 200),
     keep: float = 0.5,
     report: Callable[[int, int, float], None] = lambda done, total, best: None,

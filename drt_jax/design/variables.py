@@ -13,7 +13,7 @@ from jax import Array
 
 from ..inputs import shown
 from ..lens.lens import Lens
-from .kinds import KINDS, lift_of, step_of, whole_numbers, word_terms
+from .kinds import KINDS, VariableKind, lift_of, step_of, whole_numbers, word_terms
 from .solves import Solve, held
 
 _How = Literal["equal", "opposite", "cemented"]
@@ -85,7 +85,7 @@ class Vary:
     scale: a typical change; 0: chosen by the kind and the stop's semi-diameter, or `sag`.
     """
 
-    kind: str
+    kind: VariableKind
     surfaces: tuple[int, ...] = ()
     terms: tuple[int, ...] = ()
     low: float = -np.inf
@@ -158,7 +158,7 @@ class Tie:
 
     surfaces: tuple[int, ...]
     how: _How = "equal"
-    kind: str = "curvature"
+    kind: VariableKind | Literal["cemented"] = "curvature"
     scale: float = 1.0
     shift: float = 0.0
 
@@ -234,7 +234,7 @@ class Variables:
     def of(
         cls,
         lens: Lens,
-        vary: Sequence[Vary | str],
+        vary: Sequence[Vary | VariableKind],
         ties: Sequence[Tie] = (),
         solves: Sequence[Solve] = (),
     ) -> "Variables":

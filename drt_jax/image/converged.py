@@ -14,11 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene, field_array, scene_of
-from ..numerics import concrete, known_values, real_array
+from ..numerics import Numbers, concrete, known_values, real_array
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
 from ..rays.find import Found
@@ -41,9 +40,9 @@ _TOLD = 8
 
 def psf_moments(
     lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
     tolerance: float = 1e-6,
     rule: PupilRule | None = None,
 ) -> Moments:
@@ -68,9 +67,9 @@ def psf_moments(
 
 def focus_moments(
     lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
     tolerance: float = 1e-6,
     rule: PupilRule | None = None,
 ) -> FocusMoments:
@@ -87,9 +86,9 @@ def focus_moments(
 
 def converged_rule(
     lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
     tolerance: float = 1e-6,
 ) -> PupilRule:
     """The rule that keeps the RMS spot size on the sensor within `tolerance` (relative).
@@ -109,9 +108,9 @@ def converged_rule(
 
 def converged_focus_rule(
     lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
     tolerance: float = 1e-6,
 ) -> PupilRule:
     """`converged_rule` for any sensor position: where the spot is smallest, it may be far smaller
@@ -134,9 +133,9 @@ def best_focus(spread: np.ndarray) -> list[np.ndarray]:
 
 def _moments(
     lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
     tolerance: float,
     rule: PupilRule | None,
     places: Callable,
@@ -191,9 +190,9 @@ class _Trial(NamedTuple):
 
 def _converge(
     lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
     tolerance: float,
     places: Callable,
 ) -> _Trial:
@@ -325,7 +324,7 @@ def _change(found: FocusMoments, before: FocusMoments, places: Callable) -> floa
     return worst
 
 
-def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, passed: ArrayLike) -> None:
+def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, passed: Numbers) -> None:
     """ValueError for a colour of which nothing passed, (W,): where its light ends."""
     colour = int(np.argmin(np.asarray(passed) > 0))
     lens, scene = known_values((lens, scene))

@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
 from ..lens.scene import distance_array, scene_of, vergence_of
-from ..numerics import concrete
+from ..numerics import Numbers, concrete
 from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
 from .moments import FocusMoments, moments
@@ -39,7 +38,7 @@ class DepthMoments:
     far: Array
     series: FocusMoments
 
-    def at(self, distance: ArrayLike) -> FocusMoments:
+    def at(self, distance: Numbers) -> FocusMoments:
         """The moments of an object at `distance` mm, within near and far. ValueError for a known
         one that is not."""
         far = distance_array(distance, self.far.dtype)
@@ -59,10 +58,10 @@ class DepthMoments:
 
 def depth_moments(
     lens: Lens,
-    field: ArrayLike,
+    field: Numbers,
     near: float,
     far: float,
-    wavelengths: ArrayLike,
+    wavelengths: Numbers,
     tolerance: float = 1e-9,
 ) -> DepthMoments:
     """Moments for any sensor position and any distance between `near` and `far`, in mm.
@@ -109,9 +108,9 @@ def depth_moments(
 def moments_model(
     lens: Lens,
     trained: tuple[str, ...],
-    field: ArrayLike,
+    field: Numbers,
     distances: tuple[float, float],
-    wavelengths: ArrayLike,
+    wavelengths: Numbers,
     tolerance: float = 1e-6,
 ) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]]:
     """The cheapest exact model of the moments for what is trained.

@@ -4,18 +4,17 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax import Array
-from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
 from ..lens.paraxial import image_height
 from ..lens.scene import Scene, scene_of
-from ..numerics import real_array, safe_divide
+from ..numerics import Numbers, real_array, safe_divide
 from ..rays.trace import trace_bundle
 
 _STEPS = 20
 
 
-def image_point(lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
+def image_point(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
     """Where the chief rays, through the centre of the stop, meet the sensor: (W, 2) in mm, x and y
     along its axes; 0 where they fail. Arguments as in `trace_rays`. Differentiable in every mode.
 
@@ -31,9 +30,7 @@ def _image_point(lens: Lens, scene: Scene) -> Array:
     return jnp.concatenate([h[-1] for h in hits], axis=-1)
 
 
-def field_of_image(
-    lens: Lens, point: ArrayLike, distance: ArrayLike, wavelength: ArrayLike
-) -> Array:
+def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Numbers) -> Array:
     """The field (2,), radians along x and y, whose chief ray meets the sensor at `point`.
 
     point: (2,) in mm along the axes of the sensor. distance: as in `trace_rays`. wavelength: one,

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.scipy.special import erf
-from jax.typing import ArrayLike
 
-from ..numerics import concrete, real_array, safe_divide, safe_sqrt
+from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
 
 Form = Literal["integrated", "sampled"]
 
@@ -38,16 +37,16 @@ class SeparableKernel(NamedTuple):
 
 
 def gaussian_psf(
-    mean: ArrayLike,
-    covariance: ArrayLike,
-    pixel: ArrayLike,
+    mean: Numbers,
+    covariance: Numbers,
+    pixel: Numbers,
     size: int = 21,
     form: Form = "integrated",
-) -> SeparableKernel | Array:
-    """Gaussian kernels [channel, y, x] of C channels, in the dtype of `mean`.
+) -> Array:
+    """Gaussian kernels [channel, y, x] of C channels, (C, size, size) in the dtype of `mean`.
 
     mean: (C, 2), x and y from the centre of the grid, mm.
-    covariance: mm^2, (C, 2) for a diagonal one (the result is then separable), else (C, 2, 2).
+    covariance: mm^2, (C, 2, 2), or (C, 2) for a diagonal one; see `separable_psf` for that.
     pixel: the side of a pixel, mm; warns of one above 1 mm, which may be meant in um.
     size: pixels along a side of the grid.
     form: "integrated": each pixel collects what falls on its area, and the kernel is normalised
@@ -59,7 +58,31 @@ def gaussian_psf(
     not above 0. Inside a trace, where values are not known, a channel of infinite covariance (no
     ray arrived), or of other numbers of that kind, is black, and its derivatives are 0.
     """
-    mean, covariance, side = _checked(mean, covariance, pixel, size, form)
+    kernel = _gaussian(*_checked(mean, covariance, pixel, size, form), size, form)
+    return kernel.dense() if isinstance(kernel, SeparableKernel) else kernel
+
+
+def separable_psf(
+    mean: Numbers,
+    variances: Numbers,
+    pixel: Numbers,
+    size: int = 21,
+    form: Form = "integrated",
+) -> SeparableKernel:
+    """`gaussian_psf` of Gaussians whose axes lie along the pixels, as two rows a channel: what a
+    training step convolves with. variances: (C, 2), along x and y, mm^2. Else as there."""
+    mean, variances, side = _checked(mean, variances, pixel, size, form)
+    if variances.ndim != 2:
+        raise ValueError(f"variances: expected (C, 2), got shape {variances.shape}")
+    kernel = _gaussian(mean, variances, side, size, form)
+    assert isinstance(kernel, SeparableKernel)
+    return kernel
+
+
+def _gaussian(
+    mean: Array, covariance: Array, side: Array, size: int, form: Form
+) -> SeparableKernel | Array:
+    """The kernel; separable for variances (C, 2)."""
     usable = (side > 1 / _FAR) & (side < _FAR)
     side = jnp.where(usable, side, 1)
     known = jnp.isfinite(mean), jnp.isfinite(covariance)
@@ -80,7 +103,7 @@ def gaussian_psf(
 
 
 def _checked(
-    mean: ArrayLike, covariance: ArrayLike, pixel: ArrayLike, size: int, form: Form
+    mean: Numbers, covariance: Numbers, pixel: Numbers, size: int, form: Form
 ) -> tuple[Array, Array, Array]:
     """Centroids, covariances and pixel as arrays of one dtype, if the arguments of `gaussian_psf`
     are what they must be."""
@@ -90,7 +113,7 @@ def _checked(
         raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
     floating = jnp.issubdtype(getattr(mean, "dtype", int), jnp.floating)
     dtype = jnp.result_type(mean) if floating else jnp.result_type(float)
-    given: dict[str, ArrayLike] = {"mean": mean, "covariance": covariance, "pixel": pixel}
+    given: dict[str, Numbers] = {"mean": mean, "covariance": covariance, "pixel": pixel}
     arrays = [real_array(name, value, dtype) for name, value in given.items()]
     channels = arrays[0].shape[:1]
     shapes: list[list[tuple[int, ...]]] = [[(*channels, 2)], [(*channels, 2)], [()]]

@@ -11,11 +11,10 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import safe_divide
+from ..numerics import Numbers, safe_divide
 from ..pupil.rules import PupilRule
 from ..rays.solve import Solver, solve
 from ..rays.system import Vector
@@ -62,7 +61,7 @@ class FocusMoments:
     spread: Array
     passed: Array
 
-    def at(self, sensor: ArrayLike) -> tuple[Array, Array]:
+    def at(self, sensor: Numbers) -> tuple[Array, Array]:
         """Centroid (W, 2) in mm and covariance in mm^2 with the sensor at `sensor` mm.
 
         The covariance is (W, 2), its diagonal, when the axes are principal by symmetry; else
@@ -70,7 +69,7 @@ class FocusMoments:
         """
         return _at(self, jnp.asarray(sensor, self.reference.dtype))
 
-    def full(self, sensor: ArrayLike) -> Moments:
+    def full(self, sensor: Numbers) -> Moments:
         """The same as `Moments`, the covariance always (W, 2, 2)."""
         return _full(self, jnp.asarray(sensor, self.reference.dtype))
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
+from ..numerics import Numbers
 from .kernel import SeparableKernel
 
 Convolve = Callable[[Array, SeparableKernel | Array], Array]
@@ -103,7 +103,7 @@ def convolve_taps(scenes: Array, kernel: SeparableKernel | Array) -> Array:
 def sensor_layer(
     scenes: Array,
     kernel: SeparableKernel | Array,
-    noise: ArrayLike,
+    noise: Numbers,
     key: Array,
     convolve: Convolve = convolve,
 ) -> Array:

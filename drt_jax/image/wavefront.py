@@ -17,12 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray_at_image
 from ..lens.scene import Scene, scene_of
-from ..numerics import concrete, real_array, safe_divide, safe_sqrt
+from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
 from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import Bundle, stop_points, trace_bundle
@@ -59,11 +58,11 @@ def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
 
 def wavefront(
     lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
-    pupil: ArrayLike,
-    curvature: ArrayLike | None = None,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    pupil: Numbers,
+    curvature: Numbers | None = None,
 ) -> Wavefront:
     """Optical path difference of the rays that cross the stop at given points.
 
@@ -132,7 +131,7 @@ def path_differences(
     return opd, status, jnp.concatenate(image, axis=-1)
 
 
-def rms_wavefront(wave: Wavefront, weights: ArrayLike) -> Array:
+def rms_wavefront(wave: Wavefront, weights: Numbers) -> Array:
     """Root mean square (W,) of the opd about its mean, in waves; 0 if no ray has one.
 
     `weights` (Q,) of the points, as from `pupil.disc`; failed and clipped rays count for

@@ -8,13 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 from skimage import metrics
 
 from ..compilation import NETWORK, known_options
-from ..image.kernel import Form, gaussian_psf
+from ..image.kernel import Form, gaussian_psf, separable_psf
 from ..image.sensor import Convolve, convolve, sensor_layer
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import Numbers, safe_divide, safe_sqrt
 from .adam import adam, apply_updates
 from .network import count_parameters
 
@@ -64,7 +63,7 @@ def make_imager(
     margin = camera.kernel // 2
 
     def imager(
-        parameters: dict[str, Any], scenes: Array, distance: Array, noise: ArrayLike, key: Array
+        parameters: dict[str, Any], scenes: Array, distance: Array, noise: Numbers, key: Array
     ) -> tuple[Array, Array, Array, Array]:
         scenes = scenes.astype(jnp.float32) / 255
         mean, covariance, passed = blur(parameters["optics"], distance)
@@ -72,7 +71,8 @@ def make_imager(
         total = jnp.sum(jnp.where(arrives[:, None], mean, 0), axis=0, keepdims=True)
         offset = mean - safe_divide(total, jnp.sum(arrives, dtype=mean.dtype))
         pixel = camera.pixel_um * 1e-3
-        kernel = gaussian_psf(offset, covariance, pixel, camera.kernel, camera.form)
+        psf = separable_psf if covariance.ndim == 2 else gaussian_psf
+        kernel = psf(offset, covariance, pixel, camera.kernel, camera.form)
         light = jnp.expand_dims(passed.astype(jnp.float32), (0, 1, 2))
         image = sensor_layer(scenes * light, kernel, noise, key, convolve)
         restored = image if restore is None else restore(parameters["network"], image)

@@ -5,14 +5,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
-from ..numerics import concrete
+from ..numerics import Numbers, concrete
 from .lens import Lens
 from .paraxial import entrance_pupil
 
 
-def with_paraxial_pupil(lens: Lens, wavelength: ArrayLike = 0.5875618) -> Lens:
+def with_paraxial_pupil(lens: Lens, wavelength: Numbers = 0.5875618) -> Lens:
     """The lens with its paraxial entrance pupil as the stop.
 
     Two planes that bend no light come first, surfaces 0 and 1: one at the first vertex, from where

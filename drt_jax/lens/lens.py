@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.dtypes import canonicalize_dtype
-from jax.typing import ArrayLike
 
-from ..numerics import concrete, real_array
+from ..numerics import Numbers, concrete, real_array
 from .aperture import Apertures
 from .elements import Elements, rotation_matrix
 from .forms import Shape
@@ -20,7 +19,7 @@ from .surface import surface_sag
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Lens:
     """S surfaces and, as the last row of every array over surfaces, the sensor.
 
@@ -74,6 +73,15 @@ class Lens:
     mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True}, default=())
     curved: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
     name: str = dataclasses.field(metadata={"static": True}, default="")
+
+    def __repr__(self) -> str:
+        """In short; of a gradient too, and inside a trace."""
+        what = f"{self.count} surfaces, the stop is number {self.stop}"
+        sensor = self.sensor
+        if concrete(sensor) and getattr(sensor, "shape", None) == ():
+            what += f", sensor {float(sensor):.6g}"
+        kind = getattr(self.curvature, "dtype", None)
+        return f"Lens({self.name!r}: {what}{f', {kind}' if kind else ''})"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "forms", self.forms or ("asphere",) * (self.count + 1))
@@ -146,14 +154,14 @@ class Lens:
         along its own z axis, -1 against it after an odd number of mirrors."""
         return np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
 
-    def index(self, wavelengths: ArrayLike) -> Array:
+    def index(self, wavelengths: Numbers) -> Array:
         """Refractive index (S + 1, W) of every medium at `wavelengths` (W,), um.
 
         ValueError as `colours`.
         """
         return refractive_index(self.dispersion, self.colours(wavelengths))
 
-    def colours(self, wavelengths: ArrayLike) -> Array:
+    def colours(self, wavelengths: Numbers) -> Array:
         """`wavelengths`, one or a list, in um, as an array (W,).
 
         ValueError for none, for another shape, and as `check_wavelengths`.
@@ -164,7 +172,7 @@ class Lens:
         self.check_wavelengths(wavelengths)
         return found
 
-    def check_wavelengths(self, wavelengths: ArrayLike) -> None:
+    def check_wavelengths(self, wavelengths: Numbers) -> None:
         """ValueError if a known wavelength, (W,) or one in um, lies outside the range of a medium.
 
         Inside a trace the values are not known and nothing is checked: see `Dispersion.knows`.
@@ -172,11 +180,12 @@ class Lens:
         if not concrete(wavelengths):
             return
         low, high = self.dispersion.range
-        if all(low <= value <= high for value in np.ravel(wavelengths).tolist()):
+        values = np.ravel(np.asarray(wavelengths, float)).tolist()
+        if all(low <= value <= high for value in values):
             return
         ranges = self.dispersion.ranges or (ANY,) * len(self.glasses)
         for name, (low, high) in zip(self.glasses, ranges, strict=True):
-            for value in np.ravel(wavelengths):
+            for value in values:
                 if not low <= value <= high:
                     outside = f"wavelength {value:g} um is outside the range of {name}"
                     raise ValueError(f"{outside}, {low:g} to {high:g} um")
@@ -219,7 +228,7 @@ class Lens:
                 )
 
 
-def sag(lens: Lens, surface: int, x: ArrayLike, y: ArrayLike) -> Array:
+def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:
     """Height of a surface above its vertex plane, mm, along its own axes.
 
     surface: 0 to S - 1, or S for the sensor. x, y: mm, of shapes that broadcast together.

@@ -17,9 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
-from ..numerics import safe_divide
+from ..numerics import Numbers, safe_divide
 from .lens import Lens
 from .scene import ahead, apart, distance_array, field_array, vergence_of
 from .surface import vertex_curvature
@@ -142,7 +141,7 @@ class ParaxialRay(NamedTuple):
     behind: Array
 
 
-def paraxial_system(lens: Lens, wavelengths: ArrayLike) -> ParaxialSystem:
+def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
     """What paraxial rays of `wavelengths` (W,), um, see of a lens."""
     lens.check()
     colours = lens.colours(wavelengths)
@@ -159,7 +158,7 @@ def paraxial_system(lens: Lens, wavelengths: ArrayLike) -> ParaxialSystem:
     return ParaxialSystem(curvature, power, lens.thickness, index, aperture, known, lens.stop)
 
 
-def trace_ray(system: ParaxialSystem, height: ArrayLike, slope: ArrayLike) -> ParaxialRay:
+def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | float) -> ParaxialRay:
     """The ray of the given height (mm) and slope, () or (W,), at the first vertex, before it."""
     one = jnp.ones_like(system.index[0])
     start = one * height, one * slope
@@ -187,7 +186,7 @@ def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
     return (-height, slope) if front else (height, slope)
 
 
-def chief_ray_at_image(lens: Lens, wavelengths: ArrayLike) -> tuple[Array, Array]:
+def chief_ray_at_image(lens: Lens, wavelengths: Numbers) -> tuple[Array, Array]:
     """Height (W,) in mm and slope (W,), at the last vertex and behind it, of a ray through the
     centre of the stop; of the size that makes n u = 1 at the stop. `wavelengths` in um."""
     return chief_ray(paraxial_system(lens, wavelengths), front=False)
@@ -200,12 +199,12 @@ def _pupil(system: ParaxialSystem, front: bool) -> Pupil:
     return system.told(Pupil(_quotient(-height, slope), _quotient(system.aperture, bend)))
 
 
-def entrance_pupil(lens: Lens, wavelengths: ArrayLike) -> Pupil:
+def entrance_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
     """The stop as seen from the object; position from the first vertex. `wavelengths` in um."""
     return _pupil(paraxial_system(lens, wavelengths), front=True)
 
 
-def exit_pupil(lens: Lens, wavelengths: ArrayLike) -> Pupil:
+def exit_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
     """The stop as seen from the image; position from the last vertex. `wavelengths` in um."""
     return _pupil(paraxial_system(lens, wavelengths), front=False)
 
@@ -223,7 +222,7 @@ def petzval_parts(system: ParaxialSystem) -> Array:
     return -system.curvature[:, None] * (1 / index[1:] - 1 / index[:-1])
 
 
-def first_order(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> FirstOrder:
+def first_order(lens: Lens, distance: Numbers, wavelengths: Numbers) -> FirstOrder:
     """First-order data, see `FirstOrder`.
 
     Focal length, focal distances and pupils do not depend on the distance.
@@ -255,7 +254,7 @@ def first_order(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Firs
     return system.told(found, apart(far))
 
 
-def focal_length(lens: Lens, wavelengths: ArrayLike) -> Array:
+def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
     """Focal length in image space (W,), n' over power, mm; inf for an afocal lens. `wavelengths`
     (W,) in um. From the rear principal plane to the focus, along z: in water longer by its index
     than `effective_focal_length`, and negative for a concave mirror, whose focus lies before it."""
@@ -264,14 +263,14 @@ def focal_length(lens: Lens, wavelengths: ArrayLike) -> Array:
     return system.told(_quotient(-jnp.ones_like(slope), slope))
 
 
-def effective_focal_length(lens: Lens, wavelengths: ArrayLike) -> Array:
+def effective_focal_length(lens: Lens, wavelengths: Numbers) -> Array:
     """Effective focal length in air (W,), 1 over power, mm, whatever the medium of the image; inf
     for an afocal lens. `wavelengths` (W,) in um. The EFL of design programs; positive for lenses
     and mirrors that converge."""
     return first_order(lens, jnp.inf, wavelengths).effective_focal_length
 
 
-def back_focal_distance(lens: Lens, wavelengths: ArrayLike) -> Array:
+def back_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
     """Last vertex to the image of an infinitely far object (W,), mm; inf for an afocal lens.
     `wavelengths` (W,) in um."""
     system = paraxial_system(lens, wavelengths)
@@ -279,40 +278,38 @@ def back_focal_distance(lens: Lens, wavelengths: ArrayLike) -> Array:
     return system.told(_quotient(-ray.height[-1], ray.behind[-1]))
 
 
-def front_focal_distance(lens: Lens, wavelengths: ArrayLike) -> Array:
+def front_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
     """First vertex to the front focus (W,), mm, negative where it lies before the lens; inf
     for an afocal lens. `wavelengths` (W,) in um."""
     return first_order(lens, jnp.inf, wavelengths).front_focal_distance
 
 
-def image_distance(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
+def image_distance(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
     """First vertex to the paraxial image of an axial object at `distance` mm (W,), mm; inf
     where that lies at infinity. `wavelengths` (W,) in um."""
     return first_order(lens, distance, wavelengths).image_distance
 
 
-def numerical_aperture(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
+def numerical_aperture(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
     """Paraxial n u of the marginal ray at the image (W,), positive; 0 for an image at infinity.
     `distance` from the object to the first vertex in mm, inf allowed; `wavelengths` (W,), um."""
     return first_order(lens, distance, wavelengths).numerical_aperture
 
 
-def f_number(lens: Lens, wavelengths: ArrayLike, distance: ArrayLike = jnp.inf) -> Array:
+def f_number(lens: Lens, wavelengths: Numbers, distance: Numbers = jnp.inf) -> Array:
     """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity. For an
     infinitely far object, focal length over diameter of the entrance pupil; else the working
     f-number. `wavelengths` (W,) in um, `distance` in mm."""
     return first_order(lens, distance, wavelengths).f_number
 
 
-def lateral_magnification(lens: Lens, distance: ArrayLike, wavelengths: ArrayLike) -> Array:
+def lateral_magnification(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
     """Image height over object height (W,), negative where the image is upside down.
     `distance` from the object to the first vertex in mm; inf gives 0. `wavelengths` (W,), um."""
     return first_order(lens, distance, wavelengths).magnification
 
 
-def image_height(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike
-) -> Array:
+def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
     """Paraxial image height (..., W), mm, of the fields `field` (...), radians.
 
     As everywhere, light of a positive angle travels upwards, and the object lies below the

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
-from ..numerics import concrete, real_array
+from ..numerics import Numbers, concrete, real_array
 from .lens import Lens
 
 _RIGHT = np.pi / 2
@@ -65,7 +64,7 @@ def vergence_of(distance: Array) -> Array:
     return jnp.where(before, 1 / jnp.where(before, distance, 1), 0)
 
 
-def scene_of(lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike) -> Scene:
+def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Scene:
     """A scene in the dtype of the lens: one type for numbers, NumPy's and JAX's arrays.
 
     field: one angle (along y) or two (x, y) in radians: light goes along (tan x, tan y, 1).
@@ -85,7 +84,7 @@ def scene_of(lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: Arr
     return Scene(angles, distance_array(distance, dtype), lens.colours(wavelengths))
 
 
-def field_array(field: ArrayLike, dtype: Any) -> Array:
+def field_array(field: Numbers, dtype: Any) -> Array:
     """Angles in radians (...) as an array. ValueError for what is no angle, and for a known one of
     90 degrees and more."""
     angles = real_array("field", field, dtype)
@@ -98,7 +97,7 @@ def field_array(field: ArrayLike, dtype: Any) -> Array:
     return angles
 
 
-def distance_array(distance: ArrayLike, dtype: Any) -> Array:
+def distance_array(distance: Numbers, dtype: Any) -> Array:
     """A distance in mm as an array (). ValueError for other shapes, for what is no number, and for
     a known one that is not above 0."""
     far = real_array("distance", distance, dtype)
@@ -112,12 +111,12 @@ def distance_array(distance: ArrayLike, dtype: Any) -> Array:
     return far
 
 
-def _known(values: ArrayLike) -> list[float]:
+def _known(values: Numbers) -> list[float]:
     """Those that are known."""
     return np.ravel(np.asarray(values, float)).tolist() if concrete(values) else []
 
 
-def field_of_height(height: ArrayLike, distance: ArrayLike) -> Array:
+def field_of_height(height: Numbers, distance: Numbers) -> Array:
     """The field angle in radians of an object point `height` mm (...) above the axis.
 
     `distance` () mm from the object plane to the first vertex, finite. Light from above the axis

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
-from ..numerics import safe_divide
+from ..numerics import Numbers, safe_divide
 from .forms import FORMS
 from .lens import Lens
 from .paraxial import (
@@ -95,9 +94,7 @@ def _seidel(
     )
 
 
-def third_order(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike
-) -> ThirdOrder:
+def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> ThirdOrder:
     """Third-order aberrations of each surface, see `ThirdOrder`; `.total` sums them up.
 
     Conics and the r^2 and r^4 terms of aspheres count; odd powers of r have no place in this

@@ -13,13 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 from ..lens.aperture import depths
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
-from ..numerics import concrete, real_array, safe_sqrt
+from ..numerics import Numbers, concrete, real_array, safe_sqrt
 from ..rays.status import Status
 from ..rays.system import Vector, dot
 from ..rays.trace import Bundle
@@ -30,7 +29,7 @@ Symmetry = Literal["meridian", "half", "disc"]
 MAX_ORDER = 42
 
 
-def symmetry_of(lens: Lens, field: ArrayLike) -> Symmetry:
+def symmetry_of(lens: Lens, field: Numbers) -> Symmetry:
     """How much of the pupil must be traced for a field: an angle along y or (x, y), in radians, or
     many (F, 2).
 
@@ -119,7 +118,7 @@ class Soft(PupilRule):
 
     order: int = dataclasses.field(metadata={"static": True})
     symmetry: Symmetry = dataclasses.field(metadata={"static": True})
-    width: ArrayLike
+    width: Numbers
 
     def __post_init__(self) -> None:
         check_rule(self.order, self.symmetry)
@@ -155,8 +154,8 @@ class Pattern(PupilRule):
     weights: (Q,), adding up to 1 for a stop filled with light.
     """
 
-    positions: ArrayLike
-    weights: ArrayLike
+    positions: Numbers
+    weights: Numbers
     symmetry: Symmetry = dataclasses.field(metadata={"static": True}, default="disc")
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
@@ -183,7 +182,7 @@ def check_rule(order: int, symmetry: Symmetry) -> None:
 
 
 def pupil_points(
-    lens: Lens, field: ArrayLike, distance: ArrayLike, wavelengths: ArrayLike, rule: PupilRule
+    lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers, rule: PupilRule
 ) -> tuple[Array, Array]:
     """Where the rays of a rule cross the stop, (W, Q, 2) in units of its semi-diameter, and their
     weights (W, Q), which follow the lens. Arguments as in `trace_rays`.

@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 from ..lens.aperture import depths
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
-from ..numerics import real_array
+from ..numerics import Numbers, real_array
 from . import fermat
 from .meet import cross
 from .solve import Solver, solve
@@ -128,10 +127,10 @@ def _traced(
 
 def trace_rays(
     lens: Lens,
-    field: ArrayLike,
-    distance: ArrayLike,
-    wavelengths: ArrayLike,
-    pupil: ArrayLike,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    pupil: Numbers,
 ) -> Rays:
     """Trace the rays that cross the stop at given points.
 
@@ -150,7 +149,7 @@ def trace_rays(
     return _trace_rays(lens, scene, stop_points(lens, pupil))
 
 
-def stop_points(lens: Lens, pupil: ArrayLike) -> Array:
+def stop_points(lens: Lens, pupil: Numbers) -> Array:
     """Points (Q, 2) of the stop as an array in the dtype of the lens. ValueError for none, and for
     another shape."""
     points = real_array("pupil", pupil, lens.curvature.dtype)

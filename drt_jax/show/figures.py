@@ -1,5 +1,6 @@
 """Curves, kernels and patches: arrays in, axes out."""
 
+import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -7,6 +8,15 @@ import numpy as np
 from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+
+class _Figure(Figure):
+    """A figure that a notebook can show."""
+
+    def _repr_png_(self) -> bytes:
+        written = io.BytesIO()
+        self.savefig(written, format="png")
+        return written.getvalue()
 
 
 def new(
@@ -17,9 +27,9 @@ def new(
     width, height: of each panel, in inches.
 
     Made without pyplot, so that no window opens and no global state changes; write it with
-    `figure.savefig(path)`.
+    `figure.savefig(path)`. A notebook shows it where it is the last line of a cell.
     """
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained", dpi=150)
+    figure = _Figure(figsize=(width * columns, height * rows), layout="constrained", dpi=150)
     return figure, figure.subplots(rows, columns)
 
 

@@ -12,7 +12,17 @@ import pytest
 import drt_jax
 from drt_jax import Clipped, Gauss, Soft, design, load_lens
 from drt_jax.compilation import LARGE, jit
-from drt_jax.design import OPERANDS, Operand, Problem, Solve, Variables, values
+from drt_jax.design import (
+    OPERANDS,
+    Operand,
+    Problem,
+    Solve,
+    Variables,
+    errors,
+    kinds,
+    operands,
+    values,
+)
 from drt_jax.design.kinds import KINDS
 from drt_jax.lens.glass import glass_map_distance
 
@@ -416,3 +426,9 @@ def test_each_kind_is_told_where_a_user_reads():
         assert f"`{kind}`" in page
     for kind in get_args(Solve.__annotations__["kind"]):
         assert f"`{kind}`" in page
+
+
+def test_kinds_as_type_checkers_know_them():
+    known = ((operands.OperandKind, OPERANDS), (kinds.VariableKind, KINDS))
+    for literal, table in (*known, (errors.ToleranceKind, errors.KINDS)):
+        assert get_args(literal) == tuple(table)

@@ -9,7 +9,7 @@ import pytest
 from scipy import ndimage
 
 from drt_jax.image import sensor
-from drt_jax.image.kernel import SeparableKernel, gaussian_psf
+from drt_jax.image.kernel import SeparableKernel, gaussian_psf, separable_psf
 
 from ..conftest import assert_close
 
@@ -24,7 +24,8 @@ def kernels(dense):
         [[[4.0, 1.5], [1.5, 2.0]], [[0.3, 0.1], [0.1, 0.2]], [[9.0, 0], [0, 3.0]]]
     )
     covariance = covariance if dense else jnp.diagonal(covariance, 0, 1, 2)
-    return jax.jit(gaussian_psf, static_argnums=(2, 3))(mean, covariance, 1.0, 9)
+    psf = gaussian_psf if dense else separable_psf
+    return jax.jit(psf, static_argnums=(2, 3))(mean, covariance, 1.0, 9)
 
 
 @pytest.mark.parametrize("dense", [False, True])

@@ -42,7 +42,7 @@ def test_imager_is_the_chain_by_hand():
     x = scenes().astype(np.float32) / np.float32(255)
     np.testing.assert_array_equal(truth, x[:, 4:-4, 4:-4])
     mean, covariance, _ = blur()({"sensor": sensor}, 25000.0)
-    kernel = gaussian_psf(mean, covariance, 4.4e-3, 9).dense()
+    kernel = gaussian_psf(mean, covariance, 4.4e-3, 9)
     np.testing.assert_allclose(image, convolve(jnp.asarray(x, float), kernel), atol=1e-6)
     assert image.dtype == jnp.float32 and restored is image
     np.testing.assert_allclose(sigma, np.sqrt(covariance[:, 1]))

@@ -85,3 +85,14 @@ def test_sag_of_a_surface_and_of_the_sensor():
         drt_jax.sag(lens, 0, x, y), r - np.sqrt(r**2 - x**2 - y**2), atol=1e-13
     )
     np.testing.assert_array_equal(drt_jax.sag(lens, lens.count, x, y), np.zeros((2, 3)))
+
+
+def test_a_lens_prints_shortly():
+    """Also a gradient, and inside a trace."""
+    lens, said = load_lens("double_gauss"), []
+    gradient = jax.grad(lambda lens: lens.sensor**2)(lens)
+    jax.jit(lambda lens: said.append(repr(lens)))(lens)
+    what = f"Lens({lens.name!r}: 11 surfaces, the stop is number 5"
+    assert repr(lens) == f"{what}, sensor 133.35, float64)"
+    assert repr(gradient) == f"{what}, sensor 266.7, float64)" and said == [f"{what}, float64)"]
+    assert repr(jax.tree.map(lambda _: None, lens)).startswith("Lens(")

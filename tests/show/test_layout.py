@@ -164,3 +164,9 @@ def test_a_beam_tells_who_clips_it_and_where_it_is_sharp(tilted):
     # A cone of f/N has an RMS radius of defocus / (2 N) / sqrt(2).
     cone = abs(beam.shift) / (2 * float(f_number(lens, 0.55)[0])) / 2**0.5
     assert beam.spot == pytest.approx(cone, rel=0.01)
+
+
+def test_a_notebook_shows_a_figure():
+    """IPython asks the last value of a cell for its pictures."""
+    figure, _ = show.new()
+    assert figure._repr_png_().startswith(b"\x89PNG")

@@ -1,0 +1,30 @@
+"""Calls as pages show them, for mypy: `make check` reads this file, nothing runs it. A line with
+`type: ignore` holds what must be refused; where it no longer is, mypy says so."""
+
+import jax.numpy as jnp
+from jax import Array
+
+import drt_jax
+from drt_jax import design, pupil
+
+RGB = (0.6, 0.53, 0.48)
+LENS = drt_jax.load_lens("double_gauss")
+
+rule: drt_jax.PupilRule = drt_jax.converged_rule(LENS, 0.0, 25e3, RGB)
+rule = drt_jax.converged_rule(LENS, [(0.0, 0.1), (0.05, 0.2)], [25e3, float("inf")], RGB)
+mean, covariance = drt_jax.psf_moments(LENS, (0.0, 0.1), 25e3, [0.6, 0.53], rule=rule)
+kernel: Array = drt_jax.gaussian_psf(mean, covariance, pixel=4.4e-3)
+rows: drt_jax.SeparableKernel = drt_jax.separable_psf([(0.0, 0.0)], [(1e-4, 1e-4)], 4.4e-3)
+rays: drt_jax.Rays = drt_jax.trace_rays(LENS, 0.1, 25e3, RGB, [(0.0, 0.0), (0.0, 1.0)])
+wave: drt_jax.Wavefront = drt_jax.wavefront(LENS, 0.1, 25e3, RGB, pupil.hexapolar(3)[0].T)
+
+variables = design.Variables.of(LENS, [design.Vary("curvature"), "sensor"])
+problem = design.Problem.of(variables, ["spot"], [0.0, 0.1], RGB, field_weights=(1, 2))
+field: design.Problem = design.Problem.of(variables, ["spot"], jnp.zeros(2), RGB)
+design.Tolerance("radius", 0.1)
+
+design.Operand("sopt")  # type: ignore[arg-type]
+design.Vary("curvatures")  # type: ignore[arg-type]
+design.Tolerance("radii", 0.1)  # type: ignore[arg-type]
+design.Problem.of(variables, ["sopt"])  # type: ignore[list-item]
+drt_jax.Gauss(6, "full")  # type: ignore[arg-type]
