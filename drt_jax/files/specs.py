@@ -11,7 +11,7 @@ from ..lens.entrance import with_paraxial_pupil
 from ..lens.forms import FORMS
 from ..lens.glass import Dispersion
 from ..lens.lens import Lens
-from ..lens.paraxial import effective_focal_length, focal_length
+from ..lens.paraxial import effective_focal_length, focal_length, image_distance
 from ..lens.phase import Phase
 from .apertures import apertures_of, semi_diameter
 from .elements import elements_of
@@ -21,6 +21,7 @@ from .order import check_order
 
 _D_LINE = 0.5875618  # um
 _MOST = 5000  # surfaces
+_FOCUS = "focus"  # of a sensor
 _TOP_KEYS = (
     *("name", "source", "focal_length", "glasses", "object", "surfaces", "elements"),
     *("sensor", "sensor_tilt", "sensor_decentre", "pupil"),
@@ -88,12 +89,22 @@ def _gaps(top: Entry, surfaces: list[Entry]) -> list[float]:
     gaps = [surface.number("thickness") for surface in surfaces[:-1]]
     if ("sensor" in top) == ("thickness" in surfaces[-1]):
         raise LensError(
-            "give either sensor (mm from the first vertex) or the last surface's thickness "
-            "(its distance to the sensor)",
+            "give either sensor (mm from the first vertex, or focus) or the last surface's "
+            "thickness (its distance to the sensor)",
             "sensor",
         )
+    if top.get("sensor") == _FOCUS:
+        return [*gaps, 0.0]  # until it is known, see `_focused`
     end = top.number("sensor") - sum(gaps) if "sensor" in top else surfaces[-1].number("thickness")
     return [*gaps, end]
+
+
+def _focused(lens: Lens, wavelength: float) -> Lens:
+    """The lens with its sensor in the paraxial focus of an object at infinity."""
+    place = image_distance(lens, math.inf, wavelength)[0]
+    if not math.isfinite(float(place)):
+        raise LensError("sensor: focus: there is none, light leaves parallel; give mm", "sensor")
+    return dataclasses.replace(lens, sensor=place)
 
 
 def build_lens(values: object, name: str = "lens") -> Lens:
@@ -122,14 +133,14 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     tilt = [*(s.vector("tilt", 3) for s in surfaces), top.vector("sensor_tilt", 3)]
     moved = any(decentre) or any(tilt)
     media, gaps = media_of(top, surfaces), _gaps(top, surfaces)
-    groups = elements_of(top, len(surfaces))
+    groups, focused = elements_of(top, len(surfaces)), top.get("sensor") == _FOCUS
     lens = Lens(
         curvature=array([*(surface.curvature() for surface in surfaces), 0.0]),
         conic=array([*(surface.number("conic", 0.0, most=STEEP) for surface in surfaces), 0.0]),
         coefficients=table(coefficients, max(map(len, coefficients))),
         thickness=array(gaps[:-1]),
         semi_diameter=array([*map(semi_diameter, surfaces), math.inf]),
-        sensor=array(top.number("sensor", sum(gaps))),
+        sensor=array(sum(gaps) if focused else top.number("sensor", sum(gaps))),
         dispersion=Dispersion.of(media),
         decentre=table(decentre, 2) if moved else None,
         tilt=jnp.radians(table(tilt, 3)) if moved else None,
@@ -145,15 +156,23 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     bent = (surface.curvature() or any(row) for surface, row in zip(surfaces, coefficients))
     curved = tuple(i for i, does in enumerate(bent) if does and i not in lens.live)
     lens = dataclasses.replace(lens, curved=curved)
-    check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
     low, high = lens.dispersion.range
     line = _D_LINE if low <= _D_LINE <= high else (low + high) / 2
+    if focused:
+        lens = _focused(lens, line)
+        gaps[-1] = float(lens.sensor) - sum(gaps[:-1])
+    check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
     if "focal_length" in top:
         _check_focal_length(lens, top.number("focal_length"), line)
+    return _with_pupil(top, lens, line)
+
+
+def _with_pupil(top: Entry, lens: Lens, wavelength: float) -> Lens:
+    """The lens with the pupil that a prescription asks for."""
     pupil = top.text("pupil", "stop")
     if pupil not in ("stop", "paraxial"):
         raise top.error("pupil", f"expected stop or paraxial, got {shown(pupil)}")
-    return with_paraxial_pupil(lens, line) if pupil == "paraxial" else lens
+    return with_paraxial_pupil(lens, wavelength) if pupil == "paraxial" else lens
 
 
 def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:

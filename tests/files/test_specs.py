@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drt_jax import LensError, load_lens
+from drt_jax import LensError, image_distance, load_lens, save_lens, trace_rays
 
 GOOD = {
     "surfaces": [
@@ -90,6 +90,14 @@ BAD = {
     "sensor in the lens": (
         lambda e: e.update(sensor=3.0),
         "sensor: 3 mm lies before the vertex of surface 1 at 4 mm",
+    ),
+    "no focus": (
+        lambda e: (surface(0, radius="inf")(e), e.update(sensor="focus")),
+        "sensor: focus: there is none",
+    ),
+    "virtual focus": (
+        lambda e: (surface(0, radius=-50.0)(e), e.update(sensor="focus")),
+        "mm lies before the vertex of surface 1 at 4 mm",
     ),
     "no sensor": (lambda e: e.pop("sensor"), "either sensor"),
     "two sensors": (surface(2, thickness=84.0), "either sensor"),
@@ -265,3 +273,14 @@ def test_every_form_from_a_file(tmp_path):
         np.testing.assert_allclose(lens.tilt[-1], [0, np.radians(2.0), 0])
         np.testing.assert_array_equal(lens.decentre[3], [0, 1])
         np.testing.assert_array_equal(lens.senses, [1, 1, 1, 1, -1])
+
+
+def test_a_sensor_in_focus(tmp_path):
+    """Where an axial ray close to the axis crosses it; written as a number."""
+    lens = load_lens(write(tmp_path, lambda e: e.update(sensor="focus")))
+    (wanted,) = image_distance(lens, np.inf, 0.5875618)
+    assert float(lens.sensor) == pytest.approx(float(wanted), abs=1e-12)
+    rays = trace_rays(lens, 0.0, np.inf, 0.5875618, [(0.0, 1e-4)])
+    assert abs(float(rays.points[0, 0, -1, 1])) < 1e-9
+    save_lens(lens, tmp_path / "again.yaml")
+    assert load_lens(tmp_path / "again.yaml").sensor == lens.sensor
