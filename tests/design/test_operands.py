@@ -318,7 +318,7 @@ def test_apertures_as_variables_do_not_vignette():
     lens, rule = load_lens("petzval_100mm"), Soft(5, "half", 1.0)
     vary = ["sensor", design.Vary("curvature", (5,))]
     vary.append(design.Vary("semi_diameter", (3, 4, 5), low=10.0, high=25.0))
-    args = np.radians([0.0, 5.0, 8.0]), COLOURS
+    args = np.radians([0.0, 3.0, 5.5]), COLOURS
     light = []
     for operand in (Operand("spot"), Operand("spot", vignetting=False)):
         problem = Problem.of(Variables.of(lens, vary), [operand], *args, rule=rule)
