@@ -1,4 +1,4 @@
-"""Winograd's convolution against XLA's own, in float64, and against NumPy's sums."""
+"""Our convolutions against XLA's own, in float64, and against NumPy's sums."""
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +19,11 @@ def plain(images, kernel):
     )
 
 
-@pytest.fixture(scope="module")
-def case():
+# Winograd's, and gathered.
+@pytest.fixture(scope="module", params=[(2, 32, 36, 32), (3, 9, 20, 32)], ids=["large", "small"])
+def case(request):
     rng = np.random.default_rng(0)
-    images, kernel = rng.standard_normal((2, 32, 36, 32)), rng.standard_normal((3, 3, 32, 32)) / 17
+    images, kernel = rng.standard_normal(request.param), rng.standard_normal((3, 3, 32, 32)) / 17
     return images, kernel, rng.standard_normal(images.shape)
 
 
