@@ -7,7 +7,7 @@ denominator, so ordinary values are not biased.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,13 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-# What public functions take for numbers: an array, or numbers in lists and tuples, which JAX's
-# own alias leaves out.
-Numbers = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+if TYPE_CHECKING:
+    Numbers = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+else:
+
+    class Numbers:
+        """What public functions take for numbers: an array, or numbers in lists and tuples, which
+        JAX's own alias leaves out. A class, so that `help` prints its name and not the union."""
 
 
 def safe_sqrt(x: Array) -> Array:
