@@ -27,7 +27,6 @@ FLOORS = (
     "learn",
     "files",
     "show",
-    "runs",
     "__main__",
 )
 # Floors that know no ray, and but for `files` no optics formula: all that they may import of the
@@ -36,7 +35,6 @@ ALLOWED = {
     "learn": {"inputs", "numerics", "compilation", "image.kernel", "image.sensor"},
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
-    "runs": {"inputs"},
 }
 ALLOWED_ALL = {"show.layout"}
 # Of 8,200 that were the aim before apertures, phases and elements came, 11,200 before what comes
@@ -51,7 +49,7 @@ ONLY = {
     "skimage": {"learn.data", "learn.images", "learn.train"},
     "PIL": {"learn.data", "learn.images"},
     "tifffile": {"learn.images"},
-    "yaml": {"inputs", "files", "lens.glass", "runs.config"},
+    "yaml": {"inputs", "files", "lens.glass"},
     "tqdm": set(),
     "experiments": set(),
     "tests": set(),

@@ -32,9 +32,9 @@ import drt_jax
 from drt_jax import design, show
 from drt_jax.design.errors import KINDS
 from drt_jax.design.tolerance import Order
-from drt_jax.runs.folder import Run
 
 from . import _command, _common
+from .runs.folder import Run
 
 COLUMNS = ("mean_um", "p90_um", "seconds")
 _ORDERS = get_args(Order)

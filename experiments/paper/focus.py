@@ -21,9 +21,9 @@ import numpy as np
 
 from drt_jax import show
 from drt_jax.image.sensor import convolve_taps
-from drt_jax.runs.folder import Run
 
 from . import _command, _common, _report, _training
+from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
 # Of the mean of many numbers in float32, relative, with some room.

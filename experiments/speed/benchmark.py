@@ -27,11 +27,11 @@ import drt_jax
 from drt_jax import Lens, Status, pupil, show
 from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
-from drt_jax.runs.folder import Run
 
 from . import _command, _common, _peers, _work
 from ._reference import Moments, changed, flatten, gradient_error, reference
 from ._work import Row, compiled, peer, rows_of
+from .runs.folder import Run
 from .snell import trace_snell
 
 COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", *_work.MEASURED)

@@ -27,11 +27,11 @@ from jax import Array
 
 import drt_jax
 from drt_jax import Lens, PupilRule, pupil, show
-from drt_jax.runs.folder import Run
 
 from . import _command, _common
 from ._common import grouped
 from ._reference import Moments, flatten, gradient_error, reference
+from .runs.folder import Run
 
 _QUADRATURE = "quadrature"
 COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from drt_jax import show
-from drt_jax.runs.folder import Run
 
 from . import _command, _common, _damage, _ended, _spoilt, _zoo
 from ._outcomes import OUTCOMES
+from .runs.folder import Run
 
 COLUMNS = ("tried", *OUTCOMES)
 PARTS = ("files", "kills", "folders", "images")

@@ -16,11 +16,11 @@ import jax
 import numpy as np
 
 from drt_jax import Status, show
-from drt_jax.runs.folder import Run
 
 from . import _command, _common, _families
 from ._families import FAMILIES
 from ._survey import survey
+from .runs.folder import Run
 
 # Of each family in metrics.csv, and summed over all in results.json.
 COLUMNS = ("scenes", "rays", *(status.name.lower() for status in Status))
