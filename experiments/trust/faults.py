@@ -17,7 +17,7 @@ import numpy as np
 
 from drt_jax import show
 
-from . import _command, _common, _damage, _ended, _spoilt, _zoo
+from . import _command, _common, _damage, _ended, _plots, _spoilt, _zoo
 from ._outcomes import OUTCOMES
 from .runs.folder import Run
 
@@ -98,7 +98,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw what became of each kind."""
     figure, axes = show.new(1, 1, 8, 3.6)
     rows = {row["kind"]: [row[name] for name in OUTCOMES] for row in results["rows"]}
-    show.shares(axes, rows, OUTCOMES)
+    _plots.shares(axes, rows, OUTCOMES)
     figure.savefig(figures / "faults.png")
 
 
