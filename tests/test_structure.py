@@ -46,9 +46,8 @@ HOUSE = 20_000
 ONLY = {
     "optimistix": {"rays.aim", "rays.find", "image.field", "design.least_squares"},
     "matplotlib": {"show"},
-    "skimage": {"learn.data", "learn.images", "learn.train"},
-    "PIL": {"learn.data", "learn.images"},
-    "tifffile": {"learn.images"},
+    "skimage": {"learn.data", "learn.train"},
+    "PIL": {"learn.images"},
     "yaml": {"inputs", "files", "lens.glass"},
     "tqdm": set(),
     "experiments": set(),
