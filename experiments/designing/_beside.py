@@ -21,10 +21,10 @@ import drt_jax
 from drt_jax import design
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design.gaps import between
-from drt_jax.runs.folder import Run
 
 from . import _common, _optiland
 from ._wanted import Config
+from .runs.folder import Run
 
 # What ends the search of optimistix, relative and absolute.
 _FINE = 1e-9

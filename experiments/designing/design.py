@@ -19,10 +19,10 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import Pattern, design
-from drt_jax.runs.folder import Run
 
 from . import _beside, _command, _common, _optiland, _pictures
 from ._wanted import SHORTEST, Config as Config, Starts
+from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
 # Minima that are drawn. Clear apertures are so much wider than the light.

@@ -13,9 +13,9 @@ import pytest
 
 import drt_jax
 from drt_jax import design as lenses
-from drt_jax.runs.config import load_config
-from drt_jax.runs.folder import Run
 from experiments import _beside, _command, _wanted, design
+from experiments.runs.config import load_config
+from experiments.runs.folder import Run
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "design"
