@@ -1,13 +1,14 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
+from . import least_squares as least_squares
 from .errors import Tolerance as Tolerance, elements_of as elements_of
-from .least_squares import BoundedLM as BoundedLM
+from .field_rays import FieldRays as FieldRays
+from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit
 from .operands import Operand as Operand
-from .optimum import Optimum as Optimum, Search as Search, optimise as optimise
+from .optimum import Optimum as Optimum, optimise as optimise
 from .perturbed import Perturbed as Perturbed
-from .problem import Judged as Judged, Problem as Problem
-from .seen import Seen as Seen
+from .problem import Problem as Problem, trace_fields as trace_fields
 from .solves import Solve as Solve
 from .starts import (
     Minimum as Minimum,

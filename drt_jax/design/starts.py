@@ -16,8 +16,9 @@ from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
 from ..numerics import Numbers
-from .optimum import Search, begin, turn
-from .problem import Problem, quick
+from .least_squares import Search
+from .optimum import init_problem, step_problem
+from .problem import Problem, quick, trace_fields
 from .variables import Variables
 
 # Searches of one tile share a program and a core.
@@ -81,13 +82,13 @@ class Starts(NamedTuple):
     best: list[float]
 
 
-_begin = jax.jit(jax.vmap(begin, (None, 0)))
+_begin = jax.jit(jax.vmap(init_problem, (None, 0)))
 
 
 @partial(jit, wanted=LARGE)
 def _advance(problem: Problem, searches: Search, turns: Array) -> Search:
     """So many turns of a tile of searches, fewer if all are done."""
-    both = jax.vmap(turn, (None, 0))
+    both = jax.vmap(step_problem, (None, 0))
 
     def more(state: tuple[Array, Search]) -> Array:
         return (state[0] < turns) & ~jnp.all(state[1].done)
@@ -135,7 +136,7 @@ def many_starts(
             report(len(best), total, best[-1])
     for _ in _searched(problem, state, alive, turns[-1], threads):
         best.append(float(np.min(_score(state, alive))))
-    trials, jacobians = (int(np.sum(a)) for a in (state.state.trials, state.state.jacobians))
+    trials, jacobians = (int(np.sum(a)) for a in (state.trials, state.jacobians))
     minima = distinct(_rows(state, alive), alive)
     return Starts(
         minima,
@@ -154,14 +155,14 @@ def _searched(
 ) -> Iterator[None]:
     """Go on, as `_advanced`, with those of which the full search of the problem finds rays that
     aiming did not."""
-    failed = np.asarray(state.judged.failed)[alive]
+    failed = np.asarray(state.evaluation.failed)[alive]
     missed = [
         row
         for row, count in zip(alive[failed > 0], failed[failed > 0])
         if int(problem.failed(jnp.asarray(state.vector[row]))) < count
     ]
     if missed:
-        state.state.fresh[missed], state.done[missed] = True, False
+        state.stale[missed], state.done[missed] = True, False
         tiles = [np.array(missed[k : k + _TILE]) for k in range(0, len(missed), _TILE)]
         yield from _advanced(problem, state, tiles, turns, threads)
 
@@ -196,14 +197,14 @@ def rays_of(problem: Problem) -> int:
     """How many rays one judgement traces."""
     if not problem.traces:
         return 0
-    seen = jax.eval_shape(lambda p: p.seen(p.variables.lens).rays.light, problem)
-    return int(np.prod(seen.shape))
+    rays = jax.eval_shape(lambda p: trace_fields(p, p.variables.lens).weights, problem)
+    return int(np.prod(rays.shape))
 
 
 def distinct(searches: Search, numbers: np.ndarray) -> list[Minimum]:
     """The distinct minima that searches (K,) with their numbers of starts came to, best first."""
     scores, vectors = np.asarray(searches.score), np.asarray(searches.vector)
-    worst = np.asarray(searches.worst)
+    worst = np.asarray(searches.max_violation)
     found: list[Minimum] = []
     for k in np.argsort(scores, kind="stable"):
         if not np.isfinite(scores[k]):

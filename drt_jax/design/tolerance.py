@@ -20,9 +20,9 @@ from ..inputs import shown
 from ..lens.lens import Lens
 from ..numerics import concrete, safe_divide
 from ..rays.status import Status
+from .field_rays import EXTRAS, FieldRays, symmetry_by_structure
 from .perturbed import Perturbed
-from .problem import Problem, quick
-from .seen import EXTRAS, Seen, symmetry_by_structure
+from .problem import Problem, quick, trace_fields
 
 # What is adjusted in every lens: the sensor's distance, or its tilts about x and y, too.
 Compensator = Literal["none", "focus", "focus and tilt"]
@@ -51,11 +51,11 @@ class Made(NamedTuple):
         return jnp.sqrt(jnp.mean(self.squares, axis=-1))
 
 
-def _spots(seen: Seen) -> tuple[Array, Array, Array]:
+def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
     """Distances from the centroid, mm, and how they grow with the sensor's distance, (D, V, W Q)
     each, times the root of the light; and centroids (2, V), mm."""
-    rays, waves = seen.rays, seen.colour_weights[None, :, None]
-    light = (rays.light * waves)[..., EXTRAS:]
+    waves = rays.wavelength_weights[None, :, None]
+    light = (rays.weights * waves)[..., EXTRAS:]
     good = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
     light = jnp.where(good, light, 0)
     arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
@@ -66,7 +66,7 @@ def _spots(seen: Seen) -> tuple[Array, Array, Array]:
     total = jnp.sum(light, axis=(1, 2), keepdims=True)
     weight = safe_divide(light, jnp.broadcast_to(total, light.shape))
     # Of half a pupil, the other half has the opposite x, of a meridian the opposite y.
-    across = {"meridian": [0], "half": [1], "disc": [1, 1]}[seen.rule.symmetry]
+    across = {"meridian": [0], "half": [1], "disc": [1, 1]}[rays.symmetry]
     even = jnp.asarray(([0] * (dim - len(across)) + across) * 2, light.dtype)
     mean = jnp.sum(weight[None] * values, axis=(2, 3)) * even[:, None]
     apart = (values - mean[..., None, None]) * jnp.sqrt(jnp.where(good, weight, 1))[None]
@@ -78,8 +78,8 @@ def _spots(seen: Seen) -> tuple[Array, Array, Array]:
 def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[Made, Array]:
     """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
     squares add up to those of the RMS radii, mm."""
-    seen = problem.seen(lens)
-    apart, growth, (x, y) = _spots(seen)
+    rays = trace_fields(problem, lens)
+    apart, growth, (x, y) = _spots(rays)
     # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
     motion = lens.sensor_motion
     normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
@@ -92,9 +92,9 @@ def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tupl
         matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
         moves = jnp.linalg.solve(matrix, -levers @ jnp.sum(apart * growth, axis=(0, 2)))
         apart = apart + growth * (moves @ levers)[None, :, None]
-    light = seen.rays.light[..., EXTRAS:] > 0
-    failed = jnp.any(light & ~seen.rays.whole[..., EXTRAS:], axis=(1, 2))
-    good = ~failed & jnp.all(seen.rays.passed > 0, axis=1)
+    light = rays.weights[..., EXTRAS:] > 0
+    failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
+    good = ~failed & jnp.all(rays.throughput > 0, axis=1)
     squares = jnp.where(good, jnp.sum(apart**2, axis=(0, 2)), jnp.inf)
     return Made(squares, moves), apart
 

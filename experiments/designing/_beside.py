@@ -154,9 +154,9 @@ def told(problem: design.Problem) -> _optiland.Told:
 
 def _squares(vector: Array, problem: design.Problem) -> Array:
     """Residuals, and what exceeds limits and bounds as residuals more."""
-    variables, found = problem.variables, problem.judge(vector)
+    variables, found = problem.variables, problem.evaluate(vector)
     beyond = jnp.concatenate([variables.low - vector, vector - variables.high])
-    return jnp.concatenate([found.residuals, jnp.maximum(jnp.append(found.excess, beyond), 0)])
+    return jnp.concatenate([found.residuals, jnp.maximum(jnp.append(found.constraints, beyond), 0)])
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="most")
@@ -229,7 +229,7 @@ def _timed(run: Callable[[Array], Any], steps: int) -> tuple[Any, float, float]:
     return found, time.perf_counter() - compiled, compiled - begun
 
 
-_judge = jit(lambda problem, vector: problem.judge(vector), LARGE)
+_judge = jit(lambda problem, vector: problem.evaluate(vector), LARGE)
 
 
 def judged(problem: design.Problem, vector: Array) -> tuple[float, float]:
@@ -237,7 +237,7 @@ def judged(problem: design.Problem, vector: Array) -> tuple[float, float]:
     surfaces overlap."""
     variables = problem.variables
     found = _judge(problem, jnp.clip(vector, variables.low, variables.high))
-    worst = jnp.maximum(jnp.max(found.excess, initial=0.0), found.broken)
+    worst = jnp.maximum(jnp.max(found.constraints, initial=0.0), found.overlap)
     return float(jnp.sum(found.residuals**2)), float(worst)
 
 

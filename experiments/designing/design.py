@@ -293,7 +293,7 @@ def _bounded(config: Config, problem: design.Problem, lens: drt_jax.Lens) -> drt
     """The lens with clear apertures as wide as its light, where they float."""
     if not config.floating:
         return lens
-    wide = _WIDER * problem.extents(lens)
+    wide = _WIDER * problem.beam_radius(lens)
     wide = jnp.append(wide, jnp.inf).at[lens.stop].set(lens.semi_diameter[lens.stop])
     return dataclasses.replace(lens, semi_diameter=wide)
 

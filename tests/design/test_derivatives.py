@@ -8,7 +8,8 @@ import pytest
 
 from drt_jax import Clipped, Gauss, design, load_lens
 from drt_jax.compilation import LARGE, jit
-from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary
+from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary, trace_fields
+from drt_jax.design.field_rays import failures
 from drt_jax.design.problem import quick
 
 from .test_operands import COLOURS, model
@@ -60,9 +61,10 @@ def test_every_derivative_by_every_kind_of_variable(crooked):
     problem, x = crooked
 
     def flat(x):
-        seen = problem.seen(problem.variables.lens_of(x))
-        told = {operand.kind: operand.values(seen) for operand in problem.operands}
-        return told | {"failures": jnp.ravel(seen.failures)}, seen.rays.bundle.status
+        lens = problem.variables.lens_of(x)
+        rays = trace_fields(problem, lens)
+        told = {operand.kind: operand.values(lens, rays) for operand in problem.operands}
+        return told | {"failures": jnp.ravel(failures(lens, rays))}, rays.bundle.status
 
     value = jit(lambda x: flat(x)[0], LARGE)
     both = jit(jax.jacfwd(flat, has_aux=True), LARGE)
@@ -91,8 +93,9 @@ def test_derivatives_of_a_fitted_pupil():
     problem = Problem.of(Variables.of(lens, vary), kinds, fields, COLOURS[1], rule=rule)
 
     def values(x):
-        seen = problem.seen(problem.variables.lens_of(x))
-        return {kind: Operand(kind).values(seen) for kind in kinds}
+        lens = problem.variables.lens_of(x)
+        rays = trace_fields(problem, lens)
+        return {kind: Operand(kind).values(lens, rays) for kind in kinds}
 
     x = problem.variables.start
     value = jit(values, LARGE)
@@ -113,7 +116,7 @@ def strong(tmp_path_factory):
 def test_rays_that_fail_have_a_smooth_merit(strong):
     """Finite; its gradient, forward and reverse, agrees with differences."""
     problem, x = strong
-    whole = jax.jit(lambda x: problem.seen(problem.variables.lens_of(x)).rays.whole)(x)
+    whole = jax.jit(lambda x: trace_fields(problem, problem.variables.lens_of(x)).arrives)(x)
     assert 0.02 < 1 - np.mean(whole) < 0.5
     both = jit(jax.value_and_grad(problem.merit), LARGE)
     merit, gradient = both(x)
@@ -133,7 +136,7 @@ def test_rays_that_fail_have_a_smooth_merit(strong):
 def test_a_few_steps_bring_all_rays_through(strong):
     problem, x = strong
     found = design.optimise(problem, x, trials=15)
-    assert bool(jnp.all(problem.seen(found.lens).rays.whole))
+    assert bool(jnp.all(trace_fields(problem, found.lens).arrives))
     assert found.merit < 1e-2 * found.history[0, 0]
 
 

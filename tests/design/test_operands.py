@@ -21,8 +21,10 @@ from drt_jax.design import (
     errors,
     kinds,
     operands,
+    trace_fields,
     values,
 )
+from drt_jax.design.field_rays import relative_illumination
 from drt_jax.design.kinds import KINDS
 from drt_jax.lens.glass import glass_map_distance
 
@@ -37,8 +39,9 @@ def program(problem, kinds):
     """The values of kinds, by name, as one function of the problem and the vector."""
 
     def values(problem, vector):
-        seen = problem.seen(problem.variables.lens_of(vector))
-        return {kind: Operand(kind).values(seen) for kind in kinds}
+        lens = problem.variables.lens_of(vector)
+        rays = trace_fields(problem, lens)
+        return {kind: Operand(kind).values(lens, rays) for kind in kinds}
 
     return jit(values, LARGE)
 
@@ -183,8 +186,7 @@ def test_thickness_at_edges(triplet):
 def test_open_apertures_reach_as_far_as_the_rays(tmp_path):
     lens = model(tmp_path)
     problem = Problem.of(Variables.of(lens, ["thickness"]), ["air_edge"], [0.0, 0.2], rule=3)
-    seen = problem.seen(lens)
-    extents = np.asarray(seen.extents)
+    extents = np.asarray(problem.beam_radius(lens))
     assert extents[0] == 6 and extents[4] == 4
     rays = drt_jax.trace_rays(lens, 0.2, np.inf, 0.5875618, [[0, 1], [0, -1], [1, 0]])
     reach = np.hypot(*np.moveaxis(np.asarray(rays.points)[0, :, :, :2], -1, 0)).max(axis=0)
@@ -246,8 +248,8 @@ def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
 
     @jax.jit
     def told(lens):
-        seen = problem.seen(lens)
-        return seen.illumination, seen.rays.passed
+        rays = trace_fields(problem, lens)
+        return relative_illumination(lens, rays), rays.throughput
 
     found, passed = told(lens)
     share = passed[1, 0] / passed[0, 0]
@@ -267,8 +269,8 @@ def test_vignetted_spots():
 
     @jax.jit
     def told(lens):
-        seen = problem.seen(lens)
-        return problem.operands[0].values(seen), seen.rays.passed
+        rays = trace_fields(problem, lens)
+        return problem.operands[0].values(lens, rays), rays.throughput
 
     values, passed = told(lens)
     found = drt_jax.psf_moments(lens, field, np.inf, COLOURS[1], rule=rule)
@@ -287,8 +289,8 @@ def beam(lens, vary, rule, **given):
 
 @jax.jit
 def judged(problem, lens):
-    seen = problem.seen(lens)
-    return [operand.values(seen) for operand in problem.operands]
+    rays = trace_fields(problem, lens)
+    return [operand.values(lens, rays) for operand in problem.operands]
 
 
 def test_spots_without_vignetting():
@@ -322,8 +324,8 @@ def test_apertures_as_variables_do_not_vignette():
     light = []
     for operand in (Operand("spot"), Operand("spot", vignetting=False)):
         problem = Problem.of(Variables.of(lens, vary), [operand], *args, rule=rule)
-        before = problem.seen(problem.variables.lens).rays.passed
-        after = problem.seen(design.optimise(problem).lens).rays.passed
+        before = trace_fields(problem, problem.variables.lens).throughput
+        after = trace_fields(problem, design.optimise(problem).lens).throughput
         light.append(float(np.mean(after[2]) / np.mean(before[2])))
     assert light[0] < 0.8 and abs(light[1] - 1) < 0.01
 
@@ -429,6 +431,6 @@ def test_each_kind_is_told_where_a_user_reads():
 
 
 def test_kinds_as_type_checkers_know_them():
-    known = ((operands.OperandKind, OPERANDS), (kinds.VariableKind, KINDS))
+    known = ((operands.OperandName, OPERANDS), (kinds.VariableKind, KINDS))
     for literal, table in (*known, (errors.ToleranceKind, errors.KINDS)):
         assert get_args(literal) == tuple(table)

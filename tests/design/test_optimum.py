@@ -5,13 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
-from scipy.optimize import least_squares
+from scipy import optimize
 
 import drt_jax
 from drt_jax import design
-from drt_jax.design import Operand, Solve, Variables, Vary
+from drt_jax.design import Operand, Solve, Variables, Vary, least_squares
 
 # Of the singlet of issue 14, by another program: merit at the start and at the optimum, mm^2.
 START, OPTIMUM = 30.0924206902, 0.00172898452577
@@ -23,18 +22,21 @@ sensor: 37
 """
 
 
-def solved(function, start, lower, upper, limits=0):
-    """By the method alone: the vector, the state."""
-    solver = design.BoundedLM(rtol=1e-14, atol=1e-26, limits=limits)
-    options = {"lower": jnp.asarray(lower), "upper": jnp.asarray(upper)}
+def solved(function, start, low, high):
+    """By the method alone, in one program: the vector, the search."""
 
-    def told(y, args):
-        return function(y), (jnp.zeros(()), ())
+    def values(y):
+        residuals, constraints = function(y)
+        return design.Evaluation(residuals, constraints, jnp.zeros(()), jnp.int32(0))
 
-    found = optx.least_squares(
-        told, solver, jnp.asarray(start), options=options, has_aux=True, max_steps=200, throw=False
-    )
-    return np.asarray(found.value), found.state
+    @jax.jit
+    def run(start, low, high):
+        search = least_squares.init(values, start)
+        step = lambda _, search: least_squares.step(values, search, low, high)  # noqa: E731
+        return jax.lax.fori_loop(0, 200, step, search)
+
+    search = run(*(jnp.asarray(a, float) for a in (start, low, high)))
+    return np.asarray(search.vector), search
 
 
 def rosenbrock(y):
@@ -44,26 +46,26 @@ def rosenbrock(y):
 @pytest.mark.parametrize("upper", [(5.0, 5.0), (0.5, 5.0), (5.0, 0.3)])
 def test_bounded_minima_are_those_of_scipy(upper):
     lower, start = (-2.0, -2.0), np.array([-1.2, 0.2])
-    wanted = least_squares(rosenbrock, start, bounds=(lower, upper), xtol=1e-15, ftol=1e-15).x
-    found, state = solved(rosenbrock, start, lower, upper)
+    bounds = lower, upper
+    wanted = optimize.least_squares(rosenbrock, start, bounds=bounds, xtol=1e-15, ftol=1e-15).x
+    found, search = solved(lambda y: (rosenbrock(y), jnp.zeros(0)), start, lower, upper)
     np.testing.assert_allclose(found, wanted, atol=1e-6)
-    assert (
-        np.all(found <= upper) and float(state.merit) <= 2 * np.sum(rosenbrock(wanted) ** 2) + 1e-20
-    )
+    limit = 2 * np.sum(rosenbrock(wanted) ** 2) + 1e-20
+    assert np.all(found <= upper) and float(search.merit) <= limit and bool(search.done)
 
 
-def test_one_sided_residuals_count_where_they_are_above_zero():
-    """min (x - 3)^2 + (y - 1)^2 + max(0, 100 (x + y - 2))^2: near (2, 0)."""
+def test_constraints_hold_exactly():
+    """min (x - 3)^2 + (y - 1)^2 where x + y <= 2: at (2, 0); where x + y <= 11: at (3, 1)."""
 
-    def function(y):
-        return jnp.stack([y[0] - 3, y[1] - 1, 100 * (y[0] + y[1] - 2)])
+    def function(y, most=2.0):
+        return jnp.stack([y[0] - 3, y[1] - 1]), 100 * (y[:1] + y[1:] - most)
 
-    found, state = solved(function, np.zeros(2), (-9.0, -9.0), (9.0, 9.0), limits=1)
-    np.testing.assert_allclose(found, [2, 0], atol=2e-4)
-    free, _ = solved(lambda y: function(y) + jnp.array([0, 0, -900.0]), np.zeros(2), [-9.0] * 2,
-                     [9.0] * 2, limits=1)  # fmt: skip
+    bounds = np.zeros(2), [-9.0] * 2, [9.0] * 2
+    found, search = solved(function, *bounds)
+    np.testing.assert_allclose(found, [2, 0], atol=1e-6)
+    assert float(search.max_violation) <= 0 and int(search.jacobians) < 16
+    free, _ = solved(lambda y: function(y, 11.0), *bounds)
     np.testing.assert_allclose(free, [3, 1], atol=1e-6)
-    assert int(state.jacobians) < 12
 
 
 def grid(rings):
@@ -173,7 +175,8 @@ def test_each_limit_has_the_name_of_its_value(triplet):
             *([0.0, 0.2, 0.3], (0.48, 0.55, 0.65), (np.inf, 900.0), drt_jax.Gauss(2, symmetry)),
         )
         sizes = jax.eval_shape(
-            lambda p: [operand.excess(p.seen(lens)) for operand in p.operands], problem
+            lambda p: [o.constraints(lens, design.trace_fields(p, lens)) for o in p.operands],
+            problem,
         )
         count = sum(size.size for size in sizes)
         limits = problem.limits(-2.0 * np.arange(count))
@@ -213,7 +216,8 @@ def test_weights_of_fields(triplet):
     both = [0.0, 0.2]
     assert abs(merit(both, field_weights=[1, 3]) / (0.5 * one + 1.5 * two) - 1) < 1e-12
     assert abs(merit(both, field_weights=[0, 1]) / (2 * two) - 1) < 1e-12
-    assert abs(merit(both, field_weights=[2, 2]) / merit(both) - 1) < 1e-14
+    assert merit(both, field_weights=[2, 2]) == merit(both, field_weights=[1, 1])
+    assert abs(merit(both, field_weights=[2, 2]) / merit(both) - 1) < 1e-12
 
 
 def test_many_starts_do_not_depend_on_threads(triplet):
@@ -237,8 +241,8 @@ def test_many_starts_do_not_depend_on_threads(triplet):
         (lambda p: design.within(p.variables, 4), "sensor: starts within bounds need low and high"),
         (lambda p: design.Problem.of(p.variables, []), "operands: none"),
         (
-            lambda p: design.Problem.of(p.variables, ["spot"], colour_weights=[0.0]),
-            "colour_weights",
+            lambda p: design.Problem.of(p.variables, ["spot"], wavelength_weights=[0.0]),
+            "wavelength_weights",
         ),
         (
             lambda p: design.Problem.of(p.variables, ["spot"], [0, 0.1], field_weights=[1]),

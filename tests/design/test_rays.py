@@ -58,7 +58,7 @@ def test_spots_of_a_design_are_those_of_the_moments():
     variables = design.Variables.of(lens, [Vary("curvature")])
     rule = drt_jax.Gauss(6, "half")
     problem = design.Problem.of(variables, ["rms_spot", "spot"], [field], RGB, rule=rule)
-    judged = jax.jit(lambda p: p.judge(variables.start))(problem)
+    judged = jax.jit(lambda p: p.evaluate(variables.start))(problem)
     moments = drt_jax.psf_moments(lens, field, np.inf, RGB, rule=rule)
     assert int(judged.failed) > 0 and np.all(moments.passed < 1)
     # About the centroid of all wavelengths.
@@ -75,7 +75,7 @@ def test_lenses_as_built_are_searched_in_full(monkeypatch):
     variables = design.Variables.of(lens, [Vary("curvature")])
     rule = drt_jax.Gauss(3, "disc")
     problem = design.Problem.of(variables, ["spot"], [0.2], (0.55,), rule=rule)
-    perturbed = design.Perturbed.of(lens, problem.extents(lens), [Tolerance("thickness", 0.02)])
+    perturbed = design.Perturbed.of(lens, problem.beam_radius(lens), [Tolerance("thickness", 0.02)])
     off = design.draw_errors(perturbed, 3, seed=1)
     wanted = design.monte_carlo(problem, perturbed, off, "focus")
     assert np.all(np.isfinite(wanted.squares))
