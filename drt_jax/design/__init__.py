@@ -1,8 +1,10 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
 from . import least_squares as least_squares
+from .apertures import fit_apertures as fit_apertures, open_apertures as open_apertures
 from .errors import Tolerance as Tolerance, elements_of as elements_of
 from .field_rays import FieldRays as FieldRays
+from .growth import Growth as Growth, grow as grow, part_of as part_of
 from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit
 from .operands import Operand as Operand
@@ -13,10 +15,11 @@ from .solves import Solve as Solve
 from .starts import (
     Minimum as Minimum,
     Starts as Starts,
-    around as around,
+    as_built_starts as as_built_starts,
     many_starts as many_starts,
+    normal_starts as normal_starts,
     rays_of as rays_of,
-    within as within,
+    sobol_starts as sobol_starts,
 )
 from .tolerance import (
     Made as Made,

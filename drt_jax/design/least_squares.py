@@ -54,7 +54,7 @@ class Search(NamedTuple):
     vector: (N,), the best so far. evaluation: of it. residuals: (M + L,), with those of the
     constraints; jacobian: (M + L, N); total: (), the sum of the squares of what counts.
     scale: (N,), the largest column norms seen. damping, growth: (). gain: (), what the model
-    promised of the last trial, relative to the total. jacobians, trials: (), int32.
+    promised of the last trial, relative to the total. jacobians, steps: (), int32.
     stale: (), whether the vector must be evaluated first: at the start, and when what is asked
     changes. shift: (L,), of the constraints; stiffness: (), how much they count. rounds: (), how
     often they were shifted. fine: (), whether constraints are met and the last digits are sought.
@@ -71,7 +71,7 @@ class Search(NamedTuple):
     growth: Array
     gain: Array
     jacobians: Array
-    trials: Array
+    steps: Array
     stale: Array
     shift: Array
     stiffness: Array
@@ -114,7 +114,7 @@ def init(function: Function, vector: Array) -> Search:
         growth=2 * one,
         gain=jnp.inf * one,
         jacobians=zero,
-        trials=zero,
+        steps=zero,
         stale=jnp.bool_(True),
         shift=jnp.zeros_like(values.constraints),
         stiffness=one,
@@ -172,7 +172,7 @@ def _tried(function: Function, search: Search, low: Array, high: Array) -> Searc
         growth=jnp.where(taken, 2, 2 * search.growth),
         gain=jnp.where(search.stale, jnp.inf, safe_divide(promised, search.total)),
         jacobians=search.jacobians + taken.astype(jnp.int32),
-        trials=search.trials + 1,
+        steps=search.steps + 1,
         stale=jnp.bool_(False),
     )
 

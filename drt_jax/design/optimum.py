@@ -25,18 +25,19 @@ _LEFT = 1e-6
 _FAR = 1e6
 
 
-Ended = Literal["converged", "good", "trials", "limits", "stuck"]
+Ended = Literal["converged", "target", "steps", "limits", "stuck"]
 
 
 class Optimum(NamedTuple):
     """What a search came to.
 
     lens: the best one. vector: (N,). merit: sum of the squares of the residuals; score: with those
-    of what exceeds limits. worst: by how much the worst limit is exceeded, times its weight.
-    limits: all of them by name, the worst first, each in its own unit. ended: why: "converged", all
-    limits are kept and next to nothing is to be gained; "good", as it was asked to; "trials", that
-    are used up; "limits", that cannot be kept together; "stuck", no trial is better any more, as
-    where surfaces touch, which a limit such as air_edge keeps apart.
+    of what exceeds limits. max_violation: by how much the worst limit is exceeded, times its
+    weight. limits: all of them by name, the worst first, each in its own unit.
+    ended: why: "converged", all limits are kept and next to nothing is to be gained; "target", the
+    target merit is reached; "steps", they are used up; "limits", they cannot be kept together;
+    "stuck", no trial is better any more, as where surfaces touch, which a limit such as air_edge
+    keeps apart.
     history: (T, 3), merit, worst and Jacobians so far by trial. seconds: of all trials but the
     first; first: of that, with compilation if need be.
     """
@@ -45,7 +46,7 @@ class Optimum(NamedTuple):
     vector: np.ndarray
     merit: float
     score: float
-    worst: float
+    max_violation: float
     limits: list[Limit]
     ended: Ended
     history: np.ndarray
@@ -131,11 +132,11 @@ def _refuse_unjudged(search: Search) -> None:
         )
 
 
-def _why(problem: Problem, search: Search, good: float) -> Ended:
-    if good and float(search.score) <= good:
-        return "good"
+def _why(problem: Problem, search: Search, target_merit: float) -> Ended:
+    if target_merit and float(search.score) <= target_merit:
+        return "target"
     if not bool(search.done):
-        return "trials"
+        return "steps"
     if float(search.max_violation) > 0:
         return "limits"
     return "converged" if float(_left(problem, search)) <= _LEFT else "stuck"
@@ -144,21 +145,20 @@ def _why(problem: Problem, search: Search, good: float) -> Ended:
 def optimise(
     problem: Problem,
     vector: Array | None = None,
-    trials: int = 500,
-    report: Callable[[Search], None] = lambda search: None,
-    good: float = 0.0,
+    max_steps: int = 500,
+    callback: Callable[[Search], None] = lambda search: None,
+    target_merit: float = 0.0,
 ) -> Optimum:
     """The optimum next to a vector (N,) of the problem's variables, that of its start by default.
 
-    trials: at most. report: called after each, to show how far it is. good: the search ends as soon
-    as its merit plus the squares of what exceeds limits is no more; 0: at the optimum. For a part
-    of a field or an aperture that shall grow, some 16 times the merit that the whole is to have: a
-    lens that is perfect for a part is spoilt for more.
+    max_steps: trials at most. callback: called after each. target_merit: the search ends as soon as
+    its score, merit plus the squares of what exceeds limits, is no more; 0: at the optimum.
 
-    `Optimum.converged` tells whether it is an optimum, `Optimum.ended` why it is none. If trials
+    `Optimum.converged` tells whether it is an optimum, `Optimum.ended` why it is none. If steps
     are used up, limits that are almost kept are made good by some more.
 
-    One program is compiled for a problem, and serves all others of its kind. ValueError if the
+    One program is compiled for a problem, and serves all others that differ in numbers or names
+    alone. ValueError if the
     start itself cannot be judged: a lens whose surfaces overlap or of which no number is finite;
     and for a limit of an edge that it exceeds and no variable moves.
     """
@@ -176,17 +176,17 @@ def optimise(
     _refuse_fixed(tried, search)
     history = [[search.merit, search.max_violation, search.jacobians]]
     tried, search = _searched(problem, tried, search)
-    for _ in range(trials - 1):
+    for _ in range(max_steps - 1):
         search = _step(tried, search)
         history.append([search.merit, search.max_violation, search.jacobians])
-        report(search)
+        callback(search)
         if search.jacobians > history[-2][2]:  # a better lens
             tried, search = _searched(problem, tried, search)
-        if bool(search.done) or float(search.score) <= good:
+        if bool(search.done) or float(search.score) <= target_merit:
             break
     _refuse_unjudged(search)
-    why = _why(tried, search, good)
-    if why != "good" and 0 < float(search.max_violation) <= _NEAR:
+    why = _why(tried, search, target_merit)
+    if why != "target" and 0 < float(search.max_violation) <= _NEAR:
         search = _mended(tried, search)
     ended = time.perf_counter()
     limits = sorted(problem.limits(search.evaluation.constraints), key=lambda limit: -limit.excess)

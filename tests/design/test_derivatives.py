@@ -135,7 +135,7 @@ def test_rays_that_fail_have_a_smooth_merit(strong):
 @pytest.mark.slow
 def test_a_few_steps_bring_all_rays_through(strong):
     problem, x = strong
-    found = design.optimise(problem, x, trials=15)
+    found = design.optimise(problem, x, max_steps=15)
     assert bool(jnp.all(trace_fields(problem, found.lens).arrives))
     assert found.merit < 1e-2 * found.history[0, 0]
 

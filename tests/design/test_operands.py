@@ -338,11 +338,11 @@ def test_glasses_stay_on_the_map():
     ends = []
     for limits in ([], [Operand("glass_map", high=0.0)]):
         problem = Problem.of(variables, ["spot", *limits], [0.0, 0.02], COLOURS, rule=3)
-        found = design.optimise(problem, trials=60)
+        found = design.optimise(problem, max_steps=60)
         model = found.lens.dispersion.model[jnp.array([1, 2])]
         ends.append(np.asarray(glass_map_distance(model)))
         if limits:
-            assert found.worst == 0 and {limit.where for limit in found.limits} == {
+            assert found.max_violation == 0 and {limit.where for limit in found.limits} == {
                 "surface 0",
                 "surface 1",
             }
@@ -363,7 +363,7 @@ def test_a_dark_field_is_no_good_one(tmp_path):
     merit, gradient = jax.jit(jax.value_and_grad(problem.merit))(problem.variables.start)
     assert np.isinf(merit) and np.all(np.isfinite(gradient))
     with pytest.raises(ValueError, match="the start cannot be judged"):
-        design.optimise(problem, trials=2)
+        design.optimise(problem, max_steps=2)
 
 
 def test_obscurations_need_another_rule():

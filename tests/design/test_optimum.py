@@ -110,8 +110,8 @@ def triplet():
 
 def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
     start = float(triplet.merit(triplet.variables.start))
-    found = design.optimise(triplet, trials=200)
-    assert found.merit < start and found.worst <= 1e-9
+    found = design.optimise(triplet, max_steps=200)
+    assert found.merit < start and found.max_violation <= 1e-9
     low, high = np.asarray(triplet.variables.low), np.asarray(triplet.variables.high)
     assert np.all(low <= found.vector) and np.all(found.vector <= high)
     assert np.all(np.isfinite(found.history)) and np.all(np.diff(found.history[:, 2]) >= 0)
@@ -123,21 +123,21 @@ def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
 
 def test_a_search_ends_as_soon_as_it_is_good(triplet):
     """By its merit and its limits together, at the first trial of which that is true."""
-    whole = design.optimise(triplet, trials=40)
+    whole = design.optimise(triplet, max_steps=40)
     good = float(whole.history[10, 0])
-    found = design.optimise(triplet, trials=40, good=good)
+    found = design.optimise(triplet, max_steps=40, target_merit=good)
     assert found.score <= good and found.merit <= found.score
     count = len(found.history)
     assert 3 <= count < 40
     np.testing.assert_array_equal(found.history, whole.history[:count])
-    merit, worst, _ = design.optimise(triplet, trials=count - 1).history[-1]
-    assert merit + worst**2 > good and found.ended == "good" and not found.converged
+    merit, worst, _ = design.optimise(triplet, max_steps=count - 1).history[-1]
+    assert merit + worst**2 > good and found.ended == "target" and not found.converged
 
 
 def test_limits_are_kept_where_trials_are_used_up(triplet):
     """A search that is left before its multipliers have settled is mended by some more trials."""
-    found = design.optimise(triplet, trials=10)
-    assert found.history[-1, 1] > 1e-9 and found.worst == 0 and found.ended == "trials"
+    found = design.optimise(triplet, max_steps=10)
+    assert found.history[-1, 1] > 1e-9 and found.max_violation == 0 and found.ended == "steps"
     assert float(found.lens.sensor) <= 55 and found.merit < 2 * found.history[-1, 0]
 
 
@@ -148,7 +148,7 @@ def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
     args = np.radians([0.0, 14.0]), 0.5876
     apart = *triplet.operands, Operand("air_edge", low=0.1)
     found = design.optimise(design.Problem.of(triplet.variables, apart, *args, rule=3))
-    assert found.converged and found.worst == 0 and len(found.limits) == 6 * 4 + 1
+    assert found.converged and found.max_violation == 0 and len(found.limits) == 6 * 4 + 1
     track = next(limit for limit in found.limits if limit.kind == "total_track")
     assert track.side == "high" and abs(track.value - float(found.lens.sensor)) < 1e-12
     assert all(a.excess >= b.excess for a, b in zip(found.limits, found.limits[1:]))
@@ -157,7 +157,7 @@ def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
     assert len(both.operands) == 3
     found = design.optimise(both)
     worst = found.worst_limit
-    assert found.ended == "limits" and worst.excess == found.worst > 0.01
+    assert found.ended == "limits" and worst.excess == found.max_violation > 0.01
     if worst.kind == "glass_edge":
         assert str(worst).startswith("glass_edge of surface 2, zone ")
     assert f"beyond by {worst.excess:.3g}" in str(worst)
@@ -196,7 +196,7 @@ def test_a_limit_that_nothing_moves_is_refused(triplet):
     design.Problem.of(bent, ["spot", Operand("total_track", high=61.0)], 0.0, 0.5876)
     problem = design.Problem.of(bent, [some[0], some[2]], 0.0, 0.5876, rule=2)
     with pytest.raises(ValueError, match="glass_edge of surface 2, zone .*no variable moves it"):
-        design.optimise(problem, trials=3)
+        design.optimise(problem, max_steps=3)
     # Those of rays that fail stay where they are until they pass.
     bounded = design.Problem.of(bent, ["spot", Operand("distortion", low=-0.05)], 0.3, 0.5876)
     bounded.refuse_fixed([0.95], [0.95])
@@ -222,13 +222,13 @@ def test_weights_of_fields(triplet):
 
 def test_many_starts_do_not_depend_on_threads(triplet):
     """Two tiles, one of them not full, and a start that no light passes."""
-    starts = design.around(triplet.variables, 18, 2.0, 3)
+    starts = design.normal_starts(triplet.variables, 18, 2.0, 3)
     starts[5, :4] = [24.0, -24.0, 24.0, -24.0]
     one, two = (
         design.many_starts(triplet, starts, (4, 4), 0.5, threads=threads) for threads in (1, 2)
     )
     np.testing.assert_array_equal(one.merits, two.merits)
-    assert one.trials == two.trials and np.sum(np.isfinite(one.merits)) >= 17
+    assert one.steps == two.steps and np.sum(np.isfinite(one.merits)) >= 17
     assert [m.start for m in one.minima] == [m.start for m in two.minima]
     merits = [minimum.merit for minimum in one.minima]
     assert merits == sorted(merits) and merits[0] < float(triplet.merit(starts[0]))
@@ -238,7 +238,10 @@ def test_many_starts_do_not_depend_on_threads(triplet):
     "call, said",
     [
         (lambda p: design.many_starts(p, np.zeros((2, 3))), "starts: expected"),
-        (lambda p: design.within(p.variables, 4), "sensor: starts within bounds need low and high"),
+        (
+            lambda p: design.sobol_starts(p.variables, 4),
+            "sensor: starts within bounds need low and high",
+        ),
         (lambda p: design.Problem.of(p.variables, []), "operands: none"),
         (
             lambda p: design.Problem.of(p.variables, ["spot"], wavelength_weights=[0.0]),

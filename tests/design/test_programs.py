@@ -56,7 +56,7 @@ def searched(k):
     fields, waves = [0.0, 0.05 + 0.01 * k], (0.5 + 0.01 * k, 0.6)
     given = {"wavelength_weights": (1.0, 2.0 + k), "field_weights": (1.0 + k, 2.0)}
     problem = design.Problem.of(variables, operands, fields, waves, 900.0 + k, 2, **given)
-    return problem, design.optimise(problem, trials=3)
+    return problem, design.optimise(problem, max_steps=3)
 
 
 def test_other_numbers_and_names_compile_nothing(caplog):

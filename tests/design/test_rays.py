@@ -104,6 +104,6 @@ def test_an_optimum_is_searched_in_full(monkeypatch):
     monkeypatch.setattr("drt_jax.design.problem.solve_aimed", blind)
     found = design.optimise(problem)
     np.testing.assert_allclose(found.merit, wanted.merit, rtol=1e-9)
-    starts = design.around(variables, 4, 1.0)
-    minima = design.many_starts(problem, starts, turns=(20,)).minima
+    starts = design.normal_starts(variables, 4, 1.0)
+    minima = design.many_starts(problem, starts, steps=(20,)).minima
     np.testing.assert_allclose(minima[0].merit, wanted.merit, rtol=1e-6)
