@@ -2,14 +2,14 @@
 
 from . import least_squares as least_squares
 from .apertures import fit_apertures as fit_apertures, open_apertures as open_apertures
-from .errors import Tolerance as Tolerance, elements_of as elements_of
+from .deviations import Tolerance as Tolerance, elements_of as elements_of
 from .field_rays import FieldRays as FieldRays
 from .growth import Growth as Growth, grow as grow, part_of as part_of
 from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit
 from .operands import Operand as Operand
 from .optimum import Optimum as Optimum, optimise as optimise
-from .perturbed import Perturbed as Perturbed
+from .perturbed import PerturbedLens as PerturbedLens
 from .problem import Problem as Problem, trace_fields as trace_fields
 from .solves import Solve as Solve
 from .starts import (
@@ -22,10 +22,10 @@ from .starts import (
     sobol_starts as sobol_starts,
 )
 from .tolerance import (
-    Made as Made,
+    AsBuilt as AsBuilt,
     Predicted as Predicted,
-    draw_errors as draw_errors,
-    made as made,
+    as_built as as_built,
+    draw_perturbations as draw_perturbations,
     monte_carlo as monte_carlo,
     predict as predict,
     variances as variances,

@@ -14,7 +14,16 @@ from ..lens.elements import Elements
 from ..lens.glass import Dispersion, refractive_index
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
-from .errors import KINDS, WITH_X, Error, Tolerance, elements_of, errors_of, pieces_of, x_curvatures
+from .deviations import (
+    KINDS,
+    WITH_X,
+    Deviation,
+    Tolerance,
+    deviations_of,
+    elements_of,
+    pieces_of,
+    x_curvatures,
+)
 
 # A fringe is half a wave of green light (ISO 10110-5: 0.5460740 um), in mm.
 _FRINGE = 0.5460740e-3 / 2
@@ -24,7 +33,7 @@ _MINUTE = math.pi / 180 / 60
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Perturbed:
+class PerturbedLens:
     """A lens with P errors.
 
     lens: without any, in the form that errors need. extents: (S,), of the light on its surfaces,
@@ -37,12 +46,14 @@ class Perturbed:
     lens: Lens
     extents: Array
     sizes: Array
-    errors: tuple[Error, ...] = dataclasses.field(metadata={"static": True})
+    deviations: tuple[Deviation, ...] = dataclasses.field(metadata={"static": True})
     spans: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
     groups: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
 
     @classmethod
-    def of(cls, lens: Lens, extents: Array, tolerances: Sequence[Tolerance]) -> "Perturbed":
+    def from_lens(
+        cls, lens: Lens, extents: Array, tolerances: Sequence[Tolerance]
+    ) -> "PerturbedLens":
         """The errors that some tolerances allow.
 
         extents: (S,), how far from the axis light meets each surface, mm, such as `Seen.extents`.
@@ -52,7 +63,7 @@ class Perturbed:
         if np.shape(extents) != (lens.count,):
             raise ValueError(f"extents: expected ({lens.count},), got shape {np.shape(extents)}")
         spans, dtype = elements_of(lens), lens.curvature.dtype
-        sizes = errors_of(lens, tolerances)
+        sizes = deviations_of(lens, tolerances)
         kinds = {error.kind for error in sizes}
         lens, groups = _with_elements(lens, spans, kinds)
         if "wedge" in kinds and lens.tilt is None:
@@ -62,13 +73,13 @@ class Perturbed:
         largest = jnp.asarray([*sizes.values()], dtype)
         return cls(lens, jnp.asarray(extents, dtype), largest, tuple(sizes), spans, groups)
 
-    def lens_of(self, off: Array) -> Lens:
-        """The lens with errors `off` (P,) in parts of their largest. Differentiable, in `jit` and
-        `vmap` too; small errors of several kinds add up in any order."""
+    def lens_of(self, perturbation: Array) -> Lens:
+        """The lens with a perturbation (P,), deviations in parts of their largest. Differentiable,
+        in `jit` and `vmap` too; small errors of several kinds add up in any order."""
         lens = self.lens
-        found: dict[str, list[tuple[Error, Array]]] = {}
-        for k, error in enumerate(self.errors):
-            found.setdefault(error.kind, []).append((error, off[k] * self.sizes[k]))
+        found: dict[str, list[tuple[Deviation, Array]]] = {}
+        for k, error in enumerate(self.deviations):
+            found.setdefault(error.kind, []).append((error, perturbation[k] * self.sizes[k]))
         for kind, some in found.items():
             places = np.array([error.place for error, _ in some])
             axes = np.array([error.axis for error, _ in some])

@@ -83,7 +83,7 @@ class Problem:
     field_weights: Array | None = None
 
     @classmethod
-    def of(
+    def from_variables(
         cls,
         variables: Variables,
         operands: Sequence[Operand | OperandName | OperandFunction],

@@ -151,7 +151,7 @@ def many_starts(
             callback(len(best), total, best[-1])
     for _ in _searched(problem, state, alive, steps[-1], threads):
         best.append(float(np.min(_score(state, alive))))
-    total_steps, jacobians = (int(np.sum(a)) for a in (state.trials, state.jacobians))
+    total_steps, jacobians = (int(np.sum(a)) for a in (state.steps, state.jacobians))
     minima = distinct(_rows(state, alive), alive)
     return Starts(
         minima,

@@ -231,7 +231,7 @@ class Variables:
     ties: tuple[tuple[int, Place], ...] = dataclasses.field(metadata={"static": True})
 
     @classmethod
-    def of(
+    def from_lens(
         cls,
         lens: Lens,
         vary: Sequence[Vary | VariableKind],

@@ -38,8 +38,8 @@ def problem_of(config: Config, lens: drt_jax.Lens, order: int | None = None) -> 
         if solve.kind != "best_focus":
             waves = (waves[len(waves) // 2],)
         solves.append(dataclasses.replace(solve, distance=config.distance_mm, wavelengths=waves))
-    return design.Problem.of(
-        design.Variables.of(lens, config.variables, config.ties, solves),
+    return design.Problem.from_variables(
+        design.Variables.from_lens(lens, config.variables, config.ties, solves),
         config.operands,
         np.radians(config.fields_deg),
         config.wavelengths_um,

@@ -48,10 +48,10 @@ def assert_derivatives(value, jacobian, x, rtol, floor=1e-2):
 @pytest.fixture(scope="module")
 def crooked(tmp_path_factory):
     """A lens without symmetry, clipped in front, that some rays of the last field do not pass."""
-    variables = Variables.of(model(tmp_path_factory.mktemp("lens")), EVERY)
+    variables = Variables.from_lens(model(tmp_path_factory.mktemp("lens")), EVERY)
     kinds = [kind for kind in OPERANDS if kind != "throughput"]  # whose rays drop out one by one
     fields = [[0.02, 0.05], [0.01, 0.25], [0.03, 0.45]]
-    problem = Problem.of(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "disc"))
+    problem = Problem.from_variables(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "disc"))
     moves = np.random.default_rng(0).normal(size=len(variables.places))
     return problem, variables.start + moves
 
@@ -90,7 +90,9 @@ def test_derivatives_of_a_fitted_pupil():
     kinds = ("rms_spot", "rms_wavefront", "centroid", "relative_illumination", "throughput")
     rule = Clipped(4, "half")
     fields = np.radians([0.0, 20.0])
-    problem = Problem.of(Variables.of(lens, vary), kinds, fields, COLOURS[1], rule=rule)
+    problem = Problem.from_variables(
+        Variables.from_lens(lens, vary), kinds, fields, COLOURS[1], rule=rule
+    )
 
     def values(x):
         lens = problem.variables.lens_of(x)
@@ -108,8 +110,8 @@ def test_derivatives_of_a_fitted_pupil():
 def strong(tmp_path_factory):
     """A problem and a vector of which the last surface is too strong for the outer rays."""
     lens = model(tmp_path_factory.mktemp("lens"))
-    variables = Variables.of(lens, [Vary("curvature", (0, 3, 5, 6)), "sensor"])
-    problem = Problem.of(variables, ["spot"], [0.0, 0.15], COLOURS[:2], rule=4)
+    variables = Variables.from_lens(lens, [Vary("curvature", (0, 3, 5, 6)), "sensor"])
+    problem = Problem.from_variables(variables, ["spot"], [0.0, 0.15], COLOURS[:2], rule=4)
     return problem, variables.start.at[3].multiply(2.9)
 
 

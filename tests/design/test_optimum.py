@@ -82,8 +82,8 @@ def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):
     for first, second in ((1000, -1000), (-1000, 1000), ("inf", "inf")):
         path = tmp_path / "singlet.yaml"
         path.write_text(SINGLET.format(first, second))
-        variables = Variables.of(drt_jax.load_lens(path), ["curvature"])
-        problem = design.Problem.of(variables, ["spot"], 0.0, 0.55, rule=grid(5))
+        variables = Variables.from_lens(drt_jax.load_lens(path), ["curvature"])
+        problem = design.Problem.from_variables(variables, ["spot"], 0.0, 0.55, rule=grid(5))
         if first == 1000:
             np.testing.assert_allclose(problem.merit(variables.start), START, rtol=1e-11)
         found = design.optimise(problem)
@@ -99,13 +99,13 @@ def triplet():
     )
     lens = dataclasses.replace(lens, semi_diameter=semi)
     last = lens.live[-1]
-    variables = Variables.of(
+    variables = Variables.from_lens(
         lens,
         [Vary("curvature", low=-0.12, high=0.12), Vary("thickness", low=0.1, high=8), "sensor"],
         solves=[Solve("focal_length", surface=last), Solve("entrance_pupil")],
     )
     wanted = ["spot", Operand("glass_edge", low=1.0), Operand("total_track", high=55.0)]
-    return design.Problem.of(variables, wanted, np.radians([0.0, 14.0]), 0.5876, rule=3)
+    return design.Problem.from_variables(variables, wanted, np.radians([0.0, 14.0]), 0.5876, rule=3)
 
 
 def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
@@ -147,13 +147,15 @@ def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
     assert design.optimise(triplet).ended == "stuck"
     args = np.radians([0.0, 14.0]), 0.5876
     apart = *triplet.operands, Operand("air_edge", low=0.1)
-    found = design.optimise(design.Problem.of(triplet.variables, apart, *args, rule=3))
+    found = design.optimise(design.Problem.from_variables(triplet.variables, apart, *args, rule=3))
     assert found.converged and found.max_violation == 0 and len(found.limits) == 6 * 4 + 1
     track = next(limit for limit in found.limits if limit.kind == "total_track")
     assert track.side == "high" and abs(track.value - float(found.lens.sensor)) < 1e-12
     assert all(a.excess >= b.excess for a, b in zip(found.limits, found.limits[1:]))
     wanted = "spot", Operand("glass_edge", low=7.0, surfaces=(2,)), Operand("length", high=8.0)
-    both = design.Problem.of(triplet.variables, [*wanted, Operand("spot", weight=0)], *args, rule=3)
+    both = design.Problem.from_variables(
+        triplet.variables, [*wanted, Operand("spot", weight=0)], *args, rule=3
+    )
     assert len(both.operands) == 3
     found = design.optimise(both)
     worst = found.worst_limit
@@ -169,7 +171,7 @@ def test_each_limit_has_the_name_of_its_value(triplet):
     kinds = [kind for kind in kinds if kind not in ("magnification", "glass_map")]
     lens, lows = triplet.variables.lens, -1e9
     for symmetry in ("half", "disc"):
-        problem = design.Problem.of(
+        problem = design.Problem.from_variables(
             triplet.variables,
             [Operand(kind, low=lows, weight=2.0) for kind in kinds],
             *([0.0, 0.2, 0.3], (0.48, 0.55, 0.65), (np.inf, 900.0), drt_jax.Gauss(2, symmetry)),
@@ -189,16 +191,20 @@ def test_each_limit_has_the_name_of_its_value(triplet):
 def test_a_limit_that_nothing_moves_is_refused(triplet):
     """Where it is exceeded: of those that need no rays with the problem, else with the search."""
     lens = triplet.variables.lens
-    bent = Variables.of(lens, [Vary("curvature", (4,))], solves=[Solve("focal_length", surface=5)])
+    bent = Variables.from_lens(
+        lens, [Vary("curvature", (4,))], solves=[Solve("focal_length", surface=5)]
+    )
     some = ["spot", Operand("total_track", high=55.0), Operand("glass_edge", low=1.5)]
     with pytest.raises(ValueError, match="total_track: 60.1.*high 55.*no variable moves it"):
-        design.Problem.of(bent, some, 0.0, 0.5876)
-    design.Problem.of(bent, ["spot", Operand("total_track", high=61.0)], 0.0, 0.5876)
-    problem = design.Problem.of(bent, [some[0], some[2]], 0.0, 0.5876, rule=2)
+        design.Problem.from_variables(bent, some, 0.0, 0.5876)
+    design.Problem.from_variables(bent, ["spot", Operand("total_track", high=61.0)], 0.0, 0.5876)
+    problem = design.Problem.from_variables(bent, [some[0], some[2]], 0.0, 0.5876, rule=2)
     with pytest.raises(ValueError, match="glass_edge of surface 2, zone .*no variable moves it"):
         design.optimise(problem, max_steps=3)
     # Those of rays that fail stay where they are until they pass.
-    bounded = design.Problem.of(bent, ["spot", Operand("distortion", low=-0.05)], 0.3, 0.5876)
+    bounded = design.Problem.from_variables(
+        bent, ["spot", Operand("distortion", low=-0.05)], 0.3, 0.5876
+    )
     bounded.refuse_fixed([0.95], [0.95])
 
 
@@ -207,7 +213,7 @@ def test_weights_of_fields(triplet):
     start = triplet.variables.start
 
     def merit(fields, **given):
-        of = design.Problem.of(
+        of = design.Problem.from_variables(
             triplet.variables, ["spot", "rms_spot"], fields, 0.5876, (np.inf, 900.0), 3, **given
         )
         return float(of.merit(start))
@@ -242,21 +248,31 @@ def test_many_starts_do_not_depend_on_threads(triplet):
             lambda p: design.sobol_starts(p.variables, 4),
             "sensor: starts within bounds need low and high",
         ),
-        (lambda p: design.Problem.of(p.variables, []), "operands: none"),
+        (lambda p: design.Problem.from_variables(p.variables, []), "operands: none"),
         (
-            lambda p: design.Problem.of(p.variables, ["spot"], wavelength_weights=[0.0]),
+            lambda p: design.Problem.from_variables(
+                p.variables, ["spot"], wavelength_weights=[0.0]
+            ),
             "wavelength_weights",
         ),
         (
-            lambda p: design.Problem.of(p.variables, ["spot"], [0, 0.1], field_weights=[1]),
+            lambda p: design.Problem.from_variables(
+                p.variables, ["spot"], [0, 0.1], field_weights=[1]
+            ),
             "field_weights: expected 2 numbers",
         ),
         (
-            lambda p: design.Problem.of(p.variables, [Operand("spot", weight=0)]),
+            lambda p: design.Problem.from_variables(p.variables, [Operand("spot", weight=0)]),
             "all have the weight 0",
         ),
-        (lambda p: design.Problem.of(p.variables, ["magnification"]), "object is at infinity"),
-        (lambda p: design.Problem.of(p.variables, [Operand("spot", fields=(3,))]), "no number 3"),
+        (
+            lambda p: design.Problem.from_variables(p.variables, ["magnification"]),
+            "object is at infinity",
+        ),
+        (
+            lambda p: design.Problem.from_variables(p.variables, [Operand("spot", fields=(3,))]),
+            "no number 3",
+        ),
         (lambda p: jax.jit(lambda v: design.optimise(p, v))(p.variables.start), "outside of jax"),
     ],
 )

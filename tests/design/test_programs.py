@@ -36,7 +36,7 @@ def searched(k):
     """All of a design, its numbers and names other ones for each k."""
     glasses = (("N-BK7", "F2"), ("N-SK16", "F2"), ("SK16", "SF2"))[k]
     lens = lens_of(("one", "two", "three")[k], glasses)
-    variables = Variables.of(
+    variables = Variables.from_lens(
         lens,
         [Vary("curvature", low=-0.1 - 0.01 * k), Vary("thickness", (0, 1), low=0.5)],
         [Tie((0, 3), scale=-0.5 - 0.1 * k, shift=0.001 * k)],
@@ -55,7 +55,9 @@ def searched(k):
     ]
     fields, waves = [0.0, 0.05 + 0.01 * k], (0.5 + 0.01 * k, 0.6)
     given = {"wavelength_weights": (1.0, 2.0 + k), "field_weights": (1.0 + k, 2.0)}
-    problem = design.Problem.of(variables, operands, fields, waves, 900.0 + k, 2, **given)
+    problem = design.Problem.from_variables(
+        variables, operands, fields, waves, 900.0 + k, 2, **given
+    )
     return problem, design.optimise(problem, max_steps=3)
 
 

@@ -71,7 +71,9 @@ def test_a_stop_without_a_size_gets_one_line(semi):
     for call in (
         lambda: drt_jax.psf_moments(lens, 0.0, np.inf, 0.55),
         lambda: drt_jax.first_order(lens, np.inf, 0.55),
-        lambda: design.Problem.of(design.Variables.of(lens, ["thickness"]), ["spot"]),
+        lambda: design.Problem.from_variables(
+            design.Variables.from_lens(lens, ["thickness"]), ["spot"]
+        ),
     ):
         with pytest.raises(ValueError, match=f"stop, surface {lens.stop}, must be above 0 mm"):
             call()
