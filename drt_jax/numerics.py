@@ -8,7 +8,7 @@ denominator, so ordinary values are not biased.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,13 @@ from jax import Array
 from jax.typing import ArrayLike
 
 T = TypeVar("T")
-# What public functions take for numbers: an array, or numbers in lists and tuples, which JAX's
-# own alias leaves out.
-Numbers = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+if TYPE_CHECKING:
+    Numbers = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+else:
+
+    class Numbers:
+        """What public functions take for numbers: an array, or numbers in lists and tuples, which
+        JAX's own alias leaves out. A class, so that `help` prints its name and not the union."""
 
 
 def safe_sqrt(x: Array) -> Array:

@@ -169,7 +169,7 @@ class Problem:
         """What operands say of a vector (N,) of the variables. Differentiable, in `jit` and `vmap`
         too."""
         lens = self.variables.lens_of(vector)
-        rays = trace_fields(self, lens) if self.traces else self.views()
+        rays = _rays(self, lens)
         parts = [operand.residuals(lens, rays, self.field_weights) for operand in self.operands]
         if self.traces:
             parts.append(self._failures(lens, rays))
@@ -259,14 +259,21 @@ class Problem:
         return jnp.sum(self.evaluate(vector).residuals ** 2)
 
 
+@jax.jit
 def trace_fields(problem: Problem, lens: Lens) -> FieldRays:
     """The rays of a lens from all fields and distances of a problem. Differentiable, in `jit` and
     `vmap` too."""
     return trace_views(lens, problem.views(), problem.rule, problem.solver)
 
 
+def _rays(problem: Problem, lens: Lens) -> FieldRays:
+    """The rays of a lens, as far as operands need them."""
+    views = problem.views()
+    return trace_views(lens, views, problem.rule, problem.solver) if problem.traces else views
+
+
 def _constraints_of_each(problem: Problem, lens: Lens) -> list[Array]:
-    rays = trace_fields(problem, lens) if problem.traces else problem.views()
+    rays = _rays(problem, lens)
     return [operand.constraints(lens, rays) for operand in problem.operands]
 
 

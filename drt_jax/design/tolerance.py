@@ -20,9 +20,9 @@ from ..inputs import shown
 from ..lens.lens import Lens
 from ..numerics import concrete, safe_divide
 from ..rays.status import Status
-from .field_rays import EXTRAS, FieldRays, symmetry_by_structure
+from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
 from .perturbed import PerturbedLens
-from .problem import Problem, quick, trace_fields
+from .problem import Problem, quick
 
 # What is adjusted in every lens: the sensor's distance, or its tilts about x and y, too.
 Compensator = Literal["none", "focus", "focus and tilt"]
@@ -78,7 +78,7 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
 def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
     """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
     squares add up to those of the RMS radii, mm."""
-    rays = trace_fields(problem, lens)
+    rays = trace_views(lens, problem.views(), problem.rule, problem.solver)
     apart, growth, (x, y) = _spots(rays)
     # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
     motion = lens.sensor_motion

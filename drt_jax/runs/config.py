@@ -131,7 +131,9 @@ def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = Non
     if (kind is bool and type(value) is bool) or (origin is Literal and value in arguments):
         return value
     limit = _limit(kind, value)
-    raise source.error(key, f"{key}: expected {_say(kind)}{limit}, got {shown(value)}")
+    expected = f"{key}: expected {_say(kind)}{limit}, got {shown(value)}"
+    near = difflib.get_close_matches(str(value)[:_LONGEST], map(str, arguments), n=1)
+    raise source.error(key, expected + (f"; did you mean {near[0]}?" if near else ""))
 
 
 def _limit(kind: Any, value: object) -> str:

@@ -111,13 +111,13 @@ def test_a_phone_lens_from_a_crude_start(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "setting, said",
     [
-        ("variables=[{kind: curvture}]", "unknown kind 'curvture'"),
+        ("variables=[{kind: curvture}]", "got 'curvture'; did you mean curvature?"),
         ("variables=[{kind: curvature, low: 1, high: 0}]", "is not below high"),
         ("variables=[{kind: curvature, surfaces: [9]}]", "no surface 9"),
         ("variables=[{kind: sensor}, {kind: sensor}]", "twice"),
         ("solves=[{kind: focal_length, value: 50}]", "give surface"),
         ("operands=[]", "operands: needs at least one item"),
-        ("operands=[{kind: blur}]", "unknown kind 'blur'"),
+        ("operands=[{kind: blur}]", "operands[0].kind: expected one of spot,"),
         ("starts.how=anywhere", "one of around, within, made"),
         ("lens=nowhere.yaml", "nowhere.yaml"),
         ("growth.first=2", "growth.first: expected"),

@@ -64,7 +64,7 @@ def test_it_writes_rows_and_pictures_and_resumes(config, tmp_path, capsys):
     [
         ("fields_deg=[[1]]", "fields_deg: expected pairs x, y from -89 to 89"),
         ("scales=[]", "scales: needs at least one item"),
-        ("tolerances=[{kind: radii, size: 1}]", "tolerances: unknown kind 'radii'"),
+        ("tolerances=[{kind: radii, size: 1}]", "got 'radii'; did you mean radius?"),
         ("tolerances=[{kind: tilt, size: 1, which: [3]}]", "tilt: no element 3"),
         ("compensator=focus and tilt", "the fields lie on a line"),
     ],
