@@ -44,7 +44,7 @@ of first order
 of gaps between neighbours that bend light, and before the sensor, by the surface in front of them
     glass_centre, air_centre [surface]: thickness along the light on the axis, mm
     glass_edge, air_edge [surface, zone]: at 0.5, 0.7, 0.85 and 1 of how far the light goes, in y;
-        in glass of the larger of both extents, in air of the smaller; see `beam_radius`
+        in glass up to the larger of both beam radii, in air the smaller; see `beam_radius`
     incidence_angle [surface]: the largest, of all rays, with the normal
 
 of model glasses, by the surface where they begin

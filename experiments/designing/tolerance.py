@@ -97,8 +97,8 @@ def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.Pert
             config.colour_weights or None,
         )
 
-    extents = problem_of(lens).extents(lens)
-    perturbed = design.PerturbedLens.from_lens(lens, extents, config.tolerances)
+    radius = problem_of(lens).beam_radius(lens)
+    perturbed = design.PerturbedLens.from_lens(lens, radius, config.tolerances)
     return problem_of(perturbed.lens), perturbed
 
 

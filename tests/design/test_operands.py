@@ -18,7 +18,7 @@ from drt_jax.design import (
     Problem,
     Solve,
     Variables,
-    errors,
+    deviations,
     kinds,
     operands,
     trace_fields,
@@ -448,5 +448,5 @@ def test_each_kind_is_told_where_a_user_reads():
 
 def test_kinds_as_type_checkers_know_them():
     known = ((operands.OperandName, OPERANDS), (kinds.VariableKind, KINDS))
-    for literal, table in (*known, (errors.ToleranceKind, errors.KINDS)):
+    for literal, table in (*known, (deviations.ToleranceKind, deviations.KINDS)):
         assert get_args(literal) == tuple(table)

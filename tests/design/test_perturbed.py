@@ -272,5 +272,5 @@ def test_what_a_lens_has_none_of_is_refused_by_name():
     flat = dataclasses.replace(lens, curvature=0 * lens.curvature)
     with pytest.raises(ValueError, match="no surface is curved; of planes, tolerance fringes"):
         perturbed(flat, Tolerance("radius", 1.0))
-    with pytest.raises(ValueError, match=r"^extents: expected \(1,\), got shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"^beam_radius: expected \(1,\), got shape \(2,\)"):
         PerturbedLens.from_lens(lens, lens.semi_diameter, [Tolerance("tilt", 1.0)])
