@@ -283,16 +283,10 @@ class Variables:
         ends, scale = np.split(np.array([v.bounds(lens, place) for place, v in found]), [2], axis=1)
         low, high = jnp.asarray(ends / scale, dtype).T
         tied = [(index[p], f, line) for p, f, line in following if p in index]
-        variables = cls(
-            lens,
-            low,
-            high,
-            jnp.asarray(scale[:, 0], dtype),
-            (),
-            jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2),
-            tuple(place for place, _ in found),
-            tuple((leader, follower) for leader, follower, _ in tied),
-        )
+        lines = jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2)
+        places, ties_ = tuple(place for place, _ in found), tuple(tie[:2] for tie in tied)
+        scale = jnp.asarray(scale[:, 0], dtype)
+        variables = cls(lens, low, high, scale, (), lines, places, ties_)
         kept, start = fix_solves(variables.lens_of(variables.start), solves)
         return dataclasses.replace(variables, lens=start, solves=kept)
 
