@@ -17,6 +17,7 @@ from .files.yaml import lens_names, load_lens
 from .image.converged import psf_moments
 from .image.moments import Moments
 from .lens.lens import Lens
+from .lens.order import may_cross
 from .lens.paraxial import FirstOrder, first_order
 from .lens.scene import Scene, scene_of
 from .pupil.clipped import Clipped
@@ -90,7 +91,7 @@ def field_lines(
     whole = not any(beam.clipping or beam.ends for beam in beams)
     for field, angle, beam in zip(fields, angles, beams):
         scene = scene_of(lens, angle, distance, np.array(wavelengths))
-        rough, found = (_moments(lens, scene, _rule(n, symmetry, whole)) for n in _ORDERS)
+        rough, found = (_moments(lens, scene, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
         light = 100 * float(found.passed[middle])
         if not light > 0:
             yield _row(f"{field:.4g}", f"! {_why(lens, scene, Gauss(8, symmetry))}")
@@ -124,10 +125,10 @@ def _why(lens: Lens, scene: Scene, rule: PupilRule) -> str:
     return "no light arrives"
 
 
-def _rule(order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
+def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
     """A rule for a beam that fills the stop, or not; those of all orders share a program."""
     if not whole:
-        return Clipped(order, symmetry, _ORDERS[-1])
+        return Clipped(order, symmetry, _ORDERS[-1], may_cross(lens))
     points, weights = gauss_points(order, symmetry)
     more = gauss_points(_ORDERS[-1], symmetry)[1].size - weights.size
     return Pattern(np.pad(points, ((0, 0), (0, more))), np.pad(weights, (0, more)), symmetry)

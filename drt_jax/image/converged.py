@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
+from ..lens.order import may_cross
 from ..lens.scene import Scene, field_array, scene_of
 from ..numerics import Numbers, concrete, known_values, real_array
 from ..pupil.clipped import Clipped
@@ -229,10 +230,12 @@ def _try_orders(
     trials: list[_Trial] = []
     # A rule on the whole stop may step over an obscuration.
     clipped = lens.apertures is not None and any(lens.apertures.blocks)
-    order, solver = _CLIPPED[0] if clipped else 2, solve_aimed
+    order, solver, crossing = _CLIPPED[0] if clipped else 2, solve_aimed, may_cross(lens)
     while True:
-        rule = Clipped(order, symmetry) if clipped else Gauss(order, symmetry)
-        used = Clipped(order, symmetry, _size(order)) if clipped else _padded(order, symmetry)
+        rule: PupilRule = Gauss(order, symmetry)
+        used: PupilRule = _padded(order, symmetry)
+        if clipped:
+            rule, used = (Clipped(order, symmetry, n, crossing) for n in (order, _size(order)))
         parts = (_weigh(lens, scene, used, solver) for scene in scenes)
         found, rays, failed, cuts = zip(*parts, strict=True)
         failing, cut, sought = any(failed), any(cuts), solver is solve

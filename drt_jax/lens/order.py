@@ -74,6 +74,16 @@ def crossing(lens: Lens, pair: Pair) -> float | None:
     return float(y[np.argmax(crossed)]) if np.any(crossed) else None
 
 
+def may_cross(lens: Lens) -> bool:
+    """Whether some neighbours, of a lens whose arrays are known, cross inside their apertures, or
+    may do so: without apertures, or away from the axis."""
+    pairs, semi = neighbours_now(lens), np.asarray(lens.semi_diameter)
+    if len(pairs) < max(len(lens.live), 1):
+        return True
+    open_ones = (np.all(np.isinf(semi[list(pair[:2])])) for pair in pairs[:-1])
+    return any(open_ones) or any(crossing(lens, pair) is not None for pair in pairs)
+
+
 def neighbours_now(lens: Lens) -> list[Pair]:
     """`neighbours` of a lens as its arrays, all known, are now: after an optimiser's step, say."""
     gaps = np.asarray(lens.thickness, float).tolist()

@@ -2,9 +2,9 @@
 
 Every edge, the stop's rim among them, is a quadric: a ray passes if its hit h on that surface has
 |q| <= 1, where q = scale (h - centre) along x and y; a rectangle is two edges, each with one scale
-of 0. Where neighbouring surfaces cross, the way from one to the other is 0: an edge too, of a way
-between 0 and more than there is. Rays are launched, not aimed: a trace tells how the hits move with
-the point on the stop, also beyond all edges, where they step back to a surface; on
+of 0. Where neighbouring surfaces cross, the way from one to the other is 0: an edge too, if asked
+for, of a way between 0 and more than there is. Rays are launched, not aimed: a trace tells how the
+hits move with the point on the stop, also beyond all edges, where they step back to a surface; on
 this model, every edge ends a half-line on the stop at the root of a quadratic; the next ray is
 launched there. So each ray of the boundary takes a few steps of Newton's method.
 
@@ -99,12 +99,12 @@ class Edges(NamedTuple):
         return self.moves(hits) - self.scale * self.centre
 
 
-def edges_of(lens: Lens) -> Edges:
+def edges_of(lens: Lens, hits: Array) -> Edges:
     """Those of the S + 1 semi-diameters, of the ways from live surface to live surface and to the
-    sensor, and behind them of all other apertures."""
+    sensor, if the hits (..., H, W, B) have them, and behind them of all other apertures."""
     scale, extra = jnp.stack([1 / lens.semi_diameter] * 2), lens.apertures
     span = jnp.sum(abs(lens.thickness)) + abs(lens.sensor) + lens.semi_diameter[lens.stop]
-    longest = jnp.broadcast_to(_LONGEST * span, (1, len(lens.live)))
+    longest = jnp.broadcast_to(_LONGEST * span, (1, hits.shape[-3] - lens.count - 1))
     centre = jnp.pad(longest, ((0, 1), (lens.count + 1, 0)))
     scale = jnp.concatenate([scale, jnp.pad(1 / longest, ((0, 1), (0, 0)))], axis=1)
     rows = np.arange(centre.shape[1])
@@ -144,21 +144,26 @@ def units(like: Array) -> Array:
     return jnp.broadcast_to(jnp.eye(2, dtype=like.dtype)[..., None, None], (2, *like.shape))
 
 
-def traced(lens: Lens, system: System, launch: Array) -> tuple[Array, Array]:
+def traced(lens: Lens, system: System, launch: Array, crossing: bool) -> tuple[Array, Array]:
     """Hits (2, H, W, B), mm, and whether rays reach the sensor, (W, B): on the S surfaces and the
-    sensor, and behind these as x, with y = 0, the ways to each live surface from the one before it
-    and to the sensor, H = S + 1 + L. Launched as of `launched`; a way may be below 0."""
+    sensor, and for crossing surfaces behind these as x, with y = 0, the ways to each live surface
+    from the one before it and to the sensor, which may be below 0, H = S + 1 + L. Launched as of
+    `launched`."""
+    if not crossing:
+        plain = shoot(system, tuple(launch))
+        both, status = on_all_surfaces(lens, system, *apart(system, plain.hits), plain.fate)
+        return jnp.stack(both), status == Status.OK
     hits, ways, fate = shoot_anyway(system, tuple(launch))
     (x, y), status = on_all_surfaces(lens, system, *apart(system, hits), fate)
     found = jnp.concatenate([x, ways]), jnp.concatenate([y, 0 * ways])
     return jnp.stack(found), status == Status.OK
 
 
-def launched(lens: Lens, system: System, launch: Array) -> Rays:
+def launched(lens: Lens, system: System, launch: Array, crossing: bool) -> Rays:
     """Rays launched at points (2, W, B), mm on the vertex plane of the first row, and traced."""
 
     def along(unit):
-        trace = lambda launch: traced(lens, system, launch)  # noqa: E731
+        trace = lambda launch: traced(lens, system, launch, crossing)  # noqa: E731
         hits, columns, good = jax.jvp(trace, (launch,), (unit,), has_aux=True)
         return hits, columns, good
 
@@ -186,13 +191,13 @@ def arriving(system: System, launch: Array, radius: Array) -> Array:
 
 def gaps(lens: Lens, hits: Array, pair: Array) -> Array:
     """(2, W, B): |q|^2 - 1 of two edges; 0 on them."""
-    q = picked(edges_of(lens).at(hits), pair)
+    q = picked(edges_of(lens, hits).at(hits), pair)
     return dot(q, q) - 1
 
 
 def rates(lens: Lens, rays: Rays, pair: Array) -> Array:
     """Derivatives (2, 2, W, B) of `gaps` by the point on the stop."""
-    edges = edges_of(lens)
+    edges = edges_of(lens, rays.hits)
     q, moves = picked(edges.at(rays.hits), pair), picked(edges.moves(rays.moves), pair)
     return jnp.stack([2 * dot(q, m) for m in moves])
 
@@ -200,7 +205,7 @@ def rates(lens: Lens, rays: Rays, pair: Array) -> Array:
 def ends(lens: Lens, rays: Rays, goal: Goal) -> Array:
     """Where each edge ends a half-line, (E, W, B) in units of `goal.toward`, if hits move in
     proportion to it; inf for one that never does."""
-    edges = edges_of(lens)
+    edges = edges_of(lens, rays.hits)
     base = edges.at(rays.hits + moved(rays.moves, goal.centre - rays.point))
     rate = edges.moves(moved(rays.moves, goal.toward))
     square, linear, constant = dot(rate, rate), dot(base, rate), dot(base, base) - 1
@@ -230,14 +235,19 @@ def shifted(rays: Rays, change: Array) -> Rays:
     )
 
 
-def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) -> Reached:
-    """Newton's method from rays, to which it goes back half the way where one fails."""
+def search(
+    lens: Lens, system: System, start: Rays, goal: Goal, steps: Array, exact: Array
+) -> Reached:
+    """Newton's method from rays, to which it goes back half the way where one fails.
+
+    steps: at most. exact: whether the derivatives must be those of the last ray, too, which takes
+    one step more."""
     tiny = float(jnp.finfo(start.launch.dtype).eps) ** 0.5
     near = max(tiny, _NEAR)
 
     def step(state):
         count, rays, launch, done, _, _, before = state
-        new = launched(lens, system, launch)
+        new = launched(lens, system, launch, rays.hits.shape[1] > lens.count + 1)
         rays = jax.tree.map(lambda a, b: jnp.where(new.good & ~done, a, b), new, rays)
         change, edge = ahead(lens, rays, goal)
         back = rays.launch - launch
@@ -245,8 +255,8 @@ def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) ->
         lost = ~new.good & (dot(back, back) <= tiny**2 * (1 + dot(launch, launch)))
         onward = rays.launch + moved(rays.aims, change)
         launch = jnp.where(new.good[None], onward, launch + back / 2)
-        # Once more from there, so that the derivatives are those of the last ray too.
-        return count + 1, rays, launch, done | (settled & before) | lost, change, edge, settled
+        done = done | (settled & (before | ~exact)) | lost
+        return count + 1, rays, launch, done, change, edge, settled
 
     change, edge = ahead(lens, start, goal)
     launch, no = start.launch + moved(start.aims, change), jnp.zeros(edge.shape, bool)
@@ -260,7 +270,7 @@ def search(lens: Lens, system: System, start: Rays, goal: Goal, steps: Array) ->
 def outside(lens: Lens, rays: Rays, point: Array) -> Array:
     """How far points are outside of the edges that rays model, (W, B) in units of the stop's
     semi-diameter; negative inside."""
-    edges = edges_of(lens)
+    edges = edges_of(lens, rays.hits)
     q = edges.at(rays.hits + moved(rays.moves, point - rays.point))
     x, y = edges.moves(rays.moves)
     far, rate = safe_sqrt(dot(q, q)) - 1, safe_sqrt((dot(x, x) + dot(y, y)) / 2)
@@ -270,7 +280,7 @@ def outside(lens: Lens, rays: Rays, point: Array) -> Array:
 def barrier(lens: Lens, rays: Rays, point: Array) -> tuple[Array, Array]:
     """First (2, W, B) and second derivatives (2, 2, W, B), at points, of the sum over the edges
     that rays model of -log(1 - |q|^2), which rises to infinity towards the boundary."""
-    edges = edges_of(lens)
+    edges = edges_of(lens, rays.hits)
     q = edges.at(rays.hits + moved(rays.moves, point - rays.point))
     moves = edges.moves(rays.moves)
     room = jnp.maximum(1 - dot(q, q), jnp.finfo(q.dtype).eps)

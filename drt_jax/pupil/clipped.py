@@ -97,23 +97,27 @@ def _exists(lens: Lens, found: boundary.Reached) -> Array:
     return found.settled & inside & (found.goal.pair[0] != found.goal.pair[1])
 
 
-def _find(lens: Lens, system: System, spokes: Spokes, used: Array) -> boundary.Reached:
+def _find(
+    lens: Lens, system: System, spokes: Spokes, used: Array, crossing: bool
+) -> boundary.Reached:
     """What the stages find, one after the other, along a first axis."""
     stages = _stages(lens, system, spokes, used)
 
     def several(shape, dtype=system.index.dtype):
         return jnp.zeros((len(stages), *shape, system.index.shape[1], spokes.count), dtype)
 
-    point, rates, rows = several((2,)), several((2, 2)), lens.count + 1 + len(lens.live)
+    point, rates, rows = several((2,)), several((2, 2)), lens.count + 1 + crossing * len(lens.live)
     hits, moves, no = several((2, rows)), several((2, 2, rows)), several((), bool)
     goal = boundary.Goal(point, point, several((2,), jnp.int32))
     rays = boundary.Rays(point, point, hits, rates, moves, no)
 
     def run(stage, found):
         start, goal = jax.lax.switch(stage, stages, found)
-        new = boundary.search(lens, system, start, goal, jnp.array(_STEPS, jnp.int32)[stage])
+        steps, exact = jnp.array(_STEPS, jnp.int32)[stage], (stage == 3) | (stage == last)
+        new = boundary.search(lens, system, start, goal, steps, exact)
         return jax.tree.map(lambda a, b: a.at[stage].set(b), found, new)
 
+    last = len(stages) - 1  # with the corners, the rays that the rule is made of
     start = boundary.Reached(rays, goal, several((), jnp.int32), no)
     return jax.lax.fori_loop(0, len(stages), run, start)
 
@@ -147,8 +151,8 @@ class _Plan(NamedTuple):
         return boundary.moved(self.shape, unit(angle)), share
 
 
-def _plan(lens: Lens, scene: Scene, spokes: Spokes, used: Array) -> _Plan:
-    found = _find(lens, system_of(lens, scene), spokes, used)
+def _plan(lens: Lens, scene: Scene, spokes: Spokes, used: Array, crossing: bool) -> _Plan:
+    found = _find(lens, system_of(lens, scene), spokes, used, crossing)
     middle, nodes = (jax.tree.map(lambda a: a[k], found) for k in (1, -1))
     passes = middle.settled & (boundary.outside(lens, middle.rays, middle.rays.point) < 0)
     rays, pair, follows = nodes.rays, jnp.stack([nodes.edge] * 2), nodes.settled
@@ -165,24 +169,28 @@ def _plan(lens: Lens, scene: Scene, spokes: Spokes, used: Array) -> _Plan:
     return _Plan(centre, shape, *known, follows, passes[:, :1], used)
 
 
-def _followed(plan: _Plan, lens: Lens, scene: Scene, launch: Array) -> tuple[Array, Array]:
+def _followed(
+    crossing: bool, plan: _Plan, lens: Lens, scene: Scene, launch: Array
+) -> tuple[Array, Array]:
     """Points (2, W, K) and `boundary.gaps` of the rays of a plan launched at (2, W, K)."""
-    hits, _ = boundary.traced(lens, system_of(lens, scene), launch)
+    hits, _ = boundary.traced(lens, system_of(lens, scene), launch, crossing)
     point = hits[:, lens.stop] / lens.semi_diameter[lens.stop]
     return point, boundary.gaps(lens, hits, plan.pair)
 
 
-@jax.custom_jvp
-def _known_rates(lens: Lens, scene: Scene, launch: Array, plan: _Plan) -> tuple[Array, Array]:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _known_rates(
+    crossing: bool, lens: Lens, scene: Scene, launch: Array, plan: _Plan
+) -> tuple[Array, Array]:
     """Derivatives by the point, of the launch and of the gaps of `_followed`: known numbers, only
     theirs cost anything."""
     return plan.aims, plan.rates
 
 
 @_known_rates.defjvp
-def _known_rates_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _known_rates_jvp(crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
     def rates(lens, scene, launch):
-        follow = functools.partial(_followed, primals[3], lens, scene)
+        follow = functools.partial(_followed, crossing, primals[3], lens, scene)
         columns = jax.vmap(lambda unit: jax.jvp(follow, (launch,), (unit,))[1])
         points, gaps = columns(boundary.units(launch))
         aims = boundary.inverse(points)
@@ -191,20 +199,22 @@ def _known_rates_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return jax.jvp(rates, primals[:3], tangents[:3])
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _follow(spokes: Spokes, lens: Lens, scene: Scene, plan: _Plan) -> tuple[Array, Array]:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _follow(
+    spokes: Spokes, crossing: bool, lens: Lens, scene: Scene, plan: _Plan
+) -> tuple[Array, Array]:
     """The points of a plan, and where their rays are launched, with their derivatives by the lens
     and the scene, in every mode."""
     return plan.point, plan.launch
 
 
 @_follow.defjvp
-def _follow_jvp(spokes: Spokes, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _follow_jvp(spokes: Spokes, crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
     lens, scene, plan = primals
     # Through the function itself, so that the points carry derivatives of their own.
-    point, launch = _follow(spokes, lens, scene, plan)
-    aims, rates = _known_rates(lens, scene, launch, plan)
-    held = lambda lens, scene: _followed(plan, lens, scene, launch)  # noqa: E731
+    point, launch = _follow(spokes, crossing, lens, scene, plan)
+    aims, rates = _known_rates(crossing, lens, scene, launch, plan)
+    held = lambda lens, scene: _followed(crossing, plan, lens, scene, launch)  # noqa: E731
     _, (slid, change) = jax.jvp(held, (lens, scene), tangents[:2])
     change = change - boundary.moved(rates, slid)  # of rays through fixed points
     corners, ends = (slice(None, -spokes.count), slice(-spokes.count, None))
@@ -237,11 +247,14 @@ class Clipped(PupilRule):
     order: nodes along a radius.
     symmetry: see `symmetry_of`.
     size: the order up to which weightless rays fill up, so that orders share a compiled program.
+    crossing: whether light may end where neighbouring surfaces cross, too; without, a search takes
+        half the time.
     """
 
     order: int
     symmetry: Symmetry = dataclasses.field(metadata={"static": True})
     size: int = dataclasses.field(metadata={"static": True}, default=0)
+    crossing: bool = dataclasses.field(metadata={"static": True}, default=True)
 
     def __post_init__(self) -> None:
         if not self.size:
@@ -289,8 +302,8 @@ class Clipped(PupilRule):
         used, most = (part * (2 * n + 6 + 2 * edges) for n in (self.order, self.size))
         spokes = Spokes(self.symmetry, max(most, 32 * part) + 1)
         given = *jax.lax.stop_gradient((lens, scene)), spokes, jnp.asarray(used, jnp.int32)
-        plan = jax.lax.stop_gradient(_plan(*given))
-        point, _ = _follow(spokes, lens, scene, plan)
+        plan = jax.lax.stop_gradient(_plan(*given, self.crossing))
+        point, _ = _follow(spokes, self.crossing, lens, scene, plan)
         corner, end = point[..., : -spokes.count], point[..., -spokes.count :]
         toward, share = plan.nodes(spokes, corner)
         # The nodes have the first places; the others are of the search alone.

@@ -189,12 +189,15 @@ def aim_outwards(system: System, target: Vector) -> Aimed:
     def again(state: _Growth) -> _Growth:
         aimed, first = state.aimed, state.rounds == 0
         good = aimed.status == Status.OK
-        begin = nearest_found(aimed.launch, good, target)
+
+        def from_found(launch: Vector) -> Vector:
+            return nearest_found(launch, good, target)
 
         def from_fan(launch: Vector) -> Vector:
             fan = trace_fan(system, no_fan(system, waves, 1), launch, reach)
             return nearest_start(fan, target)
 
+        begin = run_if(~first & jnp.any(good), from_found, aimed.launch)
         begin = run_if(~first & ~jnp.any(good), from_fan, begin)
         begin = tuple(jnp.where(first | good, a, b) for a, b in zip(aimed.launch, begin))
         step = jnp.where(first, reach, reach / 8)
