@@ -285,8 +285,8 @@ class Variables:
         tied = [(index[p], f, line) for p, f, line in following if p in index]
         lines = jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2)
         places, ties_ = tuple(place for place, _ in found), tuple(tie[:2] for tie in tied)
-        scale = jnp.asarray(scale[:, 0], dtype)
-        variables = cls(lens, low, high, scale, (), lines, places, ties_)
+        scales = jnp.asarray(scale[:, 0], dtype)
+        variables = cls(lens, low, high, scales, (), lines, places, ties_)
         kept, start = fix_solves(variables.lens_of(variables.start), solves)
         return dataclasses.replace(variables, lens=start, solves=kept)
 
