@@ -5,9 +5,10 @@ argument, so neither its value nor its derivative can turn into NaN. Nothing is 
 denominator, so ordinary values are not biased.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+T = TypeVar("T")
 if TYPE_CHECKING:
     Numbers = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
 else:
@@ -61,6 +63,27 @@ def known_values(tree: Any) -> Any:
     """
     values = tree if concrete(tree) else jax.lax.stop_gradient(tree)
     return values if concrete(values) else None
+
+
+def leaves(*names: str) -> Callable[[type[T]], type[T]]:
+    """A decorator: a frozen dataclass becomes a pytree of these fields, the others static. What
+    JAX rebuilds from its leaves is not checked again by `__post_init__`."""
+
+    def register(cls: type[T]) -> type[T]:
+        static = [f.name for f in dataclasses.fields(cast(Any, cls)) if f.name not in names]
+
+        def flatten(one: Any) -> tuple[list, tuple]:
+            return [getattr(one, n) for n in names], tuple(getattr(one, n) for n in static)
+
+        def unflatten(values: tuple, children: Sequence) -> Any:
+            one = object.__new__(cls)
+            vars(one).update(zip((*names, *static), (*children, *values), strict=True))
+            return one
+
+        jax.tree_util.register_pytree_node(cls, flatten, unflatten)
+        return cls
+
+    return register
 
 
 @functools.cache

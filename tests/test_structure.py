@@ -44,7 +44,7 @@ ALLOWED_ALL = {"show.layout"}
 HOUSE = 20_000
 # Outside packages that belong to some modules or floors alone.
 ONLY = {
-    "optimistix": {"rays.aim", "rays.find", "image.field", "design.least_squares"},
+    "optimistix": {"rays.aim", "rays.find", "image.field"},
     "matplotlib": {"show"},
     "skimage": {"learn.data", "learn.train"},
     "PIL": {"learn.images"},

@@ -18,13 +18,13 @@ rows: drt_jax.SeparableKernel = drt_jax.separable_psf([(0.0, 0.0)], [(1e-4, 1e-4
 rays: drt_jax.Rays = drt_jax.trace_rays(LENS, 0.1, 25e3, RGB, [(0.0, 0.0), (0.0, 1.0)])
 wave: drt_jax.Wavefront = drt_jax.wavefront(LENS, 0.1, 25e3, RGB, pupil.hexapolar(3)[0].T)
 
-variables = design.Variables.of(LENS, [design.Vary("curvature"), "sensor"])
-problem = design.Problem.of(variables, ["spot"], [0.0, 0.1], RGB, field_weights=(1, 2))
-field: design.Problem = design.Problem.of(variables, ["spot"], jnp.zeros(2), RGB)
+variables = design.Variables.from_lens(LENS, [design.Vary("curvature"), "sensor"])
+problem = design.Problem.from_variables(variables, ["spot"], [0.0, 0.1], RGB, field_weights=(1, 2))
+field: design.Problem = design.Problem.from_variables(variables, ["spot"], jnp.zeros(2), RGB)
 design.Tolerance("radius", 0.1)
 
 design.Operand("sopt")  # type: ignore[arg-type]
 design.Vary("curvatures")  # type: ignore[arg-type]
 design.Tolerance("radii", 0.1)  # type: ignore[arg-type]
-design.Problem.of(variables, ["sopt"])  # type: ignore[list-item]
+design.Problem.from_variables(variables, ["sopt"])  # type: ignore[list-item]
 drt_jax.Gauss(6, "full")  # type: ignore[arg-type]

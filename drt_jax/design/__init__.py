@@ -1,27 +1,31 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
-from .errors import Tolerance as Tolerance, elements_of as elements_of
-from .least_squares import BoundedLM as BoundedLM
+from . import least_squares as least_squares
+from .apertures import fit_apertures as fit_apertures, open_apertures as open_apertures
+from .deviations import Tolerance as Tolerance, elements_of as elements_of
+from .field_rays import FieldRays as FieldRays
+from .growth import Growth as Growth, grow as grow, part_of as part_of
+from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit
 from .operands import Operand as Operand
-from .optimum import Optimum as Optimum, Search as Search, optimise as optimise
-from .perturbed import Perturbed as Perturbed
-from .problem import Judged as Judged, Problem as Problem
-from .seen import Seen as Seen
+from .optimum import Optimum as Optimum, optimise as optimise
+from .perturbed import PerturbedLens as PerturbedLens
+from .problem import Problem as Problem, trace_fields as trace_fields
 from .solves import Solve as Solve
 from .starts import (
     Minimum as Minimum,
     Starts as Starts,
-    around as around,
+    as_built_starts as as_built_starts,
     many_starts as many_starts,
+    normal_starts as normal_starts,
     rays_of as rays_of,
-    within as within,
+    sobol_starts as sobol_starts,
 )
 from .tolerance import (
-    Made as Made,
+    AsBuilt as AsBuilt,
     Predicted as Predicted,
-    draw_errors as draw_errors,
-    made as made,
+    as_built as as_built,
+    draw_perturbations as draw_perturbations,
     monte_carlo as monte_carlo,
     predict as predict,
     variances as variances,

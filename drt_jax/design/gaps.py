@@ -10,7 +10,7 @@ from jax import Array
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
 
-# Where edges are judged, in parts of the larger or smaller of two extents.
+# Where edges are judged, in parts of the larger or smaller of two beam radii.
 ZONES = np.array([0.5, 0.7, 0.85, 1.0])
 
 
@@ -22,23 +22,20 @@ def between(lens: Lens, glass: bool) -> list[tuple[int, int]]:
     return [(i, j) for i, j in pairs if (lens.glasses[i + 1] not in air) == glass]
 
 
-def gaps(
-    lens: Lens, extents: Array, glass: bool, surfaces: tuple[int, ...] = ()
-) -> tuple[Array, Array]:
+def gaps(lens: Lens, beam_radius: Array, glass: bool) -> tuple[Array, Array]:
     """Thickness on the axis (G,) and at zones towards the rim (G, Z), mm along the light, of the
-    gaps that `between` tells, in glass or in air; of those behind some surfaces alone, if any are
-    named. In glass up to the larger of both extents (S,), in air to the smaller; before the sensor
-    to that of the last surface."""
+    gaps of `between`, in glass or in air. In glass up to the larger of both beam radii (S,), in air
+    to the smaller; before the sensor to that of the last surface."""
     dtype = lens.curvature.dtype
-    pairs = [pair for pair in between(lens, glass) if not surfaces or pair[0] in surfaces]
+    pairs = between(lens, glass)
     if not pairs:
         return jnp.zeros(0, dtype), jnp.zeros((0, ZONES.size), dtype)
     front, back = (np.array(rows) for rows in zip(*pairs))
     sense = jnp.asarray(lens.senses[back], dtype)
     vertices = lens.vertices
-    extents = jnp.append(extents, extents[lens.live[-1]])
+    beam_radius = jnp.append(beam_radius, beam_radius[lens.live[-1]])
     wide = jnp.maximum if glass else jnp.minimum
-    y = wide(extents[front], extents[back])[:, None] * jnp.asarray(ZONES, dtype)[None]
+    y = wide(beam_radius[front], beam_radius[back])[:, None] * jnp.asarray(ZONES, dtype)[None]
 
     def heights(rows: np.ndarray) -> Array:
         shape = jax.tree.map(lambda a: a[..., rows, None], lens.shape)

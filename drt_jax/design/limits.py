@@ -9,7 +9,7 @@ import numpy as np
 from ..lens.lens import Lens
 from .gaps import ZONES
 from .operands import Operand
-from .values import OPERANDS
+from .values import kind_of
 
 _Side = Literal["low", "high"]
 
@@ -40,28 +40,36 @@ class Limit(NamedTuple):
 
 
 def limits_of(
-    operands: Sequence[Operand], lens: Lens, counts: dict[str, int], excess: np.ndarray
+    operands: Sequence[Operand],
+    lens: Lens,
+    counts: dict[str, int],
+    sizes: Sequence[int],
+    constraints: np.ndarray,
 ) -> list[Limit]:
-    """The limits of operands, in the order of `excess` (L,), see `Operand.excess`; `counts`: of
-    "fields", "wavelengths", "distances" and components in "xy"."""
-    sides: tuple[_Side, ...] = ("low", "high")
+    """The limits of operands by name.
+
+    counts: of "fields", "wavelengths", "distances" and components in "xy". sizes: how many
+    constraints each operand has. constraints: (L,), see `Operand.constraints`.
+    """
     found: list[Limit] = []
-    for operand, side in itertools.product(operands, sides):
-        bound = getattr(operand, side)
-        if np.isfinite(bound):
-            for where in _names(operand, lens, counts):
-                beyond = float(excess[len(found)]) / operand.weight
-                found.append(Limit(operand.kind, where, side, bound, beyond))
+    for operand, size in zip(operands, sizes, strict=True):
+        for side in operand.sides:
+            bound, weight = float(getattr(operand, side)), float(operand.weight)
+            for where in _names(operand, lens, counts, size // len(operand.sides)):
+                beyond = float(constraints[len(found)]) / weight
+                found.append(Limit(operand.name, where, side, bound, beyond))
     return found
 
 
-def _names(operand: Operand, lens: Lens, counts: dict[str, int]) -> list[str]:
-    """What each value of an operand is called among the others, in their order."""
-    known = OPERANDS[operand.kind]
+def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> list[str]:
+    """What each of `size` values of an operand is called among the others, in their order."""
+    known = kind_of(operand.kind)
     parts: list[Iterable[str]] = []
     for axis in known.axes:
         if axis == "zones":
             parts.append([f"zone {zone:g}" for zone in ZONES])
+        elif axis == "value":
+            parts.append([f"value {k}" if size > 1 else "" for k in range(size)])
         elif axis == "xy":
             parts.append(["x", "y"] if counts["xy"] == 2 else [""])
         elif axis == "surfaces":

@@ -1,8 +1,9 @@
-"""Operands: what a design is judged by, as vectors of residuals and limits."""
+"""Operands: what a design is judged by, as vectors of residuals and constraints."""
 
 import dataclasses
 import math
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,16 +11,16 @@ from jax import Array
 
 from ..inputs import shown
 from ..lens.lens import Lens
-from ..numerics import safe_sqrt
+from ..numerics import concrete, leaves, safe_sqrt
+from .field_rays import FieldRays
 from .kinds import whole_numbers
-from .seen import Seen
-from .values import OPERANDS, Which
+from .values import OPERANDS, kind_of
 
 # What an operand may name.
 _NUMBERS = ("fields", "wavelengths", "distances", "surfaces")
 
 # As the keys of `OPERANDS`, which a test compares.
-OperandKind = Literal[
+OperandName = Literal[
     "spot", "spot_of_colours", "spot_chief", "rms_spot", "centroid", "path_difference",
     "rms_wavefront", "focal_length", "effective_focal_length", "back_focal_distance",
     "entrance_pupil", "f_number", "magnification", "total_track", "length", "back_distance",
@@ -27,23 +28,28 @@ OperandKind = Literal[
     "relative_illumination", "throughput", "glass_centre", "glass_edge", "air_centre",
     "air_edge", "glass_map", "incidence_angle"
 ]  # fmt: skip
+OperandFunction = Callable[[Lens, FieldRays], Array]
 
 
+@leaves("target", "low", "high", "weight")
 @dataclasses.dataclass(frozen=True)
 class Operand:
-    """One thing that is wanted of a lens: a target, or limits that are kept.
+    """One thing that is asked of a lens: a target, or limits that are kept.
 
-    kind: one of `OPERANDS`; what each is, in which unit, stands at the top of values.py.
+    kind: one of `OPERANDS`; what each is, in which unit, stands at the top of values.py. Or a
+        function of a lens and its `FieldRays` that returns an array.
     target: of the values. low, high: limits instead of a target; kept exactly in the end.
     weight: the residual is weight times the difference, in the units of the values; 0: the operand
         is off.
     fields, wavelengths, distances, surfaces: which of the problem's, or of the lens', from 0;
         empty: all.
-    vignetting: of spots and wavefronts, False counts the rays that clear apertures clip as if they
-        passed, so that cutting light gains nothing.
+    vignetting: of spots, wavefronts and functions, False counts the rays that clear apertures clip
+        as if they passed, so that cutting light gains nothing.
+
+    A pytree: target, limits and weight are leaves, a limit that is not there is None in a problem.
     """
 
-    kind: OperandKind
+    kind: OperandName | OperandFunction
     target: float = 0.0
     low: float = -math.inf
     high: float = math.inf
@@ -55,27 +61,29 @@ class Operand:
     vignetting: bool = True
 
     def __post_init__(self) -> None:
-        if self.kind not in OPERANDS:
+        if not callable(self.kind) and self.kind not in OPERANDS:
             some = ", ".join(OPERANDS)
             raise ValueError(f"operands: unknown kind {shown(self.kind)}; known: {some}")
-        what, known = f"operands: {self.kind}", OPERANDS[self.kind]
+        what, known = f"operands: {self.name}", kind_of(self.kind)
         for name in _NUMBERS:
             numbers = whole_numbers(f"{what}: {name}", getattr(self, name))
             object.__setattr__(self, name, numbers)
             if numbers and name not in known.names:
                 some = " and ".join(known.names) or "nothing"
                 raise ValueError(f"{what}: {name}: it has none; leave them out, it knows {some}")
-        if self.low == self.high:
-            raise ValueError(f"{what}: low and high are both {self.low:g}; give it as the target")
-        if not self.low < self.high:
-            raise ValueError(
-                f"{what}: low {self.low:g} is not below high {self.high:g}; exchange them"
-            )
+        low = -math.inf if self.low is None else self.low
+        high = math.inf if self.high is None else self.high
+        if not concrete((low, high, self.weight, self.target)):
+            return
+        if low == high:
+            raise ValueError(f"{what}: low and high are both {low:g}; give it as the target")
+        if not low < high:
+            raise ValueError(f"{what}: low {low:g} is not below high {high:g}; exchange them")
         if not 0 <= self.weight < math.inf:
             raise ValueError(
                 f"{what}: weight: must be above 0, or 0 to leave it out, got {self.weight:g}"
             )
-        if not self.vignetting and not known.of_spots:
+        if not self.vignetting and not (known.of_spots or callable(self.kind)):
             some = ", ".join(kind for kind, value in OPERANDS.items() if value.of_spots)
             raise ValueError(f"{what}: vignetting: is of {some}; leave it out")
         if not math.isfinite(self.target):
@@ -86,15 +94,25 @@ class Operand:
             raise ValueError(f"{what}: takes no target and no limits; use {known.squared} for them")
 
     @property
+    def name(self) -> str:
+        """Its kind, or the name of its function."""
+        return self.kind if isinstance(self.kind, str) else self.kind.__name__
+
+    @property
+    def sides(self) -> list[Literal["low", "high"]]:
+        """Which limits it has."""
+        return [side for side in ("low", "high") if _is_limit(getattr(self, side))]
+
+    @property
     def limits(self) -> bool:
         """Whether it is limits that are kept, not a target."""
-        return math.isfinite(self.low) or math.isfinite(self.high)
+        return bool(self.sides)
 
     def check(self, lens: Lens, counts: dict[str, int]) -> None:
         """ValueError for what it names and neither the lens nor the problem has, whose counts are
         by "fields", "wavelengths" and "distances"."""
-        what = f"operands: {self.kind}"
-        places = OPERANDS[self.kind].places
+        what = f"operands: {self.name}"
+        places = kind_of(self.kind).places
         there = {name: list(range(count)) for name, count in counts.items()}
         there["surfaces"] = [] if places is None else places(lens)
         for name in _NUMBERS:
@@ -108,41 +126,63 @@ class Operand:
             raise ValueError(f"{what}: wavelengths: needs two or more; leave it out")
 
     def placed(self, lens: Lens) -> "Operand":
-        """The operand with the surfaces named that follow from numbers of the lens."""
-        if self.kind != "glass_map" or self.surfaces:
-            return self
-        places = OPERANDS[self.kind].places
-        return dataclasses.replace(self, surfaces=tuple(places(lens)) if places else ())
+        """The operand of a problem: the surfaces named that follow from numbers of the lens, and
+        numbers as arrays of its dtype."""
+        surfaces, places = self.surfaces, kind_of(self.kind).places
+        if self.kind == "glass_map" and not surfaces and places:
+            surfaces = tuple(places(lens))
+        placed = dataclasses.replace(self, surfaces=surfaces)
+        for name in ("target", "low", "high", "weight"):
+            number = getattr(self, name)
+            there = name not in ("low", "high") or _is_limit(number)
+            array = jnp.asarray(number, lens.curvature.dtype) if there else None
+            object.__setattr__(placed, name, array)
+        return placed
 
-    def values(self, seen: Seen) -> Array:
+    def values(self, lens: Lens, rays: FieldRays) -> Array:
         """The values (K,) of a lens, of which the target is taken or which the limits bound."""
-        return jnp.ravel(self._values(seen))
+        return jnp.ravel(self._values(lens, rays))
 
-    def _values(self, seen: Seen) -> Array:
-        which = Which(self.fields, self.wavelengths, self.distances, self.surfaces, self.vignetting)
-        return OPERANDS[self.kind].function(which, seen)
+    def _values(self, lens: Lens, rays: FieldRays) -> Array:
+        kind = kind_of(self.kind)
+        if not self.vignetting:
+            rays = rays.unvignetted()
+        if kind.of_all_views:
+            return kind.function(lens, rays)[rays.views(self.fields, self.distances)]
+        waves = self.wavelengths
+        if "middle" in kind.axes and not waves:
+            waves = (len(rays.wavelengths) // 2,)
+        values = kind.function(lens, rays.select(self.fields, self.distances, waves))
+        places = kind.rows or kind.places
+        if not self.surfaces or places is None:
+            return values
+        return values[np.array([k for k, i in enumerate(places(lens)) if i in self.surfaces])]
 
-    def residuals(self, seen: Seen, field_weights: Array | None = None) -> Array:
+    def residuals(self, lens: Lens, rays: FieldRays, field_weights: Array | None = None) -> Array:
         """(K,), the squares of which add up in the merit; none for limits. field_weights: (F,), of
-        the squares; None: 1."""
+        the squares; None: 1. A user's function has one value for all fields."""
         if self.limits:
-            return jnp.zeros(0, seen.lens.curvature.dtype)
-        values, axes = self._values(seen), OPERANDS[self.kind].axes
+            return jnp.zeros(0, lens.curvature.dtype)
+        values, axes = self._values(lens, rays), kind_of(self.kind).axes
         found = self.weight * (values - self.target)
         if field_weights is not None and "fields" in axes:
-            roots = safe_sqrt(field_weights)[np.array(self.fields or range(seen.fields))]
-            roots = jnp.tile(roots, len(self.distances or range(seen.distances)))
+            roots = safe_sqrt(field_weights)[np.array(self.fields or range(rays.fields))]
+            roots = jnp.tile(roots, len(self.distances or range(rays.distances)))
             inner = len(axes) - 1 - axes.index("fields")
             shape = (-1, *(1,) * inner)
             found = found * jnp.broadcast_to(jnp.reshape(roots, shape), found.shape)
         return jnp.ravel(found)
 
-    def excess(self, seen: Seen) -> Array:
+    def constraints(self, lens: Lens, rays: FieldRays) -> Array:
         """By how much each value is beyond each limit, times the weight, negative within; none for
         a target."""
         if not self.limits:
-            return jnp.zeros(0, seen.lens.curvature.dtype)
-        values = self.values(seen)
-        sides = [self.low - values] * math.isfinite(self.low)
-        sides += [values - self.high] * math.isfinite(self.high)
-        return self.weight * jnp.concatenate(sides)
+            return jnp.zeros(0, lens.curvature.dtype)
+        values = self.values(lens, rays)
+        parts = {"low": lambda: self.low - values, "high": lambda: values - self.high}
+        return self.weight * jnp.concatenate([parts[side]() for side in self.sides])
+
+
+def _is_limit(number: Any) -> bool:
+    """Whether a limit is there: an array, or a number that is finite."""
+    return number is not None and not (isinstance(number, float | int) and math.isinf(number))

@@ -14,7 +14,16 @@ from ..lens.elements import Elements
 from ..lens.glass import Dispersion, refractive_index
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
-from .errors import KINDS, WITH_X, Error, Tolerance, elements_of, errors_of, pieces_of, x_curvatures
+from .deviations import (
+    KINDS,
+    WITH_X,
+    Deviation,
+    Tolerance,
+    deviations_of,
+    elements_of,
+    pieces_of,
+    x_curvatures,
+)
 
 # A fringe is half a wave of green light (ISO 10110-5: 0.5460740 um), in mm.
 _FRINGE = 0.5460740e-3 / 2
@@ -24,35 +33,41 @@ _MINUTE = math.pi / 180 / 60
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Perturbed:
-    """A lens with P errors.
+class PerturbedLens:
+    """A lens with P deviations.
 
-    lens: without any, in the form that errors need. extents: (S,), of the light on its surfaces,
-    mm. sizes: (P,), the largest errors, in the units of `Tolerance`.
+    lens: without any, in the form that deviations need. beam_radius: (S,), of the light on its
+    surfaces, mm. sizes: (P,), the largest deviations, in the units of `Tolerance`.
 
-    Static: errors; those in x and in y of one part are neighbours. spans: first and last surface of
+    Static:
+    deviations: those in x and in y of one part are neighbours. spans: first and last surface of
     the elements. groups: the place of each among `lens.elements`.
     """
 
     lens: Lens
-    extents: Array
+    beam_radius: Array
     sizes: Array
-    errors: tuple[Error, ...] = dataclasses.field(metadata={"static": True})
+    deviations: tuple[Deviation, ...] = dataclasses.field(metadata={"static": True})
     spans: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
     groups: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
 
     @classmethod
-    def of(cls, lens: Lens, extents: Array, tolerances: Sequence[Tolerance]) -> "Perturbed":
+    def from_lens(
+        cls, lens: Lens, beam_radius: Array, tolerances: Sequence[Tolerance]
+    ) -> "PerturbedLens":
         """The errors that some tolerances allow.
 
-        extents: (S,), how far from the axis light meets each surface, mm, such as `Seen.extents`.
+        beam_radius: (S,), how far from the axis light meets each surface, mm, such as
+            `Problem.beam_radius`.
 
         ValueError, which lists what there is, for a part that does not exist or stands twice.
         """
-        if np.shape(extents) != (lens.count,):
-            raise ValueError(f"extents: expected ({lens.count},), got shape {np.shape(extents)}")
+        if np.shape(beam_radius) != (lens.count,):
+            raise ValueError(
+                f"beam_radius: expected ({lens.count},), got shape {np.shape(beam_radius)}"
+            )
         spans, dtype = elements_of(lens), lens.curvature.dtype
-        sizes = errors_of(lens, tolerances)
+        sizes = deviations_of(lens, tolerances)
         kinds = {error.kind for error in sizes}
         lens, groups = _with_elements(lens, spans, kinds)
         if "wedge" in kinds and lens.tilt is None:
@@ -60,15 +75,15 @@ class Perturbed:
         if "irregularity" in kinds:
             lens = _with_cylinders(lens)
         largest = jnp.asarray([*sizes.values()], dtype)
-        return cls(lens, jnp.asarray(extents, dtype), largest, tuple(sizes), spans, groups)
+        return cls(lens, jnp.asarray(beam_radius, dtype), largest, tuple(sizes), spans, groups)
 
-    def lens_of(self, off: Array) -> Lens:
-        """The lens with errors `off` (P,) in parts of their largest. Differentiable, in `jit` and
-        `vmap` too; small errors of several kinds add up in any order."""
+    def lens_of(self, perturbation: Array) -> Lens:
+        """The lens with a perturbation (P,), deviations in parts of their largest. Differentiable,
+        in `jit` and `vmap` too; small errors of several kinds add up in any order."""
         lens = self.lens
-        found: dict[str, list[tuple[Error, Array]]] = {}
-        for k, error in enumerate(self.errors):
-            found.setdefault(error.kind, []).append((error, off[k] * self.sizes[k]))
+        found: dict[str, list[tuple[Deviation, Array]]] = {}
+        for k, error in enumerate(self.deviations):
+            found.setdefault(error.kind, []).append((error, perturbation[k] * self.sizes[k]))
         for kind, some in found.items():
             places = np.array([error.place for error, _ in some])
             axes = np.array([error.axis for error, _ in some])
@@ -81,7 +96,7 @@ class Perturbed:
             part = 1 / (1 + by / 100) - 1
             return _bent(lens, at, own.curvature[at] * part, x_curvatures(own, at) * part)
         if kind in ("fringes", "irregularity"):
-            bend = by * _FRINGE / _rise(own, at, self.extents)
+            bend = by * _FRINGE / _rise(own, at, self.beam_radius)
             both = (bend, bend) if kind == "fringes" else (bend / 2, -bend / 2)
             return _bent(lens, at, *both)
         if kind == "thickness":
@@ -155,7 +170,7 @@ def _bent(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
     return dataclasses.replace(lens, curvature=bent, coefficients=coefficients)
 
 
-def _rise(lens: Lens, at: np.ndarray, extents: Array) -> Array:
+def _rise(lens: Lens, at: np.ndarray, beam_radius: Array) -> Array:
     """By how far the rim of the light moves along the normal of some surfaces, mm, for a change of
     their curvature along y of 1/mm."""
     shape = jax.tree.map(lambda a: a[..., at], lens.shape)
@@ -165,7 +180,7 @@ def _rise(lens: Lens, at: np.ndarray, extents: Array) -> Array:
         bent = shape._replace(curvature=shape.curvature + bend)
         return by_form(surface_sag, (jnp.zeros_like(y), y), bent, forms)
 
-    rim = extents[at], zero
+    rim = beam_radius[at], zero
     _, slope = jax.jvp(height, rim, (zero + 1, zero))
     _, rise = jax.jvp(height, rim, (zero, zero + 1))
     return rise / jnp.sqrt(1 + slope**2)

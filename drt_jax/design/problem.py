@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +10,23 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
-from ..lens.scene import Scene, distance_array, field_array, vergence_of
+from ..lens.scene import distance_array, field_array, vergence_of
 from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve, solve_aimed
+from .field_rays import (
+    FieldRays,
+    beam_radius,
+    failures,
+    symmetry_by_structure,
+    trace_views,
+)
 from .gaps import gaps
+from .least_squares import Evaluation
 from .limits import Limit, limits_of
-from .operands import Operand, OperandKind
-from .seen import Seen, symmetry_by_structure
-from .values import OPERANDS
+from .operands import Operand, OperandFunction, OperandName
+from .values import OPERANDS, kind_of
 from .variables import Variables
 
 # A ray that fails counts as one that misses by so many semi-diameters of the stop, and more.
@@ -30,21 +36,6 @@ _FAILED = 4.0
 _BESIDE, _STILL = 0.3, 1e-9
 # The stop is at least so wide, as part of the light's width on any surface.
 _SLIMMEST = 0.1
-
-
-class Judged(NamedTuple):
-    """A lens judged.
-
-    residuals: (M,), whose squares add up to the merit.
-    excess: (L,), by how much values are beyond their limits, times their weights.
-    broken: (), by how much surfaces overlap within the light, mm; inf where anything is not finite.
-    failed: (), int32, how many rays fail.
-    """
-
-    residuals: Array
-    excess: Array
-    broken: Array
-    failed: Array
 
 
 def _check_pairs(angles: Array) -> None:
@@ -64,17 +55,18 @@ def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What is varied, and what is wanted.
+    """What is varied, and what is asked of the lens. Whatever is a number is a leaf: another one
+    compiles nothing.
 
     variables: see there.
     fields: (F, 2), angles in radians. distances: (Z,), of the object in mm; every field is seen
         from every distance. wavelengths: (W,) in um.
-    colour_weights: (W,), of their light, adding up to 1.
+    wavelength_weights: (W,), of their light, adding up to 1.
     rule: of the pupil; the same for all fields.
+    operands: what is asked, as `Operand.placed` has it.
     field_weights: (F,), of the squares of the residuals of each field, 1 on the average; None: 1.
 
     Static:
-    operands: what is wanted.
     solver: how rays are found: by the full search, so that no ray counts as failed that exists.
         `optimise`, `many_starts` and `monte_carlo` try with `solve_aimed`, the smaller program, and
         ask the full search where that misses a ray.
@@ -84,38 +76,39 @@ class Problem:
     fields: Array
     distances: Array
     wavelengths: Array
-    colour_weights: Array
+    wavelength_weights: Array
     rule: PupilRule
-    operands: tuple[Operand, ...] = dataclasses.field(metadata={"static": True})
+    operands: tuple[Operand, ...]
     solver: Solver = dataclasses.field(metadata={"static": True}, default=solve)
     field_weights: Array | None = None
 
     @classmethod
-    def of(
+    def from_variables(
         cls,
         variables: Variables,
-        operands: Sequence[Operand | OperandKind],
+        operands: Sequence[Operand | OperandName | OperandFunction],
         fields: Numbers = 0.0,
         wavelengths: Numbers = 0.5875618,
         distances: Numbers = np.inf,
         rule: PupilRule | int = 6,
-        colour_weights: Numbers | None = None,
+        wavelength_weights: Numbers | None = None,
         field_weights: Numbers | None = None,
     ) -> "Problem":
         """The problem of some variables.
 
-        operands: at least one that is not off; a word is one of a weight of 1. fields: (F,) along y
-        or (F, 2), in radians. wavelengths: (W,) or one, um. distances: (Z,) or one, mm. rule: of
-        the pupil, or the order of a Gauss rule. colour_weights: (W,), field_weights: (F,), of any
-        sum; None: equal. Limits hold for all fields, whatever their weights.
+        operands: at least one that is not off; a word or a function is one of a weight of 1.
+        fields: (F,) along y or (F, 2), in radians. wavelengths: (W,) or one, um. distances: (Z,) or
+        one, mm. rule: of the pupil, or the order of a Gauss rule. wavelength_weights: (W,),
+        field_weights: (F,), of any sum; None: equal. Limits hold for all fields, whatever their
+        weights.
 
         ValueError, which names the argument, for what fits neither lens nor problem, and for a
         limit that the lens exceeds and no variable moves (of edges, which need rays, `optimise`
         says so).
         """
         lens = variables.lens
-        wanted = tuple(Operand(o) if isinstance(o, str) else o for o in operands)
-        if not wanted:
+        asked = tuple(o if isinstance(o, Operand) else Operand(o) for o in operands)
+        if not asked:
             raise ValueError("operands: none; a merit needs at least one, such as spot")
         dtype = lens.curvature.dtype
         angles = jnp.atleast_1d(field_array(fields, dtype))
@@ -123,28 +116,28 @@ class Problem:
             angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
         _check_pairs(angles)
         far = jnp.stack([distance_array(d, dtype) for d in np.ravel(np.asarray(distances, float))])
-        colours = lens.colours(wavelengths)
+        waves = lens.colours(wavelengths)
         if isinstance(rule, int):
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
             rule = Gauss(rule, symmetry if across else "disc")
-        counts = {"fields": len(angles), "wavelengths": len(colours), "distances": len(far)}
-        for operand in wanted:
+        counts = {"fields": len(angles), "wavelengths": len(waves), "distances": len(far)}
+        for operand in asked:
             operand.check(lens, counts)
             named = np.asarray(far)[np.array(operand.distances or range(len(far)))]
             if operand.kind == "magnification" and np.any(np.isinf(named)):
                 raise ValueError("operands: magnification: the object is at infinity")
             if not operand.vignetting and isinstance(rule, Clipped):
                 raise ValueError(
-                    f"operands: {operand.kind}: vignetting: Clipped traces only what passes; take "
+                    f"operands: {operand.name}: vignetting: Clipped traces only what passes; take "
                     "Gauss or Soft"
                 )
-        if not any(operand.weight for operand in wanted):
+        if not any(operand.weight for operand in asked):
             raise ValueError("operands: all have the weight 0; a merit needs at least one")
-        on = tuple(operand.placed(lens) for operand in wanted if operand.weight)
-        equal = np.ones(len(colours)) if colour_weights is None else colour_weights
-        share = _weights("colour_weights", equal, len(colours)) / len(colours)
-        made = cls(variables, angles, far, colours, jnp.asarray(share, dtype), rule, on)
+        on = tuple(operand.placed(lens) for operand in asked if operand.weight)
+        equal = np.ones(len(waves)) if wavelength_weights is None else wavelength_weights
+        share = _weights("wavelength_weights", equal, len(waves)) / len(waves)
+        made = cls(variables, angles, far, waves, jnp.asarray(share, dtype), rule, on)
         if field_weights is not None:
             own = jnp.asarray(_weights("field_weights", field_weights, len(angles)), dtype)
             made = dataclasses.replace(made, field_weights=own)
@@ -155,57 +148,66 @@ class Problem:
         """The problem with a Gauss rule of another order."""
         return dataclasses.replace(self, rule=Gauss(order, self.rule.symmetry))
 
-    def seen(self, lens: Lens) -> Seen:
-        """The lens from all fields and distances."""
-        views = Scene(
+    def views(self) -> FieldRays:
+        """All fields at all distances, without rays."""
+        return FieldRays(
             jnp.tile(self.fields, (len(self.distances), 1)),
             jnp.repeat(self.distances, len(self.fields)),
             self.wavelengths,
+            self.wavelength_weights,
+            len(self.fields),
+            len(self.distances),
+            self.rule.symmetry,
         )
-        return Seen(lens, views, self.rule, self.solver, self.colour_weights, len(self.fields))
 
     @property
     def traces(self) -> bool:
         """Whether any operand needs rays."""
-        return any(OPERANDS[operand.kind].traced for operand in self.operands)
+        return any(kind_of(operand.kind).traced for operand in self.operands)
 
-    def judge(self, vector: Array) -> Judged:
-        """A vector (N,) of the variables judged; see `Judged`. Differentiable, in `jit` and `vmap`
+    def evaluate(self, vector: Array) -> Evaluation:
+        """What operands say of a vector (N,) of the variables. Differentiable, in `jit` and `vmap`
         too."""
         lens = self.variables.lens_of(vector)
-        seen = self.seen(lens)
-        parts = [operand.residuals(seen, self.field_weights) for operand in self.operands]
+        rays = _rays(self, lens)
+        parts = [operand.residuals(lens, rays, self.field_weights) for operand in self.operands]
         if self.traces:
-            parts.append(self._failures(seen))
+            parts.append(self._failures(lens, rays))
         residuals = jnp.concatenate(parts)
-        excess = jnp.concatenate([operand.excess(seen) for operand in self.operands])
-        extents = seen.extents if self.traces else jnp.zeros(lens.count, vector.dtype)
-        both = [gaps(lens, extents, glass) for glass in (True, False)]
+        constraints = self._constraints(lens, rays)
+        radius = beam_radius(lens, rays) if self.traces else jnp.zeros(lens.count, vector.dtype)
+        both = [gaps(lens, radius, glass) for glass in (True, False)]
         overlap = sum(jnp.sum(jnp.maximum(-part, 0)) for pair in both for part in pair)
         # A stop at a focus of the light would make any lens perfect: all rays are one.
         system = paraxial_system(lens, self.wavelengths)
         marginal = marginal_ray(system, vergence_of(self.distances[0])).height
         slim = _SLIMMEST * jnp.max(jnp.abs(marginal)) - jnp.abs(system.aperture)
         overlap = overlap + jnp.maximum(slim, 0)
-        finite = jnp.all(jnp.isfinite(residuals)) & jnp.all(jnp.isfinite(excess))
-        broken = jnp.where(finite & jnp.isfinite(overlap), overlap, jnp.inf)
-        failed = jnp.sum(~seen.rays.whole, dtype=jnp.int32) if self.traces else jnp.int32(0)
-        return Judged(residuals, excess, jax.lax.stop_gradient(broken), failed)
+        finite = jnp.all(jnp.isfinite(residuals)) & jnp.all(jnp.isfinite(constraints))
+        overlap = jnp.where(finite & jnp.isfinite(overlap), overlap, jnp.inf)
+        failed = jnp.sum(~rays.arrives, dtype=jnp.int32) if self.traces else jnp.int32(0)
+        return Evaluation(residuals, constraints, jax.lax.stop_gradient(overlap), failed)
 
-    def _failures(self, seen: Seen) -> Array:
-        """A residual for each ray: 0 for one that passes, else the root of its share of the light
+    def _failures(self, lens: Lens, rays: FieldRays) -> Array:
+        """A residual for each ray: 0 for one that arrives, else the root of its part of the light
         times a miss of several beams."""
-        size = _FAILED * jax.lax.stop_gradient(seen.lens.semi_diameter[seen.lens.stop])
-        wanted = [o.weight * OPERANDS[o.kind].per_mm for o in self.operands if not o.limits]
-        weight = max(wanted, default=1.0)
-        return jnp.ravel(weight * size * seen.failures)
+        size = _FAILED * jax.lax.stop_gradient(lens.semi_diameter[lens.stop])
+        weights = [o.weight * kind_of(o.kind).per_mm for o in self.operands if not o.limits]
+        weight = jnp.max(jnp.stack(weights)) if weights else 1.0
+        return jnp.ravel(weight * size * failures(lens, rays))
 
-    def limits(self, excess: Numbers) -> list[Limit]:
-        """The limits by name, in the order of `Judged.excess` (L,)."""
+    def _constraints(self, lens: Lens, rays: FieldRays) -> Array:
+        return jnp.concatenate([operand.constraints(lens, rays) for operand in self.operands])
+
+    def limits(self, constraints: Numbers) -> list[Limit]:
+        """The limits by name, in the order of `Evaluation.constraints` (L,)."""
         counts = {"fields": len(self.fields), "distances": len(self.distances)}
         counts |= {"wavelengths": len(self.wavelengths)}
         counts |= {"xy": 2 if self.rule.symmetry == "disc" else 1}
-        return limits_of(self.operands, self.variables.lens, counts, np.asarray(excess))
+        lens, sizes = self.variables.lens, [0] * len(self.operands)
+        if any(callable(operand.kind) for operand in self.operands):
+            sizes = [a.size for a in jax.eval_shape(_constraints_of_each, self, lens)]
+        return limits_of(self.operands, lens, counts, sizes, np.asarray(constraints))
 
     def elsewhere(self, vector: Array) -> Array:
         """A vector (N,) beside another, within the bounds, of which no number is the same."""
@@ -214,12 +216,12 @@ class Problem:
         move = jnp.where((vector + move < low) | (vector + move > high), -move, move)
         return jnp.clip(vector + move, low, high)
 
-    def refuse_fixed(self, excess: Numbers, beside: Numbers) -> None:
+    def refuse_fixed(self, constraints: Numbers, beside: Numbers) -> None:
         """ValueError, which names it, for a limit that is exceeded (L,) and by as much beside.
         Not of rays: those that fail have no derivative until they pass."""
-        one, two = np.asarray(excess), np.asarray(beside)
+        one, two = np.asarray(constraints), np.asarray(beside)
         for limit, there in zip(self.limits(one), self.limits(two)):
-            if "fields" in OPERANDS[limit.kind].names:
+            if limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names:
                 continue
             still = abs(there.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
             if limit.excess > 0 and still:
@@ -229,33 +231,50 @@ class Problem:
                 )
 
     @jax.jit
-    def _excess(self, vector: Array) -> Array:
+    def _exceeded(self, vector: Array) -> Array:
         """Of limits that need no rays: by how much they are exceeded."""
-        seen = self.seen(self.variables.lens_of(vector))
-        return jnp.concatenate([operand.excess(seen) for operand in self.operands])
+        return self._constraints(self.variables.lens_of(vector), self.views())
 
     def _refuse_fixed(self) -> None:
         """The same for the limits that need no rays."""
-        some = tuple(o for o in self.operands if o.limits and not OPERANDS[o.kind].traced)
+        some = tuple(o for o in self.operands if o.limits and not kind_of(o.kind).traced)
         if some and concrete(self):
             part = dataclasses.replace(self, operands=some)
             start = self.variables.start
-            part.refuse_fixed(part._excess(start), part._excess(self.elsewhere(start)))
+            part.refuse_fixed(part._exceeded(start), part._exceeded(self.elsewhere(start)))
 
     @jax.jit
-    def extents(self, lens: Lens) -> Array:
-        """How far from the axis the light meets each surface (S,) of a lens; see `Seen.extents`."""
-        return self.seen(lens).extents
+    def beam_radius(self, lens: Lens) -> Array:
+        """How far from the axis the light meets each surface (S,) of a lens, mm."""
+        return beam_radius(lens, trace_fields(self, lens))
 
     @jax.jit
     def failed(self, vector: Array) -> Array:
-        """How many rays fail, (), int32; see `Judged`."""
-        return self.judge(vector).failed
+        """How many rays fail, (), int32; see `Evaluation`."""
+        return self.evaluate(vector).failed
 
     @jax.jit
     def merit(self, vector: Array) -> Array:
         """Sum () of the squares of the residuals; limits are not in it."""
-        return jnp.sum(self.judge(vector).residuals ** 2)
+        return jnp.sum(self.evaluate(vector).residuals ** 2)
+
+
+@jax.jit
+def trace_fields(problem: Problem, lens: Lens) -> FieldRays:
+    """The rays of a lens from all fields and distances of a problem. Differentiable, in `jit` and
+    `vmap` too."""
+    return trace_views(lens, problem.views(), problem.rule, problem.solver)
+
+
+def _rays(problem: Problem, lens: Lens) -> FieldRays:
+    """The rays of a lens, as far as operands need them."""
+    views = problem.views()
+    return trace_views(lens, views, problem.rule, problem.solver) if problem.traces else views
+
+
+def _constraints_of_each(problem: Problem, lens: Lens) -> list[Array]:
+    rays = _rays(problem, lens)
+    return [operand.constraints(lens, rays) for operand in problem.operands]
 
 
 def quick(problem: Problem) -> Problem:

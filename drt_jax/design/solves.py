@@ -1,9 +1,10 @@
 """Solves: numbers of a lens that follow from the others, so that a condition holds exactly."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +16,13 @@ from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil, marginal_ray, paraxial_system, trace_ray
 from ..lens.scene import scene_of, vergence_of
-from ..numerics import safe_divide
+from ..numerics import concrete, leaves, safe_divide
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
+from .field_rays import symmetry_by_structure
 from .kinds import KINDS, back_distance, step_of
-from .seen import symmetry_by_structure
 
-# In the order in which they are applied: none moves what one before it keeps, see `held`.
+# In the order in which they are applied: none moves what one before it keeps, see `fix_solves`.
 _Name = Literal[
     "focal_length",
     "effective_focal_length",
@@ -34,11 +35,13 @@ _Name = Literal[
 # Newton steps: every condition is linear in the number that meets it, the second mends rounding.
 _STEPS = 2
 _ORDER = 6  # of the rule of the best focus
-# A value is met to this part; and a typical step of the number that follows changes it by more.
-_HELD = 1e-9
+# Relative tolerance of a solve; also the least relative change of what it keeps by a typical step
+# of the number that follows.
+_TOLERANCE = 1e-9
 _NO_SURFACE = 5000  # prescriptions have at most so many, settings no negative numbers
 
 
+@leaves("value", "fields", "distance", "wavelengths")
 @dataclasses.dataclass(frozen=True)
 class Solve:
     """A condition and the number that is given up for it.
@@ -55,6 +58,8 @@ class Solve:
     fields: of the best focus, radians along y.
     distance: to the object, mm; of a focus, image_angle and f_number.
     wavelengths: um; a condition is one of their mean.
+
+    A pytree: kind and surface are static; in a problem numbers are arrays.
     """
 
     kind: _Name
@@ -112,12 +117,21 @@ class Solve:
             )
         return "curvature", self.surface, 0
 
-    def found(self, lens: Lens) -> "Solve":
+    def placed(self, lens: Lens) -> "Solve":
+        """The solve of a problem: numbers as arrays of the lens' dtype, None for a field on the
+        axis, which needs fewer rays."""
+        own = copy.copy(self)
+        if concrete(self.fields):
+            fields = tuple(field or None for field in self.fields)
+            object.__setattr__(own, "fields", fields)
+        return jax.tree.map(lambda number: jnp.asarray(number, lens.curvature.dtype), own)
+
+    def fixed(self, lens: Lens) -> "Solve":
         """The solve with the value that it keeps. ValueError where that is none, or where the
         number that follows does not change it."""
         kind, row, term = self.place(lens)
         if self.focuses:
-            if not float(_focus(lens, self)[1]) > 0:
+            if not float(_focus(lens, self.placed(lens))[1]) > 0:
                 raise ValueError(
                     f"solves: {self.kind}: there is none: the light behind the lens is parallel, "
                     "or none arrives; leave it out, or begin with another lens"
@@ -125,20 +139,22 @@ class Solve:
             return self
         condition, solve = _CONDITIONS[self.kind], self
         if self.value == 0:
-            now = condition.value(float(condition.measure(lens, self)))
+            now = condition.value(float(_measure(lens, self)))
             if now == 0 or not math.isfinite(now):
                 raise ValueError(f"solves: {self.kind}: the lens has none to keep; give its value")
             solve = dataclasses.replace(self, value=now)
-        missed = float(condition.measure(solve.apply(lens), solve)) / condition.value(solve.value)
+        wanted = condition.value(float(solve.value))
+        missed = float(_measure(solve.apply(lens), solve)) / wanted
         change = float(solve.rate(lens, solve)) * step_of(lens, kind, row, term)
-        weak = not abs(change) > _HELD * abs(condition.value(solve.value))
-        if weak or not abs(missed - 1) < _HELD:
+        weak = not abs(change) > _TOLERANCE * abs(wanted)
+        if weak or not abs(missed - 1) < _TOLERANCE:
             raise ValueError(
                 f"solves: {self.kind}: no {kind} of surface {row} gives {solve.value:g}; "
                 "is the beam in focus there? give another surface"
             )
         return solve
 
+    @jax.jit
     def rate(self, lens: Lens, other: "Solve") -> Array:
         """By how much what this one keeps changes with the number that follows from another."""
         number, with_number = _number(lens, other)
@@ -148,23 +164,14 @@ class Solve:
 
     def apply(self, lens: Lens) -> Lens:
         """The lens with the number that meets the condition; unchanged where none does."""
-        number, with_number = _number(lens, self)
-        if self.focuses:
-            return with_number(_focus(lens, self)[0])
-        condition = _CONDITIONS[self.kind]
-
-        def gap(number: Array) -> Array:
-            return condition.measure(with_number(number), self) - condition.value(self.value)
-
-        for _ in range(_STEPS):
-            miss, rate = jax.jvp(gap, (number,), (jnp.ones_like(number),))
-            number = number - safe_divide(miss, rate)
-        return with_number(number)
+        with_number, own = _number(lens, self)[1], self.placed(lens)
+        return with_number(_focus(lens, own)[0] if self.focuses else _met(lens, own))
 
 
-def held(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], Lens]:
-    """The solves with what they keep, in the order in which all hold, and the lens of which they
-    do. ValueError as of `Solve.found`, and where one changes what another keeps."""
+def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], Lens]:
+    """The solves with what they keep, in the order in which all hold, numbers as arrays; and the
+    lens of which they do. ValueError as of `Solve.fixed`, and where one changes what another keeps.
+    """
     found: list[Solve] = []
     for solve in sorted(solves, key=lambda solve: get_args(_Name).index(solve.kind)):
         for other in found:
@@ -173,9 +180,29 @@ def held(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], Lens]:
                     f"solves: {other.kind} and {solve.kind}: the second changes what the first "
                     "keeps; leave one out"
                 )
-        found.append(solve.found(lens))
+        found.append(solve.fixed(lens))
         lens = found[-1].apply(lens)
-    return tuple(found), lens
+    return tuple(solve.placed(lens) for solve in found), lens
+
+
+@jax.jit
+def _measure(lens: Lens, solve: Solve) -> Array:
+    return _CONDITIONS[solve.kind].measure(lens, solve)
+
+
+@jax.jit
+def _met(lens: Lens, solve: Solve) -> Array:
+    """The number () that meets a condition, by Newton's method."""
+    number, with_number = _number(lens, solve)
+    condition = _CONDITIONS[solve.kind]
+
+    def miss(number: Array) -> Array:
+        return condition.measure(with_number(number), solve) - condition.value(solve.value)
+
+    for _ in range(_STEPS):
+        missed, rate = jax.jvp(miss, (number,), (jnp.ones_like(number),))
+        number = number - safe_divide(missed, rate)
+    return number
 
 
 def _number(lens: Lens, solve: Solve) -> tuple[Array, Callable[[Array], Lens]]:
@@ -194,12 +221,16 @@ class _Condition(NamedTuple):
     back."""
 
     measure: Callable[[Lens, Solve], Array]
-    value: Callable[[float], float]
+    value: Callable[[Any], Any]
+
+
+def _wavelengths(lens: Lens, solve: Solve) -> Array:
+    return jnp.stack([jnp.asarray(wave, lens.curvature.dtype) for wave in solve.wavelengths])
 
 
 def _power(lens: Lens, solve: Solve) -> Array:
     """1 / focal length, in image space or in air."""
-    system = paraxial_system(lens, np.array(solve.wavelengths))
+    system = paraxial_system(lens, _wavelengths(lens, solve))
     slope = trace_ray(system, 1.0, 0.0).behind[-1]
     return -jnp.mean(slope if solve.kind == "focal_length" else system.index[-1] * slope)
 
@@ -208,20 +239,22 @@ def _slope(lens: Lens, solve: Solve) -> Array:
     """Of the marginal ray behind the lens."""
     vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
     return jnp.mean(
-        marginal_ray(paraxial_system(lens, np.array(solve.wavelengths)), vergence).behind[-1]
+        marginal_ray(paraxial_system(lens, _wavelengths(lens, solve)), vergence).behind[-1]
     )
 
 
 def _pupil(lens: Lens, solve: Solve) -> Array:
     """Diameter of the entrance pupil."""
-    return 2 * jnp.mean(entrance_pupil(lens, np.array(solve.wavelengths)).semi_diameter)
+    return 2 * jnp.mean(entrance_pupil(lens, _wavelengths(lens, solve)).semi_diameter)
 
 
-def _inverse(value: float) -> float:
-    return 1 / value if value else math.inf
+def _inverse(value: Any) -> Any:
+    if isinstance(value, float):
+        return 1 / value if value else math.inf
+    return safe_divide(jnp.ones_like(value), value)
 
 
-def _itself(value: float) -> float:
+def _itself(value: Any) -> Any:
     return value
 
 
@@ -234,10 +267,11 @@ _CONDITIONS = {
 }
 
 
+@jax.jit
 def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
     """The distance () from the last vertex to `solve.value` mm behind the focus, mm, and how
-    sharply it is told, 0 where there is no focus."""
-    waves = np.array(solve.wavelengths)
+    sharp the focus is, 0 where there is none."""
+    waves = _wavelengths(lens, solve)
     if solve.kind == "paraxial_focus":
         vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
         ray = trace_ray(paraxial_system(lens, waves), 1.0, vergence)
@@ -245,8 +279,8 @@ def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
         return back + solve.value, jnp.min(jnp.abs(ray.behind[-1]))
     spreads = []
     for field in solve.fields:
-        scene = scene_of(lens, field, solve.distance, waves)
-        rule = Gauss(_ORDER, symmetry_by_structure(lens, field == 0))
+        scene = scene_of(lens, 0.0 if field is None else field, solve.distance, waves)
+        rule = Gauss(_ORDER, symmetry_by_structure(lens, field is None))
         spread = moments(lens, scene, rule, solve_aimed).spread
         spreads.append(jnp.mean(jnp.sum(spread[..., :2], axis=-1), axis=-1))
     _, linear, square = jnp.mean(jnp.stack(spreads), axis=0)

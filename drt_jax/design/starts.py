@@ -1,6 +1,7 @@
 """Many starts: searches side by side, the better half kept again and again, their minima ranked."""
 
 import concurrent.futures
+import dataclasses
 import math
 import os
 import time
@@ -16,8 +17,9 @@ from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
 from ..numerics import Numbers
-from .optimum import Search, begin, turn
-from .problem import Problem, quick
+from .least_squares import Search
+from .optimum import init_problem, step_problem
+from .problem import Problem, quick, trace_fields
 from .variables import Variables
 
 # Searches of one tile share a program and a core.
@@ -27,7 +29,7 @@ _TILE = 16
 _SAME_MERIT, _SAME_PLACE = 1e-3, 1.0
 
 
-def around(variables: Variables, count: int, spread: float, seed: int = 0) -> np.ndarray:
+def normal_starts(variables: Variables, count: int, spread: float, seed: int = 0) -> np.ndarray:
     """Starts (count, N) about the lens: the first is its own vector, the others differ by normal
     deviates of `spread` times the scales of the variables, within their bounds."""
     moves = np.random.default_rng(seed).normal(size=(count, len(variables.places)))
@@ -35,7 +37,7 @@ def around(variables: Variables, count: int, spread: float, seed: int = 0) -> np
     return np.clip(np.asarray(variables.start) + spread * moves, variables.low, variables.high)
 
 
-def within(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
+def sobol_starts(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
     """Starts (count, N), evenly spread within the bounds (Sobol's sequence, scrambled).
 
     ValueError, which names it, for a variable without bounds.
@@ -49,16 +51,30 @@ def within(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
     return low + points * (high - low)
 
 
+def as_built_starts(
+    variables: Variables, count: int, per_cent: float = 1.0, off_mm: float = 0.1, seed: int = 0
+) -> np.ndarray:
+    """Starts (count, N) from the lens as it might be built: normal deviates of all curvatures by
+    `per_cent` and of all thicknesses by `off_mm` (standard deviations)."""
+    rng, lens, vectors = np.random.default_rng(seed), variables.lens, []
+    for _ in range(count):
+        bend = 1 + 0.01 * per_cent * rng.normal(size=lens.count + 1)
+        gap = lens.thickness + off_mm * rng.normal(size=lens.count - 1)
+        built = dataclasses.replace(lens, curvature=lens.curvature * bend, thickness=gap)
+        vectors.append(np.asarray(variables.vector(built)))
+    return np.stack(vectors)
+
+
 class Minimum(NamedTuple):
     """One of the distinct minima.
 
-    vector: (N,). merit, worst: see `Optimum`. found: how many searches ended there. start: the
-    number of the one that came lowest.
+    vector: (N,). merit, max_violation: see `Optimum`. found: how many searches ended there.
+    start: the number of the one that came lowest.
     """
 
     vector: np.ndarray
     merit: float
-    worst: float
+    max_violation: float
     found: int
     start: int
 
@@ -66,14 +82,14 @@ class Minimum(NamedTuple):
 class Starts(NamedTuple):
     """What many starts came to.
 
-    minima: the distinct ones, best first. trials, jacobians, rays: of all searches. seconds: of all
+    minima: the distinct ones, best first. steps, jacobians, rays: of all searches. seconds: of all
     of it; compile_s: of these, before anything was evaluated. best: the best score after each tile.
     merits: (K,), of every start where its search was left, inf for one that never passed a ray.
     """
 
     minima: list[Minimum]
     merits: np.ndarray
-    trials: int
+    steps: int
     jacobians: int
     rays: int
     seconds: float
@@ -81,34 +97,34 @@ class Starts(NamedTuple):
     best: list[float]
 
 
-_begin = jax.jit(jax.vmap(begin, (None, 0)))
+_begin = jax.jit(jax.vmap(init_problem, (None, 0)))
 
 
 @partial(jit, wanted=LARGE)
-def _advance(problem: Problem, searches: Search, turns: Array) -> Search:
-    """So many turns of a tile of searches, fewer if all are done."""
-    both = jax.vmap(turn, (None, 0))
+def _advance(problem: Problem, searches: Search, steps: Array) -> Search:
+    """So many steps of a tile of searches, fewer if all are done."""
+    both = jax.vmap(step_problem, (None, 0))
 
     def more(state: tuple[Array, Search]) -> Array:
-        return (state[0] < turns) & ~jnp.all(state[1].done)
+        return (state[0] < steps) & ~jnp.all(state[1].done)
 
-    step = lambda state: (state[0] + 1, both(problem, state[1]))  # noqa: E731
-    return jax.lax.while_loop(more, step, (jnp.int32(0), searches))[1]
+    next_ = lambda state: (state[0] + 1, both(problem, state[1]))  # noqa: E731
+    return jax.lax.while_loop(more, next_, (jnp.int32(0), searches))[1]
 
 
 def many_starts(
     problem: Problem,
     starts: Numbers,
-    turns: Sequence[int] = (12, 12, 24, 48, 200),
-    keep: float = 0.5,
-    report: Callable[[int, int, float], None] = lambda done, total, best: None,
+    steps: Sequence[int] = (12, 12, 24, 48, 200),
+    survivors: float = 0.5,
+    callback: Callable[[int, int, float], None] = lambda done, total, best: None,
     threads: int | None = None,
 ) -> Starts:
     """Search from many starts (K, N), with successive halving (Jamieson and Talwalkar 2016).
 
-    turns: trials of every search in each stage. keep: the part that goes on to the next, at least
-    a tile of 16. report: called with the tiles done, all tiles, and the best merit so far. threads:
-    tiles at a time; None: one a core.
+    steps: of every search in each stage. survivors: the part that goes on to the next, at least
+    a tile of 16. callback: called with the tiles done, all tiles, and the best merit so far.
+    threads: tiles at a time; None: one a core.
 
     A search that fails stays where it is and is ranked last. The result depends on neither threads
     nor tiles.
@@ -121,28 +137,28 @@ def many_starts(
     vectors = np.clip(vectors, problem.variables.low, problem.variables.high)
     state = jax.tree.map(np.array, _begin(quick(problem), jnp.asarray(vectors)))
     sizes = [len(vectors)]
-    for _ in turns[1:]:
-        sizes.append(min(sizes[-1], max(_TILE, math.ceil(keep * sizes[-1]))))
+    for _ in steps[1:]:
+        sizes.append(min(sizes[-1], max(_TILE, math.ceil(survivors * sizes[-1]))))
     alive, best, tried = np.arange(len(vectors)), list[float](), quick(problem)
     total = sum(-(-size // _TILE) for size in sizes)
     for _ in _advanced(tried, state, [np.resize(alive, _TILE)], 0, threads):
         compiled = time.perf_counter() - begun
-    for size, more in zip(sizes, turns):
+    for size, more in zip(sizes, steps):
         alive = alive[np.argsort(_score(state, alive), kind="stable")[:size]]
         tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
         for _ in _advanced(tried, state, tiles, more, threads):
             best.append(float(np.min(_score(state, alive))))
-            report(len(best), total, best[-1])
-    for _ in _searched(problem, state, alive, turns[-1], threads):
+            callback(len(best), total, best[-1])
+    for _ in _searched(problem, state, alive, steps[-1], threads):
         best.append(float(np.min(_score(state, alive))))
-    trials, jacobians = (int(np.sum(a)) for a in (state.state.trials, state.state.jacobians))
+    total_steps, jacobians = (int(np.sum(a)) for a in (state.steps, state.jacobians))
     minima = distinct(_rows(state, alive), alive)
     return Starts(
         minima,
         _score(state, np.arange(len(vectors))),
-        trials,
+        total_steps,
         jacobians,
-        trials * rays_of(problem),
+        total_steps * rays_of(problem),
         time.perf_counter() - begun,
         compiled,
         best,
@@ -150,30 +166,30 @@ def many_starts(
 
 
 def _searched(
-    problem: Problem, state: Search, alive: np.ndarray, turns: int, threads: int | None
+    problem: Problem, state: Search, alive: np.ndarray, steps: int, threads: int | None
 ) -> Iterator[None]:
     """Go on, as `_advanced`, with those of which the full search of the problem finds rays that
     aiming did not."""
-    failed = np.asarray(state.judged.failed)[alive]
+    failed = np.asarray(state.evaluation.failed)[alive]
     missed = [
         row
         for row, count in zip(alive[failed > 0], failed[failed > 0])
         if int(problem.failed(jnp.asarray(state.vector[row]))) < count
     ]
     if missed:
-        state.state.fresh[missed], state.done[missed] = True, False
+        state.stale[missed], state.done[missed] = True, False
         tiles = [np.array(missed[k : k + _TILE]) for k in range(0, len(missed), _TILE)]
-        yield from _advanced(problem, state, tiles, turns, threads)
+        yield from _advanced(problem, state, tiles, steps, threads)
 
 
 def _advanced(
-    problem: Problem, state: Search, tiles: list[np.ndarray], turns: int, threads: int | None
+    problem: Problem, state: Search, tiles: list[np.ndarray], steps: int, threads: int | None
 ) -> Iterator[None]:
     """Advance tiles of searches, the rows of `state`, in place; yields after each."""
 
     def run(rows: np.ndarray) -> None:
         whole = np.resize(rows, _TILE)  # a tile that is not full repeats its rows
-        new = _advance(problem, jax.tree.map(jnp.asarray, _rows(state, whole)), jnp.int32(turns))
+        new = _advance(problem, jax.tree.map(jnp.asarray, _rows(state, whole)), jnp.int32(steps))
         for old, array in zip(jax.tree.leaves(state), jax.tree.leaves(new), strict=True):
             old[rows] = np.asarray(array)[: len(rows)]
 
@@ -196,14 +212,14 @@ def rays_of(problem: Problem) -> int:
     """How many rays one judgement traces."""
     if not problem.traces:
         return 0
-    seen = jax.eval_shape(lambda p: p.seen(p.variables.lens).rays.light, problem)
-    return int(np.prod(seen.shape))
+    rays = jax.eval_shape(lambda p: trace_fields(p, p.variables.lens).weights, problem)
+    return int(np.prod(rays.shape))
 
 
 def distinct(searches: Search, numbers: np.ndarray) -> list[Minimum]:
     """The distinct minima that searches (K,) with their numbers of starts came to, best first."""
     scores, vectors = np.asarray(searches.score), np.asarray(searches.vector)
-    worst = np.asarray(searches.worst)
+    violations = np.asarray(searches.max_violation)
     found: list[Minimum] = []
     for k in np.argsort(scores, kind="stable"):
         if not np.isfinite(scores[k]):
@@ -215,5 +231,5 @@ def distinct(searches: Search, numbers: np.ndarray) -> list[Minimum]:
                 break
         else:
             merit = float(np.asarray(searches.merit)[k])
-            found.append(Minimum(vectors[k], merit, float(worst[k]), 1, int(numbers[k])))
+            found.append(Minimum(vectors[k], merit, float(violations[k]), 1, int(numbers[k])))
     return found

@@ -20,9 +20,9 @@ from ..inputs import shown
 from ..lens.lens import Lens
 from ..numerics import concrete, safe_divide
 from ..rays.status import Status
-from .perturbed import Perturbed
+from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
+from .perturbed import PerturbedLens
 from .problem import Problem, quick
-from .seen import EXTRAS, Seen, symmetry_by_structure
 
 # What is adjusted in every lens: the sensor's distance, or its tilts about x and y, too.
 Compensator = Literal["none", "focus", "focus and tilt"]
@@ -35,7 +35,7 @@ _ASCENTS = 16  # from so many eigenvectors, either way
 _DEVIATION = 0.5  # of normal errors, in parts of the largest
 
 
-class Made(NamedTuple):
+class AsBuilt(NamedTuple):
     """A lens as it is made, after compensation.
 
     squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
@@ -51,11 +51,11 @@ class Made(NamedTuple):
         return jnp.sqrt(jnp.mean(self.squares, axis=-1))
 
 
-def _spots(seen: Seen) -> tuple[Array, Array, Array]:
+def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
     """Distances from the centroid, mm, and how they grow with the sensor's distance, (D, V, W Q)
     each, times the root of the light; and centroids (2, V), mm."""
-    rays, waves = seen.rays, seen.colour_weights[None, :, None]
-    light = (rays.light * waves)[..., EXTRAS:]
+    waves = rays.wavelength_weights[None, :, None]
+    light = (rays.weights * waves)[..., EXTRAS:]
     good = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
     light = jnp.where(good, light, 0)
     arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
@@ -66,7 +66,7 @@ def _spots(seen: Seen) -> tuple[Array, Array, Array]:
     total = jnp.sum(light, axis=(1, 2), keepdims=True)
     weight = safe_divide(light, jnp.broadcast_to(total, light.shape))
     # Of half a pupil, the other half has the opposite x, of a meridian the opposite y.
-    across = {"meridian": [0], "half": [1], "disc": [1, 1]}[seen.rule.symmetry]
+    across = {"meridian": [0], "half": [1], "disc": [1, 1]}[rays.symmetry]
     even = jnp.asarray(([0] * (dim - len(across)) + across) * 2, light.dtype)
     mean = jnp.sum(weight[None] * values, axis=(2, 3)) * even[:, None]
     apart = (values - mean[..., None, None]) * jnp.sqrt(jnp.where(good, weight, 1))[None]
@@ -75,11 +75,11 @@ def _spots(seen: Seen) -> tuple[Array, Array, Array]:
     return apart[:dim], apart[dim:], centre
 
 
-def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[Made, Array]:
+def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
     """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
     squares add up to those of the RMS radii, mm."""
-    seen = problem.seen(lens)
-    apart, growth, (x, y) = _spots(seen)
+    rays = trace_views(lens, problem.views(), problem.rule, problem.solver)
+    apart, growth, (x, y) = _spots(rays)
     # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
     motion = lens.sensor_motion
     normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
@@ -92,14 +92,14 @@ def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tupl
         matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
         moves = jnp.linalg.solve(matrix, -levers @ jnp.sum(apart * growth, axis=(0, 2)))
         apart = apart + growth * (moves @ levers)[None, :, None]
-    light = seen.rays.light[..., EXTRAS:] > 0
-    failed = jnp.any(light & ~seen.rays.whole[..., EXTRAS:], axis=(1, 2))
-    good = ~failed & jnp.all(seen.rays.passed > 0, axis=1)
+    light = rays.weights[..., EXTRAS:] > 0
+    failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
+    good = ~failed & jnp.all(rays.throughput > 0, axis=1)
     squares = jnp.where(good, jnp.sum(apart**2, axis=(0, 2)), jnp.inf)
-    return Made(squares, moves), apart
+    return AsBuilt(squares, moves), apart
 
 
-def made(problem: Problem, lens: Lens, compensator: Compensator) -> Made:
+def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
     """A lens seen from the fields of a problem, after compensation. Differentiable, in `jit` and
     `vmap` too.
 
@@ -137,7 +137,7 @@ class Predicted(NamedTuple):
 
     nominal: (), q without errors. gradient: (P,). gauss: (P, P), of the second derivatives the part
     that follows from first derivatives of rays. hessian: (P, P), all of them. moves: (C,), of the
-    compensators without errors, see `Made`; move_slopes: (P, C), their derivatives.
+    compensators without errors, see `AsBuilt`; move_slopes: (P, C), their derivatives.
     """
 
     nominal: Array
@@ -155,12 +155,12 @@ class Predicted(NamedTuple):
             return 0 * self.hessian
         return self.gauss if order == "rays" else self.hessian
 
-    def at(self, off: Array | np.ndarray, order: Order) -> Array:
+    def at(self, perturbation: Array | np.ndarray, order: Order) -> Array:
         """q (K,) of errors (K, P); below 0 where the model fails. ValueError as `matrix`."""
         return (
             self.nominal
-            + off @ self.gradient
-            + jnp.sum(off * (off @ self.matrix(order)), axis=-1) / 2
+            + perturbation @ self.gradient
+            + jnp.sum(perturbation * (perturbation @ self.matrix(order)), axis=-1) / 2
         )
 
     def moments(self, variances: Array, order: Order) -> tuple[Array, Array]:
@@ -173,8 +173,8 @@ class Predicted(NamedTuple):
         return mean, jnp.sqrt(self.gradient**2 @ variances + pairs)
 
 
-def predict(problem: Problem, perturbed: Perturbed, compensator: Compensator) -> Predicted:
-    """What first and second derivatives say, each exact. ValueError as `made`."""
+def predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
+    """What first and second derivatives say, each exact. ValueError as `as_built`."""
     _check(problem, perturbed.lens, compensator)
     if not concrete((problem, perturbed)):
         return _predict(problem, perturbed, compensator)
@@ -183,16 +183,18 @@ def predict(problem: Problem, perturbed: Perturbed, compensator: Compensator) ->
     return found if bool(jnp.isfinite(found.nominal)) else _predict(problem, perturbed, compensator)
 
 
-def _predict_all(problem: Problem, perturbed: Perturbed, compensator: Compensator) -> Predicted:
+def _predict_all(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
     zero = jnp.zeros_like(perturbed.sizes)
     units = jnp.eye(len(zero), dtype=zero.dtype)
 
-    def rays(off: Array) -> tuple[tuple[Array, Array], Array]:
-        found, apart = _compensated(problem, perturbed.lens_of(off), compensator)
+    def rays(perturbation: Array) -> tuple[tuple[Array, Array], Array]:
+        found, apart = _compensated(problem, perturbed.lens_of(perturbation), compensator)
         return (jnp.ravel(apart) / jnp.sqrt(len(found.squares)), found.moves), found.squares
 
-    def measure(off: Array) -> Array:
-        return jnp.mean(_compensated(problem, perturbed.lens_of(off), compensator)[0].squares)
+    def measure(perturbation: Array) -> Array:
+        return jnp.mean(
+            _compensated(problem, perturbed.lens_of(perturbation), compensator)[0].squares
+        )
 
     (apart, moves), push, squares = jax.linearize(rays, zero, has_aux=True)
     moved, slopes = jax.lax.map(push, units)
@@ -205,32 +207,34 @@ def _predict_all(problem: Problem, perturbed: Perturbed, compensator: Compensato
 _predict = jit(_predict_all, ONCE, static_argnums=2)
 
 
-def _parts(perturbed: Perturbed) -> list[list[int]]:
+def _parts(perturbed: PerturbedLens) -> list[list[int]]:
     """The errors of each part: one, or those in x and y."""
     parts: dict[tuple, list[int]] = {}
-    for k, error in enumerate(perturbed.errors):
+    for k, error in enumerate(perturbed.deviations):
         parts.setdefault(error[:2], []).append(k)
     return list(parts.values())
 
 
-def draw_errors(perturbed: Perturbed, count: int, seed: int, normal: bool = False) -> np.ndarray:
+def draw_perturbations(
+    perturbed: PerturbedLens, count: int, seed: int, normal: bool = False
+) -> np.ndarray:
     """Errors (count, P) in parts of their largest, all alike up to 1, or normal with a standard
     deviation of a half, cut off at 1. Those in x and y of one part lie within a circle."""
     rng = np.random.default_rng(seed)
-    off = np.empty((count, len(perturbed.errors)))
+    perturbation = np.empty((count, len(perturbed.deviations)))
     for part in _parts(perturbed):
         todo = np.arange(count)
         while len(todo):
             shape = len(todo), len(part)
             some = rng.normal(0, _DEVIATION, shape) if normal else rng.uniform(-1, 1, shape)
-            off[todo[:, None], part] = some
+            perturbation[todo[:, None], part] = some
             todo = todo[np.linalg.norm(some, axis=1) > 1]
-    return off
+    return perturbation
 
 
-def variances(perturbed: Perturbed, normal: bool = False) -> np.ndarray:
-    """Variances (P,) of the errors that `draw_errors` draws."""
-    found = np.empty(len(perturbed.errors))
+def variances(perturbed: PerturbedLens, normal: bool = False) -> np.ndarray:
+    """Variances (P,) of the errors that `draw_perturbations` draws."""
+    found = np.empty(len(perturbed.deviations))
     for part in _parts(perturbed):
         count = len(part)
         if not normal:
@@ -243,7 +247,9 @@ def variances(perturbed: Perturbed, normal: bool = False) -> np.ndarray:
     return found
 
 
-def worst_case(perturbed: Perturbed, predicted: Predicted, order: Order = "second") -> np.ndarray:
+def worst_case(
+    perturbed: PerturbedLens, predicted: Predicted, order: Order = "second"
+) -> np.ndarray:
     """Errors (P,), each as large as it may be, for which q is predicted to be largest: the best of
     ascents from the gradient and the largest eigenvectors, which may not be the best of all.
     ValueError for an unknown order."""
@@ -255,48 +261,53 @@ def worst_case(perturbed: Perturbed, predicted: Predicted, order: Order = "secon
     largest = vectors[:, ::-1][:, :_ASCENTS].T
     found: list[np.ndarray] = []
     for start in (slope, *largest, *-largest):
-        off = _to_the_ends(perturbed, start)
+        perturbation = _to_the_ends(perturbed, start)
         for _ in range(100):
-            off, before = _to_the_ends(perturbed, slope + matrix @ off), off
-            if np.array_equal(off, before):
+            perturbation, before = (
+                _to_the_ends(perturbed, slope + matrix @ perturbation),
+                perturbation,
+            )
+            if np.array_equal(perturbation, before):
                 break
-        found.append(off)
+        found.append(perturbation)
     sizes = np.asarray(predicted.at(np.array(found), order))
     return found[int(np.argmax(sizes))]
 
 
-def _to_the_ends(perturbed: Perturbed, vector: np.ndarray) -> np.ndarray:
+def _to_the_ends(perturbed: PerturbedLens, vector: np.ndarray) -> np.ndarray:
     """The largest errors along a vector (P,): 1 for each part, in its direction across."""
-    off = np.zeros(len(vector))
+    perturbation = np.zeros(len(vector))
     for part in _parts(perturbed):
         size = np.linalg.norm(vector[part])
-        off[part] = vector[part] / size if size > 0 else np.eye(len(part))[0]
-    return off
+        perturbation[part] = vector[part] / size if size > 0 else np.eye(len(part))[0]
+    return perturbation
 
 
 def monte_carlo(
     problem: Problem,
-    perturbed: Perturbed,
-    off: np.ndarray,
+    perturbed: PerturbedLens,
+    perturbation: np.ndarray,
     compensator: Compensator,
-    report: Callable[[int], None] = lambda done: None,
+    callback: Callable[[int], None] = lambda done: None,
     threads: int | None = None,
-) -> Made:
+) -> AsBuilt:
     """The lenses of errors (K, P) in parts of their largest, traced; arrays (K, V) and (K, C).
 
-    report: called with how many are done. threads: tiles at a time; None: one a core. The result
+    callback: called with how many are done. threads: tiles at a time; None: one a core. The result
     depends on neither threads nor tiles. A lens of which aiming misses a ray is searched in full:
-    inf means that there is none. ValueError as `made`.
+    inf means that there is none. ValueError as `as_built`.
     """
     _check(problem, perturbed.lens, compensator)
-    width = len(perturbed.errors)
-    if np.ndim(off) != 2 or np.shape(off)[1] != width or not len(off):
-        raise ValueError(f"off: expected (K, {width}), got shape {np.shape(off)}")
-    found = _in_tiles(quick(problem), perturbed, off, compensator, report, threads)
+    width = len(perturbed.deviations)
+    if np.ndim(perturbation) != 2 or np.shape(perturbation)[1] != width or not len(perturbation):
+        raise ValueError(f"perturbation: expected (K, {width}), got shape {np.shape(perturbation)}")
+    found = _in_tiles(quick(problem), perturbed, perturbation, compensator, callback, threads)
     # What aiming does not find, the full search may.
     failed = np.flatnonzero(~np.all(np.isfinite(found.squares), axis=1))
     if len(failed):
-        again = _in_tiles(problem, perturbed, off[failed], compensator, lambda done: None, threads)
+        again = _in_tiles(
+            problem, perturbed, perturbation[failed], compensator, lambda done: None, threads
+        )
         for array, rows in zip(found, again):
             array[failed] = rows
     return found
@@ -304,33 +315,37 @@ def monte_carlo(
 
 def _in_tiles(
     problem: Problem,
-    perturbed: Perturbed,
-    off: np.ndarray,
+    perturbed: PerturbedLens,
+    perturbation: np.ndarray,
     compensator: Compensator,
-    report: Callable[[int], None],
+    callback: Callable[[int], None],
     threads: int | None,
-) -> Made:
+) -> AsBuilt:
     """`monte_carlo` with the solver of the problem."""
-    tiles = [off[k : k + _TILE] for k in range(0, len(off), _TILE)]
-    width = off.shape[1]
+    tiles = [perturbation[k : k + _TILE] for k in range(0, len(perturbation), _TILE)]
+    width = perturbation.shape[1]
 
-    def run(rows: np.ndarray) -> Made:
+    def run(rows: np.ndarray) -> AsBuilt:
         whole = np.resize(rows, (_TILE, width))  # a tile that is not full repeats its rows
         found = _many(problem, perturbed, jnp.asarray(whole, perturbed.sizes.dtype), compensator)
         return jax.tree.map(lambda a: np.asarray(a)[: len(rows)], found)
 
     parts, done = [run(tiles[0])], len(tiles[0])  # compiled once, not by all threads
-    report(done)
+    callback(done)
     with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         for part in pool.map(run, tiles[1:]):
             parts.append(part)
             done += len(part.squares)
-            report(done)
+            callback(done)
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
 
-def _many_of(problem: Problem, perturbed: Perturbed, off: Array, compensator: Compensator) -> Made:
-    return jax.vmap(lambda one: _compensated(problem, perturbed.lens_of(one), compensator)[0])(off)
+def _many_of(
+    problem: Problem, perturbed: PerturbedLens, perturbation: Array, compensator: Compensator
+) -> AsBuilt:
+    return jax.vmap(lambda one: _compensated(problem, perturbed.lens_of(one), compensator)[0])(
+        perturbation
+    )
 
 
 _many = jit(_many_of, LARGE, static_argnums=3)

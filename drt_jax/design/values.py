@@ -44,7 +44,7 @@ of first order
 of gaps between neighbours that bend light, and before the sensor, by the surface in front of them
     glass_centre, air_centre [surface]: thickness along the light on the axis, mm
     glass_edge, air_edge [surface, zone]: at 0.5, 0.7, 0.85 and 1 of how far the light goes, in y;
-        in glass of the larger of both extents, in air of the smaller; see `Seen.extents`
+        in glass up to the larger of both beam radii, in air the smaller; see `beam_radius`
     incidence_angle [surface]: the largest, of all rays, with the normal
 
 of model glasses, by the surface where they begin
@@ -57,7 +57,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ..image.wavefront import path_differences
@@ -65,44 +64,40 @@ from ..lens.glass import glass_map_distance
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..numerics import safe_divide, safe_sqrt
-from ..rays.status import Status
-from ..rays.trace import Bundle
+from .field_rays import (
+    EXTRAS,
+    FieldRays,
+    beam_radius,
+    incidence_cosines,
+    relative_illumination,
+)
 from .gaps import between, gaps
 from .kinds import back_distance, model_glasses
-from .seen import EXTRAS, Seen
+
+# What an operand is computed by: of a lens and its rays.
+Function = Callable[[Lens, FieldRays], Array]
 
 
-class Which(NamedTuple):
-    """What an operand names, counted from 0; empty: all.
+class OperandKind(NamedTuple):
+    """What an operand of a name is.
 
-    fields, wavelengths, distances: of the problem's. surfaces: of the lens'. vignetting: whether
-    rays that clear apertures clip are left out.
+    function: its values, of any shape, of a lens and its rays, as `Operand` selects them.
+    names: what an operand of it may name. traced: whether it needs rays.
+    places: the surfaces that have a value, None if it is none of surfaces; rows: those of the
+    values, None: the same.
+    squared: of residuals that only mean something as squares, the kind of their sum.
+    per_mm: penalty per millimetre by which a failed ray misses, in the operand's unit.
+    order: the axes of its values, see `axes`; of those of rays, the last ones.
     """
 
-    fields: tuple[int, ...]
-    wavelengths: tuple[int, ...]
-    distances: tuple[int, ...]
-    surfaces: tuple[int, ...]
-    vignetting: bool = True
-
-
-class Value(NamedTuple):
-    """What an operand judges.
-
-    function: its values, of any shape. names: what an operand of it may name. places: the surfaces
-    that have one, None if it is none of surfaces. traced: whether it needs rays. squared: for
-    residuals that only mean something as squares, the kind of their sum. per_mm: by how much a ray
-    that misses by 1 mm changes it, as what weighs a ray that fails. order: the axes of its values,
-    see `axes`; of those of rays, the last ones.
-    """
-
-    function: Callable[[Which, Seen], Array]
+    function: Function
     names: tuple[str, ...]
     places: Callable[[Lens], list[int]] | None = None
     traced: bool = True
     squared: str = ""
     per_mm: float = 1.0
     order: tuple[str, ...] = ()
+    rows: Callable[[Lens], list[int]] | None = None
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -117,39 +112,20 @@ class Value(NamedTuple):
         """Whether it takes the light of whole fields, with or without what is clipped."""
         return self.squared != "" or self.function in (_rms_spot, _rms_wavefront, _centroid)
 
-
-def _views(which: Which, seen: Seen) -> np.ndarray:
-    """Which views are meant: all fields at the first distance, then at the next."""
-    fields = which.fields or range(seen.fields)
-    distances = which.distances or range(seen.distances)
-    return np.array([d * seen.fields + f for d in distances for f in fields])
+    @property
+    def of_all_views(self) -> bool:
+        """Whether its values are computed of all fields and those that are named taken of these."""
+        return self.function is relative_illumination
 
 
-def _colours(which: Which, seen: Seen) -> np.ndarray:
-    return np.array(which.wavelengths or range(seen.views.wavelengths.shape[0]))
-
-
-def _middle(which: Which, seen: Seen) -> np.ndarray:
-    return np.array(which.wavelengths or (seen.views.wavelengths.shape[0] // 2,))
-
-
-def _hits(which: Which, seen: Seen) -> tuple[Array, Array]:
+def _hits(rays: FieldRays) -> tuple[Array, Array]:
     """Hits on the sensor (D, V, W, Q), mm, of the rays that carry light, 0 for others; and the
-    part (V, W, Q) of the light of all colours of a view: of that which passes the clear apertures
-    or, without vignetting, the stop."""
-    views, colours = _views(which, seen), _colours(which, seen)
-    rays = seen.rays
-    light = rays.light
-    if not which.vignetting:
-        weights = seen.rule.points(seen.lens, seen.views)[1]
-        light = jnp.broadcast_to(jnp.pad(weights, ((0, 0), (EXTRAS, 0)))[None], light.shape)
-    light = jnp.where(rays.whole, light, 0)[views][:, colours, EXTRAS:]
+    part (V, W, Q) of the light of all wavelengths of a view."""
+    light = jnp.where(rays.arrives, rays.weights, 0)[..., EXTRAS:]
     # Of each wavelength the light that arrives, as in `psf_moments`.
     light = safe_divide(light, jnp.sum(light, axis=-1, keepdims=True))
-    shares = seen.colour_weights[colours]
-    light = light * (shares / jnp.sum(shares))[None, :, None]
-    hits = jnp.stack([h[views, -1][:, colours, EXTRAS:] for h in rays.bundle.hits])
-    return jnp.where(light[None] > 0, hits, 0), light
+    light = light * rays.wavelength_weights[None, :, None]
+    return jnp.where(light[None] > 0, rays.sensor_hits[..., EXTRAS:], 0), light
 
 
 def _centred(values: Array, light: Array, axes: tuple[int, ...]) -> Array:
@@ -158,167 +134,130 @@ def _centred(values: Array, light: Array, axes: tuple[int, ...]) -> Array:
     return values - safe_divide(mean, total)
 
 
-def _spread(which: Which, seen: Seen, axes: tuple[int, ...]) -> Array:
+def _spread(rays: FieldRays, axes: tuple[int, ...]) -> Array:
     """Distances of rays from the centroid over `axes`, times the root of their light, mm, (D, V, W,
     Q)."""
-    hits, light = _hits(which, seen)
+    hits, light = _hits(rays)
     parts = []
     for k, hit in enumerate(hits):
-        across = len(hits) == 1 or (k == 0 and seen.rule.symmetry == "half")
+        across = len(hits) == 1 or (k == 0 and rays.symmetry == "half")
         parts.append(hit if across else _centred(hit, light, axes))  # else it averages to 0
     return jnp.stack(parts) * safe_sqrt(light)[None]
 
 
-def _spot(which: Which, seen: Seen) -> Array:
-    return _spread(which, seen, (-2, -1))
+def _spot(lens: Lens, rays: FieldRays) -> Array:
+    return _spread(rays, (-2, -1))
 
 
-def _spot_of_colours(which: Which, seen: Seen) -> Array:
-    return _spread(which, seen, (-1,))
+def _spot_of_colours(lens: Lens, rays: FieldRays) -> Array:
+    return _spread(rays, (-1,))
 
 
-def _chief(which: Which, seen: Seen, colours: np.ndarray) -> Array:
-    """Where chief rays meet the sensor, (D, V, W), mm."""
-    views = _views(which, seen)
-    return jnp.stack([h[views, -1][:, colours, 0] for h in seen.rays.bundle.hits])
-
-
-def _spot_chief(which: Which, seen: Seen) -> Array:
-    hits, light = _hits(which, seen)
-    chief = _chief(which, seen, _colours(which, seen))
+def _spot_chief(lens: Lens, rays: FieldRays) -> Array:
+    hits, light = _hits(rays)
+    chief = rays.sensor_hits[..., 0]
     middle = chief[..., chief.shape[-1] // 2, None, None]
     return jnp.where(light[None] > 0, hits - middle, 0) * safe_sqrt(light)[None]
 
 
-def _rms_spot(which: Which, seen: Seen) -> Array:
-    return safe_sqrt(jnp.sum(_spot(which, seen) ** 2, axis=(0, 2, 3)))
+def _rms_spot(lens: Lens, rays: FieldRays) -> Array:
+    return safe_sqrt(jnp.sum(_spot(lens, rays) ** 2, axis=(0, 2, 3)))
 
 
-def _centroid(which: Which, seen: Seen) -> Array:
-    hits, light = _hits(which, seen)
+def _centroid(lens: Lens, rays: FieldRays) -> Array:
+    hits, light = _hits(rays)
     return safe_divide(jnp.sum(light * hits[-1], (-2, -1)), jnp.sum(light, (-2, -1)))
 
 
-def _path_difference(which: Which, seen: Seen) -> Array:
-    views, colours = _views(which, seen), _colours(which, seen)
-    own = seen.views.wavelengths
-
-    def one(bundle: Bundle) -> Array:
-        if not which.vignetting:
-            clipped = bundle.status == Status.CLIPPED
-            bundle = bundle._replace(status=jnp.where(clipped, Status.OK, bundle.status))
-        return path_differences(seen.lens, own, bundle, None)[0]
-
-    waves = jax.vmap(one)(seen.rays.bundle)[views][:, colours, EXTRAS:]
-    _, light = _hits(which, seen)
+def _path_difference(lens: Lens, rays: FieldRays) -> Array:
+    of_view = lambda bundle: path_differences(lens, rays.wavelengths, bundle, None)[0]  # noqa: E731
+    waves = jax.vmap(of_view)(rays.bundle)[..., EXTRAS:]
+    _, light = _hits(rays)
     return _centred(waves, light, (-1,)) * safe_sqrt(light)
 
 
-def _rms_wavefront(which: Which, seen: Seen) -> Array:
-    return safe_sqrt(jnp.sum(_path_difference(which, seen) ** 2, axis=(1, 2)))
+def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:
+    return safe_sqrt(jnp.sum(_path_difference(lens, rays) ** 2, axis=(1, 2)))
 
 
-def _throughput(which: Which, seen: Seen) -> Array:
-    colours, views = _colours(which, seen), _views(which, seen)
-    weights = seen.colour_weights[colours]
-    return seen.rays.passed[views][:, colours] @ weights / jnp.sum(weights)
+def _throughput(lens: Lens, rays: FieldRays) -> Array:
+    return rays.throughput @ rays.wavelength_weights
 
 
-def _first_order(get: Callable[[FirstOrder], Array]) -> Callable[[Which, Seen], Array]:
-    """Of distances and colours (Z, W)."""
+def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
+    """Of distances and wavelengths (Z, W)."""
 
-    def values(which: Which, seen: Seen) -> Array:
-        far = seen.views.distance[:: seen.fields]
-        far = far[np.array(which.distances or range(seen.distances))]
-        waves = seen.views.wavelengths
-        found = jax.vmap(lambda distance: get(first_order(seen.lens, distance, waves)))(far)
-        return found[:, _middle(which, seen)]
+    def values(lens: Lens, rays: FieldRays) -> Array:
+        far, waves = rays.distance[:: rays.fields], rays.wavelengths
+        return jax.vmap(lambda distance: get(first_order(lens, distance, waves)))(far)
 
     return values
 
 
-def _lens_alone(get: Callable[[FirstOrder], Array]) -> Callable[[Which, Seen], Array]:
-    """Of colours (W,)."""
-
-    def values(which: Which, seen: Seen) -> Array:
-        found = first_order(seen.lens, jnp.inf, seen.views.wavelengths)
-        return get(found)[_middle(which, seen)]
-
-    return values
+def _lens_alone(get: Callable[[FirstOrder], Array]) -> Function:
+    """Of wavelengths (W,)."""
+    return lambda lens, rays: get(first_order(lens, jnp.inf, rays.wavelengths))
 
 
-def _back_distance(which: Which, seen: Seen) -> Array:
-    return float(seen.lens.senses[-1]) * back_distance(seen.lens)
+def _back_distance(lens: Lens, rays: FieldRays) -> Array:
+    return float(lens.senses[-1]) * back_distance(lens)
 
 
-def _distortion(which: Which, seen: Seen) -> Array:
-    views, colours = _views(which, seen), _middle(which, seen)
-    waves = seen.views.wavelengths
-
+def _distortion(lens: Lens, rays: FieldRays) -> Array:
     def ideal_of(field: Array, distance: Array) -> Array:
-        return image_height(seen.lens, field, distance, waves)
+        return image_height(lens, field, distance, rays.wavelengths)
 
-    real = _chief(which, seen, colours)
-    ideal = jax.vmap(ideal_of)(seen.views.field[views], seen.views.distance[views])
-    ideal = jnp.moveaxis(ideal, 1, 0)[-len(real) :, :, colours]
+    real = rays.sensor_hits[..., 0]
+    ideal = jnp.moveaxis(jax.vmap(ideal_of)(rays.field, rays.distance), 1, 0)[-len(real) :]
     size = jnp.sum(ideal**2, axis=0)
     return safe_divide(jnp.sum(real * ideal, axis=0) - size, size)
 
 
-def _lateral_colour(which: Which, seen: Seen) -> Array:
-    points = _chief(which, seen, _colours(which, seen))
-    points = points if seen.rule.symmetry == "disc" else points[-1:]
+def _lateral_colour(lens: Lens, rays: FieldRays) -> Array:
+    points = rays.sensor_hits[..., 0]
+    points = points if rays.symmetry == "disc" else points[-1:]
     return points[..., 1:] - points[..., :1]
 
 
-def _chief_ray_angle(which: Which, seen: Seen) -> Array:
-    views, colours = _views(which, seen), _colours(which, seen)
-    whole, arrival = seen.rays.whole, seen.rays.bundle.arrival
-    *across, along = (jnp.where(whole, a, 0)[views][:, colours, 0] for a in arrival)
+def _chief_ray_angle(lens: Lens, rays: FieldRays) -> Array:
+    *across, along = (jnp.where(rays.arrives, a, 0)[..., 0] for a in rays.bundle.arrival)
     sine = safe_sqrt(sum((a**2 for a in across), jnp.zeros_like(along)))
     return jnp.arctan2(sine, jnp.where(sine + along**2 > 0, jnp.abs(along), 1))
 
 
-def _numerical_aperture(which: Which, seen: Seen) -> Array:
-    views, colours = _views(which, seen), _middle(which, seen)
-    whole, arrival = seen.rays.whole, seen.rays.bundle.arrival
-    lines = jnp.stack([jnp.where(whole, a, 0)[views][:, colours, :EXTRAS] for a in arrival])
+def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
+    arrival = rays.bundle.arrival
+    lines = jnp.stack([jnp.where(rays.arrives, a, 0)[..., :EXTRAS] for a in arrival])
     square = jnp.sum((lines[..., 1:] - lines[..., :1]) ** 2, axis=0)
     sines = square * (1 - square / 4)
     top, bottom, side = jnp.moveaxis(sines, -1, 0)
     side = side if len(arrival) == 3 else top  # the meridian stands for all azimuths
-    index = seen.lens.index(seen.views.wavelengths)[-1, colours]
+    index = lens.index(rays.wavelengths)[-1]
     return index[None] * safe_sqrt((top + bottom + 2 * side) / 4)
 
 
-def _illumination(which: Which, seen: Seen) -> Array:
-    return seen.illumination[_views(which, seen)]
-
-
-def _gap(glass: bool, edge: bool) -> Value:
-    def values(which: Which, seen: Seen) -> Array:
-        lens = seen.lens
-        extents = seen.extents if edge else jnp.zeros_like(lens.semi_diameter[:-1])
-        return gaps(lens, extents, glass, which.surfaces)[int(edge)]
+def _gap(glass: bool, edge: bool) -> OperandKind:
+    def values(lens: Lens, rays: FieldRays) -> Array:
+        radius = beam_radius(lens, rays) if edge else jnp.zeros_like(lens.semi_diameter[:-1])
+        return gaps(lens, radius, glass)[int(edge)]
 
     def places(lens: Lens) -> list[int]:
         return [front for front, _ in between(lens, glass)]
 
     order = ("surfaces", "zones") if edge else ("surfaces",)
-    return Value(values, ("surfaces",), places, traced=edge, order=order)
+    return OperandKind(values, ("surfaces",), places, traced=edge, order=order)
 
 
-def _incidence(which: Which, seen: Seen) -> Array:
-    live = [k for k, i in enumerate(seen.lens.live) if i in (which.surfaces or seen.lens.live)]
-    cosines = seen.cosines[_views(which, seen)][:, np.array(live)]
-    least = jnp.min(cosines[:, :, _colours(which, seen)], axis=(0, 2, 3))
+def _incidence(lens: Lens, rays: FieldRays) -> Array:
+    least = jnp.min(incidence_cosines(lens, rays), axis=(0, 2, 3))
     return jnp.arctan2(safe_sqrt((1 - least) * (1 + least)), least)
 
 
-def _glass_map(which: Which, seen: Seen) -> Array:
-    model = seen.lens.dispersion.model
+def _glass_map(lens: Lens, rays: FieldRays) -> Array:
+    """Of all surfaces; `Operand.placed` names those where a model glass begins."""
+    model = lens.dispersion.model
     assert model is not None, "Operand.check refuses it"
-    return glass_map_distance(model[np.array(sorted(which.surfaces), int) + 1])
+    return glass_map_distance(model[1:])
 
 
 _RAYS = ("fields", "wavelengths", "distances")
@@ -327,43 +266,54 @@ _OF_RAYS = (*_VIEWS, "wavelengths", "rays")
 _COLOURS = ("wavelengths",)
 _WAVES_PER_MM = 200.0  # green light at f/5
 _SCALES = ("wavelengths", "distances")
-OPERANDS: dict[str, Value] = {
-    "spot": Value(_spot, _RAYS, squared="rms_spot", order=_OF_RAYS),
-    "spot_of_colours": Value(_spot_of_colours, _RAYS, squared="rms_spot", order=_OF_RAYS),
-    "spot_chief": Value(_spot_chief, _RAYS, squared="rms_spot", order=_OF_RAYS),
-    "rms_spot": Value(_rms_spot, _RAYS, order=_VIEWS),
-    "centroid": Value(_centroid, _RAYS, order=_VIEWS),
-    "path_difference": Value(
+OPERANDS: dict[str, OperandKind] = {
+    "spot": OperandKind(_spot, _RAYS, squared="rms_spot", order=_OF_RAYS),
+    "spot_of_colours": OperandKind(_spot_of_colours, _RAYS, squared="rms_spot", order=_OF_RAYS),
+    "spot_chief": OperandKind(_spot_chief, _RAYS, squared="rms_spot", order=_OF_RAYS),
+    "rms_spot": OperandKind(_rms_spot, _RAYS, order=_VIEWS),
+    "centroid": OperandKind(_centroid, _RAYS, order=_VIEWS),
+    "path_difference": OperandKind(
         _path_difference, _RAYS, None, True, "rms_wavefront", _WAVES_PER_MM, _OF_RAYS
     ),
-    "rms_wavefront": Value(_rms_wavefront, _RAYS, per_mm=_WAVES_PER_MM, order=_VIEWS),
-    "focal_length": Value(_lens_alone(lambda a: a.focal_length), _COLOURS, traced=False),
-    "effective_focal_length": Value(
+    "rms_wavefront": OperandKind(_rms_wavefront, _RAYS, per_mm=_WAVES_PER_MM, order=_VIEWS),
+    "focal_length": OperandKind(_lens_alone(lambda a: a.focal_length), _COLOURS, traced=False),
+    "effective_focal_length": OperandKind(
         _lens_alone(lambda a: a.effective_focal_length), _COLOURS, traced=False
     ),
-    "back_focal_distance": Value(
+    "back_focal_distance": OperandKind(
         _lens_alone(lambda a: a.back_focal_distance), _COLOURS, traced=False
     ),
-    "entrance_pupil": Value(
+    "entrance_pupil": OperandKind(
         _lens_alone(lambda a: 2 * a.entrance_pupil.semi_diameter), _COLOURS, traced=False
     ),
-    "f_number": Value(_first_order(lambda a: a.f_number), _SCALES, traced=False),
-    "magnification": Value(_first_order(lambda a: a.magnification), _SCALES, traced=False),
-    "total_track": Value(lambda which, seen: seen.lens.sensor, (), traced=False),
-    "length": Value(lambda which, seen: jnp.sum(seen.lens.thickness), (), traced=False),
-    "back_distance": Value(_back_distance, (), traced=False),
-    "distortion": Value(_distortion, _RAYS),
-    "lateral_colour": Value(_lateral_colour, _RAYS, order=("xy", *_VIEWS, "later")),
-    "chief_ray_angle": Value(_chief_ray_angle, _RAYS, order=(*_VIEWS, "wavelengths")),
-    "numerical_aperture": Value(_numerical_aperture, _RAYS),
-    "relative_illumination": Value(_illumination, ("fields", "distances")),
-    "throughput": Value(_throughput, _RAYS, order=_VIEWS),
+    "f_number": OperandKind(_first_order(lambda a: a.f_number), _SCALES, traced=False),
+    "magnification": OperandKind(_first_order(lambda a: a.magnification), _SCALES, traced=False),
+    "total_track": OperandKind(lambda lens, rays: lens.sensor, (), traced=False),
+    "length": OperandKind(lambda lens, rays: jnp.sum(lens.thickness), (), traced=False),
+    "back_distance": OperandKind(_back_distance, (), traced=False),
+    "distortion": OperandKind(_distortion, _RAYS),
+    "lateral_colour": OperandKind(_lateral_colour, _RAYS, order=("xy", *_VIEWS, "later")),
+    "chief_ray_angle": OperandKind(_chief_ray_angle, _RAYS, order=(*_VIEWS, "wavelengths")),
+    "numerical_aperture": OperandKind(_numerical_aperture, _RAYS),
+    "relative_illumination": OperandKind(relative_illumination, ("fields", "distances")),
+    "throughput": OperandKind(_throughput, _RAYS, order=_VIEWS),
     "glass_centre": _gap(True, False),
     "glass_edge": _gap(True, True),
     "air_centre": _gap(False, False),
     "air_edge": _gap(False, True),
-    "glass_map": Value(_glass_map, ("surfaces",), model_glasses, traced=False),
-    "incidence_angle": Value(
+    "glass_map": OperandKind(
+        _glass_map,
+        ("surfaces",),
+        model_glasses,
+        traced=False,
+        rows=lambda lens: [*range(lens.count)],
+    ),
+    "incidence_angle": OperandKind(
         _incidence, (*_RAYS, "surfaces"), lambda lens: [*lens.live], order=("surfaces",)
     ),
 }
+
+
+def kind_of(kind: str | Function) -> OperandKind:
+    """What an operand of a name is, or of a user's function, which may name rays."""
+    return OPERANDS[kind] if isinstance(kind, str) else OperandKind(kind, _RAYS, order=("value",))

@@ -14,7 +14,7 @@ from jax import Array
 from ..inputs import shown
 from ..lens.lens import Lens
 from .kinds import KINDS, VariableKind, lift_of, step_of, whole_numbers, word_terms
-from .solves import Solve, held
+from .solves import Solve, fix_solves
 
 _How = Literal["equal", "opposite", "cemented"]
 # A typical change of a coefficient, as part of the most.
@@ -215,23 +215,23 @@ class Variables:
 
     lens: the start; what does not vary stays as in it.
     low, high: (N,), bounds of the vector; scale: (N,), in the units of the lens.
+    solves: applied in order. lines: (T, 2), factor and shift of each tie.
 
     Static:
-    places: which numbers. ties: (leader, follower, (factor, shift)). solves: applied in order.
+    places: which numbers. ties: (number of the leader, follower).
     """
 
     lens: Lens
     low: Array
     high: Array
     scale: Array
+    solves: tuple[Solve, ...]
+    lines: Array
     places: tuple[Place, ...] = dataclasses.field(metadata={"static": True})
-    ties: tuple[tuple[int, Place, tuple[float, float]], ...] = dataclasses.field(
-        metadata={"static": True}, default=()
-    )
-    solves: tuple[Solve, ...] = dataclasses.field(metadata={"static": True}, default=())
+    ties: tuple[tuple[int, Place], ...] = dataclasses.field(metadata={"static": True})
 
     @classmethod
-    def of(
+    def from_lens(
         cls,
         lens: Lens,
         vary: Sequence[Vary | VariableKind],
@@ -282,12 +282,13 @@ class Variables:
         dtype = lens.curvature.dtype
         ends, scale = np.split(np.array([v.bounds(lens, place) for place, v in found]), [2], axis=1)
         low, high = jnp.asarray(ends / scale, dtype).T
-        tied = tuple((index[p], f, line) for p, f, line in following if p in index)
-        places = tuple(place for place, _ in found)
-        made = cls(lens, low, high, jnp.asarray(scale[:, 0], dtype), places, tied)
-        start = made.lens_of(made.start)
-        kept, start = held(start, solves)
-        return dataclasses.replace(made, lens=start, solves=kept)
+        tied = [(index[p], f, line) for p, f, line in following if p in index]
+        lines = jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2)
+        places, ties_ = tuple(place for place, _ in found), tuple(tie[:2] for tie in tied)
+        scales = jnp.asarray(scale[:, 0], dtype)
+        variables = cls(lens, low, high, scales, (), lines, places, ties_)
+        kept, start = fix_solves(variables.lens_of(variables.start), solves)
+        return dataclasses.replace(variables, lens=start, solves=kept)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -312,7 +313,8 @@ class Variables:
         too; whoever makes the vector keeps its bounds."""
         numbers = self.numbers(vector)
         changes = [(place, numbers[k]) for k, place in enumerate(self.places)]
-        changes += [(place, a * numbers[k] + b) for k, place, (a, b) in self.ties]
+        pairs = zip(self.ties, self.lines, strict=True)
+        changes += [(place, line[0] * numbers[k] + line[1]) for (k, place), line in pairs]
         lens = _with_numbers(self.lens, changes)
         for solve in self.solves:
             lens = solve.apply(lens)

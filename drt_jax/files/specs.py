@@ -10,7 +10,7 @@ from ..inputs import shown
 from ..lens.entrance import with_paraxial_pupil
 from ..lens.forms import FORMS
 from ..lens.glass import Dispersion
-from ..lens.lens import Lens
+from ..lens.lens import Labels, Lens
 from ..lens.paraxial import effective_focal_length, focal_length, image_distance
 from ..lens.phase import Phase
 from .apertures import apertures_of, semi_diameter
@@ -148,10 +148,9 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         elements=groups,
         apertures=apertures_of(surfaces),
         stop=stops[0],
-        glasses=tuple(medium.name for medium in media),
+        labels=Labels(top.text("name", name[:100]), tuple(medium.name for medium in media)),
         forms=(*map(_form, surfaces), "asphere"),
         mirrors=tuple(surface.flag("mirror") for surface in surfaces),
-        name=top.text("name", name[:100]),
     )
     bent = (surface.curvature() or any(row) for surface, row in zip(surfaces, coefficients))
     curved = tuple(i for i, does in enumerate(bent) if does and i not in lens.live)

@@ -11,7 +11,7 @@ from jax import Array
 
 from ..lens.elements import Elements
 from ..lens.forms import FORMS
-from ..lens.glass import ANY, Dispersion, find_glass
+from ..lens.glass import ANY, Dispersion, find_glass, glass_names
 from ..lens.lens import Lens
 from .entry import LensError
 
@@ -125,11 +125,15 @@ def _plain_medium(lens: Lens, i: int) -> dict[str, Any] | None:
         return {}
     if own.keys() == {"schott"} and not any(own["schott"][1:]):
         return {"index": math.sqrt(own["schott"][0])}
-    try:
-        known = find_glass(lens.glasses[i])
-    except ValueError:
-        return None
-    return {"glass": known.name} if own == _constants(Dispersion.of([known]), 0) else None
+    unnamed = lens.glasses[i] in lens.labels.unnamed.glasses  # returned by a program
+    for name in glass_names() if unnamed else [lens.glasses[i]]:
+        try:
+            known = Dispersion.of([find_glass(name)])
+        except ValueError:
+            return None
+        if own == _constants(known, 0):
+            return {"glass": name}
+    return None
 
 
 def _constants(dispersion: Dispersion, i: int) -> dict[str, Any]:
@@ -142,8 +146,9 @@ def _constants(dispersion: Dispersion, i: int) -> dict[str, Any]:
         constants["sellmeier"] = strength[:terms] + resonance[:terms]
     if schott != [1, 0, 0, 0, 0, 0]:
         constants["schott"] = schott
-    if dispersion.ranges and dispersion.ranges[i] != ANY:
-        constants["range"] = list(dispersion.ranges[i])
+    known = np.asarray(dispersion.ranges[i]).tolist()
+    if known != [*ANY]:
+        constants["range"] = known
     return constants
 
 

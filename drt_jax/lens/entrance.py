@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..numerics import Numbers, concrete
-from .lens import Lens
+from .lens import Labels, Lens
 from .paraxial import entrance_pupil
 
 
@@ -47,10 +47,7 @@ def with_paraxial_pupil(lens: Lens, wavelength: Numbers = 0.5875618) -> Lens:
         coefficients=behind(lens.coefficients),
         thickness=jnp.concatenate([jnp.stack([place, -place]), lens.thickness]),
         semi_diameter=rim.at[1].set(jnp.where(known, radius, jnp.inf)),
-        dispersion=replace(
-            jax.tree.map(lambda a: behind(a, a[:1]), lens.dispersion),
-            ranges=lens.dispersion.ranges[:1] * 2 + lens.dispersion.ranges,
-        ),
+        dispersion=jax.tree.map(lambda a: behind(a, a[:1]), lens.dispersion),
         decentre=lens.decentre if lens.decentre is None else behind(lens.decentre),
         tilt=lens.tilt if lens.tilt is None else behind(lens.tilt),
         phase=phase and replace(phase, surfaces=later(phase.surfaces)),
@@ -58,7 +55,7 @@ def with_paraxial_pupil(lens: Lens, wavelength: Numbers = 0.5875618) -> Lens:
         and replace(elements, spans=tuple(map(later, elements.spans)), about=later(elements.about)),
         apertures=extra and replace(extra, surfaces=later(extra.surfaces)),
         stop=1,
-        glasses=lens.glasses[:1] * 2 + lens.glasses,
+        labels=Labels(lens.name, lens.glasses[:1] * 2 + lens.glasses),
         forms=("asphere", "asphere", *lens.forms),
         mirrors=(False, False, *lens.mirrors),
         curved=later(lens.curved),

@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import functools
 import pathlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 import yaml
 from jax import Array
 
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import concrete, safe_divide, safe_sqrt
 
 # The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -58,31 +59,30 @@ class Dispersion:
     strength: (M, T), Sellmeier's B.
     resonance: (M, T), Sellmeier's C in um^2.
     schott: (M, 6), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
+    ranges: (M, 2), the shortest and the longest wavelength (um) for which each medium has known
+        constants.
     model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None if there is none.
-
-    Static:
-    ranges: the shortest and the longest wavelength (um) for which each of the M media has known
-        constants (empty: as for air).
     """
 
     strength: Array
     resonance: Array
     schott: Array
+    ranges: Array
     model: Array | None = None
-    ranges: tuple[tuple[float, float], ...] = dataclasses.field(
-        metadata={"static": True}, default=()
-    )
 
     @property
-    def range(self) -> tuple[float, float]:
+    def range(self) -> tuple[Any, Any]:
         """The shortest and the longest wavelength, um, at which all media have a known index; the
-        first number is the larger one if there is none."""
-        low, high = zip(*(self.ranges or (ANY,)), strict=True)
-        return max(low), min(high)
+        first number is the larger one if there is none. Floats, or arrays () in a trace."""
+        if concrete(self.ranges):
+            low, high = np.asarray(self.ranges, float).T
+            return float(low.max()), float(high.min())
+        low, high = jax.lax.stop_gradient(self.ranges).T
+        return jnp.max(low), jnp.min(high)
 
     def knows(self, wavelengths: Array) -> Array:
         """Whether all media have a known index at each wavelength (um), bool; also in a trace."""
-        low, high = self.range
+        low, high = (jnp.asarray(end, wavelengths.dtype) for end in self.range)
         return (wavelengths >= low) & (wavelengths <= high)
 
     @classmethod
@@ -100,8 +100,8 @@ class Dispersion:
             strength=array(padded[:, 0]),
             resonance=array(padded[:, 1]),
             schott=array([m.schott for m in media]),
+            ranges=array([m.range for m in media]),
             model=array(models) if set(models) != {_NO_MODEL} else None,
-            ranges=tuple(m.range for m in media),
         )
 
 
@@ -112,6 +112,11 @@ def _catalogue() -> dict[str, Glass]:
     for name, entry in yaml.load(text, _Loader).items():
         glasses[name] = Glass(name, **{key: tuple(values) for key, values in entry.items()})
     return glasses
+
+
+def glass_names() -> list[str]:
+    """The names of the catalogue."""
+    return [*_catalogue()]
 
 
 def find_glass(name: str) -> Glass:
@@ -191,13 +196,12 @@ def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
     """The dispersion with model glasses of the same nd and vd in place of some media, bool (M,)."""
     mask, found = jnp.asarray(rows)[:, None], nd_and_vd(dispersion)
     none = jnp.asarray([_NO_MODEL], found.dtype)
-    ranges = dispersion.ranges or (ANY,) * len(rows)
     return Dispersion(
         jnp.where(mask, 0, dispersion.strength),
         jnp.where(mask, 0, dispersion.resonance),
         jnp.where(mask, jnp.asarray([Glass.schott], found.dtype), dispersion.schott),
+        jnp.where(mask, jnp.asarray([VISIBLE], found.dtype), dispersion.ranges),
         jnp.where(mask, found, none if dispersion.model is None else dispersion.model),
-        tuple(VISIBLE if row else own for row, own in zip(rows, ranges, strict=True)),
     )
 
 

@@ -1,6 +1,8 @@
 """The lens: a frozen pytree of arrays over surfaces."""
 
 import dataclasses
+import functools
+import itertools
 from collections.abc import Sequence
 
 import jax
@@ -13,9 +15,45 @@ from ..numerics import Numbers, concrete, real_array
 from .aperture import Apertures
 from .elements import Elements, rotation_matrix
 from .forms import Shape
-from .glass import ANY, Dispersion, nd_and_vd, refractive_index, with_models
+from .glass import Dispersion, nd_and_vd, refractive_index, with_models
 from .phase import Phase
 from .surface import surface_sag
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Labels:
+    """The names of a lens and of its media. Two are equal where the same surfaces lie between
+    different media and the same media are air, so that names compile nothing.
+
+    name: of the lens. glasses: of the S + 1 media.
+    """
+
+    name: str
+    glasses: tuple[str, ...]
+
+    @functools.cached_property
+    def structure(self) -> tuple[int, ...]:
+        """Of each medium: 0 that in front of the lens, -1 air, else the number of the glass, one
+        more at each boundary."""
+        found, last = [0], 0
+        for before, name in itertools.pairwise(self.glasses):
+            solid = name not in ("air", self.glasses[0])
+            last += solid and name != before
+            found.append(last if solid else -(name != self.glasses[0]))
+        return (self.glasses[0] == "air", *found)
+
+    @functools.cached_property
+    def unnamed(self) -> "Labels":
+        """Labels of the same structure that name nothing."""
+        air, *media = self.structure
+        names = {0: "air" if air else "medium", -1: "air"}
+        return Labels("", tuple(names.get(k, f"glass {k}") for k in media))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Labels) and self.structure == other.structure
+
+    def __hash__(self) -> int:
+        return hash(self.structure)
 
 
 @jax.tree_util.register_dataclass
@@ -46,13 +84,12 @@ class Lens:
 
     Static:
     stop: the index of the stop surface.
-    glasses: the names of the S + 1 media.
+    labels: the names of the lens and of the S + 1 media, of which only the structure counts.
     forms: a name in `forms.FORMS` for each of the S + 1 rows (empty: all aspheres).
     mirrors: whether each of the S surfaces reflects (empty: none does).
     curved: rows that bend no light but may be curved, S for the sensor; all others are planes of
         which derivatives by curvature, conic and coefficients are 0. `load_lens` names those that a
         prescription curves.
-    name: of the lens.
     """
 
     curvature: Array
@@ -68,11 +105,10 @@ class Lens:
     elements: Elements | None = None
     apertures: Apertures | None = None
     stop: int = dataclasses.field(metadata={"static": True}, kw_only=True)
-    glasses: tuple[str, ...] = dataclasses.field(metadata={"static": True}, kw_only=True)
+    labels: Labels = dataclasses.field(metadata={"static": True}, kw_only=True)
     forms: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
     mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True}, default=())
     curved: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
-    name: str = dataclasses.field(metadata={"static": True}, default="")
 
     def __repr__(self) -> str:
         """In short; of a gradient too, and inside a trace."""
@@ -86,11 +122,23 @@ class Lens:
     def __post_init__(self) -> None:
         object.__setattr__(self, "forms", self.forms or ("asphere",) * (self.count + 1))
         object.__setattr__(self, "mirrors", self.mirrors or (False,) * self.count)
+        if not concrete(self.curvature):  # a program serves lenses of all names, and knows none
+            object.__setattr__(self, "labels", self.labels.unnamed)
+
+    @property
+    def name(self) -> str:
+        """Of the lens; empty in a trace and of what a program returns."""
+        return self.labels.name
+
+    @property
+    def glasses(self) -> tuple[str, ...]:
+        """The names of the S + 1 media; "glass 1", ... in a trace and of what a program returns."""
+        return self.labels.glasses
 
     @property
     def count(self) -> int:
         """How many surfaces S there are, without the sensor."""
-        return len(self.glasses) - 1
+        return len(self.labels.glasses) - 1
 
     @property
     def live(self) -> tuple[int, ...]:
@@ -177,14 +225,16 @@ class Lens:
 
         Inside a trace the values are not known and nothing is checked: see `Dispersion.knows`.
         """
-        if not concrete(wavelengths):
+        ranges = self.dispersion.ranges
+        if not concrete((wavelengths, ranges)):
             return
         low, high = self.dispersion.range
-        values = np.ravel(np.asarray(wavelengths, float)).tolist()
+        # As the lens rounds: 0.7 is not beyond 0.7 in float32.
+        values = np.ravel(np.asarray(wavelengths, ranges.dtype)).astype(float).tolist()
         if all(low <= value <= high for value in values):
             return
-        ranges = self.dispersion.ranges or (ANY,) * len(self.glasses)
-        for name, (low, high) in zip(self.glasses, ranges, strict=True):
+        known = np.asarray(ranges, float).tolist()
+        for name, (low, high) in zip(self.glasses, known, strict=True):
             for value in values:
                 if not low <= value <= high:
                     outside = f"wavelength {value:g} um is outside the range of {name}"
@@ -261,8 +311,9 @@ def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
         for name in np.array(media)[rows & ~((abbe >= 10) & (abbe <= 120))]:
             raise ValueError(f"glasses: {name} has no vd of 10 to 120; leave its surface out")
     names = (f"model {name.removeprefix('model ')}" for name in media)
+    glasses = tuple(new if row else old for new, old, row in zip(names, media, rows))
     return dataclasses.replace(
         lens,
         dispersion=with_models(lens.dispersion, rows),
-        glasses=tuple(new if row else old for new, old, row in zip(names, media, rows)),
+        labels=Labels(lens.name, glasses),
     )

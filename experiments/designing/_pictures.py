@@ -1,10 +1,9 @@
-"""What is drawn of a design: before and after, spots, merit, minima; and the numbers for it."""
+"""What is drawn of a design: before and after, spots, merit, minima; from the lens files."""
 
 import math
 import pathlib
 from typing import Any
 
-import jax
 import numpy as np
 
 import drt_jax
@@ -18,47 +17,46 @@ from . import _common, _plots
 _RANKED, _RINGS = 30, 8
 
 
-def polylines(config: Any, lens: drt_jax.Lens) -> dict[str, Any]:
-    """The polylines of a lens as lists."""
-    middle = config.wavelengths_um[len(config.wavelengths_um) // 2]
-    drawing = layout.draw(lens, np.radians(config.fields_deg), config.distance_mm, middle)
-    return jax.tree.map(lambda a: np.round(a, 4).tolist(), drawing._asdict())
+def _drawing(results: dict[str, Any], path: pathlib.Path) -> layout.Drawing:
+    """A lens file drawn."""
+    waves, fields = results["wavelengths_um"], np.radians(results["fields_deg"])
+    distance = results["distance_mm"] or math.inf
+    return layout.draw(drt_jax.load_lens(path), fields, distance, waves[len(waves) // 2])
 
 
-def spot_hits(config: Any, lens: drt_jax.Lens) -> list[dict[str, Any]]:
-    """By field: hits in um about the centroid of all colours, by colour, and the covariance."""
+def _spots(results: dict[str, Any], lens: drt_jax.Lens) -> list[tuple[list, np.ndarray]]:
+    """By field: hits in um about the centroid of all wavelengths, by wavelength, and their
+    covariance."""
     pupil = np.asarray(hexapolar(_RINGS)[0]).T
     found = []
-    for field in np.radians(config.fields_deg):
-        scene = field, config.distance_mm, config.wavelengths_um
+    for field in np.radians(results["fields_deg"]):
+        scene = field, results["distance_mm"] or math.inf, results["wavelengths_um"]
         rays = drt_jax.trace_rays(lens, *scene, pupil)
-        mean = np.asarray(drt_jax.psf_moments(lens, *scene, config.tolerance).mean).mean(axis=0)
+        moments = drt_jax.psf_moments(lens, *scene, results["tolerance"])
+        mean = np.asarray(moments.mean).mean(axis=0)
         hits = 1e3 * (np.asarray(rays.points)[:, :, -1, :2] - mean)
         good = np.asarray(rays.status) == 0
         every = hits[good]
-        found.append(
-            {
-                "hits": [np.round(h[g], 4).tolist() for h, g in zip(hits, good)],
-                "covariance": (every.T @ every / max(len(every), 1)).tolist(),
-            }
-        )
+        own = [h[g] for h, g in zip(hits, good)]
+        found.append((own, every.T @ every / max(len(every), 1)))
     return found
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw the lens before and after, its spots, the merit, and the minima."""
-    drawings = [_drawing(parts) for parts in results["drawings"]]
+    folder = figures.parent
+    drawings = [_drawing(results, folder / f"{name}.yaml") for name in ("start", "designed")]
     figure, axes = show.new(2, 1, 8, 3.2)
     for ax, drawing, title in zip(axes, drawings, ("start", "designed")):
         show.lens_drawing(ax, drawing).set_title(title, fontsize=9)
     figure.savefig(figures / "lens.png")
-    fields, colours = results["fields_deg"], results["wavelengths_um"]
+    fields, waves = results["fields_deg"], results["wavelengths_um"]
     figure, axes = show.new(1, len(fields), 3.2, 3.4)
-    hits = [[np.reshape(h, (-1, 2)) for h in spot["hits"]] for spot in results["spots"]]
-    side = 2.1 * max(float(np.max(np.abs(h), initial=1e-3)) for own in hits for h in own)
-    for ax, own, spot, field in zip(np.ravel(axes), hits, results["spots"], fields):
-        named = {f"{colour:.3f} um": h for colour, h in zip(colours, own)}
-        _plots.spots(ax, named, np.array(spot["covariance"]), side, f"{field:g} deg")
+    spots = _spots(results, drt_jax.load_lens(folder / "designed.yaml"))
+    side = 2.1 * max(float(np.max(np.abs(h), initial=1e-3)) for own, _ in spots for h in own)
+    for ax, (own, covariance), field in zip(np.ravel(axes), spots, fields):
+        named = {f"{wave:.3f} um": h for wave, h in zip(waves, own)}
+        _plots.spots(ax, named, covariance, side, f"{field:g} deg")
     np.ravel(axes)[0].legend(fontsize=7, loc="upper left")
     np.ravel(axes)[0].set(xlabel="um", ylabel="um")
     figure.savefig(figures / "spots.png")
@@ -69,18 +67,9 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         _plots.merits(ax, np.array(results["history"]))
     figure.savefig(figures / "merit.png")
     if results["starts"]["merits"]:
-        _draw_minima(results, drawings[1:], figures)
-
-
-def _drawing(parts: dict[str, Any]) -> layout.Drawing:
-    lines = {
-        name: [np.reshape(line, (-1, 2)) for line in some]
-        for name, some in parts.items()
-        if name not in ("sensor", "rays", "fields")
-    }
-    rays = [[np.reshape(ray, (-1, 2)) for ray in fan] for fan in parts["rays"]]
-    fields = parts.get("fields", ())  # older results have none
-    return layout.Drawing(**lines, sensor=np.array(parts["sensor"]), rays=rays, fields=fields)
+        count = sum(1 for _ in folder.glob("minimum_*.yaml"))
+        others = [_drawing(results, folder / f"minimum_{k + 1}.yaml") for k in range(count)]
+        _draw_minima(results, [drawings[1], *others], figures)
 
 
 def _draw_minima(

@@ -5,17 +5,9 @@ import math
 from typing import Literal
 
 from drt_jax.design import Operand, Solve, Tie, Vary
+from drt_jax.design.growth import SHORTEST
 
 from . import _common
-from ._optiland import SETTINGS
-
-SHORTEST = 0.002  # step of growth
-# Of `beside`; what Optiland can be told of a problem.
-_PEERS = ["ours", "optimistix", "adam", "optiland", *(f"optiland {name}" for name in SETTINGS)]
-_GAPS = {"glass_centre", "glass_edge", "air_centre", "air_edge"}
-_TELLS = "{}: knows curvatures, thicknesses and the sensor, a spot, limits of gaps, a focal length"
-_TELLS += " and a pupil, no ties, weights or clear apertures; leave it out"
-_TELLS_RADII = "{}: knows a singlet's curvatures and spot on the axis, one start, 0.55 um, 5 rings"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,29 +56,6 @@ class Growth:
 
 
 @dataclasses.dataclass(frozen=True)
-class Beside:
-    """Other optimisers from the same starts, after our own search; see `_beside`.
-
-    peers: which; "ours": each start alone to its end. "optiland NAME": of the radii of a singlet,
-    as `_optiland.SETTINGS` say. starts: how many of them; 0: all. seconds: at most of "optiland"
-    from one start. steps, rate: of "adam", the rate in scales of the variables.
-    """
-
-    peers: tuple[str, ...] = ()
-    starts: int = 0
-    seconds: float = 30.0
-    steps: int = 2000
-    rate: float = 0.01
-
-    def __post_init__(self) -> None:
-        limits = {"starts": (0, 1e5), "seconds": (1e-3, 1e5), "steps": (1, 1e6), "rate": (1e-6, 10)}
-        _common.require_within("beside.", self, **limits)
-        _common.require_known("beside.peers", self.peers, _PEERS)
-        twice = len(set(self.peers)) < len(self.peers)
-        _common.require(not twice, "beside.peers: an item stands twice")
-
-
-@dataclasses.dataclass(frozen=True)
 class Config:
     """Settings of the experiment; see configs/design/.
 
@@ -97,7 +66,7 @@ class Config:
     variables, ties, solves, operands: see drt_jax.design. order: of the pupil's rule while
     searching; the best lens is finished with as many rays as `tolerance`, relative, of its spots
     needs. rings: above 0, a hexapolar grid of so many in place of both, as other programs sum.
-    trials: at most, of the last search. beside: other optimisers.
+    trials: at most, of the last search.
     """
 
     name: str
@@ -118,7 +87,6 @@ class Config:
     growth: Growth = Growth()
     trials: int = 500
     starts: Starts = Starts()
-    beside: Beside = Beside()
 
     def __post_init__(self) -> None:
         limits = {"fields_deg": (-89, 89), "wavelengths_um": (1e-4, 1e6), "order": (1, 40)}
@@ -130,19 +98,3 @@ class Config:
         _common.require_within("", self, **limits)
         for name in ("variables", "operands", "fields_deg", "wavelengths_um"):
             _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")
-        self._require_told()
-
-    def _require_told(self) -> None:
-        """ConfigError for what Optiland's optimisers cannot be told."""
-        kinds, solves = ({one.kind for one in some} for some in (self.variables, self.solves))
-        limits = {operand.kind for operand in self.operands if operand.limits}
-        spots = [operand for operand in self.operands if not operand.limits] == [Operand("spot")]
-        lens = spots and kinds <= {"curvature", "thickness", "sensor"} and limits <= _GAPS
-        lens = lens and solves <= {"focal_length", "entrance_pupil"} and self.floating
-        lens = lens and not (self.ties or self.colour_weights or self.field_weights)
-        scene = self.fields_deg, self.wavelengths_um, self.rings, self.starts.count
-        radii = lens and kinds == {"curvature"} and scene == ((0.0,), (0.55,), 5, 1)
-        radii = radii and not limits and not solves
-        for name in (name for name in self.beside.peers if name.startswith("optiland")):
-            good, tells = (lens, _TELLS) if name == "optiland" else (radii, _TELLS_RADII)
-            _common.require(good, "beside.peers: " + tells.format(name))

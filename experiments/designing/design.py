@@ -1,10 +1,9 @@
 """Design a lens: least squares on exact Jacobians, within limits, from one start or from many.
 
-Reads what varies, what is wanted and where to start from the settings; writes the designed lens as
-designed.yaml, which load_lens reads back, pictures before and after, and results.json: `rows` with
-`problem`, `merit_start`, `merit_end`, `spots_um`, `jacobians`, `rays`, `seconds`, `compile_s`, and
-of those of Optiland's optimisers that ran beside, the one with the best lens: `peer`, its name,
-`peer_merit`, the best of its starts, `peer_s`, of all its starts; `beside` has all that ran.
+Reads what varies, what is asked and where to start from the settings; writes the designed lens as
+designed.yaml, which load_lens reads back, the start and other minima beside it, pictures, and
+results.json: `rows` with `problem`, `merit_start`, `merit_end`, `spots_um`, `jacobians`, `rays`,
+`seconds`, `compile_s`. `python -m comparisons.design` adds what other optimisers come to.
 """
 
 import dataclasses
@@ -19,40 +18,30 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import Pattern, design
+from drt_jax.design.growth import SHORTEST, grow_once, start_growth
 
-from . import _beside, _command, _common, _optiland, _pictures
-from ._wanted import SHORTEST, Config as Config, Starts
+from . import _command, _common, _pictures
+from ._wanted import Config as Config, Starts
 from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
-# Minima that are drawn. Clear apertures are so much wider than the light.
-_DRAWN, _WIDER = 6, 1.01
+_DRAWN = 6  # minima that are drawn
 # What a search took that was none.
 _NOTHING = {"trials": 0, "jacobians": 0, "seconds": 0.0, "compile_s": 0.0}
 
 
-def problem_of(
-    config: Config, lens: drt_jax.Lens, part: float = 1.0, order: int | None = None
-) -> design.Problem:
-    """The problem of the settings for a lens; `part`: of the fields and of the aperture."""
+def problem_of(config: Config, lens: drt_jax.Lens, order: int | None = None) -> design.Problem:
+    """The problem of the settings for a lens."""
     solves = []
     for solve in config.solves:
-        colours = config.wavelengths_um
+        waves = config.wavelengths_um
         if solve.kind != "best_focus":
-            colours = (colours[len(colours) // 2],)
-        solve = dataclasses.replace(solve, distance=config.distance_mm, wavelengths=colours)
-        if solve.kind in ("entrance_pupil", "f_number") and solve.value:
-            value = solve.value * part if solve.kind == "entrance_pupil" else solve.value / part
-            solve = dataclasses.replace(solve, value=value)
-        solves.append(solve)
-    if part < 1 and not any(s.kind in ("entrance_pupil", "f_number") for s in solves):
-        semi = lens.semi_diameter.at[lens.stop].multiply(part)
-        lens = dataclasses.replace(lens, semi_diameter=semi)
-    variables = design.Variables.of(lens, config.variables, config.ties, solves)
-    return design.Problem.of(
-        variables,
+            waves = (waves[len(waves) // 2],)
+        solves.append(dataclasses.replace(solve, distance=config.distance_mm, wavelengths=waves))
+    return design.Problem.from_variables(
+        design.Variables.from_lens(lens, config.variables, config.ties, solves),
         config.operands,
-        np.radians(config.fields_deg) * part,
+        np.radians(config.fields_deg),
         config.wavelengths_um,
         config.distance_mm,
         _grid(config.rings) if config.rings else (order or config.order),
@@ -104,7 +93,7 @@ class _Progress:
         """After one trial."""
         self._bar.update()
         self._bar.set_postfix_str(
-            f"merit={float(search.merit):.6g} worst limit={float(search.worst):+.2g}"
+            f"merit={float(search.merit):.6g} worst limit={float(search.max_violation):+.2g}"
         )
 
     def tiles(self, done: int, total: int, best: float) -> None:
@@ -120,52 +109,33 @@ class _Progress:
         self._bar.close()
 
 
-def grown(config: Config, lens: drt_jax.Lens, run: Run) -> drt_jax.Lens:
+def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
     """The lens designed for parts of the fields and the aperture, one after the other."""
-    growth = config.growth
-    good = len(config.fields_deg) * (1e-3 * growth.good_um) ** 2
-    whole = problem_of(config, lens).variables
-    begin = {"done": 0.0, "part": growth.first, "step": growth.step} | _NOTHING
-    state = run.kept("growth") or begin | {"numbers": whole.numbers(whole.start).tolist()}
-    while state["done"] < 1:
-        part, done, step = state["part"], state["done"], state["step"]
-        problem = problem_of(config, lens, part)
-        vector = jnp.array(state["numbers"]) / problem.variables.scale
-        with _Progress(f"{part:.1%} of field and aperture", growth.trials) as bar:
-            found = design.optimise(problem, vector, growth.trials, bar.searched, good)
-        if found.score <= good:
-            done, step = part, 1.2 * step
-            state["numbers"] = problem.variables.numbers(found.vector).tolist()
-        else:
-            step /= 2
-            told = f"growth: stops at {done:.1%} of field and aperture, where no step leads to "
-            told += f"{growth.good_um:g} um: {_in_the_way(config, found)}"
-            _common.require(step >= SHORTEST, told)
-        took = {"trials": len(found.history), "jacobians": found.jacobians}
-        took |= {"seconds": found.seconds, "compile_s": found.first}
-        state |= {name: state[name] + number for name, number in took.items()}
-        state |= {"done": done, "step": step, "part": min(done + step, 1.0) if done else part / 2}
+    settings = config.growth
+    target = len(config.fields_deg) * (1e-3 * settings.good_um) ** 2
+    saved = run.kept("growth")
+    growth = start_growth(problem, settings.first, settings.step)
+    if saved is not None:
+        growth = growth._replace(**saved | {"vector": np.array(saved["vector"])})
+    while not growth.ended:
+        with _Progress(f"{growth.part:.1%} of field and aperture", settings.trials) as bar:
+            growth = grow_once(problem, growth, target, settings.trials, bar.searched)
+        state = growth._asdict() | {"vector": growth.vector.tolist(), "failed": None}
         run.keep("growth", state)
-    return whole.lens_of(jnp.array(state["numbers"]) / whole.scale)
+    said = f"growth: stops at {growth.done:.1%} of field and aperture, where no step leads to "
+    said += f"{settings.good_um:g} um: {_in_the_way(config, growth.failed)}"
+    _common.require(growth.done >= 1, said)
+    return problem.variables.lens_of(jnp.asarray(growth.vector))
 
 
-def _in_the_way(config: Config, found: design.Optimum) -> str:
+def _in_the_way(config: Config, failed: design.Optimum | None) -> str:
     """What keeps a part from being good, and the remedy."""
-    size = 1e3 * math.sqrt(found.merit / len(config.fields_deg))
+    if failed is None:
+        return f"a step would be less than {SHORTEST:g}"
+    size = 1e3 * math.sqrt(failed.merit / len(config.fields_deg))
     if size > config.growth.good_um:
         return f"the next comes to {size:.3g}; raise growth.good_um or growth.trials"
-    return f"{found.worst_limit} is in the way; widen this limit or change the start"
-
-
-def made_vectors(variables: design.Variables, some: Starts) -> np.ndarray:
-    """The vectors of lenses whose parts are off."""
-    rng, lens, vectors = np.random.default_rng(some.seed), variables.lens, []
-    for _ in range(some.count):
-        bend = 1 + 0.01 * some.per_cent * rng.normal(size=lens.count + 1)
-        gap = lens.thickness + some.off_mm * rng.normal(size=lens.count - 1)
-        off = dataclasses.replace(lens, curvature=lens.curvature * bend, thickness=gap)
-        vectors.append(np.asarray(variables.vector(off)))
-    return np.stack(vectors)
+    return f"{failed.worst_limit} is in the way; widen this limit or change the start"
 
 
 def starts_of(variables: design.Variables, some: Starts) -> np.ndarray:
@@ -173,10 +143,10 @@ def starts_of(variables: design.Variables, some: Starts) -> np.ndarray:
     if some.count == 1:
         return np.asarray(variables.start)[None]
     if some.how == "made":
-        return made_vectors(variables, some)
+        return design.as_built_starts(variables, some.count, some.per_cent, some.off_mm, some.seed)
     if some.how == "around":
-        return design.around(variables, some.count, some.spread, some.seed)
-    return design.within(variables, some.count, some.seed)
+        return design.normal_starts(variables, some.count, some.spread, some.seed)
+    return design.sobol_starts(variables, some.count, some.seed)
 
 
 def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
@@ -200,7 +170,7 @@ def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
         "count": some.count,
         "found": [minimum.found for minimum in found.minima],
         "passed": int(np.isfinite(found.merits).sum()),
-        "trials": found.trials,
+        "trials": found.steps,
         "jacobians": found.jacobians,
         "seconds": found.seconds - found.compile_s,
         "compile_s": found.compile_s,
@@ -227,7 +197,7 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
         "vector": parts[-1].vector.tolist(),
         "merit_start": float(problem.merit(problem.variables.start)),
         "merit_end": parts[-1].merit,
-        "worst": parts[-1].worst,
+        "worst": parts[-1].max_violation,
         "order": order,
         "history": history.tolist(),
         "seconds": seconds,
@@ -238,11 +208,9 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Grow, search, finish; and write the lens."""
     start = drt_jax.load_lens(config.lens)
-    if config.floating:
-        free = jnp.full_like(start.semi_diameter, jnp.inf)
-        own = start.semi_diameter[start.stop]
-        start = dataclasses.replace(start, semi_diameter=free.at[start.stop].set(own))
-    begin = grown(config, start, run) if config.growth.first < 1 else start
+    start = design.open_apertures(start) if config.floating else start
+    first = problem_of(config, start)
+    begin = grown(config, first, run) if config.growth.first < 1 else start
     problem = problem_of(config, begin)
     if run.kept("starts") is None:
         run.keep("starts", searched(config, problem))
@@ -252,11 +220,9 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     end = run.kept("finish")
     history = np.array(end["history"])
     run.log("least squares", 0, dict(zip(COLUMNS, history.T)))
-    variables = problem.variables
-    designed = _bounded(config, problem, variables.lens_of(jnp.asarray(end["vector"])))
-    drt_jax.save_lens(designed, run.folder / "designed.yaml")
-    rays = design.rays_of(problem)
-    first, before = problem_of(config, start), run.kept("growth") or _NOTHING
+    _save(config, problem, start, [end["vector"], *found["vectors"][1:_DRAWN]], run.folder)
+    rays, before = design.rays_of(problem), run.kept("growth") or {"steps": 0, "first": 0.0}
+    before = _NOTHING | before | {"trials": before["steps"], "compile_s": before["first"]}
     row = {
         "problem": config.name,
         "merit_start": float(first.merit(first.variables.start)),
@@ -268,46 +234,42 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "seconds": before["seconds"] + found["seconds"] + end["seconds"],
         "compile_s": before["compile_s"] + found["compile_s"] + end["compile_s"],
     }
-    scene = config.fields_deg, config.wavelengths_um, config.distance_mm
-    read = drt_jax.load_lens(run.folder / "designed.yaml")
-    rows = _beside.beside(config, problem, starts_of(variables, config.starts), end, run)
-    row |= _beside.peer(rows) | {"peer_spots_um": _optiland.spots_um(read, *scene)}
-    others = (variables.lens_of(jnp.asarray(vector)) for vector in _others(found))
-    drawn = [designed, *(_bounded(config, problem, lens) for lens in others)]
-    drawn = [_bounded(config, problem, start), *drawn]
     return {
         "rows": [row],
-        "beside": rows,
         "lens": config.lens,
         "how": config.starts.how,
         "fields_deg": list(config.fields_deg),
         "wavelengths_um": list(config.wavelengths_um),
+        "distance_mm": config.distance_mm if math.isfinite(config.distance_mm) else None,
+        "tolerance": config.tolerance,
         "starts": {key: value for key, value in found.items() if key != "vectors"},
-        "drawings": [_pictures.polylines(config, lens) for lens in drawn],
-        "spots": _pictures.spot_hits(config, drawn[1]),
         "history": history.tolist(),
     }
 
 
-def _bounded(config: Config, problem: design.Problem, lens: drt_jax.Lens) -> drt_jax.Lens:
-    """The lens with clear apertures as wide as its light, where they float."""
-    if not config.floating:
-        return lens
-    wide = _WIDER * problem.extents(lens)
-    wide = jnp.append(wide, jnp.inf).at[lens.stop].set(lens.semi_diameter[lens.stop])
-    return dataclasses.replace(lens, semi_diameter=wide)
-
-
-def _others(found: dict[str, Any]) -> list[Any]:
-    """Of the minima but the best, those that are drawn."""
-    return found["vectors"][1:_DRAWN]
+def _save(
+    config: Config,
+    problem: design.Problem,
+    start: drt_jax.Lens,
+    vectors: list[list[float]],
+    folder: pathlib.Path,
+) -> None:
+    """Write the designed lens, the start and the minima that are drawn; clear apertures as wide as
+    the light, where they float."""
+    lenses = {"start": start}
+    for k, vector in enumerate(vectors):
+        name = f"minimum_{k}" if k else "designed"
+        lenses[name] = problem.variables.lens_of(jnp.asarray(vector))
+    for name, lens in lenses.items():
+        lens = design.fit_apertures(problem, lens) if config.floating else lens
+        drt_jax.save_lens(lens, folder / f"{name}.yaml")
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """The design in a row for each field, and what it took."""
     (row,), some = results["rows"], results["starts"]
     fields = results["fields_deg"]
-    peers = row["peer_spots_um"] or [None] * len(fields)
+    peers = row.get("peer_spots_um") or [None] * len(fields)
     spots = [[field, um, peer] for field, um, peer in zip(fields, row["spots_um"], peers)]
     spots.append(["root of the sum of squares", *(_total(c) for c in (row["spots_um"], peers))])
     took = [
@@ -330,8 +292,27 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         f"design, {name}": _common.table(("what", "value"), took),
     }
     if results.get("beside"):
-        found[f"design, {name}: beside"] = _beside.table(results["beside"], results["how"])
+        found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
     return found
+
+
+def _peers_table(rows: list[dict[str, Any]], how: str) -> str:
+    """Other optimisers in a row each, see `comparisons`."""
+    goal = "no worse than the lens" if how == "made" else "within 1% of the design"
+    header = ["optimiser", f"starts {goal}", "merit, best", "median", "limit exceeded by"]
+    header += ["Jacobians until then", "s until then", "s a start"]
+    lines = []
+    for row in rows:
+        met = "not installed" if row["met"] is None else f"{row['met']} of {row['starts']}"
+        worst = max((x for x in row["worst"] if x is not None), default=None)
+        ways = (_median(row[key]) for key in ("met_jacobians", "met_s", "seconds"))
+        lines.append([row["optimiser"], met, row["best"], row["median"], worst, *ways])
+    return _common.table(header, lines)
+
+
+def _median(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
 def _total(sizes: list[float | None]) -> float | None:

@@ -30,7 +30,7 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import design, show
-from drt_jax.design.errors import KINDS
+from drt_jax.design.deviations import KINDS
 from drt_jax.design.tolerance import Order
 
 from . import _command, _common, _plots
@@ -82,13 +82,13 @@ class Config:
             _common.require(good, f"fields_deg: expected pairs x, y from -89 to 89, got {pair}")
 
 
-def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.Perturbed]:
+def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.PerturbedLens]:
     """What judges the lens, with another order of the rule if one is given; and its errors."""
     lens = drt_jax.load_lens(config.lens)
 
     def problem_of(lens: drt_jax.Lens) -> design.Problem:
-        return design.Problem.of(
-            design.Variables.of(lens, ["sensor"]),
+        return design.Problem.from_variables(
+            design.Variables.from_lens(lens, ["sensor"]),
             ["spot"],
             np.radians(config.fields_deg),
             config.wavelengths_um,
@@ -97,8 +97,8 @@ def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.Pert
             config.colour_weights or None,
         )
 
-    extents = problem_of(lens).extents(lens)
-    perturbed = design.Perturbed.of(lens, extents, config.tolerances)
+    radius = problem_of(lens).beam_radius(lens)
+    perturbed = design.PerturbedLens.from_lens(lens, radius, config.tolerances)
     return problem_of(perturbed.lens), perturbed
 
 
@@ -108,7 +108,7 @@ def derivatives(config: Config) -> dict[str, Any]:
     spots = []
     for order in (config.order, min(config.order + 4, 40)):
         some, _ = prepare(config, order)
-        nominal = jax.jit(lambda p, lens: design.made(p, lens, config.compensator).spot)
+        nominal = jax.jit(lambda p, lens: design.as_built(p, lens, config.compensator).spot)
         spots.append(float(nominal(some, perturbed.lens)))
     seconds = []
     for _ in range(2):
@@ -126,29 +126,37 @@ def predicted_of(found: dict[str, Any]) -> design.Predicted:
 
 
 def traced(
-    config: Config, off: np.ndarray, title: str, problem: design.Problem, perturbed: Any
-) -> design.Made:
+    config: Config, perturbations: np.ndarray, title: str, problem: design.Problem, perturbed: Any
+) -> design.AsBuilt:
     """Monte Carlo with a progress bar."""
-    with tqdm(total=len(off), desc=title, unit="lens", dynamic_ncols=True) as bar:
+    with tqdm(total=len(perturbations), desc=title, unit="lens", dynamic_ncols=True) as bar:
         return design.monte_carlo(
-            problem, perturbed, off, config.compensator, lambda done: bar.update(done - bar.n)
+            problem,
+            perturbed,
+            perturbations,
+            config.compensator,
+            lambda done: bar.update(done - bar.n),
         )
 
 
 def sensitivity(config: Config, found: dict[str, Any]) -> dict[str, Any]:
     """Each error alone at both its ends, and all of them at their worst."""
     problem, perturbed = prepare(config)
-    predicted, count = predicted_of(found), len(perturbed.errors)
+    predicted, count = predicted_of(found), len(perturbed.deviations)
     worst = design.worst_case(perturbed, predicted)
-    off = np.concatenate([-np.eye(count), np.eye(count), np.zeros((1, count)), worst[None]])
-    made = traced(config, off, "one error", problem, perturbed)
+    perturbations = np.concatenate(
+        [-np.eye(count), np.eye(count), np.zeros((1, count)), worst[None]]
+    )
+    made = traced(config, perturbations, "one error", problem, perturbed)
     spots, nominal = _um(made.spot), float(_um(made.spot[-2]))
-    foretold = _um(predicted.at(off, "second"), root=True) - float(_um(predicted.nominal, True))
-    moves = np.asarray(predicted.moves) + off @ np.asarray(predicted.move_slopes)
+    foretold = _um(predicted.at(perturbations, "second"), root=True) - float(
+        _um(predicted.nominal, True)
+    )
+    moves = np.asarray(predicted.moves) + perturbations @ np.asarray(predicted.move_slopes)
     variances = design.variances(perturbed, config.errors == "normal")
     share = np.diag(np.asarray(predicted.hessian)) * variances / 2
     rows = []
-    for k, error in enumerate(perturbed.errors):
+    for k, error in enumerate(perturbed.deviations):
         ends = [k, count + k]
         rows.append({
             "error": str(error), "kind": error.kind, "place": error.place, "axis": error.axis,
@@ -172,15 +180,15 @@ def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -
     """Spots of all lenses at one scale of the sizes, and as predicted; logs them."""
     problem, perturbed = prepare(config)
     predicted, normal = predicted_of(found), config.errors == "normal"
-    off = scale * design.draw_errors(perturbed, config.count, config.seed, normal)
+    perturbations = scale * design.draw_perturbations(perturbed, config.count, config.seed, normal)
     begun = time.perf_counter()
-    design.monte_carlo(problem, perturbed, off[:1], config.compensator)
+    design.monte_carlo(problem, perturbed, perturbations[:1], config.compensator)
     warm = time.perf_counter()
-    made = traced(config, off, f"sizes x {scale:g}", problem, perturbed)
+    made = traced(config, perturbations, f"sizes x {scale:g}", problem, perturbed)
     seconds = time.perf_counter() - warm
     spots, good = _um(made.spot), np.isfinite(made.spot)
     _common.require(bool(good.any()), f"scales: {scale:g}: light passes through no lens; take less")
-    draws = scale * design.draw_errors(perturbed, config.draws, config.seed + 1, normal)
+    draws = scale * design.draw_perturbations(perturbed, config.draws, config.seed + 1, normal)
     samples = {"traced": spots}
     samples |= {order: _um(predicted.at(draws, order), True) for order in _ORDERS}
     ends = np.quantile(spots[good], [0, 0.999])
@@ -189,7 +197,7 @@ def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -
     row: dict[str, Any] = {"scale": scale, "edges_um": edges.tolist(), "seconds": seconds}
     row |= {"compile_s": warm - begun, "failed": int(np.sum(~good))}
     row |= {"moves_deviation": np.std(made.moves[good], axis=0).tolist()}
-    row["rays"] = design.rays_of(problem) * len(off)
+    row["rays"] = design.rays_of(problem) * len(perturbations)
     for name, values in samples.items():
         whole = values[np.isfinite(values)]
         ninth = np.quantile(values, 0.9, method="higher")

@@ -103,7 +103,7 @@ class Trained:
         parts = [name.partition(" ") for name in variables if name != "sensor"]
         try:
             vary = [design.Vary(kind, (int(i),) if i else (), scale=1.0) for kind, _, i in parts]
-            return cls(lens, design.Variables.of(lens, vary) if vary else None, moves)
+            return cls(lens, design.Variables.from_lens(lens, vary) if vary else None, moves)
         except ValueError as error:
             raise ConfigError(f"train.{error}") from error
 

@@ -114,7 +114,7 @@ def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = Non
     if dataclasses.is_dataclass(kind):
         return _build(kind, value, source, f"{key}.", old)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is types.UnionType:  # of one value and of a list
+    if origin in (types.UnionType, typing.Union):  # of one value and of a list
         return _convert(arguments[isinstance(value, list | tuple)], value, source, key)
     if origin is tuple and isinstance(value, list | tuple) and len(value) <= _ITEMS:
         items = enumerate(value)
@@ -161,7 +161,7 @@ def _say(kind: Any) -> str:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
         return f"a list, each item {_say(arguments[0])}"
-    if origin is types.UnionType:
+    if origin in (types.UnionType, typing.Union):
         return " or ".join(map(_say, arguments))
     if origin is Literal:
         return "one of " + ", ".join(map(str, arguments))

@@ -8,7 +8,8 @@ import pytest
 
 from drt_jax import Clipped, Gauss, design, load_lens
 from drt_jax.compilation import LARGE, jit
-from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary
+from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary, trace_fields
+from drt_jax.design.field_rays import failures
 from drt_jax.design.problem import quick
 
 from .test_operands import COLOURS, model
@@ -47,10 +48,10 @@ def assert_derivatives(value, jacobian, x, rtol, floor=1e-2):
 @pytest.fixture(scope="module")
 def crooked(tmp_path_factory):
     """A lens without symmetry, clipped in front, that some rays of the last field do not pass."""
-    variables = Variables.of(model(tmp_path_factory.mktemp("lens")), EVERY)
+    variables = Variables.from_lens(model(tmp_path_factory.mktemp("lens")), EVERY)
     kinds = [kind for kind in OPERANDS if kind != "throughput"]  # whose rays drop out one by one
     fields = [[0.02, 0.05], [0.01, 0.25], [0.03, 0.45]]
-    problem = Problem.of(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "disc"))
+    problem = Problem.from_variables(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "disc"))
     moves = np.random.default_rng(0).normal(size=len(variables.places))
     return problem, variables.start + moves
 
@@ -60,9 +61,10 @@ def test_every_derivative_by_every_kind_of_variable(crooked):
     problem, x = crooked
 
     def flat(x):
-        seen = problem.seen(problem.variables.lens_of(x))
-        told = {operand.kind: operand.values(seen) for operand in problem.operands}
-        return told | {"failures": jnp.ravel(seen.failures)}, seen.rays.bundle.status
+        lens = problem.variables.lens_of(x)
+        rays = trace_fields(problem, lens)
+        told = {operand.kind: operand.values(lens, rays) for operand in problem.operands}
+        return told | {"failures": jnp.ravel(failures(lens, rays))}, rays.bundle.status
 
     value = jit(lambda x: flat(x)[0], LARGE)
     both = jit(jax.jacfwd(flat, has_aux=True), LARGE)
@@ -88,11 +90,14 @@ def test_derivatives_of_a_fitted_pupil():
     kinds = ("rms_spot", "rms_wavefront", "centroid", "relative_illumination", "throughput")
     rule = Clipped(4, "half")
     fields = np.radians([0.0, 20.0])
-    problem = Problem.of(Variables.of(lens, vary), kinds, fields, COLOURS[1], rule=rule)
+    problem = Problem.from_variables(
+        Variables.from_lens(lens, vary), kinds, fields, COLOURS[1], rule=rule
+    )
 
     def values(x):
-        seen = problem.seen(problem.variables.lens_of(x))
-        return {kind: Operand(kind).values(seen) for kind in kinds}
+        lens = problem.variables.lens_of(x)
+        rays = trace_fields(problem, lens)
+        return {kind: Operand(kind).values(lens, rays) for kind in kinds}
 
     x = problem.variables.start
     value = jit(values, LARGE)
@@ -105,15 +110,15 @@ def test_derivatives_of_a_fitted_pupil():
 def strong(tmp_path_factory):
     """A problem and a vector of which the last surface is too strong for the outer rays."""
     lens = model(tmp_path_factory.mktemp("lens"))
-    variables = Variables.of(lens, [Vary("curvature", (0, 3, 5, 6)), "sensor"])
-    problem = Problem.of(variables, ["spot"], [0.0, 0.15], COLOURS[:2], rule=4)
+    variables = Variables.from_lens(lens, [Vary("curvature", (0, 3, 5, 6)), "sensor"])
+    problem = Problem.from_variables(variables, ["spot"], [0.0, 0.15], COLOURS[:2], rule=4)
     return problem, variables.start.at[3].multiply(2.9)
 
 
 def test_rays_that_fail_have_a_smooth_merit(strong):
     """Finite; its gradient, forward and reverse, agrees with differences."""
     problem, x = strong
-    whole = jax.jit(lambda x: problem.seen(problem.variables.lens_of(x)).rays.whole)(x)
+    whole = jax.jit(lambda x: trace_fields(problem, problem.variables.lens_of(x)).arrives)(x)
     assert 0.02 < 1 - np.mean(whole) < 0.5
     both = jit(jax.value_and_grad(problem.merit), LARGE)
     merit, gradient = both(x)
@@ -132,8 +137,8 @@ def test_rays_that_fail_have_a_smooth_merit(strong):
 @pytest.mark.slow
 def test_a_few_steps_bring_all_rays_through(strong):
     problem, x = strong
-    found = design.optimise(problem, x, trials=15)
-    assert bool(jnp.all(problem.seen(found.lens).rays.whole))
+    found = design.optimise(problem, x, max_steps=15)
+    assert bool(jnp.all(trace_fields(problem, found.lens).arrives))
     assert found.merit < 1e-2 * found.history[0, 0]
 
 

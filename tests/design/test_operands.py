@@ -18,11 +18,13 @@ from drt_jax.design import (
     Problem,
     Solve,
     Variables,
-    errors,
+    deviations,
     kinds,
     operands,
+    trace_fields,
     values,
 )
+from drt_jax.design.field_rays import relative_illumination
 from drt_jax.design.kinds import KINDS
 from drt_jax.lens.glass import glass_map_distance
 
@@ -37,8 +39,9 @@ def program(problem, kinds):
     """The values of kinds, by name, as one function of the problem and the vector."""
 
     def values(problem, vector):
-        seen = problem.seen(problem.variables.lens_of(vector))
-        return {kind: Operand(kind).values(seen) for kind in kinds}
+        lens = problem.variables.lens_of(vector)
+        rays = trace_fields(problem, lens)
+        return {kind: Operand(kind).values(lens, rays) for kind in kinds}
 
     return jit(values, LARGE)
 
@@ -47,10 +50,10 @@ def program(problem, kinds):
 def triplet():
     """The Cooke triplet, what all operands say of it, and the rule of its rays."""
     lens, rule = load_lens("cooke_triplet"), Gauss(4, "half")
-    variables = Variables.of(lens, ["curvature"])
+    variables = Variables.from_lens(lens, ["curvature"])
     kinds = [kind for kind in OPERANDS if kind not in ("magnification", "glass_map")]
     given = FIELDS, COLOURS, DISTANCES, rule, WEIGHTS
-    problem = Problem.of(variables, kinds, *given)
+    problem = Problem.from_variables(variables, kinds, *given)
     return lens, rule, program(problem, kinds)(problem, variables.start)
 
 
@@ -182,9 +185,10 @@ def test_thickness_at_edges(triplet):
 @pytest.mark.slow
 def test_open_apertures_reach_as_far_as_the_rays(tmp_path):
     lens = model(tmp_path)
-    problem = Problem.of(Variables.of(lens, ["thickness"]), ["air_edge"], [0.0, 0.2], rule=3)
-    seen = problem.seen(lens)
-    extents = np.asarray(seen.extents)
+    problem = Problem.from_variables(
+        Variables.from_lens(lens, ["thickness"]), ["air_edge"], [0.0, 0.2], rule=3
+    )
+    extents = np.asarray(problem.beam_radius(lens))
     assert extents[0] == 6 and extents[4] == 4
     rays = drt_jax.trace_rays(lens, 0.2, np.inf, 0.5875618, [[0, 1], [0, -1], [1, 0]])
     reach = np.hypot(*np.moveaxis(np.asarray(rays.points)[0, :, :, :2], -1, 0)).max(axis=0)
@@ -242,12 +246,14 @@ def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
     path.write_text(WEAK.format(semi=semi))
     lens = load_lens(path)
     fields = np.radians([0.0, 14.0])
-    problem = Problem.of(Variables.of(lens, ["thickness"]), ["spot"], fields, rule=rule)
+    problem = Problem.from_variables(
+        Variables.from_lens(lens, ["thickness"]), ["spot"], fields, rule=rule
+    )
 
     @jax.jit
     def told(lens):
-        seen = problem.seen(lens)
-        return seen.illumination, seen.rays.passed
+        rays = trace_fields(problem, lens)
+        return relative_illumination(lens, rays), rays.throughput
 
     found, passed = told(lens)
     share = passed[1, 0] / passed[0, 0]
@@ -261,14 +267,18 @@ def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
 def test_vignetted_spots():
     """By a rule fitted to what is left of the pupil."""
     lens, rule, field = load_lens("camera_50mm"), Clipped(4, "half"), np.radians(20)
-    problem = Problem.of(
-        Variables.of(lens, ["thickness"]), ["spot_of_colours"], [field], COLOURS[1], rule=rule
+    problem = Problem.from_variables(
+        Variables.from_lens(lens, ["thickness"]),
+        ["spot_of_colours"],
+        [field],
+        COLOURS[1],
+        rule=rule,
     )
 
     @jax.jit
     def told(lens):
-        seen = problem.seen(lens)
-        return problem.operands[0].values(seen), seen.rays.passed
+        rays = trace_fields(problem, lens)
+        return problem.operands[0].values(lens, rays), rays.throughput
 
     values, passed = told(lens)
     found = drt_jax.psf_moments(lens, field, np.inf, COLOURS[1], rule=rule)
@@ -282,13 +292,15 @@ def beam(lens, vary, rule, **given):
     fields = np.radians([0.0, 8.0])
     kinds = ("spot", "rms_spot", "rms_wavefront", "centroid")
     wanted = [*(Operand(kind, **given) for kind in kinds), "throughput"]
-    return Problem.of(Variables.of(lens, vary), wanted, fields, COLOURS, rule=rule)
+    return Problem.from_variables(
+        Variables.from_lens(lens, vary), wanted, fields, COLOURS, rule=rule
+    )
 
 
 @jax.jit
 def judged(problem, lens):
-    seen = problem.seen(lens)
-    return [operand.values(seen) for operand in problem.operands]
+    rays = trace_fields(problem, lens)
+    return [operand.values(lens, rays) for operand in problem.operands]
 
 
 def test_spots_without_vignetting():
@@ -321,9 +333,11 @@ def test_apertures_as_variables_do_not_vignette():
     args = np.radians([0.0, 3.0, 5.5]), COLOURS
     light = []
     for operand in (Operand("spot"), Operand("spot", vignetting=False)):
-        problem = Problem.of(Variables.of(lens, vary), [operand], *args, rule=rule)
-        before = problem.seen(problem.variables.lens).rays.passed
-        after = problem.seen(design.optimise(problem).lens).rays.passed
+        problem = Problem.from_variables(
+            Variables.from_lens(lens, vary), [operand], *args, rule=rule
+        )
+        before = trace_fields(problem, problem.variables.lens).throughput
+        after = trace_fields(problem, design.optimise(problem).lens).throughput
         light.append(float(np.mean(after[2]) / np.mean(before[2])))
     assert light[0] < 0.8 and abs(light[1] - 1) < 0.01
 
@@ -332,15 +346,15 @@ def test_glasses_stay_on_the_map():
     """A doublet whose glasses vary: without the limit they end where no glass is."""
     lens = drt_jax.with_model_glass(load_lens(DOUBLET))
     free = ["curvature", "index", "abbe", "sensor"]
-    variables = Variables.of(lens, free, solves=[Solve("focal_length", 100.0, surface=2)])
+    variables = Variables.from_lens(lens, free, solves=[Solve("focal_length", 100.0, surface=2)])
     ends = []
     for limits in ([], [Operand("glass_map", high=0.0)]):
-        problem = Problem.of(variables, ["spot", *limits], [0.0, 0.02], COLOURS, rule=3)
-        found = design.optimise(problem, trials=60)
+        problem = Problem.from_variables(variables, ["spot", *limits], [0.0, 0.02], COLOURS, rule=3)
+        found = design.optimise(problem, max_steps=60)
         model = found.lens.dispersion.model[jnp.array([1, 2])]
         ends.append(np.asarray(glass_map_distance(model)))
         if limits:
-            assert found.worst == 0 and {limit.where for limit in found.limits} == {
+            assert found.max_violation == 0 and {limit.where for limit in found.limits} == {
                 "surface 0",
                 "surface 1",
             }
@@ -357,16 +371,20 @@ def model(tmp_path):
 def test_a_dark_field_is_no_good_one(tmp_path):
     lens = model(tmp_path)
     lens = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[6].set(1e-3))
-    problem = Problem.of(Variables.of(lens, ["curvature"]), ["spot"], [0.3], rule=3)
+    problem = Problem.from_variables(
+        Variables.from_lens(lens, ["curvature"]), ["spot"], [0.3], rule=3
+    )
     merit, gradient = jax.jit(jax.value_and_grad(problem.merit))(problem.variables.start)
     assert np.isinf(merit) and np.all(np.isfinite(gradient))
     with pytest.raises(ValueError, match="the start cannot be judged"):
-        design.optimise(problem, trials=2)
+        design.optimise(problem, max_steps=2)
 
 
 def test_obscurations_need_another_rule():
     lens = load_lens("hubble")
-    problem = Problem.of(Variables.of(lens, ["sensor"]), ["spot"], rule=Clipped(3, "disc"))
+    problem = Problem.from_variables(
+        Variables.from_lens(lens, ["sensor"]), ["spot"], rule=Clipped(3, "disc")
+    )
     if lens.apertures is not None and any(lens.apertures.blocks):
         with pytest.raises(ValueError, match="rule: Clipped subtracts"):
             problem.merit(problem.variables.start)
@@ -411,9 +429,9 @@ def test_bad_words_and_numbers(arguments, said):
     ],
 )
 def test_what_neither_lens_nor_problem_has(tmp_path, operand, said):
-    variables = Variables.of(model(tmp_path), ["curvature"])
+    variables = Variables.from_lens(model(tmp_path), ["curvature"])
     with pytest.raises(ValueError) as told:
-        Problem.of(variables, [operand], [0.0, 0.1])
+        Problem.from_variables(variables, [operand], [0.0, 0.1])
     assert said in str(told.value)
     assert hash(Operand("spot", fields=[0]))
 
@@ -429,6 +447,6 @@ def test_each_kind_is_told_where_a_user_reads():
 
 
 def test_kinds_as_type_checkers_know_them():
-    known = ((operands.OperandKind, OPERANDS), (kinds.VariableKind, KINDS))
-    for literal, table in (*known, (errors.ToleranceKind, errors.KINDS)):
+    known = ((operands.OperandName, OPERANDS), (kinds.VariableKind, KINDS))
+    for literal, table in (*known, (deviations.ToleranceKind, deviations.KINDS)):
         assert get_args(literal) == tuple(table)

@@ -5,13 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
-from scipy.optimize import least_squares
+from scipy import optimize
 
 import drt_jax
 from drt_jax import design
-from drt_jax.design import Operand, Solve, Variables, Vary
+from drt_jax.design import Operand, Solve, Variables, Vary, least_squares
 
 # Of the singlet of issue 14, by another program: merit at the start and at the optimum, mm^2.
 START, OPTIMUM = 30.0924206902, 0.00172898452577
@@ -23,18 +22,21 @@ sensor: 37
 """
 
 
-def solved(function, start, lower, upper, limits=0):
-    """By the method alone: the vector, the state."""
-    solver = design.BoundedLM(rtol=1e-14, atol=1e-26, limits=limits)
-    options = {"lower": jnp.asarray(lower), "upper": jnp.asarray(upper)}
+def solved(function, start, low, high):
+    """By the method alone, in one program: the vector, the search."""
 
-    def told(y, args):
-        return function(y), (jnp.zeros(()), ())
+    def values(y):
+        residuals, constraints = function(y)
+        return design.Evaluation(residuals, constraints, jnp.zeros(()), jnp.int32(0))
 
-    found = optx.least_squares(
-        told, solver, jnp.asarray(start), options=options, has_aux=True, max_steps=200, throw=False
-    )
-    return np.asarray(found.value), found.state
+    @jax.jit
+    def run(start, low, high):
+        search = least_squares.init(values, start)
+        step = lambda _, search: least_squares.step(values, search, low, high)  # noqa: E731
+        return jax.lax.fori_loop(0, 200, step, search)
+
+    search = run(*(jnp.asarray(a, float) for a in (start, low, high)))
+    return np.asarray(search.vector), search
 
 
 def rosenbrock(y):
@@ -44,26 +46,26 @@ def rosenbrock(y):
 @pytest.mark.parametrize("upper", [(5.0, 5.0), (0.5, 5.0), (5.0, 0.3)])
 def test_bounded_minima_are_those_of_scipy(upper):
     lower, start = (-2.0, -2.0), np.array([-1.2, 0.2])
-    wanted = least_squares(rosenbrock, start, bounds=(lower, upper), xtol=1e-15, ftol=1e-15).x
-    found, state = solved(rosenbrock, start, lower, upper)
+    bounds = lower, upper
+    wanted = optimize.least_squares(rosenbrock, start, bounds=bounds, xtol=1e-15, ftol=1e-15).x
+    found, search = solved(lambda y: (rosenbrock(y), jnp.zeros(0)), start, lower, upper)
     np.testing.assert_allclose(found, wanted, atol=1e-6)
-    assert (
-        np.all(found <= upper) and float(state.merit) <= 2 * np.sum(rosenbrock(wanted) ** 2) + 1e-20
-    )
+    limit = 2 * np.sum(rosenbrock(wanted) ** 2) + 1e-20
+    assert np.all(found <= upper) and float(search.merit) <= limit and bool(search.done)
 
 
-def test_one_sided_residuals_count_where_they_are_above_zero():
-    """min (x - 3)^2 + (y - 1)^2 + max(0, 100 (x + y - 2))^2: near (2, 0)."""
+def test_constraints_hold_exactly():
+    """min (x - 3)^2 + (y - 1)^2 where x + y <= 2: at (2, 0); where x + y <= 11: at (3, 1)."""
 
-    def function(y):
-        return jnp.stack([y[0] - 3, y[1] - 1, 100 * (y[0] + y[1] - 2)])
+    def function(y, most=2.0):
+        return jnp.stack([y[0] - 3, y[1] - 1]), 100 * (y[:1] + y[1:] - most)
 
-    found, state = solved(function, np.zeros(2), (-9.0, -9.0), (9.0, 9.0), limits=1)
-    np.testing.assert_allclose(found, [2, 0], atol=2e-4)
-    free, _ = solved(lambda y: function(y) + jnp.array([0, 0, -900.0]), np.zeros(2), [-9.0] * 2,
-                     [9.0] * 2, limits=1)  # fmt: skip
+    bounds = np.zeros(2), [-9.0] * 2, [9.0] * 2
+    found, search = solved(function, *bounds)
+    np.testing.assert_allclose(found, [2, 0], atol=1e-6)
+    assert float(search.max_violation) <= 0 and int(search.jacobians) < 16
+    free, _ = solved(lambda y: function(y, 11.0), *bounds)
     np.testing.assert_allclose(free, [3, 1], atol=1e-6)
-    assert int(state.jacobians) < 12
 
 
 def grid(rings):
@@ -80,8 +82,8 @@ def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):
     for first, second in ((1000, -1000), (-1000, 1000), ("inf", "inf")):
         path = tmp_path / "singlet.yaml"
         path.write_text(SINGLET.format(first, second))
-        variables = Variables.of(drt_jax.load_lens(path), ["curvature"])
-        problem = design.Problem.of(variables, ["spot"], 0.0, 0.55, rule=grid(5))
+        variables = Variables.from_lens(drt_jax.load_lens(path), ["curvature"])
+        problem = design.Problem.from_variables(variables, ["spot"], 0.0, 0.55, rule=grid(5))
         if first == 1000:
             np.testing.assert_allclose(problem.merit(variables.start), START, rtol=1e-11)
         found = design.optimise(problem)
@@ -97,19 +99,19 @@ def triplet():
     )
     lens = dataclasses.replace(lens, semi_diameter=semi)
     last = lens.live[-1]
-    variables = Variables.of(
+    variables = Variables.from_lens(
         lens,
         [Vary("curvature", low=-0.12, high=0.12), Vary("thickness", low=0.1, high=8), "sensor"],
         solves=[Solve("focal_length", surface=last), Solve("entrance_pupil")],
     )
     wanted = ["spot", Operand("glass_edge", low=1.0), Operand("total_track", high=55.0)]
-    return design.Problem.of(variables, wanted, np.radians([0.0, 14.0]), 0.5876, rule=3)
+    return design.Problem.from_variables(variables, wanted, np.radians([0.0, 14.0]), 0.5876, rule=3)
 
 
 def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
     start = float(triplet.merit(triplet.variables.start))
-    found = design.optimise(triplet, trials=200)
-    assert found.merit < start and found.worst <= 1e-9
+    found = design.optimise(triplet, max_steps=200)
+    assert found.merit < start and found.max_violation <= 1e-9
     low, high = np.asarray(triplet.variables.low), np.asarray(triplet.variables.high)
     assert np.all(low <= found.vector) and np.all(found.vector <= high)
     assert np.all(np.isfinite(found.history)) and np.all(np.diff(found.history[:, 2]) >= 0)
@@ -121,21 +123,21 @@ def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
 
 def test_a_search_ends_as_soon_as_it_is_good(triplet):
     """By its merit and its limits together, at the first trial of which that is true."""
-    whole = design.optimise(triplet, trials=40)
+    whole = design.optimise(triplet, max_steps=40)
     good = float(whole.history[10, 0])
-    found = design.optimise(triplet, trials=40, good=good)
+    found = design.optimise(triplet, max_steps=40, target_merit=good)
     assert found.score <= good and found.merit <= found.score
     count = len(found.history)
     assert 3 <= count < 40
     np.testing.assert_array_equal(found.history, whole.history[:count])
-    merit, worst, _ = design.optimise(triplet, trials=count - 1).history[-1]
-    assert merit + worst**2 > good and found.ended == "good" and not found.converged
+    merit, worst, _ = design.optimise(triplet, max_steps=count - 1).history[-1]
+    assert merit + worst**2 > good and found.ended == "target" and not found.converged
 
 
 def test_limits_are_kept_where_trials_are_used_up(triplet):
     """A search that is left before its multipliers have settled is mended by some more trials."""
-    found = design.optimise(triplet, trials=10)
-    assert found.history[-1, 1] > 1e-9 and found.worst == 0 and found.ended == "trials"
+    found = design.optimise(triplet, max_steps=10)
+    assert found.history[-1, 1] > 1e-9 and found.max_violation == 0 and found.ended == "steps"
     assert float(found.lens.sensor) <= 55 and found.merit < 2 * found.history[-1, 0]
 
 
@@ -145,17 +147,19 @@ def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
     assert design.optimise(triplet).ended == "stuck"
     args = np.radians([0.0, 14.0]), 0.5876
     apart = *triplet.operands, Operand("air_edge", low=0.1)
-    found = design.optimise(design.Problem.of(triplet.variables, apart, *args, rule=3))
-    assert found.converged and found.worst == 0 and len(found.limits) == 6 * 4 + 1
+    found = design.optimise(design.Problem.from_variables(triplet.variables, apart, *args, rule=3))
+    assert found.converged and found.max_violation == 0 and len(found.limits) == 6 * 4 + 1
     track = next(limit for limit in found.limits if limit.kind == "total_track")
     assert track.side == "high" and abs(track.value - float(found.lens.sensor)) < 1e-12
     assert all(a.excess >= b.excess for a, b in zip(found.limits, found.limits[1:]))
     wanted = "spot", Operand("glass_edge", low=7.0, surfaces=(2,)), Operand("length", high=8.0)
-    both = design.Problem.of(triplet.variables, [*wanted, Operand("spot", weight=0)], *args, rule=3)
+    both = design.Problem.from_variables(
+        triplet.variables, [*wanted, Operand("spot", weight=0)], *args, rule=3
+    )
     assert len(both.operands) == 3
     found = design.optimise(both)
     worst = found.worst_limit
-    assert found.ended == "limits" and worst.excess == found.worst > 0.01
+    assert found.ended == "limits" and worst.excess == found.max_violation > 0.01
     if worst.kind == "glass_edge":
         assert str(worst).startswith("glass_edge of surface 2, zone ")
     assert f"beyond by {worst.excess:.3g}" in str(worst)
@@ -167,13 +171,14 @@ def test_each_limit_has_the_name_of_its_value(triplet):
     kinds = [kind for kind in kinds if kind not in ("magnification", "glass_map")]
     lens, lows = triplet.variables.lens, -1e9
     for symmetry in ("half", "disc"):
-        problem = design.Problem.of(
+        problem = design.Problem.from_variables(
             triplet.variables,
             [Operand(kind, low=lows, weight=2.0) for kind in kinds],
             *([0.0, 0.2, 0.3], (0.48, 0.55, 0.65), (np.inf, 900.0), drt_jax.Gauss(2, symmetry)),
         )
         sizes = jax.eval_shape(
-            lambda p: [operand.excess(p.seen(lens)) for operand in p.operands], problem
+            lambda p: [o.constraints(lens, design.trace_fields(p, lens)) for o in p.operands],
+            problem,
         )
         count = sum(size.size for size in sizes)
         limits = problem.limits(-2.0 * np.arange(count))
@@ -186,16 +191,20 @@ def test_each_limit_has_the_name_of_its_value(triplet):
 def test_a_limit_that_nothing_moves_is_refused(triplet):
     """Where it is exceeded: of those that need no rays with the problem, else with the search."""
     lens = triplet.variables.lens
-    bent = Variables.of(lens, [Vary("curvature", (4,))], solves=[Solve("focal_length", surface=5)])
+    bent = Variables.from_lens(
+        lens, [Vary("curvature", (4,))], solves=[Solve("focal_length", surface=5)]
+    )
     some = ["spot", Operand("total_track", high=55.0), Operand("glass_edge", low=1.5)]
     with pytest.raises(ValueError, match="total_track: 60.1.*high 55.*no variable moves it"):
-        design.Problem.of(bent, some, 0.0, 0.5876)
-    design.Problem.of(bent, ["spot", Operand("total_track", high=61.0)], 0.0, 0.5876)
-    problem = design.Problem.of(bent, [some[0], some[2]], 0.0, 0.5876, rule=2)
+        design.Problem.from_variables(bent, some, 0.0, 0.5876)
+    design.Problem.from_variables(bent, ["spot", Operand("total_track", high=61.0)], 0.0, 0.5876)
+    problem = design.Problem.from_variables(bent, [some[0], some[2]], 0.0, 0.5876, rule=2)
     with pytest.raises(ValueError, match="glass_edge of surface 2, zone .*no variable moves it"):
-        design.optimise(problem, trials=3)
+        design.optimise(problem, max_steps=3)
     # Those of rays that fail stay where they are until they pass.
-    bounded = design.Problem.of(bent, ["spot", Operand("distortion", low=-0.05)], 0.3, 0.5876)
+    bounded = design.Problem.from_variables(
+        bent, ["spot", Operand("distortion", low=-0.05)], 0.3, 0.5876
+    )
     bounded.refuse_fixed([0.95], [0.95])
 
 
@@ -204,7 +213,7 @@ def test_weights_of_fields(triplet):
     start = triplet.variables.start
 
     def merit(fields, **given):
-        of = design.Problem.of(
+        of = design.Problem.from_variables(
             triplet.variables, ["spot", "rms_spot"], fields, 0.5876, (np.inf, 900.0), 3, **given
         )
         return float(of.merit(start))
@@ -213,18 +222,19 @@ def test_weights_of_fields(triplet):
     both = [0.0, 0.2]
     assert abs(merit(both, field_weights=[1, 3]) / (0.5 * one + 1.5 * two) - 1) < 1e-12
     assert abs(merit(both, field_weights=[0, 1]) / (2 * two) - 1) < 1e-12
-    assert abs(merit(both, field_weights=[2, 2]) / merit(both) - 1) < 1e-14
+    assert merit(both, field_weights=[2, 2]) == merit(both, field_weights=[1, 1])
+    assert abs(merit(both, field_weights=[2, 2]) / merit(both) - 1) < 1e-12
 
 
 def test_many_starts_do_not_depend_on_threads(triplet):
     """Two tiles, one of them not full, and a start that no light passes."""
-    starts = design.around(triplet.variables, 18, 2.0, 3)
+    starts = design.normal_starts(triplet.variables, 18, 2.0, 3)
     starts[5, :4] = [24.0, -24.0, 24.0, -24.0]
     one, two = (
         design.many_starts(triplet, starts, (4, 4), 0.5, threads=threads) for threads in (1, 2)
     )
     np.testing.assert_array_equal(one.merits, two.merits)
-    assert one.trials == two.trials and np.sum(np.isfinite(one.merits)) >= 17
+    assert one.steps == two.steps and np.sum(np.isfinite(one.merits)) >= 17
     assert [m.start for m in one.minima] == [m.start for m in two.minima]
     merits = [minimum.merit for minimum in one.minima]
     assert merits == sorted(merits) and merits[0] < float(triplet.merit(starts[0]))
@@ -234,22 +244,35 @@ def test_many_starts_do_not_depend_on_threads(triplet):
     "call, said",
     [
         (lambda p: design.many_starts(p, np.zeros((2, 3))), "starts: expected"),
-        (lambda p: design.within(p.variables, 4), "sensor: starts within bounds need low and high"),
-        (lambda p: design.Problem.of(p.variables, []), "operands: none"),
         (
-            lambda p: design.Problem.of(p.variables, ["spot"], colour_weights=[0.0]),
-            "colour_weights",
+            lambda p: design.sobol_starts(p.variables, 4),
+            "sensor: starts within bounds need low and high",
+        ),
+        (lambda p: design.Problem.from_variables(p.variables, []), "operands: none"),
+        (
+            lambda p: design.Problem.from_variables(
+                p.variables, ["spot"], wavelength_weights=[0.0]
+            ),
+            "wavelength_weights",
         ),
         (
-            lambda p: design.Problem.of(p.variables, ["spot"], [0, 0.1], field_weights=[1]),
+            lambda p: design.Problem.from_variables(
+                p.variables, ["spot"], [0, 0.1], field_weights=[1]
+            ),
             "field_weights: expected 2 numbers",
         ),
         (
-            lambda p: design.Problem.of(p.variables, [Operand("spot", weight=0)]),
+            lambda p: design.Problem.from_variables(p.variables, [Operand("spot", weight=0)]),
             "all have the weight 0",
         ),
-        (lambda p: design.Problem.of(p.variables, ["magnification"]), "object is at infinity"),
-        (lambda p: design.Problem.of(p.variables, [Operand("spot", fields=(3,))]), "no number 3"),
+        (
+            lambda p: design.Problem.from_variables(p.variables, ["magnification"]),
+            "object is at infinity",
+        ),
+        (
+            lambda p: design.Problem.from_variables(p.variables, [Operand("spot", fields=(3,))]),
+            "no number 3",
+        ),
         (lambda p: jax.jit(lambda v: design.optimise(p, v))(p.variables.start), "outside of jax"),
     ],
 )

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax.design import Perturbed, Tolerance, elements_of
-from drt_jax.design.errors import KINDS
+from drt_jax.design import PerturbedLens, Tolerance, elements_of
+from drt_jax.design.deviations import KINDS
 from drt_jax.lens.glass import refractive_index
 from drt_jax.lens.lens import sag
 
@@ -37,7 +37,7 @@ def lens_of(rows=(), **top):
 
 
 def perturbed(lens, *tolerances):
-    return Perturbed.of(lens, lens.semi_diameter[:-1], tolerances)
+    return PerturbedLens.from_lens(lens, lens.semi_diameter[:-1], tolerances)
 
 
 def same(ours, wanted):
@@ -68,14 +68,14 @@ def test_elements_are_what_glass_holds_together():
     assert elements_of(lens) == ((0, 2),)
     # One piece of glass, seen twice.
     some = perturbed(lens, Tolerance("index", 1e-3))
-    assert len(some.errors) == 1
+    assert len(some.deviations) == 1
     changed = some.lens_of(jnp.ones(1)).index(LINES) - lens.index(LINES)
     np.testing.assert_allclose(changed[1:3, 1], 1e-3, rtol=1e-10)
 
 
 def test_shifts_and_tilts_are_those_of_elements_in_a_prescription():
     some = perturbed(lens_of(), Tolerance("shift", 0.1), Tolerance("tilt", 6, (1,)))
-    assert list(map(str, some.errors)) == [
+    assert list(map(str, some.deviations)) == [
         *("shift of element 0, x", "shift of element 0, y"),
         *("shift of element 1, x", "shift of element 1, y"),
         *("tilt of element 1, x", "tilt of element 1, y"),
@@ -122,7 +122,7 @@ def test_elements_move_within_those_of_the_prescription():
 
 def test_wedge_is_the_tilt_of_a_surface():
     some = perturbed(lens_of({1: {"tilt": [0.2, 0, 0]}}), Tolerance("wedge", 3, (1, 5)))
-    assert list(map(str, some.errors)) == [
+    assert list(map(str, some.deviations)) == [
         *("wedge of surface 1, x", "wedge of surface 1, y"),
         *("wedge of surface 5, x", "wedge of surface 5, y"),
     ]
@@ -132,7 +132,17 @@ def test_wedge_is_the_tilt_of_a_surface():
 
 def test_radius_and_thickness_are_those_of_a_prescription():
     some = perturbed(lens_of(), Tolerance("radius", 2.0), Tolerance("thickness", 0.1))
-    assert [e.place for e in some.errors] == [0, 1, 4, 5, 0, 1, 2, 3, 4]  # planes have no radius
+    assert [e.place for e in some.deviations] == [
+        0,
+        1,
+        4,
+        5,
+        0,
+        1,
+        2,
+        3,
+        4,
+    ]  # planes have no radius
     off = jnp.array([1.0, 0, -0.5, 0, 0, 0, -1, 0, 1])
     by_hand = lens_of({
         0: {"radius": 30.6}, 4: {"radius": 59.4, "thickness": 3.1}, 2: {"thickness": 2.9},
@@ -180,7 +190,7 @@ def test_irregularity_is_the_biconic_with_these_fringes_between_its_meridians():
 def test_index_and_abbe_number_are_off_by_what_is_said():
     lens = lens_of()
     some = perturbed(lens, Tolerance("index", 1e-3), Tolerance("abbe", 1.0))
-    assert [e.place for e in some.errors] == [0, 1, 4, 0, 1, 4]
+    assert [e.place for e in some.deviations] == [0, 1, 4, 0, 1, 4]
 
     def told(lens):
         f, d, c = refractive_index(lens.dispersion, LINES).T[:, jnp.array([1, 2, 5])]
@@ -200,10 +210,10 @@ def test_errors_have_derivatives_and_keep_the_dtype():
     lens = jax.tree.map(lambda a: a.astype(jnp.float32), lens_of())
     kinds = [Tolerance(kind, 1e-2) for kind in KINDS]
     some = perturbed(lens, *kinds)
-    off = jnp.zeros(len(some.errors), jnp.float32)
+    off = jnp.zeros(len(some.deviations), jnp.float32)
     assert {a.dtype for a in jax.tree.leaves(some.lens_of(off))} == {jnp.dtype("float32")}
     some = perturbed(lens_of(), *kinds)
-    off = jnp.full(len(some.errors), 0.3)
+    off = jnp.full(len(some.deviations), 0.3)
     numbers = jax.jit(lambda off: jnp.concatenate([*map(jnp.ravel, leaves(some.lens_of(off)))]))
     ahead = jax.jit(lambda off, unit: jax.jvp(numbers, (off,), (unit,))[1])
     for unit in jnp.eye(len(off))[::7]:
@@ -262,5 +272,5 @@ def test_what_a_lens_has_none_of_is_refused_by_name():
     flat = dataclasses.replace(lens, curvature=0 * lens.curvature)
     with pytest.raises(ValueError, match="no surface is curved; of planes, tolerance fringes"):
         perturbed(flat, Tolerance("radius", 1.0))
-    with pytest.raises(ValueError, match=r"^extents: expected \(1,\), got shape \(2,\)"):
-        Perturbed.of(lens, lens.semi_diameter, [Tolerance("tilt", 1.0)])
+    with pytest.raises(ValueError, match=r"^beam_radius: expected \(1,\), got shape \(2,\)"):
+        PerturbedLens.from_lens(lens, lens.semi_diameter, [Tolerance("tilt", 1.0)])

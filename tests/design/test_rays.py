@@ -55,10 +55,12 @@ def test_aiming_finds_what_the_full_search_finds(name, factor, degrees):
 def test_spots_of_a_design_are_those_of_the_moments():
     """A fifth of the rays fails: what is left is weighed as by `psf_moments`."""
     lens, field = opened("phone", 1.5), np.radians(14.0)
-    variables = design.Variables.of(lens, [Vary("curvature")])
+    variables = design.Variables.from_lens(lens, [Vary("curvature")])
     rule = drt_jax.Gauss(6, "half")
-    problem = design.Problem.of(variables, ["rms_spot", "spot"], [field], RGB, rule=rule)
-    judged = jax.jit(lambda p: p.judge(variables.start))(problem)
+    problem = design.Problem.from_variables(
+        variables, ["rms_spot", "spot"], [field], RGB, rule=rule
+    )
+    judged = jax.jit(lambda p: p.evaluate(variables.start))(problem)
     moments = drt_jax.psf_moments(lens, field, np.inf, RGB, rule=rule)
     assert int(judged.failed) > 0 and np.all(moments.passed < 1)
     # About the centroid of all wavelengths.
@@ -72,11 +74,13 @@ def test_spots_of_a_design_are_those_of_the_moments():
 def test_lenses_as_built_are_searched_in_full(monkeypatch):
     """Of whatever aiming misses, here every ray, the full search finds all."""
     lens = opened("cooke_triplet", 1.0)
-    variables = design.Variables.of(lens, [Vary("curvature")])
+    variables = design.Variables.from_lens(lens, [Vary("curvature")])
     rule = drt_jax.Gauss(3, "disc")
-    problem = design.Problem.of(variables, ["spot"], [0.2], (0.55,), rule=rule)
-    perturbed = design.Perturbed.of(lens, problem.extents(lens), [Tolerance("thickness", 0.02)])
-    off = design.draw_errors(perturbed, 3, seed=1)
+    problem = design.Problem.from_variables(variables, ["spot"], [0.2], (0.55,), rule=rule)
+    perturbed = design.PerturbedLens.from_lens(
+        lens, problem.beam_radius(lens), [Tolerance("thickness", 0.02)]
+    )
+    off = design.draw_perturbations(perturbed, 3, seed=1)
     wanted = design.monte_carlo(problem, perturbed, off, "focus")
     assert np.all(np.isfinite(wanted.squares))
 
@@ -91,8 +95,8 @@ def test_lenses_as_built_are_searched_in_full(monkeypatch):
 
 def test_an_optimum_is_searched_in_full(monkeypatch):
     """The same of a search for an optimum."""
-    variables = design.Variables.of(drt_jax.load_lens("singlet"), ["sensor"])
-    problem = design.Problem.of(variables, ["spot"], [0.0], (0.55,), rule=3)
+    variables = design.Variables.from_lens(drt_jax.load_lens("singlet"), ["sensor"])
+    problem = design.Problem.from_variables(variables, ["spot"], [0.0], (0.55,), rule=3)
     wanted = design.optimise(problem)
 
     def blind(system, target):
@@ -104,6 +108,6 @@ def test_an_optimum_is_searched_in_full(monkeypatch):
     monkeypatch.setattr("drt_jax.design.problem.solve_aimed", blind)
     found = design.optimise(problem)
     np.testing.assert_allclose(found.merit, wanted.merit, rtol=1e-9)
-    starts = design.around(variables, 4, 1.0)
-    minima = design.many_starts(problem, starts, turns=(20,)).minima
+    starts = design.normal_starts(variables, 4, 1.0)
+    minima = design.many_starts(problem, starts, steps=(20,)).minima
     np.testing.assert_allclose(minima[0].merit, wanted.merit, rtol=1e-6)

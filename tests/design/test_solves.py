@@ -58,7 +58,9 @@ CASES = [
 @pytest.mark.parametrize("solve", CASES, ids=lambda s: f"{s.kind}-{s.value:g}-{s.surface}")
 def test_conditions_hold_whatever_varies(solve):
     """To 1e-12, at the start and for random vectors; by `first_order`."""
-    variables = Variables.of(load_lens("cooke_triplet"), ["curvature", "thickness"], solves=[solve])
+    variables = Variables.from_lens(
+        load_lens("cooke_triplet"), ["curvature", "thickness"], solves=[solve]
+    )
     kept = variables.solves[0]
     lens_of = jax.jit(variables.lens_of)
     if not solve.focuses:
@@ -77,7 +79,7 @@ def test_a_focal_length_in_air_is_kept_in_front_of_water():
     lens = load_lens({"surfaces": [*rows, {"radius": -40, "glass": "water", "thickness": 70.0}]})
     water = float(lens.index(0.5875618)[-1, 0])
     for kind, power in (("focal_length", water / 90), ("effective_focal_length", 1 / 90)):
-        kept = Variables.of(lens, ["thickness"], solves=[Solve(kind, 90.0, 1)]).lens
+        kept = Variables.from_lens(lens, ["thickness"], solves=[Solve(kind, 90.0, 1)]).lens
         found = drt_jax.effective_focal_length(kept, 0.5875618)[0]
         assert abs(found * power - 1) < EXACT
 
@@ -90,7 +92,9 @@ def test_all_together_in_any_order():
         Solve("f_number", 4.5),
         Solve("focal_length", 52.0, 5),
     ]
-    variables = Variables.of(load_lens("cooke_triplet"), ["curvature", "thickness"], solves=solves)
+    variables = Variables.from_lens(
+        load_lens("cooke_triplet"), ["curvature", "thickness"], solves=solves
+    )
     assert [s.kind for s in variables.solves] == ["focal_length", "f_number", "best_focus"]
     lens_of = jax.jit(variables.lens_of)
     for vector in random_lenses(variables, size=0.2):
@@ -118,7 +122,7 @@ def test_best_focus_is_best():
     lens = load_lens("cooke_triplet")
     solve = Solve("best_focus", fields=(0.0, 0.25), wavelengths=COLOURS)
     sensor = [
-        float(Variables.of(lens, ["thickness"], solves=[s]).lens.sensor)
+        float(Variables.from_lens(lens, ["thickness"], solves=[s]).lens.sensor)
         for s in (solve, dataclasses.replace(solve, value=0.1))
     ]
     assert abs(sensor[1] - sensor[0] - 0.1) < 1e-12
@@ -136,7 +140,9 @@ def test_best_focus_is_best():
 def test_solved_numbers_have_derivatives():
     """In forward and reverse mode, against central differences; the condition itself has none."""
     solves = [Solve("focal_length", surface=5), Solve("f_number"), Solve("best_focus")]
-    variables = Variables.of(load_lens("cooke_triplet"), ["curvature", "thickness"], solves=solves)
+    variables = Variables.from_lens(
+        load_lens("cooke_triplet"), ["curvature", "thickness"], solves=solves
+    )
 
     def follows(vector):
         lens = variables.lens_of(vector)
@@ -158,7 +164,7 @@ def test_solved_numbers_have_derivatives():
 def test_a_mirror_keeps_its_focus():
     lens = load_lens("ritchey_chretien")
     solves = [Solve("focal_length", surface=lens.live[-1]), Solve("paraxial_focus")]
-    variables = Variables.of(lens, ["curvature", "thickness"], solves=solves)
+    variables = Variables.from_lens(lens, ["curvature", "thickness"], solves=solves)
     for vector in random_lenses(variables, size=0.01):
         found = drt_jax.first_order(variables.lens_of(vector), np.inf, 0.5875618)
         assert abs(found.focal_length[0] / variables.solves[0].value - 1) < EXACT
@@ -168,7 +174,7 @@ def test_a_mirror_keeps_its_focus():
 def test_the_patent_lens_keeps_its_data(shared):
     solves = [Solve("focal_length", 49.565, 11), Solve("f_number", 1.84), Solve("paraxial_focus")]
     lens = load_lens(shared / "patent_rf50.yaml")
-    variables = Variables.of(lens, ["curvature", "index", "thickness"], solves=solves)
+    variables = Variables.from_lens(lens, ["curvature", "index", "thickness"], solves=solves)
     for vector in random_lenses(variables, size=0.2):
         found = drt_jax.first_order(variables.lens_of(vector), np.inf, 0.5875618)
         assert abs(found.focal_length[0] / 49.565 - 1) < EXACT
@@ -201,16 +207,16 @@ BAD = [
 @pytest.mark.parametrize("solves, said", BAD)
 def test_what_cannot_hold_is_told_in_one_line(solves, said):
     with pytest.raises(ValueError) as told:
-        Variables.of(load_lens("cooke_triplet"), ["curvature", "thickness"], solves=solves)
+        Variables.from_lens(load_lens("cooke_triplet"), ["curvature", "thickness"], solves=solves)
     assert said in str(told.value) and "\n" not in str(told.value)
 
 
 def test_more_solves_than_variables():
     solves = [Solve("focal_length", surface=5), Solve("paraxial_focus")]
     with pytest.raises(ValueError, match="solves: 2 of them, but 1 variables; leave some out"):
-        Variables.of(load_lens("cooke_triplet"), [Vary("curvature", (0,))], solves=solves)
+        Variables.from_lens(load_lens("cooke_triplet"), [Vary("curvature", (0,))], solves=solves)
     with pytest.raises(ValueError, match="variables: sensor follows|variables: none is left"):
-        Variables.of(load_lens("cooke_triplet"), [Vary("sensor", (0,))], solves=solves[1:])
+        Variables.from_lens(load_lens("cooke_triplet"), [Vary("sensor", (0,))], solves=solves[1:])
 
 
 @pytest.mark.parametrize(
@@ -242,8 +248,8 @@ def test_a_lens_without_focus(tmp_path):
         (Solve("focal_length", surface=1), "focal_length: the lens has none to keep; give its"),
     ):
         with pytest.raises(ValueError, match=said):
-            Variables.of(plate, ["thickness", Vary("curvature", (0,))], solves=[solve])
-    made = Variables.of(plate, ["thickness"], solves=[Solve("focal_length", 80.0, 1)])
+            Variables.from_lens(plate, ["thickness", Vary("curvature", (0,))], solves=[solve])
+    made = Variables.from_lens(plate, ["thickness"], solves=[Solve("focal_length", 80.0, 1)])
     assert abs(drt_jax.focal_length(made.lens, 0.5875618)[0] / 80 - 1) < EXACT
 
 
@@ -258,4 +264,4 @@ def test_a_curvature_where_the_beam_is_in_focus_keeps_nothing(tmp_path):
     focused = 51.8 / 0.518 * 1.518
     lens = dataclasses.replace(lens, thickness=jnp.array([focused]), sensor=jnp.array(focused + 10))
     with pytest.raises(ValueError, match="is the beam in focus there"):
-        Variables.of(lens, ["thickness"], solves=[Solve("focal_length", 70.0, 1)])
+        Variables.from_lens(lens, ["thickness"], solves=[Solve("focal_length", 70.0, 1)])

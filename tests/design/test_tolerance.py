@@ -12,8 +12,8 @@ from scipy import optimize
 
 import drt_jax
 from drt_jax import design
-from drt_jax.design import Perturbed, Problem, Tolerance, Variables, tolerance
-from drt_jax.design.errors import KINDS
+from drt_jax.design import PerturbedLens, Problem, Tolerance, Variables, tolerance
+from drt_jax.design.deviations import KINDS
 from drt_jax.pupil.rules import Gauss
 
 SINGLET = drt_jax.load_lens("singlet")
@@ -27,11 +27,13 @@ ALL = [Tolerance(kind, size) for kind, size in SIZES.items()]
 
 
 def perturbed(*tolerances):
-    return Perturbed.of(SINGLET, jnp.array([5.0, 6.0, 6.0]), tolerances or ALL)
+    return PerturbedLens.from_lens(SINGLET, jnp.array([5.0, 6.0, 6.0]), tolerances or ALL)
 
 
 def problem_of(lens, fields=FIELDS, rule=3, **more):
-    return Problem.of(Variables.of(lens, ["sensor"]), ["spot"], fields, COLOURS, np.inf, rule)
+    return Problem.from_variables(
+        Variables.from_lens(lens, ["sensor"]), ["spot"], fields, COLOURS, np.inf, rule
+    )
 
 
 @pytest.fixture(scope="module")
@@ -46,11 +48,11 @@ def predicted(singlet):
     return tolerance.predict(*singlet, "focus")
 
 
-_made = jax.jit(tolerance.made, static_argnums=2)
+_made = jax.jit(tolerance.as_built, static_argnums=2)
 
 
 def some_lens(some, seed=5):
-    return some.lens_of(jnp.asarray(design.draw_errors(some, 1, seed)[0]))
+    return some.lens_of(jnp.asarray(design.draw_perturbations(some, 1, seed)[0]))
 
 
 def test_squares_are_those_of_the_moments(singlet):
@@ -94,7 +96,7 @@ def test_tilt_of_the_sensor_is_where_a_scan_finds_it(singlet):
     def spot(moves):
         tilt = lens.tilt.at[-1, :2].add(jnp.stack([moves[1], -moves[2]]))
         moved = dataclasses.replace(lens, sensor=lens.sensor + moves[0], tilt=tilt)
-        return 1e3 * tolerance.made(problem, moved, "none").spot
+        return 1e3 * tolerance.as_built(problem, moved, "none").spot
 
     scales = np.array([0.1, 0.05, 0.05])
     best = optimize.minimize(
@@ -127,7 +129,7 @@ def measures(singlet, off):
 def test_gradient_and_hessian_are_those_of_differences(singlet, predicted):
     """Central differences: at some step they agree to six digits, and before it the error falls
     with the square of the step."""
-    count = len(singlet[1].errors)
+    count = len(singlet[1].deviations)
     units = np.eye(count)
     steps = np.array([0.4, 0.2, 0.1, 0.05, 0.01])
     ends = [s * h * u for h in steps for u in units for s in (1, -1)]
@@ -157,7 +159,7 @@ def test_gradient_and_hessian_are_those_of_differences(singlet, predicted):
 def test_what_rays_know_of_second_derivatives_are_their_products(singlet, predicted):
     problem, some = singlet
     residuals = jax.jit(lambda off: tolerance._compensated(problem, some.lens_of(off), "focus")[1])
-    units = jnp.eye(len(some.errors))
+    units = jnp.eye(len(some.deviations))
     rows = [np.ravel(residuals(1e-4 * u) - residuals(-1e-4 * u)) / 2e-4 for u in units]
     products = 2 * np.array(rows) @ np.array(rows).T / len(FIELDS)
     np.testing.assert_allclose(predicted.gauss, products, atol=1e-6 * products.max())
@@ -167,13 +169,13 @@ def test_what_rays_know_of_second_derivatives_are_their_products(singlet, predic
 @pytest.mark.slow
 def test_predictions_are_monte_carlo(singlet, predicted):
     """The quadratic of all second derivatives, with errors so small that it holds."""
-    off = 0.1 * design.draw_errors(singlet[1], 200, 3)
+    off = 0.1 * design.draw_perturbations(singlet[1], 200, 3)
     true = measures(singlet, off)
     foretold = np.asarray(predicted.at(off, "second"))
     assert np.max(np.abs(foretold - true)) < 0.02 * np.std(true)
     first = np.asarray(predicted.at(off, "first"))
     assert np.max(np.abs(foretold - true)) < 0.2 * np.max(np.abs(first - true))
-    many = design.draw_errors(singlet[1], 50_000, 4)
+    many = design.draw_perturbations(singlet[1], 50_000, 4)
     for order in ("first", "rays", "second"):
         mean, deviation = predicted.moments(design.variances(singlet[1]), order)
         q = np.asarray(predicted.at(many, order))
@@ -209,7 +211,7 @@ def test_orders_that_are_unknown_are_refused(word):
 @pytest.mark.slow
 def test_nothing_drawn_is_worse_than_the_worst_case(singlet, predicted):
     some = singlet[1]
-    many = np.asarray(predicted.at(design.draw_errors(some, 20_000, 1), "second"))
+    many = np.asarray(predicted.at(design.draw_perturbations(some, 20_000, 1), "second"))
     for order in ("first", "second"):
         off = design.worst_case(some, predicted, order)
         for part in tolerance._parts(some):
@@ -220,16 +222,16 @@ def test_nothing_drawn_is_worse_than_the_worst_case(singlet, predicted):
 @pytest.mark.parametrize("normal", [False, True])
 def test_errors_are_drawn_within_circles(normal):
     some = perturbed(Tolerance("shift", 1.0), Tolerance("radius", 1.0), Tolerance("tilt", 1.0))
-    off = design.draw_errors(some, 100_000, 0, normal)
+    off = design.draw_perturbations(some, 100_000, 0, normal)
     for part in tolerance._parts(some):
         assert 0.99 < np.max(np.linalg.norm(off[:, part], axis=1)) <= 1
     assert [len(part) for part in tolerance._parts(some)] == [2, 1, 2]
     np.testing.assert_allclose(off.var(axis=0), design.variances(some, normal), rtol=0.02)
-    assert np.array_equal(off, design.draw_errors(some, 100_000, 0, normal))
+    assert np.array_equal(off, design.draw_perturbations(some, 100_000, 0, normal))
 
 
 def test_monte_carlo_depends_on_neither_threads_nor_tiles(singlet, monkeypatch):
-    off = design.draw_errors(singlet[1], 120, 2)
+    off = design.draw_perturbations(singlet[1], 120, 2)
     told = []
     one = design.monte_carlo(*singlet, off, "focus", told.append, threads=1)
     assert told == [50, 100, 120]
@@ -244,7 +246,7 @@ def test_monte_carlo_depends_on_neither_threads_nor_tiles(singlet, monkeypatch):
 
 def test_lenses_that_pass_no_light_are_as_bad_as_can_be(singlet):
     """Errors of any size: no NaN, and no good spot of the few rays that are left."""
-    off = 1e3 * design.draw_errors(singlet[1], 50, 0)
+    off = 1e3 * design.draw_perturbations(singlet[1], 50, 0)
     found = design.monte_carlo(*singlet, off, "focus")
     assert not any(np.isnan(a).any() for a in found)
     assert np.mean(np.isinf(found.spot)) > 0.5
@@ -268,7 +270,7 @@ def test_half_a_pupil_is_enough_where_nothing_is_moved():
 
 def test_what_cannot_be_is_refused_by_name(singlet):
     problem, some = singlet
-    off = np.zeros((1, len(some.errors)))
+    off = np.zeros((1, len(some.deviations)))
     with pytest.raises(ValueError, match="^compensator: unknown 'zoom'; known: none, focus"):
         design.predict(problem, some, "zoom")
     line = problem_of(some.lens, FIELDS[:3])
@@ -276,7 +278,7 @@ def test_what_cannot_be_is_refused_by_name(singlet):
         design.monte_carlo(line, some, off, "focus and tilt")
     for rule, needs in ((Gauss(3, "half"), "disc"), (Gauss(3, "meridian"), "disc")):
         with pytest.raises(ValueError, match=f'^rule: "{rule.symmetry}" .* Gauss.6, "{needs}".'):
-            design.made(problem_of(some.lens, rule=rule), some.lens, "focus")
+            design.as_built(problem_of(some.lens, rule=rule), some.lens, "focus")
     for bad in (off[0], off[:, 1:], off[:0]):
-        with pytest.raises(ValueError, match=r"^off: expected \(K, 13\), got shape"):
+        with pytest.raises(ValueError, match=r"^perturbation: expected \(K, 13\), got shape"):
             design.monte_carlo(problem, some, bad, "focus")

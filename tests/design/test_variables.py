@@ -57,13 +57,13 @@ def test_all_kinds_are_here():
 @pytest.mark.parametrize("kind", ALL)
 def test_a_word_is_all_of_a_kind(lens, kind):
     rows, terms = ALL[kind]
-    places = Variables.of(lens, [kind]).places
+    places = Variables.from_lens(lens, [kind]).places
     assert [p[1:] for p in places] == [(row, term) for row in rows for term in terms]
 
 
 @pytest.mark.parametrize("kind", ALL)
 def test_each_number_moves_alone_and_by_itself(lens, kind):
-    variables = Variables.of(lens, [kind])
+    variables = Variables.from_lens(lens, [kind])
     start = variables.start
     for k, place in enumerate(variables.places):
         moved = variables.lens_of(start.at[k].add(0.1))
@@ -80,7 +80,7 @@ def test_each_number_moves_alone_and_by_itself(lens, kind):
 
 
 def test_from_vector_to_lens_and_back(lens):
-    every = Variables.of(lens, [*ALL])
+    every = Variables.from_lens(lens, [*ALL])
     rng = np.random.default_rng(0)
     vector = jnp.asarray(rng.normal(size=len(every.places))) + every.start
     np.testing.assert_allclose(every.vector(every.lens_of(vector)), vector, rtol=1e-13, atol=1e-13)
@@ -99,7 +99,7 @@ def test_from_vector_to_lens_and_back(lens):
 
 
 def test_the_sensor_goes_along_with_thicknesses(lens):
-    variables = Variables.of(lens, ["thickness"])
+    variables = Variables.from_lens(lens, ["thickness"])
     longer = variables.lens_of(variables.start + 1)
     grown = jnp.sum(longer.thickness) - jnp.sum(lens.thickness)
     assert grown > 0.1 and abs(longer.sensor - lens.sensor - grown) < 1e-12
@@ -111,7 +111,7 @@ def test_bounds_and_scales(lens):
         Vary("index", (0,), low=1.0, high=1.8),
         "thickness",
     ]
-    variables = Variables.of(lens, vary)
+    variables = Variables.from_lens(lens, vary)
     np.testing.assert_allclose(variables.low[:2], 0)
     np.testing.assert_allclose(variables.high[:2], 6)
     # Indices end where glasses do, the others nowhere; the start lies within.
@@ -123,7 +123,7 @@ def test_bounds_and_scales(lens):
 
 def test_scales_are_what_moves_the_light(lens):
     """A step of any coefficient lifts its surface by the same at the beam's edge."""
-    variables = Variables.of(lens, [Vary("coefficients", (2,))])
+    variables = Variables.from_lens(lens, [Vary("coefficients", (2,))])
     np.testing.assert_allclose(variables.scale, [0.04 / 4.0**4, 0.04 / 4.0**6], rtol=1e-12)
 
 
@@ -136,7 +136,7 @@ def test_coefficients_bounded_by_what_they_add_to_the_sag(form):
     front = {"radius": 20, "thickness": 2, "glass": "N-BK7", "semi_diameter": 2.5, "stop": True}
     bent = load_lens({"surfaces": [front, {"radius": -40, **own}], "sensor": 30.0})
     vary = Vary("coefficients", (1,), sag=0.2, semi_diameter=3.0)
-    variables = Variables.of(bent, [vary])
+    variables = Variables.from_lens(bent, [vary])
     assert len(variables.places) >= 2
     angle = np.linspace(0, 2 * np.pi, 721)
 
@@ -174,7 +174,7 @@ def test_norm_radii_are_no_variables(tmp_path):
         "     norm_radius: 6.0, coefficients: {0: 1.0e-3, 1: 1.0e-4}}\n"
         "  - {radius: inf, thickness: 95, form: toroid, curvature_x: 0.001}\n"
     )
-    names = Variables.of(load_lens(path), ["coefficients"]).names
+    names = Variables.from_lens(load_lens(path), ["coefficients"]).names
     # Of the toroid its curvature in x and y^4; that of y^2 is its curvature.
     assert names == (
         *("coefficients 0[1]", "coefficients 0[2]"),
@@ -184,7 +184,7 @@ def test_norm_radii_are_no_variables(tmp_path):
 
 def test_ties(lens):
     ties = [Tie((0, 3)), Tie((1, 6), "opposite"), Tie((0, 5), kind="thickness")]
-    variables = Variables.of(lens, ["curvature", "thickness"], ties)
+    variables = Variables.from_lens(lens, ["curvature", "thickness"], ties)
     names = variables.names
     assert "curvature 3" not in names and "curvature 6" not in names and "thickness 5" not in names
     vector = variables.start + jnp.linspace(0.1, 1, len(names))
@@ -200,7 +200,7 @@ def test_scaled_and_shifted_ties(lens):
     """A follower is scale x leader + shift, also of what does not vary, and moves by the scale."""
     ties = [Tie((0, 3), scale=-0.5), Tie((1, 6), "opposite", scale=2.0, shift=0.01)]
     ties.append(Tie((0, 5), kind="thickness", scale=0.25, shift=2.0))
-    variables = Variables.of(lens, ["curvature"], ties)
+    variables = Variables.from_lens(lens, ["curvature"], ties)
     assert variables.lens.thickness[5] == 0.25 * lens.thickness[0] + 2
     vector = variables.start + jnp.linspace(0.1, 1, len(variables.names))
     made = variables.lens_of(vector)
@@ -227,7 +227,9 @@ def test_ties_that_mean_nothing(given, said):
 
 def test_cemented_surfaces_have_one_shape(lens):
     """Also where only some of the shape varies: what does not is made alike once."""
-    variables = Variables.of(lens, ["curvature", Vary("conic", (2,))], [Tie((2, 3), "cemented")])
+    variables = Variables.from_lens(
+        lens, ["curvature", Vary("conic", (2,))], [Tie((2, 3), "cemented")]
+    )
     assert variables.lens.coefficients[3, 1] == lens.coefficients[2, 1] != 0
     made = variables.lens_of(variables.start + 1)
     for name in ("curvature", "conic", "coefficients"):
@@ -237,7 +239,7 @@ def test_cemented_surfaces_have_one_shape(lens):
 
 
 def test_what_follows_a_number_that_does_not_change(lens):
-    variables = Variables.of(lens, [Vary("thickness")], [Tie((0, 6), "opposite")])
+    variables = Variables.from_lens(lens, [Vary("thickness")], [Tie((0, 6), "opposite")])
     assert variables.lens.curvature[6] == -lens.curvature[0]
 
 
@@ -251,7 +253,7 @@ def test_media_go_on_behind_a_stop_and_a_mirror(tmp_path):
         "  - {radius: -150, thickness: -4, mirror: true, semi_diameter: 6}\n"
         "  - {radius: -100, thickness: -60, semi_diameter: 6}\n"
     )
-    variables = Variables.of(load_lens(path), ["index", "abbe"])
+    variables = Variables.from_lens(load_lens(path), ["index", "abbe"])
     assert variables.names == ("index 0", "abbe 0")
     made = variables.lens_of(variables.start + 1)
     index = np.asarray(made.index(0.55))[:, 0]
@@ -299,7 +301,7 @@ BAD = [
 def test_what_does_not_fit_is_told_in_one_line(lens, k):
     arguments, said = BAD[k]
     with pytest.raises(ValueError) as told:
-        Variables.of(lens, **arguments)
+        Variables.from_lens(lens, **arguments)
     assert said in str(told.value) and "\n" not in str(told.value)
 
 
@@ -330,12 +332,12 @@ def test_a_lens_without_any():
     singlet = load_lens("singlet")
     for kind, said in (("index", "write nd and vd"), ("coefficients", "zeros too")):
         with pytest.raises(ValueError, match=said):
-            Variables.of(singlet, [kind])
+            Variables.from_lens(singlet, [kind])
     assert Vary("curvature", [1]).surfaces == (1,) and hash(Vary("curvature", [1]))
 
 
 def test_float32_stays(lens):
     small = jax.tree.map(lambda a: a.astype(jnp.float32), lens)
-    variables = Variables.of(small, [*ALL], solves=[Solve("focal_length", surface=6)])
+    variables = Variables.from_lens(small, [*ALL], solves=[Solve("focal_length", surface=6)])
     made = variables.lens_of(variables.start)
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((made, variables.start)))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import drt_jax
+from drt_jax.design import growth as growing
 from experiments import _command, design
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -50,7 +51,6 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
     it was; or it says how far it came."""
     monkeypatch.chdir(ROOT)
     growth = ["growth.first=0.5", "growth.step=0.3", "growth.trials=20", "tolerance=0.1"]
-    growth.append("beside.peers=[]")
     searched = []
     optimise = design.design.optimise
     monkeypatch.setattr(design, "draw", lambda *_: None)
@@ -64,7 +64,8 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
         searched.append((size, found.score, found.jacobians))
         return found
 
-    monkeypatch.setattr(design.design, "optimise", watched)
+    for module in (design.design, growing):
+        monkeypatch.setattr(module, "optimise", watched)
     growth.append("growth.good_um=100")
     with pytest.raises(SystemExit) as caught:
         main("singlet", tmp_path / "run", *growth)

@@ -67,13 +67,22 @@ CASES = {
 }
 
 
+def test_a_lens_that_a_program_returns_keeps_its_glasses(tmp_path):
+    """Its names are lost, as the program serves lenses of all names; constants tell the glasses."""
+    lens = load_lens("double_gauss")
+    returned = jax.jit(lambda lens: lens)(lens)
+    assert returned.name == "" and returned.glasses[1] == "glass 1"
+    save_lens(returned, tmp_path / "lens.yaml")
+    assert load_lens(tmp_path / "lens.yaml").glasses == lens.glasses
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_lens_comes_back(name, tmp_path):
     """Everything that is static, and every number but tilts to the last digit."""
     lens = load_lens(CASES[name])
     save_lens(lens, tmp_path / "lens.yaml")
     again = load_lens(tmp_path / "lens.yaml")
-    again = again if lens.name else dataclasses.replace(again, name="")
+    assert again.glasses == lens.glasses and again.name == (lens.name or again.name)
     assert jax.tree.structure(again) == jax.tree.structure(dataclasses.replace(lens))
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(lens), strict=True):
         np.testing.assert_array_max_ulp(np.asarray(a), np.asarray(b), 1)
@@ -123,7 +132,7 @@ def test_glasses_that_an_optimiser_moved(tmp_path):
     save_lens(moved, tmp_path / "lens.yaml")
     again = load_lens(tmp_path / "lens.yaml")
     assert again.glasses == ("air", "SK16", "F2", "SK16*", "air")
-    assert again.dispersion.ranges == lens.dispersion.ranges
+    np.testing.assert_array_equal(again.dispersion.ranges, lens.dispersion.ranges)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(moved), strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -14,6 +14,7 @@ import pytest
 import drt_jax
 from drt_jax import Status, load_lens, pupil, trace_rays
 from drt_jax.lens.forms import Shape
+from drt_jax.lens.lens import Labels
 from drt_jax.lens.paraxial import trace_yu
 from drt_jax.lens.surface import sag_derivatives, surface_sag
 
@@ -241,7 +242,8 @@ def wyld(entry, line):
         n = row["n_D"] + part * (row["n_D"] - 1) / row["V"] if "V" in row else 1.0
         surfaces.append({"radius": row["R"], "index": n, "thickness": row.get("t", 50.0)})
     lens = behind_stop(surfaces, 1.0, entry["height"])
-    return dataclasses.replace(lens, glasses=tuple("abcdef"))  # one program for all lines
+    labels = Labels("", tuple("abcdef"))  # one program for all lines
+    return dataclasses.replace(lens, labels=labels)
 
 
 def test_c16_wyld_achromat(cases):

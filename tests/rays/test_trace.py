@@ -10,6 +10,7 @@ from experiments.snell import trace_snell
 
 from drt_jax import Status, entrance_pupil, load_lens, pupil, sag, scene_of, trace_rays
 from drt_jax.lens.forms import FORMS
+from drt_jax.lens.lens import Labels
 from drt_jax.rays.trace import trace_bundle
 
 from ..conftest import LENSES, RGB, assert_close
@@ -175,7 +176,6 @@ def with_dummy(lens, gap, curvature):
         return jnp.concatenate([array[:i], jnp.full_like(array[:1], value), array[i:]])
 
     dispersion = jax.tree.map(lambda a: jnp.insert(a, i, a[i], axis=0), lens.dispersion)
-    ranges = (*dispersion.ranges[:i], dispersion.ranges[i], *dispersion.ranges[i:])
     return dataclasses.replace(
         lens,
         curvature=insert(lens.curvature, curvature),
@@ -187,8 +187,8 @@ def with_dummy(lens, gap, curvature):
         thickness=jnp.concatenate(
             [lens.thickness[:gap], jnp.stack([half, half]), lens.thickness[gap + 1 :]]
         ),
-        dispersion=dataclasses.replace(dispersion, ranges=ranges),
-        glasses=(*lens.glasses[:i], lens.glasses[i], *lens.glasses[i:]),
+        dispersion=dispersion,
+        labels=Labels("", (*lens.glasses[:i], lens.glasses[i], *lens.glasses[i:])),
         stop=lens.stop + (i <= lens.stop),
     )
 

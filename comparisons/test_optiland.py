@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import drt_jax
-from experiments import _optiland
+
+from . import _optiland
 
 needed = pytest.mark.skipif(
     importlib.util.find_spec("optiland") is None, reason="optiland is not installed"

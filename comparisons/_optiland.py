@@ -18,8 +18,7 @@ import numpy as np
 
 import drt_jax
 from drt_jax.pupil.rules import Pattern
-
-from . import _peers
+from experiments import _peers
 
 Numbers = Sequence[float]
 COLOURS = (0.4861, 0.5876, 0.6563)

@@ -15,16 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from experiments.design import Config
 from jax import Array
+from tqdm import tqdm
 
 import drt_jax
 from drt_jax import design
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design.gaps import between
 
-from . import _common, _optiland
-from ._wanted import Config
-from .runs.folder import Run
+from . import _optiland
+from ._settings import Beside
 
 # What ends the search of optimistix, relative and absolute.
 _FINE = 1e-9
@@ -35,11 +36,12 @@ _NEAR = 0.01
 class Task(NamedTuple):
     """What is to be done.
 
-    config: the settings. problem: as it is searched. judging: with the rays that judge. target: a
-    merit to be reached.
+    config: the settings of the design, settings: of the comparison. problem: as it is searched.
+    judging: with the rays that judge. target: a merit to be reached.
     """
 
     config: Config
+    settings: Beside
     problem: design.Problem
     judging: design.Problem
     target: float
@@ -86,7 +88,7 @@ def marquardt(task: Task, vector: Array) -> Way:
 def adam(task: Task, vector: Array) -> Way:
     """`drt_jax.adam` on the sum of the same squares, numbers clipped to their bounds after each of
     `steps`, over which the rate falls to 0. What is counted are gradients."""
-    steps, rate = task.config.beside.steps, task.config.beside.rate
+    steps, rate = task.settings.steps, task.settings.rate
     run = functools.partial(_adam, task.problem, vector, most=steps, rate=rate)
     (end, merits), *times = _timed(run, steps)
     return Way(end, np.asarray(merits), 1 + np.arange(len(merits)), *times)
@@ -106,7 +108,7 @@ def optiland(task: Task, vector: Array) -> Way | None:
         fields_deg=config.fields_deg,
         wavelengths_um=config.wavelengths_um,
         distance_mm=config.distance_mm,
-        seconds=config.beside.seconds,
+        seconds=task.settings.seconds,
     )
     if found is None:
         return None
@@ -154,9 +156,9 @@ def told(problem: design.Problem) -> _optiland.Told:
 
 def _squares(vector: Array, problem: design.Problem) -> Array:
     """Residuals, and what exceeds limits and bounds as residuals more."""
-    variables, found = problem.variables, problem.judge(vector)
+    variables, found = problem.variables, problem.evaluate(vector)
     beyond = jnp.concatenate([variables.low - vector, vector - variables.high])
-    return jnp.concatenate([found.residuals, jnp.maximum(jnp.append(found.excess, beyond), 0)])
+    return jnp.concatenate([found.residuals, jnp.maximum(jnp.append(found.constraints, beyond), 0)])
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="most")
@@ -229,7 +231,7 @@ def _timed(run: Callable[[Array], Any], steps: int) -> tuple[Any, float, float]:
     return found, time.perf_counter() - compiled, compiled - begun
 
 
-_judge = jit(lambda problem, vector: problem.judge(vector), LARGE)
+_judge = jit(lambda problem, vector: problem.evaluate(vector), LARGE)
 
 
 def judged(problem: design.Problem, vector: Array) -> tuple[float, float]:
@@ -237,7 +239,7 @@ def judged(problem: design.Problem, vector: Array) -> tuple[float, float]:
     surfaces overlap."""
     variables = problem.variables
     found = _judge(problem, jnp.clip(vector, variables.low, variables.high))
-    worst = jnp.maximum(jnp.max(found.excess, initial=0.0), found.broken)
+    worst = jnp.maximum(jnp.max(found.constraints, initial=0.0), found.overlap)
     return float(jnp.sum(found.residuals**2)), float(worst)
 
 
@@ -275,23 +277,22 @@ def one(name: str, task: Task, vector: Array) -> dict[str, Any] | None:
 
 
 def beside(
-    config: Config, problem: design.Problem, vectors: np.ndarray, end: dict[str, Any], run: Run
-) -> list[dict[str, Any]]:
-    """A row for each optimiser of the settings from starts (K, N); `end`: of our own design."""
-    settings = config.beside
-    judging = problem
-    if not config.rings:
-        judging = problem.with_order(max(end["order"], config.order))
+    config: Config, settings: Beside, problem: design.Problem, vectors: np.ndarray, order: int,
+    row: dict[str, Any],
+) -> list[dict[str, Any]]:  # fmt: skip
+    """A row for each optimiser of the settings from starts (K, N); order: of the rule that judges;
+    row: of our own design."""
+    judging = problem if config.rings else problem.with_order(max(order, config.order))
     made = config.starts.how == "made" and config.starts.count > 1
-    target = end["merit_start"] if made else (1 + _NEAR) * end["merit_end"]
-    task = Task(config, problem, judging, target)
+    target = row["merit_start"] if made else (1 + _NEAR) * row["merit_end"]
+    task = Task(config, settings, problem, judging, target)
     low, high = problem.variables.low, problem.variables.high
     jobs = {
         f"{name}, start {k}": functools.partial(one, name, task, jnp.clip(vector, low, high))
         for name in settings.peers
         for k, vector in enumerate(jnp.asarray(vectors[: settings.starts or None]))
     }
-    found = _common.measured(run, "start", jobs)
+    found = [jobs[job]() for job in tqdm(jobs, unit="start", dynamic_ncols=True)]
     each = np.split(np.array(found, object), len(settings.peers)) if found else []
     return [summary(name, list(records)) for name, records in zip(settings.peers, each)]
 
@@ -319,22 +320,3 @@ def peer(rows: list[dict[str, Any]]) -> dict[str, Any]:
     row = min(known, key=lambda row: row["best"])
     name, merit = row["optimiser"], row["best"]
     return {"peer": name, "peer_merit": merit, "peer_s": sum(row["seconds"])}
-
-
-def table(rows: list[dict[str, Any]], how: str) -> str:
-    """The optimisers in a row each."""
-    goal = "no worse than the lens" if how == "made" else f"within {_NEAR:.0%} of the design"
-    header = ["optimiser", f"starts {goal}", "merit, best", "median", "limit exceeded by"]
-    header += ["Jacobians until then", "s until then", "s a start"]
-    lines = []
-    for row in rows:
-        met = "not installed" if row["met"] is None else f"{row['met']} of {row['starts']}"
-        worst = max((x for x in row["worst"] if x is not None), default=None)
-        ways = (_median(row[key]) for key in ("met_jacobians", "met_s", "seconds"))
-        lines.append([row["optimiser"], met, row["best"], row["median"], worst, *ways])
-    return _common.table(header, lines)
-
-
-def _median(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None

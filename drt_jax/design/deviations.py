@@ -73,7 +73,7 @@ class Tolerance:
             )
 
 
-class Error(NamedTuple):
+class Deviation(NamedTuple):
     """One number that may be off: what, where (a surface or an element), and its component."""
 
     kind: str
@@ -126,14 +126,14 @@ def x_curvatures(lens: Lens, at: np.ndarray) -> Array:
     return jnp.where(has, lens.coefficients[at, 0], 0)
 
 
-def errors_of(lens: Lens, tolerances: Sequence[Tolerance]) -> dict[Error, float]:
+def deviations_of(lens: Lens, tolerances: Sequence[Tolerance]) -> dict[Deviation, float]:
     """The errors that some tolerances allow, and how large each may be, in the units of
     `Tolerance`; those in x and in y of one part are neighbours.
 
     ValueError, which lists what there is, for none, and for a part that does not exist or stands
     twice.
     """
-    sizes: dict[Error, float] = {}
+    sizes: dict[Deviation, float] = {}
     for tolerance in tolerances:
         kind = tolerance.kind
         there = _there(lens, kind)
@@ -147,7 +147,7 @@ def errors_of(lens: Lens, tolerances: Sequence[Tolerance]) -> dict[Error, float]
                 )
         axes = range(KINDS[kind].axes)
         for place, axis in itertools.product(tolerance.which or there, axes):
-            error = Error(kind, place, axis)
+            error = Deviation(kind, place, axis)
             if error in sizes:
                 raise ValueError(f"tolerances: {error} stands twice; leave one out")
             sizes[error] = tolerance.size

@@ -1,0 +1,1 @@
+"""Other programs on our problems: `python -m comparisons.design`. Not a part of the package."""

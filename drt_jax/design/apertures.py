@@ -1,0 +1,23 @@
+"""Clear apertures that follow the light of a design instead of clipping it."""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from ..lens.lens import Lens
+from .problem import Problem
+
+
+def open_apertures(lens: Lens) -> Lens:
+    """The lens with all circles open but the stop's."""
+    free = jnp.full_like(lens.semi_diameter, jnp.inf)
+    own = lens.semi_diameter[lens.stop]
+    return dataclasses.replace(lens, semi_diameter=free.at[lens.stop].set(own))
+
+
+def fit_apertures(problem: Problem, lens: Lens, margin: float = 0.01) -> Lens:
+    """A lens with open apertures, see `open_apertures`, with circles as wide as the light of the
+    problem's fields plus a part `margin` of it; the stop stays."""
+    wide = jnp.append((1 + margin) * problem.beam_radius(lens), jnp.inf)
+    own = lens.semi_diameter[lens.stop]
+    return dataclasses.replace(lens, semi_diameter=wide.at[lens.stop].set(own))
