@@ -257,9 +257,9 @@ def outputs(scene, rule, symmetry, points, starts=(None, None)):
     """centroid (..., W, 2), covariance (..., W, 2, 2), path (..., W, Q) and hits
     (..., W, Q, S + 1, 3) along the axes of the lens.
 
-    The moments are averages over `rule` = points (2, n) and weights of the disc ("disc"), of
-    its half x > 0 ("half") or of the radius x = 0, y > 0 ("meridian"); path and hits are those
-    of the rays through `points` (2, Q).
+    The moments are averages over `rule` = points (2, n) and weights of the disc ("none"), of
+    its half x > 0 ("bilateral") or of the radius x = 0, y > 0 ("rotational"); path and hits are
+    those of the rays through `points` (2, Q).
     """
     nodes, weights = rule
     x, y, _ = trace(scene, *aim(scene, nodes, starts[0])).own[-1]
@@ -268,13 +268,13 @@ def outputs(scene, rule, symmetry, points, starts=(None, None)):
         return np.sum(weights * values, axis=-1)
 
     zero = 0 * average(x)
-    if symmetry == "meridian":
+    if symmetry == "rotational":
         mean, (xx, yy, xy) = [zero, zero], [average(y * y) / 2] * 2 + [zero]
     else:
-        mean = [zero if symmetry == "half" else average(x), average(y)]
+        mean = [zero if symmetry == "bilateral" else average(x), average(y)]
         x, y = x - mean[0][..., None], y - mean[1][..., None]
         xx, yy, xy = average(x * x), average(y * y), average(x * y)
-        xy = zero if symmetry == "half" else xy
+        xy = zero if symmetry == "bilateral" else xy
     covariance = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
     rays = trace(scene, *aim(scene, points, starts[1]))
     centroid = np.stack(mean, -1)

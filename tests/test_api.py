@@ -14,7 +14,7 @@ from drt_jax import Gauss, Pattern, Status, load_lens, psf_moments, pupil
 from drt_jax.image import lost
 
 LENS = load_lens("singlet")
-GREEN, POINTS, RULE = (0.55,), pupil.hexapolar(1)[0].T, Gauss(4, "half")
+GREEN, POINTS, RULE = (0.55,), pupil.hexapolar(1)[0].T, Gauss(4, "bilateral")
 SCENE = (0.05, 25e3, GREEN)
 # Every public function of a field, of a distance, of wavelengths, of points of the stop.
 CALLS = {
@@ -35,7 +35,7 @@ CALLS = {
     "first_order": lambda f, d, w, p: drt_jax.first_order(LENS, d, w),
     "image_distance": lambda f, d, w, p: drt_jax.image_distance(LENS, d, w),
     "numerical_aperture": lambda f, d, w, p: drt_jax.numerical_aperture(LENS, d, w),
-    "f_number": lambda f, d, w, p: drt_jax.f_number(LENS, w, d),
+    "f_number": lambda f, d, w, p: drt_jax.f_number(LENS, d, w),
     "lateral_magnification": lambda f, d, w, p: drt_jax.lateral_magnification(LENS, d, w),
     "focal_length": lambda f, d, w, p: drt_jax.focal_length(LENS, w),
     "back_focal_distance": lambda f, d, w, p: drt_jax.back_focal_distance(LENS, w),
@@ -145,10 +145,10 @@ def test_orders_and_symmetries_that_no_rule_has_are_refused():
     for kind in (Gauss, drt_jax.Clipped, lambda *a: drt_jax.Soft(*a, 0.1)):
         for order in (2.5, 0, 43, "4", None, True, np.float64(4)):
             with pytest.raises(ValueError, match="order: expected a whole number from 1 to 42"):
-                kind(order, "half")
+                kind(order, "bilateral")
         with pytest.raises(ValueError, match="expected one of meridian, half, disc, got 'whole'"):
             kind(4, "whole")
-    assert Gauss(np.int64(4), "half") == RULE
+    assert Gauss(np.int64(4), "bilateral") == RULE
     for pattern in (pupil.meridian, pupil.hexapolar, pupil.square_grid, pupil.sobol_disc):
         for count in (2.5, 0, None):
             with pytest.raises(ValueError, match="expected at least 1, a whole number, got"):
@@ -294,7 +294,7 @@ def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
     updates, _ = update({"thickness": jnp.array([0.0, 1.0])}, init(values))
     crossed = dataclasses.replace(thin, **drt_jax.apply_updates(values, updates))
     why = "surface 1 and surface 2 cross on the axis: -0.2 mm between them"
-    for rule in (None, Gauss(4, "meridian")):
+    for rule in (None, Gauss(4, "rotational")):
         with pytest.raises(ValueError, match=why):
             psf_moments(crossed, 0.0, np.inf, GREEN, rule=rule)
     with pytest.raises(ValueError, match="surface 2 and the sensor cross on the axis: -3 mm"):

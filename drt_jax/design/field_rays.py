@@ -38,8 +38,8 @@ def symmetry_by_structure(lens: Lens, axial: bool = False) -> Symmetry:
     forms = (*lens.forms, *(() if lens.phase is None else lens.phase.forms))
     kinds = {FORMS[form].symmetry for form in forms}
     if any(a is not None for a in moves) or "none" in kinds:
-        return "disc"
-    return "meridian" if axial and kinds == {"rotation"} else "half"
+        return "none"
+    return "rotational" if axial and kinds == {"rotational"} else "bilateral"
 
 
 @jax.tree_util.register_dataclass

@@ -120,7 +120,7 @@ class Problem:
         if isinstance(rule, int):
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
-            rule = Gauss(rule, symmetry if across else "disc")
+            rule = Gauss(rule, symmetry if across else "none")
         counts = {"fields": len(angles), "wavelengths": len(waves), "distances": len(far)}
         for operand in asked:
             operand.check(lens, counts)
@@ -203,7 +203,7 @@ class Problem:
         """The limits by name, in the order of `Evaluation.constraints` (L,)."""
         counts = {"fields": len(self.fields), "distances": len(self.distances)}
         counts |= {"wavelengths": len(self.wavelengths)}
-        counts |= {"xy": 2 if self.rule.symmetry == "disc" else 1}
+        counts |= {"xy": 2 if self.rule.symmetry == "none" else 1}
         lens, sizes = self.variables.lens, [0] * len(self.operands)
         if any(callable(operand.kind) for operand in self.operands):
             sizes = [a.size for a in jax.eval_shape(_constraints_of_each, self, lens)]

@@ -30,7 +30,7 @@ Compensator = Literal["none", "focus", "focus and tilt"]
 Order = Literal["first", "rays", "second"]
 _TILE = 50  # lenses of a tile, in one program on one core
 _STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
-_SYMMETRIES = ("meridian", "half", "disc")  # from the least of the pupil to all of it
+_SYMMETRIES = ("rotational", "bilateral", "none")  # from the least of the pupil to all of it
 _ASCENTS = 16  # from so many eigenvectors, either way
 _DEVIATION = 0.5  # of normal errors, in parts of the largest
 
@@ -66,7 +66,7 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
     total = jnp.sum(light, axis=(1, 2), keepdims=True)
     weight = safe_divide(light, jnp.broadcast_to(total, light.shape))
     # Of half a pupil, the other half has the opposite x, of a meridian the opposite y.
-    across = {"meridian": [0], "half": [1], "disc": [1, 1]}[rays.symmetry]
+    across = {"rotational": [0], "bilateral": [1], "none": [1, 1]}[rays.symmetry]
     even = jnp.asarray(([0] * (dim - len(across)) + across) * 2, light.dtype)
     mean = jnp.sum(weight[None] * values, axis=(2, 3)) * even[:, None]
     apart = (values - mean[..., None, None]) * jnp.sqrt(jnp.where(good, weight, 1))[None]

@@ -140,7 +140,7 @@ def _spread(rays: FieldRays, axes: tuple[int, ...]) -> Array:
     hits, light = _hits(rays)
     parts = []
     for k, hit in enumerate(hits):
-        across = len(hits) == 1 or (k == 0 and rays.symmetry == "half")
+        across = len(hits) == 1 or (k == 0 and rays.symmetry == "bilateral")
         parts.append(hit if across else _centred(hit, light, axes))  # else it averages to 0
     return jnp.stack(parts) * safe_sqrt(light)[None]
 
@@ -215,7 +215,7 @@ def _distortion(lens: Lens, rays: FieldRays) -> Array:
 
 def _lateral_colour(lens: Lens, rays: FieldRays) -> Array:
     points = rays.sensor_hits[..., 0]
-    points = points if rays.symmetry == "disc" else points[-1:]
+    points = points if rays.symmetry == "none" else points[-1:]
     return points[..., 1:] - points[..., :1]
 
 

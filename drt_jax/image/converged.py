@@ -38,24 +38,28 @@ _DOUBLE = 1e-12
 # The order of the rule that tells where light ends.
 _TOLD = 8
 
+# Relative error of the RMS spot size where none is asked for.
+_TOLERANCE = 1e-6
+
 
 def psf_moments(
     lens: Lens,
     field: Numbers,
     distance: Numbers,
     wavelengths: Numbers,
-    tolerance: float = 1e-6,
+    tolerance: float | None = None,
     rule: PupilRule | None = None,
 ) -> Moments:
-    """Centroid and covariance of the rays on the sensor: `mean, covariance = psf_moments(...)`.
+    """Centroid, covariance and throughput of the rays on the sensor: a record `Moments`.
 
     field: angle along y, or (x, y), in radians.
     distance: mm from the object plane to the first vertex, inf allowed.
     wavelengths: (W,) in um.
-    tolerance: relative error of the RMS spot size; the rule follows from it. In float32
-        spots of cameras are right to about 1e-3 of 4 um or of themselves: warns if that is more.
-    rule: of the pupil, instead of a tolerance; needed inside `jax.jit` and `jax.vmap`, where
-        `converged_rule`, called outside, makes it.
+    tolerance: relative error of the RMS spot size, 1e-6 by default; the rule follows from it. In
+        float32 spots of cameras are right to about 1e-3 of 4 um or of themselves: warns if that is
+        more.
+    rule: of the pupil, instead of a tolerance (not both); needed inside `jax.jit` and `jax.vmap`,
+        where `converged_rule`, called outside, makes it.
 
     See `Moments`. Rays fill the stop uniformly. Differentiable in all arguments but the last two,
     in every mode. ValueError as of `scene_of`, and if no ray of a colour arrives, which says where
@@ -71,7 +75,7 @@ def focus_moments(
     field: Numbers,
     distance: Numbers,
     wavelengths: Numbers,
-    tolerance: float = 1e-6,
+    tolerance: float | None = None,
     rule: PupilRule | None = None,
 ) -> FocusMoments:
     """Moments of the rays as functions of the sensor position, about `lens.sensor`; see
@@ -90,7 +94,7 @@ def converged_rule(
     field: Numbers,
     distance: Numbers,
     wavelengths: Numbers,
-    tolerance: float = 1e-6,
+    tolerance: float = _TOLERANCE,
 ) -> PupilRule:
     """The rule that keeps the RMS spot size on the sensor within `tolerance` (relative).
 
@@ -112,7 +116,7 @@ def converged_focus_rule(
     field: Numbers,
     distance: Numbers,
     wavelengths: Numbers,
-    tolerance: float = 1e-6,
+    tolerance: float = _TOLERANCE,
 ) -> PupilRule:
     """`converged_rule` for any sensor position: where the spot is smallest, it may be far smaller
     than on the sensor, and the tolerance is relative to it. ValueError as of `focus_moments`."""
@@ -137,12 +141,15 @@ def _moments(
     field: Numbers,
     distance: Numbers,
     wavelengths: Numbers,
-    tolerance: float,
+    tolerance: float | None,
     rule: PupilRule | None,
     places: Callable,
 ) -> FocusMoments:
+    if not (tolerance is None or rule is None):
+        raise ValueError("tolerance and rule: give one of them; a rule has its own precision")
     scene = scene_of(lens, field, distance, wavelengths)
     if rule is None:
+        tolerance = _TOLERANCE if tolerance is None else tolerance
         trial = _converge(lens, field, distance, wavelengths, tolerance, places)
         if concrete((lens, scene)):
             return trial.moments[0]
@@ -306,9 +313,9 @@ def _padded(order: int, symmetry: Symmetry) -> Pattern:
     They run along the rim of the stop, where clear apertures clip first.
     """
     points, weights = gauss_points(order, symmetry)
-    sizes = (_MAX_ORDER + 2,) if symmetry == "meridian" else (208, 416, 1768, 3696)
+    sizes = (_MAX_ORDER + 2,) if symmetry == "rotational" else (208, 416, 1768, 3696)
     missing = next(size for size in sizes if size >= weights.size + len(points)) - weights.size
-    turn = np.pi if symmetry == "half" else 2 * np.pi
+    turn = np.pi if symmetry == "bilateral" else 2 * np.pi
     angle = -np.pi / 2 + turn * np.arange(missing) / max(missing - 1, 1)
     rim = np.stack([np.cos(angle), np.sin(angle)]) if len(points) == 2 else np.ones((1, missing))
     filled = np.concatenate([points, rim], axis=1)

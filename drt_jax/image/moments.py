@@ -6,7 +6,6 @@ the sensor, because the moments are exact polynomials in it.
 """
 
 import dataclasses
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -34,12 +33,6 @@ class Moments:
     mean: Array
     covariance: Array
     passed: Array
-
-    def __iter__(self) -> Iterator[Array]:
-        return iter((self.mean, self.covariance))
-
-    def __getitem__(self, item: int) -> Array:
-        return (self.mean, self.covariance)[item]
 
 
 @jax.tree_util.register_dataclass
@@ -138,10 +131,10 @@ def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusM
     counts = weight != 0
     hit = tuple(jnp.where(counts, h[-1], 0) for h in bundle.hits)
     slope = tuple(jnp.where(counts, s, 0) for s in slope)
-    if rule.symmetry == "meridian":
+    if rule.symmetry == "rotational":
         mean, tilt, spread = _meridional(weight, hit[0], slope[0])
     else:
-        mean, tilt, spread = _central(weight, hit, slope, rule.symmetry == "half")
+        mean, tilt, spread = _central(weight, hit, slope, rule.symmetry == "bilateral")
     return FocusMoments(lens.sensor, mean, tilt, spread, passed)
 
 

@@ -230,14 +230,14 @@ class Form(NamedTuple):
     """A kind of surface.
 
     function: (w, shape) -> (sag in mm, argument), as described above.
-    symmetry: "rotation" about the z axis, "plane" (x -> -x leaves it alone) or "none".
+    symmetry: "rotational" about the z axis, "bilateral" (x -> -x leaves it alone) or "none".
     powers: what files call the coefficients, in their order.
     named: files have keys of their own for the first coefficients.
     round: whether the conic is one of r, so that the surface ends at a rim.
     """
 
     function: Callable[[Point, Shape], tuple[Array, Array]]
-    symmetry: Literal["rotation", "plane", "none"]
+    symmetry: Literal["rotational", "bilateral", "none"]
     powers: tuple[int | str, ...]
     named: tuple[str, ...] = ()
     round: bool = True
@@ -246,12 +246,12 @@ class Form(NamedTuple):
 _EVEN = tuple(range(2, 400, 2))
 _XY = tuple(f"x{i}y{j}" for i, j in powers_xy(230))
 FORMS: dict[str, Form] = {
-    "asphere": Form(asphere, "rotation", _EVEN),
-    "odd_asphere": Form(odd_asphere, "rotation", tuple(range(1, 200))),
-    "biconic": Form(biconic, "plane", _EVEN, ("curvature_x", "conic_x"), round=False),
-    "toroid": Form(toroid, "plane", _EVEN, ("curvature_x",), round=False),
+    "asphere": Form(asphere, "rotational", _EVEN),
+    "odd_asphere": Form(odd_asphere, "rotational", tuple(range(1, 200))),
+    "biconic": Form(biconic, "bilateral", _EVEN, ("curvature_x", "conic_x"), round=False),
+    "toroid": Form(toroid, "bilateral", _EVEN, ("curvature_x",), round=False),
     "polynomial_xy": Form(polynomial_xy, "none", _XY),
-    "linear": Form(linear, "plane", ("y",)),
+    "linear": Form(linear, "bilateral", ("y",)),
     "zernike": Form(zernike, "none", tuple(range(1, 92)), ("norm_radius",)),
-    "qbfs": Form(qbfs, "rotation", tuple(range(100)), ("norm_radius",)),
+    "qbfs": Form(qbfs, "rotational", tuple(range(100)), ("norm_radius",)),
 }

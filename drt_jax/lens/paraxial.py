@@ -296,10 +296,10 @@ def numerical_aperture(lens: Lens, distance: Numbers, wavelengths: Numbers) -> A
     return first_order(lens, distance, wavelengths).numerical_aperture
 
 
-def f_number(lens: Lens, wavelengths: Numbers, distance: Numbers = jnp.inf) -> Array:
+def f_number(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
     """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity. For an
     infinitely far object, focal length over diameter of the entrance pupil; else the working
-    f-number. `wavelengths` (W,) in um, `distance` in mm."""
+    f-number. `distance` from the object to the first vertex in mm; `wavelengths` (W,), um."""
     return first_order(lens, distance, wavelengths).f_number
 
 

@@ -105,7 +105,7 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
     distance: from the object to the first vertex in mm, inf allowed.
     wavelengths: (W,) in um.
     """
-    others = sorted({form for form in lens.forms if FORMS[form].symmetry != "rotation"})
+    others = sorted({form for form in lens.forms if FORMS[form].symmetry != "rotational"})
     if others:
         raise ValueError(f"third order: no theory for surfaces of the form {', '.join(others)}")
     if lens.phase is not None:

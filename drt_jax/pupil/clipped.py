@@ -70,7 +70,7 @@ def _stages(lens: Lens, system: System, spokes: Spokes, used: Array) -> list:
 
     def corners(found):  # to the corners, in the first places
         even = of(found, 2)
-        place, pair = changes(boundary.ends(lens, even.rays, even.goal), spokes.symmetry == "disc")
+        place, pair = changes(boundary.ends(lens, even.rays, even.goal), spokes.symmetry == "none")
         more = (0, spokes.count - CORNERS)
         place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
         rays = even.rays.at(jnp.round(place).astype(jnp.int32))
@@ -88,7 +88,7 @@ def _stages(lens: Lens, system: System, spokes: Spokes, used: Array) -> list:
         toward = boundary.moved(own, unit(angle))
         return rays.at(spokes.nearest(angle)), goal(found.goal.centre, toward)
 
-    return [scout, middle, ends, corners, nodes][: 3 if spokes.symmetry == "meridian" else 5]
+    return [scout, middle, ends, corners, nodes][: 3 if spokes.symmetry == "rotational" else 5]
 
 
 def _exists(lens: Lens, found: boundary.Reached) -> Array:
@@ -156,7 +156,7 @@ def _plan(lens: Lens, scene: Scene, spokes: Spokes, used: Array, crossing: bool)
     middle, nodes = (jax.tree.map(lambda a: a[k], found) for k in (1, -1))
     passes = middle.settled & (boundary.outside(lens, middle.rays, middle.rays.point) < 0)
     rays, pair, follows = nodes.rays, jnp.stack([nodes.edge] * 2), nodes.settled
-    if spokes.symmetry != "meridian":
+    if spokes.symmetry != "rotational":
         corners = jax.tree.map(lambda a: a[3, ..., :CORNERS], found)
         join = lambda a, b: jnp.concatenate([a, b], axis=-1)  # noqa: E731
         rays, pair = jax.tree.map(join, corners.rays, rays), join(corners.goal.pair, pair)
@@ -294,8 +294,8 @@ class Clipped(PupilRule):
 
     def _inside(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """Points and weights of what is inside of all apertures and obscurations."""
-        axial = self.symmetry == "meridian"
-        part = {"meridian": 0, "half": 1, "disc": 2}[self.symmetry]
+        axial = self.symmetry == "rotational"
+        part = {"rotational": 0, "bilateral": 1, "none": 2}[self.symmetry]
         # Apertures of all shapes make corners; the narrow panels between them need spokes too.
         kinds = () if lens.apertures is None else lens.apertures.kinds
         edges = sum(2 if kind == "rectangle" else 1 for kind in kinds)

@@ -25,7 +25,7 @@ from ..rays.trace import Bundle
 from . import patterns
 
 # How much of the pupil stands for all of it: one radius, half of it (x > 0), or the whole disc.
-Symmetry = Literal["meridian", "half", "disc"]
+Symmetry = Literal["rotational", "bilateral", "none"]
 MAX_ORDER = 42
 
 
@@ -48,15 +48,15 @@ def symmetry_of(lens: Lens, field: Numbers) -> Symmetry:
     forms = (*lens.forms, *(() if lens.phase is None else lens.phase.forms))
     kinds = {FORMS[form].symmetry for form in forms}
     if extra is not None and {*extra.kinds} != {"circle"}:
-        kinds.add("plane")
+        kinds.add("bilateral")
     # Neither x, nor a turn about y or z, takes anything out of the plane x = 0.
     sideways = zip(moves, ([0], [1, 2], [0], [1, 2], [0]), strict=True)
     still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
     angles = np.asarray(field)
     if "none" in kinds or not still or (angles.ndim and np.any(angles[..., 0])):
-        return "disc"
-    axial = kinds == {"rotation"} and all(a is None for a in moves) and not np.any(angles)
-    return "meridian" if axial else "half"
+        return "none"
+    axial = kinds == {"rotational"} and all(a is None for a in moves) and not np.any(angles)
+    return "rotational" if axial else "bilateral"
 
 
 class PupilRule(abc.ABC):
@@ -80,9 +80,9 @@ def gauss_points(order: int, symmetry: Symmetry) -> tuple[np.ndarray, np.ndarray
     An aberration of degree p in the pupil reaches azimuthal order p: as many azimuths on the half
     disc as there are radial nodes, and one, integrate its square to the same degree.
     """
-    if symmetry == "meridian":
+    if symmetry == "rotational":
         return patterns.meridian(order)
-    return (patterns.half_disc if symmetry == "half" else patterns.disc)(order, order + 1)
+    return (patterns.half_disc if symmetry == "bilateral" else patterns.disc)(order, order + 1)
 
 
 @jax.tree_util.register_dataclass
@@ -156,14 +156,14 @@ class Pattern(PupilRule):
 
     positions: Numbers
     weights: Numbers
-    symmetry: Symmetry = dataclasses.field(metadata={"static": True}, default="disc")
+    symmetry: Symmetry = dataclasses.field(metadata={"static": True}, default="none")
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """The points and weights as they are. ValueError for other shapes than these."""
         dtype = lens.curvature.dtype
         positions = real_array("positions", self.positions, dtype)
         weights = real_array("weights", self.weights, dtype)
-        rows = 1 if self.symmetry == "meridian" else 2
+        rows = 1 if self.symmetry == "rotational" else 2
         if weights.ndim != 1 or not weights.size or positions.shape != (rows, weights.size):
             raise ValueError(
                 f"Pattern: expected positions ({rows}, Q) and weights (Q,), got {positions.shape} "

@@ -73,12 +73,12 @@ class Spokes:
     @property
     def turn(self) -> float:
         """The azimuths there are, radians from -pi/2."""
-        return 2 * np.pi if self.symmetry == "disc" else np.pi
+        return 2 * np.pi if self.symmetry == "none" else np.pi
 
     @property
     def even(self) -> np.ndarray:
         """Azimuths (B,) of even spokes, ends included; the meridian's is y > 0."""
-        axial = self.symmetry == "meridian"
+        axial = self.symmetry == "rotational"
         return np.linspace(-np.pi / 2 + axial * np.pi, self.turn - np.pi / 2, self.count)
 
     def nearest(self, angle: Array) -> Array:
@@ -89,7 +89,7 @@ class Spokes:
     def scouts(self) -> np.ndarray:
         """Points (2, B) all over the stop, and a little beyond its rim."""
         k = np.arange(self.count) + 0.5
-        if self.symmetry == "disc":
+        if self.symmetry == "none":
             angle = np.pi * (1 + 5**0.5) * k
             return 1.2 * np.sqrt(k / self.count) * np.stack([np.cos(angle), np.sin(angle)])
         return np.stack([0 * k, 1.2 * (2 * k / self.count - 1)])
@@ -98,7 +98,7 @@ class Spokes:
         """Azimuths (W, B) and their weights, which add up to 1: `used` Gauss nodes between the
         corners (2, W, C) that exist, about the origin; more in a wide gap."""
         low, turn = -np.pi / 2, self.turn
-        if self.symmetry == "meridian":
+        if self.symmetry == "rotational":
             one = jnp.ones((len(exists), 1), corner.dtype)
             return one * (np.pi / 2), one
         x, y = jnp.where(exists[None], corner, 1)

@@ -57,7 +57,7 @@ def _grid(rings: int) -> Pattern:
         angle = 2 * np.pi * np.arange(6 * k) / (6 * k)
         points.append(k / rings * np.stack([np.cos(angle), np.sin(angle)]))
     positions = np.concatenate(points, axis=1)
-    return Pattern(positions, np.full(positions.shape[1], 1 / positions.shape[1]), "disc")
+    return Pattern(positions, np.full(positions.shape[1], 1 / positions.shape[1]), "none")
 
 
 def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:

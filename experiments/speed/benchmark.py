@@ -102,7 +102,7 @@ def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
 
     def sigma(values):
         lens_now = changed(lens, values)
-        covariance = drt_jax.psf_moments(lens_now, field, distance, waves, rule=rule)[1]
+        covariance = drt_jax.psf_moments(lens_now, field, distance, waves, rule=rule).covariance
         return (jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]),)
 
     def jacobian(values):

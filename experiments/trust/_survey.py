@@ -20,7 +20,7 @@ from .snell import trace_snell
 
 _BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
 _BOTH = 4  # one scene of so many of a float64 family is traced in float32 too
-_RULE = Gauss(2, "disc")  # whose moments are differentiated
+_RULE = Gauss(2, "none")  # whose moments are differentiated
 _ROUNDINGS = 1000  # how many roundings of the hits two traces may be apart
 _GRID = 41  # launch points along each side of the search for a ray that was not found
 _STARTS = 4  # candidates refined for each such ray

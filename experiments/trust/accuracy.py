@@ -94,7 +94,7 @@ class AccuracyScene:
     def rule(self, order: int) -> PupilRule:
         """The rule of an order that `converged_rule` would try."""
         kind = drt_jax.Clipped if self.vignetted else drt_jax.Gauss
-        return kind(order, "half" if self.field_deg else "meridian")
+        return kind(order, "bilateral" if self.field_deg else "rotational")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +131,8 @@ class Config:
 def spot(*arguments: Any) -> tuple[Array, Array]:
     """sigmas (W,) and centroids (W, 2) in mm, by the arguments of psf_moments and a rule."""
     *scene, rule = arguments
-    mean, covariance = drt_jax.psf_moments(*scene, rule=rule)
+    moments = drt_jax.psf_moments(*scene, rule=rule)
+    mean, covariance = moments.mean, moments.covariance
     return jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]), mean
 
 

@@ -51,7 +51,7 @@ def crooked(tmp_path_factory):
     variables = Variables.from_lens(model(tmp_path_factory.mktemp("lens")), EVERY)
     kinds = [kind for kind in OPERANDS if kind != "throughput"]  # whose rays drop out one by one
     fields = [[0.02, 0.05], [0.01, 0.25], [0.03, 0.45]]
-    problem = Problem.from_variables(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "disc"))
+    problem = Problem.from_variables(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "none"))
     moves = np.random.default_rng(0).normal(size=len(variables.places))
     return problem, variables.start + moves
 
@@ -88,7 +88,7 @@ def test_derivatives_of_a_fitted_pupil():
     lens = load_lens("camera_50mm")
     vary = [Vary("curvature", (0,)), Vary("index", (2,)), Vary("semi_diameter", (2, 8))]
     kinds = ("rms_spot", "rms_wavefront", "centroid", "relative_illumination", "throughput")
-    rule = Clipped(4, "half")
+    rule = Clipped(4, "bilateral")
     fields = np.radians([0.0, 20.0])
     problem = Problem.from_variables(
         Variables.from_lens(lens, vary), kinds, fields, COLOURS[1], rule=rule

@@ -49,7 +49,7 @@ def program(problem, kinds):
 @pytest.fixture(scope="module")
 def triplet():
     """The Cooke triplet, what all operands say of it, and the rule of its rays."""
-    lens, rule = load_lens("cooke_triplet"), Gauss(4, "half")
+    lens, rule = load_lens("cooke_triplet"), Gauss(4, "bilateral")
     variables = Variables.from_lens(lens, ["curvature"])
     kinds = [kind for kind in OPERANDS if kind not in ("magnification", "glass_map")]
     given = FIELDS, COLOURS, DISTANCES, rule, WEIGHTS
@@ -238,7 +238,7 @@ surfaces:
 
 
 @pytest.mark.parametrize(
-    "semi, rule", [(100, 4), pytest.param(15, Clipped(6, "half"), marks=pytest.mark.slow)]
+    "semi, rule", [(100, 4), pytest.param(15, Clipped(6, "bilateral"), marks=pytest.mark.slow)]
 )
 def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
     """The fourth power of the cosine, times the light that passes a clear aperture far in front."""
@@ -266,7 +266,7 @@ def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
 @pytest.mark.slow
 def test_vignetted_spots():
     """By a rule fitted to what is left of the pupil."""
-    lens, rule, field = load_lens("camera_50mm"), Clipped(4, "half"), np.radians(20)
+    lens, rule, field = load_lens("camera_50mm"), Clipped(4, "bilateral"), np.radians(20)
     problem = Problem.from_variables(
         Variables.from_lens(lens, ["thickness"]),
         ["spot_of_colours"],
@@ -305,7 +305,7 @@ def judged(problem, lens):
 
 def test_spots_without_vignetting():
     """As if no clear aperture were there: narrower ones cut light and spots, these stay."""
-    lens, rule = load_lens("petzval_100mm"), Gauss(6, "half")
+    lens, rule = load_lens("petzval_100mm"), Gauss(6, "bilateral")
     narrow = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[5].set(13.0))
     free = jnp.full_like(lens.semi_diameter, jnp.inf)
     free = free.at[lens.stop].set(lens.semi_diameter[lens.stop])
@@ -321,13 +321,13 @@ def test_spots_without_vignetting():
         np.testing.assert_allclose(one, wanted, rtol=1e-12, atol=1e-15)
         np.testing.assert_allclose(three, wanted, rtol=1e-12, atol=1e-15)
     with pytest.raises(ValueError, match="vignetting: Clipped traces only what passes"):
-        beam(lens, ["sensor"], Clipped(3, "half"), vignetting=False)
+        beam(lens, ["sensor"], Clipped(3, "bilateral"), vignetting=False)
 
 
 @pytest.mark.slow
 def test_apertures_as_variables_do_not_vignette():
     """With spots of what arrives they close, with those of the whole stop they stay."""
-    lens, rule = load_lens("petzval_100mm"), Soft(5, "half", 1.0)
+    lens, rule = load_lens("petzval_100mm"), Soft(5, "bilateral", 1.0)
     vary = ["sensor", design.Vary("curvature", (5,))]
     vary.append(design.Vary("semi_diameter", (3, 4, 5), low=10.0, high=25.0))
     args = np.radians([0.0, 3.0, 5.5]), COLOURS
@@ -383,7 +383,7 @@ def test_a_dark_field_is_no_good_one(tmp_path):
 def test_obscurations_need_another_rule():
     lens = load_lens("hubble")
     problem = Problem.from_variables(
-        Variables.from_lens(lens, ["sensor"]), ["spot"], rule=Clipped(3, "disc")
+        Variables.from_lens(lens, ["sensor"]), ["spot"], rule=Clipped(3, "none")
     )
     if lens.apertures is not None and any(lens.apertures.blocks):
         with pytest.raises(ValueError, match="rule: Clipped subtracts"):

@@ -74,7 +74,7 @@ def grid(rings):
         angle = 2 * np.pi * np.arange(6 * k) / (6 * k)
         rows.append(k / rings * np.stack([np.cos(angle), np.sin(angle)]))
     points = np.concatenate(rows, axis=1)
-    return drt_jax.Pattern(points, np.full(points.shape[1], 1 / points.shape[1]), "disc")
+    return drt_jax.Pattern(points, np.full(points.shape[1], 1 / points.shape[1]), "none")
 
 
 def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):
@@ -170,7 +170,7 @@ def test_each_limit_has_the_name_of_its_value(triplet):
     kinds = [kind for kind, value in design.OPERANDS.items() if not value.squared]
     kinds = [kind for kind in kinds if kind not in ("magnification", "glass_map")]
     lens, lows = triplet.variables.lens, -1e9
-    for symmetry in ("half", "disc"):
+    for symmetry in ("bilateral", "none"):
         problem = design.Problem.from_variables(
             triplet.variables,
             [Operand(kind, low=lows, weight=2.0) for kind in kinds],

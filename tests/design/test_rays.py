@@ -44,7 +44,7 @@ def both(lens, scene, points):
 def test_aiming_finds_what_the_full_search_finds(name, factor, degrees):
     lens = opened(name, factor)
     scene = scene_of(lens, np.radians(degrees), np.inf, RGB)
-    points, _ = drt_jax.Gauss(6, "half").points(lens, scene)
+    points, _ = drt_jax.Gauss(6, "bilateral").points(lens, scene)
     aimed, full = both(lens, scene, points)
     assert np.all(full.status == drt_jax.Status.OK)
     assert np.array_equal(aimed.status, full.status)
@@ -56,7 +56,7 @@ def test_spots_of_a_design_are_those_of_the_moments():
     """A fifth of the rays fails: what is left is weighed as by `psf_moments`."""
     lens, field = opened("phone", 1.5), np.radians(14.0)
     variables = design.Variables.from_lens(lens, [Vary("curvature")])
-    rule = drt_jax.Gauss(6, "half")
+    rule = drt_jax.Gauss(6, "bilateral")
     problem = design.Problem.from_variables(
         variables, ["rms_spot", "spot"], [field], RGB, rule=rule
     )
@@ -75,7 +75,7 @@ def test_lenses_as_built_are_searched_in_full(monkeypatch):
     """Of whatever aiming misses, here every ray, the full search finds all."""
     lens = opened("cooke_triplet", 1.0)
     variables = design.Variables.from_lens(lens, [Vary("curvature")])
-    rule = drt_jax.Gauss(3, "disc")
+    rule = drt_jax.Gauss(3, "none")
     problem = design.Problem.from_variables(variables, ["spot"], [0.2], (0.55,), rule=rule)
     perturbed = design.PerturbedLens.from_lens(
         lens, problem.beam_radius(lens), [Tolerance("thickness", 0.02)]

@@ -109,7 +109,7 @@ def best(lens, solve):
     """How far the sensor is from the best focus, relative: by moments that know no solve."""
     total = jnp.zeros(3)
     for field in solve.fields:
-        symmetry = "meridian" if field == 0 else "half"
+        symmetry = "rotational" if field == 0 else "bilateral"
         found = drt_jax.focus_moments(
             lens, field, solve.distance, solve.wavelengths, rule=drt_jax.Gauss(6, symmetry)
         )
@@ -130,7 +130,9 @@ def test_best_focus_is_best():
     for shift in (-0.05, 0, 0.05):
         moved = dataclasses.replace(lens, sensor=jnp.asarray(sensor[0] + shift))
         traces = [
-            drt_jax.psf_moments(moved, f, np.inf, COLOURS, rule=drt_jax.Gauss(6, "half"))[1]
+            drt_jax.psf_moments(
+                moved, f, np.inf, COLOURS, rule=drt_jax.Gauss(6, "bilateral")
+            ).covariance
             for f in solve.fields
         ]
         spots.append(np.mean(np.trace(np.stack(traces), axis1=-2, axis2=-1)))

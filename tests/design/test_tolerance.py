@@ -257,14 +257,14 @@ def test_half_a_pupil_is_enough_where_nothing_is_moved():
     centred = [t for t in ALL if KINDS[t.kind].axes == 1]
     for others in ([], [Tolerance("irregularity", 9.0)]):
         some = perturbed(*others, *centred)
-        assert problem_of(some.lens, FIELDS[:3]).rule.symmetry == "half"
+        assert problem_of(some.lens, FIELDS[:3]).rule.symmetry == "bilateral"
     lens = some_lens(perturbed(*centred))
     half, disc = (
         _made(problem_of(lens, FIELDS[:3], Gauss(4, symmetry)), lens, "none").squares
-        for symmetry in ("half", "disc")
+        for symmetry in ("bilateral", "none")
     )
     np.testing.assert_allclose(half, disc, rtol=1e-9)
-    radius = _made(problem_of(lens, [0.0], Gauss(4, "meridian")), lens, "none").squares
+    radius = _made(problem_of(lens, [0.0], Gauss(4, "rotational")), lens, "none").squares
     np.testing.assert_allclose(radius, disc[:1], rtol=1e-9)
 
 
@@ -276,7 +276,7 @@ def test_what_cannot_be_is_refused_by_name(singlet):
     line = problem_of(some.lens, FIELDS[:3])
     with pytest.raises(ValueError, match="^compensator: focus and tilt: the fields lie on a line"):
         design.monte_carlo(line, some, off, "focus and tilt")
-    for rule, needs in ((Gauss(3, "half"), "disc"), (Gauss(3, "meridian"), "disc")):
+    for rule, needs in ((Gauss(3, "bilateral"), "none"), (Gauss(3, "rotational"), "none")):
         with pytest.raises(ValueError, match=f'^rule: "{rule.symmetry}" .* Gauss.6, "{needs}".'):
             design.as_built(problem_of(some.lens, rule=rule), some.lens, "focus")
     for bad in (off[0], off[:, 1:], off[:0]):

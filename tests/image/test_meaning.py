@@ -12,7 +12,7 @@ from drt_jax import Gauss, Status, load_lens, psf_moments, trace_rays
 
 from ..conftest import assert_close
 
-RULE = Gauss(4, "half")
+RULE = Gauss(4, "bilateral")
 SCENE = (0.05, np.inf, (0.6, 0.48))
 
 

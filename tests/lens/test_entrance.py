@@ -33,7 +33,7 @@ HELD = {"surfaces": [3, 4], "about": 3, "tilt": [0.5, 0, 0]}
 @jax.jit
 def spots(lens, field):
     """RMS radius, mm."""
-    rule = Gauss(12, "half")
+    rule = Gauss(12, "bilateral")
     return jnp.sqrt(jnp.trace(psf_moments(lens, field, INF, WAVE, rule=rule).covariance[0]))
 
 
@@ -88,7 +88,7 @@ def test_the_pupil_follows_the_lens():
     def merit(curvature):
         moved = dataclasses.replace(lens, curvature=lens.curvature.at[1].add(curvature))
         aimed = with_paraxial_pupil(moved, WAVE)
-        return psf_moments(aimed, 0.1, INF, WAVE, rule=Gauss(3, "half")).covariance[0, 1, 1]
+        return psf_moments(aimed, 0.1, INF, WAVE, rule=Gauss(3, "bilateral")).covariance[0, 1, 1]
 
     slope = merit(0.0)[1]
     ends = [merit(h)[0] for h in (1e-6, -1e-6)]

@@ -207,7 +207,7 @@ def test_catalogue_glasses_made_model_glasses(tmp_path):
     ours, own = (float(drt_jax.focal_length(each, LINES[0])[0]) for each in (model, lens))
     assert abs(ours / own - 1) < 1e-12 and model.live == lens.live
     spots = [
-        np.trace(drt_jax.psf_moments(each, 0.0, np.inf, (0.48, 0.6), rule=Gauss(6, "meridian"))
+        np.trace(drt_jax.psf_moments(each, 0.0, np.inf, (0.48, 0.6), rule=Gauss(6, "rotational"))
         .covariance, axis1=1, axis2=2) for each in (model, lens)
     ]  # fmt: skip
     np.testing.assert_allclose(*spots, rtol=0.1)

@@ -51,7 +51,7 @@ def test_overlap_of_two_discs():
         }
     )
     tilt = np.arcsin(1.5 * np.sin(np.arctan(0.7 / 20)))  # in the glass: 0.7 mm over 20 mm
-    moments = focus_moments(lens, tilt, jnp.inf, [0.55], rule=Clipped(10, "half"))
+    moments = focus_moments(lens, tilt, jnp.inf, [0.55], rule=Clipped(10, "bilateral"))
     half = 0.35  # the front aperture, seen from the stop, lies 0.7 above it
     angle = np.arccos(half)
     area = 2 * (angle - half * np.sin(angle))
@@ -111,7 +111,8 @@ def test_gradients_follow_the_boundary(name):
 
     @jax.jit
     def blur(lens):
-        mean, covariance = drt_jax.psf_moments(lens, field, FAR, GREEN, rule=rule)
+        moments = drt_jax.psf_moments(lens, field, FAR, GREEN, rule=rule)
+        mean, covariance = moments.mean, moments.covariance
         return 1e3 * covariance.ravel() @ weights + mean[0, 1]
 
     gradient = jax.jit(jax.grad(blur))(lens)
@@ -149,7 +150,7 @@ def test_one_rule_for_a_clipped_field_and_the_axis():
 def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
     @jax.jit
     def passed(lens, width):
-        rule = Soft(40, "meridian", width)
+        rule = Soft(40, "rotational", width)
         return focus_moments(lens, 0.0, FAR, GREEN, rule=rule).passed[0]
 
     lens, h = clipped(12.0, 21.0), 1e-4
@@ -161,7 +162,7 @@ def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
     difference = (passed(moved[0], 0.5) - passed(moved[1], 0.5)) / (2 * h)
     np.testing.assert_allclose(slope[0], difference, rtol=1e-6)
     with pytest.raises(ValueError, match="width: expected a number above 0 mm, got 0"):
-        Soft(4, "half", 0.0)
+        Soft(4, "bilateral", 0.0)
 
 
 @pytest.mark.slow
@@ -169,8 +170,8 @@ def test_a_pupil_that_paraxial_optics_does_not_find():
     """A fisheye at 85 degrees, its paraxial entrance pupil far from the real one: the nearest ray
     of a fan leads all others, and the rule finds the stop, which nothing clips."""
     lens, field, green = load_lens("fisheye_8mm"), np.radians(85.0), (0.55,)
-    ours = psf_moments(lens, field, jnp.inf, green, rule=Clipped(10, "half"))
-    theirs = psf_moments(lens, field, jnp.inf, green, rule=Gauss(14, "half"))
+    ours = psf_moments(lens, field, jnp.inf, green, rule=Clipped(10, "bilateral"))
+    theirs = psf_moments(lens, field, jnp.inf, green, rule=Gauss(14, "bilateral"))
     np.testing.assert_allclose(ours.passed, 1, rtol=1e-12)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-12)
     rays = trace_rays(lens, field, jnp.inf, green, hexapolar(8)[0].T)

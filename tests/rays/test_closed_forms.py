@@ -131,7 +131,7 @@ def test_p11_defocused_paraboloid(cases, gap):
 
     def variance(defocus):
         moved = dataclasses.replace(lens, sensor=lens.sensor - defocus)
-        spot = drt_jax.psf_moments(moved, 0.0, INF, [0.55], rule=drt_jax.Gauss(14, "meridian"))
+        spot = drt_jax.psf_moments(moved, 0.0, INF, [0.55], rule=drt_jax.Gauss(14, "rotational"))
         return spot.covariance[0, 1, 1]
 
     both = jax.jit(jax.value_and_grad(variance))

@@ -153,7 +153,7 @@ SCENES = {
         },
         [0.06, -0.09],
         (300.0,),
-        "disc",
+        "none",
     ),
     "folded": (
         {
@@ -164,10 +164,10 @@ SCENES = {
         },
         [0.02, 0.03],
         (500.0,),
-        "disc",
+        "none",
     ),
-    "double_gauss": ("double_gauss", np.radians(10), (25000.0, np.inf), "half"),
-    "on_axis": ({"surfaces": ROUND, "sensor": 110}, 0.0, (400.0,), "meridian"),
+    "double_gauss": ("double_gauss", np.radians(10), (25000.0, np.inf), "bilateral"),
+    "on_axis": ({"surfaces": ROUND, "sensor": 110}, 0.0, (400.0,), "rotational"),
 }
 TITLES = {
     "freeform": "No symmetry, all forms, tilts and decentres; field (0.06, -0.09), 300 mm",
@@ -208,7 +208,7 @@ def parameters(name, distance):
     _, field, _, symmetry = SCENES[name]
     lens = load(name)
     arguments = {"lens": lens, "distance": jnp.asarray(distance)}
-    if symmetry != "meridian":
+    if symmetry != "rotational":
         arguments["field"] = jnp.asarray(field, float)
     rows = [*oracle.LENS, *oracle.MEDIA]
     rows += oracle.MOVES if lens.tilt is not None else ()
@@ -223,7 +223,8 @@ def derivatives(mode, symmetry):
 
     def outputs(arguments):
         scene = arguments["lens"], arguments.get("field", 0.0), arguments["distance"], WAVELENGTHS
-        mean, covariance = psf_moments(*scene, rule=Gauss(ORDER, symmetry))
+        moments = psf_moments(*scene, rule=Gauss(ORDER, symmetry))
+        mean, covariance = moments.mean, moments.covariance
         return mean, covariance, trace_rays(*scene, POINTS).path
 
     return jax.jit(mode(outputs))
@@ -278,8 +279,8 @@ def test_all_derivatives_agree_with_the_complex_step(name, write_tables):
     _, field, distances, symmetry = SCENES[name]
     rule = (
         pupil.meridian(ORDER)
-        if symmetry == "meridian"
-        else (pupil.half_disc if symmetry == "half" else pupil.disc)(ORDER, ORDER + 1)
+        if symmetry == "rotational"
+        else (pupil.half_disc if symmetry == "bilateral" else pupil.disc)(ORDER, ORDER + 1)
     )
     nodes, weights = rule
     if len(nodes) == 1:

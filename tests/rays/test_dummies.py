@@ -108,7 +108,7 @@ SHAPE = ("curvature", "conic", "coefficients")
 @jax.jit
 @jax.grad
 def by_the_lens(lens):
-    return jnp.sum(psf_moments(lens, 0.1, 200.0, 0.55, rule=Gauss(3, "half")).covariance)
+    return jnp.sum(psf_moments(lens, 0.1, 200.0, 0.55, rule=Gauss(3, "bilateral")).covariance)
 
 
 def test_sensor_and_plane_stop_do_not_bend():

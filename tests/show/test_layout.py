@@ -162,7 +162,7 @@ def test_a_beam_tells_who_clips_it_and_where_it_is_sharp(tilted):
     assert beam.clipping == beam.ends == []
     assert 60 + beam.shift == pytest.approx(focus, abs=0.05) and beam.best < 1e-4
     # A cone of f/N has an RMS radius of defocus / (2 N) / sqrt(2).
-    cone = abs(beam.shift) / (2 * float(f_number(lens, 0.55)[0])) / 2**0.5
+    cone = abs(beam.shift) / (2 * float(f_number(lens, jnp.inf, 0.55)[0])) / 2**0.5
     assert beam.spot == pytest.approx(cone, rel=0.01)
 
 
