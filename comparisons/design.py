@@ -13,8 +13,8 @@ import sys
 import drt_jax
 from drt_jax import design
 from drt_jax.__main__ import set_up
-from drt_jax.runs.config import load_config
 from experiments import design as experiment
+from experiments.runs.config import load_config
 
 from . import _optiland, _optimisers
 from ._settings import Beside, require_told

@@ -13,8 +13,8 @@ import pytest
 
 import drt_jax
 from drt_jax import design as lenses
-from drt_jax.runs.config import load_config
 from experiments import design
+from experiments.runs.config import load_config
 
 from . import _optimisers
 from ._settings import Beside, require_told

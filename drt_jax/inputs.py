@@ -8,17 +8,17 @@ documents, keys given twice, of which other readers take the last.
 import os
 import reprlib
 import stat
+from collections.abc import Iterable
 from typing import Any
 
 import yaml
 
 # The parser of libyaml, where PyYAML was built with it, takes a tenth of the time.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_RESOLVER, _CONSTRUCTOR = yaml.resolver.Resolver(), yaml.constructor.SafeConstructor()
+_CONSTRUCTOR = yaml.constructor.SafeConstructor()
 # Bytes of a file, values in it, how deep they nest, characters of a number, of a message.
 LARGEST = 2**20
 _VALUES, _DEEPEST, _DIGITS, _LONGEST = 100_000, 20, 40, 300
-_NO_KEY = object()
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxlevel = 3
@@ -90,94 +90,67 @@ def parse(text: str) -> tuple[Any, Lines]:
 
     InputError, with the line, for what is not YAML or is refused, see above.
     """
-    building = _Building()
     try:
-        for event in yaml.parse(text, Loader=_Loader):
-            building.take(event)
+        _check(yaml.parse(text, Loader=_Loader))
+        root = yaml.compose(text, Loader=_Loader)
     except yaml.YAMLError as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         where = f"line {mark.line + 1}: " if mark else ""
         raise InputError(f"{where}not YAML: {problem or error}") from error
-    return building.root, building.lines
+    lines = Lines()
+    return (None if root is None else _value(root, "", lines)), lines
 
 
-class _Open:
-    """A list or mapping that is being filled, what it is called, and the key that waits."""
-
-    def __init__(self, value: Any, name: str):
-        self.value, self.name, self.key = value, name, _NO_KEY
-
-    def place(self) -> str:
-        """What the next value is called."""
-        if isinstance(self.value, list):
-            return f"{self.name}[{len(self.value)}]"
-        return f"{self.name}.{self.key}".lstrip(".")
-
-
-class _Building:
-    """Values built from the events of a parser, without recursion."""
-
-    def __init__(self) -> None:
-        self.root: Any = None
-        self.lines = Lines()
-        self._open: list[_Open] = []
-        self._count = self._documents = 0
-
-    def take(self, event: Any) -> None:
-        """One event more."""
-        line = event.start_mark.line + 1
-        self._documents += isinstance(event, yaml.DocumentStartEvent)
+def _check(events: Iterable[Any]) -> None:
+    """InputError, with the line, for YAML that is refused. Before nodes are made of it, which
+    takes recursion."""
+    documents = values = depth = 0
+    for event in events:
+        documents += isinstance(event, yaml.DocumentStartEvent)
+        values += isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
         refused = {
             "an alias or an anchor (*name, &name)": getattr(event, "anchor", None) is not None,
             "a tag (!name)": getattr(event, "tag", None) is not None,
-            "a second document": self._documents > 1,
-            f"more than {_VALUES} values": self._count > _VALUES,
-            f"nesting deeper than {_DEEPEST}": len(self._open) > _DEEPEST,
+            "a second document": documents > 1,
+            f"more than {_VALUES} values": values > _VALUES,
+            f"nesting deeper than {_DEEPEST}": depth > _DEEPEST,
         }
         if any(refused.values()):
             what = next(what for what, is_so in refused.items() if is_so)
+            line = event.start_mark.line + 1
             raise InputError(f"line {line}: {what} is not taken; write the values out")
-        if isinstance(event, yaml.ScalarEvent):
-            self._add(_scalar(event, line), line)
-        elif isinstance(event, yaml.CollectionStartEvent):
-            value: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
-            self._open.append(_Open(value, self._add(value, line)))
-        elif isinstance(event, yaml.CollectionEndEvent):
-            self._open.pop()
-
-    def _add(self, value: Any, line: int) -> str:
-        """Put a value where it belongs; what it is called."""
-        self._count += 1
-        if not self._open:
-            self.root = value
-            return ""
-        top = self._open[-1]
-        if isinstance(top.value, list):
-            place = top.place()
-            top.value.append(value)
-        elif top.key is _NO_KEY:
-            if isinstance(value, dict | list):
-                raise InputError(f"line {line}: a key must be text or a number")
-            top.key = value
-            place = top.place()
-            if value in top.value:
-                raise InputError(f"line {line}: {one_line(place)} is given twice", place)
-        else:
-            place = top.place()
-            top.value[top.key], top.key = value, _NO_KEY
-        self.lines.setdefault(place, line)
-        return place
 
 
-def _scalar(event: Any, line: int) -> Any:
+def _value(node: Any, name: str, lines: Lines) -> Any:
+    """The value of a node of YAML that is called `name`; adds the lines of all keys in it."""
+    if name:
+        lines.setdefault(name, node.start_mark.line + 1)
+    if isinstance(node, yaml.ScalarNode):
+        return _scalar(node)
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(item, f"{name}[{k}]", lines) for k, item in enumerate(node.value)]
+    mapping: dict[Any, Any] = {}
+    for key_node, item in node.value:
+        line = key_node.start_mark.line + 1
+        if not isinstance(key_node, yaml.ScalarNode):
+            raise InputError(f"line {line}: a key must be text or a number")
+        key = _scalar(key_node)
+        place = f"{name}.{key}".lstrip(".")
+        if key in mapping:
+            raise InputError(f"line {line}: {one_line(place)} is given twice", place)
+        lines.setdefault(place, line)
+        mapping[key] = _value(item, place, lines)
+    return mapping
+
+
+def _scalar(node: Any) -> Any:
     """A word, quoted or not, as YAML 1.1 reads it, but no date and no number of sixties."""
-    text = event.value
-    if not event.implicit[0]:
+    text, kind = node.value, node.tag.rpartition(":")[2]
+    if kind not in ("null", "bool", "int", "float") or (kind != "null" and ":" in text):
         return text
-    tag = _RESOLVER.resolve(yaml.ScalarNode, text, (True, False)).rpartition(":")[2]
-    if tag not in ("null", "bool", "int", "float") or (tag != "null" and ":" in text):
-        return text
-    if tag in ("int", "float") and len(text) > _DIGITS:
+    if kind in ("int", "float") and len(text) > _DIGITS:
+        line = node.start_mark.line + 1
         raise InputError(f"line {line}: a number of {len(text)} characters; at most {_DIGITS}")
-    node = yaml.ScalarNode(f"tag:yaml.org,2002:{tag}", text)
-    return getattr(_CONSTRUCTOR, f"construct_yaml_{tag}")(node)
+    return getattr(_CONSTRUCTOR, f"construct_yaml_{kind}")(node)

@@ -13,11 +13,11 @@ from typing import Any
 
 import drt_jax
 from drt_jax.__main__ import set_up
-from drt_jax.runs import config as configs
-from drt_jax.runs.folder import Run, begun
-from drt_jax.runs.interrupt import deferred_interrupt
 
 from . import _common, hear
+from .runs import config as configs
+from .runs.folder import Run, begun
+from .runs.interrupt import deferred_interrupt
 
 # Errors raised in these folders are about the input; others are faults to be shown whole.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)

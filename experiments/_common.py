@@ -14,8 +14,9 @@ import numpy as np
 from tqdm import tqdm
 
 from drt_jax import show
-from drt_jax.runs.config import ConfigError
-from drt_jax.runs.folder import Run
+
+from .runs.config import ConfigError
+from .runs.folder import Run
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 # A turn of `medians` lasts at least so many seconds.

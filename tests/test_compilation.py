@@ -36,7 +36,7 @@ def test_a_program_with_options_is_part_of_another(outer):
 def test_importing_starts_no_backend():
     """A user may still choose one, or begin `jax.distributed`."""
     code = (
-        "import drt_jax.design, drt_jax.learn.train, drt_jax.show, drt_jax.runs.config, jax\n"
+        "import drt_jax.design, drt_jax.learn.train, drt_jax.show, jax\n"
         "jax.config.update('jax_platforms', 'none such')\n"
         "try: jax.devices()\n"
         "except RuntimeError as error: print(error)"

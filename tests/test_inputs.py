@@ -10,8 +10,8 @@ from experiments._outcomes import judged
 
 from drt_jax import LensError, load_lens
 from drt_jax.inputs import InputError, one_line, parse, shown
-from drt_jax.runs.config import ConfigError, load_config
 from experiments import _mutants, _spoilt
+from experiments.runs.config import ConfigError, load_config
 
 LENS = """\
 name: singlet

@@ -27,7 +27,6 @@ FLOORS = (
     "learn",
     "files",
     "show",
-    "runs",
     "__main__",
 )
 # Floors that know no ray, and but for `files` no optics formula: all that they may import of the
@@ -36,7 +35,6 @@ ALLOWED = {
     "learn": {"inputs", "numerics", "compilation", "image.kernel", "image.sensor"},
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
-    "runs": {"inputs"},
 }
 ALLOWED_ALL = {"show.layout"}
 # Of 8,200 that were the aim before apertures, phases and elements came, 11,200 before what comes
@@ -48,10 +46,9 @@ HOUSE = 20_000
 ONLY = {
     "optimistix": {"rays.aim", "rays.find", "image.field"},
     "matplotlib": {"show"},
-    "skimage": {"learn.data", "learn.images", "learn.train"},
-    "PIL": {"learn.data", "learn.images"},
-    "tifffile": {"learn.images"},
-    "yaml": {"inputs", "files", "lens.glass", "runs.config"},
+    "skimage": {"learn.data", "learn.train"},
+    "PIL": {"learn.images"},
+    "yaml": {"inputs", "files", "lens.glass"},
     "tqdm": set(),
     "experiments": set(),
     "tests": set(),

@@ -16,11 +16,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import IO, NamedTuple, TypeVar
 
 import numpy as np
-from PIL import Image
 from skimage import data
 
 from ..inputs import InputError, one_line, shown
-from .images import SUFFIXES, Picture, find_images, look, read
+from .images import SUFFIXES, find_images, look, read
 
 # Colour and texture photographs that lie inside the scikit-image wheel.
 _BUNDLED = (
@@ -96,12 +95,12 @@ def load_patches(
     with contextlib.ExitStack() as open_files, _room(config.memory_map):
         pool, kept = (_file(config.memory_map, open_files) for _ in range(2))
         for i in progress(fitting):
-            picture = _tried(_picture, sources[i], skipped)
-            if picture is not None:
+            pixels = _tried(_pixels, sources[i], skipped)
+            if pixels is not None:
                 usable += 1
-                for crop in _crops(picture, config.crops_per_image, side, [seed, 1, i]):
+                for crop in _crops(pixels, config.crops_per_image, side, [seed, 1, i]):
                     pool.write(crop.tobytes())
-            del picture  # before the next is decoded
+            del pixels  # before the next is decoded
         if usable < 2:
             raise DataError(
                 f"data.root: {config.root}: {usable} usable images; train and test need one each, "
@@ -132,17 +131,26 @@ def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
     return paths, left_out
 
 
-def _picture(source: _Source) -> Picture:
+def _pixels(source: _Source) -> np.ndarray:
+    """The pixels uint8 (H, W, 3) of a file or of a bundled photograph."""
     if isinstance(source, pathlib.Path):
         return read(source)
     pixels = getattr(data, source)()
-    return Picture(Image.fromarray(pixels[0] if isinstance(pixels, tuple) else pixels))  # of a pair
+    pixels = pixels[0] if isinstance(pixels, tuple) else pixels  # of a pair
+    return np.broadcast_to(pixels[..., None], (*pixels.shape, 3)) if pixels.ndim == 2 else pixels
+
+
+def _size(source: _Source) -> tuple[int, int]:
+    """Width and height in pixels."""
+    if isinstance(source, pathlib.Path):
+        return look(source)
+    height, width = _pixels(source).shape[:2]
+    return width, height
 
 
 def _fits(source: _Source, side: int, skipped: list[str]) -> bool:
     """Whether an image is large enough, as far as its header tells; else a line more of why not."""
-    measure = look if isinstance(source, pathlib.Path) else lambda name: _picture(name).size
-    size = _tried(measure, source, skipped)
+    size = _tried(_size, source, skipped)
     if size and min(size) < side:
         skipped.append(one_line(f"{source}: {size[0]} x {size[1]} pixels, smaller than {side}"))
     return bool(size and min(size) >= side)
@@ -160,12 +168,12 @@ def _tried(reader: Callable[..., _T], source: _Source, skipped: list[str]) -> _T
         return None
 
 
-def _crops(picture: Picture, count: int, side: int, seed: list[int]) -> Iterator[np.ndarray]:
-    width, height = picture.size
+def _crops(pixels: np.ndarray, count: int, side: int, seed: list[int]) -> Iterator[np.ndarray]:
+    height, width = pixels.shape[:2]
     generator = np.random.default_rng(seed)
     tops = generator.integers(0, height - side + 1, count)
     lefts = generator.integers(0, width - side + 1, count)
-    return (picture.cut(int(top), int(left), side) for top, left in zip(tops, lefts))
+    return (pixels[top : top + side, left : left + side] for top, left in zip(tops, lefts))
 
 
 def _check_room(config: DataConfig, count: int, side: int) -> None:

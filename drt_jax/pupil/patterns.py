@@ -9,8 +9,6 @@ order or a number that is not whole or below 1.
 
 import numpy as np
 
-_SOBOL_BITS = 30
-
 
 def _count(what: str, value: int) -> None:
     if not isinstance(value, int | np.integer) or value < 1:
@@ -93,23 +91,13 @@ def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sobol(count: int) -> np.ndarray:
-    """The first points (2, count) of the Sobol sequence in the unit square, not scrambled.
+    """The first points (2, count) of the Sobol sequence in the unit square, not scrambled: those of
+    `scipy.stats.qmc`. Best at powers of two."""
+    from scipy.stats import qmc  # takes a second to import
 
-    Direction numbers of the polynomials 1 and x + 1, Gray-code order: Antonov and Saleev, USSR
-    Comput. Math. Math. Phys. 19, 252 (1980). Best at powers of two.
-    """
     _count("count", count)
-    bits = np.arange(_SOBOL_BITS)
-    second = [1]
-    for _ in bits[1:]:
-        second.append(second[-1] ^ (second[-1] << 1))
-    directions = np.array([np.ones_like(bits), second]) << (_SOBOL_BITS - 1 - bits)
-    index = np.arange(count)
-    gray = index ^ (index >> 1)
-    points = np.zeros((2, count), np.int64)
-    for bit in bits[: int(count).bit_length()]:
-        points ^= np.where(gray >> bit & 1, directions[:, bit : bit + 1], 0)
-    return points / 2.0**_SOBOL_BITS
+    sequence = qmc.Sobol(2, scramble=False)
+    return sequence.random_base2(int(count - 1).bit_length())[:count].T
 
 
 def sobol_disc(rays: int) -> tuple[np.ndarray, np.ndarray]:

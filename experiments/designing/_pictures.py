@@ -11,7 +11,7 @@ from drt_jax import show
 from drt_jax.pupil import hexapolar
 from drt_jax.show import layout
 
-from . import _common
+from . import _common, _plots
 
 # Minima that are ranked; rings of the rays of a spot that is drawn.
 _RANKED, _RINGS = 30, 8
@@ -56,15 +56,15 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     side = 2.1 * max(float(np.max(np.abs(h), initial=1e-3)) for own, _ in spots for h in own)
     for ax, (own, covariance), field in zip(np.ravel(axes), spots, fields):
         named = {f"{wave:.3f} um": h for wave, h in zip(waves, own)}
-        show.spots(ax, named, covariance, side, f"{field:g} deg")
+        _plots.spots(ax, named, covariance, side, f"{field:g} deg")
     np.ravel(axes)[0].legend(fontsize=7, loc="upper left")
     np.ravel(axes)[0].set(xlabel="um", ylabel="um")
     figure.savefig(figures / "spots.png")
     figure, ax = show.new(1, 1, 6, 3.6)
     if results["starts"]["merits"]:
-        show.searching(ax, np.array(results["starts"]["best"]))
+        _plots.searching(ax, np.array(results["starts"]["best"]))
     else:
-        show.merits(ax, np.array(results["history"]))
+        _plots.merits(ax, np.array(results["history"]))
     figure.savefig(figures / "merit.png")
     if results["starts"]["merits"]:
         count = sum(1 for _ in folder.glob("minimum_*.yaml"))
@@ -78,7 +78,7 @@ def _draw_minima(
     some = results["starts"]
     sizes = [1e3 * math.sqrt(merit) for merit in some["merits"][:_RANKED]]
     figure, ax = show.new(1, 1, 7, 3.6)
-    show.ranks(ax, sizes, some["found"][:_RANKED])
+    _plots.ranks(ax, sizes, some["found"][:_RANKED])
     figure.savefig(figures / "minima.png")
     figure, axes = _common.panels(len(drawings), 6, 2.6)
     for ax, drawing, size in zip(np.ravel(axes), drawings, sizes):

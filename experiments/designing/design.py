@@ -19,10 +19,10 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import Pattern, design
 from drt_jax.design.growth import SHORTEST, grow_once, start_growth
-from drt_jax.runs.folder import Run
 
 from . import _command, _common, _pictures
 from ._wanted import Config as Config, Starts
+from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
 _DRAWN = 6  # minima that are drawn

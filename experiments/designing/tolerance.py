@@ -32,9 +32,9 @@ import drt_jax
 from drt_jax import design, show
 from drt_jax.design.deviations import KINDS
 from drt_jax.design.tolerance import Order
-from drt_jax.runs.folder import Run
 
-from . import _command, _common
+from . import _command, _common, _plots
+from .runs.folder import Run
 
 COLUMNS = ("mean_um", "p90_um", "seconds")
 _ORDERS = get_args(Order)
@@ -313,14 +313,14 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         parts = dict.fromkeys(_SAMPLES, 100 * _LEVELS)
         parts["traced"] = parts["traced"] * (1 - row["failed"] / results["count"])
         lines = {name: (row[name]["quantiles_um"], parts[name]) for name in _SAMPLES}
-        show.yields(ax, lines, "spot (µm)", "lenses at least so good (%)")
+        _plots.yields(ax, lines, "spot (µm)", "lenses at least so good (%)")
         ax.set_title(f"sizes × {row['scale']:g}", fontsize=10)
         ax.set_xlim(0, 1.05 * row["traced"]["quantiles_um"][-1])
     figure.savefig(figures / "yield.png")
     some = merged(results)[:_SHOWN]
     figure, ax = show.new(1, 1, 7, 5)
     bars = {name: np.array([m[f"{name}_um"] for m in some]) for name in ("traced", "predicted")}
-    show.offenders(ax, [f"{m['name']}: {m['size']}" for m in some], bars)
+    _plots.offenders(ax, [f"{m['name']}: {m['size']}" for m in some], bars)
     ax.set_xlabel("spot grows by (µm)")
     figure.savefig(figures / "offenders.png")
     row = main_scale(results)
@@ -329,7 +329,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     marks = {"nominal": results["nominal_um"], "mean": row["traced"]["mean_um"]}
     if row["traced"]["p90_um"] is not None:
         marks["90 %"] = row["traced"]["p90_um"]
-    show.histogram(ax, np.array(row["edges_um"]), shares, marks, "spot (µm)")
+    _plots.histogram(ax, np.array(row["edges_um"]), shares, marks, "spot (µm)")
     figure.savefig(figures / "histogram.png")
 
 

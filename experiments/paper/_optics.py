@@ -18,9 +18,9 @@ from drt_jax.pupil import hexapolar
 from drt_jax.rays.solve import solve_aimed
 from drt_jax.rays.status import Status
 from drt_jax.rays.trace import trace_bundle
-from drt_jax.runs.config import ConfigError
 
 from ._common import require, require_known, require_within
+from .runs.config import ConfigError
 
 # Kinds of numbers that may be trained. Tilts and decentres would break the symmetry for which the
 # rays are chosen; semi-diameters would shrink to nothing, as that costs an image no light here.

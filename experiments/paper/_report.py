@@ -8,6 +8,7 @@ import numpy as np
 import drt_jax
 from drt_jax import show
 
+from . import _plots
 from ._common import number, panels, table
 from ._optics import Trained
 
@@ -22,7 +23,7 @@ def start_label(start: float) -> str:
 
 
 def start_lines(results: dict[str, Any], column: str, batches: int | None = None) -> dict:
-    """(batch, value) by start, for `show.convergence`, of the first `batches`."""
+    """(batch, value) by start, for `_plots.convergence`, of the first `batches`."""
     rows = [values[:batches] for values in results[column]]
     labels = map(start_label, results["starts_mm"])
     return {label: (np.arange(len(row)), row) for label, row in zip(labels, rows)}
@@ -73,7 +74,7 @@ def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
     """Picture of the sensor position of all starts over training, if it is trained."""
     if moves(results):
         figure, axes = show.new(width=7, height=4.5)
-        show.convergence(axes, start_lines(results, "sensor_mm"), "sensor position (mm)")
+        _plots.convergence(axes, start_lines(results, "sensor_mm"), "sensor position (mm)")
         figure.savefig(path)
 
 
@@ -87,7 +88,7 @@ def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
     figure, axes = panels(len(labels), 6, 4)
     for ax, label, changes in zip(axes, labels, results["changes_mm"]):
         lines = {n: (np.arange(len(row)), row) for n, row in zip(trained.names, changes)}
-        show.convergence(ax, lines, "change, as mm of the sensor")
+        _plots.convergence(ax, lines, "change, as mm of the sensor")
         ax.set_title(label, fontsize=9)
     figure.savefig(folder / "numbers.png")
     figure, axes = show.new(2, 1, 8, 3)
@@ -117,4 +118,4 @@ def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path)
     rows = {name: np.float32(results[name]) for name in IMAGES}
     errors = {name: rows[name] - rows["truth"] for name in IMAGES[1:]}
     notes = {n: [f"{np.sqrt(np.mean(e**2)):.3f}" for e in some] for n, some in errors.items()}
-    show.patch_grid(rows, titles, notes).savefig(path)
+    _plots.patch_grid(rows, titles, notes).savefig(path)

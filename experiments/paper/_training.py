@@ -17,14 +17,14 @@ from drt_jax.image.lost import crossed
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
 from drt_jax.learn.data import DataConfig, batches, load_patches
-from drt_jax.runs.config import ConfigError
-from drt_jax.runs.folder import Run
-from drt_jax.runs.interrupt import deferred_interrupt
-from drt_jax.runs.write import replace
 
 from ._common import require, require_list, require_within
 from ._optics import Scene, Trained, check_variables, middle, spot_of
 from ._report import IMAGES, start_label
+from .runs.config import ConfigError
+from .runs.folder import Run
+from .runs.interrupt import deferred_interrupt
+from .runs.write import replace
 
 # So many files that were skipped are named on the terminal, all of more in the run's folder.
 _NAMED = 20

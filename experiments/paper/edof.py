@@ -21,9 +21,9 @@ import numpy as np
 
 from drt_jax import show
 from drt_jax.learn import train
-from drt_jax.runs.folder import Run
 
-from . import _command, _common, _report, _training
+from . import _command, _common, _plots, _report, _training
+from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um", "depth_mm")
 
@@ -151,7 +151,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     labels = [f"{sensor:.2f} mm" for sensor in results["blur_sensor_mm"]]
     if "numbers" in results or len(set(labels)) < len(labels):
         labels = [f"{label}, {name}" for label, name in zip(labels, ("fixed", "trained"))]
-    show.sigma_over_depth(axes, results["blur_depth_m"], dict(zip(labels, results["blur_um"])))
+    _plots.sigma_over_depth(axes, results["blur_depth_m"], dict(zip(labels, results["blur_um"])))
     figure.savefig(figures / "figure_6b.png")
     titles = [f"{depth:g} m" for depth in results["patch_depth_m"]]
     _report.draw_patches(results, titles, figures / "figure_7.png")

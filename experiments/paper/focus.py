@@ -21,9 +21,9 @@ import numpy as np
 
 from drt_jax import show
 from drt_jax.image.sensor import convolve_taps
-from drt_jax.runs.folder import Run
 
-from . import _command, _common, _report, _training
+from . import _command, _common, _plots, _report, _training
+from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
 # Of the mean of many numbers in float32, relative, with some room.
@@ -113,8 +113,8 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)", None),
     )[not _report.moves(results) :]:
         figure, (left, right) = show.new(1, 2, 5.5, 4)
-        show.convergence(left, _report.start_lines(results, column), label, level)
-        show.convergence(right, _report.start_lines(results, column, 100), label, level)
+        _plots.convergence(left, _report.start_lines(results, column), label, level)
+        _plots.convergence(right, _report.start_lines(results, column, 100), label, level)
         right.set_title("the first 100 batches", fontsize=9)
         figure.savefig(figures / f"{name}.png")
 

@@ -13,9 +13,9 @@ import sys
 from typing import Any
 
 from drt_jax.learn import train
-from drt_jax.runs.folder import Run
 
 from . import _command, _common, _report, _training
+from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
 

@@ -27,11 +27,11 @@ import drt_jax
 from drt_jax import Lens, Status, pupil, show
 from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
-from drt_jax.runs.folder import Run
 
-from . import _command, _common, _peers, _work
+from . import _command, _common, _peers, _plots, _work
 from ._reference import Moments, changed, flatten, gradient_error, reference
 from ._work import Row, compiled, peer, rows_of
+from .runs.folder import Run
 from .snell import trace_snell
 
 COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", *_work.MEASURED)
@@ -285,7 +285,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw run time against error, and how it grows."""
     if "work" in results:
         figure, axes = show.new(1, 1, 5.5, 4)
-        show.growth(axes, results["work"])
+        _plots.growth(axes, results["work"])
         figure.savefig(figures / "work.png")
     spots = [row for row in results["rows"] if row["task"].startswith("sigma")]
     if spots:
@@ -295,7 +295,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
             marks = {"drt_jax": [(1e3 * rows[0]["ours_s"], rows[0]["ours_error"])]}
             peers = [row for row in rows if row["peer_s"]]
             marks |= {row["peer"]: [(1e3 * row["peer_s"], row["peer_error"])] for row in peers}
-            show.programs(ax, marks, task)
+            _plots.programs(ax, marks, task)
         figure.savefig(figures / "peers.png")
 
 

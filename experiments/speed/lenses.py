@@ -27,10 +27,10 @@ from jax import Array
 
 import drt_jax
 from drt_jax import Lens, show
-from drt_jax.runs.folder import Run
 
-from . import _command, _common, _peers, _work
+from . import _command, _common, _peers, _plots, _work
 from ._reference import reference
+from .runs.folder import Run
 
 COLUMNS = ("first_s", "loose_s", "tight_s", "value_s", "gradient_s", "loose_error", "tight_error")
 _LOOSE, _TIGHT = 1e-3, 1e-6
@@ -286,7 +286,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
                 )
                 for swept in results["sweeps"]
             }
-            show.curves(ax, series, "field / widest field", f"{what}{name} / its largest")
+            _plots.curves(ax, series, "field / widest field", f"{what}{name} / its largest")
         figure.savefig(figures / f"fields_{key}.png")
 
 

@@ -12,11 +12,11 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import Lens, Status
 from drt_jax.inputs import InputError, shown
-from drt_jax.runs import config as configs
 
 from ._common import settings_files
 from ._mutants import mutated
 from ._outcomes import Tally, judged
+from .runs import config as configs
 
 _LENSES = pathlib.Path(drt_jax.__file__).parent / "lens" / "catalogue" / "lenses"
 # Programs of many structures exhaust what a process may map.

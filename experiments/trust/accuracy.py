@@ -26,12 +26,12 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import Lens, PupilRule, pupil, show
-from drt_jax.runs.folder import Run
+from drt_jax import Lens, PupilRule, pupil
 
-from . import _command, _common
+from . import _command, _common, _plots
 from ._common import grouped
 from ._reference import Moments, flatten, gradient_error, reference
+from .runs.folder import Run
 
 _QUADRATURE = "quadrature"
 COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")
@@ -333,7 +333,7 @@ def draw_panel(axes: Any, rows: list[dict], x: str, y: str, labels: tuple[str, s
         for place, (size, group) in zip(across, groups):
             if (method, size) == ("random", _RANDOM):
                 note = place, middle(group, y), f"the paper's {_RANDOM} rays"
-    show.error_curves(axes, curves, *labels, note)
+    _plots.error_curves(axes, curves, *labels, note)
 
 
 if __name__ == "__main__":

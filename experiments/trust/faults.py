@@ -1,4 +1,4 @@
-"""Hostile input and sudden ends: files spoilt at random, runs killed, folders damaged, odd images.
+"""Hostile input and sudden ends: files spoilt at random, runs killed and stopped.
 
 Nothing may be used that cannot be trusted: what is spoilt is refused in one line of at most 300
 characters, or the result is right. Writes results.json: `rows` hold `kind`, `tried`, `refused`,
@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from drt_jax import show
-from drt_jax.runs.folder import Run
 
-from . import _command, _common, _damage, _ended, _spoilt, _zoo
+from . import _command, _common, _ended, _plots, _spoilt
 from ._outcomes import OUTCOMES
+from .runs.folder import Run
 
 COLUMNS = ("tried", *OUTCOMES)
-PARTS = ("files", "kills", "folders", "images")
+PARTS = ("files", "kills")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,20 +30,18 @@ class Config:
     """Settings of the experiment; see configs/faults.yaml.
 
     files: how many prescriptions and settings are spoilt. traced: how many of the lenses that load
-    are traced. kills: how many runs are ended. folders: how many run folders are damaged. parts:
-    the names of those to try (files, kills, folders, images), empty for all. seed: of all random
-    numbers.
+    are traced. kills: how many runs are ended. parts: the names of those to try (files, kills),
+    empty for all. seed: of all random numbers.
     """
 
     files: int = 10_000
     traced: int = 20
     kills: int = 200
-    folders: int = 63
     parts: tuple[str, ...] = ()
     seed: int = 0
 
     def __post_init__(self) -> None:
-        limits = {"files": (2, 1e6), "traced": (0, 1e5), "kills": (3, 1e4), "folders": (1, 1e4)}
+        limits = {"files": (2, 1e6), "traced": (0, 1e5), "kills": (3, 1e4)}
         _common.require_within("", self, **limits)
         _common.require_known("parts", self.parts, PARTS)
 
@@ -56,20 +54,13 @@ def rows_of(config: Config, part: str) -> Iterator[dict[str, Any]]:
         yield row
         yield _spoilt.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
         yield _spoilt.settings(config.files - config.files // 2, some[1])
-    if part == "images":
-        yield _zoo.images()
-    if part not in ("kills", "folders"):
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        toy = _ended.Toy(pathlib.Path(folder))
-        if part == "folders":
-            yield _damage.damaged(toy, config.folders, some[0])
-            return
-        third = config.kills // 3
-        yield _ended.killed(toy, third, some[0])
-        yield _ended.killed_at_writes(toy, third, some[1])
-        yield _ended.stopped(toy, config.kills - 2 * third, some[2])
-        yield _ended.two(toy, 3)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            toy, third = _ended.Toy(pathlib.Path(folder)), config.kills // 3
+            yield _ended.killed(toy, third, some[0])
+            yield _ended.killed_at_writes(toy, third, some[1])
+            yield _ended.stopped(toy, config.kills - 2 * third, some[2])
+            yield _ended.two(toy, 3)
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -98,7 +89,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw what became of each kind."""
     figure, axes = show.new(1, 1, 8, 3.6)
     rows = {row["kind"]: [row[name] for name in OUTCOMES] for row in results["rows"]}
-    show.shares(axes, rows, OUTCOMES)
+    _plots.shares(axes, rows, OUTCOMES)
     figure.savefig(figures / "faults.png")
 
 

@@ -16,11 +16,11 @@ import jax
 import numpy as np
 
 from drt_jax import Status, show
-from drt_jax.runs.folder import Run
 
-from . import _command, _common, _families
+from . import _command, _common, _families, _plots
 from ._families import FAMILIES
 from ._survey import survey
+from .runs.folder import Run
 
 # Of each family in metrics.csv, and summed over all in results.json.
 COLUMNS = ("scenes", "rays", *(status.name.lower() for status in Status))
@@ -152,7 +152,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     ):
         ends = np.cumsum([row[size] for row in rows])[:-1]
         families = dict(zip([row["name"] for row in rows], np.split(samples, ends)))
-        show.by_family(ax, families, label, log=size == "float32_rays")
+        _plots.by_family(ax, families, label, log=size == "float32_rays")
     figure.savefig(figures / "families.png")
 
 

@@ -10,8 +10,8 @@ import sys
 
 import numpy as np
 
-from drt_jax.runs.interrupt import deferred_interrupt
 from experiments import _command
+from experiments.runs.interrupt import deferred_interrupt
 
 COLUMNS = ("loss",)
 # What writes, or makes others wait: the moments at which to die.

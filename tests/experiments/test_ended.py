@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax.runs.config import ConfigError
-from drt_jax.runs.folder import Run
 from experiments import _command, _common, focus
+from experiments.runs.config import ConfigError
+from experiments.runs.folder import Run
 
 from . import counting
 

@@ -16,9 +16,9 @@ import yaml
 from skimage import io
 
 from drt_jax.learn import train
-from drt_jax.runs.config import load_config
-from drt_jax.runs.folder import Run, begun
 from experiments import _command, _common, tables
+from experiments.runs.config import load_config
+from experiments.runs.folder import Run, begun
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 CONFIGS = dict(_common.settings_files())

@@ -14,8 +14,8 @@ import pytest
 import drt_jax
 from drt_jax.learn import train
 from drt_jax.pupil import hexapolar
-from drt_jax.runs.folder import Run
 from experiments import _optics
+from experiments.runs.folder import Run
 
 from .test_experiments import SMALL, assert_same, main
 

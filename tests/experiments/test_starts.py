@@ -19,7 +19,7 @@ AXIAL = ["wavelengths_um=[0.55]", "distance_mm=.inf", "order=2"]
 STARTS = {
     "accuracy": ["scenes=[{lens: singlet}]", "orders=[2]", "rays=[7]", "tolerances=[1e-2]"],
     "stability": ["families=[mirror]", "scenes=3"],
-    "faults": ["parts=[files, images]", "files=24", "traced=1"],
+    "faults": ["parts=[files]", "files=24", "traced=1"],
     "benchmark": ["tasks=[axial]", "growth=false", "repeats=1", "lens=singlet"],
     "lenses": [
         "lenses=[{lens: singlet, field_deg: 3}]",

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..inputs import shown
+from drt_jax.inputs import shown
 
 
 @dataclasses.dataclass(frozen=True)

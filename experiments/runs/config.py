@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
-from ..inputs import InputError, Lines, parse, read_yaml, shown
+from drt_jax.inputs import InputError, Lines, parse, read_yaml, shown
 
 T = TypeVar("T")
 # Of what is given: the largest whole number, the largest size of another that is finite, items of a

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax.runs.checkpoint import Checkpoint, unpacked
-from drt_jax.runs.config import ConfigError
-from drt_jax.runs.folder import Run
-from drt_jax.runs.write import replace
+from experiments.runs.checkpoint import Checkpoint, unpacked
+from experiments.runs.config import ConfigError
+from experiments.runs.folder import Run
+from experiments.runs.write import replace
 
 HEADER = b"job,step,loss,check\r\n"
 
@@ -242,7 +242,7 @@ def test_a_state_that_is_not_finite_is_not_saved(folder):
 
 HOLDER = """
 import dataclasses, pathlib, sys, time
-from drt_jax.runs.folder import Run
+from experiments.runs.folder import Run
 Config = dataclasses.make_dataclass("Config", [("seed", int, 0)], frozen=True)
 run = Run(pathlib.Path(sys.argv[1]), Config(), ("loss",), True)
 print("open", flush=True)

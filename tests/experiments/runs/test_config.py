@@ -4,7 +4,7 @@ from typing import Literal
 
 import pytest
 
-from drt_jax.runs.config import ConfigError, describe, dump_config, load_config
+from experiments.runs.config import ConfigError, describe, dump_config, load_config
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from drt_jax.runs.interrupt import deferred_interrupt
+from experiments.runs.interrupt import deferred_interrupt
 
 
 def press_ctrl_c():
@@ -30,7 +30,7 @@ def test_first_interrupt_is_deferred_second_is_not():
 
 IGNORED = """
 import signal
-from drt_jax.runs.interrupt import deferred_interrupt
+from experiments.runs.interrupt import deferred_interrupt
 
 handler = signal.getsignal(signal.SIGTERM)
 with deferred_interrupt() as asked:

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax.runs.config import ConfigError
-from drt_jax.runs.folder import Run
+from experiments.runs.config import ConfigError
+from experiments.runs.folder import Run
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,313 @@
+"""What experiments draw of their results: arrays in, axes out."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import ticker
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from drt_jax.show import new
+
+
+def _finished(axes: Axes, xlabel: str, ylabel: str, columns: int = 1) -> Axes:
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, ncols=columns)
+    return axes
+
+
+def convergence(
+    axes: Axes,
+    traces: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    ylabel: str,
+    level: tuple[float, str] | None = None,
+) -> Axes:
+    """Lines over training batches.
+
+    traces: (x (N,), y (N,)) by label.
+    level: a horizontal mark and its label.
+    """
+    for label, (x, y) in traces.items():
+        axes.plot(x, y, linewidth=1.1, label=label)
+    if level is not None:
+        axes.axhline(level[0], color="black", linestyle=":", linewidth=1, label=level[1])
+    return _finished(axes, "training batch", ylabel)
+
+
+def curves(
+    axes: Axes, series: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, ylabel: str
+) -> Axes:
+    """Lines: (x (N,), y (N,)) by label."""
+    for k, (label, (x, y)) in enumerate(series.items()):
+        axes.plot(x, y, linewidth=1.1, linestyle="-" if k < 10 else "--", label=label)
+    return _finished(axes, xlabel, ylabel)
+
+
+def error_curves(
+    axes: Axes,
+    curves: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float | None]]]],
+    xlabel: str,
+    ylabel: str,
+    note: tuple[float, float, str] | None = None,
+) -> Axes:
+    """Errors over cost, both logarithmic: the median of the scenes as a line, and a band from the
+    best to the worst.
+
+    curves: (x (N,), errors (N, M) of M scenes) by label; errors that are not known (None) or 0
+        are left out.
+    note: x, y and a text that points there.
+    """
+    for k, (label, (x, errors)) in enumerate(curves.items()):
+        known = [(a, [e for e in row if e]) for a, row in zip(x, errors)]
+        bands = [(a, min(row), np.median(row), max(row)) for a, row in known if row]
+        if not bands:
+            continue
+        across, low, middle, high = np.array(bands).T
+        axes.fill_between(across, low, high, color=f"C{k}", alpha=0.12, linewidth=0)
+        (line,) = axes.plot(across, middle, color=f"C{k}", linewidth=1.2, zorder=2, label=label)
+        line.set(marker="osD^v"[k % 5], markersize=4)
+        if k == 0:
+            line.set(linewidth=2.2, zorder=3)
+    if note is not None:
+        point, text = note[:2], note[2]
+        arrow = {"arrowstyle": "-", "linewidth": 0.7}
+        above = axes.annotate(text, point, (0, 22), textcoords="offset points", arrowprops=arrow)
+        above.set(fontsize=8, ha="center")
+    axes.set(xscale="log", yscale="log")
+    # Over less than a decade or so, labels between the powers of ten would overlap.
+    axes.xaxis.set_minor_locator(ticker.LogLocator(subs=(2, 5)))
+    return _finished(axes, xlabel, ylabel)
+
+
+def programs(axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], title: str) -> Axes:
+    """Points of programs, both axes logarithmic.
+
+    marks: (time of a call in ms, relative error) of each point, by program.
+    """
+    for name, points in marks.items():
+        axes.plot(*zip(*points), marker="o", linestyle="none", markersize=8, label=name)
+    axes.set(xscale="log", yscale="log", title=title)
+    return _finished(axes, "time of a call (ms)", "error, relative")
+
+
+def sigma_over_depth(axes: Axes, depths: np.ndarray, curves: Mapping[str, np.ndarray]) -> Axes:
+    """Blur over the object distance: the first curve dotted and pale, the others solid.
+
+    depths: (N,) in m.
+    curves: blur (N, 3) in um of R, G, B, by label.
+    """
+    for k, (label, sigma) in enumerate(curves.items()):
+        for channel, colour in enumerate(("red", "green", "blue")):
+            name = f"{colour[0].upper()}, {label}"
+            (line,) = axes.plot(depths, sigma[:, channel], color=f"tab:{colour}", label=name)
+            if k == 0:
+                line.set(linestyle=":", alpha=0.6)
+    axes.set_ylim(0, None)
+    return _finished(axes, "object distance (m)", r"blur $\sigma$ (µm)", len(curves))
+
+
+def patch_grid(
+    rows: Mapping[str, Sequence[np.ndarray]],
+    titles: Sequence[str],
+    notes: Mapping[str, Sequence[str]],
+) -> Figure:
+    """Images in labelled rows.
+
+    rows: images (H, W, 3), 0 to 1, by label.
+    titles: of the columns.
+    notes: texts for the corners of the images, by the label of their row.
+    """
+    figure, axes = new(len(rows), len(titles), 1.7, 1.75 + 0.3 / len(rows))
+    axes = np.reshape(axes, (len(rows), len(titles)))
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.2}
+    for line, (name, images) in zip(axes, rows.items()):
+        line[0].set_ylabel(name)
+        for ax, image in zip(line, images):
+            ax.imshow(np.clip(image, 0, 1), interpolation="nearest")
+            ax.set(xticks=[], yticks=[])
+        for ax, note in zip(line, notes.get(name, ())):
+            ax.text(0.04, 0.96, note, transform=ax.transAxes, va="top", fontsize=8, bbox=box)
+    for ax, title in zip(axes[0], titles):
+        ax.set_title(title, fontsize=9)
+    return figure
+
+
+def growth(axes: Axes, series: Mapping[str, Sequence[tuple[float, float]]]) -> Axes:
+    """Run time against a number of things, both logarithmic, and a line of slope one.
+
+    series: (number, time in s) of each point, by what is counted.
+    """
+    for name, points in series.items():
+        number, seconds = np.asarray(points, float).T
+        axes.loglog(number, 1e3 * seconds, marker="o", label=name)
+    line = np.array(axes.get_xlim())
+    slope = 1e3 * seconds[-1] / number[-1]
+    axes.plot(line, slope * line, color="grey", linestyle=":", label="linear")
+    axes.set_xlim(*line)
+    return _finished(axes, "number", "run time (ms)")
+
+
+def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bool = False) -> Axes:
+    """A box for each family, from the first to the third quartile with its median, whiskers from
+    the 1st to the 99th percentile, and the largest sample as a point.
+
+    samples: (N,) by family.
+    label: of the axis.
+    log: a logarithmic scale, which leaves out samples of 0.
+    """
+    shown = {name: np.asarray(values, float) for name, values in samples.items() if np.size(values)}
+    if log:
+        shown = {name: values[values > 0] for name, values in shown.items()}
+        axes.set_xscale("log")
+    axes.boxplot(
+        list(shown.values()), orientation="horizontal", whis=(1, 99), showfliers=False, widths=0.6
+    )
+    for k, values in enumerate(shown.values()):
+        if values.size:
+            axes.plot(np.max(values), k + 1, marker=".", color="tab:red", linestyle="none")
+    axes.set_yticks(range(1, len(shown) + 1), list(shown))
+    axes.invert_yaxis()
+    axes.set_xlabel(label)
+    axes.grid(axis="x", alpha=0.3)
+    return axes
+
+
+def shares(axes: Axes, rows: Mapping[str, Sequence[float]], names: Sequence[str]) -> Axes:
+    """Bars of what parts of each row come to: the numbers of `names` by label, as shares."""
+    labels = list(rows)
+    parts = np.array([rows[label] for label in labels], float)
+    ends = np.cumsum(parts / np.maximum(parts.sum(axis=1, keepdims=True), 1), axis=1)
+    for k, name in enumerate(names):
+        begin = ends[:, k - 1] if k else 0.0
+        axes.barh(labels, ends[:, k] - begin, left=begin, label=name)
+    axes.invert_yaxis()
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, ncols=len(names), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    axes.set(xlabel="share")
+    return axes
+
+
+_COLOURS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
+
+
+def spots(
+    axes: Axes, hits: Mapping[str, np.ndarray], covariance: np.ndarray, side: float, title: str
+) -> Axes:
+    """A spot: hits (N, 2) in um about the centroid by colour, and the ellipse of one standard
+    deviation of `covariance` (2, 2), um^2. side: of the square shown, um."""
+    for (label, points), colour in zip(hits.items(), _COLOURS * len(hits)):
+        axes.plot(points[:, 0], points[:, 1], ".", markersize=2, color=colour, label=label)
+    sizes, turned = np.linalg.eigh(covariance)
+    width, height = 2 * np.sqrt(np.maximum(sizes, 0))
+    angle = np.degrees(np.arctan2(turned[1, 0], turned[0, 0]))
+    axes.add_patch(Ellipse((0, 0), width, height, angle=angle, fill=False, color="black"))
+    axes.set(xlim=(-side / 2, side / 2), ylim=(-side / 2, side / 2), aspect="equal")
+    axes.set_title(title, fontsize=9)
+    axes.grid(alpha=0.3)
+    return axes
+
+
+def merits(axes: Axes, history: np.ndarray) -> Axes:
+    """How the root of the merit (um) fell over the trials, and by how much limits were exceeded;
+    history (T, 3): merit in mm^2, worst limit, Jacobians."""
+    axes.semilogy(1e3 * np.sqrt(history[:, 0]), color="tab:blue")
+    axes.set(xlabel="trial", ylabel="root of the merit (um)")
+    axes.grid(alpha=0.3)
+    other = axes.twinx()
+    other.plot(np.maximum(history[:, 1], 0), color="tab:red", linewidth=0.8)
+    other.set_ylabel("worst limit exceeded by", color="tab:red")
+    return axes
+
+
+def searching(axes: Axes, best: np.ndarray) -> Axes:
+    """How the root of the best merit (um) of many starts fell; best (T,): in mm^2, after each tile
+    of searches."""
+    axes.semilogy(np.arange(1, len(best) + 1), 1e3 * np.sqrt(best), color="tab:blue")
+    axes.set(xlabel="tiles of 16 searches, by stages", ylabel="root of the best merit (um)")
+    axes.grid(alpha=0.3, which="both")
+    return axes
+
+
+def ranks(axes: Axes, sizes: Sequence[float], found: Sequence[int]) -> Axes:
+    """The distinct minima: the root of the merit (um) of each, and how often it was found."""
+    axes.bar(range(1, len(sizes) + 1), sizes, color="tab:blue")
+    for k, (size, often) in enumerate(zip(sizes, found), 1):
+        axes.text(k, size, str(often), ha="center", va="bottom", fontsize=7)
+    axes.set(xlabel="minimum, and how many starts ended there", ylabel="root of the merit (um)")
+    axes.grid(alpha=0.3, axis="y")
+    return axes
+
+
+def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]) -> Axes:
+    """Groups of horizontal bars, the first on top.
+
+    names: of the groups, N. series: lengths (N,) by label; the first filled, the others as outlines
+    of it.
+    """
+    places = np.arange(len(names))
+    for k, (label, values) in enumerate(series.items()):
+        fill: dict[str, Any] = {"fill": False, "edgecolor": f"C{k}"}
+        if k == 0:
+            fill = {"color": "C0", "alpha": 0.7}
+        axes.barh(places, values, height=0.8 - 0.25 * k, label=label, linewidth=1.4, **fill)
+    axes.set_yticks(places, list(names), fontsize=8)
+    axes.invert_yaxis()
+    axes.grid(axis="x", alpha=0.3)
+    axes.legend(fontsize=8)
+    return axes
+
+
+# Lines that may lie on each other, below one broad line of what is true.
+_TRUE: dict[str, Any] = {"color": "black", "alpha": 0.35, "linewidth": 4}
+_STYLES = ("-", "--", ":")
+_DOTS = {"color": "black", "linewidth": 2.2, "zorder": 4}  # on top of what they agree with
+
+
+def yields(
+    axes: Axes, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, ylabel: str
+) -> Axes:
+    """Shares of lenses, in per cent, over what they reach: the first curve broad, those that are
+    to be compared with it thin.
+
+    curves: (x (N,), shares (N,) in per cent) by label.
+    """
+    for k, (label, (x, share)) in enumerate(curves.items()):
+        style: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
+        style |= _DOTS if k % 3 == 2 else {}
+        axes.plot(x, share, label=label, **(style if k else _TRUE))
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return axes
+
+
+def histogram(
+    axes: Axes,
+    edges: np.ndarray,
+    shares: Mapping[str, np.ndarray],
+    marks: Mapping[str, float],
+    xlabel: str,
+) -> Axes:
+    """Shares of samples between edges, in per cent.
+
+    edges: (N + 1,). shares: (N,) by label; the first filled, the others as lines. marks: places of
+    vertical lines, by label.
+    """
+    for k, (label, values) in enumerate(shares.items()):
+        line: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
+        line |= _DOTS if k % 3 == 2 else {}
+        fill: dict[str, Any] = {"color": "black", "alpha": 0.2, "fill": True}
+        axes.stairs(values, edges, label=label, **(line if k else fill))
+    for k, (label, place) in enumerate(marks.items()):
+        axes.axvline(place, color="black", linestyle="-.", linewidth=0.8)
+        axes.annotate(
+            label, (place, 1), (3, -10 - 11 * k), xycoords=("data", "axes fraction"),
+            textcoords="offset points", fontsize=8,
+        )  # fmt: skip
+    axes.set(xlabel=xlabel, ylabel="share (%)")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, loc="center right")
+    return axes
