@@ -131,7 +131,7 @@ def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
         return Clipped(order, symmetry, _ORDERS[-1], may_cross(lens))
     points, weights = gauss_points(order, symmetry)
     more = gauss_points(_ORDERS[-1], symmetry)[1].size - weights.size
-    return Pattern(np.pad(points, ((0, 0), (0, more))), np.pad(weights, (0, more)), symmetry)
+    return Pattern(np.pad(points, ((0, more), (0, 0))), np.pad(weights, (0, more)), symmetry)
 
 
 def aperture_lines(lens: Lens, beams: list[Beam]) -> Iterator[str]:

@@ -14,7 +14,7 @@ from drt_jax import Gauss, Pattern, Status, load_lens, psf_moments, pupil
 from drt_jax.image import lost
 
 LENS = load_lens("singlet")
-GREEN, POINTS, RULE = (0.55,), pupil.hexapolar(1)[0].T, Gauss(4, "bilateral")
+GREEN, POINTS, RULE = (0.55,), pupil.hexapolar(1)[0], Gauss(4, "bilateral")
 SCENE = (0.05, 25e3, GREEN)
 # Every public function of a field, of a distance, of wavelengths, of points of the stop.
 CALLS = {
@@ -146,15 +146,17 @@ def test_orders_and_symmetries_that_no_rule_has_are_refused():
         for order in (2.5, 0, 43, "4", None, True, np.float64(4)):
             with pytest.raises(ValueError, match="order: expected a whole number from 1 to 42"):
                 kind(order, "bilateral")
-        with pytest.raises(ValueError, match="expected one of meridian, half, disc, got 'whole'"):
+        with pytest.raises(
+            ValueError, match="expected one of rotational, bilateral, none, got 'whole'"
+        ):
             kind(4, "whole")
     assert Gauss(np.int64(4), "bilateral") == RULE
     for pattern in (pupil.meridian, pupil.hexapolar, pupil.square_grid, pupil.sobol_disc):
         for count in (2.5, 0, None):
             with pytest.raises(ValueError, match="expected at least 1, a whole number, got"):
                 pattern(count)
-    for points, weights in ((POINTS, np.ones(7)), (POINTS.T, np.ones(6)), (POINTS.T, 1.0)):
-        with pytest.raises(ValueError, match=r"expected positions \(2, Q\) and weights \(Q,\)"):
+    for points, weights in ((POINTS.T, np.ones(7)), (POINTS, np.ones(6)), (POINTS, 1.0)):
+        with pytest.raises(ValueError, match=r"expected positions \(Q, 2\) and weights \(Q,\)"):
             psf_moments(LENS, *SCENE, rule=Pattern(points, weights))
 
 

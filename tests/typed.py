@@ -17,7 +17,7 @@ mean, covariance = moments.mean, moments.covariance
 kernel: Array = drt_jax.gaussian_psf(mean, covariance, pixel=4.4e-3)
 rows: drt_jax.SeparableKernel = drt_jax.separable_psf([(0.0, 0.0)], [(1e-4, 1e-4)], 4.4e-3)
 rays: drt_jax.Rays = drt_jax.trace_rays(LENS, 0.1, 25e3, RGB, [(0.0, 0.0), (0.0, 1.0)])
-wave: drt_jax.Wavefront = drt_jax.wavefront(LENS, 0.1, 25e3, RGB, pupil.hexapolar(3)[0].T)
+wave: drt_jax.Wavefront = drt_jax.wavefront(LENS, 0.1, 25e3, RGB, pupil.hexapolar(3)[0])
 
 variables = design.Variables.from_lens(LENS, [design.Vary("curvature"), "sensor"])
 problem = design.Problem.from_variables(variables, ["spot"], [0.0, 0.1], RGB, field_weights=(1, 2))

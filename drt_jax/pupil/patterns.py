@@ -22,32 +22,32 @@ def _gauss(order: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def meridian(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (1, n) and weights (n,) on one radius: enough for an axial object."""
+    """Points (n, 1) and weights (n,) on one radius: enough for an axial object."""
     radius, weights = _gauss(order)
-    return radius[None], weights
+    return radius[:, None], weights
 
 
 def half_disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, n m) in the half x > 0 and weights: enough for a field along y.
+    """Points (n m, 2) in the half x > 0 and weights: enough for a field along y.
 
     n Gauss nodes in r^2 times m uniform azimuths, the mirror half of a rule of 2 m.
     """
     radius, weights = _gauss(order)
     _count("azimuths", azimuths)
     angle = np.pi * ((np.arange(azimuths) + 0.5) / azimuths - 0.5)
-    points = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))])
-    return points.reshape(2, -1), np.repeat(weights / azimuths, azimuths)
+    points = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))], axis=-1)
+    return points.reshape(-1, 2), np.repeat(weights / azimuths, azimuths)
 
 
 def disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, 2 n m) and weights of the same rule on the whole disc."""
+    """Points (2 n m, 2) and weights of the same rule on the whole disc."""
     points, weights = half_disc(order, azimuths)
-    mirrored = points * np.array([[-1.0], [1.0]])
-    return np.concatenate([points, mirrored], axis=1), np.tile(weights / 2, 2)
+    mirrored = points * np.array([-1.0, 1.0])
+    return np.concatenate([points, mirrored]), np.tile(weights / 2, 2)
 
 
 def random_disc(rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform random points (2, rays), as the paper's 256 rays, and equal weights."""
+    """Uniform random points (rays, 2), as the paper's 256 rays, and equal weights."""
     _count("rays", rays)
     generator = np.random.default_rng(seed)
     return _of_square(generator.random(rays), generator.random(rays))
@@ -56,24 +56,24 @@ def random_disc(rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def _of_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points of the unit square on the disc: r = sqrt(u), azimuth 2 pi v; equal weights."""
     radius, angle = np.sqrt(u), 2 * np.pi * v
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)])
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     return points, np.full(len(u), 1 / len(u))
 
 
 def square_grid(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, Q) of a square grid inside the disc and equal weights.
+    """Points (Q, 2) of a square grid inside the disc and equal weights.
 
     The centres of `side` x `side` cells of the square round the disc; those in the disc stay.
     """
     _count("side", side)
     line = (np.arange(side) + 0.5) / side * 2 - 1
-    points = np.stack(np.meshgrid(line, line)).reshape(2, -1)
-    points = points[:, np.sum(points**2, axis=0) <= 1]
-    return points, np.full(points.shape[1], 1 / points.shape[1])
+    points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    points = points[np.sum(points**2, axis=-1) <= 1]
+    return points, np.full(len(points), 1 / len(points))
 
 
 def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, Q), Q = 1 + 3 n (n + 1): the centre and n rings of 6, 12, 18, ...; equal weights.
+    """Points (Q, 2), Q = 1 + 3 n (n + 1): the centre and n rings of 6, 12, 18, ...; equal weights.
 
     Each ray stands for the same area of the disc: a ring of 6 k lies at the radius that halves
     the area of its annulus. (Lens design programs often put the outermost ring on the rim and
@@ -83,23 +83,23 @@ def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
     k = np.arange(1, rings + 1)
     total = 1 + 3 * rings * (rings + 1)
     radius = np.sqrt((1 + 3 * k * k) / total)  # the mean of r^2 at its edges, 1 + 3 k (k +- 1)
-    points = [np.zeros((2, 1))]
+    points = [np.zeros((1, 2))]
     for ring, r in zip(k, radius):
         angle = 2 * np.pi * (np.arange(6 * ring) + 0.5) / (6 * ring)
-        points.append(r * np.stack([np.cos(angle), np.sin(angle)]))
-    return np.concatenate(points, axis=1), np.full(total, 1 / total)
+        points.append(r * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    return np.concatenate(points), np.full(total, 1 / total)
 
 
 def sobol(count: int) -> np.ndarray:
-    """The first points (2, count) of the Sobol sequence in the unit square, not scrambled: those of
+    """The first points (count, 2) of the Sobol sequence in the unit square, not scrambled: those of
     `scipy.stats.qmc`. Best at powers of two."""
     from scipy.stats import qmc  # takes a second to import
 
     _count("count", count)
     sequence = qmc.Sobol(2, scramble=False)
-    return sequence.random_base2(int(count - 1).bit_length())[:count].T
+    return sequence.random_base2(int(count - 1).bit_length())[:count]
 
 
 def sobol_disc(rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2, rays) of the Sobol sequence and equal weights: r^2 and azimuth are its axes."""
-    return _of_square(*sobol(rays))
+    """Points (rays, 2) of the Sobol sequence and equal weights: r^2 and azimuth are its axes."""
+    return _of_square(*sobol(rays).T)

@@ -75,7 +75,7 @@ class PupilRule(abc.ABC):
 
 
 def gauss_points(order: int, symmetry: Symmetry) -> tuple[np.ndarray, np.ndarray]:
-    """Points (D, Q) and weights (Q,) of the Gauss rule of an order on what symmetry leaves.
+    """Points (Q, D) and weights (Q,) of the Gauss rule of an order on what symmetry leaves.
 
     An aberration of degree p in the pupil reaches azimuthal order p: as many azimuths on the half
     disc as there are radial nodes, and one, integrate its square to the same degree.
@@ -104,7 +104,7 @@ class Gauss(PupilRule):
         """Points and weights of the order: constants."""
         points, weights = gauss_points(self.order, self.symmetry)
         dtype = lens.curvature.dtype
-        return tuple(jnp.asarray(p, dtype) for p in points), jnp.asarray(weights, dtype)[None]
+        return tuple(jnp.asarray(p, dtype) for p in points.T), jnp.asarray(weights, dtype)[None]
 
 
 @jax.tree_util.register_dataclass
@@ -150,7 +150,7 @@ class Soft(PupilRule):
 class Pattern(PupilRule):
     """Any points on the stop, such as those of `pupil.hexapolar`; clipped rays drop out.
 
-    positions: (2, Q), x and y in units of the stop's semi-diameter; (1, Q) on the meridian.
+    positions: (Q, 2), x and y in units of the stop's semi-diameter; (Q, 1) on the meridian.
     weights: (Q,), adding up to 1 for a stop filled with light.
     """
 
@@ -163,13 +163,13 @@ class Pattern(PupilRule):
         dtype = lens.curvature.dtype
         positions = real_array("positions", self.positions, dtype)
         weights = real_array("weights", self.weights, dtype)
-        rows = 1 if self.symmetry == "rotational" else 2
-        if weights.ndim != 1 or not weights.size or positions.shape != (rows, weights.size):
+        columns = 1 if self.symmetry == "rotational" else 2
+        if weights.ndim != 1 or not weights.size or positions.shape != (weights.size, columns):
             raise ValueError(
-                f"Pattern: expected positions ({rows}, Q) and weights (Q,), got {positions.shape} "
-                f"and {weights.shape}"
+                f"Pattern: expected positions (Q, {columns}) and weights (Q,), got "
+                f"{positions.shape} and {weights.shape}"
             )
-        return tuple(positions), weights[None]
+        return tuple(positions.T), weights[None]
 
 
 def check_rule(order: int, symmetry: Symmetry) -> None:

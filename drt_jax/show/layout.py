@@ -166,7 +166,7 @@ class Beam(NamedTuple):
 def beam_of(lens: Lens, field: float, distance: float, wavelength: float) -> Beam:
     """The beam of a field in radians from a distance in mm, of a wavelength in um."""
     rim = np.linspace(0, 2 * np.pi, _RIM)
-    pupil = np.concatenate([hexapolar(_RINGS)[0].T, np.stack([np.sin(rim), np.cos(rim)], axis=-1)])
+    pupil = np.concatenate([hexapolar(_RINGS)[0], np.stack([np.sin(rim), np.cos(rim)], axis=-1)])
     scene = scene_of(lens, field, distance, wavelength)
     points, directions, status = _traced(lens, scene, pupil)
     clipped, arrived = points[status == Status.CLIPPED], points[status == Status.OK]

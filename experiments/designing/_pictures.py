@@ -27,7 +27,7 @@ def _drawing(results: dict[str, Any], path: pathlib.Path) -> layout.Drawing:
 def _spots(results: dict[str, Any], lens: drt_jax.Lens) -> list[tuple[list, np.ndarray]]:
     """By field: hits in um about the centroid of all wavelengths, by wavelength, and their
     covariance."""
-    pupil = np.asarray(hexapolar(_RINGS)[0]).T
+    pupil = hexapolar(_RINGS)[0]
     found = []
     for field in np.radians(results["fields_deg"]):
         scene = field, results["distance_mm"] or math.inf, results["wavelengths_um"]

@@ -52,12 +52,12 @@ def problem_of(config: Config, lens: drt_jax.Lens, order: int | None = None) -> 
 
 def _grid(rings: int) -> Pattern:
     """Rays of equal weight on rings of equal distances, 6 k on the k-th, and one in the centre."""
-    points = [np.zeros((2, 1))]
+    points = [np.zeros((1, 2))]
     for k in range(1, rings + 1):
         angle = 2 * np.pi * np.arange(6 * k) / (6 * k)
-        points.append(k / rings * np.stack([np.cos(angle), np.sin(angle)]))
-    positions = np.concatenate(points, axis=1)
-    return Pattern(positions, np.full(positions.shape[1], 1 / positions.shape[1]), "none")
+        points.append(k / rings * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    positions = np.concatenate(points)
+    return Pattern(positions, np.full(len(positions), 1 / len(positions)), "none")
 
 
 def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:

@@ -155,7 +155,7 @@ class Trained:
         typical steps of a design as 1 mm is of the sensor's: a conic of a nearly flat surface
         would have to change by thousands.
         """
-        pupil = tuple(jnp.asarray(hexapolar(_RINGS)[0], self.lens.curvature.dtype))
+        pupil = tuple(jnp.asarray(hexapolar(_RINGS)[0].T, self.lens.curvature.dtype))
 
         def hits(values: dict[str, Array]) -> tuple[Array, Array]:
             lens = self.lens_of(values)

@@ -152,7 +152,7 @@ def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
     points = pupil.hexapolar(rings(rays))[0]
     place, radius = lens.pupil
     toward = np.array([0.0, np.tan(lens.field), 1.0])
-    through = np.stack([*(radius * points), np.full(points.shape[1], place)], axis=-1)
+    through = np.column_stack([radius * points, np.full(len(points), place)])
     # From the object point, or for an object at infinity along its direction.
     direction = toward + through / lens.distance
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)

@@ -174,7 +174,7 @@ def growth(lens: Lens, field: float, distance: float, repeats: int) -> dict[str,
     (number, seconds)."""
 
     def seconds(lens, rays, waves, angle=field):
-        points = jnp.asarray(pupil.random_disc(rays, 0)[0].T)
+        points = jnp.asarray(pupil.random_disc(rays, 0)[0])
         call, _ = compiled(partial(hits, lens, angle, distance, waves), points)
         if jnp.any(call()[1] != drt_jax.Status.OK):
             raise RuntimeError(f"{lens.name}: rays of the measurement fail")

@@ -76,7 +76,7 @@ class Config:
     @property
     def bundle_trace(self) -> tuple[Callable, Array]:
         """What traces the task of many rays at one wavelength, and their points on the stop."""
-        points = jnp.asarray(pupil.random_disc(self.bundle, self.seed)[0].T)
+        points = jnp.asarray(pupil.random_disc(self.bundle, self.seed)[0])
         waves = jnp.asarray(self.wavelengths_um[:1])
         return functools.partial(_work.hits, *self.scene, waves), points
 

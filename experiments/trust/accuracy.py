@@ -159,7 +159,7 @@ def patterns(rays: int, seeds: int, dtype: Any) -> dict[str, list[PupilRule]]:
     def padded(pattern):
         points, weights = pattern
         missing = rays - weights.size
-        points, weights = np.pad(points, ((0, 0), (0, missing))), np.pad(weights, (0, missing))
+        points, weights = np.pad(points, ((0, missing), (0, 0))), np.pad(weights, (0, missing))
         return drt_jax.Pattern(points.astype(dtype), weights.astype(dtype))
 
     return {

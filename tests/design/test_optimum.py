@@ -69,12 +69,12 @@ def test_constraints_hold_exactly():
 
 
 def grid(rings):
-    rows = [np.zeros((2, 1))]
+    rows = [np.zeros((1, 2))]
     for k in range(1, rings + 1):
         angle = 2 * np.pi * np.arange(6 * k) / (6 * k)
-        rows.append(k / rings * np.stack([np.cos(angle), np.sin(angle)]))
-    points = np.concatenate(rows, axis=1)
-    return drt_jax.Pattern(points, np.full(points.shape[1], 1 / points.shape[1]), "none")
+        rows.append(k / rings * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    points = np.concatenate(rows)
+    return drt_jax.Pattern(points, np.full(len(points), 1 / len(points)), "none")
 
 
 def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):

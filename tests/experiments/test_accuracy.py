@@ -115,7 +115,7 @@ def test_reference_of_a_clipped_beam():
     tilted = reference(lens, 0.15, math.inf, [0.55])[0]
     assert tilted.error < 1e-11 and tilted.gradient_error < 1e-6
     points, _ = pupil.square_grid(400)
-    rays = drt_jax.trace_rays(lens, 0.15, math.inf, [0.55], points.T)
+    rays = drt_jax.trace_rays(lens, 0.15, math.inf, [0.55], points)
     good = np.asarray(rays.status[0]) == drt_jax.Status.OK
     assert 0.3 < np.mean(good) < 0.6
     spot = np.asarray(rays.points[0, good, -1, :2])

@@ -186,7 +186,7 @@ def test_gradient_of_the_joint_loss_by_a_curvature(name):
 def test_a_change_of_the_scale_moves_the_rays_as_a_millimetre_of_the_sensor_does():
     """Against differences of rays; a conic that would have to change by thousands does not."""
     some = lens("sensor", "curvature", "thickness 1", "conic 1")
-    scale, pupil = some.scale(SCENE, FAR), np.asarray(hexapolar(4)[0]).T
+    scale, pupil = some.scale(SCENE, FAR), hexapolar(4)[0]
     start = some.start(float(some.lens.sensor))
     assert set(scale) == set(start)
     assert scale["sensor"] == 1

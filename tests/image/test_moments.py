@@ -138,7 +138,7 @@ def test_moments_are_those_of_many_random_rays():
     """The paper's way, with 40,000 rays instead of 256: agrees within 4 standard errors."""
     lens = load_lens("cooke_triplet")
     points, _ = pupil.random_disc(40_000, seed=0)
-    hits = np.asarray(trace_rays(lens, 0.2, 5000.0, [0.53], points.T).points[0, :, -1, :2])
+    hits = np.asarray(trace_rays(lens, 0.2, 5000.0, [0.53], points).points[0, :, -1, :2])
     moments = psf_moments(lens, 0.2, 5000.0, [0.53])
     mean, covariance = moments.mean, moments.covariance
     centred = hits - hits.mean(axis=0)

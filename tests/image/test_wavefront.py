@@ -218,6 +218,6 @@ def test_failed_chief_ray(monkeypatch):
 def test_rms_of_pure_defocus():
     """W = a r^2 over the disc has the standard deviation a / sqrt(12)."""
     points, weights = pupil.disc(4, 5)
-    opd = 0.7 * jnp.sum(jnp.asarray(points) ** 2, axis=0)[None]
+    opd = 0.7 * jnp.sum(jnp.asarray(points) ** 2, axis=-1)[None]
     wave = drt_jax.Wavefront(opd, jnp.zeros(opd.shape, jnp.int32), jnp.zeros((1, 2)))
     np.testing.assert_allclose(rms_wavefront(wave, weights), 0.7 / np.sqrt(12), rtol=1e-12)

@@ -167,7 +167,7 @@ def test_a_telescope_with_a_hole():
     angle = 2 * np.pi * np.arange(24) / 24
     points = np.sqrt(square) * np.stack([np.cos(angle), np.sin(angle)])[..., None]
     share = np.broadcast_to(weights / 2 / 24, (24, 12))
-    ring = Pattern(points.reshape(2, -1), share.ravel())
+    ring = Pattern(points.reshape(2, -1).T, share.ravel())
     whole = dataclasses.replace(lens, apertures=None)
     for field in (0.0, np.radians(5 / 60)):
         wanted = drt_jax.psf_moments(whole, field, jnp.inf, GREEN, rule=ring)

@@ -174,5 +174,5 @@ def test_a_pupil_that_paraxial_optics_does_not_find():
     theirs = psf_moments(lens, field, jnp.inf, green, rule=Gauss(14, "bilateral"))
     np.testing.assert_allclose(ours.passed, 1, rtol=1e-12)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-12)
-    rays = trace_rays(lens, field, jnp.inf, green, hexapolar(8)[0].T)
+    rays = trace_rays(lens, field, jnp.inf, green, hexapolar(8)[0])
     assert np.all(rays.status == 0) and rays.newton_steps < 20

@@ -25,7 +25,7 @@ def lens():
 
 @pytest.fixture(scope="module")
 def points():
-    return tuple(jnp.asarray(pupil.random_disc(RAYS, 0)[0]))
+    return tuple(jnp.asarray(pupil.random_disc(RAYS, 0)[0].T))
 
 
 def scene(lens, field=FIELD):

@@ -282,7 +282,7 @@ def test_all_derivatives_agree_with_the_complex_step(name, write_tables):
         if symmetry == "rotational"
         else (pupil.half_disc if symmetry == "bilateral" else pupil.disc)(ORDER, ORDER + 1)
     )
-    nodes, weights = rule
+    nodes, weights = rule[0].T, rule[1]
     if len(nodes) == 1:
         nodes = np.concatenate([np.zeros_like(nodes), nodes])
     modes = [derivatives(mode, symmetry) for mode in (jax.jacrev, jax.jacfwd)]

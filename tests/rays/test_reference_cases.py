@@ -323,10 +323,10 @@ def test_p01_wavefront(cases, p01):
     reference = cases["P01"]["reference"]
     points, weights = pupil.disc(8, 9)
     edge = on_y(*np.linspace(0, 1, 401))
-    wave = drt_jax.wavefront(p01, 0.0, INF, [0.543], np.concatenate([points.T, edge]))
+    wave = drt_jax.wavefront(p01, 0.0, INF, [0.543], np.concatenate([points, edge]))
     assert np.all(wave.status == Status.OK)
     opd = np.asarray(wave.opd[0, : len(weights)])
-    t = np.sum(points**2, axis=0)
+    t = np.sum(points**2, axis=-1)
     radial = {
         "Z1": np.ones_like(t),
         "Z4": np.sqrt(3) * (2 * t - 1),

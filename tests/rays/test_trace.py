@@ -16,7 +16,7 @@ from drt_jax.rays.trace import trace_bundle
 from ..conftest import LENSES, RGB, assert_close
 from ..known import known, search
 
-POINTS = pupil.half_disc(4, 5)[0].T
+POINTS = pupil.half_disc(4, 5)[0]
 SINGLET = load_lens("singlet")
 # Twenty rays of three colours in all tests of one lens: one program.
 HEIGHTS = np.stack([np.zeros(20), np.linspace(-1, 1, 20)], axis=1)
