@@ -138,7 +138,7 @@ def told(problem: design.Problem) -> _optiland.Told:
         where[lens.count - 1 if place.kind == "sensor" else place.row] = low, high
     held = {"focal_length": 0.0, "entrance_pupil": 0.0}
     for solve in variables.solves:
-        held[solve.kind] = solve.value
+        held[solve.kind] = float(solve.value)
         if solve.kind == "focal_length":
             bends[solve.surface] = -math.inf, math.inf
     edges = []
@@ -146,11 +146,13 @@ def told(problem: design.Problem) -> _optiland.Told:
         for front, back in between(lens, operand.kind.startswith("glass")):
             if back > front + 1 or (operand.surfaces and front not in operand.surfaces):
                 continue
+            least = -math.inf if operand.low is None else float(operand.low)
+            most = math.inf if operand.high is None else float(operand.high)
             if operand.kind.endswith("edge"):
-                edges.append((front, operand.low, operand.high))
+                edges.append((front, least, most))
             elif front in gaps:
                 low, high = gaps[front]
-                gaps[front] = max(low, operand.low), min(high, operand.high)
+                gaps[front] = max(low, least), min(high, most)
     return _optiland.Told(bends, gaps, *held.values(), edges)
 
 

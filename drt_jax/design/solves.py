@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, get_args
@@ -32,6 +33,8 @@ _Name = Literal[
     "paraxial_focus",
     "best_focus",
 ]
+# Compiled where numbers are known, part of the caller's program in a trace.
+_program = functools.partial(jax.jit, inline=True)
 # Newton steps: every condition is linear in the number that meets it, the second mends rounding.
 _STEPS = 2
 _ORDER = 6  # of the rule of the best focus
@@ -154,7 +157,7 @@ class Solve:
             )
         return solve
 
-    @jax.jit
+    @_program
     def rate(self, lens: Lens, other: "Solve") -> Array:
         """By how much what this one keeps changes with the number that follows from another."""
         number, with_number = _number(lens, other)
@@ -185,12 +188,12 @@ def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], 
     return tuple(solve.placed(lens) for solve in found), lens
 
 
-@jax.jit
+@_program
 def _measure(lens: Lens, solve: Solve) -> Array:
     return _CONDITIONS[solve.kind].measure(lens, solve)
 
 
-@jax.jit
+@_program
 def _met(lens: Lens, solve: Solve) -> Array:
     """The number () that meets a condition, by Newton's method."""
     number, with_number = _number(lens, solve)
@@ -267,7 +270,7 @@ _CONDITIONS = {
 }
 
 
-@jax.jit
+@_program
 def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
     """The distance () from the last vertex to `solve.value` mm behind the focus, mm, and how
     sharp the focus is, 0 where there is none."""
