@@ -239,10 +239,12 @@ def _try_orders(
     clipped = lens.apertures is not None and any(lens.apertures.blocks)
     order, solver, crossing = _CLIPPED[0] if clipped else 2, solve_aimed, may_cross(lens)
     while True:
-        rule: PupilRule = Gauss(order, symmetry)
-        used: PupilRule = _padded(order, symmetry)
+        rule: PupilRule
+        used: PupilRule
         if clipped:
             rule, used = (Clipped(order, symmetry, n, crossing) for n in (order, _size(order)))
+        else:
+            rule, used = Gauss(order, symmetry), _padded(order, symmetry)
         parts = (_weigh(lens, scene, used, solver) for scene in scenes)
         found, rays, failed, cuts = zip(*parts, strict=True)
         failing, cut, sought = any(failed), any(cuts), solver is solve

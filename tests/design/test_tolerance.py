@@ -60,7 +60,7 @@ def test_squares_are_those_of_the_moments(singlet):
     problem, some = singlet
     lens = some_lens(some)
     found = drt_jax.psf_moments(lens, FIELDS[4], np.inf, COLOURS, rule=problem.rule)
-    mean, spread = map(np.asarray, found)
+    mean, spread = np.asarray(found.mean), np.asarray(found.covariance)
     apart = np.sum((mean - np.mean(mean, axis=0)) ** 2, axis=1)
     wanted = np.mean(np.trace(spread, axis1=1, axis2=2) + apart)
     assert float(_made(problem, lens, "none").squares[4]) == pytest.approx(wanted, rel=1e-9)

@@ -70,7 +70,7 @@ def test_a_lens_is_trained_off_the_axis(own):
     assert designed.curvature.tolist() == [*(end[name] for name in NAMES), 0.0]
     assert float(designed.sensor) == end["sensor"]
     found = drt_jax.psf_moments(designed, np.radians(10), 5e3, (0.6, 0.53, 0.48), 1e-9)
-    mean, spread = map(np.asarray, found)
+    mean, spread = np.asarray(found.mean), np.asarray(found.covariance)
     apart = np.sum((mean - mean.mean(axis=0)) ** 2, axis=1)
     radius = np.sqrt(np.mean(np.trace(spread, axis1=1, axis2=2) + apart))
     assert end["rms_um"] == pytest.approx(1e3 * radius, rel=1e-7)

@@ -50,11 +50,11 @@ def at(sensor, lens=LENS):
 @pytest.mark.parametrize("sensor", SIGMA)
 def test_blur_of_the_double_gauss(sensor):
     found = psf_moments(at(sensor), 0.0, FAR, RGB)
-    mean, covariance = found
-    assert mean.shape == (3, 2) and covariance.shape == (3, 2, 2)
-    assert found[0] is mean and found[1] is covariance
+    assert found.mean.shape == (3, 2) and found.covariance.shape == (3, 2, 2)
     np.testing.assert_allclose(found.passed, 1, rtol=1e-14)
-    np.testing.assert_allclose(1e3 * np.sqrt(covariance[:, 0, 0]).mean(), SIGMA[sensor], atol=0.051)
+    np.testing.assert_allclose(
+        1e3 * np.sqrt(found.covariance[:, 0, 0]).mean(), SIGMA[sensor], atol=0.051
+    )
 
 
 def test_meridional_half_and_whole_pupil_agree():

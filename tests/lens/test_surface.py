@@ -262,7 +262,7 @@ def test_zernike_polynomials_are_orthonormal():
     count = 91
     points, weights = disc(14, 14)
     unit = Shape(*(jnp.zeros((count, 1)),) * 2, np.insert(np.eye(count), 0, 1, axis=0)[..., None])
-    w = jnp.broadcast_to(points[:, None], (2, count, len(weights)))
+    w = jnp.broadcast_to(points.T[:, None], (2, count, len(weights)))
     z = np.asarray(jax.jit(surface_sag, static_argnums=2)(w, unit, "zernike"))
     np.testing.assert_allclose(z * weights @ z.T, np.eye(count), atol=1e-11)
     edge = jnp.stack([jnp.ones((count, 1)), jnp.zeros((count, 1))])  # Z_j(1, 0): n and m alone
