@@ -38,6 +38,33 @@ _BESIDE, _STILL = 0.3, 1e-9
 _SLIMMEST = 0.1
 
 
+def _check_operands(
+    operands: Sequence[Operand],
+    lens: Lens,
+    fields: int,
+    wavelengths: int,
+    distances: np.ndarray,
+    rule: PupilRule,
+) -> None:
+    """ValueError for operands that do not fit the lens, the scene or the rule. fields, wavelengths:
+    how many; distances: (Z,), mm."""
+    if not operands:
+        raise ValueError("operands: none; a merit needs at least one, such as spot")
+    counts = {"fields": fields, "wavelengths": wavelengths, "distances": len(distances)}
+    for operand in operands:
+        operand.check(lens, counts)
+        named = distances[np.array(operand.distances or range(len(distances)))]
+        if operand.kind == "magnification" and np.any(np.isinf(named)):
+            raise ValueError("operands: magnification: the object is at infinity")
+        if not operand.vignetting and isinstance(rule, Clipped):
+            raise ValueError(
+                f"operands: {operand.name}: vignetting: Clipped traces only what passes; take "
+                "Gauss or Soft"
+            )
+    if not any(operand.weight for operand in operands):
+        raise ValueError("operands: all have the weight 0; a merit needs at least one")
+
+
 def _check_pairs(angles: Array) -> None:
     if angles.ndim != 2 or angles.shape[1] != 2:
         raise ValueError(f"fields: expected (F,) or (F, 2), got shape {angles.shape}")
@@ -108,8 +135,6 @@ class Problem:
         """
         lens = variables.lens
         asked = tuple(o if isinstance(o, Operand) else Operand(o) for o in operands)
-        if not asked:
-            raise ValueError("operands: none; a merit needs at least one, such as spot")
         dtype = lens.curvature.dtype
         angles = jnp.atleast_1d(field_array(fields, dtype))
         if angles.ndim == 1:
@@ -121,19 +146,7 @@ class Problem:
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
             rule = Gauss(rule, symmetry if across else "none")
-        counts = {"fields": len(angles), "wavelengths": len(waves), "distances": len(far)}
-        for operand in asked:
-            operand.check(lens, counts)
-            named = np.asarray(far)[np.array(operand.distances or range(len(far)))]
-            if operand.kind == "magnification" and np.any(np.isinf(named)):
-                raise ValueError("operands: magnification: the object is at infinity")
-            if not operand.vignetting and isinstance(rule, Clipped):
-                raise ValueError(
-                    f"operands: {operand.name}: vignetting: Clipped traces only what passes; take "
-                    "Gauss or Soft"
-                )
-        if not any(operand.weight for operand in asked):
-            raise ValueError("operands: all have the weight 0; a merit needs at least one")
+        _check_operands(asked, lens, len(angles), len(waves), np.asarray(far), rule)
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)
         equal = np.ones(len(waves)) if wavelength_weights is None else wavelength_weights
         share = _weights("wavelength_weights", equal, len(waves)) / len(waves)
