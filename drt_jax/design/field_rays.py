@@ -1,7 +1,6 @@
 """The rays of a lens from all fields of a problem, traced once: what operands are computed from."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,7 +22,7 @@ from ..rays.snell import lack
 from ..rays.solve import Solver, reattach
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide, dot, system_of
-from ..rays.trace import Bundle, trace_bundle
+from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 
 # The first rays of every view: the chief ray, then those through the top, the bottom and the side
 # of the stop. They carry no light.
@@ -208,9 +207,7 @@ def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
 
     def of_view(field: Array, distance: Array, points: Vector) -> Array:
         scene = Scene(field, distance, rays.wavelengths)
-        system = system_of(lens, scene, len(points))
-        radius = lens.semi_diameter[lens.stop]
-        target = tuple(radius * p for p in points)
+        system, target = aims(lens, scene, points)
         launch = paraxial_launch(system, target, beam_size(system, target)[1])
         return lack(system, launch, target)
 
@@ -265,12 +262,12 @@ def _solid_angles(
     hits = jax.lax.stop_gradient(tuple(h[rows, one] for h in bundle.hits))
     arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
     status = jnp.where(bundle.status == Status.CLIPPED, Status.OK, bundle.status)[one]
-    known = functools.partial(
-        reattach, Found(hits, arrival, status.astype(jnp.int32), bundle.steps)
-    )
+    found = Found(hits, arrival, status.astype(jnp.int32), bundle.steps)
 
     def arriving(points: Vector, field: Array) -> tuple[Vector, Vector]:
-        bundle = trace_bundle(lens, Scene(field, distance, wavelength), points, known)
+        scene = Scene(field, distance, wavelength)
+        system, target = aims(lens, scene, points)
+        bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
         return tuple(h[-1] for h in bundle.hits), bundle.arrival[:-1]
 
     points = tuple(p[one] for p in points)

@@ -24,7 +24,7 @@ from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, sym
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.status import Status
-from ..rays.trace import trace_bundle
+from ..rays.trace import aims, bundle_of
 from .lost import check_order, crossed, reasons
 from .moments import FocusMoments, Moments, check_sensor, weigh
 
@@ -166,23 +166,20 @@ def _moments(
 def _weigh(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> tuple:
     """Moments, the rays on the live surfaces, and whether any fails and whether any is clipped."""
     points, weights = rule.points(lens, scene)
-    kept: list[Found] = []
-
-    def keep(system, target):
-        kept.append(solver(system, target))
-        return kept[0]
-
-    bundle = trace_bundle(lens, scene, points, keep)
+    system, target = aims(lens, scene, points)
+    found = solver(system, target)
+    bundle = bundle_of(lens, scene, system, target, found)
     clipped = bundle.status == Status.CLIPPED
     failing = jnp.any((bundle.status != Status.OK) & ~clipped)
-    return weigh(lens, rule, weights, bundle), kept[0], failing, jnp.any(clipped)
+    return weigh(lens, rule, weights, bundle), found, failing, jnp.any(clipped)
 
 
 @jax.jit
 def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> FocusMoments:
     """The moments of rays that are known, with their derivatives: nothing is searched for."""
     points, weights = rule.points(lens, scene)
-    bundle = trace_bundle(lens, scene, points, partial(reattach, found))
+    system, target = aims(lens, scene, points)
+    bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
     return weigh(lens, rule, weights, bundle)
 
 

@@ -151,12 +151,13 @@ def traced(lens: Lens, system: System, launch: Array, crossing: bool) -> tuple[A
     `launched`."""
     if not crossing:
         plain = shoot(system, tuple(launch))
-        both, status = on_all_surfaces(lens, system, *apart(system, plain.hits), plain.fate)
-        return jnp.stack(both), status == Status.OK
+        good = plain.fate == Status.OK
+        both, good = on_all_surfaces(lens, system, *apart(system, plain.hits), good)
+        return jnp.stack(both), good
     hits, ways, fate = shoot_anyway(system, tuple(launch))
-    (x, y), status = on_all_surfaces(lens, system, *apart(system, hits), fate)
+    (x, y), good = on_all_surfaces(lens, system, *apart(system, hits), fate == Status.OK)
     found = jnp.concatenate([x, ways]), jnp.concatenate([y, 0 * ways])
-    return jnp.stack(found), status == Status.OK
+    return jnp.stack(found), good
 
 
 def launched(lens: Lens, system: System, launch: Array, crossing: bool) -> Rays:
