@@ -16,9 +16,7 @@ from ..numerics import safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.rules import PupilRule, Symmetry
 from ..rays import fermat
-from ..rays.aim import beam_size, paraxial_launch
 from ..rays.find import Found
-from ..rays.snell import lack
 from ..rays.solve import Solver, reattach
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide, dot, system_of
@@ -184,39 +182,6 @@ def beam_radius(lens: Lens, rays: FieldRays) -> Array:
     reach = safe_sqrt(jnp.max(jnp.where(rays.arrives[:, None], squares, 0), axis=(0, 2, 3)))
     semi = lens.semi_diameter
     return jnp.where(jnp.isfinite(semi), semi, reach)[:-1]
-
-
-def failures(lens: Lens, rays: FieldRays) -> Array:
-    """Residual (V, W, Q) of a failed ray: the root of the light that it stands for times 1 + its
-    shortfall; 0 for one that arrives. A chief ray that fails stands for all light of its
-    wavelength; where all light is clipped, inf."""
-    light = rays.weights * rays.wavelength_weights[None, :, None]
-    chief = np.arange(light.shape[-1]) == 0
-    light = jnp.where(chief[None, None], rays.wavelength_weights[None, :, None], light)
-    failed = ~rays.arrives & (light > 0)
-    root = jnp.sqrt(jnp.where(failed, light, 1))
-    dark = rays.throughput[..., None] == 0
-    residual = jnp.where(failed, root * (1 + _shortfalls(lens, rays)), 0)
-    return jnp.where(dark, jnp.inf, residual)
-
-
-def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
-    """By how much each ray fails (V, W, Q), see `snell.lack`: 0 for one that arrives, else what its
-    first guess lacks."""
-    failed = ~rays.arrives
-
-    def of_view(field: Array, distance: Array, points: Vector) -> Array:
-        scene = Scene(field, distance, rays.wavelengths)
-        system, target = aims(lens, scene, points)
-        launch = paraxial_launch(system, target, beam_size(system, target)[1])
-        return lack(system, launch, target)
-
-    def of_all(_: None) -> Array:
-        return jax.vmap(of_view)(rays.field, rays.distance, rays.points)
-
-    none = jnp.zeros_like(rays.weights)
-    found = jax.lax.cond(jnp.any(failed), of_all, lambda _: none, None)
-    return jnp.where(failed, found, 0)
 
 
 def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:

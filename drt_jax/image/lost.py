@@ -12,7 +12,7 @@ from ..lens.scene import Scene
 from ..pupil.rules import PupilRule
 from ..rays.aim import beam_size, paraxial_launch
 from ..rays.find import Found
-from ..rays.snell import fates
+from ..rays.snell import meetings
 from ..rays.status import Status
 from ..rays.trace import Bundle, aims, bundle_of
 
@@ -74,9 +74,9 @@ def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Bund
     places = [*lens.live, lens.count]
     if system.stop is not None:
         places.insert(system.before, lens.stop)
-    lost = fates(system, launch) != Status.OK
-    ends = jnp.array(places)[jnp.argmax(lost, axis=0)]
-    return bundle, jnp.where(jnp.any(lost, axis=0), ends, -1)
+    failed = meetings(system, launch).status != Status.OK
+    ends = jnp.array(places)[jnp.argmax(failed, axis=0)]
+    return bundle, jnp.where(jnp.any(failed, axis=0), ends, -1)
 
 
 def _stopped(lens: Lens, bundle: Bundle) -> np.ndarray:

@@ -278,9 +278,9 @@ def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Arr
     than 1e-6 (float32: 2e-2) when its hits are rounded determines no path."""
     trace = shoot(system, launch)
     eps = float(jnp.finfo(launch[0].dtype).eps)
-    drowned = (trace.fate == Status.OK) & (trace.shake > 4 / eps**0.5)
-    fate = jnp.where(drowned, jnp.int32(Status.UNCONVERGED), trace.fate)
-    return trace.hits, jnp.where(status == Status.OK, fate, status)
+    drowned = (trace.status == Status.OK) & (trace.rounding_angle > 4 / eps**0.5)
+    traced = jnp.where(drowned, jnp.int32(Status.UNCONVERGED), trace.status)
+    return trace.hits, jnp.where(status == Status.OK, traced, status)
 
 
 def find_many(system: System, target: Vector) -> Found:
