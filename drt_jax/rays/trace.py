@@ -3,6 +3,7 @@
 Three steps: `aims` says what is sought, a `Solver` finds it, `bundle_of` completes it.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from ..lens.aperture import depths
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
-from ..numerics import Numbers, real_array
+from ..numerics import Numbers, concrete, known_values, real_array
 from . import fermat
 from .find import Found
 from .meet import cross
@@ -153,8 +154,29 @@ def trace_rays(
     are not known, rays of a wavelength outside the range of a glass have the status NO_INDEX, those
     of a field of 90 degrees and more or of a distance not above 0 are MISSED.
     """
-    scene = scene_of(lens, field, distance, wavelengths)
-    return _trace_rays(lens, scene, stop_points(lens, pupil))
+    scene, points = scene_of(lens, field, distance, wavelengths), stop_points(lens, pupil)
+    count, size = len(points), _padded(len(points))
+    if count == size or known_values((lens, scene, points)) is None:
+        return _trace_rays(lens, scene, points)
+    # Bundles of nearly as many rays share a program: the first ray is traced several times.
+    known = np.asarray(points) if concrete(points) else points
+    places = np.where(np.arange(size) < count, np.arange(size), 0)
+    return _first(_trace_rays(lens, scene, known[places]), count)
+
+
+def _padded(count: int) -> int:
+    """How many rays are traced for so many: 16 for fewer, then a multiple of an eighth of the next
+    power of 2; above 1024 no more than asked for, as time is arithmetic there."""
+    if count > 1024:
+        return count
+    step = max(16, 1 << (count - 1).bit_length()) // 8
+    return max(16, -(-count // step) * step)
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _first(rays: Rays, count: int) -> Rays:
+    """The first rays of some."""
+    return jax.tree.map(lambda a: a[:, :count] if a.ndim else a, rays)
 
 
 def stop_points(lens: Lens, pupil: Numbers) -> Array:
