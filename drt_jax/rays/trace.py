@@ -158,10 +158,10 @@ def trace_rays(
     count, size = len(points), _padded(len(points))
     if count == size or known_values((lens, scene, points)) is None:
         return _trace_rays(lens, scene, points)
-    # Bundles of nearly as many rays share a program: the first ray is traced several times.
-    known = np.asarray(points) if concrete(points) else points
-    places = np.where(np.arange(size) < count, np.arange(size), 0)
-    return _first(_trace_rays(lens, scene, known[places]), count)
+    # Bundles of nearly as many rays share a program: those that are not finite cost little.
+    library = np if concrete(points) else jnp
+    filled = library.pad(points, ((0, size - count), (0, 0)), constant_values=np.inf)
+    return _first(_trace_rays(lens, scene, filled), count)
 
 
 def _padded(count: int) -> int:
