@@ -5,25 +5,15 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 
 from drt_jax.rays.find import find_many
 from drt_jax.rays.solve import reattach
-from drt_jax.rays.system import system_of
+from drt_jax.rays.trace import aims
 
 
 def bendable(lens):
     """The lens, every row of which may be curved: derivatives by all shapes."""
     return dataclasses.replace(lens, curved=tuple(range(lens.count + 1)))
-
-
-def aims(lens, scene, points):
-    """The system of a lens, and the stop points, D arrays (W, Q) in mm, of points (Q,) or (W, Q)
-    on the unit disc; D = 1 for meridional rays."""
-    system = system_of(lens, scene, len(points))
-    radius, waves = lens.semi_diameter[lens.stop], scene.wavelengths.shape[0]
-    target = (jnp.broadcast_to(radius * p, (waves, p.shape[-1])) for p in points)
-    return system, tuple(target)
 
 
 @jax.jit

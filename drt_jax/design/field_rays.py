@@ -1,7 +1,6 @@
 """The rays of a lens from all fields of a problem, traced once: what operands are computed from."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,13 +16,11 @@ from ..numerics import safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.rules import PupilRule, Symmetry
 from ..rays import fermat
-from ..rays.aim import beam_size, paraxial_launch
 from ..rays.find import Found
-from ..rays.snell import lack
 from ..rays.solve import Solver, reattach
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide, dot, system_of
-from ..rays.trace import Bundle, trace_bundle
+from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 
 # The first rays of every view: the chief ray, then those through the top, the bottom and the side
 # of the stop. They carry no light.
@@ -187,41 +184,6 @@ def beam_radius(lens: Lens, rays: FieldRays) -> Array:
     return jnp.where(jnp.isfinite(semi), semi, reach)[:-1]
 
 
-def failures(lens: Lens, rays: FieldRays) -> Array:
-    """Residual (V, W, Q) of a failed ray: the root of the light that it stands for times 1 + its
-    shortfall; 0 for one that arrives. A chief ray that fails stands for all light of its
-    wavelength; where all light is clipped, inf."""
-    light = rays.weights * rays.wavelength_weights[None, :, None]
-    chief = np.arange(light.shape[-1]) == 0
-    light = jnp.where(chief[None, None], rays.wavelength_weights[None, :, None], light)
-    failed = ~rays.arrives & (light > 0)
-    root = jnp.sqrt(jnp.where(failed, light, 1))
-    dark = rays.throughput[..., None] == 0
-    residual = jnp.where(failed, root * (1 + _shortfalls(lens, rays)), 0)
-    return jnp.where(dark, jnp.inf, residual)
-
-
-def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
-    """By how much each ray fails (V, W, Q), see `snell.lack`: 0 for one that arrives, else what its
-    first guess lacks."""
-    failed = ~rays.arrives
-
-    def of_view(field: Array, distance: Array, points: Vector) -> Array:
-        scene = Scene(field, distance, rays.wavelengths)
-        system = system_of(lens, scene, len(points))
-        radius = lens.semi_diameter[lens.stop]
-        target = tuple(radius * p for p in points)
-        launch = paraxial_launch(system, target, beam_size(system, target)[1])
-        return lack(system, launch, target)
-
-    def of_all(_: None) -> Array:
-        return jax.vmap(of_view)(rays.field, rays.distance, rays.points)
-
-    none = jnp.zeros_like(rays.weights)
-    found = jax.lax.cond(jnp.any(failed), of_all, lambda _: none, None)
-    return jnp.where(failed, found, 0)
-
-
 def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
     """Cosines (V, L, W, Q) of the angles at which rays fall on the L surfaces that bend light; 1
     for rays that fail."""
@@ -265,12 +227,12 @@ def _solid_angles(
     hits = jax.lax.stop_gradient(tuple(h[rows, one] for h in bundle.hits))
     arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
     status = jnp.where(bundle.status == Status.CLIPPED, Status.OK, bundle.status)[one]
-    known = functools.partial(
-        reattach, Found(hits, arrival, status.astype(jnp.int32), bundle.steps)
-    )
+    found = Found(hits, arrival, status.astype(jnp.int32), bundle.steps)
 
     def arriving(points: Vector, field: Array) -> tuple[Vector, Vector]:
-        bundle = trace_bundle(lens, Scene(field, distance, wavelength), points, known)
+        scene = Scene(field, distance, wavelength)
+        system, target = aims(lens, scene, points)
+        bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
         return tuple(h[-1] for h in bundle.hits), bundle.arrival[:-1]
 
     points = tuple(p[one] for p in points)

@@ -15,10 +15,10 @@ from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve, solve_aimed
+from .failures import failures
 from .field_rays import (
     FieldRays,
     beam_radius,
-    failures,
     symmetry_by_structure,
     trace_views,
 )

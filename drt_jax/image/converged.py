@@ -6,7 +6,7 @@ from values: `psf_moments` and `focus_moments` then take the rule, made outside.
 
 import itertools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, sym
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.status import Status
-from ..rays.trace import trace_bundle
+from ..rays.trace import aims, bundle_of
 from .lost import check_order, crossed, reasons
 from .moments import FocusMoments, Moments, check_sensor, weigh
 
@@ -166,23 +166,20 @@ def _moments(
 def _weigh(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> tuple:
     """Moments, the rays on the live surfaces, and whether any fails and whether any is clipped."""
     points, weights = rule.points(lens, scene)
-    kept: list[Found] = []
-
-    def keep(system, target):
-        kept.append(solver(system, target))
-        return kept[0]
-
-    bundle = trace_bundle(lens, scene, points, keep)
+    system, target = aims(lens, scene, points)
+    found = solver(system, target)
+    bundle = bundle_of(lens, scene, system, target, found)
     clipped = bundle.status == Status.CLIPPED
     failing = jnp.any((bundle.status != Status.OK) & ~clipped)
-    return weigh(lens, rule, weights, bundle), kept[0], failing, jnp.any(clipped)
+    return weigh(lens, rule, weights, bundle), found, failing, jnp.any(clipped)
 
 
 @jax.jit
 def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> FocusMoments:
     """The moments of rays that are known, with their derivatives: nothing is searched for."""
     points, weights = rule.points(lens, scene)
-    bundle = trace_bundle(lens, scene, points, partial(reattach, found))
+    system, target = aims(lens, scene, points)
+    bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
     return weigh(lens, rule, weights, bundle)
 
 
@@ -190,7 +187,7 @@ class _Trial(NamedTuple):
     """rule: that meets the tolerance. used: the same as it was evaluated. moments, found: its
     moments and its rays, of each scene."""
 
-    rule: PupilRule
+    rule: Gauss | Clipped
     used: PupilRule
     moments: tuple[FocusMoments, ...]
     found: tuple[Found, ...]
@@ -234,53 +231,66 @@ def _each(values: Array, rank: int) -> list[Array]:
 def _try_orders(
     lens: Lens, scenes: Sequence[Scene], symmetry: Symmetry, tolerance: float, places: Callable
 ) -> _Trial:
-    trials: list[_Trial] = []
+    """The first of three orders that agree: of Gauss rules or, once a ray ends before the sensor,
+    of rules fitted to the light that is left."""
     # A rule on the whole stop may step over an obscuration.
-    clipped = lens.apertures is not None and any(lens.apertures.blocks)
-    order, solver, crossing = _CLIPPED[0] if clipped else 2, solve_aimed, may_cross(lens)
-    while True:
-        rule: PupilRule
-        used: PupilRule
-        if clipped:
-            rule, used = (Clipped(order, symmetry, n, crossing) for n in (order, _size(order)))
+    blocked = lens.apertures is not None and any(lens.apertures.blocks)
+    solver: Solver = solve_aimed
+    for clipped in (False, True)[blocked:]:
+        trials: list[_Trial] = []
+        for rule, used in _rules(lens, symmetry, clipped):
+            trial, failing, cut = _try(lens, scenes, rule, used, solver)
+            if failing and solver is solve_aimed and (clipped or not cut):
+                solver = solve  # some rays must be searched for
+                trial, failing, cut = _try(lens, scenes, rule, used, solver)
+            if failing and solver is solve:
+                check_order(lens)
+            if (failing or cut) and not clipped:
+                break
+            for scene, found in zip(scenes, trial.moments, strict=True):
+                if not np.all(np.asarray(found.passed) > 0):
+                    _say_why(lens, scene, symmetry, found.passed)
+            trials = [*trials, trial][-3:]
+            changes = (_change(trials[0], later, places) for later in trials[1:])
+            change = max(changes, default=np.inf)
+            rough = max(_rounding(lens, found) for found in trial.moments)
+            if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
+                _warn_of_rounding(lens, rough, tolerance)
+                # Where rounding hides how far they are apart, the last is right to it.
+                return trials[-1 if 2 * rough > tolerance else 0]
         else:
-            rule, used = Gauss(order, symmetry), _padded(order, symmetry)
-        parts = (_weigh(lens, scene, used, solver) for scene in scenes)
-        found, rays, failed, cuts = zip(*parts, strict=True)
-        failing, cut, sought = any(failed), any(cuts), solver is solve
-        if failing and sought:
-            check_order(lens)
-        if not clipped and (cut or (failing and sought)):
-            trials, clipped, order = [], True, _CLIPPED[0]
-            continue
-        if failing and not sought:  # some rays must be
-            solver = solve
-            continue
-        for scene, of_scene in zip(scenes, found, strict=True):
-            if not np.all(np.asarray(of_scene.passed) > 0):
-                _say_why(lens, scene, symmetry, of_scene.passed)
-        trials = [*trials, _Trial(rule, used, found, rays)][-3:]
-        change = max(
-            (
-                _change(*both, places)
-                for later in trials[1:]
-                for both in zip(later.moments, trials[0].moments, strict=True)
-            ),
-            default=np.inf,
-        )
-        rough = max(_rounding(lens, of_scene) for of_scene in found)
-        if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
-            _warn_of_rounding(lens, rough, tolerance)
-            # Where rounding hides how far they are apart, the last is right to it.
-            return trials[-1 if 2 * rough > tolerance else 0]
-        if order > _MAX_ORDER:
-            warnings.warn(
-                f"the spot size has converged to {change:.1e} only, not to {tolerance:.1e}, with "
-                f"the order {order}; does the edge of the beam fail?{crossed(lens)}",
-                stacklevel=4,
-            )
-            return trials[-1]
-        order += _CLIPPED[1] if clipped else 1
+            break
+    warnings.warn(
+        f"the spot size has converged to {change:.1e} only, not to {tolerance:.1e}, with "
+        f"the order {trials[-1].rule.order}; does the edge of the beam fail?{crossed(lens)}",
+        stacklevel=4,
+    )
+    return trials[-1]
+
+
+def _rules(
+    lens: Lens, symmetry: Symmetry, clipped: bool
+) -> Iterator[tuple[Gauss | Clipped, PupilRule]]:
+    """Rules by rising order, each also filled up, so that orders share a few compiled programs."""
+    if not clipped:
+        orders = range(2, _MAX_ORDER + 2)
+        yield from ((Gauss(order, symmetry), _padded(order, symmetry)) for order in orders)
+        return
+    first, step = _CLIPPED
+    crossing = may_cross(lens)
+    for order in range(first, _MAX_ORDER + step + 1, step):
+        size = 20 if order <= 20 else _MAX_ORDER + 2
+        rule, used = (Clipped(order, symmetry, n, crossing) for n in (order, size))
+        yield rule, used
+
+
+def _try(
+    lens: Lens, scenes: Sequence[Scene], rule: Gauss | Clipped, used: PupilRule, solver: Solver
+) -> tuple[_Trial, bool, bool]:
+    """A rule on all scenes; whether any ray fails, and whether any is clipped."""
+    parts = (_weigh(lens, scene, used, solver) for scene in scenes)
+    moments, found, failing, cut = zip(*parts, strict=True)
+    return _Trial(rule, used, moments, found), any(failing), any(cut)
 
 
 def _eps(lens: Lens) -> float:
@@ -304,11 +314,6 @@ def _warn_of_rounding(lens: Lens, rough: float, tolerance: float) -> None:
         )
 
 
-def _size(order: int) -> int:
-    """The order up to which those about `order` fill up, to share a compiled program."""
-    return 20 if order <= 20 else _MAX_ORDER + 2
-
-
 def _padded(order: int, symmetry: Symmetry) -> Pattern:
     """A Gauss rule filled up with weightless rays, so that orders share a few compiled programs.
 
@@ -324,15 +329,16 @@ def _padded(order: int, symmetry: Symmetry) -> Pattern:
     return Pattern(filled, np.pad(weights, (0, missing)), symmetry)
 
 
-def _change(found: FocusMoments, before: FocusMoments, places: Callable) -> float:
-    """Largest change of the covariance relative to its trace, at the `places` of the sensor."""
-    spread, previous = np.asarray(found.spread, float), np.asarray(before.spread, float)
+def _change(before: _Trial, now: _Trial, places: Callable) -> float:
+    """Largest change of a covariance relative to its trace, at the `places` of the sensor."""
     worst = 0.0
-    for place in places(spread):
-        d = place[:, None]
-        now, then = (s[0] + d * (s[1] + d * s[2]) for s in (spread, previous))
-        size = np.sum(now[:, :2], axis=-1, keepdims=True)
-        worst = max(worst, float(np.max(np.abs(now - then) / np.maximum(size, _SMALLEST**2))))
+    for pair in zip(now.moments, before.moments, strict=True):
+        spreads = [np.asarray(found.spread, float) for found in pair]
+        for place in places(spreads[0]):
+            d = place[:, None]
+            new, old = (s[0] + d * (s[1] + d * s[2]) for s in spreads)
+            size = np.sum(new[:, :2], axis=-1, keepdims=True)
+            worst = max(worst, float(np.max(np.abs(new - old) / np.maximum(size, _SMALLEST**2))))
     return worst
 
 

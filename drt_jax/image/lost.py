@@ -12,10 +12,9 @@ from ..lens.scene import Scene
 from ..pupil.rules import PupilRule
 from ..rays.aim import beam_size, paraxial_launch
 from ..rays.find import Found
-from ..rays.snell import fates
+from ..rays.snell import meetings
 from ..rays.status import Status
-from ..rays.system import System, Vector
-from ..rays.trace import Bundle, trace_bundle
+from ..rays.trace import Bundle, aims, bundle_of
 
 _HOW = {
     Status.OK: "arrives, but by none of the rays of the rule",
@@ -69,21 +68,15 @@ def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Bund
     """The bundle of known rays, and the surface (W, Q) where each that paraxial optics launches
     towards its point of the stop ends, S for the sensor, -1 for none."""
     points, _ = rule.points(lens, scene)
-    given: list[tuple[System, Vector]] = []
-
-    def known(system, target):
-        given.append((system, target))
-        return found
-
-    bundle = trace_bundle(lens, scene, points, known)
-    system, target = given[0]
+    system, target = aims(lens, scene, points)
+    bundle = bundle_of(lens, scene, system, target, found)
     launch = paraxial_launch(system, target, beam_size(system, target)[1])
     places = [*lens.live, lens.count]
     if system.stop is not None:
         places.insert(system.before, lens.stop)
-    lost = fates(system, launch) != Status.OK
-    ends = jnp.array(places)[jnp.argmax(lost, axis=0)]
-    return bundle, jnp.where(jnp.any(lost, axis=0), ends, -1)
+    failed = meetings(system, launch).status != Status.OK
+    ends = jnp.array(places)[jnp.argmax(failed, axis=0)]
+    return bundle, jnp.where(jnp.any(failed, axis=0), ends, -1)
 
 
 def _stopped(lens: Lens, bundle: Bundle) -> np.ndarray:

@@ -151,12 +151,13 @@ def traced(lens: Lens, system: System, launch: Array, crossing: bool) -> tuple[A
     `launched`."""
     if not crossing:
         plain = shoot(system, tuple(launch))
-        both, status = on_all_surfaces(lens, system, *apart(system, plain.hits), plain.fate)
-        return jnp.stack(both), status == Status.OK
-    hits, ways, fate = shoot_anyway(system, tuple(launch))
-    (x, y), status = on_all_surfaces(lens, system, *apart(system, hits), fate)
+        good = plain.status == Status.OK
+        both, good = on_all_surfaces(lens, system, *apart(system, plain.hits), good)
+        return jnp.stack(both), good
+    hits, ways, status = shoot_anyway(system, tuple(launch))
+    (x, y), good = on_all_surfaces(lens, system, *apart(system, hits), status == Status.OK)
     found = jnp.concatenate([x, ways]), jnp.concatenate([y, 0 * ways])
-    return jnp.stack(found), status == Status.OK
+    return jnp.stack(found), good
 
 
 def launched(lens: Lens, system: System, launch: Array, crossing: bool) -> Rays:
@@ -177,7 +178,7 @@ def launched(lens: Lens, system: System, launch: Array, crossing: bool) -> Rays:
 def arriving(system: System, launch: Array, radius: Array) -> Array:
     """Launches (2, W, B) in mm; for a colour of which no ray reaches the sensor, that of the ray of
     a fan which crosses the stop, of `radius` mm, nearest to its centre."""
-    dark = jnp.all(shoot(system, tuple(launch)).fate != Status.OK, axis=-1)
+    dark = jnp.all(shoot(system, tuple(launch)).status != Status.OK, axis=-1)
     rim = (jnp.zeros_like(launch[0]), jnp.full_like(launch[0], radius))
 
     def sought(launch):

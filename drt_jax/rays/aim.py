@@ -52,7 +52,7 @@ class AimNewton(optx.AbstractRootFinder):
     """Newton's method for one launch point, damped: after a step with which the ray is lost or
     farther off, the next is half as long; after a good one, at most twice as long.
 
-    The function returns the miss (D numbers) and the fate of the ray as its auxiliary output.
+    The function returns the miss (D numbers) and the status of the ray as its auxiliary output.
     Options: "reach", the longest first step in mm; "upright", whether trials beyond a fold of the
     beam, where its image on the stop is turned over, are as bad as lost ones: of two rays through
     one stop point, neighbours then take the same. Ends when the miss is at most `atol` mm, and
@@ -72,9 +72,9 @@ class AimNewton(optx.AbstractRootFinder):
     def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
         """One trial."""
         trial = tuple(a + b for a, b in zip(y, state.move, strict=True))
-        miss, columns, fate = _derivatives(lambda y: fn(y, args), trial)
+        miss, columns, status = _derivatives(lambda y: fn(y, args), trial)
         folded = determinant(columns) < 0
-        counts = (fate == Status.OK) & ~(folded & options.get("upright", False))
+        counts = (status == Status.OK) & ~(folded & options.get("upright", False))
         far = jnp.where(counts, self.norm(miss), jnp.inf)
         better = far < state.far
         newton = tuple(-a for a in divide(columns, miss))
@@ -84,7 +84,7 @@ class AimNewton(optx.AbstractRootFinder):
         y = tuple(jnp.where(better, a, b) for a, b in zip(trial, y, strict=True))
         bad = jnp.where(better, 0, state.bad + 1).astype(jnp.int32)
         folded = jnp.where(better, folded, state.folded)
-        return y, _State(move, jnp.minimum(far, state.far), bad, folded), fate
+        return y, _State(move, jnp.minimum(far, state.far), bad, folded), status
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
         """Whether the ray is aimed, or given up."""
@@ -140,8 +140,8 @@ def aim(
 
     def one(own, target, launch):
         def miss(launch, target):
-            crossing, fate = shoot_to_stop(own, launch)
-            return tuple(a - b for a, b in zip(crossing, target, strict=True)), fate
+            crossing, status = shoot_to_stop(own, launch)
+            return tuple(a - b for a, b in zip(crossing, target, strict=True)), status
 
         solution: optx.Solution = optx.root_find(
             miss,
@@ -324,7 +324,7 @@ def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
     trace = shoot(system, flat)
     _, there = apart(system, trace.hits)
-    good = trace.fate == Status.OK
+    good = trace.status == Status.OK
     return Fan(launch, tuple(jnp.where(good, a, jnp.inf).reshape(shape) for a in there))
 
 

@@ -201,8 +201,8 @@ def stationary(path: Path, system: System, target: Vector) -> Array:
     size = _width(path.hits, system)
     widest = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
     near = _inverse(path.length).at[0].set(jnp.abs(system.vergence) * path.shrink)
-    shake = system.index * (1 + near * widest)
-    both = shake + jnp.concatenate([shake[1:], shake[-1:]])
+    angle = system.index * (1 + near * widest)  # by which rounding turns a segment
+    both = angle + jnp.concatenate([angle[1:], angle[-1:]])
     gradient = residual(path, system)
     bound = 64 * eps * both * jnp.sqrt(1 + dot(path.slope, path.slope))
     good = (dot(gradient, gradient) <= bound**2) & (both <= 4 / eps**0.5)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import Array
 
@@ -28,6 +29,7 @@ from .aim import (
 )
 from .bundle import in_tiles, polynomial_launch, tile_of
 from .snell import apart, shoot
+from .sparse import Lanes
 from .status import Status
 from .system import System, Vector, dot
 
@@ -125,16 +127,20 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
     return solution.value, all_solved | solution.state.solved, solution.stats["num_steps"]
 
 
-def find(system: System, target: Vector, launch: Vector | None = None) -> Found:
+def find(
+    system: System, target: Vector, launch: Vector | None = None, wanted: Array | None = None
+) -> Found:
     """The rays through stop points `target`, D arrays (W, Q) in mm; not differentiable.
 
     launch: D arrays (W, Q) in mm, where to start instead of at the paraxial entrance pupil.
-    Rays that are not found at once are sought again in a fan; those that miss their stop points by
-    more than rounding are polished on the Fermat system.
+    wanted: (W, Q), bool, the rays that are sought again if they are not found at once; all.
+    They are sought again in a fan; those that miss their stop points by more than rounding are
+    polished on the Fermat system.
     """
     sizes = beam_size(system, target)
     launch = paraxial_launch(system, target, sizes[1]) if launch is None else launch
-    search = _search(system, target, launch, sizes)
+    wanted = jnp.ones(target[0].shape, bool) if wanted is None else wanted
+    search = _search(system, target, launch, sizes, wanted)
     good = search.status == Status.OK
     hits, crossing = apart(system, search.hits)
     hits = tuple(jnp.where(good, a, 0) for a in hits)
@@ -171,41 +177,47 @@ class _Search(NamedTuple):
     steps: Array
 
 
-def _room(rays: int) -> tuple[int, int, int]:
-    """Of a bundle in which rays are sought again: how many starts each has in a turn, how many rays
-    that leaves room for, and how many turns it takes to try all `STARTS`."""
-    starts = min(STARTS, rays)
-    return starts, rays // starts, -(-STARTS // starts)
-
-
-def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Search:
-    """All rays from their first launch; then those that failed, each from the nearest of a fan;
-    then a few a turn, each from several of it. One loop with as many places as there are rays, so
-    that under `vmap` too the fan costs nothing while no ray is missing."""
+def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted: Array) -> _Search:
+    """All rays from their first launch; then those that are wanted and failed, each from the
+    nearest of a fan; then a few a turn, each from several of it, which takes `rounds` turns for all
+    `STARTS`. One loop with as many lanes as there are rays: the aiming is compiled once, and under
+    `vmap` too the fan costs nothing while no ray is missing."""
     waves, rays = target[0].shape
-    _, few, rounds = _room(rays)
-    ray = jnp.arange(rays, dtype=jnp.int32)
+    starts = min(STARTS, rays)
+    rounds, ray = -(-STARTS // starts), np.arange(rays, dtype=np.int32)
+
+    def from_fan(given):
+        fan, target, launch = given
+        fan = trace_fan(system, fan, launch, sizes[1])
+        return fan, target, nearest_start(fan, target)
 
     def turn(state):
         whole, sought = state.turn < 2, state.left > 0
-        # The first few that are left have several places each.
-        rank = jnp.cumsum(sought, axis=-1, dtype=jnp.int32) - 1
-        mine = sought & (rank < few)
-        fan, own, begin = _sought(system, state, mine, (state.fan, target, launch), sizes[1])
+        lanes = Lanes(sought, starts)
+
+        def from_several(given):
+            fan, target, _ = given
+            wanted, left = lanes.of_rays((target, state.left))
+            ranks = (rounds - left)[..., None] * starts + ray[None, None, :starts]
+            begin = starts_of(fan, wanted, ranks)
+            return fan, *lanes.spread((tuple(a[..., None] for a in wanted), begin))
+
+        given = run_if(state.turn == 1, from_fan, (state.fan, target, launch))
+        fan, own, begin = run_if(state.turn > 1, from_several, given)
         reach = jnp.where(state.turn == 0, sizes[1], sizes[1] / 8)
         upright = whole & (system.rows.rotation is None)
         new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
 
         worth = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
-        place, found = _best(worth, jnp.clip(rank, 0, few - 1))
-        place = jnp.where(whole, ray, place)
-        found = jnp.where(whole, (state.turn == 0) | (sought & (worth > 0)), found & mine)
-        status = jnp.take_along_axis(new.status, place, axis=-1)
+        lane, found = lanes.best(worth)
+        lane = jnp.where(whole, ray[None], lane)
+        found = jnp.where(whole, (state.turn == 0) | (sought & (worth > 0)), found)
+        status = jnp.take_along_axis(new.status, lane, axis=-1)
         status = jnp.where(found, status, state.status)
-        taken = (jnp.take_along_axis(h, place[None], axis=-1) for h in new.hits)
+        taken = (jnp.take_along_axis(h, lane[None], axis=-1) for h in new.hits)
         hits = tuple(jnp.where(found, a, b) for a, b in zip(taken, state.hits, strict=True))
-        left = state.left - (mine & ~whole).astype(jnp.int32)
-        left = jnp.where(state.turn == 0, rounds, left)
+        left = state.left - (lanes.served & ~whole).astype(jnp.int32)
+        left = jnp.where(state.turn == 0, jnp.where(wanted, rounds, 0), left)
         left = jnp.where((found & (state.turn > 0)) | (status == Status.OK), 0, left)
         return _Search(hits, status, left, fan, state.turn + 1, state.steps + new.steps)
 
@@ -215,45 +227,6 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple) -> _Se
     none = jnp.int32(0)
     start = _Search((zero,) * len(target), status, status, no_fan(system, waves), none, none)
     return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left > 0), turn, start)
-
-
-def _sought(
-    system: System, state: _Search, mine: Array, given: tuple[Fan, Vector, Vector], width: Array
-) -> tuple[Fan, Vector, Vector]:
-    """Fan, stop points and launches of a turn: those `given` in the first; in the second, the
-    nearest launch of a fan for each ray; then several for each of the few rays that are `mine`."""
-    waves, rays = mine.shape
-    starts, few, rounds = _room(rays)
-    ray = jnp.arange(rays, dtype=jnp.int32)
-
-    def places(a):  # (W, few, starts or 1) -> (W, Q)
-        a = jnp.broadcast_to(a, (waves, few, starts)).reshape(waves, -1)
-        return jnp.pad(a, ((0, 0), (0, rays - few * starts)), mode="edge")
-
-    def once(given):
-        fan, target, launch = given
-        fan = trace_fan(system, fan, launch, width)
-        return fan, target, nearest_start(fan, target)
-
-    def several(given):
-        fan, target, _ = given
-        rows = rays - jax.lax.top_k(jnp.where(mine, rays - ray, 0), few)[0]
-        wanted = tuple(jnp.take_along_axis(a, rows, 1, mode="clip") for a in target)
-        tried = rounds - jnp.take_along_axis(state.left, rows, 1, mode="clip")
-        begin = starts_of(fan, wanted, (tried * starts)[..., None] + ray[None, None, :starts])
-        return fan, tuple(places(a[..., None]) for a in wanted), tuple(map(places, begin))
-
-    return run_if(state.turn > 1, several, run_if(state.turn == 1, once, given))
-
-
-def _best(worth: Array, slot: Array) -> tuple[Array, Array]:
-    """The place of the best start (W, Q) of each ray, whose places have the number `slot`, and
-    whether it is worth anything."""
-    waves, rays = worth.shape
-    starts, few, _ = _room(rays)
-    each = worth[:, : few * starts].reshape(waves, few, starts)
-    choice = jnp.take_along_axis(jnp.argmax(each, axis=-1).astype(jnp.int32), slot, axis=-1)
-    return slot * starts + choice, jnp.take_along_axis(jnp.any(each > 0, axis=-1), slot, axis=-1)
 
 
 class _Traced(NamedTuple):
@@ -278,37 +251,38 @@ def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Arr
     than 1e-6 (float32: 2e-2) when its hits are rounded determines no path."""
     trace = shoot(system, launch)
     eps = float(jnp.finfo(launch[0].dtype).eps)
-    drowned = (trace.fate == Status.OK) & (trace.shake > 4 / eps**0.5)
-    fate = jnp.where(drowned, jnp.int32(Status.UNCONVERGED), trace.fate)
-    return trace.hits, jnp.where(status == Status.OK, fate, status)
+    drowned = (trace.status == Status.OK) & (trace.rounding_angle > 4 / eps**0.5)
+    traced = jnp.where(drowned, jnp.int32(Status.UNCONVERGED), trace.status)
+    return trace.hits, jnp.where(status == Status.OK, traced, status)
 
 
 def find_many(system: System, target: Vector) -> Found:
     """`find`; a large bundle in tiles, its rays launched by polynomials and searched for only
-    where these miss. A stop point that is not finite is MISSED and changes no other ray."""
+    where these miss. A stop point that is not finite is MISSED, and not sought."""
     known = jnp.all(jnp.isfinite(jnp.stack(target)), axis=0)
-    found = _find_many(system, tuple(jnp.where(known, a, 0) for a in target))
+    found = _find_many(system, tuple(jnp.where(known, a, 0) for a in target), known)
     return found._replace(
         hits=tuple(jnp.where(known, a, 0) for a in found.hits),
         status=jnp.where(known, found.status, jnp.int32(Status.MISSED)),
     )
 
 
-def _find_many(system: System, target: Vector) -> Found:
+def _find_many(system: System, target: Vector, known: Array) -> Found:
     waves, rays = target[0].shape
     size = tile_of(rays, waves)
     if len(target) == 1 or size == rays:
-        return find(system, target)
+        return find(system, target, wanted=known)
     launch_of = polynomial_launch(system, target)
 
-    def tile(target):
+    def tile(target, known):
         launch = launch_of(target)
         hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
         hits, crossing = apart(system, hits)
         solved = fermat.met(crossing, target, hits, system) & (status == Status.OK)
         found = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0))
-        found = run_if(~jnp.all(solved), lambda _: find(system, target, launch), found)
+        search = lambda _: find(system, target, launch, known)  # noqa: E731
+        found = run_if(~jnp.all(solved | ~known), search, found)
         return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
 
-    found = in_tiles(tile, size, target)
+    found = in_tiles(tile, size, target, known)
     return found._replace(steps=jnp.max(found.steps))

@@ -6,7 +6,6 @@ Arrays have any shape: () for one ray, or (wavelength, ray) beside an index (wav
 Source: Welford, Aberrations of Optical Systems (1986), ch. 4.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from jax import Array
 from ..lens.forms import Shape
 from ..lens.surface import sag_derivatives
 from ..numerics import safe_divide, safe_sqrt
-from .meet import meet, quadratic
+from .meet import meet
 from .status import Status
 from .system import Placed, System, Vector, dot, turn
 
@@ -31,13 +30,13 @@ class Trace(NamedTuple):
 
     hits: D arrays (R, ...), transverse coordinates on the rows in mm, and on a stop that is none
         of them, which has its place among them: see `apart`. Void behind a failure.
-    fate: (...), int32, OK, MISSED or TIR, see `Status`.
-    shake: (...), the most that rounding the hits turns a segment by, in units of rounding.
+    status: (...), int32, OK, MISSED or TIR.
+    rounding_angle: (...), the most that rounding the hits turns a segment by, in units of rounding.
     """
 
     hits: Vector
-    fate: Array
-    shake: Array
+    status: Array
+    rounding_angle: Array
 
 
 def apart(system: System, hits: Vector) -> tuple[Vector, Vector]:
@@ -61,7 +60,7 @@ def _begin(system: System, launch: Vector) -> tuple[Vector, Vector]:
     return point, tuple(d * shrink for d in direction)
 
 
-def _refract(d: Vector, normal: Vector, row: "_Row", kick: Vector) -> tuple[Vector, Array, Array]:
+def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector) -> tuple[Vector, Array, Array]:
     """Direction behind a surface by Snell's law in vector form; and by how much light comes from
     its front, and gets through, both above 0. `kick`: what a phase adds to it, D arrays or none."""
     front = jnp.minimum(d[-1] * row.sense - _FLATTEST, dot(normal, d) * row.sense)
@@ -109,7 +108,7 @@ def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
     return tuple(row.wave * s for s in slope)
 
 
-class _Row(NamedTuple):
+class Row(NamedTuple):
     """One thing that a ray meets: a live surface, the stop, the sensor; or with a first axis some.
 
     first: whether it is the first. live: whether light must come to it from the front, or the ray,
@@ -129,12 +128,19 @@ class _Row(NamedTuple):
     kick: _Kick | None
 
 
-def _rows(system: System, kinds: list[str], phases: list[str], to_stop: bool) -> _Row:
+def _forms(system: System) -> tuple[list[str], list[str]]:
+    """The different forms of surfaces and of phases."""
+    by = system.diffraction
+    return sorted({*system.forms, system.at_stop[1]}), sorted(set(by.forms)) if by else []
+
+
+def rows_met(system: System, to_stop: bool = False) -> Row:
     """All that rays meet, or what they meet up to the stop and the stop, which then is crossed."""
+    kinds, phases = _forms(system)
     count, at = len(system.forms), system.before
     senses = system.senses
     forms = np.array([kinds.index(form) for form in system.forms])
-    rows = _Row(
+    rows = Row(
         np.arange(count) == 0,
         np.ones(count, bool),
         np.ones(count, bool),
@@ -164,146 +170,115 @@ def _rows(system: System, kinds: list[str], phases: list[str], to_stop: bool) ->
 
 class _State(NamedTuple):
     """Rays behind a row: point, direction: D + 1 arrays (...), along the axes of the lens. hit: D
-    arrays, on that row. fate, shake: see `Trace`."""
+    arrays, on that row. status, rounding_angle: see `Trace`."""
 
     point: Vector
     direction: Vector
     hit: Vector
-    fate: Array
-    shake: Array
+    status: Array
+    rounding_angle: Array
 
 
-class _Meeting(NamedTuple):
-    """Of rays with a row: `hit`, D arrays (...), and `fate` so far (...), see `Trace`. length:
-    (...), mm from the live surface before it, below 0 for a step back. short: by how much a ray
-    misses the row, comes from behind, is bent too far; called where it is asked."""
+class Meeting(NamedTuple):
+    """Of rays with all that they meet: the R rows, and a stop that is none of them in its place
+    among these, see `apart`. Along the axes of each; void behind a failure.
 
+    point, direction: D + 1 arrays (R, ...), in front of it, a point in mm and a unit vector.
+    hit: D arrays (R, ...), where the ray, prolonged either way, crosses it, mm.
+    crosses: (R, ...), bool, whether it does.
+    length: (R, ...), mm from the active surface before it, below 0 for a step back.
+    front, through: (R, ...), above 0 where light comes from its front, and gets through.
+    status: (R, ...), int32, so far, see `Trace`.
+    """
+
+    point: Vector
+    direction: Vector
     hit: Vector
+    crosses: Array
     length: Array
-    fate: Array
-    short: Callable[[], Array]
-
-
-def _as_it_is(going: Array, sense: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
-    """A lost ray goes on as it came: its numbers are void."""
-    return p, d
+    front: Array
+    through: Array
+    status: Array
 
 
 def _along_the_axis(going: Array, sense: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
-    """A lost ray goes on along the axis, so that its numbers and their derivatives are finite."""
+    """A failed ray goes on along the axis, so that its numbers and their derivatives are finite."""
     axis: Vector = (*(jnp.zeros_like(a) for a in d[:-1]), sense)
     p = tuple(jnp.where(going, a, 0) for a in p)
     return p, tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
 
 
+def _meet(system: System, row: "Row", state: _State, smooth: bool) -> tuple[Meeting, _State]:
+    """Rays that come to a row, and behind it. smooth: see `meetings`."""
+    kinds, phases = _forms(system)
+    going = state.status == Status.OK
+    p, d = row.surface.local(state.point, state.direction)
+    if smooth:
+        p, d = _along_the_axis(going, row.sense, p, d)
+    each = [partial(meet, kind) for kind in kinds]
+    encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
+    own, normal, crosses, length = encounter(p, d, row.surface.shape, going)
+    bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
+    hit, origin = own[:-1], row.surface.origin(len(own) - 1)
+    point = tuple(a + o for a, o in zip(turn(row.surface.rotation, own), origin, strict=True))
+    behind = state._replace(point=point, direction=turn(row.surface.rotation, bent), hit=hit)
+    return Meeting(p, d, hit, crosses, length, front, through, state.status), behind
+
+
 def _follow(
     system: System,
     launch: Vector,
-    to_stop: bool,
-    keep: Callable[[_Meeting], Any],
-    lost: Callable[..., tuple[Vector, Vector]] = _as_it_is,
+    to_stop: bool = False,
+    smooth: bool = False,
     forward: bool = True,
 ) -> tuple[_State, Any]:
-    """Rays behind the last row; and unless that is the stop, what is to `keep` of each meeting.
-    lost: how a ray that failed goes on. forward: whether a ray fails that steps back to a row."""
-    kinds = sorted({*system.forms, system.at_stop[1]})
-    each = [partial(meet, kind) for kind in kinds]
-    phases = [] if system.diffraction is None else sorted(set(system.diffraction.forms))
+    """Rays behind the last row, and all that they met; or behind the stop, and None. smooth: see
+    `meetings`. forward: whether a ray fails that steps back to a row."""
 
     def step(state, row):
-        p, d = row.surface.local(state.point, state.direction)
-        p, d = lost(state.fate == Status.OK, row.sense, p, d)
-        encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
-        own, normal, met, length = encounter(p, d, row.surface.shape, state.fate == Status.OK)
-        bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
-        crosses = met
-        ahead = (length > 0) | row.first | (not forward)
-        met = met & (~row.live | ((front > 0) & ahead))
-        passes = (through > 0) | ~row.bends
+        meeting, behind = _meet(system, row, state, smooth)
+        ahead = (meeting.length > 0) | row.first | (not forward)
+        met = meeting.crosses & (~row.live | ((meeting.front > 0) & ahead))
+        passes = (meeting.through > 0) | ~row.bends
         here = jnp.where(met, jnp.where(passes, Status.OK, Status.TIR), Status.MISSED)
-        fate = jnp.where(state.fate == Status.OK, here.astype(jnp.int32), state.fate)
-        hit, before = own[:-1], state.hit
-        wide = jnp.sqrt(jnp.maximum(dot(hit, hit), dot(before, before)))
-        wide = jax.lax.stop_gradient(wide)  # its root has no derivative on the axis
-        shake = jnp.where(fate == Status.OK, safe_divide(wide, jnp.where(row.first, 0, length)), 0)
-        origin = row.surface.origin(len(hit))
-        point = tuple(a + o for a, o in zip(turn(row.surface.rotation, own), origin, strict=True))
-        shake = jnp.maximum(shake, state.shake)
-        new = _State(point, turn(row.surface.rotation, bent), hit, fate, shake)
+        status = jnp.where(state.status == Status.OK, here.astype(jnp.int32), state.status)
+        wide = jnp.maximum(dot(meeting.hit, meeting.hit), dot(state.hit, state.hit))
+        wide = jax.lax.stop_gradient(jnp.sqrt(wide))  # has no derivative on the axis
+        angle = safe_divide(wide, jnp.where(row.first, 0, meeting.length))
+        angle = jnp.maximum(jnp.where(status == Status.OK, angle, 0), state.rounding_angle)
+        behind = behind._replace(status=status, rounding_angle=angle)
         if to_stop:
-            return new, None
-        kept = state._replace(fate=fate)
-
-        def short() -> Array:
-            square, linear, constant = quadratic(p, d, row.surface.shape)
-            behind = jnp.where(row.first, 0, jnp.maximum(-length, 0)) + jnp.maximum(-front, 0)
-            behind = jnp.where(row.live, behind, 0)
-            behind = behind + jnp.where(row.bends, jnp.maximum(-through, 0), 0)
-            # By how much a conic is missed, on from the total reflection of rays that graze it.
-            missed = jnp.maximum(square * constant - linear**2, 0)
-            missed = missed + jnp.where(row.bends, jnp.maximum(row.ratio**2 - 1, 0), 0)
-            return jnp.where(crosses, behind, missed)
-
-        keeping = keep(_Meeting(hit, length, fate, short))
-        return jax.tree.map(partial(jnp.where, row.bends), new, kept), keeping
+            return behind, None
+        behind = jax.tree.map(partial(jnp.where, row.bends), behind, state._replace(status=status))
+        return behind, meeting._replace(status=status)
 
     zero = jnp.zeros_like(launch[0])
     none, begin = jnp.zeros(zero.shape, jnp.int32), _begin(system, launch)
     start = _State(*begin, (zero,) * len(launch), none, zero)
-    return jax.lax.scan(step, start, _rows(system, kinds, phases, to_stop))
+    return jax.lax.scan(step, start, rows_met(system, to_stop))
 
 
 def shoot(system: System, launch: Vector) -> Trace:
     """Trace rays to the sensor; `launch` D arrays in mm on the vertex plane of the first row."""
-    state, hits = _follow(system, launch, False, lambda meeting: meeting.hit)
-    return Trace(hits, state.fate, state.shake)
+    state, met = _follow(system, launch)
+    return Trace(met.hit, state.status, state.rounding_angle)
 
 
 def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
-    """`hits` and `fate` of `Trace`, and between them the lengths (R - 1, ...) of the segments from
-    each live surface to the next and to the sensor, mm: a ray may step back, where neighbours
-    cross, by a length below 0. Differentiable; void rays are finite."""
-    state, (hits, lengths) = _follow(
-        system,
-        launch,
-        False,
-        lambda meeting: (meeting.hit, meeting.length),
-        _along_the_axis,
-        forward=False,
-    )
-    return hits, apart(system, (lengths,))[0][0][1:], state.fate
+    """`hits` and `status` of `Trace`, and between them the lengths (R - 1, ...) of the segments
+    from each active surface to the next and to the sensor, mm: a ray may step back, where
+    neighbours cross, by a length below 0. Differentiable; void rays are finite."""
+    state, met = _follow(system, launch, smooth=True, forward=False)
+    return met.hit, apart(system, (met.length,))[0][0][1:], state.status
 
 
-def fates(system: System, launch: Vector) -> Array:
-    """What became of rays up to each row, and up to a stop that is none of them in its place among
-    these: (R, ...) or (R + 1, ...), int32, see `Trace`. `launch` as of `shoot`."""
-    return _follow(system, launch, False, lambda meeting: meeting.fate)[1]
-
-
-def lack(system: System, launch: Vector, target: Vector) -> Array:
-    """By how much rays fail to come through stop points, (...): the part of the rows that they do
-    not come to, and more the farther one is from getting past the first of these; for one that
-    reaches the sensor, more the farther from its stop point it crosses the stop. Finite, and
-    differentiable by what pulls the ray through. `launch` as of `shoot`; target: D arrays (...)
-    in mm, whose largest counts as far."""
-    fate, short, hits = _follow(
-        system,
-        launch,
-        False,
-        lambda meeting: (meeting.fate, meeting.short(), meeting.hit),
-        _along_the_axis,
-    )[1]
-    lost = fate != Status.OK
-    first = lost & ~jnp.concatenate([jnp.zeros_like(lost[:1]), lost[:-1]])
-    _, crossing = apart(system, hits)
-    miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
-    off = safe_divide(safe_sqrt(dot(miss, miss)), jnp.sqrt(jnp.max(dot(target, target))))
-    short = jnp.sum(jnp.where(first, short, 0), axis=0)
-    part = jnp.mean(lost.astype(short.dtype), axis=0)
-    return part + jnp.log1p(jnp.where(lost[-1], short, off))
+def meetings(system: System, launch: Vector, smooth: bool = False) -> Meeting:
+    """What rays meet on their way to the sensor; `launch` as of `shoot`. smooth: failed rays go on
+    along the axis, and all derivatives are finite."""
+    return _follow(system, launch, smooth=smooth)[1]
 
 
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:
-    """Where rays cross the stop, D arrays in mm along its axes, and their fate so far (...)."""
-    state, _ = _follow(system, launch, True, lambda meeting: None)
-    return state.hit, state.fate
+    """Where rays cross the stop, D arrays in mm along its axes, and their status so far (...)."""
+    state, _ = _follow(system, launch, to_stop=True)
+    return state.hit, state.status

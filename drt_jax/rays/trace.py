@@ -1,5 +1,9 @@
-"""Lens + scene + points on the stop -> rays with a status."""
+"""Lens + scene + points on the stop -> rays with a status.
 
+Three steps: `aims` says what is sought, a `Solver` finds it, `bundle_of` completes it.
+"""
+
+import functools
 from typing import NamedTuple
 
 import jax
@@ -11,8 +15,9 @@ from ..lens.aperture import depths
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
-from ..numerics import Numbers, real_array
+from ..numerics import Numbers, concrete, known_values, real_array
 from . import fermat
+from .find import Found
 from .meet import cross
 from .solve import Solver, solve
 from .status import Status
@@ -62,11 +67,11 @@ def _rows_behind(lens: Lens) -> list[int]:
 
 
 def on_all_surfaces(
-    lens: Lens, system: System, hits: Vector, stop: Vector, status: Array
+    lens: Lens, system: System, hits: Vector, stop: Vector, good: Array
 ) -> tuple[Vector, Array]:
-    """Hits on all surfaces from those on the rows of the system and on the stop, and status:
-    where the straight ray, prolonged either way, does not meet a surface that bends no light, it
-    is MISSED."""
+    """Hits on all surfaces from those on the rows of the system and on the stop, 0 for failed rays;
+    and which of the `good` rays (W, Q), straight and prolonged either way, meet all surfaces that
+    bend no light."""
     pieces, begin, behind = [], 0, _rows_behind(lens)
     for i in sorted({*range(lens.count)} - {*lens.live}):
         row, crossing = behind[i], stop
@@ -74,55 +79,59 @@ def on_all_surfaces(
             some, part = fermat.up_to(hits, system, row)
             line = fermat.ray_at(fermat.geometry(some, part), part, -1)
             crossing, met = cross(placed(lens, i), lens.forms[i], *line)
-            missed = (status == Status.OK) & ~met
-            status = jnp.where(missed, Status.MISSED, status).astype(jnp.int32)
+            good = good & met
         pieces += [tuple(h[begin:row] for h in hits), tuple(c[None] for c in crossing)]
         begin = row
     pieces.append(tuple(h[begin:] for h in hits))
-    whole = status == Status.OK
     joined = (jnp.concatenate(part) for part in zip(*pieces, strict=True))
-    return tuple(jnp.where(whole, a, 0) for a in joined), status
+    return tuple(jnp.where(good, a, 0) for a in joined), good
 
 
-def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:
-    """Trace rays in the array layout of `fermat`, rays last.
+def aims(lens: Lens, scene: Scene, points: Vector) -> tuple[System, Vector]:
+    """The system of a bundle, and the stop points that its rays cross, D arrays (W, Q) in mm.
 
     points: D arrays (Q,) or (W, Q) on the unit disc of the stop, or any part of its plane; D = 1
         for rays in the meridional (y, z) plane of a lens with rotational symmetry and an object
-        on its axis, else 2.
-    solver: `solve`, for all modes of derivatives, or `solve_reverse`.
+        on its axis, else 2. One that is not finite stays so, and has no derivative.
     """
-    return _traced(lens, scene, points, solver)[0]
-
-
-def _traced(
-    lens: Lens, scene: Scene, points: Vector, solver: Solver
-) -> tuple[Bundle, System, Vector]:
-    """The bundle, and its system with the hits on the rows of that."""
-    system = system_of(lens, scene, len(points))
-    waves = scene.wavelengths.shape[0]
-    radius = lens.semi_diameter[lens.stop]
-    # A point that is not finite stays so, and has no derivative.
+    radius, waves = lens.semi_diameter[lens.stop], scene.wavelengths.shape[0]
     finite = [(jnp.isfinite(p), jnp.where(jnp.isfinite(p), p, 0)) for p in points]
-    scaled = (jnp.where(known, radius * p, jnp.inf) for known, p in finite)
-    target = tuple(jnp.broadcast_to(p, (waves, p.shape[-1])) for p in scaled)
-    found = solver(system, target)
-    known = lens.dispersion.knows(scene.wavelengths)[:, None]
+    target = (jnp.where(known, radius * p, jnp.inf) for known, p in finite)
+    target = (jnp.broadcast_to(p, (waves, p.shape[-1])) for p in target)
+    return system_of(lens, scene, len(points)), tuple(target)
+
+
+def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: Found) -> Bundle:
+    """The bundle of the rays found through stop points; `system` and `target` as of `aims`."""
     status = jnp.where(scene.possible, found.status, jnp.int32(Status.MISSED))
+    known = lens.dispersion.knows(scene.wavelengths)[:, None]
     status = jnp.where(known, status, jnp.int32(Status.NO_INDEX))
+    hits, good = on_all_surfaces(lens, system, found.hits, target, status == Status.OK)
+    status = jnp.where((status == Status.OK) & ~good, jnp.int32(Status.MISSED), status)
+    status = jnp.where(good & _clipped(lens, hits), jnp.int32(Status.CLIPPED), status)
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = turn(rotation, found.arrival, back=True)
-    path = fermat.optical_path(found.hits, system)
-    hits, status = on_all_surfaces(lens, system, found.hits, target, status)
+    return Bundle(hits, status, arrival, fermat.optical_path(found.hits, system), found.steps)
+
+
+def _clipped(lens: Lens, hits: Vector) -> Array:
+    """Whether hits D (S + 1, W, Q) lie outside of an aperture or inside an obscuration, (W, Q)."""
     edge = lens.semi_diameter.at[lens.stop].set(jnp.inf)[:, None, None]
-    stopped = jnp.any(dot(hits, hits) > edge**2, axis=0)
-    if lens.apertures is not None:
-        blocks = np.array(lens.apertures.blocks)[:, None, None]
-        depth = depths(lens.apertures, hits)
-        stopped = stopped | jnp.any(jnp.where(blocks, depth > 0, depth < 0), axis=0)
-    stopped = stopped & (status == Status.OK)
-    status = jnp.where(stopped, Status.CLIPPED, status).astype(jnp.int32)
-    return Bundle(hits, status, arrival, path, found.steps), system, found.hits
+    clipped = jnp.any(dot(hits, hits) > edge**2, axis=0)
+    if lens.apertures is None:
+        return clipped
+    blocks = np.array(lens.apertures.blocks)[:, None, None]
+    depth = depths(lens.apertures, hits)
+    return clipped | jnp.any(jnp.where(blocks, depth > 0, depth < 0), axis=0)
+
+
+def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:
+    """Trace rays in the array layout of `fermat`, rays last; points as of `aims`.
+
+    solver: `solve`, for all modes of derivatives, or `solve_reverse`.
+    """
+    system, target = aims(lens, scene, points)
+    return bundle_of(lens, scene, system, target, solver(system, target))
 
 
 def trace_rays(
@@ -145,8 +154,29 @@ def trace_rays(
     are not known, rays of a wavelength outside the range of a glass have the status NO_INDEX, those
     of a field of 90 degrees and more or of a distance not above 0 are MISSED.
     """
-    scene = scene_of(lens, field, distance, wavelengths)
-    return _trace_rays(lens, scene, stop_points(lens, pupil))
+    scene, points = scene_of(lens, field, distance, wavelengths), stop_points(lens, pupil)
+    count, size = len(points), _padded(len(points))
+    if count == size or known_values((lens, scene, points)) is None:
+        return _trace_rays(lens, scene, points)
+    # Bundles of nearly as many rays share a program: those that are not finite cost little.
+    library = np if concrete(points) else jnp
+    filled = library.pad(points, ((0, size - count), (0, 0)), constant_values=np.inf)
+    return _first(_trace_rays(lens, scene, filled), count)
+
+
+def _padded(count: int) -> int:
+    """How many rays are traced for so many: 16 for fewer, then a multiple of an eighth of the next
+    power of 2; above 1024 no more than asked for, as time is arithmetic there."""
+    if count > 1024:
+        return count
+    step = max(16, 1 << (count - 1).bit_length()) // 8
+    return max(16, -(-count // step) * step)
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _first(rays: Rays, count: int) -> Rays:
+    """The first rays of some."""
+    return jax.tree.map(lambda a: a[:, :count] if a.ndim else a, rays)
 
 
 def stop_points(lens: Lens, pupil: Numbers) -> Array:
@@ -161,13 +191,15 @@ def stop_points(lens: Lens, pupil: Numbers) -> Array:
 
 @jax.jit
 def _trace_rays(lens: Lens, scene: Scene, pupil: Array) -> Rays:
-    bundle, system, hits = _traced(lens, scene, (pupil[:, 0], pupil[:, 1]), solve)
+    system, target = aims(lens, scene, (pupil[:, 0], pupil[:, 1]))
+    found = solve(system, target)
+    bundle = bundle_of(lens, scene, system, target, found)
     good = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     rows = placed(lens, range(lens.count + 1))
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
     own = turn(rows.rotation, (*bundle.hits, heights))
     points = (p + o[:, None, None] for p, o in zip(own, rows.origin(2), strict=True))
-    direction = turn(system.rows.rotation, fermat.geometry(hits, system).before)
+    direction = turn(system.rows.rotation, fermat.geometry(found.hits, system).before)
     behind = np.array(_rows_behind(lens))
 
     def stacked(vector):  # (3, S + 1, W, Q) -> (W, Q, S + 1, 3)

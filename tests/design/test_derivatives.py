@@ -9,7 +9,7 @@ import pytest
 from drt_jax import Clipped, Gauss, design, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary, trace_fields
-from drt_jax.design.field_rays import failures
+from drt_jax.design.failures import failures
 from drt_jax.design.problem import quick
 
 from .test_operands import COLOURS, model

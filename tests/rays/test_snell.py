@@ -170,7 +170,7 @@ def test_a_trace_against_the_yardstick(lens, distance):
     system, launch = scene_system(lens, distance), launches()
     trace = shoot(system, launch)
     trace = trace._replace(hits=snell.apart(system, trace.hits)[0])
-    assert np.all(trace.fate == Status.OK)
+    assert np.all(trace.status == Status.OK)
     points, source = corners(system, trace.hits)
     start = np.stack([*map(np.asarray, launch), np.zeros(launch[0].shape)], axis=-1)
     direction = -source if np.isinf(distance) else start - source
@@ -186,7 +186,7 @@ def test_a_trace_against_the_yardstick(lens, distance):
     wide = np.sqrt(np.sum(np.square(trace.hits), axis=0))
     length = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     wanted = np.max(np.maximum(wide[1:], wide[:-1]) / length, axis=0)
-    np.testing.assert_allclose(trace.shake, wanted, rtol=1e-12)
+    np.testing.assert_allclose(trace.rounding_angle, wanted, rtol=1e-12)
 
 
 @pytest.mark.parametrize("stop", ["in front", "live"])
@@ -200,13 +200,13 @@ def test_the_stop_of_a_ray(stop):
         label = fermat.label(fermat.geometry(hits, system), system)
         return snell.shoot_to_stop(system, launch), label, there
 
-    (crossing, fate), label, there = both(scene_system(lens_with(stop, True)), launches())
-    assert np.all(fate == Status.OK)
+    (crossing, status), label, there = both(scene_system(lens_with(stop, True)), launches())
+    assert np.all(status == Status.OK)
     np.testing.assert_allclose(crossing, label, rtol=0, atol=1e-12)
     np.testing.assert_allclose(crossing, there, rtol=0, atol=1e-12)
 
 
-def test_fates():
+def test_status():
     """What stops a ray first: a plane glass face beyond the critical angle; the curved one missed;
     surfaces that cross, so that the second lies behind the ray; all without a number that is not
     finite."""
@@ -216,12 +216,12 @@ def test_fates():
     ]
     heights = jnp.asarray([[0.0, 32.0, 34.0, 49.0, 51.0]])
     lens = load_lens({"surfaces": faces})
-    flat = shoot(meridional(lens, [0.55]), (heights,)).fate[0]
+    flat = shoot(meridional(lens, [0.55]), (heights,)).status[0]
     # sin(critical) = 1 / 1.5: at 33.3 mm of R = 50; the sphere ends at 50 mm.
     assert flat.tolist() == [Status.OK, Status.OK, Status.TIR, Status.TIR, Status.MISSED]
     faces[0] |= {"radius": 20, "thickness": 2.0, "semi_diameter": 1.0}
     faces[1]["radius"] = 50  # crosses the first face 11.5 mm from the axis
     crossed = shoot(meridional(load_lens({"surfaces": faces}), [0.55]), (heights / 2,))
-    assert crossed.fate[0].tolist()[0] == Status.OK
-    assert set(crossed.fate[0].tolist()[1:]) == {Status.MISSED}
+    assert crossed.status[0].tolist()[0] == Status.OK
+    assert set(crossed.status[0].tolist()[1:]) == {Status.MISSED}
     assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(crossed))

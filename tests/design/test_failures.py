@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from drt_jax import load_lens, scene_of
+from drt_jax.design.failures import shortfall
 from drt_jax.rays.aim import beam_size, paraxial_launch
-from drt_jax.rays.snell import fates, lack
+from drt_jax.rays.snell import meetings
 from drt_jax.rays.system import system_of
 
 POINTS = tuple(jnp.asarray(np.stack([[0.0, 0.0, 0.7, 0.0], [0.0, 1.0, 0.7, -1.0]])))
@@ -17,12 +18,12 @@ WAVES = (0.48, 0.6)
 
 
 def told(lens, field=0.2):
-    """Fates at the end and what rays lack, (W, Q) each; the guess is the paraxial one."""
+    """Status at the end and shortfall, (W, Q) each; the guess is the paraxial one."""
     system = system_of(lens, scene_of(lens, field, jnp.inf, WAVES))
     radius = lens.semi_diameter[lens.stop]
     target = tuple(jnp.broadcast_to(radius * p, (2, p.size)) for p in POINTS)
     launch = paraxial_launch(system, target, beam_size(system, target)[1])
-    return fates(system, launch)[-1], lack(system, launch, target)
+    return meetings(system, launch).status[-1], shortfall(system, launch, target)
 
 
 told = jax.jit(told)
@@ -34,8 +35,8 @@ def bent(lens, surface, factor):
 
 
 def test_rays_that_come_near_their_stop_points_lack_little():
-    fate, found = told(load_lens("cooke_triplet"))
-    assert np.all(fate == 0) and np.all(found >= 0) and np.max(found) < 0.05
+    status, found = told(load_lens("cooke_triplet"))
+    assert np.all(status == 0) and np.all(found >= 0) and np.max(found) < 0.05
     assert np.all(told(load_lens("singlet"))[1] < 1e-12)  # the stop comes first
 
 
@@ -45,8 +46,8 @@ def test_rays_that_come_near_their_stop_points_lack_little():
 def test_the_stronger_a_surface_the_more_is_lacking(name, surface):
     lens, before = load_lens(name), -1.0
     for factor in (3.0, 4.0, 6.0):
-        fate, found = told(bent(lens, surface, factor))
-        lost = np.asarray(fate) != 0
+        status, found = told(bent(lens, surface, factor))
+        lost = np.asarray(status) != 0
         assert lost.any() and np.all(np.isfinite(found)) and np.all(found[lost] > 0)
         assert found.max() > before or surface == 0
         before = found.max()

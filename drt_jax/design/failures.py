@@ -1,0 +1,79 @@
+"""Residuals of rays that fail: finite, and differentiable by what brings the ray through."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..lens.lens import Lens
+from ..lens.scene import Scene
+from ..numerics import safe_divide, safe_sqrt
+from ..rays.aim import beam_size, paraxial_launch
+from ..rays.meet import quadratic
+from ..rays.snell import Meeting, Row, apart, meetings, rows_met
+from ..rays.status import Status
+from ..rays.system import System, Vector, dot
+from ..rays.trace import aims
+from .field_rays import FieldRays
+
+
+def failures(lens: Lens, rays: FieldRays) -> Array:
+    """Residual (V, W, Q) of a failed ray: the root of the light that it stands for times 1 + its
+    shortfall; 0 for one that arrives. A chief ray that fails stands for all light of its
+    wavelength; where all light is clipped, inf."""
+    light = rays.weights * rays.wavelength_weights[None, :, None]
+    chief = np.arange(light.shape[-1]) == 0
+    light = jnp.where(chief[None, None], rays.wavelength_weights[None, :, None], light)
+    failed = ~rays.arrives & (light > 0)
+    root = jnp.sqrt(jnp.where(failed, light, 1))
+    dark = rays.throughput[..., None] == 0
+    residual = jnp.where(failed, root * (1 + _shortfalls(lens, rays)), 0)
+    return jnp.where(dark, jnp.inf, residual)
+
+
+def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
+    """The shortfall of the first guess of each ray (V, W, Q) that fails; 0 for one that arrives."""
+    failed = ~rays.arrives
+
+    def of_view(field: Array, distance: Array, points: Vector) -> Array:
+        scene = Scene(field, distance, rays.wavelengths)
+        system, target = aims(lens, scene, points)
+        launch = paraxial_launch(system, target, beam_size(system, target)[1])
+        return shortfall(system, launch, target)
+
+    def of_all(_: None) -> Array:
+        return jax.vmap(of_view)(rays.field, rays.distance, rays.points)
+
+    none = jnp.zeros_like(rays.weights)
+    found = jax.lax.cond(jnp.any(failed), of_all, lambda _: none, None)
+    return jnp.where(failed, found, 0)
+
+
+def shortfall(system: System, launch: Vector, target: Vector) -> Array:
+    """Shortfall (W, Q) of rays on the way through their stop points: the fraction of rows that a
+    ray does not come to, plus log(1 + by how much it misses the first of them). For one that
+    reaches the sensor log(1 + its distance from the stop point, relative to the largest).
+
+    launch: as of `snell.shoot`. target: D arrays (W, Q) in mm.
+    """
+    met, rows = meetings(system, launch, smooth=True), rows_met(system)
+    failed = met.status != Status.OK
+    first = failed & ~jnp.concatenate([jnp.zeros_like(failed[:1]), failed[:-1]])
+    _, crossing = apart(system, met.hit)
+    miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
+    off = safe_divide(safe_sqrt(dot(miss, miss)), jnp.sqrt(jnp.max(dot(target, target))))
+    missed = jnp.sum(jnp.where(first, _missed(met, rows), 0), axis=0)
+    part = jnp.mean(failed.astype(missed.dtype), axis=0)
+    return part + jnp.log1p(jnp.where(failed[-1], missed, off))
+
+
+def _missed(met: Meeting, rows: Row) -> Array:
+    """By how much rays miss each row, come to it from behind or are bent too far, (R, W, Q)."""
+    first, live, bends = (a[:, None, None] for a in (rows.first, rows.live, rows.bends))
+    back = jnp.where(first, 0, jnp.maximum(-met.length, 0)) + jnp.maximum(-met.front, 0)
+    back = jnp.where(live, back, 0) + jnp.where(bends, jnp.maximum(-met.through, 0), 0)
+    # By how much a conic is missed, on from the total reflection of rays that graze it.
+    square, linear, constant = quadratic(met.point, met.direction, rows.surface.wide)
+    conic = jnp.maximum(square * constant - linear**2, 0)
+    conic = conic + jnp.where(bends, jnp.maximum(rows.ratio**2 - 1, 0), 0)
+    return jnp.where(met.crosses, back, conic)
