@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.aperture import depths
+from ..lens.clearance import clearance
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
@@ -16,7 +16,7 @@ from . import fermat
 from .meet import cross
 from .solve import Solver, solve
 from .status import Status
-from .system import System, Vector, dot, placed, system_of, turn
+from .system import System, Vector, placed, system_of, turn
 
 
 class Bundle(NamedTuple):
@@ -114,13 +114,7 @@ def _traced(
     arrival = turn(rotation, found.arrival, back=True)
     path = fermat.optical_path(found.hits, system)
     hits, status = on_all_surfaces(lens, system, found.hits, target, status)
-    edge = lens.semi_diameter.at[lens.stop].set(jnp.inf)[:, None, None]
-    stopped = jnp.any(dot(hits, hits) > edge**2, axis=0)
-    if lens.apertures is not None:
-        blocks = np.array(lens.apertures.blocks)[:, None, None]
-        depth = depths(lens.apertures, hits)
-        stopped = stopped | jnp.any(jnp.where(blocks, depth > 0, depth < 0), axis=0)
-    stopped = stopped & (status == Status.OK)
+    stopped = jnp.any(clearance(lens, hits) < 0, axis=0) & (status == Status.OK)
     status = jnp.where(stopped, Status.CLIPPED, status).astype(jnp.int32)
     return Bundle(hits, status, arrival, path, found.steps), system, found.hits
 
