@@ -81,7 +81,7 @@ def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Arra
     if system.stop is not None:
         places.insert(system.before, lens.stop)
     lost = fates(system, launch) != Status.OK
-    ends = jnp.array(places)[jnp.argmax(lost, axis=0)]
+    ends = jnp.array(places, jnp.int32)[jnp.argmax(lost, axis=0)]
     ends = jnp.where(jnp.any(lost, axis=0), ends, -1)
     clips = clipping_surface(lens, bundle.hits)
     return bundle.status, jnp.where(bundle.status == Status.CLIPPED, clips, ends)
