@@ -34,7 +34,7 @@ TESTS = (
     "tests/design/test_optimum.py::test_singlet_reaches_the_known_optimum_in_twenty_jacobians",
     "tests/learn/test_train.py::test_training_moves_the_sensor_to_focus_and_compiles_once",
     "tests/learn/test_images.py",
-    "tests/runs",
+    "tests/experiments/runs",
 )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 import drt_jax
 from drt_jax.lens.glass import Dispersion
+from drt_jax.lens.lens import Labels
 
 RAYS = 8  # of each scene: the chief ray, three on the rim, the rest at random
 WAVELENGTH = 0.55
@@ -41,10 +42,13 @@ def batch_of(parts, h, stop, media=None, **static):
     schott = np.zeros((count, surfaces + 1, 6))
     schott[..., 0] = 1 if media is None else media**2
     none = jnp.zeros((count, surfaces + 1, 3))
-    names = {"glasses": tuple(f"medium {i}" for i in range(surfaces + 1))}
+    ranges = jnp.broadcast_to(jnp.array([0.1, 10.0]), (count, surfaces + 1, 2))
+    glasses = static.pop("glasses", tuple(f"medium {i}" for i in range(surfaces + 1)))
     arrays = {name: jnp.asarray(value, float) for name, value in parts.items()}
-    constants = Dispersion(none, none, jnp.asarray(schott))
-    return drt_jax.Lens(dispersion=constants, stop=stop, **names | static, **arrays)
+    constants = Dispersion(none, none, jnp.asarray(schott), ranges)
+    return drt_jax.Lens(
+        dispersion=constants, stop=stop, labels=Labels("", glasses), **static, **arrays
+    )
 
 
 def pupil_points(rng, count):

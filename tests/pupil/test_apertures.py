@@ -135,7 +135,7 @@ def test_derivatives_by_sizes_and_centres(cut):
     np.testing.assert_allclose(forward, total, rtol=1e-9)
     h = 1e-3
     for leaf, places in (
-        ("bilateral", [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]),
+        ("half", [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)]),
         ("centre", [(0, 1), (1, 1)]),
     ):
         value = getattr(cut.apertures, leaf)

@@ -101,8 +101,9 @@ def found(lens, rule):
 
     def of(lens):
         moments = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=rule)
-        _, mean, ((xx, xy), (_, yy)) = moments.passed, *(a[0] for a in moments.full(4.0)[:2])
-        return jnp.stack([moments.passed[0], *mean, xx, yy, xy])
+        found = moments.full(4.0)
+        (xx, xy), (_, yy) = found.covariance[0]
+        return jnp.stack([found.passed[0], *found.mean[0], xx, yy, xy])
 
     return of(lens), jax.jacrev(of)(lens)
 
