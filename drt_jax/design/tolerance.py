@@ -16,9 +16,10 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, ONCE, jit
+from ..image.spot import deviations, normalised
 from ..inputs import shown
 from ..lens.lens import Lens
-from ..numerics import concrete, safe_divide
+from ..numerics import concrete, safe_divide, safe_sqrt
 from ..rays.status import Status
 from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
 from .perturbed import PerturbedLens
@@ -59,20 +60,19 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
     good = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
     light = jnp.where(good, light, 0)
     arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
-    both = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
-    dim = len(both)
-    both += [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
-    values = jnp.where(good[None], jnp.stack(both), 0)
-    total = jnp.sum(light, axis=(1, 2), keepdims=True)
-    weight = safe_divide(light, jnp.broadcast_to(total, light.shape))
-    # Of half a pupil, the other half has the opposite x, of a meridian the opposite y.
-    across = {"rotational": [0], "bilateral": [1], "none": [1, 1]}[rays.symmetry]
-    even = jnp.asarray(([0] * (dim - len(across)) + across) * 2, light.dtype)
-    mean = jnp.sum(weight[None] * values, axis=(2, 3)) * even[:, None]
-    apart = (values - mean[..., None, None]) * jnp.sqrt(jnp.where(good, weight, 1))[None]
-    apart = jnp.where(good[None], apart, 0).reshape(2 * dim, len(light), -1)
-    centre = jnp.concatenate([jnp.zeros_like(mean[: 2 - dim]), mean[:dim]])
-    return apart[:dim], apart[dim:], centre
+    hits = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
+    slopes = [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
+    weight = normalised(light, (-2, -1))
+    root = safe_sqrt(weight)
+
+    def scaled(values: list[Array]) -> tuple[Array, tuple[Array, ...]]:
+        known = tuple(jnp.where(good, value, 0) for value in values)
+        parts, means = deviations(known, weight, rays.symmetry, (-2, -1))
+        return jnp.stack([root * part for part in parts]).reshape(len(hits), len(light), -1), means
+
+    (apart, means), (growth, _) = scaled(hits), scaled(slopes)
+    centre = jnp.stack(means)[..., 0, 0]
+    return apart, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
 
 
 def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:

@@ -59,6 +59,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..image.spot import deviations, normalised
 from ..image.wavefront import path_differences
 from ..lens.glass import glass_map_distance
 from ..lens.lens import Lens
@@ -123,25 +124,15 @@ def _hits(rays: FieldRays) -> tuple[Array, Array]:
     part (V, W, Q) of the light of all wavelengths of a view."""
     light = jnp.where(rays.arrives, rays.weights, 0)[..., EXTRAS:]
     # Of each wavelength the light that arrives, as in `psf_moments`.
-    light = safe_divide(light, jnp.sum(light, axis=-1, keepdims=True))
-    light = light * rays.wavelength_weights[None, :, None]
+    light = normalised(light) * rays.wavelength_weights[None, :, None]
     return jnp.where(light[None] > 0, rays.sensor_hits[..., EXTRAS:], 0), light
-
-
-def _centred(values: Array, light: Array, axes: tuple[int, ...]) -> Array:
-    """Values (V, W, Q) less their mean over axes."""
-    total, mean = (jnp.sum(a, axis=axes, keepdims=True) for a in (light, light * values))
-    return values - safe_divide(mean, total)
 
 
 def _spread(rays: FieldRays, axes: tuple[int, ...]) -> Array:
     """Distances of rays from the centroid over `axes`, times the root of their light, mm, (D, V, W,
     Q)."""
     hits, light = _hits(rays)
-    parts = []
-    for k, hit in enumerate(hits):
-        across = len(hits) == 1 or (k == 0 and rays.symmetry == "bilateral")
-        parts.append(hit if across else _centred(hit, light, axes))  # else it averages to 0
+    parts, _ = deviations(tuple(hits), normalised(light, axes), rays.symmetry, axes)
     return jnp.stack(parts) * safe_sqrt(light)[None]
 
 
@@ -173,7 +164,8 @@ def _path_difference(lens: Lens, rays: FieldRays) -> Array:
     of_view = lambda bundle: path_differences(lens, rays.wavelengths, bundle, None)[0]  # noqa: E731
     waves = jax.vmap(of_view)(rays.bundle)[..., EXTRAS:]
     _, light = _hits(rays)
-    return _centred(waves, light, (-1,)) * safe_sqrt(light)
+    mean = jnp.sum(normalised(light) * waves, axis=-1, keepdims=True)
+    return (waves - mean) * safe_sqrt(light)
 
 
 def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:

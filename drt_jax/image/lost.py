@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.aperture import depths
+from ..lens.clearance import clipping_surface
 from ..lens.lens import Lens
 from ..lens.order import crossing, neighbours_now, told
 from ..lens.scene import Scene
@@ -14,7 +14,7 @@ from ..rays.aim import beam_size, paraxial_launch
 from ..rays.find import Found
 from ..rays.snell import meetings
 from ..rays.status import Status
-from ..rays.trace import Bundle, aims, bundle_of
+from ..rays.trace import aims, bundle_of
 
 _HOW = {
     Status.OK: "arrives, but by none of the rays of the rule",
@@ -34,14 +34,12 @@ def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, colour: int
     rule: whose weights tell how much light a ray stands for. found: its rays. All is known.
     """
     _, weights = rule.points(lens, scene)
-    bundle, row = _ends(lens, scene, rule, found)
-    status, row = np.asarray(bundle.status)[colour], np.asarray(row)[colour]
-    weight = np.broadcast_to(np.asarray(weights, float), bundle.status.shape)[colour]
-    edges = np.argmax(_stopped(lens, bundle)[:, colour], axis=0)
-    surface = np.where(status == Status.CLIPPED, edges, row)
+    status, surface = (np.asarray(a) for a in _ends(lens, scene, rule, found))
+    weight = np.broadcast_to(np.asarray(weights, float), status.shape)[colour]
     names = {-1: "a surface", lens.count: "the sensor"}
     parts: dict[str, float] = {}
-    for code, index, share in zip(status.tolist(), surface.tolist(), weight.tolist(), strict=True):
+    rays = status[colour].tolist(), surface[colour].tolist()
+    for code, index, share in zip(*rays, weight.tolist(), strict=True):
         place = names.get(index, f"surface {index}")
         how = _HOW[Status(code)].format(place)
         parts[how] = parts.get(how, 0.0) + share
@@ -64,9 +62,10 @@ def check_order(lens: Lens) -> None:
 
 
 @jax.jit
-def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Bundle, Array]:
-    """The bundle of known rays, and the surface (W, Q) where each that paraxial optics launches
-    towards its point of the stop ends, S for the sensor, -1 for none."""
+def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Array, Array]:
+    """The status of known rays, and the surface (W, Q) where each ends, S for the sensor, -1 for
+    none: the first that clips it, or where the one does that paraxial optics launches towards its
+    point of the stop."""
     points, _ = rule.points(lens, scene)
     system, target = aims(lens, scene, points)
     bundle = bundle_of(lens, scene, system, target, found)
@@ -75,17 +74,7 @@ def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Bund
     if system.stop is not None:
         places.insert(system.before, lens.stop)
     failed = meetings(system, launch).status != Status.OK
-    ends = jnp.array(places)[jnp.argmax(failed, axis=0)]
-    return bundle, jnp.where(jnp.any(failed, axis=0), ends, -1)
-
-
-def _stopped(lens: Lens, bundle: Bundle) -> np.ndarray:
-    """Whether each surface and the sensor clips rays, (S + 1, W, Q)."""
-    semi = np.asarray(lens.semi_diameter.at[lens.stop].set(jnp.inf))
-    wide = np.sqrt(sum(np.asarray(hit) ** 2 for hit in bundle.hits))
-    found = wide > semi[:, None, None]
-    if lens.apertures is not None:
-        pairs = zip(lens.apertures.surfaces, lens.apertures.blocks)
-        for (surface, blocks), depth in zip(pairs, np.asarray(depths(lens.apertures, bundle.hits))):
-            found[surface] |= (depth > 0) == blocks
-    return found
+    ends = jnp.array(places, jnp.int32)[jnp.argmax(failed, axis=0)]
+    ends = jnp.where(jnp.any(failed, axis=0), ends, -1)
+    clips = clipping_surface(lens, bundle.hits)
+    return bundle.status, jnp.where(bundle.status == Status.CLIPPED, clips, ends)

@@ -18,6 +18,7 @@ from ..pupil.rules import PupilRule
 from ..rays.solve import Solver, solve
 from ..rays.system import Vector
 from ..rays.trace import Bundle, trace_bundle
+from .spot import deviations, mean_products, normalised
 
 
 @jax.tree_util.register_dataclass
@@ -122,7 +123,7 @@ def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusM
     """Moments of traced rays; `weights` (1 or W, Q) are those of the rule."""
     weight = weights * rule.transmission(lens, bundle)
     passed = jnp.sum(weight, axis=-1)
-    weight = safe_divide(weight, jnp.broadcast_to(passed[:, None], weight.shape))
+    weight = normalised(weight)
     # How the hits move with the sensor.
     slope = tuple(safe_divide(a, bundle.arrival[-1]) for a in bundle.arrival[:-1])
     motion = lens.sensor_motion
@@ -131,38 +132,12 @@ def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusM
     counts = weight != 0
     hit = tuple(jnp.where(counts, h[-1], 0) for h in bundle.hits)
     slope = tuple(jnp.where(counts, s, 0) for s in slope)
-    if rule.symmetry == "rotational":
-        mean, tilt, spread = _meridional(weight, hit[0], slope[0])
-    else:
-        mean, tilt, spread = _central(weight, hit, slope, rule.symmetry == "bilateral")
-    return FocusMoments(lens.sensor, mean, tilt, spread, passed)
+    (x, mean), (u, tilt) = (deviations(v, weight, rule.symmetry) for v in (hit, slope))
+    pairs = (1, x, x), (2, x, u), (1, u, u)
+    spread = [k * mean_products(a, b, weight, rule.symmetry) for k, a, b in pairs]
+    return FocusMoments(lens.sensor, _plane(mean), _plane(tilt), jnp.stack(spread), passed)
 
 
-def _meridional(weight: Array, y: Array, u: Array) -> tuple[Array, Array, Array]:
-    """y = rho(r) on one radius; over the full circle <xx> = <yy> = <rho^2> / 2."""
-    products = (y * y, 2 * y * u, u * u)
-    spread = jnp.stack([jnp.sum(weight * p, axis=-1) for p in products]) / 2
-    zero = jnp.zeros((weight.shape[0], 2), weight.dtype)
-    return zero, zero, jnp.stack([spread, spread], axis=-1)
-
-
-def _central(weight: Array, hit: Vector, slope: Vector, half: bool) -> tuple[Array, Array, Array]:
-    """Means and central products; with `half` a pupil the other half is the mirror image, so that
-    x and x y average to 0."""
-
-    def average(values):
-        return jnp.sum(weight * values, axis=-1)
-
-    mean, tilt = ([average(a) for a in vector] for vector in (hit, slope))
-    if half:
-        mean[0], tilt[0] = jnp.zeros_like(mean[0]), jnp.zeros_like(tilt[0])
-    x = tuple(a - m[:, None] for a, m in zip(hit, mean, strict=True))
-    u = tuple(a - m[:, None] for a, m in zip(slope, tilt, strict=True))
-    pairs = ((0, 0), (1, 1)) if half else ((0, 0), (1, 1), (0, 1))
-    spread = [
-        [average(x[i] * x[j]) for i, j in pairs],
-        [average(x[i] * u[j] + u[i] * x[j]) for i, j in pairs],
-        [average(u[i] * u[j]) for i, j in pairs],
-    ]
-    rows = jnp.stack([jnp.stack(row, axis=-1) for row in spread])
-    return jnp.stack(mean, axis=-1), jnp.stack(tilt, axis=-1), rows
+def _plane(mean: Vector) -> Array:
+    """Means, D arrays (W, 1), as (W, 2)."""
+    return jnp.concatenate([jnp.zeros_like(mean[0])] * (2 - len(mean)) + [*mean], axis=-1)

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.aperture import depths
+from ..lens.clearance import clearance
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
-from ..numerics import Numbers, concrete, real_array, safe_sqrt
+from ..numerics import Numbers, concrete, real_array
 from ..rays.status import Status
-from ..rays.system import Vector, dot
+from ..rays.system import Vector
 from ..rays.trace import Bundle
 from . import patterns
 
@@ -132,17 +132,11 @@ class Soft(PupilRule):
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
         """The product of the steps of all apertures but the stop's circle, and obscurations."""
         whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
-        radius = safe_sqrt(dot(bundle.hits, bundle.hits))
-        edge = lens.semi_diameter[:, None, None]
-        bounded = jnp.isfinite(edge).at[lens.stop].set(False)
-        width = jnp.asarray(self.width, radius.dtype)
-        within = jnp.where(bounded, (jnp.where(bounded, edge, 0) - radius) / width, jnp.inf)
-        steps = jnp.prod(jax.nn.sigmoid(within), axis=0)
-        if lens.apertures is not None:
-            sign = jnp.where(jnp.array(lens.apertures.blocks), -1, 1)[:, None, None]
-            within = sign.astype(width.dtype) * depths(lens.apertures, bundle.hits) / width
-            steps = steps * jnp.prod(jax.nn.sigmoid(within), axis=0)
-        return jnp.where(whole, steps, 0)
+        inside = clearance(lens, bundle.hits)
+        bounded = jnp.isfinite(inside)  # else the width would have no derivative
+        inside = jnp.where(bounded, inside, 0) / jnp.asarray(self.width, inside.dtype)
+        steps = jax.nn.sigmoid(jnp.where(bounded, inside, jnp.inf))
+        return jnp.where(whole, jnp.prod(steps, axis=0), 0)
 
 
 @jax.tree_util.register_dataclass

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..lens.aperture import depths
+from ..lens.clearance import clearance
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
@@ -21,7 +21,7 @@ from .find import Found
 from .meet import cross
 from .solve import Solver, solve
 from .status import Status
-from .system import System, Vector, dot, placed, system_of, turn
+from .system import System, Vector, placed, system_of, turn
 
 
 class Bundle(NamedTuple):
@@ -108,21 +108,11 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
     status = jnp.where(known, status, jnp.int32(Status.NO_INDEX))
     hits, good = on_all_surfaces(lens, system, found.hits, target, status == Status.OK)
     status = jnp.where((status == Status.OK) & ~good, jnp.int32(Status.MISSED), status)
-    status = jnp.where(good & _clipped(lens, hits), jnp.int32(Status.CLIPPED), status)
+    clipped = good & jnp.any(clearance(lens, hits) < 0, axis=0)
+    status = jnp.where(clipped, jnp.int32(Status.CLIPPED), status)
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = turn(rotation, found.arrival, back=True)
     return Bundle(hits, status, arrival, fermat.optical_path(found.hits, system), found.steps)
-
-
-def _clipped(lens: Lens, hits: Vector) -> Array:
-    """Whether hits D (S + 1, W, Q) lie outside of an aperture or inside an obscuration, (W, Q)."""
-    edge = lens.semi_diameter.at[lens.stop].set(jnp.inf)[:, None, None]
-    clipped = jnp.any(dot(hits, hits) > edge**2, axis=0)
-    if lens.apertures is None:
-        return clipped
-    blocks = np.array(lens.apertures.blocks)[:, None, None]
-    depth = depths(lens.apertures, hits)
-    return clipped | jnp.any(jnp.where(blocks, depth > 0, depth < 0), axis=0)
 
 
 def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:

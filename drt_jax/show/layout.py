@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 
 from ..compilation import ONCE, jit
 from ..lens.aperture import depths
+from ..lens.clearance import clipping_surface
 from ..lens.lens import Lens, sag
 from ..lens.scene import Scene, scene_of
 from ..pupil.patterns import hexapolar
@@ -77,10 +78,10 @@ def draw(
     hits, ends = [], []
     for angle in angles:
         scene = scene_of(lens, angle, distance, wavelength)
-        points, status = _fan(lens, scene, rays)
-        hits.append(points[status == Status.OK][:, corners, :0:-1])
-        clipped = points[status == Status.CLIPPED]
-        for ray, stop in zip(clipped, np.argmax(outside(lens, clipped), axis=1)):
+        fan = _fan(lens, scene, rays)
+        hits.append(fan.points[fan.status == Status.OK][:, corners, :0:-1])
+        clipped = fan.status == Status.CLIPPED
+        for ray, stop in zip(fan.points[clipped], fan.clips[clipped]):
             cut = [*(k for k in lens.live if k < stop), stop]
             ends.append((ray[cut, :0:-1], angle))
     drawn = np.concatenate([np.zeros((1, 2)), *(hit.reshape(-1, 2) for hit in hits)])
@@ -107,42 +108,63 @@ def draw(
     return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles)
 
 
+class _Traced(NamedTuple):
+    """Q rays of one wavelength.
+
+    points: (Q, S + 1, 3), mm along the axes of the lens. hits: (Q, S + 1, 2), x and y from the
+    vertices, along the axes of the surfaces. directions: (Q, 3), at the sensor, along its axes.
+    status: (Q,). clips: (Q,), the first surface whose aperture stops a clipped ray.
+    """
+
+    points: np.ndarray
+    hits: np.ndarray
+    directions: np.ndarray
+    status: np.ndarray
+    clips: np.ndarray
+
+
 def _rays(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
     rays = trace_rays(lens, scene.field, scene.distance, scene.wavelengths, pupil)
-    return rays.points[0], rays.directions[0, :, -1], rays.status[0]
+    points, directions = rays.points[0], rays.directions[0, :, -1]
+    vertex, across, turned = lens.places
+    across = jnp.zeros((len(vertex), 2), vertex.dtype) if across is None else across
+    own = points - jnp.concatenate([across, vertex[:, None]], axis=1)[None]
+    if turned is not None:
+        own = jnp.einsum("qsi,sij->qsj", own, turned)
+        directions = directions @ turned[-1]
+    hits = own[..., :2]
+    clips = clipping_surface(lens, (hits[..., 0].T, hits[..., 1].T))
+    return points, hits, directions, rays.status[0], clips
 
 
 _trace = jit(_rays, ONCE)
 
 
-def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Hits (Q, S + 1, 3), directions at the sensor (Q, 3) and status (Q,) of rays of one
-    wavelength through points (Q, 2) of the stop, of its radius."""
+def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> _Traced:
+    """Rays of one wavelength through points (Q, 2) of the stop, of its radius."""
     filled = np.resize(pupil, (-(-len(pupil) // _RAYS) * _RAYS, 2))
     found = _trace(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
-    return tuple(np.asarray(a)[: len(pupil)] for a in found)
+    return _Traced(*(np.asarray(a)[: len(pupil)] for a in found))
 
 
-def _fan(lens: Lens, scene: Scene, rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """Hits (N, S + 1, 3) and status (N,) of an even fan of meridional rays, and then of those at
-    the edges of what passes, where the stop's rim is not the edge."""
+def _fan(lens: Lens, scene: Scene, rays: int) -> _Traced:
+    """An even fan of meridional rays, and then those at the edges of what passes, where the
+    stop's rim is not the edge."""
 
     def traced(heights):
-        points, _, status = _traced(lens, scene, np.stack([0 * heights, heights], axis=-1))
-        return points, status
+        return _traced(lens, scene, np.stack([0 * heights, heights], axis=-1))
 
-    points, status = traced(np.linspace(-1.0, 1.0, rays))
-    heights = np.linspace(-1.0, 1.0, _RAYS)
+    fan, heights = traced(np.linspace(-1.0, 1.0, rays)), np.linspace(-1.0, 1.0, _RAYS)
     for _ in range(_SCANS):
-        found, ends = traced(heights)
-        good = ends == Status.OK
+        found = traced(heights)
+        good = found.status == Status.OK
         (last,) = np.nonzero(good[1:] != good[:-1])
         if not len(last):
-            return points, status
+            return fan
         edges = last + good[last + 1]
         pairs = zip(heights[last], heights[last + 1])
         heights = np.concatenate([np.linspace(*pair, _RAYS // len(last)) for pair in pairs])
-    return np.concatenate([points, found[edges]]), np.concatenate([status, ends[edges]])
+    return _Traced(*(np.concatenate([a, b[edges]]) for a, b in zip(fan, found)))
 
 
 class Beam(NamedTuple):
@@ -168,45 +190,19 @@ def beam_of(lens: Lens, field: float, distance: float, wavelength: float) -> Bea
     rim = np.linspace(0, 2 * np.pi, _RIM)
     pupil = np.concatenate([hexapolar(_RINGS)[0], np.stack([np.sin(rim), np.cos(rim)], axis=-1)])
     scene = scene_of(lens, field, distance, wavelength)
-    points, directions, status = _traced(lens, scene, pupil)
-    clipped, arrived = points[status == Status.CLIPPED], points[status == Status.OK]
-    clipping = np.unique(np.argmax(outside(lens, clipped), axis=1)).tolist()
+    _, hits, directions, status, clips = _traced(lens, scene, pupil)
+    clipping = np.unique(clips[status == Status.CLIPPED]).tolist()
     ends = [words for end, words in _ENDS.items() if np.any(status == end)]
-    wide = np.max(np.linalg.norm(local_hits(lens, arrived), axis=-1), axis=0, initial=0.0)
+    wide = np.max(np.linalg.norm(hits[status == Status.OK], axis=-1), axis=0, initial=0.0)
     inside = (status == Status.OK) & (np.arange(len(pupil)) < len(pupil) - _RIM)
     if not np.any(inside):
         return Beam(clipping, ends, wide, math.nan, math.nan, math.nan)
-    hits, slopes = local_hits(lens, points[inside])[:, -1], directions[inside]
-    turned = lens.places[2]
-    if turned is not None:
-        slopes = slopes @ np.asarray(turned)[-1]
+    hits, slopes = hits[inside, -1], directions[inside]
     hits, slopes = (a - a.mean(axis=0) for a in (hits, slopes[:, :2] / slopes[:, 2:]))
     size, growth = np.mean(np.sum(hits**2, axis=1)), np.mean(np.sum(slopes**2, axis=1))
     shift = -np.mean(np.sum(hits * slopes, axis=1)) / growth if growth > 0 else 0.0
     best = math.sqrt(max(size - growth * shift**2, 0.0))
     return Beam(clipping, ends, wide, math.sqrt(size), best, float(shift))
-
-
-def outside(lens: Lens, points: np.ndarray) -> np.ndarray:
-    """Whether rays through points (Q, S + 1, 3), mm along the axes of the lens, are stopped by an
-    aperture of each surface, (Q, S + 1); the stop's rim stops none, as it is filled."""
-    hits = local_hits(lens, points)
-    semi = np.asarray(lens.semi_diameter.at[lens.stop].set(jnp.inf))
-    found = np.linalg.norm(hits, axis=-1) > semi
-    if lens.apertures is not None:
-        inside = depths(lens.apertures, tuple(jnp.asarray(a.T) for a in np.moveaxis(hits, -1, 0)))
-        for surface, blocks, depth in zip(lens.apertures.surfaces, lens.apertures.blocks, inside):
-            found[:, surface] |= (np.asarray(depth) > 0) == blocks
-    return found
-
-
-def local_hits(lens: Lens, points: np.ndarray) -> np.ndarray:
-    """x and y (Q, S + 1, 2), along the axes of the surfaces and from their vertices, of points
-    (Q, S + 1, 3) along the axes of the lens, mm."""
-    vertex, across, turned = jax.tree.map(np.asarray, lens.places)
-    across = np.zeros((len(vertex), 2)) if across is None else across
-    own = points - np.concatenate([across, vertex[:, None]], axis=1)
-    return (own if turned is None else np.einsum("qsi,sij->qsj", own, turned))[..., :2]
 
 
 def _extents(lens: Lens, reach: float) -> tuple[np.ndarray, np.ndarray]:

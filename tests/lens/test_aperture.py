@@ -1,10 +1,14 @@
 """Depths inside of apertures, against geometry."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from drt_jax import load_lens
 from drt_jax.lens.aperture import Apertures, depths
+from drt_jax.lens.clearance import clearance, clipping_surface
 
 HALF = jnp.array([[2.0, 9.0], [3.0, 0.8], [1.5, 0.4]])
 CENTRE = jnp.array([[0.3, -0.2], [0.5, 0.1], [-1.0, 2.0]])
@@ -44,3 +48,22 @@ def test_on_the_meridian_and_in_the_middle():
     np.testing.assert_allclose(depths(both, (hits,))[0], [1.7, 2.0, -0.5])
     slope = jax.jacrev(lambda h: depths(both, (0 * h, h)))(hits)
     assert np.all(np.isfinite(slope))
+
+
+def test_clearance_of_all_edges():
+    """Circles of semi-diameters but the stop's, then other apertures, obscurations from outside."""
+    lens = load_lens("cooke_triplet")
+    extra = Apertures(
+        jnp.array([[4.0, 0.0], [1.0, 2.0]]), surfaces=(1, 0), kinds=("circle", "rectangle"),
+        blocks=(False, True),
+    )  # fmt: skip
+    semi = jnp.full_like(lens.semi_diameter, jnp.inf).at[2].set(3.0).at[lens.stop].set(1.0)
+    lens = dataclasses.replace(lens, semi_diameter=semi, apertures=extra)
+    y = jnp.array([0.5, 2.6, 3.5, 4.5])
+    hits = tuple(jnp.broadcast_to(a, (lens.count + 1, 4)) for a in (0 * y, y))
+    found = np.asarray(clearance(lens, hits))
+    assert found.shape == (lens.count + 3, 4)
+    np.testing.assert_allclose(found[2], 3 - y)
+    np.testing.assert_allclose(found[-2:], [4 - y, [-1, 0.6, 1.5, 2.5]])
+    assert np.all(np.isinf(np.delete(found, [2, -2, -1], axis=0)))
+    np.testing.assert_array_equal(clipping_surface(lens, hits), [0, 2, 2, 1])
