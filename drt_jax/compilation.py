@@ -37,7 +37,8 @@ def _known(name: str, value: Any) -> bool:
 
 def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
     """`jax.jit(function, **keywords)` with the options that the backend knows, asked at the first
-    call. Without any inside of another program or of a derivative, where JAX takes none."""
+    call. Without any inside of another program or of a derivative, where JAX takes none: these
+    are its `program(False)`."""
 
     @functools.cache
     def program(outside: bool) -> Callable:
@@ -49,4 +50,5 @@ def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Calla
         # Inside `jax.jit` a new array is a tracer, too.
         return program(concrete((args, named, jnp.zeros(()))))(*args, **named)
 
+    run.program = program  # type: ignore[attr-defined]
     return run

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.order import may_cross
 from ..lens.scene import Scene, field_array, scene_of
@@ -162,7 +163,7 @@ def _moments(
     return found
 
 
-@partial(jax.jit, static_argnames="solver")
+@partial(jit, wanted=LARGE, static_argnames="solver")
 def _weigh(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> tuple:
     """Moments, the rays on the live surfaces, and whether any fails and whether any is clipped."""
     points, weights = rule.points(lens, scene)

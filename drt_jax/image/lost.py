@@ -1,10 +1,12 @@
 """Why no light arrives: which surface stops it, and which surfaces cross."""
 
-import jax
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import ONCE, jit
 from ..lens.clearance import clipping_surface
 from ..lens.lens import Lens
 from ..lens.order import crossing, neighbours_now, told
@@ -61,7 +63,7 @@ def check_order(lens: Lens) -> None:
             raise ValueError(f"{told(lens, pair, 0.0)}; light cannot go backwards")
 
 
-@jax.jit
+@functools.partial(jit, wanted=ONCE)
 def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Array, Array]:
     """The status of known rays, and the surface (W, Q) where each ends, S for the sensor, -1 for
     none: the first that clips it, or where the one does that paraxial optics launches towards its

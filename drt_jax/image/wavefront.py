@@ -11,13 +11,14 @@ the sensor at P = C + e met the sphere at the distance R + t before P, where
 Source: Welford, Aberrations of Optical Systems (1986), ch. 7.
 """
 
+import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray_at_image
 from ..lens.scene import Scene, scene_of
@@ -87,7 +88,7 @@ def wavefront(
     return _wavefront(lens, scene, points, kappa)
 
 
-@jax.jit
+@functools.partial(jit, wanted=LARGE)
 def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) -> Wavefront:
     points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil])  # the chief ray first
     bundle = trace_bundle(lens, scene, (points[:, 0], points[:, 1]))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import LARGE, jit
 from ..lens.clearance import clearance
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
@@ -147,11 +148,11 @@ def trace_rays(
     scene, points = scene_of(lens, field, distance, wavelengths), stop_points(lens, pupil)
     count, size = len(points), _padded(len(points))
     if count == size or known_values((lens, scene, points)) is None:
-        return _trace_rays(lens, scene, points)
+        return _trace(lens, scene, points)
     # Bundles of nearly as many rays share a program: those that are not finite cost little.
     library = np if concrete(points) else jnp
     filled = library.pad(points, ((0, size - count), (0, 0)), constant_values=np.inf)
-    return _first(_trace_rays(lens, scene, filled), count)
+    return _first(_trace(lens, scene, filled), count)
 
 
 def _padded(count: int) -> int:
@@ -179,8 +180,8 @@ def stop_points(lens: Lens, pupil: Numbers) -> Array:
     return points
 
 
-@jax.jit
-def _trace_rays(lens: Lens, scene: Scene, pupil: Array) -> Rays:
+@functools.partial(jit, wanted=LARGE)
+def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     system, target = aims(lens, scene, (pupil[:, 0], pupil[:, 1]))
     found = solve(system, target)
     bundle = bundle_of(lens, scene, system, target, found)
