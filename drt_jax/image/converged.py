@@ -7,7 +7,7 @@ from values: `psf_moments` and `focus_moments` then take the rule, made outside.
 import itertools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -24,10 +24,10 @@ from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
-from ..rays.status import Status
-from ..rays.trace import aims, bundle_of
+from ..rays.trace import aims, bundle_of, trace_bundle
 from .lost import check_order, crossed, reasons
 from .moments import FocusMoments, Moments, check_sensor, weigh
+from .tiles import trace_rule
 
 _MAX_ORDER = 40
 # A spot below 1 nm is a point: relative to it, rounding would never converge.
@@ -156,23 +156,18 @@ def _moments(
             return trial.moments[0]
         # The rays are known; what is left is to weigh and to differentiate them.
         return _weigh_known(lens, scene, trial.used, trial.found[0])
-    found = _weigh(lens, scene, rule, solve)[0]
+    found = _weigh(lens, scene, rule)
     passed = known_values(found.passed)
     if passed is not None and not np.all(np.asarray(passed) > 0):
         _say_why(lens, scene, rule.symmetry, passed)
     return found
 
 
-@partial(jit, wanted=LARGE, static_argnames="solver")
-def _weigh(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> tuple:
-    """Moments, the rays on the live surfaces, and whether any fails and whether any is clipped."""
+@partial(jit, wanted=LARGE)
+def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> FocusMoments:
+    """The moments of a rule."""
     points, weights = rule.points(lens, scene)
-    system, target = aims(lens, scene, points)
-    found = solver(system, target)
-    bundle = bundle_of(lens, scene, system, target, found)
-    clipped = bundle.status == Status.CLIPPED
-    failing = jnp.any((bundle.status != Status.OK) & ~clipped)
-    return weigh(lens, rule, weights, bundle), found, failing, jnp.any(clipped)
+    return weigh(lens, rule, weights, trace_bundle(lens, scene, points))
 
 
 @jax.jit
@@ -289,7 +284,7 @@ def _try(
     lens: Lens, scenes: Sequence[Scene], rule: Gauss | Clipped, used: PupilRule, solver: Solver
 ) -> tuple[_Trial, bool, bool]:
     """A rule on all scenes; whether any ray fails, and whether any is clipped."""
-    parts = (_weigh(lens, scene, used, solver) for scene in scenes)
+    parts = (trace_rule(lens, scene, used, solver) for scene in scenes)
     moments, found, failing, cut = zip(*parts, strict=True)
     return _Trial(rule, used, moments, found), any(failing), any(cut)
 
@@ -315,6 +310,7 @@ def _warn_of_rounding(lens: Lens, rough: float, tolerance: float) -> None:
         )
 
 
+@cache
 def _padded(order: int, symmetry: Symmetry) -> Pattern:
     """A Gauss rule filled up with weightless rays, so that orders share a few compiled programs.
 
@@ -351,7 +347,7 @@ def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, passed: Numbers) -> N
         # Of an eager gradient, whose values were not seen before.
         scene_of(lens, scene.field, scene.distance, scene.wavelengths)
         rule = _padded(_TOLD, symmetry)
-        found = _weigh(lens, scene, rule, solve)[1]
+        found = trace_rule(lens, scene, rule, solve).found
         raise ValueError(
             f"no ray at {float(scene.wavelengths[colour]):g} um reaches the sensor: "
             f"{reasons(lens, scene, rule, found, colour)}{crossed(lens)}; see "

@@ -1,0 +1,81 @@
+"""The rays of a rule traced some at a time, so that rules of all sizes share a compiled program.
+
+All is known here: nothing of it runs inside `jax.jit`.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax import Array
+
+from ..compilation import LARGE, jit
+from ..lens.lens import Lens
+from ..lens.scene import Scene
+from ..pupil.clipped import Clipped
+from ..pupil.rules import PupilRule
+from ..rays.find import Found
+from ..rays.solve import Solver
+from ..rays.status import Status
+from ..rays.system import Vector
+from ..rays.trace import Bundle, aims, bundle_of
+from .moments import FocusMoments, weigh
+
+# Rays of a tile, by the number of their coordinates on the stop. Gauss rules of 13 nodes fill one.
+_TILE = {1: 42, 2: 208}
+
+
+class Traced(NamedTuple):
+    """The rays of a rule. found: those on the active surfaces; of rays without weight, MISSED.
+    failing, cut: whether any ray fails, and whether any is clipped."""
+
+    moments: FocusMoments
+    found: Found
+    failing: bool
+    cut: bool
+
+
+def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Traced:
+    """The rays of a rule, and their moments."""
+    points, weights = _points(lens, scene, rule)
+    waves, total = scene.wavelengths.size, weights.shape[-1]
+    # Of fitted rules most rays fill up only; of others, those without weight tell what is clipped.
+    fitted = isinstance(rule, Clipped)
+    rays = np.flatnonzero(np.any(np.asarray(weights), axis=0)) if fitted else np.arange(total)
+    size, count = _TILE[len(points)], len(rays)
+    tiles = np.resize(rays if count else 0, (max(-(-count // size), 1), size))
+    aimed = [np.broadcast_to(p, (waves, total)) for p in points]
+    parts = [_trace(lens, scene, tuple(p[:, tile] for p in aimed), solver) for tile in tiles]
+
+    def whole(*parts: Array) -> np.ndarray:  # (..., size) each -> (..., Q)
+        arrays = [np.asarray(a) for a in parts]
+        if not arrays[0].ndim:
+            return np.max(arrays, axis=0)
+        joined = np.concatenate(arrays, axis=-1)[..., :count]
+        blank = Status.MISSED if joined.dtype == np.int32 else 0
+        found = np.full((*joined.shape[:-1], total), blank, joined.dtype)
+        found[..., rays] = joined
+        return found
+
+    bundle, found = parts[0] if total == size else jax.tree.map(whole, *parts)
+    status = np.asarray(bundle.status)[:, rays]
+    cut = status == Status.CLIPPED
+    failing = np.any((status != Status.OK) & ~cut)
+    moments = _weigh(lens, rule, weights, bundle)
+    return Traced(moments, found, bool(failing), bool(np.any(cut)))
+
+
+@partial(jit, wanted=LARGE)
+def _points(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
+    return rule.points(lens, scene)
+
+
+@partial(jit, wanted=LARGE, static_argnames="solver")
+def _trace(lens: Lens, scene: Scene, points: Vector, solver: Solver) -> tuple[Bundle, Found]:
+    system, target = aims(lens, scene, points)
+    found = solver(system, target)
+    return bundle_of(lens, scene, system, target, found), found
+
+
+_weigh = jit(weigh, LARGE)
