@@ -21,215 +21,229 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import safe_divide
-from ..rays.aim import paraxial_launch
+from ..numerics import run_if, safe_divide
+from ..rays.aim import beam_size, nearest_start, no_fan, paraxial_launch, trace_fan
 from ..rays.status import Status
 from ..rays.system import System, Vector, determinant, dot, system_of
 from ..rays.trace import Bundle
 from . import boundary
+from .boundary import EdgeRays, Rays, Target, displace
+from .radial import CORNERS, Frame, RadialRule, changes, gauss
 from .rules import PupilRule, Symmetry, check_rule
-from .spokes import CORNERS, Spokes, changes, gauss, unit
 
 __all__ = ["Clipped"]
 
-# Steps of each stage of the search.
-_STEPS = 1, 48, 48, 16, 48
+# Steps of one search at most, and of that for corners.
+_STEPS, _CORNER_STEPS = np.int32(48), np.int32(16)
+# How far outside of other edges a corner may be, in units of the stop's semi-diameter.
+_BESIDE = 0.01
 
 
-def _stages(lens: Lens, system: System, spokes: Spokes, used: Array) -> list:
-    """The stages of the search: each takes what they found, the stages along a first axis, and
-    tells the rays to start from and their goals."""
-    like = jnp.zeros((2, system.index.shape[1], spokes.count), system.index.dtype)
-    of = lambda found, stage: jax.tree.map(lambda a: a[stage], found)  # noqa: E731
-    scouts = jnp.asarray(spokes.scouts(), like.dtype)
+class _Given(NamedTuple):
+    """What all stages of the search are given. used: (), how many spokes count."""
 
-    def goal(centre, toward=None, pair=None):
-        toward = like if toward is None else toward
-        pair = like.astype(jnp.int32) if pair is None else pair
-        return boundary.Goal(like + centre, toward, pair)
-
-    def shape(found):  # of what is left about the middle
-        return boundary.stretch(lens, jax.tree.map(lambda a: a[1, ..., :1], found.rays))
-
-    def scout(found):  # all over the stop, to where paraxial optics puts them
-        radius = lens.semi_diameter[lens.stop]
-        launch = paraxial_launch(system, tuple(like + radius * scouts[:, None]), 4 * radius)
-        arriving = boundary.arriving(system, jnp.stack(launch), radius)
-        return of(found.rays, 0)._replace(launch=arriving), goal(like)
-
-    def middle(found):  # all to the point deepest inside, by the model of the best scout
-        rays = of(found.rays, 0)
-        far = jnp.where(rays.good, boundary.outside(lens, rays, rays.point), jnp.inf)
-        best = jnp.argmin(far, axis=-1)[:, None]
-        rays = rays.at(best)
-        return rays.at(like[0].astype(jnp.int32)), goal(boundary.middle(lens, rays, scouts))
-
-    def ends(found):  # to the ends of even spokes
-        rays, toward = of(found.rays, 1), unit(jnp.asarray(spokes.even, like.dtype))[:, None]
-        return rays, goal(rays.point, boundary.moved(shape(found), toward))
-
-    def corners(found):  # to the corners, in the first places
-        even = of(found, 2)
-        place, pair = changes(boundary.ends(lens, even.rays, even.goal), spokes.symmetry == "none")
-        more = (0, spokes.count - CORNERS)
-        place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
-        rays = even.rays.at(jnp.round(place).astype(jnp.int32))
-        angle = place * (spokes.turn / (spokes.count - 1)) - np.pi / 2
-        toward = boundary.moved(shape(found), unit(angle))
-        line = boundary.ahead(lens, rays, goal(even.goal.centre, toward))[0]
-        return boundary.shifted(rays, line), goal(even.goal.centre, None, pair)
-
-    def nodes(found):  # to the ends of the spokes of the rule
-        own = shape(found)
-        rays, found = of(found.rays, 2), of(found, 3)
-        corner = (found.rays.point - found.goal.centre)[..., :CORNERS]
-        corner = boundary.moved(boundary.inverse(own), corner)
-        angle, _ = spokes.nodes(used, corner, _exists(lens, found)[:, :CORNERS])
-        toward = boundary.moved(own, unit(angle))
-        return rays.at(spokes.nearest(angle)), goal(found.goal.centre, toward)
-
-    return [scout, middle, ends, corners, nodes][: 3 if spokes.symmetry == "rotational" else 5]
+    lens: Lens
+    system: System
+    radial: RadialRule
+    used: Array
 
 
-def _exists(lens: Lens, found: boundary.Reached) -> Array:
-    """Whether rays (W, B) lie in corners of the boundary, or near it."""
-    inside = boundary.outside(lens, found.rays, found.rays.point) < 0.01
-    return found.settled & inside & (found.goal.pair[0] != found.goal.pair[1])
+class _State(NamedTuple):
+    """What the search knows before each of its stages.
+
+    frame: about the point deepest inside. passes: (W, 1), whether light passes there. even: rays at
+    the ends of even spokes. corners: C of them. latest: what the stage before has found.
+    """
+
+    frame: Frame
+    passes: Array
+    even: Rays
+    corners: EdgeRays
+    latest: EdgeRays
 
 
-def _find(
-    lens: Lens, system: System, spokes: Spokes, used: Array, crossing: bool
-) -> boundary.Reached:
-    """What the stages find, one after the other, along a first axis."""
-    stages = _stages(lens, system, spokes, used)
+# Rays to start from, B a colour, their targets, and how many steps at most.
+_Task = tuple[Rays, Target, Any]
 
-    def several(shape, dtype=system.index.dtype):
-        return jnp.zeros((len(stages), *shape, system.index.shape[1], spokes.count), dtype)
 
-    point, rates, rows = several((2,)), several((2, 2)), lens.count + 1 + crossing * len(lens.live)
-    hits, moves, no = several((2, rows)), several((2, 2, rows)), several((), bool)
-    goal = boundary.Goal(point, point, several((2,), jnp.int32))
-    rays = boundary.Rays(point, point, hits, rates, moves, no)
+def _target(rays: Rays, centre: Array, toward: Any = 0, pair: Any = 0) -> Target:
+    """A target of each ray: `centre` itself, the end of the half-line `toward`, or a corner."""
+    full = lambda a, kind: jnp.broadcast_to(jnp.asarray(a, kind), rays.point.shape)  # noqa: E731
+    kind = rays.point.dtype
+    return Target(full(centre, kind), full(toward, kind), full(pair, jnp.int32))
 
-    def run(stage, found):
-        start, goal = jax.lax.switch(stage, stages, found)
-        steps, exact = jnp.array(_STEPS, jnp.int32)[stage], (stage == 3) | (stage == last)
-        new = boundary.search(lens, system, start, goal, steps, exact)
-        return jax.tree.map(lambda a, b: a.at[stage].set(b), found, new)
 
-    last = len(stages) - 1  # with the corners, the rays that the rule is made of
-    start = boundary.Reached(rays, goal, several((), jnp.int32), no)
-    return jax.lax.fori_loop(0, len(stages), run, start)
+def _scouts(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """First, rays all over the stop, from where paraxial optics puts them."""
+    rays, radius = state.latest.rays, given.lens.semi_diameter[given.lens.stop]
+    pattern = jnp.asarray(given.radial.scouts(), radius.dtype)
+    points = jnp.zeros_like(rays.point) + radius * pattern[:, None]
+    launch = jnp.stack(paraxial_launch(given.system, tuple(points), 4 * radius))
+    rays = rays._replace(launch=launch)
+    return state, (rays, _target(rays, rays.point), np.int32(1))
+
+
+def _rescue(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """Where no scout of a colour arrived, the ray of a fan that crosses the stop nearest to its
+    centre."""
+    system, rays = given.system, state.latest.rays
+    dark = ~jnp.any(rays.good, axis=-1)
+    zero = jnp.zeros_like(rays.point[0])
+    rim = zero, zero + given.lens.semi_diameter[given.lens.stop]
+
+    def sought(launch):
+        fan = trace_fan(system, no_fan(system, len(dark)), tuple(launch), beam_size(system, rim)[1])
+        best = nearest_start(fan, tuple(jnp.zeros_like(launch[:, :, :1])))
+        return jnp.where(dark[None, :, None], jnp.stack(best), launch)
+
+    rays = rays._replace(launch=run_if(jnp.any(dark), sought, rays.launch))
+    return state, (rays, _target(rays, rays.point), jnp.any(dark).astype(jnp.int32))
+
+
+def _middle(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """All rays to the point deepest inside, by the model of the best scout."""
+    scouts = state.latest.rays
+    far = jnp.where(scouts.good, boundary.outside(scouts, scouts.point), jnp.inf)
+    best = jnp.argmin(far, axis=-1)[:, None]
+    pattern = jnp.asarray(given.radial.scouts(), far.dtype)
+    centre = boundary.middle(scouts.at(best), pattern)
+    rays = scouts.at(jnp.broadcast_to(best, far.shape))
+    return state, (rays, _target(rays, centre), _STEPS)
+
+
+def _ends(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """To the ends of even spokes about that point."""
+    rays, _, settled = state.latest
+    ray = jax.tree.map(lambda a: a[..., :1], rays)
+    passes = settled[:, :1] & (boundary.outside(ray, ray.point) < 0)
+    frame = Frame(ray.point, boundary.stretch(ray))
+    target = _target(rays, frame.centre, frame.toward(given.radial.even[None]))
+    return state._replace(frame=frame, passes=passes), (rays, target, _STEPS)
+
+
+def _corners(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """To the corners, in the first places: where one edge takes over from another."""
+    radial, frame, even = given.radial, state.frame, state.latest.rays
+    line = _target(even, frame.centre, frame.toward(radial.even[None]))
+    distance = boundary.edge_distance(even, line)
+    place, pair = changes(distance, radial.symmetry == "none")
+    more = (0, radial.count - CORNERS)
+    place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
+    rays = even.at(jnp.round(place).astype(jnp.int32))
+    angle = place * (radial.range / (radial.count - 1)) - np.pi / 2
+    line = _target(rays, frame.centre, frame.toward(angle))
+    rays = boundary.extrapolated(rays, boundary.newton_step(rays, line)[0])
+    target = _target(rays, frame.centre, pair=pair)
+    return state._replace(even=even), (rays, target, _CORNER_STEPS)
+
+
+def _nodes(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """To the ends of the spokes of the rule, which lie between the corners."""
+    rays, pair, settled = jax.tree.map(lambda a: a[..., :CORNERS], state.latest)
+    beside = boundary.outside(rays, rays.point) < _BESIDE
+    exists = settled & beside & (pair[0] != pair[1])
+    angle, _ = given.radial.nodes(state.frame, given.used, rays.point, exists)
+    start = state.even.at(given.radial.nearest(angle))
+    target = _target(start, state.frame.centre, state.frame.toward(angle))
+    return state._replace(corners=EdgeRays(rays, pair, exists)), (start, target, _STEPS)
+
+
+def _nothing(given: _Given, crossing: bool) -> _State:
+    """The state before the first stage."""
+    lens, waves, kind = given.lens, given.system.index.shape[1], given.system.index.dtype
+    edges = lens.count + 1 + crossing * len(lens.live) + boundary.aperture_edges(lens)
+    zeros = functools.partial(jnp.zeros, dtype=kind)
+
+    def none(count):
+        point, no = zeros((2, waves, count)), jnp.zeros((waves, count), bool)
+        q, rates = zeros((2, edges, waves, count)), zeros((2, 2, waves, count))
+        rays = Rays(point, point, q, rates, jnp.stack([q, q]), no)
+        return EdgeRays(rays, point.astype(jnp.int32), no)
+
+    one, latest = none(1), none(given.radial.count)
+    corners = none(0 if given.radial.symmetry == "rotational" else CORNERS)
+    frame = Frame(one.rays.point, one.rays.d_launch)
+    return _State(frame, one.settled, latest.rays, corners, latest)
 
 
 class _Plan(NamedTuple):
-    """The boundary without derivatives: C corners and B spokes, K = C + B rays.
-
-    centre: (2, W, 1). shape: (2, 2, W, 1), see `boundary.stretch`. point: (2, W, K) in units of
-    the stop's semi-diameter. launch: (2, W, K), mm, and aims: (2, 2, W, K), see `boundary.Rays`.
-    pair: (2, W, K), the edges that end a ray, for a spoke both the same. rates: (2, 2, W, K), see
-    `boundary.rates`.
-    follows: (W, K), whether a ray follows the lens. passes: (W, 1), whether light passes. used: (),
-    how many spokes count.
+    """The boundary without derivatives. edge: K = C + B rays, at C corners and at the ends of B
+    spokes, settled where they follow the lens. used: (), how many spokes count. Else see `_State`.
     """
 
-    centre: Array
-    shape: Array
-    point: Array
-    launch: Array
-    aims: Array
-    pair: Array
-    rates: Array
-    follows: Array
+    frame: Frame
     passes: Array
+    edge: EdgeRays
     used: Array
 
-    def nodes(self, spokes: Spokes, corner: Array) -> tuple[Array, Array]:
+    def spokes(self, radial: RadialRule, corner: Array) -> tuple[Array, Array]:
         """Directions (2, W, B) of the spokes between corners (2, W, C), and weights (W, B)."""
-        own = boundary.moved(boundary.inverse(self.shape), corner - self.centre)
-        angle, share = spokes.nodes(self.used, own, self.follows[:, : corner.shape[-1]])
-        return boundary.moved(self.shape, unit(angle)), share
+        exists = self.edge.settled[:, : corner.shape[-1]]
+        angle, share = radial.nodes(self.frame, self.used, corner, exists)
+        return self.frame.toward(angle), share
 
 
-def _plan(lens: Lens, scene: Scene, spokes: Spokes, used: Array, crossing: bool) -> _Plan:
-    found = _find(lens, system_of(lens, scene), spokes, used, crossing)
-    middle, nodes = (jax.tree.map(lambda a: a[k], found) for k in (1, -1))
-    passes = middle.settled & (boundary.outside(lens, middle.rays, middle.rays.point) < 0)
-    rays, pair, follows = nodes.rays, jnp.stack([nodes.edge] * 2), nodes.settled
-    if spokes.symmetry != "rotational":
-        corners = jax.tree.map(lambda a: a[3, ..., :CORNERS], found)
-        join = lambda a, b: jnp.concatenate([a, b], axis=-1)  # noqa: E731
-        rays, pair = jax.tree.map(join, corners.rays, rays), join(corners.goal.pair, pair)
-        follows = join(_exists(lens, corners), follows)
-    follows = follows & passes[:, :1]
-    first = jax.tree.map(lambda a: a[..., :1], middle.rays)
-    centre, shape = first.point, boundary.stretch(lens, first)
-    rates = boundary.rates(lens, rays, pair)
-    known = rays.point, rays.launch, rays.aims, pair, rates
-    return _Plan(centre, shape, *known, follows, passes[:, :1], used)
+def _plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, crossing: bool) -> _Plan:
+    """The boundary of the pupil, searched in stages, each from what those before it found.
 
+    One loop runs them all, so that a program holds the trace, which takes long to compile, once.
+    """
+    given = _Given(lens, system_of(lens, scene), radial, used)
+    trace = functools.partial(boundary.trace, lens, given.system, crossing)
+    stages = [_scouts, _rescue, _middle, _ends, _corners, _nodes]
+    count = 4 if radial.symmetry == "rotational" else 6  # on the meridian there are no corners
+    tasks = [functools.partial(stage, given) for stage in stages[:count]]
 
-def _followed(
-    crossing: bool, plan: _Plan, lens: Lens, scene: Scene, launch: Array
-) -> tuple[Array, Array]:
-    """Points (2, W, K) and `boundary.gaps` of the rays of a plan launched at (2, W, K)."""
-    hits, _ = boundary.traced(lens, system_of(lens, scene), launch, crossing)
-    point = hits[:, lens.stop] / lens.semi_diameter[lens.stop]
-    return point, boundary.gaps(lens, hits, plan.pair)
+    def run(stage, state):
+        state, task = jax.lax.switch(stage, tasks, state)
+        return state._replace(latest=boundary.search(trace, *task))
 
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _known_rates(
-    crossing: bool, lens: Lens, scene: Scene, launch: Array, plan: _Plan
-) -> tuple[Array, Array]:
-    """Derivatives by the point, of the launch and of the gaps of `_followed`: known numbers, only
-    theirs cost anything."""
-    return plan.aims, plan.rates
-
-
-@_known_rates.defjvp
-def _known_rates_jvp(crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
-    def rates(lens, scene, launch):
-        follow = functools.partial(_followed, crossing, primals[3], lens, scene)
-        columns = jax.vmap(lambda unit: jax.jvp(follow, (launch,), (unit,))[1])
-        points, gaps = columns(boundary.units(launch))
-        aims = boundary.inverse(points)
-        return aims, jnp.stack([boundary.moved(gaps, a) for a in aims])
-
-    return jax.jvp(rates, primals[:3], tangents[:3])
+    state = jax.lax.fori_loop(0, count, run, _nothing(given, crossing))
+    join = lambda a, b: jnp.concatenate([a, b], axis=-1)  # noqa: E731
+    edge = jax.tree.map(join, state.corners, state.latest)
+    edge = edge._replace(settled=edge.settled & state.passes)
+    return _Plan(state.frame, state.passes, edge, used)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _follow(
-    spokes: Spokes, crossing: bool, lens: Lens, scene: Scene, plan: _Plan
+    radial: RadialRule, crossing: bool, lens: Lens, scene: Scene, plan: _Plan
 ) -> tuple[Array, Array]:
-    """The points of a plan, and where their rays are launched, with their derivatives by the lens
+    """Points of the rays of a plan, and where they are launched, with their derivatives by the lens
     and the scene, in every mode."""
-    return plan.point, plan.launch
+    return plan.edge.rays.point, plan.edge.rays.launch
 
 
 @_follow.defjvp
-def _follow_jvp(spokes: Spokes, crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _follow_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
     lens, scene, plan = primals
+    _, pair, follows = plan.edge
     # Through the function itself, so that the points carry derivatives of their own.
-    point, launch = _follow(spokes, crossing, lens, scene, plan)
-    aims, rates = _known_rates(crossing, lens, scene, launch, plan)
-    held = lambda lens, scene: _followed(crossing, plan, lens, scene, launch)  # noqa: E731
-    _, (slid, change) = jax.jvp(held, (lens, scene), tangents[:2])
-    change = change - boundary.moved(rates, slid)  # of rays through fixed points
-    corners, ends = (slice(None, -spokes.count), slice(-spokes.count, None))
-    # A corner stays on both edges.
-    corner = -boundary.moved(boundary.inverse(rates[..., corners]), change[..., corners])
-    corner = jnp.where(plan.follows[:, corners], corner, 0)
-    # A spoke turns with the corners, and ends on its edge.
-    nodes = lambda corner: plan.nodes(spokes, corner)[0]  # noqa: E731
-    toward, turned = jax.jvp(nodes, (point[..., corners],), (corner,))
-    side = _along(point[..., ends] - plan.centre, toward)[None] * turned
-    rate = rates[:, 0, :, ends]
-    longer = -safe_divide(change[0, :, ends] + dot(rate, side), dot(rate, toward))
-    longer = jnp.where(plan.follows[:, ends], longer, 0)
-    moved = jnp.concatenate([corner, side + longer[None] * toward], axis=-1)
-    return (point, launch), (moved, jnp.where(plan.follows, boundary.moved(aims, moved - slid), 0))
+    point, launch = _follow(radial, crossing, lens, scene, plan)
+
+    def trace(lens, scene, launch):
+        return boundary.trace(lens, system_of(lens, scene), crossing, launch)
+
+    rays = boundary.launched(functools.partial(trace, lens, scene), launch)
+    corners, ends = (slice(None, -radial.count), slice(-radial.count, None))
+
+    def step(lens, scene):  # of Newton's method, by the models of these rays
+        (crossed, q), _ = trace(lens, scene, launch)
+        moved = rays._replace(point=crossed, q=q)
+        # A corner stays on both edges.
+        corner = (crossed + boundary.corner_step(moved, pair))[..., corners]
+        corner = jnp.where(follows[:, corners], corner, point[..., corners])
+        # A spoke turns with the corners, and ends on its edge.
+        toward, _ = plan.spokes(radial, corner)
+        moved = jax.tree.map(lambda a: a[..., ends], moved)
+        distance = boundary.edge_distance(moved, _target(moved, plan.frame.centre, toward))
+        length = boundary.picked(distance, pair[:1, :, ends])[0]
+        known = jax.lax.stop_gradient(_along(point[..., ends] - plan.frame.centre, toward))
+        length = jnp.where(follows[:, ends], length, known)
+        new = jnp.concatenate([corner, plan.frame.centre + length[None] * toward], axis=-1)
+        return new, jnp.where(follows, displace(rays.d_launch, new - crossed), 0)
+
+    return (point, launch), jax.jvp(step, (lens, scene), tangents[:2])[1]
 
 
 def _along(line: Array, toward: Array) -> Array:
@@ -297,23 +311,22 @@ class Clipped(PupilRule):
         axial = self.symmetry == "rotational"
         part = {"rotational": 0, "bilateral": 1, "none": 2}[self.symmetry]
         # Apertures of all shapes make corners; the narrow panels between them need spokes too.
-        kinds = () if lens.apertures is None else lens.apertures.kinds
-        edges = sum(2 if kind == "rectangle" else 1 for kind in kinds)
+        edges = boundary.aperture_edges(lens)
         used, most = (part * (2 * n + 6 + 2 * edges) for n in (self.order, self.size))
-        spokes = Spokes(self.symmetry, max(most, 32 * part) + 1)
-        given = *jax.lax.stop_gradient((lens, scene)), spokes, jnp.asarray(used, jnp.int32)
+        radial = RadialRule(self.symmetry, max(most, 32 * part) + 1)
+        given = *jax.lax.stop_gradient((lens, scene)), radial, jnp.asarray(used, jnp.int32)
         plan = jax.lax.stop_gradient(_plan(*given, self.crossing))
-        point, _ = _follow(spokes, self.crossing, lens, scene, plan)
-        corner, end = point[..., : -spokes.count], point[..., -spokes.count :]
-        toward, share = plan.nodes(spokes, corner)
+        point, _ = _follow(radial, self.crossing, lens, scene, plan)
+        corner, end = point[..., : -radial.count], point[..., -radial.count :]
+        toward, share = plan.spokes(radial, corner)
         # The nodes have the first places; the others are of the search alone.
         toward, share, end = (a[..., : max(most, 1)] for a in (toward, share, end))
-        length = _along(end - plan.centre, toward)
+        length = _along(end - plan.frame.centre, toward)
         node, weight = jnp.asarray(gauss(self.size), length.dtype)[:, self.order, None, None]
         # On the axis r^2 is the variable, as without clipping.
         node, weight = (jnp.sqrt(node), weight) if axial else (node, 2 * node * weight)
-        size = determinant(plan.shape)
+        size = determinant(plan.frame.shape)
         weight = jnp.where(plan.passes, share * length**2 * size, 0)[..., None] * weight
-        points = plan.centre[..., None] + (length[..., None] * node)[None] * toward[..., None]
+        points = plan.frame.centre[..., None] + (length[..., None] * node)[None] * toward[..., None]
         points = points.reshape(2, len(length), -1)
         return tuple(points[1:] if axial else points), weight.reshape(len(length), -1)
