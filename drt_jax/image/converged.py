@@ -67,7 +67,7 @@ def psf_moments(
     then. Paper section 4.3.
     """
     found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
-    return found.full(lens.sensor)
+    return found.at(lens.sensor)
 
 
 def focus_moments(
