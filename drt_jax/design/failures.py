@@ -69,9 +69,9 @@ def shortfall(system: System, launch: Vector, target: Vector) -> Array:
 
 def _missed(met: Meeting, rows: Row) -> Array:
     """By how much rays miss each row, come to it from behind or are bent too far, (R, W, Q)."""
-    first, live, bends = (a[:, None, None] for a in (rows.first, rows.live, rows.bends))
+    first, active, bends = (a[:, None, None] for a in (rows.first, rows.active, rows.bends))
     back = jnp.where(first, 0, jnp.maximum(-met.length, 0)) + jnp.maximum(-met.front, 0)
-    back = jnp.where(live, back, 0) + jnp.where(bends, jnp.maximum(-met.through, 0), 0)
+    back = jnp.where(active, back, 0) + jnp.where(bends, jnp.maximum(-met.through, 0), 0)
     # By how much a conic is missed, on from the total reflection of rays that graze it.
     square, linear, constant = quadratic(met.point, met.direction, rows.surface.wide)
     conic = jnp.maximum(square * constant - linear**2, 0)

@@ -164,7 +164,7 @@ def _moments(
 
 @partial(jax.jit, static_argnames="solver")
 def _weigh(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> tuple:
-    """Moments, the rays on the live surfaces, and whether any fails and whether any is clipped."""
+    """Moments, rays on the active surfaces, whether any ray fails, and whether any is clipped."""
     points, weights = rule.points(lens, scene)
     system, target = aims(lens, scene, points)
     found = solver(system, target)

@@ -106,7 +106,11 @@ def _find(
     def several(shape, dtype=system.index.dtype):
         return jnp.zeros((len(stages), *shape, system.index.shape[1], spokes.count), dtype)
 
-    point, rates, rows = several((2,)), several((2, 2)), lens.count + 1 + crossing * len(lens.live)
+    point, rates, rows = (
+        several((2,)),
+        several((2, 2)),
+        lens.count + 1 + crossing * len(lens.active),
+    )
     hits, moves, no = several((2, rows)), several((2, 2, rows)), several((), bool)
     goal = boundary.Goal(point, point, several((2,), jnp.int32))
     rays = boundary.Rays(point, point, hits, rates, moves, no)

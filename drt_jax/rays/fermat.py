@@ -1,8 +1,8 @@
 """The Fermat system of a bundle of rays: optical path, its gradient, and the label of a ray.
 
 A ray is labelled by its object point and by where it crosses the stop. Unknown are its hits on
-the L live surfaces, those that bend light, and on the sensor; the equations are dOP/dw_i = 0 on
-the live surfaces (paper Eqs. 2 and 3) and one more, the label: the straight line through the
+the L active surfaces, those that bend light, and on the sensor; the equations are dOP/dw_i = 0 on
+the active surfaces (paper Eqs. 2 and 3) and one more, the label: the straight line through the
 hits that enclose the stop, prolonged either way, crosses the stop at the wanted point. A stop
 that bends light itself is one of the surfaces, and the label is its hit.
 
@@ -93,8 +93,7 @@ def added(hits: Vector, by: Diffraction) -> tuple[np.ndarray, tuple]:
 
 
 def residual(path: Path, system: System) -> Vector:
-    """F = dOP/dw on every live surface, dimensionless (paper Eq. 3), and on the sensor, where it is
-    0 for any path: D arrays (R, W, Q)."""
+    """F = dOP/dw, D arrays (R, W, Q), dimensionless (paper Eq. 3); 0 on the sensor for any path."""
     index, behind = (jnp.broadcast_to(n, path.length.shape) for n in (system.index, system.behind))
     *across, along = (index * b - behind * a for b, a in zip(path.before, path.after, strict=True))
     force = tuple(c + s * along for c, s in zip(across, path.slope, strict=True))

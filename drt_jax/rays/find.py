@@ -39,7 +39,7 @@ _MAX_STEPS = 16
 class Found(NamedTuple):
     """Rays of a bundle.
 
-    hits: D arrays (R, W, Q) in mm on the live surfaces and the sensor; 0 for failed rays.
+    hits: D arrays (R, W, Q) in mm on the active surfaces and the sensor; 0 for failed rays.
     arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along the axes of the lens; void for
         failed rays.
     status: (W, Q), int32, see `Status`.

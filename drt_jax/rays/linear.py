@@ -71,10 +71,12 @@ class _March(NamedTuple):
 
 
 def _step(
-    row: _Row, live: bool, good: Array, march: _March, force: Vector, moved: Vector
+    row: _Row, active_stop: bool, good: Array, march: _March, force: Vector, moved: Vector
 ) -> tuple[_March, Vector]:
-    """Onto a row and through it: the changes behind it, and of its hit, D arrays; `live`: whether
-    the stop bends light."""
+    """Onto a row and through it: the change behind it, and that of its hit, D arrays.
+
+    active_stop: whether the stop is an active surface.
+    """
     carried = (
         p + row.length * s - m for p, s, m in zip(march.point, march.swing, moved, strict=True)
     )
@@ -94,7 +96,7 @@ def _step(
     normal = jnp.where(good, row.after[-1] - dot(row.slope, row.after[:-1]), 1)
     along = -dot(row.after[:-1], pull) / (row.index_behind * normal)
     behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
-    made = hit if live else (*point, *march.swing)
+    made = hit if active_stop else (*point, *march.swing)
     made = tuple(jnp.where(row.labels, a, b) for a, b in zip(made, march.label, strict=True))
     return _March(point, turn(row.rotation, (*behind, along)), made), hit
 
@@ -105,11 +107,11 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
 
     good: (W, Q), the rays of interest: what comes out for the others is finite if they are.
     """
-    dim, zero, live = len(push.label), jnp.zeros_like(push.label[0]), system.stop is None
+    dim, zero, active_stop = len(push.label), jnp.zeros_like(push.label[0]), system.stop is None
     at = np.arange(len(system.forms)) == system.before
     path_rows = _Row(*path[2:7], system.index, system.behind, system.rows.rotation, at)
     still, none = (zero,) * (dim + 1), (zero,) * dim
-    unknown = none if live else (*still, *still)
+    unknown = none if active_stop else (*still, *still)
     # A march from each unit change of the first hit, and one that the push makes.
     units = [[jnp.full_like(zero, float(d == k)) for k in range(dim)] for d in range(dim)]
     first = jax.vmap(lambda hit: _first(path, system, hit))(tuple(map(jnp.stack, units)))
@@ -117,8 +119,8 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
 
     def step(marches, given):
         row, *pushed = given
-        free = jax.vmap(lambda march: _step(row, live, good, march, none, still))(marches[0])
-        forced = _step(row, live, good, marches[1], *pushed)
+        free = jax.vmap(lambda march: _step(row, active_stop, good, march, none, still))(marches[0])
+        forced = _step(row, active_stop, good, marches[1], *pushed)
         return (free[0], forced[0]), (free[1], forced[1])
 
     start = free, _March(still, push.swing, unknown)

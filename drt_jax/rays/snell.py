@@ -109,16 +109,20 @@ def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
 
 
 class Row(NamedTuple):
-    """One thing that a ray meets: a live surface, the stop, the sensor; or with a first axis some.
+    """What a ray meets: an active surface, the stop or the sensor; or several, with a first axis.
 
-    first: whether it is the first. live: whether light must come to it from the front, or the ray,
-    prolonged either way, is a line that crosses it. bends: whether the ray goes on from here. kind:
-    of its form. ratio: of the indices before and behind. sense, leaving: 1 or -1, light goes along
-    or against z before it and behind. kick: None for no phase at all.
+    first: whether it is the first.
+    active: False for a stop that only labels: the line is extended either way to it.
+    bends: False if the ray continues unchanged.
+    surface: in its place.
+    kind: number of its form.
+    ratio: index before it / index behind it.
+    sense, leaving: 1 if light travels along z before it (behind it), -1 if against.
+    kick: of its phase; None if no row has a phase.
     """
 
     first: Any
-    live: Any
+    active: Any
     bends: Any
     surface: Placed
     kind: Any
@@ -155,9 +159,9 @@ def rows_met(system: System, to_stop: bool = False) -> Row:
         return rows
     stop, form = system.at_stop
     around = jax.tree.map(lambda a: a[at], rows)
-    live = np.bool_(system.stop is None)
+    active = np.bool_(system.stop is None)
     label = around._replace(
-        live=live, bends=np.False_, surface=stop, kind=np.int32(kinds.index(form))
+        active=active, bends=np.False_, surface=stop, kind=np.int32(kinds.index(form))
     )
     ends = jax.tree.map(lambda a: a[at:at] if to_stop else a[at:], rows)
 
@@ -238,7 +242,7 @@ def _follow(
     def step(state, row):
         meeting, behind = _meet(system, row, state, smooth)
         ahead = (meeting.length > 0) | row.first | (not forward)
-        met = meeting.crosses & (~row.live | ((meeting.front > 0) & ahead))
+        met = meeting.crosses & (~row.active | ((meeting.front > 0) & ahead))
         passes = (meeting.through > 0) | ~row.bends
         here = jnp.where(met, jnp.where(passes, Status.OK, Status.TIR), Status.MISSED)
         status = jnp.where(state.status == Status.OK, here.astype(jnp.int32), state.status)

@@ -63,7 +63,7 @@ class Rays(NamedTuple):
 
 def _rows_behind(lens: Lens) -> list[int]:
     """The row of the system that each surface and the sensor is, or that lies behind it."""
-    return [sum(j < i for j in lens.live) for i in range(lens.count + 1)]
+    return [sum(j < i for j in lens.active) for i in range(lens.count + 1)]
 
 
 def on_all_surfaces(
@@ -73,7 +73,7 @@ def on_all_surfaces(
     and which of the `good` rays (W, Q), straight and prolonged either way, meet all surfaces that
     bend no light."""
     pieces, begin, behind = [], 0, _rows_behind(lens)
-    for i in sorted({*range(lens.count)} - {*lens.live}):
+    for i in sorted({*range(lens.count)} - {*lens.active}):
         row, crossing = behind[i], stop
         if i != lens.stop:
             some, part = fermat.up_to(hits, system, row)

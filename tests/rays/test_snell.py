@@ -177,7 +177,7 @@ def test_a_trace_against_the_yardstick(lens, distance):
     direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     direction = np.broadcast_to(direction, start.shape)
     begin = start - 5 * direction
-    rows = [*lens.live, lens.count]
+    rows = [*lens.active, lens.count]
     for k, colour in enumerate(COLOURS):
         hits, ok = yardstick(lens, jnp.asarray(colour, float), begin[k], direction[k])
         assert np.all(ok)
@@ -189,7 +189,7 @@ def test_a_trace_against_the_yardstick(lens, distance):
     np.testing.assert_allclose(trace.rounding_angle, wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize("stop", ["in front", "live"])
+@pytest.mark.parametrize("stop", ["in front", "active"])
 def test_the_stop_of_a_ray(stop):
     """The trace to the stop crosses it where the whole trace does, and where the label of the ray
     says."""
