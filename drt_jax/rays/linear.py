@@ -18,7 +18,7 @@ from jax import Array
 
 from .fermat import Path, label, ray_at, residual
 from .meet import cross
-from .system import System, Vector, divide, dot, turn
+from .system import System, Vector, divide, dot, rotate
 
 
 class Push(NamedTuple):
@@ -80,13 +80,13 @@ def _step(
     carried = (
         p + row.length * s - m for p, s, m in zip(march.point, march.swing, moved, strict=True)
     )
-    *across, depth = turn(row.rotation, tuple(carried), back=True)
-    *swung, along = turn(row.rotation, march.swing, back=True)
+    *across, depth = rotate(row.rotation, tuple(carried), back=True)
+    *swung, along = rotate(row.rotation, march.swing, back=True)
     # Along the ray onto the tangent plane of the surface.
     normal = jnp.where(good, row.before[-1] - dot(row.slope, row.before[:-1]), 1)
     slide = (depth - dot(row.slope, across)) / normal
     hit = tuple(c - slide * e for c, e in zip(across, row.before, strict=False))
-    here = turn(row.rotation, (*hit, dot(row.slope, hit)))
+    here = rotate(row.rotation, (*hit, dot(row.slope, hit)))
     point = tuple(a + m for a, m in zip(here, moved, strict=True))
     pull = tuple(
         row.index_before * (v + s * along) + dot(bend, hit) - f
@@ -98,7 +98,7 @@ def _step(
     behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
     made = hit if active_stop else (*point, *march.swing)
     made = tuple(jnp.where(row.labels, a, b) for a, b in zip(made, march.label, strict=True))
-    return _March(point, turn(row.rotation, (*behind, along)), made), hit
+    return _March(point, rotate(row.rotation, (*behind, along)), made), hit
 
 
 def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, Vector]:
@@ -147,7 +147,7 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
 def _first(path: Path, system: System, hit: Vector) -> tuple[Vector, Vector]:
     """Changes of the point and of the direction in front of it when the first hit moves."""
     rotation = None if system.rows.rotation is None else system.rows.rotation[0]
-    moved = turn(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
+    moved = rotate(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
     first = ray_at(path, system, 0)[1]
     along, spread = dot(first, moved), system.vergence * path.shrink
     return moved, tuple(spread * (m - e * along) for m, e in zip(moved, first, strict=True))

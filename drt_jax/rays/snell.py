@@ -19,7 +19,7 @@ from ..lens.surface import sag_derivatives
 from ..numerics import safe_divide, safe_sqrt
 from .meet import meet
 from .status import Status
-from .system import Placed, System, Vector, dot, turn
+from .system import Placed, System, Vector, dot, rotate
 
 # A ray that leans more than this (cosine with the axis) is not followed.
 _FLATTEST = 1e-4
@@ -224,8 +224,8 @@ def _meet(system: System, row: "Row", state: _State, smooth: bool) -> tuple[Meet
     own, normal, crosses, length = encounter(p, d, row.surface.shape, going)
     bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
     hit, origin = own[:-1], row.surface.origin(len(own) - 1)
-    point = tuple(a + o for a, o in zip(turn(row.surface.rotation, own), origin, strict=True))
-    behind = state._replace(point=point, direction=turn(row.surface.rotation, bent), hit=hit)
+    point = tuple(a + o for a, o in zip(rotate(row.surface.rotation, own), origin, strict=True))
+    behind = state._replace(point=point, direction=rotate(row.surface.rotation, bent), hit=hit)
     return Meeting(p, d, hit, crosses, length, front, through, state.status), behind
 
 

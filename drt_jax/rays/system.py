@@ -47,7 +47,7 @@ def divide(rows: Any, b: Vector) -> Vector:
     return safe_divide(x, size), safe_divide(y, size)
 
 
-def turn(rotation: Array | None, vector: Vector, back: bool = False) -> Vector:
+def rotate(rotation: Array | None, vector: Vector, back: bool = False) -> Vector:
     """A vector from the axes of its surface to those of the lens, or `back`.
 
     rotation: (3, 3), or (R, 3, 3) for components (R, ...); None: the axes are the same.
@@ -109,7 +109,9 @@ class Placed(NamedTuple):
         """A line along the axes of one surface, from its vertex."""
         origin = self.origin(len(point) - 1)
         shifted = tuple(p - o for p, o in zip(point, origin, strict=True))
-        return turn(self.rotation, shifted, back=True), turn(self.rotation, direction, back=True)
+        return rotate(self.rotation, shifted, back=True), rotate(
+            self.rotation, direction, back=True
+        )
 
 
 @jax.tree_util.register_dataclass

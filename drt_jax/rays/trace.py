@@ -21,7 +21,7 @@ from .find import Found
 from .meet import cross
 from .solve import Solver, solve
 from .status import Status
-from .system import System, Vector, placed, system_of, turn
+from .system import System, Vector, placed, rotate, system_of
 
 
 class Bundle(NamedTuple):
@@ -111,7 +111,7 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
     clipped = good & jnp.any(clearance(lens, hits) < 0, axis=0)
     status = jnp.where(clipped, jnp.int32(Status.CLIPPED), status)
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
-    arrival = turn(rotation, found.arrival, back=True)
+    arrival = rotate(rotation, found.arrival, back=True)
     return Bundle(hits, status, arrival, fermat.optical_path(found.hits, system), found.steps)
 
 
@@ -187,9 +187,9 @@ def _trace_rays(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     good = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     rows = placed(lens, range(lens.count + 1))
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
-    own = turn(rows.rotation, (*bundle.hits, heights))
+    own = rotate(rows.rotation, (*bundle.hits, heights))
     points = (p + o[:, None, None] for p, o in zip(own, rows.origin(2), strict=True))
-    direction = turn(system.rows.rotation, fermat.geometry(found.hits, system).before)
+    direction = rotate(system.rows.rotation, fermat.geometry(found.hits, system).before)
     behind = np.array(_rows_behind(lens))
 
     def stacked(vector):  # (3, S + 1, W, Q) -> (W, Q, S + 1, 3)

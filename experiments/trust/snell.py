@@ -53,8 +53,8 @@ class _Row(NamedTuple):
 
     shape, form: what `_intersect` takes, the form by its place among those of the lens. origin,
     axes: of the vertex, mm; from the surface's axes to those of the lens. active: whether it is an
-    active surface; the sensor counts as one. mirror: whether it reflects. sense: 1 or -1, light goes along
-    or against its z axis. ratio: the index in front by that behind.
+    active surface; the sensor counts as one. mirror: whether it reflects. sense: 1 or -1, light
+    goes along or against its z axis. ratio: the index in front by that behind.
     """
 
     shape: Shape
