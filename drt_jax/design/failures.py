@@ -10,7 +10,7 @@ from ..lens.scene import Scene
 from ..numerics import safe_divide, safe_sqrt
 from ..rays.aim import beam_size, paraxial_launch
 from ..rays.meet import quadratic
-from ..rays.snell import Meeting, Row, apart, meetings, rows_met
+from ..rays.snell import Meeting, Row, meetings, rows_met, split_stop
 from ..rays.status import Status
 from ..rays.system import System, Vector, dot
 from ..rays.trace import aims
@@ -59,7 +59,7 @@ def shortfall(system: System, launch: Vector, target: Vector) -> Array:
     met, rows = meetings(system, launch, smooth=True), rows_met(system)
     failed = met.status != Status.OK
     first = failed & ~jnp.concatenate([jnp.zeros_like(failed[:1]), failed[:-1]])
-    _, crossing = apart(system, met.hit)
+    _, crossing = split_stop(system, met.hit)
     miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
     off = safe_divide(safe_sqrt(dot(miss, miss)), jnp.sqrt(jnp.max(dot(target, target))))
     missed = jnp.sum(jnp.where(first, _missed(met, rows), 0), axis=0)

@@ -39,13 +39,13 @@ def neighbours(lens: Lens, gaps: list[float], moved: list[bool]) -> list[Pair]:
     moved: of each surface and the sensor.
     """
     groups = () if lens.elements is None else lens.elements.spans
-    apart = lambda i, j: any((a <= i <= b) != (a <= j <= b) for a, b in groups)  # noqa: E731
+    separated = lambda i, j: any((a <= i <= b) != (a <= j <= b) for a, b in groups)  # noqa: E731
     chain = itertools.pairwise([*(lens.active or (lens.stop,)), lens.count])
     senses = lens.senses.tolist()
     return [
         Pair(i, j, senses[i + 1] * sum(gaps[i:j]))
         for i, j in chain
-        if not (moved[i] or moved[j] or apart(i, j))
+        if not (moved[i] or moved[j] or separated(i, j))
     ]
 
 

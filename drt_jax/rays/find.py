@@ -28,7 +28,7 @@ from .aim import (
     trace_fan,
 )
 from .bundle import in_tiles, polynomial_launch, tile_of
-from .snell import apart, shoot
+from .snell import shoot, split_stop
 from .sparse import Lanes
 from .status import Status
 from .system import System, Vector, dot
@@ -142,7 +142,7 @@ def find(
     wanted = jnp.ones(target[0].shape, bool) if wanted is None else wanted
     search = _search(system, target, launch, sizes, wanted)
     good = search.status == Status.OK
-    hits, crossing = apart(system, search.hits)
+    hits, crossing = split_stop(system, search.hits)
     hits = tuple(jnp.where(good, a, 0) for a in hits)
     rough = good & ~fermat.met(crossing, target, hits, system)
     hits, solved, steps = _polish(system, target, hits, rough)
@@ -158,7 +158,7 @@ def find_aimed(system: System, target: Vector) -> Found:
     `find` is, and a tenth of its time where rays fail."""
     aimed = aim_outwards(system, target)
     hits, status = _verdict(system, aimed.launch, aimed.status)
-    hits, crossing = apart(system, hits)
+    hits, crossing = split_stop(system, hits)
     good = (status == Status.OK) & fermat.met(crossing, target, hits, system)
     hits = tuple(jnp.where(good, a, 0) for a in hits)
     status = jnp.where(good, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
@@ -286,7 +286,7 @@ def _find_many(system: System, target: Vector, known: Array) -> Found:
     def tile(target, known):
         launch = launch_of(target)
         hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
-        hits, crossing = apart(system, hits)
+        hits, crossing = split_stop(system, hits)
         solved = fermat.met(crossing, target, hits, system) & (status == Status.OK)
         found = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0))
         search = lambda _: find(system, target, launch, known)  # noqa: E731

@@ -29,7 +29,7 @@ class Trace(NamedTuple):
     """Rays traced one surface after the other.
 
     hits: D arrays (R, ...), transverse coordinates on the rows in mm, and on a stop that is none
-        of them, which has its place among them: see `apart`. Void behind a failure.
+        of them, which has its place among them: see `split_stop`. Void behind a failure.
     status: (...), int32, OK, MISSED or TIR.
     rounding_angle: (...), the most that rounding the hits turns a segment by, in units of rounding.
     """
@@ -39,7 +39,7 @@ class Trace(NamedTuple):
     rounding_angle: Array
 
 
-def apart(system: System, hits: Vector) -> tuple[Vector, Vector]:
+def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
     """Traced hits as those on the rows of the system, D arrays (R, ...), and on the stop (...)."""
     at = system.before
     crossing = tuple(h[at] for h in hits)
@@ -185,7 +185,7 @@ class _State(NamedTuple):
 
 class Meeting(NamedTuple):
     """Of rays with all that they meet: the R rows, and a stop that is none of them in its place
-    among these, see `apart`. Along the axes of each; void behind a failure.
+    among these, see `split_stop`. Along the axes of each; void behind a failure.
 
     point, direction: D + 1 arrays (R, ...), in front of it, a point in mm and a unit vector.
     hit: D arrays (R, ...), where the ray, prolonged either way, crosses it, mm.
@@ -273,7 +273,7 @@ def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
     from each active surface to the next and to the sensor, mm: a ray may step back, where
     neighbours cross, by a length below 0. Differentiable; void rays are finite."""
     state, met = _follow(system, launch, smooth=True, forward=False)
-    return met.hit, apart(system, (met.length,))[0][0][1:], state.status
+    return met.hit, split_stop(system, (met.length,))[0][0][1:], state.status
 
 
 def meetings(system: System, launch: Vector, smooth: bool = False) -> Meeting:

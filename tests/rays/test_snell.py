@@ -169,7 +169,7 @@ def test_a_trace_against_the_yardstick(lens, distance):
     """Hits within 1e-12 mm; and how far rounding them turns a segment."""
     system, launch = scene_system(lens, distance), launches()
     trace = shoot(system, launch)
-    trace = trace._replace(hits=snell.apart(system, trace.hits)[0])
+    trace = trace._replace(hits=snell.split_stop(system, trace.hits)[0])
     assert np.all(trace.status == Status.OK)
     points, source = corners(system, trace.hits)
     start = np.stack([*map(np.asarray, launch), np.zeros(launch[0].shape)], axis=-1)
@@ -196,7 +196,7 @@ def test_the_stop_of_a_ray(stop):
 
     @jax.jit
     def both(system, launch):
-        hits, there = snell.apart(system, snell.shoot(system, launch).hits)
+        hits, there = snell.split_stop(system, snell.shoot(system, launch).hits)
         label = fermat.label(fermat.geometry(hits, system), system)
         return snell.shoot_to_stop(system, launch), label, there
 
