@@ -44,8 +44,8 @@ def safe_divide(numerator: Array, denominator: Array) -> Array:
 def run_if(condition: Array, function: Callable, value: Any) -> Any:
     """`function(value)`, of the same structure, if the condition holds, else the value. A loop:
     under `vmap` too it costs nothing where the condition holds nowhere. Not for reverse mode."""
-    turn = lambda state: (function(state[0]), jnp.array(False))  # noqa: E731
-    return jax.lax.while_loop(lambda state: state[1], turn, (value, condition))[0]
+    once = lambda state: (function(state[0]), jnp.array(False))  # noqa: E731
+    return jax.lax.while_loop(lambda state: state[1], once, (value, condition))[0]
 
 
 def concrete(tree: Any) -> bool:

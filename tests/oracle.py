@@ -112,7 +112,7 @@ def vertices(scene):
 class Trace(NamedTuple):
     """own, hits: triples along the axes of each surface and along those of the lens, S + 1 each;
     path (..., W, Q), mm; good (..., W, Q): real rays that meet every surface, the sensor and the
-    dummies, from the front, forwards from live surface to live surface, and without total
+    dummies, from the front, forwards from active surface to active surface, and without total
     reflection."""
 
     own: list

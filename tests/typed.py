@@ -15,7 +15,7 @@ rule = drt_jax.converged_rule(LENS, [(0.0, 0.1), (0.05, 0.2)], [25e3, float("inf
 moments = drt_jax.psf_moments(LENS, (0.0, 0.1), 25e3, [0.6, 0.53], rule=rule)
 mean, covariance = moments.mean, moments.covariance
 kernel: Array = drt_jax.gaussian_psf(mean, covariance, pixel=4.4e-3)
-rows: drt_jax.SeparableKernel = drt_jax.separable_psf([(0.0, 0.0)], [(1e-4, 1e-4)], 4.4e-3)
+rows: drt_jax.SeparableKernel = drt_jax.separable_psf(mean, covariance, 4.4e-3)
 rays: drt_jax.Rays = drt_jax.trace_rays(LENS, 0.1, 25e3, RGB, [(0.0, 0.0), (0.0, 1.0)])
 wave: drt_jax.Wavefront = drt_jax.wavefront(LENS, 0.1, 25e3, RGB, pupil.hexapolar(3)[0])
 

@@ -94,7 +94,7 @@ def elements_of(lens: Lens) -> tuple[tuple[int, int], ...]:
     """First and last surface of each element: neighbours that bend light, with glass between them,
     cemented ones together; a mirror in air is one."""
     spans: list[tuple[int, int]] = []
-    for i in lens.live:
+    for i in lens.active:
         if spans and _solid(lens, i):
             spans[-1] = (spans[-1][0], i)
         else:
@@ -107,7 +107,7 @@ def pieces_of(lens: Lens) -> dict[int, tuple[int, ...]]:
     light back into it, or a surface in it bends none."""
     pieces: dict[int, tuple[int, ...]] = {}
     for i in range(lens.count):
-        inside = lens.mirrors[i] or i not in lens.live
+        inside = lens.mirrors[i] or i not in lens.active
         if not _solid(lens, i + 1):
             continue
         if pieces and inside and _solid(lens, i):
@@ -167,7 +167,7 @@ _NONE = {
 
 def _there(lens: Lens, kind: str) -> list[int]:
     """The numbers of the surfaces or elements that may be off."""
-    live = list(lens.live)
+    active = list(lens.active)
     if KINDS[kind].whole == "element":
         return list(range(len(elements_of(lens))))
     if kind == "thickness":
@@ -177,7 +177,7 @@ def _there(lens: Lens, kind: str) -> list[int]:
     if kind == "radius":
         curved = np.asarray(lens.curvature) != 0
         curved[:-1] |= np.asarray(x_curvatures(lens, np.arange(lens.count))) != 0
-        return [i for i in live if curved[i]]
+        return [i for i in active if curved[i]]
     if kind == "irregularity":
-        return [i for i in live if lens.forms[i] in ("asphere", *WITH_X)]
-    return live
+        return [i for i in active if lens.forms[i] in ("asphere", *WITH_X)]
+    return active

@@ -10,7 +10,7 @@ from ..lens.scene import Scene
 from ..numerics import safe_divide, safe_sqrt
 from ..rays.aim import beam_size, paraxial_launch
 from ..rays.meet import quadratic
-from ..rays.snell import Meeting, Row, apart, meetings, rows_met
+from ..rays.snell import Meeting, Row, meetings, rows_met, split_stop
 from ..rays.status import Status
 from ..rays.system import System, Vector, dot
 from ..rays.trace import aims
@@ -59,7 +59,7 @@ def shortfall(system: System, launch: Vector, target: Vector) -> Array:
     met, rows = meetings(system, launch, smooth=True), rows_met(system)
     failed = met.status != Status.OK
     first = failed & ~jnp.concatenate([jnp.zeros_like(failed[:1]), failed[:-1]])
-    _, crossing = apart(system, met.hit)
+    _, crossing = split_stop(system, met.hit)
     miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
     off = safe_divide(safe_sqrt(dot(miss, miss)), jnp.sqrt(jnp.max(dot(target, target))))
     missed = jnp.sum(jnp.where(first, _missed(met, rows), 0), axis=0)
@@ -69,9 +69,9 @@ def shortfall(system: System, launch: Vector, target: Vector) -> Array:
 
 def _missed(met: Meeting, rows: Row) -> Array:
     """By how much rays miss each row, come to it from behind or are bent too far, (R, W, Q)."""
-    first, live, bends = (a[:, None, None] for a in (rows.first, rows.live, rows.bends))
+    first, active, bends = (a[:, None, None] for a in (rows.first, rows.active, rows.bends))
     back = jnp.where(first, 0, jnp.maximum(-met.length, 0)) + jnp.maximum(-met.front, 0)
-    back = jnp.where(live, back, 0) + jnp.where(bends, jnp.maximum(-met.through, 0), 0)
+    back = jnp.where(active, back, 0) + jnp.where(bends, jnp.maximum(-met.through, 0), 0)
     # By how much a conic is missed, on from the total reflection of rays that graze it.
     square, linear, constant = quadratic(met.point, met.direction, rows.surface.wide)
     conic = jnp.maximum(square * constant - linear**2, 0)

@@ -187,7 +187,7 @@ def beam_radius(lens: Lens, rays: FieldRays) -> Array:
 def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
     """Cosines (V, L, W, Q) of the angles at which rays fall on the L surfaces that bend light; 1
     for rays that fail."""
-    rows = np.array([*lens.live, lens.count])
+    rows = np.array([*lens.active, lens.count])
 
     def one(field: Array, distance: Array, hits: Vector, arrives: Array) -> Array:
         scene = Scene(field, distance, rays.wavelengths)
@@ -222,7 +222,7 @@ def _solid_angles(
     """|dl / dp| (1, Q): the area of direction cosines l at one point of the sensor by the area of
     the stop. With hit h and direction l as functions of the stop point p and the field f, h stays
     where df = -(dh/df)^-1 (dh/dp) dp; so dl / dp = l_p - l_f h_f^-1 h_p."""
-    rows = np.array([*lens.live, lens.count])
+    rows = np.array([*lens.active, lens.count])
     scene = Scene(field, distance, wavelength)
     hits = jax.lax.stop_gradient(tuple(h[rows, one] for h in bundle.hits))
     arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))

@@ -18,7 +18,7 @@ def between(lens: Lens, glass: bool) -> list[tuple[int, int]]:
     """Neighbouring surfaces that bend light, and the last of them and the sensor, with glass or
     with air between; what is before the lens counts as air, too."""
     air = lens.glasses[0], "air"
-    pairs = itertools.pairwise([*lens.live, lens.count])
+    pairs = itertools.pairwise([*lens.active, lens.count])
     return [(i, j) for i, j in pairs if (lens.glasses[i + 1] not in air) == glass]
 
 
@@ -33,7 +33,7 @@ def gaps(lens: Lens, beam_radius: Array, glass: bool) -> tuple[Array, Array]:
     front, back = (np.array(rows) for rows in zip(*pairs))
     sense = jnp.asarray(lens.senses[back], dtype)
     vertices = lens.vertices
-    beam_radius = jnp.append(beam_radius, beam_radius[lens.live[-1]])
+    beam_radius = jnp.append(beam_radius, beam_radius[lens.active[-1]])
     wide = jnp.maximum if glass else jnp.minimum
     y = wide(beam_radius[front], beam_radius[back])[:, None] * jnp.asarray(ZONES, dtype)[None]
 

@@ -56,7 +56,7 @@ def _all(lens: Lens) -> list[int]:
 
 
 def _live(lens: Lens) -> list[int]:
-    return list(lens.live)
+    return list(lens.active)
 
 
 def model_glasses(lens: Lens) -> list[int]:

@@ -207,7 +207,7 @@ def _medium(lens: Lens, nominal: Dispersion, kind: str, at: np.ndarray, by: Arra
     else:
         change = (f - c) * (1 / (1 + by / 100) - 1)
         inverse = [1 / line**2 for line in _LINES]
-        turn = (inverse[0] - inverse[1]) / (2 * f) + (inverse[1] - inverse[2]) / (2 * c)
-        strength = jnp.where(own, 0, change / turn)
+        slope = (inverse[0] - inverse[1]) / (2 * f) + (inverse[1] - inverse[2]) / (2 * c)
+        strength = jnp.where(own, 0, change / slope)
         schott = schott.at[at, 2].add(strength).at[at, 0].add(-strength * inverse[1])
     return dataclasses.replace(constants, schott=schott, model=model)

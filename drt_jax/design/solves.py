@@ -108,15 +108,15 @@ class Solve:
             return "sensor", 0, 0
         if self.aperture:
             return "semi_diameter", lens.stop, 0
-        live = ", ".join(map(str, lens.live))
-        if self.surface not in lens.live:
+        active = ", ".join(map(str, lens.active))
+        if self.surface not in lens.active:
             raise ValueError(
-                f"solves: {self.kind}: its curvature follows: give surface, one of {live}"
+                f"solves: {self.kind}: its curvature follows: give surface, one of {active}"
             )
         if self.kind == "image_angle" and self.surface < lens.stop:
             raise ValueError(
                 f"solves: image_angle: surface {self.surface} lies before the stop, which is "
-                f"number {lens.stop}; give one at it or behind, of {live}"
+                f"number {lens.stop}; give one at it or behind, of {active}"
             )
         return "curvature", self.surface, 0
 

@@ -70,16 +70,16 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
         parts, means = deviations(known, weight, rays.symmetry, (-2, -1))
         return jnp.stack([root * part for part in parts]).reshape(len(hits), len(light), -1), means
 
-    (apart, means), (growth, _) = scaled(hits), scaled(slopes)
+    (offsets, means), (growth, _) = scaled(hits), scaled(slopes)
     centre = jnp.stack(means)[..., 0, 0]
-    return apart, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
+    return offsets, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
 
 
 def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
     """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
     squares add up to those of the RMS radii, mm."""
     rays = trace_views(lens, problem.views(), problem.rule, problem.solver)
-    apart, growth, (x, y) = _spots(rays)
+    offsets, growth, (x, y) = _spots(rays)
     # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
     motion = lens.sensor_motion
     normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
@@ -90,13 +90,13 @@ def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tupl
         matrix = (levers * square[None]) @ levers.T
         lit = matrix[0, 0] > 0
         matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
-        moves = jnp.linalg.solve(matrix, -levers @ jnp.sum(apart * growth, axis=(0, 2)))
-        apart = apart + growth * (moves @ levers)[None, :, None]
+        moves = jnp.linalg.solve(matrix, -levers @ jnp.sum(offsets * growth, axis=(0, 2)))
+        offsets = offsets + growth * (moves @ levers)[None, :, None]
     light = rays.weights[..., EXTRAS:] > 0
     failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
     good = ~failed & jnp.all(rays.throughput > 0, axis=1)
-    squares = jnp.where(good, jnp.sum(apart**2, axis=(0, 2)), jnp.inf)
-    return AsBuilt(squares, moves), apart
+    squares = jnp.where(good, jnp.sum(offsets**2, axis=(0, 2)), jnp.inf)
+    return AsBuilt(squares, moves), offsets
 
 
 def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
@@ -188,18 +188,18 @@ def _predict_all(problem: Problem, perturbed: PerturbedLens, compensator: Compen
     units = jnp.eye(len(zero), dtype=zero.dtype)
 
     def rays(perturbation: Array) -> tuple[tuple[Array, Array], Array]:
-        found, apart = _compensated(problem, perturbed.lens_of(perturbation), compensator)
-        return (jnp.ravel(apart) / jnp.sqrt(len(found.squares)), found.moves), found.squares
+        found, offsets = _compensated(problem, perturbed.lens_of(perturbation), compensator)
+        return (jnp.ravel(offsets) / jnp.sqrt(len(found.squares)), found.moves), found.squares
 
     def measure(perturbation: Array) -> Array:
         return jnp.mean(
             _compensated(problem, perturbed.lens_of(perturbation), compensator)[0].squares
         )
 
-    (apart, moves), push, squares = jax.linearize(rays, zero, has_aux=True)
+    (offsets, moves), push, squares = jax.linearize(rays, zero, has_aux=True)
     moved, slopes = jax.lax.map(push, units)
     hessian = jax.lax.map(lambda unit: jax.jvp(jax.grad(measure), (zero,), (unit,))[1], units)
-    gradient, gauss = 2 * moved @ apart, 2 * moved @ moved.T
+    gradient, gauss = 2 * moved @ offsets, 2 * moved @ moved.T
     return Predicted(jnp.mean(squares), gradient, gauss, hessian, moves, slopes)
 
 

@@ -301,7 +301,7 @@ OPERANDS: dict[str, OperandKind] = {
         rows=lambda lens: [*range(lens.count)],
     ),
     "incidence_angle": OperandKind(
-        _incidence, (*_RAYS, "surfaces"), lambda lens: [*lens.live], order=("surfaces",)
+        _incidence, (*_RAYS, "surfaces"), lambda lens: [*lens.active], order=("surfaces",)
     ),
 }
 

@@ -153,7 +153,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         mirrors=tuple(surface.flag("mirror") for surface in surfaces),
     )
     bent = (surface.curvature() or any(row) for surface, row in zip(surfaces, coefficients))
-    curved = tuple(i for i, does in enumerate(bent) if does and i not in lens.live)
+    curved = tuple(i for i, does in enumerate(bent) if does and i not in lens.active)
     lens = dataclasses.replace(lens, curved=curved)
     low, high = lens.dispersion.range
     line = _D_LINE if low <= _D_LINE <= high else (low + high) / 2

@@ -68,7 +68,7 @@ def psf_moments(
     then. Paper section 4.3.
     """
     found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
-    return found.full(lens.sensor)
+    return found.at(lens.sensor)
 
 
 def focus_moments(
@@ -319,8 +319,8 @@ def _padded(order: int, symmetry: Symmetry) -> Pattern:
     points, weights = gauss_points(order, symmetry)
     sizes = (_MAX_ORDER + 2,) if symmetry == "rotational" else (208, 416, 1768, 3696)
     missing = next(size for size in sizes if size >= weights.size + points.shape[1]) - weights.size
-    turn = np.pi if symmetry == "bilateral" else 2 * np.pi
-    angle = -np.pi / 2 + turn * np.arange(missing) / max(missing - 1, 1)
+    span = np.pi if symmetry == "bilateral" else 2 * np.pi
+    angle = -np.pi / 2 + span * np.arange(missing) / max(missing - 1, 1)
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     filled = np.concatenate([points, rim if points.shape[1] == 2 else np.ones((missing, 1))])
     return Pattern(filled, np.pad(weights, (0, missing)), symmetry)

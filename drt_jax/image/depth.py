@@ -18,7 +18,7 @@ from ..lens.scene import distance_array, scene_of, vergence_of
 from ..numerics import Numbers, concrete
 from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
-from .moments import FocusMoments, moments
+from .moments import FocusMoments, Moments, moments
 
 _MAX_NODES = 64
 # By this part a distance may lie outside of its range: 1 / (1 / far) is not always far.
@@ -112,14 +112,15 @@ def moments_model(
     distances: tuple[float, float],
     wavelengths: Numbers,
     tolerance: float = 1e-6,
-) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]]:
+) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], Moments]]:
     """The cheapest exact model of the moments for what is trained.
 
-    `trained` names fields of `Lens`; `distances` = (near, far) in mm, equal for one depth.
-    Returns their initial values and a function (values, distance) -> (centroid, covariance
-    as in `FocusMoments.at`, and the fraction (W,) of the light that passes). With the sensor
-    alone, nothing is traced inside that function: polynomials in its position, and in
-    1/distance when the depth varies. Anything else traces the rays anew.
+    trained: names of fields of `Lens`.
+    distances: (near, far) in mm, equal for one depth.
+
+    Returns the initial values of these fields, and a function (values, distance) -> `Moments`. If
+    only the sensor is trained, this function traces nothing: it is a polynomial in the sensor
+    position, and in 1/distance if the depth varies. Otherwise it traces the rays anew.
     """
     near, far = distances
     for distance in distances:
@@ -133,8 +134,7 @@ def moments_model(
             at = depth_moments(lens, field, near, far, wavelengths, tolerance).at
 
         def from_plane(values, distance):
-            moments = at(distance)
-            return *moments.at(values.get("sensor", lens.sensor)), moments.passed
+            return at(distance).at(values.get("sensor", lens.sensor))
 
         return values, from_plane
     ends = np.unique([near, far])
@@ -143,7 +143,6 @@ def moments_model(
     def retrace(values, distance):
         moved = dataclasses.replace(lens, **values)
         scene = scene_of(moved, field, distance, wavelengths)
-        found = moments(moved, scene, rule, solve_reverse)
-        return *found.at(moved.sensor), found.passed
+        return moments(moved, scene, rule, solve_reverse).at(moved.sensor)
 
     return values, retrace

@@ -46,7 +46,7 @@ def gaussian_psf(
     """Gaussian kernels [channel, y, x] of C channels, (C, size, size) in the dtype of `mean`.
 
     mean: (C, 2), x and y from the centre of the grid, mm.
-    covariance: mm^2, (C, 2, 2), or (C, 2) for a diagonal one; see `separable_psf` for that.
+    covariance: (C, 2, 2), mm^2.
     pixel: the side of a pixel, mm; warns of one above 1 mm, which may be meant in um.
     size: pixels along a side of the grid.
     form: "integrated": each pixel collects what falls on its area, and the kernel is normalised
@@ -59,22 +59,27 @@ def gaussian_psf(
     ray arrived), or of other numbers of that kind, is black, and its derivatives are 0.
     """
     kernel = _gaussian(*_checked(mean, covariance, pixel, size, form), size, form)
-    return kernel.dense() if isinstance(kernel, SeparableKernel) else kernel
+    assert not isinstance(kernel, SeparableKernel)
+    return kernel
 
 
 def separable_psf(
     mean: Numbers,
-    variances: Numbers,
+    covariance: Numbers,
     pixel: Numbers,
     size: int = 21,
     form: Form = "integrated",
 ) -> SeparableKernel:
-    """`gaussian_psf` of Gaussians whose axes lie along the pixels, as two rows a channel: what a
-    training step convolves with. variances: (C, 2), along x and y, mm^2. Else as there."""
-    mean, variances, side = _checked(mean, variances, pixel, size, form)
-    if variances.ndim != 2:
-        raise ValueError(f"variances: expected (C, 2), got shape {variances.shape}")
-    kernel = _gaussian(mean, variances, side, size, form)
+    """`gaussian_psf` of Gaussians whose axes lie along the pixels, as a row and a column for each
+    channel: what a training step convolves with.
+
+    Arguments as there. The covariance is taken as diagonal, see `Moments.separable`. ValueError if
+    its xy elements are known and not 0.
+    """
+    centroid, matrix, side = _checked(mean, covariance, pixel, size, form)
+    if concrete(covariance) and np.any(np.asarray(matrix)[:, [0, 1], [1, 0]]):
+        raise ValueError("covariance: xy must be 0 for a separable kernel; use gaussian_psf")
+    kernel = _gaussian(centroid, jnp.diagonal(matrix, 0, 1, 2), side, size, form)
     assert isinstance(kernel, SeparableKernel)
     return kernel
 
@@ -82,7 +87,7 @@ def separable_psf(
 def _gaussian(
     mean: Array, covariance: Array, side: Array, size: int, form: Form
 ) -> SeparableKernel | Array:
-    """The kernel; separable for variances (C, 2)."""
+    """The kernel; separable if the variances (C, 2) stand for the covariance."""
     usable = (side > 1 / _FAR) & (side < _FAR)
     side = jnp.where(usable, side, 1)
     known = jnp.isfinite(mean), jnp.isfinite(covariance)
@@ -116,11 +121,10 @@ def _checked(
     given: dict[str, Numbers] = {"mean": mean, "covariance": covariance, "pixel": pixel}
     arrays = [real_array(name, value, dtype) for name, value in given.items()]
     channels = arrays[0].shape[:1]
-    shapes: list[list[tuple[int, ...]]] = [[(*channels, 2)], [(*channels, 2)], [()]]
-    shapes[1].append((*channels, 2, 2))
-    for name, array, wanted in zip(given, arrays, shapes, strict=True):
-        if array.shape not in wanted or array.size == 0:
-            text = "(C, 2), (C, 2) or (C, 2, 2), and one pixel"
+    shapes = (*channels, 2), (*channels, 2, 2), ()
+    texts = "(C, 2)", "(C, 2, 2) with the C of mean", "one number"
+    for name, array, wanted, text in zip(given, arrays, shapes, texts, strict=True):
+        if array.shape != wanted or array.size == 0:
             raise ValueError(f"{name}: expected {text}, got shape {array.shape}")
         if concrete(given[name]) and not np.all(np.isfinite(np.asarray(given[name], float))):
             hint = "; no ray of that colour arrives" if name == "covariance" else ""

@@ -72,7 +72,7 @@ def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Arra
     system, target = aims(lens, scene, points)
     bundle = bundle_of(lens, scene, system, target, found)
     launch = paraxial_launch(system, target, beam_size(system, target)[1])
-    places = [*lens.live, lens.count]
+    places = [*lens.active, lens.count]
     if system.stop is not None:
         places.insert(system.before, lens.stop)
     failed = meetings(system, launch).status != Status.OK

@@ -24,16 +24,19 @@ from .spot import deviations, mean_products, normalised
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Moments:
-    """The spot of W colours. Unpacks, and is indexed, as (mean, covariance).
+    """The spot of W wavelengths.
 
-    mean: (W, 2), x and y of the centroid in mm on the sensor.
-    covariance: (W, 2, 2) in mm^2; inf on the diagonal for a colour of which no light passes.
-    passed: (W,), the share of the light through the stop that reaches the sensor.
+    mean: (W, 2), x and y of the centroid on the sensor, mm.
+    covariance: (W, 2, 2), mm^2; inf on the diagonal for a wavelength of which no light arrives.
+    passed: (W,), the fraction of the light through the stop that reaches the sensor.
+    separable: static; True if symmetry makes the xy element 0, so that the Gaussian kernel is
+        separable, see `separable_psf`.
     """
 
     mean: Array
     covariance: Array
     passed: Array
+    separable: bool = dataclasses.field(default=False, metadata={"static": True})
 
 
 @jax.tree_util.register_dataclass
@@ -55,43 +58,22 @@ class FocusMoments:
     spread: Array
     passed: Array
 
-    def at(self, sensor: Numbers) -> tuple[Array, Array]:
-        """Centroid (W, 2) in mm and covariance in mm^2 with the sensor at `sensor` mm.
-
-        The covariance is (W, 2), its diagonal, when the axes are principal by symmetry; else
-        (W, 2, 2). That of a colour of which no light passes is inf: no failing lens looks good.
-        """
+    def at(self, sensor: Numbers) -> Moments:
+        """The spot with the sensor at `sensor` mm."""
         return _at(self, jnp.asarray(sensor, self.reference.dtype))
-
-    def full(self, sensor: Numbers) -> Moments:
-        """The same as `Moments`, the covariance always (W, 2, 2)."""
-        return _full(self, jnp.asarray(sensor, self.reference.dtype))
 
 
 @jax.jit
-def _at(moments: FocusMoments, sensor: Array) -> tuple[Array, Array]:
+def _at(moments: FocusMoments, sensor: Array) -> Moments:
     # One program rather than one for each operation.
     d = sensor - moments.reference
     spread = moments.spread[0] + d * (moments.spread[1] + d * moments.spread[2])
-    lit = (moments.passed > 0)[:, None]
-    diagonal = jnp.where(lit, spread[:, :2], jnp.inf)
-    mean = moments.mean + d * moments.slope
-    if spread.shape[-1] == 2:
-        return mean, diagonal
-    return mean, _matrix(diagonal[:, 0], diagonal[:, 1], spread[:, 2])
-
-
-@jax.jit
-def _full(moments: FocusMoments, sensor: Array) -> Moments:
-    mean, covariance = _at(moments, sensor)
-    if covariance.ndim == 2:
-        xx, yy = covariance[:, 0], covariance[:, 1]
-        covariance = _matrix(xx, yy, jnp.zeros_like(xx))
-    return Moments(mean, covariance, moments.passed)
-
-
-def _matrix(xx: Array, yy: Array, xy: Array) -> Array:
-    return jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
+    arrives = (moments.passed > 0)[:, None]
+    xx, yy = jnp.where(arrives, spread[:, :2], jnp.inf).T
+    separable = spread.shape[-1] == 2
+    xy = jnp.zeros_like(xx) if separable else spread[:, 2]
+    covariance = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
+    return Moments(moments.mean + d * moments.slope, covariance, moments.passed, separable)
 
 
 def moments(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver = solve) -> FocusMoments:

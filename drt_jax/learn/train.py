@@ -12,12 +12,13 @@ from skimage import metrics
 
 from ..compilation import NETWORK, known_options
 from ..image.kernel import Form, gaussian_psf, separable_psf
+from ..image.moments import Moments
 from ..image.sensor import Convolve, convolve, sensor_layer
 from ..numerics import Numbers, safe_divide, safe_sqrt
 from .adam import adam, apply_updates
 from .network import count_parameters
 
-Blur = Callable[[dict[str, Array], Array], tuple[Array, Array, Array]]
+Blur = Callable[[dict[str, Array], Array], Moments]
 Restore = Callable[[Any, Array], Array]
 Imager = Callable[..., tuple[Array, Array, Array, Array]]
 
@@ -66,28 +67,27 @@ def make_imager(
         parameters: dict[str, Any], scenes: Array, distance: Array, noise: Numbers, key: Array
     ) -> tuple[Array, Array, Array, Array]:
         scenes = scenes.astype(jnp.float32) / 255
-        mean, covariance, passed = blur(parameters["optics"], distance)
-        arrives = passed > 0
-        total = jnp.sum(jnp.where(arrives[:, None], mean, 0), axis=0, keepdims=True)
-        offset = mean - safe_divide(total, jnp.sum(arrives, dtype=mean.dtype))
+        spot = blur(parameters["optics"], distance)
+        arrives = spot.passed > 0
+        total = jnp.sum(jnp.where(arrives[:, None], spot.mean, 0), axis=0, keepdims=True)
+        offset = spot.mean - safe_divide(total, jnp.sum(arrives, dtype=spot.mean.dtype))
         pixel = camera.pixel_um * 1e-3
-        psf = separable_psf if covariance.ndim == 2 else gaussian_psf
-        kernel = psf(offset, covariance, pixel, camera.kernel, camera.form)
-        light = jnp.expand_dims(passed.astype(jnp.float32), (0, 1, 2))
+        psf = separable_psf if spot.separable else gaussian_psf
+        kernel = psf(offset, spot.covariance, pixel, camera.kernel, camera.form)
+        light = jnp.expand_dims(spot.passed.astype(jnp.float32), (0, 1, 2))
         image = sensor_layer(scenes * light, kernel, noise, key, convolve)
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin
         truth = scenes[:, margin : end[0], margin : end[1]]
-        return truth, image, restored, blur_width(covariance)
+        return truth, image, restored, blur_width(spot.covariance)
 
     return imager
 
 
 def blur_width(covariance: Array) -> Array:
     """Standard deviation (C,) of a blur, root of the mean of the variances along x and y, from its
-    covariance (C, 2) or (C, 2, 2) as `moments_model` gives it."""
-    diagonal = covariance if covariance.ndim == 2 else jnp.diagonal(covariance, 0, 1, 2)
-    return safe_sqrt(jnp.mean(diagonal, axis=1))
+    covariance (C, 2, 2)."""
+    return safe_sqrt(jnp.mean(jnp.diagonal(covariance, 0, 1, 2), axis=1))
 
 
 def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:

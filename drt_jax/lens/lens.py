@@ -141,7 +141,7 @@ class Lens:
         return len(self.labels.glasses) - 1
 
     @property
-    def live(self) -> tuple[int, ...]:
+    def active(self) -> tuple[int, ...]:
         """The surfaces that bend light: mirrors, those between different media, and diffractive
         ones."""
         media, added = self.glasses, () if self.phase is None else self.phase.surfaces

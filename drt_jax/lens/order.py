@@ -39,13 +39,13 @@ def neighbours(lens: Lens, gaps: list[float], moved: list[bool]) -> list[Pair]:
     moved: of each surface and the sensor.
     """
     groups = () if lens.elements is None else lens.elements.spans
-    apart = lambda i, j: any((a <= i <= b) != (a <= j <= b) for a, b in groups)  # noqa: E731
-    chain = itertools.pairwise([*(lens.live or (lens.stop,)), lens.count])
+    separated = lambda i, j: any((a <= i <= b) != (a <= j <= b) for a, b in groups)  # noqa: E731
+    chain = itertools.pairwise([*(lens.active or (lens.stop,)), lens.count])
     senses = lens.senses.tolist()
     return [
         Pair(i, j, senses[i + 1] * sum(gaps[i:j]))
         for i, j in chain
-        if not (moved[i] or moved[j] or apart(i, j))
+        if not (moved[i] or moved[j] or separated(i, j))
     ]
 
 
@@ -78,7 +78,7 @@ def may_cross(lens: Lens) -> bool:
     """Whether some neighbours, of a lens whose arrays are known, cross inside their apertures, or
     may do so: without apertures, or away from the axis."""
     pairs, semi = neighbours_now(lens), np.asarray(lens.semi_diameter)
-    if len(pairs) < max(len(lens.live), 1):
+    if len(pairs) < max(len(lens.active), 1):
         return True
     open_ones = (np.all(np.isinf(semi[list(pair[:2])])) for pair in pairs[:-1])
     return any(open_ones) or any(crossing(lens, pair) is not None for pair in pairs)

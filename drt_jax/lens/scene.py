@@ -35,7 +35,7 @@ class Scene:
     def possible(self) -> Array:
         """Whether the object lies before the lens, () bool: angles below 90 degrees, and a distance
         above 0. Known in a trace only when it runs; light from elsewhere then is MISSED."""
-        return jnp.all(ahead(self.field)) & apart(self.distance)
+        return jnp.all(ahead(self.field)) & in_front(self.distance)
 
     @property
     def tangent(self) -> Array:
@@ -53,14 +53,14 @@ def ahead(angle: Array) -> Array:
     return jnp.abs(angle) < _RIGHT
 
 
-def apart(distance: Array) -> Array:
+def in_front(distance: Array) -> Array:
     """Whether an object at a distance (...) in mm lies before the lens, bool; inf does."""
     return distance >= _NEAREST
 
 
 def vergence_of(distance: Array) -> Array:
     """1 / `distance` (...), 1/mm, also of inf; 0 for a distance in mm that is not above 0."""
-    before = apart(distance)
+    before = in_front(distance)
     return jnp.where(before, 1 / jnp.where(before, distance, 1), 0)
 
 
@@ -127,5 +127,5 @@ def field_of_height(height: Numbers, distance: Numbers) -> Array:
     far = distance_array(distance, float)
     if np.inf in _known(distance):
         raise ValueError("distance: at infinity an object has a field, but no height")
-    good = apart(far) & (far < jnp.inf)
+    good = in_front(far) & (far < jnp.inf)
     return jnp.where(good, -jnp.arctan(heights / jnp.where(good, far, 1)), _RIGHT)

@@ -22,7 +22,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..numerics import safe_divide, safe_sqrt
-from ..rays.snell import apart, shoot, shoot_anyway
+from ..rays.snell import shoot, shoot_anyway, split_stop
 from ..rays.status import Status
 from ..rays.system import System, dot
 from ..rays.trace import on_all_surfaces
@@ -114,7 +114,7 @@ def trace(
         hits, ways, status = shoot_anyway(system, tuple(launch))
     else:
         hits, status, _ = shoot(system, tuple(launch))
-    both, good = on_all_surfaces(lens, system, *apart(system, hits), status == Status.OK)
+    both, good = on_all_surfaces(lens, system, *split_stop(system, hits), status == Status.OK)
     hit = jnp.stack(both)
     q = [hit / lens.semi_diameter[None, :, None, None]]
     if crossing:

@@ -151,7 +151,7 @@ def _nodes(given: _Given, state: _State) -> tuple[_State, _Task]:
 def _nothing(given: _Given, crossing: bool) -> _State:
     """The state before the first stage."""
     lens, waves, kind = given.lens, given.system.index.shape[1], given.system.index.dtype
-    edges = lens.count + 1 + crossing * len(lens.live) + boundary.aperture_edges(lens)
+    edges = lens.count + 1 + crossing * len(lens.active) + boundary.aperture_edges(lens)
     zeros = functools.partial(jnp.zeros, dtype=kind)
 
     def none(count):

@@ -19,7 +19,7 @@ from ..lens.forms import Shape
 from ..lens.paraxial import trace_yu
 from ..lens.surface import vertex_curvature
 from ..numerics import run_if, safe_divide, safe_sqrt
-from .snell import apart, shoot, shoot_to_stop
+from .snell import shoot, shoot_to_stop, split_stop
 from .status import Status
 from .system import System, Vector, determinant, divide, dot
 
@@ -323,7 +323,7 @@ def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
     shape = fan.there[0].shape
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
     trace = shoot(system, flat)
-    _, there = apart(system, trace.hits)
+    _, there = split_stop(system, trace.hits)
     good = trace.status == Status.OK
     return Fan(launch, tuple(jnp.where(good, a, jnp.inf).reshape(shape) for a in there))
 

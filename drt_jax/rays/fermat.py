@@ -1,8 +1,8 @@
 """The Fermat system of a bundle of rays: optical path, its gradient, and the label of a ray.
 
 A ray is labelled by its object point and by where it crosses the stop. Unknown are its hits on
-the L live surfaces, those that bend light, and on the sensor; the equations are dOP/dw_i = 0 on
-the live surfaces (paper Eqs. 2 and 3) and one more, the label: the straight line through the
+the L active surfaces, those that bend light, and on the sensor; the equations are dOP/dw_i = 0 on
+the active surfaces (paper Eqs. 2 and 3) and one more, the label: the straight line through the
 hits that enclose the stop, prolonged either way, crosses the stop at the wanted point. A stop
 that bends light itself is one of the surfaces, and the label is its hit.
 
@@ -22,7 +22,7 @@ from ..lens.forms import Shape
 from ..lens.surface import by_form, domain, sag_derivatives, surface_sag
 from ..numerics import safe_divide, safe_sqrt
 from .meet import cross
-from .system import Diffraction, System, Vector, dot, turn
+from .system import Diffraction, System, Vector, dot, rotate
 
 
 class Path(NamedTuple):
@@ -52,7 +52,7 @@ class Path(NamedTuple):
 def _segments(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vector]:
     """First points, D + 1 arrays (W, Q), and the steps from each to the next, (L, W, Q). Steps
     are sums of small differences: no digit is lost far from the origin."""
-    own = turn(system.rows.rotation, (*hits, heights))
+    own = rotate(system.rows.rotation, (*hits, heights))
     origin = [a[..., None, None] for a in system.rows.origin(len(hits))]
     step = tuple((o[1:] - o[:-1]) + (p[1:] - p[:-1]) for o, p in zip(origin, own, strict=True))
     return tuple(o[0] + p[0] for o, p in zip(origin, own, strict=True)), step
@@ -74,8 +74,8 @@ def geometry(hits: Vector, system: System) -> Path:
     length = _length(chain)
     shrink = _inverse(length)
     direction = tuple(s * shrink for s in chain)
-    before = turn(rotation, tuple(d[:-1] for d in direction), back=True)
-    after = turn(rotation, tuple(d[1:] for d in direction), back=True)
+    before = rotate(rotation, tuple(d[:-1] for d in direction), back=True)
+    after = rotate(rotation, tuple(d[1:] for d in direction), back=True)
     jump = system.index * before[-1] - system.behind * after[-1]
     bend = tuple(tuple(jump * b for b in row) for row in bend)
     if system.diffraction is not None:
@@ -93,8 +93,7 @@ def added(hits: Vector, by: Diffraction) -> tuple[np.ndarray, tuple]:
 
 
 def residual(path: Path, system: System) -> Vector:
-    """F = dOP/dw on every live surface, dimensionless (paper Eq. 3), and on the sensor, where it is
-    0 for any path: D arrays (R, W, Q)."""
+    """F = dOP/dw, D arrays (R, W, Q), dimensionless (paper Eq. 3); 0 on the sensor for any path."""
     index, behind = (jnp.broadcast_to(n, path.length.shape) for n in (system.index, system.behind))
     *across, along = (index * b - behind * a for b, a in zip(path.before, path.after, strict=True))
     force = tuple(c + s * along for c, s in zip(across, path.slope, strict=True))
@@ -125,9 +124,9 @@ def ray_at(path: Path, system: System, row: int) -> tuple[Vector, Vector]:
     of the lens."""
     rotation = None if system.rows.rotation is None else system.rows.rotation[row]
     origin = (a[row] for a in system.rows.origin(system.dim))
-    own = turn(rotation, (*(h[row] for h in path.hits), path.height[row]))
+    own = rotate(rotation, (*(h[row] for h in path.hits), path.height[row]))
     point = tuple(o + p for o, p in zip(origin, own, strict=True))
-    return point, turn(rotation, tuple(b[row] for b in path.before))
+    return point, rotate(rotation, tuple(b[row] for b in path.before))
 
 
 def label(path: Path, system: System) -> Vector:

@@ -28,7 +28,7 @@ from .aim import (
     trace_fan,
 )
 from .bundle import in_tiles, polynomial_launch, tile_of
-from .snell import apart, shoot
+from .snell import shoot, split_stop
 from .sparse import Lanes
 from .status import Status
 from .system import System, Vector, dot
@@ -39,7 +39,7 @@ _MAX_STEPS = 16
 class Found(NamedTuple):
     """Rays of a bundle.
 
-    hits: D arrays (R, W, Q) in mm on the live surfaces and the sensor; 0 for failed rays.
+    hits: D arrays (R, W, Q) in mm on the active surfaces and the sensor; 0 for failed rays.
     arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along the axes of the lens; void for
         failed rays.
     status: (W, Q), int32, see `Status`.
@@ -142,7 +142,7 @@ def find(
     wanted = jnp.ones(target[0].shape, bool) if wanted is None else wanted
     search = _search(system, target, launch, sizes, wanted)
     good = search.status == Status.OK
-    hits, crossing = apart(system, search.hits)
+    hits, crossing = split_stop(system, search.hits)
     hits = tuple(jnp.where(good, a, 0) for a in hits)
     rough = good & ~fermat.met(crossing, target, hits, system)
     hits, solved, steps = _polish(system, target, hits, rough)
@@ -158,7 +158,7 @@ def find_aimed(system: System, target: Vector) -> Found:
     `find` is, and a tenth of its time where rays fail."""
     aimed = aim_outwards(system, target)
     hits, status = _verdict(system, aimed.launch, aimed.status)
-    hits, crossing = apart(system, hits)
+    hits, crossing = split_stop(system, hits)
     good = (status == Status.OK) & fermat.met(crossing, target, hits, system)
     hits = tuple(jnp.where(good, a, 0) for a in hits)
     status = jnp.where(good, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
@@ -166,22 +166,31 @@ def find_aimed(system: System, target: Vector) -> Found:
 
 
 class _Search(NamedTuple):
-    """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). left: (W, Q), how many turns each ray
-    that failed is still to be sought. fan: as far as it is traced. turn, steps: ()."""
+    """The state of a search.
+
+    hits: D arrays in mm, see `snell.Trace`.
+    status: (W, Q), int32.
+    left: (W, Q), int32, in how many more rounds each missing ray is aimed again.
+    fan: traced from round 1 on.
+    round, steps: (), int32, rounds and Newton steps so far.
+    """
 
     hits: Vector
     status: Array
     left: Array
     fan: Fan
-    turn: Array
+    round: Array
     steps: Array
 
 
 def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted: Array) -> _Search:
-    """All rays from their first launch; then those that are wanted and failed, each from the
-    nearest of a fan; then a few a turn, each from several of it, which takes `rounds` turns for all
-    `STARTS`. One loop with as many lanes as there are rays: the aiming is compiled once, and under
-    `vmap` too the fan costs nothing while no ray is missing."""
+    """Round 0 aims all rays from their first launch. Round 1 aims those that are wanted and failed
+    from the nearest ray of a fan. Each later round aims the first few of those that are missing
+    from several rays of the fan each; after `rounds` rounds a ray has had all `STARTS` of them.
+
+    One loop with as many lanes as rays, so that the aiming is compiled once; and the fan costs
+    nothing while no ray is missing, also under `vmap`.
+    """
     waves, rays = target[0].shape
     starts = min(STARTS, rays)
     rounds, ray = -(-STARTS // starts), np.arange(rays, dtype=np.int32)
@@ -191,8 +200,8 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted
         fan = trace_fan(system, fan, launch, sizes[1])
         return fan, target, nearest_start(fan, target)
 
-    def turn(state):
-        whole, sought = state.turn < 2, state.left > 0
+    def next_round(state):
+        whole, sought = state.round < 2, state.left > 0
         lanes = Lanes(sought, starts)
 
         def from_several(given):
@@ -202,31 +211,31 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted
             begin = starts_of(fan, wanted, ranks)
             return fan, *lanes.spread((tuple(a[..., None] for a in wanted), begin))
 
-        given = run_if(state.turn == 1, from_fan, (state.fan, target, launch))
-        fan, own, begin = run_if(state.turn > 1, from_several, given)
-        reach = jnp.where(state.turn == 0, sizes[1], sizes[1] / 8)
+        given = run_if(state.round == 1, from_fan, (state.fan, target, launch))
+        fan, own, begin = run_if(state.round > 1, from_several, given)
+        reach = jnp.where(state.round == 0, sizes[1], sizes[1] / 8)
         upright = whole & (system.rows.rotation is None)
         new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
 
         worth = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
         lane, found = lanes.best(worth)
         lane = jnp.where(whole, ray[None], lane)
-        found = jnp.where(whole, (state.turn == 0) | (sought & (worth > 0)), found)
+        found = jnp.where(whole, (state.round == 0) | (sought & (worth > 0)), found)
         status = jnp.take_along_axis(new.status, lane, axis=-1)
         status = jnp.where(found, status, state.status)
         taken = (jnp.take_along_axis(h, lane[None], axis=-1) for h in new.hits)
         hits = tuple(jnp.where(found, a, b) for a, b in zip(taken, state.hits, strict=True))
         left = state.left - (lanes.served & ~whole).astype(jnp.int32)
-        left = jnp.where(state.turn == 0, jnp.where(wanted, rounds, 0), left)
-        left = jnp.where((found & (state.turn > 0)) | (status == Status.OK), 0, left)
-        return _Search(hits, status, left, fan, state.turn + 1, state.steps + new.steps)
+        left = jnp.where(state.round == 0, jnp.where(wanted, rounds, 0), left)
+        left = jnp.where((found & (state.round > 0)) | (status == Status.OK), 0, left)
+        return _Search(hits, status, left, fan, state.round + 1, state.steps + new.steps)
 
     count = len(system.forms) + (system.stop is not None)
     zero = jnp.zeros((count, waves, rays), target[0].dtype)
     status = jnp.zeros((waves, rays), jnp.int32)
     none = jnp.int32(0)
     start = _Search((zero,) * len(target), status, status, no_fan(system, waves), none, none)
-    return jax.lax.while_loop(lambda s: (s.turn == 0) | jnp.any(s.left > 0), turn, start)
+    return jax.lax.while_loop(lambda s: (s.round == 0) | jnp.any(s.left > 0), next_round, start)
 
 
 class _Traced(NamedTuple):
@@ -277,7 +286,7 @@ def _find_many(system: System, target: Vector, known: Array) -> Found:
     def tile(target, known):
         launch = launch_of(target)
         hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
-        hits, crossing = apart(system, hits)
+        hits, crossing = split_stop(system, hits)
         solved = fermat.met(crossing, target, hits, system) & (status == Status.OK)
         found = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0))
         search = lambda _: find(system, target, launch, known)  # noqa: E731

@@ -18,7 +18,7 @@ from jax import Array
 
 from .fermat import Path, label, ray_at, residual
 from .meet import cross
-from .system import System, Vector, divide, dot, turn
+from .system import System, Vector, divide, dot, rotate
 
 
 class Push(NamedTuple):
@@ -71,20 +71,22 @@ class _March(NamedTuple):
 
 
 def _step(
-    row: _Row, live: bool, good: Array, march: _March, force: Vector, moved: Vector
+    row: _Row, active_stop: bool, good: Array, march: _March, force: Vector, moved: Vector
 ) -> tuple[_March, Vector]:
-    """Onto a row and through it: the changes behind it, and of its hit, D arrays; `live`: whether
-    the stop bends light."""
+    """Onto a row and through it: the change behind it, and that of its hit, D arrays.
+
+    active_stop: whether the stop is an active surface.
+    """
     carried = (
         p + row.length * s - m for p, s, m in zip(march.point, march.swing, moved, strict=True)
     )
-    *across, depth = turn(row.rotation, tuple(carried), back=True)
-    *swung, along = turn(row.rotation, march.swing, back=True)
+    *across, depth = rotate(row.rotation, tuple(carried), back=True)
+    *swung, along = rotate(row.rotation, march.swing, back=True)
     # Along the ray onto the tangent plane of the surface.
     normal = jnp.where(good, row.before[-1] - dot(row.slope, row.before[:-1]), 1)
     slide = (depth - dot(row.slope, across)) / normal
     hit = tuple(c - slide * e for c, e in zip(across, row.before, strict=False))
-    here = turn(row.rotation, (*hit, dot(row.slope, hit)))
+    here = rotate(row.rotation, (*hit, dot(row.slope, hit)))
     point = tuple(a + m for a, m in zip(here, moved, strict=True))
     pull = tuple(
         row.index_before * (v + s * along) + dot(bend, hit) - f
@@ -94,9 +96,9 @@ def _step(
     normal = jnp.where(good, row.after[-1] - dot(row.slope, row.after[:-1]), 1)
     along = -dot(row.after[:-1], pull) / (row.index_behind * normal)
     behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
-    made = hit if live else (*point, *march.swing)
+    made = hit if active_stop else (*point, *march.swing)
     made = tuple(jnp.where(row.labels, a, b) for a, b in zip(made, march.label, strict=True))
-    return _March(point, turn(row.rotation, (*behind, along)), made), hit
+    return _March(point, rotate(row.rotation, (*behind, along)), made), hit
 
 
 def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, Vector]:
@@ -105,11 +107,11 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
 
     good: (W, Q), the rays of interest: what comes out for the others is finite if they are.
     """
-    dim, zero, live = len(push.label), jnp.zeros_like(push.label[0]), system.stop is None
+    dim, zero, active_stop = len(push.label), jnp.zeros_like(push.label[0]), system.stop is None
     at = np.arange(len(system.forms)) == system.before
     path_rows = _Row(*path[2:7], system.index, system.behind, system.rows.rotation, at)
     still, none = (zero,) * (dim + 1), (zero,) * dim
-    unknown = none if live else (*still, *still)
+    unknown = none if active_stop else (*still, *still)
     # A march from each unit change of the first hit, and one that the push makes.
     units = [[jnp.full_like(zero, float(d == k)) for k in range(dim)] for d in range(dim)]
     first = jax.vmap(lambda hit: _first(path, system, hit))(tuple(map(jnp.stack, units)))
@@ -117,8 +119,8 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
 
     def step(marches, given):
         row, *pushed = given
-        free = jax.vmap(lambda march: _step(row, live, good, march, none, still))(marches[0])
-        forced = _step(row, live, good, marches[1], *pushed)
+        free = jax.vmap(lambda march: _step(row, active_stop, good, march, none, still))(marches[0])
+        forced = _step(row, active_stop, good, marches[1], *pushed)
         return (free[0], forced[0]), (free[1], forced[1])
 
     start = free, _March(still, push.swing, unknown)
@@ -145,7 +147,7 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
 def _first(path: Path, system: System, hit: Vector) -> tuple[Vector, Vector]:
     """Changes of the point and of the direction in front of it when the first hit moves."""
     rotation = None if system.rows.rotation is None else system.rows.rotation[0]
-    moved = turn(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
+    moved = rotate(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
     first = ray_at(path, system, 0)[1]
     along, spread = dot(first, moved), system.vergence * path.shrink
     return moved, tuple(spread * (m - e * along) for m, e in zip(moved, first, strict=True))

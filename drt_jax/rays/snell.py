@@ -19,7 +19,7 @@ from ..lens.surface import sag_derivatives
 from ..numerics import safe_divide, safe_sqrt
 from .meet import meet
 from .status import Status
-from .system import Placed, System, Vector, dot, turn
+from .system import Placed, System, Vector, dot, rotate
 
 # A ray that leans more than this (cosine with the axis) is not followed.
 _FLATTEST = 1e-4
@@ -29,7 +29,7 @@ class Trace(NamedTuple):
     """Rays traced one surface after the other.
 
     hits: D arrays (R, ...), transverse coordinates on the rows in mm, and on a stop that is none
-        of them, which has its place among them: see `apart`. Void behind a failure.
+        of them, which has its place among them: see `split_stop`. Void behind a failure.
     status: (...), int32, OK, MISSED or TIR.
     rounding_angle: (...), the most that rounding the hits turns a segment by, in units of rounding.
     """
@@ -39,7 +39,7 @@ class Trace(NamedTuple):
     rounding_angle: Array
 
 
-def apart(system: System, hits: Vector) -> tuple[Vector, Vector]:
+def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
     """Traced hits as those on the rows of the system, D arrays (R, ...), and on the stop (...)."""
     at = system.before
     crossing = tuple(h[at] for h in hits)
@@ -109,16 +109,20 @@ def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
 
 
 class Row(NamedTuple):
-    """One thing that a ray meets: a live surface, the stop, the sensor; or with a first axis some.
+    """What a ray meets: an active surface, the stop or the sensor; or several, with a first axis.
 
-    first: whether it is the first. live: whether light must come to it from the front, or the ray,
-    prolonged either way, is a line that crosses it. bends: whether the ray goes on from here. kind:
-    of its form. ratio: of the indices before and behind. sense, leaving: 1 or -1, light goes along
-    or against z before it and behind. kick: None for no phase at all.
+    first: whether it is the first.
+    active: False for a stop that only labels: the line is extended either way to it.
+    bends: False if the ray continues unchanged.
+    surface: in its place.
+    kind: number of its form.
+    ratio: index before it / index behind it.
+    sense, leaving: 1 if light travels along z before it (behind it), -1 if against.
+    kick: of its phase; None if no row has a phase.
     """
 
     first: Any
-    live: Any
+    active: Any
     bends: Any
     surface: Placed
     kind: Any
@@ -155,9 +159,9 @@ def rows_met(system: System, to_stop: bool = False) -> Row:
         return rows
     stop, form = system.at_stop
     around = jax.tree.map(lambda a: a[at], rows)
-    live = np.bool_(system.stop is None)
+    active = np.bool_(system.stop is None)
     label = around._replace(
-        live=live, bends=np.False_, surface=stop, kind=np.int32(kinds.index(form))
+        active=active, bends=np.False_, surface=stop, kind=np.int32(kinds.index(form))
     )
     ends = jax.tree.map(lambda a: a[at:at] if to_stop else a[at:], rows)
 
@@ -181,7 +185,7 @@ class _State(NamedTuple):
 
 class Meeting(NamedTuple):
     """Of rays with all that they meet: the R rows, and a stop that is none of them in its place
-    among these, see `apart`. Along the axes of each; void behind a failure.
+    among these, see `split_stop`. Along the axes of each; void behind a failure.
 
     point, direction: D + 1 arrays (R, ...), in front of it, a point in mm and a unit vector.
     hit: D arrays (R, ...), where the ray, prolonged either way, crosses it, mm.
@@ -220,8 +224,8 @@ def _meet(system: System, row: "Row", state: _State, smooth: bool) -> tuple[Meet
     own, normal, crosses, length = encounter(p, d, row.surface.shape, going)
     bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
     hit, origin = own[:-1], row.surface.origin(len(own) - 1)
-    point = tuple(a + o for a, o in zip(turn(row.surface.rotation, own), origin, strict=True))
-    behind = state._replace(point=point, direction=turn(row.surface.rotation, bent), hit=hit)
+    point = tuple(a + o for a, o in zip(rotate(row.surface.rotation, own), origin, strict=True))
+    behind = state._replace(point=point, direction=rotate(row.surface.rotation, bent), hit=hit)
     return Meeting(p, d, hit, crosses, length, front, through, state.status), behind
 
 
@@ -238,7 +242,7 @@ def _follow(
     def step(state, row):
         meeting, behind = _meet(system, row, state, smooth)
         ahead = (meeting.length > 0) | row.first | (not forward)
-        met = meeting.crosses & (~row.live | ((meeting.front > 0) & ahead))
+        met = meeting.crosses & (~row.active | ((meeting.front > 0) & ahead))
         passes = (meeting.through > 0) | ~row.bends
         here = jnp.where(met, jnp.where(passes, Status.OK, Status.TIR), Status.MISSED)
         status = jnp.where(state.status == Status.OK, here.astype(jnp.int32), state.status)
@@ -269,7 +273,7 @@ def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
     from each active surface to the next and to the sensor, mm: a ray may step back, where
     neighbours cross, by a length below 0. Differentiable; void rays are finite."""
     state, met = _follow(system, launch, smooth=True, forward=False)
-    return met.hit, apart(system, (met.length,))[0][0][1:], state.status
+    return met.hit, split_stop(system, (met.length,))[0][0][1:], state.status
 
 
 def meetings(system: System, launch: Vector, smooth: bool = False) -> Meeting:

@@ -20,7 +20,7 @@ from .fermat import Path
 from .find import Found, find_aimed, find_many
 from .meet import cross
 from .status import Status
-from .system import System, Vector, dot, turn
+from .system import System, Vector, dot, rotate
 
 
 @jax.custom_jvp
@@ -62,7 +62,7 @@ def _push(path: Path, system: System, moving: list[Array | None]) -> linear.Push
     """What a path has to make up for when leaves of its system move (paper Eq. 4)."""
     leaves, structure = jax.tree.flatten(system)
     some = [k for k, change in enumerate(moving) if change is not None]
-    directions = [turn(system.rows.rotation, a) for a in (path.before, path.after)]
+    directions = [rotate(system.rows.rotation, a) for a in (path.before, path.after)]
     first, line = (fermat.ray_at(path, system, row) for row in (0, system.before))
 
     def held(changed):
@@ -71,9 +71,9 @@ def _push(path: Path, system: System, moving: list[Array | None]) -> linear.Push
         own = jax.tree.unflatten(structure, [new.get(k, a) for k, a in enumerate(leaves)])
         rows = own.rows
         height, slope, _ = by_form(sag_derivatives, path.hits, rows.on(path.length), own.forms)
-        before, after = (turn(rows.rotation, a, back=True) for a in directions)
+        before, after = (rotate(rows.rotation, a, back=True) for a in directions)
         force = fermat.residual(path._replace(before=before, after=after, slope=slope), own)
-        point = turn(rows.rotation, (*path.hits, height))
+        point = rotate(rows.rotation, (*path.hits, height))
         origin = (a[:, None, None] for a in rows.origin(own.dim))
         point = tuple(p + o for p, o in zip(point, origin, strict=True))
         toward = (own.vergence * p - s for p, s in zip(first[0], own.source, strict=True))

@@ -1,4 +1,4 @@
-"""What a bundle of rays goes through: the live surfaces in their places, and the stop as a label.
+"""What a bundle of rays goes through: the active surfaces in their places, and the stop as a label.
 
 Vectors are tuples of components: D = 1 for rays in the meridional plane (y) or 2 (x, y), and z
 where a vector has it; each an array of one number a ray. XLA joins sums of components into few
@@ -47,7 +47,7 @@ def divide(rows: Any, b: Vector) -> Vector:
     return safe_divide(x, size), safe_divide(y, size)
 
 
-def turn(rotation: Array | None, vector: Vector, back: bool = False) -> Vector:
+def rotate(rotation: Array | None, vector: Vector, back: bool = False) -> Vector:
     """A vector from the axes of its surface to those of the lens, or `back`.
 
     rotation: (3, 3), or (R, 3, 3) for components (R, ...); None: the axes are the same.
@@ -109,7 +109,9 @@ class Placed(NamedTuple):
         """A line along the axes of one surface, from its vertex."""
         origin = self.origin(len(point) - 1)
         shifted = tuple(p - o for p, o in zip(point, origin, strict=True))
-        return turn(self.rotation, shifted, back=True), turn(self.rotation, direction, back=True)
+        return rotate(self.rotation, shifted, back=True), rotate(
+            self.rotation, direction, back=True
+        )
 
 
 @jax.tree_util.register_dataclass
@@ -136,7 +138,7 @@ class Diffraction:
 class System:
     """Everything that the path of a ray depends on; the differentiable arguments.
 
-    rows: the L live surfaces, those that bend light, and the sensor: R = L + 1.
+    rows: the L active surfaces, those that bend light, and the sensor: R = L + 1.
     stop: the stop in its place if it bends no light, else None.
     index: (R, W, 1), of the medium in front of each row; (R,) for a single ray.
     source: (D + 1,), the object point divided by its distance; its last component is -1.
@@ -144,10 +146,10 @@ class System:
     diffraction: None for none.
 
     Static:
-    before: how many live surfaces lie before the stop.
+    before: how many active surfaces lie before the stop.
     forms: of the R rows.
     stop_form: of the stop.
-    mirrors: whether each of the L live surfaces reflects.
+    mirrors: whether each of the L active surfaces reflects.
     """
 
     rows: Placed
@@ -191,7 +193,7 @@ def placed(lens: Lens, rows: Any) -> Placed:
     themselves, but where `Lens.curved` has them."""
     rows = np.asarray(rows)
     vertex, offset, rotation = lens.places
-    bends = np.isin(rows, [*lens.live, *lens.curved])
+    bends = np.isin(rows, [*lens.active, *lens.curved])
 
     def shape(array: Array) -> Array:
         own = array[rows]
@@ -212,26 +214,26 @@ def placed(lens: Lens, rows: Any) -> Placed:
 def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
     """The system of a lens and a scene for rays of `dim` components: 2, or 1 for the meridional
     rays of an axial object in a lens with rotational symmetry."""
-    live, stop = lens.live, lens.stop
+    active, stop = lens.active, lens.stop
     # Wavelengths without an index have one that is finite; their rays fail, see `Status`.
     colours = jnp.clip(scene.wavelengths, *lens.dispersion.range)
-    rows = [*live, lens.count]
+    rows = [*active, lens.count]
     tangent = scene.tangent[2 - dim :]
     return System(
         rows=placed(lens, rows),
-        stop=None if stop in live else placed(lens, stop),
-        index=lens.index(colours)[np.array([0, *(i + 1 for i in live)]), :, None],
+        stop=None if stop in active else placed(lens, stop),
+        index=lens.index(colours)[np.array([0, *(i + 1 for i in active)]), :, None],
         # Light with a positive field angle travels upwards: the object lies below the axis.
         source=jnp.concatenate([-tangent, -jnp.ones_like(tangent[:1])]),
         vergence=scene.vergence,
-        diffraction=None if lens.phase is None else _diffraction(lens.phase, live, colours),
-        before=sum(i < stop for i in live),
+        diffraction=None if lens.phase is None else _diffraction(lens.phase, active, colours),
+        before=sum(i < stop for i in active),
         forms=tuple(lens.forms[i] for i in rows),
         stop_form=lens.forms[stop],
-        mirrors=tuple(lens.mirrors[i] for i in live),
+        mirrors=tuple(lens.mirrors[i] for i in active),
     )
 
 
-def _diffraction(phase: Phase, live: tuple[int, ...], wavelengths: Array) -> Diffraction:
+def _diffraction(phase: Phase, active: tuple[int, ...], wavelengths: Array) -> Diffraction:
     wave = _MM * phase.order[:, None, None] * wavelengths[None, :, None]
-    return Diffraction(phase.shape, wave, tuple(map(live.index, phase.surfaces)), phase.forms)
+    return Diffraction(phase.shape, wave, tuple(map(active.index, phase.surfaces)), phase.forms)

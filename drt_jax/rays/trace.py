@@ -22,7 +22,7 @@ from .find import Found
 from .meet import cross
 from .solve import Solver, solve
 from .status import Status
-from .system import System, Vector, placed, system_of, turn
+from .system import System, Vector, placed, rotate, system_of
 
 
 class Bundle(NamedTuple):
@@ -64,7 +64,7 @@ class Rays(NamedTuple):
 
 def _rows_behind(lens: Lens) -> list[int]:
     """The row of the system that each surface and the sensor is, or that lies behind it."""
-    return [sum(j < i for j in lens.live) for i in range(lens.count + 1)]
+    return [sum(j < i for j in lens.active) for i in range(lens.count + 1)]
 
 
 def on_all_surfaces(
@@ -74,7 +74,7 @@ def on_all_surfaces(
     and which of the `good` rays (W, Q), straight and prolonged either way, meet all surfaces that
     bend no light."""
     pieces, begin, behind = [], 0, _rows_behind(lens)
-    for i in sorted({*range(lens.count)} - {*lens.live}):
+    for i in sorted({*range(lens.count)} - {*lens.active}):
         row, crossing = behind[i], stop
         if i != lens.stop:
             some, part = fermat.up_to(hits, system, row)
@@ -112,7 +112,7 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
     clipped = good & jnp.any(clearance(lens, hits) < 0, axis=0)
     status = jnp.where(clipped, jnp.int32(Status.CLIPPED), status)
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
-    arrival = turn(rotation, found.arrival, back=True)
+    arrival = rotate(rotation, found.arrival, back=True)
     return Bundle(hits, status, arrival, fermat.optical_path(found.hits, system), found.steps)
 
 
@@ -188,9 +188,9 @@ def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     good = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     rows = placed(lens, range(lens.count + 1))
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
-    own = turn(rows.rotation, (*bundle.hits, heights))
+    own = rotate(rows.rotation, (*bundle.hits, heights))
     points = (p + o[:, None, None] for p, o in zip(own, rows.origin(2), strict=True))
-    direction = turn(system.rows.rotation, fermat.geometry(found.hits, system).before)
+    direction = rotate(system.rows.rotation, fermat.geometry(found.hits, system).before)
     behind = np.array(_rows_behind(lens))
 
     def stacked(vector):  # (3, S + 1, W, Q) -> (W, Q, S + 1, 3)

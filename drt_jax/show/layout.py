@@ -74,7 +74,7 @@ def draw(
     """
     angles = [float(angle) for angle in np.atleast_1d(fields)]
     # A surface that bends no light is no corner of a ray, nor a face of glass.
-    corners = [*lens.live, lens.count]
+    corners = [*lens.active, lens.count]
     hits, ends = [], []
     for angle in angles:
         scene = scene_of(lens, angle, distance, wavelength)
@@ -82,7 +82,7 @@ def draw(
         hits.append(fan.points[fan.status == Status.OK][:, corners, :0:-1])
         clipped = fan.status == Status.CLIPPED
         for ray, stop in zip(fan.points[clipped], fan.clips[clipped]):
-            cut = [*(k for k in lens.live if k < stop), stop]
+            cut = [*(k for k in lens.active if k < stop), stop]
             ends.append((ray[cut, :0:-1], angle))
     drawn = np.concatenate([np.zeros((1, 2)), *(hit.reshape(-1, 2) for hit in hits)])
     reach = float(np.max(np.abs(drawn[:, 1]))) or 1.0
@@ -97,7 +97,7 @@ def draw(
     faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
     glass = [
         np.concatenate([faces[i], faces[j][::-1], faces[i][:1]])
-        for i, j in itertools.pairwise(lens.live)
+        for i, j in itertools.pairwise(lens.active)
         if lens.glasses[i + 1] != lens.glasses[0]
     ]
     pierced = _pierced(lens, profiles)

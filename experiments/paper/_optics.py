@@ -139,7 +139,7 @@ class Trained:
         )[1]
 
         @jax.jit
-        def blur(values: dict[str, Array], distance: Array) -> tuple[Array, Array, Array]:
+        def blur(values: dict[str, Array], distance: Array) -> drt_jax.Moments:
             lens = self.lens_of(values)
             return model({name: getattr(lens, name) for name in leaves}, distance)
 

@@ -113,7 +113,7 @@ def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[s
 def blur_over_depth(blur: Callable, lenses: tuple, near: float, far: float) -> dict[str, Any]:
     """Blur in um along y of each colour, by depth in m, of lenses by their trained numbers."""
     grid = np.linspace(near, far, 121)
-    sigma = jax.vmap(lambda d, v: train.blur_width(blur(v, d)[1]), in_axes=(0, None))
+    sigma = jax.vmap(lambda d, v: train.blur_width(blur(v, d).covariance), in_axes=(0, None))
     curves = np.stack([1e3 * np.asarray(sigma(jnp.asarray(grid), values)) for values in lenses])
     sensors = [float(values["sensor"]) for values in lenses]
     return {"blur_sensor_mm": sensors, "blur_depth_m": grid / 1e3, "blur_um": curves}

@@ -81,16 +81,16 @@ def _residual(lens, field, distance, pupil, points):
     Along a stationary path, n e - n' e' is normal to each surface that bends light, e and e' being
     the directions before and behind it, n and n' the indices.
     """
-    live, stop = [*lens.live, lens.count], lens.stop
+    active, stop = [*lens.active, lens.count], lens.stop
     index = lens.index(jnp.full(1, WAVELENGTH, points.dtype))[:, 0]
-    path = points[jnp.array(live)]
+    path = points[jnp.array(active)]
     steps = jnp.concatenate([_entering(path[0], field, distance)[None], jnp.diff(path, axis=0)])
     length = jnp.linalg.norm(steps, axis=1)
     inverse = 1 / jnp.where(length > 0, length, jnp.finfo(points.dtype).tiny ** 0.5)
     e, size = steps * inverse[:, None], jnp.max(jnp.abs(points))
     miss = _place(lens, stop, points[stop])[:2] - lens.semi_diameter[stop] * pupil
     error, steepest = jnp.max(jnp.abs(miss)) / (1 + size), jnp.zeros_like(size)
-    for k, i in enumerate(lens.live):
+    for k, i in enumerate(lens.active):
         row = Shape(lens.curvature[i], lens.conic[i], lens.coefficients[i])
         slope = jnp.stack(sag_derivatives(_place(lens, i, path[k])[:2], row, lens.forms[i])[1])
         kink = _own(lens, i, index[i] * e[k] - index[i + 1] * e[k + 1])

@@ -52,16 +52,16 @@ class _Row(NamedTuple):
     """A surface or the sensor, or with a first axis all of them.
 
     shape, form: what `_intersect` takes, the form by its place among those of the lens. origin,
-    axes: of the vertex, mm; from the surface's axes to those of the lens. live: whether light bends
-    here; the sensor counts as live. mirror: whether it reflects. sense: 1 or -1, light goes along
-    or against its z axis. ratio: the index in front by that behind.
+    axes: of the vertex, mm; from the surface's axes to those of the lens. active: whether it is an
+    active surface; the sensor counts as one. mirror: whether it reflects. sense: 1 or -1, light
+    goes along or against its z axis. ratio: the index in front by that behind.
     """
 
     shape: Shape
     form: Array
     origin: Array
     axes: Array
-    live: Array
+    active: Array
     mirror: Array
     sense: Array
     ratio: Array
@@ -76,7 +76,7 @@ def _rows(lens: Lens, wavelength: Array, forms: list[str]) -> _Row:
         jnp.array([forms.index(form) for form in lens.forms]),
         jnp.concatenate([across, lens.vertices[:, None]], axis=1),
         jax.vmap(rotation_matrix)(tilt),
-        jnp.array([i in (*lens.live, lens.count) for i in range(lens.count + 1)]),
+        jnp.array([i in (*lens.active, lens.count) for i in range(lens.count + 1)]),
         jnp.array([*lens.mirrors, False]),
         jnp.asarray(lens.senses, dtype),
         index / jnp.append(index[1:], index[-1]),
@@ -117,8 +117,11 @@ def trace_snell(
         ahead = ~begun | (row.sense * (hit - p)[2] >= 0)
         bent, whole = _bend(d, normal, row)
         hit = row.axes @ hit + row.origin
-        behind = jnp.where(row.live, hit, point), jnp.where(row.live, row.axes @ bent, direction)
-        return (*behind, begun | row.live, ok & met & (~row.live | (ahead & whole))), hit
+        behind = (
+            jnp.where(row.active, hit, point),
+            jnp.where(row.active, row.axes @ bent, direction),
+        )
+        return (*behind, begun | row.active, ok & met & (~row.active | (ahead & whole))), hit
 
     start = point, direction, jnp.array(False), jnp.array(True)
     wavelength = jnp.asarray(wavelength, point.dtype)

@@ -98,7 +98,7 @@ def triplet():
         jnp.full_like(lens.semi_diameter, jnp.inf).at[lens.stop].set(lens.semi_diameter[lens.stop])
     )
     lens = dataclasses.replace(lens, semi_diameter=semi)
-    last = lens.live[-1]
+    last = lens.active[-1]
     variables = Variables.from_lens(
         lens,
         [Vary("curvature", low=-0.12, high=0.12), Vary("thickness", low=0.1, high=8), "sensor"],

@@ -57,7 +57,7 @@ def test_elements_are_what_glass_holds_together():
     double_gauss = drt_jax.load_lens("double_gauss")
     assert elements_of(double_gauss) == ((0, 1), (2, 4), (6, 8), (9, 10))
     hubble = drt_jax.load_lens("hubble")
-    assert elements_of(hubble) == tuple((i, i) for i in hubble.live)
+    assert elements_of(hubble) == tuple((i, i) for i in hubble.active)
     # A back surface that is a mirror belongs to its glass; so does where the light comes out.
     back = [
         {"radius": -100.0, "thickness": 5.0, "glass": "N-BK7", "semi_diameter": 10.0, "stop": True},

@@ -165,7 +165,7 @@ def test_solved_numbers_have_derivatives():
 
 def test_a_mirror_keeps_its_focus():
     lens = load_lens("ritchey_chretien")
-    solves = [Solve("focal_length", surface=lens.live[-1]), Solve("paraxial_focus")]
+    solves = [Solve("focal_length", surface=lens.active[-1]), Solve("paraxial_focus")]
     variables = Variables.from_lens(lens, ["curvature", "thickness"], solves=solves)
     for vector in random_lenses(variables, size=0.01):
         found = drt_jax.first_order(variables.lens_of(vector), np.inf, 0.5875618)

@@ -17,7 +17,7 @@ def test_model_glasses(entry):
         {"radius": "inf", "thickness": 50.0, "stop": True, "semi_diameter": 5.0},
     ]
     lens = load_lens({"surfaces": rows})
-    assert lens.live == (0, 2)
+    assert lens.active == (0, 2)
     np.testing.assert_allclose(lens.index([0.5875618])[1:3, 0], 1.835, rtol=1e-12)
     with pytest.raises(ValueError, match="2 um is outside the range of model 1.835 42.7"):
         lens.index([2.0])

@@ -40,7 +40,7 @@ def test_a_stop_that_bends_no_light_may_lie_anywhere(name):
     surfaces = ANYWHERE[name]
     lens = load_lens(in_order(*surfaces))
     np.testing.assert_array_equal(lens.vertices, np.cumsum([0.0, *surfaces[1::2]]))
-    assert lens.stop not in lens.live
+    assert lens.stop not in lens.active
 
 
 def test_stop_plane_that_touches_a_lens(shared):
@@ -63,7 +63,7 @@ def test_index_1_is_air():
     """A surface between them bends no light, so that it need not keep its order."""
     surfaces = in_order(FRONT, 1.0, BACK | {"index": 1.0}, 5.0, {"radius": 9.0}, -5.0, STOP, 20.0)
     lens = load_lens({"object": {"index": 1}, **surfaces})
-    assert lens.glasses == ("air", "index 1.5", "air", "air", "air") and lens.live == (0, 1)
+    assert lens.glasses == ("air", "index 1.5", "air", "air", "air") and lens.active == (0, 1)
 
 
 DUMMY = {"radius": 5.0, "semi_diameter": 4.0}

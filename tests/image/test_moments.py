@@ -108,11 +108,9 @@ def slopes(lens, distance, found):
 
     def blur(lens, distance):
         scene = scene_of(lens, 0.1, distance, RGB[:2])
-        mean, covariance = moments(lens, scene, Gauss(4, "bilateral"), known(found)).at(lens.sensor)
-        return jnp.sum(covariance[..., 0] + 0.3 * covariance[..., 1]) + 0.1 * jnp.sum(mean), (
-            mean,
-            covariance,
-        )
+        spot = moments(lens, scene, Gauss(4, "bilateral"), known(found)).at(lens.sensor)
+        xx, yy = spot.covariance[:, 0, 0], spot.covariance[:, 1, 1]
+        return jnp.sum(xx + 0.3 * yy) + 0.1 * jnp.sum(spot.mean), (spot.mean, spot.covariance)
 
     return jax.value_and_grad(blur, (0, 1), has_aux=True)(lens, distance)
 
@@ -155,13 +153,10 @@ def test_sensor_polynomial_is_the_traced_moment(field):
     focus = focus_moments(LENS, field, FAR, RGB, 1e-9)
     for sensor in (130.0, 133.0, 133.35, 135.0):
         moments = psf_moments(at(sensor), field, FAR, RGB, 1e-9)
-        mean, covariance = moments.mean, moments.covariance
-        m, variances = focus.at(sensor)
-        assert variances.shape == (3, 2)  # principal axes by symmetry
-        np.testing.assert_allclose(m, mean, atol=1e-10)
-        diagonal = jnp.diagonal(covariance, 0, 1, 2)
-        np.testing.assert_allclose(variances, diagonal, rtol=2e-9, atol=1e-13)
-        np.testing.assert_array_equal(focus.full(sensor).covariance[:, 0, 0], variances[:, 0])
+        found = focus.at(sensor)
+        assert found.separable and found.covariance.shape == (3, 2, 2)  # axes by symmetry
+        np.testing.assert_allclose(found.mean, moments.mean, atol=1e-10)
+        np.testing.assert_allclose(found.covariance, moments.covariance, rtol=2e-9, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -171,8 +166,8 @@ def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
     scene, rule = (LENS, FAR, jnp.array(131.0)), Gauss(4, "bilateral")
 
     def polynomial(lens, distance, sensor):
-        mean, variances = focus_moments(lens, 0.1, distance, RGB[:2], rule=rule).at(sensor)
-        return jnp.sum(mean) + jnp.sum(variances)
+        found = focus_moments(lens, 0.1, distance, RGB[:2], rule=rule).at(sensor)
+        return jnp.sum(found.mean) + jnp.sum(jnp.trace(found.covariance, axis1=1, axis2=2))
 
     def traced(lens, distance, sensor):
         moved = dataclasses.replace(lens, sensor=sensor)
@@ -232,7 +227,7 @@ def test_tolerance_holds_at_any_sensor_position():
     for tolerance in (1e-3, 1e-6, 1e-9):
         ours = focus_moments(lens, 0.0, FAR, RGB, tolerance)
         for sensor in (130.0, 133.3, 133.37, 133.45):
-            got, wanted = (np.sqrt(m.at(sensor)[1][:, 0]) for m in (ours, exact))
+            got, wanted = (np.sqrt(m.at(sensor).covariance[:, 0, 0]) for m in (ours, exact))
             np.testing.assert_allclose(got, wanted, rtol=tolerance)
     focus, there = (f(lens, 0.0, FAR, RGB) for f in (converged_focus_rule, converged_rule))
     assert focus.order > there.order

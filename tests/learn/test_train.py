@@ -41,11 +41,11 @@ def test_imager_is_the_chain_by_hand():
     )
     x = scenes().astype(np.float32) / np.float32(255)
     np.testing.assert_array_equal(truth, x[:, 4:-4, 4:-4])
-    mean, covariance, _ = blur()({"sensor": sensor}, 25000.0)
-    kernel = gaussian_psf(mean, covariance, 4.4e-3, 9)
+    spot = blur()({"sensor": sensor}, 25000.0)
+    kernel = gaussian_psf(spot.mean, spot.covariance, 4.4e-3, 9)
     np.testing.assert_allclose(image, convolve(jnp.asarray(x, float), kernel), atol=1e-6)
     assert image.dtype == jnp.float32 and restored is image
-    np.testing.assert_allclose(sigma, np.sqrt(covariance[:, 1]))
+    np.testing.assert_allclose(sigma, np.sqrt(spot.covariance[:, 1, 1]))
 
 
 def test_gradient_of_the_loss_by_the_sensor_position():
@@ -106,9 +106,10 @@ def test_a_colour_without_rays_is_black_and_moves_no_other():
     def blur(values, distance):
         passed = jnp.array([1.0, 0.5, 0.0])
         mean = 17 + jnp.zeros((3, 2)) * values["sensor"]
-        covariance = jnp.zeros((3, 2)) * values["sensor"]
-        lost = passed[:, None] == 0
-        return jnp.where(lost, 0, mean), jnp.where(lost, jnp.inf, covariance), passed
+        covariance = jnp.zeros((3, 2, 2)) * values["sensor"]
+        none = passed[:, None] == 0
+        covariance = jnp.where(none[..., None], jnp.diag(jnp.full(2, jnp.inf)), covariance)
+        return drt_jax.Moments(jnp.where(none, 0, mean), covariance, passed, separable=True)
 
     imager = train.make_imager(blur, None, CAMERA)
     others = (jnp.array(1.0), np.float32(0), jax.random.key(0))
@@ -183,7 +184,8 @@ def test_metrics_of_known_images():
 def test_width_of_a_blur_is_that_of_both_axes():
     whole = jnp.array([[[9.0, 2.0], [2.0, 7.0]], [[jnp.inf, 0.0], [0.0, jnp.inf]]])
     np.testing.assert_allclose(train.blur_width(whole), [8**0.5, np.inf])
-    np.testing.assert_allclose(train.blur_width(jnp.array([[9.0, 7.0], [4.0, 4.0]])), [8**0.5, 2])
+    round_ = jnp.diag(jnp.array([4.0, 4.0]))[None]
+    np.testing.assert_allclose(train.blur_width(round_), [2])
 
 
 def test_bad_camera():

@@ -205,7 +205,7 @@ def test_catalogue_glasses_made_model_glasses(tmp_path):
     np.testing.assert_allclose(after[:, 0], before[:, 0], rtol=1e-14)
     np.testing.assert_allclose(after[:, 1] - after[:, 2], before[:, 1] - before[:, 2], atol=1e-14)
     ours, own = (float(drt_jax.focal_length(each, LINES[0])[0]) for each in (model, lens))
-    assert abs(ours / own - 1) < 1e-12 and model.live == lens.live
+    assert abs(ours / own - 1) < 1e-12 and model.active == lens.active
     spots = [
         np.trace(drt_jax.psf_moments(each, 0.0, np.inf, (0.48, 0.6), rule=Gauss(6, "rotational"))
         .covariance, axis1=1, axis2=2) for each in (model, lens)

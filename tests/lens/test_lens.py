@@ -29,7 +29,7 @@ def test_live_surfaces_bend_light():
         {"radius": "inf", "thickness": 1, "stop": True, "semi_diameter": 2},
         {"radius": -90, "thickness": -9, "mirror": True},
     ]
-    assert load_lens({"surfaces": surfaces}).live == (0, 2, 4)
+    assert load_lens({"surfaces": surfaces}).active == (0, 2, 4)
 
 
 def test_gradient_with_respect_to_a_lens_is_a_lens():

@@ -89,8 +89,8 @@ CUT = {
 
 def blur(lens, field=0.08):
     found = focus_moments(lens, field, jnp.inf, GREEN, rule=Clipped(12, "bilateral"))
-    mean, spread = found.at(lens.sensor)
-    return jnp.concatenate([found.passed, mean[0, 1:], spread[0]])
+    spot = found.at(lens.sensor)
+    return jnp.concatenate([spot.passed, spot.mean[0, 1:], jnp.diagonal(spot.covariance[0])])
 
 
 @pytest.fixture(scope="module")

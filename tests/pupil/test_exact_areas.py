@@ -101,7 +101,7 @@ def found(lens, rule):
 
     def of(lens):
         moments = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=rule)
-        found = moments.full(4.0)
+        found = moments.at(4.0)
         (xx, xy), (_, yy) = found.covariance[0]
         return jnp.stack([found.passed[0], *found.mean[0], xx, yy, xy])
 

@@ -13,7 +13,7 @@ from .systems import COLOURS, lens_with
 
 POINTS = tuple(jnp.asarray(p) for p in ([0.0, 0.5, -0.3, 0.8, -0.9], [0.1, 0.6, -0.8, -0.2, 0.1]))
 # A mirror and a stop that bends light, all tilted; meridional rays and one that bends none.
-PROBLEMS = {"tilted": ("live", True, 2), "meridional": ("between", False, 1)}
+PROBLEMS = {"tilted": ("active", True, 2), "meridional": ("between", False, 1)}
 
 
 @functools.cache

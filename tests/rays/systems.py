@@ -19,14 +19,14 @@ LIVE = [
 MIRROR = {"radius": -400, "conic": -1, "coefficients": {4: 1e-8}, "mirror": True, "thickness": -5}
 STOP = {"radius": -70, "conic": 0.3, "semi_diameter": 4.0, "stop": True}
 # Where the stop is: in the list of the surfaces, bending no light, or one of them.
-PLACES = {"in front": 0, "between": 2, "behind": None, "live": 2}
+PLACES = {"in front": 0, "between": 2, "behind": None, "active": 2}
 
 
 def lens_with(stop, tilted=False):
     """Two lenses and a curved stop; `tilted` adds a mirror, tilts and decentres everything."""
     rows = [dict(row) for row in (*LIVE, *([MIRROR] if tilted else []))]
     place = len(rows) if PLACES[stop] is None else PLACES[stop]
-    if stop == "live":
+    if stop == "active":
         rows[place] |= {"semi_diameter": 4.0, "stop": True}
     else:
         rows.insert(place, STOP | {"thickness": 3.0})

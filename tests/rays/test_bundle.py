@@ -180,4 +180,4 @@ def test_memory_a_ray_keeps_for_the_backward_pass(lens, solver, monkeypatch):
         return sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
 
     each = (kept(65536) - kept(4096)) / (65536 - 4096) / len(WAVES)
-    assert each <= 16 * (len(lens.live) + 1) + 4 + 16
+    assert each <= 16 * (len(lens.active) + 1) + 4 + 16

@@ -172,8 +172,8 @@ def test_a_held_sensor_moves_as_its_elements_turn_it(name):
         moved = dataclasses.replace(lens, sensor=jnp.asarray(sensor))
         return focus_moments(moved, (0.02, 0.06), INF, 0.55, rule=Gauss(4, "none"))
 
-    ours = focus(lens.sensor).full(lens.sensor + 1.5)
-    wanted = focus(lens.sensor + 1.5).full(lens.sensor + 1.5)
+    ours = focus(lens.sensor).at(lens.sensor + 1.5)
+    wanted = focus(lens.sensor + 1.5).at(lens.sensor + 1.5)
     np.testing.assert_allclose(ours.mean, wanted.mean, atol=1e-12)
     np.testing.assert_allclose(ours.covariance, wanted.covariance, rtol=1e-12, atol=1e-15)
 

@@ -28,10 +28,10 @@ from .systems import (
 
 CASES = {
     "meridional": ("between", 1, False),
-    "meridional, live stop": ("live", 1, False),
+    "meridional, active stop": ("active", 1, False),
     "centred": ("between", 2, False),
     "tilted, stop in front": ("in front", 2, True),
-    "tilted, live stop": ("live", 2, True),
+    "tilted, active stop": ("active", 2, True),
 }
 RAYS = 3
 ALL = jnp.ones((len(COLOURS), RAYS), bool)
@@ -215,7 +215,7 @@ def test_only_rays_are_stationary():
 
 def test_arrival_is_the_last_segment():
     """Along the axes of the lens, with a tilted sensor."""
-    system = system_with("live", 2, True)
+    system = system_with("active", 2, True)
     hits = rough_path(system, RAYS)
     points, _ = corners(system, hits)
     step = points[-1] - points[-2]

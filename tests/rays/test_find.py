@@ -135,7 +135,7 @@ def test_hostile_lenses():
         found, first = search(lens, scene, points), aimed(lens, scene, points, ZERO)
         good = np.asarray(found.status) == Status.OK
         for hits, target in zip(found.hits, crossings(lens, scene, points), strict=True):
-            ours = np.asarray(hits)[2]  # the stop is the third live surface
+            ours = np.asarray(hits)[2]  # the stop is the third active surface
             np.testing.assert_allclose(ours[good], np.asarray(target)[good], rtol=0, atol=1e-12)
         every = found.hits, gradient(lens, scene, points, found, weights)
         assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(every))

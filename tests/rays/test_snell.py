@@ -169,7 +169,7 @@ def test_a_trace_against_the_yardstick(lens, distance):
     """Hits within 1e-12 mm; and how far rounding them turns a segment."""
     system, launch = scene_system(lens, distance), launches()
     trace = shoot(system, launch)
-    trace = trace._replace(hits=snell.apart(system, trace.hits)[0])
+    trace = trace._replace(hits=snell.split_stop(system, trace.hits)[0])
     assert np.all(trace.status == Status.OK)
     points, source = corners(system, trace.hits)
     start = np.stack([*map(np.asarray, launch), np.zeros(launch[0].shape)], axis=-1)
@@ -177,7 +177,7 @@ def test_a_trace_against_the_yardstick(lens, distance):
     direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     direction = np.broadcast_to(direction, start.shape)
     begin = start - 5 * direction
-    rows = [*lens.live, lens.count]
+    rows = [*lens.active, lens.count]
     for k, colour in enumerate(COLOURS):
         hits, ok = yardstick(lens, jnp.asarray(colour, float), begin[k], direction[k])
         assert np.all(ok)
@@ -189,14 +189,14 @@ def test_a_trace_against_the_yardstick(lens, distance):
     np.testing.assert_allclose(trace.rounding_angle, wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize("stop", ["in front", "live"])
+@pytest.mark.parametrize("stop", ["in front", "active"])
 def test_the_stop_of_a_ray(stop):
     """The trace to the stop crosses it where the whole trace does, and where the label of the ray
     says."""
 
     @jax.jit
     def both(system, launch):
-        hits, there = snell.apart(system, snell.shoot(system, launch).hits)
+        hits, there = snell.split_stop(system, snell.shoot(system, launch).hits)
         label = fermat.label(fermat.geometry(hits, system), system)
         return snell.shoot_to_stop(system, launch), label, there
 
