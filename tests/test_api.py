@@ -192,6 +192,7 @@ NOWHERE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOWHERE)
 def test_no_light_comes_from_where_the_lens_cannot_see(name):
     """Status MISSED, nothing passes, the blur is infinite, derivatives are 0; no NaN."""
@@ -273,6 +274,7 @@ GLASS = {"curvature": 0, "index": 1.5, "thickness": 10.0, "semi_diameter": 8.0, 
 PLANE = {"object": {"index": 1.5}, "surfaces": [GLASS, {"curvature": 0, "thickness": 30.0}]}
 
 
+@pytest.mark.slow
 def test_a_lens_that_passes_no_ray_says_which_surface():
     narrow = dataclasses.replace(LENS, semi_diameter=LENS.semi_diameter.at[1].set(1e-3))
     cases = [
@@ -314,6 +316,7 @@ def test_a_wrong_field_in_an_eager_gradient_is_named():
         slope(10.0)
 
 
+@pytest.mark.slow
 def test_random_lenses_give_finite_moments_or_an_error():
     """And no RuntimeWarning of NumPy, which would be an error here."""
     rng, results = np.random.default_rng(0), []
@@ -335,6 +338,7 @@ def test_random_lenses_give_finite_moments_or_an_error():
     assert 5 < sum(results) < 40
 
 
+@pytest.mark.slow
 def test_the_promise_of_float32_is_kept_and_warned_of():
     """Double Gauss at 10 degrees, a spot of 4.7 um, where it was once missed by 1.4e-3."""
     double = dataclasses.replace(load_lens("double_gauss"), sensor=jnp.asarray(133.35))

@@ -36,6 +36,7 @@ surfaces:
 """
 
 
+@pytest.mark.slow
 def test_a_rim_that_shaves_the_axial_beam_is_named_wherever_it_matters(tmp_path, capsys):
     """0.8 % were cut by "none", and a warning said that apertures cut. Spots are those of
     `psf_moments`, cells do not run together, and what is far from focus is said."""

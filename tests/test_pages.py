@@ -15,6 +15,7 @@ CODE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page, blocks in CODE.items() if blocks])
 def test_code_runs(tmp_path, page):
     flags = {"XLA_FLAGS": os.environ["XLA_FLAGS"], "JAX_PLATFORMS": "cpu"}

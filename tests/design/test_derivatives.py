@@ -142,6 +142,7 @@ def test_a_few_steps_bring_all_rays_through(strong):
     assert found.merit < 1e-2 * found.history[0, 0]
 
 
+@pytest.mark.slow
 def test_random_lenses_are_never_nan(strong):
     """However many rays fail, merit and gradients are numbers: as optimisers try them, and of a few
     as they are searched in full."""

@@ -303,6 +303,7 @@ def judged(problem, lens):
     return [operand.values(lens, rays) for operand in problem.operands]
 
 
+@pytest.mark.slow
 def test_spots_without_vignetting():
     """As if no clear aperture were there: narrower ones cut light and spots, these stay."""
     lens, rule = load_lens("petzval_100mm"), Gauss(6, "bilateral")
@@ -342,6 +343,7 @@ def test_apertures_as_variables_do_not_vignette():
     assert light[0] < 0.8 and abs(light[1] - 1) < 0.01
 
 
+@pytest.mark.slow
 def test_glasses_stay_on_the_map():
     """A doublet whose glasses vary: without the limit they end where no glass is."""
     lens = drt_jax.with_model_glass(load_lens(DOUBLET))

@@ -108,6 +108,7 @@ def triplet():
     return design.Problem.from_variables(variables, wanted, np.radians([0.0, 14.0]), 0.5876, rule=3)
 
 
+@pytest.mark.slow
 def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
     start = float(triplet.merit(triplet.variables.start))
     found = design.optimise(triplet, max_steps=200)
@@ -141,6 +142,7 @@ def test_limits_are_kept_where_trials_are_used_up(triplet):
     assert float(found.lens.sensor) <= 55 and found.merit < 2 * found.history[-1, 0]
 
 
+@pytest.mark.slow
 def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
     """Of limits that cannot be kept together, the worst one by kind, surface, zone and amount."""
     # Without a limit for air the search ends where surfaces touch, which is no optimum.
@@ -208,6 +210,7 @@ def test_a_limit_that_nothing_moves_is_refused(triplet):
     bounded.refuse_fixed([0.95], [0.95])
 
 
+@pytest.mark.slow
 def test_weights_of_fields(triplet):
     """They weigh squares, 1 on the average; 0 leaves a field out."""
     start = triplet.variables.start
@@ -226,6 +229,7 @@ def test_weights_of_fields(triplet):
     assert abs(merit(both, field_weights=[2, 2]) / merit(both) - 1) < 1e-12
 
 
+@pytest.mark.slow
 def test_many_starts_do_not_depend_on_threads(triplet):
     """Two tiles, one of them not full, and a start that no light passes."""
     starts = design.normal_starts(triplet.variables, 18, 2.0, 3)

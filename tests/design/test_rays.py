@@ -52,6 +52,7 @@ def test_aiming_finds_what_the_full_search_finds(name, factor, degrees):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_spots_of_a_design_are_those_of_the_moments():
     """A fifth of the rays fails: what is left is weighed as by `psf_moments`."""
     lens, field = opened("phone", 1.5), np.radians(14.0)
@@ -71,6 +72,7 @@ def test_spots_of_a_design_are_those_of_the_moments():
     np.testing.assert_allclose(jnp.sum(spot**2), square, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_lenses_as_built_are_searched_in_full(monkeypatch):
     """Of whatever aiming misses, here every ray, the full search finds all."""
     lens = opened("cooke_triplet", 1.0)
@@ -93,6 +95,7 @@ def test_lenses_as_built_are_searched_in_full(monkeypatch):
     np.testing.assert_allclose(found.squares, wanted.squares, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_optimum_is_searched_in_full(monkeypatch):
     """The same of a search for an optimum."""
     variables = design.Variables.from_lens(drt_jax.load_lens("singlet"), ["sensor"])

@@ -66,6 +66,7 @@ def test_squares_are_those_of_the_moments(singlet):
     assert float(_made(problem, lens, "none").squares[4]) == pytest.approx(wanted, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_focus_is_where_a_scan_finds_it(singlet):
     problem, some = singlet
     lens = some_lens(some)
@@ -85,6 +86,7 @@ def test_focus_is_where_a_scan_finds_it(singlet):
     assert float(found.moves[0]) != 0
 
 
+@pytest.mark.slow
 def test_tilt_of_the_sensor_is_where_a_scan_finds_it(singlet):
     """The sensor really tilted, about where the axis meets it."""
     problem, some = singlet
@@ -244,6 +246,7 @@ def test_monte_carlo_depends_on_neither_threads_nor_tiles(singlet, monkeypatch):
         np.testing.assert_allclose(a, b[60], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_lenses_that_pass_no_light_are_as_bad_as_can_be(singlet):
     """Errors of any size: no NaN, and no good spot of the few rays that are left."""
     off = 1e3 * design.draw_perturbations(singlet[1], 50, 0)
@@ -253,6 +256,7 @@ def test_lenses_that_pass_no_light_are_as_bad_as_can_be(singlet):
     assert np.all(np.isfinite(found.moves))
 
 
+@pytest.mark.slow
 def test_half_a_pupil_is_enough_where_nothing_is_moved():
     centred = [t for t in ALL if KINDS[t.kind].axes == 1]
     for others in ([], [Tolerance("irregularity", 9.0)]):

@@ -124,6 +124,7 @@ def test_reference_of_a_clipped_beam():
     np.testing.assert_allclose(np.mean(spot[:, 1]), tilted.centroid, atol=1e-3 * tilted.sigma)
 
 
+@pytest.mark.slow
 def test_reference_refuses_a_blocked_beam():
     lens = load_lens(CLIPPED)
     with pytest.raises(ValueError, match="no ray at 0.55 um reaches the sensor"):

@@ -46,6 +46,7 @@ def test_a_lens_is_designed_from_several_starts(tmp_path, monkeypatch, capsys):
     assert again["rows"] == results["rows"]
 
 
+@pytest.mark.slow
 def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
     """Half of the beam first, then more, each until it is good; a run that is stopped goes on where
     it was; or it says how far it came."""

@@ -78,6 +78,7 @@ def pressing(monkeypatch, moments):
     return lambda: len(seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("again", [(), (1,), (2, 3)], ids=["once", "twice", "three times"])
 def test_ctrl_c_at_any_moment_says_what_it_leaves(again, unbroken, tmp_path, monkeypatch, capsys):
     said, moment = set(), 0
@@ -103,6 +104,7 @@ def test_ctrl_c_at_any_moment_says_what_it_leaves(again, unbroken, tmp_path, mon
     }
 
 
+@pytest.mark.slow
 def test_kill_at_any_moment(unbroken, tmp_path):
     """No handler runs: the file that is being written stays half there, the lock is gone."""
     command = [sys.executable, "-m", "tests.experiments.counting", "killed", tmp_path, CONFIG]

@@ -54,6 +54,7 @@ def own(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_lens_is_trained_off_the_axis(own):
     results, rows = read(own), np.genfromtxt(own / "metrics.csv", delimiter=",", names=True)
     header = (own / "metrics.csv").read_text().splitlines()[0].split(",")
@@ -87,6 +88,7 @@ def test_its_table_has_none_of_the_papers_numbers(own, capsys):
     assert drawn == {path.name: path.read_bytes() for path in (own / "figures").iterdir()}
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_resumes_to_the_same_lens(own, tmp_path, monkeypatch):
     log, calls = Run.log, []
 
@@ -107,6 +109,7 @@ def test_an_interrupted_run_resumes_to_the_same_lens(own, tmp_path, monkeypatch)
     assert (own / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_focus_without_its_sensor_and_how_a_lens_goes_bad(tmp_path, capsys):
     """A sensor that is no variable stays; and surfaces that cross end a run, with the lens from
     before and all metrics in its folder."""

@@ -31,8 +31,8 @@ STARTS = {
         *(*AXIAL, "count=16", "draws=10", "limits_um=[50]"),
     ],
 }
-# Programs of many kinds, for a survey of as little as one scene.
-LONG = ("stability",)
+# Programs of many kinds.
+LONG = ("accuracy", "design", "lenses", "stability", "tolerance")
 
 
 def runnable():

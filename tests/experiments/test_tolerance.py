@@ -59,6 +59,7 @@ def test_it_writes_rows_and_pictures_and_resumes(config, tmp_path, capsys):
     assert json.loads((folder / "results.json").read_text()) == results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "setting, said",
     [

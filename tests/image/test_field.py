@@ -18,6 +18,7 @@ def field(point):
     return drt_jax.field_of_image(LENS, point, 1e4, 0.55)
 
 
+@pytest.mark.slow
 def test_the_field_of_an_image_point_is_the_field_it_came_from():
     angles = jnp.array([0.05, 0.25])
     point, turned = image(angles), jax.jacfwd(image)(angles)

@@ -233,6 +233,7 @@ def test_tolerance_holds_at_any_sensor_position():
     assert focus.order > there.order
 
 
+@pytest.mark.slow
 def test_slow_convergence_is_said():
     """Where light is reflected totally, no aperture ends the beam."""
     faces = [

@@ -37,6 +37,7 @@ def spots(lens, field):
     return jnp.sqrt(jnp.trace(psf_moments(lens, field, INF, WAVE, rule=rule).covariance[0]))
 
 
+@pytest.mark.slow
 def test_spots_are_those_that_another_program_prints(shared):
     """OpticStudio without ray aiming, clear apertures ignored: 16 fields, 1e-9 of each; through the
     real stop the edge of the field has another."""
@@ -58,6 +59,7 @@ def test_spots_are_those_that_another_program_prints(shared):
     assert abs(1e3 * float(spots(lens, fields[-1])) / printed[-1] - 1) > 0.005
 
 
+@pytest.mark.slow
 def test_all_else_of_the_lens_stays():
     """First order, and where rays go; the old stop clips nothing but by its own aperture."""
     lens = load_lens({"surfaces": MOVED, "object": {"index": 1.2}, "elements": [HELD]})

@@ -253,6 +253,7 @@ def test_image_space_in_water():
         np.testing.assert_allclose(points[k], hits, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_gradients_batches_and_one_program_for_all():
     """Gradients against central differences of the fourth order, to 1e-6, all in one vmap."""
     lens = load_lens(IMMERSED)

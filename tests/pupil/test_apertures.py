@@ -98,6 +98,7 @@ def cut():
     return load_lens(CUT)
 
 
+@pytest.mark.slow
 def test_the_status_of_rays(cut):
     points = np.random.default_rng(1).uniform(-1, 1, (400, 2))
     rays = trace_rays(cut, (0.05, 0.08), 300.0, GREEN, points)
@@ -180,6 +181,7 @@ def test_a_telescope_with_a_hole():
             np.testing.assert_allclose(found.mean, wanted.mean, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_rule_does_not_step_over_an_obscuration():
     lens = beam(obscuration={"circle": 0.05})
     assert isinstance(drt_jax.converged_rule(lens, 0.0, 1e4, GREEN, 1e-3), Clipped)

@@ -38,6 +38,7 @@ def found(name, order):
     return focus_moments(lens, field, FAR, GREEN, rule=rule)
 
 
+@pytest.mark.slow
 def test_overlap_of_two_discs():
     """What two shifted discs have in common: area, centroid and second moments in closed form,
     here from a dense integral over y of the chord (a substitution makes it smooth)."""

@@ -27,6 +27,7 @@ def light(lens, field, rule):
     return focus_moments(lens, field, jnp.inf, GREEN, rule=rule).passed[0]
 
 
+@pytest.mark.slow
 def test_on_axis():
     """A circle of r^2 = 2 R t - t^2, its derivatives by curvature and thickness."""
     lens = wide(25.0)

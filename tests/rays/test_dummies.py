@@ -111,6 +111,7 @@ def by_the_lens(lens):
     return jnp.sum(psf_moments(lens, 0.1, 200.0, 0.55, rule=Gauss(3, "bilateral")).covariance)
 
 
+@pytest.mark.slow
 def test_sensor_and_plane_stop_do_not_bend():
     """They have no derivatives by curvature, conic and coefficients, unless asked for by name."""
     lens = load_lens({"surfaces": [STOP, PLATE[0], PLATE[1] | {"coefficients": {4: 1e-6}}]})

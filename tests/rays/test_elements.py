@@ -178,6 +178,7 @@ def test_a_held_sensor_moves_as_its_elements_turn_it(name):
     np.testing.assert_allclose(ours.covariance, wanted.covariance, rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_sensor_turned_by_an_element_is_one_that_is_tilted():
     lens = lens_with(*HELD["alone"])
     tilted = load_lens({"surfaces": SURFACES, "sensor_tilt": [10.0, 0, 0]})

@@ -63,6 +63,7 @@ def test_an_evanescent_order_is_totally_reflected():
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
 
 
+@pytest.mark.slow
 def test_a_zone_plate_is_stigmatic_and_its_focal_length_falls_with_the_wavelength():
     f, design = 50.0, COLOURS[1]
     lens = zone_plate(f, design, 12)
@@ -75,6 +76,7 @@ def test_a_zone_plate_is_stigmatic_and_its_focal_length_falls_with_the_wavelengt
     np.testing.assert_allclose(focal_length(third, COLOURS), f * design / COLOURS / 3, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_mirror_of_phase_focuses_like_a_paraboloid():
     f, design = 50.0, 0.6
     lens = zone_plate(f, design, 12, mirror=True, thickness=-f)
@@ -177,6 +179,7 @@ def test_rays_are_stationary_and_their_derivatives_right(form, base, stop):
         np.testing.assert_allclose(along, change, rtol=1e-6, atol=1e-8 * scale)
 
 
+@pytest.mark.slow
 def test_a_hybrid_needs_one_radius_on_the_axis():
     lens = hybrid("asphere", "asphere", 0)
     assert drt_jax.symmetry_of(lens, 0.0) == "rotational"

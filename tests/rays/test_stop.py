@@ -57,6 +57,7 @@ def misaligned(lens, seed=0):
     return dataclasses.replace(lens, **{k: jnp.asarray(v) for k, v in moves.items()})
 
 
+@pytest.mark.slow
 def test_every_ray_of_the_phone_lenses():
     """12 lenses, 5 fields, 331 rays over the whole stop: what the oracle finds is found and
     nothing else, points and paths within 1e-11 mm, 2.5e-12 of the focal length."""
@@ -133,6 +134,7 @@ def mirror_cases():
         yield pytest.param(system, stop, marks=[] if place == 1 else pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system, stop", [*mirror_cases()])
 def test_three_mirrors(system, stop):
     """Rays and derivatives of off-axis systems, a degree off the axis of the light."""

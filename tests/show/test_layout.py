@@ -149,6 +149,7 @@ def test_a_steep_ray_does_not_leave_the_picture():
     assert np.hypot(*(corner - begin)) == pytest.approx(2 * (corner[0] - axial[1][0, 0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilted", [False, True])
 def test_a_beam_tells_who_clips_it_and_where_it_is_sharp(tilted):
     more = {"sensor_tilt": [0, 0, 0]} if tilted else {}
