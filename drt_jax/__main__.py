@@ -92,7 +92,7 @@ def field_lines(
     for field, angle, beam in zip(fields, angles, beams):
         scene = scene_of(lens, angle, distance, np.array(wavelengths))
         rough, found = (_moments(lens, scene, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
-        light = 100 * float(found.passed[middle])
+        light = 100 * float(found.throughput[middle])
         if not light > 0:
             yield _row(f"{field:.4g}", f"! {_why(lens, scene, Gauss(8, symmetry))}")
             continue

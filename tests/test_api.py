@@ -171,7 +171,7 @@ def everything(lens, field, distance, wavelengths):
         scene = field, distance, wavelengths
         rays = drt_jax.trace_rays(lens, *scene, POINTS)
         spot = psf_moments(lens, *scene, rule=RULE)
-        found = rays[:3], spot.mean, spot.passed
+        found = rays[:3], spot.mean, spot.throughput
         summed = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(found) if leaf.dtype == float)
         return summed + jnp.sum(spot.covariance), (found, rays.status, spot)
 
@@ -200,7 +200,7 @@ def test_no_light_comes_from_where_the_lens_cannot_see(name):
     slopes, (found, status, spot) = everything(LENS, *scene)
     assert np.all(status == Status.MISSED)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
-    assert np.all(spot.passed == 0) and np.all(spot.mean == 0)
+    assert np.all(spot.throughput == 0) and np.all(spot.mean == 0)
     assert np.all(np.isposinf(spot.covariance[:, [0, 1], [0, 1]]))
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(slopes))
 
@@ -292,7 +292,7 @@ def test_a_lens_that_passes_no_ray_says_which_surface():
 
 def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
     thin = changed(thickness=[2.0, 0.3])
-    assert psf_moments(thin, 0.0, np.inf, GREEN).passed[0] > 0.999
+    assert psf_moments(thin, 0.0, np.inf, GREEN).throughput[0] > 0.999
     init, update = drt_jax.adam({"thickness": 0.5})
     values = {"thickness": thin.thickness}
     updates, _ = update({"thickness": jnp.array([0.0, 1.0])}, init(values))

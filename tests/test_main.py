@@ -51,7 +51,7 @@ def test_a_rim_that_shaves_the_axial_beam_is_named_wherever_it_matters(tmp_path,
         found = psf_moments(lens, field, np.inf, 0.55)
         spot = 1e3 * float(np.trace(found.covariance[0])) ** 0.5
         assert len(row) == 5 and float(row[2]) == pytest.approx(spot, rel=2e-4)
-        assert float(row[3]) == pytest.approx(100 * float(found.passed[0]), abs=0.02)
+        assert float(row[3]) == pytest.approx(100 * float(found.throughput[0]), abs=0.02)
     back = float(back_focal_distance(lens, 0.55)[0])  # light converges from the rim to the stop
     share = 100 * (5.03 / 5 * back / (back + 1)) ** 2
     assert axial[-1] == "1" and float(axial[3]) == pytest.approx(share, abs=0.2)

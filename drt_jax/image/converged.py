@@ -64,7 +64,7 @@ def psf_moments(
 
     See `Moments`. Rays fill the stop uniformly. Differentiable in all arguments but the last two,
     in every mode. ValueError as of `scene_of`, and if no ray of a colour arrives, which says where
-    its light ends; inside a trace, where that cannot be known, `passed` is 0 and the covariance inf
+    its light ends; inside a trace, where that cannot be known, `throughput` is 0 and the covariance inf
     then. Paper section 4.3.
     """
     found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
@@ -157,9 +157,9 @@ def _moments(
         # The rays are known; what is left is to weigh and to differentiate them.
         return _weigh_known(lens, scene, trial.used, trial.found[0])
     found = _weigh(lens, scene, rule)
-    passed = known_values(found.passed)
-    if passed is not None and not np.all(np.asarray(passed) > 0):
-        _say_why(lens, scene, rule.symmetry, passed)
+    throughput = known_values(found.throughput)
+    if throughput is not None and not np.all(np.asarray(throughput) > 0):
+        _say_why(lens, scene, rule.symmetry, throughput)
     return found
 
 
@@ -244,8 +244,8 @@ def _try_orders(
             if (failing or cut) and not clipped:
                 break
             for scene, found in zip(scenes, trial.moments, strict=True):
-                if not np.all(np.asarray(found.passed) > 0):
-                    _say_why(lens, scene, symmetry, found.passed)
+                if not np.all(np.asarray(found.throughput) > 0):
+                    _say_why(lens, scene, symmetry, found.throughput)
             trials = [*trials, trial][-3:]
             changes = (_change(trials[0], later, places) for later in trials[1:])
             change = max(changes, default=np.inf)
@@ -339,9 +339,9 @@ def _change(before: _Trial, now: _Trial, places: Callable) -> float:
     return worst
 
 
-def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, passed: Numbers) -> None:
+def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) -> None:
     """ValueError for a colour of which nothing passed, (W,): where its light ends."""
-    colour = int(np.argmin(np.asarray(passed) > 0))
+    colour = int(np.argmin(np.asarray(throughput) > 0))
     lens, scene = known_values((lens, scene))
     with jax.core.eval_context():
         # Of an eager gradient, whose values were not seen before.

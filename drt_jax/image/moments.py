@@ -28,14 +28,14 @@ class Moments:
 
     mean: (W, 2), x and y of the centroid on the sensor, mm.
     covariance: (W, 2, 2), mm^2; inf on the diagonal for a wavelength of which no light arrives.
-    passed: (W,), the fraction of the light through the stop that reaches the sensor.
+    throughput: (W,), the fraction of the light through the stop that reaches the sensor.
     separable: static; True if symmetry makes the xy element 0, so that the Gaussian kernel is
         separable, see `separable_psf`.
     """
 
     mean: Array
     covariance: Array
-    passed: Array
+    throughput: Array
     separable: bool = dataclasses.field(default=False, metadata={"static": True})
 
 
@@ -49,14 +49,14 @@ class FocusMoments:
 
     reference: (), mm. mean, slope: (W, 2). spread: (3, W, C) with C = 2 for the variances (xx, yy)
     when symmetry makes the axes principal, else C = 3 (xx, yy, xy).
-    passed: (W,), the share of the light that reaches the sensor.
+    throughput: (W,), the share of the light that reaches the sensor.
     """
 
     reference: Array
     mean: Array
     slope: Array
     spread: Array
-    passed: Array
+    throughput: Array
 
     def at(self, sensor: Numbers) -> Moments:
         """The spot with the sensor at `sensor` mm."""
@@ -68,12 +68,12 @@ def _at(moments: FocusMoments, sensor: Array) -> Moments:
     # One program rather than one for each operation.
     d = sensor - moments.reference
     spread = moments.spread[0] + d * (moments.spread[1] + d * moments.spread[2])
-    arrives = (moments.passed > 0)[:, None]
+    arrives = (moments.throughput > 0)[:, None]
     xx, yy = jnp.where(arrives, spread[:, :2], jnp.inf).T
     separable = spread.shape[-1] == 2
     xy = jnp.zeros_like(xx) if separable else spread[:, 2]
     covariance = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
-    return Moments(moments.mean + d * moments.slope, covariance, moments.passed, separable)
+    return Moments(moments.mean + d * moments.slope, covariance, moments.throughput, separable)
 
 
 def moments(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver = solve) -> FocusMoments:
@@ -104,7 +104,7 @@ def check_sensor(lens: Lens) -> None:
 def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusMoments:
     """Moments of traced rays; `weights` (1 or W, Q) are those of the rule."""
     weight = weights * rule.transmission(lens, bundle)
-    passed = jnp.sum(weight, axis=-1)
+    throughput = jnp.sum(weight, axis=-1)
     weight = normalised(weight)
     # How the hits move with the sensor.
     slope = tuple(safe_divide(a, bundle.arrival[-1]) for a in bundle.arrival[:-1])
@@ -117,7 +117,7 @@ def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusM
     (x, mean), (u, tilt) = (deviations(v, weight, rule.symmetry) for v in (hit, slope))
     pairs = (1, x, x), (2, x, u), (1, u, u)
     spread = [k * mean_products(a, b, weight, rule.symmetry) for k, a, b in pairs]
-    return FocusMoments(lens.sensor, _plane(mean), _plane(tilt), jnp.stack(spread), passed)
+    return FocusMoments(lens.sensor, _plane(mean), _plane(tilt), jnp.stack(spread), throughput)
 
 
 def _plane(mean: Vector) -> Array:

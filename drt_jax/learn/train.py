@@ -68,13 +68,13 @@ def make_imager(
     ) -> tuple[Array, Array, Array, Array]:
         scenes = scenes.astype(jnp.float32) / 255
         spot = blur(parameters["optics"], distance)
-        arrives = spot.passed > 0
+        arrives = spot.throughput > 0
         total = jnp.sum(jnp.where(arrives[:, None], spot.mean, 0), axis=0, keepdims=True)
         offset = spot.mean - safe_divide(total, jnp.sum(arrives, dtype=spot.mean.dtype))
         pixel = camera.pixel_um * 1e-3
         psf = separable_psf if spot.separable else gaussian_psf
         kernel = psf(offset, spot.covariance, pixel, camera.kernel, camera.form)
-        light = jnp.expand_dims(spot.passed.astype(jnp.float32), (0, 1, 2))
+        light = jnp.expand_dims(spot.throughput.astype(jnp.float32), (0, 1, 2))
         image = sensor_layer(scenes * light, kernel, noise, key, convolve)
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin

@@ -79,7 +79,7 @@ def spot_of(scene: Scene, lens: drt_jax.Lens, distance: float) -> dict[str, floa
     mean, covariance = np.asarray(found.mean), np.asarray(found.covariance)
     squares = np.trace(covariance, axis1=1, axis2=2)
     squares = squares + np.sum((mean - mean.mean(axis=0)) ** 2, axis=1)
-    return {"rms_um": 1e3 * math.sqrt(squares.mean()), "light": float(np.min(found.passed))}
+    return {"rms_um": 1e3 * math.sqrt(squares.mean()), "light": float(np.min(found.throughput))}
 
 
 @dataclasses.dataclass(frozen=True)

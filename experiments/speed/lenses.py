@@ -128,7 +128,7 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     points, _ = drt_jax.pupil_points(lens, field, math.inf, waves, rule)
     return {
         "rays": points.shape[1],
-        "passed": float(np.mean(loose.passed)),
+        "passed": float(np.mean(loose.throughput)),
         "first_s": first,
         "loose_s": seconds[0],
         "tight_s": seconds[1],
@@ -197,7 +197,7 @@ def sweep(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) ->
         )
         found = drt_jax.psf_moments(now, field, math.inf, waves, rule=rule)
         sigma = jnp.sqrt(found.covariance[0, 0, 0] + found.covariance[0, 1, 1])
-        return jnp.stack([sigma, found.mean[0, 1], found.passed[0]])
+        return jnp.stack([sigma, found.mean[0, 1], found.throughput[0]])
 
     def both(field):
         return jax.jvp(lambda grown: spot(grown, field), (jnp.zeros(()),), (jnp.ones(()),))

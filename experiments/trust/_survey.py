@@ -128,10 +128,10 @@ def _moments(lens, field, distance):
 
     def scalar(lens, field, distance):
         found = drt_jax.psf_moments(lens, field, distance, colour, rule=_RULE)
-        none = (found.passed == 0)[:, None, None] & jnp.isposinf(found.covariance)
+        none = (found.throughput == 0)[:, None, None] & jnp.isposinf(found.covariance)
         covariance = jnp.where(none, 0, found.covariance)
         value = jnp.sum(found.mean) + jnp.sum(covariance) + safe_sqrt(covariance[0, 0, 0])
-        return value, (found.mean, covariance, found.passed)
+        return value, (found.mean, covariance, found.throughput)
 
     return jax.grad(scalar, argnums=(0, 1, 2), has_aux=True)(lens, field, distance)
 

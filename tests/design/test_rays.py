@@ -63,7 +63,7 @@ def test_spots_of_a_design_are_those_of_the_moments():
     )
     judged = jax.jit(lambda p: p.evaluate(variables.start))(problem)
     moments = drt_jax.psf_moments(lens, field, np.inf, RGB, rule=rule)
-    assert int(judged.failed) > 0 and np.all(moments.passed < 1)
+    assert int(judged.failed) > 0 and np.all(moments.throughput < 1)
     # About the centroid of all wavelengths.
     apart = moments.mean - jnp.mean(moments.mean, axis=0, keepdims=True)
     square = jnp.mean(jnp.trace(moments.covariance, axis1=1, axis2=2) + jnp.sum(apart**2, -1))

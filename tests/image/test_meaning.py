@@ -64,13 +64,13 @@ def test_eager_and_compiled_agree(name, field, distance):
 
     compiled, inside = jax.jit(jax.grad(total, has_aux=True))(lens, rule)
     eager, outside = jax.grad(total, has_aux=True)(lens)
-    assert np.all(np.isfinite(inside.covariance)) and np.all(inside.passed > 0)
+    assert np.all(np.isfinite(inside.covariance)) and np.all(inside.throughput > 0)
     assert_close(outside, inside, 1e-12)
     assert_close(eager, compiled, 1e-10)
     plain = psf_moments(lens, field, distance, colours)
     assert_close(plain, inside, 1e-12)
     if name == "double_gauss":
-        assert isinstance(rule, drt_jax.Clipped) and np.all(inside.passed < 0.9)
+        assert isinstance(rule, drt_jax.Clipped) and np.all(inside.throughput < 0.9)
 
 
 @pytest.mark.slow
@@ -83,7 +83,7 @@ def test_a_lens_that_passes_no_ray(singlet):
         psf_moments(singlet, *scene, rule=RULE)
     gradient, spot = blur(singlet, *typed(*scene))
     assert np.all(np.isposinf(spot.covariance[:, [0, 1], [0, 1]]))
-    assert np.all(spot.passed == 0)
+    assert np.all(spot.throughput == 0)
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
 
 
@@ -95,7 +95,7 @@ def test_a_wavelength_without_an_index(singlet):
     with pytest.raises(ValueError, match=r"0\.1 um is outside the range"):
         trace_rays(singlet, *SCENE[:2], (0.1,), np.zeros((1, 2)))
     gradient, spot = blur(singlet, *typed(*SCENE[:2], (0.6, 0.1)))
-    assert np.all(np.isposinf(spot.covariance[1, [0, 1], [0, 1]])) and spot.passed[1] == 0
+    assert np.all(np.isposinf(spot.covariance[1, [0, 1], [0, 1]])) and spot.throughput[1] == 0
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
     _, good = blur(singlet, *typed(*SCENE))
     np.testing.assert_allclose(spot.covariance[0], good.covariance[0], rtol=1e-12, atol=1e-20)

@@ -51,7 +51,7 @@ def at(sensor, lens=LENS):
 def test_blur_of_the_double_gauss(sensor):
     found = psf_moments(at(sensor), 0.0, FAR, RGB)
     assert found.mean.shape == (3, 2) and found.covariance.shape == (3, 2, 2)
-    np.testing.assert_allclose(found.passed, 1, rtol=1e-14)
+    np.testing.assert_allclose(found.throughput, 1, rtol=1e-14)
     np.testing.assert_allclose(
         1e3 * np.sqrt(found.covariance[:, 0, 0]).mean(), SIGMA[sensor], atol=0.051
     )
@@ -244,7 +244,7 @@ def test_slow_convergence_is_said():
     with pytest.warns(UserWarning, match="converged to .* only.* does the edge of the beam fail"):
         found = psf_moments(ball, 0.0, np.inf, 0.55, 1e-9)
     edge = 12 / ball.index(np.array([0.55]))[1]  # where the angle of incidence is the critical one
-    np.testing.assert_allclose(found.passed, (edge / 10) ** 2, rtol=0.05)
+    np.testing.assert_allclose(found.throughput, (edge / 10) ** 2, rtol=0.05)
 
 
 def test_inside_a_trace_the_rule_must_be_given():
@@ -299,7 +299,7 @@ def test_no_failing_lens_looks_good():
     with pytest.raises(ValueError, match="no ray at 0.6 um reaches the sensor"):
         psf_moments(blocked, 0.0, FAR, RGB, rule=rule)
     (value, found), gradient = whole(blocked, rule)
-    assert np.isinf(value) and np.all(found.passed == 0)
+    assert np.isinf(value) and np.all(found.throughput == 0)
     assert np.all(np.isinf(np.diagonal(found.covariance, 0, 1, 2)))
     assert all(np.all(a == 0) for a in jax.tree.leaves(gradient))
 

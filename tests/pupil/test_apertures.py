@@ -38,7 +38,7 @@ def test_light_and_spot_of_a_clear_aperture(name):
     wide = {"rectangle": [9.0, 9.0]}, {"ellipse": [9.0, 9.0]}, {"circle": 9.0}
     lens = beam(aperture=[aperture if {*w} < {*aperture} else w for w in wide])
     found = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Clipped(16, "none"))
-    np.testing.assert_allclose(found.passed, area / (np.pi * R**2), rtol=1e-12)
+    np.testing.assert_allclose(found.throughput, area / (np.pi * R**2), rtol=1e-12)
     np.testing.assert_allclose(found.mean[0], aperture["centre"], atol=1e-11)
     np.testing.assert_allclose(found.spread[0, 0], [*variances, 0], rtol=1e-10, atol=1e-12)
 
@@ -59,7 +59,7 @@ def test_light_past_a_ring_and_a_bar():
         return np.array([step.sum(), step @ x**2, step @ y**2 / 3])
 
     area, *squares = part(R, R) - part(hole, hole) - part(R, bar) + part(hole, bar)
-    np.testing.assert_allclose(found.passed, area / (np.pi * R**2), rtol=1e-11)
+    np.testing.assert_allclose(found.throughput, area / (np.pi * R**2), rtol=1e-11)
     np.testing.assert_allclose(found.spread[0, 0], np.array(squares) / area, rtol=1e-10)
 
 
@@ -90,7 +90,7 @@ CUT = {
 def blur(lens, field=0.08):
     found = focus_moments(lens, field, jnp.inf, GREEN, rule=Clipped(12, "bilateral"))
     spot = found.at(lens.sensor)
-    return jnp.concatenate([spot.passed, spot.mean[0, 1:], jnp.diagonal(spot.covariance[0])])
+    return jnp.concatenate([spot.throughput, spot.mean[0, 1:], jnp.diagonal(spot.covariance[0])])
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +175,7 @@ def test_a_telescope_with_a_hole():
         for order, error in ((4, 1e-6), (6, 1e-8)):
             rule = Clipped(order, "bilateral", 10)
             found = drt_jax.psf_moments(lens, field, jnp.inf, GREEN, rule=rule)
-            np.testing.assert_allclose(found.passed, 1 - 0.33**2, rtol=1e-12)
+            np.testing.assert_allclose(found.throughput, 1 - 0.33**2, rtol=1e-12)
             size = np.trace(wanted.covariance[0]) + 1e-8  # 0.1 um: the spot on axis is smaller
             np.testing.assert_allclose(found.covariance, wanted.covariance, atol=error * size)
             np.testing.assert_allclose(found.mean, wanted.mean, atol=1e-9)
@@ -185,14 +185,14 @@ def test_a_telescope_with_a_hole():
 def test_a_rule_does_not_step_over_an_obscuration():
     lens = beam(obscuration={"circle": 0.05})
     assert isinstance(drt_jax.converged_rule(lens, 0.0, 1e4, GREEN, 1e-3), Clipped)
-    share = focus_moments(lens, 0.0, 1e4, GREEN, rule=Gauss(2, "rotational")).passed
+    share = focus_moments(lens, 0.0, 1e4, GREEN, rule=Gauss(2, "rotational")).throughput
     np.testing.assert_allclose(share, 1)
 
 
 def test_soft_edges_tend_to_hard_ones():
     lens = beam(obscuration={"rectangle": [0.5, 0.4]}, aperture={"ellipse": [1.2, 0.9]})
     share = jax.jit(
-        lambda w: focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Soft(40, "bilateral", w)).passed
+        lambda w: focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Soft(40, "bilateral", w)).throughput
     )
     errors = [abs(float(share(w)[0]) - (0.27 - 0.2 / np.pi)) for w in (0.05, 0.02)]
     assert max(errors) < 1e-3

@@ -56,7 +56,7 @@ def test_overlap_of_two_discs():
     half = 0.35  # the front aperture, seen from the stop, lies 0.7 above it
     angle = np.arccos(half)
     area = 2 * (angle - half * np.sin(angle))
-    np.testing.assert_allclose(moments.passed, area / np.pi, rtol=1e-12)
+    np.testing.assert_allclose(moments.throughput, area / np.pi, rtol=1e-12)
     # y about the middle of the overlap; chord of the lower or the upper disc
     nodes, weights = np.polynomial.legendre.leggauss(60)
     edge = 1 - half
@@ -76,13 +76,13 @@ def test_overlap_of_two_discs():
 @pytest.mark.parametrize("name", SCENES)
 def test_converges_like_an_open_pupil(name):
     exact = found(name, 20)
-    assert np.min(exact.passed) > 0.3 and np.max(exact.passed) < 0.95
+    assert np.min(exact.throughput) > 0.3 and np.max(exact.throughput) < 0.95
     size = np.sum(np.asarray(exact.spread)[0, :, :2], axis=-1)
     for order, error in ((8, 1e-5), (12, 1e-9)):
         ours = found(name, order)
         change = np.abs(ours.spread[0] - exact.spread[0]) / size[:, None]
         assert np.max(change) < error
-        np.testing.assert_allclose(ours.passed, exact.passed, rtol=1e-8)
+        np.testing.assert_allclose(ours.throughput, exact.throughput, rtol=1e-8)
         np.testing.assert_allclose(ours.mean, exact.mean, atol=error * np.sqrt(size.max()) + 1e-13)
 
 
@@ -98,7 +98,7 @@ def test_agrees_with_many_rays_that_drop_out():
     moments = found("front and rear", 12)
     spot = moments.at(lens.sensor)
     mean, spread = spot.mean, np.diagonal(spot.covariance, 0, 1, 2)
-    np.testing.assert_allclose(moments.passed[0], len(hits) / len(grid), rtol=2e-3)
+    np.testing.assert_allclose(moments.throughput[0], len(hits) / len(grid), rtol=2e-3)
     np.testing.assert_allclose(spread[0], hits.var(axis=0), rtol=3e-3)
     np.testing.assert_allclose(mean[0], hits.mean(axis=0), atol=2e-3 * np.sqrt(spread.max()))
 
@@ -154,10 +154,10 @@ def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
     @jax.jit
     def passed(lens, width):
         rule = Soft(40, "rotational", width)
-        return focus_moments(lens, 0.0, FAR, GREEN, rule=rule).passed[0]
+        return focus_moments(lens, 0.0, FAR, GREEN, rule=rule).throughput[0]
 
     lens, h = clipped(12.0, 21.0), 1e-4
-    hard = found("on axis", 10).passed[0]
+    hard = found("on axis", 10).throughput[0]
     errors = [abs(float(passed(lens, width) - hard)) for width in (1.0, 0.5, 0.25)]
     assert errors[2] < errors[1] / 2 < errors[0] / 4 and errors[2] < 0.01
     slope = jax.jit(jax.grad(passed))(lens, 0.5).semi_diameter
@@ -175,7 +175,7 @@ def test_a_pupil_that_paraxial_optics_does_not_find():
     lens, field, green = load_lens("fisheye_8mm"), np.radians(85.0), (0.55,)
     ours = psf_moments(lens, field, jnp.inf, green, rule=Clipped(10, "bilateral"))
     theirs = psf_moments(lens, field, jnp.inf, green, rule=Gauss(14, "bilateral"))
-    np.testing.assert_allclose(ours.passed, 1, rtol=1e-12)
+    np.testing.assert_allclose(ours.throughput, 1, rtol=1e-12)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-12)
     rays = trace_rays(lens, field, jnp.inf, green, hexapolar(8)[0])
     assert np.all(rays.status == 0) and rays.newton_steps < 20

@@ -24,7 +24,7 @@ def wide(semi):
 
 def light(lens, field, rule):
     """What part of the light on the stop passes."""
-    return focus_moments(lens, field, jnp.inf, GREEN, rule=rule).passed[0]
+    return focus_moments(lens, field, jnp.inf, GREEN, rule=rule).throughput[0]
 
 
 @pytest.mark.slow
@@ -145,7 +145,7 @@ def test_a_thin_gap_inside_of_a_lens():
     @jax.jit
     def ours(gap):
         found = drt_jax.psf_moments(moved(gap), field, jnp.inf, GREEN, rule=rule)
-        return jnp.stack([found.passed[0], jnp.sqrt(jnp.trace(found.covariance[0]))])
+        return jnp.stack([found.throughput[0], jnp.sqrt(jnp.trace(found.covariance[0]))])
 
     h = 1e-3
     wanted = integral(moved(0.3), field)

@@ -103,7 +103,7 @@ def found(lens, rule):
         moments = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=rule)
         found = moments.at(4.0)
         (xx, xy), (_, yy) = found.covariance[0]
-        return jnp.stack([found.passed[0], *found.mean[0], xx, yy, xy])
+        return jnp.stack([found.throughput[0], *found.mean[0], xx, yy, xy])
 
     return of(lens), jax.jacrev(of)(lens)
 
