@@ -64,8 +64,8 @@ def psf_moments(
 
     See `Moments`. Rays fill the stop uniformly. Differentiable in all arguments but the last two,
     in every mode. ValueError as of `scene_of`, and if no ray of a colour arrives, which says where
-    its light ends; inside a trace, where that cannot be known, `throughput` is 0 and the covariance inf
-    then. Paper section 4.3.
+    its light ends; inside a trace, where that cannot be known, `throughput` is 0 and the covariance
+    inf then. Paper section 4.3.
     """
     found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
     return found.at(lens.sensor)
