@@ -25,7 +25,7 @@ from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.status import Status
 from ..rays.trace import aims, bundle_of
-from .lost import check_order, crossed, reasons
+from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, Moments, check_sensor, weigh
 
 _MAX_ORDER = 40
@@ -36,7 +36,7 @@ _CLIPPED = 4, 2
 # The last digit of float64 is below this, that of float32 above.
 _DOUBLE = 1e-12
 # The order of the rule that tells where light ends.
-_TOLD = 8
+_DIAGNOSIS = 8
 
 # Relative error of the RMS spot size where none is asked for.
 _TOLERANCE = 1e-6
@@ -349,7 +349,7 @@ def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, passed: Numbers) -> N
     with jax.core.eval_context():
         # Of an eager gradient, whose values were not seen before.
         scene_of(lens, scene.field, scene.distance, scene.wavelengths)
-        rule = _padded(_TOLD, symmetry)
+        rule = _padded(_DIAGNOSIS, symmetry)
         found = _weigh(lens, scene, rule, solve)[1]
         raise ValueError(
             f"no ray at {float(scene.wavelengths[colour]):g} um reaches the sensor: "

@@ -21,7 +21,7 @@ from jax import Array
 from ..lens.lens import Lens
 from ..numerics import run_if, safe_divide, safe_sqrt
 from ..rays.aim import beam_size, nearest_start, no_fan, trace_fan
-from ..rays.snell import apart, shoot, shoot_anyway
+from ..rays.snell import shoot, shoot_anyway, split_stop
 from ..rays.status import Status
 from ..rays.system import System, dot
 from ..rays.trace import on_all_surfaces
@@ -152,10 +152,10 @@ def traced(lens: Lens, system: System, launch: Array, crossing: bool) -> tuple[A
     if not crossing:
         plain = shoot(system, tuple(launch))
         good = plain.status == Status.OK
-        both, good = on_all_surfaces(lens, system, *apart(system, plain.hits), good)
+        both, good = on_all_surfaces(lens, system, *split_stop(system, plain.hits), good)
         return jnp.stack(both), good
     hits, ways, status = shoot_anyway(system, tuple(launch))
-    (x, y), good = on_all_surfaces(lens, system, *apart(system, hits), status == Status.OK)
+    (x, y), good = on_all_surfaces(lens, system, *split_stop(system, hits), status == Status.OK)
     found = jnp.concatenate([x, ways]), jnp.concatenate([y, 0 * ways])
     return jnp.stack(found), good
 
