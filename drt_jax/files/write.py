@@ -98,13 +98,13 @@ def _phase(lens: Lens, i: int) -> dict[str, Any]:
 def _media(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Keys of each medium, none for air, and the glasses whose constants the file has to tell."""
     plain = [_plain_medium(lens, i) for i in range(lens.count + 1)]
-    told = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
+    described = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
     media: list[dict[str, Any]] = []
     glasses: dict[str, Any] = {}
     for i, (name, keys) in enumerate(zip(lens.glasses, plain, strict=True)):
         if i and name == lens.glasses[i - 1]:  # light keeps the constants of the medium in front
             keys = media[-1]
-        elif keys is None or keys.get("glass") in told:
+        elif keys is None or keys.get("glass") in described:
             own = _constants(lens.dispersion, i)
             while glasses.setdefault(name, own) != own:  # another medium of this name
                 name += "*"

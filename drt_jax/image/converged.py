@@ -25,7 +25,7 @@ from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, sym
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.trace import aims, bundle_of, trace_bundle
-from .lost import check_order, crossed, reasons
+from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, Moments, check_sensor, weigh
 from .tiles import trace_rule
 
@@ -37,7 +37,7 @@ _CLIPPED = 4, 2
 # The last digit of float64 is below this, that of float32 above.
 _DOUBLE = 1e-12
 # The order of the rule that tells where light ends.
-_TOLD = 8
+_DIAGNOSIS = 8
 
 # Relative error of the RMS spot size where none is asked for.
 _TOLERANCE = 1e-6
@@ -346,7 +346,7 @@ def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) 
     with jax.core.eval_context():
         # Of an eager gradient, whose values were not seen before.
         scene_of(lens, scene.field, scene.distance, scene.wavelengths)
-        rule = _padded(_TOLD, symmetry)
+        rule = _padded(_DIAGNOSIS, symmetry)
         found = trace_rule(lens, scene, rule, solve).found
         raise ValueError(
             f"no ray at {float(scene.wavelengths[colour]):g} um reaches the sensor: "

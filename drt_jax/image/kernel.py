@@ -91,8 +91,8 @@ def _gaussian(
     usable = (side > 1 / _FAR) & (side < _FAR)
     side = jnp.where(usable, side, 1)
     known = jnp.isfinite(mean), jnp.isfinite(covariance)
-    lost = ~(jnp.all(known[0], axis=1) & jnp.all(known[1], axis=tuple(range(1, covariance.ndim))))
-    lost = lost | ~usable
+    void = ~(jnp.all(known[0], axis=1) & jnp.all(known[1], axis=tuple(range(1, covariance.ndim))))
+    void = void | ~usable
     far, wide = _FAR * side, _WIDE * side**2
     mean = jnp.clip(jnp.where(known[0], mean, 0), -far, far) / side
     covariance = jnp.clip(jnp.where(known[1], covariance, 0), -wide, wide) / side**2
@@ -104,7 +104,7 @@ def _gaussian(
     else:
         edges = jnp.arange(size + 1, dtype=dtype)[None, None] - size / 2
         kernel = _integrated(edges - mean[..., None], covariance)
-    return jax.tree.map(lambda k: jnp.where(jnp.expand_dims(lost, range(1, k.ndim)), 0, k), kernel)
+    return jax.tree.map(lambda k: jnp.where(jnp.expand_dims(void, range(1, k.ndim)), 0, k), kernel)
 
 
 def _checked(

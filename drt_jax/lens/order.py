@@ -92,7 +92,7 @@ def neighbours_now(lens: Lens) -> list[Pair]:
     return neighbours(lens, [*gaps, float(lens.sensor) - sum(gaps)], moved)
 
 
-def told(lens: Lens, pair: Pair, place: float) -> str:
+def describe_crossing(lens: Lens, pair: Pair, place: float) -> str:
     """That two neighbours cross, in words; `place` as of `crossing`."""
     second = "the sensor" if pair.second == lens.count else f"surface {pair.second}"
     where = f"from {place:.3g} mm off the axis on" if place else "on the axis"

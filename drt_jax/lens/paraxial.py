@@ -122,15 +122,15 @@ class ParaxialSystem:
     known: Array
     stop: int
 
-    def told(self, results: Any, good: Array | bool = True) -> Any:
+    def masked(self, results: Any, good: Array | bool = True) -> Any:
         """Results (..., W); inf where an index is not known, or what came in is not `good`, bool
         of a shape that broadcasts."""
 
-        def told(found):
+        def masked(found):
             sure = (jnp.broadcast_to(a, found.shape) for a in (self.known, good))
             return jnp.where(jnp.logical_and(*sure), found, jnp.inf)
 
-        return jax.tree.map(told, results)
+        return jax.tree.map(masked, results)
 
 
 class ParaxialRay(NamedTuple):
@@ -196,7 +196,7 @@ def _pupil(system: ParaxialSystem, front: bool) -> Pupil:
     height, slope = chief_ray(system, front)
     # n u times the size of the pupil is the same in all media (Lagrange).
     bend = jnp.abs(system.index[0 if front else -1] * slope)
-    return system.told(Pupil(_quotient(-height, slope), _quotient(system.aperture, bend)))
+    return system.masked(Pupil(_quotient(-height, slope), _quotient(system.aperture, bend)))
 
 
 def entrance_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
@@ -251,7 +251,7 @@ def first_order(lens: Lens, distance: Numbers, wavelengths: Numbers) -> FirstOrd
         petzval_radius=_quotient(-one, index[-1] * jnp.sum(petzval_parts(system), axis=0)),
         effective_focal_length=_quotient(-one, index[-1] * u),
     )
-    return system.told(found, in_front(far))
+    return system.masked(found, in_front(far))
 
 
 def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
@@ -260,7 +260,7 @@ def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
     than `effective_focal_length`, and negative for a concave mirror, whose focus lies before it."""
     system = paraxial_system(lens, wavelengths)
     slope = trace_ray(system, 1.0, 0.0).behind[-1]
-    return system.told(_quotient(-jnp.ones_like(slope), slope))
+    return system.masked(_quotient(-jnp.ones_like(slope), slope))
 
 
 def effective_focal_length(lens: Lens, wavelengths: Numbers) -> Array:
@@ -275,7 +275,7 @@ def back_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
     `wavelengths` (W,) in um."""
     system = paraxial_system(lens, wavelengths)
     ray = trace_ray(system, 1.0, 0.0)
-    return system.told(_quotient(-ray.height[-1], ray.behind[-1]))
+    return system.masked(_quotient(-ray.height[-1], ray.behind[-1]))
 
 
 def front_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
@@ -324,4 +324,4 @@ def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Num
     tangent = jnp.tan(jnp.where(forwards, angle, 0))
     fields = tuple(range(tangent.ndim - 1))
     front, bend = (jnp.expand_dims(a, fields) for a in (system.index[0], system.index[-1] * slope))
-    return system.told(_quotient(-tangent * front, bend), forwards & in_front(far))
+    return system.masked(_quotient(-tangent * front, bend), forwards & in_front(far))

@@ -140,4 +140,4 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
         lateral_colour=2 * half * colour * (chief.height * c + chief.before),
         petzval_curvature=-n[-1:] * petzval_parts(system),
     )
-    return system.told(found, forwards & in_front(far))
+    return system.masked(found, forwards & in_front(far))

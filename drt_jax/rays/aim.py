@@ -49,12 +49,12 @@ class _State(NamedTuple):
 
 
 class AimNewton(optx.AbstractRootFinder):
-    """Newton's method for one launch point, damped: after a step with which the ray is lost or
+    """Newton's method for one launch point, damped: after a step with which the ray fails or is
     farther off, the next is half as long; after a good one, at most twice as long.
 
     The function returns the miss (D numbers) and the status of the ray as its auxiliary output.
     Options: "reach", the longest first step in mm; "upright", whether trials beyond a fold of the
-    beam, where its image on the stop is turned over, are as bad as lost ones: of two rays through
+    beam, where its image on the stop is turned over, are as bad as failed ones: of two rays through
     one stop point, neighbours then take the same. Ends when the miss is at most `atol` mm, and
     the step that remains is taken; or with RESULTS.nonlinear_divergence.
     """
@@ -153,9 +153,9 @@ def aim(
             max_steps=_STEPS,
             throw=False,
         )
-        lost = jnp.where(solution.aux == Status.OK, Status.UNCONVERGED, solution.aux)
+        failed = jnp.where(solution.aux == Status.OK, Status.UNCONVERGED, solution.aux)
         found = solution.result == optx.RESULTS.successful
-        status = jnp.where(found, Status.OK, lost).astype(jnp.int32)
+        status = jnp.where(found, Status.OK, failed).astype(jnp.int32)
         return solution.value, status, solution.state.folded, solution.stats["num_steps"]
 
     def one_colour(index, wave, target, launch):

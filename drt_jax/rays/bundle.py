@@ -19,9 +19,9 @@ from .system import System, Vector, dot
 
 # More rays than `_MANY` are aimed by polynomials and solved in tiles of `_TILE` rays, of all
 # wavelengths together: what belongs to a surface then stays in the cache of a core. Derivatives
-# hold 0.9 kB a ray and row, of `_HELD` of them 21 MB; more than 32 MB at once are given back to the
-# system after each call, which takes longer than to compute them.
-_MANY, _TILE, _HELD = 1024, 2048, 24_000
+# hold 0.9 kB a ray and row, of `_DERIVATIVES` of them 21 MB; more than 32 MB at once are given back
+# to the system after each call, which takes longer than to compute them.
+_MANY, _TILE, _DERIVATIVES = 1024, 2048, 24_000
 # In a Double Gauss at 10 degrees, the launch misses the stop points by 1e-13 mm with degree 18, by
 # 1e-10 mm with 14.
 _DEGREE = 18
@@ -33,9 +33,9 @@ def tile_of(rays: int, waves: int) -> int:
     return rays if rays <= max(_MANY, size) else size
 
 
-def held_tile(waves: int, rows: int) -> int:
+def derivative_tile(waves: int, rows: int) -> int:
     """Of how many rays a wavelength derivatives are taken at once, in a system of so many rows."""
-    return max(min(_TILE, _HELD // rows) // waves, 64)
+    return max(min(_TILE, _DERIVATIVES // rows) // waves, 64)
 
 
 def in_tiles(function: Callable, most: int, *trees: Any) -> Any:

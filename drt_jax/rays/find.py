@@ -201,8 +201,8 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted
         return fan, target, nearest_start(fan, target)
 
     def next_round(state):
-        whole, sought = state.round < 2, state.left > 0
-        lanes = Lanes(sought, starts)
+        whole, missing = state.round < 2, state.left > 0
+        lanes = Lanes(missing, starts)
 
         def from_several(given):
             fan, target, _ = given
@@ -220,7 +220,7 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted
         worth = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
         lane, found = lanes.best(worth)
         lane = jnp.where(whole, ray[None], lane)
-        found = jnp.where(whole, (state.round == 0) | (sought & (worth > 0)), found)
+        found = jnp.where(whole, (state.round == 0) | (missing & (worth > 0)), found)
         status = jnp.take_along_axis(new.status, lane, axis=-1)
         status = jnp.where(found, status, state.status)
         taken = (jnp.take_along_axis(h, lane[None], axis=-1) for h in new.hits)

@@ -15,7 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from ..lens.surface import by_form, sag_derivatives
 from . import fermat, linear
-from .bundle import held_tile, in_tiles
+from .bundle import derivative_tile, in_tiles
 from .fermat import Path
 from .find import Found, find_aimed, find_many
 from .meet import cross
@@ -51,7 +51,7 @@ def _attach_jvp(primals: Any, tangents: Any) -> tuple:
         moved = linear.solve(path, system, good, push)
         return jax.tree.map(lambda a: jnp.where(good, a, 0), moved)
 
-    tile = held_tile(len(good), len(system.forms))
+    tile = derivative_tile(len(good), len(system.forms))
     return (hits, arrival), in_tiles(tangent, tile, hits, turning, good)
 
 
@@ -122,8 +122,8 @@ def _forward(system: System, target: Vector) -> tuple[Found, tuple]:
     return found, (system, target, found.hits, found.status == Status.OK)
 
 
-def _backward(kept: tuple, cotangent: Found) -> tuple[System, Vector]:
-    system, target, hits, good = kept
+def _backward(saved: tuple, cotangent: Found) -> tuple[System, Vector]:
+    system, target, hits, good = saved
     void = jax.tree.map(jnp.zeros_like, cotangent.arrival)  # only its derivatives are asked for
 
     def attached(system, target):

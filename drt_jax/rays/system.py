@@ -197,8 +197,8 @@ def placed(lens: Lens, rows: Any) -> Placed:
 
     def shape(array: Array) -> Array:
         own = array[rows]
-        kept = bends.reshape(bends.shape + (1,) * (own.ndim - bends.ndim))
-        return own if bends.all() else jnp.where(kept, own, jax.lax.stop_gradient(own))
+        mask = bends.reshape(bends.shape + (1,) * (own.ndim - bends.ndim))
+        return own if bends.all() else jnp.where(mask, own, jax.lax.stop_gradient(own))
 
     return Placed(
         vertex[rows],

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax.image.lost import crossed
+from drt_jax.image.diagnose import crossed
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
 from drt_jax.learn.data import DataConfig, batches, load_patches

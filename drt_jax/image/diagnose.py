@@ -9,7 +9,7 @@ from jax import Array
 from ..compilation import ONCE, jit
 from ..lens.clearance import clipping_surface
 from ..lens.lens import Lens
-from ..lens.order import crossing, neighbours_now, told
+from ..lens.order import crossing, describe_crossing, neighbours_now
 from ..lens.scene import Scene
 from ..pupil.rules import PupilRule
 from ..rays.aim import beam_size, paraxial_launch
@@ -52,7 +52,7 @@ def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, colour: int
 def crossed(lens: Lens) -> str:
     """Which surfaces of a known lens cross, in words after a semicolon; nothing if none does."""
     pairs = [(pair, crossing(lens, pair)) for pair in neighbours_now(lens)]
-    parts = [told(lens, pair, place) for pair, place in pairs if place is not None]
+    parts = [describe_crossing(lens, pair, place) for pair, place in pairs if place is not None]
     return "".join(f"; {part}" for part in parts[:_PARTS])
 
 
@@ -60,7 +60,7 @@ def check_order(lens: Lens) -> None:
     """ValueError for a known lens with the vertices of two neighbours in the wrong order."""
     for pair in neighbours_now(lens):
         if pair.gap <= 0:
-            raise ValueError(f"{told(lens, pair, 0.0)}; light cannot go backwards")
+            raise ValueError(f"{describe_crossing(lens, pair, 0.0)}; light cannot go backwards")
 
 
 @functools.partial(jit, wanted=ONCE)
