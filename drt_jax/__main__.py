@@ -83,7 +83,7 @@ def field_lines(
     lens: Lens, fields: list[float], distance: float, wavelengths: list[float], beams: list[Beam]
 ) -> Iterator[str]:
     """A table of spots over fields in degrees, and what is odd about it."""
-    spots = [f"spot at {colour:.3f}" for colour in wavelengths]
+    spots = [f"spot at {wavelength:.3f}" for wavelength in wavelengths]
     yield _row("field", "image height", *spots, "light", "surfaces that clip")
     yield _row("deg", "mm", *("RMS um" for _ in spots), "%", "")
     angles, middle = [math.radians(field) for field in fields], len(wavelengths) // 2

@@ -141,7 +141,7 @@ class Problem:
             angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
         _check_pairs(angles)
         far = jnp.stack([distance_array(d, dtype) for d in np.ravel(np.asarray(distances, float))])
-        waves = lens.colours(wavelengths)
+        waves = lens.checked_wavelengths(wavelengths)
         if isinstance(rule, int):
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))

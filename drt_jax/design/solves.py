@@ -52,7 +52,7 @@ class Solve:
     kind: "focal_length" in image space or "effective_focal_length" in air, in mm, or "image_angle",
         the paraxial slope of the marginal ray behind the lens, negative where light converges: the
         curvature of `surface` follows. "paraxial_focus",
-        or "best_focus" where the spots of `fields`, each colour about its own centroid, are
+        or "best_focus" where the spots of `fields`, each wavelength about its own centroid, are
         smallest (the root of their mean square): the distance of the sensor behind the last vertex
         follows. "entrance_pupil", its diameter in mm, or "f_number", the working one: the
         semi-diameter of the stop follows.

@@ -2,42 +2,43 @@
 
 Lengths in mm, angles in radians. Each kind has one value for each of what stands in brackets; of
 these an operand may name some: fields, wavelengths, distances, surfaces. "Middle": the middle
-colour, unless wavelengths are named.
+wavelength, unless wavelengths are named.
 
 residuals to be squared, which take neither a target nor limits
-    spot: each ray from the centroid of all colours, times the root of the light it stands for: the
-        squares of a field add up to the mean square radius of its spot, mm^2. Of the light that
+    spot: each ray from the centroid of all wavelengths, times the root of the light it stands for:
+        the squares of a field add up to the mean square radius of its spot, mm^2. Of the light that
         arrives, so that cutting the worst rays gains: vignetting=False, of this and all that
         follow up to centroid, counts rays that clear apertures clip as if they passed
-    spot_of_colours: the same from the centroid of its own colour
-    spot_chief: the same from where the chief ray of the middle colour falls
-    path_difference: of each ray less the mean of its colour, waves, times the same root: the
-        squares add up to the mean square wavefront error of the colours
+    spot_of_colours: the same from the centroid of its own wavelength
+    spot_chief: the same from where the chief ray of the middle wavelength falls
+    path_difference: of each ray less the mean of its wavelength, waves, times the same root: the
+        squares add up to the mean square wavefront error of the wavelengths
 
 of spots and wavefronts [distance, field]
     rms_spot: mm, the root of what the squares of spot add up to
     rms_wavefront: waves, of path_difference
-    centroid: y on the sensor, mm, of all colours
+    centroid: y on the sensor, mm, of all wavelengths
     throughput: part of the light through the stop that clear apertures let pass; has derivatives
         with the rules Soft and Clipped, while Gauss drops rays one by one
-    relative_illumination: by projected solid angles (with clipped light that of the middle colour),
-        of that of the first field
+    relative_illumination: by projected solid angles (with clipped light that of the middle
+        wavelength), of that of the first field
 
 of chief rays, through the middle of the stop
-    distortion [distance, field, colour: middle]: how much farther out than where the paraxial image
-        is, as a part of that; 0 on the axis
-    lateral_colour [distance, field, colour but the first]: y on the sensor less that of the first
-        colour, mm; x, too, where the pupil rule is one of the whole disc
-    chief_ray_angle [distance, field, colour]: with the normal of the sensor's vertex, from 0
+    distortion [distance, field, wavelength: middle]: how much farther out than where the paraxial
+        image is, as a part of that; 0 on the axis
+    lateral_colour [distance, field, wavelength but the first]: y on the sensor less that of the
+        first wavelength, mm; x, too, where the pupil rule is one of the whole disc
+    chief_ray_angle [distance, field, wavelength]: with the normal of the sensor's vertex, from 0
 
-    numerical_aperture [distance, field, colour: middle]: index times sine of the angle between the
-        chief ray and those through the rim of the stop, root of the mean square, at the sensor
+    numerical_aperture [distance, field, wavelength: middle]: index times sine of the angle between
+        the chief ray and those through the rim of the stop, root of the mean square, at the sensor
 
 of first order
-    focal_length, effective_focal_length, back_focal_distance [colour: middle]: mm; the first in
+    focal_length, effective_focal_length, back_focal_distance [wavelength: middle]: mm; the first in
         image space, n' over power, the second in air, 1 over power
-    entrance_pupil [colour: middle]: its diameter, mm
-    f_number, magnification [distance, colour: middle]: working f-number; image over object height
+    entrance_pupil [wavelength: middle]: its diameter, mm
+    f_number, magnification [distance, wavelength: middle]: working f-number; image over object
+        height
     total_track, length, back_distance: first vertex to sensor, to the last vertex, and from that to
         the sensor, mm
 

@@ -63,9 +63,9 @@ def psf_moments(
         where `converged_rule`, called outside, makes it.
 
     See `Moments`. Rays fill the stop uniformly. Differentiable in all arguments but the last two,
-    in every mode. ValueError as of `scene_of`, and if no ray of a colour arrives, which says where
-    its light ends; inside a trace, where that cannot be known, `throughput` is 0 and the covariance
-    inf then. Paper section 4.3.
+    in every mode. ValueError as of `scene_of`, and if no ray of a wavelength arrives, which says
+    where its light ends; inside a trace, where that cannot be known, `throughput` is 0 and the
+    covariance inf then. Paper section 4.3.
     """
     found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
     return found.at(lens.sensor)
@@ -131,8 +131,8 @@ def at_sensor(spread: np.ndarray) -> list[np.ndarray]:
 
 
 def best_focus(spread: np.ndarray) -> list[np.ndarray]:
-    """Where the spot must be right: at the sensor, and where that of each colour is smallest, (W,)
-    mm behind the reference."""
+    """Where the spot must be right: at the sensor, and where that of each wavelength is smallest,
+    (W,) mm behind the reference."""
     _, linear, square = np.sum(spread[..., :2], axis=-1)
     return [*at_sensor(spread), -linear / np.where(square > 0, 2 * square, 1)]
 
@@ -340,8 +340,8 @@ def _change(before: _Trial, now: _Trial, places: Callable) -> float:
 
 
 def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) -> None:
-    """ValueError for a colour of which nothing passed, (W,): where its light ends."""
-    colour = int(np.argmin(np.asarray(throughput) > 0))
+    """ValueError for a wavelength of which nothing passed, (W,): where its light ends."""
+    wavelength = int(np.argmin(np.asarray(throughput) > 0))
     lens, scene = known_values((lens, scene))
     with jax.core.eval_context():
         # Of an eager gradient, whose values were not seen before.
@@ -349,7 +349,7 @@ def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) 
         rule = _padded(_DIAGNOSIS, symmetry)
         found = trace_rule(lens, scene, rule, solve).found
         raise ValueError(
-            f"no ray at {float(scene.wavelengths[colour]):g} um reaches the sensor: "
-            f"{reasons(lens, scene, rule, found, colour)}{crossed(lens)}; see "
+            f"no ray at {float(scene.wavelengths[wavelength]):g} um reaches the sensor: "
+            f"{reasons(lens, scene, rule, found, wavelength)}{crossed(lens)}; see "
             "trace_rays(...).status"
         )

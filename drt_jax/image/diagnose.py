@@ -30,17 +30,17 @@ _HOW = {
 _PARTS = 3
 
 
-def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, colour: int) -> str:
-    """What stops the light of a colour, in words: "87 % misses surface 3, ...".
+def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, wavelength: int) -> str:
+    """What stops the light of a wavelength, in words: "87 % misses surface 3, ...".
 
     rule: whose weights tell how much light a ray stands for. found: its rays. All is known.
     """
     _, weights = rule.points(lens, scene)
     status, surface = (np.asarray(a) for a in _ends(lens, scene, rule, found))
-    weight = np.broadcast_to(np.asarray(weights, float), status.shape)[colour]
+    weight = np.broadcast_to(np.asarray(weights, float), status.shape)[wavelength]
     names = {-1: "a surface", lens.count: "the sensor"}
     parts: dict[str, float] = {}
-    rays = status[colour].tolist(), surface[colour].tolist()
+    rays = status[wavelength].tolist(), surface[wavelength].tolist()
     for code, index, share in zip(*rays, weight.tolist(), strict=True):
         place = names.get(index, f"surface {index}")
         how = _HOW[Status(code)].format(place)

@@ -127,7 +127,7 @@ def _checked(
         if array.shape != wanted or array.size == 0:
             raise ValueError(f"{name}: expected {text}, got shape {array.shape}")
         if concrete(given[name]) and not np.all(np.isfinite(np.asarray(given[name], float))):
-            hint = "; no ray of that colour arrives" if name == "covariance" else ""
+            hint = "; no ray of that wavelength arrives" if name == "covariance" else ""
             raise ValueError(f"{name}: must be finite{hint}")
     if concrete(pixel):
         side = np.asarray(pixel, float).item()

@@ -42,7 +42,7 @@ class Moments:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class FocusMoments:
-    """Moments of W colours as polynomials in the sensor position: no ray is traced again.
+    """Moments of W wavelengths as polynomials in the sensor position: no ray is traced again.
 
     With d = sensor - reference (mm): centroid = mean + d slope, covariance = spread[0] +
     d spread[1] + d^2 spread[2].

@@ -1,6 +1,6 @@
 """Optical path difference of the rays against a sphere round the image point.
 
-For a colour, the chief ray (through the centre of the stop) meets the sensor at C. The
+For a wavelength, the chief ray (through the centre of the stop) meets the sensor at C. The
 reference sphere has its centre at C and its radius R along the chief ray to the plane of the
 paraxial exit pupil, positive against the light. Written in kappa = 1 / R, so that a telecentric
 exit pupil (kappa = 0) is a point like any other: a ray with the unit direction d that meets
@@ -36,8 +36,8 @@ class Wavefront(NamedTuple):
     opd: (W, Q) in waves, path of the chief ray less path of the ray, both to the reference
         sphere: positive where the wavefront is ahead of the sphere; 0 for a ray that failed or is
         clipped.
-    status: (W, Q), int32, see `Status`; where the chief ray of a colour failed, no ray has an opd,
-        and its status is its own or, if that is OK or CLIPPED, the chief ray's.
+    status: (W, Q), int32, see `Status`; where the chief ray of a wavelength failed, no ray has an
+        opd, and its status is its own or, if that is OK or CLIPPED, the chief ray's.
     image: (W, 2) in mm, where the chief rays meet the sensor, along its axes; 0 if they failed.
     """
 
@@ -82,7 +82,9 @@ def wavefront(
     if curvature is not None:
         kappa = real_array("curvature", curvature, lens.curvature.dtype)
         if kappa.shape not in ((), scene.wavelengths.shape):
-            raise ValueError(f"curvature: expected one or one a colour, got shape {kappa.shape}")
+            raise ValueError(
+                f"curvature: expected one or one a wavelength, got shape {kappa.shape}"
+            )
         if concrete(curvature) and not np.all(np.isfinite(np.asarray(curvature, float))):
             raise ValueError("curvature: must be finite; 0 for a telecentric exit pupil")
     return _wavefront(lens, scene, points, kappa)
@@ -101,15 +103,15 @@ def path_differences(
 ) -> tuple[Array, Array, Array]:
     """Path differences (W, Q) in waves, status (W, Q) and image points (W, D) of traced rays, the
     chief ray first; see `Wavefront` and `wavefront`."""
-    colours = jnp.clip(wavelengths, *lens.dispersion.range)
+    waves = jnp.clip(wavelengths, *lens.dispersion.range)
     whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     chief_ok = whole[:, :1]
 
     if curvature is None:
-        curvature = reference_curvature(lens, colours)
+        curvature = reference_curvature(lens, waves)
     finite = jnp.isfinite(curvature)
     curvature = jnp.where(finite, curvature, 0)
-    sphere = chief_ok & jnp.broadcast_to(finite, colours.shape)[:, None]
+    sphere = chief_ok & jnp.broadcast_to(finite, waves.shape)[:, None]
     good = sphere & (bundle.status == Status.OK)
     # cosine between the chief ray and the axis, along which the sensor moves
     axis = lens.sensor_motion
@@ -124,9 +126,9 @@ def path_differences(
     along = dot(e, bundle.arrival[:-1])
     x = along**2 - dot(e, e)
     to_sphere = along + kappa * x / (1 + safe_sqrt(1 + kappa**2 * x))
-    index = lens.index(colours)[-1][:, None]
+    index = lens.index(waves)[-1][:, None]
     path = bundle.path[:, :1] - bundle.path + index * to_sphere
-    opd = jnp.where(good, path, 0) / (_MM * colours[:, None])
+    opd = jnp.where(good, path, 0) / (_MM * waves[:, None])
     without = jnp.where(chief_ok, jnp.int32(Status.UNCONVERGED), bundle.status[:, :1])
     status = jnp.where(sphere | ~whole, bundle.status, without)
     return opd, status, jnp.concatenate(image, axis=-1)

@@ -58,7 +58,7 @@ def make_imager(
     The result maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
     distance mm, noise, key) to (truth, sensor image, restored image), float32 (B, H, W, C), and
     the `deviation` (C,) of the blur in mm. The kernel is centred on the mean
-    centroid of the colours that arrive: patches are registered. A colour that loses rays is
+    centroid of the wavelengths that arrive: patches are registered. A wavelength that loses rays is
     darker by what it loses, and black without any.
     """
     margin = camera.kernel // 2
@@ -123,7 +123,7 @@ def make_step(
     vectorised: over the first axis of all parameters, of N jobs.
 
     init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the
-    state donated. metrics: loss, sigma_um (mean over the colours), depth_mm, and the optics'
+    state donated. metrics: loss, sigma_um (mean over the wavelengths), depth_mm, and the optics'
     parameters by name, that of "sensor" as sensor_mm, each () or, vectorised, (N,).
     """
     init_adam, update = adam(rates)

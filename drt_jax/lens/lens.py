@@ -205,11 +205,11 @@ class Lens:
     def index(self, wavelengths: Numbers) -> Array:
         """Refractive index (S + 1, W) of every medium at `wavelengths` (W,), um.
 
-        ValueError as `colours`.
+        ValueError as `checked_wavelengths`.
         """
-        return refractive_index(self.dispersion, self.colours(wavelengths))
+        return refractive_index(self.dispersion, self.checked_wavelengths(wavelengths))
 
-    def colours(self, wavelengths: Numbers) -> Array:
+    def checked_wavelengths(self, wavelengths: Numbers) -> Array:
         """`wavelengths`, one or a list, in um, as an array (W,).
 
         ValueError for none, for another shape, and as `check_wavelengths`.

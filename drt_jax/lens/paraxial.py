@@ -144,17 +144,17 @@ class ParaxialRay(NamedTuple):
 def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
     """What paraxial rays of `wavelengths` (W,), um, see of a lens."""
     lens.check()
-    colours = lens.colours(wavelengths)
-    index = lens.index(jnp.clip(colours, *lens.dispersion.range))
+    waves = lens.checked_wavelengths(wavelengths)
+    index = lens.index(jnp.clip(waves, *lens.dispersion.range))
     index = index * jnp.asarray(lens.senses[:, None], index.dtype)
     curvature = vertex_curvature(lens.shape, lens.forms, 1)[0][:-1]
     power = curvature[:, None] * jnp.diff(index, axis=0)
     if lens.phase is not None:
         turned = vertex_curvature(lens.phase.shape, lens.phase.forms, 1)[0]
-        wave = 1e-3 * lens.phase.order[:, None] * colours[None]
+        wave = 1e-3 * lens.phase.order[:, None] * waves[None]
         power = power.at[np.array(lens.phase.surfaces)].add(-wave * turned[:, None])
     aperture = lens.semi_diameter[lens.stop]
-    known = lens.dispersion.knows(colours)
+    known = lens.dispersion.knows(waves)
     return ParaxialSystem(curvature, power, lens.thickness, index, aperture, known, lens.stop)
 
 

@@ -19,7 +19,7 @@ _NEAREST = 1e-6
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """An object point and its colours, arrays of one floating dtype.
+    """An object point and its wavelengths, arrays of one floating dtype.
 
     field: (2,) angles in radians along x and y, whose tangents add: light goes along (tan x, tan y,
         1); positive light travels upwards.
@@ -81,7 +81,7 @@ def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers
         raise ValueError(f"field: expected one angle or two, got shape {angles.shape}")
     if angles.ndim == 0:
         angles = jnp.stack([jnp.zeros_like(angles), angles])
-    return Scene(angles, distance_array(distance, dtype), lens.colours(wavelengths))
+    return Scene(angles, distance_array(distance, dtype), lens.checked_wavelengths(wavelengths))
 
 
 def field_array(field: Numbers, dtype: Any) -> Array:

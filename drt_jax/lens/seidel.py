@@ -125,7 +125,7 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
     figure = _fourth_order(lens, system.curvature)
     s1, s2, s3, s4, s5 = _seidel(system, figure, marginal, chief)
 
-    colours = lens.colours(wavelengths)
+    colours = lens.checked_wavelengths(wavelengths)
     spread = (n[:, jnp.argmin(colours)] - n[:, jnp.argmax(colours)])[:, None] / n
     colour = n[:-1] * marginal.height * (spread[1:] - spread[:-1])
     half = safe_divide(jnp.ones_like(n[-1]), 2 * n[-1] * marginal.behind[-1])[None]

@@ -9,7 +9,7 @@ Rays are launched, not aimed. A trace tells how q changes with the point on the 
 all edges, where rays step back to a surface. This linear model of a ray ends every half-line on the
 stop at the root of a quadratic; the next ray is launched there: Newton's method, of a few steps.
 
-Vectors are arrays with their 2 components first, and B rays a colour last.
+Vectors are arrays with their 2 components first, and B rays a wavelength last.
 """
 
 from collections.abc import Callable
@@ -242,8 +242,8 @@ def stretch(rays: Rays) -> Array:
 
 
 def middle(rays: Rays, pattern: Array) -> Array:
-    """A point (2, W, 1) far from all edges by the model of one ray a colour: at first the deepest
-    of many, a `pattern` (2, B) zoomed in on, then the lowest of the barrier."""
+    """A point (2, W, 1) far from all edges by the model of one ray a wavelength: at first the
+    deepest of many, a `pattern` (2, B) zoomed in on, then the lowest of the barrier."""
 
     def zoom(_, state):
         best, span = state

@@ -6,7 +6,7 @@ smooth but for the corners where one edge takes over from another. Gauss rules b
 and along the radii converge as on an open stop; also in a narrow slit, as its coordinates are
 stretched until it is about as wide as long.
 
-Vectors are arrays with their 2 components first, and B rays a colour last.
+Vectors are arrays with their 2 components first, and B rays a wavelength last.
 """
 
 import dataclasses
@@ -62,7 +62,7 @@ class _State(NamedTuple):
     latest: EdgeRays
 
 
-# Rays to start from, B a colour, their targets, and how many steps at most.
+# Rays to start from, B a wavelength, their targets, and how many steps at most.
 _Task = tuple[Rays, Target, Any]
 
 
@@ -84,7 +84,7 @@ def _scouts(given: _Given, state: _State) -> tuple[_State, _Task]:
 
 
 def _rescue(given: _Given, state: _State) -> tuple[_State, _Task]:
-    """Where no scout of a colour arrived, the ray of a fan that crosses the stop nearest to its
+    """Where no scout of a wavelength arrived, the ray of a fan that crosses the stop nearest to its
     centre."""
     system, rays = given.system, state.latest.rays
     dark = ~jnp.any(rays.good, axis=-1)

@@ -1,6 +1,6 @@
 """Spokes, the half-lines from a centre to the boundary: where they lie, and their quadrature.
 
-Vectors are arrays with their 2 components first, and B rays a colour last.
+Vectors are arrays with their 2 components first, and B rays a wavelength last.
 """
 
 import dataclasses

@@ -216,17 +216,17 @@ def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
     rays of an axial object in a lens with rotational symmetry."""
     active, stop = lens.active, lens.stop
     # Wavelengths without an index have one that is finite; their rays fail, see `Status`.
-    colours = jnp.clip(scene.wavelengths, *lens.dispersion.range)
+    waves = jnp.clip(scene.wavelengths, *lens.dispersion.range)
     rows = [*active, lens.count]
     tangent = scene.tangent[2 - dim :]
     return System(
         rows=placed(lens, rows),
         stop=None if stop in active else placed(lens, stop),
-        index=lens.index(colours)[np.array([0, *(i + 1 for i in active)]), :, None],
+        index=lens.index(waves)[np.array([0, *(i + 1 for i in active)]), :, None],
         # Light with a positive field angle travels upwards: the object lies below the axis.
         source=jnp.concatenate([-tangent, -jnp.ones_like(tangent[:1])]),
         vergence=scene.vergence,
-        diffraction=None if lens.phase is None else _diffraction(lens.phase, active, colours),
+        diffraction=None if lens.phase is None else _diffraction(lens.phase, active, waves),
         before=sum(i < stop for i in active),
         forms=tuple(lens.forms[i] for i in rows),
         stop_form=lens.forms[stop],
