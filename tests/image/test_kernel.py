@@ -148,7 +148,7 @@ def test_derivative_of_the_kernel():
 
 ONE, WIDE = np.zeros((1, 2)), np.eye(2)[None]
 BAD = {
-    "NaN": (ONE, WIDE * np.nan, 1.0, "covariance: must be finite; no ray of that colour"),
+    "NaN": (ONE, WIDE * np.nan, 1.0, "covariance: must be finite; no ray of that wavelength"),
     "inf": (ONE, WIDE + np.inf, 1.0, "covariance: must be finite"),
     "one NaN": (ONE, [[[1, np.nan], [0, 1]]], 1.0, "covariance: must be finite"),
     "no centroid": (ONE * np.nan, WIDE, 1.0, "mean: must be finite"),
