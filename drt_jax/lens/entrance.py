@@ -17,7 +17,8 @@ def with_paraxial_pupil(lens: Lens, wavelength: Numbers = 0.5875618) -> Lens:
     Two planes that bend no light come first, surfaces 0 and 1: one at the first vertex, from where
     z and distances are counted as before, and the pupil, in object space. At every field and
     wavelength rays fill that pupil's plane uniformly, and the chief ray goes through its centre.
-    The real stop is a surface like others, without a rim: of its own apertures only `Lens.apertures` clip.
+    The real stop is a surface like others, without a rim: of its own apertures only
+    `Lens.apertures` clip.
 
     wavelength: of the paraxial rays, the primary one, () in um.
 

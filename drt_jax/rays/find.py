@@ -61,7 +61,7 @@ class _State(NamedTuple):
 
 
 class BlockNewton(optx.AbstractRootFinder):
-    """Newton's method for a bundle of Fermat paths, with the march of `linear` as its solve.
+    """Newton's method for a bundle of Fermat paths, with the propagation of `linear` as its solve.
 
     Its arguments are (system, target, which rays are to move (W, Q)). These step together; one
     whose correction is not finite stays where it is, so that it cannot spoil the others. Ends

@@ -1,11 +1,11 @@
-"""The linear system of all derivatives: how a path answers when it is pushed.
+"""The linear system of all derivatives: how a path answers when the equations change.
 
 The Jacobian of the Fermat equations and the label, dE/dw, is banded: each equation knows three
-neighbouring hits. It is solved by marching along the ray. Given the change dw_1 of the first hit,
-the equation of each surface yields the change of direction behind it, and that the next hit;
-the label then picks dw_1 among D + 1 such marches. So O(surfaces) a ray, nothing is divided by the
-length of a segment, and every derivative mode, transposition among them, is JAX's own: a march
-is linear in its pushes.
+neighbouring hits. It is solved by propagation along the ray. Given the change dw_1 of the first
+hit, the equation of each surface yields the change of direction behind it, and that the next hit;
+the label then picks dw_1 among D + 1 such propagations. So O(surfaces) a ray, nothing is divided by
+the length of a segment, and every derivative mode, transposition among them, is JAX's own:
+propagation is linear in the right-hand side.
 """
 
 from collections.abc import Callable
@@ -21,34 +21,34 @@ from .meet import cross
 from .system import System, Vector, divide, dot, rotate
 
 
-class Push(NamedTuple):
-    """What a path answers to.
+class RightSide(NamedTuple):
+    """The right-hand side: what the changes of a path have to make up for.
 
-    force: D arrays (R, W, Q), change of the equations that hits have to make up for; of the
-        sensor's, which has none, 0.
+    residual: D arrays (R, W, Q), change of the equations of each row; 0 for the sensor, which has
+        none.
     point: D + 1 arrays (R, W, Q), how far surfaces move under fixed transverse coordinates, mm
         along the axes of the lens.
-    swing: D + 1 arrays (W, Q), change of the direction in front of the first row at a fixed point.
+    direction: D + 1 arrays (W, Q), its change in front of the first row at a fixed point.
     label: D arrays (W, Q), change of the crossing of the stop that hits have to make, mm.
     """
 
-    force: Vector
+    residual: Vector
     point: Vector
-    swing: Vector
+    direction: Vector
     label: Vector
 
 
-def shortfall(path: Path, system: System, target: Vector) -> Push:
+def shortfall(path: Path, system: System, target: Vector) -> RightSide:
     """What a path that is no ray through `target`, D arrays (W, Q) in mm, falls short by: its hits
     less the answer to this are one step of Newton's method."""
     miss = (a - b for a, b in zip(label(path, system), target, strict=True))
     still = tuple(jnp.zeros_like(a) for a in path.before)
-    return Push(residual(path, system), still, tuple(a[0] for a in still), tuple(miss))
+    return RightSide(residual(path, system), still, tuple(a[0] for a in still), tuple(miss))
 
 
 class _Row(NamedTuple):
-    """What a march needs of one row: of a `Path`, and of a `System`. labels: whether the label is
-    made of its hit, or of the ray in front of it."""
+    """What propagation needs of one row, of a `Path` and of a `System`. labels: whether the label
+    is made of its hit, or of the ray in front of it."""
 
     before: Vector
     after: Vector
@@ -61,27 +61,28 @@ class _Row(NamedTuple):
     labels: Array
 
 
-class _March(NamedTuple):
+class _Change(NamedTuple):
     """Changes on the way: of a point on the ray, mm, and of the direction there, D + 1 arrays each,
     along the axes of the lens; and what the label is made of, as far as that is known."""
 
     point: Vector
-    swing: Vector
+    direction: Vector
     label: Vector
 
 
 def _step(
-    row: _Row, active_stop: bool, good: Array, march: _March, force: Vector, moved: Vector
-) -> tuple[_March, Vector]:
+    row: _Row, active_stop: bool, good: Array, change: _Change, residual: Vector, moved: Vector
+) -> tuple[_Change, Vector]:
     """Onto a row and through it: the change behind it, and that of its hit, D arrays.
 
     active_stop: whether the stop is an active surface.
     """
     carried = (
-        p + row.length * s - m for p, s, m in zip(march.point, march.swing, moved, strict=True)
+        p + row.length * s - m
+        for p, s, m in zip(change.point, change.direction, moved, strict=True)
     )
     *across, depth = rotate(row.rotation, tuple(carried), back=True)
-    *swung, along = rotate(row.rotation, march.swing, back=True)
+    *turned, along = rotate(row.rotation, change.direction, back=True)
     # Along the ray onto the tangent plane of the surface.
     normal = jnp.where(good, row.before[-1] - dot(row.slope, row.before[:-1]), 1)
     slide = (depth - dot(row.slope, across)) / normal
@@ -90,44 +91,45 @@ def _step(
     point = tuple(a + m for a, m in zip(here, moved, strict=True))
     pull = tuple(
         row.index_before * (v + s * along) + dot(bend, hit) - f
-        for v, s, bend, f in zip(swung, row.slope, row.bend, force, strict=True)
+        for v, s, bend, f in zip(turned, row.slope, row.bend, residual, strict=True)
     )
     # The change of direction behind: its product with the tangents is known, with itself 0.
     normal = jnp.where(good, row.after[-1] - dot(row.slope, row.after[:-1]), 1)
     along = -dot(row.after[:-1], pull) / (row.index_behind * normal)
     behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
-    made = hit if active_stop else (*point, *march.swing)
-    made = tuple(jnp.where(row.labels, a, b) for a, b in zip(made, march.label, strict=True))
-    return _March(point, rotate(row.rotation, (*behind, along)), made), hit
+    made = hit if active_stop else (*point, *change.direction)
+    made = tuple(jnp.where(row.labels, a, b) for a, b in zip(made, change.label, strict=True))
+    return _Change(point, rotate(row.rotation, (*behind, along)), made), hit
 
 
-def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, Vector]:
-    """How a path answers to a push: changes of the hits, D arrays (R, W, Q), and of the direction
-    at the sensor, D + 1 arrays (W, Q) along the axes of the lens. Linear in the push.
+def solve(path: Path, system: System, good: Array, rhs: RightSide) -> tuple[Vector, Vector]:
+    """How a path answers to a right-hand side: changes of the hits, D arrays (R, W, Q), and of the
+    direction at the sensor, D + 1 arrays (W, Q) along the axes of the lens. Linear in it.
 
     good: (W, Q), the rays of interest: what comes out for the others is finite if they are.
     """
-    dim, zero, active_stop = len(push.label), jnp.zeros_like(push.label[0]), system.stop is None
+    dim, zero, active_stop = len(rhs.label), jnp.zeros_like(rhs.label[0]), system.stop is None
     at = np.arange(len(system.forms)) == system.before
     path_rows = _Row(*path[2:7], system.index, system.behind, system.rows.rotation, at)
     still, none = (zero,) * (dim + 1), (zero,) * dim
     unknown = none if active_stop else (*still, *still)
-    # A march from each unit change of the first hit, and one that the push makes.
+    # Changes from each unit change of the first hit, and those that the right-hand side makes.
     units = [[jnp.full_like(zero, float(d == k)) for k in range(dim)] for d in range(dim)]
     first = jax.vmap(lambda hit: _first(path, system, hit))(tuple(map(jnp.stack, units)))
-    free = _March(*first, jax.tree.map(lambda a: jnp.stack([a] * dim), unknown))
+    free = _Change(*first, jax.tree.map(lambda a: jnp.stack([a] * dim), unknown))
 
-    def step(marches, given):
-        row, *pushed = given
-        free = jax.vmap(lambda march: _step(row, active_stop, good, march, none, still))(marches[0])
-        forced = _step(row, active_stop, good, marches[1], *pushed)
+    def step(changes, given):
+        row, *given_here = given
+        alone = lambda change: _step(row, active_stop, good, change, none, still)  # noqa: E731
+        free = jax.vmap(alone)(changes[0])
+        forced = _step(row, active_stop, good, changes[1], *given_here)
         return (free[0], forced[0]), (free[1], forced[1])
 
-    start = free, _March(still, push.swing, unknown)
-    marched, hits = jax.lax.scan(step, start, (path_rows, push.force, push.point))
+    start = free, _Change(still, rhs.direction, unknown)
+    through, hits = jax.lax.scan(step, start, (path_rows, rhs.residual, rhs.point))
     crossing = _crossing(path, system)
-    columns = jax.vmap(crossing)(marched[0].label)
-    wanted = tuple(s - c for s, c in zip(push.label, crossing(marched[1].label), strict=True))
+    columns = jax.vmap(crossing)(through[0].label)
+    wanted = tuple(s - c for s, c in zip(rhs.label, crossing(through[1].label), strict=True))
     # Rays of no interest have a matrix that can be divided by.
     rows = [
         [jnp.where(good, c, float(i == k)) for k, c in enumerate(row)]
@@ -140,8 +142,8 @@ def solve(path: Path, system: System, good: Array, push: Push) -> tuple[Vector, 
         products = (jnp.broadcast_to(w, forced.shape) * c for w, c in zip(weights, columns))
         return sum(products, forced)
 
-    swing = jax.tree.map(joined, *(march.swing for march in marched))
-    return jax.tree.map(joined, *hits), swing
+    direction = jax.tree.map(joined, *(change.direction for change in through))
+    return jax.tree.map(joined, *hits), direction
 
 
 def _first(path: Path, system: System, hit: Vector) -> tuple[Vector, Vector]:

@@ -45,10 +45,10 @@ def _attach_jvp(primals: Any, tangents: Any) -> tuple:
 
     def tangent(hits, turning, good):
         path = fermat.geometry(hits, system)
-        push = _push(path, system, moving)
-        label = (a if t is None else a + t for a, t in zip(push.label, turning, strict=True))
-        push = jax.tree.map(lambda a: jnp.where(good, a, 0), push._replace(label=tuple(label)))
-        moved = linear.solve(path, system, good, push)
+        rhs = _right_side(path, system, moving)
+        label = (a if t is None else a + t for a, t in zip(rhs.label, turning, strict=True))
+        rhs = jax.tree.map(lambda a: jnp.where(good, a, 0), rhs._replace(label=tuple(label)))
+        moved = linear.solve(path, system, good, rhs)
         return jax.tree.map(lambda a: jnp.where(good, a, 0), moved)
 
     tile = derivative_tile(len(good), len(system.forms))
@@ -58,21 +58,21 @@ def _attach_jvp(primals: Any, tangents: Any) -> tuple:
 attach.defjvp(_attach_jvp, symbolic_zeros=True)
 
 
-def _push(path: Path, system: System, moving: list[Array | None]) -> linear.Push:
+def _right_side(path: Path, system: System, moving: list[Array | None]) -> linear.RightSide:
     """What a path has to make up for when leaves of its system move (paper Eq. 4)."""
     leaves, structure = jax.tree.flatten(system)
     some = [k for k, change in enumerate(moving) if change is not None]
     directions = [rotate(system.rows.rotation, a) for a in (path.before, path.after)]
     first, line = (fermat.ray_at(path, system, row) for row in (0, system.before))
 
-    def held(changed):
-        """The equations with the hits and the directions held, these along the axes of the lens."""
+    def with_fixed_path(changed):
+        """The equations; hits and directions are fixed, these along the axes of the lens."""
         new = dict(zip(some, changed, strict=True))
         own = jax.tree.unflatten(structure, [new.get(k, a) for k, a in enumerate(leaves)])
         rows = own.rows
         height, slope, _ = by_form(sag_derivatives, path.hits, rows.on(path.length), own.forms)
         before, after = (rotate(rows.rotation, a, back=True) for a in directions)
-        force = fermat.residual(path._replace(before=before, after=after, slope=slope), own)
+        residual = fermat.residual(path._replace(before=before, after=after, slope=slope), own)
         point = rotate(rows.rotation, (*path.hits, height))
         origin = (a[:, None, None] for a in rows.origin(own.dim))
         point = tuple(p + o for p, o in zip(point, origin, strict=True))
@@ -80,14 +80,14 @@ def _push(path: Path, system: System, moving: list[Array | None]) -> linear.Push
         crossing = tuple(h[own.before] for h in path.hits)
         if own.stop is not None:
             crossing, _ = cross(own.stop, own.stop_form, *line)
-        return force, point, tuple(toward), crossing
+        return residual, point, tuple(toward), crossing
 
     now, change = ([a[k] for k in some] for a in (leaves, moving))
-    force, point, toward, label = jax.jvp(held, (now,), (change,))[1]
+    residual, point, toward, label = jax.jvp(with_fixed_path, (now,), (change,))[1]
     along = dot(first[1], toward)
-    swing = (path.shrink * (t - e * along) for t, e in zip(toward, first[1], strict=True))
-    force, label = (tuple(-a for a in part) for part in (force, label))
-    return linear.Push(force, point, tuple(swing), label)
+    direction = (path.shrink * (t - e * along) for t, e in zip(toward, first[1], strict=True))
+    residual, label = (tuple(-a for a in part) for part in (residual, label))
+    return linear.RightSide(residual, point, tuple(direction), label)
 
 
 def solve(system: System, target: Vector) -> Found:

@@ -71,7 +71,7 @@ def answers(system, hits, good, forces, shift, other):
 
     def solve(forces, shift):
         forces = tuple(jnp.pad(f, ((0, 1), (0, 0), (0, 0))) for f in forces)
-        push = linear.Push(forces, still, tuple(a[0] for a in still), shift)
+        push = linear.RightSide(forces, still, tuple(a[0] for a in still), shift)
         return linear.solve(path, system, good, push)[0]
 
     solved, pull_back = jax.vjp(solve, forces, shift)

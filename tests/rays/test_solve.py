@@ -102,7 +102,7 @@ def equations(hits, system, target):
     """F and by how much the rays miss their stop points; both are 0 for rays."""
     path = fermat.geometry(hits, system)
     short = linear.shortfall(path, system, target)
-    return tuple(f[:-1] for f in short.force), short.label
+    return tuple(f[:-1] for f in short.residual), short.label
 
 
 def test_against_optimistix():
