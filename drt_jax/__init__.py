@@ -29,8 +29,9 @@ from .image.kernel import (
     gaussian_psf as gaussian_psf,
     separable_psf as separable_psf,
 )
-from .image.moments import FocusMoments as FocusMoments, Moments as Moments, moments as moments
+from .image.moments import FocusMoments as FocusMoments, moments as moments
 from .image.sensor import convolve as convolve, sensor_layer as sensor_layer
+from .image.spot import Moments as Moments
 from .image.wavefront import (
     Wavefront as Wavefront,
     rms_wavefront as rms_wavefront,

@@ -15,7 +15,7 @@ import numpy as np
 from .compilation import ONCE, jit
 from .files.yaml import lens_names, load_lens
 from .image.converged import psf_moments
-from .image.moments import Moments
+from .image.spot import Moments
 from .lens.lens import Lens
 from .lens.order import may_cross
 from .lens.paraxial import FirstOrder, first_order

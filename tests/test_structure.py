@@ -32,7 +32,7 @@ FLOORS = (
 # Floors that know no ray, and but for `files` no optics formula: all that they may import of the
 # package.
 ALLOWED = {
-    "learn": {"inputs", "numerics", "compilation", "image.kernel", "image.sensor"},
+    "learn": {"inputs", "numerics", "compilation", "image.kernel", "image.sensor", "image.spot"},
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
 }
@@ -41,7 +41,7 @@ ALLOWED_ALL = {"show.layout"}
 # from outside was checked throughout, 13,900 before whole lenses are designed and toleranced,
 # 18,000 before other optimisers ran beside a design, 18,500 before what misled was mended (issue 22
 # brings it down).
-HOUSE = 19_300
+HOUSE = 19_350
 # Outside packages that belong to some modules or floors alone.
 ONLY = {
     "optimistix": {"rays.aim", "rays.find", "image.field"},

@@ -26,7 +26,8 @@ from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
-from .moments import FocusMoments, Moments, check_sensor, weigh
+from .moments import FocusMoments, check_sensor, weigh
+from .spot import Moments
 from .tiles import trace_rule
 
 _MAX_ORDER = 40

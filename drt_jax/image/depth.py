@@ -18,7 +18,8 @@ from ..lens.scene import distance_array, scene_of, vergence_of
 from ..numerics import Numbers, concrete
 from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
-from .moments import FocusMoments, Moments, moments
+from .moments import FocusMoments, moments
+from .spot import Moments
 
 _MAX_NODES = 64
 # By this part a distance may lie outside of its range: 1 / (1 / far) is not always far.

@@ -18,25 +18,7 @@ from ..pupil.rules import PupilRule
 from ..rays.solve import Solver, solve
 from ..rays.system import Vector
 from ..rays.trace import Bundle, trace_bundle
-from .spot import deviations, mean_products, normalised
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Moments:
-    """The spot of W wavelengths.
-
-    mean: (W, 2), x and y of the centroid on the sensor, mm.
-    covariance: (W, 2, 2), mm^2; inf on the diagonal for a wavelength of which no light arrives.
-    throughput: (W,), the fraction of the light through the stop that reaches the sensor.
-    separable: static; True if symmetry makes the xy element 0, so that the Gaussian kernel is
-        separable, see `separable_psf`.
-    """
-
-    mean: Array
-    covariance: Array
-    throughput: Array
-    separable: bool = dataclasses.field(default=False, metadata={"static": True})
+from .spot import Moments, deviations, mean_products, normalised
 
 
 @jax.tree_util.register_dataclass

@@ -3,6 +3,9 @@
 Where rays of a part of the pupil stand for all of it, what they leave out is their mirror image.
 """
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -14,6 +17,24 @@ from ..rays.system import Vector
 _MIRRORED = {"rotational": (True,), "bilateral": (True, False), "none": (False, False)}
 # Pairs of components whose products do not average to 0.
 _PAIRS = {"rotational": ((0, 0),), "bilateral": ((0, 0), (1, 1))}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Moments:
+    """The spot of W wavelengths.
+
+    mean: (W, 2), x and y of the centroid on the sensor, mm.
+    covariance: (W, 2, 2), mm^2; inf on the diagonal for a wavelength of which no light arrives.
+    throughput: (W,), the fraction of the light through the stop that reaches the sensor.
+    separable: static; True if symmetry makes the xy element 0, so that the Gaussian kernel is
+        separable, see `separable_psf`.
+    """
+
+    mean: Array
+    covariance: Array
+    throughput: Array
+    separable: bool = dataclasses.field(default=False, metadata={"static": True})
 
 
 def normalised(weight: Array, axes: tuple[int, ...] = (-1,)) -> Array:

@@ -12,8 +12,8 @@ from skimage import metrics
 
 from ..compilation import NETWORK, known_options
 from ..image.kernel import Form, gaussian_psf, separable_psf
-from ..image.moments import Moments
 from ..image.sensor import Convolve, convolve, sensor_layer
+from ..image.spot import Moments
 from ..numerics import Numbers, safe_divide, safe_sqrt
 from .adam import adam, apply_updates
 from .network import count_parameters
