@@ -11,7 +11,7 @@ import pytest
 
 import drt_jax
 from drt_jax import Gauss, Pattern, Status, load_lens, psf_moments, pupil
-from drt_jax.image import lost
+from drt_jax.image import diagnose
 
 LENS = load_lens("singlet")
 GREEN, POINTS, RULE = (0.55,), pupil.hexapolar(1)[0], Gauss(4, "bilateral")
@@ -304,8 +304,8 @@ def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
     with pytest.raises(ValueError, match="surface 2 and the sensor cross on the axis: -3 mm"):
         psf_moments(changed(sensor=3.0), 0.0, np.inf, GREEN)
     wide = changed(thickness=[2.0, 1.0], semi_diameter=[5.0, 12.5, 12.5, np.inf])
-    assert "surface 1 and surface 2 cross from 10.2 mm off the axis on" in lost.crossed(wide)
-    assert lost.crossed(LENS) == ""
+    assert "surface 1 and surface 2 cross from 10.2 mm off the axis on" in diagnose.crossed(wide)
+    assert diagnose.crossed(LENS) == ""
 
 
 def test_a_wrong_field_in_an_eager_gradient_is_named():
