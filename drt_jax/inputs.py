@@ -61,11 +61,11 @@ class Lines(dict[str, int]):
         return f", line {self[key]}" if key else ""
 
 
-def read_text(path: str | os.PathLike, largest: int = LARGEST) -> str:
-    """Text of a file of at most so many bytes. InputError for what cannot be read."""
+def read_bytes(path: str | os.PathLike, largest: int = LARGEST, what: str = "YAML file") -> bytes:
+    """Content of a file of at most so many bytes. InputError for what cannot be read."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
-            raise InputError("is not a file; give the path of a YAML file")
+            raise InputError(f"is not a file; give the path of a {what}")
         with open(path, "rb") as file:
             content = file.read(largest + 1)
     except OSError as error:
@@ -74,8 +74,13 @@ def read_text(path: str | os.PathLike, largest: int = LARGEST) -> str:
         raise error if isinstance(error, InputError) else InputError(str(error)) from error
     if len(content) > largest:
         raise InputError(f"is larger than {largest // 2**20} MB; is it the right file?")
+    return content
+
+
+def read_text(path: str | os.PathLike, largest: int = LARGEST) -> str:
+    """UTF-8 text of a file of at most so many bytes. InputError for what cannot be read."""
     try:
-        return content.decode()
+        return read_bytes(path, largest).decode()
     except UnicodeDecodeError as error:
         raise InputError(f"byte {error.start} is no UTF-8 text; save the file as UTF-8") from error
 

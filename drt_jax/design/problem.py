@@ -10,7 +10,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
-from ..lens.scene import distance_array, field_array, vergence_of
+from ..lens.scene import distance_array, fields_array, vergence_of
 from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
@@ -63,11 +63,6 @@ def _check_operands(
             )
     if not any(operand.weight for operand in operands):
         raise ValueError("operands: all have the weight 0; a merit needs at least one")
-
-
-def _check_pairs(angles: Array) -> None:
-    if angles.ndim != 2 or angles.shape[1] != 2:
-        raise ValueError(f"fields: expected (F,) or (F, 2), got shape {angles.shape}")
 
 
 def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
@@ -136,10 +131,7 @@ class Problem:
         lens = variables.lens
         asked = tuple(o if isinstance(o, Operand) else Operand(o) for o in operands)
         dtype = lens.curvature.dtype
-        angles = jnp.atleast_1d(field_array(fields, dtype))
-        if angles.ndim == 1:
-            angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
-        _check_pairs(angles)
+        angles = fields_array(fields, dtype)
         far = jnp.stack([distance_array(d, dtype) for d in np.ravel(np.asarray(distances, float))])
         waves = lens.checked_wavelengths(wavelengths)
         if isinstance(rule, int):

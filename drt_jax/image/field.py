@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import Array
 
@@ -12,6 +13,9 @@ from ..numerics import Numbers, real_array, safe_divide
 from ..rays.trace import trace_bundle
 
 _STEPS = 20
+# Points of the stop: the chief ray's, and one beside it, as the search takes its steps from how
+# wide a beam is; without, a chief ray in a stop at the first vertex is not found.
+CHIEF = np.array([[0.0, 0.0], [0.0, 0.1]])
 
 
 def image_point(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
@@ -25,9 +29,9 @@ def image_point(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
 
 @jax.jit
 def _image_point(lens: Lens, scene: Scene) -> Array:
-    centre = jnp.zeros(1, lens.curvature.dtype)
-    hits = trace_bundle(lens, scene, (centre, centre)).hits
-    return jnp.concatenate([h[-1] for h in hits], axis=-1)
+    points = jnp.asarray(CHIEF, lens.curvature.dtype)
+    hits = trace_bundle(lens, scene, tuple(points)).hits
+    return jnp.stack([h[-1, :, 0] for h in hits], axis=-1)
 
 
 def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Numbers) -> Array:

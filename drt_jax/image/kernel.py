@@ -1,7 +1,7 @@
 """Kernels on the pixel grid from centroid and covariance (paper Eq. 5). From here on: pixels."""
 
 import warnings
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -84,10 +84,19 @@ def separable_psf(
     return kernel
 
 
+def gaussian_shares(mean: Array, covariance: Array, pixel: Array, size: int) -> Array:
+    """`gaussian_psf` of checked arrays, not normalised: what pixels collect adds to the part of the
+    light that falls on the grid."""
+    kernel = _gaussian(mean, covariance, pixel, size, "integrated", whole=False)
+    assert not isinstance(kernel, SeparableKernel)
+    return kernel
+
+
 def _gaussian(
-    mean: Array, covariance: Array, side: Array, size: int, form: Form
+    mean: Array, covariance: Array, side: Array, size: int, form: Form, whole: bool = True
 ) -> SeparableKernel | Array:
-    """The kernel; separable if the variances (C, 2) stand for the covariance."""
+    """The kernel; separable if the variances (C, 2) stand for the covariance. whole: whether an
+    integrated one adds to 1 on the grid."""
     usable = (side > 1 / _FAR) & (side < _FAR)
     side = jnp.where(usable, side, 1)
     known = jnp.isfinite(mean), jnp.isfinite(covariance)
@@ -104,6 +113,10 @@ def _gaussian(
     else:
         edges = jnp.arange(size + 1, dtype=dtype)[None, None] - size / 2
         kernel = _integrated(edges - mean[..., None], covariance)
+        if whole and isinstance(kernel, SeparableKernel):
+            kernel = SeparableKernel(*(_normalised(part, (-1,)) for part in kernel))
+        elif whole:
+            kernel = _normalised(jnp.asarray(kernel), (-2, -1))
     return jax.tree.map(lambda k: jnp.where(jnp.expand_dims(void, range(1, k.ndim)), 0, k), kernel)
 
 
@@ -114,29 +127,40 @@ def _checked(
     are what they must be."""
     if form not in get_args(Form):
         raise ValueError(f"form: expected 'integrated' or 'sampled', got {form!r}")
-    if not isinstance(size, int | np.integer) or size < 1:
-        raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
     floating = jnp.issubdtype(getattr(mean, "dtype", int), jnp.floating)
     dtype = jnp.result_type(mean) if floating else jnp.result_type(float)
-    given: dict[str, Numbers] = {"mean": mean, "covariance": covariance, "pixel": pixel}
+    given: dict[str, Numbers] = {"mean": mean, "covariance": covariance}
     arrays = [real_array(name, value, dtype) for name, value in given.items()]
     channels = arrays[0].shape[:1]
-    shapes = (*channels, 2), (*channels, 2, 2), ()
-    texts = "(C, 2)", "(C, 2, 2) with the C of mean", "one number"
+    shapes = (*channels, 2), (*channels, 2, 2)
+    texts = "(C, 2)", "(C, 2, 2) with the C of mean"
     for name, array, wanted, text in zip(given, arrays, shapes, texts, strict=True):
         if array.shape != wanted or array.size == 0:
             raise ValueError(f"{name}: expected {text}, got shape {array.shape}")
         if concrete(given[name]) and not np.all(np.isfinite(np.asarray(given[name], float))):
             hint = "; no ray of that wavelength arrives" if name == "covariance" else ""
             raise ValueError(f"{name}: must be finite{hint}")
+    return arrays[0], arrays[1], check_pixels(pixel, size, dtype, stacklevel=4)[0]
+
+
+def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> tuple[Array, int]:
+    """The side of a pixel (), mm, and how many there are along a grid. ValueError for what is none;
+    warns of a large pixel."""
+    if not isinstance(size, int | np.integer) or size < 1:
+        raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
+    side = real_array("pixel", pixel, dtype)
+    if side.shape:
+        raise ValueError(f"pixel: expected one number, got shape {side.shape}")
     if concrete(pixel):
-        side = np.asarray(pixel, float).item()
-        if not side > 0:
-            raise ValueError(f"pixel: must be above 0 mm, got {side:g}")
-        if side > _LARGE_PIXEL:
-            um = f"if it is {side:g} um, give {1e-3 * side:g}"
-            warnings.warn(f"pixel: {side:g} mm is a large one; {um}", stacklevel=3)
-    return arrays[0], arrays[1], arrays[2]
+        known = np.asarray(pixel, float).item()
+        if not np.isfinite(known):
+            raise ValueError("pixel: must be finite")
+        if not known > 0:
+            raise ValueError(f"pixel: must be above 0 mm, got {known:g}")
+        if known > _LARGE_PIXEL:
+            um = f"if it is {known:g} um, give {1e-3 * known:g}"
+            warnings.warn(f"pixel: {known:g} mm is a large one; {um}", stacklevel=stacklevel)
+    return side, int(size)
 
 
 def _normalised(kernel: Array, axes: tuple[int, ...]) -> Array:
@@ -162,7 +186,7 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
     below = [_cumulative(edges[:, i], diagonal[:, i]) for i in range(2)]
     row, column = (jnp.diff(part, axis=-1) for part in below)
     if covariance.ndim == 2:
-        return SeparableKernel(_normalised(column, (-1,)), _normalised(row, (-1,)))
+        return SeparableKernel(column, row)
     # The bivariate normal distribution as the product of its marginals plus an integral over
     # the correlation (Plackett 1954; Drezner and Wesolowsky 1990), then differences over the
     # corners of each pixel.
@@ -179,8 +203,7 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
     exponent = (x * x - 2 * x * y * jnp.sin(angle) + y * y) / (2 * jnp.cos(angle) ** 2)
     correction = jnp.sum(weights * jnp.exp(-exponent), axis=0) * limit / (4 * jnp.pi)
     kernel = column[:, :, None] * row[:, None, :]
-    kernel = kernel + jnp.diff(jnp.diff(correction, axis=-1), axis=-2)
-    return _normalised(kernel, (-2, -1))
+    return kernel + jnp.diff(jnp.diff(correction, axis=-1), axis=-2)
 
 
 def _sampled(offset: Array, covariance: Array) -> SeparableKernel | Array:

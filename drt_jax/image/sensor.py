@@ -91,6 +91,25 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
     )
 
 
+def convolve_each(scenes: Array, kernels: Array) -> Array:
+    """'Valid' convolution of each image, and each of its channels, with a kernel of its own, as
+    `kernels_at` gives them, by Fourier transform: (B, H, W, C).
+
+    scenes: (B, H + K - 1, W + K - 1, C), with true context on all sides.
+    kernels: (B, C, K, K) [image, channel, y, x]; cast to the dtype of the scenes.
+
+    ValueError for shapes that do not fit.
+    """
+    _check(scenes, jnp.zeros((scenes.shape[-1], *kernels.shape[-2:]), scenes.dtype))
+    if kernels.shape[:2] != (scenes.shape[0], scenes.shape[3]):
+        raise ValueError(f"kernels: expected (B, C, K, K) of {scenes.shape}, got {kernels.shape}")
+    shape, size = scenes.shape[1:3], kernels.shape[-1]
+    spectra = jnp.fft.rfft2(jnp.moveaxis(scenes, -1, 1))
+    response = jnp.fft.rfft2(kernels.astype(scenes.dtype), shape)
+    images = jnp.fft.irfft2(spectra * response, shape)
+    return jnp.moveaxis(images[..., size - 1 :, size - 1 :], 1, -1)
+
+
 def convolve_taps(scenes: Array, kernel: SeparableKernel | Array) -> Array:
     """`convolve`, on a CPU with a separable kernel tap by tap: the faster form for values and
     forward mode, ten times slower in reverse. Arguments and result as there."""

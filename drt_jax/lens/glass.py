@@ -20,7 +20,7 @@ _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # Schott's normal line as (constant, slope by vd), and where they are used: from line i to line t.
 _LINES, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
 _NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
-_NO_MODEL = 1.0, 50.0
+_NO_MODEL, _FARTHEST = (1.0, 50.0), 0.2
 # In the plane of nd and vd a difference of 100 of vd counts as one of 1 of nd: the weights, 1 and
 # 1e-4 of squares, that Zemax has by default where it replaces model glasses.
 _PER_VD = 0.01
@@ -40,6 +40,7 @@ class Glass:
     schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
     range: wavelengths in um for which they hold.
     model: nd and vd of a model glass, see `model_glass`.
+    partial: how far a model glass lies above the normal line, in P_gF.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Glass:
     schott: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     range: tuple[float, float] = ANY
     model: tuple[float, float] = _NO_MODEL
+    partial: float = 0.0
 
 
 @jax.tree_util.register_dataclass
@@ -62,6 +64,7 @@ class Dispersion:
     ranges: (M, 2), the shortest and the longest wavelength (um) for which each medium has known
         constants.
     model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None if there is none.
+    partial: (M,), how far model glasses lie above the normal line, in P_gF; None: all on it.
     """
 
     strength: Array
@@ -69,6 +72,7 @@ class Dispersion:
     schott: Array
     ranges: Array
     model: Array | None = None
+    partial: Array | None = None
 
     @property
     def range(self) -> tuple[Any, Any]:
@@ -91,7 +95,7 @@ class Dispersion:
         halves = [np.asarray(m.sellmeier, float).reshape(2, -1) for m in media]
         terms = max(3, *(half.shape[1] for half in halves))
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
-        models = [m.model for m in media]
+        models, partial = [m.model for m in media], [m.partial for m in media]
 
         def array(values):
             return jax.device_put(np.asarray(values, jnp.result_type(float)))
@@ -102,6 +106,7 @@ class Dispersion:
             schott=array([m.schott for m in media]),
             ranges=array([m.range for m in media]),
             model=array(models) if set(models) != {_NO_MODEL} else None,
+            partial=array(partial) if any(partial) else None,
         )
 
 
@@ -110,7 +115,8 @@ def _catalogue() -> dict[str, Glass]:
     text = (pathlib.Path(__file__).parent / "catalogue" / "glasses.yaml").read_text()
     glasses = {"air": Glass("air")}
     for name, entry in yaml.load(text, _Loader).items():
-        glasses[name] = Glass(name, **{key: tuple(values) for key, values in entry.items()})
+        constants: dict[str, Any] = {key: tuple(values) for key, values in entry.items()}
+        glasses[name] = Glass(name, **constants)
     return glasses
 
 
@@ -134,15 +140,20 @@ def find_glass(name: str) -> Glass:
     raise ValueError(f"unknown glass {name!r}; {hint}")
 
 
-def model_glass(nd: float, vd: float) -> Glass:
-    """A glass of which only nd and the Abbe number vd = (nd - 1) / (nF - nC) are known.
+def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
+    """A glass of which only nd and the Abbe number vd = (nd - 1) / (nF - nC) are known, and perhaps
+    how far its P_gF lies above Schott's normal line, `partial`.
 
-    n = A + B / L + C / L^3.5 (Conrady) through nd, nF - nC and ng - nF, the last as on Schott's
-    normal line: P_gF = 0.6438 - 0.001682 vd. ValueError unless 1 < nd <= 4 and 10 <= vd <= 120.
+    n = A + B / L + C / L^3.5 (Conrady) through nd, nF - nC and ng - nF = P_gF (nF - nC), with
+    P_gF = 0.6438 - 0.001682 vd + partial. ValueError unless 1 < nd <= 4, 10 <= vd <= 120 and
+    |partial| <= 0.2.
     """
     if not (1 < nd <= 4 and 10 <= vd <= 120):
         raise ValueError(f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
-    return Glass(f"model {nd!r} {vd!r}", range=VISIBLE, model=(nd, vd))
+    if not abs(partial) <= _FARTHEST:
+        raise ValueError(f"expected P_gF within {_FARTHEST:g} of the normal line, got {partial:g}")
+    name = f"model {nd!r} {vd!r}" + (f" {partial!r}" if partial else "")
+    return Glass(name, range=VISIBLE, model=(nd, vd), partial=partial)
 
 
 def nd_and_vd(dispersion: Dispersion) -> Array:
@@ -202,16 +213,18 @@ def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
         jnp.where(mask, jnp.asarray([Glass.schott], found.dtype), dispersion.schott),
         jnp.where(mask, jnp.asarray([VISIBLE], found.dtype), dispersion.ranges),
         jnp.where(mask, found, none if dispersion.model is None else dispersion.model),
+        None if dispersion.partial is None else jnp.where(mask[:, 0], 0, dispersion.partial),
     )
 
 
-def _model_index(model: Array, wavelengths: Array) -> Array:
-    """n - 1, (M, W), of model glasses (M, 2)."""
+def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Array:
+    """n - 1, (M, W), of model glasses (M, 2), `partial` (M,) above the normal line."""
     d, f, c, g = np.power.outer(_LINES, np.asarray(_CONRADY, float))
     formula = np.linalg.inv(np.stack([d, f - c, g - f])).T
     nd, vd = model[:, 0], model[:, 1]
     mean = (nd - 1) / vd
-    known = jnp.stack([nd - 1, mean, (_NORMAL_LINE[0] + _NORMAL_LINE[1] * vd) * mean], axis=-1)
+    above = _NORMAL_LINE[0] + _NORMAL_LINE[1] * vd + (0 if partial is None else partial)
+    known = jnp.stack([nd - 1, mean, above * mean], axis=-1)
     powers = jnp.stack([wavelengths**p for p in _CONRADY])
     return known @ jnp.asarray(formula, known.dtype) @ powers
 
@@ -233,4 +246,4 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     index = safe_sqrt(sellmeier + dispersion.schott @ powers)
     if dispersion.model is None:
         return index
-    return index + _model_index(dispersion.model, wavelengths)
+    return index + _model_index(dispersion.model, dispersion.partial, wavelengths)

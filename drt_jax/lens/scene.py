@@ -97,6 +97,17 @@ def field_array(field: Numbers, dtype: Any) -> Array:
     return angles
 
 
+def fields_array(fields: Numbers, dtype: Any) -> Array:
+    """Angles in radians of F fields, one, (F,) along y or (F, 2), as an array (F, 2). ValueError
+    for other shapes, and as of `field_array`."""
+    angles = jnp.atleast_1d(field_array(fields, dtype))
+    if angles.ndim == 1:
+        angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
+    if angles.ndim != 2 or angles.shape[1] != 2 or not len(angles):
+        raise ValueError(f"fields: expected (F,) or (F, 2), got shape {angles.shape}")
+    return angles
+
+
 def distance_array(distance: Numbers, dtype: Any) -> Array:
     """A distance in mm as an array (). ValueError for other shapes, for what is no number, and for
     a known one that is not above 0."""

@@ -1,0 +1,302 @@
+"""All rays of an object point as polynomials of the pupil, fitted to a few traced ones.
+
+Where rays meet the surfaces and the sensor, their directions and their optical paths are smooth
+functions of the point of the stop, and of the direction at the sensor. Some dozens of rays give the
+polynomials; spots, kernels and transfer functions of any density follow from these without another
+ray.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..lens.clearance import clearance
+from ..lens.lens import Lens
+from ..lens.scene import Scene
+from ..numerics import safe_divide, safe_sqrt
+from ..pupil.clipped import Clipped
+from ..pupil.patterns import disc, half_disc, meridian
+from ..pupil.rules import Pattern, PupilRule, Symmetry
+from ..rays.solve import Solver, solve
+from ..rays.status import Status
+from ..rays.system import dot
+from ..rays.trace import Bundle, trace_bundle
+from .zernike import Polynomials, fitted
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("points", "weights", "hits", "direction", "path", "index", "motion", "known"),
+    meta_fields=("degree", "clipped"),
+)
+@dataclasses.dataclass(frozen=True)
+class Beam:
+    """Rays of W wavelengths that stand for all light of an object point; Q of them all over the
+    part of the pupil that the light fills.
+
+    points: (2, W, Q), where they cross the stop, in units of its semi-diameter.
+    weights: (W, Q), the light that they stand for, adding up to the throughput.
+    hits: (2, S + 1, W, Q) mm, on all surfaces and the sensor.
+    direction: (3, W, Q), unit vectors at the sensor, along its axes.
+    path: (W, Q) mm, optical path from the object to the foot of the perpendicular from the middle
+        of the sensor to the ray: the phase of its plane wave there.
+    index: (W,), refractive index before the sensor.
+    motion: (3,), how the sensor's vertex moves in mm a mm of `Lens.sensor`, along its axes.
+    known: (W, Q), whether the ray exists.
+    degree: of the polynomials. clipped: whether more than the rim of the stop bounds the light.
+    """
+
+    points: Array
+    weights: Array
+    hits: Array
+    direction: Array
+    path: Array
+    index: Array
+    motion: Array
+    known: Array
+    degree: int
+    clipped: bool
+
+    @property
+    def throughput(self) -> Array:
+        """The part of the light through the stop that reaches the sensor, (W,)."""
+        return jnp.sum(self.weights, axis=-1)
+
+    def refocused(self, step: Array) -> "Beam":
+        """The same light with the sensor `step` mm, (), farther along its way: no ray is traced."""
+        # The middle of the sensor moves by `move`; rays go on to the plane where it then lies.
+        move = step * self.motion[:, None, None]
+        ahead = safe_divide(jnp.broadcast_to(move[2], self.path.shape), self.direction[2])
+        hits = self.hits
+        for k in range(2):
+            hits = hits.at[k, -1].add(ahead * self.direction[k] - move[k])
+        path = self.path + self.index[:, None] * dot(tuple(self.direction), tuple(move))
+        return dataclasses.replace(self, hits=hits, path=path)
+
+    def over_stop(self) -> Polynomials:
+        """Hits on the sensor (2) and, of a clipped pupil, on all surfaces (2 S + 2), mm, as
+        functions of the stop point."""
+        return self._fitted(self.points, self._with_edges([self.hits[:, -1]]))
+
+    def over_directions(self) -> Polynomials:
+        """Path (1), mm, stop point (2) and, of a clipped pupil, hits on all surfaces (2 S + 2), mm,
+        as functions of the first two direction cosines at the sensor."""
+        values = self._with_edges([self.path[None], self.points])
+        return self._fitted(self.direction[:2], values)
+
+    def solid_angle(self) -> Array:
+        """Area of the cone of light on the sensor, (W,), in direction cosines: irradiance is this
+        times the radiance that fills the stop."""
+        directions = self._fitted(self.points, self.direction[:2])
+        one, zero = jnp.ones_like(self.points[0]), jnp.zeros_like(self.points[0])
+
+        def slope(x: Array, y: Array) -> Array:
+            return jax.jvp(directions.at, (self.points,), (jnp.stack([x, y]),))[1]
+
+        (a, b), (c, d) = slope(one, zero), slope(zero, one)
+        return jnp.pi * jnp.sum(self.weights * jnp.abs(a * d - b * c), axis=-1)
+
+    def extent(self) -> tuple[Array, Array]:
+        """The square of the stop that the light lies in: two corners, (2, W)."""
+        if not self.clipped:
+            one = jnp.ones((2, self.path.shape[0]), self.path.dtype)
+            return -one, one
+        return _extent(self.points, self.known, _margin(self.degree, self.clipped))
+
+    def directions_extent(self) -> tuple[Array, Array]:
+        """The rectangle of direction cosines that the light lies in: two corners, (2, W)."""
+        return _extent(self.direction[:2], self.known, _margin(self.degree, self.clipped))
+
+    def _with_edges(self, values: list[Array]) -> Array:
+        """The values, and hits on all surfaces of a beam that their edges clip, (D, W, Q)."""
+        edges = [self.hits.reshape(-1, *self.path.shape)] if self.clipped else []
+        return jnp.concatenate([*values, *edges])
+
+    def _fitted(self, points: Array, values: Array) -> Polynomials:
+        # Where light is taken away, rays stand for it as well as where it is.
+        weights = jnp.where(self.known, jnp.abs(self.weights), 0)
+        weights = jnp.where(self.throughput[:, None] > 0, weights, 1)
+        return fitted(points, values, weights, self.degree)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class BeamRule:
+    """Which rays make a beam, and the degree of its polynomials, see `beam_rule`."""
+
+    rule: PupilRule
+    degree: int = dataclasses.field(metadata={"static": True})
+
+
+def beam_rule(degree: int, symmetry: Symmetry, clipped: PupilRule | None = None) -> BeamRule:
+    """The fewest rays that give polynomials of a degree: a rule that integrates products of two of
+    them. clipped: the rule of a clipped pupil, if it is, whose kind is kept."""
+    order = degree // 2 + 1
+    if isinstance(clipped, Clipped):
+        rule = dataclasses.replace(clipped, order=order + 1, size=order + 1)
+        return BeamRule(rule, degree)
+    if symmetry == "rotational":
+        return BeamRule(Pattern(*meridian(order), symmetry), degree)
+    pattern = half_disc if symmetry == "bilateral" else disc
+    return BeamRule(Pattern(*pattern(order, degree + 1), symmetry), degree)
+
+
+def trace_beam(lens: Lens, scene: Scene, rule: BeamRule, solver: Solver = solve) -> Beam:
+    """The beam of an object point. Differentiable in the modes of the solver."""
+    points, weights = rule.rule.points(lens, scene)
+    bundle = trace_bundle(lens, scene, points, solver)
+    weights = weights * rule.rule.transmission(lens, bundle)
+    symmetry: Symmetry = rule.rule.symmetry
+    clipped = isinstance(rule.rule, Clipped)
+    return beam_of(lens, scene, points, weights, bundle, symmetry, rule.degree, clipped)
+
+
+def beam_of(
+    lens: Lens,
+    scene: Scene,
+    points: tuple[Array, ...],
+    weights: Array,
+    bundle: Bundle,
+    symmetry: Symmetry,
+    degree: int,
+    clipped: bool,
+) -> Beam:
+    """The beam of traced rays; `points` and `symmetry` are those of their rule, `weights` (W, Q)
+    theirs times what they transmit."""
+    known = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+    index = lens.index(scene.wavelengths)[-1]
+    hits = [jnp.where(known, h, 0) for h in bundle.hits]
+    arrival = [jnp.where(known, a, 0) for a in bundle.arrival]
+    sensor = tuple(h[-1] for h in hits)
+    path = bundle.path - index[:, None] * dot(tuple(arrival[:-1]), sensor)
+    # A constant is no phase.
+    path = jnp.where(known, path, 0)
+    total = jnp.sum(known, axis=-1, keepdims=True).astype(path.dtype)
+    mean = safe_divide(jnp.sum(path, axis=-1, keepdims=True), total)
+    path = jnp.where(known, path - jax.lax.stop_gradient(mean), 0)
+    turns, mirrors = _images(symmetry, degree)
+    images = len(turns) * len(mirrors)
+
+    def spread(vector: Sequence[Array]) -> Array:
+        return _spread(turns, mirrors, vector)
+
+    def repeated(values: Array) -> Array:
+        return jnp.tile(jnp.broadcast_to(values, known.shape), (1, images))
+
+    beam = Beam(
+        points=spread([jnp.broadcast_to(p, known.shape) for p in points]),
+        weights=repeated(weights) / images,
+        hits=spread(hits),
+        direction=jnp.concatenate([spread(arrival[:-1]), repeated(arrival[-1])[None]]),
+        path=repeated(path),
+        index=index,
+        motion=_motion(lens),
+        known=repeated(known),
+        degree=degree,
+        clipped=clipped,
+    )
+    return _filled(beam)
+
+
+def _filled(beam: Beam) -> Beam:
+    """The beam; for a wavelength of which no light arrives, rays without light that fill a pupil,
+    so that all that follows from them is finite."""
+    count = beam.path.shape[-1]
+    place = np.arange(count) + 0.5
+    spiral = np.sqrt(place / count) * np.exp(2.4j * place)
+    disc = jnp.asarray(np.stack([spiral.real, spiral.imag])[:, None], beam.path.dtype)
+    lit = beam.throughput[:, None] > 0
+    return dataclasses.replace(
+        beam,
+        points=jnp.where(lit, beam.points, disc),
+        weights=jnp.where(lit, beam.weights, 0),
+        direction=jnp.where(lit, beam.direction, jnp.concatenate([disc, disc[:1]])),
+        known=beam.known | ~lit,
+    )
+
+
+def _margin(degree: int, clipped: bool) -> float:
+    """By what part the light may reach farther than the outermost rays of `beam_rule`: they lie
+    inside of the rim, and between two of their azimuths."""
+    order = degree // 2 + 1
+    outermost = np.polynomial.legendre.leggauss(order + clipped)[0][-1]
+    radius = (1 + outermost) / 2 if clipped else np.sqrt((1 + outermost) / 2)
+    return float(1.005 / (radius * np.cos(np.pi / (2 * degree + 2))))
+
+
+def _extent(places: Array, known: Array, margin: float) -> tuple[Array, Array]:
+    """Two corners (2, W) of what holds all light whose rays are at places (2, W, Q)."""
+    low = jnp.min(jnp.where(known, places, jnp.inf), axis=-1)
+    high = jnp.max(jnp.where(known, places, -jnp.inf), axis=-1)
+    middle, half = (low + high) / 2, margin * (high - low) / 2
+    return middle - half, middle + half
+
+
+def _motion(lens: Lens) -> Array:
+    motion = lens.sensor_motion
+    return jnp.array([0, 0, 1], lens.curvature.dtype) if motion is None else motion
+
+
+def _images(symmetry: Symmetry, degree: int) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Azimuths by which, and signs of x with which, rays of a part of the pupil fill all of it."""
+    if symmetry == "rotational":
+        azimuths = 2 * degree + 1
+        return 2 * np.pi * np.arange(azimuths) / azimuths, (1,)
+    return np.zeros(1), ((1, -1) if symmetry == "bilateral" else (1,))
+
+
+def _spread(turns: np.ndarray, mirrors: tuple[int, ...], vector: Sequence[Array]) -> Array:
+    """Vectors of rays, D arrays (..., Q), turned and mirrored: (2, ..., images Q)."""
+    if len(vector) == 1:
+        parts = [(np.cos(a) * vector[0], np.sin(a) * vector[0]) for a in turns]
+    else:
+        parts = [(sign * vector[0], vector[1]) for sign in mirrors]
+    return jnp.stack([jnp.concatenate(side, axis=-1) for side in zip(*parts)])
+
+
+def means(values: Array, weights: Array) -> Array:
+    """Means (D, W) of values (D, W, Q) with weights (W, Q)."""
+    total = jnp.einsum("wq,dwq->dw", weights, values)
+    return safe_divide(total, jnp.broadcast_to(jnp.sum(weights, -1), total.shape))
+
+
+def centroid_and_variances(hits: Array, weights: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Centroid (2, W) of hits (2, W, Q) and their variances xx, xy, yy, (W,) each."""
+    mean = means(hits, weights)
+    x, y = hits - mean[..., None]
+    xx, xy, yy = means(jnp.stack([x * x, x * y, y * y]), weights)
+    return mean, (xx, xy, yy)
+
+
+def cover(lens: Lens, beam: Beam, stop: Array, hits: Array) -> Array:
+    """The part of each cell of a grid of rays that light fills, (W, N, N).
+
+    stop: (2, W, N, N), where they cross the stop. hits: (2 S + 2, W, N, N) on all surfaces, of a
+    clipped beam.
+    """
+    inside = _cover(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
+    if beam.clipped:
+        x, y = hits.reshape(2, -1, *stop.shape[1:])
+        for edge in clearance(lens, (x, y)):
+            inside = jnp.minimum(inside, _cover(jnp.where(jnp.isfinite(edge), edge, 1)))
+    return inside
+
+
+def _cover(depth: Array) -> Array:
+    """The part of each cell, (W, N, N), inside of an edge, of which the cell's middle lies at
+    `depth`, in any unit: the edge is straight in a cell."""
+    down, across = jnp.gradient(depth, axis=(-2, -1))
+    a = jnp.maximum(jnp.abs(down), jnp.abs(across))
+    b = jnp.minimum(jnp.abs(down), jnp.abs(across))
+    # A unit square cut across by a line: its area is linear in between, a parabola at corners.
+    whole, flat = (a + b) / 2, (a - b) / 2
+    t = jnp.clip(depth, -whole, whole)
+    corner = safe_divide((whole - jnp.abs(t)) ** 2, 2 * a * b)
+    linear = 0.5 + safe_divide(t, a)
+    part = jnp.where(jnp.abs(t) <= flat, linear, jnp.where(t > 0, 1 - corner, corner))
+    return jnp.where(jnp.abs(depth) < whole, part, (depth > 0).astype(depth.dtype))

@@ -1,0 +1,251 @@
+"""Chief rays over the field: distortion, field curvature, lateral colour, chief ray angle.
+
+A chief ray goes through the centre of the stop. How the hit h on the sensor and the slope m there
+follow from the stop point p comes from the derivatives of the traced ray: neighbouring rays meet
+it where h_p + s m_p is singular, a distance s behind the sensor. These are the foci of
+Coddington's equations, in any lens, tilted or not.
+
+All functions take `fields`, F angles along y (F,) or pairs (F, 2) in radians, and return an array
+with the field as its first axis; jit, vmap and derivatives in every mode as of `trace_rays`. A
+field whose chief ray fails has inf; one that an aperture clips counts like others. ValueError as
+of `scene_of`. Chief rays of the paraxial entrance pupil, as other programs have them unless they
+aim at the stop, are those of `with_paraxial_pupil(lens)`.
+
+Sources: Welford, Aberrations of Optical Systems (1986), ch. 4.5 and 6; conventions of the field
+curvature and distortion plots of OpticStudio where they are named.
+"""
+
+import functools
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..compilation import LARGE, jit
+from ..lens.lens import Lens
+from ..lens.scene import Scene, fields_array, scene_of
+from ..lens.surface import surface_sag
+from ..numerics import Numbers, known_values, real_array, safe_divide, safe_sqrt
+from ..rays.status import Status
+from ..rays.system import Vector, determinant, divide
+from ..rays.trace import trace_bundle
+from .field import CHIEF
+
+Mapping = Literal["tangent", "angle"]
+# As many fields at a time are a program.
+_FIELDS = 16
+
+
+class FieldCurvature(NamedTuple):
+    """Foci of thin pencils about the chief rays, (F, W) in mm along the z axis of the sensor, from
+    where the chief ray meets it; inf for none.
+
+    tangential: of rays that cross the stop beside its centre in the direction of the field (y, for
+        the axis). sagittal: across it.
+    """
+
+    tangential: Array
+    sagittal: Array
+
+
+class Distortion(NamedTuple):
+    """Chief rays on the sensor against an ideal image.
+
+    relative: (F, W), how much farther from the image of the axis they are than the ideal point,
+        towards which it counts, in parts of its distance; 0 on the axis.
+    real, ideal: (F, W, 2) mm, x and y on the sensor.
+    focal_length: (W,) mm, the y of the ideal image by the tangent of the field, or by the angle.
+    """
+
+    relative: Array
+    real: Array
+    ideal: Array
+    focal_length: Array
+
+
+class _ChiefRays(NamedTuple):
+    """Of the axis and F fields: hit (F + 1, W, 2) mm; angle, tangential, sagittal (F + 1, W);
+    by_field (F + 1, W, 2, 2) mm per radian, [x y of the hit, x y of the field]; whole (F + 1, W).
+    """
+
+    hit: Array
+    angle: Array
+    tangential: Array
+    sagittal: Array
+    by_field: Array
+    whole: Array
+
+
+def field_curvature(
+    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers
+) -> FieldCurvature:
+    """Tangential and sagittal foci relative to the sensor, see `FieldCurvature`.
+
+    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
+
+    Positive where the focus has the larger z, as OpticStudio plots it. In a lens without a plane of
+    symmetry these are the two focal lines, named by the direction that they are nearer to.
+    """
+    found = _chief_rays(lens, fields, distance, wavelengths)
+    return FieldCurvature(found.tangential[1:], found.sagittal[1:])
+
+
+def chief_ray_angle(lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
+    """Angle (F, W) in radians between the chief ray and the normal of the sensor's vertex, from 0.
+    Arguments as of `field_curvature`."""
+    return _chief_rays(lens, fields, distance, wavelengths).angle[1:]
+
+
+def lateral_colour(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    reference: int | None = None,
+) -> Array:
+    """Where the chief rays meet the sensor, (F, W, 2) in mm along its x and y, less where that of
+    the reference wavelength does.
+
+    reference: its index, by default the middle one, W // 2. Else as `field_curvature`.
+    """
+    found = _chief_rays(lens, fields, distance, wavelengths)
+    middle = found.whole.shape[1] // 2 if reference is None else reference
+    if not -found.whole.shape[1] <= middle < found.whole.shape[1]:
+        raise ValueError(f"reference: expected an index of the wavelengths, got {reference!r}")
+    moved = found.hit - found.hit[:, middle, None]
+    whole = found.whole & found.whole[:, middle, None]
+    return jnp.where(whole[..., None], moved, jnp.inf)[1:]
+
+
+def distortion(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    mapping: Mapping = "tangent",
+    focal_length: Numbers | Literal["fitted"] | None = None,
+) -> Distortion:
+    """Chief rays against the ideal image f tan(field) or f field, see `Distortion`.
+
+    mapping: "tangent" or "angle" (f-theta; of a field (x, y) the angle to the axis).
+    focal_length: () or (W,) mm; None: the limit of real chief rays near the axis, on the sensor
+        where it is, which is OpticStudio's reference; "fitted": calibrated, the least squares over
+        these fields. A finite distance has the same formulae: tan(field) is height over distance.
+        A lens without an axis has a matrix in place of f, the derivative at the field 0.
+
+    Else as `field_curvature`.
+    """
+    if mapping not in (known := get_args(Mapping)):
+        raise ValueError(f"mapping: expected one of {', '.join(known)}, got {mapping!r}")
+    if isinstance(focal_length, str) and focal_length != "fitted":
+        raise ValueError(f"focal_length: expected mm, None or 'fitted', got {focal_length!r}")
+    dtype = lens.curvature.dtype
+    angles = fields_array(fields, dtype)
+    found = _chief_rays(lens, fields, distance, wavelengths)
+    waves = found.whole.shape[1]
+    scale = found.by_field[0]
+    if focal_length is not None and not isinstance(focal_length, str):
+        length = real_array("focal_length", focal_length, dtype)
+        if length.shape not in ((), (waves,)):
+            raise ValueError(f"focal_length: expected () or ({waves},), got {length.shape}")
+        scale = jnp.broadcast_to(length, (waves,))[:, None, None] * jnp.eye(2, dtype=dtype)[None]
+    fitted = isinstance(focal_length, str)
+    return _distortion(found, angles, scale, mapping, fitted)
+
+
+@functools.partial(jax.jit, static_argnames=("mapping", "fitted"))
+def _distortion(
+    found: _ChiefRays, angles: Array, scale: Array, mapping: Mapping, fitted: bool
+) -> Distortion:
+    """Of chief rays, scale (W, 2, 2) mm."""
+    whole = found.whole[1:] & found.whole[:1]
+    place = jnp.tan(angles)
+    if mapping == "angle":
+        size = safe_sqrt(jnp.sum(place**2, axis=-1, keepdims=True))
+        place = place * jnp.where(size > 0, safe_divide(jnp.arctan(size), size), 1)
+    ideal = jnp.einsum("wij,fj->fwi", scale, place)
+    moved = jnp.where(whole[..., None], found.hit[1:] - found.hit[:1], 0)
+    along, square = jnp.sum(moved * ideal, axis=-1), jnp.sum(ideal**2, axis=-1)
+    square = jnp.where(whole, square, 0)
+    if fitted:
+        factor = safe_divide(jnp.sum(along, axis=0), jnp.sum(square, axis=0))
+        scale, ideal = scale * factor[:, None, None], ideal * factor[None, :, None]
+        along, square = along * factor[None], square * factor[None] ** 2
+    relative = jnp.where(whole, safe_divide(along - square, square), jnp.inf)
+    real, ideal = (
+        jnp.where(whole[..., None], a, jnp.inf) for a in (found.hit[1:], ideal + found.hit[:1])
+    )
+    focal_length = jnp.where(found.whole[0], scale[:, 1, 1], jnp.inf)
+    return Distortion(relative, real, ideal, focal_length)
+
+
+def _chief_rays(lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers) -> _ChiefRays:
+    """The chief rays of the axis and of all fields."""
+    angles = fields_array(fields, lens.curvature.dtype)
+    scene = scene_of(lens, 0.0, distance, wavelengths)
+    count = len(angles)
+    # Nearly as many fields share a program.
+    spare = -(count + 1) % _FIELDS if known_values((lens, angles, scene)) is not None else 0
+    angles = jnp.pad(angles, ((1, spare), (0, 0)))
+    found = _traced(lens, angles, scene)
+    return jax.tree.map(lambda a: a[: count + 1], found)
+
+
+@functools.partial(jit, wanted=LARGE)
+def _traced(lens: Lens, fields: Array, scene: Scene) -> _ChiefRays:
+    one = functools.partial(_chief_ray, lens, scene)
+    return jax.vmap(one)(fields)
+
+
+def _chief_ray(lens: Lens, axis: Scene, field: Array) -> _ChiefRays:
+    """The chief rays of one field."""
+
+    def arriving(point: Vector, field: Array) -> tuple[tuple[Vector, Array, Vector], tuple]:
+        scene = Scene(field, axis.distance, axis.wavelengths)
+        bundle = trace_bundle(lens, scene, point)
+        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        hit = tuple(jnp.where(whole, h[-1], 0)[:, 0] for h in bundle.hits)
+        *across, along = (jnp.where(whole, a, 0)[:, 0] for a in bundle.arrival)
+        slope = tuple(safe_divide(a, along) for a in across)
+        row = jax.tree.map(lambda a: a[..., -1], lens.shape)
+        return (hit, surface_sag(hit, row, lens.forms[-1]), slope), (whole[:, 0], across, along)
+
+    points = tuple(jnp.asarray(CHIEF, lens.curvature.dtype))
+    (hit, _, slope), push, rest = jax.linearize(arriving, points, field, has_aux=True)
+    whole, across, along = rest
+    none, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
+    # Derivatives by the stop point, of hits on the plane through that of the chief ray.
+    columns = []
+    for k in range(2):
+        beside = tuple(jnp.full_like(p, float(k == j)) for j, p in enumerate(points))
+        moved, height, bent = push(beside, jnp.zeros_like(field))
+        columns.append(([a - m * height for a, m in zip(moved, slope)], bent))
+    by_field = jnp.stack([jnp.stack(push(none, unit)[0], axis=-1) for unit in units], axis=-1)
+    tangential, sagittal = _foci(Scene(field, axis.distance, axis.wavelengths), columns)
+    sine = safe_sqrt(across[0] ** 2 + across[1] ** 2)
+    angle = jnp.arctan2(sine, jnp.where(whole, jnp.abs(along), 1))
+    lost = lambda a: jnp.where(whole, a, jnp.inf)  # noqa: E731
+    return _ChiefRays(
+        jnp.stack(hit, axis=-1), lost(angle), lost(tangential), lost(sagittal), by_field, whole
+    )
+
+
+def _foci(scene: Scene, columns: list[tuple]) -> tuple[Array, Array]:
+    """Tangential and sagittal foci (W,), mm: s with det(h_p + s m_p) = 0, the eigenvalues of
+    -m_p^-1 h_p, which maps the plane of the stop onto itself."""
+    rows = tuple(zip(*(bent for _, bent in columns)))
+    first, second = (divide(rows, tuple(-a for a in moved)) for moved, _ in columns)
+    (a, c), (b, d) = first, second
+    mean, half, product = (a + d) / 2, (a - d) / 2, b * c
+    root = safe_sqrt(half**2 + product)
+    # Which of them is tangential: [x y] turned so that y is the direction of the field.
+    tangent = jax.lax.stop_gradient(scene.tangent)
+    size = safe_sqrt(jnp.sum(tangent**2))
+    x, y = safe_divide(tangent, jnp.broadcast_to(size, (2,)))
+    y = jnp.where(size > 0, y, 1)
+    turned = half * (y**2 - x**2) - (b + c) * x * y
+    sign = jnp.where(turned < 0, -1, 1).astype(mean.dtype)
+    focused = determinant(rows) != 0
+    pair = mean - sign * root, mean + sign * root
+    return tuple(jnp.where(focused, s, jnp.inf) for s in pair)  # type: ignore[return-value]

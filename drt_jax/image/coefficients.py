@@ -1,0 +1,114 @@
+"""Wavefronts as Zernike coefficients: Noll's standard ones, and the fringe ones.
+
+The path difference of `wavefront` over the stop, W = sum of c_j Z_j, in least squares with the
+light that is not clipped as the weight. Pupil coordinates are those of the stop in units of its
+semi-diameter, angles from the x axis.
+
+Sources: Noll, J. Opt. Soc. Am. 66, 207 (1976), which OpticStudio calls Standard; for the order of
+the fringe terms, Wyant and Creath, Basic Wavefront Aberration Theory (1992).
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..compilation import LARGE, jit
+from ..lens.lens import Lens
+from ..lens.scene import Scene, fields_array, scene_of
+from ..numerics import Numbers
+from ..pupil.patterns import disc
+from ..rays.status import Status
+from ..rays.trace import trace_bundle
+from .wavefront import path_differences
+from .zernike import noll_terms, zernike
+
+# Nodes along a radius, and azimuths: no term up to the degree 24 is taken for another.
+_ORDER, _AZIMUTHS = 13, 26
+_MOST = 91
+
+
+def zernike_standard(
+    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, count: int = 37
+) -> Array:
+    """Coefficients (F, W, count) in waves of Noll's Zernike polynomials, orthonormal over the disc:
+    the squares of all but the first add up to the mean square wavefront error.
+
+    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
+    count: how many, 1 to 91.
+
+    inf where the chief ray fails, or so many rays that the terms are not told apart. Differentiable
+    in every mode.
+    """
+    return _coefficients(lens, fields, distance, wavelengths, _checked(count, _MOST))
+
+
+def zernike_fringe(
+    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, count: int = 37
+) -> Array:
+    """Coefficients (F, W, count) in waves of fringe Zernike polynomials, 1 at the edge of the disc.
+    count: 1 to 37. Else as `zernike_standard`."""
+    count = _checked(count, 37)
+    terms = fringe_terms()[:count]
+    most = max(n for n, _ in terms)
+    noll = noll_terms(most)
+    scale = np.array([np.sqrt(n + 1 if m == 0 else 2 * (n + 1)) for n, m in terms])
+    # The fit is of these terms alone, as the standard one is of its own.
+    rows = np.array([noll.index(term) for term in terms])
+    return (
+        _coefficients(lens, fields, distance, wavelengths, tuple(rows.tolist())) * scale[None, None]
+    )
+
+
+def fringe_terms() -> list[tuple[int, int]]:
+    """(n, m) of the 37 fringe terms, m below 0 for the sines."""
+    found: list[tuple[int, int]] = []
+    for half in range(6):
+        for m in range(half, -1, -1):
+            n = 2 * half - m
+            found += [(n, 0)] if m == 0 else [(n, m), (n, -m)]
+    return [*found, (12, 0)]
+
+
+def _checked(count: int, most: int) -> int:
+    if not isinstance(count, int | np.integer) or not 1 <= count <= most:
+        raise ValueError(f"count: expected a whole number from 1 to {most}, got {count!r}")
+    return int(count)
+
+
+def _coefficients(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    rows: int | tuple[int, ...],
+) -> Array:
+    """Of some terms in Noll's order, counted from 0."""
+    rows = tuple(range(rows)) if isinstance(rows, int) else rows
+    axis = scene_of(lens, 0.0, distance, wavelengths)
+    return _fitted(lens, fields_array(fields, lens.curvature.dtype), axis, rows)
+
+
+@functools.partial(jit, wanted=LARGE, static_argnames="rows")
+def _fitted(lens: Lens, fields: Array, axis: Scene, rows: tuple[int, ...]) -> Array:
+    points, weights = disc(_ORDER, _AZIMUTHS)
+    degree = next(n for n in range(40) if (n + 1) * (n + 2) // 2 > max(rows))
+    dtype = lens.curvature.dtype
+    aimed = jnp.asarray(np.concatenate([np.zeros((1, 2)), points]).T, dtype)
+    basis = zernike(aimed[:, 1:], degree)[np.array(rows)]
+
+    def one(field: Array) -> Array:
+        bundle = trace_bundle(lens, Scene(field, axis.distance, axis.wavelengths), tuple(aimed))
+        opd, status, _ = path_differences(lens, axis.wavelengths, bundle)
+        light = jnp.asarray(weights, dtype)[None] * (status[:, 1:] == Status.OK).astype(dtype)
+        whole = (status[:, 0] == Status.OK) | (status[:, 0] == Status.CLIPPED)
+        enough = whole & (jnp.sum(light > 0, axis=-1) > 2 * len(rows))
+        light = jnp.where(enough[:, None], light, jnp.asarray(weights, dtype)[None])
+        normal = jnp.einsum("wq,pq,rq->wpr", light, basis, basis)
+        right = jnp.einsum("wq,pq,wq->wp", light, basis, opd[:, 1:])
+        found = jnp.linalg.solve(normal, right[..., None])[..., 0]
+        return jnp.where(enough[:, None], found, jnp.inf)
+
+    return jax.vmap(one)(fields)

@@ -1,0 +1,136 @@
+"""Fans of rays: transverse and path errors along two diameters of the stop, and colour on the axis.
+
+Where an exit pupil would have to be found first, the stop is the label: a fan runs over its points.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..compilation import LARGE, jit
+from ..lens.lens import Lens
+from ..lens.paraxial import image_distance
+from ..lens.scene import Scene, fields_array, scene_of
+from ..numerics import Numbers, real_array, safe_divide
+from ..rays.status import Status
+from ..rays.trace import trace_bundle
+from .wavefront import path_differences
+
+
+class RayFans(NamedTuple):
+    """Rays through N points of two diameters of the stop, of F fields and W wavelengths.
+
+    pupil: (N,), from -1 to 1, in units of the stop's semi-diameter.
+    tangential, sagittal: (F, W, N, 2) mm, x and y on the sensor of the rays through points on the
+        y axis of the stop and on its x axis, less those of the reference chief ray.
+    tangential_path, sagittal_path: (F, W, N) waves, path of the chief ray of the same wavelength
+        less that of the ray, to the reference sphere of `wavefront`.
+
+    All but the first are inf for a ray that fails or is clipped, and where a chief ray fails.
+    """
+
+    pupil: Array
+    tangential: Array
+    sagittal: Array
+    tangential_path: Array
+    sagittal_path: Array
+
+
+class AxialColour(NamedTuple):
+    """Foci on the axis, mm along z from the sensor; inf for none.
+
+    paraxial: (W,). real: (W, N), where rays through N heights on the stop cross the chief ray of
+        the field 0: spherical aberration by colour.
+    """
+
+    paraxial: Array
+    real: Array
+
+
+def ray_fans(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    count: int = 41,
+    reference: int | None = None,
+) -> RayFans:
+    """Transverse ray errors and path differences along the y and the x axis of the stop.
+
+    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
+    count: N, evenly spaced points from rim to rim; odd to hold the centre.
+    reference: index of the wavelength whose chief ray transverse errors count from; None: the
+        middle one, W // 2. Paths count from the chief ray of each wavelength.
+
+    As OpticStudio plots ey against Py and ex against Px, with rays aimed at the real stop; without
+    aiming, of `with_paraxial_pupil(lens)`. Differentiable like `trace_rays`. ValueError as of
+    `scene_of`.
+    """
+    if not isinstance(count, int | np.integer) or count < 2:
+        raise ValueError(f"count: expected at least 2, a whole number, got {count!r}")
+    heights = jnp.linspace(-1, 1, int(count), dtype=lens.curvature.dtype)
+    hit, _, opd, good = _of_fields(lens, fields, distance, wavelengths, heights)
+    middle = hit.shape[1] // 2 if reference is None else reference
+    if not -hit.shape[1] <= middle < hit.shape[1]:
+        raise ValueError(f"reference: expected an index of the wavelengths, got {reference!r}")
+    moved = hit[:, :, 1:] - hit[:, middle, None, :1]
+    arrives = good[:, :, 1:] & good[:, middle, None, :1] & good[:, :, :1]
+    moved = jnp.where(arrives[..., None], moved, jnp.inf)
+    path = jnp.where(arrives, opd[:, :, 1:], jnp.inf)
+    halves = (slice(None, count), slice(count, None))
+    parts = [a[:, :, half] for a in (moved, path) for half in halves]
+    return RayFans(heights, *parts)
+
+
+def axial_colour(
+    lens: Lens, distance: Numbers, wavelengths: Numbers, heights: Numbers = (0.7, 1.0)
+) -> AxialColour:
+    """Where light of each wavelength is in focus on the axis, see `AxialColour`.
+
+    distance: mm, inf allowed. wavelengths: (W,) um. heights: (N,) on the y axis of the stop, in
+    units of its semi-diameter, none 0.
+
+    The paraxial foci leave out tilts and decentres. ValueError as of `scene_of`.
+    """
+    points = real_array("heights", heights, lens.curvature.dtype)
+    if points.ndim != 1:
+        raise ValueError(f"heights: expected (N,), got shape {points.shape}")
+    hit, slope, _, good = _of_fields(lens, 0.0, distance, wavelengths, points)
+    height, bend = (a[0, :, 1 : len(points) + 1, 1] - a[0, :, :1, 1] for a in (hit, slope))
+    arrives = good[0, :, 1 : len(points) + 1] & good[0, :, :1] & (bend != 0)
+    real = jnp.where(arrives, safe_divide(-height, bend), jnp.inf)
+    return AxialColour(image_distance(lens, distance, wavelengths) - lens.sensor, real)
+
+
+def _of_fields(
+    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, heights: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Hits and slopes (F, W, 1 + 2 N, 2), path differences and whether rays arrive, of the chief
+    ray and those through heights (N,) on the y axis and on the x axis of the stop."""
+    angles = fields_array(fields, lens.curvature.dtype)
+    return _traced(lens, angles, scene_of(lens, 0.0, distance, wavelengths), heights)
+
+
+@functools.partial(jit, wanted=LARGE)
+def _traced(
+    lens: Lens, fields: Array, axis: Scene, heights: Array
+) -> tuple[Array, Array, Array, Array]:
+    none, first = jnp.zeros_like(heights), jnp.zeros_like(heights[:1])
+    points = jnp.concatenate([first, none, heights]), jnp.concatenate([first, heights, none])
+
+    def one(field: Array) -> tuple[Array, Array, Array, Array]:
+        bundle = trace_bundle(lens, Scene(field, axis.distance, axis.wavelengths), points)
+        opd, status, _ = path_differences(lens, axis.wavelengths, bundle)
+        whole = (status == Status.OK) | (status == Status.CLIPPED)
+        # A chief ray may be clipped: others are measured from it all the same.
+        good = (status == Status.OK) | (whole & (np.arange(status.shape[-1]) == 0)[None])
+        *across, along = (jnp.where(whole, a, 0) for a in bundle.arrival)
+        hit = jnp.stack([jnp.where(whole, h[-1], 0) for h in bundle.hits], axis=-1)
+        slope = jnp.stack([safe_divide(a, along) for a in across], axis=-1)
+        return hit, slope, opd, good
+
+    return jax.vmap(one)(fields)

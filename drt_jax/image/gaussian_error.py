@@ -1,0 +1,70 @@
+"""Is the Gaussian good enough here? Its kernels against those with diffraction."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..lens.lens import Lens
+from ..lens.scene import fields_array
+from ..numerics import Numbers, known_values
+from .psf import PsfModel, converged_psf, difference, psf
+
+_LINES = 64  # Frequencies on either side, at least.
+
+
+class GaussianError(NamedTuple):
+    """How far Gaussian kernels are from those of waves, for F fields at D distances, the worst of
+    the wavelengths.
+
+    misplaced: (F, D), the sum of the absolute differences of all pixels: 0 to 2.
+    contrast: (F, D), the largest difference of the MTF of both kernels up to the pixels' Nyquist
+        frequency.
+    outside: (F, D), the part of the light that falls beside the kernel of waves.
+    """
+
+    misplaced: np.ndarray
+    contrast: np.ndarray
+    outside: np.ndarray
+
+
+def gaussian_error(
+    lens: Lens,
+    fields: Numbers,
+    distances: Numbers,
+    wavelengths: Numbers,
+    pixel: Numbers,
+    size: int = 21,
+    tolerance: float = 1e-2,
+) -> GaussianError:
+    """How far the Gaussian of the moments is from the kernel with diffraction, on `size` x `size`
+    pixels of a side of `pixel` mm.
+
+    fields: (F,) angles along y, or pairs (F, 2), radians. distances: (D,) mm, inf allowed.
+    wavelengths: (W,) um. tolerance: of the kernels of waves, as of `psf`.
+
+    Known numbers: ValueError inside a trace, and as of `psf`.
+    """
+    known = known_values((lens, fields, distances, wavelengths, pixel))
+    if known is None:
+        raise ValueError("gaussian_error compares known numbers: call it outside of jax.jit")
+    lens, fields, distances, wavelengths, pixel = known
+    pairs = fields_array(fields, lens.curvature.dtype)
+    far = np.atleast_1d(np.asarray(distances, float))
+    around = wavelengths, pixel, size
+    fine = converged_psf(lens, pairs, far, *around, "waves", tolerance)
+    models = PsfModel("gaussian", fine.rule, 0), fine
+    found = np.zeros((3, len(pairs), len(far)))
+    for i, field in enumerate(pairs):
+        for k, distance in enumerate(far):
+            blur, light = (psf(lens, field, distance, *around, model) for model in models)
+            a, b = np.asarray(blur.kernel), np.asarray(light.kernel)
+            found[:, i, k] = difference(a, b), _contrast(a, b), np.max(np.asarray(light.outside))
+    return GaussianError(*found)
+
+
+def _contrast(a: np.ndarray, b: np.ndarray) -> float:
+    """The largest difference of the MTF of kernels (W, size, size)."""
+    count = max(2 * _LINES, 2 * a.shape[-1])
+    spectra = [np.abs(np.fft.rfft2(k, (count, count))) for k in (a, b)]
+    first, second = (s / np.maximum(s[:, :1, :1], 1e-300) for s in spectra)
+    return float(np.max(np.abs(first - second)))

@@ -1,0 +1,72 @@
+"""Interpolation on equidistant nodes by local polynomials, and of pictures by cubic convolution."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+
+def lagrange(place: Array, count: int, order: int) -> tuple[Array, Array]:
+    """First node (...), int32, and weights (..., order) of the polynomial through the `order` nodes
+    nearest to `place` (...), in units of nodes 0 to count - 1. Continuous; exact for polynomials
+    of degree order - 1; beyond the ends the outermost polynomial goes on."""
+    order = min(order, count)
+    known = jax.lax.stop_gradient(place)
+    first = jnp.clip(jnp.floor(known) - (order - 1) // 2, 0, count - order)
+    offset = place - first
+    nodes = range(order)
+    parts = []
+    for j in nodes:
+        factors = [(offset - m) / (j - m) for m in nodes if m != j]
+        parts.append(jnp.prod(jnp.stack(factors), axis=0) if factors else jnp.ones_like(offset))
+    return first.astype(jnp.int32), jnp.stack(parts, axis=-1)
+
+
+def basis(place: Array, count: int, order: int) -> Array:
+    """The matrix (N, count) that interpolates values at nodes 0 to count - 1 at `place` (N,)."""
+    first, weights = lagrange(place, count, order)
+    columns = first[:, None] + jnp.arange(weights.shape[1], dtype=first.dtype)[None]
+    chosen = columns[:, :, None] == jnp.arange(count, dtype=first.dtype)[None, None]
+    return jnp.sum(jnp.where(chosen, weights[:, :, None], 0), axis=1)
+
+
+def at_point(table: Array, place: Array, order: int) -> Array:
+    """`table` (Ny, Nx, ...) interpolated at one `place` (2,), x and y in units of nodes."""
+    for where in (place[1], place[0]):
+        first, weights = lagrange(where, table.shape[0], order)
+        rows = jax.lax.dynamic_slice_in_dim(table, first, weights.shape[0], axis=0)
+        table = jnp.tensordot(weights, rows, axes=1)
+    return table
+
+
+def cubic(planes: Array, y: Array, x: Array) -> Array:
+    """Pictures (C, H, W) at the places y, x (C, ...), in pixels, by cubic convolution (Keys, IEEE
+    Trans. ASSP 29, 1153, 1981), of third order; beyond its edge a picture goes on as it ends."""
+    return jax.vmap(_cubic)(planes, y, x)
+
+
+def _cubic(plane: Array, y: Array, x: Array) -> Array:
+    height, width = plane.shape
+    (row, down), (column, across) = (_keys(a, n) for a, n in ((y, height), (x, width)))
+    rows = [jnp.clip(row + k, 0, height - 1) * width for k in range(-1, 3)]
+    columns = [jnp.clip(column + k, 0, width - 1) for k in range(-1, 3)]
+    flat = plane.reshape(-1)
+    lines = []
+    for start in rows:
+        parts = [w * flat[start + c] for w, c in zip(across, columns, strict=True)]
+        lines.append(sum(parts[1:], parts[0]))
+    total = [w * line for w, line in zip(down, lines, strict=True)]
+    return sum(total[1:], total[0])
+
+
+def _keys(place: Array, count: int) -> tuple[Array, list[Array]]:
+    """The pixel before `place` and the weights of the four around it."""
+    inside = jnp.clip(place, 0, count - 1)
+    first = jnp.floor(jax.lax.stop_gradient(inside))
+    s = inside - first
+    weights = [
+        s * (-0.5 + s * (1 - 0.5 * s)),
+        1 + s * s * (-2.5 + 1.5 * s),
+        s * (0.5 + s * (2 - 1.5 * s)),
+        s * s * (-0.5 + 0.5 * s),
+    ]
+    return first.astype(jnp.int32), weights

@@ -1,0 +1,303 @@
+"""The photograph that a lens takes of an ideal picture.
+
+Radiance stays the same along a ray. So a point of the sensor collects the mean radiance over its
+cone of light, times the cone's solid angle in direction cosines:
+
+    irradiance(p) = solid_angle(p) sum_k G(k; p) radiance(source of p - k),
+
+where the source of a point is the field whose centroid lies there, each colour its own, and G the
+kernel as seen from the sensor: that of the source of p - k, weighted with its light, at k. G adds
+up to 1, less what falls beside the kernel, so that an even scene stays even but for the solid
+angle. Between the corners of tiles G is interpolated, see `blur`.
+"""
+
+import functools
+from collections.abc import Callable, Iterable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..compilation import LARGE, jit
+from ..lens.lens import Lens
+from ..lens.paraxial import effective_focal_length
+from ..lens.scene import vergence_of
+from ..numerics import Numbers, concrete, known_values, safe_divide, safe_sqrt
+from .blur import blur_row
+from .fields import (
+    check_pixel,
+    grid_method,
+    image_points,
+)
+from .interpolate import basis, cubic
+from .psf import Kind, PsfModel
+from .sensor_maps import LOCAL, SMOOTH, Maps, RenderMethod, controls, sensor_maps, tiles_of
+
+_WAVELENGTHS = (0.6, 0.53, 0.48)
+# Sides of the squares that are transformed: fast ones.
+_SIDES = (32, 48, 64, 96, 128, 192, 256, 384, 512)
+# How much farther than the field of a pinhole that of a pixel is looked for, as a part of it.
+_TRIED = np.linspace(0, 2, 81)
+# The largest tangent of a field, that of 85 degrees.
+_WIDEST = 11.4
+
+
+def render_method(
+    lens: Lens,
+    shape: tuple[int, int],
+    distance: Numbers,
+    pixel: Numbers,
+    wavelengths: Numbers = _WAVELENGTHS,
+    size: int | None = None,
+    nodes: int = 8,
+    tile: int | None = None,
+    layers: int = 8,
+    model: Kind | Literal["auto"] | PsfModel = "rays",
+    tolerance: float = 5e-3,
+) -> RenderMethod:
+    """Choose how `render` works; all numbers are known.
+
+    shape: of the picture, H and W.
+    distance: mm, one or a depth map (H, W), of which `layers` follow, equidistant in 1 / distance.
+    pixel: mm. wavelengths: (C,) um.
+    size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
+    nodes: fields on one side of the axis, along the longer side of the picture, see `grid_method`.
+    tile: side of a tile in pixels.
+    model, tolerance: of the kernels, as of `psf`.
+
+    ValueError inside a trace, for numbers that make no sense, and where no light arrives.
+    """
+    known = known_values((lens, distance, pixel, wavelengths))
+    if known is None:
+        raise ValueError(
+            "inside jax.jit or jax.vmap fields and rays cannot be chosen: call render_method "
+            "outside, and pass on what it returns, method=..."
+        )
+    with jax.core.eval_context():
+        lens, distance, pixel, wavelengths = known
+        check_pixel(pixel)
+        if len(shape) != 2 or min(shape) < 1:
+            raise ValueError(f"shape: expected the height and width of a picture, got {shape}")
+        waves = lens.checked_wavelengths(wavelengths).reshape(-1)
+        focal = float(np.mean(np.asarray(effective_focal_length(lens, waves))))
+        if not 0 < abs(focal) < np.inf:
+            raise ValueError("lens: without a focal length it makes no picture")
+        far = layer_distances(distance, shape, layers)
+        side = float(np.asarray(pixel))
+        angles = _angles(lens, shape, far, side, focal, waves)
+        grid = grid_method(lens, angles, far, waves, side, size, nodes, model, tolerance)
+        if tile is None:
+            # About as wide as the fields lie apart, at least twice the kernel.
+            apart = max(shape) / 2 / nodes
+            wanted = max(min(apart, 160), grid.size) + grid.size
+            tile = next((s for s in _SIDES if s >= wanted), _SIDES[-1]) - grid.size + 1
+        # Equal tiles, the last of which end where the picture does.
+        tiles = tuple(-(-n // -(-n // tile)) for n in shape)
+        return RenderMethod(
+            grid,
+            jnp.asarray(focal, lens.curvature.dtype),
+            (shape[0], shape[1]),
+            (tiles[0], tiles[1]),
+        )
+
+
+def layer_distances(distance: Numbers, shape: tuple[int, int], layers: int) -> np.ndarray:
+    """Distances (D,) mm of the layers of a known distance or depth map, the nearest first."""
+    far = np.asarray(distance, float)
+    if far.ndim and far.shape != tuple(shape):
+        raise ValueError(
+            f"distance: expected one number or a depth map of {shape[0]} x {shape[1]} pixels, as "
+            f"the picture, got {' x '.join(map(str, far.shape))}"
+        )
+    if not np.all(far > 0):
+        raise ValueError("distance: must be above 0 mm everywhere, inf for infinity")
+    ends = 1 / np.min(far), 1 / np.max(far)
+    if ends[0] == ends[1]:
+        return np.ravel(far)[:1]
+    with np.errstate(divide="ignore"):
+        return 1 / np.linspace(*ends, max(layers, 2))
+
+
+def _angles(
+    lens: Lens,
+    shape: tuple[int, int],
+    far: np.ndarray,
+    pixel: float,
+    focal: float,
+    wavelengths: Any,
+) -> np.ndarray:
+    """Fields (2,), radians along x and y, whose image points lie at the edges of the picture, or as
+    far outside as the lens has any."""
+    half = np.array([shape[1], shape[0]]) / 2 * pixel
+    corners = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * half
+    tangents = corners[:, None] * _TRIED[None, :, None] / abs(focal)
+    points = image_points(lens, tangents.reshape(-1, 2), far[[0, -1]], wavelengths)
+    points = points.reshape(2, *tangents.shape[:2], -1, 2)
+    there = np.isfinite(points)
+    units = corners / np.sum(corners**2, axis=1, keepdims=True)
+    radii = np.sum(np.where(there, points, 0) * units[None, :, None, None], axis=-1)
+    radii = np.where(np.all(there, axis=-1), np.abs(radii), np.nan)
+    farthest = 1.0
+    for ray in np.moveaxis(radii, 2, -1).reshape(-1, len(_TRIED)):
+        rising = np.concatenate([[True], np.diff(ray) > 0])  # False for a NaN, too
+        end = len(ray) if np.all(rising) else int(np.argmin(rising))
+        reached = np.flatnonzero(ray[:end] >= 1)
+        farthest = max(farthest, _TRIED[reached[0] if len(reached) else end - 1])
+    return np.arctan(np.minimum(half / abs(focal) * farthest, _WIDEST))
+
+
+@functools.partial(jit, wanted=LARGE, static_argnames="lit")
+def _strip(maps: Maps, method: RenderMethod, planes: Array, row: Array, lit: bool) -> Array:
+    """A row of tiles of one distance, (height, n width, C): what the kernels make of the planes
+    (C, H, W); if `lit`, times the light."""
+    (tile, wide), margin, dtype = method.tile, method.grid.size // 2, planes.dtype
+    maps = jax.tree.map(lambda a: a.astype(dtype), maps)
+    starts = (row * tile).astype(dtype), jnp.zeros((), dtype)
+    lengths = tile, tiles_of(method)[1] * wide
+    places, local = [], []
+    for start, length, nodes in zip(starts, lengths, controls(method), strict=True):
+        pixels = start + jnp.arange(-margin, length + margin, dtype=dtype)
+        first, gap, count = float(nodes[0]), float(nodes[1] - nodes[0]), len(nodes)
+        place = (pixels - first) / gap
+        places.append(basis(place, count, SMOOTH))
+        local.append(basis(place[margin : length + margin], count, LOCAL))
+    exact = jax.lax.Precision.HIGHEST
+    between = jnp.einsum("ym,cmnk->cynk", places[0], maps.sources, precision=exact)
+    x, y = (jnp.einsum("cyn,xn->cyx", between[..., k], places[1], precision=exact) for k in (0, 1))
+    warped = jnp.moveaxis(cubic(planes, y, x), 0, -1)
+    kernels = jax.lax.dynamic_slice_in_dim(maps.kernels, row, 2, axis=0)
+    blurred = blur_row(warped, kernels, method.tile)
+    if not lit:
+        return blurred
+    between = jnp.einsum("ym,cmn->cyn", local[0], maps.light, precision=exact)
+    return blurred * jnp.einsum("cyn,xn->yxc", between, local[1], precision=exact)
+
+
+def render(
+    lens: Lens,
+    image: Array,
+    distance: Numbers,
+    pixel: Numbers,
+    wavelengths: Numbers = _WAVELENGTHS,
+    method: RenderMethod | None = None,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> Array:
+    """What a lens makes of an ideal picture on its sensor: distortion, lateral colour, blur that
+    varies over the field, vignetting and relative illumination: (H, W, C) in the dtype of `image`.
+
+    image: (H, W, C), radiance, linear, of C wavelengths, in floating numbers; (H, W) stands for all
+        colours. What a pinhole of the lens's effective focal length f sees: f tan(field), centred
+        on the axis, at the sensor's pixels; rows along y, columns along x of the sensor (where
+        pictures stand upside down, as this one does for a scene the right way up).
+        Outside of the picture it goes on as at its edge.
+    distance: mm, inf allowed, or a depth map (H, W) of the picture: layers, see `composed`.
+    pixel: side of a pixel, mm. wavelengths: (C,) um.
+    method: of `render_method`, made outside; needed inside `jax.jit` and `jax.vmap`. By default it
+        is made here, with its own defaults.
+    progress: wraps the loop over rows of tiles (tqdm), where all numbers are known.
+
+    The result is the irradiance over that of the axis: 1 where a picture of 1 meets the axis. Light
+    beside the kernels is lost. Each colour is resampled by cubic convolution, to third order in
+    the distortion. Differentiable in the lens and the image, in every mode. ValueError for other
+    shapes and dtypes, pictures that are not finite, and as of `render_method`.
+    """
+    count = len(lens.checked_wavelengths(wavelengths).reshape(-1))
+    picture = _picture(image, count)
+    if method is None:
+        method = render_method(
+            lens, (picture.shape[0], picture.shape[1]), distance, pixel, wavelengths
+        )
+    if picture.shape[:2] != method.shape:
+        raise ValueError(f"image: the method is for {method.shape}, got {picture.shape[:2]}")
+    maps = sensor_maps(lens, method, wavelengths)
+    if jnp.ndim(jnp.asarray(distance)) == 0:
+        return _whole(maps, method, picture, progress)
+    return composed(maps, method, picture, jnp.asarray(distance), progress)
+
+
+def _picture(image: Array, channels: int) -> Array:
+    """(H, W, C), checked."""
+    shape, dtype = np.shape(image), jnp.result_type(image)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(f"image: linear floating numbers are expected, not {dtype}")
+    if len(shape) == 2:
+        image = jnp.broadcast_to(jnp.asarray(image)[..., None], (*shape, channels))
+    elif len(shape) != 3 or shape[2] != channels:
+        raise ValueError(f"image: expected (H, W, {channels}) or (H, W), got {shape}")
+    if concrete(image) and not np.all(np.isfinite(np.asarray(image))):
+        raise ValueError("image: must be finite everywhere")
+    return image
+
+
+def _whole(
+    maps: Maps,
+    method: RenderMethod,
+    picture: Array,
+    progress: Callable,
+    layer: int = 0,
+    lit: bool = True,
+) -> Any:
+    """All rows of tiles of a picture (H, W, C), see `_strip`."""
+    (height, width), tile, rows = method.shape, method.tile[0], tiles_of(method)[0]
+    one = jax.tree.map(lambda a: a[layer], maps)
+    if not concrete((maps, picture, method)):
+        planes = jnp.moveaxis(jnp.asarray(picture), -1, 0)
+        strip = jax.checkpoint(lambda row: _strip(one, method, planes, row, lit=lit))
+        found = jax.lax.map(strip, jnp.arange(rows, dtype=jnp.int32))
+        return found.reshape(rows * tile, -1, len(planes))[:height, :width]
+    planes = jnp.asarray(np.ascontiguousarray(np.moveaxis(np.asarray(picture), -1, 0)))
+    result = np.empty((height, width, len(planes)), planes.dtype)
+    for row in progress(range(rows)):
+        part = _strip(one, method, planes, jnp.asarray(row, jnp.int32), lit=lit)
+        inside = slice(row * tile, min((row + 1) * tile, height))
+        result[inside] = np.asarray(part)[: height - row * tile, :width]
+    return result
+
+
+def composed(
+    maps: Maps, method: RenderMethod, picture: Array, depth: Array, progress: Callable = iter
+) -> Any:
+    """The picture of a depth map in layers, the nearest first.
+
+    A pixel belongs to the layer nearest to it in 1 / distance. Each layer is blurred with its own
+    kernels, and so is its cover, 1 where it has a pixel; what a cover lets through, the layers
+    behind it fill. What a near layer hides is not known: where layers together cover less than all,
+    what there is of them is divided by their cover. So an even scene stays even at any depth; but
+    behind a blurred edge stands what is visible beside it, and a slope shows its steps where the
+    blur of neighbouring layers differs.
+    """
+    vergences = np.asarray(jax.vmap(vergence_of)(method.grid.distances)).tolist()
+    at = vergence_of(depth)
+    apart = jnp.stack([jnp.abs(at - v) for v in vergences])
+    label = jnp.argmin(apart, axis=0)
+    dtype = picture.dtype
+    total: Any = 0.0
+    cover: Any = 0.0
+    open_: Any = 1.0
+    for layer in range(len(vergences)):
+        mask = (label == layer)[..., None]
+        part = _whole(maps, method, jnp.where(mask, picture, 0), progress, layer)
+        ones = jnp.broadcast_to(mask, picture.shape).astype(dtype)
+        own = _whole(maps, method, ones, progress, layer, lit=False)
+        total = total + open_ * part
+        cover = cover + open_ * own
+        open_ = open_ * (1 - own)
+    return safe_divide(jnp.asarray(total), jnp.asarray(cover))
+
+
+def sensor_noise(image: Array, key: Array, full_well: Numbers, read_noise: Numbers) -> Array:
+    """An image with the noise of a sensor, in the units of the image, not clipped.
+
+    image: (...), 1 for a pixel that is full. key: a PRNG key.
+    full_well: electrons of a full pixel. read_noise: standard deviation, electrons.
+
+    Shot noise as a Gaussian whose variance is the number of electrons, right to a few per cent from
+    some 20 electrons on; differentiable in the image.
+    """
+    dtype = image.dtype
+    full, read = (jnp.asarray(a, dtype) for a in (full_well, read_noise))
+    variance = jnp.maximum(image, 0) * full + read**2
+    white = jax.random.normal(key, image.shape, dtype)
+    return image + safe_sqrt(variance) * white / full

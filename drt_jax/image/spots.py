@@ -1,0 +1,348 @@
+"""Spots over the field, and how much light arrives there: throughput and relative illumination.
+
+One trace of a rule of the pupil gives all: where its rays meet the sensor, the light that they
+carry, and the area of their directions. A uniform, Lambertian scene gives a point of the sensor an
+irradiance in proportion to the area of the cone of light that comes to it in direction cosines:
+that of the stop, by the determinant |dl / dp| of directions l by stop points p.
+
+All functions take `fields`, F angles along y (F,) or pairs (F, 2) in radians, and return arrays
+with the field as their first axis. A rule, one for all fields, is found where none is given;
+inside `jax.jit` and `jax.vmap` it must be. Differentiable in every mode where the rule is.
+
+Sources: Rimmer, Relative illumination calculations, Proc. SPIE 655, 99 (1986), which OpticStudio
+follows; Slater, Remote Sensing (1980), for the cone at a point of the sensor.
+"""
+
+import dataclasses
+import functools
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..compilation import LARGE, jit
+from ..lens.lens import Lens
+from ..lens.order import may_cross
+from ..lens.scene import Scene, fields_array, scene_of
+from ..numerics import Numbers, known_values, real_array, safe_divide, safe_sqrt
+from ..pupil.clipped import Clipped
+from ..pupil.patterns import hexapolar
+from ..pupil.rules import Gauss, PupilRule, symmetry_of
+from ..rays.status import Status
+from ..rays.system import Vector, determinant, divide
+from ..rays.trace import trace_bundle
+
+Point = Literal["object", "sensor"]
+# Nodes along a radius of the rules that are made here.
+_ORDER = 12
+# Rays on the rim of the stop, which carry no light of a rule, and how many azimuths stand for a
+# rule of one radius.
+_RIM, _AZIMUTHS = 48, 24
+# Rings of rays that tell whether light fills the stop.
+_RINGS = 6
+# The first zero of the Airy pattern, in mm by um over NA.
+_AIRY = 0.60983494563325225e-3
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Spots:
+    """Spots of F fields in W wavelengths, of Q rays each.
+
+    points: (F, W, Q, 2) mm, x and y on the sensor; inf for rays that do not arrive.
+    weights: (F, W, Q), the light that each ray stands for, adding up to the throughput times the
+        wavelength's part; rays on the rim of the stop have none.
+    centroid: (F, 2) mm, of all wavelengths. chief: (F, 2) mm, the chief ray of the reference
+        wavelength.
+    rms, rms_chief: (F,) mm, root mean square distance of the light from either.
+    radius, radius_chief: (F,) mm, largest distance of a ray from either ("geometric").
+    airy_radius: (F,) mm, 0.61 wavelength / NA for the reference wavelength, where pi NA^2 is its
+        solid angle; of a round pupil the first zero of the diffraction pattern.
+    throughput, solid_angle: (F, W), as of `vignetting` and `solid_angle`.
+
+    Lengths are inf where no light arrives, those from the chief ray also where it fails.
+    """
+
+    points: Array
+    weights: Array
+    centroid: Array
+    chief: Array
+    rms: Array
+    rms_chief: Array
+    radius: Array
+    radius_chief: Array
+    airy_radius: Array
+    throughput: Array
+    solid_angle: Array
+
+
+def spot_diagram(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    rule: PupilRule | None = None,
+    wavelength_weights: Numbers | None = None,
+    reference: int | None = None,
+) -> Spots:
+    """Where the light of each field meets the sensor, see `Spots`.
+
+    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
+    rule: of the pupil; for a picture a `Pattern` such as that of `pupil.hexapolar`. None: Gauss
+        nodes, fitted to what apertures leave.
+    wavelength_weights: (W,), of any sum; None: equal. reference: index of a wavelength; None: the
+        middle one, W // 2.
+
+    ValueError as of `scene_of`; without a rule also inside a trace.
+    """
+    light = _light(lens, fields, distance, wavelengths, rule, "object")
+    waves = light.hit.shape[1]
+    middle = waves // 2 if reference is None else reference
+    if not -waves <= middle < waves:
+        raise ValueError(f"reference: expected an index of the wavelengths, got {reference!r}")
+    dtype = lens.curvature.dtype
+    spectrum = jnp.ones(waves, dtype)
+    if wavelength_weights is not None:
+        spectrum = real_array("wavelength_weights", wavelength_weights, dtype)
+        if spectrum.shape != (waves,):
+            raise ValueError(f"wavelength_weights: expected ({waves},), got {spectrum.shape}")
+    colour = lens.checked_wavelengths(wavelengths)[middle]
+    index = lens.index(colour)[-1, 0]
+    return _spots(light, spectrum / jnp.sum(spectrum), colour / index, middle)
+
+
+def vignetting(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    rule: PupilRule | None = None,
+) -> Array:
+    """The part (F, W) of the light through the stop that reaches the sensor, from 0 to 1: the
+    unvignetted fraction. Arguments and errors as of `spot_diagram`."""
+    return _light(lens, fields, distance, wavelengths, rule, "object").throughput[1:]
+
+
+def relative_illumination(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    rule: PupilRule | None = None,
+    point: Point = "object",
+) -> Array:
+    """Irradiance (F, W) on the sensor relative to that of the field 0, of a uniform, Lambertian
+    scene: the ratio of the areas of the cones of light in direction cosines.
+
+    point: "object": the cone of light from one object point, as OpticStudio and CODE V have it;
+        "sensor": the cone at one point of the sensor, what a pixel collects. Both agree as far as
+        rays from one meet in the other.
+
+    0 where no light arrives. OpticStudio's analysis divides by the brightest field of its scan,
+    `r / r.max()`, its operand RELI by the axis. Other arguments and errors as of `spot_diagram`.
+    """
+    area = _light(lens, fields, distance, wavelengths, rule, point).solid_angle
+    return safe_divide(area[1:], jnp.broadcast_to(area[:1], area[1:].shape))
+
+
+def solid_angle(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    rule: PupilRule | None = None,
+    point: Point = "object",
+) -> Array:
+    """Area (F, W) of the cone of light in direction cosines on the sensor: irradiance over
+    radiance; for a cone round the normal pi sin^2 of its half angle, 0 where no light arrives.
+    Arguments and errors as of `relative_illumination`."""
+    return _light(lens, fields, distance, wavelengths, rule, point).solid_angle[1:]
+
+
+def light_rule(
+    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, order: int = _ORDER
+) -> Gauss | Clipped:
+    """A rule of an order for the light of all fields and the axis: on the stop if that is filled,
+    else one fitted to what apertures leave. All is known; ValueError inside a trace."""
+    known = known_values((lens, fields, distance, wavelengths))
+    if known is None:
+        raise ValueError(
+            "inside jax.jit or jax.vmap the rays cannot follow from what is clipped: make the rule "
+            "outside and pass it on, rule=drt_jax.converged_rule(lens, fields, ...), or name one, "
+            "such as rule=drt_jax.Gauss(12, 'bilateral')"
+        )
+    with jax.core.eval_context():
+        lens, fields, distance, wavelengths = known
+        angles = np.asarray(fields_array(fields, lens.curvature.dtype))
+        angles = np.concatenate([np.zeros_like(angles[:1]), angles])
+        scene = scene_of(lens, 0.0, distance, wavelengths)
+        symmetry = symmetry_of(lens, angles)
+        full = bool(_fills(lens, jnp.asarray(angles), scene))
+    if full and not (lens.apertures is not None and any(lens.apertures.blocks)):
+        return Gauss(order, symmetry)
+    return Clipped(order, symmetry, crossing=may_cross(lens))
+
+
+@functools.partial(jit, wanted=LARGE)
+def _fills(lens: Lens, fields: Array, axis: Scene) -> Array:
+    """Whether all rays over the stop and on its rim arrive."""
+    points = np.concatenate([hexapolar(_RINGS)[0], _rim()])
+    aimed = tuple(jnp.asarray(p, lens.curvature.dtype) for p in points.T)
+
+    def one(field: Array) -> Array:
+        scene = Scene(field, axis.distance, axis.wavelengths)
+        return jnp.all(trace_bundle(lens, scene, aimed).status == Status.OK)
+
+    return jnp.all(jax.vmap(one)(fields))
+
+
+def _rim() -> np.ndarray:
+    angle = 2 * np.pi * (np.arange(_RIM) + 0.25) / _RIM
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Light:
+    """Of the axis and F fields: hit (F + 1, W, Q, 2) mm, weight (F + 1, W, Q), arrives likewise,
+    rays of the rule first, then their mirror images, then the chief ray and those on the rim;
+    chief_whole, throughput, solid_angle (F + 1, W)."""
+
+    hit: Array
+    weight: Array
+    arrives: Array
+    chief: Array
+    chief_whole: Array
+    throughput: Array
+    solid_angle: Array
+
+
+def _light(
+    lens: Lens,
+    fields: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    rule: PupilRule | None,
+    point: Point,
+) -> _Light:
+    """The light of the axis and of all fields."""
+    if point not in (known := get_args(Point)):
+        raise ValueError(f"point: expected one of {', '.join(known)}, got {point!r}")
+    angles = fields_array(fields, lens.curvature.dtype)
+    axis = scene_of(lens, 0.0, distance, wavelengths)
+    if rule is None:
+        rule = light_rule(lens, fields, distance, wavelengths)
+    angles = jnp.concatenate([jnp.zeros_like(angles[:1]), angles])
+    return _traced(lens, angles, axis, rule, point == "sensor")
+
+
+@functools.partial(jit, wanted=LARGE, static_argnames="fixed")
+def _traced(lens: Lens, fields: Array, axis: Scene, rule: PupilRule, fixed: bool) -> _Light:
+    """`fixed`: the point on the sensor is, not the object point."""
+    return jax.vmap(lambda field: _of_field(lens, field, axis, rule, fixed))(fields)
+
+
+def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: bool) -> _Light:
+    """Arrays without the axis of fields."""
+    scene = Scene(field, axis.distance, axis.wavelengths)
+    points, weights = _whole_rule(lens, scene, rule)
+    count = weights.shape[-1]
+
+    def arriving(points: Vector, field: Array) -> tuple[tuple[Vector, Vector], tuple]:
+        scene = Scene(field, axis.distance, axis.wavelengths)
+        bundle = trace_bundle(lens, scene, points)
+        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        hit = tuple(jnp.where(whole, h[-1], 0) for h in bundle.hits)
+        line = tuple(jnp.where(whole, a, 0) for a in bundle.arrival[:-1])
+        return (hit, line), (bundle.status, rule.transmission(lens, bundle))
+
+    (hit, _), push, (status, passes) = jax.linearize(arriving, points, field, has_aux=True)
+    area = np.pi * jnp.abs(_determinant(push, points, field, fixed))[:, :count]
+    weight = weights * passes[:, :count]
+    throughput, cone = jnp.sum(weight, axis=-1), jnp.sum(weight * area, axis=-1)
+    arrives = status == Status.OK
+    parts = [jnp.stack(hit, axis=-1), arrives]
+    weight = jnp.pad(weight, ((0, 0), (0, 1 + _RIM)))
+    if rule.symmetry == "bilateral":  # and the mirror images of the rays of the rule
+        images = parts[0][:, :count] * jnp.array([[[-1, 1]]], weight.dtype), arrives[:, :count]
+        parts = [jnp.concatenate(pair, axis=1) for pair in zip(images, parts)]
+        weight = jnp.concatenate([weight[:, :count], weight], axis=1) / 2
+    hits, arrives = parts
+    chief = status[:, count]
+    whole = (chief == Status.OK) | (chief == Status.CLIPPED)
+    chief_hit = jnp.stack([h[:, count] for h in hit], axis=-1)
+    return _Light(hits, weight, arrives, chief_hit, whole, throughput, cone)
+
+
+def _whole_rule(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
+    """Points of a rule, then the centre and the rim of the stop, 2 arrays (W, Q + 1 + _RIM), and
+    weights (W, Q). One radius stands for azimuths that it is turned by."""
+    points, weights = rule.points(lens, scene)
+    waves = scene.wavelengths.shape[0]
+    wide = lambda a: jnp.broadcast_to(a, (waves, a.shape[-1]))  # noqa: E731
+    weights = wide(weights)
+    if len(points) == 1:
+        angle = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+        turned = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)]), weights.dtype)
+        points = tuple(jnp.outer(wide(points[0]), t).reshape(waves, -1) for t in turned)
+        weights = jnp.repeat(weights, _AZIMUTHS, axis=-1) / _AZIMUTHS
+    extra = np.concatenate([np.zeros((1, 2)), _rim()]).T
+    rows = zip(points, extra, strict=True)
+    joined = ((wide(p), wide(jnp.asarray(e, weights.dtype)[None])) for p, e in rows)
+    return tuple(jnp.concatenate(pair, axis=-1) for pair in joined), weights
+
+
+def _determinant(push, points: Vector, field: Array, fixed: bool) -> Array:
+    """|dl / dp| (W, Q), of the object point or, `fixed`, of the point on the sensor: where that
+    stays the field moves by -h_f^-1 h_p, so that it is l_p - l_f h_f^-1 h_p."""
+    zero, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
+    sides = [tuple(jnp.full_like(p, float(j == k)) for j, p in enumerate(points)) for k in range(2)]
+    columns = []
+    for side in sides:
+        hit, line = push(side, jnp.zeros_like(field))
+        if fixed:
+            (hit_x, line_x), (hit_y, line_y) = (push(zero, unit) for unit in units)
+            back = divide(tuple(zip(hit_x, hit_y)), hit)
+            line = [a - back[0] * b - back[1] * c for a, b, c in zip(line, line_x, line_y)]
+        columns.append(line)
+    return determinant(columns)
+
+
+@functools.partial(jax.jit, static_argnames="middle")
+def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
+    """The fields' spots; wavelength: the reference one in the medium of the sensor, um."""
+    light = jax.tree.map(lambda a: a[1:], light)
+    weight = light.weight * spectrum[None, :, None]
+    hit = light.hit
+    lit = jnp.sum(weight, axis=(1, 2))
+    share = safe_divide(weight, jnp.broadcast_to(lit[:, None, None], weight.shape))
+    centroid = jnp.sum(share[..., None] * hit, axis=(1, 2))
+    chief = light.chief[:, middle]
+    good = lit > 0
+    whole = good & light.chief_whole[:, middle]
+
+    def spread(centre: Array, good: Array) -> tuple[Array, Array]:
+        square = jnp.sum((hit - centre[:, None, None]) ** 2, axis=-1)
+        mean = safe_sqrt(jnp.sum(share * square, axis=(1, 2)))
+        largest = safe_sqrt(jnp.max(jnp.where(light.arrives, square, 0), axis=(1, 2)))
+        return jnp.where(good, mean, jnp.inf), jnp.where(good, largest, jnp.inf)
+
+    (rms, radius), (rms_chief, radius_chief) = spread(centroid, good), spread(chief, whole)
+    cone = light.solid_angle[:, middle]
+    aperture = safe_sqrt(cone / np.pi)
+    airy = jnp.where(aperture > 0, safe_divide(_AIRY * wavelength, aperture), jnp.inf)
+    return Spots(
+        jnp.where(light.arrives[..., None], hit, jnp.inf),
+        weight,
+        jnp.where(good[:, None], centroid, jnp.inf),
+        jnp.where(light.chief_whole[:, middle, None], chief, jnp.inf),
+        rms,
+        rms_chief,
+        radius,
+        radius_chief,
+        airy,
+        light.throughput,
+        light.solid_angle,
+    )

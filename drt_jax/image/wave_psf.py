@@ -1,0 +1,98 @@
+"""The kernel of wave optics: plane waves of all directions of a beam, added up on the pixels.
+
+The field at a place x of the sensor is U(x) = sum over directions d of c exp(i k n d.x), with
+k = 2 pi / wavelength, and |c|^2 the light times the cell's area of direction cosines. On a regular
+grid of direction cosines |U|^2 is a sum over the differences of two directions, the optical
+transfer function: the autocorrelation of c, which two Fourier transforms give. A pixel's integral
+of each of its waves is a sinc, so that the kernel is a product of three matrices, and exact for
+the grid. Source: Goodman, Introduction to Fourier Optics (2005), ch. 6; Soummer et al., Opt.
+Express 15, 15935 (2007) for the product.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..lens.lens import Lens
+from ..numerics import safe_sqrt
+from .beam import Beam, cover
+
+_UM = 1e3  # per mm
+
+
+def wave_kernel(
+    lens: Lens,
+    beam: Beam,
+    wavelengths: Array,
+    centre: Array,
+    pixel: Array,
+    size: int,
+    cells: int,
+) -> Array:
+    """What pixels collect of the light, (W, size, size) [y, x], adding to the part of the
+    throughput that falls on the grid.
+
+    wavelengths: (W,) um. centre: (2,) mm of the grid on the sensor. pixel: () mm. cells: of the
+    grid of directions, along a side; the kernel repeats every `period`.
+    """
+    amplitude, step = pupil_function(lens, beam, wavelengths, cells)
+    transfer = autocorrelation(amplitude)
+    lags = np.fft.fftfreq(2 * cells, 1 / (2 * cells))
+    # Waves of the differences of two directions, cycles a mm: (2, W, 2 N).
+    unit = step * (beam.index * _UM / wavelengths)[None]
+    frequency = unit[..., None] * jnp.asarray(lags, unit.dtype)[None, None]
+    place = (jnp.arange(size, dtype=pixel.dtype) - (size - 1) / 2) * pixel
+    waves = []
+    for f, c in zip(frequency, centre):
+        f, x = f[:, None], (place + c)[None, :, None]
+        phase = 2 * jnp.pi * f * x
+        wave = jax.lax.complex(jnp.cos(phase), jnp.sin(phase))
+        waves.append(wave * jnp.sinc(f * pixel).astype(wave.dtype))
+    across, down = waves
+    kernel = jnp.einsum("wyv,wvu,wxu->wyx", down, transfer, across).real
+    cell = step[0] * step[1] * beam.index * _UM / wavelengths
+    return kernel * (cell * pixel)[:, None, None] ** 2
+
+
+def period(beam: Beam, wavelengths: Array, cells: int) -> Array:
+    """After how many mm along x and y, (2, W), the kernel of so many cells repeats."""
+    step = _grid(beam, cells)[1]
+    return (wavelengths / (_UM * beam.index))[None] / step
+
+
+def _grid(beam: Beam, cells: int) -> tuple[Array, Array]:
+    """Centre and step of the grid of direction cosines, (2, W) each."""
+    low, high = beam.directions_extent()
+    return (low + high) / 2, (high - low) / cells
+
+
+def pupil_function(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tuple[Array, Array]:
+    """Amplitudes (W, cells, cells) [y, x] on a regular grid of direction cosines, whose squares are
+    the light a unit of their area, and the step of the grid, (2, W)."""
+    functions = beam.over_directions()
+    middle, step = _grid(beam, cells)
+    side = np.arange(cells) - (cells - 1) / 2
+    values, by_x, by_y = functions.on_grid(
+        (middle - functions.centre) / functions.scale, step / functions.scale, side
+    )
+    path, stop = values[0], values[1:3]
+    # The light of a part of the stop goes into a part of the directions.
+    (_, ax, ay), (_, bx, by) = by_x[:3], by_y[:3]
+    part = functions.scale[0] * functions.scale[1] * jnp.pi
+    density = jnp.abs(ax * by - ay * bx) / part[:, None, None]
+    amplitude = safe_sqrt(density) * cover(lens, beam, stop, values[3:])
+    phase = path * (2 * jnp.pi * _UM / wavelengths)[:, None, None]
+    return jax.lax.complex(amplitude * jnp.cos(phase), amplitude * jnp.sin(phase)), step
+
+
+def autocorrelation(amplitude: Array) -> Array:
+    """Sums over the cells of products with those some cells away, (W, 2 N, 2 N), in the order of
+    `numpy.fft.fftfreq`: at a lag (v, u) of c[y + v, x + u] conj(c[y, x])."""
+    cells = amplitude.shape[-1]
+    pad = functools.partial(jnp.pad, pad_width=((0, 0), (0, cells), (0, cells)))
+    spectrum = jnp.fft.fft2(pad(amplitude))
+    power = spectrum.real**2 + spectrum.imag**2
+    return jnp.fft.ifft2(power.astype(spectrum.dtype))

@@ -1,0 +1,273 @@
+"""Kernels of the three models against sums that nobody here shares: histograms of traced rays,
+direct sums of plane waves, closed forms; and their derivatives against differences."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import j1
+
+import drt_jax
+from drt_jax.image.beam import beam_rule, centroid_and_variances, trace_beam
+from drt_jax.image.psf import difference
+from drt_jax.image.ray_psf import ray_spots
+from drt_jax.lens.scene import scene_of
+from drt_jax.pupil import patterns
+
+WAVES = (0.6, 0.48)
+PIXEL, SIZE = 4.4e-3, 21
+FAR = 25e3
+# One off axis, one on it, and a clipped one.
+SCENES = {"double_gauss": 14.0, "singlet": 0.0, "camera_50mm": 12.0}
+LONGER = ("singlet", "camera_50mm")
+
+
+def scene(name):
+    return drt_jax.load_lens(name), np.radians(SCENES[name]), FAR, WAVES
+
+
+@pytest.fixture(scope="module")
+def double_gauss():
+    return scene("double_gauss")
+
+
+def histogram(rays, weights, centre, size=SIZE):
+    """The shares (W, size, size) of weighted hits (W, Q, 2) in the pixels."""
+    edges = (np.arange(size + 1) - size / 2) * PIXEL
+    return np.stack(
+        [
+            np.histogram2d(p[:, 1] - centre[1], p[:, 0] - centre[0], [edges, edges], weights=w)[0]
+            for p, w in zip(rays, weights)
+        ]
+    )
+
+
+def traced(lens, field, points):
+    found = drt_jax.trace_rays(lens, field, FAR, WAVES, points)
+    return np.asarray(found.points[:, :, -1, :2]), np.asarray(found.status) == 0
+
+
+def test_rays_are_the_histogram_of_traced_rays(double_gauss):
+    lens, field, *_ = double_gauss
+    found = drt_jax.psf(*double_gauss, PIXEL, SIZE, "rays", 1e-2)
+    points, weights = patterns.sobol_disc(1 << 15)
+    hits, good = traced(lens, field, points)
+    assert np.all(good)
+    # 32,768 points in some 200 pixels: each holds its share to about 1 %.
+    truth = histogram(hits, np.stack([weights, weights]), np.asarray(found.centre))
+    assert difference(np.asarray(found.kernel), truth) < 2.5e-2
+
+
+@pytest.mark.parametrize(
+    "name", ["double_gauss", *(pytest.param(n, marks=pytest.mark.slow) for n in LONGER)]
+)
+def test_sums_and_moments(name):
+    """Of a model with more rays than it needs: its moments are those of the rays."""
+    lens, *rest = scene(name)
+    moments = drt_jax.psf_moments(lens, *rest, tolerance=1e-8)
+    sigma = float(jnp.sqrt(jnp.max(jnp.diagonal(moments.covariance, 0, 1, 2))))
+    found = drt_jax.converged_rule(lens, *rest, 1e-3)
+    clipped = found if isinstance(found, drt_jax.Clipped) else None
+    rule = beam_rule(16, drt_jax.symmetry_of(lens, rest[0]), clipped)
+    beam = trace_beam(lens, scene_of(lens, *rest), rule)
+    hits, width, light = ray_spots(lens, beam, 48)
+    mean, variances = centroid_and_variances(hits, light)
+    np.testing.assert_allclose(mean.T, moments.mean, rtol=0, atol=1e-6 * sigma)
+    for k, i, j in ((0, 0, 0), (1, 0, 1), (2, 1, 1)):
+        own = np.sum(np.asarray(light * width[i] ** 2), -1) / np.sum(np.asarray(light), -1) / 7
+        found = np.asarray(variances[k]) + own * (i == j)
+        wanted = np.asarray(moments.covariance)[:, i, j]
+        np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6 * sigma**2)
+    pixel, size = sigma / 6, 161
+    kernel = drt_jax.psf(lens, *rest, pixel, size, drt_jax.PsfModel("rays", rule, 48))
+    np.testing.assert_allclose(jnp.sum(kernel.kernel, (1, 2)) + kernel.outside, 1, atol=1e-12)
+    assert np.all(np.abs(np.asarray(kernel.outside)) < 1e-9)
+    np.testing.assert_allclose(kernel.throughput, moments.throughput, rtol=1e-6)
+
+
+def test_waves_are_the_sum_of_plane_waves(double_gauss):
+    lens, field, *_ = double_gauss
+    found = drt_jax.psf(*double_gauss, PIXEL, SIZE, "waves", 2e-3)
+    # One plane wave a ray of a fine Gauss rule, all path differences to the sphere at infinity.
+    points, weights = patterns.disc(40, 100)
+    rays = drt_jax.trace_rays(lens, field, FAR, WAVES, points)
+    for w, wavelength in enumerate(WAVES):
+        wave = 2 * np.pi / (wavelength * 1e-3)
+        hits = np.asarray(rays.points[w, :, -1, :2])
+        d = np.asarray(rays.directions[w, :, -1, :2])
+        path = np.asarray(rays.path[w]) - np.sum(d * hits, -1)
+        area = _area(lens, field, wavelength, points)
+        amplitude = np.sqrt(weights * np.pi * weights * area) * np.exp(1j * wave * path)
+        nodes, node_weights = np.polynomial.legendre.leggauss(8)
+        pixels = (np.arange(SIZE)[:, None] - (SIZE - 1) / 2 + nodes / 2) * PIXEL
+        across, down = (
+            np.exp(1j * wave * np.outer(pixels.ravel() + c, part))
+            for c, part in zip(np.asarray(found.centre), d.T)
+        )
+        light = np.abs((down * amplitude) @ across.T) ** 2
+        light = light.reshape(SIZE, 8, SIZE, 8) * node_weights[:, None, None] * node_weights / 4
+        truth = light.sum((1, 3)) * (PIXEL / (wavelength * 1e-3)) ** 2
+        assert np.abs(truth - np.asarray(found.kernel[w])).sum() < 3e-3
+
+
+def _area(lens, field, wavelength, points):
+    """|d(l, m) / d(x, y)| at points of the stop, by differences."""
+    step = 1e-4
+    moved = [
+        drt_jax.trace_rays(lens, field, FAR, wavelength, points + np.array(s) * step)
+        for s in ((1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    right, left, up, down = (np.asarray(r.directions[0, :, -1, :2]) for r in moved)
+    (a, b), (c, d) = ((right - left).T / (2 * step), (up - down).T / (2 * step))
+    return np.abs(a * d - b * c)
+
+
+def paraboloid(semi_diameter=1.0, sensor=50.0):
+    """A mirror without aberrations for an object at infinity, f/25."""
+    surface = {"radius": -100.0, "conic": -1.0, "mirror": True, "thickness": -sensor}
+    surface |= {"stop": True, "semi_diameter": semi_diameter}
+    return drt_jax.load_lens({"surfaces": [surface]})
+
+
+def test_waves_of_a_perfect_mirror_are_airys_pattern():
+    lens = paraboloid()
+    pixel, wavelength = 2e-4, 0.5
+    found = drt_jax.psf(lens, 0.0, np.inf, wavelength, pixel, 101, "waves", 1e-3)
+    place = (np.arange(101) - 50) * pixel
+    x = np.pi * np.hypot(*np.meshgrid(place, place)) / (wavelength * 1e-3 * 25)
+    airy = np.where(x == 0, 1, 2 * j1(np.where(x == 0, 1, x)) / np.where(x == 0, 1, x)) ** 2
+    airy *= np.pi / 4 * (pixel / (wavelength * 1e-3 * 25)) ** 2
+    # The pixels are small: their own size is what is left, and f/25 by sines.
+    assert np.abs(np.asarray(found.kernel[0]) - airy).max() < 3e-3 * airy.max()
+
+
+@pytest.mark.slow
+def test_waves_come_to_rays_when_they_are_short():
+    # A disc out of focus; no glass, so that the rays do not know the wavelength.
+    lens, pixel, size = paraboloid(sensor=55.0), 0.02, 31
+    apart = []
+    for wavelength in (2.0, 0.5, 0.125):
+        view = lens, 0.0, np.inf, wavelength, pixel, size
+        pair = (drt_jax.psf(*view, kind, 1e-2).kernel for kind in ("rays", "waves"))
+        apart.append(difference(*map(np.asarray, pair)))
+    assert apart[0] > 1.5 * apart[1] > 3 * apart[2]
+    assert apart[2] < 0.2
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "rays", "waves"])
+def test_derivatives_are_those_of_the_kernel(double_gauss, kind):
+    lens, field, far, waves = double_gauss
+    model = drt_jax.converged_psf(lens, field, far, waves, PIXEL, SIZE, kind, 5e-2)
+    wanted = jnp.asarray(np.random.default_rng(0).normal(size=(len(waves), SIZE, SIZE)))
+
+    @jax.jit
+    def merit(lens, defocus):
+        found = drt_jax.psf(
+            lens, field, far, waves, PIXEL, SIZE, model, centre=(0.0, 24.57), defocus=defocus
+        )
+        return jnp.sum(wanted * found.kernel) + found.solid_angle[0]
+
+    gradient = jax.jit(jax.grad(merit, argnums=(0, 1)))(lens, 0.0)
+    for name in ("curvature", "thickness", "sensor"):
+        value = np.asarray(getattr(lens, name))
+        size = 1e-9 if name == "curvature" else 1e-6
+        toward = np.random.default_rng(1).normal(size=value.shape) * size
+        if name == "curvature":
+            toward[value == 0] = 0  # neither the sensor nor the plane stop bends
+        moved = [
+            merit(dataclasses.replace(lens, **{name: jnp.asarray(value + s * toward)}), 0.0)
+            for s in (-2, -1, 1, 2)
+        ]
+        slope = (8 * (moved[2] - moved[1]) - (moved[3] - moved[0])) / 12
+        found = np.sum(np.asarray(getattr(gradient[0], name)) * toward)
+        np.testing.assert_allclose(found, slope, rtol=2e-5, err_msg=name)
+    step = 1e-5
+    focus = [merit(lens, s * step) for s in (-2, -1, 1, 2)]
+    slope = (8 * (focus[2] - focus[1]) - (focus[3] - focus[0])) / (12 * step)
+    np.testing.assert_allclose(gradient[1], slope, rtol=2e-5)
+
+
+def test_defocus_is_the_sensor_moved(double_gauss):
+    lens, *rest = double_gauss
+    model = drt_jax.converged_psf(*double_gauss, PIXEL, SIZE, "waves", 5e-2)
+    moved = dataclasses.replace(lens, sensor=lens.sensor + 0.05)
+    one = drt_jax.psf(lens, *rest, PIXEL, SIZE, model, defocus=0.05)
+    two = drt_jax.psf(moved, *rest, PIXEL, SIZE, model)
+    np.testing.assert_allclose(one.centre, two.centre, atol=1e-12)
+    np.testing.assert_allclose(one.kernel, two.kernel, atol=1e-9)
+
+
+def test_auto_says_how_good_the_gaussian_is(double_gauss):
+    model = drt_jax.converged_psf(*double_gauss, PIXEL, SIZE, "auto", 0.2)
+    # Here the Gaussian misses the waves by more than half of the light.
+    assert 0.3 < model.errors["gaussian"] < 2
+    assert model.kind != "gaussian"
+    assert set(model.errors) == {"gaussian", "rays"}
+
+
+def test_a_model_serves_inside_jit_and_vmap(double_gauss):
+    lens, _, far, waves = double_gauss
+    fields = jnp.radians(jnp.array([[0.0, 5.0], [0.0, 12.0]]))
+    model = drt_jax.converged_psf(lens, fields, far, waves, PIXEL, SIZE, "rays", 5e-2)
+
+    @jax.jit
+    def kernels(fields):
+        return jax.vmap(lambda f: drt_jax.psf(lens, f, far, waves, PIXEL, SIZE, model).kernel)(
+            fields
+        )
+
+    alone = drt_jax.psf(lens, fields[1], far, waves, PIXEL, SIZE, model).kernel
+    np.testing.assert_allclose(kernels(fields)[1], alone, atol=1e-12)
+    with pytest.raises(ValueError, match="make the model outside"):
+        jax.jit(lambda f: drt_jax.psf(lens, f, far, waves, PIXEL).kernel)(fields[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pixel": 0.0}, "pixel: must be above 0"),
+        ({"size": 0}, "size: expected"),
+        ({"model": "airy"}, "model: expected one of gaussian, rays, waves, auto"),
+        ({"tolerance": 2.0}, "tolerance: expected"),
+        ({"centre": (0.0, 0.0, 0.0)}, "centre: expected x and y"),
+    ],
+)
+def test_what_is_no_kernel_is_refused(double_gauss, change, message):
+    named = {"pixel": PIXEL, "size": SIZE, "model": "gaussian"} | change
+    with pytest.raises(ValueError, match=message):
+        drt_jax.psf(*double_gauss, **named)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "rays", "waves"])
+def test_without_light_a_kernel_is_dark_and_its_slopes_are_nothing(kind):
+    lens = drt_jax.load_lens("cooke_triplet")
+    model = drt_jax.converged_psf(lens, [0.0, 0.1], jnp.inf, [0.55], 0.02, 5, kind, 0.1)
+
+    def light(lens):
+        found = drt_jax.psf(lens, [0.0, 0.7], jnp.inf, [0.55], 0.02, 5, model)
+        return jnp.sum(found.kernel) + jnp.sum(found.solid_angle), found
+
+    slopes, found = jax.grad(light, has_aux=True)(lens)
+    parts = (found.kernel, found.outside, found.throughput, found.solid_angle)
+    assert all(np.all(np.asarray(part) == 0) for part in parts)
+    assert all(np.all(np.asarray(leaf) == 0) for leaf in jax.tree.leaves(slopes))
+
+
+def test_no_program_takes_several_matrices_to_lapack_at_once():
+    """LAPACK's loop over matrices waits for XLA's threads in one of them: two of them never end."""
+    lens, rule = drt_jax.load_lens("singlet"), beam_rule(4, "bilateral")
+    model = drt_jax.PsfModel("waves", rule, 8)
+
+    def light(lens, field):
+        found = drt_jax.psf(lens, field, FAR, WAVES, PIXEL, 3, model)
+        return jnp.sum(found.kernel**2) + jnp.sum(found.solid_angle)
+
+    fields = jnp.array([0.01, 0.02])
+    many = jax.jit(jax.vmap(jax.value_and_grad(light), (None, 0)))
+    text = many.lower(lens, fields).compile().as_text()
+    calls = [line for line in text.splitlines() if re.search('target="(lapack|blas)_', line)]
+    shapes = [re.search(r"f64\[([\d,]+)\]", line).group(1) for line in calls]
+    assert shapes and all(s.count(",") < 2 or s.startswith("1,") for s in shapes), shapes

@@ -1,0 +1,67 @@
+"""Images against closed forms and against what OpticStudio prints."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import yaml
+
+import drt_jax
+from drt_jax import Gauss, load_lens
+from drt_jax.image.beam import beam_rule, centroid_and_variances, trace_beam
+from drt_jax.lens.scene import scene_of
+
+WAVE = 0.5
+# P11: per axis, mm^2, of a paraboloid f = 50 of semi-diameter 20, out of focus by delta.
+VARIANCES = {0.1: 0.00042233607320576864, -1.0: 0.042233607320576856}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delta", VARIANCES)
+def test_the_exact_moment_of_defocus(delta):
+    """P11: a ray meets the sensor at delta h / (f - h^2 / (4 f)); so do beams moved to it."""
+    surface = {"radius": -100.0, "conic": -1.0, "mirror": True, "thickness": -50.0}
+    lens = load_lens({"surfaces": [surface | {"stop": True, "semi_diameter": 20.0}]})
+    rule, scene = Gauss(24, "bilateral"), (0.0, np.inf, WAVE)
+
+    @jax.jit
+    def variances(step):
+        moved = dataclasses.replace(lens, sensor=lens.sensor + step)
+        return drt_jax.psf_moments(moved, *scene, rule=rule).covariance[0]
+
+    wanted = VARIANCES[delta]
+    for step in (delta, -delta):  # the light runs backwards; only its size counts
+        np.testing.assert_allclose(variances(step), wanted * np.eye(2), rtol=1e-12, atol=1e-15)
+        slope = jax.jacfwd(variances)(step)
+        np.testing.assert_allclose(slope, 2 * wanted / step * np.eye(2), rtol=1e-11, atol=1e-14)
+    beam = trace_beam(lens, scene_of(lens, *scene), beam_rule(20, "bilateral")).refocused(delta)
+    xx, xy, yy = centroid_and_variances(beam.hits[:, -1], beam.weights)[1]
+    np.testing.assert_allclose([xx[0], xy[0], yy[0]], [wanted, 0, wanted], rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_the_huygens_psf_that_opticstudio_prints(shared):
+    """P04: to its sampling of the pupil's edge."""
+    rows = yaml.safe_load((shared / "psf_cases.yaml").read_text())["cases"]
+    case = next(row for row in rows if row["id"].startswith("P04"))
+    printed, tolerance = case["reference"], case["tolerance"]
+    stop = {"curvature": 0, "thickness": 0.0, "semi_diameter": 1.0, "stop": True}
+    front = {"radius": 20.0, "index": 1.5, "thickness": 1.0}
+    lens = load_lens({"surfaces": [stop, front, {"radius": -20.0, "thickness": 19.792}]})
+    scene, wave = (lens, 0.0, np.inf, 0.543), 0.543e-3
+    spacing, size = case["inputs"]["pixel_um"] * 1e-3, 127
+    model = drt_jax.PsfModel("waves", beam_rule(10, "bilateral"), 128)
+    wanted = np.array(printed["profile_along_x_from_centre_pixels_0_to_20"])
+    diagonal = np.array(printed["diagonal_from_centre_pixels_0_to_11"])
+    pixel = spacing / 3
+    found = drt_jax.psf(*scene, pixel, size, model)
+    light = np.asarray(found.kernel[0]) * wave**2 / (pixel**2 * float(found.solid_angle[0]))
+    # A pixel holds the mean over its square: that of a point is less by its bend / 24.
+    around = sum(np.roll(light, s, a) for s in (-1, 1) for a in (0, 1)) - 4 * light
+    light = light - around / 24
+    across = light[63, 63::3][: wanted.size]
+    down = np.diagonal(light)[63::3][: diagonal.size]
+    assert abs(across[0] - printed["strehl_printed"]) < tolerance["strehl"]
+    np.testing.assert_allclose(across, wanted, rtol=0, atol=tolerance["intensity_abs"])
+    np.testing.assert_allclose(down, diagonal, rtol=0, atol=tolerance["intensity_abs"])
