@@ -10,7 +10,7 @@ from ..lens.glass import VISIBLE, Dispersion, Glass, find_glass, model_glass, re
 from .entry import Entry
 
 _DENSEST = 10
-MEDIUM_KEYS = ("glass", "index", "nd", "vd")
+MEDIUM_KEYS = ("glass", "index", "nd", "vd", "partial")
 
 
 def _own_glasses(top: Entry) -> dict[str, Glass]:
@@ -54,7 +54,10 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
     if ("nd" in entry) != ("vd" in entry):
         raise entry.error("", "nd and vd make a model glass together: give both or neither")
     if "nd" in entry:
-        return _model_glass(entry, "nd", entry.number("nd"), entry.number("vd"))
+        values = entry.number("nd"), entry.number("vd"), entry.number("partial", 0.0)
+        return _model_glass(entry, "nd", *values)
+    if "partial" in entry:
+        raise entry.error("partial", "belongs to a model glass: give nd and vd as well")
     if "index" in entry:
         value = entry.number("index")
         if not 1 <= value <= _DENSEST:
@@ -75,9 +78,9 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
         raise entry.error("glass", str(error)) from error
 
 
-def _model_glass(entry: Entry, key: str, nd: float, vd: float) -> Glass:
+def _model_glass(entry: Entry, key: str, *values: float) -> Glass:
     try:
-        return model_glass(nd, vd)
+        return model_glass(*values)
     except ValueError as error:
         raise entry.error(key, str(error)) from error
 

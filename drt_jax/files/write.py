@@ -11,14 +11,16 @@ from jax import Array
 
 from ..lens.elements import Elements
 from ..lens.forms import FORMS
-from ..lens.glass import ANY, Dispersion, find_glass, glass_names
 from ..lens.lens import Lens
 from .entry import LensError
+from .media_out import constants_of, medium_of
+from .write_zmx import zmx_text
 
 
 def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
-    """Write a lens as a YAML prescription; `load_lens` makes the same lens of it, to the last digit
-    (of tilts, which files hold in degrees, to the last but one).
+    """Write a lens as a YAML prescription, or as a Zemax file where the path ends in `.zmx`;
+    `load_lens` makes the same lens of it, to the last digit (of tilts, which files hold in degrees,
+    and of model glasses and radii in `.zmx`, to the last but one).
 
     Constants of a glass that are not those of the catalogue stand in the file, where a second
     medium of the same name that has other constants is called name*.
@@ -26,6 +28,10 @@ def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
     path: of the file, which is replaced. LensError for what a prescription cannot hold, such as a
     curved sensor, or if the file cannot be written.
     """
+    if pathlib.Path(path).suffix.lower() == ".zmx":
+        return _write(zmx_text(lens), path)
+    if pathlib.Path(path).suffix.lower() == ".seq":
+        raise LensError(f"{path}: .seq files are not written; save as .yaml or .zmx")
     if np.any([np.asarray(a)[-1] for a in (lens.curvature, lens.conic)]):
         raise LensError("sensor: a prescription has none that is curved")
     top: dict[str, Any] = {"name": lens.name} if lens.name else {}
@@ -38,8 +44,12 @@ def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
     top["sensor"] = float(lens.sensor)
     top |= {f"sensor_{key}": value for key, value in _place(lens, lens.count).items()}
     text = yaml.safe_dump(top, sort_keys=False, default_flow_style=None, width=1000)
+    _write(text, path)
+
+
+def _write(text: str, path: str | pathlib.Path) -> None:
     try:
-        pathlib.Path(path).write_text(text)
+        pathlib.Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
         raise LensError(f"{path}: cannot be written: {error.strerror}") from error
 
@@ -97,7 +107,7 @@ def _phase(lens: Lens, i: int) -> dict[str, Any]:
 
 def _media(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Keys of each medium, none for air, and the glasses whose constants the file has to tell."""
-    plain = [_plain_medium(lens, i) for i in range(lens.count + 1)]
+    plain = [medium_of(lens, i) for i in range(lens.count + 1)]
     described = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
     media: list[dict[str, Any]] = []
     glasses: dict[str, Any] = {}
@@ -105,51 +115,12 @@ def _media(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
         if i and name == lens.glasses[i - 1]:  # light keeps the constants of the medium in front
             keys = media[-1]
         elif keys is None or keys.get("glass") in described:
-            own = _constants(lens.dispersion, i)
+            own = constants_of(lens.dispersion, i)
             while glasses.setdefault(name, own) != own:  # another medium of this name
                 name += "*"
             keys = {"glass": name}
         media.append(keys)
     return media, glasses
-
-
-def _plain_medium(lens: Lens, i: int) -> dict[str, Any] | None:
-    """Keys of a medium; None if its constants are its own."""
-    own = _constants(lens.dispersion, i)
-    if lens.dispersion.model is not None and lens.dispersion.model[i, 0] != 1:
-        if own.keys() - {"range"}:
-            raise LensError(f"glasses[{i}]: a prescription has no constants beside nd and vd")
-        nd, vd = np.asarray(lens.dispersion.model[i]).tolist()
-        return {"nd": nd, "vd": vd}
-    if not own:
-        return {}
-    if own.keys() == {"schott"} and not any(own["schott"][1:]):
-        return {"index": math.sqrt(own["schott"][0])}
-    unnamed = lens.glasses[i] in lens.labels.unnamed.glasses  # returned by a program
-    for name in glass_names() if unnamed else [lens.glasses[i]]:
-        try:
-            known = Dispersion.of([find_glass(name)])
-        except ValueError:
-            return None
-        if own == _constants(known, 0):
-            return {"glass": name}
-    return None
-
-
-def _constants(dispersion: Dispersion, i: int) -> dict[str, Any]:
-    """What tells medium i among the glasses of a prescription; nothing for air."""
-    parts = (dispersion.strength, dispersion.resonance, dispersion.schott)
-    strength, resonance, schott = (np.asarray(part[i]).tolist() for part in parts)
-    terms = max((k + 1 for k, pair in enumerate(zip(strength, resonance)) if any(pair)), default=0)
-    constants: dict[str, Any] = {}
-    if terms:
-        constants["sellmeier"] = strength[:terms] + resonance[:terms]
-    if schott != [1, 0, 0, 0, 0, 0]:
-        constants["schott"] = schott
-    known = np.asarray(dispersion.ranges[i]).tolist()
-    if known != [*ANY]:
-        constants["range"] = known
-    return constants
 
 
 def _apertures(lens: Lens, i: int) -> dict[str, Any]:

@@ -1,0 +1,51 @@
+"""Media of a lens as entries of a prescription."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..lens.glass import ANY, Dispersion, find_glass, glass_names
+from ..lens.lens import Lens
+from .entry import LensError
+
+
+def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
+    """Keys of a medium; None if its constants are its own."""
+    own = constants_of(lens.dispersion, i)
+    if lens.dispersion.model is not None and lens.dispersion.model[i, 0] != 1:
+        if own.keys() - {"range"}:
+            raise LensError(f"glasses[{i}]: a prescription has no constants beside nd and vd")
+        nd, vd = np.asarray(lens.dispersion.model[i]).tolist()
+        partial = lens.dispersion.partial
+        above = {} if partial is None or not partial[i] else {"partial": float(partial[i])}
+        return {"nd": nd, "vd": vd} | above
+    if not own:
+        return {}
+    if own.keys() == {"schott"} and not any(own["schott"][1:]):
+        return {"index": math.sqrt(own["schott"][0])}
+    unnamed = lens.glasses[i] in lens.labels.unnamed.glasses  # returned by a program
+    for name in glass_names() if unnamed else [lens.glasses[i]]:
+        try:
+            known = Dispersion.of([find_glass(name)])
+        except ValueError:
+            return None
+        if own == constants_of(known, 0):
+            return {"glass": name}
+    return None
+
+
+def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
+    """What tells medium i among the glasses of a prescription; nothing for air."""
+    parts = (dispersion.strength, dispersion.resonance, dispersion.schott)
+    strength, resonance, schott = (np.asarray(part[i]).tolist() for part in parts)
+    terms = max((k + 1 for k, pair in enumerate(zip(strength, resonance)) if any(pair)), default=0)
+    constants: dict[str, Any] = {}
+    if terms:
+        constants["sellmeier"] = strength[:terms] + resonance[:terms]
+    if schott != [1, 0, 0, 0, 0, 0]:
+        constants["schott"] = schott
+    known = np.asarray(dispersion.ranges[i]).tolist()
+    if known != [*ANY]:
+        constants["range"] = known
+    return constants

@@ -1,0 +1,211 @@
+"""What lens files of other programs have in common: a prescription with the lines it came from."""
+
+import dataclasses
+import math
+import re
+import warnings
+from typing import Any, Literal
+
+import numpy as np
+
+from ..inputs import InputError, Lines, one_line, shown
+from ..lens.lens import Lens
+from .entry import LensError
+from .specs import build_lens
+
+Missing = Literal["error", "warn"]
+_FAR = 1e10  # mm, from where on a distance of a file is infinite
+_TINY = 1e-6  # mm, of the stop until its size is known
+
+
+@dataclasses.dataclass
+class Breaking:
+    """A coordinate break: shift in mm, tilt in degrees about x, the turned y and the turned z, and
+    the distance to what follows, mm."""
+
+    line: int
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    thickness: float = 0.0
+
+
+@dataclasses.dataclass
+class Row:
+    """A surface of a file: entry as of a prescription, name in messages, its line."""
+
+    name: str
+    line: int
+    entry: dict[str, Any] = dataclasses.field(default_factory=dict)
+    lines: dict[str, int] = dataclasses.field(default_factory=dict)
+    thickness: float = 0.0
+
+    def put(self, key: str, value: object, line: int) -> None:
+        """An entry and its line."""
+        self.entry[key] = value
+        self.lines[key] = line
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is a plane in air that does nothing."""
+        return set(self.entry) <= {"curvature"} and not self.entry.get("curvature")
+
+
+@dataclasses.dataclass
+class Record:
+    """A file as it is read. Lengths in mm.
+
+    path, missing: as of `load_lens`. name: of the lens. source: what makes the object's medium.
+    parts: surfaces and coordinate breaks in their order, the image the last surface.
+    notes: what is read otherwise than it stands there.
+    """
+
+    path: str
+    missing: Missing
+    name: str = ""
+    distance: float = math.inf
+    parts: list[Row | Breaking] = dataclasses.field(default_factory=list)
+    medium: dict[str, Any] = dataclasses.field(default_factory=dict)
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    def error(self, line: int, message: str) -> LensError:
+        """An error of a line of the file; 0: of the file."""
+        return LensError(f"{self.path}{f', line {line}' if line else ''}: {message}")
+
+    def lacks(self, line: int, message: str) -> None:
+        """LensError for what the package has not, or a note where it may be left out."""
+        if self.missing == "error":
+            raise self.error(line, f'{message}; missing="warn" leaves it out')
+        self.notes.append(f"line {line}: left out: {message}")
+
+    def say(self) -> None:
+        """One warning of all notes."""
+        if self.notes:
+            warnings.warn(f"{self.path}: {'; '.join(self.notes)}", stacklevel=4)
+
+    def number(
+        self, line: int, words: list[str], at: int = 0, default: float | None = None
+    ) -> float:
+        """A number among words, finite."""
+        if at >= len(words):
+            if default is None:
+                raise self.error(line, f"a number is missing: word {at + 2} of the line")
+            return default
+        try:
+            value = float(words[at]) if len(words[at]) <= 60 else math.nan
+        except ValueError:
+            value = math.nan
+        if "_" in words[at] or not math.isfinite(value):
+            raise self.error(line, f"expected a number, got {shown(words[at])}")
+        return value
+
+    def count(self, line: int, words: list[str], at: int = 0, default: int | None = None) -> int:
+        """A whole number among words."""
+        value = self.number(line, words, at, default)
+        if value % 1 or abs(value) > 1e9:
+            raise self.error(line, f"expected a whole number, got {value:g}")
+        return int(value)
+
+    def numbers(self, line: int, words: list[str], count: int) -> list[float]:
+        """The first numbers, so many."""
+        return [self.number(line, words, i) for i in range(count)]
+
+    def lens(self, semi_diameter: float | None) -> Lens:
+        """The lens; its stop has no size yet unless `semi_diameter` (mm) is given."""
+        top, lines, names = self._prescription(semi_diameter or _TINY)
+        image = [part for part in self.parts if isinstance(part, Row)][-1]
+        try:
+            lens = build_lens(top, self.name or "lens")
+        except InputError as error:
+            found = re.sub(r"surfaces\[(\d+)\]", lambda m: names[int(m[1])], str(error))
+            raise LensError(f"{self.path}{lines.of(error.key)}: {found}", error.key) from None
+        return _with_image(lens, image)
+
+    def _prescription(self, semi_diameter: float) -> tuple[dict[str, Any], Lines, list[str]]:
+        """As `build_lens` takes it, the line of each key, the name of each surface."""
+        surfaces: list[dict[str, Any]] = []
+        elements: list[dict[str, Any]] = []
+        lines, names, waiting = Lines(), list[str](), list[Breaking]()
+        *rows, image = [part for part in self.parts if isinstance(part, Row)]
+        for part in self.parts:
+            if isinstance(part, Breaking):
+                waiting.append(part)
+                if surfaces:
+                    surfaces[-1]["thickness"] += part.thickness
+                else:
+                    self.distance += part.thickness
+                continue
+            if not surfaces and self.distance <= 0 and part.plain and not waiting:
+                self.distance += part.thickness  # a plane at the object
+                continue
+            i, behind = len(surfaces), sum(own.thickness for own in waiting)
+            for own in waiting:
+                lines[f"elements[{len(elements)}]"] = own.line
+                elements.append(
+                    {
+                        "surfaces": [i, "sensor"] if part is not image else ["sensor", "sensor"],
+                        "about": i if part is not image else "sensor",
+                        "pivot": -behind,
+                        "shift": list(own.shift),
+                        "tilt": list(own.tilt),
+                    }
+                )
+                behind -= own.thickness
+            waiting = []
+            if part is image:
+                break
+            place = f"surfaces[{i}]"
+            lines[place] = part.line
+            lines |= {f"{place}.{key}": line for key, line in part.lines.items()}
+            names.append(part.name)
+            surfaces.append(part.entry | {"thickness": part.thickness})
+            if part.entry.get("stop"):
+                surfaces[-1]["semi_diameter"] = semi_diameter
+        if not surfaces:
+            raise self.error(0, "no surface lies between object and image")
+        if self.distance <= 0:
+            raise self.error(rows[0].line, f"the object lies {-self.distance:g} mm behind this")
+        top: dict[str, Any] = {"surfaces": surfaces}
+        top |= {"elements": elements} if elements else {}
+        top |= {"object": self.medium} if self.medium else {}
+        return top, lines, names
+
+
+def _with_image(lens: Lens, image: Row) -> Lens:
+    """The lens with the curved sensor of a file."""
+    curvature, conic = image.entry.get("curvature", 0.0), image.entry.get("conic", 0.0)
+    if not curvature:
+        return lens
+    return dataclasses.replace(
+        lens,
+        curvature=lens.curvature.at[-1].set(curvature),
+        conic=lens.conic.at[-1].set(conic),
+        curved=(*lens.curved, lens.count),
+    )
+
+
+def distance_of(value: float) -> float:
+    """A distance of a file, inf from 1e10 mm on."""
+    return math.inf if value >= _FAR else value
+
+
+def turned_back(tilt: tuple[float, float, float]) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """The rotation of tilts in degrees about z, the turned y and the turned x, and the same as
+    tilts about x, y and z."""
+    a, b, c = np.radians(tilt)
+    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    turn = z @ y @ x
+    if np.count_nonzero(tilt) <= 1:
+        return turn, tilt
+    angles = (
+        math.degrees(math.atan2(-turn[1, 2], turn[2, 2])),
+        math.degrees(math.asin(max(-1.0, min(1.0, turn[0, 2])))),
+        math.degrees(math.atan2(-turn[0, 1], turn[0, 0])),
+    )
+    return turn, angles
+
+
+def short(text: str) -> str:
+    """Words of a file in a message or a name."""
+    return one_line(text)[:60]

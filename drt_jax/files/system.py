@@ -1,0 +1,174 @@
+"""What a lens is used for, as files of other programs tell: fields, wavelengths, aperture."""
+
+import dataclasses
+import math
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..lens.lens import Lens
+from ..lens.paraxial import (
+    effective_focal_length,
+    entrance_pupil,
+    f_number,
+    image_height,
+)
+from ..lens.scene import field_of_height
+from .record import Record
+
+ApertureKind = Literal["pupil diameter", "f-number", "working f-number", "object NA", "image NA"]
+FieldKind = Literal["angle", "object height", "paraxial image height", "real image height"]
+
+
+@dataclasses.dataclass(frozen=True)
+class System:
+    """A lens and how a file uses it.
+
+    lens: its stop as wide as the aperture of the file asks.
+    distance: from the object to the first vertex, mm, inf allowed.
+    fields: (F, 2) in radians along x and y, see `Scene`; None where the file tells real image
+        heights: `field_of_image(lens, height, ...)` finds the field of each.
+    heights: (F, 2), the fields as they stand in the file: degrees, or mm.
+    field_kind: what `heights` are.
+    field_weights: (F,).
+    vignetting: (F, 5), of each field the shift of the pupil in x and y, its compression in x and y,
+        in parts of its radius, and its turn in radians: x' = shift + (1 - compression) x.
+    wavelengths: (W,) in um. wavelength_weights: (W,). primary: the index of the primary one.
+    aperture: the value that the file gives for `aperture_kind`; None for the size of the stop.
+    ray_aiming: how the other program launches rays: at the paraxial entrance pupil, `off` (see
+        `with_paraxial_pupil`), or as here at the stop.
+    notes: what the file has and the lens has not, or reads otherwise.
+    """
+
+    lens: Lens
+    distance: float
+    fields: np.ndarray | None
+    heights: np.ndarray
+    field_kind: FieldKind
+    field_weights: np.ndarray
+    vignetting: np.ndarray
+    wavelengths: np.ndarray
+    wavelength_weights: np.ndarray
+    primary: int
+    aperture: float | None
+    aperture_kind: ApertureKind | None
+    ray_aiming: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass
+class Use:
+    """What `System` needs, as it is read; line: of the aperture."""
+
+    line: int = 0
+    aperture: float | None = None
+    aperture_kind: ApertureKind | None = None
+    field_kind: FieldKind = "angle"
+    field_line: int = 0
+    heights: list[tuple[float, float]] = dataclasses.field(default_factory=lambda: [(0.0, 0.0)])
+    field_weights: list[float] = dataclasses.field(default_factory=lambda: [1.0])
+    vignetting: list[list[float]] = dataclasses.field(default_factory=lambda: [[0.0] * 5])
+    wavelengths: list[float] = dataclasses.field(default_factory=list)
+    wavelength_weights: list[float] = dataclasses.field(default_factory=list)
+    primary: int = 0
+    primary_line: int = 0
+    ray_aiming: str = ""
+    stop: float | None = None
+
+
+def lens_of(record: Record, use: Use) -> Lens:
+    """The lens of a file, its stop as wide as the aperture asks."""
+    if not use.wavelengths:
+        raise record.error(0, "no wavelength is given")
+    if not 0 <= use.primary < len(use.wavelengths):
+        many = len(use.wavelengths)
+        raise record.error(use.primary_line, f"the primary wavelength is none of the {many}")
+    direct = use.aperture_kind is None
+    if direct and not use.stop:
+        raise record.error(use.line, "the aperture is the size of the stop, which has none")
+    lens = record.lens(use.stop if direct else None)
+    try:
+        lens.check_wavelengths(use.wavelengths)
+    except ValueError as error:
+        raise record.error(use.primary_line, str(error)) from None
+    return lens if direct else _opened(record, use, lens, use.wavelengths[use.primary])
+
+
+def system_of(record: Record, use: Use) -> System:
+    """The lens of a file and its use."""
+    lens = lens_of(record, use)
+    wave = use.wavelengths[use.primary]
+    heights = np.array(use.heights, float)
+    return System(
+        lens=lens,
+        distance=record.distance,
+        fields=_angles(record, use, lens, heights, wave),
+        heights=heights,
+        field_kind=use.field_kind,
+        field_weights=np.array(use.field_weights, float),
+        vignetting=np.array(use.vignetting, float),
+        wavelengths=np.array(use.wavelengths, float),
+        wavelength_weights=np.array(use.wavelength_weights, float),
+        primary=use.primary,
+        aperture=use.aperture,
+        aperture_kind=use.aperture_kind,
+        ray_aiming=use.ray_aiming,
+        notes=tuple(record.notes),
+    )
+
+
+def _opened(record: Record, use: Use, lens: Lens, wave: float) -> Lens:
+    """The lens with its stop as wide as the aperture asks, by paraxial optics."""
+    semi, value = float(lens.semi_diameter[lens.stop]), float(use.aperture or 0)
+    pupil = entrance_pupil(lens, wave)
+    place, radius = float(pupil.position[0]), float(pupil.semi_diameter[0])
+    far, kind = record.distance, use.aperture_kind
+    front, last = (float(lens.index(wave)[k, 0]) for k in (0, -1))
+    if value <= 0:
+        raise record.error(use.line, f"the aperture must be above 0, got {value:g}")
+    if kind == "pupil diameter":
+        wide = value / 2
+    elif kind == "f-number":
+        wide = abs(float(effective_focal_length(lens, wave)[0])) / value / 2
+    elif kind == "object NA":
+        sine = value / front
+        if not (sine < 1 and math.isfinite(far)):
+            raise record.error(use.line, f"no object at {far:g} mm has an NA of {value:g}")
+        wide = abs(math.tan(math.asin(sine)) * (far + place))
+    else:
+        slope = value / last if kind == "image NA" else 1 / (2 * value * last)
+        if kind == "image NA" and not slope < 1:
+            raise record.error(use.line, f"there is no image NA of {value:g}")
+        slope = math.tan(math.asin(slope)) if kind == "image NA" else slope
+        wide = radius * slope * 2 * float(f_number(lens, far, wave)[0])
+    found = semi * wide / radius if radius else math.nan
+    if not (math.isfinite(found) and 0 < found < 1e9):
+        raise record.error(use.line, f"no stop makes {kind} {value:g}: is the lens afocal there?")
+    return dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[lens.stop].set(found))
+
+
+def _angles(
+    record: Record, use: Use, lens: Lens, heights: np.ndarray, wave: float
+) -> np.ndarray | None:
+    """Fields in radians (F, 2); None for real image heights."""
+    far, line = record.distance, use.field_line
+    if use.field_kind == "angle":
+        if np.any(np.abs(heights) >= 90):
+            raise record.error(line, "a field angle of 90 degrees and more; give image heights")
+        if math.isinf(far):
+            return np.radians(heights)
+        place = float(entrance_pupil(lens, wave).position[0])
+        if not math.isfinite(place):
+            raise record.error(line, "field angles at a telecentric lens; give object heights")
+        return np.asarray(field_of_height(-np.tan(np.radians(heights)) * (far + place), far))
+    if use.field_kind == "object height":
+        if math.isinf(far):
+            raise record.error(line, "object heights of an object at infinity; give angles")
+        return np.asarray(field_of_height(heights, far))
+    if use.field_kind == "paraxial image height":
+        scale = float(image_height(lens, jnp.asarray(math.pi / 4), far, wave)[0])
+        if not math.isfinite(scale) or not scale:
+            raise record.error(line, "paraxial image heights of an image at infinity; give angles")
+        return np.arctan(heights / scale)
+    return None

@@ -1,0 +1,73 @@
+"""Text of lens files of other programs: bounded, in the encodings that occur, in lines of words."""
+
+import codecs
+import os
+import re
+from typing import NamedTuple
+
+from ..inputs import InputError, one_line, read_bytes
+
+LARGEST = 2**24  # bytes of a file
+_MOST = 400_000  # lines
+_LONGEST = 4000  # characters of a line that are read
+_BOMS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+
+
+class Words(NamedTuple):
+    """A line of a file: its number, from 1, its first word and the others, and whether it was
+    indented."""
+
+    line: int
+    key: str
+    rest: list[str]
+    indented: bool
+
+
+def decoded(content: bytes) -> str:
+    """Text of a file: its byte order mark decides, else UTF-8, else Latin-1. InputError, with the
+    byte, for what is no text."""
+    known = [name for mark, name in _BOMS if content.startswith(mark)]
+    head = content[:1000]
+    if not known and head[1::2].count(0) > len(head) // 4:
+        known = ["utf-16-le"]
+    elif not known and head[::2].count(0) > len(head) // 4:
+        known = ["utf-16-be"]
+    for name in known or ("utf-8", "latin-1"):
+        try:
+            text = content.decode(name)
+        except UnicodeDecodeError as error:
+            if known:
+                raise InputError(
+                    f"byte {error.start} is no {name} text: is the file cut short?"
+                ) from error
+            continue
+        break
+    odd = re.search("[\x00-\x08\x0e-\x19\x1b-\x1f\x7f-\x84\x86-\x9f]", text)
+    if odd:
+        raise InputError(f"character {odd.start()} is no text: is this a lens file?")
+    return text
+
+
+def lines_of(path: str | os.PathLike) -> list[str]:
+    """The lines of a file of at most 16 MB. InputError for what cannot be read."""
+    lines = decoded(read_bytes(path, LARGEST, "lens file")).splitlines()
+    if len(lines) > _MOST:
+        raise InputError(f"{len(lines)} lines are more than {_MOST}; is it the right file?")
+    for i, text in enumerate(lines):
+        if len(text) > _LONGEST and re.match(r"\s*[A-Z]{4}\s+[-+.\d]", text):
+            raise InputError(f"line {i + 1}: {len(text)} characters are more than {_LONGEST}")
+    return [text[:_LONGEST] for text in lines]
+
+
+def words_of(path: str | os.PathLike) -> list[Words]:
+    """Lines in words, without empty ones."""
+    found = []
+    for i, text in enumerate(lines_of(path)):
+        words = text.split()
+        if words:
+            found.append(Words(i + 1, one_line(words[0]).upper(), words[1:], text[0].isspace()))
+    return found

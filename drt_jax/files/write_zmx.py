@@ -1,0 +1,154 @@
+"""A lens written as a `.zmx` file: what `zmx` reads, backwards."""
+
+import math
+
+import numpy as np
+
+from ..lens.lens import Lens
+from .entry import LensError
+from .glasses import MAKERS
+from .media_out import medium_of
+from .model_zmx import to_ours, to_theirs
+
+_HEAD = """VERS 150514 0 0
+MODE SEQ
+NAME {name}
+UNIT MM X W X CM MR CPMM
+FLOA
+ENVD 2.0E+1 1 0
+GCAT {makers}
+RAIM 0 2 1 1 0 0 0 0 0
+FTYP 0 0 1 1 0 0 0
+XFLN 0 0 0 0 0 0 0 0 0 0 0 0
+YFLN 0 0 0 0 0 0 0 0 0 0 0 0
+FWGN 1 1 1 1 1 1 1 1 1 1 1 1
+WAVM 1 {wave!r} 1
+PWAV 1"""
+_TYPES = {  # of a form: the type, the parameters of coefficients, the first of which is a radius
+    "asphere": ("EVENASPH", range(1, 9), False),
+    "odd_asphere": ("ODDASPHE", range(1, 9), False),
+    "toroid": ("TOROIDAL", range(1, 9), True),
+    "biconic": ("BICONICX", range(1, 3), True),
+}
+_OTHERS = {"silica": "F_SILICA"}
+
+
+def zmx_text(lens: Lens) -> str:
+    """The lines of a file with an object at infinity and the line d, or the middle of the range of
+    the glasses. LensError, with the remedy, for what such files do not hold or we do not write."""
+    if lens.elements is not None or lens.tilt is not None or lens.decentre is not None:
+        raise LensError("elements, tilts and decentres are not written to .zmx: save as .yaml")
+    low, high = lens.dispersion.range
+    wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
+    makers = sorted({MAKERS[name] for name in lens.glasses if name in MAKERS})
+    head = {"name": " ".join(lens.name.split()), "wave": wave}
+    lines = [_HEAD.format(makers=" ".join([*makers, "SCHOTT"]), **head)]
+    front = ["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY", *_glass(lens, 0)]
+    blocks = [front, *(_surface(lens, i) for i in range(lens.count))]
+    curvature, conic = (float(a[-1]) for a in (lens.curvature, lens.conic))
+    blocks.append(["TYPE STANDARD", f"CURV {curvature!r}", f"CONI {conic!r}", "DISZ 0"])
+    for i, block in enumerate(blocks):
+        lines += [f"SURF {i}", *(f"  {line}" for line in block)]
+    return "\n".join([*lines, "MNUM 1 1", ""])
+
+
+def _gap(lens: Lens, i: int) -> float:
+    """The thickness behind a surface; of the last, that which makes the sum exact."""
+    gaps = np.asarray(lens.thickness, float).tolist()
+    if i < lens.count - 1:
+        return gaps[i]
+    before, sensor = sum(gaps), float(lens.sensor)
+    near = sensor - before + np.arange(-8, 9) * np.spacing(abs(sensor - before))
+    return float(near[np.argmin(np.abs(sum(gaps) + near - sensor))])
+
+
+def _surface(lens: Lens, i: int) -> list[str]:
+    lines = ["STOP"] if i == lens.stop else []
+    lines += [*_form(lens, i), f"CURV {float(lens.curvature[i])!r}"]
+    lines += [f"CONI {float(lens.conic[i])!r}"] if lens.conic[i] else []
+    lines += [f"DISZ {_gap(lens, i)!r}", *_glass(lens, i + 1)]
+    semi = float(lens.semi_diameter[i])
+    if math.isfinite(semi):
+        lines.append(f"DIAM {semi!r} 1 0 0 1")
+        lines += [f"FLAP 0 {semi!r} 0"] if i != lens.stop else []
+    return lines + _apertures(lens, i)
+
+
+def _form(lens: Lens, i: int) -> list[str]:
+    name, row = lens.forms[i], np.asarray(lens.coefficients[i], float).tolist()
+    if lens.phase is not None and i in lens.phase.surfaces:
+        return _grating(lens, i, any(row))
+    if name == "asphere" and not any(row):
+        return ["TYPE STANDARD"]
+    kind, numbers, radius = _TYPES.get(name, ("", (), False))
+    used = [k for k, value in enumerate(row) if value]
+    if not kind or (used and used[-1] >= len(numbers)):
+        what = f"form {name}" + (f" with {used[-1] + 1} coefficients" if kind else "")
+        raise LensError(f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
+    if radius and row[0]:
+        row[0] = 1 / row[0]
+    # The last one keeps the number of columns.
+    return [
+        f"TYPE {kind}",
+        *(f"PARM {n} {value!r}" for n, value in zip(numbers, row, strict=False)),
+    ]
+
+
+def _grating(lens: Lens, i: int, aspheric: bool) -> list[str]:
+    assert lens.phase is not None
+    at = lens.phase.surfaces.index(i)
+    row = np.asarray(lens.phase.coefficients[at], float)
+    if lens.phase.forms[at] != "linear" or aspheric or lens.forms[i] != "asphere":
+        raise LensError(f"surfaces[{i}].phase: only gratings on conics are written: save as .yaml")
+    return [
+        "TYPE DGRATING",
+        f"PARM 1 {float(row[0]) / 1e3!r}",
+        f"PARM 2 {float(lens.phase.order[at])!r}",
+    ]
+
+
+def _glass(lens: Lens, m: int) -> list[str]:
+    """The medium behind a surface, m from 1, or of the object."""
+    if m and lens.mirrors[m - 1]:
+        return ["GLAS MIRROR 0 0 1.5 40"]
+    keys = medium_of(lens, m)
+    if keys is None:
+        raise LensError(
+            f"glasses[{m}]: {lens.glasses[m]} has constants of its own, which a .zmx file does not "
+            "hold: save as .yaml, or use with_model_glass"
+        )
+    if "glass" in keys:
+        return [f"GLAS {_OTHERS.get(keys['glass'], keys['glass'])} 0 0 1.5 40"]
+    if "index" in keys:
+        return [f"GLAS ___BLANK 1 0 {keys['index']!r} 0 0"]
+    if not keys:
+        return []
+    ours = keys["nd"], keys["vd"], keys.get("partial", 0.0)
+    theirs = to_theirs(*ours)
+    for digits in range(3, 17):  # as short as it was
+        short = (round(theirs[0], digits), round(theirs[1], digits), round(theirs[2], digits))
+        if to_ours(*short) == ours:
+            theirs = short
+            break
+    return [f"GLAS ___BLANK 1 0 {' '.join(map(repr, theirs))}"]
+
+
+def _apertures(lens: Lens, i: int) -> list[str]:
+    extra = lens.apertures
+    own = [] if extra is None else [k for k, s in enumerate(extra.surfaces) if s == i]
+    if not own or extra is None:
+        return []
+    (k,) = own if len(own) == 1 else (None,)
+    if k is None or (math.isfinite(float(lens.semi_diameter[i])) and i != lens.stop):
+        raise LensError(f"surfaces[{i}]: a .zmx surface has one aperture: save as .yaml")
+    x, y = np.asarray(extra.sizes[k], float).tolist()
+    kind, blocks = extra.kinds[k], extra.blocks[k]
+    if kind == "circle":
+        lines = [f"OBSC 0 {x!r} 0" if blocks else f"CLAP 0 {x!r} 0"]
+    elif kind == "rectangle" and not blocks:
+        lines = [f"SQAP {x!r} {y!r} 0"]
+    else:
+        raise LensError(f"surfaces[{i}]: this aperture is not written to .zmx: save as .yaml")
+    if extra.centre is not None:
+        lines.append("OBDC " + " ".join(map(repr, np.asarray(extra.centre[k], float).tolist())))
+    return lines

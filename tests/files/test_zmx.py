@@ -1,0 +1,341 @@
+"""`.zmx` files: each keyword by its meaning, OpticStudio's own listings, and what is no file."""
+
+import pathlib
+import re
+import time
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drt_jax import LensError, first_order, load_lens, load_system, save_lens
+
+SHARED = pathlib.Path(__file__).resolve().parents[3] / "shared" / "data" / "lens_files"
+LISTED = pytest.mark.skipif(not SHARED.is_dir(), reason="listings lie beside the repository")
+HEADER = {
+    "UNIT": "MM X W X CM MR CPMM",
+    "ENPD": "10",
+    "GCAT": "SCHOTT",
+    "FTYP": "0 0 2 2 0 0 0",
+    "XFLN": "0 1 0 0",
+    "YFLN": "0 5 0 0",
+    "FWGN": "1 2 1 1",
+    "VDXN": "0 0 0 0",
+    "VDYN": "0 .1 0 0",
+    "VCXN": "0 .2 0 0",
+    "VCYN": "0 .3 0 0",
+    "VANN": "0 90 0 0",
+    "PWAV": "2",
+}
+WAVES = ["WAVM 1 .48 1", "WAVM 2 .55 3", "WAVM 3 .55 1"]
+FRONT = "TYPE STANDARD|STOP|CURV .02|DISZ 4|GLAS N-BK7 0 0 1.5 40|DIAM 6 0"
+BACK = "TYPE STANDARD|CURV -.02|DISZ 48|DIAM 6 0"
+IMAGE = "TYPE STANDARD|CURV 0|DISZ 0"
+
+
+def text(*surfaces, object="INFINITY", tail=("MNUM 1 1",), **header):
+    """A file with these surfaces between object and image, lines parted by |."""
+    top = [f"{key} {value}" for key, value in (HEADER | header).items() if value is not None]
+    blocks = [f"TYPE STANDARD|CURV 0|DISZ {object}", *surfaces, IMAGE]
+    for i, block in enumerate(blocks):
+        top += [f"SURF {i}", *(f"  {line}" for line in block.split("|"))]
+    return "\n".join([*top[:13], *WAVES, *top[13:], *tail])
+
+
+def read(folder, *surfaces, missing="error", **others):
+    path = folder / "lens.zmx"
+    path.write_text(text(*(surfaces or (FRONT, BACK)), **others))
+    return load_system(path, missing)
+
+
+def refused(folder, *surfaces, **others):
+    with pytest.raises(LensError) as error:
+        read(folder, *surfaces, **others)
+    return str(error.value).partition("lens.zmx")[2]
+
+
+def test_use_of_a_lens(tmp_path):
+    """The first of the columns, in their order; repeated wavelengths stay; pupil diameter."""
+    system = read(tmp_path)
+    np.testing.assert_array_equal(system.wavelengths, [0.48, 0.55])
+    np.testing.assert_array_equal(system.wavelength_weights, [1, 3])
+    assert system.primary == 1 and system.distance == np.inf and system.notes == ()
+    np.testing.assert_allclose(np.degrees(system.fields), [[0, 0], [1, 5]])
+    np.testing.assert_array_equal(system.field_weights, [1, 2])
+    np.testing.assert_allclose(system.vignetting[1], [0, 0.1, 0.2, 0.3, np.pi / 2])
+    assert float(system.lens.semi_diameter[0]) == 5  # stop at the first vertex
+    assert np.isinf(system.lens.semi_diameter[1])  # DIAM alone clips nothing
+    assert system.lens.glasses == ("air", "N-BK7", "air")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-8", "utf-8-sig", "latin-1"])
+def test_encodings_and_indents(tmp_path, encoding):
+    path = tmp_path / "lens.zmx"
+    own = text(FRONT, BACK, NAME="Zweilinser für 5 µm").replace("\n  ", "\n")
+    path.write_bytes(own.encode(encoding))
+    lens = load_lens(path)
+    assert lens.name == "Zweilinser für 5 µm" and lens.count == 2
+
+
+def test_units(tmp_path):
+    """Lengths in inches, coefficients in their powers; never wavelengths."""
+    even = FRONT.replace("STANDARD", "EVENASPH") + "|PARM 1 .001|PARM 2 1e-5"
+    mm, inch = read(tmp_path, even, BACK), read(tmp_path, even, BACK, UNIT="IN X")
+    scale = 25.4
+    np.testing.assert_allclose(inch.lens.curvature, mm.lens.curvature / scale, rtol=1e-15)
+    np.testing.assert_allclose(inch.lens.sensor, mm.lens.sensor * scale, rtol=1e-15)
+    np.testing.assert_allclose(mm.lens.coefficients[0], [1e-3, 1e-5])  # of r^2, r^4
+    np.testing.assert_allclose(inch.lens.coefficients[0], [1e-3 / scale, 1e-5 / scale**3])
+    np.testing.assert_array_equal(inch.wavelengths, mm.wavelengths)
+
+
+@pytest.mark.parametrize(
+    ("own", "form", "coefficients"),
+    [
+        ("ODDASPHE|PARM 1 .01|PARM 3 1e-4", "odd_asphere", [0.01, 0, 1e-4]),
+        ("TOROIDAL|PARM 1 40|PARM 2 1e-4|PARM 3 1e-6", "toroid", [0.025, 1e-4, 1e-6]),
+        ("TOROIDAL|PARM 1 0", "toroid", [0]),  # flat in x
+        ("BICONICX|PARM 1 -50|PARM 2 -1", "biconic", [-0.02, -1]),
+        ("TILTSURF|PARM 1 .1|PARM 2 .2", "polynomial_xy", [0.1, 0.2]),
+    ],
+)
+def test_types_of_surfaces(tmp_path, own, form, coefficients):
+    lens = read(tmp_path, FRONT.replace("STANDARD", own) + "|CONI -.5", BACK).lens
+    assert lens.forms[0] == form and lens.conic[0] == -0.5
+    np.testing.assert_allclose(lens.coefficients[0], coefficients, rtol=1e-15)
+
+
+def test_apertures(tmp_path):
+    """Floating and fixed rings, rectangles, obscurations, their centre; the stop's is its own."""
+    clear = "|FLAP 0 6 0|OBDC 1 -2"
+    ring = "TYPE STANDARD|CURV 0|DISZ 2|CLAP 1 5 0"
+    square = "TYPE STANDARD|CURV 0|DISZ 2|SQAP 3 4 0|OBDC 0 0"
+    dark = "TYPE STANDARD|CURV 0|DISZ 2|OBSC 0 2 0"
+    lens = read(tmp_path, FRONT, BACK + clear, ring, square, dark).lens
+    own = lens.apertures
+    np.testing.assert_array_equal(lens.semi_diameter[1:3], [np.inf, 5])
+    kinds = [*zip(own.surfaces, own.kinds, own.blocks, strict=True)]
+    assert set(kinds) == {
+        *((1, "circle", False), (2, "circle", True)),
+        *((3, "rectangle", False), (4, "circle", True)),
+    }
+    half = dict(zip(kinds, own.half.tolist(), strict=True))
+    assert half[1, "circle", False][0] == 6 and half[2, "circle", True][0] == 1
+    assert half[3, "rectangle", False] == [3, 4]
+    np.testing.assert_array_equal(own.centre[kinds.index((1, "circle", False))], [1, -2])
+
+
+BREAK = "TYPE COORDBRK|CURV 0|PARM 1 {}|PARM 2 {}|PARM 3 {}|PARM 4 {}|PARM 5 {}|PARM 6 {}|DISZ {}"
+
+
+def test_coordinate_breaks_are_right_handed_and_have_an_order(tmp_path):
+    """Order 0 decentres, then tilts about x, y, z; order 1 with all signs turned undoes it."""
+    there = BREAK.format(1, 2, 10, 20, 30, 0, 5)
+    back = BREAK.format(-1, -2, -10, -20, -30, 1, -5)
+    moved = read(tmp_path, FRONT, BACK, there).lens
+    x, y, z = (np.radians(angle) for angle in (10, 20, 30))
+    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+    about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+    turn = about_x @ about_y @ about_z
+    place, across, rotation = moved.places
+    np.testing.assert_allclose(rotation[-1], turn, atol=1e-15)
+    ahead = turn @ [0, 0, 5]
+    np.testing.assert_allclose([*across[-1], place[-1]], [1, 2, 52] + ahead, rtol=1e-14)
+    # Nothing is left of it once it is undone: 5 mm forward, 5 mm back in the turned frame.
+    undone = read(tmp_path, FRONT, BACK, there, BREAK.format(0, 0, 0, 0, 0, 0, -5), back).lens
+    place, across, rotation = undone.places
+    np.testing.assert_allclose(rotation[-1], np.eye(3), atol=1e-15)
+    np.testing.assert_allclose([*across[-1], place[-1]], [0, 0, 47], atol=1e-13)
+
+
+def test_a_mirror_keeps_the_medium_and_a_tilted_one_folds(tmp_path):
+    tilt, mirror = (
+        BREAK.format(0, 0, 45, 0, 0, 0, 0),
+        "TYPE STANDARD|STOP|CURV 0|DISZ 0|GLAS MIRROR",
+    )
+    lens = read(
+        tmp_path, FRONT.replace("|STOP", ""), BACK, tilt, mirror, tilt.replace("DISZ 0", "DISZ -20")
+    ).lens
+    assert lens.mirrors == (False, False, True)
+    np.testing.assert_allclose(lens.places[1][-1], [0, 20], atol=1e-14)  # -y' is +y here
+
+
+def test_apertures_of_systems_by_their_definition(tmp_path):
+    def first(**own):
+        system = read(tmp_path, ENPD=None, **own)
+        return first_order(system.lens, system.distance, jnp.array([0.55]))
+
+    found = first(FNUM="8 0")
+    wide = 2 * found.entrance_pupil.semi_diameter
+    np.testing.assert_allclose(found.effective_focal_length / wide, 8)
+    np.testing.assert_allclose(first(FNUM="8 1", object="200").f_number, 8)
+    edge = np.tan(np.arcsin(0.02)) * 200
+    for aperture in ("0.02 0", f"{np.degrees(np.arcsin(0.02))} 1", "0.02"):
+        found = first(OBNA=aperture, object="200")
+        np.testing.assert_allclose(found.entrance_pupil.semi_diameter, edge)
+    np.testing.assert_allclose(first(FLOA="").entrance_pupil.semi_diameter, 6)
+
+
+def test_kinds_of_fields(tmp_path):
+    system = read(tmp_path, object="200", FTYP="1 0 2 2")
+    np.testing.assert_allclose(np.tan(system.fields[1]), [-1 / 200, -5 / 200])
+    angled = read(tmp_path, object="200")  # seen from the entrance pupil, at the first vertex
+    np.testing.assert_allclose(np.degrees(angled.fields[1]), [1, 5])
+    system = read(tmp_path, FTYP="2 0 2 2")
+    focal = float(first_order(system.lens, jnp.inf, jnp.array([0.55])).focal_length[0])
+    np.testing.assert_allclose(np.tan(system.fields[1]), [1 / focal, 5 / focal])
+    assert read(tmp_path, FTYP="3 0 2 2").fields is None
+
+
+def test_what_is_not_read_is_refused_by_line(tmp_path):
+    assert re.match(
+        r", line 29: SURF 2: type PARAXIAL is not known",
+        refused(tmp_path, FRONT, BACK.replace("STANDARD", "PARAXIAL")),
+    )
+    message = refused(tmp_path, FRONT.replace("N-BK7", "S-BSL7"), BACK)
+    assert "line 26: SURF 1: unknown glass 'S-BSL7'" in message and "nd and vd" in message
+    assert "of SCHOTT alone" in refused(tmp_path, GCAT="OHARA")
+    assert "line 4: fields of kind 7" in refused(tmp_path, FTYP="7 0 2 2")
+    assert "cut short" in refused(tmp_path, FRONT, BACK, tail=("SURF 4", "  DISZ 3"))
+    spider = BACK + "|SPID .1 3"
+    assert 'missing="warn" leaves it out' in refused(tmp_path, FRONT, spider)
+    with pytest.warns(UserWarning, match="left out: SPID, a spider"):
+        assert "SPID" in read(tmp_path, FRONT, spider, missing="warn").notes[0]
+
+
+def test_what_is_read_otherwise_is_said(tmp_path):
+    own = BACK + "|PZUP 1 -1 0 0|ABCD 7"
+    with pytest.warns(UserWarning) as said:
+        read(tmp_path, FRONT, own, tail=("MNUM 3 2",))
+    message = str(said[0].message)
+    assert all(
+        word in message for word in ("3 configurations number 2", "lines 33", "ABCD (line 34)")
+    )
+
+
+def test_model_glasses_without_dispersion_and_with(tmp_path):
+    """Vd 0 is a constant index; nd and vd as OpticStudio's listing of 1.511, 60.6 at 0.55 um."""
+    constant = read(tmp_path, FRONT.replace("N-BK7 0 0 1.5 40", "___BLANK 1 0 1.6 0"), BACK).lens
+    np.testing.assert_array_equal(constant.index([0.45, 0.7])[1], [1.6, 1.6])
+    model = read(tmp_path, FRONT.replace("N-BK7 0 0 1.5 40", "___BLANK 1 0 1.511 60.6 0"), BACK)
+    np.testing.assert_allclose(model.lens.index(0.55)[1], 1.5128031808, rtol=0, atol=2e-10)
+
+
+def same(one, two):
+    """Two lenses, but for their names, to 17 digits; model glasses to the last digits of nd."""
+    for key in ("curvature", "conic", "thickness", "semi_diameter", "sensor"):
+        np.testing.assert_array_equal(getattr(one, key), getattr(two, key))
+    width = one.coefficients.shape[1]
+    np.testing.assert_allclose(two.coefficients[:, :width], one.coefficients, rtol=3e-16)
+    assert not np.any(two.coefficients[:, width:])
+    assert (one.stop, one.forms, one.mirrors) == (two.stop, two.forms, two.mirrors)
+    low, high = (one.dispersion.range[k] for k in (0, 1))
+    waves = np.linspace(max(low, 0.4), min(high, 0.7), 5)
+    np.testing.assert_allclose(two.index(waves), one.index(waves), rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["cooke_triplet", "double_gauss", "phone", "hubble", "singlet"])
+def test_written_and_read_back(tmp_path, name):
+    lens = load_lens(name)
+    save_lens(lens, tmp_path / "lens.zmx")
+    same(lens, load_lens(tmp_path / "lens.zmx"))
+
+
+def test_written_forms_glasses_and_apertures(tmp_path):
+    ring = "TYPE STANDARD|CURV 0|DISZ 2|OBSC 0 2 0|OBDC 1 2"
+    glass = FRONT.replace("N-BK7 0 0 1.5 40", "___BLANK 1 0 1.511 60.6 0.01")
+    odd = BACK.replace("STANDARD", "ODDASPHE|PARM 1 .01|PARM 3 1e-4")
+    toroid = BACK.replace("STANDARD", "TOROIDAL|PARM 1 40|PARM 2 1e-4")
+    lens = read(tmp_path, glass, odd, toroid, ring).lens
+    save_lens(lens, tmp_path / "own.zmx")
+    assert "___BLANK 1 0 1.511 60.6 0.01" in (tmp_path / "own.zmx").read_text()
+    again = load_lens(tmp_path / "own.zmx")
+    same(lens, again)
+    np.testing.assert_array_equal(lens.apertures.half, again.apertures.half)
+    np.testing.assert_array_equal(lens.apertures.centre, again.apertures.centre)
+    with pytest.raises(LensError, match="save as .yaml"):
+        save_lens(
+            read(tmp_path, FRONT, BACK, BREAK.format(0, 1, 0, 0, 0, 0, 0)).lens, tmp_path / "x.zmx"
+        )
+
+
+def test_files_that_are_none(tmp_path):
+    path, noise = tmp_path / "lens.zmx", np.random.default_rng(0)
+    whole = text(FRONT, BACK).encode("utf-16")
+    spoilt = [
+        b"",
+        b"0" * 2**25,
+        b"SURF 0 " + b"1 " * 10**6,
+        b"SURF 0\n" * 10**6,
+        noise.bytes(10**5),
+    ]
+    spoilt += [bytes(10**5), b"x: 1\n", whole[:301], whole[: len(whole) // 2]]
+    for content in spoilt:
+        path.write_bytes(content)
+        began = time.perf_counter()
+        with pytest.raises(LensError) as error:
+            load_lens(path)
+        assert time.perf_counter() - began < 2
+        assert str(path) in str(error.value) and "\n" not in str(error.value)
+        assert len(str(error.value)) <= 300
+    for _ in range(150):  # a few bytes changed: refused in a line, or a lens
+        own = bytearray(text(FRONT, BACK).encode())
+        for place in noise.integers(0, len(own), 4):
+            own[place] = noise.integers(0, 256)
+        path.write_bytes(own)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                load_lens(path)
+            except LensError as error:
+                assert "\n" not in str(error) and str(path) in str(error)
+
+
+def listing(name):
+    return (SHARED / f"{name}.txt").read_text("latin-1")
+
+
+def listed(content, key):
+    """A number of a listing and half of its last digit."""
+    found = re.search(rf"^{re.escape(key)}\s*:\s*(\S+)", content, re.MULTILINE)
+    word = found[1]
+    digits, _, power = word.lower().partition("e")
+    step = 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
+    return float(word), step
+
+
+# Of the 28, those whose glasses we have and whose surfaces do not touch.
+READ = (
+    *("10281683", "1792917", "1843519", "2453260", "2645156", "528155", "5852515a", "6744570a"),
+    *("7558005a", "7643216a", "7821720a", "7821720b", "895045a", "Dyson1959", "WIYN"),
+)
+
+
+@LISTED
+@pytest.mark.parametrize("name", READ)
+def test_listed_first_order(name):
+    """Focal length, pupil and f-number to the listing's last digit, indices to 2e-10."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        system = load_system(SHARED / f"{name}.zmx")
+    content, wave = listing(name), system.wavelengths[system.primary]
+    found = first_order(system.lens, system.distance, jnp.array([wave]))
+    focal, pupil = found.effective_focal_length[0], found.entrance_pupil
+    wanted = {
+        "Effective Focal Length": focal,
+        "Image Space F/#": abs(focal) / (2 * pupil.semi_diameter[0]),
+        "Paraxial Working F/#": 0.5 / found.numerical_aperture[0],
+        "Entrance Pupil Diameter": 2 * pupil.semi_diameter[0],
+        "Entrance Pupil Position": pupil.position[0],
+        "Stop Radius": system.lens.semi_diameter[system.lens.stop],
+    }
+    for key, value in wanted.items():
+        number, step = listed(content, key)
+        assert abs(float(value) - number) <= 1.01 * step, key
+    rows = re.findall(r"^ +\d+ .*?((?:\s+\d\.\d{10})+)", content.partition("INDEX OF")[2], re.M)
+    indices = np.array([row.split() for row in rows[: system.lens.count]], float)
+    # Silica's constants, Malitson's, have one digit more here.
+    index, most = system.lens.index(system.wavelengths)[:-1], 2e-9 if name == "Dyson1959" else 2e-10
+    np.testing.assert_allclose(index, indices, rtol=0, atol=most)
