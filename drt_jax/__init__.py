@@ -14,8 +14,25 @@ Conventions, everywhere in the package:
 """
 
 from .files.entry import LensError as LensError
+from .files.system import System as System
 from .files.write import save_lens as save_lens
-from .files.yaml import lens_names as lens_names, load_lens as load_lens
+from .files.yaml import (
+    lens_names as lens_names,
+    load_lens as load_lens,
+    load_system as load_system,
+)
+from .image.chief import (
+    Distortion as Distortion,
+    FieldCurvature as FieldCurvature,
+    chief_ray_angle as chief_ray_angle,
+    distortion as distortion,
+    field_curvature as field_curvature,
+    lateral_colour as lateral_colour,
+)
+from .image.coefficients import (
+    zernike_fringe as zernike_fringe,
+    zernike_standard as zernike_standard,
+)
 from .image.converged import (
     converged_focus_rule as converged_focus_rule,
     converged_rule as converged_rule,
@@ -23,15 +40,52 @@ from .image.converged import (
     psf_moments as psf_moments,
 )
 from .image.depth import depth_moments as depth_moments, moments_model as moments_model
+from .image.fans import (
+    AxialColour as AxialColour,
+    RayFans as RayFans,
+    axial_colour as axial_colour,
+    ray_fans as ray_fans,
+)
 from .image.field import field_of_image as field_of_image, image_point as image_point
+from .image.fields import (
+    GridMethod as GridMethod,
+    KernelGrid as KernelGrid,
+    grid_method as grid_method,
+    kernel_grid as kernel_grid,
+    kernels_at as kernels_at,
+)
+from .image.gaussian_error import (
+    GaussianError as GaussianError,
+    gaussian_error as gaussian_error,
+)
 from .image.kernel import (
     SeparableKernel as SeparableKernel,
     gaussian_psf as gaussian_psf,
     separable_psf as separable_psf,
 )
 from .image.moments import FocusMoments as FocusMoments, moments as moments
-from .image.sensor import convolve as convolve, sensor_layer as sensor_layer
+from .image.psf import Psf as Psf, PsfModel as PsfModel, converged_psf as converged_psf, psf as psf
+from .image.render import (
+    RenderMethod as RenderMethod,
+    render as render,
+    render_method as render_method,
+    sensor_noise as sensor_noise,
+)
+from .image.sensor import (
+    convolve as convolve,
+    convolve_each as convolve_each,
+    sensor_layer as sensor_layer,
+)
 from .image.spot import Moments as Moments
+from .image.spots import (
+    Spots as Spots,
+    light_rule as light_rule,
+    relative_illumination as relative_illumination,
+    solid_angle as solid_angle,
+    spot_diagram as spot_diagram,
+    vignetting as vignetting,
+)
+from .image.transfer import Transfer as Transfer, strehl as strehl, transfer as transfer
 from .image.wavefront import (
     Wavefront as Wavefront,
     rms_wavefront as rms_wavefront,

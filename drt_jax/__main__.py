@@ -22,8 +22,8 @@ from .lens.paraxial import FirstOrder, first_order
 from .lens.scene import Scene, scene_of
 from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
-from .show.figures import new
-from .show.layout import Beam, beam_of, draw, lens_drawing
+from .show.layout import Beam, beam_of
+from .show.sheet import sheet
 
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 # Of the rules for the spots; by how much of their size these may differ between both.
@@ -34,13 +34,15 @@ _DEFOCUS = 3.0  # times the smallest spot is out of focus
 def _options(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m drt_jax", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="show")
-    about = "first-order data, spots over the field, share of light, warnings, and a drawing"
+    about = (
+        "first-order data, spots over the field, share of light, warnings, and a sheet of analyses"
+    )
     show = commands.add_parser("show", help=about, description=about)
     show.add_argument("lens", help=f"YAML file or bundled name: {', '.join(lens_names())}")
     show.add_argument("--field", type=float, nargs="+", default=[0, 7, 10], help="degrees")
     show.add_argument("--distance", type=float, default=math.inf, help="to the object, mm")
     show.add_argument("--wavelengths", type=float, nargs="+", default=_LINES, help="um")
-    show.add_argument("--out", type=pathlib.Path, help="of the drawing; default: LENS.png here")
+    show.add_argument("--out", type=pathlib.Path, help="of the sheet; default: LENS.png here")
     options = parser.parse_args(argv)
     if not all(abs(field) < 90 for field in options.field):
         raise ValueError("--field: must be within 90 degrees")
@@ -87,8 +89,7 @@ def field_lines(
     yield _row("field", "image height", *spots, "light", "surfaces that clip")
     yield _row("deg", "mm", *("RMS um" for _ in spots), "%", "")
     angles, middle = [math.radians(field) for field in fields], len(wavelengths) // 2
-    symmetry = max((symmetry_of(lens, a) for a in angles), key=get_args(Symmetry).index)
-    whole = not any(beam.clipping or beam.ends for beam in beams)
+    symmetry, whole = _widest(lens, angles), _whole(beams)
     for field, angle, beam in zip(fields, angles, beams):
         scene = scene_of(lens, angle, distance, np.array(wavelengths))
         rough, found = (_moments(lens, scene, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
@@ -107,6 +108,15 @@ def field_lines(
         if field == 0 and f"{light:.2f}" != "100.00":
             share = f"{100 - light:.2g} % of the light that fills the stop"
             yield f"  ! on the axis {share} does not arrive; surfaces that clip: {cut}"
+
+
+def _widest(lens: Lens, angles: list[float]) -> Symmetry:
+    """The symmetry of all fields together."""
+    return max((symmetry_of(lens, a) for a in angles), key=get_args(Symmetry).index)
+
+
+def _whole(beams: list[Beam]) -> bool:
+    return not any(beam.clipping or beam.ends for beam in beams)
 
 
 def _moments_of(lens: Lens, scene: Scene, rule: PupilRule) -> Moments:
@@ -182,9 +192,9 @@ def show(options: argparse.Namespace) -> None:
         _say(field_lines(lens, fields, distance, waves, beams))
         _say(aperture_lines(lens, beams))
         out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}.png")
-        figure, axes = new(width=9, height=4)
-        lens_drawing(axes, draw(lens, angles, distance, middle))
-        figure.savefig(out)
+        symmetry, cut = _widest(lens, angles), not _whole(beams)
+        rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
+        sheet(lens, angles, distance, waves, rule, _wait).savefig(out)
     _say([f"drawn in {out}"])
 
 

@@ -7,5 +7,16 @@ show.lens_drawing(axes, show.draw(lens))
 figure.savefig("lens.png")
 """
 
+from .analyses import (
+    distortion as distortion,
+    fan as fan,
+    field_curvature as field_curvature,
+    gaussian_error as gaussian_error,
+    illumination as illumination,
+    lateral_colour as lateral_colour,
+    mtf as mtf,
+    spots as spots,
+)
 from .figures import kernels as kernels, new as new
 from .layout import Drawing as Drawing, draw as draw, lens_drawing as lens_drawing
+from .sheet import sheet as sheet

@@ -48,6 +48,17 @@ def planes(results: dict[str, Any], paper: str, more: str = "") -> list[tuple[st
     return [] if "numbers" in results else [row]
 
 
+def gaussian(results: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """The row of a table that says how far the Gaussian is from the kernel with diffraction."""
+    words = [
+        f"{50 * row['misplaced']:.0f} % of the light, {row['contrast']:.2f} of the contrast at "
+        f"{row['distance_m']:g} m"
+        for row in results.get("gaussian", [])
+    ]
+    what = "error of the Gaussian kernel against waves: light in wrong pixels, contrast"
+    return [(what, "", "; ".join(words))] if words else []
+
+
 def beside(results: dict[str, Any], rows: list[tuple[str, str, str]]) -> str:
     """A table of (what, the paper's, ours), without the paper's of what it does not have."""
     if results.get("paper", True):

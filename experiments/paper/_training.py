@@ -5,6 +5,7 @@ import functools
 import math
 import pathlib
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -28,6 +29,8 @@ from .runs.write import replace
 
 # So many files that were skipped are named on the terminal, all of more in the run's folder.
 _NAMED = 20
+# Sum of the absolute errors of the pixels of kernels with diffraction.
+_KERNELS = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,8 +276,29 @@ class Jobs:
             "final_window_batches": window,
             "seconds": self._run.seconds,
             **{column: np.stack([trace[column] for trace in traces]) for column in columns},
+            "gaussian": self._gaussian(),
             **numbers,
         }
+
+    def _gaussian(self) -> list[dict[str, float]]:
+        """How far the Gaussians of the first start's lens are from kernels with diffraction, for
+        the nearest and the farthest object; none where these do not converge."""
+        config, camera = self._config, self._config.camera
+        lens = self.lens.lens_of(self._good[start_label(config.starts_mm[0])])
+        distances = sorted(set(self._depths))
+        field, _, colours = config.scene.seen(distances[0])
+        pairs = np.reshape(field, (1, 2)) if np.size(field) == 2 else np.reshape(field, 1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            try:
+                pixel = 1e-3 * camera.pixel_um
+                found = drt_jax.gaussian_error(
+                    lens, pairs, distances, colours, pixel, camera.kernel, _KERNELS
+                )
+            except (UserWarning, ValueError):
+                return []
+        columns = zip(distances, found.misplaced[0], found.contrast[0])
+        return [{"distance_m": d / 1e3, "misplaced": m, "contrast": c} for d, m, c in columns]
 
     def _numbers(self, traces: list[dict[str, np.ndarray]], window: int) -> dict[str, Any]:
         """What became of the lens: its numbers, loss and spot at each start and end, and the

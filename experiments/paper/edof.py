@@ -130,6 +130,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     beside = [
         *_report.planes(results, "145.29 mm"),
         ("joint against fixed sensor", "joint better, but for 15 to 20 m", against),
+        *_report.gaussian(results),
     ]
     errors = [(m.upper() + " " + n, n, m) for n in ("fixed", "joint") for m in ("mae", "rmse")]
     lines = [(title, *(_common.number(row[n][m], ".4f") for row in rows)) for title, n, m in errors]

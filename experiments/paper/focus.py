@@ -98,6 +98,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         firsts = [(what, '"within the first 60"', first)]
     took = ("training of all starts", "", _common.duration(results["seconds"]))
     rows = [*_report.planes(results, "133.35 mm", search), *firsts, took]
+    rows += _report.gaussian(results)
     more = _report.numbers_tables("focus, lens", results)
     return {"focus": _report.beside(results, rows)} | more
 

@@ -71,6 +71,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     test = f"test MAE at noise {first['noise']:g}, after and before the network"
     errors = " and ".join(_common.number(first[name], ".4f") for name in ("mae", "sensor_mae"))
     rows = [*_report.planes(results, "133.35 mm"), (test, "0.02 and 0.03", errors)]
+    rows += _report.gaussian(results)
     measures = ["RMSE", "PSNR dB", "SSIM"]
     header = ["noise", "start mm", "MAE", *measures, "sensor MAE", *measures]
     columns = [a + b for a in ("", "sensor_") for b in ("mae", "rmse", "psnr", "ssim")]

@@ -84,8 +84,10 @@ def unbroken(tmp_path_factory):
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_config_loads_strictly(path):
     kind = CONFIGS[path].Config
-    seed = "seed" if hasattr(kind, "seed") else "starts.seed"
-    assert load_config(kind, path) != load_config(kind, path, [f"{seed}=99"])
+    others = {"seed": "99", "repeats": "99", "folder": "elsewhere", "starts": "{seed: 99}"}
+    name = next(name for name in others if name in kind.__dataclass_fields__)
+    other = "starts.seed=99" if name == "starts" else f"{name}={others[name]}"
+    assert load_config(kind, path) != load_config(kind, path, [other])
 
 
 @pytest.mark.parametrize("name", TOY)
@@ -98,6 +100,9 @@ def test_a_run_explains_itself(name, unbroken):
         assert io.imread(path).std() > 5, f"{path} is blank"
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["train"]["batches"] == 25 and config["camera"]["form"] == "integrated"
+    distances = [row["distance_m"] for row in results["gaussian"]]
+    assert distances == ([10, 50] if name == "edof" else [25])
+    assert all(0 < row["misplaced"] < 2 and row["contrast"] < 1 for row in results["gaussian"])
     if name == "restore":
         assert results["parameters"] == 298_947
         assert [row["noise"] for row in results["test"]] == [0.01, 0.05]

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import experiments
-from experiments import _command, _peers, _work, tables
+from drt_jax import first_order, load_lens, save_lens
+from experiments import _command, _peers, _psf_peers, _work, tables
 
 from .test_experiments import TOY
 
@@ -20,19 +21,32 @@ STARTS = {
     "accuracy": ["scenes=[{lens: singlet}]", "orders=[2]", "rays=[7]", "tolerances=[1e-2]"],
     "stability": ["families=[mirror]", "scenes=3"],
     "faults": ["parts=[files]", "files=30", "traced=1"],
+    "files": ["folder={toy}"],
     "benchmark": ["tasks=[axial]", "growth=false", "repeats=1", "lens=singlet"],
     "lenses": [
         "lenses=[{lens: singlet, field_deg: 3}]",
         *("parts=[0]", "copies=1", "fields=1", "sweep=8", "repeats=1"),
     ],
     "design": [*AXIAL, "fields_deg=[0]", "starts.count=1", "trials=2", "tolerance=0.1"],
+    "images": [
+        *(
+            "views=[{lens: singlet, field_deg: 2, pixel_um: 8}]",
+            "size=9",
+            "rays=[16]",
+            "waves=[48]",
+        ),
+        "photographs=[{lens: singlet, pixel_um: 100}]",
+        *("limit=64", "rounds=2", "peers=[64]", "frequencies=5", "photo_pixels=48", "repeats=1"),
+        *("gallery.lens=singlet", "gallery.fields_deg=[0]", "gallery.distances_m=[.inf]"),
+    ],
+    "render": ["nodes=2", "kernel=9", "model=gaussian", "scene.lens=cooke_triplet", "pixel_um=20"],
     "tolerance": [
         *("lens=singlet", "tolerances=[{kind: radius, size: 1.0}]", "fields_deg=[[0, 0]]"),
         *(*AXIAL, "count=16", "draws=10", "limits_um=[50]"),
     ],
 }
 # Programs of many kinds.
-LONG = ("accuracy", "design", "lenses", "stability", "tolerance")
+LONG = ("accuracy", "design", "images", "lenses", "render", "stability", "tolerance")
 
 
 def runnable():
@@ -62,6 +76,19 @@ def checked_faults(results):
     assert sum(row["refused"] for row in results["rows"]) > 20
 
 
+def toy_files(folder):
+    """A file and a listing that fits it, and a file that is none."""
+    save_lens(load_lens("singlet"), folder / "singlet.zmx")
+    focal = first_order(load_lens("singlet"), np.inf, [0.5875618]).effective_focal_length[0]
+    (folder / "singlet.txt").write_text(f"Effective Focal Length :  {float(focal):.4f}\n")
+    (folder / "none.zmx").write_text("SURF 0\n")
+    return folder
+
+
+def checked_files(results):
+    assert [row["outcome"] for row in results["rows"]] == ["refused", "right"]
+
+
 def checked_benchmark(results):
     """A row for each peer, which is measured or says what is missing, and the counts."""
     assert [(row["peer"], row["peer_s"], row["note"]) for row in results["rows"]] == [
@@ -77,13 +104,25 @@ def checked_lenses(results):
     """A lens on the axis, copies of it and a sweep; peers that fail have their reason."""
     (row,), (group,), (swept,) = (results[key] for key in ("rows", "copies", "sweeps"))
     assert row["tight_error"] < 1e-6 and row["loose_error"] < 1e-3 and row["passed"] == 1
-    assert set(row["notes"].values()) == {"no lens of this kind"} and not row["peers"]
+    assert set(row["notes"].values()) == {"no program of this kind"} and not row["peers"]
     assert group["bad"] == 0 and max(swept["steps"]["values"]) < 0.1
 
 
 def checked_design(results):
     (row,) = results["rows"]
     assert row["merit_end"] < row["merit_start"]
+
+
+def checked_images(results):
+    """Every model near its limit; peers that are missing have their reason."""
+    errors = {row["model"]: row["error"] for row in results["kernels"]}
+    assert errors["gaussian"] is None and errors["rays"] < 0.1 and errors["waves"] < 0.02
+    assert {row["note"] for row in results["peers"]} == {"no program of this kind"}
+    assert np.max(results["views"][0]["transfer"]) <= 1 + 1e-9
+
+
+def checked_render(results):
+    assert results["kernel"] == 9 and results["seconds"] > 0 == results["dark"]
 
 
 def checked_tolerance(results):
@@ -99,20 +138,24 @@ def test_it_ends_with_results_tables_and_pictures(name, tmp_path, monkeypatch, c
         raise ModuleNotFoundError(name=name)
 
     def fails(lens, rays):
-        raise ValueError("no lens of this kind")
+        raise ValueError("no program of this kind")
 
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(_work, "version", missing)
     for peer in ("optiland_spot", "batoid_spot"):
         monkeypatch.setattr(_peers, peer, fails)
+    for peer in ("optiland", "prysm"):
+        monkeypatch.setattr(_psf_peers, peer, lambda *_: fails(None, None))
     experiment = importlib.import_module(f"experiments.{name}")
     try:
-        _command.main(experiment, ["--out", str(tmp_path), "--set", *STARTS[name]])
+        (toy := tmp_path / "toy").mkdir()
+        own = [key.format(toy=toy_files(toy)) if "{toy}" in key else key for key in STARTS[name]]
+        _command.main(experiment, ["--out", str(tmp_path / "run"), "--set", *own])
     finally:  # those on speed compile everything anew
         jax.config.update("jax_enable_compilation_cache", True)
-    globals()[f"checked_{name}"](json.loads((tmp_path / "results.json").read_text()))
+    globals()[f"checked_{name}"](json.loads((tmp_path / "run" / "results.json").read_text()))
     assert "done in" in capsys.readouterr().out
-    assert all(p.stat().st_size > 3000 for p in (tmp_path / "figures").iterdir())
+    assert all(p.stat().st_size > 3000 for p in (tmp_path / "run" / "figures").iterdir())
 
 
 def test_tables_has_nothing_to_write(capsys):

@@ -1,0 +1,174 @@
+"""Pictures of analyses over the field: what `drt_jax` computes in, axes out.
+
+wavelengths (W,) in um give each curve its colour: blue for the shortest, red for the longest.
+fields (F,) are angles in radians. What is not finite is left out.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jax.typing import ArrayLike
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, to_hex
+from matplotlib.patches import Circle
+
+from ..image.chief import Distortion, FieldCurvature
+from ..image.fans import RayFans
+from ..image.gaussian_error import GaussianError
+from ..image.spots import Spots
+
+
+def colours(wavelengths: ArrayLike) -> list[str]:
+    """A colour for each wavelength."""
+    waves = np.ravel(np.asarray(wavelengths, float))
+    if np.ptp(waves) == 0:
+        return ["tab:blue"] * waves.size
+    place = (waves - waves.min()) / np.ptp(waves)
+    ramp = LinearSegmentedColormap.from_list("", ["tab:blue", "tab:green", "tab:red"])
+    return [to_hex(c) for c in ramp(place)]
+
+
+def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: float = 0) -> Axes:
+    """The spot of one of the fields about its centroid, in um, with the Airy circle.
+
+    half: half the width of the picture in um; 0 for as wide as the spot.
+    """
+    centroid = np.asarray(found.centroid)[field]
+    points = 1e3 * (np.asarray(found.points)[field] - centroid)
+    airy = 1e3 * float(found.airy_radius[field])
+    for rays, colour in zip(points, colours(wavelengths)):
+        good = np.all(np.isfinite(rays), axis=-1)
+        axes.plot(*rays[good].T, ".", markersize=1.5, color=colour)
+    if np.isfinite(airy):
+        axes.add_patch(Circle((0, 0), airy, fill=False, color="black", linewidth=0.8))
+        reach = 1.15 * max(1e3 * float(found.radius[field]), airy)
+        half = half or reach
+        axes.set(xlim=(-half, half), ylim=(-half, half))
+        size = f"RMS {1e3 * float(found.rms[field]):.3g}, Airy {airy:.3g} um"
+    else:
+        size = "no light arrives"
+    axes.set_aspect("equal")
+    axes.set_xlabel(size, fontsize=7)
+    return axes
+
+
+def fan(
+    axes: Axes, found: RayFans, field: int, wavelengths: ArrayLike, sagittal: bool = False
+) -> Axes:
+    """Transverse errors of one of the fields along the y axis of the stop or, sagittal, the x axis,
+    in um."""
+    errors, component = (found.sagittal, 0) if sagittal else (found.tangential, 1)
+    for curve, colour in zip(np.asarray(errors)[field, ..., component], colours(wavelengths)):
+        axes.plot(found.pupil, 1e3 * _finite(curve), color=colour)
+    _cross(axes)
+    axes.set(xlim=(-1, 1))
+    return axes
+
+
+def field_curvature(
+    axes: Axes, found: FieldCurvature, fields: ArrayLike, wavelengths: ArrayLike
+) -> Axes:
+    """Foci over the field in mm from the sensor: tangential lines, dashed for sagittal ones."""
+    for k, colour in enumerate(colours(wavelengths)):
+        for foci, style in zip(found, ("-", "--")):
+            curve = np.asarray(foci)[:, k]
+            axes.plot(_finite(curve), _degrees(fields), style, color=colour)
+    _over_field(axes, fields, "focus (mm), S dashed")
+    return axes
+
+
+def distortion(axes: Axes, found: Distortion, fields: ArrayLike, wavelengths: ArrayLike) -> Axes:
+    """Distortion over the field in per cent."""
+    curves = 100 * np.asarray(found.relative).T
+    for curve, colour in zip(curves, colours(wavelengths)):
+        axes.plot(_finite(curve), _degrees(fields), color=colour)
+    _over_field(axes, fields, "distortion (%)")
+    return axes
+
+
+def lateral_colour(
+    axes: Axes, found: ArrayLike, fields: ArrayLike, wavelengths: ArrayLike, airy: float = 0
+) -> Axes:
+    """Lateral colour (F, W, 2) mm along y over the field, in um; airy: a radius in um to be
+    shaded."""
+    curves = 1e3 * np.asarray(found)[..., 1].T
+    if 0 < airy < np.inf:
+        axes.axvspan(-airy, airy, color="0.92")
+    for curve, colour in zip(curves, colours(wavelengths)):
+        axes.plot(_finite(curve), _degrees(fields), color=colour)
+    _over_field(axes, fields, "lateral colour (um)")
+    return axes
+
+
+def illumination(axes: Axes, light: ArrayLike, throughput: ArrayLike, fields: ArrayLike) -> Axes:
+    """Relative illumination and throughput (F,) over the field."""
+    axes.plot(_degrees(fields), light, color="black", label="relative illumination")
+    axes.plot(_degrees(fields), throughput, "--", color="tab:grey", label="unvignetted")
+    axes.set(ylim=(0, 1.05), xlabel="field (degrees)")
+    axes.set_xlim(*_range(fields))
+    axes.legend(fontsize=6, loc="lower left", frameon=False)
+    return axes
+
+
+def mtf(
+    axes: Axes,
+    frequencies: ArrayLike,
+    curves: ArrayLike,
+    limit: ArrayLike,
+    names: Sequence[str],
+) -> Axes:
+    """MTF (F, 2, N) over frequencies (N,) in cycles/mm, tangential and, dashed, sagittal, with the
+    diffraction limit (N,)."""
+    axes.plot(frequencies, limit, ":", color="black", label="limit")
+    for k, (both, name) in enumerate(zip(np.asarray(curves), names)):
+        axes.plot(frequencies, both[0], color=f"C{k}", label=name)
+        axes.plot(frequencies, both[1], "--", color=f"C{k}")
+    axes.set(ylim=(0, 1.02), xlabel="cycles/mm")
+    axes.set_xlim(0, float(np.max(np.asarray(frequencies))))
+    axes.legend(fontsize=6, frameon=False)
+    return axes
+
+
+def gaussian_error(
+    axes: Axes, found: GaussianError, fields: ArrayLike, distances: ArrayLike
+) -> Axes:
+    """By how much Gaussian kernels are wrong over field (F,) and distance (D,) mm, as numbers and
+    colours: the share of light in the wrong pixels, half of what is `misplaced`, in per cent."""
+    share = 50 * np.asarray(found.misplaced)
+    axes.imshow(share.T, vmin=0, vmax=100, cmap="magma_r", aspect="auto", origin="lower")
+    for place, value in np.ndenumerate(share):
+        colour = "white" if value > 50 else "black"
+        axes.text(
+            place[0], place[1], f"{value:.2g}", ha="center", va="center", color=colour, fontsize=7
+        )
+    axes.set_xticks(range(len(share)), [f"{a:.3g}" for a in _degrees(fields)])
+    far = 1e-3 * np.asarray(distances, float)
+    axes.set_yticks(range(share.shape[1]), [f"{d:.3g}" if d < np.inf else "∞" for d in far])
+    axes.set(xlabel="field (degrees)", ylabel="distance (m)")
+    axes.set_title("light in wrong pixels (%)", fontsize=9)
+    return axes
+
+
+def _finite(curve: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(curve), curve, np.nan)
+
+
+def _degrees(fields: ArrayLike) -> np.ndarray:
+    return np.degrees(np.asarray(fields, float))
+
+
+def _range(fields: ArrayLike) -> tuple[float, float]:
+    angles = _degrees(fields)
+    low, high = float(angles.min()), float(angles.max())
+    return (low, high) if high > low else (low - 1, high + 1)
+
+
+def _cross(axes: Axes) -> None:
+    axes.axhline(0, color="0.7", linewidth=0.6, zorder=0)
+    axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
+
+
+def _over_field(axes: Axes, fields: ArrayLike, label: str) -> None:
+    axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
+    axes.set_ylim(*_range(fields))
+    axes.set(xlabel=label)

@@ -1,0 +1,394 @@
+"""The image of a point by each model: what it takes, by how much it is wrong, how it looks.
+
+For each lens and field, kernels by rays and by waves over the cells of their grids, and the
+Gaussian. `error` is against the model's own limit: of rays a histogram of very many traced ones, of
+waves a grid of very many cells; `off` is against the limit of waves. Both are sums of absolute
+differences of all pixels, of the worst colour. Optiland's FFT PSF and prysm's matrix Fourier
+transform stand beside them, for the middle colour, against the same limit of waves; prysm is given
+the pupil, and traces nothing. Writes results.json: `kernels` hold `lens`, `model`, `cells`,
+`value_s`, `gradient_s` (of a mean over the kernel, by every number of the lens), `error`, `off`;
+`peers`; `limits`: the share outside of the kernel, the noise of the histogram and the rays that
+arrive; `grids`: seconds of 9 x 9 fields; `transfer`: MTF and its limit; `photographs`, in figures.
+"""
+
+import dataclasses
+import math
+import pathlib
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+from skimage import data, transform
+
+import drt_jax
+from drt_jax import Lens, PsfModel, show
+
+from . import _command, _common, _peers, _psf_peers, _work, render
+from ._plots import error_curves
+from .runs.folder import Run
+
+COLUMNS = ("value_s", "gradient_s", "error", "off")
+MODELS = "gaussian", "rays", "waves"
+# Rays that are traced at once for a histogram, a power of 2 as Sobol's points want it.
+_ROUND = 2**17
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A lens and what it looks at. lens: bundled name or YAML path. field_deg: of the point, along
+    y. pixel_um: of the sensor."""
+
+    lens: str
+    field_deg: float
+    pixel_um: float
+
+    def __post_init__(self) -> None:
+        _common.require_within("", self, field_deg=(0, 89.9), pixel_um=(0.05, 1e4))
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """A lens that takes the photograph. pixel_um: of its sensor."""
+
+    lens: str
+    pixel_um: float
+
+    def __post_init__(self) -> None:
+        _common.require_within("photographs.", self, pixel_um=(0.05, 1e4))
+
+
+@dataclasses.dataclass(frozen=True)
+class Gallery:
+    """Points whose kernels are drawn. distances_m: in front of the first surface."""
+
+    lens: str = "double_gauss"
+    fields_deg: tuple[float, ...] = (0.0, 7.0, 14.0)
+    distances_m: tuple[float, ...] = (10.0, 25.0, math.inf)
+    pixel_um: float = 4.4
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment; see configs/images.yaml.
+
+    views: what is measured. size: of a kernel in pixels. rays, waves: cells along a side of their
+    grids. limit: cells of the limit of waves. rounds: of 2^17 rays a colour of the histogram.
+    peers: samples along a side of their pupils. frequencies: of a transfer function up to the
+    pixels' Nyquist frequency. photographs: lenses that take one. photo_pixels: of its side.
+    """
+
+    views: tuple[View, ...]
+    photographs: tuple[Photo, ...]
+    gallery: Gallery = dataclasses.field(default_factory=Gallery)
+    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
+    size: int = 21
+    rays: tuple[int, ...] = (24, 36, 52, 72, 104)
+    waves: tuple[int, ...] = (48, 64, 96, 128, 192, 256)
+    limit: int = 640
+    rounds: int = 16
+    peers: tuple[int, ...] = (64, 128, 256, 512)
+    frequencies: int = 41
+    photo_pixels: int = 512
+    repeats: int = 15
+
+    def __post_init__(self) -> None:
+        _common.require(len(self.views) > 0, "views: needs at least one item")
+        three = len(self.wavelengths_um) == 3
+        _common.require(three, "wavelengths_um: expected three, of R, G and B")
+        _common.require_within("", self, wavelengths_um=(1e-2, 1e3), rays=(8, 1024))
+        _common.require_within("", self, waves=(8, 1024), limit=(8, 2048), peers=(16, 2048))
+        _common.require_within("", self, size=(3, 255), rounds=(2, 1024), frequencies=(2, 1e4))
+        _common.require_within("", self, photo_pixels=(16, 4096), repeats=(1, 1000))
+        _common.require(self.size % 2 == 1, "size: expected an odd number")
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A view in numbers: radians and mm."""
+
+    lens: Lens
+    field: float
+    pixel: float
+    waves: np.ndarray
+    size: int
+
+    def model(self, kind: Any, tolerance: float = 1e-2) -> PsfModel:
+        """The model that the tolerance asks for."""
+        around = self.waves, self.pixel, self.size
+        return drt_jax.converged_psf(self.lens, self.field, math.inf, *around, kind, tolerance)
+
+    def kernel(self, lens: Lens, model: PsfModel, centre: Any = None) -> jax.Array:
+        """(W, size, size)."""
+        around = self.waves, self.pixel, self.size, model
+        return drt_jax.psf(lens, self.field, math.inf, *around, centre=centre).kernel
+
+
+def _apart(a: Any, b: Any) -> float:
+    return float(np.max(np.sum(np.abs(np.asarray(a) - np.asarray(b)), axis=(-2, -1))))
+
+
+def histogram(scene: Scene, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, float, int]:
+    """What pixels about `centre` (2,) mm collect of traced rays, (W, size, size), its noise (of
+    halves against each other) and how many rays of each colour arrive."""
+    edges = (np.arange(scene.size + 1) - scene.size / 2) * scene.pixel
+    points, trace = drt_jax.pupil.random_disc(_ROUND * rounds, 0)[0], drt_jax.trace_rays
+    halves = np.zeros((2, len(scene.waves), scene.size, scene.size))
+    arrived = np.zeros((2, len(scene.waves)))
+    for k in range(rounds):
+        some = points[k * _ROUND : (k + 1) * _ROUND]
+        rays = trace(scene.lens, scene.field, math.inf, scene.waves, some)
+        good = np.asarray(rays.status) == drt_jax.Status.OK
+        hits = np.asarray(rays.points[:, :, -1, :2]) - centre
+        for w, (ok, (x, y)) in enumerate(zip(good, np.moveaxis(hits, -1, 1))):
+            halves[k % 2, w] += np.histogram2d(y[ok], x[ok], (edges, edges))[0]
+        arrived[k % 2] += good.sum(axis=1)
+    whole = halves.sum(axis=0) / arrived.sum(axis=0)[:, None, None]
+    noise = (
+        _apart(*(h / n[:, None, None] for h, n in zip(halves, arrived))) / 2 if rounds > 1 else 2
+    )
+    return whole, noise, int(arrived.sum(axis=0).min())
+
+
+def measure(config: Config, view: View) -> dict[str, Any]:
+    """Time and error of every model, and of the peers, at one view."""
+    lens = drt_jax.load_lens(view.lens)
+    field, pixel = math.radians(view.field_deg), 1e-3 * view.pixel_um
+    scene = Scene(lens, field, pixel, np.array(config.wavelengths_um), config.size)
+    rule = scene.model("waves", 1e-3).rule
+    around = scene.waves, pixel, config.size
+    finest = drt_jax.psf(lens, field, math.inf, *around, PsfModel("waves", rule, config.limit))
+    collected, noise, arrived = histogram(scene, config.rounds, np.asarray(finest.centre))
+    limits = {"rays": collected, "waves": np.asarray(finest.kernel)}
+    cells = {"gaussian": (0,), "rays": config.rays, "waves": config.waves}
+    name = {"lens": view.lens, "field_deg": view.field_deg}
+    rows = []
+    for model in (PsfModel(kind, rule, n) for kind in MODELS for n in cells[kind]):
+        kernel, *seconds = _timed(scene, model, config.repeats)
+        own = limits.get(model.kind)
+        known = {"model": model.kind, "cells": model.cells, "off": _apart(kernel, limits["waves"])}
+        known |= dict(zip(("value_s", "gradient_s"), seconds))
+        rows.append(name | known | {"error": None if own is None else _apart(kernel, own)})
+    told = {"outside": float(np.max(finest.outside)), "noise": noise, "rays": arrived}
+    told |= {"rays_off": _apart(*limits.values()), "grid_s": field_grid(scene, config.repeats)}
+    lines, curves = contrast(config, lens, field, pixel)
+    told |= {"frequencies": lines, "transfer": curves}
+    return {"rows": rows, "view": name | told, "peers": _beside(config, scene, rule, name)}
+
+
+def _timed(scene: Scene, model: PsfModel, repeats: int) -> tuple[np.ndarray, float, float]:
+    """A kernel, and seconds that it takes, alone and with the gradient of a mean over it."""
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=(scene.size, scene.size)))
+
+    def mean(lens: Lens) -> jax.Array:
+        return jnp.sum(weights * scene.kernel(lens, model))
+
+    value, _ = _work.compiled(partial(scene.kernel, model=model), scene.lens)
+    gradient, _ = _work.compiled(jax.value_and_grad(mean), scene.lens)
+    return np.asarray(value()), *_common.medians([value, gradient], repeats)
+
+
+def field_grid(scene: Scene, repeats: int) -> float:
+    """Seconds of the waves kernels of 9 x 9 fields, to the view's in the corners."""
+    side = math.atan(math.tan(max(scene.field, 1e-3)) / math.sqrt(2))
+    fields, far = (side, side), [math.inf]
+    method = drt_jax.grid_method(
+        scene.lens, fields, far, scene.waves, scene.pixel, scene.size, 4, "waves", 1e-2
+    )
+    grid = partial(drt_jax.kernel_grid, method=method, wavelengths=scene.waves)
+    call, _ = _work.compiled(lambda lens: grid(lens).kernels, scene.lens)
+    return _common.medians([call], repeats)[0]
+
+
+def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[list, list]:
+    """Frequencies up to Nyquist's, and MTF by waves and by rays and its limit, (3, 2, N)."""
+    lines = np.linspace(0, 0.5 / pixel, config.frequencies)
+    scene = lens, [field], math.inf, np.array(config.wavelengths_um), lines
+    by_waves, by_rays = (drt_jax.transfer(*scene, model) for model in ("waves", "rays"))
+    curves = np.stack([by_waves.mtf[0], by_rays.mtf[0], by_waves.limit[0]])
+    return lines.tolist(), curves.tolist()
+
+
+def _beside(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of what other programs make of the middle colour."""
+    middle = scene.waves[[len(scene.waves) // 2]]
+    one = dataclasses.replace(scene, waves=middle)
+    chief = np.ravel(drt_jax.image_point(scene.lens, scene.field, math.inf, middle))
+    limit = PsfModel("waves", rule, config.limit)
+
+    def optiland(count: int) -> tuple[Callable, Any]:
+        numbers = _peers.Lens(scene.lens, scene.field, math.inf, middle)
+        call = _psf_peers.optiland(numbers, scene.pixel, scene.size, count, 4 * count)
+        return call, one.kernel(one.lens, limit, chief)[0]
+
+    def prysm(count: int) -> tuple[Callable, Any]:
+        pupil, step, centre = _psf_peers.pupil(scene.lens, scene.field, middle, rule, count)
+        call = _psf_peers.prysm(pupil, step, middle[0], scene.pixel, scene.size)
+        return call, one.kernel(one.lens, limit, centre)[0]
+
+    rows = []
+    for program, make in (("optiland", optiland), ("prysm", prysm)):
+        for count in config.peers:
+            row = name | {"program": program, "samples": count, "note": ""}
+            try:
+                call, truth = make(count)
+                error, seconds = _apart(call(), truth), _common.medians([call], 3)[0]
+                rows.append(row | {"seconds": seconds, "error": error})
+            except (ImportError, ValueError) as failure:
+                rows.append(row | {"seconds": None, "error": None, "note": str(failure)[:80]})
+                break
+    return rows
+
+
+def gallery(config: Config) -> np.ndarray:
+    """Kernels (distances, fields, models, W, size, size) for the picture."""
+    what = config.gallery
+    lens, waves = drt_jax.load_lens(what.lens), np.array(config.wavelengths_um)
+    around = waves, 1e-3 * what.pixel_um, config.size
+    fields, distances = np.radians(what.fields_deg), [1e3 * d for d in what.distances_m]
+    many = np.stack([0 * fields, fields], axis=-1)
+    models = [drt_jax.converged_psf(lens, many, distances, *around, kind) for kind in MODELS]
+    made = [drt_jax.psf(lens, f, d, *around, m) for d in distances for f in fields for m in models]
+    kernels = np.stack([np.asarray(one.kernel, np.float32) for one in made])
+    return kernels.reshape(len(distances), len(fields), len(models), *kernels.shape[1:])
+
+
+def photograph(config: Config, view: Photo, figures: pathlib.Path) -> dict[str, Any]:
+    """What a lens makes of a photograph, written into figures."""
+    count = config.photo_pixels
+    picture = transform.resize(data.astronaut(), (count, count), anti_aliasing=True)
+    pixels = np.round(255 * picture).astype(np.uint8)
+    lens, waves = drt_jax.load_lens(view.lens), np.array(config.wavelengths_um)
+    ideal = render.linear(pixels)
+    method = drt_jax.render_method(lens, ideal.shape[:2], math.inf, 1e-3 * view.pixel_um, waves)
+    call = partial(drt_jax.render, lens, ideal, math.inf, 1e-3 * view.pixel_um, waves, method)
+    start = time.perf_counter()
+    image = np.asarray(call())
+    first = time.perf_counter() - start
+    figures.mkdir(exist_ok=True)
+    Image.fromarray(pixels).save(figures / "ideal.png")
+    Image.fromarray(render.encoded(image)).save(figures / f"photo_{view.lens}.png")
+    seconds = _common.medians([call], 3)[0]
+    name = {"lens": view.lens, "pixel_um": view.pixel_um}
+    return name | {"first_s": first, "seconds": seconds, "kernel": method.grid.size}
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Measure the views, then take the pictures."""
+    jobs = {f"{v.lens} {v.field_deg:g}": partial(measure, config, v) for v in config.views}
+    taken = {f"photo {v.lens}": v for v in config.photographs}
+    jobs |= {name: partial(photograph, config, v, run.figures) for name, v in taken.items()}
+    found = _common.measured(run, "part", jobs)
+    views, photographs = found[: len(config.views)], found[len(config.views) :]
+    settings = dataclasses.asdict(config.gallery)
+    return {
+        "kernels": sum((each["rows"] for each in views), []),
+        "peers": sum((each["peers"] for each in views), []),
+        "views": [each["view"] for each in views],
+        "photographs": photographs,
+        "wavelengths_um": list(config.wavelengths_um),
+        "gallery": settings | {"distances_m": [str(d) for d in config.gallery.distances_m]},
+        "gallery_kernels": gallery(config),
+        "seconds": run.seconds,
+    }
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Every model; the peers; the views; the photographs."""
+
+    def short(error: float | None) -> str:
+        return "" if error is None else f"{error:.1e}"
+
+    def place(row: dict[str, Any]) -> str:
+        return f"{row['lens']} {row['field_deg']:g}"
+
+    time_of = _common.duration
+    lines = [
+        (place(r), r["model"], r["cells"] or None, time_of(r["value_s"]), time_of(r["gradient_s"]))
+        + (short(r["error"]), short(r["off"]))
+        for r in results["kernels"]
+    ]
+    header = ("lens, degrees", "model", "cells", "kernel", "and gradient")
+    header += ("error", "off the waves")
+    others = [
+        (place(r), r["program"], r["samples"], time_of(r["seconds"]), short(r["error"]), r["note"])
+        for r in results["peers"]
+    ]
+    views = [
+        (place(v), short(v["outside"]), v["rays"], short(v["noise"]), short(v["rays_off"]))
+        + (time_of(v["grid_s"]),)
+        for v in results["views"]
+    ]
+    columns = ("lens, degrees", "outside", "rays of the histogram", "its noise")
+    columns += ("rays off the waves", "9 x 9 fields")
+    photos = [
+        (p["lens"], p["pixel_um"], p["kernel"], time_of(p["first_s"]), time_of(p["seconds"]))
+        for p in results["photographs"]
+    ]
+    names = ("lens", "pixel, um", "kernel", "first", "next")
+    beside = ("lens, degrees", "program", "samples", "time, one colour", "error", "")
+    return {
+        "images": _common.table(header, lines),
+        "images, other programs": _common.table(beside, others),
+        "images, views": _common.table(columns, views),
+        "images, photographs": _common.table(names, photos),
+    }
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """The gallery, error over time, transfer functions, the photographs."""
+    _draw_gallery(results, figures / "gallery.png")
+    views = results["views"]
+    figure, axes = show.new(2, len(views), 4.2, 3.4)
+    for view, (above, below) in zip(views, np.reshape(axes, (2, -1)).T):
+        ours = [r for r in results["kernels"] if r["lens"] == view["lens"] and r["error"]]
+        theirs = [r for r in results["peers"] if r["lens"] == view["lens"] and r["error"]]
+        series = {
+            key[0]: ([r["value_s"] for r in rows], [[r["error"]] for r in rows])
+            for key, rows in _common.grouped(ours, "model").items()
+        }
+        series |= {
+            key[0]: ([r["seconds"] for r in rows], [[r["error"]] for r in rows])
+            for key, rows in _common.grouped(theirs, "program").items()
+        }
+        error_curves(above, series, "seconds", "error of the kernel (L1)")
+        above.set_title(f"{view['lens']}, {view['field_deg']:g} degrees", fontsize=9)
+        by_waves, by_rays, limit = np.asarray(view["transfer"])
+        lines = view["frequencies"]
+        show.mtf(below, lines, [by_waves, by_rays], limit[0], ("waves", "rays"))
+    figure.savefig(figures / "models.png")
+    photos = [("ideal", "ideal")] + [
+        (f"photo_{p['lens']}", p["lens"]) for p in results["photographs"]
+    ]
+    figure, axes = show.new(1, len(photos), 3.6, 3.8)
+    for ax, (name, title) in zip(np.ravel(axes), photos):
+        ax.imshow(np.asarray(Image.open(figures / f"{name}.png")), interpolation="antialiased")
+        ax.set(xticks=[], yticks=[], title=title)
+    figure.savefig(figures / "photographs.png")
+
+
+def _draw_gallery(results: dict[str, Any], path: pathlib.Path) -> None:
+    """Fields down, distances across, of each the three models, colours as they are."""
+    kernels, what = results["gallery_kernels"], results["gallery"]
+    count, fields, models = kernels.shape[:3]
+    figure, axes = show.new(fields, count * models, 1.3, 1.45)
+    for row, ax in zip(range(fields), np.reshape(axes, (fields, -1))):
+        for k, one in enumerate(ax):
+            far, model = divmod(k, models)
+            picture = np.moveaxis(kernels[far, row, model], 0, -1)
+            one.imshow(np.sqrt(np.clip(picture / picture.max(), 0, 1)), origin="lower")
+            one.set(xticks=[], yticks=[])
+            if row == 0:
+                away = what["distances_m"][far]
+                one.set_title(f"{MODELS[model]}\n{away} m", fontsize=7)
+        ax[0].set_ylabel(f"{what['fields_deg'][row]:g} degrees", fontsize=7)
+    figure.savefig(path)
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__])

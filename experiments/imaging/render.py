@@ -1,0 +1,221 @@
+"""The photograph that a lens takes: `python -m experiments.render photo.jpg --set scene.lens=...`.
+
+The photograph is taken for what a pinhole of the lens's focal length sees, pixel for pixel of the
+sensor; nothing is enlarged or reduced. Its values are linearised by the curve of sRGB, and those of
+the result turned back. Outside of the photograph it goes on as at its edge. Writes ideal.png
+and photo.png, of the same size, and both side by side, into figures.
+"""
+
+import dataclasses
+import os
+import pathlib
+import sys
+import time
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+from skimage import data
+from tqdm import tqdm
+
+import drt_jax
+from drt_jax import show
+from drt_jax.inputs import one_line
+from drt_jax.learn import images
+
+from . import _command, _common
+from .runs.config import ConfigError
+from .runs.folder import Run
+
+COLUMNS = ("seconds",)
+# Bytes for each value of a picture: the picture, the result, its light and what is on the way.
+_BYTES = 40
+_BEYOND = 1e-3  # of the light outside the kernels, from where it is worth a warning
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """lens: bundled name or YAML path. wavelengths_um: of R, G, B. distance_m: .inf, or a number.
+    depth: a picture of the size of the photograph whose white is `near_m` and whose black is
+    `distance_m`, even in 1 / distance; none: all at distance_m."""
+
+    lens: str = "double_gauss"
+    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
+    distance_m: float = float("inf")
+    depth: str = ""
+    near_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        _common.require(len(self.wavelengths_um) == 3, "scene.wavelengths_um: expected R, G, B")
+        _common.require(self.distance_m > 0, "scene.distance_m: must be above 0")
+        _common.require(self.near_m > 0, "scene.near_m: must be above 0")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment; see configs/render.yaml.
+
+    photo: a file, or "bundled". pixel_um: 0 spreads the photograph over `field_deg` from the middle
+    to a corner. model: of the kernels. kernel: its side in pixels; 0: what the blur needs. nodes:
+    fields on one side of the axis. layers: of a depth map. full_well, read_noise: electrons; a full
+    well of 0 leaves noise out.
+    """
+
+    photo: str = "bundled"
+    pixel_um: float = 0.0
+    field_deg: float = 12.0
+    model: Literal["gaussian", "rays", "waves", "auto"] = "rays"
+    kernel: int = 0
+    nodes: int = 8
+    layers: int = 8
+    full_well: float = 10000.0
+    read_noise: float = 3.0
+    seed: int = 0
+    scene: Scene = dataclasses.field(default_factory=Scene)
+
+    def __post_init__(self) -> None:
+        least = (0.05, 1e4)
+        good = self.pixel_um == 0 or least[0] <= self.pixel_um <= least[1]
+        got = f"got {self.pixel_um!r}"
+        _common.require(good, f"pixel_um: expected {least[0]} to {least[1]:g}, or 0, {got}")
+        limits = {"field_deg": (0.01, 60), "kernel": (0, 255), "nodes": (2, 64), "layers": (2, 64)}
+        _common.require_within("", self, **limits, full_well=(0, 1e9), read_noise=(0, 1e6))
+        _common.require(self.kernel % 2 or not self.kernel, "kernel: expected an odd number, or 0")
+
+
+def linear(pixels: np.ndarray) -> np.ndarray:
+    """Light of 8-bit values, by the curve of sRGB (IEC 61966-2-1): float32, 0 to 1."""
+    level = np.arange(256) / 255
+    curve = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    return curve.astype(np.float32)[pixels]
+
+
+def encoded(light: np.ndarray) -> np.ndarray:
+    """8-bit values of light, by the curve of sRGB; beyond 0 to 1 cut off."""
+    level = np.clip(light, 0, 1)
+    curve = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)
+    return np.round(255 * curve).astype(np.uint8)
+
+
+def _read(key: str, name: str) -> np.ndarray:
+    """A picture, uint8 (H, W, 3). ConfigError for one that cannot be read, or is too large."""
+    if name == "bundled":
+        return np.asarray(data.astronaut())
+    path = pathlib.Path(name).expanduser()
+    try:
+        width, height = images.look(path)
+        needed = 3 * width * height * _BYTES
+        room = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        if needed > room:
+            raise ValueError(
+                f"{width} x {height} pixels take {needed / 1e9:.1f} GB, there are {room / 1e9:.1f}"
+            )
+        return images.read(path)
+    except Exception as error:  # an image reader may raise anything on a damaged file
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise ConfigError(one_line(f"{key}: {name}: {reason}")) from error
+
+
+def _distance(config: Config, shape: tuple[int, int]) -> Any:
+    """mm: a number, or (H, W)."""
+    scene = config.scene
+    if not scene.depth:
+        return 1e3 * scene.distance_m
+    grey = _read("scene.depth", scene.depth).mean(axis=-1) / 255
+    if grey.shape != shape:
+        sizes = f"{grey.shape[1]} x {grey.shape[0]}, the photograph {shape[1]} x {shape[0]}"
+        raise ConfigError(f"scene.depth: {scene.depth} has {sizes} pixels: give one of its size")
+    far, near = 1e-3 / scene.distance_m, 1e-3 / scene.near_m
+    with np.errstate(divide="ignore"):
+        return 1 / (far + (near - far) * grey)
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Render the photograph."""
+    pixels = _read("photo", config.photo)
+    shape = pixels.shape[:2]
+    lens = drt_jax.load_lens(config.scene.lens)
+    waves = config.scene.wavelengths_um
+    distance = _distance(config, shape)
+    focal = float(np.mean(drt_jax.effective_focal_length(lens, waves)))
+    pixel = 1e-3 * config.pixel_um
+    if not pixel:
+        pixel = abs(focal) * np.tan(np.radians(config.field_deg)) / (np.hypot(*shape) / 2)
+    began = time.perf_counter()
+    method = drt_jax.render_method(
+        lens, shape, distance, pixel, waves, config.kernel or None, config.nodes,
+        layers=config.layers, model=config.model,
+    )  # fmt: skip
+    bar = lambda rows: tqdm(rows, unit="row", dynamic_ncols=True)  # noqa: E731
+    ideal = linear(pixels)
+    image = drt_jax.render(lens, ideal, distance, pixel, waves, method, bar)
+    if config.full_well:
+        key = jax.random.key(config.seed)
+        noisy = drt_jax.sensor_noise(jnp.asarray(image), key, config.full_well, config.read_noise)
+        image = np.asarray(noisy)
+    grid = drt_jax.kernel_grid(lens, method.grid, waves)
+    lit = np.asarray(grid.solid_angle) > 0
+    result = encoded(np.asarray(image))
+    run.figures.mkdir(exist_ok=True)
+    Image.fromarray(pixels).save(run.figures / "ideal.png")
+    Image.fromarray(result).save(run.figures / "photo.png")
+    angle = np.degrees(np.arctan(np.hypot(*shape) / 2 * pixel / abs(focal)))
+    return {
+        "pixel_um": 1e3 * pixel,
+        "sensor_mm": [shape[1] * pixel, shape[0] * pixel],
+        "focal_mm": focal,
+        "field_deg": float(angle),
+        "kernel": method.grid.size,
+        "tile": list(method.tile),
+        "outside": float(np.max(np.asarray(grid.outside), where=lit, initial=0)),
+        "dark": float(np.mean(~lit)),
+        "light": float(np.min(np.where(lit, grid.solid_angle, 0)) / np.max(grid.solid_angle)),
+        "seconds": time.perf_counter() - began,
+        "shape": list(shape),
+    }
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """What was done, and warnings."""
+    wide, high = results["sensor_mm"]
+    outside = f"{100 * results['outside']:.2g} %"
+    if results["outside"] > _BEYOND:
+        outside += f": raise kernel above {results['kernel']}"
+    dark = f"{100 * results['dark']:.2g} %"
+    if results["dark"]:
+        dark += ": the picture reaches beyond the image circle, and is black there"
+    rows = [
+        ("pixel, um", results["pixel_um"]),
+        ("sensor, mm", f"{wide:.4g} x {high:.4g}"),
+        ("focal length, mm", results["focal_mm"]),
+        ("field in the corners, degrees", results["field_deg"]),
+        ("kernel, pixels", results["kernel"]),
+        ("light outside the kernels, at most", outside),
+        ("fields without light", dark),
+        ("time", _common.duration(results["seconds"])),
+    ]
+    return {"render": _common.table(("", "value"), rows)}
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Both pictures side by side."""
+    height, width = results["shape"]
+    figure, axes = show.new(1, 2, 5, 5 * height / width + 0.3)
+    for ax, name in zip(axes, ("ideal", "photo")):
+        ax.imshow(np.asarray(Image.open(figures / f"{name}.png")), interpolation="antialiased")
+        ax.set(xticks=[], yticks=[], title=name)
+    figure.savefig(figures / "beside.png")
+
+
+def arguments(words: list[str]) -> list[str]:
+    """The words of a command line, of which the first may be a photograph."""
+    if not words or words[0].startswith("-"):
+        return words
+    quoted = words[0].replace("'", "''")
+    return ["--set", f"photo='{quoted}'", *words[1:]]
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__], arguments(sys.argv[1:]))

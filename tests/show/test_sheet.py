@@ -1,0 +1,67 @@
+"""Pictures of analyses show what was computed."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import show
+from drt_jax.show import analyses
+
+WAVES = (0.6, 0.53, 0.48)
+LENS = drt_jax.load_lens("cooke_triplet")
+SCENE = np.array([0.0, 0.1, 0.2]), np.inf, WAVES
+
+
+def test_colours_run_from_blue_to_red():
+    assert analyses.colours((0.48, 0.6)) == ["#1f77b4", "#d62728"]
+    assert analyses.colours(WAVES)[1] not in ("#1f77b4", "#d62728")
+    assert len(analyses.colours([0.55])) == 1 and len(analyses.colours([0.5, 0.5])) == 2
+
+
+def test_curves_hold_the_numbers():
+    bent = drt_jax.distortion(LENS, *SCENE)
+    _, axes = show.new()
+    show.distortion(axes, bent, SCENE[0], WAVES)
+    *curves, _ = axes.lines
+    assert len(curves) == 3
+    np.testing.assert_allclose(curves[0].get_xdata(), 100 * np.asarray(bent.relative)[:, 0])
+    np.testing.assert_allclose(curves[0].get_ydata(), np.degrees(SCENE[0]))
+    foci = drt_jax.field_curvature(LENS, *SCENE)
+    _, axes = show.new()
+    show.field_curvature(axes, foci, SCENE[0], WAVES)
+    styles = [line.get_linestyle() for line in axes.lines[:6]]
+    assert sorted(styles) == ["-"] * 3 + ["--"] * 3
+
+
+def test_what_is_not_finite_is_left_out():
+    """A spot without light, a fan whose ends are clipped."""
+    lens = dataclasses.replace(LENS, semi_diameter=LENS.semi_diameter.at[0].set(5.0))
+    fans = drt_jax.ray_fans(lens, [0.0, 0.3], np.inf, WAVES, 9)
+    _, axes = show.new()
+    show.fan(axes, fans, 1, WAVES)
+    drawn = axes.lines[0].get_ydata()
+    assert np.any(np.isnan(drawn)) and np.any(np.isfinite(drawn))
+    found = drt_jax.spot_diagram(LENS, *SCENE, drt_jax.Gauss(4, "bilateral"))
+    dark = dataclasses.replace(
+        found,
+        points=jnp.full_like(found.points, jnp.inf),
+        airy_radius=jnp.full_like(found.airy_radius, jnp.inf),
+    )
+    for each, label in ((found, "RMS"), (dark, "no light arrives")):
+        figure, axes = show.new()
+        show.spots(axes, each, 1, WAVES)
+        assert axes.get_xlabel().startswith(label)
+        assert figure._repr_png_()
+
+
+@pytest.mark.slow
+def test_a_sheet_has_all_panels():
+    """Also of the axis alone, and of a lens that passes no light at one of its fields."""
+    for fields, count in (([0.0, 0.1, 0.2, 0.3], 15), ([0.0], 9)):
+        said: list[str] = []
+        figure = show.sheet(LENS, fields, np.inf, WAVES, say=said.append)
+        assert len(figure.axes) == count and said[-1] == "drawing"
+        assert len(figure._repr_png_()) > 20_000
