@@ -186,7 +186,7 @@ def _timed(scene: Scene, model: PsfModel, repeats: int) -> tuple[np.ndarray, flo
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(scene.size, scene.size)))
 
     def mean(lens: Lens) -> jax.Array:
-        return jnp.sum(weights * scene.kernel(lens, model))
+        return jnp.sum(weights[None] * scene.kernel(lens, model))
 
     value, _ = _work.compiled(partial(scene.kernel, model=model), scene.lens)
     gradient, _ = _work.compiled(jax.value_and_grad(mean), scene.lens)

@@ -34,10 +34,6 @@ class Config:
 
     folder: str
 
-    def __post_init__(self) -> None:
-        found = any(pathlib.Path(self.folder).glob("*.zmx"))
-        _common.require(found, f"folder: no .zmx file in {self.folder}")
-
 
 def listed(content: str, key: str) -> tuple[float, float] | None:
     """A number of a listing and one of its last digit; None if it is not there."""
@@ -87,6 +83,7 @@ def outcome(path: pathlib.Path) -> dict[str, str]:
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Read each file."""
     paths = sorted(pathlib.Path(config.folder).glob("*.zmx"))
+    _common.require(len(paths) > 0, f"folder: no .zmx file in {config.folder}")
     rows = _common.measured(run, "file", {p.name: lambda p=p: outcome(p) for p in paths})
     for row in rows:
         own = {name: np.array([float(row["outcome"] == name)]) for name in COLUMNS}
