@@ -28,7 +28,7 @@ def blur_row(light: Array, kernels: Array, shares: Array, tile: tuple[int, int])
 
     def added(total: Array, given: tuple[Array, Array]) -> tuple[Array, None]:
         kernel, share = given
-        blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides), sides)
+        blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides)[None], sides)
         inside = blurred[..., size - 1 : ends[0], size - 1 : ends[1]]
         return total + share * jnp.moveaxis(inside, 0, 2).reshape(share.shape), None
 

@@ -77,7 +77,8 @@ def render_method(
     tile: side of a tile in pixels.
     model, tolerance: of the kernels, as of `psf`; to the same tolerance kernels are sums of a few.
 
-    ValueError inside a trace, for numbers that make no sense, and where no light arrives.
+    Warns of light beside kernels that are too small. ValueError inside a trace, for numbers that
+    make no sense, and where no light arrives.
     """
     known = known_values((lens, distance, pixel, wavelengths))
     if known is None:
@@ -223,6 +224,8 @@ def render(
         )
     if picture.shape[:2] != method.shape:
         raise ValueError(f"image: the method is for {method.shape}, got {picture.shape[:2]}")
+    if concrete(distance):
+        layer_distances(distance, method.shape, 2)
     maps = sensor_maps(lens, method, wavelengths)
     if jnp.ndim(jnp.asarray(distance)) == 0:
         return _whole(maps, method, picture, progress)
@@ -304,20 +307,24 @@ def composed(
 
 def spread(values: Array, known: Array) -> Array:
     """`values` (H, W, C), 0 where unknown, gone on to where `known` (H, W, 1) is 0: there the mean
-    of what is known in the smallest square of 2, 4, 8, ... pixels that knows any, in steps half as
-    large where more squares do."""
+    of what is known in the 3 x 3 pixels around; where none is, of pixels 2, 4, 8, ... as large."""
     height, width = known.shape[:2]
-    if height == width == 1:
-        return safe_divide(values, known)
-    even = ((0, height % 2), (0, width % 2), (0, 0))
+    zero = jnp.zeros((), values.dtype)
+
+    def around(a: Array) -> Array:
+        return jax.lax.reduce_window(a, zero, jax.lax.add, (3, 3, 1), (1, 1, 1), "SAME")
 
     def halved(a: Array) -> Array:
-        a = jnp.pad(a, even)
-        return a.reshape(a.shape[0] // 2, 2, a.shape[1] // 2, 2, -1).mean(axis=(1, 3))
+        a = jnp.pad(a, ((0, height % 2), (0, width % 2), (0, 0)))
+        return a.reshape(-(-height // 2), 2, -(-width // 2), 2, -1).mean(axis=(1, 3))
 
-    far = spread(halved(values), halved(known))
-    across = jnp.repeat(jnp.repeat(far, 2, axis=0), 2, axis=1)[:height, :width]
-    return jnp.where(known > 0, safe_divide(values, known), across)
+    share = around(known)
+    near = safe_divide(around(values), share)
+    if max(height, width) > 3:
+        far = spread(halved(values), halved(known))
+        across = jnp.repeat(jnp.repeat(far, 2, axis=0), 2, axis=1)[:height, :width]
+        near = jnp.where(share > 0, near, across)
+    return jnp.where(known > 0, safe_divide(values, known), near)
 
 
 def sensor_noise(image: Array, key: Array, full_well: Numbers, read_noise: Numbers) -> Array:

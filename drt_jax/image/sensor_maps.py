@@ -16,7 +16,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..numerics import Numbers, safe_divide, safe_sqrt
-from .fields import GridMethod, KernelGrid, kernel_grid
+from .fields import GridMethod, KernelGrid, kernel_grid, warn_of_loss
 from .interpolate import at_point, lagrange
 
 # Nodes that a place, and a kernel or its light, are interpolated from along each axis.
@@ -119,8 +119,10 @@ def chosen_places(
     lens: Lens, method: RenderMethod, wavelengths: Numbers, tolerance: float
 ) -> np.ndarray:
     """Places (R,) whose kernels give back those of all places, at all distances, but for
-    `tolerance`, the sum of the absolute errors of the pixels. Known numbers."""
+    `tolerance`, the sum of the absolute errors of the pixels. Known numbers. Warns of light beside
+    the kernels, and of too many."""
     grid = kernel_grid(lens, method.grid, wavelengths)
+    warn_of_loss(lens, method.grid, grid, wavelengths)
     chosen: list[int] = []
     for distance in range(len(grid.vergences)):
         for colour in range(grid.solid_angle.shape[-1]):
@@ -215,7 +217,8 @@ def _seen(
     half = jnp.asarray(method.grid.half[::-1], u.dtype)
     end = 2 * half
     moved = (u + half).reshape(1, 1, 2) - jnp.einsum("ab,yxb->yxa", slope, shift)
-    places = jnp.clip(moved, 0, end.reshape(1, 1, 2))
+    # Half a step beyond the nodes, where light from outside of the picture comes from.
+    places = jnp.clip(moved, -0.5, end.reshape(1, 1, 2) + 0.5)
     down, across = table.shape[:2]
     (row, wy), (column, wx) = (
         lagrange(places[..., 1], down, LOCAL),
