@@ -1,7 +1,7 @@
-"""Blur that varies over the picture: a few fixed kernels, whose shares vary from pixel to pixel.
+"""Blur that varies over the picture: a few kernels, whose shares vary from pixel to pixel.
 
-The kernel of a pixel is a sum of R kernels, the same for all pixels, times shares of its own. Each
-kernel takes one transform back of a tile's light; the shares are smooth, so that no seam is left.
+The kernel of a pixel is a sum of R kernels, the same for all pixels of a tile, times shares of its
+own. Each kernel takes one transform back of a tile's light.
 """
 
 import jax
@@ -18,8 +18,9 @@ def blur_row(
     """A row of n tiles of height and width `tile`, blurred: (C, height, n width).
 
     light: (C, height + K - 1, n width + K - 1), with what lies around.
-    kernels: (C, R, K, K); a pixel collects kernel[k] of the light k pixels before it, as in a
-    convolution. shares: (C, R, height, M), what of each kernel a row of pixels takes at M places
+    kernels: (n, C, R, K, K) of each tile, or (1, ...) of all; a pixel collects kernel[k] of the
+        light k pixels before it, as in a convolution.
+    shares: (C, R, height, M) or (1, ...), what of each kernel a row of pixels takes at M places
         along it; across: (n width, M), the matrix that interpolates between them.
     """
     size, channels = kernels.shape[-1], len(light)
@@ -31,11 +32,11 @@ def blur_row(
 
     def added(total: Array, given: tuple[Array, Array]) -> tuple[Array, None]:
         kernel, share = given
-        blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides)[None], sides)
+        blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides), sides)
         inside = blurred[..., size - 1 : ends[0], size - 1 : ends[1]]
         exact = jax.lax.Precision.HIGHEST
         each = jnp.einsum("cym,xm->cyx", share, across, precision=exact)
-        return total + each * jnp.moveaxis(inside, 0, 2).reshape(each.shape), None
+        return total + each * jnp.moveaxis(inside, 0, 2).reshape(total.shape), None
 
     start = jnp.zeros((channels, height, count * width), light.dtype)
-    return jax.lax.scan(added, start, (jnp.moveaxis(kernels, 1, 0), jnp.moveaxis(shares, 1, 0)))[0]
+    return jax.lax.scan(added, start, (jnp.moveaxis(kernels, 2, 0), jnp.moveaxis(shares, 1, 0)))[0]

@@ -11,7 +11,6 @@ up to 1, less what falls beside the kernel, so that an even scene stays even but
 angle. G is a sum of a few kernels with shares that vary over the picture, see `blur`.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
@@ -26,7 +25,7 @@ from ..lens.lens import Lens
 from ..lens.paraxial import effective_focal_length
 from ..lens.scene import vergence_of
 from ..numerics import Numbers, concrete, known_values, safe_divide, safe_sqrt
-from .blur import SIDES, blur_row
+from .blur import blur_row
 from .fields import (
     check_pixel,
     grid_method,
@@ -39,15 +38,13 @@ from .sensor_maps import (
     SMOOTH,
     Maps,
     RenderMethod,
-    chosen_places,
+    chosen,
     controls,
     sensor_maps,
     tiles_of,
 )
 
 _WAVELENGTHS = (0.6, 0.53, 0.48)
-# The side of the squares that are transformed, at most, unless the kernels need a larger one.
-_SIDE = 256
 # How much farther than the field of a pinhole that of a pixel is looked for, as a part of it.
 _TRIED = np.linspace(0, 2, 81)
 # The largest tangent of a field, that of 85 degrees.
@@ -62,7 +59,6 @@ def render_method(
     wavelengths: Numbers = _WAVELENGTHS,
     size: int | None = None,
     nodes: int = 16,
-    tile: int | None = None,
     layers: int = 8,
     model: Kind | Literal["auto"] | PsfModel = "rays",
     tolerance: float = 1e-3,
@@ -74,9 +70,8 @@ def render_method(
     pixel: mm. wavelengths: (C,) um.
     size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
     nodes: fields on one side of the axis, along the longer side of the picture, see `grid_method`.
-    tile: side of a tile in pixels.
-    model, tolerance: of the kernels, as of `psf`; kernels are sums of a few to the same number, see
-        `chosen_places`.
+    model, tolerance: of the kernels, as of `psf`; kernels are interpolated to the same number, see
+        `sensor_maps.chosen`.
 
     Warns of light beside kernels that are too small. ValueError inside a trace, for numbers that
     make no sense, and where no light arrives.
@@ -100,19 +95,9 @@ def render_method(
         side = float(np.asarray(pixel))
         angles = _angles(lens, shape, far, side, focal, waves)
         grid = grid_method(lens, angles, far, waves, side, size, nodes, model, tolerance)
-        if tile is None:
-            tile = (_SIDE if grid.size <= _SIDE // 2 else SIDES[-1]) - grid.size + 1
-        # Equal tiles, the last of which end where the picture does.
-        tiles = tuple(-(-n // -(-n // tile)) for n in shape)
-        method = RenderMethod(
-            grid,
-            jnp.asarray(focal, lens.curvature.dtype),
-            jnp.zeros(0, jnp.int32),
-            (shape[0], shape[1]),
-            (tiles[0], tiles[1]),
-        )
-        places = chosen_places(lens, method, waves, tolerance)
-        return dataclasses.replace(method, places=jnp.asarray(places, jnp.int32))
+        dtype, size = lens.curvature.dtype, (shape[0], shape[1])
+        method = RenderMethod(grid, jnp.asarray(focal, dtype), jnp.zeros(0, jnp.int32), size, size)
+        return chosen(lens, method, waves, tolerance)
 
 
 def layer_distances(distance: Numbers, shape: tuple[int, int], layers: int) -> np.ndarray:
@@ -183,11 +168,29 @@ def _strip(maps: Maps, method: RenderMethod, planes: Array, row: Array, lit: boo
 
     x, y = (between(maps.sources[..., k], places) for k in (0, 1))
     warped = cubic(planes, y, x)
-    shares = product("ym,crmn->cryn", local[0], maps.shares)
-    blurred = blur_row(warped, maps.kernels, shares, local[1], method.tile)
+    if maps.shares is None:
+        kernels, shares, across = _corners(maps.kernels, method, row)
+    else:
+        kernels, across = maps.kernels[None], local[1]
+        shares = product("ym,crmn->cryn", local[0], maps.shares)
+    blurred = blur_row(warped, kernels, shares, across, method.tile)
     if lit:
         blurred = blurred * between(maps.light, local)
     return jnp.moveaxis(blurred, 0, -1)
+
+
+def _corners(kernels: Array, method: RenderMethod, row: Array) -> tuple[Array, Array, Array]:
+    """What `blur_row` takes of a row of n tiles: kernels (n, C, 4, K, K) of the corners, from all
+    (C, Cy, Cx, K, K), their shares (1, 4, height, 2) and the matrix (n width, 2)."""
+    count, dtype = tiles_of(method)[1], kernels.dtype
+    near = jax.lax.dynamic_slice_in_dim(kernels, row, 2, axis=1)
+    four = [near[:, d, a : a + count] for d in (0, 1) for a in (0, 1)]
+    ramps = [np.arange(n) / n for n in method.tile]
+    down, across = (np.stack([1 - ramp, ramp], -1) for ramp in ramps)
+    shares = np.stack([down[:, d, None] * np.eye(2)[a] for d in (0, 1) for a in (0, 1)])
+    matrix = np.tile(across, (count, 1))
+    moved = jnp.moveaxis(jnp.stack(four), (0, 2), (2, 0))
+    return moved, jnp.asarray(shares[None], dtype), jnp.asarray(matrix, dtype)
 
 
 def render(
