@@ -56,7 +56,7 @@ def _all(lens: Lens) -> list[int]:
     return list(range(lens.count))
 
 
-def _live(lens: Lens) -> list[int]:
+def _active(lens: Lens) -> list[int]:
     return list(lens.active)
 
 
@@ -154,9 +154,9 @@ VariableKind = Literal[
     "decentre", "semi_diameter"
 ]  # fmt: skip
 KINDS: dict[str, Kind] = {
-    "curvature": Kind(_live, _all, _one, *_leaf("curvature"), (-1, 0.02)),
-    "conic": Kind(_live, _all, _one, *_leaf("conic"), (0, 0.1)),
-    "coefficients": Kind(_live, _all, _terms, *_leaf("coefficients"), (1, 0.01)),
+    "curvature": Kind(_active, _all, _one, *_leaf("curvature"), (-1, 0.02)),
+    "conic": Kind(_active, _all, _one, *_leaf("conic"), (0, 0.1)),
+    "coefficients": Kind(_active, _all, _terms, *_leaf("coefficients"), (1, 0.01)),
     "thickness": Kind(_gaps, _gaps, _one, _leaf("thickness")[0], _write_thickness, (1, 0.05)),
     "sensor": Kind(
         lambda lens: [0],
@@ -168,8 +168,8 @@ KINDS: dict[str, Kind] = {
     ),
     "index": Kind(model_glasses, model_glasses, _one, *_glass(0), (0, 0.02), (1.3, 2.2)),
     "abbe": Kind(model_glasses, model_glasses, _one, *_glass(1), (0, 2.0), (15, 100)),
-    "tilt": Kind(_live, _placed, lambda lens: 3, *_leaf("tilt"), (0, 1e-3)),
-    "decentre": Kind(_live, _placed, lambda lens: 2, *_leaf("decentre"), (1, 1e-3)),
+    "tilt": Kind(_active, _placed, lambda lens: 3, *_leaf("tilt"), (0, 1e-3)),
+    "decentre": Kind(_active, _placed, lambda lens: 2, *_leaf("decentre"), (1, 1e-3)),
     "semi_diameter": Kind(
         _finite, _finite, _one, *_leaf("semi_diameter"), (1, 0.05), (1e-6, np.inf)
     ),
