@@ -408,7 +408,10 @@ def test_obscurations_need_another_rule():
         (dict(kind="length", target=3, high=4), "has a target and limits; make two operands"),
         (dict(kind="spot", high=0.1), "spot: takes no target and no limits; use rms_spot"),
         (dict(kind="length", fields=(0,)), "length: does not depend on fields; remove fields"),
-        (dict(kind="focal_length", distances=(0,)), "does not depend on distances, only on wavelengths"),
+        (
+            dict(kind="focal_length", distances=(0,)),
+            "does not depend on distances, only on wavelengths",
+        ),
         (dict(kind="spot", fields=0), "operands: spot: fields: expected whole numbers"),
         (dict(kind="spot", fields=("x",)), "operands: spot: fields: expected whole numbers"),
     ],
