@@ -154,10 +154,13 @@ def _angles(
     """Fields in radians (F, 2); None for real image heights."""
     far, line = record.distance, use.field_line
     if use.field_kind == "angle":
-        if np.any(np.abs(heights) >= 90):
-            raise record.error(line, "a field angle of 90 degrees and more; give image heights")
+        beyond = bool(np.any(np.abs(heights) >= 90))
         if math.isinf(far):
+            if beyond:
+                record.notes.append(f"line {line}: fields of 90 degrees and more cannot be traced")
             return np.radians(heights)
+        if beyond:
+            raise record.error(line, "a field angle of 90 degrees and more; give object heights")
         place = float(entrance_pupil(lens, wave).position[0])
         if not math.isfinite(place):
             raise record.error(line, "field angles at a telecentric lens; give object heights")
