@@ -304,7 +304,9 @@ def test_what_is_not_read_is_refused_by_line(tmp_path):
     )
     toroid = FRONT.replace("STANDARD", "TOROIDAL|PARM 1 40|XDAT 1 4|XDAT 2 10|XDAT 3 0|XDAT 4 {}")
     assert read(tmp_path, toroid.format(0), BACK).lens.forms[0] == "toroid"
-    assert "line 27: parameter 16 (XDAT 4) of SURF 1" in refused(tmp_path, toroid.format(1e-3), BACK)
+    assert "line 27: parameter 16 (XDAT 4) of SURF 1" in refused(
+        tmp_path, toroid.format(1e-3), BACK
+    )
     for key in ("SQOB 1 2 0", "UDAP 1", "XDAT 1 2"):
         even = f"{BACK}|{key}".replace("STANDARD", "EVENASPH")
         assert "leaves it out" in refused(tmp_path, FRONT, even)
