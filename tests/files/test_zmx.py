@@ -372,6 +372,24 @@ def test_written_forms_glasses_and_apertures(tmp_path):
         )
 
 
+def test_written_series_and_phases(tmp_path):
+    """Extra data and radial phases, read back; and a sag that does not come from this reader."""
+    series = "XDAT 1 3|XDAT 2 4|XDAT 3 {0}|XDAT 4 -.2|XDAT 5 .3"
+    kinds = [f"{kind}|{series.format(0.1)}" for kind in ("XPOLYNOM", "SZERNSAG|PARM 0 1")]
+    kinds.append("XASPHERE|XDAT 1 9|XDAT 2 20|XDAT 4 .1|XDAT 11 .2")
+    kinds.append("QED_TYPE|XDAT 1 0|XDAT 2 2|XDAT 3 20|XDAT 4 .1|XDAT 5 .2")
+    kinds.append("BINARY_2|PARM 0 -1|PARM 2 1e-5|XDAT 1 2|XDAT 2 20|XDAT 3 700|XDAT 4 .3")
+    surfaces = [BACK.replace("STANDARD", kind).replace("48", "9") for kind in kinds]
+    lens = read(tmp_path, FRONT, *surfaces).lens
+    save_lens(lens, tmp_path / "own.zmx")
+    again = load_lens(tmp_path / "own.zmx")
+    same(lens, again)
+    np.testing.assert_array_equal(lens.phase.coefficients, again.phase.coefficients)
+    assert again.phase.order.tolist() == [-1]
+    linear = 0.1 * 1 / 4 - 0.2 * 2 / 4 + 0.3 * 1 / 16 - (50 - np.sqrt(50**2 - 5))
+    np.testing.assert_allclose(sag(again, 1, 1.0, 2.0), linear)
+
+
 def test_files_that_are_none(tmp_path):
     path, noise = tmp_path / "lens.zmx", np.random.default_rng(0)
     whole = text(FRONT, BACK).encode("utf-16")
