@@ -11,11 +11,13 @@ import numpy as np
 from ..inputs import InputError, Lines, one_line, shown
 from ..lens.lens import Lens
 from .entry import LensError
+from .order import CLOSEST
 from .specs import build_lens
 
 Missing = Literal["error", "warn"]
 _FAR = 1e10  # mm, from where on a distance of a file is infinite
 _TINY = 1e-6  # mm, of the stop until its size is known
+_MEDIUM = ("glass", "index", "nd", "vd", "partial")
 
 
 @dataclasses.dataclass
@@ -111,6 +113,7 @@ class Record:
 
     def lens(self, semi_diameter: float | None) -> Lens:
         """The lens; its stop has no size yet unless `semi_diameter` (mm) is given."""
+        self._spaced()
         top, lines, names = self._prescription(semi_diameter or _TINY)
         image = [part for part in self.parts if isinstance(part, Row)][-1]
         try:
@@ -119,6 +122,28 @@ class Record:
             found = re.sub(r"surfaces\[(\d+)\]", lambda m: names[int(m[1])], str(error))
             raise LensError(f"{self.path}{lines.of(error.key)}: {found}", error.key) from None
         return _with_image(lens, image)
+
+    def _spaced(self) -> None:
+        """Put the least gap between surfaces that touch, of those that bend light, and say so."""
+        medium, sense, last, before, found = self.medium, 1, False, None, list[str]()
+        gap = 0.0
+        for part in self.parts:
+            if isinstance(part, Breaking):
+                last = False
+                continue
+            own = {key: part.entry[key] for key in _MEDIUM if key in part.entry}
+            turns, image = part.entry.get("mirror", False), part is self.parts[-1]
+            bends = turns or "phase" in part.entry or own != medium
+            if last and before and (bends or image) and abs(gap) < CLOSEST:
+                before.thickness += sense * CLOSEST - gap
+                found.append(before.name)
+            if bends:
+                medium, sense = medium if turns else own, -sense if turns else sense
+                last, gap = True, 0.0
+            before, gap = part, gap + part.thickness
+        if found:
+            some = ", ".join(found[:8]) + (", ..." if len(found) > 8 else "")
+            self.notes.append(f"surfaces that touch stand {CLOSEST:g} mm apart: {some}")
 
     def _prescription(self, semi_diameter: float) -> tuple[dict[str, Any], Lines, list[str]]:
         """As `build_lens` takes it, the line of each key, the name of each surface."""
@@ -152,6 +177,7 @@ class Record:
                 behind -= own.thickness
             waiting = []
             if part is image:
+                lines["sensor"] = part.line
                 break
             place = f"surfaces[{i}]"
             lines[place] = part.line

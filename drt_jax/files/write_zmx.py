@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from .entry import LensError
 from .glasses import MAKERS
@@ -29,6 +30,13 @@ _TYPES = {  # of a form: the type, the parameters of coefficients, the first of 
     "odd_asphere": ("ODDASPHE", range(1, 9), False),
     "toroid": ("TOROIDAL", range(1, 9), True),
     "biconic": ("BICONICX", range(1, 3), True),
+}
+_SERIES = {  # of a form: the type whose extra data are its coefficients, what comes before them
+    "asphere": ("XASPHERE", ()),
+    "odd_asphere": ("XOSPHERE", ()),
+    "polynomial_xy": ("XPOLYNOM", ()),
+    "zernike": ("SZERNSAG", ()),
+    "qbfs": ("QED_TYPE", (0,)),
 }
 _OTHERS = {"silica": "F_SILICA"}
 
@@ -77,11 +85,16 @@ def _surface(lens: Lens, i: int) -> list[str]:
 def _form(lens: Lens, i: int) -> list[str]:
     name, row = lens.forms[i], np.asarray(lens.coefficients[i], float).tolist()
     if lens.phase is not None and i in lens.phase.surfaces:
-        return _grating(lens, i, any(row))
+        return _phase(lens, i, row)
     if name == "asphere" and not any(row):
         return ["TYPE STANDARD"]
     kind, numbers, radius = _TYPES.get(name, ("", (), False))
     used = [k for k, value in enumerate(row) if value]
+    if name in _SERIES and (not kind or (used and used[-1] >= len(numbers))):
+        kind, before = _SERIES[name]
+        size, terms = (row[0], row[1:]) if FORMS[name].named else (1.0, row)
+        goes_on = ["PARM 0 1"] if name == "zernike" else []  # beyond the radius
+        return [f"TYPE {kind}", *goes_on, *_extra(*before, len(terms), size, *terms)]
     if not kind or (used and used[-1] >= len(numbers)):
         what = f"form {name}" + (f" with {used[-1] + 1} coefficients" if kind else "")
         raise LensError(f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
@@ -94,17 +107,30 @@ def _form(lens: Lens, i: int) -> list[str]:
     ]
 
 
-def _grating(lens: Lens, i: int, aspheric: bool) -> list[str]:
+def _extra(*values: float) -> list[str]:
+    return [f"XDAT {k + 1} {value!r}" for k, value in enumerate(values)]
+
+
+def _phase(lens: Lens, i: int, row: list[float]) -> list[str]:
+    """A grating on a conic, or a radial phase, in radians over 1 mm, on an even asphere."""
     assert lens.phase is not None
     at = lens.phase.surfaces.index(i)
-    row = np.asarray(lens.phase.coefficients[at], float)
-    if lens.phase.forms[at] != "linear" or aspheric or lens.forms[i] != "asphere":
-        raise LensError(f"surfaces[{i}].phase: only gratings on conics are written: save as .yaml")
-    return [
-        "TYPE DGRATING",
-        f"PARM 1 {float(row[0]) / 1e3!r}",
-        f"PARM 2 {float(lens.phase.order[at])!r}",
-    ]
+    order, form = float(lens.phase.order[at]), lens.phase.forms[at]
+    own = np.asarray(lens.phase.coefficients[at], float).tolist()
+    if form == "linear" and lens.forms[i] == "asphere" and not any(row):
+        return ["TYPE DGRATING", f"PARM 1 {own[0] / 1e3!r}", f"PARM 2 {order!r}"]
+    if form != "asphere" or lens.forms[i] != "asphere" or any(row[8:]):
+        raise LensError(f"surfaces[{i}].phase: not written to .zmx on this surface: save as .yaml")
+    powers = [f"PARM {k + 1} {value!r}" for k, value in enumerate(row[:8])]
+    whole = [_times_turn(value) for value in own]
+    return ["TYPE BINARY_2", f"PARM 0 {order!r}", *powers, *_extra(len(own), 1.0, *whole)]
+
+
+def _times_turn(waves: float) -> float:
+    """Radians that, divided by 2 pi, are these waves to the last digit where there are such."""
+    turn = 2 * math.pi
+    near = [waves * turn, *(math.nextafter(waves * turn, end) for end in (-math.inf, math.inf))]
+    return min(near, key=lambda value: abs(value / turn - waves))
 
 
 def _glass(lens: Lens, m: int) -> list[str]:
