@@ -30,7 +30,7 @@ class Clips:
         """Write them as entries of a prescription; the radius of a circle about the vertex of the
         stop, mm, which `lens_of` may take for the stop itself."""
         size = None
-        for (use, _), sizes in self.found.items():
+        for (use, label), sizes in self.found.items():
             if use == "EDG":
                 continue  # the rim of the glass, which clips nothing
             shapes = self._shapes(record, row, unit, sizes)
@@ -39,7 +39,7 @@ class Clips:
                 record.notes.append(f"line {line}: {row.name}: a hole is read as an obscuration")
             for line, shape in shapes:
                 if use == "CLR":
-                    size = self._clear(row, line, shape, stop) or size
+                    size = self._clear(row, line, shape, stop and not label, label) or size
                 else:
                     row.put("obscuration", [*row.entry.get("obscuration", []), shape], line)
         return size
@@ -70,12 +70,13 @@ class Clips:
         return found
 
     @staticmethod
-    def _clear(row: Row, line: int, shape: dict[str, Any], stop: bool) -> float | None:
+    def _clear(row: Row, line: int, shape: dict[str, Any], stop: bool, label: str) -> float | None:
         radius, centred = shape.get("circle"), "centre" not in shape
         rim = (row.entry.get("conic", 0.0) + 1) * (row.entry["curvature"] * (radius or 0)) ** 2
         if centred and row.entry.get("form") is None and rim >= 1:
             return None  # beyond the end of the surface
-        if radius and centred and not stop and "semi_diameter" not in row.entry:
+        plain = not label and not row.entry.get("stop") and "semi_diameter" not in row.entry
+        if radius and centred and plain:
             row.put("semi_diameter", radius, line)
             return None
         row.put("aperture", [*row.entry.get("aperture", []), shape], line)

@@ -10,9 +10,9 @@ from .glasses import named_glass
 from .record import Record, Row, short
 from .seq_text import Command
 
-_CODE = re.compile(r"(\d{3,15})\.(\d{3,17})")
+_CODE = re.compile(r"(\d{3,17})\.(\d{3,18})")
 _SHORT_CODE = re.compile(r"\d{6}")
-_PAIR = re.compile(r"(\d\.\d{1,16}):(\d{2,3}(?:\.\d{1,16})?)")
+_PAIR = re.compile(r"(\d\.\d{1,17}):(\d{2,3}(?:\.\d{1,17})?)")
 _POWERS = (0, -2, 2, -4, -6, -8)  # of L in Schott's formula, as further indices need them
 _SCHOTT = (0, 2, -2, -4, -6, -8)
 _SAME = 1e-9  # um, wavelengths of a table
@@ -144,7 +144,10 @@ def _near(table: list[tuple[float, float]], system: list[float]) -> list[tuple[f
     eight."""
     inside = [k for k, (wave, _) in enumerate(table) if min(system) <= wave <= max(system)]
     above = sum(wave < min(system) for wave, _ in table)
-    first, end = max((inside or [above])[0] - 1, 0), min((inside or [above - 1])[-1] + 2, len(table))
+    first, end = (
+        max((inside or [above])[0] - 1, 0),
+        min((inside or [above - 1])[-1] + 2, len(table)),
+    )
     while end - first < 8 and end - first < len(table):
         first, end = max(first - 1, 0), min(end + 1, len(table))
     return table[first:end]
