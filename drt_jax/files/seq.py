@@ -53,7 +53,6 @@ class _Reader:
         self.surfaces: list[Surface] = []
         self.complete, self.stop, self.clips = False, 0, True
         self.solves: list[int] = []
-        self.zooms = 1
         self.unknown: dict[str, int] = {}
 
     def at(self, line: int, name: str) -> int:
@@ -119,17 +118,15 @@ def _surface(reader: _Reader, command: Command) -> None:
     record, line, name = reader.record, command.line, command.key[1:]
     if name == "S" or (reader.complete and name != "I" and not name.isdecimal()):
         raise record.error(line, f"{command.key}: a surface behind the image")
-    number = {"": len(reader.surfaces), "O": 0, "I": -1}.get(name)
-    if number is None:
-        number = int(name)
-    if number == -1:
-        number = len(reader.surfaces) - (1 if reader.complete else 0)
-        reader.complete = True
-    if number > len(reader.surfaces) or (not reader.surfaces and number):
-        raise record.error(line, f"{command.key} stands where S{len(reader.surfaces)} should")
+    due = len(reader.surfaces)
+    number = {"": due, "O": 0, "I": due - reader.complete}.get(name)
+    number = int(name) if number is None else number
+    reader.complete = reader.complete or name == "I"
+    if number > due:
+        raise record.error(line, f"{command.key} stands where S{due} should")
     if number > _SURFACES:
         raise record.error(line, f"more than {_SURFACES} surfaces")
-    if number == len(reader.surfaces):
+    if number == due:
         called = {"O": "SO", "I": "SI"}.get(name, f"S{number}")
         reader.surfaces.append(Surface(Row(called, line)))
     surface, words = reader.surfaces[number], command.values
@@ -252,9 +249,8 @@ def _zoom(reader: _Reader, command: Command) -> None:
     """`ZOO 3`; or a command with a value for each position, of which the first is taken."""
     record, line, words = reader.record, command.line, command.values
     if words and words[0].isdecimal():
-        reader.zooms = record.count(line, words)
-        if reader.zooms > 1:
-            record.notes.append(f"line {line}: of {reader.zooms} zoom positions the first")
+        if record.count(line, words) > 1:
+            record.notes.append(f"line {line}: of {words[0]} zoom positions the first")
         return
     if not words:
         return

@@ -8,6 +8,7 @@ from .seq_text import Command
 
 KEYS = ("CIR", "REX", "REY", "ELX", "ELY", "ADX", "ADY", "ARO")
 _KINDS = {"C": "circle", "R": "rectangle", "E": "ellipse"}
+_SIZES = {"C": ("CIR",), "R": ("REX", "REY"), "E": ("ELX", "ELY")}
 _MOST = 50
 
 
@@ -54,8 +55,7 @@ class Clips:
         centre = [centre[1], -centre[0]] if turned else centre
         found = []
         for letter in dict.fromkeys(key[0] for key in sizes if key[0] in _KINDS):
-            keys = ["CIR"] if letter == "C" else [f"{letter}{end}" for end in ("EX", "EY")]
-            keys = keys if letter != "E" else ["ELX", "ELY"]
+            keys = _SIZES[letter]
             line = next(own for key, (own, _) in sizes.items() if key in keys)
             if not all(key in value for key in keys):
                 raise record.error(line, f"{row.name}: give both {' and '.join(keys)}")

@@ -11,8 +11,14 @@ from .text import lines_of
 _LONGEST = 4000  # characters of a line
 _WIDEST = 100_000  # of a command over several lines
 _SURFACE_KEY = re.compile(r"S(\d{1,6}|O|I)?", re.IGNORECASE)
-_QUALIFIER = re.compile(r"([SFWZLC])(\d{1,6}|[OISK])(\.\.(?:\d{1,6}|[OISK]))?", re.IGNORECASE)
+_QUALIFIER = re.compile(r"([SZFWC])(\d{1,6}|[OISK])(\.\.(?:\d{1,6}|[OISK]))?", re.IGNORECASE)
 _LABEL = re.compile(r"L(['\"].*)", re.IGNORECASE | re.DOTALL)
+# Letters of qualifiers beside S and Z, by key; elsewhere F2 is a glass.
+_OTHERS = (
+    (re.compile("[XY](AN|OB|IM|RI)|V[UL][XY]|WTF"), "F"),
+    (re.compile("WL|WTW"), "W"),
+    (re.compile("SCO|HCO"), "C"),
+)
 USES = ("CLR", "EDG", "OBS", "HOL")
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")
 
@@ -95,9 +101,10 @@ def commands_of(path: str | os.PathLike) -> Iterator[Command]:
 def command_of(line: int, key: str, quoted: bool, words: list[str]) -> Command:
     """A command of the words behind its key."""
     qualifiers, label, use, rest = list[tuple[str, str, str]](), "", "", len(words)
+    letters = "SZ" + "".join(more for known, more in _OTHERS if known.fullmatch(key))
     for at, word in enumerate(words):
         found, named = _QUALIFIER.fullmatch(word), _LABEL.fullmatch(word)
-        if found:
+        if found and found[1].upper() in letters:
             first = found[2].upper()
             qualifiers.append((found[1].upper(), first, (found[3] or first).strip(".").upper()))
         elif named:

@@ -88,7 +88,7 @@ def _word(keys: dict[str, Any], private: dict[str, str]) -> str:
         if keys.get("partial"):
             raise LensError("a model glass off the normal line: use .yaml, or set partial to 0")
         nd, vd = repr(keys["nd"]), repr(keys["vd"])
-        if nd[:2] != "1." or not vd[:3:2].isdecimal() or vd[2:3] != "." or "e" in nd + vd:
+        if nd[:2] != "1." or not vd[:2].isdecimal() or vd[2:3] != "." or "e" in nd + vd:
             return f"{nd}:{vd}"
         return f"{nd[2:].ljust(3, '0')}.{(vd[:2] + vd[3:]).ljust(3, '0')}"
     name = keys.get("glass", "")
