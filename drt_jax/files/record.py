@@ -15,6 +15,7 @@ from .specs import build_lens
 
 Missing = Literal["error", "warn"]
 _FAR = 1e10  # mm, from where on a distance of a file is infinite
+_LARGEST = 1e9  # of lengths, angles and curvatures
 _TINY = 1e-6  # mm, of the stop until its size is known
 
 
@@ -98,6 +99,13 @@ class Record:
             value = math.nan
         if "_" in words[at] or not math.isfinite(value):
             raise self.error(line, f"expected a number, got {shown(words[at])}")
+        return value
+
+    def bounded(self, line: int, words: list[str], at: int = 0) -> float:
+        """A number whose square is one, too: at most 1e9."""
+        value = self.number(line, words, at)
+        if abs(value) > _LARGEST:
+            raise self.error(line, f"{value:g} is not within {_LARGEST:g}; which unit?")
         return value
 
     def count(self, line: int, words: list[str], at: int = 0, default: int | None = None) -> int:

@@ -11,30 +11,11 @@ from .seq_fields import FIELD_KEYS, WAVE_KEYS, Fields
 from .seq_glass import Glasses
 from .seq_places import Frames
 from .seq_surfaces import Surface
-from .seq_text import Command, command_of, commands_of
+from .seq_text import COSMETIC, REFUSED, SOLVES, Command, command_of, commands_of
 from .system import ApertureKind, Use
 
 _UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
 _SURFACES = 5000
-# Names, drawing, variables and tolerances, ray aiming, what is computed: no rays.
-_COSMETIC = frozenset(
-    """
-    LEN INI PRE GO CWL SLB DER CLS DOR WID CUM THM POL SPH PIK AUT DDM VER INC
-    CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC XDC YDC ZDC ADC BDC CDC SCC HCC CCF
-    """.split()  # noqa: SIM905
-)
-_SOLVES = frozenset(
-    """
-    PIM RED OAL HMY HMX HCY HCX UMY UMX UCY UCX IMY IMX ICY ICX APN APL CMY CMX EFL EFX EFY PIK
-    """.split()  # noqa: SIM905
-)
-# What changes rays and is not read.
-_REFUSED = frozenset(
-    """
-    NSS GL1 GL2 INS DEL COP FLY SCA INV URN GRC GRI ARR CIG REG ELG SPL TRP GLB HOE HV1 HV2 HX1 HX2
-    HY1 HY2 HZ1 HZ2 XOD YOD ZOD MOD SWI AFI USR UDS MIR
-    """.split()  # noqa: SIM905
-)
 _APERTURES: dict[str, ApertureKind] = {
     "EPD": "pupil diameter",
     "FNO": "f-number",
@@ -97,10 +78,14 @@ def _unit(reader: _Reader, command: Command) -> None:
     reader.unit = _UNITS[name]
 
 
-def _temperature(reader: _Reader, command: Command) -> None:
-    value = reader.record.number(command.line, command.values)
-    if abs(value - 20) > 5:
-        reader.record.lacks(command.line, f"{value:g} C; our indices are those of 20")
+def _air(reader: _Reader, command: Command) -> None:
+    """Temperature in C and pressure in mm of mercury."""
+    ours, unit = (20, "C") if command.key == "TEM" else (760, "mm Hg")
+    value, line = reader.record.number(command.line, command.values), command.line
+    if abs(value - ours) > ours / 4:
+        reader.record.lacks(line, f"{value:g} {unit}; our indices are those of {ours}")
+    elif value != ours:
+        reader.record.notes.append(f"line {line}: {value:g} {unit}; indices are those of {ours}")
 
 
 def _aperture(reader: _Reader, command: Command) -> None:
@@ -141,7 +126,7 @@ def _surface(reader: _Reader, command: Command) -> None:
 def _number(reader: _Reader, command: Command) -> float | None:
     """The value of a command; None for a solve, whose value stands elsewhere."""
     words = command.values
-    if words and words[0][:3].upper() in _SOLVES:
+    if words and words[0][:3].upper() in SOLVES:
         reader.solves.append(command.line)
         return None
     if len(words) > 1:
@@ -157,6 +142,8 @@ def _curvature(reader: _Reader, command: Command, surface: Surface) -> None:
         return
     if command.key in ("RDY", "RDX"):
         value = 1 / value if abs(value) > 1e-12 else 0.0
+    elif abs(value) > 1e9:
+        raise reader.record.error(command.line, f"a curvature of {value:g}; which unit?")
     if command.key in ("RDX", "CUX"):
         surface.curvature_x = command.line, value
     else:
@@ -262,7 +249,16 @@ def _zoom(reader: _Reader, command: Command) -> None:
 
 
 _SYSTEM: dict[str, Callable[[_Reader, Command], None]] = {
-    **{"TIT": _title, "RDM": _mode, "LEN": _new, "DIM": _unit, "TEM": _temperature, "STO": _stop},
+    **{
+        "TIT": _title,
+        "RDM": _mode,
+        "LEN": _new,
+        "DIM": _unit,
+        "DDM": _unit,
+        "TEM": _air,
+        "PRE": _air,
+        "STO": _stop,
+    },
     **dict.fromkeys(_APERTURES, _aperture),
     **{"CA": _checks_apertures, "ZOO": _zoom, "RET": _return},
 }
@@ -288,14 +284,14 @@ def _dispatch(reader: _Reader, command: Command) -> None:
         reader.fields.take(reader.record, command)
     elif key in _SYSTEM:
         _SYSTEM[key](reader, command)
-    elif key in _SOLVES:
+    elif key in SOLVES:
         reader.solves.append(command.line)
     elif key in _OF_SURFACES:
         for surface in reader.targets(command):
             _OF_SURFACES[key](reader, command, surface)
-    elif key in _REFUSED:
+    elif key in REFUSED:
         raise reader.record.error(command.line, f"{key} is not read")
-    elif key not in _COSMETIC:
+    elif key not in COSMETIC:
         reader.unknown.setdefault(short(key), command.line)
 
 
@@ -383,7 +379,9 @@ def _parts(reader: _Reader) -> None:
         else:
             row.entry |= _medium(reader, surface)
             surface.diffraction(record, unit)
-        if surface.clips.found and reader.clips and surface is not image:
+        if surface.clips.found and surface is image:
+            record.notes.append("apertures of the image clip nothing")
+        elif surface.clips.found and reader.clips:
             stop = bool(row.entry.get("stop"))
             size = surface.clips.entries(record, row, unit, stop)
             reader.use.stop = size if stop else reader.use.stop

@@ -25,7 +25,7 @@ class Clips:
         own = self.found.setdefault((command.use or "CLR", command.label), {})
         if len(self.found) > _MOST:
             raise record.error(command.line, f"more than {_MOST} apertures of a surface")
-        own[command.key] = command.line, record.number(command.line, command.values)
+        own[command.key] = command.line, record.bounded(command.line, command.values)
 
     def entries(self, record: Record, row: Row, unit: float, stop: bool) -> float | None:
         """Write them as entries of a prescription; the radius of a circle about the vertex of the

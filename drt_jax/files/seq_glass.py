@@ -48,8 +48,10 @@ class Glasses:
         """A line of the private catalogue."""
         if command.key == "PWL" and not command.quoted:
             values = self.record.numbers(command.line, command.values, len(command.values))
-            if not values or min(values) <= 0 or len({*values}) < len(values):
-                raise self.record.error(command.line, "PWL: expected wavelengths above 0, in nm")
+            if not values or not 0.1 <= min(values) <= max(values) <= 1e9:
+                raise self.record.error(command.line, "PWL: expected wavelengths in nm")
+            if len({*values}) < len(values):
+                raise self.record.error(command.line, "PWL: a wavelength stands twice")
             self.waves = [value / 1000 for value in values]
             return
         if len(self.tables) >= _MOST:
@@ -114,6 +116,8 @@ class Glasses:
             many = f"{len(command.values)} indices for {len(waves)} wavelengths of PWL"
             raise record.error(line, f"{name}: {many}; known formulas: {', '.join(_FORMULAS)}")
         table = sorted(zip(waves, record.numbers(line, command.values, len(waves)), strict=True))
+        if not all(1 < index <= 10 for _, index in table):
+            raise record.error(line, f"{name}: an index that is not between 1 and 10")
         at, indices = np.array(_near(table, system)).T
         held = [k for k in range(len(at)) if any(abs(at[k] - w) < _SAME for w in system)][:5]
         if len(at) <= 6:

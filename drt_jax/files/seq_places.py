@@ -35,7 +35,7 @@ class Place:
         """One of `KEYS` or of `KINDS`; RET is given its target by the reader."""
         self.line = command.line
         if command.key in KEYS:
-            self.values[command.key] = record.number(command.line, command.values)
+            self.values[command.key] = record.bounded(command.line, command.values)
             return
         if self.kind not in ("", command.key):
             raise record.error(command.line, f"both {self.kind} and {command.key}")

@@ -15,7 +15,7 @@ _LOPSIDED = tuple(f"{letter}P" for letter in "ABCD")
 COEFFICIENTS = ("K", *LETTERS, "KX", "KY", *_ANAMORPHIC, *_LOPSIDED, "CUF")
 KINDS = ("SPH", "CON", "ASP", "XTO", "YTO", "CYL", "AAS", "SPS")
 DIFFRACTIVE = ("DIF", "HOR", "HWL", "HCT", "HCO", "GRO", "GRS", "GRX", "GRY", "GRZ")
-_SPECIAL_TERMS = 99
+_SPECIAL_TERMS, _LEAST = 99, 1e-6
 
 
 @dataclasses.dataclass
@@ -56,8 +56,7 @@ class Surface:
                 command.line, f"{self.row.name}: SPS {self.special} is not read; known: {known}"
             )
         if len(command.values) > 1:
-            value = record.number(command.line, command.values, 1)
-            self.terms["NRADIUS"] = command.line, value
+            self.terms["NRADIUS"] = command.line, record.bounded(command.line, command.values, 1)
 
     def entries(self, record: Record, unit: float) -> None:
         """Write form, curvature and coefficients as entries of a prescription."""
@@ -134,10 +133,13 @@ class Surface:
                 raise record.error(line, f"{self.row.name}: SCO {key} of SPS {self.special}")
         return {k: value for k, value in found.items() if value}
 
-    def _radius(self, record: Record) -> float:
-        value = self.term("NRADIUS")
-        if value <= 0:
-            raise record.error(self.kind_line, f"{self.row.name}: SPS needs a radius, NRADIUS")
+    def radius(self, record: Record, default: float = 0.0) -> float:
+        """The radius to which coefficients belong, in units of the file."""
+        value = self.term("NRADIUS") or default
+        if not _LEAST <= value <= 1 / _LEAST:
+            raise record.error(
+                self.kind_line, f"{self.row.name}: SPS {self.special} of NRADIUS {value:g}"
+            )
         return value
 
     def diffraction(self, record: Record, unit: float) -> None:
@@ -171,14 +173,15 @@ class Surface:
 
 def _odd(surface: Surface, record: Record, unit: float) -> None:
     found = surface._special(record, 2, 30, "C1", "C33")
-    radius = surface.term("NRADIUS") or surface.term("C33") or 1.0
+    surface.terms.setdefault("NRADIUS", surface.terms.get("C33", (0, 0.0)))
+    radius = surface.radius(record, 1.0)
     terms = {k + 1: v / radius ** (k + 1) * unit**-k for k, v in found.items()}
     surface.row.put("form", "odd_asphere", surface.kind_line)
     surface.row.put("coefficients", terms, surface.kind_line)
 
 
 def _polynomial(surface: Surface, record: Record, unit: float) -> None:
-    found, radius = surface._special(record, 2, 65, "C1"), surface.term("NRADIUS") or 1.0
+    found, radius = surface._special(record, 2, 65, "C1"), surface.radius(record, 1.0)
     pairs = [(n - j, j) for n in range(1, 11) for j in range(n + 1)]
     terms = {}
     for k, value in found.items():
@@ -192,7 +195,7 @@ def _forbes(surface: Surface, record: Record, unit: float) -> None:
     surface.terms.setdefault("NRADIUS", surface.terms.get("C1", (0, 0.0)))
     found = surface._special(record, 3, 14, "C1", "C17")
     surface.row.put("form", "qbfs", surface.kind_line)
-    surface.row.put("norm_radius", surface._radius(record) * unit, surface.kind_line)
+    surface.row.put("norm_radius", surface.radius(record) * unit, surface.kind_line)
     surface.row.put("coefficients", {k: v * unit for k, v in found.items()}, surface.kind_line)
 
 
@@ -204,7 +207,7 @@ def _fringe(surface: Surface, record: Record, unit: float) -> None:
         number, n, m = noll_of_fringe(k + 1)
         terms[number] = value * unit / math.sqrt((n + 1) * (2 if m else 1))
     surface.row.put("form", "zernike", surface.kind_line)
-    surface.row.put("norm_radius", surface._radius(record) * unit, surface.kind_line)
+    surface.row.put("norm_radius", surface.radius(record) * unit, surface.kind_line)
     surface.row.put("coefficients", terms, surface.kind_line)
 
 

@@ -22,6 +22,26 @@ _OTHERS = (
 USES = ("CLR", "EDG", "OBS", "HOL")
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")
 
+# Names, drawing, variables and tolerances, ray aiming, what is computed: no rays.
+COSMETIC = frozenset(
+    """
+    LEN INI GO CWL SLB DER CLS DOR WID CUM THM POL PIK AUT VER INC
+    CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC XDC YDC ZDC ADC BDC CDC SCC HCC CCF
+    """.split()  # noqa: SIM905
+)
+SOLVES = frozenset(
+    """
+    PIM RED OAL HMY HMX HCY HCX UMY UMX UCY UCX IMY IMX ICY ICX APN APL CMY CMX EFL EFX EFY PIK
+    """.split()  # noqa: SIM905
+)
+# What changes rays and is not read.
+REFUSED = frozenset(
+    """
+    NSS GL1 GL2 INS DEL COP FLY SCA INV URN GRC GRI ARR CIG REG ELG SPL TRP GLB HOE HV1 HV2 HX1 HX2
+    HY1 HY2 HZ1 HZ2 XOD YOD ZOD MOD SWI AFI TEL USR UDS MIR
+    """.split()  # noqa: SIM905
+)
+
 
 class Command(NamedTuple):
     """A command. line: where it begins. key: its first three letters, `S` with what follows for a

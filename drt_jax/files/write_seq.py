@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..lens.glass import ANY
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil
 from .entry import LensError
@@ -65,7 +66,7 @@ def _nanometres(wave: float) -> float:
 
 def _private(name: str, called: str, constants: dict[str, Any]) -> list[str]:
     """The lines of a glass with constants of its own."""
-    low, high = constants.get("range", (1e-4, 1e6))
+    low, high = constants.get("range", ANY)
     sellmeier, schott = constants.get("sellmeier"), constants.get("schott")
     if sellmeier and schott:
         raise LensError(f"glass {name}: .seq files hold no two formulas at once: save as .yaml")

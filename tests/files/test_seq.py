@@ -224,6 +224,14 @@ def assert_close(found, wanted):
         assert found == (wanted if isinstance(wanted, str) else pytest.approx(wanted, rel=1e-14))
 
 
+def test_a_zone_plate_focuses_as_its_optical_path_says(tmp_path):
+    """OPD C1 r^2 at HWL is that of a thin lens of f = -1 / (2 C1); f goes as 1 / wavelength."""
+    own = "S 0 9; STO; DIF DOE; HOR 1; HWL 550; HCT R; HCO C1 -.005"
+    system = read(tmp_path, own, "S 0 91", head=HEAD.replace("DIM M", "DIM C"))
+    found = first_order(system.lens, np.inf, jnp.array([0.55, 0.5]))
+    np.testing.assert_allclose(found.focal_length, [1000, 1100])  # 100 cm
+
+
 def test_fringe_polynomials(tmp_path):
     """Spherical aberration (9) is 6 r^4 - 6 r^2 + 1, 5 and 6 astigmatism, 8 coma along y."""
     shapes = {
@@ -416,6 +424,7 @@ def test_what_is_not_read_is_refused_by_line(tmp_path):
     assert "a second lens begins" in refused(tmp_path, FRONT, "LEN")
     assert "there is no surface S7 yet" in refused(tmp_path, FRONT, "THI S7 3")
     assert "an infinite thickness" in refused(tmp_path, FRONT, "S 9 1e13")
+    assert "0 mm Hg; our indices are those of 760" in refused(tmp_path, head=HEAD + "PRE 0")
     hot = HEAD + "TEM 60"
     assert 'missing="warn" leaves it out' in refused(tmp_path, head=hot)
     assert "60 C" in record(tmp_path, FRONT, BACK, missing="warn", head=hot)[0].notes[0]
@@ -503,6 +512,12 @@ def test_files_that_are_none(tmp_path):
     spoilt = [b"", b"0" * 2**25, b"S 0 " + b"1 " * 10**6, b"S 0 1\n" * 10**6, noise.bytes(10**5)]
     spoilt += [bytes(10**5), b"x: 1\n", whole.encode()[:60], b"S 0 1 &\n" * 10**5, b"'\"" * 1900]
     spoilt += [b"S 0 1\n" * 6000, b"SO 0 9;S 0 1 F2;RET S" + b"9" * 3900, b"ZOO " * 900]
+    plain = whole.encode()
+    far = ["SPS XYP 1e-200; SCO C9 1", "YDE 1e300; ADE 1e300", "CIR 1e200", "CUY 1e300; CIR 1"]
+    spoilt += [plain.replace(b"STO", f"STO; {own}".encode()) for own in far]
+    far = ["PWL 1e-300 1; 'A' 1 2", "PWL 500; 'A' 1e300", "'A' CAU 1e200 1e200", "'A' GMS 1 .3"]
+    private = plain.replace(b"NBK7_SCHOTT", b"'A'")
+    spoilt += [private.replace(b"SO", f"PRV; {own}; END\nSO".encode()) for own in far]
     spoilt += [(b"\"'" * 1900 + b"\n") * 100, b"ZFR;SPS;HCO;SCO;REF x;STO;RET;WL;DIM;YAN\n" * 9]
     for content in spoilt:
         path.write_bytes(content)
