@@ -33,3 +33,8 @@ def named_glass(
             f"{short(' '.join(makers))}; give nd and vd as a model glass in the file",
         )
     return {"glass": own}
+
+
+def maker_of(name: str) -> str:
+    """Whose glass it is; "" for a substance that has no maker."""
+    return "" if name in _PLAIN else MAKERS.get(name, "SCHOTT")

@@ -49,3 +49,21 @@ def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
     if known != [*ANY]:
         constants["range"] = known
     return constants
+
+
+def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Keys of each medium, none for air, and the glasses whose constants the file has to tell."""
+    plain = [medium_of(lens, i) for i in range(lens.count + 1)]
+    described = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
+    media: list[dict[str, Any]] = []
+    glasses: dict[str, Any] = {}
+    for i, (name, keys) in enumerate(zip(lens.glasses, plain, strict=True)):
+        if i and name == lens.glasses[i - 1]:  # light keeps the constants of the medium in front
+            keys = media[-1]
+        elif keys is None or keys.get("glass") in described:
+            own = constants_of(lens.dispersion, i)
+            while glasses.setdefault(name, own) != own:  # another medium of this name
+                name += "*"
+            keys = {"glass": name}
+        media.append(keys)
+    return media, glasses

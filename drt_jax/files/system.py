@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from ..lens.scene import field_of_height
 from .record import Record
 
 ApertureKind = Literal["pupil diameter", "f-number", "working f-number", "object NA", "image NA"]
+_SAME = 1e-9  # of a size of the stop that a file tells twice
 FieldKind = Literal["angle", "object height", "paraxial image height", "real image height"]
 
 
@@ -34,7 +35,8 @@ class System:
     wavelengths: (W,) in um. wavelength_weights: (W,). primary: the index of the primary one.
     aperture: the value that the file gives for `aperture_kind`; None for the size of the stop.
     ray_aiming: how the other program launches rays: at the paraxial entrance pupil, `off` (see
-        `with_paraxial_pupil`), or as here at the stop.
+        `with_paraxial_pupil`), or as here at the stop; CODE V, `chief`, so that the chief ray meets
+        the centre of the stop, the others about it over an entrance pupil of paraxial width.
     notes: what the file has and the lens has not, or reads otherwise.
     """
 
@@ -147,16 +149,42 @@ def _opened(record: Record, use: Use, lens: Lens, wave: float) -> Lens:
         if not (sine < 1 and math.isfinite(far)):
             raise record.error(use.line, f"no object at {far:g} mm has an NA of {value:g}")
         wide = abs(math.tan(math.asin(sine)) * (far + place))
-    else:
-        slope = (value if kind == "image NA" else 0.5 / value) / last
-        if kind == "image NA" and not slope < 1:
+    elif kind == "image NA" and math.isinf(far):
+        wide = abs(float(first.effective_focal_length)) * value
+    elif kind == "image NA":  # the object's, over the magnification
+        sine = value * abs(float(first.magnification)) / front
+        if not sine < 1:
             raise record.error(use.line, f"there is no image NA of {value:g}")
-        slope = math.tan(math.asin(slope)) if kind == "image NA" else slope
-        wide = radius * slope * 2 * float(first.f_number)
+        wide = abs(math.tan(math.asin(sine)) * (far + place))
+    else:
+        wide = radius / (value * last) * float(first.f_number)
     found = semi * wide / radius if radius else math.nan
     if not (math.isfinite(found) and 0 < found < 1e9):
         raise record.error(use.line, f"no stop makes {kind} {value:g}: is the lens afocal there?")
+    if use.stop and math.isclose(found, use.stop, rel_tol=_SAME):
+        lens, found = _without_rim(lens), use.stop
     return dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[lens.stop].set(found))
+
+
+def _without_rim(lens: Lens) -> Lens:
+    """The lens without the first clear circle about the vertex of its stop, whose size the stop
+    has: twice, it would clip by rounding."""
+    own = lens.apertures
+    if own is None:
+        return lens
+    lies = zip(own.surfaces, own.kinds, own.blocks, strict=True)
+    rims = [k for k, place in enumerate(lies) if place == (lens.stop, "circle", False)]
+    keep = [k for k in range(len(own.surfaces)) if k not in rims[:1]]
+    if not keep:
+        return dataclasses.replace(lens, apertures=None)
+    chosen: dict[str, Any] = {
+        name: tuple(getattr(own, name)[k] for k in keep) for name in ("surfaces", "kinds", "blocks")
+    }
+    centre = None if own.centre is None else own.centre[np.array(keep)]
+    return dataclasses.replace(
+        lens,
+        apertures=dataclasses.replace(own, half=own.half[np.array(keep)], centre=centre, **chosen),
+    )
 
 
 def _angles(

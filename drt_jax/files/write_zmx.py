@@ -60,7 +60,7 @@ def zmx_text(lens: Lens) -> str:
     return "\n".join([*lines, "MNUM 1 1", ""])
 
 
-def _gap(lens: Lens, i: int) -> float:
+def gap_behind(lens: Lens, i: int) -> float:
     """The thickness behind a surface; of the last, that which makes the sum exact."""
     gaps = np.asarray(lens.thickness, float).tolist()
     if i < lens.count - 1:
@@ -74,7 +74,7 @@ def _surface(lens: Lens, i: int) -> list[str]:
     lines = ["STOP"] if i == lens.stop else []
     lines += [*_form(lens, i), f"CURV {float(lens.curvature[i])!r}"]
     lines += [f"CONI {float(lens.conic[i])!r}"] if lens.conic[i] else []
-    lines += [f"DISZ {_gap(lens, i)!r}", *_glass(lens, i + 1)]
+    lines += [f"DISZ {gap_behind(lens, i)!r}", *_glass(lens, i + 1)]
     semi = float(lens.semi_diameter[i])
     if math.isfinite(semi):
         lines.append(f"DIAM {semi!r} 1 0 0 1")

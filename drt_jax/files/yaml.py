@@ -9,12 +9,13 @@ from ..inputs import InputError, read_yaml, shown
 from ..lens.lens import Lens
 from .entry import LensError
 from .record import Missing, Record
+from .seq import read_seq
 from .specs import build_lens
 from .system import System, Use, lens_of, system_of
 from .zmx import read_zmx
 
 _BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
-_READERS = {".zmx": read_zmx}
+_READERS = {".zmx": read_zmx, ".seq": read_seq}
 
 
 def lens_names() -> list[str]:
@@ -29,7 +30,8 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
     for a missing file, an unknown key or glass, or numbers that make no lens, with the line.
 
     source: a bundled name (see `lens_names`), the path of a YAML prescription of at most 1 MB or
-        of a Zemax `.zmx` file, see `load_system`, or a mapping with the keys of a prescription.
+        of a Zemax `.zmx` or CODE V `.seq` file, see `load_system`, or a mapping with the keys of a
+        prescription.
     missing: as of `load_system`.
     """
     with jax.core.eval_context():  # a lens loaded inside a jitted function is a constant
@@ -60,8 +62,8 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
 
 
 def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
-    """Read a lens with its fields, wavelengths and aperture from a Zemax `.zmx` file of at most
-    16 MB; see docs/lens_files.md.
+    """Read a lens with its fields, wavelengths and aperture from a Zemax `.zmx` or CODE V
+    `.seq` file of at most 16 MB; see docs/lens_files.md.
 
     What is read otherwise than it stands there, solves as the values beside them say, is told in
     one warning and in `System.notes`. LensError, in one line with the line of the file, for what
