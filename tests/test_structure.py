@@ -48,7 +48,7 @@ ONLY = {
     "matplotlib": {"show"},
     "skimage": {"learn.data", "learn.train"},
     "PIL": {"learn.images"},
-    "yaml": {"inputs", "files", "lens.glass"},
+    "yaml": {"inputs", "files"},
     "tqdm": set(),
     "experiments": set(),
     "tests": set(),

@@ -8,15 +8,8 @@ from scipy.spatial import ConvexHull
 
 import drt_jax
 from drt_jax import Gauss, load_lens
-from drt_jax.lens.glass import (
-    Dispersion,
-    Glass,
-    _catalogue,
-    find_glass,
-    glass_map_distance,
-    model_glass,
-    refractive_index,
-)
+from drt_jax.lens.glass import Dispersion, Glass, model_glass, refractive_index
+from drt_jax.lens.glasses import _table, find_glass, glass_map_distance
 
 # n_d of the catalogue pages and, for CODE V's listing of its Double Gauss sample, the indices
 # that program prints at 656.3, 587.6 and 486.1 nm (6 decimals).
@@ -178,7 +171,8 @@ def test_impossible_model_glasses(nd, vd):
 
 def solids():
     """nd and vd of the catalogue but for air and water, by `index`."""
-    names = [name for name in _catalogue() if name not in ("air", "water")]
+    plain = [name for name, entries in _table().items() if entries[0].plain]
+    names = [name for name in plain if name not in ("air", "water")]
     lines = np.array([index(name, *LINES[:3]) for name in names])
     return np.stack([lines[:, 0], (lines[:, 0] - 1) / (lines[:, 1] - lines[:, 2])], axis=1)
 
