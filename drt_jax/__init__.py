@@ -13,6 +13,7 @@ Conventions, everywhere in the package:
   before loading a lens; the library changes no global setting.
 """
 
+from .files.agf import load_agf as load_agf
 from .files.entry import LensError as LensError
 from .files.system import System as System
 from .files.write import save_lens as save_lens

@@ -1,4 +1,5 @@
-"""`python -m drt_jax show my_lens.yaml`: what a lens is, before anything is done with it."""
+"""`python -m drt_jax show my_lens.yaml`: what a lens is, before anything is done with it;
+`python -m drt_jax glass N-BK7`: what a glass is."""
 
 import argparse
 import math
@@ -22,6 +23,7 @@ from .lens.paraxial import FirstOrder, first_order
 from .lens.scene import Scene, scene_of
 from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
+from .show import glasses
 from .show.layout import Beam, beam_of
 from .show.sheet import sheet
 
@@ -33,7 +35,7 @@ _DEFOCUS = 3.0  # times the smallest spot is out of focus
 
 def _options(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m drt_jax", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="show")
+    commands = parser.add_subparsers(required=True, metavar="show, glass")
     about = (
         "first-order data, spots over the field, share of light, warnings, and a sheet of analyses"
     )
@@ -43,12 +45,12 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     show.add_argument("--distance", type=float, default=math.inf, help="to the object, mm")
     show.add_argument("--wavelengths", type=float, nargs="+", default=_LINES, help="um")
     show.add_argument("--out", type=pathlib.Path, help="of the sheet; default: LENS.png here")
-    options = parser.parse_args(argv)
-    if not all(abs(field) < 90 for field in options.field):
-        raise ValueError("--field: must be within 90 degrees")
-    if not options.distance > 0:
-        raise ValueError("--distance: must be above 0 mm")
-    return options
+    show.set_defaults(run=_show)
+    about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
+    glass = commands.add_parser("glass", help=about, description=about)
+    glasses.arguments(glass)
+    glass.set_defaults(run=lambda options: _say(glasses.told(options)))
+    return parser.parse_args(argv)
 
 
 def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[str]:
@@ -175,8 +177,12 @@ def _wait(what: str) -> None:
         sys.stderr.flush()
 
 
-def show(options: argparse.Namespace) -> None:
+def _show(options: argparse.Namespace) -> None:
     """Print what a lens is, as it becomes known, and draw it."""
+    if not all(abs(field) < 90 for field in options.field):
+        raise ValueError("--field: must be within 90 degrees")
+    if not options.distance > 0:
+        raise ValueError("--distance: must be above 0 mm")
     distance, waves, fields = options.distance, list(options.wavelengths), options.field
     middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
     with warnings.catch_warnings():
@@ -212,7 +218,8 @@ def main(argv: list[str] | None = None) -> None:
     """Run the command line; errors are one line, and the exit status 2, or 130 after Ctrl-C."""
     try:
         set_up()
-        show(_options(argv))
+        options = _options(argv)
+        options.run(options)
     except KeyboardInterrupt:
         sys.stderr.write("stopped\n")
         raise SystemExit(130) from None

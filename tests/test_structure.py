@@ -36,7 +36,7 @@ ALLOWED = {
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
 }
-ALLOWED_ALL = {"show.layout", "show.analyses", "show.sheet"}
+ALLOWED_ALL = {"show.layout", "show.analyses", "show.sheet", "show.glasses"}
 # Of 8,200 that were the aim before apertures, phases and elements came, 11,200 before what comes
 # from outside was checked throughout, 13,900 before whole lenses are designed and toleranced,
 # 18,000 before other optimisers ran beside a design, 18,500 before what misled was mended (issue 22

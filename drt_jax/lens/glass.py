@@ -13,7 +13,7 @@ from ..numerics import concrete, safe_divide, safe_sqrt
 # Of model glasses: the lines d, F, C, g in um, the powers of L in Conrady's formula, P_gF on
 # Schott's normal line as (constant, slope by vd), and where they are used: from line i to line t.
 FRAUNHOFER, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
-_NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
+NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL, _FARTHEST = (1.0, 50.0), 0.2
 # Wavelengths in um of a medium without a range: 0.1 nm to 1 m.
 ANY = 1e-4, 1e6
@@ -136,13 +136,12 @@ def nd_and_vd(dispersion: Dispersion) -> Array:
 def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
     """The dispersion with model glasses of the same nd and vd in place of some media, bool (M,)."""
     mask, found = jnp.asarray(rows)[:, None], nd_and_vd(dispersion)
+    one = jnp.eye(1, dispersion.schott.shape[1], dtype=found.dtype)
     none = jnp.asarray([_NO_MODEL], found.dtype)
     return Dispersion(
         jnp.where(mask, 0, dispersion.strength),
         jnp.where(mask, 0, dispersion.resonance),
-        jnp.where(
-            mask, jnp.eye(1, dispersion.schott.shape[1], dtype=found.dtype), dispersion.schott
-        ),
+        jnp.where(mask, one, dispersion.schott),
         jnp.where(mask, jnp.asarray([VISIBLE], found.dtype), dispersion.ranges),
         jnp.where(mask, found, none if dispersion.model is None else dispersion.model),
         None if dispersion.partial is None else jnp.where(mask[:, 0], 0, dispersion.partial),
@@ -155,7 +154,7 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
     formula = np.linalg.inv(np.stack([d, f - c, g - f])).T
     nd, vd = model[:, 0], model[:, 1]
     mean = (nd - 1) / vd
-    above = _NORMAL_LINE[0] + _NORMAL_LINE[1] * vd + (0 if partial is None else partial)
+    above = NORMAL_LINE[0] + NORMAL_LINE[1] * vd + (0 if partial is None else partial)
     known = jnp.stack([nd - 1, mean, above * mean], axis=-1)
     powers = jnp.stack([wavelengths**p for p in _CONRADY])
     return known @ jnp.asarray(formula, known.dtype) @ powers

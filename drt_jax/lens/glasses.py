@@ -96,7 +96,7 @@ def _all() -> list[tuple[str, _Entry]]:
 
 @functools.cache
 def glass_names() -> tuple[str, ...]:
-    """Names that `find_glass` knows: plain ones first, and NAME_MAKER where a name is not enough."""
+    """Names that `find_glass` knows, NAME_MAKER where a name is not enough; plain ones first."""
     ordered = sorted(_all(), key=lambda own: not own[1].plain)
     return ("air", *dict.fromkeys(_glass(name, entry).name for name, entry in ordered))
 
@@ -153,11 +153,12 @@ def spellings(name: str) -> list[str]:
 
 
 def near_names(name: str, count: int = 6) -> list[str]:
-    """Names of the table that look like `name`."""
+    """Names that `find_glass` knows and that look like `name`."""
     folded, name = _folded(), name.lower()
     near = difflib.get_close_matches(name, folded, n=count, cutoff=0.5)
     near += [known for known in folded if name in known and known not in near]
-    return [own for known in near for own in folded[known]][:count]
+    entries = ((own, entry) for at in near for own in folded[at] for entry in _table()[own])
+    return [*dict.fromkeys(_glass(own, entry).name for own, entry in entries)][:count]
 
 
 def indices(glass: Glass, wavelengths: np.ndarray) -> np.ndarray:
@@ -199,9 +200,12 @@ def nearest_glasses(
         raise ValueError(f"unknown maker {maker!r}; makers: {', '.join(glass_makers())}")
     glasses, points = _mapped()
     away = np.hypot(points[:, 0] - nd, _PER_VD * (points[:, 1] - vd))
-    ordered = (i for i in np.argsort(away, kind="stable"))
-    own = [i for i in ordered if wanted is None or glasses[i][0].maker in wanted]
-    return [Neighbour(glasses[i][0], *points[i].tolist(), float(away[i])) for i in own[:count]]
+    own = [
+        Neighbour(glasses[i][0], float(points[i, 0]), float(points[i, 1]), float(away[i]))
+        for i in np.argsort(away, kind="stable")
+        if wanted is None or glasses[i][0].maker in wanted
+    ]
+    return own[:count]
 
 
 @functools.cache
@@ -231,8 +235,8 @@ def _left_of(a: tuple[float, float], b: tuple[float, float], point: tuple[float,
 
 
 def glass_map_distance(model: Array) -> Array:
-    """How far glasses of nd and vd (G, 2) lie outside of the convex hull of the plain glasses but for
-    water, (G,), from its farthest edge, negative within: in units of nd, 100 of vd as one.
+    """How far glasses of nd and vd (G, 2) lie outside of the convex hull of the plain glasses, but
+    for water: (G,), from its farthest edge, negative within, in units of nd, 100 of vd as one.
     """
     normals, away = (jnp.asarray(a, model.dtype) for a in _glass_map())
     scaled = model * jnp.array([[1, _PER_VD]], model.dtype)
