@@ -20,9 +20,8 @@ def _powers(*order: int) -> Callable[[list[float]], _Forms]:
     """Of coefficients whose place in `Glass.schott` is in `order`."""
 
     def formula(c: list[float]) -> _Forms:
-        schott = [0.0] * 9
-        for place, value in zip(order, c, strict=False):
-            schott[place] = value
+        placed = dict(zip(order, c, strict=False))
+        schott = [placed.get(place, 0.0) for place in range(9)]
         return [0.0] * 2, schott[: 9 if any(schott[6:]) else 6]
 
     return formula

@@ -68,9 +68,7 @@ def _with_catalogues(top: Any, folder: pathlib.Path) -> Any:
         return top
     paths, surfaces = top["catalogues"], top.get("surfaces")
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-        raise LensError(
-            f"catalogues: expected a list of .agf files, got {shown(paths)}", "catalogues"
-        )
+        raise LensError(f"catalogues: expected a list of paths, got {shown(paths)}", "catalogues")
     places = [top.get("object"), *(surfaces if isinstance(surfaces, list) else [])]
     used = [place.get("glass") for place in places if isinstance(place, dict)]
     found: dict[str, dict[str, list[float]]] = {}

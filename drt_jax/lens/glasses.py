@@ -1,7 +1,6 @@
 """The table of the makers' glasses: by name and maker, by nd and vd, and the hull of its map.
 
-Written by tools/glasses.py, whose head tells sources and form. It is read when a glass is asked
-for, line by line what is needed.
+Written by tools/glasses.py, whose head tells sources and form; read when a glass is asked for.
 """
 
 import difflib
@@ -24,8 +23,7 @@ _PER_VD = 0.01
 
 
 class _Entry(NamedTuple):
-    """A line of the table: whether its name means it where no maker is given, its maker, the
-    temperature in C, its source, and its constants as text."""
+    """A line of the table: whether its name alone means it, maker, C, source, constants as text."""
 
     plain: bool
     maker: str
@@ -85,7 +83,7 @@ def _glass(name: str, entry: _Entry) -> Glass:
 
 
 def _differ(entries: list[_Entry]) -> bool:
-    """Whether glasses of one name have different constants, or hold for different ranges."""
+    """Whether glasses of one name have different constants or ranges."""
     return len({entry.constants for entry in entries}) > 1
 
 
@@ -121,43 +119,33 @@ def find_glass(name: str, maker: str | None = None) -> Glass:
         )
     entries = table.get(name, [])
     found = [entry for entry in entries if maker is None or entry.maker == maker.upper()]
+    of = ", ".join(entry.maker or "no maker" for entry in entries)
     if not found and entries:
-        raise ValueError(f"glass {name!r} is not of {maker} but of {_makers(entries)}")
+        raise ValueError(f"glass {name!r} is not of {maker} but of {of}")
     if not found:
         near = near_names(name)
         hint = f"near names: {', '.join(near)}" if near else "no near name"
         raise ValueError(f"unknown glass {name!r}; {hint}")
     if not found[0].plain and _differ(found):
         raise ValueError(
-            f"glass {name!r} is of several makers, {_makers(found)}, with different constants; "
-            f"give one, as {name}_{found[0].maker}"
+            f"glass {name!r} is of several makers, {of}, with different constants; give one, as "
+            f"{name}_{found[0].maker}"
         )
     return _glass(name, found[0])
 
 
-def _makers(entries: list[_Entry]) -> str:
-    return ", ".join(entry.maker or "no maker" for entry in entries)
-
-
-@functools.cache
-def _folded() -> dict[str, list[str]]:
-    folded: dict[str, list[str]] = {}
-    for name in _table():
-        folded.setdefault(name.lower(), []).append(name)
-    return folded
-
-
 def spellings(name: str) -> list[str]:
     """Names of the table that differ by capitals alone."""
-    return _folded().get(name.lower(), [])
+    return [own for own in _table() if own.lower() == name.lower()]
 
 
 def near_names(name: str, count: int = 6) -> list[str]:
     """Names that `find_glass` knows and that look like `name`."""
-    folded, name = _folded(), name.lower()
+    folded, name = dict.fromkeys(own.lower() for own in _table()), name.lower()
     near = difflib.get_close_matches(name, folded, n=count, cutoff=0.5)
     near += [known for known in folded if name in known and known not in near]
-    entries = ((own, entry) for at in near for own in folded[at] for entry in _table()[own])
+    alike = [own for known in near[:count] for own in spellings(known)]
+    entries = ((own, entry) for own in alike for entry in _table()[own])
     return [*dict.fromkeys(_glass(own, entry).name for own, entry in entries)][:count]
 
 
@@ -170,19 +158,22 @@ def indices(glass: Glass, wavelengths: np.ndarray) -> np.ndarray:
     return np.sqrt(terms + powers @ np.asarray(glass.schott, float))
 
 
+def map_point(glass: Glass) -> tuple[float, float] | None:
+    """nd and vd of a glass of the table; None where its range has not the lines F, d and C, or it
+    has no dispersion."""
+    if glass.range[0] > FRAUNHOFER[1] or glass.range[1] < FRAUNHOFER[2]:
+        return None
+    d, f, c = indices(glass, np.array(FRAUNHOFER[:3])).tolist()
+    return (d, (d - 1) / (f - c)) if f > c else None
+
+
 @functools.cache
-def _mapped() -> tuple[list[tuple[Glass, bool]], np.ndarray]:
-    """Solids that are known at the lines F and C, and whether each is plain, with nd and vd."""
-    found, points = [], []
-    for name, entry in _all():
-        glass = _glass(name, entry)
-        low, high = glass.range
-        if low <= FRAUNHOFER[1] and high >= FRAUNHOFER[2] and name.lower() != "water":
-            nd, f, c = indices(glass, np.array(FRAUNHOFER[:3]))
-            if f > c:
-                found.append((glass, entry.plain))
-                points.append((nd, (nd - 1) / (f - c)))
-    return found, np.array(points)
+def _mapped() -> tuple[list[_Entry], list[Glass], np.ndarray]:
+    """Solids that are known at the lines F and C: entries, glasses, nd and vd (G, 2)."""
+    solids = [(entry, _glass(name, entry)) for name, entry in _all() if name.lower() != "water"]
+    found = [(*own, point) for own in solids if (point := map_point(own[1]))]
+    entries, glasses, points = zip(*found, strict=True)
+    return [*entries], [*glasses], np.array(points)
 
 
 def nearest_glasses(
@@ -198,46 +189,29 @@ def nearest_glasses(
     wanted = None if makers is None else {maker.upper() for maker in makers}
     for maker in sorted((wanted or set()) - {*glass_makers()}):
         raise ValueError(f"unknown maker {maker!r}; makers: {', '.join(glass_makers())}")
-    glasses, points = _mapped()
+    entries, glasses, points = _mapped()
     away = np.hypot(points[:, 0] - nd, _PER_VD * (points[:, 1] - vd))
     own = [
-        Neighbour(glasses[i][0], float(points[i, 0]), float(points[i, 1]), float(away[i]))
+        Neighbour(glasses[i], float(points[i, 0]), float(points[i, 1]), float(away[i]))
         for i in np.argsort(away, kind="stable")
-        if wanted is None or glasses[i][0].maker in wanted
+        if wanted is None or entries[i].maker in wanted
     ]
     return own[:count]
 
 
 @functools.cache
-def _glass_map() -> tuple[np.ndarray, np.ndarray]:
+def _glass_map() -> np.ndarray:
     """The edges of the convex hull of the plain glasses but for water, in nd and scaled vd: their
-    normals (E, 2), outwards, and how far they are from the origin (E,)."""
-    glasses, found = _mapped()
-    plain = found[[plain for _, plain in glasses]] * (1, _PER_VD)
-    points: list[tuple[float, float]] = [(nd, vd) for nd, vd in plain.tolist()]
-    corners: list[tuple[float, float]] = []
-    for ordered in (sorted(points), sorted(points, reverse=True)):  # below, then above
-        half: list[tuple[float, float]] = []
-        for x, y in ordered:
-            while len(half) > 1 and _left_of(half[-2], half[-1], (x, y)) <= 0:
-                half.pop()
-            half.append((x, y))
-        corners += half[:-1]
-    edges = np.roll(corners, -1, axis=0) - corners
-    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals, np.sum(normals * corners, axis=1)
+    normals, outwards, and how far the origin lies behind them, (E, 3)."""
+    from scipy.spatial import ConvexHull  # takes half a second to import
 
-
-def _left_of(a: tuple[float, float], b: tuple[float, float], point: tuple[float, float]) -> float:
-    """Above 0 for a point to the left of the way from a to b."""
-    return (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])
+    entries, _, points = _mapped()
+    return ConvexHull(points[[entry.plain for entry in entries]] * (1, _PER_VD)).equations
 
 
 def glass_map_distance(model: Array) -> Array:
     """How far glasses of nd and vd (G, 2) lie outside of the convex hull of the plain glasses, but
-    for water: (G,), from its farthest edge, negative within, in units of nd, 100 of vd as one.
-    """
-    normals, away = (jnp.asarray(a, model.dtype) for a in _glass_map())
+    for water: (G,), from its farthest edge, negative within, in units of nd, 100 of vd as one."""
+    edges = jnp.asarray(_glass_map(), model.dtype)
     scaled = model * jnp.array([[1, _PER_VD]], model.dtype)
-    return jnp.max(scaled @ normals.T - away[None], axis=1)
+    return jnp.max(scaled @ edges[:, :2].T + edges[None, :, 2], axis=1)

@@ -8,17 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..lens.glass import FRAUNHOFER, NORMAL_LINE, Glass
-from ..lens.glasses import (
-    Neighbour,
-    find_glass,
-    indices,
-    near_names,
-    nearest_glasses,
-)
+from ..lens.glasses import find_glass, indices, map_point, near_names, nearest_glasses
 from .figures import new
 
 _NEAR, _ALL = 6, 10_000  # of the lists, and of the map
-_LINES = "dFCg"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +35,9 @@ def told(options: argparse.Namespace) -> Iterator[str]:
     if point is not None:
         around = nearest_glasses(*point, options.makers, _NEAR + 1)
         yield f"  near in nd and vd    {'distance':>9} {'nd':>9} {'vd':>6}  maker     name"
-        yield from map(_neighbour_line, [n for n in around if n.glass.name != name][:_NEAR])
+        for near in [near for near in around if near.glass.name != name][:_NEAR]:
+            numbers = f"{near.distance:9.6f} {near.nd:9.6f} {near.vd:6.2f}"
+            yield f"{'':23}{numbers}  {near.glass.maker or '-':<9} {near.glass.name}"
     if options.plot:
         if point is None:
             raise ValueError(f"--plot: {name} is not known at the lines F and C")
@@ -62,19 +57,11 @@ def _pair(text: str) -> tuple[float, float]:
     return nd, vd
 
 
-def map_point(glass: Glass) -> tuple[float, float] | None:
-    """nd and vd; None where the range has not the lines F, d and C, or there is no dispersion."""
-    if not (glass.range[0] <= FRAUNHOFER[1] and glass.range[1] >= FRAUNHOFER[2]):
-        return None
-    d, f, c = indices(glass, np.array(FRAUNHOFER[:3])).tolist()
-    return (d, (d - 1) / (f - c)) if f > c else None
-
-
 def glass_lines(glass: Glass) -> Iterator[str]:
     """What is known of a glass of the table, in lines."""
     yield f"{glass.name}{f' ({glass.maker})' if glass.maker else ''}"
     low, high = glass.range
-    lines = {f"{name}, {1e3 * w:.2f} nm": w for name, w in zip(_LINES, FRAUNHOFER, strict=True)}
+    lines = {f"{name}, {1e3 * w:.2f} nm": w for name, w in zip("dFCg", FRAUNHOFER, strict=True)}
     known = {name: w for name, w in lines.items() if low <= w <= high}
     known = known or {f"{w:g} um": w for w in (low, (low + high) / 2, high)}
     found = indices(glass, np.array([*known.values()])).tolist()
@@ -82,7 +69,7 @@ def glass_lines(glass: Glass) -> Iterator[str]:
     point = map_point(glass)
     if point is not None:
         yield f"  Abbe number vd       {point[1]:.2f}"
-    if point is not None and len(found) == len(_LINES):
+    if point is not None and len(found) == 4:
         partial = (found[3] - found[1]) / (found[1] - found[2])
         above = partial - NORMAL_LINE[0] - NORMAL_LINE[1] * point[1]
         yield f"  P_gF                 {partial:.4f}, {above:+.4f} from the normal line"
@@ -92,22 +79,14 @@ def glass_lines(glass: Glass) -> Iterator[str]:
     yield f"  near in spelling     {', '.join(near[:_NEAR])}"
 
 
-def _neighbour_line(near: Neighbour) -> str:
-    maker, name = near.glass.maker or "-", near.glass.name
-    return f"{'':23}{near.distance:9.6f} {near.nd:9.6f} {near.vd:6.2f}  {maker:<9} {name}"
-
-
 def glass_map(
-    axes: Axes,
-    point: Sequence[float],
-    name: str,
-    makers: Collection[str] | None = None,
+    axes: Axes, point: Sequence[float], name: str, makers: Collection[str] | None = None
 ) -> Axes:
     """nd over vd of all glasses of the table, with one of them marked.
 
     point: nd and vd of the mark. name: what it says. makers: of the glasses; None: all.
     """
-    found = nearest_glasses(*point, makers, _ALL)
+    found = nearest_glasses(point[0], point[1], makers, _ALL)
     for maker in sorted({near.glass.maker for near in found}):
         own = np.array([(near.vd, near.nd) for near in found if near.glass.maker == maker])
         axes.plot(*own.T, ".", markersize=4, label=maker or "substances")
