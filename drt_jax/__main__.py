@@ -1,5 +1,5 @@
 """`python -m drt_jax show my_lens.yaml`: what a lens is, before anything is done with it; `convert`
-writes a lens file in the format of another program."""
+writes a lens file in the format of another program; `glass N-BK7`: what a glass is."""
 
 import argparse
 import contextlib
@@ -25,6 +25,7 @@ from .lens.paraxial import FirstOrder, first_order
 from .lens.scene import Scene, scene_of
 from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
+from .show import glasses
 from .show.layout import Beam, beam_of
 from .show.sheet import sheet
 
@@ -37,7 +38,7 @@ _DEFOCUS = 3.0  # times the smallest spot is out of focus
 
 def _options(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m drt_jax", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="show or convert")
+    commands = parser.add_subparsers(required=True, metavar="show, convert or glass")
     about = (
         "first-order data, spots over the field, share of light, warnings, and a sheet of analyses"
     )
@@ -54,14 +55,11 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     convert.add_argument("out", type=pathlib.Path, help="file that ends in .yaml, .zmx or .seq")
     convert.add_argument("--missing", choices=("error", "warn"), default="error", help=_MISSING)
     convert.set_defaults(run=run_convert)
-    options = parser.parse_args(argv)
-    if options.run is run_convert:
-        return options
-    if not all(abs(field) < 90 for field in options.field):
-        raise ValueError("--field: must be within 90 degrees")
-    if not options.distance > 0:
-        raise ValueError("--distance: must be above 0 mm")
-    return options
+    about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
+    glass = commands.add_parser("glass", help=about, description=about)
+    glasses.arguments(glass)
+    glass.set_defaults(run=lambda options: _say(glasses.told(options)))
+    return parser.parse_args(argv)
 
 
 def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[str]:
@@ -211,6 +209,10 @@ def _warnings_on_stdout() -> Iterator[None]:
 
 def run_show(options: argparse.Namespace) -> None:
     """Print what a lens is, as it becomes known, and draw it."""
+    if not all(abs(field) < 90 for field in options.field):
+        raise ValueError("--field: must be within 90 degrees")
+    if not options.distance > 0:
+        raise ValueError("--distance: must be above 0 mm")
     distance, waves, fields = options.distance, list(options.wavelengths), options.field
     middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
     with _warnings_on_stdout():

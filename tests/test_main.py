@@ -148,3 +148,24 @@ def test_errors_are_one_line(words, message, tmp_path, capsys):
         main([*words, *(["--out", str(tmp_path / "lens.png")] if words[0] == "show" else [])])
     said = capsys.readouterr().err
     assert ended.value.code == 2 and message in said and said.count("\n") == 1
+
+
+def test_a_glass_shows_itself(tmp_path, capsys):
+    """N-BK7 of Schott's sheet: nd 1.51680, vd 64.17, P_gF 0.5349, 0.0009 below the normal line."""
+    picture = tmp_path / "map.png"
+    main(["glass", "N-BK7", "--plot", str(picture)])
+    said = capsys.readouterr().out
+    assert re.search(r"d, 587.56 nm +1.51680", said) and re.search(r"vd +64.17\n", said)
+    assert "0.5349, -0.0009" in said and "(SCHOTT)" in said and "0.3 to 2.5 um" in said
+    assert "H-K9L" in said and picture.stat().st_size > 10_000
+    main(["glass", "--near", "1.6204,60.3", "--makers", "SCHOTT"])
+    assert "N-SK16\n" in capsys.readouterr().out
+    for words, message in {
+        ("BAF4",): "error: glass 'BAF4' is of several makers",
+        ("--near", "1,2,3"): "error: --near: expected ND,VD",
+        (): "error: give the name of a glass or --near",
+        ("IRG22", "--plot", "no.png"): "error: --plot: IRG22 is not known at the lines F and C",
+    }.items():
+        with pytest.raises(SystemExit):
+            main(["glass", *words])
+        assert capsys.readouterr().err.startswith(message)

@@ -64,7 +64,7 @@ from jax import Array
 
 from ..image.spot import deviations, normalised
 from ..image.wavefront import path_differences
-from ..lens.glass import glass_map_distance
+from ..lens.glasses import glass_map_distance
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..numerics import safe_divide, safe_sqrt

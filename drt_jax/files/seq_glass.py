@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..lens.glass import glass_names
-from .glasses import named_glass
+from ..lens.glasses import plain_names
+from .glasses import in_catalogues, named_glass
 from .record import Record, Row, short
 from .seq_text import Command
 
@@ -76,8 +76,13 @@ class Glasses:
                 self.record.notes.append(note)
             return {"nd": code[0], "vd": code[1]}
         name, _, maker = word.partition("_")
-        known = [other for other in glass_names() if folded(other) == folded(name)]
         makers = [maker.upper()] if maker and maker.upper() != "SPECIAL" else []
+        known = [other for other in plain_names() if folded(other) == folded(name)]
+        known = [other for other in known if in_catalogues(other, makers)] or known
+        if len(known) > 1 and not makers:
+            raise self.record.error(
+                line, f"{row.name}: glass {short(word)} may be {' or '.join(known)}; add _MAKER"
+            )
         return dict(named_glass(self.record, row, line, known[0] if known else name, makers))
 
     def _private(self, name: str, system: list[float]) -> str:

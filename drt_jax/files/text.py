@@ -46,7 +46,7 @@ def decoded(content: bytes) -> str:
                 ) from error
             continue
         break
-    odd = re.search("[\x00-\x08\x0e-\x19\x1b-\x1f\x7f-\x84\x86-\x9f]", text)
+    odd = re.search("[\x00-\x08\x0e-\x19\x1b-\x1f]", text)
     if odd:
         raise InputError(f"character {odd.start()} is no text: is this a lens file?")
     return text

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from ..lens.glass import ANY
+from ..lens.glasses import find_glass
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil
 from .entry import LensError
 from .exact import degrees_of, number_for
-from .glasses import maker_of
 from .media_out import media_of_lens
 from .record import turns_of
 from .seq_glass import folded
@@ -95,8 +95,8 @@ def _word(keys: dict[str, Any], private: dict[str, str]) -> str:
     name = keys.get("glass", "")
     if not name or name in private:
         return f"'{private[name]}'" if name else ""
-    maker = maker_of(name)
-    return folded(name) + (f"_{maker}" if maker else "")
+    maker = find_glass(name).maker
+    return folded(name.removesuffix(f"_{maker}")) + (f"_{maker}" if maker else "")
 
 
 def _surface(lens: Lens, i: int) -> list[str]:

@@ -1,13 +1,14 @@
 """A lens written as a `.zmx` file: what `zmx` reads, backwards."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from .entry import LensError
-from .glasses import MAKERS
+from .glasses import written_names
 from .media_out import medium_of
 from .model_zmx import to_ours, to_theirs
 
@@ -48,11 +49,13 @@ def zmx_text(lens: Lens) -> str:
         raise LensError("elements, tilts and decentres are not written to .zmx: save as .yaml")
     low, high = lens.dispersion.range
     wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
-    makers = sorted({MAKERS[name] for name in lens.glasses if name in MAKERS})
+    media = [medium_of(lens, i) or {} for i in range(lens.count + 1)]
+    makers, names = written_names([own["glass"] for own in media if "glass" in own])
+    names |= {name: other for name, other in _OTHERS.items() if name in names}
     head = {"name": " ".join(lens.name.split()), "wave": wave}
-    lines = [_HEAD.format(makers=" ".join([*makers, "SCHOTT"]), **head)]
-    front = ["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY", *_glass(lens, 0)]
-    blocks = [front, *(_surface(lens, i) for i in range(lens.count))]
+    lines = [_HEAD.format(makers=" ".join(makers), **head)]
+    front = ["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY", *_glass(lens, 0, names)]
+    blocks = [front, *(_surface(lens, i, names) for i in range(lens.count))]
     curvature, conic = (float(a[-1]) for a in (lens.curvature, lens.conic))
     blocks.append(["TYPE STANDARD", f"CURV {curvature!r}", f"CONI {conic!r}", "DISZ 0"])
     for i, block in enumerate(blocks):
@@ -70,11 +73,11 @@ def gap_behind(lens: Lens, i: int) -> float:
     return float(near[np.argmin(np.abs(sum(gaps) + near - sensor))])
 
 
-def _surface(lens: Lens, i: int) -> list[str]:
+def _surface(lens: Lens, i: int, names: Mapping[str, str]) -> list[str]:
     lines = ["STOP"] if i == lens.stop else []
     lines += [*_form(lens, i), f"CURV {float(lens.curvature[i])!r}"]
     lines += [f"CONI {float(lens.conic[i])!r}"] if lens.conic[i] else []
-    lines += [f"DISZ {gap_behind(lens, i)!r}", *_glass(lens, i + 1)]
+    lines += [f"DISZ {gap_behind(lens, i)!r}", *_glass(lens, i + 1, names)]
     semi = float(lens.semi_diameter[i])
     if math.isfinite(semi):
         lines.append(f"DIAM {semi!r} 1 0 0 1")
@@ -133,8 +136,8 @@ def _times_turn(waves: float) -> float:
     return min(near, key=lambda value: abs(value / turn - waves))
 
 
-def _glass(lens: Lens, m: int) -> list[str]:
-    """The medium behind a surface, m from 1, or of the object."""
+def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
+    """The medium behind a surface, m from 1, or of the object; `names` of glasses in the file."""
     if m and lens.mirrors[m - 1]:
         return ["GLAS MIRROR 0 0 1.5 40"]
     keys = medium_of(lens, m)
@@ -144,7 +147,7 @@ def _glass(lens: Lens, m: int) -> list[str]:
             "hold: save as .yaml, or use with_model_glass"
         )
     if "glass" in keys:
-        return [f"GLAS {_OTHERS.get(keys['glass'], keys['glass'])} 0 0 1.5 40"]
+        return [f"GLAS {names[keys['glass']]} 0 0 1.5 40"]
     if "index" in keys:
         return [f"GLAS ___BLANK 1 0 {keys['index']!r} 0 0"]
     if not keys:

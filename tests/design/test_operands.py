@@ -26,7 +26,7 @@ from drt_jax.design import (
 )
 from drt_jax.design.field_rays import relative_illumination
 from drt_jax.design.kinds import KINDS
-from drt_jax.lens.glass import glass_map_distance
+from drt_jax.lens.glasses import glass_map_distance
 
 from .test_variables import MODEL
 
