@@ -12,15 +12,18 @@ from jax import Array
 SIDES = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 
 
-def blur_row(light: Array, kernels: Array, shares: Array, tile: tuple[int, int]) -> Array:
+def blur_row(
+    light: Array, kernels: Array, shares: Array, across: Array, tile: tuple[int, int]
+) -> Array:
     """A row of n tiles of height and width `tile`, blurred: (C, height, n width).
 
     light: (C, height + K - 1, n width + K - 1), with what lies around.
     kernels: (C, R, K, K); a pixel collects kernel[k] of the light k pixels before it, as in a
-    convolution. shares: (C, R, height, n width), what of each kernel a pixel takes.
+    convolution. shares: (C, R, height, M), what of each kernel a row of pixels takes at M places
+        along it; across: (n width, M), the matrix that interpolates between them.
     """
     size, channels = kernels.shape[-1], len(light)
-    (height, width), count = tile, shares.shape[-1] // tile[1]
+    (height, width), count = tile, len(across) // tile[1]
     ends = height + size - 1, width + size - 1
     sides = tuple(next((s for s in SIDES if s >= end), end) for end in ends)
     tiles = jnp.stack([light[:, :, j * width : j * width + ends[1]] for j in range(count)])
@@ -30,7 +33,9 @@ def blur_row(light: Array, kernels: Array, shares: Array, tile: tuple[int, int])
         kernel, share = given
         blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides)[None], sides)
         inside = blurred[..., size - 1 : ends[0], size - 1 : ends[1]]
-        return total + share * jnp.moveaxis(inside, 0, 2).reshape(share.shape), None
+        exact = jax.lax.Precision.HIGHEST
+        each = jnp.einsum("cym,xm->cyx", share, across, precision=exact)
+        return total + each * jnp.moveaxis(inside, 0, 2).reshape(each.shape), None
 
     start = jnp.zeros((channels, height, count * width), light.dtype)
     return jax.lax.scan(added, start, (jnp.moveaxis(kernels, 1, 0), jnp.moveaxis(shares, 1, 0)))[0]

@@ -61,7 +61,7 @@ def render_method(
     pixel: Numbers,
     wavelengths: Numbers = _WAVELENGTHS,
     size: int | None = None,
-    nodes: int = 8,
+    nodes: int = 16,
     tile: int | None = None,
     layers: int = 8,
     model: Kind | Literal["auto"] | PsfModel = "rays",
@@ -75,7 +75,8 @@ def render_method(
     size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
     nodes: fields on one side of the axis, along the longer side of the picture, see `grid_method`.
     tile: side of a tile in pixels.
-    model, tolerance: of the kernels, as of `psf`; to the same tolerance kernels are sums of a few.
+    model, tolerance: of the kernels, as of `psf`; kernels are sums of a few to the same number, see
+        `chosen_places`.
 
     Warns of light beside kernels that are too small. ValueError inside a trace, for numbers that
     make no sense, and where no light arrives.
@@ -175,14 +176,15 @@ def _strip(maps: Maps, method: RenderMethod, planes: Array, row: Array, lit: boo
         places.append(basis(place, count, SMOOTH))
         local.append(basis(place[margin : length + margin], count, LOCAL))
 
+    product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+
     def between(values: Array, where: list[Array]) -> Array:
-        exact = jax.lax.Precision.HIGHEST
-        lines = jnp.einsum("ym,...mn->...yn", where[0], values, precision=exact)
-        return jnp.einsum("...yn,xn->...yx", lines, where[1], precision=exact)
+        return product("ym,cmn,xn->cyx", where[0], values, where[1])
 
     x, y = (between(maps.sources[..., k], places) for k in (0, 1))
     warped = cubic(planes, y, x)
-    blurred = blur_row(warped, maps.kernels, between(maps.shares, local), method.tile)
+    shares = product("ym,crmn->cryn", local[0], maps.shares)
+    blurred = blur_row(warped, maps.kernels, shares, local[1], method.tile)
     if lit:
         blurred = blurred * between(maps.light, local)
     return jnp.moveaxis(blurred, 0, -1)

@@ -40,8 +40,10 @@ def grid():
 def test_a_row_of_tiles_is_blurred_by_each_pixels_own_kernel():
     random = np.random.default_rng(1)
     light, kernels = random.random((2, 14, 22)), random.random((2, 3, 7, 7))
-    shares = random.random((2, 3, 8, 16))
-    found = np.asarray(blur.blur_row(*map(jnp.asarray, (light, kernels, shares)), (8, 8)))
+    lines, across = random.random((2, 3, 8, 4)), random.random((16, 4))
+    shares = lines @ across.T
+    given = map(jnp.asarray, (light, kernels, lines, across))
+    found = np.asarray(blur.blur_row(*given, (8, 8)))
     assert found.shape == (2, 8, 16)
     for y, x in ((0, 0), (3, 7), (7, 8), (5, 13)):
         kernel = np.einsum("crij,cr->cij", kernels, shares[:, :, y, x])
@@ -210,6 +212,7 @@ def test_hidden_parts_go_on_as_what_is_seen_beside_them():
     np.testing.assert_array_equal(rendering.spread(nothing, nothing), 0)
 
 
+@pytest.mark.slow
 def test_a_near_plane_covers_what_lies_behind_it_by_its_blurred_cover():
     """Planes of radiance 1 and 0.25: by the cover alone, in the near plane's kernels."""
     lens, near, far = lens_of(), 800.0, 5000.0
