@@ -79,6 +79,7 @@ class Glasses:
         makers = [maker.upper()] if maker and maker.upper() != "SPECIAL" else []
         known = [other for other in plain_names() if folded(other) == folded(name)]
         known = [other for other in known if in_catalogues(other, makers)] or known
+        known = [other for other in known if other == name] or known
         if len(known) > 1 and not makers:
             raise self.record.error(
                 line, f"{row.name}: glass {short(word)} may be {' or '.join(known)}; add _MAKER"
