@@ -143,8 +143,10 @@ def test_glasses(tmp_path):
     assert entry(tmp_path, "S 9 -1 REFL") == {"curvature": 1 / 9, "mirror": True}
     assert entry(tmp_path, "S 9 1; RMD REFL")["mirror"]
     assert entry(tmp_path, "S 9 1; GLA S2 F2")["glass"] == "F2"
-    assert "unknown glass 'SLAL8'" in refused(tmp_path, "S 9 1 SLAL8_OHARA; STO", BACK)
-    assert "we have N-BK7 of SCHOTT alone" in refused(tmp_path, "S 9 1 NBK7_HOYA; STO", BACK)
+    assert entry(tmp_path, "S 9 1 SLAL8_OHARA")["glass"] == "S-LAL8"
+    assert entry(tmp_path, "S 9 1 SK16_SCHOTT")["glass"] == "SK16_SCHOTT"  # SK16 is Hikari's
+    assert "unknown glass 'SLAL99'" in refused(tmp_path, "S 9 1 SLAL99_OHARA; STO", BACK)
+    assert "N-BK7 is known of SCHOTT" in refused(tmp_path, "S 9 1 NBK7_HOYA; STO", BACK)
 
 
 def test_private_glasses(tmp_path):
