@@ -55,16 +55,16 @@ def test_defocus_and_strehl():
     lens = load_lens(MIRROR)
     side = (np.arange(2000) + 0.5) / 1000 - 1
     x, y = np.meshgrid(side, side)
-    for edge in (0.25, 0.5, 1.0):
-        focus = edge * WAVE * 1e-3 / (1 - np.sqrt(1 - APERTURE**2))
+    edges, parts = np.array([0.25, 0.5, 1.0]), np.array([0.1, 0.3, 0.6])
+    steps = edges * WAVE * 1e-3 / (1 - np.sqrt(1 - APERTURE**2))
+    given = lens, 0.0, np.inf, WAVE, parts * LIMIT
+    found = drt_jax.transfer(*given, focus=steps, rule=RULE, cells=128)  # through focus
+    assert found.mtf.shape == (1, 3, 2, 3)
+    for k, (edge, focus) in enumerate(zip(edges, steps)):
         moved = dataclasses.replace(lens, sensor=lens.sensor + focus)
         ratio = drt_jax.strehl(moved, 0.0, np.inf, WAVE, RULE)
         np.testing.assert_allclose(ratio, np.sinc(edge) ** 2, rtol=0, atol=2e-4)
-        parts = np.array([0.1, 0.3, 0.6])
-        found = drt_jax.transfer(
-            lens, 0.0, np.inf, WAVE, parts * LIMIT, focus=focus, rule=RULE, cells=128
-        )
-        for part, ours in zip(parts, found.mtf[0, 0]):
+        for part, ours in zip(parts, found.mtf[0, k, 0]):
             both = (np.hypot(x, y + part) < 1) & (np.hypot(x, y - part) < 1)
             waves = np.cos(2 * np.pi * edge * 4 * y[both] * part)
             wanted = abs(np.sum(waves)) / np.sum(np.hypot(x, y) < 1)
