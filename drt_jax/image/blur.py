@@ -1,35 +1,41 @@
-"""Blur that varies over the picture: tiles with their corners' kernels, blended.
+"""Blur that varies over the picture: a few fixed kernels, whose shares vary from pixel to pixel.
 
-The kernel of a pixel is the bilinear blend of those at the corners of its tile. A tile takes one
-transform of its light and one back for each corner; tiles share the kernels of their corners, so
-that the blend is continuous and no seam is left.
+The kernel of a pixel is a sum of R kernels, the same for all pixels, times shares of its own. Each
+kernel takes one transform back of a tile's light; the shares are smooth, so that no seam is left.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
+# Sides of the squares that are transformed: fast ones.
+SIDES = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 
-def blur_row(light: Array, kernels: Array, tile: tuple[int, int]) -> Array:
-    """A row of n tiles of height and width `tile`, blurred: (height, n width, C).
 
-    light: (height + K - 1, n width + K - 1, C), with what lies around.
-    kernels: (2, n + 1, C, K, K), at the upper and the lower corners of the tiles; a pixel collects
-        kernel[k] of the light k pixels before it, as in a convolution.
+def blur_row(
+    light: Array, kernels: Array, shares: Array, across: Array, tile: tuple[int, int]
+) -> Array:
+    """A row of n tiles of height and width `tile`, blurred: (C, height, n width).
+
+    light: (C, height + K - 1, n width + K - 1), with what lies around.
+    kernels: (C, R, K, K); a pixel collects kernel[k] of the light k pixels before it, as in a
+    convolution. shares: (C, R, height, M), what of each kernel a row of pixels takes at M places
+        along it; across: (n width, M), the matrix that interpolates between them.
     """
-    size, count, channels = kernels.shape[-1], kernels.shape[1] - 1, light.shape[-1]
-    height, width = tile
-    sides = height + size - 1, width + size - 1
-    planes = jnp.moveaxis(light, -1, 0)
-    tiles = jnp.stack([planes[:, :, j * width : j * width + sides[1]] for j in range(count)])
-    spectra = jnp.fft.rfft2(tiles)  # (n, C, ...)
-    responses = jnp.fft.rfft2(kernels, sides)
-    ramps = [jnp.arange(n, dtype=light.dtype) / n for n in tile]
-    downs, acrosses = ((1 - ramp, ramp) for ramp in ramps)
-    total = jnp.zeros((count, channels, height, width), light.dtype)
-    for down in range(2):
-        for across in range(2):
-            response = responses[down, across : across + count]
-            blurred = jnp.fft.irfft2(spectra * response, sides)
-            share = downs[down][:, None] * acrosses[across][None, :]
-            total = total + share[None, None] * blurred[..., size - 1 :, size - 1 :]
-    return jnp.moveaxis(total, 0, 2).reshape(channels, height, count * width).transpose(1, 2, 0)
+    size, channels = kernels.shape[-1], len(light)
+    (height, width), count = tile, len(across) // tile[1]
+    ends = height + size - 1, width + size - 1
+    sides = tuple(next((s for s in SIDES if s >= end), end) for end in ends)
+    tiles = jnp.stack([light[:, :, j * width : j * width + ends[1]] for j in range(count)])
+    spectra = jnp.fft.rfft2(tiles, sides)  # (n, C, ...)
+
+    def added(total: Array, given: tuple[Array, Array]) -> tuple[Array, None]:
+        kernel, share = given
+        blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides)[None], sides)
+        inside = blurred[..., size - 1 : ends[0], size - 1 : ends[1]]
+        exact = jax.lax.Precision.HIGHEST
+        each = jnp.einsum("cym,xm->cyx", share, across, precision=exact)
+        return total + each * jnp.moveaxis(inside, 0, 2).reshape(each.shape), None
+
+    start = jnp.zeros((channels, height, count * width), light.dtype)
+    return jax.lax.scan(added, start, (jnp.moveaxis(kernels, 1, 0), jnp.moveaxis(shares, 1, 0)))[0]

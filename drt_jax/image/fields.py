@@ -6,6 +6,7 @@ pixels, give the others.
 """
 
 import dataclasses
+import warnings
 from typing import Any, Literal
 
 import jax
@@ -29,6 +30,8 @@ from .spot import Moments
 _SIZES = (9, 13, 17, 21, 25, 33, 41, 49, 65, 97, 129)
 # Standard deviations of the blur that a kernel reaches to each side.
 _REACH = 4.5
+# The part of the light beside a kernel from which a picture is worth a warning.
+_LOST = 1e-2
 # Sum of the absolute errors of a kernel's pixels.
 _TOLERANCE = 5e-3
 # The order of the rule that finds where light arrives.
@@ -136,7 +139,9 @@ def grid_method(
         arrives = np.all(np.asarray(found.throughput) > 0, axis=-1)
         if not np.any(arrives):
             raise ValueError("fields: no light of any of them reaches the sensor")
-        size = _side(found, arrives, pixel) if size is None else int(size)
+        if size is None:
+            need = _reach(found, arrives, pixel)
+            size = next((n for n in _SIZES if n >= need), _SIZES[-1])
         if isinstance(model, str):
             fields, ends = _some(tangents, far, arrives)
             model = converged_psf(lens, fields, ends, wavelengths, pixel, size, model, tolerance)
@@ -163,11 +168,26 @@ def _check_counts(size: Any, nodes: Any) -> None:
         raise ValueError(f"nodes: expected a whole number from 2 on, got {nodes!r}")
 
 
-def _side(found: Moments, arrives: np.ndarray, pixel: Any) -> int:
+def _reach(found: Moments, arrives: np.ndarray, pixel: Any) -> int:
     """The side of kernels that are wide enough for spots (D, U, W), where light arrives (D, U)."""
     sigma = np.sqrt(np.diagonal(np.asarray(found.covariance), 0, -2, -1))[arrives]
-    need = 2 * _REACH * np.max(sigma) / float(np.asarray(pixel)) + 1
-    return next((n for n in _SIZES if n >= need), _SIZES[-1])
+    return int(np.ceil(_REACH * np.max(sigma) / float(np.asarray(pixel)))) * 2 + 1
+
+
+def warn_of_loss(lens: Lens, method: GridMethod, grid: KernelGrid, wavelengths: Any) -> None:
+    """A warning if kernels are too small for the blur: what share is lost and the size that would
+    do. Known numbers."""
+    lost = np.max(np.asarray(grid.outside), initial=0.0)
+    if lost > _LOST:
+        tangents = _unique(method.half, method.symmetry)[0] * float(method.step)
+        found = _look(lens, tangents, np.asarray(method.distances), wavelengths)
+        need = _reach(found, np.all(np.asarray(found.throughput) > 0, axis=-1), method.pixel)
+        remedy = f"give {need}" if need > method.size else "give more, or larger pixels"
+        warnings.warn(
+            f"size: {100 * lost:.2g} % of the light of a point falls beside a kernel of "
+            f"{method.size} x {method.size} pixels: {remedy}",
+            stacklevel=3,
+        )
 
 
 def _unique(half: tuple[int, int], symmetry: Symmetry) -> tuple[np.ndarray, ...]:

@@ -8,9 +8,10 @@ cone of light, times the cone's solid angle in direction cosines:
 where the source of a point is the field whose centroid lies there, each colour its own, and G the
 kernel as seen from the sensor: that of the source of p - k, weighted with its light, at k. G adds
 up to 1, less what falls beside the kernel, so that an even scene stays even but for the solid
-angle. Between the corners of tiles G is interpolated, see `blur`.
+angle. G is a sum of a few kernels with shares that vary over the picture, see `blur`.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
@@ -25,7 +26,7 @@ from ..lens.lens import Lens
 from ..lens.paraxial import effective_focal_length
 from ..lens.scene import vergence_of
 from ..numerics import Numbers, concrete, known_values, safe_divide, safe_sqrt
-from .blur import blur_row
+from .blur import SIDES, blur_row
 from .fields import (
     check_pixel,
     grid_method,
@@ -33,11 +34,20 @@ from .fields import (
 )
 from .interpolate import basis, cubic
 from .psf import Kind, PsfModel
-from .sensor_maps import LOCAL, SMOOTH, Maps, RenderMethod, controls, sensor_maps, tiles_of
+from .sensor_maps import (
+    LOCAL,
+    SMOOTH,
+    Maps,
+    RenderMethod,
+    chosen_places,
+    controls,
+    sensor_maps,
+    tiles_of,
+)
 
 _WAVELENGTHS = (0.6, 0.53, 0.48)
-# Sides of the squares that are transformed: fast ones.
-_SIDES = (32, 48, 64, 96, 128, 192, 256, 384, 512)
+# The side of the squares that are transformed, at most, unless the kernels need a larger one.
+_SIDE = 256
 # How much farther than the field of a pinhole that of a pixel is looked for, as a part of it.
 _TRIED = np.linspace(0, 2, 81)
 # The largest tangent of a field, that of 85 degrees.
@@ -51,11 +61,11 @@ def render_method(
     pixel: Numbers,
     wavelengths: Numbers = _WAVELENGTHS,
     size: int | None = None,
-    nodes: int = 8,
+    nodes: int = 16,
     tile: int | None = None,
     layers: int = 8,
     model: Kind | Literal["auto"] | PsfModel = "rays",
-    tolerance: float = 5e-3,
+    tolerance: float = 1e-3,
 ) -> RenderMethod:
     """Choose how `render` works; all numbers are known.
 
@@ -65,9 +75,11 @@ def render_method(
     size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
     nodes: fields on one side of the axis, along the longer side of the picture, see `grid_method`.
     tile: side of a tile in pixels.
-    model, tolerance: of the kernels, as of `psf`.
+    model, tolerance: of the kernels, as of `psf`; kernels are sums of a few to the same number, see
+        `chosen_places`.
 
-    ValueError inside a trace, for numbers that make no sense, and where no light arrives.
+    Warns of light beside kernels that are too small. ValueError inside a trace, for numbers that
+    make no sense, and where no light arrives.
     """
     known = known_values((lens, distance, pixel, wavelengths))
     if known is None:
@@ -89,18 +101,18 @@ def render_method(
         angles = _angles(lens, shape, far, side, focal, waves)
         grid = grid_method(lens, angles, far, waves, side, size, nodes, model, tolerance)
         if tile is None:
-            # About as wide as the fields lie apart, at least twice the kernel.
-            apart = max(shape) / 2 / nodes
-            wanted = max(min(apart, 160), grid.size) + grid.size
-            tile = next((s for s in _SIDES if s >= wanted), _SIDES[-1]) - grid.size + 1
+            tile = (_SIDE if grid.size <= _SIDE // 2 else SIDES[-1]) - grid.size + 1
         # Equal tiles, the last of which end where the picture does.
         tiles = tuple(-(-n // -(-n // tile)) for n in shape)
-        return RenderMethod(
+        method = RenderMethod(
             grid,
             jnp.asarray(focal, lens.curvature.dtype),
+            jnp.zeros(0, jnp.int32),
             (shape[0], shape[1]),
             (tiles[0], tiles[1]),
         )
+        places = chosen_places(lens, method, waves, tolerance)
+        return dataclasses.replace(method, places=jnp.asarray(places, jnp.int32))
 
 
 def layer_distances(distance: Numbers, shape: tuple[int, int], layers: int) -> np.ndarray:
@@ -163,16 +175,19 @@ def _strip(maps: Maps, method: RenderMethod, planes: Array, row: Array, lit: boo
         place = (pixels - first) / gap
         places.append(basis(place, count, SMOOTH))
         local.append(basis(place[margin : length + margin], count, LOCAL))
-    exact = jax.lax.Precision.HIGHEST
-    between = jnp.einsum("ym,cmnk->cynk", places[0], maps.sources, precision=exact)
-    x, y = (jnp.einsum("cyn,xn->cyx", between[..., k], places[1], precision=exact) for k in (0, 1))
-    warped = jnp.moveaxis(cubic(planes, y, x), 0, -1)
-    kernels = jax.lax.dynamic_slice_in_dim(maps.kernels, row, 2, axis=0)
-    blurred = blur_row(warped, kernels, method.tile)
-    if not lit:
-        return blurred
-    between = jnp.einsum("ym,cmn->cyn", local[0], maps.light, precision=exact)
-    return blurred * jnp.einsum("cyn,xn->yxc", between, local[1], precision=exact)
+
+    product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+
+    def between(values: Array, where: list[Array]) -> Array:
+        return product("ym,cmn,xn->cyx", where[0], values, where[1])
+
+    x, y = (between(maps.sources[..., k], places) for k in (0, 1))
+    warped = cubic(planes, y, x)
+    shares = product("ym,crmn->cryn", local[0], maps.shares)
+    blurred = blur_row(warped, maps.kernels, shares, local[1], method.tile)
+    if lit:
+        blurred = blurred * between(maps.light, local)
+    return jnp.moveaxis(blurred, 0, -1)
 
 
 def render(
@@ -211,6 +226,8 @@ def render(
         )
     if picture.shape[:2] != method.shape:
         raise ValueError(f"image: the method is for {method.shape}, got {picture.shape[:2]}")
+    if concrete(distance):
+        layer_distances(distance, method.shape, 2)
     maps = sensor_maps(lens, method, wavelengths)
     if jnp.ndim(jnp.asarray(distance)) == 0:
         return _whole(maps, method, picture, progress)
@@ -261,12 +278,12 @@ def composed(
 ) -> Any:
     """The picture of a depth map in layers, the nearest first.
 
-    A pixel belongs to the layer nearest to it in 1 / distance. Each layer is blurred with its own
-    kernels, and so is its cover, 1 where it has a pixel; what a cover lets through, the layers
-    behind it fill. What a near layer hides is not known: where layers together cover less than all,
-    what there is of them is divided by their cover. So an even scene stays even at any depth; but
-    behind a blurred edge stands what is visible beside it, and a slope shows its steps where the
-    blur of neighbouring layers differs.
+    A pixel belongs to the layer nearest to it in 1 / distance. Behind nearer layers each goes on
+    as `spread` has it, since nobody knows what is hidden there. It is blurred with its own
+    kernels, and so is its cover, 1 where it is; what the covers of nearer layers let through is
+    seen. So an even scene stays even at any depth. The covers multiply, as if light met the layers
+    independently of where it crosses the pupil; a slope shows its steps where the blur of
+    neighbouring layers differs.
     """
     vergences = np.asarray(jax.vmap(vergence_of)(method.grid.distances)).tolist()
     at = vergence_of(depth)
@@ -277,14 +294,39 @@ def composed(
     cover: Any = 0.0
     open_: Any = 1.0
     for layer in range(len(vergences)):
-        mask = (label == layer)[..., None]
-        part = _whole(maps, method, jnp.where(mask, picture, 0), progress, layer)
-        ones = jnp.broadcast_to(mask, picture.shape).astype(dtype)
-        own = _whole(maps, method, ones, progress, layer, lit=False)
+        own = (label == layer)[..., None].astype(dtype)
+        known = (label >= layer)[..., None].astype(dtype)
+        share = spread(own, known)
+        here = spread(picture * own, own) * share
+        part = _whole(maps, method, here, progress, layer)
+        there = jnp.broadcast_to(share, picture.shape)
+        covered = _whole(maps, method, there, progress, layer, lit=False)
         total = total + open_ * part
-        cover = cover + open_ * own
-        open_ = open_ * (1 - own)
+        cover = cover + open_ * covered
+        open_ = open_ * (1 - covered)
     return safe_divide(jnp.asarray(total), jnp.asarray(cover))
+
+
+def spread(values: Array, known: Array) -> Array:
+    """`values` (H, W, C), 0 where unknown, gone on to where `known` (H, W, 1) is 0: there the mean
+    of what is known in the 3 x 3 pixels around; where none is, of pixels 2, 4, 8, ... as large."""
+    height, width = known.shape[:2]
+    zero = jnp.zeros((), values.dtype)
+
+    def around(a: Array) -> Array:
+        return jax.lax.reduce_window(a, zero, jax.lax.add, (3, 3, 1), (1, 1, 1), "SAME")
+
+    def halved(a: Array) -> Array:
+        a = jnp.pad(a, ((0, height % 2), (0, width % 2), (0, 0)))
+        return a.reshape(-(-height // 2), 2, -(-width // 2), 2, -1).mean(axis=(1, 3))
+
+    share = around(known)
+    near = safe_divide(around(values), share)
+    if max(height, width) > 3:
+        far = spread(halved(values), halved(known))
+        across = jnp.repeat(jnp.repeat(far, 2, axis=0), 2, axis=1)[:height, :width]
+        near = jnp.where(share > 0, near, across)
+    return jnp.where(known > 0, safe_divide(values, known), near)
 
 
 def sensor_noise(image: Array, key: Array, full_well: Numbers, read_noise: Numbers) -> Array:

@@ -97,14 +97,15 @@ def spot_diagram(
 
     ValueError as of `scene_of`; without a rule also inside a trace.
     """
-    light = _light(lens, fields, distance, wavelengths, rule, "object")
-    waves = light.hit.shape[1]
+    known = lens.checked_wavelengths(wavelengths)
+    waves = len(known)
     middle = waves // 2 if reference is None else reference
     if not -waves <= middle < waves:
         raise ValueError(f"reference: expected an index of the wavelengths, got {reference!r}")
     axis = scene_of(lens, 0.0, distance, wavelengths)
     spectrum = spectrum_of(wavelength_weights, axis, lens.curvature.dtype)
-    colour = lens.checked_wavelengths(wavelengths)[middle]
+    light = _light(lens, fields, distance, wavelengths, rule, "object")
+    colour = known[middle]
     index = lens.index(colour)[-1, 0]
     return _spots(light, spectrum / jnp.sum(spectrum), colour / index, middle)
 

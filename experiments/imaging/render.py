@@ -68,7 +68,7 @@ class Config:
     field_deg: float = 12.0
     model: Literal["gaussian", "rays", "waves", "auto"] = "rays"
     kernel: int = 0
-    nodes: int = 8
+    nodes: int = 16
     layers: int = 8
     full_well: float = 10000.0
     read_noise: float = 3.0
