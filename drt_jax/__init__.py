@@ -41,6 +41,7 @@ from .image.converged import (
     psf_moments as psf_moments,
 )
 from .image.depth import depth_moments as depth_moments, moments_model as moments_model
+from .image.encircled import encircled_energy as encircled_energy
 from .image.fans import (
     AxialColour as AxialColour,
     RayFans as RayFans,
