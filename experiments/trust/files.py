@@ -99,7 +99,8 @@ def listed(content: str, key: str) -> tuple[float, float] | None:
 
 
 def listed_indices(content: str) -> list[float]:
-    """Of all glasses at the primary wavelength; empty if they are not listed."""
+    """Of all glasses at the primary wavelength but for that behind the image, which no ray meets;
+    empty if they are not listed."""
     table = content.partition("INDEX OF REFRACTION")[2]
     head = re.search(r"^Surf .*?((?:\s+\d\.\d{8})+)", table, re.MULTILINE)
     primary = re.search(r"^Primary Wavelength.*:\s*([\d.]+)", content, re.MULTILINE)
@@ -108,7 +109,7 @@ def listed_indices(content: str) -> list[float]:
     at = np.argmin(np.abs(np.array(head[1].split(), float) - float(primary[1])))
     own = re.split(r"\n\s*\n", table[head.end() :])[0]  # other tables follow
     rows = re.findall(r"^ +\d+ .*?((?:\s+\d\.\d{10})+)", own, re.MULTILINE)
-    return [float(row.split()[at]) for row in rows]
+    return [float(row.split()[at]) for row in rows[:-1]]
 
 
 def differences(
