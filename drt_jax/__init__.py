@@ -13,6 +13,7 @@ Conventions, everywhere in the package:
   before loading a lens; the library changes no global setting.
 """
 
+from .files.agf import load_agf as load_agf
 from .files.entry import LensError as LensError
 from .files.system import System as System
 from .files.write import save_lens as save_lens
@@ -40,6 +41,7 @@ from .image.converged import (
     psf_moments as psf_moments,
 )
 from .image.depth import depth_moments as depth_moments, moments_model as moments_model
+from .image.encircled import encircled_energy as encircled_energy
 from .image.fans import (
     AxialColour as AxialColour,
     RayFans as RayFans,
@@ -96,7 +98,8 @@ from .learn.network import red_net as red_net
 from .lens.aperture import Apertures as Apertures
 from .lens.elements import Elements as Elements
 from .lens.entrance import with_paraxial_pupil as with_paraxial_pupil
-from .lens.glass import find_glass as find_glass, refractive_index as refractive_index
+from .lens.glass import refractive_index as refractive_index
+from .lens.glasses import find_glass as find_glass, nearest_glasses as nearest_glasses
 from .lens.lens import Lens as Lens, sag as sag, with_model_glass as with_model_glass
 from .lens.paraxial import (
     FirstOrder as FirstOrder,

@@ -1,6 +1,8 @@
-"""`python -m drt_jax show my_lens.yaml`: what a lens is, before anything is done with it."""
+"""`python -m drt_jax show my_lens.yaml`: what a lens is, before anything is done with it; `convert`
+writes a lens file in the format of another program; `glass N-BK7`: what a glass is."""
 
 import argparse
+import contextlib
 import math
 import os
 import pathlib
@@ -13,6 +15,7 @@ import jax
 import numpy as np
 
 from .compilation import ONCE, jit
+from .files.write import save_lens
 from .files.yaml import lens_names, load_lens
 from .image.converged import psf_moments
 from .image.spot import Moments
@@ -22,18 +25,20 @@ from .lens.paraxial import FirstOrder, first_order
 from .lens.scene import Scene, scene_of
 from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
+from .show import glasses
 from .show.layout import Beam, beam_of
 from .show.sheet import sheet
 
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 # Of the rules for the spots; by how much of their size these may differ between both.
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
+_MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
 _DEFOCUS = 3.0  # times the smallest spot is out of focus
 
 
 def _options(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m drt_jax", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="show")
+    commands = parser.add_subparsers(required=True, metavar="show, convert or glass")
     about = (
         "first-order data, spots over the field, share of light, warnings, and a sheet of analyses"
     )
@@ -43,12 +48,18 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     show.add_argument("--distance", type=float, default=math.inf, help="to the object, mm")
     show.add_argument("--wavelengths", type=float, nargs="+", default=_LINES, help="um")
     show.add_argument("--out", type=pathlib.Path, help="of the sheet; default: LENS.png here")
-    options = parser.parse_args(argv)
-    if not all(abs(field) < 90 for field in options.field):
-        raise ValueError("--field: must be within 90 degrees")
-    if not options.distance > 0:
-        raise ValueError("--distance: must be above 0 mm")
-    return options
+    show.set_defaults(run=run_show)
+    about = "write a lens as a file of another program; says what is not in it"
+    convert = commands.add_parser("convert", help=about, description=about)
+    convert.add_argument("lens", help=".yaml, .zmx or .seq file, or a bundled name")
+    convert.add_argument("out", type=pathlib.Path, help="file that ends in .yaml, .zmx or .seq")
+    convert.add_argument("--missing", choices=("error", "warn"), default="error", help=_MISSING)
+    convert.set_defaults(run=run_convert)
+    about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
+    glass = commands.add_parser("glass", help=about, description=about)
+    glasses.arguments(glass)
+    glass.set_defaults(run=lambda options: _say(glasses.told(options)))
+    return parser.parse_args(argv)
 
 
 def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[str]:
@@ -175,13 +186,36 @@ def _wait(what: str) -> None:
         sys.stderr.flush()
 
 
-def show(options: argparse.Namespace) -> None:
-    """Print what a lens is, as it becomes known, and draw it."""
-    distance, waves, fields = options.distance, list(options.wavelengths), options.field
-    middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
+def run_convert(options: argparse.Namespace) -> None:
+    """Write a lens in another format, and print what the new file does not say."""
+    ends, kind = (".yaml", ".yml", ".zmx", ".seq"), pathlib.Path(options.lens).suffix.lower()
+    if options.out.suffix.lower() not in ends:
+        raise ValueError(f"{options.out}: expected a name that ends in {', '.join(ends)}")
+    with _warnings_on_stdout():
+        lens = load_lens(options.lens, options.missing)
+    save_lens(lens, options.out)
+    if kind in (".zmx", ".seq"):
+        _say(["  ! fields, wavelengths and vignetting are not written: see load_system"])
+    _say([f"{lens.name or 'the lens'}, {lens.count} surfaces, is written to {options.out}"])
+
+
+@contextlib.contextmanager
+def _warnings_on_stdout() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = lambda message, *_, **__: _say([f"  ! {message}"])
+        yield
+
+
+def run_show(options: argparse.Namespace) -> None:
+    """Print what a lens is, as it becomes known, and draw it."""
+    if not all(abs(field) < 90 for field in options.field):
+        raise ValueError("--field: must be within 90 degrees")
+    if not options.distance > 0:
+        raise ValueError("--distance: must be above 0 mm")
+    distance, waves, fields = options.distance, list(options.wavelengths), options.field
+    middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
+    with _warnings_on_stdout():
         lens = load_lens(options.lens)
         scene_of(lens, 0.0, distance, np.array(waves))  # refuses what is no scene
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
@@ -212,7 +246,8 @@ def main(argv: list[str] | None = None) -> None:
     """Run the command line; errors are one line, and the exit status 2, or 130 after Ctrl-C."""
     try:
         set_up()
-        show(_options(argv))
+        options = _options(argv)
+        options.run(options)
     except KeyboardInterrupt:
         sys.stderr.write("stopped\n")
         raise SystemExit(130) from None

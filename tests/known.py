@@ -5,6 +5,7 @@ import dataclasses
 import functools
 
 import jax
+import numpy as np
 
 from drt_jax.rays.find import find_many
 from drt_jax.rays.solve import reattach
@@ -25,3 +26,25 @@ def search(lens, scene, points):
 def known(found):
     """A solver for `trace_bundle` and `moments` that has found its rays: all derivatives."""
     return functools.partial(reattach, found)
+
+
+def check_slopes(program, lens, steps, rtol):
+    """Gradients against central differences of the fourth order, along one random direction of each
+    kind of numbers.
+
+    program: lens -> ((value, anything), gradient), one for all. steps: by kind, the size of a step;
+    numbers that are 0 or infinite stay.
+    """
+    gradient = program(lens)[1]
+    for seed, (name, step) in enumerate(steps.items()):
+        value = np.asarray(getattr(lens, name))
+        way = step * np.random.default_rng(seed).normal(size=value.shape)
+        way = np.where(np.isfinite(value) & (value != 0), way, 0)
+        moved = (dataclasses.replace(lens, **{name: value + s * way}) for s in (-2, -1, 1, 2))
+        a, b, c, d = (float(program(one)[0][0]) for one in moved)
+        slope, found = (
+            (8 * (c - b) - (d - a)) / 12,
+            np.sum(np.asarray(getattr(gradient, name)) * way),
+        )
+        assert slope != 0
+        np.testing.assert_allclose(found, slope, rtol=rtol, err_msg=name)

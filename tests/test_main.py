@@ -1,4 +1,4 @@
-"""`python -m drt_jax show`."""
+"""`python -m drt_jax show` and `convert`."""
 
 import re
 import signal
@@ -102,6 +102,27 @@ def test_words_for_apertures_and_focal_length(tmp_path, capsys):
         load_lens(tmp_path / "mine.yaml")
 
 
+def test_lens_files_are_converted(tmp_path, capsys):
+    """Any format to any; a solve, a part that is left out and what is not written are told."""
+    lines = (
+        "RDM; LEN; EPD 9; WL 550\nSO 0 1e11; S 50 4 NBK7; STO; CIR 6; S -50 48; PIM\nTEM 90\nSI; GO"
+    )
+    (tmp_path / "a.seq").write_text(lines)
+    with pytest.raises(SystemExit):
+        main(["convert", str(tmp_path / "a.seq"), str(tmp_path / "b.yaml")])
+    assert 'line 3: 90 C; our indices are those of 20; missing="warn"' in capsys.readouterr().err
+    main(["convert", str(tmp_path / "a.seq"), str(tmp_path / "b.yaml"), "--missing", "warn"])
+    said = capsys.readouterr().out
+    assert "left out: 90 C" in said and "solves and pickups" in said and "not written" in said
+    for one, two in (("b.yaml", "c.zmx"), ("c.zmx", "d.seq"), ("d.seq", "e.yaml")):
+        main(["convert", str(tmp_path / one), str(tmp_path / two)])
+        assert capsys.readouterr().out.endswith(f"is written to {tmp_path / two}\n")
+    first, last = (load_lens(tmp_path / name) for name in ("b.yaml", "e.yaml"))
+    np.testing.assert_array_equal(first.curvature, last.curvature)
+    np.testing.assert_array_equal(first.semi_diameter, last.semi_diameter)
+    assert first.sensor == last.sensor == 52 and first.glasses == last.glasses
+
+
 def test_ctrl_c_is_one_line(monkeypatch, capsys):
     def stop(*args):
         signal.raise_signal(signal.SIGINT)
@@ -119,10 +140,32 @@ def test_ctrl_c_is_one_line(monkeypatch, capsys):
         (["show", "singlet", "--field", "90"], "--field: must be within 90 degrees"),
         (["show", "singlet", "--distance", "0"], "--distance: must be above 0"),
         (["show", "singlet", "--wavelengths", "9"], "outside the range"),
+        (["convert", "singlet", "lens.txt"], "lens.txt: expected a name that ends in .yaml"),
     ],
 )
 def test_errors_are_one_line(words, message, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
-        main([*words, "--out", str(tmp_path / "lens.png")])
+        main([*words, *(["--out", str(tmp_path / "lens.png")] if words[0] == "show" else [])])
     said = capsys.readouterr().err
     assert ended.value.code == 2 and message in said and said.count("\n") == 1
+
+
+def test_a_glass_shows_itself(tmp_path, capsys):
+    """N-BK7 of Schott's sheet: nd 1.51680, vd 64.17, P_gF 0.5349, 0.0009 below the normal line."""
+    picture = tmp_path / "map.png"
+    main(["glass", "N-BK7", "--plot", str(picture)])
+    said = capsys.readouterr().out
+    assert re.search(r"d, 587.56 nm +1.51680", said) and re.search(r"vd +64.17\n", said)
+    assert "0.5349, -0.0009" in said and "(SCHOTT)" in said and "0.3 to 2.5 um" in said
+    assert "H-K9L" in said and picture.stat().st_size > 10_000
+    main(["glass", "--near", "1.6204,60.3", "--makers", "SCHOTT"])
+    assert "N-SK16\n" in capsys.readouterr().out
+    for words, message in {
+        ("BAF4",): "error: glass 'BAF4' is of several makers",
+        ("--near", "1,2,3"): "error: --near: expected ND,VD",
+        (): "error: give the name of a glass or --near",
+        ("IRG22", "--plot", "no.png"): "error: --plot: IRG22 is not known at the lines F and C",
+    }.items():
+        with pytest.raises(SystemExit):
+            main(["glass", *words])
+        assert capsys.readouterr().err.startswith(message)

@@ -36,19 +36,19 @@ ALLOWED = {
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
 }
-ALLOWED_ALL = {"show.layout", "show.analyses", "show.sheet"}
+ALLOWED_ALL = {"show.layout", "show.analyses", "show.sheet", "show.glasses"}
 # Of 8,200 that were the aim before apertures, phases and elements came, 11,200 before what comes
 # from outside was checked throughout, 13,900 before whole lenses are designed and toleranced,
 # 18,000 before other optimisers ran beside a design, 18,500 before what misled was mended (issue 22
-# brings it down), 19,350 before the analyses over the field.
-HOUSE = 25_500
+# brings it down), 19,350 before the analyses over the field, 25,500 before CODE V's files.
+HOUSE = 28_500
 # Outside packages that belong to some modules or floors alone.
 ONLY = {
     "optimistix": {"rays.aim", "rays.find", "image.field"},
     "matplotlib": {"show"},
     "skimage": {"learn.data", "learn.train"},
     "PIL": {"learn.images"},
-    "yaml": {"inputs", "files", "lens.glass"},
+    "yaml": {"inputs", "files"},
     "tqdm": set(),
     "experiments": set(),
     "tests": set(),

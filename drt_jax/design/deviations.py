@@ -1,4 +1,4 @@
-"""What may be off in a lens as it is made: kinds of errors, how large, and of which parts."""
+"""Tolerances and deviations of a lens as built: their kinds, sizes and parts."""
 
 import dataclasses
 import itertools
@@ -17,7 +17,13 @@ WITH_X = ("biconic", "toroid")
 
 
 class Kind(NamedTuple):
-    """A kind of error: of what, whether in x and y, in which unit, and how large it may be."""
+    """A kind of deviation.
+
+    whole: the part that deviates, "surface" or "element".
+    axes: number of components, 2 for x and y.
+    unit: unit of the deviation.
+    most: upper bound of the size, in that unit.
+    """
 
     whole: str
     axes: int
@@ -25,7 +31,7 @@ class Kind(NamedTuple):
     most: float = math.inf
 
 
-# As the keys of `KINDS`, which a test compares.
+# The keys of `KINDS`; a test compares them.
 ToleranceKind = Literal[
     "radius", "fringes", "irregularity", "wedge", "thickness", "index", "abbe", "shift",
     "tilt"
@@ -45,17 +51,18 @@ KINDS = {
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
-    """By how much parts of a kind may be off, to either side.
+    """Largest deviation of parts of one kind, in both directions.
 
-    kind: of surfaces "radius", that of the vertex, in per cent; "fringes", another curvature, told
-        by how far the rim of the light is off along the normal; "irregularity", a cylinder, in
-        fringes between both directions, half of them along y and minus half along x; "wedge", a
-        tilt, in arc minutes about x and y. Behind surfaces "thickness" in mm, "index" (of the line
-        d) and "abbe" in per cent. Of elements "shift" across the axis in mm, along x and y, and
-        "tilt" about their first vertex in arc minutes, about x and y. A fringe is half a wave of
-        546 nm.
-    size: the largest error, in these units.
-    which: surfaces or elements, from 0; empty: all that there are.
+    kind: one of these. A fringe is half a wave of 546 nm.
+        Of surfaces: "radius", of the vertex, per cent; "fringes", a change of curvature, measured
+        along the normal at the rim of the light; "irregularity", a cylinder, in fringes between
+        both directions, half of them along y and minus half along x; "wedge", a tilt about x and y,
+        arc minutes.
+        Behind surfaces: "thickness", mm; "index", of the d line; "abbe", per cent.
+        Of elements: "shift" along x and y, mm; "tilt" about x and y through the first vertex, arc
+        minutes.
+    size: largest deviation, in these units.
+    which: numbers of surfaces or elements, from 0; () for all.
     """
 
     kind: ToleranceKind
@@ -74,7 +81,12 @@ class Tolerance:
 
 
 class Deviation(NamedTuple):
-    """One number that may be off: what, where (a surface or an element), and its component."""
+    """One number of a lens that deviates.
+
+    kind: as in `Tolerance`.
+    place: number of the surface or element.
+    axis: component, 0 for x, 1 for y; 0 for a kind without components.
+    """
 
     kind: str
     place: int
@@ -91,8 +103,8 @@ def _solid(lens: Lens, medium: int) -> bool:
 
 
 def elements_of(lens: Lens) -> tuple[tuple[int, int], ...]:
-    """First and last surface of each element: neighbours that bend light, with glass between them,
-    cemented ones together; a mirror in air is one."""
+    """First and last surface of each element: active surfaces with glass between neighbours.
+    Cemented elements count as one; so does a mirror in air."""
     spans: list[tuple[int, int]] = []
     for i in lens.active:
         if spans and _solid(lens, i):
@@ -103,8 +115,8 @@ def elements_of(lens: Lens) -> tuple[tuple[int, int], ...]:
 
 
 def pieces_of(lens: Lens) -> dict[int, tuple[int, ...]]:
-    """The media that each piece of glass is, by the surface before it: several where a mirror sends
-    light back into it, or a surface in it bends none."""
+    """Media of each piece of glass, by the surface in front of it. A piece has several media if a
+    mirror sends light back into it or if a surface inside it is not active."""
     pieces: dict[int, tuple[int, ...]] = {}
     for i in range(lens.count):
         inside = lens.mirrors[i] or i not in lens.active
@@ -119,7 +131,7 @@ def pieces_of(lens: Lens) -> dict[int, tuple[int, ...]]:
 
 
 def x_curvatures(lens: Lens, at: np.ndarray) -> Array:
-    """Curvatures along x of some surfaces, 1/mm, where they have one of their own; else 0."""
+    """Curvatures along x of surfaces `at`, 1/mm; 0 for a form without one of its own."""
     has = np.array([lens.forms[i] in WITH_X for i in at])
     if not has.any():
         return jnp.zeros(len(at), lens.curvature.dtype)
@@ -127,11 +139,11 @@ def x_curvatures(lens: Lens, at: np.ndarray) -> Array:
 
 
 def deviations_of(lens: Lens, tolerances: Sequence[Tolerance]) -> dict[Deviation, float]:
-    """The errors that some tolerances allow, and how large each may be, in the units of
-    `Tolerance`; those in x and in y of one part are neighbours.
+    """Deviations that tolerances allow, and the largest size of each in the units of `Tolerance`.
+    The components x and y of one part follow each other.
 
-    ValueError, which lists what there is, for none, and for a part that does not exist or stands
-    twice.
+    ValueError for no tolerance, for a part that does not exist (it lists those that do), and for a
+    part that is named twice.
     """
     sizes: dict[Deviation, float] = {}
     for tolerance in tolerances:
@@ -142,31 +154,31 @@ def deviations_of(lens: Lens, tolerances: Sequence[Tolerance]) -> dict[Deviation
         for place in tolerance.which:
             if place not in there:
                 raise ValueError(
-                    f"tolerances: {kind}: no {KINDS[kind].whole} {place} that could be off; "
+                    f"tolerances: {kind}: no {KINDS[kind].whole} {place} can deviate; "
                     f"there are {', '.join(map(str, there))}"
                 )
         axes = range(KINDS[kind].axes)
         for place, axis in itertools.product(tolerance.which or there, axes):
-            error = Deviation(kind, place, axis)
-            if error in sizes:
-                raise ValueError(f"tolerances: {error} stands twice; leave one out")
-            sizes[error] = tolerance.size
+            deviation = Deviation(kind, place, axis)
+            if deviation in sizes:
+                raise ValueError(f"tolerances: {deviation} is named twice; remove one")
+            sizes[deviation] = tolerance.size
     if not sizes:
         raise ValueError("tolerances: none; name at least one")
     return sizes
 
 
 _NONE = {
-    "radius": "no surface is curved; of planes, tolerance fringes",
-    "irregularity": "no surface is a sphere, a conic, an even asphere or has one more curvature",
-    "thickness": "there is one surface; none has a thickness behind it",
+    "radius": "no surface is curved; for planes use fringes",
+    "irregularity": "no surface is a sphere, conic, even asphere, biconic or toroid",
+    "thickness": "the lens has one surface, without a thickness behind it",
     "index": "the lens has no glass",
     "abbe": "the lens has no glass",
 }
 
 
 def _there(lens: Lens, kind: str) -> list[int]:
-    """The numbers of the surfaces or elements that may be off."""
+    """Numbers of the surfaces or elements that have deviations of a kind."""
     active = list(lens.active)
     if KINDS[kind].whole == "element":
         return list(range(len(elements_of(lens))))

@@ -1,4 +1,4 @@
-"""Residuals of rays that fail: finite, and differentiable by what brings the ray through."""
+"""Residuals of failed rays: finite, with derivatives that point to where the ray passes."""
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,9 @@ from .field_rays import FieldRays
 
 
 def failures(lens: Lens, rays: FieldRays) -> Array:
-    """Residual (V, W, Q) of a failed ray: the root of the light that it stands for times 1 + its
-    shortfall; 0 for one that arrives. A chief ray that fails stands for all light of its
-    wavelength; where all light is clipped, inf."""
+    """Failure residual (V, W, Q): 0 if the ray arrives, otherwise sqrt(weight) x (1 + shortfall).
+    A chief ray has the weight of all light of its wavelength. If all light of a wavelength is
+    clipped, its residuals are inf."""
     light = rays.weights * rays.wavelength_weights[None, :, None]
     chief = np.arange(light.shape[-1]) == 0
     light = jnp.where(chief[None, None], rays.wavelength_weights[None, :, None], light)
@@ -32,7 +32,7 @@ def failures(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
-    """The shortfall of the first guess of each ray (V, W, Q) that fails; 0 for one that arrives."""
+    """Shortfall (V, W, Q) of the paraxial launch of each failed ray; 0 for one that arrives."""
     failed = ~rays.arrives
 
     def of_view(field: Array, distance: Array, points: Vector) -> Array:
@@ -50,11 +50,12 @@ def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
 
 
 def shortfall(system: System, launch: Vector, target: Vector) -> Array:
-    """Shortfall (W, Q) of rays on the way through their stop points: the fraction of rows that a
-    ray does not come to, plus log(1 + by how much it misses the first of them). For one that
-    reaches the sensor log(1 + its distance from the stop point, relative to the largest).
+    """Shortfall (W, Q) of a failed ray: the fraction of rows it does not reach, plus log(1 +
+    distance by which it misses the first of them). For a ray that reaches the sensor it is log(1 +
+    distance from its stop point), in units of the largest distance of a stop point from the axis.
 
-    launch: as of `snell.shoot`. target: D arrays (W, Q) in mm.
+    launch: D arrays (W, Q), as in `snell.shoot`, mm.
+    target: D arrays (W, Q), stop points, mm.
     """
     met, rows = meetings(system, launch, smooth=True), rows_met(system)
     failed = met.status != Status.OK
@@ -68,11 +69,12 @@ def shortfall(system: System, launch: Vector, target: Vector) -> Array:
 
 
 def _missed(met: Meeting, rows: Row) -> Array:
-    """By how much rays miss each row, come to it from behind or are bent too far, (R, W, Q)."""
+    """Measure (R, W, Q) of how far rays miss each row, meet it from behind, or exceed the limit of
+    total reflection there."""
     first, active, bends = (a[:, None, None] for a in (rows.first, rows.active, rows.bends))
     back = jnp.where(first, 0, jnp.maximum(-met.length, 0)) + jnp.maximum(-met.front, 0)
     back = jnp.where(active, back, 0) + jnp.where(bends, jnp.maximum(-met.through, 0), 0)
-    # By how much a conic is missed, on from the total reflection of rays that graze it.
+    # Miss of a conic. It continues the measure of total reflection at grazing incidence.
     square, linear, constant = quadratic(met.point, met.direction, rows.surface.wide)
     conic = jnp.maximum(square * constant - linear**2, 0)
     conic = conic + jnp.where(bends, jnp.maximum(rows.ratio**2 - 1, 0), 0)

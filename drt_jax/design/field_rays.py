@@ -1,4 +1,4 @@
-"""The rays of a lens from all fields of a problem, traced once: what operands are computed from."""
+"""The rays of a lens from all fields of a problem, traced once for all operands."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,15 +22,15 @@ from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide, dot, system_of
 from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 
-# The first rays of every view: the chief ray, then those through the top, the bottom and the side
-# of the stop. They carry no light.
+# The first rays of every view, without weight: the chief ray, and those through the top, bottom and
+# side of the stop.
 _EXTRA = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
 EXTRAS = _EXTRA.shape[1]
 
 
 def symmetry_by_structure(lens: Lens, axial: bool = False) -> Symmetry:
-    """How much of the pupil must be traced for fields along y, or for the axis alone, whatever the
-    numbers of the lens are; known inside a trace, too."""
+    """Symmetry of the pupil for fields along y, from the structure of a lens alone: its numbers may
+    be unknown, as in `jit`. axial: True for the axial field alone."""
     moves = (lens.decentre, lens.tilt, lens.elements, lens.apertures)
     forms = (*lens.forms, *(() if lens.phase is None else lens.phase.forms))
     kinds = {FORMS[form].symmetry for form in forms}
@@ -42,21 +42,24 @@ def symmetry_by_structure(lens: Lens, axial: bool = False) -> Symmetry:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class FieldRays:
-    """Rays of V views, each of W wavelengths: all fields at the first distance, then all at the
-    next. Of Q rays of each the first is the chief ray, the next three run through the rim of the
-    stop; these four carry no light. What stands from `bundle` on is None where nothing is traced.
+    """Rays of V views: all fields at the first distance, then all fields at the next. Each view has
+    W wavelengths of Q rays. The first ray is the chief ray, the next three pass the rim of the
+    stop; these four have no weight. The fields from `bundle` on are None before rays are traced.
 
-    field: (V, 2), radians. distance: (V,), mm. wavelengths: (W,), um.
-    wavelength_weights: (W,), of their light, adding up to 1.
-    bundle: arrays with a first axis (V,).
-    points: D arrays (V, W, Q), where rays cross the stop, in units of its semi-diameter.
-    stop_weights: (V, W, Q), what part of the light through the stop each ray stands for.
-    weights: (V, W, Q), the same of the light that arrives: 0 for rays that are clipped, for those
-        that fail as much as if they passed; adds up to 1, where there is any.
-    throughput: (V, W), what part of the light through the stop is not clipped.
+    field: (V, 2), radians.
+    distance: (V,), mm.
+    wavelengths: (W,), um.
+    wavelength_weights: (W,), weights of the wavelengths, with the sum 1.
+    bundle: the rays, with a first axis (V,) in every array.
+    points: D arrays (V, W, Q), stop points in units of the semi-diameter of the stop.
+    stop_weights: (V, W, Q), weights of the light through the stop, with the sum 1.
+    weights: (V, W, Q), weights of the light that is not clipped, with the sum 1 if there is any; 0
+        for clipped rays. A failed ray keeps its weight.
+    throughput: (V, W), fraction of the light through the stop that is not clipped.
 
     Static:
-    fields, distances: how many. symmetry: what part of the pupil the rays stand for.
+    fields, distances: numbers of fields and of distances.
+    symmetry: part of the pupil that is traced, see `symmetry_of`.
     """
 
     field: Array
@@ -74,16 +77,16 @@ class FieldRays:
 
     @property
     def arrives(self) -> Array:
-        """Rays that meet the sensor, also those that are clipped, (V, W, Q) bool."""
+        """Mask (V, W, Q) of rays that meet the sensor, clipped or not."""
         return (self.bundle.status == Status.OK) | (self.bundle.status == Status.CLIPPED)
 
     @property
     def sensor_hits(self) -> Array:
-        """Where rays meet the sensor, (D, V, W, Q), mm, y last; 0 for rays that fail."""
+        """Hits on the sensor, (D, V, W, Q), mm, y last; 0 for failed rays."""
         return jnp.stack([h[:, -1] for h in self.bundle.hits])
 
     def views(self, fields: Sequence[int], distances: Sequence[int]) -> np.ndarray:
-        """The numbers of the views of some fields and distances, counted from 0; empty: all."""
+        """Numbers of the views of given fields and distances, all counted from 0; () for all."""
         distances = distances or range(self.distances)
         return np.array(
             [d * self.fields + f for d in distances for f in fields or range(self.fields)]
@@ -92,14 +95,14 @@ class FieldRays:
     def select(
         self, fields: Sequence[int], distances: Sequence[int], wavelengths: Sequence[int]
     ) -> "FieldRays":
-        """The rays of some fields, distances and wavelengths, counted from 0; empty: all."""
+        """The rays of given fields, distances and wavelengths, counted from 0; () for all."""
         if not (fields or distances or wavelengths):
             return self
         views = self.views(fields, distances)
         waves = np.array(wavelengths or range(len(self.wavelengths)))
 
         def some(tree: Any) -> Any:
-            """Of arrays (V, W) and (V, ..., W, Q)."""
+            """Selects from arrays (V, W) and (V, ..., W, Q)."""
             return jax.tree.map(lambda a: a[views][..., *[waves, slice(None)][: a.ndim - 1]], tree)
 
         shares = self.wavelength_weights[waves]
@@ -125,7 +128,7 @@ class FieldRays:
         )
 
     def unvignetted(self) -> "FieldRays":
-        """The rays as if no clear aperture but the stop clipped any."""
+        """The rays with the weights they have if only the stop clips."""
         clipped = self.bundle.status == Status.CLIPPED
         status = jnp.where(clipped, Status.OK, self.bundle.status)
         bundle = self.bundle._replace(status=status)
@@ -133,12 +136,17 @@ class FieldRays:
 
 
 def trace_views(lens: Lens, views: FieldRays, rule: PupilRule, solver: Solver) -> FieldRays:
-    """The views with their rays, traced together; rule: of the pupil."""
+    """Traces the rays of all views together.
+
+    views: views without rays.
+    rule: the pupil rule. ValueError for `Clipped`, if the lens has obscurations.
+    solver: a ray solver.
+    """
     extra = lens.apertures
     if extra is not None and any(extra.blocks) and isinstance(rule, Clipped):
         raise ValueError(
-            "rule: Clipped subtracts the light inside of obscurations, which has no residuals; "
-            "take Gauss or Soft"
+            "rule: Clipped gives negative weights for obscurations, which have no residuals; use "
+            "Gauss or Soft"
         )
 
     def one(field: Array, distance: Array) -> tuple[Bundle, Vector, Array, Array, Array]:
@@ -163,8 +171,8 @@ def trace_views(lens: Lens, views: FieldRays, rule: PupilRule, solver: Solver) -
 
 
 def _points(rule: PupilRule, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-    """Where rays cross the stop, D arrays (W, Q) in units of its semi-diameter, and their weights
-    (W, Q): 0 for the extra ones, which come first."""
+    """Stop points, D arrays (W, Q) in units of the semi-diameter of the stop, and weights (W, Q), 0
+    for the four extra rays, which come first."""
     points, weights = rule.points(lens, scene)
     waves = scene.wavelengths.shape[0]
     extra = jnp.asarray(_EXTRA[2 - len(points) :], weights.dtype)
@@ -176,17 +184,17 @@ def _points(rule: PupilRule, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
 
 
 def beam_radius(lens: Lens, rays: FieldRays) -> Array:
-    """How far from the axis the light meets each surface (S,), mm: its semi-diameter or, where that
-    is inf, as far as the rays go."""
+    """Radius of the beam footprint on each surface (S,), mm: the semi-diameter or, if that is inf,
+    the largest distance of a ray from the axis."""
     squares = sum((h**2 for h in rays.bundle.hits), jnp.zeros(()))
-    reach = safe_sqrt(jnp.max(jnp.where(rays.arrives[:, None], squares, 0), axis=(0, 2, 3)))
+    radius = safe_sqrt(jnp.max(jnp.where(rays.arrives[:, None], squares, 0), axis=(0, 2, 3)))
     semi = lens.semi_diameter
-    return jnp.where(jnp.isfinite(semi), semi, reach)[:-1]
+    return jnp.where(jnp.isfinite(semi), semi, radius)[:-1]
 
 
 def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
-    """Cosines (V, L, W, Q) of the angles at which rays fall on the L surfaces that bend light; 1
-    for rays that fail."""
+    """Cosines (V, L, W, Q) of the angles of incidence on the L active surfaces; 1 for failed
+    rays."""
     rows = np.array([*lens.active, lens.count])
 
     def one(field: Array, distance: Array, hits: Vector, arrives: Array) -> Array:
@@ -201,10 +209,9 @@ def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
 
 
 def relative_illumination(lens: Lens, rays: FieldRays) -> Array:
-    """Light on the sensor (V,) of the middle wavelength relative to that of the first field at the
-    same distance, of an object that is everywhere as bright: the sum over rays of weight x solid
-    angle, projected on the sensor (Slater), see `_solid_angles`. Clipped light counts for nothing.
-    """
+    """Relative illumination (V,) at the middle wavelength, relative to the first field at the same
+    distance, for a uniform Lambertian object: the sum over rays that are not clipped of weight
+    times projected solid angle at the sensor (Slater), see `_solid_angles`."""
     middle = len(rays.wavelengths) // 2
     one = slice(middle, middle + 1)
     scene = rays.field, rays.distance, rays.bundle, rays.points
@@ -219,9 +226,9 @@ def _solid_angles(
     lens: Lens, wavelength: Array, one: slice, field: Array, distance: Array, bundle: Bundle,
     points: Vector
 ) -> Array:  # fmt: skip
-    """|dl / dp| (1, Q): the area of direction cosines l at one point of the sensor by the area of
-    the stop. With hit h and direction l as functions of the stop point p and the field f, h stays
-    where df = -(dh/df)^-1 (dh/dp) dp; so dl / dp = l_p - l_f h_f^-1 h_p."""
+    """Determinant dl/dp (1, Q): area of direction cosines l at a fixed point of the sensor per area
+    of the stop. Hit h and direction l are functions of the stop point p and the field f; h is fixed
+    for df = -(dh/df)^-1 (dh/dp) dp, so that dl/dp = l_p - l_f h_f^-1 h_p."""
     rows = np.array([*lens.active, lens.count])
     scene = Scene(field, distance, wavelength)
     hits = jax.lax.stop_gradient(tuple(h[rows, one] for h in bundle.hits))

@@ -1,4 +1,4 @@
-"""How thick a lens is between its surfaces, on the axis and towards the rim."""
+"""Thicknesses of glass and air between surfaces, on the axis and towards the rim."""
 
 import itertools
 
@@ -10,22 +10,26 @@ from jax import Array
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
 
-# Where edges are judged, in parts of the larger or smaller of two beam radii.
+# Zones of edge thicknesses, in units of the larger (glass) or smaller (air) of two beam radii.
 ZONES = np.array([0.5, 0.7, 0.85, 1.0])
 
 
 def between(lens: Lens, glass: bool) -> list[tuple[int, int]]:
-    """Neighbouring surfaces that bend light, and the last of them and the sensor, with glass or
-    with air between; what is before the lens counts as air, too."""
+    """Pairs of neighbours among the active surfaces and the sensor, with glass between them, or
+    with air. The medium in front of the lens counts as air."""
     air = lens.glasses[0], "air"
     pairs = itertools.pairwise([*lens.active, lens.count])
     return [(i, j) for i, j in pairs if (lens.glasses[i + 1] not in air) == glass]
 
 
 def gaps(lens: Lens, beam_radius: Array, glass: bool) -> tuple[Array, Array]:
-    """Thickness on the axis (G,) and at zones towards the rim (G, Z), mm along the light, of the
-    gaps of `between`, in glass or in air. In glass up to the larger of both beam radii (S,), in air
-    to the smaller; before the sensor to that of the last surface."""
+    """Thicknesses of the G gaps of `between`, mm along the light: on the axis (G,), and at zones
+    towards the rim (G, Z).
+
+    beam_radius: (S,), mm. Zones reach the larger radius of the two surfaces in glass, the smaller
+        in air; in front of the sensor that of the last surface.
+    glass: True for gaps of glass, False for air.
+    """
     dtype = lens.curvature.dtype
     pairs = between(lens, glass)
     if not pairs:

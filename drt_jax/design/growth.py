@@ -1,4 +1,4 @@
-"""Growth: design for a part of the fields and of the aperture first, then for more and more."""
+"""Growth: a design for a part of the fields and aperture, extended step by step to the whole."""
 
 import copy
 import dataclasses
@@ -13,17 +13,19 @@ from .least_squares import Search
 from .optimum import Optimum, optimise
 from .problem import Problem
 
-# A step to the next part is no smaller; one that succeeds is followed by a step so much larger.
+# Least step to the next part, and the factor of the step after a success.
 SHORTEST, _FASTER = 0.002, 1.2
 
 
 class Growth(NamedTuple):
-    """How far a lens has grown.
+    """State of a growth. A part is a fraction of the fields and of the aperture.
 
-    done: the largest part that meets the target, 1 for all, 0 for none yet. part: the one to try
-    next, step: from there. vector: (N,), of the variables, the best for `done`. failed: the last
-    search that missed the target, None if none did.
-    steps, jacobians, seconds, first: of all searches, see `Optimum`.
+    done: largest part that meets the target; 1 for the whole, 0 for none yet.
+    part: part to try next.
+    step: step to the part after that.
+    vector: (N,), best vector of the variables for `done`.
+    failed: last search that missed the target; None if none did.
+    steps, jacobians, seconds, first: totals over all searches, see `Optimum`.
     """
 
     done: float
@@ -38,13 +40,17 @@ class Growth(NamedTuple):
 
     @property
     def ended(self) -> bool:
-        """Whether the whole is reached, or no step leads farther."""
+        """True once the whole is reached, or once the step is too small."""
         return self.done >= 1 or self.step < SHORTEST
 
 
 def part_of(problem: Problem, part: Array | float) -> Problem:
-    """The problem for a part of its fields and of its aperture: the entrance pupil or f-number of a
-    solve, else the stop. Numbers alone differ, so that one program serves all parts."""
+    """The problem for a part of its fields and aperture. Only numbers differ: one program serves
+    all parts.
+
+    part: factor of the fields, and of the entrance pupil or f-number of a solve, if there is one,
+        else of the stop.
+    """
     variables, solves = problem.variables, []
     lens = variables.lens
     for solve in variables.solves:
@@ -61,7 +67,7 @@ def part_of(problem: Problem, part: Array | float) -> Problem:
 
 
 def start_growth(problem: Problem, first: float = 0.3, step: float = 0.1) -> Growth:
-    """The start of a problem, to be grown from a part `first` in steps of about `step`."""
+    """The state before the first search. first: part to begin with. step: step to the next."""
     return Growth(0.0, first, step, np.asarray(problem.variables.start))
 
 
@@ -72,8 +78,8 @@ def grow_once(
     max_steps: int = 40,
     callback: Callable[[Search], None] = lambda search: None,
 ) -> Growth:
-    """One part more: accepted when its score is the target or less, else tried with half the
-    step."""
+    """Optimises the next part. It is accepted if its score is at most the target; otherwise the
+    step is halved. Arguments as in `grow`."""
     part, done, step = growth.part, growth.done, growth.step
     vector = jnp.asarray(growth.vector)
     found = optimise(part_of(problem, part), vector, max_steps, callback, target_merit)
@@ -103,16 +109,15 @@ def grow(
     max_steps: int = 40,
     callback: Callable[[Search], None] = lambda search: None,
 ) -> Growth:
-    """Design a lens for a part of its fields and aperture, then for more and more.
+    """Designs a lens for a part of its fields and aperture, and extends it step by step. If the
+    whole meets the target, `Growth.done` is 1; start `optimise` from its `vector`.
 
-    target_merit: with which the next part is tried at once, in the unit of `Optimum.score`; some 16
-        times the merit that the whole is to have: a lens that is perfect for a part is spoilt for
-        more. first: part to begin with. step: to the next; 1.2 times as much after one that meets
-        the target, half as much after one that does not, down to 0.002. max_steps: at each part.
-    callback: called after each step of a search.
-
-    `Growth.done` is 1 where the whole meets the target; its `vector` is then the start of
-    `optimise`. One program serves all parts.
+    target_merit: score, as `Optimum.score`, at which a part is accepted; about 16 times the merit
+        wanted of the whole. A lens that is perfect for a part is a bad start for more.
+    first: part to begin with.
+    step: first step; it grows by 1.2 after a success and halves after a failure, down to 0.002.
+    max_steps: most steps for each part.
+    callback: called with the search after each step.
     """
     growth = start_growth(problem, first, step)
     while not growth.ended:

@@ -1,4 +1,4 @@
-"""The kinds of numbers of a lens that may change, each an array over rows and terms."""
+"""The kinds of variables of a lens, each an array over rows and terms."""
 
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -16,15 +16,16 @@ from ..lens.surface import surface_sag
 
 
 class Kind(NamedTuple):
-    """One kind of number.
+    """One kind of variable.
 
-    rows: the rows of a lens that have one, all that is meant when none are named.
-    allowed: the rows that may be named.
-    terms: how many numbers a row has.
-    read, write: the array (rows, terms) of a lens, and a lens with another.
-    step: by how much a typical design moves one, from a length h (mm) across the beam: (power of h,
-        factor); of coefficients, by how much that moves the surface at h.
-    limits: between which its values mean anything.
+    rows: function of a lens, the rows that vary if none are named.
+    allowed: function of a lens, the rows that may be named.
+    terms: function of a lens, the number of values per row.
+    read: function of a lens, its array (rows, terms).
+    write: function of a lens and an array (rows, terms), the lens with that array.
+    step: (power, factor), typical change factor x h^power for a semi-diameter h of the stop, mm; of
+        coefficients, the change of the sag at h, mm.
+    limits: least and largest meaningful value.
     """
 
     rows: Callable[[Lens], list[int]]
@@ -37,8 +38,8 @@ class Kind(NamedTuple):
 
 
 def whole_numbers(what: str, given: Any) -> tuple[int, ...]:
-    """Numbers of surfaces and the like as a tuple. ValueError, which begins with `what`, for what
-    they are not."""
+    """Numbers of surfaces and the like as a tuple. ValueError, which begins with `what`, unless
+    `given` is an iterable of whole numbers."""
     wanted = given if isinstance(given, Iterable) and not isinstance(given, str) else [None]
     found = tuple(wanted)
     if all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in found):
@@ -47,7 +48,7 @@ def whole_numbers(what: str, given: Any) -> tuple[int, ...]:
 
 
 def back_distance(lens: Lens) -> Array:
-    """From the last vertex to the sensor along the axis (), mm."""
+    """Distance from the last vertex to the sensor along the axis, (), mm."""
     return lens.sensor - jnp.sum(lens.thickness)
 
 
@@ -55,7 +56,7 @@ def _all(lens: Lens) -> list[int]:
     return list(range(lens.count))
 
 
-def _live(lens: Lens) -> list[int]:
+def _active(lens: Lens) -> list[int]:
     return list(lens.active)
 
 
@@ -69,8 +70,8 @@ def model_glasses(lens: Lens) -> list[int]:
 
 
 def _begins(lens: Lens) -> np.ndarray:
-    """Where the medium behind each surface begins (S,): a mirror, or a stop inside a glass, goes on
-    with the one in front."""
+    """Surface (S,) at which the medium behind each surface begins; a mirror, or a stop inside a
+    glass, continues the medium in front."""
     found: list[int] = []
     for i in range(lens.count):
         same = i > 0 and lens.glasses[i] == lens.glasses[i + 1]
@@ -89,7 +90,7 @@ def _placed(lens: Lens) -> list[int]:
 
 
 def _leaf(name: str) -> tuple[Callable, Callable]:
-    """Reader and writer of an array over surfaces; zeros in place of none."""
+    """Reader and writer of an array over surfaces; the reader returns zeros for None."""
 
     def read(lens: Lens) -> Array:
         array = getattr(lens, name)
@@ -113,7 +114,7 @@ def _write_sensor(lens: Lens, array: Array) -> Lens:
 
 
 def _write_thickness(lens: Lens, array: Array) -> Lens:
-    """The sensor goes along with the last vertex."""
+    """Writes thicknesses; the sensor keeps its distance from the last vertex."""
     moved = dataclasses.replace(lens, thickness=array[:, 0])
     return _write_sensor(moved, back_distance(lens)[None, None])
 
@@ -153,9 +154,9 @@ VariableKind = Literal[
     "decentre", "semi_diameter"
 ]  # fmt: skip
 KINDS: dict[str, Kind] = {
-    "curvature": Kind(_live, _all, _one, *_leaf("curvature"), (-1, 0.02)),
-    "conic": Kind(_live, _all, _one, *_leaf("conic"), (0, 0.1)),
-    "coefficients": Kind(_live, _all, _terms, *_leaf("coefficients"), (1, 0.01)),
+    "curvature": Kind(_active, _all, _one, *_leaf("curvature"), (-1, 0.02)),
+    "conic": Kind(_active, _all, _one, *_leaf("conic"), (0, 0.1)),
+    "coefficients": Kind(_active, _all, _terms, *_leaf("coefficients"), (1, 0.01)),
     "thickness": Kind(_gaps, _gaps, _one, _leaf("thickness")[0], _write_thickness, (1, 0.05)),
     "sensor": Kind(
         lambda lens: [0],
@@ -167,8 +168,8 @@ KINDS: dict[str, Kind] = {
     ),
     "index": Kind(model_glasses, model_glasses, _one, *_glass(0), (0, 0.02), (1.3, 2.2)),
     "abbe": Kind(model_glasses, model_glasses, _one, *_glass(1), (0, 2.0), (15, 100)),
-    "tilt": Kind(_live, _placed, lambda lens: 3, *_leaf("tilt"), (0, 1e-3)),
-    "decentre": Kind(_live, _placed, lambda lens: 2, *_leaf("decentre"), (1, 1e-3)),
+    "tilt": Kind(_active, _placed, lambda lens: 3, *_leaf("tilt"), (0, 1e-3)),
+    "decentre": Kind(_active, _placed, lambda lens: 2, *_leaf("decentre"), (1, 1e-3)),
     "semi_diameter": Kind(
         _finite, _finite, _one, *_leaf("semi_diameter"), (1, 0.05), (1e-6, np.inf)
     ),
@@ -176,19 +177,19 @@ KINDS: dict[str, Kind] = {
 
 
 def beam(lens: Lens) -> float:
-    """A length across the beam, mm: the semi-diameter of the stop."""
+    """Semi-diameter of the stop, mm, a measure of the beam."""
     return float(np.asarray(lens.semi_diameter)[lens.stop])
 
 
 def step_of(lens: Lens, kind: str, row: int, term: int) -> float:
-    """By how much a typical design moves a number of a lens."""
+    """Typical change of a variable, in its unit."""
     power, factor = KINDS[kind].step
     step = factor * beam(lens) ** power
     return step / lift_of(lens, row, term, beam(lens)) if kind == "coefficients" else step
 
 
 def lift_of(lens: Lens, row: int, term: int, away: float) -> float:
-    """By how much a coefficient lifts a surface, mm a unit, at `away` mm from its axis."""
+    """Largest change of the sag per unit of a coefficient, mm, at `away` mm from the axis."""
     shape = jax.tree.map(lambda a: a[..., row, None], lens.shape)
     angle, dtype = np.pi * np.arange(8) / 8, lens.curvature.dtype
     points = tuple(jnp.asarray(away * f(angle), dtype) for f in (np.cos, np.sin))
@@ -202,8 +203,8 @@ def lift_of(lens: Lens, row: int, term: int, away: float) -> float:
 
 
 def word_terms(lens: Lens, kind: str, row: int) -> list[int]:
-    """The terms of a row that a word for all of a kind means: of coefficients not those that its
-    curvature stands for, r^2, nor the radius that others are counted in."""
+    """Terms of a row that vary if none are named: all, except the coefficient of r^2, which the
+    curvature replaces, or, if there is one, the norm radius."""
     count = KINDS[kind].terms(lens)
     if kind != "coefficients":
         return list(range(count))

@@ -1,12 +1,12 @@
 """Least squares by Levenberg and Marquardt's method within bounds, on exact Jacobians.
 
-More, The Levenberg-Marquardt algorithm (1978): damping in units of the largest column norms seen;
-Nielsen, Damping parameter in Marquardt's method (1999): its size by the gain of each trial. Numbers
-that meet a bound are fixed there while the merit would fall beyond it.
+Damping in units of column norms: More, The Levenberg-Marquardt algorithm (1978). Its size follows
+from the gain of each trial: Nielsen, Damping parameter in Marquardt's method (1999). A number at a
+bound is fixed there while the merit falls only beyond the bound.
 
-Constraints c <= 0 enter as one-sided residuals max(0, c + shift). Each time that the merit has
-settled, the shift takes up what is left of c: the method of multipliers (Rockafellar 1973), which
-keeps constraints without weights that would be stiff.
+Constraints c <= 0 enter as one-sided residuals max(0, c + shift). Each time the merit has settled,
+the remaining violation is added to the shift: the method of multipliers (Rockafellar 1973), which
+meets constraints exactly without large penalty weights.
 """
 
 from collections.abc import Callable
@@ -20,23 +20,22 @@ from ..numerics import run_if, safe_divide
 
 _DAMPING, _MOST_DAMPING = 1e-3, 1e16
 _PARTS = (1.0, 0.5, 0.25, 0.1, 0.03)
-_SETS = 5  # how often what is fixed at a bound, and which constraints count, is asked in one step
-# A merit has settled when less than `_COARSE` of it is to be gained, while constraints are still to
-# be met, and in the end `_FINE`. A search aims `_WITHIN` inside of its constraints, in their own
-# units, so that they are kept where it comes as near as that.
+_SETS = 5  # updates of the active set (bounds and constraints) in one step
+# A merit has settled when the model promises a relative gain below `_COARSE`, or `_FINE` once
+# constraints are met. A search aims `_WITHIN` inside of its constraints, in their own units, so
+# that they are met although it only converges to them.
 _COARSE, _FINE, _WITHIN = 1e-5, 1e-13, 1e-9
 _ROUNDS = 30
 
 
 class Evaluation(NamedTuple):
-    """What a function says of a vector, such as a problem of a lens.
+    """Evaluation of a function at a vector, such as that of a problem.
 
-    residuals: (M,), whose squares add up to the merit.
-    constraints: (L,), by how much values are beyond their limits, times their weights; kept where
-        they are 0 or less.
-    overlap: (), by how much it is unphysical: how far surfaces overlap within the light, mm; inf
+    residuals: (M,); the merit is the sum of their squares.
+    constraints: (L,), violations of the limits times their weights; met where 0 or less.
+    overlap: (), total overlap of surfaces within the beam, mm, a measure of an unphysical lens; inf
         where a number is not finite.
-    failed: (), int32, how many rays fail.
+    failed: (), int32, number of failed rays.
     """
 
     residuals: Array
@@ -49,16 +48,24 @@ Function = Callable[[Array], Evaluation]
 
 
 class Search(NamedTuple):
-    """A search for an optimum, as far as it has come.
+    """State of a search for an optimum.
 
-    vector: (N,), the best so far. evaluation: of it. residuals: (M + L,), with those of the
-    constraints; jacobian: (M + L, N); total: (), the sum of the squares of what counts.
-    scale: (N,), the largest column norms seen. damping, growth: (). gain: (), what the model
-    promised of the last trial, relative to the total. jacobians, steps: (), int32.
-    stale: (), whether the vector must be evaluated first: at the start, and when what is asked
-    changes. shift: (L,), of the constraints; stiffness: (), how much they count. rounds: (), how
-    often they were shifted. fine: (), whether constraints are met and the last digits are sought.
-    done: (), whether nothing more is to be gained.
+    vector: (N,), best so far.
+    evaluation: evaluation of the vector.
+    residuals: (M + L,), residuals, then the shifted constraints.
+    jacobian: (M + L, N), their derivatives.
+    total: (), sum of the squares of residuals and of violated constraints.
+    scale: (N,), column norms of the Jacobian.
+    damping: (), damping of the next step.
+    growth: (), factor of the damping after a rejected trial.
+    gain: (), gain that the model promised for the last trial, relative to the total.
+    jacobians, steps: (), int32, numbers of Jacobians and of trials.
+    stale: (), bool, True if the vector must be evaluated first: at the start, and after a shift.
+    shift: (L,), shifts of the constraints.
+    stiffness: (), factor of the constraints.
+    rounds: (), int32, number of shifts.
+    fine: (), bool, True if constraints are met and the search only refines.
+    done: (), bool, True if the search has ended.
     """
 
     vector: Array
@@ -86,12 +93,12 @@ class Search(NamedTuple):
 
     @property
     def max_violation(self) -> Array:
-        """By how much the worst constraint is exceeded, (); 0 where all are kept."""
+        """Largest violation of a constraint, (); 0 if all are met."""
         return jnp.max(self.evaluation.constraints, axis=-1, initial=0.0)
 
     @property
     def score(self) -> Array:
-        """Merit plus the squares of what exceeds constraints, (); inf for an unphysical lens."""
+        """Merit plus the squares of the violations, (); inf for an unphysical lens."""
         exceeded = jnp.maximum(self.evaluation.constraints, 0)
         score = self.merit + jnp.sum(exceeded**2, axis=-1)
         physical = jnp.isfinite(score) & jnp.isfinite(self.evaluation.overlap)
@@ -99,7 +106,7 @@ class Search(NamedTuple):
 
 
 def init(function: Function, vector: Array) -> Search:
-    """A search from a vector (N,); nothing is evaluated yet."""
+    """The state of a search before the first step from a vector (N,); evaluates nothing."""
     values = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(function, vector))
     count, dtype = values.residuals.size + values.constraints.size, vector.dtype
     one, zero, no = jnp.ones((), dtype), jnp.zeros((), jnp.int32), jnp.bool_(False)
@@ -125,18 +132,21 @@ def init(function: Function, vector: Array) -> Search:
 
 
 def step(function: Function, search: Search, low: Array, high: Array) -> Search:
-    """One trial more within bounds (N,), unless the search is done.
+    """One trial of a search; none if the search is done.
 
-    A trial is taken if the total falls and it is no more unphysical; then the Jacobian is computed
-    there. Done when the model promises less than 1e-13 of the total, or no trial is taken any more,
-    and constraints are met or were shifted 30 times.
+    A trial is accepted if the total falls and the overlap does not grow; then its Jacobian is
+    computed. The search is done when the model promises a relative gain below 1e-13 or the damping
+    is at its limit, and constraints are met or were shifted 30 times.
+
+    function: from a vector (N,) to its evaluation.
+    low, high: (N,), bounds of the vector.
     """
     new = _shifted(_tried(function, search, low, high))
     return jax.tree.map(lambda a, b: jnp.where(search.done, a, b), search, new)
 
 
 def _tried(function: Function, search: Search, low: Array, high: Array) -> Search:
-    """One trial, and if it is taken, the Jacobian there."""
+    """One trial, and its Jacobian if it is accepted."""
 
     def residuals_of(vector: Array) -> tuple[Array, Evaluation]:
         values = function(vector)
@@ -178,7 +188,7 @@ def _tried(function: Function, search: Search, low: Array, high: Array) -> Searc
 
 
 def _shifted(search: Search) -> Search:
-    """The multipliers: where the merit has settled, constraints that are exceeded are shifted."""
+    """The method of multipliers: shifts violated constraints once the merit has settled."""
     constraints = search.evaluation.constraints
     small = ((search.gain >= 0) & (search.gain <= _FINE)) | (search.total <= 0)
     ended = small | (search.damping > _MOST_DAMPING)
@@ -196,19 +206,20 @@ def _shifted(search: Search) -> Search:
 
 
 def _counting(residuals: Array, sided: Array) -> Array:
-    """The residuals (M,), 0 where they are one-sided and not above 0."""
+    """The residuals, with 0 for one-sided residuals below 0."""
     return jnp.where(sided, jnp.maximum(residuals, 0), residuals)
 
 
 def _sided(search: Search) -> Array:
-    """Which residuals (M + L,) are those of constraints."""
+    """Mask (M + L,) of the residuals that belong to constraints."""
     count = search.residuals.shape[-1]
     return jnp.arange(count) >= count - search.shift.shape[-1]
 
 
 def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
-    """The damped step within the bounds, and by how much the model has the total fall. Which
-    constraints count, and which numbers are fixed at a bound, follows from where the step leads."""
+    """The damped step within the bounds (N,), and the decrease of the total that the model
+    promises. The end of the step determines the active set: the constraints that count and the
+    numbers that are fixed at a bound."""
     y, sided = search.vector, _sided(search)
     scale = jnp.where(search.scale > 0, search.scale, 1)
     move, fixed = jnp.zeros_like(y), jnp.zeros(y.shape, bool)
@@ -219,7 +230,7 @@ def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
         square = search.jacobian.T @ (counts[:, None] * search.jacobian)
         if not k:
             fixed = ((y <= low) & (gradient > 0)) | ((y >= high) & (gradient < 0))
-        # In units of the columns' norms; what is fixed moves as far as it does already.
+        # In units of the column norms; fixed numbers keep their move.
         free = (~fixed).astype(y.dtype)
         matrix = square / scale[:, None] / scale[None] * free[:, None] * free[None]
         matrix = matrix + jnp.diag(search.damping * free + (1 - free))
@@ -229,7 +240,7 @@ def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
         fixed = fixed | (y + move < low) | (y + move > high)
         move = jnp.clip(y + move, low, high) - y
     move = jnp.where(jnp.isfinite(move), move, 0)
-    # Where that goes round in circles, a part of the step is better than all of it.
+    # If the active set cycles, a part of the step is better than the whole.
     parts = jnp.asarray(_PARTS, y.dtype)
     model = search.residuals[:, None] + (search.jacobian @ move)[:, None] * parts[None]
     totals = jnp.sum(_counting(model, sided[:, None]) ** 2, axis=0)
@@ -238,7 +249,7 @@ def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
 
 
 def promised_gain(search: Search, low: Array, high: Array) -> Array:
-    """What part of the total, (), a step that is hardly damped is promised to gain."""
+    """Relative gain (), as the model promises it for a step with little damping."""
     search = search._replace(damping=jnp.full_like(search.damping, _DAMPING))
     gain = _proposal(search, low, high)[1]
     return safe_divide(jnp.abs(gain), search.total)

@@ -1,4 +1,4 @@
-"""Limits by name: which value of which operand, and by how much it is beyond."""
+"""Limits by name: the value of an operand, and by how much it violates its limit."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -15,11 +15,13 @@ _Side = Literal["low", "high"]
 
 
 class Limit(NamedTuple):
-    """One limit of one value; as text, one line that says all of it.
+    """One limit of one value; its text is one complete line.
 
-    kind: of the operand. where: which of its values, such as "surface 7, zone 1"; empty if it has
-    one. side: which limit. bound: the limit, in the unit of the values. excess: by how much the
-    value is beyond it, in that unit, negative within.
+    kind: kind of the operand.
+    where: name of the value, such as "surface 7, zone 1"; empty if the operand has one value.
+    side: "low" or "high".
+    bound: the limit, in the unit of the values.
+    excess: violation in that unit; negative if the limit is met.
     """
 
     kind: str
@@ -48,8 +50,9 @@ def limits_of(
 ) -> list[Limit]:
     """The limits of operands by name.
 
-    counts: of "fields", "wavelengths", "distances" and components in "xy". sizes: how many
-    constraints each operand has. constraints: (L,), see `Operand.constraints`.
+    counts: numbers of "fields", "wavelengths", "distances" and of components, "xy".
+    sizes: number of constraints of each operand.
+    constraints: (L,), see `Operand.constraints`.
     """
     found: list[Limit] = []
     for operand, size in zip(operands, sizes, strict=True):
@@ -62,7 +65,7 @@ def limits_of(
 
 
 def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> list[str]:
-    """What each of `size` values of an operand is called among the others, in their order."""
+    """Names of the `size` values of an operand, in their order."""
     known = kind_of(operand.kind)
     parts: list[Iterable[str]] = []
     for axis in known.axes:

@@ -1,4 +1,4 @@
-"""Operands: what a design is judged by, as vectors of residuals and constraints."""
+"""Operands of a merit function: residuals for targets, constraints for limits."""
 
 import dataclasses
 import math
@@ -34,19 +34,18 @@ OperandFunction = Callable[[Lens, FieldRays], Array]
 @leaves("target", "low", "high", "weight")
 @dataclasses.dataclass(frozen=True)
 class Operand:
-    """One thing that is asked of a lens: a target, or limits that are kept.
+    """One operand of a merit function: a target, or limits that are met exactly. A pytree: target,
+    limits and weight are leaves; in a problem, a limit that is not given is None.
 
-    kind: one of `OPERANDS`; what each is, in which unit, stands at the top of values.py. Or a
-        function of a lens and its `FieldRays` that returns an array.
-    target: of the values. low, high: limits instead of a target; kept exactly in the end.
-    weight: the residual is weight times the difference, in the units of the values; 0: the operand
-        is off.
-    fields, wavelengths, distances, surfaces: which of the problem's, or of the lens', from 0;
-        empty: all.
-    vignetting: of spots, wavefronts and functions, False counts the rays that clear apertures clip
-        as if they passed, so that cutting light gains nothing.
-
-    A pytree: target, limits and weight are leaves, a limit that is not there is None in a problem.
+    kind: one of `OPERANDS`, see values.py for their meaning and units; or a function of a lens and
+        its `FieldRays` that returns an array.
+    target: target of the values, in their unit.
+    low, high: limits instead of a target, in the unit of the values.
+    weight: factor of the difference to the target, or of the violation; 0 turns the operand off.
+    fields, wavelengths, distances, surfaces: numbers of those of the problem or lens, from 0; ()
+        for all.
+    vignetting: for spots, wavefronts and functions. False counts clipped rays as if they passed, so
+        that clipping light does not lower the merit.
     """
 
     kind: OperandName | OperandFunction
@@ -69,8 +68,8 @@ class Operand:
             numbers = whole_numbers(f"{what}: {name}", getattr(self, name))
             object.__setattr__(self, name, numbers)
             if numbers and name not in known.names:
-                some = " and ".join(known.names) or "nothing"
-                raise ValueError(f"{what}: {name}: it has none; leave them out, it knows {some}")
+                only = f", only on {' and '.join(known.names)}" if known.names else ""
+                raise ValueError(f"{what}: does not depend on {name}{only}; remove {name}")
         low = -math.inf if self.low is None else self.low
         high = math.inf if self.high is None else self.high
         if not concrete((low, high, self.weight, self.target)):
@@ -95,22 +94,22 @@ class Operand:
 
     @property
     def name(self) -> str:
-        """Its kind, or the name of its function."""
+        """The kind, or the name of the function."""
         return self.kind if isinstance(self.kind, str) else self.kind.__name__
 
     @property
     def sides(self) -> list[Literal["low", "high"]]:
-        """Which limits it has."""
+        """The limits that are given."""
         return [side for side in ("low", "high") if _is_limit(getattr(self, side))]
 
     @property
     def limits(self) -> bool:
-        """Whether it is limits that are kept, not a target."""
+        """True for limits, False for a target."""
         return bool(self.sides)
 
     def check(self, lens: Lens, counts: dict[str, int]) -> None:
-        """ValueError for what it names and neither the lens nor the problem has, whose counts are
-        by "fields", "wavelengths" and "distances"."""
+        """Raises ValueError for a number that the lens or problem does not have. counts: numbers of
+        "fields", "wavelengths" and "distances" of the problem."""
         what = f"operands: {self.name}"
         places = kind_of(self.kind).places
         there = {name: list(range(count)) for name, count in counts.items()}
@@ -126,8 +125,8 @@ class Operand:
             raise ValueError(f"{what}: wavelengths: needs two or more; leave it out")
 
     def placed(self, lens: Lens) -> "Operand":
-        """The operand of a problem: the surfaces named that follow from numbers of the lens, and
-        numbers as arrays of its dtype."""
+        """The operand for a problem: numbers become arrays in the dtype of the lens, and surfaces
+        that depend on numbers of the lens are named."""
         surfaces, places = self.surfaces, kind_of(self.kind).places
         if self.kind == "glass_map" and not surfaces and places:
             surfaces = tuple(places(lens))
@@ -140,7 +139,7 @@ class Operand:
         return placed
 
     def values(self, lens: Lens, rays: FieldRays) -> Array:
-        """The values (K,) of a lens, of which the target is taken or which the limits bound."""
+        """The values (K,) of a lens, which are compared with the target or limits."""
         return jnp.ravel(self._values(lens, rays))
 
     def _values(self, lens: Lens, rays: FieldRays) -> Array:
@@ -159,8 +158,8 @@ class Operand:
         return values[np.array([k for k, i in enumerate(places(lens)) if i in self.surfaces])]
 
     def residuals(self, lens: Lens, rays: FieldRays, field_weights: Array | None = None) -> Array:
-        """(K,), the squares of which add up in the merit; none for limits. field_weights: (F,), of
-        the squares; None: 1. A user's function has one value for all fields."""
+        """Residuals (K,), (0,) for limits. field_weights: (F,), factors of the squares of each
+        field; None for 1. They do not apply to a user's function."""
         if self.limits:
             return jnp.zeros(0, lens.curvature.dtype)
         values, axes = self._values(lens, rays), kind_of(self.kind).axes
@@ -174,8 +173,7 @@ class Operand:
         return jnp.ravel(found)
 
     def constraints(self, lens: Lens, rays: FieldRays) -> Array:
-        """By how much each value is beyond each limit, times the weight, negative within; none for
-        a target."""
+        """Violations of the limits times the weight, negative where met; (0,) for a target."""
         if not self.limits:
             return jnp.zeros(0, lens.curvature.dtype)
         values = self.values(lens, rays)
@@ -184,5 +182,5 @@ class Operand:
 
 
 def _is_limit(number: Any) -> bool:
-    """Whether a limit is there: an array, or a number that is finite."""
+    """True for a limit that is given: an array, or a finite number."""
     return number is not None and not (isinstance(number, float | int) and math.isinf(number))

@@ -1,4 +1,4 @@
-"""A problem's optimum: least squares, and limits that hold exactly in the end."""
+"""Optimisation of a problem: least squares with limits that are met exactly."""
 
 import time
 from collections.abc import Callable
@@ -16,12 +16,12 @@ from .least_squares import Search, init, promised_gain, step
 from .limits import Limit
 from .problem import Problem, quick
 
-# What is left of limits when the trials are used up, if it is less than `_NEAR`, is made good in at
-# most `_MENDING` trials in which they count so many times more.
+# Violations below `_NEAR` that remain when the steps are used up are removed in at most `_MENDING`
+# more steps, in which constraints count `_STIFF` times.
 _NEAR, _MENDING, _STIFF = 1e-3, 20, 1e4
-# Converged is a search if a step that is hardly damped promises less of the merit.
+# A search has converged if the relative gain promised for a step with little damping is at most:
 _LEFT = 1e-6
-# In its scales no variable goes farther than that.
+# Largest change of a variable, in units of its scale.
 _FAR = 1e6
 
 
@@ -29,17 +29,21 @@ Ended = Literal["converged", "target", "steps", "limits", "stuck"]
 
 
 class Optimum(NamedTuple):
-    """What a search came to.
+    """Result of an optimisation.
 
-    lens: the best one. vector: (N,). merit: sum of the squares of the residuals; score: with those
-    of what exceeds limits. max_violation: by how much the worst limit is exceeded, times its
-    weight. limits: all of them by name, the worst first, each in its own unit.
-    ended: why: "converged", all limits are kept and next to nothing is to be gained; "target", the
-    target merit is reached; "steps", they are used up; "limits", they cannot be kept together;
-    "stuck", no trial is better any more, as where surfaces touch, which a limit such as air_edge
-    keeps apart.
-    history: (T, 3), merit, worst and Jacobians so far by trial. seconds: of all trials but the
-    first; first: of that, with compilation if need be.
+    lens: the best lens.
+    vector: (N,), its vector.
+    merit: sum of the squares of the residuals.
+    score: merit plus the squares of the violations.
+    max_violation: largest violation of a limit times its weight; 0 if all are met.
+    limits: all limits by name, the largest violation first, each in its own unit.
+    ended: why the search ended. "converged": all limits are met and there is next to no gain left.
+        "target": the target merit is reached. "steps": the steps are used up. "limits": the limits
+        contradict each other. "stuck": no trial is better, for instance because surfaces touch,
+        which a limit such as air_edge prevents.
+    history: (T, 3), merit, largest violation and number of Jacobians after each trial.
+    seconds: time of all trials except the first.
+    first: time of the first trial, with compilation if needed, s.
     """
 
     lens: Lens
@@ -55,28 +59,28 @@ class Optimum(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether it is an optimum: nothing more is to be gained, and all limits are kept."""
+        """True at an optimum that meets all limits."""
         return self.ended == "converged"
 
     @property
     def worst_limit(self) -> Limit | None:
-        """The limit that is exceeded most or, if none is, the nearest; None without limits."""
+        """The limit with the largest violation or, if all are met, the nearest; None without."""
         return self.limits[0] if self.limits else None
 
     @property
     def jacobians(self) -> int:
-        """How many were computed."""
+        """Number of Jacobians computed."""
         return int(self.history[-1, 2])
 
 
 @jax.jit
 def init_problem(problem: Problem, vector: Array) -> Search:
-    """A search from a vector (N,) of a problem's variables."""
+    """The state of a search before the first step from a vector (N,) of the variables."""
     return init(problem.evaluate, vector)
 
 
 def step_problem(problem: Problem, search: Search) -> Search:
-    """One trial more of a problem, unless the search is done."""
+    """One trial of a search for a problem; none if the search is done."""
     return step(problem.evaluate, search, problem.variables.low, problem.variables.high)
 
 
@@ -84,8 +88,8 @@ _step = jit(step_problem, LARGE)
 
 
 def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem, Search]:
-    """What to go on with: `tried`, which aims rays, or where the full search of the `problem` finds
-    more of them at the best vector, the problem itself, evaluated anew."""
+    """The problem and search to continue with: `tried`, whose rays are only aimed; or, if the full
+    ray search of `problem` finds more rays at the best vector, that problem, evaluated again."""
     failed = int(search.evaluation.failed)
     if tried.solver is problem.solver or not failed or int(problem.failed(search.vector)) == failed:
         return tried, search
@@ -95,12 +99,12 @@ def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem
 
 @jax.jit
 def _left(problem: Problem, search: Search) -> Array:
-    """What part of the merit a step that is hardly damped promises."""
+    """Relative gain promised for a step with little damping."""
     return promised_gain(search, problem.variables.low, problem.variables.high)
 
 
 def _mended(problem: Problem, search: Search) -> Search:
-    """A search whose limits are kept, next to one that comes near."""
+    """A search near another that meets all limits; the other if there is none."""
     stiff = search._replace(
         stale=jnp.bool_(True),
         shift=jnp.zeros_like(search.shift),
@@ -115,7 +119,7 @@ def _mended(problem: Problem, search: Search) -> Search:
 
 
 def _refuse_fixed(problem: Problem, search: Search) -> None:
-    """ValueError for a limit that the start exceeds and no variable moves."""
+    """Raises ValueError for a limit that the start violates and no variable changes."""
     excess = np.asarray(search.evaluation.constraints)
     slopes = np.asarray(search.jacobian)[-len(excess) or len(search.jacobian) :]
     if np.any((excess > 0) & (np.max(np.abs(slopes), axis=1, initial=0) * _FAR < excess)):
@@ -124,7 +128,7 @@ def _refuse_fixed(problem: Problem, search: Search) -> None:
 
 
 def _refuse_unjudged(search: Search) -> None:
-    """ValueError for a search that found no lens that can be judged."""
+    """Raises ValueError for a search without a lens that can be evaluated."""
     if not bool(jnp.isfinite(search.evaluation.overlap)):
         raise ValueError(
             "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
@@ -149,18 +153,17 @@ def optimise(
     callback: Callable[[Search], None] = lambda search: None,
     target_merit: float = 0.0,
 ) -> Optimum:
-    """The optimum next to a vector (N,) of the problem's variables, that of its start by default.
+    """Searches for the optimum near a vector. Read `Optimum.converged` and `Optimum.ended`. A few
+    more steps remove small violations that remain when the steps are used up.
 
-    max_steps: trials at most. callback: called after each. target_merit: the search ends as soon as
-    its score, merit plus the squares of what exceeds limits, is no more; 0: at the optimum.
+    vector: (N,), start of the variables; None for that of the problem.
+    max_steps: largest number of trials.
+    callback: called with the search after each trial.
+    target_merit: the search ends once its score is at most this; 0 to search for the optimum.
 
-    `Optimum.converged` tells whether it is an optimum, `Optimum.ended` why it is none. If steps
-    are used up, limits that are almost kept are made good by some more.
-
-    One program is compiled for a problem, and serves all others that differ in numbers or names
-    alone. ValueError if the
-    start itself cannot be judged: a lens whose surfaces overlap or of which no number is finite;
-    and for a limit of an edge that it exceeds and no variable moves.
+    One compiled program serves all problems that differ only in numbers or names. ValueError if the
+    start cannot be evaluated (no ray of a field passes, or a number is not finite), and for a limit
+    that the start violates and no variable changes.
     """
     if not concrete((problem, vector)):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""A lens as it is made: errors of its parts as a vector."""
+"""A lens as built: the deviations of its parts as a vector."""
 
 import dataclasses
 import itertools
@@ -36,12 +36,14 @@ _MINUTE = math.pi / 180 / 60
 class PerturbedLens:
     """A lens with P deviations.
 
-    lens: without any, in the form that deviations need. beam_radius: (S,), of the light on its
-    surfaces, mm. sizes: (P,), the largest deviations, in the units of `Tolerance`.
+    lens: the nominal lens, with all arrays that deviations need.
+    beam_radius: (S,), radius of the beam footprint on each surface, mm.
+    sizes: (P,), largest deviations, in the units of `Tolerance`.
 
     Static:
-    deviations: those in x and in y of one part are neighbours. spans: first and last surface of
-    the elements. groups: the place of each among `lens.elements`.
+    deviations: P of them; the components x and y of one part follow each other.
+    spans: first and last surface of each element.
+    groups: index of each element in `lens.elements`.
     """
 
     lens: Lens
@@ -55,12 +57,11 @@ class PerturbedLens:
     def from_lens(
         cls, lens: Lens, beam_radius: Array, tolerances: Sequence[Tolerance]
     ) -> "PerturbedLens":
-        """The errors that some tolerances allow.
+        """The lens with the deviations that tolerances allow.
 
-        beam_radius: (S,), how far from the axis light meets each surface, mm, such as
-            `Problem.beam_radius`.
+        beam_radius: (S,), mm, for instance that of `Problem.beam_radius`.
 
-        ValueError, which lists what there is, for a part that does not exist or stands twice.
+        ValueError for a part that does not exist (it lists those that do) or is named twice.
         """
         if np.shape(beam_radius) != (lens.count,):
             raise ValueError(
@@ -78,8 +79,8 @@ class PerturbedLens:
         return cls(lens, jnp.asarray(beam_radius, dtype), largest, tuple(sizes), spans, groups)
 
     def lens_of(self, perturbation: Array) -> Lens:
-        """The lens with a perturbation (P,), deviations in parts of their largest. Differentiable,
-        in `jit` and `vmap` too; small errors of several kinds add up in any order."""
+        """The lens with a perturbation (P,): deviations in units of their largest. Works in `jit`,
+        `vmap` and under differentiation."""
         lens = self.lens
         found: dict[str, list[tuple[Deviation, Array]]] = {}
         for k, error in enumerate(self.deviations):
@@ -123,8 +124,8 @@ class PerturbedLens:
 def _with_elements(
     lens: Lens, spans: tuple[tuple[int, int], ...], kinds: set[str]
 ) -> tuple[Lens, tuple[int, ...]]:
-    """The same lens with a group for each element if any may move, and the groups' numbers; within
-    groups that it has already, and around those that are part of an element."""
+    """The same lens with a group for each element, and the indices of these groups; unchanged if no
+    deviation moves an element. Groups that the lens has stay, inside or around them."""
     if not any(KINDS[kind].whole == "element" for kind in kinds):
         return lens, ()
     zero = jnp.zeros((len(spans), 3), lens.curvature.dtype)
@@ -135,11 +136,11 @@ def _with_elements(
             if a < first <= b < last or first < a <= last < b:
                 raise ValueError(
                     f"tolerances: the element of surfaces {first} to {last} is cut by that of the "
-                    f"prescription, {a} to {b}; put one inside the other, or apart"
+                    f"lens file, {a} to {b}; put one inside the other, or apart"
                 )
         arrays.insert(0, (old.shift, old.tilt, old.pivot))
         where, about = [*old.spans, *where], [*old.about, *about]
-    # One that holds another comes first.
+    # A group comes before the groups inside it.
     order = sorted(range(len(where)), key=lambda g: (where[g][0], -where[g][1], g))
     shift, tilt, pivot = (jnp.concatenate(parts)[np.array(order)] for parts in zip(*arrays))
     elements = Elements(
@@ -150,7 +151,7 @@ def _with_elements(
 
 
 def _with_cylinders(lens: Lens) -> Lens:
-    """The same lens with biconics in place of aspheres, curved alike in both directions."""
+    """The same lens with every asphere as a biconic of equal curvatures."""
     round_ = np.array([form == "asphere" for form in lens.forms])
     own = jnp.stack([lens.curvature, lens.conic], axis=1)
     wide = jnp.concatenate([own, lens.coefficients], axis=1)
@@ -161,7 +162,7 @@ def _with_cylinders(lens: Lens) -> Lens:
 
 
 def _bent(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
-    """Curvatures changed, and those along x, where surfaces have one of their own."""
+    """The lens with curvatures of surfaces `at` changed, and those along x by `across`."""
     own = np.array([lens.forms[i] in WITH_X for i in at])
     coefficients = lens.coefficients
     if own.any():
@@ -171,8 +172,8 @@ def _bent(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
 
 
 def _rise(lens: Lens, at: np.ndarray, beam_radius: Array) -> Array:
-    """By how far the rim of the light moves along the normal of some surfaces, mm, for a change of
-    their curvature along y of 1/mm."""
+    """Displacement of surfaces `at` along the normal at the rim of the beam, mm per 1/mm of
+    curvature along y."""
     shape = jax.tree.map(lambda a: a[..., at], lens.shape)
     forms, zero = tuple(lens.forms[i] for i in at), jnp.zeros(len(at), lens.curvature.dtype)
 
@@ -187,10 +188,10 @@ def _rise(lens: Lens, at: np.ndarray, beam_radius: Array) -> Array:
 
 
 def _medium(lens: Lens, nominal: Dispersion, kind: str, at: np.ndarray, by: Array) -> Dispersion:
-    """Dispersion with nd of some media off, or with vd off by per cent and nd kept.
+    """Dispersion with a change of nd of media `at`, or of vd by per cent at constant nd.
 
-    Of a glass of which a formula is known, n^2 is changed by a constant or by a term in 1 / L^2, as
-    large as this takes at the lines d, or F and C.
+    For a glass with a formula, n^2 changes by a constant, or by a term in 1/L^2, that gives this
+    change at the d line, or between the F and C lines.
     """
     constants, model = lens.dispersion, lens.dispersion.model
     own = jnp.zeros(len(at), bool)

@@ -1,4 +1,4 @@
-"""A design problem: variables, and what is wanted of the lens from all its fields."""
+"""A design problem: variables, a scene and operands."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -29,12 +29,12 @@ from .operands import Operand, OperandFunction, OperandName
 from .values import OPERANDS, kind_of
 from .variables import Variables
 
-# A ray that fails counts as one that misses by so many semi-diameters of the stop, and more.
+# Least miss that a failed ray counts for, in semi-diameters of the stop.
 _FAILED = 4.0
-# A limit that is as far exceeded, to a part, by numbers that differ by up to so many scales, is one
-# that no variable moves.
+# No variable changes a limit if its violation differs by at most `_STILL` (relative) at vectors
+# that differ by up to `_BESIDE`.
 _BESIDE, _STILL = 0.3, 1e-9
-# The stop is at least so wide, as part of the light's width on any surface.
+# Least width of the beam at the stop, relative to that on any surface.
 _SLIMMEST = 0.1
 
 
@@ -46,8 +46,8 @@ def _check_operands(
     distances: np.ndarray,
     rule: PupilRule,
 ) -> None:
-    """ValueError for operands that do not fit the lens, the scene or the rule. fields, wavelengths:
-    how many; distances: (Z,), mm."""
+    """Raises ValueError for operands that do not fit the lens, the scene or the rule. fields,
+    wavelengths: their numbers. distances: (Z,), mm."""
     if not operands:
         raise ValueError("operands: none; a merit needs at least one, such as spot")
     counts = {"fields": fields, "wavelengths": wavelengths, "distances": len(distances)}
@@ -66,7 +66,7 @@ def _check_operands(
 
 
 def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
-    """Weights (count,), 1 on the average. ValueError for what they are not."""
+    """Weights (count,) with the mean 1. ValueError for a wrong shape or value."""
     found = np.asarray(given, float)
     good = found.shape == (count,) and np.all(np.isfinite(found) & (found >= 0))
     if not good or not np.any(found):
@@ -77,21 +77,22 @@ def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What is varied, and what is asked of the lens. Whatever is a number is a leaf: another one
-    compiles nothing.
+    """A design problem. All numbers are leaves, so that another number compiles nothing.
 
-    variables: see there.
-    fields: (F, 2), angles in radians. distances: (Z,), of the object in mm; every field is seen
-        from every distance. wavelengths: (W,) in um.
-    wavelength_weights: (W,), of their light, adding up to 1.
-    rule: of the pupil; the same for all fields.
-    operands: what is asked, as `Operand.placed` has it.
-    field_weights: (F,), of the squares of the residuals of each field, 1 on the average; None: 1.
+    variables: the variables of the lens.
+    fields: (F, 2), radians.
+    distances: (Z,), distances of the object, mm; every field is traced at every distance.
+    wavelengths: (W,), um.
+    wavelength_weights: (W,), with the sum 1.
+    rule: pupil rule of all fields.
+    operands: operands as `Operand.placed` returns them.
+    field_weights: (F,), factors of the squares of the residuals of each field, with the mean 1;
+        None for 1.
 
     Static:
-    solver: how rays are found: by the full search, so that no ray counts as failed that exists.
-        `optimise`, `many_starts` and `monte_carlo` try with `solve_aimed`, the smaller program, and
-        ask the full search where that misses a ray.
+    solver: ray solver. The default, a full search, finds every ray that exists. `optimise`,
+        `many_starts` and `monte_carlo` first use `solve_aimed`, a smaller program, and the full
+        search only where that misses a ray.
     """
 
     variables: Variables
@@ -116,17 +117,20 @@ class Problem:
         wavelength_weights: Numbers | None = None,
         field_weights: Numbers | None = None,
     ) -> "Problem":
-        """The problem of some variables.
+        """Makes a problem.
 
-        operands: at least one that is not off; a word or a function is one of a weight of 1.
-        fields: (F,) along y or (F, 2), in radians. wavelengths: (W,) or one, um. distances: (Z,) or
-        one, mm. rule: of the pupil, or the order of a Gauss rule. wavelength_weights: (W,),
-        field_weights: (F,), of any sum; None: equal. Limits hold for all fields, whatever their
-        weights.
+        operands: operands, at least one with a weight above 0; a name or function stands for an
+            operand of weight 1.
+        fields: one, (F,) along y, or (F, 2), radians.
+        wavelengths: one or (W,), um.
+        distances: one or (Z,), mm.
+        rule: pupil rule, or the order of a Gauss rule.
+        wavelength_weights: (W,), of any sum; None for equal weights.
+        field_weights: (F,), of any sum; None for equal weights. Limits do not depend on them.
 
-        ValueError, which names the argument, for what fits neither lens nor problem, and for a
-        limit that the lens exceeds and no variable moves (of edges, which need rays, `optimise`
-        says so).
+        ValueError, which names the argument, if an argument does not fit the lens or the problem,
+        and for a limit that the lens violates and no variable changes. (For limits that need rays,
+        `optimise` raises it.)
         """
         lens = variables.lens
         asked = tuple(o if isinstance(o, Operand) else Operand(o) for o in operands)
@@ -171,8 +175,8 @@ class Problem:
         return any(kind_of(operand.kind).traced for operand in self.operands)
 
     def evaluate(self, vector: Array) -> Evaluation:
-        """What operands say of a vector (N,) of the variables. Differentiable, in `jit` and `vmap`
-        too."""
+        """Residuals, constraints, overlap and failed rays at a vector (N,) of the variables. Works
+        in `jit`, `vmap` and under differentiation."""
         lens = self.variables.lens_of(vector)
         rays = _rays(self, lens)
         parts = [operand.residuals(lens, rays, self.field_weights) for operand in self.operands]
@@ -183,7 +187,7 @@ class Problem:
         radius = beam_radius(lens, rays) if self.traces else jnp.zeros(lens.count, vector.dtype)
         both = [gaps(lens, radius, glass) for glass in (True, False)]
         overlap = sum(jnp.sum(jnp.maximum(-part, 0)) for pair in both for part in pair)
-        # A stop at a focus of the light would make any lens perfect: all rays are one.
+        # With the stop at a focus of the beam all rays coincide, and any lens seems perfect.
         system = paraxial_system(lens, self.wavelengths)
         marginal = marginal_ray(system, vergence_of(self.distances[0])).height
         slim = _SLIMMEST * jnp.max(jnp.abs(marginal)) - jnp.abs(system.aperture)
@@ -194,8 +198,7 @@ class Problem:
         return Evaluation(residuals, constraints, jax.lax.stop_gradient(overlap), failed)
 
     def _failures(self, lens: Lens, rays: FieldRays) -> Array:
-        """A residual for each ray: 0 for one that arrives, else the root of its part of the light
-        times a miss of several beams."""
+        """Residuals of failed rays, see `failures`, in the unit of the operand that weighs most."""
         size = _FAILED * jax.lax.stop_gradient(lens.semi_diameter[lens.stop])
         weights = [o.weight * kind_of(o.kind).per_mm for o in self.operands if not o.limits]
         weight = jnp.max(jnp.stack(weights)) if weights else 1.0
@@ -215,15 +218,18 @@ class Problem:
         return limits_of(self.operands, lens, counts, sizes, np.asarray(constraints))
 
     def elsewhere(self, vector: Array) -> Array:
-        """A vector (N,) beside another, within the bounds, of which no number is the same."""
+        """A vector (N,) near another, within the bounds, with every number changed."""
         low, high = self.variables.low, self.variables.high
         move = _BESIDE * jnp.cos(1 + 2 * jnp.arange(vector.size, dtype=vector.dtype))
         move = jnp.where((vector + move < low) | (vector + move > high), -move, move)
         return jnp.clip(vector + move, low, high)
 
     def refuse_fixed(self, constraints: Numbers, beside: Numbers) -> None:
-        """ValueError, which names it, for a limit that is exceeded (L,) and by as much beside.
-        Not of rays: those that fail have no derivative until they pass."""
+        """Raises ValueError for a limit that is violated by as much at a nearby vector. Limits on
+        rays are left out: a failed ray does not change until it passes.
+
+        constraints, beside: (L,), constraints at both vectors.
+        """
         one, two = np.asarray(constraints), np.asarray(beside)
         for limit, there in zip(self.limits(one), self.limits(two)):
             if limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names:
@@ -237,11 +243,11 @@ class Problem:
 
     @jax.jit
     def _exceeded(self, vector: Array) -> Array:
-        """Of limits that need no rays: by how much they are exceeded."""
+        """Constraints of operands that need no rays, at a vector (N,)."""
         return self._constraints(self.variables.lens_of(vector), self.views())
 
     def _refuse_fixed(self) -> None:
-        """The same for the limits that need no rays."""
+        """Calls `refuse_fixed` for limits that need no rays."""
         some = tuple(o for o in self.operands if o.limits and not kind_of(o.kind).traced)
         if some and concrete(self):
             part = dataclasses.replace(self, operands=some)
@@ -250,12 +256,12 @@ class Problem:
 
     @jax.jit
     def beam_radius(self, lens: Lens) -> Array:
-        """How far from the axis the light meets each surface (S,) of a lens, mm."""
+        """Radius of the beam footprint on each surface of a lens (S,), mm."""
         return beam_radius(lens, trace_fields(self, lens))
 
     @jax.jit
     def failed(self, vector: Array) -> Array:
-        """How many rays fail, (), int32; see `Evaluation`."""
+        """Number of failed rays, (), int32."""
         return self.evaluate(vector).failed
 
     @jax.jit
@@ -272,7 +278,7 @@ def trace_fields(problem: Problem, lens: Lens) -> FieldRays:
 
 
 def _rays(problem: Problem, lens: Lens) -> FieldRays:
-    """The rays of a lens, as far as operands need them."""
+    """The views of a lens, with rays if any operand needs them."""
     views = problem.views()
     return trace_views(lens, views, problem.rule, problem.solver) if problem.traces else views
 
@@ -283,5 +289,5 @@ def _constraints_of_each(problem: Problem, lens: Lens) -> list[Array]:
 
 
 def quick(problem: Problem) -> Problem:
-    """The problem with the smaller program: rays are aimed, not searched for."""
+    """The problem with `solve_aimed`, a smaller program without the full ray search."""
     return dataclasses.replace(problem, solver=solve_aimed)

@@ -23,7 +23,7 @@ from ..rays.solve import solve_aimed
 from .field_rays import symmetry_by_structure
 from .kinds import KINDS, back_distance, step_of
 
-# In the order in which they are applied: none moves what one before it keeps, see `fix_solves`.
+# In the order of application: no solve changes what an earlier one fixes, see `fix_solves`.
 _Name = Literal[
     "focal_length",
     "effective_focal_length",
@@ -35,34 +35,34 @@ _Name = Literal[
 ]
 # Compiled where numbers are known, part of the caller's program in a trace.
 _program = functools.partial(jax.jit, inline=True)
-# Newton steps: every condition is linear in the number that meets it, the second mends rounding.
+# Newton steps: every condition is linear in its number; the second step removes rounding errors.
 _STEPS = 2
 _ORDER = 6  # of the rule of the best focus
-# Relative tolerance of a solve; also the least relative change of what it keeps by a typical step
-# of the number that follows.
+# Relative tolerance of a solve; also the least relative sensitivity to the solved number.
 _TOLERANCE = 1e-9
-_NO_SURFACE = 5000  # prescriptions have at most so many, settings no negative numbers
+_NO_SURFACE = 5000  # larger than any number of a surface; settings have no negative numbers
 
 
 @leaves("value", "fields", "distance", "wavelengths")
 @dataclasses.dataclass(frozen=True)
 class Solve:
-    """A condition and the number that is given up for it.
+    """A condition, and the number of the lens that is solved for it. A pytree: kind and surface are
+    static; in a problem, numbers are arrays.
 
-    kind: "focal_length" in image space or "effective_focal_length" in air, in mm, or "image_angle",
-        the paraxial slope of the marginal ray behind the lens, negative where light converges: the
-        curvature of `surface` follows. "paraxial_focus",
-        or "best_focus" where the spots of `fields`, each wavelength about its own centroid, are
-        smallest (the root of their mean square): the distance of the sensor behind the last vertex
-        follows. "entrance_pupil", its diameter in mm, or "f_number", the working one: the
-        semi-diameter of the stop follows.
-    value: to keep; 0: that of the lens at the start; of a focus, mm from there to the sensor.
-    surface: whose curvature follows, from 0.
-    fields: of the best focus, radians along y.
-    distance: to the object, mm; of a focus, image_angle and f_number.
-    wavelengths: um; a condition is one of their mean.
-
-    A pytree: kind and surface are static; in a problem numbers are arrays.
+    kind: one of these.
+        Solved by the curvature of `surface`: "focal_length" in image space, mm;
+        "effective_focal_length" in air, mm; "image_angle", the paraxial slope of the marginal ray
+        behind the lens, negative for converging light.
+        Solved by the distance of the sensor from the last vertex: "paraxial_focus"; "best_focus",
+        of least mean square spots of `fields`, each wavelength about its own centroid.
+        Solved by the semi-diameter of the stop: "entrance_pupil", its diameter, mm; "f_number", the
+        working f-number.
+    value: value of the condition; 0 for that of the lens at the start. For a focus, distance from
+        the focus to the sensor, mm.
+    surface: number of the surface whose curvature is solved, from 0.
+    fields: fields of the best focus along y, radians.
+    distance: distance of the object, mm, for a focus, image_angle and f_number.
+    wavelengths: um; the condition holds for the mean over them.
     """
 
     kind: _Name
@@ -80,7 +80,7 @@ class Solve:
             raise ValueError(f"solves: {self.kind}: value: must be finite, got {self.value:g}")
         if self.aperture and self.value < 0:
             raise ValueError(
-                f"solves: {self.kind}: value: must be above 0, or 0 to keep that of the start, "
+                f"solves: {self.kind}: value: must be above 0, or 0 for that of the start, "
                 f"got {self.value:g}"
             )
         for name in ("fields", "wavelengths"):
@@ -91,19 +91,17 @@ class Solve:
 
     @property
     def focuses(self) -> bool:
-        """Whether the sensor follows."""
+        """True if the sensor is solved."""
         return self.kind in ("paraxial_focus", "best_focus")
 
     @property
     def aperture(self) -> bool:
-        """Whether the stop follows."""
+        """True if the semi-diameter of the stop is solved."""
         return self.kind in ("entrance_pupil", "f_number")
 
     def place(self, lens: Lens) -> tuple[str, int, int]:
-        """Kind, row and term of the number that follows.
-
-        ValueError if there is none, or if it does not determine the condition.
-        """
+        """Kind, row and term of the solved number. ValueError if there is none, or if the condition
+        does not depend on it."""
         if self.focuses:
             return "sensor", 0, 0
         if self.aperture:
@@ -121,8 +119,8 @@ class Solve:
         return "curvature", self.surface, 0
 
     def placed(self, lens: Lens) -> "Solve":
-        """The solve of a problem: numbers as arrays of the lens' dtype, None for a field on the
-        axis, which needs fewer rays."""
+        """The solve for a problem: numbers as arrays in the dtype of the lens; None for the axial
+        field, which needs fewer rays."""
         own = copy.copy(self)
         if concrete(self.fields):
             fields = tuple(field or None for field in self.fields)
@@ -130,8 +128,8 @@ class Solve:
         return jax.tree.map(lambda number: jnp.asarray(number, lens.curvature.dtype), own)
 
     def fixed(self, lens: Lens) -> "Solve":
-        """The solve with the value that it keeps. ValueError where that is none, or where the
-        number that follows does not change it."""
+        """The solve with its value filled in. ValueError if the lens has no such value, or if the
+        solved number does not change it."""
         kind, row, term = self.place(lens)
         if self.focuses:
             if not float(_focus(lens, self.placed(lens))[1]) > 0:
@@ -159,22 +157,21 @@ class Solve:
 
     @_program
     def rate(self, lens: Lens, other: "Solve") -> Array:
-        """By how much what this one keeps changes with the number that follows from another."""
+        """Derivative () of this condition by the solved number of another solve."""
         number, with_number = _number(lens, other)
         measure = _CONDITIONS[self.kind].measure
         one = jnp.ones_like(number)
         return jax.jvp(lambda n: measure(with_number(n), self), (number,), (one,))[1]
 
     def apply(self, lens: Lens) -> Lens:
-        """The lens with the number that meets the condition; unchanged where none does."""
+        """The lens with the solved number; unchanged if no number meets the condition."""
         with_number, own = _number(lens, self)[1], self.placed(lens)
         return with_number(_focus(lens, own)[0] if self.focuses else _met(lens, own))
 
 
 def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], Lens]:
-    """The solves with what they keep, in the order in which all hold, numbers as arrays; and the
-    lens of which they do. ValueError as of `Solve.fixed`, and where one changes what another keeps.
-    """
+    """The solves with their values, as arrays, in the order of application; and the lens that meets
+    them. ValueError as in `Solve.fixed`, and if one solve changes the condition of another."""
     found: list[Solve] = []
     for solve in sorted(solves, key=lambda solve: get_args(_Name).index(solve.kind)):
         for other in found:
@@ -195,7 +192,7 @@ def _measure(lens: Lens, solve: Solve) -> Array:
 
 @_program
 def _met(lens: Lens, solve: Solve) -> Array:
-    """The number () that meets a condition, by Newton's method."""
+    """The solved number (), by Newton's method."""
     number, with_number = _number(lens, solve)
     condition = _CONDITIONS[solve.kind]
 
@@ -209,7 +206,7 @@ def _met(lens: Lens, solve: Solve) -> Array:
 
 
 def _number(lens: Lens, solve: Solve) -> tuple[Array, Callable[[Array], Lens]]:
-    """The number () that follows, and the lens with another."""
+    """The solved number () of a lens, and a function from such a number to the lens with it."""
     kind, row, term = solve.place(lens)
     array = KINDS[kind].read(lens)
 
@@ -220,8 +217,11 @@ def _number(lens: Lens, solve: Solve) -> tuple[Array, Callable[[Array], Lens]]:
 
 
 class _Condition(NamedTuple):
-    """measure: linear in the number that follows. value: what it is to be for what is kept, and
-    back."""
+    """A condition.
+
+    measure: function of the lens and the solve, linear in the solved number.
+    value: conversion between `Solve.value` and the measure, its own inverse.
+    """
 
     measure: Callable[[Lens, Solve], Array]
     value: Callable[[Any], Any]
@@ -239,7 +239,7 @@ def _power(lens: Lens, solve: Solve) -> Array:
 
 
 def _slope(lens: Lens, solve: Solve) -> Array:
-    """Of the marginal ray behind the lens."""
+    """Paraxial slope of the marginal ray behind the lens."""
     vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
     return jnp.mean(
         marginal_ray(paraxial_system(lens, _wavelengths(lens, solve)), vergence).behind[-1]
@@ -272,8 +272,8 @@ _CONDITIONS = {
 
 @_program
 def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
-    """The distance () from the last vertex to `solve.value` mm behind the focus, mm, and how
-    sharp the focus is, 0 where there is none."""
+    """Distance () from the last vertex to `solve.value` mm behind the focus, mm, and a measure of
+    the convergence, 0 where there is no focus."""
     waves = _wavelengths(lens, solve)
     if solve.kind == "paraxial_focus":
         vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))

@@ -1,4 +1,4 @@
-"""Many starts: searches side by side, the better half kept again and again, their minima ranked."""
+"""Many starts: parallel searches with successive halving, and a ranking of their minima."""
 
 import concurrent.futures
 import dataclasses
@@ -24,21 +24,21 @@ from .variables import Variables
 
 # Searches of one tile share a program and a core.
 _TILE = 16
-# Two minima are one if their merits differ by less than a part, and their numbers by less, in
-# units of their scales (root mean square).
+# Two minima are the same if their merits differ by less than `_SAME_MERIT` (relative), and their
+# vectors by less than `_SAME_PLACE` (root mean square, in units of the scales).
 _SAME_MERIT, _SAME_PLACE = 1e-3, 1.0
 
 
 def normal_starts(variables: Variables, count: int, spread: float, seed: int = 0) -> np.ndarray:
-    """Starts (count, N) about the lens: the first is its own vector, the others differ by normal
-    deviates of `spread` times the scales of the variables, within their bounds."""
+    """Starts (count, N) about the lens within the bounds: its own vector, then vectors with normal
+    deviates. spread: their standard deviation, in units of the scales of the variables."""
     moves = np.random.default_rng(seed).normal(size=(count, len(variables.places)))
     moves[0] = 0
     return np.clip(np.asarray(variables.start) + spread * moves, variables.low, variables.high)
 
 
 def sobol_starts(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
-    """Starts (count, N), evenly spread within the bounds (Sobol's sequence, scrambled).
+    """Starts (count, N), evenly distributed within the bounds (scrambled Sobol sequence).
 
     ValueError, which names it, for a variable without bounds.
     """
@@ -54,8 +54,11 @@ def sobol_starts(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
 def as_built_starts(
     variables: Variables, count: int, per_cent: float = 1.0, off_mm: float = 0.1, seed: int = 0
 ) -> np.ndarray:
-    """Starts (count, N) from the lens as it might be built: normal deviates of all curvatures by
-    `per_cent` and of all thicknesses by `off_mm` (standard deviations)."""
+    """Starts (count, N) from the lens as it might be built, with normal deviates.
+
+    per_cent: standard deviation of all curvatures, per cent.
+    off_mm: standard deviation of all thicknesses, mm.
+    """
     rng, lens, vectors = np.random.default_rng(seed), variables.lens, []
     for _ in range(count):
         bend = 1 + 0.01 * per_cent * rng.normal(size=lens.count + 1)
@@ -68,8 +71,10 @@ def as_built_starts(
 class Minimum(NamedTuple):
     """One of the distinct minima.
 
-    vector: (N,). merit, max_violation: see `Optimum`. found: how many searches ended there.
-    start: the number of the one that came lowest.
+    vector: (N,), its vector.
+    merit, max_violation: as in `Optimum`.
+    found: number of searches that ended there.
+    start: number of the start of the search with the lowest score.
     """
 
     vector: np.ndarray
@@ -80,11 +85,14 @@ class Minimum(NamedTuple):
 
 
 class Starts(NamedTuple):
-    """What many starts came to.
+    """Result of many starts.
 
-    minima: the distinct ones, best first. steps, jacobians, rays: of all searches. seconds: of all
-    of it; compile_s: of these, before anything was evaluated. best: the best score after each tile.
-    merits: (K,), of every start where its search was left, inf for one that never passed a ray.
+    minima: the distinct minima, best first.
+    merits: (K,), score of every start at the end of its search; inf if no ray ever passed.
+    steps, jacobians, rays: totals over all searches.
+    seconds: total time.
+    compile_s: time of the compilation, part of `seconds`.
+    best: best score after each tile.
     """
 
     minima: list[Minimum]
@@ -102,7 +110,7 @@ _begin = jax.jit(jax.vmap(init_problem, (None, 0)))
 
 @partial(jit, wanted=LARGE)
 def _advance(problem: Problem, searches: Search, steps: Array) -> Search:
-    """So many steps of a tile of searches, fewer if all are done."""
+    """Takes `steps` steps of a tile of searches, fewer if all are done."""
     both = jax.vmap(step_problem, (None, 0))
 
     def more(state: tuple[Array, Search]) -> Array:
@@ -120,14 +128,14 @@ def many_starts(
     callback: Callable[[int, int, float], None] = lambda done, total, best: None,
     threads: int | None = None,
 ) -> Starts:
-    """Search from many starts (K, N), with successive halving (Jamieson and Talwalkar 2016).
+    """Searches from many starts with successive halving (Jamieson and Talwalkar 2016). A search
+    that fails is ranked last. The result does not depend on threads or tiles.
 
-    steps: of every search in each stage. survivors: the part that goes on to the next, at least
-    a tile of 16. callback: called with the tiles done, all tiles, and the best merit so far.
-    threads: tiles at a time; None: one a core.
-
-    A search that fails stays where it is and is ranked last. The result depends on neither threads
-    nor tiles.
+    starts: (K, N).
+    steps: steps of every search in each stage.
+    survivors: fraction that continues to the next stage, at least a tile of 16.
+    callback: called with the tiles done, all tiles, and the best score so far.
+    threads: number of threads; None for one per core.
     """
     begun = time.perf_counter()
     vectors = np.asarray(starts, float)
@@ -168,8 +176,8 @@ def many_starts(
 def _searched(
     problem: Problem, state: Search, alive: np.ndarray, steps: int, threads: int | None
 ) -> Iterator[None]:
-    """Go on, as `_advanced`, with those of which the full search of the problem finds rays that
-    aiming did not."""
+    """Continues, as `_advanced`, the searches in which the full ray search finds rays that aiming
+    did not."""
     failed = np.asarray(state.evaluation.failed)[alive]
     missed = [
         row
@@ -185,7 +193,7 @@ def _searched(
 def _advanced(
     problem: Problem, state: Search, tiles: list[np.ndarray], steps: int, threads: int | None
 ) -> Iterator[None]:
-    """Advance tiles of searches, the rows of `state`, in place; yields after each."""
+    """Advances tiles of searches (rows of `state`) in place; yields after each tile."""
 
     def run(rows: np.ndarray) -> None:
         whole = np.resize(rows, _TILE)  # a tile that is not full repeats its rows
@@ -209,7 +217,7 @@ def _rows(tree: Search, rows: np.ndarray) -> Search:
 
 
 def rays_of(problem: Problem) -> int:
-    """How many rays one judgement traces."""
+    """Number of rays that one evaluation traces."""
     if not problem.traces:
         return 0
     rays = jax.eval_shape(lambda p: trace_fields(p, p.variables.lens).weights, problem)
@@ -217,7 +225,7 @@ def rays_of(problem: Problem) -> int:
 
 
 def distinct(searches: Search, numbers: np.ndarray) -> list[Minimum]:
-    """The distinct minima that searches (K,) with their numbers of starts came to, best first."""
+    """The distinct minima of searches (K,), best first. numbers: (K,), numbers of their starts."""
     scores, vectors = np.asarray(searches.score), np.asarray(searches.vector)
     violations = np.asarray(searches.max_violation)
     found: list[Minimum] = []

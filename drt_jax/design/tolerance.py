@@ -1,8 +1,8 @@
-"""Tolerances: what errors of the parts do to the spots, by derivatives and by Monte Carlo.
+"""Tolerances: the effect of deviations on the spots, by derivatives and by Monte Carlo.
 
 The measure q of a lens is the mean over its fields of the squared RMS radius of the polychromatic
-spot, after the compensators have done their best. Spots are quadratic in where the sensor is, so
-that this is a small linear system, solved for every lens.
+spot, after optimal compensation. Squared radii are quadratic in the position of the sensor, so that
+a small linear system gives the compensation of every lens.
 """
 
 import concurrent.futures
@@ -25,22 +25,22 @@ from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
 from .perturbed import PerturbedLens
 from .problem import Problem, quick
 
-# What is adjusted in every lens: the sensor's distance, or its tilts about x and y, too.
+# Adjustment of every lens: the distance of the sensor, or also its tilts about x and y.
 Compensator = Literal["none", "focus", "focus and tilt"]
-# Of a prediction: q from its gradient, from first derivatives of rays, from all second derivatives.
+# Order of a prediction: gradient of q, Gauss-Newton part of its Hessian, or whole Hessian.
 Order = Literal["first", "rays", "second"]
 _TILE = 50  # lenses of a tile, in one program on one core
 _STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
 _SYMMETRIES = ("rotational", "bilateral", "none")  # from the least of the pupil to all of it
-_ASCENTS = 16  # from so many eigenvectors, either way
-_DEVIATION = 0.5  # of normal errors, in parts of the largest
+_ASCENTS = 16  # eigenvectors from which ascents start, in both directions
+_DEVIATION = 0.5  # standard deviation of normal deviations, in units of the largest
 
 
 class AsBuilt(NamedTuple):
-    """A lens as it is made, after compensation.
+    """A lens as built, after compensation.
 
     squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
-    moves: (C,), of the compensators: mm of the sensor, then its tilts about x and -y, radians.
+    moves: (C,), compensation: shift of the sensor, mm, then its tilts about x and -y, radians.
     """
 
     squares: Array
@@ -100,11 +100,11 @@ def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tupl
 
 
 def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
-    """A lens seen from the fields of a problem, after compensation. Differentiable, in `jit` and
-    `vmap` too.
+    """Evaluates a lens at the fields of a problem after compensation. Works in `jit`, `vmap` and
+    under differentiation.
 
-    ValueError for a compensator that is unknown or that the fields do not determine, and for a rule
-    that leaves out part of the pupil of a lens that is not symmetric.
+    ValueError for an unknown compensator, for one that the fields do not determine, and for a rule
+    with more symmetry than the lens.
     """
     _check(problem, lens, compensator)
     return _compensated(problem, lens, compensator)[0]
@@ -120,8 +120,8 @@ def _check(problem: Problem, lens: Lens, compensator: str) -> None:
     has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
     if _SYMMETRIES.index(has) < _SYMMETRIES.index(needs):
         raise ValueError(
-            f'rule: "{has}" leaves out part of the pupil, but errors make the lens unsymmetric; '
-            f'take one of symmetry "{needs}", such as Gauss(6, "{needs}")'
+            f'rule: "{has}" leaves out part of the pupil, but deviations break the symmetry; '
+            f'use one of symmetry "{needs}", such as Gauss(6, "{needs}")'
         )
     if compensator == "focus and tilt" and concrete(problem.fields):
         tangents = np.tan(np.asarray(problem.fields, float))
@@ -133,11 +133,15 @@ def _check(problem: Problem, lens: Lens, compensator: str) -> None:
 
 
 class Predicted(NamedTuple):
-    """q = mean squared RMS radius, mm^2, as a function of errors in parts of their largest.
+    """Model of q, the mean squared RMS radius, mm^2, as a function of deviations in units of their
+    largest.
 
-    nominal: (), q without errors. gradient: (P,). gauss: (P, P), of the second derivatives the part
-    that follows from first derivatives of rays. hessian: (P, P), all of them. moves: (C,), of the
-    compensators without errors, see `AsBuilt`; move_slopes: (P, C), their derivatives.
+    nominal: (), q without deviations.
+    gradient: (P,), first derivatives.
+    gauss: (P, P), Gauss-Newton part of the Hessian, 2 J^T J.
+    hessian: (P, P), second derivatives.
+    moves: (C,), compensation without deviations, see `AsBuilt`.
+    move_slopes: (P, C), derivatives of the compensation.
     """
 
     nominal: Array
@@ -148,15 +152,15 @@ class Predicted(NamedTuple):
     move_slopes: Array
 
     def matrix(self, order: Order) -> Array:
-        """The second derivatives (P, P) that an order knows: none, those of first derivatives of
-        rays, or all. ValueError for another order."""
+        """Matrix (P, P) of an order: 0 for "first", `gauss` for "rays", `hessian` for "second".
+        ValueError for another order."""
         _require_known("order", order, get_args(Order))
         if order == "first":
             return 0 * self.hessian
         return self.gauss if order == "rays" else self.hessian
 
     def at(self, perturbation: Array | np.ndarray, order: Order) -> Array:
-        """q (K,) of errors (K, P); below 0 where the model fails. ValueError as `matrix`."""
+        """q (K,) for deviations (K, P); below 0 where the model fails. ValueError as `matrix`."""
         return (
             self.nominal
             + perturbation @ self.gradient
@@ -164,9 +168,9 @@ class Predicted(NamedTuple):
         )
 
     def moments(self, variances: Array, order: Order) -> tuple[Array, Array]:
-        """Mean and standard deviation of q, (), for errors that are independent, with these
-        variances (P,). The first is that of the quadratic, the second adds up as of normal errors
-        (root sum of squares). ValueError as `matrix`."""
+        """Mean and standard deviation of q, () each, for independent deviations with variances
+        (P,). The mean is exact for the quadratic model; the standard deviation holds for normal
+        deviations (root sum of squares). ValueError as in `matrix`."""
         matrix = self.matrix(order)
         mean = self.nominal + jnp.diag(matrix) @ variances / 2
         pairs = variances @ matrix**2 @ variances / 2
@@ -174,7 +178,7 @@ class Predicted(NamedTuple):
 
 
 def predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
-    """What first and second derivatives say, each exact. ValueError as `as_built`."""
+    """Predicts q from exact first and second derivatives. ValueError as in `as_built`."""
     _check(problem, perturbed.lens, compensator)
     if not concrete((problem, perturbed)):
         return _predict(problem, perturbed, compensator)
@@ -208,7 +212,7 @@ _predict = jit(_predict_all, ONCE, static_argnums=2)
 
 
 def _parts(perturbed: PerturbedLens) -> list[list[int]]:
-    """The errors of each part: one, or those in x and y."""
+    """Indices of the deviations of each part: one, or the components x and y."""
     parts: dict[tuple, list[int]] = {}
     for k, error in enumerate(perturbed.deviations):
         parts.setdefault(error[:2], []).append(k)
@@ -218,8 +222,8 @@ def _parts(perturbed: PerturbedLens) -> list[list[int]]:
 def draw_perturbations(
     perturbed: PerturbedLens, count: int, seed: int, normal: bool = False
 ) -> np.ndarray:
-    """Errors (count, P) in parts of their largest, all alike up to 1, or normal with a standard
-    deviation of a half, cut off at 1. Those in x and y of one part lie within a circle."""
+    """Random deviations (count, P) in units of their largest: uniform up to 1, or normal with a
+    standard deviation of 0.5, cut off at 1. Components x and y of one part lie within a circle."""
     rng = np.random.default_rng(seed)
     perturbation = np.empty((count, len(perturbed.deviations)))
     for part in _parts(perturbed):
@@ -233,7 +237,7 @@ def draw_perturbations(
 
 
 def variances(perturbed: PerturbedLens, normal: bool = False) -> np.ndarray:
-    """Variances (P,) of the errors that `draw_perturbations` draws."""
+    """Variances (P,) of the deviations that `draw_perturbations` draws."""
     found = np.empty(len(perturbed.deviations))
     for part in _parts(perturbed):
         count = len(part)
@@ -250,13 +254,13 @@ def variances(perturbed: PerturbedLens, normal: bool = False) -> np.ndarray:
 def worst_case(
     perturbed: PerturbedLens, predicted: Predicted, order: Order = "second"
 ) -> np.ndarray:
-    """Errors (P,), each as large as it may be, for which q is predicted to be largest: the best of
-    ascents from the gradient and the largest eigenvectors, which may not be the best of all.
-    ValueError for an unknown order."""
+    """Largest deviations (P,) with the largest predicted q that several ascents find, which may not
+    be the global maximum. They start at the gradient and at the largest eigenvectors. ValueError
+    for an unknown order."""
     slope, matrix = np.asarray(predicted.gradient), np.asarray(predicted.matrix(order))
     values, vectors = np.linalg.eigh(matrix)
-    # On the ends of all errors a multiple of the unit matrix changes nothing, but makes q convex,
-    # so that going as far as possible along its gradient never descends.
+    # Where all deviations are largest, a multiple of the unit matrix only adds a constant to q. It
+    # makes q convex, so that the largest step along its gradient never descends.
     matrix = matrix + max(0.0, -values[0]) * np.eye(len(matrix))
     largest = vectors[:, ::-1][:, :_ASCENTS].T
     found: list[np.ndarray] = []
@@ -275,7 +279,7 @@ def worst_case(
 
 
 def _to_the_ends(perturbed: PerturbedLens, vector: np.ndarray) -> np.ndarray:
-    """The largest errors along a vector (P,): 1 for each part, in its direction across."""
+    """The largest deviations (P,) along a vector (P,): each part has the length 1."""
     perturbation = np.zeros(len(vector))
     for part in _parts(perturbed):
         size = np.linalg.norm(vector[part])
@@ -291,11 +295,14 @@ def monte_carlo(
     callback: Callable[[int], None] = lambda done: None,
     threads: int | None = None,
 ) -> AsBuilt:
-    """The lenses of errors (K, P) in parts of their largest, traced; arrays (K, V) and (K, C).
+    """Traces lenses with given deviations; arrays (K, V) and (K, C). The result does not depend on
+    threads or tiles. Where aiming misses a ray, the full ray search decides whether it exists.
 
-    callback: called with how many are done. threads: tiles at a time; None: one a core. The result
-    depends on neither threads nor tiles. A lens of which aiming misses a ray is searched in full:
-    inf means that there is none. ValueError as `as_built`.
+    perturbation: (K, P), deviations in units of their largest.
+    callback: called with the number of lenses done.
+    threads: number of threads; None for one per core.
+
+    ValueError as in `as_built`.
     """
     _check(problem, perturbed.lens, compensator)
     width = len(perturbed.deviations)

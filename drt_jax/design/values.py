@@ -1,56 +1,58 @@
-"""Values of a lens: what operands take as residuals, compare with a target or keep within limits.
+"""Operand kinds: the values of a lens that a merit function compares with targets and limits.
 
-Lengths in mm, angles in radians. Each kind has one value for each of what stands in brackets; of
-these an operand may name some: fields, wavelengths, distances, surfaces. "Middle": the middle
-wavelength, unless wavelengths are named.
+Lengths are in mm, angles in radians. A kind has one value for each combination of the names in
+brackets, and an operand may select some of them: fields, wavelengths, distances, surfaces.
+"Middle": the middle wavelength, unless wavelengths are named.
 
-residuals to be squared, which take neither a target nor limits
-    spot: each ray from the centroid of all wavelengths, times the root of the light it stands for:
-        the squares of a field add up to the mean square radius of its spot, mm^2. Of the light that
-        arrives, so that cutting the worst rays gains: vignetting=False, of this and all that
-        follow up to centroid, counts rays that clear apertures clip as if they passed
-    spot_of_colours: the same from the centroid of its own wavelength
-    spot_chief: the same from where the chief ray of the middle wavelength falls
-    path_difference: of each ray less the mean of its wavelength, waves, times the same root: the
-        squares add up to the mean square wavefront error of the wavelengths
+residuals that are squared, without a target or limits
+    spot: distance of each ray from the centroid of all wavelengths, times the root of its weight;
+        the squares of a field add up to the mean square radius of its spot, mm^2. Clipped rays have
+        no weight, so that clipping the worst rays lowers the merit. vignetting=False, here and up
+        to centroid, counts clipped rays as if they passed
+    spot_of_colours: the same from the centroid of the ray's own wavelength
+    spot_chief: the same from the chief ray of the middle wavelength
+    path_difference: optical path of each ray less the mean of its wavelength, waves, times the root
+        of its weight; the squares add up to the mean square wavefront error
 
-of spots and wavefronts [distance, field]
-    rms_spot: mm, the root of what the squares of spot add up to
-    rms_wavefront: waves, of path_difference
-    centroid: y on the sensor, mm, of all wavelengths
-    throughput: part of the light through the stop that clear apertures let pass; has derivatives
-        with the rules Soft and Clipped, while Gauss drops rays one by one
-    relative_illumination: by projected solid angles (with clipped light that of the middle
-        wavelength), of that of the first field
+spots and wavefronts [distance, field]
+    rms_spot: root of the sum of the squares of spot, mm
+    rms_wavefront: root of the sum of the squares of path_difference, waves
+    centroid: y of the centroid of all wavelengths on the sensor, mm
+    throughput: fraction of the light through the stop that is not clipped; it has derivatives with
+        the rules Soft and Clipped, while Gauss drops rays one by one
+    relative_illumination: from projected solid angles, relative to the first field; at the middle
+        wavelength
 
-of chief rays, through the middle of the stop
-    distortion [distance, field, wavelength: middle]: how much farther out than where the paraxial
-        image is, as a part of that; 0 on the axis
+chief rays, through the centre of the stop
+    distortion [distance, field, wavelength: middle]: (real - paraxial image height) / paraxial
+        image height; 0 on the axis
     lateral_colour [distance, field, wavelength but the first]: y on the sensor less that of the
-        first wavelength, mm; x, too, where the pupil rule is one of the whole disc
-    chief_ray_angle [distance, field, wavelength]: with the normal of the sensor's vertex, from 0
+        first wavelength, mm; and x, if the pupil rule covers the whole disc
+    chief_ray_angle [distance, field, wavelength]: angle with the normal at the sensor's vertex, at
+        least 0
 
-    numerical_aperture [distance, field, wavelength: middle]: index times sine of the angle between
-        the chief ray and those through the rim of the stop, root of the mean square, at the sensor
+    numerical_aperture [distance, field, wavelength: middle]: index times the sine of the angle
+        between the chief ray and rays through the rim of the stop, root mean square, at the sensor
 
-of first order
+first order
     focal_length, effective_focal_length, back_focal_distance [wavelength: middle]: mm; the first in
-        image space, n' over power, the second in air, 1 over power
-    entrance_pupil [wavelength: middle]: its diameter, mm
-    f_number, magnification [distance, wavelength: middle]: working f-number; image over object
-        height
-    total_track, length, back_distance: first vertex to sensor, to the last vertex, and from that to
-        the sensor, mm
+        image space, n' / power, the second in air, 1 / power
+    entrance_pupil [wavelength: middle]: diameter, mm
+    f_number [distance, wavelength: middle]: working f-number
+    magnification [distance, wavelength: middle]: image height / object height
+    total_track: first vertex to sensor, mm
+    length: first vertex to last vertex, mm
+    back_distance: last vertex to sensor, mm
 
-of gaps between neighbours that bend light, and before the sensor, by the surface in front of them
+thicknesses between active surfaces, and in front of the sensor, by the surface in front
     glass_centre, air_centre [surface]: thickness along the light on the axis, mm
-    glass_edge, air_edge [surface, zone]: at 0.5, 0.7, 0.85 and 1 of how far the light goes, in y;
-        in glass up to the larger of both beam radii, in air the smaller; see `beam_radius`
-    incidence_angle [surface]: the largest, of all rays, with the normal
+    glass_edge, air_edge [surface, zone]: thickness at 0.5, 0.7, 0.85 and 1 of a beam radius along
+        y, mm: of the larger of both radii in glass, of the smaller in air; see `beam_radius`
+    incidence_angle [surface]: largest angle of incidence of all rays
 
-of model glasses, by the surface where they begin
-    glass_map [surface]: how far nd and vd lie outside of the convex hull of the catalogue, negative
-        within, in units of nd, a vd of 100 being as far as an nd of 1; high=0 keeps them within
+model glasses, by the surface where they begin
+    glass_map [surface]: distance of (nd, vd) outside of the convex hull of the catalogue, negative
+        inside, in units of nd; a vd of 100 counts as an nd of 1. high=0 keeps them inside
 """
 
 from collections.abc import Callable
@@ -62,7 +64,7 @@ from jax import Array
 
 from ..image.spot import deviations, normalised
 from ..image.wavefront import path_differences
-from ..lens.glass import glass_map_distance
+from ..lens.glasses import glass_map_distance
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..numerics import safe_divide, safe_sqrt
@@ -76,20 +78,21 @@ from .field_rays import (
 from .gaps import between, gaps
 from .kinds import back_distance, model_glasses
 
-# What an operand is computed by: of a lens and its rays.
+# A function of a lens and its rays that returns the values of an operand.
 Function = Callable[[Lens, FieldRays], Array]
 
 
 class OperandKind(NamedTuple):
-    """What an operand of a name is.
+    """Kind of an operand.
 
-    function: its values, of any shape, of a lens and its rays, as `Operand` selects them.
-    names: what an operand of it may name. traced: whether it needs rays.
-    places: the surfaces that have a value, None if it is none of surfaces; rows: those of the
-    values, None: the same.
-    squared: of residuals that only mean something as squares, the kind of their sum.
-    per_mm: penalty per millimetre by which a failed ray misses, in the operand's unit.
-    order: the axes of its values, see `axes`; of those of rays, the last ones.
+    function: values, of any shape, from a lens and the rays that `Operand` selects.
+    names: names by which an operand may select values.
+    places: function of a lens, the surfaces that have a value; None if values are not of surfaces.
+    traced: True if the function needs rays.
+    squared: for residuals that are squared, the kind of the root of their sum; else empty.
+    per_mm: penalty per millimetre of miss for a failed ray, in the unit of the operand.
+    order: axes of the values, see `axes`; () for the usual ones.
+    rows: function of a lens, the surfaces that the function returns; None for `places`.
     """
 
     function: Function
@@ -103,35 +106,35 @@ class OperandKind(NamedTuple):
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """What stands behind each other in its values: "xy", "distances", "fields" (these two as
-        one axis), "wavelengths", "middle" (wavelengths, the middle one if none is named), "later"
-        (all but the first), "surfaces", "zones", "rays"."""
+        """Axes of the values in their order: "xy", "distances" and "fields" (together one axis),
+        "wavelengths", "middle" (wavelengths; the middle one if none is named), "later" (all but the
+        first), "surfaces", "zones", "rays"."""
         ours = [name for name in ("distances", "fields", "surfaces") if name in self.names]
         return self.order or (*ours, *["middle"] * ("wavelengths" in self.names))
 
     @property
     def of_spots(self) -> bool:
-        """Whether it takes the light of whole fields, with or without what is clipped."""
+        """True for spots and wavefronts, to which `Operand.vignetting` applies."""
         return self.squared != "" or self.function in (_rms_spot, _rms_wavefront, _centroid)
 
     @property
     def of_all_views(self) -> bool:
-        """Whether its values are computed of all fields and those that are named taken of these."""
+        """True if values of all fields are computed before some are selected."""
         return self.function is relative_illumination
 
 
 def _hits(rays: FieldRays) -> tuple[Array, Array]:
-    """Hits on the sensor (D, V, W, Q), mm, of the rays that carry light, 0 for others; and the
-    part (V, W, Q) of the light of all wavelengths of a view."""
+    """Hits on the sensor (D, V, W, Q), mm, 0 for rays without weight; and weights (V, W, Q) with
+    the sum 1 over all wavelengths of a view."""
     light = jnp.where(rays.arrives, rays.weights, 0)[..., EXTRAS:]
-    # Of each wavelength the light that arrives, as in `psf_moments`.
+    # Normalise the light that arrives for each wavelength, as in `psf_moments`.
     light = normalised(light) * rays.wavelength_weights[None, :, None]
     return jnp.where(light[None] > 0, rays.sensor_hits[..., EXTRAS:], 0), light
 
 
 def _spread(rays: FieldRays, axes: tuple[int, ...]) -> Array:
-    """Distances of rays from the centroid over `axes`, times the root of their light, mm, (D, V, W,
-    Q)."""
+    """Distances of rays from the centroid over `axes`, times the root of their weight, (D, V, W,
+    Q), mm."""
     hits, light = _hits(rays)
     parts, _ = deviations(tuple(hits), normalised(light, axes), rays.symmetry, axes)
     return jnp.stack(parts) * safe_sqrt(light)[None]
@@ -178,7 +181,7 @@ def _throughput(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
-    """Of distances and wavelengths (Z, W)."""
+    """Function of a first-order value that depends on distance and wavelength, (Z, W)."""
 
     def values(lens: Lens, rays: FieldRays) -> Array:
         far, waves = rays.distance[:: rays.fields], rays.wavelengths
@@ -188,7 +191,7 @@ def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
 
 
 def _lens_alone(get: Callable[[FirstOrder], Array]) -> Function:
-    """Of wavelengths (W,)."""
+    """Function of a first-order value that depends on wavelength alone, (W,)."""
     return lambda lens, rays: get(first_order(lens, jnp.inf, rays.wavelengths))
 
 
@@ -224,7 +227,7 @@ def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
     square = jnp.sum((lines[..., 1:] - lines[..., :1]) ** 2, axis=0)
     sines = square * (1 - square / 4)
     top, bottom, side = jnp.moveaxis(sines, -1, 0)
-    side = side if len(arrival) == 3 else top  # the meridian stands for all azimuths
+    side = side if len(arrival) == 3 else top  # one radius stands for all azimuths
     index = lens.index(rays.wavelengths)[-1]
     return index[None] * safe_sqrt((top + bottom + 2 * side) / 4)
 
@@ -247,7 +250,7 @@ def _incidence(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _glass_map(lens: Lens, rays: FieldRays) -> Array:
-    """Of all surfaces; `Operand.placed` names those where a model glass begins."""
+    """Values of all surfaces; `Operand.placed` selects those where a model glass begins."""
     model = lens.dispersion.model
     assert model is not None, "Operand.check refuses it"
     return glass_map_distance(model[1:])
@@ -308,5 +311,5 @@ OPERANDS: dict[str, OperandKind] = {
 
 
 def kind_of(kind: str | Function) -> OperandKind:
-    """What an operand of a name is, or of a user's function, which may name rays."""
+    """The kind of an operand, by its name or function; a user's function may select rays."""
     return OPERANDS[kind] if isinstance(kind, str) else OperandKind(kind, _RAYS, order=("value",))

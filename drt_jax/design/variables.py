@@ -17,9 +17,9 @@ from .kinds import KINDS, VariableKind, lift_of, step_of, whole_numbers, word_te
 from .solves import Solve, fix_solves
 
 _How = Literal["equal", "opposite", "cemented"]
-# A typical change of a coefficient, as part of the most.
+# Typical change of a coefficient, relative to its bound.
 _STEP_OF_SAG = 0.03
-# What neighbours that are cemented share.
+# What cemented neighbours share.
 _SHAPE = ("curvature", "conic", "coefficients")
 _NONE = {
     "coefficients": "the lens has none; write them into its prescription, zeros too",
@@ -49,8 +49,8 @@ def _known_kind(what: str, kind: str) -> None:
 def _places(
     what: str, lens: Lens, kind: str, surfaces: tuple[int, ...], terms: tuple[int, ...] = ()
 ) -> list[Place]:
-    """Numbers of a kind. ValueError, which begins with `what` and lists those that exist, for one
-    that does not."""
+    """Places of a kind. ValueError, which begins with `what`, for a surface or term that does not
+    exist; it lists those that do."""
     known = KINDS[kind]
     allowed, count = known.allowed(lens), known.terms(lens)
     if not allowed or not count:
@@ -69,20 +69,21 @@ def _places(
 
 @dataclasses.dataclass(frozen=True)
 class Vary:
-    """Numbers of a lens that may change, within bounds.
+    """Variables of one kind, with bounds.
 
     kind: "curvature", "conic", "coefficients", "thickness" (behind a surface; the sensor keeps its
-        distance from the last vertex), "sensor" (behind the last vertex), "index" and "abbe" of the
-        model glass that begins behind a surface, "tilt", "decentre", "semi_diameter".
-    surfaces: which, from 0; empty: all that have one (curvature, conic, coefficients, tilt,
-        decentre: those that bend light; semi_diameter: those that are finite).
-    terms: of coefficients, and the components of a tilt or decentre, from 0; empty: all (but not
-        the coefficient of r^2, which the curvature stands for, nor a norm radius).
+        distance from the last vertex), "sensor" (its distance from the last vertex), "index" and
+        "abbe" of the model glass that begins behind a surface, "tilt", "decentre", "semi_diameter".
+    surfaces: numbers of surfaces from 0; () for all that have one (curvature, conic, coefficients,
+        tilt, decentre: active surfaces; semi_diameter: finite ones).
+    terms: numbers of coefficients, or components of a tilt or decentre, from 0; () for all except
+        the coefficient of r^2, which the curvature replaces, and a norm radius.
     low, high: bounds in the units of the lens.
-    sag, semi_diameter: of coefficients, mm, instead of bounds: each adds at most `sag` to the
-        surface, up or down, at `semi_diameter` from the axis, where the light of the whole design
-        will reach. What only low powers bend then stays free, and high ones cannot run off.
-    scale: a typical change; 0: chosen by the kind and the stop's semi-diameter, or `sag`.
+    scale: typical change in the units of the lens; 0 to choose it by the kind, the semi-diameter of
+        the stop and `sag`.
+    sag, semi_diameter: for coefficients, mm, instead of low and high: each coefficient changes the
+        sag by at most `sag` at `semi_diameter` from the axis, the largest beam of the design. This
+        leaves low powers free and keeps high ones small.
     """
 
     kind: VariableKind
@@ -132,28 +133,26 @@ class Vary:
             raise ValueError(f"{what}: stand instead of low and high; leave these out")
 
     def bounds(self, lens: Lens, place: Place) -> tuple[float, float, float]:
-        """Low, high and scale of one of its numbers, in the units of the lens."""
+        """Low, high and scale of one variable, in the units of the lens."""
         if not self.sag:
             return self.low, self.high, self.scale or step_of(lens, *place)
         most = self.sag / lift_of(lens, place.row, place.term, self.semi_diameter)
         return -most, most, self.scale or _STEP_OF_SAG * most
 
     def places(self, lens: Lens) -> list[Place]:
-        """The numbers it stands for. ValueError, listing those that exist, for one that does
-        not."""
+        """The places of the variables. ValueError for a surface or term that does not exist."""
         return _places("variables", lens, self.kind, self.surfaces, self.terms)
 
 
 @dataclasses.dataclass(frozen=True)
 class Tie:
-    """Numbers that follow the first of them: scale x the first + shift.
+    """A tie: followers = scale x leader + shift.
 
-    surfaces: two or more; the others follow the first.
-    how: "equal", "opposite" (the same with the other sign), or "cemented": two neighbours of one
-        shape.
-    kind: of the numbers, see `Vary`; of "cemented", all of the shape.
-    scale: of the followers, 1; not 0. shift: added to them, in the unit of the kind. Neither is of
-        "cemented".
+    surfaces: numbers of two or more surfaces; the first is the leader.
+    how: "equal", "opposite" (with the other sign), or "cemented" (two neighbours of one shape).
+    kind: kind of the numbers, see `Vary`; not used by "cemented", which ties the whole shape.
+    scale: factor, not 0; not for "cemented".
+    shift: added to the followers, in the unit of the kind; not for "cemented".
     """
 
     surfaces: tuple[int, ...]
@@ -183,11 +182,11 @@ class Tie:
 
     @property
     def line(self) -> tuple[float, float]:
-        """Factor of the leader and what is added, of a follower."""
+        """Factor and shift of the followers."""
         return (-self.scale if self.how == "opposite" else self.scale), self.shift
 
     def pairs(self, lens: Lens) -> list[tuple[Place, Place]]:
-        """Leaders and followers. ValueError as of `Vary.places`."""
+        """Pairs of a leader and a follower. ValueError as in `Vary.places`."""
         first, *others = self.surfaces
         kinds: tuple[str, ...] = (self.kind,)
         if self.how == "cemented":
@@ -211,14 +210,17 @@ class Tie:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Variables:
-    """N numbers of a lens as a vector of order 1, each in units of its scale.
+    """N numbers of a lens as a vector, each in units of its scale.
 
-    lens: the start; what does not vary stays as in it.
-    low, high: (N,), bounds of the vector; scale: (N,), in the units of the lens.
-    solves: applied in order. lines: (T, 2), factor and shift of each tie.
+    lens: the lens at the start; all other numbers stay as in it.
+    low, high: (N,), bounds of the vector.
+    scale: (N,), in the units of the lens.
+    solves: applied in this order.
+    lines: (T, 2), factor and shift of each tie.
 
     Static:
-    places: which numbers. ties: (number of the leader, follower).
+    places: N places in the lens.
+    ties: T pairs of the index of a leader and the place of a follower.
     """
 
     lens: Lens
@@ -238,13 +240,14 @@ class Variables:
         ties: Sequence[Tie] = (),
         solves: Sequence[Solve] = (),
     ) -> "Variables":
-        """The variables of a lens.
+        """Makes the variables of a lens.
 
-        vary: what may change; a word alone is all of a kind. ties: what follows a variable, or
-        stays tied to what does not change. solves: conditions that hold exactly.
+        vary: variables; the name of a kind stands for all of that kind.
+        ties: numbers that follow a variable, or a number that does not change.
+        solves: conditions that hold exactly.
 
-        ValueError, which begins with the list that is wrong, for a number that does not exist,
-        stands twice, or is both a variable and what a solve determines; and as `Lens.check`.
+        ValueError, which begins with the name of the argument, for a number that does not exist, is
+        named twice, or is both a variable and solved; and as in `Lens.check`.
         """
         lens.check()
         wanted = [Vary(v) if isinstance(v, str) else v for v in vary]
@@ -260,7 +263,7 @@ class Variables:
                     f"ties: {leader}, which {follower} follows, itself follows from a tie or a "
                     "solve; begin with another surface"
                 )
-        # A word for all of a kind leaves out what is tied or solved; a number that is named stays.
+        # The name of a kind leaves out tied and solved numbers; naming one of them is an error.
         for place, v in found:
             if place in taken and v.surfaces:
                 raise ValueError(
@@ -276,7 +279,7 @@ class Variables:
                 f"solves: {len(solves)} of them, but {len(found)} variables; leave some out"
             )
         index = {place: k for k, (place, _) in enumerate(found)}
-        # What follows a number that does not change stays as that is.
+        # Followers of a number that does not change are set once.
         fixed = [(f, a * _number(lens, p) + b) for p, f, (a, b) in following if p not in index]
         lens = _with_numbers(_with_arrays(lens, {place.kind for place, _ in found}), fixed)
         dtype = lens.curvature.dtype
@@ -292,7 +295,7 @@ class Variables:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Such as "curvature 3"."""
+        """Names of the variables, such as "curvature 3"."""
         return tuple(map(str, self.places))
 
     @property
@@ -309,8 +312,8 @@ class Variables:
         return vector * self.scale
 
     def lens_of(self, vector: Array) -> Lens:
-        """The lens of a vector (N,), its ties and solves kept. Differentiable, in `jit` and `vmap`
-        too; whoever makes the vector keeps its bounds."""
+        """The lens of a vector (N,), with ties and solves applied, bounds not. Works in `jit`,
+        `vmap` and under differentiation."""
         numbers = self.numbers(vector)
         changes = [(place, numbers[k]) for k, place in enumerate(self.places)]
         pairs = zip(self.ties, self.lines, strict=True)
@@ -326,8 +329,8 @@ def _number(lens: Lens, place: Place) -> Array:
 
 
 def _with_numbers(lens: Lens, changes: Sequence[tuple[Place, Array]]) -> Lens:
-    """The lens with other numbers; thicknesses before the sensor, which is told from the last
-    vertex."""
+    """The lens with changed numbers; thicknesses come before the sensor, whose distance counts from
+    the last vertex."""
     for name, kind in KINDS.items():
         own = [(place, number) for place, number in changes if place.kind == name]
         if own:
@@ -344,7 +347,7 @@ def _refuse_twice(what: str, places: Iterable[Place], said: str) -> None:
 
 
 def _with_arrays(lens: Lens, kinds: set[str]) -> Lens:
-    """The lens with arrays of zeros in place of none, where they vary."""
+    """The lens with arrays of zeros for tilts and decentres that vary but are None."""
     for kind in kinds & {"tilt", "decentre"}:
         lens = KINDS[kind].write(lens, KINDS[kind].read(lens))
     return lens

@@ -6,19 +6,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..lens.forms import powers_xy
 from .record import Breaking, Record, Row, turned_back
+
+EXTRA = 13  # the parameter that XDAT 1 is
+_QCON = 11  # terms: the powers of the last lose 8 of 16 digits
 
 
 class Surface(NamedTuple):
     """A surface of a file before its type is looked at. unit: mm of its unit of length.
 
-    parameters: (line, value) by number, as they stand there.
+    parameters: (line, value) by number, as they stand there; extra data begin with number 13.
+    semi: what DIAM says, mm.
     """
 
     record: Record
     row: Row
     unit: float
     parameters: dict[int, tuple[int, float]]
+    semi: float = 0.0
 
     def value(self, number: int) -> float:
         """A parameter; 0 if it is not given."""
@@ -32,7 +38,8 @@ class Surface(NamedTuple):
         """Refuse other parameters that are not 0."""
         for number, (line, value) in self.parameters.items():
             if value and number not in known:
-                self.record.lacks(line, f"parameter {number} of {self.row.name}")
+                extra = f" (XDAT {number - EXTRA + 1})" if number >= EXTRA else ""
+                self.record.lacks(line, f"parameter {number}{extra} of {self.row.name}")
 
     def powers(self, numbers: dict[int, int]) -> None:
         """Coefficients by power of length, from parameters."""
@@ -40,6 +47,27 @@ class Surface(NamedTuple):
         found = {p: a for p, a in found.items() if a}
         if found:
             self.put("coefficients", found)
+
+    def series(self, first: int = EXTRA) -> tuple[float, list[float]]:
+        """The radius, mm, and the values, as they stand there, of a series in parts of it: from
+        parameter `first` on their number, the radius, then each; those beyond mean nothing."""
+        count, radius = self.value(first), self.value(first + 1) * self.unit
+        line = self.parameters.get(first, (self.row.line, 0))[0]
+        if count % 1 or not 0 <= count <= 300:
+            raise self.record.error(line, f"{self.row.name}: {count:g} terms; give 0 to 300")
+        found = [self.value(first + 2 + k) for k in range(int(count))]
+        if any(found) and not 1e-6 <= radius <= 1e6:
+            raise self.record.error(line, f"{self.row.name}: a norm radius of {radius:g} mm")
+        return radius, found
+
+    def spread(self, radius: float, found: dict[Any, tuple[float, int]]) -> dict[Any, float]:
+        """Coefficients by key, from values and the powers of the radius that they go with."""
+        with np.errstate(all="ignore"):
+            terms = {k: float(v / np.float64(radius) ** p) for k, (v, p) in found.items() if v}
+        for key, value in terms.items():
+            if not (value and math.isfinite(value)):
+                raise self.record.error(self.row.line, f"{self.row.name}: term {key} overflows")
+        return terms
 
     def curvature(self, number: int) -> float:
         """1 / a radius, 0 for none, in 1/mm."""
@@ -63,7 +91,9 @@ def _odd(surface: Surface) -> None:
 
 
 def _toroid(surface: Surface) -> None:
-    surface.only(*range(1, 9))
+    # Extra data: how many Zernike terms, their radius, and the terms, which must be 0.
+    none = range(EXTRA, 400) if not surface.value(EXTRA) else (EXTRA, EXTRA + 1)
+    surface.only(*range(9), *none)
     surface.put("form", "toroid")
     surface.put("curvature_x", surface.curvature(1))
     surface.powers({k: 2 * (k - 1) for k in range(2, 9)})
@@ -80,6 +110,86 @@ def _tilted(surface: Surface) -> None:
     surface.only(1, 2)
     surface.put("form", "polynomial_xy")
     surface.put("coefficients", {"x1y0": surface.value(1), "x0y1": surface.value(2)})
+
+
+def _extended(surface: Surface, form: str, keys: Callable[[int], tuple[Any, int]]) -> None:
+    """A conic and a series over a norm radius; keys: of term k, its key and its power."""
+    surface.only(*range(EXTRA, 400))
+    radius, found = surface.series()
+    terms = {keys(k)[0]: (a * surface.unit, keys(k)[1]) for k, a in enumerate(found)}
+    surface.put("form", form)
+    surface.put("coefficients", surface.spread(radius, terms))
+
+
+def _extended_xy(k: int) -> tuple[str, int]:
+    i, j = powers_xy(k + 1)[k]
+    return f"x{i}y{j}", i + j
+
+
+def _binary(surface: Surface) -> None:
+    """An even asphere with a phase in radians: order (a_1 u^2 + a_2 u^4 + ...)."""
+    surface.only(*range(9), *range(EXTRA, 400))
+    surface.powers({k: 2 * k for k in range(1, 9)})
+    radius, found = surface.series()
+    terms = {2 * k + 2: (a / (2 * math.pi), 2 * k + 2) for k, a in enumerate(found)}
+    phase = surface.spread(radius, terms)
+    if phase and 0 not in surface.parameters:
+        raise surface.record.error(surface.row.line, f"{surface.row.name}: PARM 0, the order")
+    if phase and surface.value(0):
+        surface.put("phase", {"form": "asphere", "order": surface.value(0), "coefficients": phase})
+
+
+def _forbes(surface: Surface) -> None:
+    """Forbes' aspheres: type 0, slopes are orthonormal (Qbfs), or 1, u^4 P_m^(0,4)(2 u^2 - 1)
+    (Qcon), which is a polynomial in u^2."""
+    surface.only(*range(EXTRA, 400))
+    radius, found = surface.series(EXTRA + 1)
+    found = [a * surface.unit for a in found]
+    if surface.value(EXTRA) not in (0, 1):
+        raise surface.record.error(surface.row.line, f"{surface.row.name}: neither Qbfs nor Qcon")
+    if not any(found):
+        return
+    if surface.value(EXTRA) == 0:
+        surface.put("form", "qbfs")
+        surface.put("norm_radius", radius)
+        surface.put("coefficients", {m: a for m, a in enumerate(found) if a})
+        return
+    if any(found[_QCON:]):
+        what = f"{surface.row.name}: of Qcon {_QCON} terms are exact enough as powers"
+        raise surface.record.error(surface.row.line, what)
+    total: dict[int, float] = {}
+    for m, a in enumerate(found):
+        for s in range(m + 1):
+            part = math.comb(m + 4 + s, m) * math.comb(m, s) * (-1) ** (m - s)
+            total[4 + 2 * s] = total.get(4 + 2 * s, 0.0) + a * part
+    surface.put("coefficients", surface.spread(radius, {p: (a, p) for p, a in total.items()}))
+
+
+def _zernike(surface: Surface) -> None:
+    """Conic, even powers of r and Noll's Zernike polynomials, into which the powers go: u^2k is
+    sum_s (2 s + 1) k!^2 / ((k - s)! (k + s + 1)!) R_2s(u)."""
+    surface.only(0, *range(1, 9), *range(EXTRA, 400))
+    radius, found = surface.series()
+    terms = {k + 1: a * surface.unit for k, a in enumerate(found) if a}
+    if not terms:
+        surface.powers({k: 2 * k for k in range(1, 9)})
+        return
+    if not surface.value(0) and surface.semi > radius * (1 + 1e-9):
+        line = surface.row.line
+        surface.record.lacks(line, f"the end of the Zernike terms at {radius:g} mm; ours go on")
+    for k in range(1, 9):
+        height = surface.value(k) * surface.unit * (radius / surface.unit) ** (2 * k)
+        for s in range(k + 1 if height else 0):
+            below = math.factorial(k - s) * math.factorial(k + s + 1)
+            part = (2 * s + 1) * math.factorial(k) ** 2 / below
+            j = s * (2 * s + 1) + 1
+            terms[j] = terms.get(j, 0.0) + height * part / math.sqrt(2 * s + 1)
+    if max(terms) > 91:
+        line = surface.row.line
+        raise surface.record.error(line, f"{surface.row.name}: Zernike terms end with 91 here")
+    surface.put("form", "zernike")
+    surface.put("norm_radius", radius)
+    surface.put("coefficients", terms)
 
 
 def _grating(surface: Surface, lines: int = 1, order: int = 2) -> None:
@@ -106,6 +216,12 @@ TYPES: dict[str, Callable[[Surface], None]] = {
     "TILTSURF": _tilted,
     "DGRATING": _grating,
     "TOROGRAT": _toroidal_grating,
+    "XASPHERE": lambda surface: _extended(surface, "asphere", lambda k: (2 * k + 2, 2 * k + 2)),
+    "XOSPHERE": lambda surface: _extended(surface, "odd_asphere", lambda k: (k + 1, k + 1)),
+    "XPOLYNOM": lambda surface: _extended(surface, "polynomial_xy", _extended_xy),
+    "BINARY_2": _binary,
+    "QED_TYPE": _forbes,
+    "SZERNSAG": _zernike,
 }
 
 

@@ -1,16 +1,31 @@
 """Glasses of lens files of other programs: names of their catalogues in ours."""
 
+import re
 from collections.abc import Sequence
 
-from ..lens.glass import find_glass
+from ..lens.glass import Glass
+from ..lens.glasses import find_glass, glass_makers, spellings
 from .record import Record, Row, short
 
-# Of our catalogue: whose glasses those are that are not Schott's; see its head.
-MAKERS = {"SK2": "HIKARI", "SK16": "HIKARI"}
-_PLAIN = {"air", "water", "silica", "CaF2", "PMMA", "polycarbonate", "polystyrene", "SAN", "COC"}
-_PLAIN |= {"E48R", "480R", "330R", "Optorez-1330"}
 # What other programs call substances whose constants in their catalogues are the same.
 _SAME = {"F_SILICA": "silica", "SILICA": "silica"}
+_NIKON = {"NIKON": "HIKARI"}
+
+
+def in_catalogues(name: str, catalogues: Sequence[str]) -> Glass | None:
+    """The glass of a name, in capitals or not, in the first of these catalogues that has it.
+
+    catalogues: makers in capitals, with or without what comes behind, as in OHARA_210226_CATALOG.
+    """
+    for catalogue in catalogues:
+        word = re.split(r"[^A-Z]", catalogue, maxsplit=1)[0]
+        maker = _NIKON.get(word, word)
+        for own in spellings(name) if maker in glass_makers() else ():
+            try:
+                return find_glass(own, maker)
+            except ValueError:  # of others
+                continue
+    return None
 
 
 def named_glass(
@@ -19,17 +34,35 @@ def named_glass(
     """The entry of a glass, by its name in the catalogues of these makers; empty: of any. LensError
     for one that we have not from one of them."""
     own = _SAME.get(name.upper(), name)
+    found = in_catalogues(own, makers)
     try:
-        find_glass(own)
+        alone = find_glass(own)
     except ValueError as error:
-        raise record.error(
-            line, f"{row.name}: {error}; give nd and vd as a model glass in the file"
-        ) from None
-    maker = MAKERS.get(own, "SCHOTT")
-    if own not in _PLAIN and makers and maker not in makers:
-        raise record.error(
-            line,
-            f"{row.name}: we have {short(own)} of {maker} alone, the file's catalogues are "
-            f"{short(' '.join(makers))}; give nd and vd as a model glass in the file",
-        )
-    return {"glass": own}
+        if not found:
+            raise record.error(
+                line, f"{row.name}: {error}; give nd and vd as a model glass in the file"
+            ) from None
+    else:
+        if not makers or not alone.maker or own.endswith(f"_{alone.maker}"):
+            return {"glass": alone.name}
+        if not found:
+            raise record.error(
+                line,
+                f"{row.name}: {short(own)} is known of {alone.maker}, the file's catalogues are "
+                f"{short(' '.join(makers))}; add the right one behind GCAT, or give nd and vd",
+            )
+    return {"glass": found.name}
+
+
+def written_names(names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """Catalogues that have all these glasses, and the name of each there: NAME_MAKER, which other
+    programs do not know, where an earlier catalogue has another glass of this name."""
+    glasses = {name: find_glass(name) for name in names}
+    makers = {glass.maker for glass in glasses.values()} - {"", "SCHOTT"}
+    order, written = [*sorted(makers), "SCHOTT"], {}
+    for name, glass in glasses.items():
+        plain = name.removesuffix(f"_{glass.maker}")
+        met = in_catalogues(plain, order)
+        alone = not glass.maker or (met is not None and met == glass)
+        written[name] = plain if alone else f"{plain}_{glass.maker}"
+    return order, written

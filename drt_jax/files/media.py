@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..inputs import shown
-from ..lens.glass import VISIBLE, Dispersion, Glass, find_glass, model_glass, refractive_index
+from ..lens.glass import VISIBLE, Dispersion, Glass, model_glass, refractive_index
+from ..lens.glasses import find_glass
 from .entry import Entry
 
 _DENSEST = 10
@@ -27,7 +28,9 @@ def _own_glass(name: str, entry: Entry) -> Glass:
     terms = entry.get("sellmeier", [0.0, 0.0])
     if not isinstance(terms, list) or not terms or len(terms) % 2:
         raise entry.error("sellmeier", f"expected a list, all B and then all C, got {shown(terms)}")
-    lengths = {"sellmeier": len(terms), "schott": 6}
+    powers = entry.get("schott", [])
+    more = isinstance(powers, list) and len(powers) == 9
+    lengths = {"sellmeier": len(terms), "schott": 9 if more else 6}
     constants: dict[str, Any] = {
         key: tuple(entry.vector(key, n)) for key, n in lengths.items() if key in entry
     }

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..lens.glass import ANY, Dispersion, find_glass, glass_names
+from ..lens.glass import ANY, Dispersion
+from ..lens.glasses import find_glass, glass_names
 from ..lens.lens import Lens
 from .entry import LensError
 
@@ -27,10 +28,11 @@ def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
     unnamed = lens.glasses[i] in lens.labels.unnamed.glasses  # returned by a program
     for name in glass_names() if unnamed else [lens.glasses[i]]:
         try:
-            known = Dispersion.of([find_glass(name)])
+            glass = find_glass(name)
         except ValueError:
             return None
-        if own == constants_of(known, 0):
+        alike = np.float32(glass.range[1]) == np.float32(lens.dispersion.ranges[i, 1])
+        if alike and own == constants_of(Dispersion.of([glass]), 0):
             return {"glass": name}
     return None
 
@@ -43,9 +45,28 @@ def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
     constants: dict[str, Any] = {}
     if terms:
         constants["sellmeier"] = strength[:terms] + resonance[:terms]
+    schott = schott if any(schott[6:]) else schott[:6]
     if schott != [1, 0, 0, 0, 0, 0]:
         constants["schott"] = schott
     known = np.asarray(dispersion.ranges[i]).tolist()
     if known != [*ANY]:
         constants["range"] = known
     return constants
+
+
+def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Keys of each medium, none for air, and the glasses whose constants the file has to tell."""
+    plain = [medium_of(lens, i) for i in range(lens.count + 1)]
+    described = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
+    media: list[dict[str, Any]] = []
+    glasses: dict[str, Any] = {}
+    for i, (name, keys) in enumerate(zip(lens.glasses, plain, strict=True)):
+        if i and name == lens.glasses[i - 1]:  # light keeps the constants of the medium in front
+            keys = media[-1]
+        elif keys is None or keys.get("glass") in described:
+            own = constants_of(lens.dispersion, i)
+            while glasses.setdefault(name, own) != own:  # another medium of this name
+                name += "*"
+            keys = {"glass": name}
+        media.append(keys)
+    return media, glasses

@@ -12,7 +12,7 @@ from .entry import LensError
 # semi-diameter on.
 _RIM = 0.9
 # The direction of a ray between vertices closer than this (mm) drowns in rounding.
-_CLOSEST = 1e-6
+CLOSEST = 1e-6
 
 
 def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
@@ -25,7 +25,7 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
     for i, j, gap in pairs:
         forwards = lens.senses[i + 1] > 0
         turned = "" if forwards else ", as a mirror has turned the light"
-        if gap >= _CLOSEST:
+        if gap >= CLOSEST:
             continue
         if j == lens.count:
             raise LensError(
@@ -36,7 +36,7 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
         reach = "" if j == i + 1 else f" up to surface {j}, in sum"
         raise LensError(
             f"surfaces[{i}].thickness{reach}: must be {'positive' if forwards else 'negative'}"
-            f"{turned}, at least {_CLOSEST} mm; leave out one of two surfaces that touch",
+            f"{turned}, at least {CLOSEST} mm; leave out one of two surfaces that touch",
             f"surfaces[{i}].thickness",
         )
     semi = np.asarray(lens.semi_diameter)

@@ -11,11 +11,14 @@ import numpy as np
 from ..inputs import InputError, Lines, one_line, shown
 from ..lens.lens import Lens
 from .entry import LensError
+from .order import CLOSEST
 from .specs import build_lens
 
 Missing = Literal["error", "warn"]
 _FAR = 1e10  # mm, from where on a distance of a file is infinite
+_LARGEST = 1e9  # of lengths, angles and curvatures
 _TINY = 1e-6  # mm, of the stop until its size is known
+_MEDIUM = ("glass", "index", "nd", "vd", "partial")
 
 
 @dataclasses.dataclass
@@ -56,6 +59,7 @@ class Record:
 
     path, missing: as of `load_lens`. name: of the lens. source: what makes the object's medium.
     parts: surfaces and coordinate breaks in their order, the image the last surface.
+    glasses: of the file itself, as of a prescription.
     notes: what is read otherwise than it stands there.
     """
 
@@ -65,6 +69,7 @@ class Record:
     distance: float = math.inf
     parts: list[Row | Breaking] = dataclasses.field(default_factory=list)
     medium: dict[str, Any] = dataclasses.field(default_factory=dict)
+    glasses: dict[str, Any] = dataclasses.field(default_factory=dict)
     notes: list[str] = dataclasses.field(default_factory=list)
 
     def error(self, line: int, message: str) -> LensError:
@@ -98,6 +103,13 @@ class Record:
             raise self.error(line, f"expected a number, got {shown(words[at])}")
         return value
 
+    def bounded(self, line: int, words: list[str], at: int = 0) -> float:
+        """A number whose square is one, too: at most 1e9."""
+        value = self.number(line, words, at)
+        if abs(value) > _LARGEST:
+            raise self.error(line, f"{value:g} is not within {_LARGEST:g}; which unit?")
+        return value
+
     def count(self, line: int, words: list[str], at: int = 0, default: int | None = None) -> int:
         """A whole number among words."""
         value = self.number(line, words, at, default)
@@ -111,6 +123,7 @@ class Record:
 
     def lens(self, semi_diameter: float | None) -> Lens:
         """The lens; its stop has no size yet unless `semi_diameter` (mm) is given."""
+        self._spaced()
         top, lines, names = self._prescription(semi_diameter or _TINY)
         image = [part for part in self.parts if isinstance(part, Row)][-1]
         try:
@@ -119,6 +132,28 @@ class Record:
             found = re.sub(r"surfaces\[(\d+)\]", lambda m: names[int(m[1])], str(error))
             raise LensError(f"{self.path}{lines.of(error.key)}: {found}", error.key) from None
         return _with_image(lens, image)
+
+    def _spaced(self) -> None:
+        """Put the least gap between surfaces that touch, of those that bend light, and say so."""
+        medium, sense, last, before, found = self.medium, 1, False, None, list[str]()
+        gap = 0.0
+        for part in self.parts:
+            if isinstance(part, Breaking):
+                last = False
+                continue
+            own = {key: part.entry[key] for key in _MEDIUM if key in part.entry}
+            turns, image = part.entry.get("mirror", False), part is self.parts[-1]
+            bends = turns or "phase" in part.entry or own != medium
+            if last and before and (bends or image) and abs(gap) < CLOSEST:
+                before.thickness += sense * CLOSEST - gap
+                found.append(before.name)
+            if bends:
+                medium, sense = medium if turns else own, -sense if turns else sense
+                last, gap = True, 0.0
+            before, gap = part, gap + part.thickness
+        if found:
+            some = ", ".join(found[:8]) + (", ..." if len(found) > 8 else "")
+            self.notes.append(f"surfaces that touch stand {CLOSEST:g} mm apart: {some}")
 
     def _prescription(self, semi_diameter: float) -> tuple[dict[str, Any], Lines, list[str]]:
         """As `build_lens` takes it, the line of each key, the name of each surface."""
@@ -152,6 +187,7 @@ class Record:
                 behind -= own.thickness
             waiting = []
             if part is image:
+                lines["sensor"] = part.line
                 break
             place = f"surfaces[{i}]"
             lines[place] = part.line
@@ -167,6 +203,9 @@ class Record:
         top: dict[str, Any] = {"surfaces": surfaces}
         top |= {"elements": elements} if elements else {}
         top |= {"object": self.medium} if self.medium else {}
+        top |= {"glasses": self.glasses} if self.glasses else {}
+        moves = {f"sensor_{key}": image.entry.get(key) for key in ("decentre", "tilt")}
+        top |= {key: value for key, value in moves.items() if value}
         return top, lines, names
 
 
@@ -188,22 +227,35 @@ def distance_of(value: float) -> float:
     return math.inf if value >= _FAR else value
 
 
-def turned_back(tilt: tuple[float, float, float]) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """The rotation of tilts in degrees about z, the turned y and the turned x, and the same as
-    tilts about x, y and z."""
+def rotation_of(tilt: tuple[float, float, float]) -> np.ndarray:
+    """The rotation (3, 3) of tilts in degrees about x, the turned y and the turned z."""
+    x, y, z = _turns(tilt)
+    return x @ y @ z
+
+
+def _turns(tilt: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     a, b, c = np.radians(tilt)
     x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
     z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
-    turn = z @ y @ x
-    if np.count_nonzero(tilt) <= 1:
-        return turn, tilt
-    angles = (
+    return x, y, z
+
+
+def turns_of(turn: np.ndarray) -> tuple[float, float, float]:
+    """A rotation (3, 3) as tilts in degrees about x, the turned y and the turned z."""
+    return (
         math.degrees(math.atan2(-turn[1, 2], turn[2, 2])),
         math.degrees(math.asin(max(-1.0, min(1.0, turn[0, 2])))),
         math.degrees(math.atan2(-turn[0, 1], turn[0, 0])),
     )
-    return turn, angles
+
+
+def turned_back(tilt: tuple[float, float, float]) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """The rotation of tilts in degrees about z, the turned y and the turned x, and the same as
+    tilts about x, y and z."""
+    x, y, z = _turns(tilt)
+    turn = z @ y @ x
+    return turn, tilt if np.count_nonzero(tilt) <= 1 else turns_of(turn)
 
 
 def short(text: str) -> str:

@@ -2,22 +2,20 @@
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..lens.lens import Lens
-from ..lens.paraxial import (
-    effective_focal_length,
-    entrance_pupil,
-    f_number,
-    image_height,
-)
+from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..lens.scene import field_of_height
 from .record import Record
 
 ApertureKind = Literal["pupil diameter", "f-number", "working f-number", "object NA", "image NA"]
+_SAME = 1e-9  # of a size of the stop that a file tells twice
 FieldKind = Literal["angle", "object height", "paraxial image height", "real image height"]
 
 
@@ -37,7 +35,8 @@ class System:
     wavelengths: (W,) in um. wavelength_weights: (W,). primary: the index of the primary one.
     aperture: the value that the file gives for `aperture_kind`; None for the size of the stop.
     ray_aiming: how the other program launches rays: at the paraxial entrance pupil, `off` (see
-        `with_paraxial_pupil`), or as here at the stop.
+        `with_paraxial_pupil`), or as here at the stop; CODE V, `chief`, so that the chief ray meets
+        the centre of the stop, the others about it over an entrance pupil of paraxial width.
     notes: what the file has and the lens has not, or reads otherwise.
     """
 
@@ -118,34 +117,74 @@ def system_of(record: Record, use: Use) -> System:
     )
 
 
+@jax.jit  # one program in place of hundreds of small ones
+def _paraxial(lens: Lens, distance: Array, wave: Array) -> tuple[FirstOrder, Array, Array]:
+    """First-order data, the image height of a field of 45 degrees, mm, and the indices of the media
+    of object and image."""
+    height = image_height(lens, jnp.full_like(distance, math.pi / 4), distance, wave)
+    return first_order(lens, distance, wave), height, lens.index(wave)[jnp.array([0, -1])]
+
+
+def _first(record: Record, lens: Lens, wave: float) -> tuple[FirstOrder, float, list[float]]:
+    """The same as numbers, of one wavelength."""
+    found = _paraxial(lens, *map(jnp.asarray, (record.distance, wave)))
+    first, height, index = jax.tree.map(lambda a: np.asarray(a)[..., 0], found)
+    return first, float(height), index.tolist()
+
+
 def _opened(record: Record, use: Use, lens: Lens, wave: float) -> Lens:
     """The lens with its stop as wide as the aperture asks, by paraxial optics."""
     semi, value = float(lens.semi_diameter[lens.stop]), float(use.aperture or 0)
-    pupil = entrance_pupil(lens, wave)
-    place, radius = float(pupil.position[0]), float(pupil.semi_diameter[0])
+    first, _, (front, last) = _first(record, lens, wave)
+    place, radius = map(float, first.entrance_pupil)
     far, kind = record.distance, use.aperture_kind
-    front, last = (float(lens.index(wave)[k, 0]) for k in (0, -1))
     if value <= 0:
         raise record.error(use.line, f"the aperture must be above 0, got {value:g}")
     if kind == "pupil diameter":
         wide = value / 2
     elif kind == "f-number":
-        wide = abs(float(effective_focal_length(lens, wave)[0])) / value / 2
+        wide = abs(float(first.effective_focal_length)) / value / 2
     elif kind == "object NA":
         sine = value / front
         if not (sine < 1 and math.isfinite(far)):
             raise record.error(use.line, f"no object at {far:g} mm has an NA of {value:g}")
         wide = abs(math.tan(math.asin(sine)) * (far + place))
-    else:
-        slope = value / last if kind == "image NA" else 1 / (2 * value * last)
-        if kind == "image NA" and not slope < 1:
+    elif kind == "image NA" and math.isinf(far):
+        wide = abs(float(first.effective_focal_length)) * value
+    elif kind == "image NA":  # the object's, over the magnification
+        sine = value * abs(float(first.magnification)) / front
+        if not sine < 1:
             raise record.error(use.line, f"there is no image NA of {value:g}")
-        slope = math.tan(math.asin(slope)) if kind == "image NA" else slope
-        wide = radius * slope * 2 * float(f_number(lens, far, wave)[0])
+        wide = abs(math.tan(math.asin(sine)) * (far + place))
+    else:
+        wide = radius / (value * last) * float(first.f_number)
     found = semi * wide / radius if radius else math.nan
     if not (math.isfinite(found) and 0 < found < 1e9):
         raise record.error(use.line, f"no stop makes {kind} {value:g}: is the lens afocal there?")
+    if use.stop and math.isclose(found, use.stop, rel_tol=_SAME):
+        lens, found = _without_rim(lens), use.stop
     return dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[lens.stop].set(found))
+
+
+def _without_rim(lens: Lens) -> Lens:
+    """The lens without the first clear circle about the vertex of its stop, whose size the stop
+    has: twice, it would clip by rounding."""
+    own = lens.apertures
+    if own is None:
+        return lens
+    lies = zip(own.surfaces, own.kinds, own.blocks, strict=True)
+    rims = [k for k, place in enumerate(lies) if place == (lens.stop, "circle", False)]
+    keep = [k for k in range(len(own.surfaces)) if k not in rims[:1]]
+    if not keep:
+        return dataclasses.replace(lens, apertures=None)
+    chosen: dict[str, Any] = {
+        name: tuple(getattr(own, name)[k] for k in keep) for name in ("surfaces", "kinds", "blocks")
+    }
+    centre = None if own.centre is None else own.centre[np.array(keep)]
+    return dataclasses.replace(
+        lens,
+        apertures=dataclasses.replace(own, half=own.half[np.array(keep)], centre=centre, **chosen),
+    )
 
 
 def _angles(
@@ -154,11 +193,14 @@ def _angles(
     """Fields in radians (F, 2); None for real image heights."""
     far, line = record.distance, use.field_line
     if use.field_kind == "angle":
-        if np.any(np.abs(heights) >= 90):
-            raise record.error(line, "a field angle of 90 degrees and more; give image heights")
+        beyond = bool(np.any(np.abs(heights) >= 90))
         if math.isinf(far):
+            if beyond:
+                record.notes.append(f"line {line}: fields of 90 degrees and more cannot be traced")
             return np.radians(heights)
-        place = float(entrance_pupil(lens, wave).position[0])
+        if beyond:
+            raise record.error(line, "a field angle of 90 degrees and more; give object heights")
+        place = float(_first(record, lens, wave)[0].entrance_pupil.position)
         if not math.isfinite(place):
             raise record.error(line, "field angles at a telecentric lens; give object heights")
         return np.asarray(field_of_height(-np.tan(np.radians(heights)) * (far + place), far))
@@ -167,7 +209,7 @@ def _angles(
             raise record.error(line, "object heights of an object at infinity; give angles")
         return np.asarray(field_of_height(heights, far))
     if use.field_kind == "paraxial image height":
-        scale = float(image_height(lens, jnp.asarray(math.pi / 4), far, wave)[0])
+        scale = _first(record, lens, wave)[1]
         if not math.isfinite(scale) or not scale:
             raise record.error(line, "paraxial image heights of an image at infinity; give angles")
         return np.arctan(heights / scale)

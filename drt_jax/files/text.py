@@ -46,7 +46,7 @@ def decoded(content: bytes) -> str:
                 ) from error
             continue
         break
-    odd = re.search("[\x00-\x08\x0e-\x19\x1b-\x1f\x7f-\x84\x86-\x9f]", text)
+    odd = re.search("[\x00-\x08\x0e-\x19\x1b-\x1f]", text)
     if odd:
         raise InputError(f"character {odd.start()} is no text: is this a lens file?")
     return text
@@ -57,17 +57,16 @@ def lines_of(path: str | os.PathLike) -> list[str]:
     lines = decoded(read_bytes(path, LARGEST, "lens file")).splitlines()
     if len(lines) > _MOST:
         raise InputError(f"{len(lines)} lines are more than {_MOST}; is it the right file?")
-    for i, text in enumerate(lines):
-        if len(text) > _LONGEST and re.match(r"\s*[A-Z]{4}\s+[-+.\d]", text):
-            raise InputError(f"line {i + 1}: {len(text)} characters are more than {_LONGEST}")
-    return [text[:_LONGEST] for text in lines]
+    return lines
 
 
 def words_of(path: str | os.PathLike) -> list[Words]:
-    """Lines in words, without empty ones."""
+    """Lines in words, without empty ones; of notes that are long, the beginning."""
     found = []
     for i, text in enumerate(lines_of(path)):
-        words = text.split()
+        if len(text) > _LONGEST and re.match(r"\s*[A-Z]{4}\s+[-+.\d]", text):
+            raise InputError(f"line {i + 1}: {len(text)} characters are more than {_LONGEST}")
+        words = text[:_LONGEST].split()
         if words:
             found.append(Words(i + 1, one_line(words[0]).upper(), words[1:], text[0].isspace()))
     return found

@@ -4,7 +4,6 @@ import math
 import pathlib
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import yaml
 from jax import Array
@@ -13,14 +12,16 @@ from ..lens.elements import Elements
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from .entry import LensError
-from .media_out import constants_of, medium_of
+from .exact import degrees_of
+from .media_out import media_of_lens
+from .write_seq import seq_text
 from .write_zmx import zmx_text
 
 
 def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
-    """Write a lens as a YAML prescription, or as a Zemax file where the path ends in `.zmx`;
-    `load_lens` makes the same lens of it, to the last digit (of tilts, which files hold in degrees,
-    and of model glasses and radii in `.zmx`, to the last but one).
+    """Write a lens as a YAML prescription, or as a file of Zemax or CODE V where the path ends in
+    `.zmx` or `.seq`; `load_lens` makes the same lens of it, to the last digit (of tilts, which
+    files hold in degrees, and of model glasses and radii in `.zmx`, to the last but one).
 
     Constants of a glass that are not those of the catalogue stand in the file, where a second
     medium of the same name that has other constants is called name*.
@@ -28,14 +29,13 @@ def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
     path: of the file, which is replaced. LensError for what a prescription cannot hold, such as a
     curved sensor, or if the file cannot be written.
     """
-    if pathlib.Path(path).suffix.lower() == ".zmx":
-        return _write(zmx_text(lens), path)
-    if pathlib.Path(path).suffix.lower() == ".seq":
-        raise LensError(f"{path}: .seq files are not written; save as .yaml or .zmx")
+    other = {".zmx": zmx_text, ".seq": seq_text}.get(pathlib.Path(path).suffix.lower())
+    if other is not None:
+        return _write(other(lens), path)
     if np.any([np.asarray(a)[-1] for a in (lens.curvature, lens.conic)]):
         raise LensError("sensor: a prescription has none that is curved")
     top: dict[str, Any] = {"name": lens.name} if lens.name else {}
-    media, glasses = _media(lens)
+    media, glasses = media_of_lens(lens)
     top |= {"glasses": glasses} if glasses else {}
     top |= {"object": media[0]} if media[0] else {}
     top["surfaces"] = [_surface(lens, i, media[i + 1]) for i in range(lens.count)]
@@ -91,7 +91,7 @@ def _element(elements: Elements, g: int) -> dict[str, Any]:
         "about": elements.about[g],
         "pivot": float(elements.pivot[g]),
         "shift": np.asarray(elements.shift[g]).tolist(),
-        "tilt": [_degrees(angle) for angle in np.asarray(elements.tilt[g])],
+        "tilt": [degrees_of(angle) for angle in np.asarray(elements.tilt[g])],
     }
 
 
@@ -103,24 +103,6 @@ def _phase(lens: Lens, i: int) -> dict[str, Any]:
     form, order = lens.phase.forms[row], float(lens.phase.order[row])
     named, rest = _coefficients(form, lens.phase.coefficients[row])
     return {"phase": {"form": form, "order": order} | named | {"coefficients": rest}}
-
-
-def _media(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Keys of each medium, none for air, and the glasses whose constants the file has to tell."""
-    plain = [medium_of(lens, i) for i in range(lens.count + 1)]
-    described = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
-    media: list[dict[str, Any]] = []
-    glasses: dict[str, Any] = {}
-    for i, (name, keys) in enumerate(zip(lens.glasses, plain, strict=True)):
-        if i and name == lens.glasses[i - 1]:  # light keeps the constants of the medium in front
-            keys = media[-1]
-        elif keys is None or keys.get("glass") in described:
-            own = constants_of(lens.dispersion, i)
-            while glasses.setdefault(name, own) != own:  # another medium of this name
-                name += "*"
-            keys = {"glass": name}
-        media.append(keys)
-    return media, glasses
 
 
 def _apertures(lens: Lens, i: int) -> dict[str, Any]:
@@ -143,11 +125,5 @@ def _place(lens: Lens, i: int) -> dict[str, Any]:
     if lens.decentre is not None:
         place["decentre"] = np.asarray(lens.decentre[i]).tolist()
     if lens.tilt is not None:
-        place["tilt"] = [_degrees(angle) for angle in np.asarray(lens.tilt[i])]
+        place["tilt"] = [degrees_of(angle) for angle in np.asarray(lens.tilt[i])]
     return place
-
-
-def _degrees(angle: np.floating) -> float:
-    """The number of degrees that is read as this angle in radians, or the next to it."""
-    near = np.degrees(angle) + np.arange(-4, 5) * np.spacing(np.degrees(angle))
-    return float(near[np.argmin(np.abs(np.asarray(jnp.radians(near)) - angle))])

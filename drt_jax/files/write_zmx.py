@@ -1,12 +1,14 @@
 """A lens written as a `.zmx` file: what `zmx` reads, backwards."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
+from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from .entry import LensError
-from .glasses import MAKERS
+from .glasses import written_names
 from .media_out import medium_of
 from .model_zmx import to_ours, to_theirs
 
@@ -30,6 +32,13 @@ _TYPES = {  # of a form: the type, the parameters of coefficients, the first of 
     "toroid": ("TOROIDAL", range(1, 9), True),
     "biconic": ("BICONICX", range(1, 3), True),
 }
+_SERIES = {  # of a form: the type whose extra data are its coefficients, what comes before them
+    "asphere": ("XASPHERE", ()),
+    "odd_asphere": ("XOSPHERE", ()),
+    "polynomial_xy": ("XPOLYNOM", ()),
+    "zernike": ("SZERNSAG", ()),
+    "qbfs": ("QED_TYPE", (0,)),
+}
 _OTHERS = {"silica": "F_SILICA"}
 
 
@@ -40,11 +49,13 @@ def zmx_text(lens: Lens) -> str:
         raise LensError("elements, tilts and decentres are not written to .zmx: save as .yaml")
     low, high = lens.dispersion.range
     wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
-    makers = sorted({MAKERS[name] for name in lens.glasses if name in MAKERS})
+    media = [medium_of(lens, i) or {} for i in range(lens.count + 1)]
+    makers, names = written_names([own["glass"] for own in media if "glass" in own])
+    names |= {name: other for name, other in _OTHERS.items() if name in names}
     head = {"name": " ".join(lens.name.split()), "wave": wave}
-    lines = [_HEAD.format(makers=" ".join([*makers, "SCHOTT"]), **head)]
-    front = ["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY", *_glass(lens, 0)]
-    blocks = [front, *(_surface(lens, i) for i in range(lens.count))]
+    lines = [_HEAD.format(makers=" ".join(makers), **head)]
+    front = ["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY", *_glass(lens, 0, names)]
+    blocks = [front, *(_surface(lens, i, names) for i in range(lens.count))]
     curvature, conic = (float(a[-1]) for a in (lens.curvature, lens.conic))
     blocks.append(["TYPE STANDARD", f"CURV {curvature!r}", f"CONI {conic!r}", "DISZ 0"])
     for i, block in enumerate(blocks):
@@ -52,7 +63,7 @@ def zmx_text(lens: Lens) -> str:
     return "\n".join([*lines, "MNUM 1 1", ""])
 
 
-def _gap(lens: Lens, i: int) -> float:
+def gap_behind(lens: Lens, i: int) -> float:
     """The thickness behind a surface; of the last, that which makes the sum exact."""
     gaps = np.asarray(lens.thickness, float).tolist()
     if i < lens.count - 1:
@@ -62,11 +73,11 @@ def _gap(lens: Lens, i: int) -> float:
     return float(near[np.argmin(np.abs(sum(gaps) + near - sensor))])
 
 
-def _surface(lens: Lens, i: int) -> list[str]:
+def _surface(lens: Lens, i: int, names: Mapping[str, str]) -> list[str]:
     lines = ["STOP"] if i == lens.stop else []
     lines += [*_form(lens, i), f"CURV {float(lens.curvature[i])!r}"]
     lines += [f"CONI {float(lens.conic[i])!r}"] if lens.conic[i] else []
-    lines += [f"DISZ {_gap(lens, i)!r}", *_glass(lens, i + 1)]
+    lines += [f"DISZ {gap_behind(lens, i)!r}", *_glass(lens, i + 1, names)]
     semi = float(lens.semi_diameter[i])
     if math.isfinite(semi):
         lines.append(f"DIAM {semi!r} 1 0 0 1")
@@ -77,11 +88,16 @@ def _surface(lens: Lens, i: int) -> list[str]:
 def _form(lens: Lens, i: int) -> list[str]:
     name, row = lens.forms[i], np.asarray(lens.coefficients[i], float).tolist()
     if lens.phase is not None and i in lens.phase.surfaces:
-        return _grating(lens, i, any(row))
+        return _phase(lens, i, row)
     if name == "asphere" and not any(row):
         return ["TYPE STANDARD"]
     kind, numbers, radius = _TYPES.get(name, ("", (), False))
     used = [k for k, value in enumerate(row) if value]
+    if name in _SERIES and (not kind or (used and used[-1] >= len(numbers))):
+        kind, before = _SERIES[name]
+        size, terms = (row[0], row[1:]) if FORMS[name].named else (1.0, row)
+        goes_on = ["PARM 0 1"] if name == "zernike" else []  # beyond the radius
+        return [f"TYPE {kind}", *goes_on, *_extra(*before, len(terms), size, *terms)]
     if not kind or (used and used[-1] >= len(numbers)):
         what = f"form {name}" + (f" with {used[-1] + 1} coefficients" if kind else "")
         raise LensError(f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
@@ -94,21 +110,34 @@ def _form(lens: Lens, i: int) -> list[str]:
     ]
 
 
-def _grating(lens: Lens, i: int, aspheric: bool) -> list[str]:
+def _extra(*values: float) -> list[str]:
+    return [f"XDAT {k + 1} {value!r}" for k, value in enumerate(values)]
+
+
+def _phase(lens: Lens, i: int, row: list[float]) -> list[str]:
+    """A grating on a conic, or a radial phase, in radians over 1 mm, on an even asphere."""
     assert lens.phase is not None
     at = lens.phase.surfaces.index(i)
-    row = np.asarray(lens.phase.coefficients[at], float)
-    if lens.phase.forms[at] != "linear" or aspheric or lens.forms[i] != "asphere":
-        raise LensError(f"surfaces[{i}].phase: only gratings on conics are written: save as .yaml")
-    return [
-        "TYPE DGRATING",
-        f"PARM 1 {float(row[0]) / 1e3!r}",
-        f"PARM 2 {float(lens.phase.order[at])!r}",
-    ]
+    order, form = float(lens.phase.order[at]), lens.phase.forms[at]
+    own = np.asarray(lens.phase.coefficients[at], float).tolist()
+    if form == "linear" and lens.forms[i] == "asphere" and not any(row):
+        return ["TYPE DGRATING", f"PARM 1 {own[0] / 1e3!r}", f"PARM 2 {order!r}"]
+    if form != "asphere" or lens.forms[i] != "asphere" or any(row[8:]):
+        raise LensError(f"surfaces[{i}].phase: not written to .zmx on this surface: save as .yaml")
+    powers = [f"PARM {k + 1} {value!r}" for k, value in enumerate(row[:8])]
+    whole = [_times_turn(value) for value in own]
+    return ["TYPE BINARY_2", f"PARM 0 {order!r}", *powers, *_extra(len(own), 1.0, *whole)]
 
 
-def _glass(lens: Lens, m: int) -> list[str]:
-    """The medium behind a surface, m from 1, or of the object."""
+def _times_turn(waves: float) -> float:
+    """Radians that, divided by 2 pi, are these waves to the last digit where there are such."""
+    turn = 2 * math.pi
+    near = [waves * turn, *(math.nextafter(waves * turn, end) for end in (-math.inf, math.inf))]
+    return min(near, key=lambda value: abs(value / turn - waves))
+
+
+def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
+    """The medium behind a surface, m from 1, or of the object; `names` of glasses in the file."""
     if m and lens.mirrors[m - 1]:
         return ["GLAS MIRROR 0 0 1.5 40"]
     keys = medium_of(lens, m)
@@ -118,7 +147,7 @@ def _glass(lens: Lens, m: int) -> list[str]:
             "hold: save as .yaml, or use with_model_glass"
         )
     if "glass" in keys:
-        return [f"GLAS {_OTHERS.get(keys['glass'], keys['glass'])} 0 0 1.5 40"]
+        return [f"GLAS {names[keys['glass']]} 0 0 1.5 40"]
     if "index" in keys:
         return [f"GLAS ___BLANK 1 0 {keys['index']!r} 0 0"]
     if not keys:

@@ -2,19 +2,22 @@
 
 import pathlib
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 
 from ..inputs import InputError, read_yaml, shown
 from ..lens.lens import Lens
+from .agf import load_agf
 from .entry import LensError
 from .record import Missing, Record
+from .seq import read_seq
 from .specs import build_lens
 from .system import System, Use, lens_of, system_of
 from .zmx import read_zmx
 
 _BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
-_READERS = {".zmx": read_zmx}
+_READERS = {".zmx": read_zmx, ".seq": read_seq}
 
 
 def lens_names() -> list[str]:
@@ -29,12 +32,13 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
     for a missing file, an unknown key or glass, or numbers that make no lens, with the line.
 
     source: a bundled name (see `lens_names`), the path of a YAML prescription of at most 1 MB or
-        of a Zemax `.zmx` file, see `load_system`, or a mapping with the keys of a prescription.
+        of a Zemax `.zmx` or CODE V `.seq` file, see `load_system`, or a mapping with the keys of a
+        prescription.
     missing: as of `load_system`.
     """
     with jax.core.eval_context():  # a lens loaded inside a jitted function is a constant
         if isinstance(source, Mapping):
-            return build_lens(dict(source))
+            return build_lens(_with_catalogues(dict(source), pathlib.Path()))
         path = pathlib.Path(source)
         if path.suffix.lower() in _READERS:
             record, use = _read(path, missing)
@@ -54,14 +58,38 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
         except InputError as error:
             raise LensError(f"{path}: {error}") from error
         try:
-            return build_lens(values, path.stem)
+            return build_lens(_with_catalogues(values, path.parent), path.stem)
         except LensError as error:
             raise LensError(f"{path}{lines.of(error.key)}: {error}", error.key) from None
 
 
+def _with_catalogues(top: Any, folder: pathlib.Path) -> Any:
+    """A prescription with those of its glasses that its `catalogues` have, in `glasses`; these win
+    over the table, and the prescription's own over these."""
+    if not isinstance(top, dict) or "catalogues" not in top:
+        return top
+    paths, surfaces = top["catalogues"], top.get("surfaces")
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise LensError(f"catalogues: expected a list of paths, got {shown(paths)}", "catalogues")
+    places = [top.get("object"), *(surfaces if isinstance(surfaces, list) else [])]
+    used = [place.get("glass") for place in places if isinstance(place, dict)]
+    found: dict[str, dict[str, list[float]]] = {}
+    for path in paths:
+        try:
+            read = load_agf(folder / path, [name for name in used if isinstance(name, str)])
+        except LensError as error:
+            raise LensError(f"catalogues: {error}", "catalogues") from None
+        for name, glass in read.items():
+            constants = {key: [*getattr(glass, key)] for key in ("sellmeier", "schott", "range")}
+            found.setdefault(name, constants)
+    own = top.get("glasses", {})
+    rest = {key: value for key, value in top.items() if key != "catalogues"}
+    return rest | {"glasses": found | own if isinstance(own, dict) else own}
+
+
 def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
-    """Read a lens with its fields, wavelengths and aperture from a Zemax `.zmx` file of at most
-    16 MB; see docs/lens_files.md.
+    """Read a lens with its fields, wavelengths and aperture from a Zemax `.zmx` or CODE V
+    `.seq` file of at most 16 MB; see docs/lens_files.md.
 
     What is read otherwise than it stands there, solves as the values beside them say, is told in
     one warning and in `System.notes`. LensError, in one line with the line of the file, for what

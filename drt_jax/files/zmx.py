@@ -3,10 +3,11 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import get_args
 
 from ..inputs import InputError
 from .entry import LensError
-from .forms_zmx import TYPES, Surface, breaking, clipping
+from .forms_zmx import EXTRA, TYPES, Surface, breaking, clipping
 from .glasses import named_glass
 from .model_zmx import to_ours
 from .record import Breaking, Missing, Record, Row, distance_of, short
@@ -21,7 +22,7 @@ _COSMETIC = frozenset(
     """
     VERS MODE PFIL LANG GFAC PUSH SDMA ROPD PICB POLS GLRS GSTD NSCD COFN NOTE AUTH
     IWDP HYPR LUID EERA FIMP HIDE MIRR SLAB POPS COMM BLNK PRIM COAT VPAR VDSZ VCON
-    MEMA SSID STUD DBDT
+    MEMA OEMA OMMA SSID STUD DBDT
     """.split()  # noqa: SIM905
 )
 _SOLVES = ("PPAR", "PZUP", "MAZH")
@@ -31,10 +32,7 @@ _REFUSED = {
     "SPID": "a spider",
     "UDAP": "an aperture from a file",
     "UDOB": "an obscuration from a file",
-    "XDAT": "extra data",
     "SCBD": "tilts and decentres beside coordinate breaks",
-    "OEMA": "a mechanical chip zone",
-    "OMMA": "a mechanical chip zone",
 }
 
 
@@ -113,12 +111,7 @@ def _fields(reader: _Reader, words: Words) -> None:
     kind, telecentric, fields, waves = (
         record.count(line, words.rest, i, d) for i, d in enumerate((None, 0, 1, 1))
     )
-    kinds: tuple[FieldKind, ...] = (
-        "angle",
-        "object height",
-        "paraxial image height",
-        "real image height",
-    )
+    kinds: tuple[FieldKind, ...] = get_args(FieldKind)
     if not 0 <= kind < len(kinds):
         raise record.error(line, f"fields of kind {kind}; give angles or heights")
     if telecentric:
@@ -204,6 +197,7 @@ def _thickness(reader: _Reader, words: Words) -> None:
 def _parameter(reader: _Reader, words: Words) -> None:
     number = reader.record.count(words.line, words.rest)
     value = reader.record.number(words.line, words.rest, 1)
+    number += EXTRA - 1 if words.key == "XDAT" else 0
     reader.block.parameters[number] = words.line, value
 
 
@@ -264,9 +258,9 @@ _HEADER: dict[str, Callable[[_Reader, Words], None]] = {
 }
 _SURFACE: dict[str, Callable[[_Reader, Words], None]] = {
     **{"TYPE": _type, "STOP": _stop, "CURV": _curvature, "CONI": _conic, "DISZ": _thickness},
-    **{"PARM": _parameter, "GLAS": _glass, "DIAM": _diameter, "FLAP": _floating},
+    **dict.fromkeys(("PARM", "XDAT"), _parameter),
+    **{"GLAS": _glass, "DIAM": _diameter, "FLAP": _floating, "OBDC": _centre},
     **dict.fromkeys(("CLAP", "SQAP", "ELAP", "OBSC", "ELOB"), _clip),
-    **{"OBDC": _centre},
     **dict.fromkeys(_REFUSED, _refused),
 }
 
@@ -353,14 +347,17 @@ def _part(reader: _Reader, block: _Block, image: bool) -> Row | Breaking:
     record, row = reader.record, block.row
     if block.infinite:
         raise record.error(block.infinite, f"{row.name}: an infinite thickness; give a length")
-    surface = Surface(record, row, reader.unit, block.parameters)
+    surface = Surface(record, row, reader.unit, block.parameters, block.semi)
     row.thickness = block.thickness or 0.0
     if block.kind == "COORDBRK":
-        if row.entry.get("stop"):
-            raise record.error(row.line, f"{row.name}: a coordinate break is no stop")
+        if image or row.entry.get("stop"):
+            what = "image" if image else "stop"
+            raise record.error(row.line, f"{row.name}: a coordinate break is no {what}")
         return breaking(surface, row.thickness)
     if block.kind not in TYPES or (image and block.kind not in ("STANDARD", "EVENASPH")):
         where = " of the image" if image else f"; known: COORDBRK, {', '.join(TYPES)}"
+        if block.kind == "PARAXIAL":
+            where = ": an ideal thin lens is none of our surfaces; give real ones"
         raise record.error(
             block.kind_line, f"{row.name}: type {short(block.kind)} is not known{where}"
         )

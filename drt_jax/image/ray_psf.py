@@ -84,8 +84,12 @@ def _root(covariance: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
 def _shares(edges: Array, place: Array, width: Array) -> Array:
     """The part (W, Q, size) of spots at `place` (W, Q) of half `width` (W, Q) between neighbouring
     edges (size + 1,)."""
-    t = jnp.clip((edges[None, None] - place[..., None]) / width[..., None], -1, 1)
+    found = below((edges[None, None] - place[..., None]) / width[..., None])
+    return found[..., 1:] - found[..., :-1]
+
+
+def below(t: Array) -> Array:
+    """The part of a spot of half width 1 below t: the integral of 15 / 16 (1 - t^2)^2."""
+    t = jnp.clip(t, -1, 1)
     square = t * t
-    # The integral of 15 / 16 (1 - t^2)^2.
-    below = 0.5 + t * (15 / 16 + square * (-5 / 8 + square * (3 / 16)))
-    return below[..., 1:] - below[..., :-1]
+    return 0.5 + t * (15 / 16 + square * (-5 / 8 + square * (3 / 16)))

@@ -25,8 +25,8 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.order import may_cross
-from ..lens.scene import Scene, fields_array, scene_of
-from ..numerics import Numbers, known_values, real_array, safe_divide, safe_sqrt
+from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
+from ..numerics import Numbers, known_values, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import hexapolar
 from ..pupil.rules import Gauss, PupilRule, symmetry_of
@@ -97,18 +97,15 @@ def spot_diagram(
 
     ValueError as of `scene_of`; without a rule also inside a trace.
     """
-    light = _light(lens, fields, distance, wavelengths, rule, "object")
-    waves = light.hit.shape[1]
+    known = lens.checked_wavelengths(wavelengths)
+    waves = len(known)
     middle = waves // 2 if reference is None else reference
     if not -waves <= middle < waves:
         raise ValueError(f"reference: expected an index of the wavelengths, got {reference!r}")
-    dtype = lens.curvature.dtype
-    spectrum = jnp.ones(waves, dtype)
-    if wavelength_weights is not None:
-        spectrum = real_array("wavelength_weights", wavelength_weights, dtype)
-        if spectrum.shape != (waves,):
-            raise ValueError(f"wavelength_weights: expected ({waves},), got {spectrum.shape}")
-    colour = lens.checked_wavelengths(wavelengths)[middle]
+    axis = scene_of(lens, 0.0, distance, wavelengths)
+    spectrum = spectrum_of(wavelength_weights, axis, lens.curvature.dtype)
+    light = _light(lens, fields, distance, wavelengths, rule, "object")
+    colour = known[middle]
     index = lens.index(colour)[-1, 0]
     return _spots(light, spectrum / jnp.sum(spectrum), colour / index, middle)
 

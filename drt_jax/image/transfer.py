@@ -8,10 +8,9 @@ grid of d covers what both pupils share, however little that is, so that the fun
 where it ends. In the limit of short wavelengths it is the mean of exp(-2 pi i f.x) over rays.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fields_array, scene_of
+from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
 from ..numerics import Numbers, real_array, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam, beam_rule, cover, trace_beam
@@ -37,9 +36,10 @@ class Transfer(NamedTuple):
     """Transfer functions of F fields at N frequencies, of all wavelengths together.
 
     frequencies: (N,) cycles/mm on the sensor.
-    otf: (F, 2, N), complex, 1 at 0: of a grating across the y axis of the sensor (tangential, for a
-        field along y), and across its x axis (sagittal), about the centroid of the light.
-    limit: (F, 2, N), the same of waves without aberrations in the same pupil.
+    otf: (F, 2, N) or, through focus, (F, Z, 2, N), complex, 1 at 0: of a grating across the y axis
+        of the sensor (tangential, for a field along y), and across its x axis (sagittal), about the
+        centroid of the light.
+    limit: the same of waves without aberrations in the same pupil.
 
     All are 0 where no light arrives.
     """
@@ -50,7 +50,7 @@ class Transfer(NamedTuple):
 
     @property
     def mtf(self) -> Array:
-        """The modulus (F, 2, N) of the otf."""
+        """The modulus of the otf."""
         return jnp.abs(self.otf)
 
 
@@ -72,7 +72,8 @@ def transfer(
     fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
     frequencies: (N,) cycles/mm.
     model: "waves" (diffraction) or "rays" (geometric).
-    focus: () mm, added to `lens.sensor`.
+    focus: () mm by which the sensor stands behind its place; or (Z,), through focus: arrays are
+        then (F, Z, 2, N), and no more rays are traced.
     wavelength_weights: (W,), of any sum; None: equal. Light that is lost counts less.
     rule: of the pupil, whose kind is kept (`Gauss` or `Clipped`); None: found, outside of a trace.
     degree: of the polynomials of the pupil. cells: of the grid, along a side.
@@ -86,16 +87,13 @@ def transfer(
     angles, lines = fields_array(fields, dtype), real_array("frequencies", frequencies, dtype)
     if lines.ndim != 1:
         raise ValueError(f"frequencies: expected (N,), got shape {lines.shape}")
-    waves = axis.wavelengths.shape[0]
-    spectrum = jnp.ones(waves, dtype)
-    if wavelength_weights is not None:
-        spectrum = real_array("wavelength_weights", wavelength_weights, dtype)
-        if spectrum.shape != (waves,):
-            raise ValueError(f"wavelength_weights: expected ({waves},), got {spectrum.shape}")
+    spectrum = spectrum_of(wavelength_weights, axis, dtype)
+    steps = real_array("focus", focus, dtype)
+    if steps.ndim > 1:
+        raise ValueError(f"focus: expected one number or (Z,), got shape {steps.shape}")
     if rule is None:
         rule = light_rule(lens, fields, distance, wavelengths)
-    lens = dataclasses.replace(lens, sensor=lens.sensor + real_array("focus", focus, dtype))
-    return _transfer(lens, angles, axis, lines, spectrum, rule, model, degree, cells)
+    return _transfer(lens, angles, axis, lines, spectrum, steps, rule, model, degree, cells)
 
 
 def strehl(
@@ -128,25 +126,30 @@ def _strehl(
 
     def one(field: Array) -> Array:
         beam = trace_beam(lens, Scene(field, axis.distance, axis.wavelengths), made)
-        lit = beam.throughput > 0
-        low, high = beam.directions_extent()
-        pupil = pupil_function(lens, beam, axis.wavelengths, cells)
-        density, inside, phase = pupil((low + high) / 2, (high - low) / cells)
-        size = safe_sqrt(density) * inside
-        share = normalised(size, (1, 2))
-        # The tilt goes along x, then y, which have no mean and a product of their own.
-        side = np.arange(cells) - (cells - 1) / 2
-        for line in np.meshgrid(side, side):
-            place = jnp.asarray(line, phase.dtype)[None]
-            place = place - jnp.sum(share * place, axis=(1, 2), keepdims=True)
-            phase = phase - jnp.sum(share * phase, axis=(1, 2), keepdims=True)
-            square = jnp.sum(share * place**2, axis=(1, 2), keepdims=True)
-            product = jnp.sum(share * place * phase, axis=(1, 2), keepdims=True)
-            phase = phase - safe_divide(product, square) * place
-        parts = (jnp.sum(share * f(phase), axis=(1, 2)) for f in (jnp.cos, jnp.sin))
-        return jnp.where(lit, sum(p**2 for p in parts), 0)
+        return strehl_of(lens, beam, axis.wavelengths, cells)
 
     return jax.vmap(one)(fields)
+
+
+def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
+    """The ratio (W,) of one beam, see `strehl`."""
+    lit = beam.throughput > 0
+    low, high = beam.directions_extent()
+    pupil = pupil_function(lens, beam, wavelengths, cells)
+    density, inside, phase = pupil((low + high) / 2, (high - low) / cells)
+    size = safe_sqrt(density) * inside
+    share = normalised(size, (1, 2))
+    # The tilt goes along x, then y, which have no mean and a product of their own.
+    side = np.arange(cells) - (cells - 1) / 2
+    for line in np.meshgrid(side, side):
+        place = jnp.asarray(line, phase.dtype)[None]
+        place = place - jnp.sum(share * place, axis=(1, 2), keepdims=True)
+        phase = phase - jnp.sum(share * phase, axis=(1, 2), keepdims=True)
+        square = jnp.sum(share * place**2, axis=(1, 2), keepdims=True)
+        product = jnp.sum(share * place * phase, axis=(1, 2), keepdims=True)
+        phase = phase - safe_divide(product, square) * place
+    parts = (jnp.sum(share * f(phase), axis=(1, 2)) for f in (jnp.cos, jnp.sin))
+    return jnp.where(lit, sum(p**2 for p in parts), 0)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames=("model", "degree", "cells"))
@@ -156,6 +159,7 @@ def _transfer(
     axis: Scene,
     frequencies: Array,
     spectrum: Array,
+    focus: Array,
     rule: PupilRule,
     model: Model,
     degree: int,
@@ -164,17 +168,43 @@ def _transfer(
     made = beam_rule(degree, rule.symmetry, rule)
 
     def one(field: Array) -> tuple[Array, Array]:
-        scene = Scene(field, axis.distance, axis.wavelengths)
-        beam = trace_beam(lens, scene, made)
-        share = normalised(spectrum * beam.throughput)
-        centre = jnp.einsum("w,wq,dwq->d", share, normalised(beam.weights), beam.hits[:, -1])
-        of = _of_rays if model == "rays" else _of_waves
-        found = of(lens, beam, axis.wavelengths, frequencies, centre, cells)
-        otf, limit = (jnp.einsum("w,wkn->kn", share.astype(a.dtype), a) for a in found)
-        return otf, limit
+        beam = trace_beam(lens, Scene(field, axis.distance, axis.wavelengths), made)
+        given = axis.wavelengths, frequencies, spectrum, model, cells
+        return through_focus(beam, focus, lambda moved: transfer_of(lens, moved, *given))
 
     otf, limit = jax.vmap(one)(fields)
     return Transfer(frequencies, otf, limit)
+
+
+def through_focus(beam: Beam, focus: Array, of: Callable[[Beam], Any]) -> Any:
+    """`of` the beam with the sensor `focus` mm farther, (), or of all (Z,) in a first axis."""
+    moved = lambda step: of(beam.refocused(step))  # noqa: E731
+    return jax.vmap(moved)(focus) if focus.ndim else moved(focus)
+
+
+def centre_of(beam: Beam, spectrum: Array) -> tuple[Array, Array]:
+    """The part (W,) of the light on the sensor in each wavelength and the centroid (2,) of all, mm.
+    spectrum: (W,), weights of the light that fills the stop."""
+    share = normalised(spectrum * beam.throughput)
+    centre = jnp.einsum("w,wq,dwq->d", share, normalised(beam.weights), beam.hits[:, -1])
+    return share, centre
+
+
+def transfer_of(
+    lens: Lens,
+    beam: Beam,
+    wavelengths: Array,
+    frequencies: Array,
+    spectrum: Array,
+    model: Model,
+    cells: int,
+) -> tuple[Array, Array]:
+    """Transfer function and limit (2, N) of one beam, see `Transfer`."""
+    share, centre = centre_of(beam, spectrum)
+    of = _of_rays if model == "rays" else _of_waves
+    found = of(lens, beam, wavelengths, frequencies, centre, cells)
+    otf, limit = (jnp.einsum("w,wkn->kn", share.astype(a.dtype), a) for a in found)
+    return otf, limit
 
 
 def _turned(size: Array, phase: Array) -> Array:

@@ -1,31 +1,25 @@
-"""Refractive index: the catalogue of glasses and one dispersion formula for all media."""
+"""Refractive index: one dispersion formula for all media, and model glasses."""
 
 import dataclasses
-import difflib
-import functools
-import pathlib
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import yaml
 from jax import Array
 
 from ..numerics import concrete, safe_divide, safe_sqrt
 
-# The loader of libyaml, where PyYAML was built with it, takes a tenth of the time.
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # Of model glasses: the lines d, F, C, g in um, the powers of L in Conrady's formula, P_gF on
 # Schott's normal line as (constant, slope by vd), and where they are used: from line i to line t.
-_LINES, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
-_NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
+FRAUNHOFER, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
+NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL, _FARTHEST = (1.0, 50.0), 0.2
-# In the plane of nd and vd a difference of 100 of vd counts as one of 1 of nd: the weights, 1 and
-# 1e-4 of squares, that Zemax has by default where it replaces model glasses.
-_PER_VD = 0.01
 # Wavelengths in um of a medium without a range: 0.1 nm to 1 m.
 ANY = 1e-4, 1e6
+# Powers of L of `Glass.schott`, and the shortest wavelength of the last two, whose values are
+# too large for float32 below.
+POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12), 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +31,12 @@ class Glass:
 
     name: as in a prescription.
     sellmeier: (B1 .. BT, C1 .. CT), C in um^2, of any number of terms T.
-    schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
+    schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8, or three more, of
+        L^4, L^-10, L^-12.
     range: wavelengths in um for which they hold.
     model: nd and vd of a model glass, see `model_glass`.
     partial: how far a model glass lies above the normal line, in P_gF.
+    maker, source: of the table of glasses; "" where there is none.
     """
 
     name: str
@@ -49,6 +45,8 @@ class Glass:
     range: tuple[float, float] = ANY
     model: tuple[float, float] = _NO_MODEL
     partial: float = 0.0
+    maker: str = ""
+    source: str = ""
 
 
 @jax.tree_util.register_dataclass
@@ -56,11 +54,12 @@ class Glass:
 class Dispersion:
     """Dispersion constants of M media as arrays, so that an index can be differentiated.
 
-    T = 3 or the number of terms of the medium with the most, the others padded with zeros.
+    T = 3 or the number of terms of the medium with the most, the others padded with zeros; so is
+    K = 6 or 9, the number of Schott's coefficients.
 
     strength: (M, T), Sellmeier's B.
     resonance: (M, T), Sellmeier's C in um^2.
-    schott: (M, 6), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8.
+    schott: (M, K), the coefficients of the powers of L that `Glass` has.
     ranges: (M, 2), the shortest and the longest wavelength (um) for which each medium has known
         constants.
     model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None if there is none.
@@ -95,6 +94,7 @@ class Dispersion:
         halves = [np.asarray(m.sellmeier, float).reshape(2, -1) for m in media]
         terms = max(3, *(half.shape[1] for half in halves))
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
+        powers = max(len(m.schott) for m in media)
         models, partial = [m.model for m in media], [m.partial for m in media]
 
         def array(values):
@@ -103,41 +103,11 @@ class Dispersion:
         return cls(
             strength=array(padded[:, 0]),
             resonance=array(padded[:, 1]),
-            schott=array([m.schott for m in media]),
+            schott=array([[*m.schott, *[0.0] * (powers - len(m.schott))] for m in media]),
             ranges=array([m.range for m in media]),
             model=array(models) if set(models) != {_NO_MODEL} else None,
             partial=array(partial) if any(partial) else None,
         )
-
-
-@functools.cache
-def _catalogue() -> dict[str, Glass]:
-    text = (pathlib.Path(__file__).parent / "catalogue" / "glasses.yaml").read_text()
-    glasses = {"air": Glass("air")}
-    for name, entry in yaml.load(text, _Loader).items():
-        constants: dict[str, Any] = {key: tuple(values) for key, values in entry.items()}
-        glasses[name] = Glass(name, **constants)
-    return glasses
-
-
-def glass_names() -> list[str]:
-    """The names of the catalogue."""
-    return [*_catalogue()]
-
-
-def find_glass(name: str) -> Glass:
-    """The catalogue's entry for `name`. ValueError, listing near names, if there is none.
-
-    Names are exact: SK16 and N-SK16 are two glasses. Source: `glasses.yaml`.
-    """
-    glasses = _catalogue()
-    if name in glasses:
-        return glasses[name]
-    folded = {known.lower(): known for known in glasses}
-    near = difflib.get_close_matches(name.lower(), folded, n=5, cutoff=0.5)
-    near += [known for known in folded if name.lower() in known and known not in near]
-    hint = f"near names: {', '.join(folded[n] for n in near[:6])}" if near else "no near name"
-    raise ValueError(f"unknown glass {name!r}; {hint}")
 
 
 def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
@@ -158,59 +128,20 @@ def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
 
 def nd_and_vd(dispersion: Dispersion) -> Array:
     """nd and the Abbe number vd (M, 2) of all media; vd 0 where there is no dispersion."""
-    lines = jnp.asarray(_LINES[:3], dispersion.schott.dtype)
+    lines = jnp.asarray(FRAUNHOFER[:3], dispersion.schott.dtype)
     nd, f, c = refractive_index(dispersion, lines).T
     return jnp.stack([nd, safe_divide(nd - 1, f - c)], axis=-1)
-
-
-@functools.cache
-def _glass_map() -> tuple[np.ndarray, np.ndarray]:
-    """The edges of the convex hull of the catalogue but for air and water, in nd and scaled vd:
-    their normals (E, 2), outwards, and how far they are from the origin (E,)."""
-    square = np.square(_LINES[:3])
-    powers = np.power.outer(square, (0, 1, -1, -2, -3, -4))
-    points: list[tuple[float, float]] = []
-    for glass in (glass for name, glass in _catalogue().items() if name not in ("air", "water")):
-        b, c = np.reshape(glass.sellmeier, (2, -1, 1))
-        terms = np.sum(b * square / (square - c), axis=0)
-        nd, f, c = np.sqrt(terms + powers @ np.asarray(glass.schott, float))
-        points.append((nd, _PER_VD * (nd - 1) / (f - c)))
-    corners: list[tuple[float, float]] = []
-    for ordered in (sorted(points), sorted(points, reverse=True)):  # below, then above
-        half: list[tuple[float, float]] = []
-        for x, y in ordered:
-            while len(half) > 1 and _left_of(half[-2], half[-1], (x, y)) <= 0:
-                half.pop()
-            half.append((x, y))
-        corners += half[:-1]
-    edges = np.roll(corners, -1, axis=0) - corners
-    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals, np.sum(normals * corners, axis=1)
-
-
-def _left_of(a: tuple[float, float], b: tuple[float, float], point: tuple[float, float]) -> float:
-    """Above 0 for a point to the left of the way from a to b."""
-    return (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])
-
-
-def glass_map_distance(model: Array) -> Array:
-    """How far glasses of nd and vd (G, 2) lie outside of the convex hull of the catalogue but for
-    air and water, (G,), from its farthest edge, negative within: in units of nd, 100 of vd as one.
-    """
-    normals, away = (jnp.asarray(a, model.dtype) for a in _glass_map())
-    scaled = model * jnp.array([[1, _PER_VD]], model.dtype)
-    return jnp.max(scaled @ normals.T - away[None], axis=1)
 
 
 def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
     """The dispersion with model glasses of the same nd and vd in place of some media, bool (M,)."""
     mask, found = jnp.asarray(rows)[:, None], nd_and_vd(dispersion)
+    one = jnp.eye(1, dispersion.schott.shape[1], dtype=found.dtype)
     none = jnp.asarray([_NO_MODEL], found.dtype)
     return Dispersion(
         jnp.where(mask, 0, dispersion.strength),
         jnp.where(mask, 0, dispersion.resonance),
-        jnp.where(mask, jnp.asarray([Glass.schott], found.dtype), dispersion.schott),
+        jnp.where(mask, one, dispersion.schott),
         jnp.where(mask, jnp.asarray([VISIBLE], found.dtype), dispersion.ranges),
         jnp.where(mask, found, none if dispersion.model is None else dispersion.model),
         None if dispersion.partial is None else jnp.where(mask[:, 0], 0, dispersion.partial),
@@ -219,11 +150,11 @@ def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
 
 def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Array:
     """n - 1, (M, W), of model glasses (M, 2), `partial` (M,) above the normal line."""
-    d, f, c, g = np.power.outer(_LINES, np.asarray(_CONRADY, float))
+    d, f, c, g = np.power.outer(FRAUNHOFER, np.asarray(_CONRADY, float))
     formula = np.linalg.inv(np.stack([d, f - c, g - f])).T
     nd, vd = model[:, 0], model[:, 1]
     mean = (nd - 1) / vd
-    above = _NORMAL_LINE[0] + _NORMAL_LINE[1] * vd + (0 if partial is None else partial)
+    above = NORMAL_LINE[0] + NORMAL_LINE[1] * vd + (0 if partial is None else partial)
     known = jnp.stack([nd - 1, mean, above * mean], axis=-1)
     powers = jnp.stack([wavelengths**p for p in _CONRADY])
     return known @ jnp.asarray(formula, known.dtype) @ powers
@@ -242,7 +173,9 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     b, c = dispersion.strength[..., None], dispersion.resonance[..., None]
     square = (wavelengths**2)[None, None]
     sellmeier = jnp.sum(safe_divide(b * square, square - c), axis=1)
-    powers = jnp.stack([wavelengths**p for p in (0, 2, -2, -4, -6, -8)])
+    within = jnp.clip(wavelengths, _SHORTEST)
+    count = dispersion.schott.shape[1]
+    powers = jnp.stack([(wavelengths if p > -9 else within) ** p for p in POWERS[:count]])
     index = safe_sqrt(sellmeier + dispersion.schott @ powers)
     if dispersion.model is None:
         return index

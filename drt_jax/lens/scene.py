@@ -108,6 +108,18 @@ def fields_array(fields: Numbers, dtype: Any) -> Array:
     return angles
 
 
+def spectrum_of(weights: Numbers | None, scene: Scene, dtype: Any) -> Array:
+    """Weights (W,) of the light of a scene's wavelengths, of any sum; None: equal. ValueError for
+    another number of them."""
+    count = scene.wavelengths.shape[0]
+    if weights is None:
+        return jnp.ones(count, dtype)
+    spectrum = real_array("wavelength_weights", weights, dtype)
+    if spectrum.shape != (count,):
+        raise ValueError(f"wavelength_weights: expected ({count},), got {spectrum.shape}")
+    return spectrum
+
+
 def distance_array(distance: Numbers, dtype: Any) -> Array:
     """A distance in mm as an array (). ValueError for other shapes, for what is no number, and for
     a known one that is not above 0."""

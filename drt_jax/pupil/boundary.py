@@ -1,13 +1,14 @@
-"""Where clear apertures end the pupil: rays launched until they meet an aperture's edge.
+"""The boundary of a clipped pupil: rays that meet the edge of an aperture.
 
-Every edge, the stop's rim among them, is a quadric: a ray passes if |q| <= 1, where q is its hit on
-that surface, less the edge's centre, in units of the edge's half widths; a rectangle is two edges,
-each with one component of q only. Where neighbouring surfaces cross, the way from one to the other
-is 0: an edge too, if asked for, of a way between 0 and more than there is.
+Every edge, the rim of the stop included, is a quadric: a ray passes if |q| <= 1, where q is its hit
+on that surface, relative to the centre of the edge, in units of its half widths. A rectangle is two
+edges, each with one component of q. Where neighbouring surfaces cross, the length of a ray from one
+to the next is 0; with `crossing`, this is an edge too.
 
-Rays are launched, not aimed. A trace tells how q changes with the point on the stop, also beyond
-all edges, where rays step back to a surface. This linear model of a ray ends every half-line on the
-stop at the root of a quadratic; the next ray is launched there: Newton's method, of a few steps.
+Rays are launched, not aimed. A trace yields the derivative of q by the stop point, also outside of
+all edges, where rays may step back to a surface. By this linear model, every half-line on the stop
+ends at the root of a quadratic equation. The next ray is launched there: Newton's method, which
+takes a few steps.
 
 Vectors are arrays with their 2 components first, and B rays a wavelength last.
 """
@@ -27,20 +28,23 @@ from ..rays.status import Status
 from ..rays.system import System, dot
 from ..rays.trace import on_all_surfaces
 
-_ZOOMS, _STEPS = 10, 8  # of the search for the middle: rounds, and steps of Newton's method
-# No ray is longer between two surfaces than so many times the lens.
+_ZOOMS, _STEPS = 10, 8  # rounds and Newton steps of the search for the middle
+# Longest path between two surfaces, in units of the length of the lens.
 _LONGEST = 100.0
 
-# Of launches (2, W, B): points on the stop and q, see `Rays`, and whether rays reach the sensor.
+# From launches (2, W, B) to stop points and q, see `Rays`, and a mask of rays that arrive.
 Trace = Callable[[Array], tuple[tuple[Array, Array], Array]]
 
 
 class Rays(NamedTuple):
-    """Traced rays, each with its linear model about its point on the stop.
+    """Traced rays, each with its linear model about its stop point.
 
-    launch: (2, W, B), mm on the vertex plane of the first row. point: (2, W, B) in units of the
-    stop's semi-diameter. q: (2, E, W, B) at the E edges. d_launch, d_q: (2, ...), derivatives by
-    `point`. good: (W, B), whether they reach the sensor.
+    launch: (2, W, B), mm on the vertex plane of the first row.
+    point: (2, W, B), stop point in units of the semi-diameter of the stop.
+    q: (2, E, W, B), at the E edges.
+    d_launch: (2, 2, W, B), derivatives of `launch` by `point`, mm.
+    d_q: (2, 2, E, W, B), derivatives of `q` by `point`.
+    good: (W, B), bool, rays that reach the sensor.
     """
 
     launch: Array
@@ -51,7 +55,7 @@ class Rays(NamedTuple):
     good: Array
 
     def at(self, index: Array) -> "Rays":
-        """Those at `index` (W, B)."""
+        """The rays at `index` (W, B)."""
 
         def take(a):
             return jnp.take_along_axis(a, index.reshape(*[1] * (a.ndim - 2), *index.shape), axis=-1)
@@ -60,10 +64,11 @@ class Rays(NamedTuple):
 
 
 class Target(NamedTuple):
-    """Where rays are to go: to the end of a half-line, or to a corner.
+    """Target of each ray: the end of a half-line, or a corner.
 
-    centre, toward: (2, W, B), start and direction of the half-line; 0: to the centre itself.
-    pair: (2, W, B), the edges that meet in a corner; equal for none.
+    centre: (2, W, B), start of the half-line.
+    toward: (2, W, B), direction of the half-line; 0 for the centre itself as the target.
+    pair: (2, W, B), int32, the edges that meet in a corner; equal for a half-line.
     """
 
     centre: Array
@@ -72,8 +77,12 @@ class Target(NamedTuple):
 
 
 class EdgeRays(NamedTuple):
-    """Rays that were found. pair: (2, W, B), the edges they meet, for a half-line both the same.
-    settled: (W, B), whether the target is met; else the ray is the last one before others fail."""
+    """Rays on the boundary.
+
+    rays: the rays.
+    pair: (2, W, B), int32, the edges they meet; equal for a half-line.
+    settled: (W, B), bool, rays that meet their target; the others are the last that did not fail.
+    """
 
     rays: Rays
     pair: Array
@@ -81,26 +90,25 @@ class EdgeRays(NamedTuple):
 
 
 def displace(rates: Array, change: Array) -> Array:
-    """How far something moves with a point: `rates` (2, ..., W, B), its derivatives by the two
-    components of the point, times the `change` (2, W, B)."""
+    """Product of derivatives by a point, `rates` (2, ..., W, B), and its `change` (2, W, B)."""
     x, y = change.reshape(2, *[1] * (rates.ndim - 3), *change.shape[1:])
     return rates[0] * x + rates[1] * y
 
 
 def inverse(matrix: Array) -> Array:
-    """Of matrices (2, 2, W, B); 0 for those that have none."""
+    """Inverse of matrices (2, 2, W, B); 0 for a singular matrix."""
     (p, q), (r, s) = matrix
     return safe_divide(jnp.array([[s, -q], [-r, p]]), (p * s - q * r)[None, None])
 
 
 def picked(values: Array, edge: Array) -> Array:
-    """Of `values` (..., E, W, B) those of a few edges (N, W, B)."""
+    """Entries (..., N, W, B) of `values` (..., E, W, B) at edges (N, W, B)."""
     index = edge.reshape(*[1] * (values.ndim - 3), *edge.shape)
     return jnp.take_along_axis(values, index, axis=-3)
 
 
 def aperture_edges(lens: Lens) -> int:
-    """How many edges the apertures beside the semi-diameters have."""
+    """Number of edges of the apertures other than the semi-diameters."""
     kinds = () if lens.apertures is None else lens.apertures.kinds
     return sum(2 if kind == "rectangle" else 1 for kind in kinds)
 
@@ -108,8 +116,9 @@ def aperture_edges(lens: Lens) -> int:
 def trace(
     lens: Lens, system: System, crossing: bool, launch: Array
 ) -> tuple[tuple[Array, Array], Array]:
-    """A `Trace`. The edges are the S + 1 semi-diameters, with `crossing` the L ways to each
-    active surface and to the sensor, and all other apertures, obscurations taken for clear ones."""
+    """A `Trace` of launches (2, W, B). The edges are the S + 1 semi-diameters, with `crossing` the
+    L lengths behind each active surface, and all other apertures; an obscuration counts as a clear
+    aperture."""
     if crossing:
         hits, ways, status = shoot_anyway(system, tuple(launch))
     else:
@@ -133,7 +142,7 @@ def trace(
 
 
 def launched(trace: Trace, launch: Array) -> Rays:
-    """Rays launched at points (2, W, B), with their models."""
+    """Traces rays launched at points (2, W, B), mm, with their linear models."""
 
     def along(unit):
         (point, q), columns, good = jax.jvp(trace, (launch,), (unit,), has_aux=True)
@@ -147,7 +156,7 @@ def launched(trace: Trace, launch: Array) -> Rays:
 
 
 def extrapolated(rays: Rays, change: Array) -> Rays:
-    """Rays through points (2, W, B) farther, by their models."""
+    """Rays through stop points changed by (2, W, B), by their linear models."""
     return rays._replace(
         launch=rays.launch + displace(rays.d_launch, change),
         point=rays.point + change,
@@ -156,27 +165,27 @@ def extrapolated(rays: Rays, change: Array) -> Rays:
 
 
 def corner_step(rays: Rays, pair: Array) -> Array:
-    """How far (2, W, B) rays are from where the edges of a pair (2, W, B) meet, by their models."""
+    """Newton step (2, W, B) to the corner of a pair of edges (2, W, B), by the linear models."""
     q, d_q = picked(rays.q, pair), picked(rays.d_q, pair)
     rates = jnp.stack([2 * dot(q, rate) for rate in d_q])
     return -displace(inverse(rates), dot(q, q) - 1)
 
 
 def edge_distance(rays: Rays, target: Target) -> Array:
-    """Where each edge ends the half-line of a target, (E, W, B) in units of `target.toward`, by the
-    models of rays; inf for an edge that never does."""
+    """Distance (E, W, B) to each edge along the half-line of a target, in units of `target.toward`,
+    by the linear models; inf for an edge that does not depend on the stop point."""
     base = rays.q + displace(rays.d_q, target.centre - rays.point)
     rate = displace(rays.d_q, target.toward)
     square, linear, constant = dot(rate, rate), dot(base, rate), dot(base, base) - 1
     root = safe_sqrt(linear**2 - square * constant)
-    out = linear > 0  # of the two ways to write a root, the one that does not subtract
+    out = linear > 0  # of the two forms of the root, the one without cancellation
     above = jnp.where(out, -constant, root - linear)
     return jnp.where(square > 0, safe_divide(above, jnp.where(out, linear + root, square)), jnp.inf)
 
 
 def newton_step(rays: Rays, target: Target) -> tuple[Array, Array]:
-    """How far (2, W, B) rays are from their targets by their models, and the edges (2, W, B) that
-    they meet there."""
+    """Newton step (2, W, B) of the stop points to the targets, and the edges (2, W, B) there, by
+    the linear models."""
     far = edge_distance(rays, target)
     length = jnp.where(dot(target.toward, target.toward) > 0, jnp.min(far, axis=0), 0)
     line = target.centre + length[None] * target.toward - rays.point
@@ -187,8 +196,8 @@ def newton_step(rays: Rays, target: Target) -> tuple[Array, Array]:
 
 
 def search(trace: Trace, start: Rays, target: Target, steps: Array) -> EdgeRays:
-    """Newton's method, of so many `steps` at most; a ray that fails goes back half the way to the
-    last one that did not."""
+    """Newton's method with at most `steps` steps from rays `start` to targets. After a failed ray,
+    the next one is launched halfway to the last ray that did not fail."""
     tiny = float(jnp.finfo(start.launch.dtype).eps) ** 0.5
 
     def step(state):
@@ -208,13 +217,13 @@ def search(trace: Trace, start: Rays, target: Target, steps: Array) -> EdgeRays:
     state = (0, start, launch, no, change, pair, no)
     state = jax.lax.while_loop(lambda s: (s[0] < steps) & ~jnp.all(s[3]), step, state)
     _, rays, _, _, change, pair, settled = state
-    # The last step, right to its square, on the model.
+    # Take the last step by the linear model; its error is of second order.
     return EdgeRays(extrapolated(rays, jnp.where(settled[None], change, 0)), pair, settled)
 
 
 def outside(rays: Rays, point: Array) -> Array:
-    """How far points are outside of all edges by the models of rays, (W, B) in units of the stop's
-    semi-diameter; negative inside."""
+    """Distance of points (2, W, B) outside of all edges by the linear models, (W, B) in units of
+    the semi-diameter of the stop; negative inside."""
     q = rays.q + displace(rays.d_q, point - rays.point)
     x, y = rays.d_q
     far, rate = safe_sqrt(dot(q, q)) - 1, safe_sqrt((dot(x, x) + dot(y, y)) / 2)
@@ -222,8 +231,8 @@ def outside(rays: Rays, point: Array) -> Array:
 
 
 def barrier(rays: Rays, point: Array) -> tuple[Array, Array]:
-    """First (2, W, B) and second derivatives (2, 2, W, B), at points, of the sum over the edges of
-    -log(1 - |q|^2), which rises to infinity towards the boundary."""
+    """First (2, W, B) and second derivatives (2, 2, W, B) at points (2, W, B) of the sum over the
+    edges of -log(1 - |q|^2), which is infinite on the boundary."""
     q, rates = rays.q + displace(rays.d_q, point - rays.point), rays.d_q
     room = jnp.maximum(1 - dot(q, q), jnp.finfo(q.dtype).eps)
     slope = jnp.stack([2 * dot(q, rate) / room for rate in rates])
@@ -232,18 +241,18 @@ def barrier(rays: Rays, point: Array) -> tuple[Array, Array]:
 
 
 def stretch(rays: Rays) -> Array:
-    """Symmetric matrices (2, 2, W, B) that stretch a circle to about the shape of what the edges
-    leave around rays; 1 for a circle."""
+    """Symmetric matrices (2, 2, W, B) that stretch a circle to about the shape of the open area
+    around rays; the unit matrix for a circle."""
     (xx, xy), (_, yy) = barrier(rays, rays.point)[1]
-    # The inverse with the trace 2, and its root.
+    # Square root of the inverse, scaled to the trace 2.
     square = safe_divide(2 * jnp.array([[yy, -xy], [-xy, xx]]), (xx + yy)[None, None])
     size = safe_sqrt(square[0, 0] * square[1, 1] - square[0, 1] ** 2)[None, None]
     return (square + size * jnp.eye(2, dtype=size.dtype)[..., None, None]) / jnp.sqrt(2 + 2 * size)
 
 
 def middle(rays: Rays, pattern: Array) -> Array:
-    """A point (2, W, 1) far from all edges by the model of one ray a wavelength: at first the
-    deepest of many, a `pattern` (2, B) zoomed in on, then the lowest of the barrier."""
+    """A point (2, W, 1) far from all edges, by the linear model of one ray per wavelength: first
+    the deepest point of a `pattern` (2, B) that zooms in, then the minimum of the barrier."""
 
     def zoom(_, state):
         best, span = state

@@ -1,12 +1,12 @@
-"""Quadrature fitted to the part of the pupil that apertures and obscurations leave.
+"""Quadrature fitted to the open part of a clipped pupil.
 
 A rule on the whole stop whose clipped rays drop out one by one converges like a sum of pixels.
-Here the boundary is found: in polar coordinates about a point inside, the distance to it is
-smooth but for the corners where one edge takes over from another. Gauss rules between the corners
-and along the radii converge as on an open stop; also in a narrow slit, as its coordinates are
-stretched until it is about as wide as long.
+`Clipped` finds the boundary. In polar coordinates about a point inside, the distance to the
+boundary is smooth between the corners where the nearest edge changes. Gauss rules between corners
+and along the radii converge as on an open stop. In a narrow slit the coordinates are stretched
+until the slit is about as wide as long.
 
-Vectors are arrays with their 2 components first, and B rays a wavelength last.
+Vectors are arrays with 2 components on the first axis and B rays per wavelength on the last.
 """
 
 import dataclasses
@@ -33,14 +33,14 @@ from .rules import PupilRule, Symmetry, check_rule
 
 __all__ = ["Clipped"]
 
-# Steps of one search at most, and of that for corners.
+# Most steps of a search, and of the search for corners.
 _STEPS, _CORNER_STEPS = np.int32(48), np.int32(16)
-# How far outside of other edges a corner may be, in units of the stop's semi-diameter.
+# Largest distance of a corner outside of other edges, in units of the semi-diameter of the stop.
 _BESIDE = 0.01
 
 
 class _Given(NamedTuple):
-    """What all stages of the search are given. used: (), how many spokes count."""
+    """Arguments of all stages of the search. used: (), int32, number of spokes with weight."""
 
     lens: Lens
     system: System
@@ -49,10 +49,13 @@ class _Given(NamedTuple):
 
 
 class _State(NamedTuple):
-    """What the search knows before each of its stages.
+    """State of the search between its stages.
 
-    frame: about the point deepest inside. passes: (W, 1), whether light passes there. even: rays at
-    the ends of even spokes. corners: C of them. latest: what the stage before has found.
+    frame: polar coordinates about the point deepest inside.
+    passes: (W, 1), bool, whether light passes that point.
+    even: rays at the ends of even spokes.
+    corners: rays at C corners.
+    latest: result of the last stage.
     """
 
     frame: Frame
@@ -62,19 +65,19 @@ class _State(NamedTuple):
     latest: EdgeRays
 
 
-# Rays to start from, B a wavelength, their targets, and how many steps at most.
+# Start rays, B per wavelength, their targets, and the largest number of steps.
 _Task = tuple[Rays, Target, Any]
 
 
 def _target(rays: Rays, centre: Array, toward: Any = 0, pair: Any = 0) -> Target:
-    """A target of each ray: `centre` itself, the end of the half-line `toward`, or a corner."""
+    """Target of each ray: the `centre`, the end of the half-line `toward`, or the corner `pair`."""
     full = lambda a, kind: jnp.broadcast_to(jnp.asarray(a, kind), rays.point.shape)  # noqa: E731
     kind = rays.point.dtype
     return Target(full(centre, kind), full(toward, kind), full(pair, jnp.int32))
 
 
 def _scouts(given: _Given, state: _State) -> tuple[_State, _Task]:
-    """First, rays all over the stop, from where paraxial optics puts them."""
+    """Stage 1: rays over the whole stop, from their paraxial launches."""
     rays, radius = state.latest.rays, given.lens.semi_diameter[given.lens.stop]
     pattern = jnp.asarray(given.radial.scouts(), radius.dtype)
     points = jnp.zeros_like(rays.point) + radius * pattern[:, None]
@@ -84,8 +87,8 @@ def _scouts(given: _Given, state: _State) -> tuple[_State, _Task]:
 
 
 def _rescue(given: _Given, state: _State) -> tuple[_State, _Task]:
-    """Where no scout of a wavelength arrived, the ray of a fan that crosses the stop nearest to its
-    centre."""
+    """Stage 2: for a wavelength without a ray that arrives, the ray of a fan that crosses the stop
+    nearest to its centre."""
     system, rays = given.system, state.latest.rays
     dark = ~jnp.any(rays.good, axis=-1)
     zero = jnp.zeros_like(rays.point[0])
@@ -101,7 +104,7 @@ def _rescue(given: _Given, state: _State) -> tuple[_State, _Task]:
 
 
 def _middle(given: _Given, state: _State) -> tuple[_State, _Task]:
-    """All rays to the point deepest inside, by the model of the best scout."""
+    """Stage 3: all rays to the point deepest inside, by the linear model of the best ray."""
     scouts = state.latest.rays
     far = jnp.where(scouts.good, boundary.outside(scouts, scouts.point), jnp.inf)
     best = jnp.argmin(far, axis=-1)[:, None]
@@ -112,7 +115,7 @@ def _middle(given: _Given, state: _State) -> tuple[_State, _Task]:
 
 
 def _ends(given: _Given, state: _State) -> tuple[_State, _Task]:
-    """To the ends of even spokes about that point."""
+    """Stage 4: rays to the ends of even spokes about that point."""
     rays, _, settled = state.latest
     ray = jax.tree.map(lambda a: a[..., :1], rays)
     passes = settled[:, :1] & (boundary.outside(ray, ray.point) < 0)
@@ -122,7 +125,7 @@ def _ends(given: _Given, state: _State) -> tuple[_State, _Task]:
 
 
 def _corners(given: _Given, state: _State) -> tuple[_State, _Task]:
-    """To the corners, in the first places: where one edge takes over from another."""
+    """Stage 5: the first `CORNERS` rays to the corners, where the nearest edge changes."""
     radial, frame, even = given.radial, state.frame, state.latest.rays
     line = _target(even, frame.centre, frame.toward(radial.even[None]))
     distance = boundary.edge_distance(even, line)
@@ -138,7 +141,7 @@ def _corners(given: _Given, state: _State) -> tuple[_State, _Task]:
 
 
 def _nodes(given: _Given, state: _State) -> tuple[_State, _Task]:
-    """To the ends of the spokes of the rule, which lie between the corners."""
+    """Stage 6: rays to the ends of the spokes of the rule, which lie between the corners."""
     rays, pair, settled = jax.tree.map(lambda a: a[..., :CORNERS], state.latest)
     beside = boundary.outside(rays, rays.point) < _BESIDE
     exists = settled & beside & (pair[0] != pair[1])
@@ -167,8 +170,11 @@ def _nothing(given: _Given, crossing: bool) -> _State:
 
 
 class _Plan(NamedTuple):
-    """The boundary without derivatives. edge: K = C + B rays, at C corners and at the ends of B
-    spokes, settled where they follow the lens. used: (), how many spokes count. Else see `_State`.
+    """The boundary, without derivatives.
+
+    frame, passes: as in `_State`.
+    edge: K = C + B rays, at C corners and at the ends of B spokes; derivatives exist where settled.
+    used: (), int32, number of spokes with weight.
     """
 
     frame: Frame
@@ -184,14 +190,12 @@ class _Plan(NamedTuple):
 
 
 def _plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, crossing: bool) -> _Plan:
-    """The boundary of the pupil, searched in stages, each from what those before it found.
-
-    One loop runs them all, so that a program holds the trace, which takes long to compile, once.
-    """
+    """Finds the boundary of the pupil in stages. One loop runs all stages, so that the trace, which
+    takes long to compile, stands once in the program."""
     given = _Given(lens, system_of(lens, scene), radial, used)
     trace = functools.partial(boundary.trace, lens, given.system, crossing)
     stages = [_scouts, _rescue, _middle, _ends, _corners, _nodes]
-    count = 4 if radial.symmetry == "rotational" else 6  # on the meridian there are no corners
+    count = 4 if radial.symmetry == "rotational" else 6  # one radius has no corners
     tasks = [functools.partial(stage, given) for stage in stages[:count]]
 
     def run(stage, state):
@@ -209,8 +213,8 @@ def _plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, crossing: b
 def _follow(
     radial: RadialRule, crossing: bool, lens: Lens, scene: Scene, plan: _Plan
 ) -> tuple[Array, Array]:
-    """Points of the rays of a plan, and where they are launched, with their derivatives by the lens
-    and the scene, in every mode."""
+    """Stop points and launches (2, W, K) of the rays of a plan, with derivatives by the lens and
+    the scene in every mode."""
     return plan.edge.rays.point, plan.edge.rays.launch
 
 
@@ -218,7 +222,7 @@ def _follow(
 def _follow_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
     lens, scene, plan = primals
     _, pair, follows = plan.edge
-    # Through the function itself, so that the points carry derivatives of their own.
+    # Call the function itself, so that the points have derivatives for higher orders.
     point, launch = _follow(radial, crossing, lens, scene, plan)
 
     def trace(lens, scene, launch):
@@ -227,13 +231,13 @@ def _follow_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any)
     rays = boundary.launched(functools.partial(trace, lens, scene), launch)
     corners, ends = (slice(None, -radial.count), slice(-radial.count, None))
 
-    def step(lens, scene):  # of Newton's method, by the models of these rays
+    def step(lens, scene):  # one Newton step, by the linear models of these rays
         (crossed, q), _ = trace(lens, scene, launch)
         moved = rays._replace(point=crossed, q=q)
         # A corner stays on both edges.
         corner = (crossed + boundary.corner_step(moved, pair))[..., corners]
         corner = jnp.where(follows[:, corners], corner, point[..., corners])
-        # A spoke turns with the corners, and ends on its edge.
+        # A spoke rotates with the corners, and ends on its edge.
         toward, _ = plan.spokes(radial, corner)
         moved = jax.tree.map(lambda a: a[..., ends], moved)
         distance = boundary.edge_distance(moved, _target(moved, plan.frame.centre, toward))
@@ -247,22 +251,22 @@ def _follow_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any)
 
 
 def _along(line: Array, toward: Array) -> Array:
-    """How many `toward` long a line is, (W, B)."""
+    """Length (W, B) of a line in units of `toward`."""
     return safe_divide(dot(toward, line), dot(toward, toward))
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Clipped(PupilRule):
-    """Gauss rules between the corners of the boundary and along the radii to it.
-
-    Each obscuration doubles the rays: what lies inside of it is subtracted, by rays of its own.
+    """Gauss rules between the corners of the boundary and along the radii to it. Each obscuration
+    doubles the number of rays: the light inside of it is subtracted.
 
     order: nodes along a radius.
     symmetry: see `symmetry_of`.
-    size: the order up to which weightless rays fill up, so that orders share a compiled program.
-    crossing: whether light may end where neighbouring surfaces cross, too; without, a search takes
-        half the time.
+    size: order up to which rays of weight 0 fill up, so that orders share a compiled program; 0 for
+        `order`.
+    crossing: True if the boundary also contains points where neighbouring surfaces cross; False
+        takes half the time.
     """
 
     order: int
@@ -276,11 +280,11 @@ class Clipped(PupilRule):
             object.__setattr__(self, "size", self.order)
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points and weights, which follow the lens.
+        """Points and weights, differentiable by the lens.
 
-        Light passes where it passes all clear apertures and is inside of no obscuration: by
-        inclusion and exclusion, the sum of parts of the pupil that are each inside of some
-        obscurations, with the weights negative for an odd number of them.
+        Light passes inside of all clear apertures and outside of all obscurations. By inclusion and
+        exclusion, this is a sum over sets of obscurations of the light inside of all of a set, with
+        negative weights for an odd number.
         """
         extra = lens.apertures
         if extra is None or not any(extra.blocks):
@@ -296,21 +300,21 @@ class Clipped(PupilRule):
         points, weight = jax.vmap(part, out_axes=1)(jnp.asarray(inside))
         weight = weight * jnp.asarray(1 - 2 * odd, weight.dtype)[None, :, None]
         points, weight = jax.tree.map(lambda a: a.reshape(len(a), -1), (points, weight))
-        # What rounding leaves of no light is none.
+        # A total within rounding counts as no light.
         least = float(jnp.finfo(weight.dtype).eps) ** 0.5
         lit = jnp.sum(weight, axis=-1, keepdims=True) > least
         return points, jnp.where(lit, weight, 0)
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """1 for all rays (W, Q) that exist: the weights know the edges."""
+        """1 for all rays (W, Q) that exist: the weights contain the clipping."""
         whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
         return whole.astype(bundle.path.dtype)
 
     def _inside(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points and weights of what is inside of all apertures and obscurations."""
+        """Points and weights of the light inside of all apertures and obscurations."""
         axial = self.symmetry == "rotational"
         part = {"rotational": 0, "bilateral": 1, "none": 2}[self.symmetry]
-        # Apertures of all shapes make corners; the narrow panels between them need spokes too.
+        # Edges make corners; narrow panels between them need spokes too.
         edges = boundary.aperture_edges(lens)
         used, most = (part * (2 * n + 6 + 2 * edges) for n in (self.order, self.size))
         radial = RadialRule(self.symmetry, max(most, 32 * part) + 1)
@@ -319,11 +323,11 @@ class Clipped(PupilRule):
         point, _ = _follow(radial, self.crossing, lens, scene, plan)
         corner, end = point[..., : -radial.count], point[..., -radial.count :]
         toward, share = plan.spokes(radial, corner)
-        # The nodes have the first places; the others are of the search alone.
+        # The first spokes are nodes of the rule; the others serve the search alone.
         toward, share, end = (a[..., : max(most, 1)] for a in (toward, share, end))
         length = _along(end - plan.frame.centre, toward)
         node, weight = jnp.asarray(gauss(self.size), length.dtype)[:, self.order, None, None]
-        # On the axis r^2 is the variable, as without clipping.
+        # For "rotational" r^2 is the variable, as without clipping.
         node, weight = (jnp.sqrt(node), weight) if axial else (node, 2 * node * weight)
         size = determinant(plan.frame.shape)
         weight = jnp.where(plan.passes, share * length**2 * size, 0)[..., None] * weight

@@ -1,10 +1,11 @@
 """Points on the unit disc of the stop and their weights, as arrays.
 
-All rules integrate over the area of the disc with weights that sum to 1. The order n of a
-Gauss rule is its number of nodes in t = r^2, the variable in which a rotationally symmetric
-aberration is smooth. Source: Forbes, JOSA A 5, 1943 (1988). The moments use the Gauss rules;
-the patterns of equal weights are what other programs use, for comparison. ValueError for an
-order or a number that is not whole or below 1.
+Every rule integrates over the area of the disc with weights that sum to 1. The order n of a Gauss
+rule is its number of nodes in r^2, the variable in which a rotationally symmetric aberration is
+smooth. The moments use Gauss rules; other programs use the patterns of equal weights. ValueError
+for an order or a number that is not a whole number of at least 1.
+
+Source: Forbes, JOSA A 5, 1943 (1988).
 """
 
 import numpy as np
@@ -22,15 +23,15 @@ def _gauss(order: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def meridian(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 1) and weights (n,) on one radius: enough for an axial object."""
+    """Points (n, 1) and weights (n,) on one radius, for an axial object."""
     radius, weights = _gauss(order)
     return radius[:, None], weights
 
 
 def half_disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n m, 2) in the half x > 0 and weights: enough for a field along y.
+    """Points (n m, 2) in the half x > 0 and weights (n m,), for a field along y.
 
-    n Gauss nodes in r^2 times m uniform azimuths, the mirror half of a rule of 2 m.
+    n Gauss nodes in r^2 times m uniform azimuths, half of a rule of 2 m azimuths.
     """
     radius, weights = _gauss(order)
     _count("azimuths", azimuths)
@@ -40,31 +41,29 @@ def half_disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def disc(order: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (2 n m, 2) and weights of the same rule on the whole disc."""
+    """Points (2 n m, 2) and weights (2 n m,) of the rule of `half_disc` on the whole disc."""
     points, weights = half_disc(order, azimuths)
     mirrored = points * np.array([-1.0, 1.0])
     return np.concatenate([points, mirrored]), np.tile(weights / 2, 2)
 
 
 def random_disc(rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform random points (rays, 2), as the paper's 256 rays, and equal weights."""
+    """Uniform random points (rays, 2), as the 256 rays of the paper, and equal weights (rays,)."""
     _count("rays", rays)
     generator = np.random.default_rng(seed)
     return _of_square(generator.random(rays), generator.random(rays))
 
 
 def _of_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the unit square on the disc: r = sqrt(u), azimuth 2 pi v; equal weights."""
+    """Maps points of the unit square to the disc: r = sqrt(u), azimuth 2 pi v; equal weights."""
     radius, angle = np.sqrt(u), 2 * np.pi * v
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     return points, np.full(len(u), 1 / len(u))
 
 
 def square_grid(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (Q, 2) of a square grid inside the disc and equal weights.
-
-    The centres of `side` x `side` cells of the square round the disc; those in the disc stay.
-    """
+    """Points (Q, 2) of a square grid and equal weights (Q,): those centres of `side` x `side` cells
+    of the square about the disc that lie in the disc."""
     _count("side", side)
     line = (np.arange(side) + 0.5) / side * 2 - 1
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
@@ -73,11 +72,12 @@ def square_grid(side: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (Q, 2), Q = 1 + 3 n (n + 1): the centre and n rings of 6, 12, 18, ...; equal weights.
+    """Points (Q, 2), Q = 1 + 3 n (n + 1): the centre and n rings of 6, 12, 18, ... points; equal
+    weights (Q,).
 
-    Each ray stands for the same area of the disc: a ring of 6 k lies at the radius that halves
-    the area of its annulus. (Lens design programs often put the outermost ring on the rim and
-    so count the rim twice.)
+    Each ray stands for the same area of the disc: a ring lies at the radius that halves the area of
+    its annulus. (Lens design programs often put the outermost ring on the rim, which gives the rim
+    twice its weight.)
     """
     _count("rings", rings)
     k = np.arange(1, rings + 1)
@@ -91,8 +91,8 @@ def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sobol(count: int) -> np.ndarray:
-    """The first points (count, 2) of the Sobol sequence in the unit square, not scrambled: those of
-    `scipy.stats.qmc`. Best at powers of two."""
+    """The first points (count, 2) of the Sobol sequence of `scipy.stats.qmc` in the unit square,
+    not scrambled. Best for powers of two."""
     from scipy.stats import qmc  # takes a second to import
 
     _count("count", count)
@@ -101,5 +101,5 @@ def sobol(count: int) -> np.ndarray:
 
 
 def sobol_disc(rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (rays, 2) of the Sobol sequence and equal weights: r^2 and azimuth are its axes."""
+    """Points (rays, 2) of the Sobol sequence in r^2 and azimuth, and equal weights (rays,)."""
     return _of_square(*sobol(rays).T)

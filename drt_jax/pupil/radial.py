@@ -1,4 +1,4 @@
-"""Spokes, the half-lines from a centre to the boundary: where they lie, and their quadrature.
+"""Radial quadrature inside a boundary, along spokes: half-lines from a centre to the boundary.
 
 Vectors are arrays with their 2 components first, and B rays a wavelength last.
 """
@@ -16,29 +16,31 @@ from ..numerics import safe_divide
 from .boundary import displace, inverse, picked
 from .rules import Symmetry
 
-# Corners that have a panel of their own, and what each gap between two of the even spokes on which
-# they are sought is divided into. A panel gets nodes by its width in half turns and `_EXTRA`.
+# `CORNERS`: most corners of a boundary. `_PARTS`: parts into which each interval between two even
+# spokes is divided to find them. The nodes of a panel between corners are proportional to its width
+# in units of pi, plus `_EXTRA`.
 CORNERS, _PARTS, _EXTRA = 8, 32, 0.15
 
 
 @functools.cache
 def _taps() -> np.ndarray:
-    """Weights (6, _PARTS + 1) that interpolate between the two middle ones of 6 even values."""
+    """Weights (6, _PARTS + 1) for interpolation between the middle two of 6 even samples."""
     t, knots = np.linspace(0, 1, _PARTS + 1), np.arange(-2, 4)
     rows = [(knot, np.delete(knots, k)[:, None]) for k, knot in enumerate(knots)]
     return np.array([np.prod((t - others) / (knot - others), axis=0) for knot, others in rows])
 
 
 def changes(distance: Array, closed: bool) -> tuple[Array, Array]:
-    """Where one edge takes over from another along even spokes, from `edge_distance` (E, W, B) of
-    them: places (W, C) in gaps between spokes, and the two edges (2, W, C), equal for no corner.
+    """Corners of a boundary, where the nearest edge along even spokes changes: positions (W, C) in
+    intervals between spokes, and both edges (2, W, C), equal where there is no corner.
 
-    closed: whether the first spoke is the last; else the pupil is mirrored at both.
+    distance: (E, W, B), `edge_distance` along even spokes.
+    closed: True if the first spoke is also the last; False if the pupil is mirrored at both.
     """
     last = distance.shape[-1] - 1
     index = np.arange(last)[:, None] + np.arange(-2, 4)
     index = index % last if closed else last - abs(last - abs(index))
-    # An edge beyond 4 times the longest spoke ends nothing; a spoke is no longer than 2.
+    # Clip distances at 4 times the longest spoke; no spoke is longer than 2.
     far = 4 * jnp.minimum(jnp.max(jnp.min(distance, axis=0), axis=-1), 2)
     distance = jnp.clip(distance, 0, far[None, :, None])[..., index]
     distance = distance @ jnp.asarray(_taps(), distance.dtype)
@@ -49,14 +51,14 @@ def changes(distance: Array, closed: bool) -> tuple[Array, Array]:
     place = jax.vmap(lambda change: find(change)[0])(first[0] != first[1])
     pair = jnp.take_along_axis(first, place[None], axis=-1)
     near = picked(jnp.take_along_axis(ends, place[None, None], axis=-1), pair)
-    start, end = near[:, 1] - near[:, 0]  # by how far the second edge is beyond the first
+    start, end = near[:, 1] - near[:, 0]  # distance of the second edge beyond the first
     part = jnp.clip(safe_divide(start, start - end), 0, 1)
     return (place.astype(part.dtype) + part) / _PARTS, pair
 
 
 @functools.cache
 def gauss(most: int) -> np.ndarray:
-    """Gauss nodes on [0, 1] and weights, (2, most + 1, most): in row n those of n, then zeros."""
+    """Gauss nodes on [0, 1] and weights, (2, most + 1, most): row n has n nodes, then zeros."""
     table = np.zeros((2, most + 1, most))
     for n in range(1, most + 1):
         nodes, weights = np.polynomial.legendre.leggauss(n)
@@ -65,8 +67,11 @@ def gauss(most: int) -> np.ndarray:
 
 
 class Frame(NamedTuple):
-    """Polar coordinates about a centre (2, W, 1), stretched by matrices `shape` (2, 2, W, 1) to
-    about the shape of the pupil."""
+    """Polar coordinates about a centre, stretched to about the shape of the pupil.
+
+    centre: (2, W, 1), in units of the semi-diameter of the stop.
+    shape: (2, 2, W, 1), matrices of the stretching.
+    """
 
     centre: Array
     shape: Array
@@ -76,13 +81,17 @@ class Frame(NamedTuple):
         return displace(self.shape, jnp.stack([jnp.cos(angle), jnp.sin(angle)]))
 
     def unstretched(self, point: Array) -> Array:
-        """Where points (2, W, C) lie about the centre without the stretching."""
+        """Positions of points (2, W, C) relative to the centre without the stretching."""
         return displace(inverse(self.shape), point - self.centre)
 
 
 @dataclasses.dataclass(frozen=True)
 class RadialRule:
-    """Spokes and their weights: there are places for `count` of them, B."""
+    """Spokes and their weights.
+
+    symmetry: part of the pupil that is traced.
+    count: B, largest number of spokes.
+    """
 
     symmetry: Symmetry
     count: int
@@ -94,17 +103,17 @@ class RadialRule:
 
     @property
     def even(self) -> np.ndarray:
-        """Azimuths (B,) of even spokes, ends included; the meridian's is y > 0."""
+        """Azimuths (B,) of even spokes, with both ends; that of "rotational" is +y."""
         axial = self.symmetry == "rotational"
         return np.linspace(-np.pi / 2 + axial * np.pi, self.range - np.pi / 2, self.count)
 
     def nearest(self, angle: Array) -> Array:
-        """Which of the even spokes is nearest to an azimuth."""
+        """Index of the even spoke that is nearest to an azimuth, int32."""
         index = jnp.round((angle + np.pi / 2) * ((self.count - 1) / self.range))
         return jnp.clip(index.astype(jnp.int32), 0, self.count - 1)
 
     def scouts(self) -> np.ndarray:
-        """Points (2, B) all over the stop, and a little beyond its rim."""
+        """Points (2, B) over the whole stop and a little beyond its rim."""
         k = np.arange(self.count) + 0.5
         if self.symmetry == "none":
             angle = np.pi * (1 + 5**0.5) * k
@@ -112,8 +121,14 @@ class RadialRule:
         return np.stack([0 * k, 1.2 * (2 * k / self.count - 1)])
 
     def nodes(self, frame: Frame, used: Array, corner: Array, exists: Array) -> tuple[Array, Array]:
-        """Azimuths (W, B) and their weights, which add up to 1: `used` Gauss nodes between the
-        corners (2, W, C) that exist (W, C); more in a wide gap."""
+        """Azimuths (W, B) and weights (W, B) with the sum 1: Gauss nodes between corners, more
+        in a wider panel.
+
+        frame: the polar coordinates.
+        used: (), int32, number of nodes.
+        corner: (2, W, C), corners.
+        exists: (W, C), bool, corners that exist.
+        """
         low, full = -np.pi / 2, self.range
         if self.symmetry == "rotational":
             one = jnp.ones((len(exists), 1), corner.dtype)
@@ -128,7 +143,7 @@ class RadialRule:
         last = jnp.round(used.astype(need.dtype) * need / need[:, -1:]).astype(jnp.int32)
         slot = jnp.arange(self.count, dtype=jnp.int32)[None]
         panel = jnp.sum(slot[..., None] >= last[:, None], axis=-1, dtype=jnp.int32)
-        # Behind the last panel there are no nodes, and no weight.
+        # Slots behind the last panel have no nodes and no weight.
         last = jnp.pad(last, ((0, 0), (1, 1)))
         begin, end = (jnp.take_along_axis(last, panel + k, axis=-1) for k in (0, 1))
         table = jnp.asarray(gauss(self.count), width.dtype)

@@ -1,8 +1,8 @@
-"""Quadrature rules on the pupil: which rays stand for all the light of a point.
+"""Quadrature rules on the pupil: points on the stop with weights.
 
 A rule is a value: a frozen pytree whose kind, order and symmetry are static. It chooses points on
-the stop, their weights, and what part of a traced ray counts. Weights add up to 1 over the light
-that fills the stop; what is missing is the light that is lost.
+the stop, their weights, and the transmission of each ray. The weights of the light that fills the
+stop add up to 1; with transmission they add up to the throughput.
 """
 
 import abc
@@ -24,32 +24,32 @@ from ..rays.system import Vector
 from ..rays.trace import Bundle
 from . import patterns
 
-# How much of the pupil stands for all of it: one radius, half of it (x > 0), or the whole disc.
+# Part of the pupil that is traced: one radius, the half x > 0, or the whole disc.
 Symmetry = Literal["rotational", "bilateral", "none"]
 MAX_ORDER = 42
 
 
 def symmetry_of(lens: Lens, field: Numbers) -> Symmetry:
-    """How much of the pupil must be traced for a field: an angle along y or (x, y), in radians, or
-    many (F, 2).
+    """Symmetry of the pupil for a field: "rotational" on the axis of a rotationally symmetric lens,
+    "bilateral" for a field along y if x -> -x does not change the lens, else "none".
 
-    In a lens with an axis, a field known to be 0 needs one radius; one along y needs half a pupil,
-    if x -> -x leaves the lens and its apertures alone. ValueError inside a trace where the answer
-    depends on values that are not known there.
+    field: angle along y, (x, y), or several (F, 2), radians.
+
+    ValueError inside `jit` or `vmap`, if values that are not known there decide.
     """
     group, extra = lens.elements, lens.apertures
     shift, turned = (None, None) if group is None else (group.shift, group.tilt)
     moves = (lens.decentre, lens.tilt, shift, turned, extra and extra.centre)
     if not concrete((field, moves)):
         raise ValueError(
-            "the symmetry of a pupil follows from known numbers: ask for it, or for a rule, "
-            "outside of jax.jit and jax.vmap"
+            "symmetry_of: needs known numbers; call it, or make the rule, outside of jax.jit and "
+            "jax.vmap"
         )
     forms = (*lens.forms, *(() if lens.phase is None else lens.phase.forms))
     kinds = {FORMS[form].symmetry for form in forms}
     if extra is not None and {*extra.kinds} != {"circle"}:
         kinds.add("bilateral")
-    # Neither x, nor a turn about y or z, takes anything out of the plane x = 0.
+    # True if nothing is shifted along x or rotated about y or z, out of the plane x = 0.
     sideways = zip(moves, ([0], [1, 2], [0], [1, 2], [0]), strict=True)
     still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)
     angles = np.asarray(field)
@@ -60,25 +60,28 @@ def symmetry_of(lens: Lens, field: Numbers) -> Symmetry:
 
 
 class PupilRule(abc.ABC):
-    """A rule: `points` on the stop with weights, and the `transmission` of each ray."""
+    """A rule: `points` on the stop with weights, and the `transmission` of each ray.
+
+    symmetry: part of the pupil that is traced, see `symmetry_of`.
+    """
 
     symmetry: Symmetry
 
     @abc.abstractmethod
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points, D arrays (Q,) or (W, Q) on the unit disc of the stop, D = 1 for the meridian, and
-        weights (1, Q) or (W, Q)."""
+        """Points on the unit disc of the stop, D arrays (Q,) or (W, Q), and weights, (1, Q) or
+        (W, Q). D = 1 for "rotational", else 2."""
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """What part of each ray (W, Q) arrives; 0 for rays that fail or are clipped."""
+        """Transmitted fraction of each ray (W, Q); 0 for rays that fail or are clipped."""
         return (bundle.status == Status.OK).astype(bundle.path.dtype)
 
 
 def gauss_points(order: int, symmetry: Symmetry) -> tuple[np.ndarray, np.ndarray]:
-    """Points (Q, D) and weights (Q,) of the Gauss rule of an order on what symmetry leaves.
+    """Points (Q, D) and weights (Q,) of a Gauss rule on the part of the pupil that is traced.
 
-    An aberration of degree p in the pupil reaches azimuthal order p: as many azimuths on the half
-    disc as there are radial nodes, and one, integrate its square to the same degree.
+    An aberration of degree p in the pupil reaches azimuthal order p. With order + 1 azimuths on the
+    half disc, azimuths and radii integrate its square to the same degree.
     """
     if symmetry == "rotational":
         return patterns.meridian(order)
@@ -90,7 +93,8 @@ def gauss_points(order: int, symmetry: Symmetry) -> tuple[np.ndarray, np.ndarray
 class Gauss(PupilRule):
     """Gauss rule on the stop. Rays that fail or are clipped drop out one by one.
 
-    order: nodes in r^2, 1 to 42; n on the meridian, n (n + 1) on half a pupil.
+    order: nodes n in r^2, 1 to 42; n rays for "rotational", n (n + 1) for "bilateral", twice as
+        many for "none".
     symmetry: see `symmetry_of`.
     """
 
@@ -110,10 +114,10 @@ class Gauss(PupilRule):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Soft(PupilRule):
-    """Gauss rule behind clear apertures that fade instead of cutting off: each is a logistic step.
+    """Gauss rule with smooth aperture edges: the transmission of each is a logistic step.
 
-    order, symmetry: as of `Gauss`.
-    width: (), mm over which an aperture fades.
+    order, symmetry: as in `Gauss`.
+    width: (), width of the steps, mm.
     """
 
     order: int = dataclasses.field(metadata={"static": True})
@@ -130,10 +134,11 @@ class Soft(PupilRule):
         return Gauss(self.order, self.symmetry).points(lens, scene)
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """The product of the steps of all apertures but the stop's circle, and obscurations."""
+        """Product (W, Q) of the steps of all apertures and obscurations except the stop's circle;
+        0 for rays that fail."""
         whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
         inside = clearance(lens, bundle.hits)
-        bounded = jnp.isfinite(inside)  # else the width would have no derivative
+        bounded = jnp.isfinite(inside)  # inf / width has no derivative by the width
         inside = jnp.where(bounded, inside, 0) / jnp.asarray(self.width, inside.dtype)
         steps = jax.nn.sigmoid(jnp.where(bounded, inside, jnp.inf))
         return jnp.where(whole, jnp.prod(steps, axis=0), 0)
@@ -142,10 +147,11 @@ class Soft(PupilRule):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Pattern(PupilRule):
-    """Any points on the stop, such as those of `pupil.hexapolar`; clipped rays drop out.
+    """Rule of any points on the stop, such as those of `pupil.hexapolar`; clipped rays drop out.
 
-    positions: (Q, 2), x and y in units of the stop's semi-diameter; (Q, 1) on the meridian.
-    weights: (Q,), adding up to 1 for a stop filled with light.
+    positions: (Q, 2), x and y in units of the semi-diameter of the stop; (Q, 1) for "rotational".
+    weights: (Q,), with the sum 1 for a stop filled with light.
+    symmetry: see `symmetry_of`.
     """
 
     positions: Numbers
@@ -153,7 +159,7 @@ class Pattern(PupilRule):
     symmetry: Symmetry = dataclasses.field(metadata={"static": True}, default="none")
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """The points and weights as they are. ValueError for other shapes than these."""
+        """The points and weights. ValueError for wrong shapes."""
         dtype = lens.curvature.dtype
         positions = real_array("positions", self.positions, dtype)
         weights = real_array("weights", self.weights, dtype)
@@ -167,7 +173,7 @@ class Pattern(PupilRule):
 
 
 def check_rule(order: int, symmetry: Symmetry) -> None:
-    """ValueError for an order or a symmetry that no rule has."""
+    """Raises ValueError for an order or a symmetry that no rule has."""
     whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
     if not whole or not 1 <= order <= MAX_ORDER:
         raise ValueError(f"order: expected a whole number from 1 to {MAX_ORDER}, got {order!r}")
@@ -178,10 +184,12 @@ def check_rule(order: int, symmetry: Symmetry) -> None:
 def pupil_points(
     lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers, rule: PupilRule
 ) -> tuple[Array, Array]:
-    """Where the rays of a rule cross the stop, (W, Q, 2) in units of its semi-diameter, and their
-    weights (W, Q), which follow the lens. Arguments as in `trace_rays`.
+    """Points where the rays of a rule cross the stop, (W, Q, 2) in units of its semi-diameter, and
+    their weights (W, Q). Both are differentiable by the lens. Points of a "rotational" rule lie on
+    the y axis and stand for all azimuths.
 
-    Points of the meridian lie on the y axis, and stand for all azimuths.
+    field, distance, wavelengths: as in `trace_rays`.
+    rule: the rule.
     """
     scene = scene_of(lens, field, distance, wavelengths)
     points, weights = rule.points(lens, scene)

@@ -1,8 +1,8 @@
-"""Aiming: from where to launch a ray so that it crosses the stop at a wanted point.
+"""Aiming: the launch point of a ray that crosses the stop at a given point.
 
-Newton's method in the launch point of one ray, mapped over a bundle, from where paraxial optics
-puts it. Rays that this does not find, and only those, start again from the nearest rays that were
-found, and from a fan of rays over the first surface.
+Newton's method in the launch point of one ray, mapped over a bundle, starts at the paraxial launch.
+Only the rays that fail start again: from the nearest rays that were found, and from a fan of rays
+over the first surface.
 """
 
 import dataclasses
@@ -23,24 +23,27 @@ from .snell import shoot, shoot_to_stop, split_stop
 from .status import Status
 from .system import System, Vector, determinant, divide, dot
 
-# A ray counts as aimed if it misses its stop point by less than `_NEAR` of the beam's radius: one
-# more step of Newton's method, which converges quadratically, then brings it there to rounding,
-# and the path needs no polish.
+# A ray is aimed if it misses its stop point by less than `_NEAR` times the beam radius. Newton's
+# method converges quadratically: one more step reaches the point to rounding, without polish.
 _NEAR = 1e-7
-# Steps of one search; it ends after `_PATIENCE` in a row that came no nearer.
+# Most steps of one search; it ends after `_PATIENCE` steps in a row that came no nearer.
 _STEPS, _PATIENCE = 48, 12
-# The fan has `_TILES` tiles a side of `_FAN` rays a side; a stop point takes the ray that comes
-# nearest of each of its `STARTS` nearest tiles.
+# The fan has `_TILES` tiles per side, each with `_FAN` rays per side. The starts for a stop point
+# are the nearest ray of each of its `STARTS` nearest tiles.
 _TILES, _FAN, STARTS = 15, 5, 24
-# How often at most a bundle is aimed again from the rays that were found. Bundled lenses at twice
-# their apertures and fields take 3.
+# Most rounds in which a bundle is aimed again from the rays that were found. The bundled lenses at
+# twice their apertures and fields take 3.
 _ROUNDS = 8
 
 
 class _State(NamedTuple):
-    """move: D numbers, from the best launch so far to the next trial, mm. far: by how much the best
-    misses its stop point, mm, inf before one arrived. bad: trials in a row that came no nearer.
-    folded: whether the best crosses the stop on the other side of a fold of the beam."""
+    """State of the aiming of one ray.
+
+    move: D numbers, step from the best launch so far to the next trial, mm.
+    far: (), miss of the best launch at the stop, mm; inf before a ray arrives.
+    bad: (), int32, trials in a row that came no nearer.
+    folded: (), bool, whether the best ray crosses the stop beyond a fold of the beam.
+    """
 
     move: Vector
     far: Array
@@ -49,14 +52,20 @@ class _State(NamedTuple):
 
 
 class AimNewton(optx.AbstractRootFinder):
-    """Newton's method for one launch point, damped: after a step with which the ray fails or is
-    farther off, the next is half as long; after a good one, at most twice as long.
+    """Damped Newton's method for one launch point. A step after which the ray fails or misses by
+    more is followed by one half as long; a good step by one at most twice as long.
 
-    The function returns the miss (D numbers) and the status of the ray as its auxiliary output.
-    Options: "reach", the longest first step in mm; "upright", whether trials beyond a fold of the
-    beam, where its image on the stop is turned over, are as bad as failed ones: of two rays through
-    one stop point, neighbours then take the same. Ends when the miss is at most `atol` mm, and
-    the step that remains is taken; or with RESULTS.nonlinear_divergence.
+    The function returns the miss (D numbers, mm) and the status of the ray as auxiliary output. The
+    search ends when the miss is at most `atol`, and takes the remaining step; or it ends with
+    RESULTS.nonlinear_divergence.
+
+    rtol: not used.
+    atol: accepted miss, mm.
+    norm: norm of D numbers.
+    Option "reach": longest first step, mm.
+    Option "upright": True if trials beyond a fold of the beam, where its image on the stop is
+        mirrored, count as failed. Where two rays pass one stop point, neighbouring stop points then
+        take rays of the same branch.
     """
 
     rtol: float
@@ -64,7 +73,7 @@ class AimNewton(optx.AbstractRootFinder):
     norm: Callable = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        """The state before the first trial, at the launch that is given."""
+        """The state before the first trial, which is the first guess."""
         far = jnp.full(y[0].shape, jnp.inf, y[0].dtype)
         none = tuple(jnp.zeros_like(a) for a in y)
         return _State(none, far, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
@@ -87,22 +96,22 @@ class AimNewton(optx.AbstractRootFinder):
         return y, _State(move, jnp.minimum(far, state.far), bad, folded), status
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
-        """Whether the ray is aimed, or given up."""
+        """True once the ray is aimed or given up, and the result."""
         given_up = state.bad > jnp.where(jnp.isinf(state.far), 0, _PATIENCE)
         near = state.far <= self.atol
         results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         return near | given_up, optx.RESULTS.where(given_up & ~near, *results)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """The last step, from the best launch."""
+        """Takes the remaining step of an aimed ray."""
         near = state.far <= self.atol
         y = tuple(a + jnp.where(near, b, 0) for a, b in zip(y, state.move, strict=True))
         return y, aux, {}
 
 
 def _derivatives(function: Callable, y: Vector) -> tuple[Vector, Vector, Any]:
-    """Value, D numbers, of a function of D numbers, its derivatives by each, D arrays (D,), and its
-    auxiliary output: all in one trace."""
+    """Value (D numbers) of a function of D numbers, its derivatives by each (D arrays (D,)) and its
+    auxiliary output, all from one trace."""
     units = tuple(jnp.asarray(u, y[0].dtype) for u in np.eye(len(y)))
 
     def along(unit):
@@ -112,9 +121,14 @@ def _derivatives(function: Callable, y: Vector) -> tuple[Vector, Vector, Any]:
 
 
 class Aimed(NamedTuple):
-    """launch: D arrays (W, Q) in mm. status: (W, Q), OK for an aimed ray; else what stopped it
-    before the stop, UNCONVERGED if nothing did. folded: (W, Q), see `AimNewton`. steps: (), trials
-    of the whole bundle."""
+    """Aimed rays.
+
+    launch: D arrays (W, Q), mm.
+    status: (W, Q), int32, OK for an aimed ray, otherwise the failure in front of the stop, or
+        UNCONVERGED.
+    folded: (W, Q), bool, whether the ray crosses the stop beyond a fold of the beam.
+    steps: (), int32, trials of the whole bundle.
+    """
 
     launch: Vector
     status: Array
@@ -129,10 +143,12 @@ def aim(
     sizes: tuple[Array, Array],
     upright: Array | bool = False,
 ) -> Aimed:
-    """Aim rays at stop points `target`, D arrays (W, Q) in mm, from first guesses `launch`.
+    """Aims rays at stop points.
 
-    sizes: () radius of the beam at the stop, and the longest first step, mm. upright: see
-    `AimNewton`.
+    target: D arrays (W, Q), stop points, mm.
+    launch: D arrays (W, Q), first guesses, mm.
+    sizes: () and (), radius of the beam at the stop, and the longest first step, mm.
+    upright: as in `AimNewton`.
     """
     eps = float(jnp.finfo(launch[0].dtype).eps)
     beam, reach = sizes
@@ -170,7 +186,12 @@ def aim(
 
 
 class _Growth(NamedTuple):
-    """A bundle aimed so far: aimed, and whether another round may find more."""
+    """State of `aim_outwards`.
+
+    aimed: the bundle so far.
+    more: (), bool, whether another round may find more rays.
+    rounds: (), int32, rounds so far.
+    """
 
     aimed: Aimed
     more: Array
@@ -178,10 +199,9 @@ class _Growth(NamedTuple):
 
 
 def aim_outwards(system: System, target: Vector) -> Aimed:
-    """Aim rays at stop points `target`, D arrays (W, Q) in mm, from the paraxial launch; then those
-    that fail from the nearest ray, of any wavelength, that was found, as long as that finds more.
-    Where no ray was found at all, they begin at the nearest ray of a coarse fan.
-    """
+    """Aims rays at stop points from the paraxial launch. Rays that fail start again from the
+    nearest ray of any wavelength that was found, as long as a round finds more; if no ray was
+    found, from the nearest ray of a coarse fan. target: D arrays (W, Q), mm."""
     beam, reach = beam_size(system, target)
     upright = system.rows.rotation is None
     waves = target[0].shape[0]
@@ -219,8 +239,13 @@ def aim_outwards(system: System, target: Vector) -> Aimed:
 
 
 def nearest_found(launch: Vector, good: Array, target: Vector) -> Vector:
-    """Launches, D arrays (W, Q), for stop points: that of the `good` ray (W, Q), of any wavelength,
-    that crosses the stop nearest; void where none is good."""
+    """For each stop point, the launch of the nearest good ray of any wavelength, D arrays (W, Q),
+    mm; undefined if no ray is good.
+
+    launch: D arrays (W, Q), mm.
+    good: (W, Q), bool.
+    target: D arrays (W, Q), stop points of the rays, mm.
+    """
     every = [a.reshape(-1) for a in target]
     gaps = (a[..., None] - b[None, None] for a, b in zip(target, every, strict=True))
     far = jnp.where(good.reshape(-1)[None, None], sum(g * g for g in gaps), jnp.inf)
@@ -229,7 +254,7 @@ def nearest_found(launch: Vector, good: Array, target: Vector) -> Vector:
 
 
 def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
-    """Radius of the beam at the stop, and how wide it may be on the first surface, mm."""
+    """Radius of the beam at the stop, and its largest likely radius on the first surface, mm."""
     beam = jnp.sqrt(jnp.max(dot(target, target)))
     lean = jnp.sqrt(dot(system.source[:-1], system.source[:-1]))
     depth = jnp.abs(system.at_stop[0].axial - system.rows.axial[0])
@@ -238,18 +263,22 @@ def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
 
 
 def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
-    """Launch of the rays through the paraxial entrance pupil to stop points `target`, D arrays
-    (W, Q) in mm; tilts are left out. At most 4 times `width` from the axis, mm: where the stop is
-    imaged to infinity, the pupil lies beyond any lens."""
+    """Launches of the rays through the paraxial entrance pupil, D arrays (W, Q), mm; tilts are
+    neglected. No launch is farther than 4 `width` from the axis: the pupil of a telecentric
+    lens lies at infinity.
+
+    target: D arrays (W, Q), stop points, mm.
+    width: (), radius of the beam on the first surface, mm.
+    """
     dim, rows, before = system.dim, system.rows, system.before
     dtype = target[0].dtype
     stop, _ = system.at_stop
-    # The surfaces before the stop; then a plane without power at the stop, which may lie anywhere.
+    # The surfaces in front of the stop; then a plane without power at the stop.
     shape = Shape(*(a[..., :before] for a in (rows.curvature, rows.conic, rows.coefficients.T)))
     bent = jnp.stack(vertex_curvature(shape, system.forms[:before], dim), axis=-1)
     bent = jnp.concatenate([bent, jnp.zeros((1, dim), dtype)])[:, None, :, None]
     gaps = jnp.diff(jnp.append(rows.axial[:before], stop.axial))
-    # In a mirrored space, distances and indices are both negative.
+    # Behind a mirror, distances and indices are both negative.
     index = system.index[: before + 1] * system.senses[: before + 1, None, None]
     index = jnp.moveaxis(jnp.concatenate([index, index[-1:]]), -1, 1)[:, None]
     power = bent * jnp.diff(index, axis=0)
@@ -261,7 +290,7 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
     one = jnp.ones((2, dim, system.index.shape[1]), dtype)
     first = rows.axial[0] if before else stop.axial
     v = system.vergence
-    # Two rays: from the object's point on the axis, and slanted.
+    # Two rays: one from the axial object point, and an oblique one.
     height = one * jnp.stack([1 + first * v, first])[:, None, None]
     slope = one * jnp.stack([v, jnp.ones_like(v)])[:, None, None]
     (axial, tilted), _ = (
@@ -275,7 +304,7 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
         amplitude = safe_divide(wanted - tangent * tilted[-1, d, :, None], axial[-1, d, :, None])
         start = amplitude * axial[0, d, :, None] + tangent * tilted[0, d, :, None]
         launch.append(start)
-    # The light at z = `first`, brought to the vertex plane of the first row.
+    # Transfer from z = `first` to the vertex plane of the first row.
     depth, near = rows.vertex[0] - first, 1 / (v * first + 1)
     launch = [a + depth * near * (v * a - s) for a, s in zip(launch, system.source, strict=False)]
     far = safe_sqrt(dot(launch, launch))
@@ -284,8 +313,8 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
 
 
 def _fan(dim: int, rays: int) -> np.ndarray:
-    """Launch points (D, tiles, rays of a tile) between -1 and 1, denser in the middle; `rays` a
-    side of each tile."""
+    """Launch points (D, tiles, rays of a tile) between -1 and 1, denser in the middle. rays: number
+    of rays per side of a tile."""
     side = np.linspace(-1, 1, _TILES * rays)
     side = (side * (0.3 + 0.7 * side**2)).reshape(_TILES, rays)
     places = np.meshgrid(*[np.arange(side.size)] * dim, indexing="ij")
@@ -297,8 +326,9 @@ def _fan(dim: int, rays: int) -> np.ndarray:
 class Fan(NamedTuple):
     """A fan of rays over the first surface.
 
-    launch: D arrays (tiles, rays of a tile), mm. there: D arrays (W, tiles, rays of a tile), where
-    those that reach the sensor cross the stop, mm; inf for the others.
+    launch: D arrays (tiles, rays of a tile), mm.
+    there: D arrays (W, tiles, rays of a tile), crossing of the stop by rays that reach the sensor,
+        mm; inf for the others.
     """
 
     launch: Vector
@@ -306,17 +336,25 @@ class Fan(NamedTuple):
 
 
 def no_fan(system: System, waves: int, rays: int = _FAN) -> Fan:
-    """A fan before it is traced: the points of launch between -1 and 1, `rays` a side of a tile."""
+    """A fan before it is traced, its launch points scaled to -1 to 1.
+
+    waves: number of wavelengths.
+    rays: number of rays per side of a tile.
+    """
     points = jnp.asarray(_fan(system.dim, rays), system.index.dtype)
     nowhere = jnp.full((waves, *points.shape[1:]), jnp.inf, points.dtype)
     return Fan(tuple(points), (nowhere,) * system.dim)
 
 
 def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
-    """The fan traced, over twice the `width` of the beam (mm) and beyond the launches `tried`.
+    """Traces a fan.
 
-    In a loop that runs only where a ray is missing, these must be what that loop is given: from
-    what does not change in it XLA computes the whole fan beforehand, missing rays or not.
+    fan: the fan of `no_fan`.
+    tried: D arrays (W, Q), launches already tried, mm; the fan reaches beyond them.
+    width: (), radius of the beam on the first surface, mm; the fan reaches twice as far.
+
+    Pass `fan` and `tried` through the loop carry: XLA hoists loop-invariant work out of a loop and
+    would trace the fan even when no ray is missing.
     """
     reach = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
     launch = tuple(reach * a for a in fan.launch)
@@ -329,8 +367,12 @@ def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
 
 
 def nearest_start(fan: Fan, target: Vector) -> Vector:
-    """Launches, D arrays (W, Q), for stop points, D arrays (W, Q): of the ray of each tile that
-    crosses the stop nearest to its centre, the one that comes nearest."""
+    """One launch for each stop point, D arrays (W, Q), mm. Each tile offers its ray that crosses
+    the stop nearest to the centre of the stop; the nearest of these is taken.
+
+    fan: a traced fan.
+    target: D arrays (W, Q), stop points, mm.
+    """
     central = jnp.argmin(dot(fan.there, fan.there), axis=-1)  # (W, tiles)
     there = (jnp.take_along_axis(a, central[..., None], axis=-1)[..., 0] for a in fan.there)
     gaps = (a[..., None] - b[:, None] for a, b in zip(target, there, strict=True))
@@ -339,8 +381,13 @@ def nearest_start(fan: Fan, target: Vector) -> Vector:
 
 
 def starts_of(fan: Fan, target: Vector, ranks: Array) -> Vector:
-    """Launches, D arrays (W, K, N), for stop points, D arrays (W, K): the rays of the fan that come
-    nearest, each the nearest of one tile, the tiles by rank; `ranks` (W, K, N)."""
+    """N launches for each of K stop points, D arrays (W, K, N), mm: the nearest ray of each of the
+    tiles of given ranks.
+
+    fan: a traced fan.
+    target: D arrays (W, K), stop points, mm.
+    ranks: (W, K, N), int32, ranks of tiles by distance to the stop point, 0 for the nearest.
+    """
     gaps = (a[:, :, None, None] - b[:, None] for a, b in zip(target, fan.there, strict=True))
     far = sum(g * g for g in gaps)  # (W, K, tiles, rays)
     near, which = jnp.min(far, axis=-1), jnp.argmin(far, axis=-1)

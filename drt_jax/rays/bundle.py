@@ -1,8 +1,8 @@
-"""Large bundles: rays aimed by polynomials, in tiles that stay in the cache of a core.
+"""Large bundles: rays launched by polynomials, in tiles that fit the cache of a core.
 
-Where a ray through a stop point enters the lens is a smooth function of that point. It is fitted
-to a few hundred rays that are searched for; all others are launched by it, meet their stop points
-to rounding, and are searched for only where they do not.
+The launch of a ray is a smooth function of its stop point. Polynomials are fitted to a few hundred
+aimed rays and launch all others, which meet their stop points to rounding; only where they do not,
+they are searched for.
 """
 
 from collections.abc import Callable
@@ -17,32 +17,33 @@ from .aim import aim, beam_size, paraxial_launch
 from .status import Status
 from .system import System, Vector, dot
 
-# More rays than `_MANY` are aimed by polynomials and solved in tiles of `_TILE` rays, of all
-# wavelengths together: what belongs to a surface then stays in the cache of a core. Derivatives
-# hold 0.9 kB a ray and row, of `_DERIVATIVES` of them 21 MB; more than 32 MB at once are given back
-# to the system after each call, which takes longer than to compute them.
+# Bundles of more than `_MANY` rays are launched by polynomials and solved in tiles of `_TILE` rays,
+# all wavelengths together: the arrays of one surface then fit the cache of a core. Derivatives hold
+# 0.9 kB per ray and row, 21 MB for `_DERIVATIVES`. The allocator returns blocks above 32 MB to the
+# operating system after each call, which takes longer than the computation.
 _MANY, _TILE, _DERIVATIVES = 1024, 2048, 24_000
-# In a Double Gauss at 10 degrees, the launch misses the stop points by 1e-13 mm with degree 18, by
-# 1e-10 mm with 14.
+# In a Double Gauss at 10 degrees, rays miss their stop points by 1e-13 mm with degree 18, by
+# 1e-10 mm with degree 14.
 _DEGREE = 18
 
 
 def tile_of(rays: int, waves: int) -> int:
-    """How many rays a wavelength of a bundle of so many are found at once: all, or a tile."""
+    """Rays per wavelength that are found at once: all `rays` of a bundle, or those of a tile."""
     size = max(_TILE // waves, 64)
     return rays if rays <= max(_MANY, size) else size
 
 
 def derivative_tile(waves: int, rows: int) -> int:
-    """Of how many rays a wavelength derivatives are taken at once, in a system of so many rows."""
+    """Rays per wavelength whose derivatives are taken at once, for `rows` rows."""
     return max(min(_TILE, _DERIVATIVES // rows) // waves, 64)
 
 
 def in_tiles(function: Callable, most: int, *trees: Any) -> Any:
-    """`function(*trees)` for arrays (..., W, Q), rays last, in tiles of at most so many rays.
+    """Evaluates `function(*trees)` in tiles of at most `most` rays.
 
-    The function returns arrays with rays last, too. In reverse mode it is run again for each tile,
-    so that nothing is kept but what it is given.
+    function: takes and returns arrays with rays on the last axis. Reverse mode evaluates it again
+        for each tile, so that only its arguments are stored.
+    trees: pytrees of arrays (..., W, Q).
     """
     rays = jax.tree.leaves(trees)[0].shape[-1]
     tiles = -(-rays // most)
@@ -64,7 +65,7 @@ def in_tiles(function: Callable, most: int, *trees: Any) -> Any:
 
 
 def _nodes() -> np.ndarray:
-    """Points (2, N) all over the unit disc to fit to: Gauss nodes in r^2, uniform azimuths."""
+    """Points (2, N) of the fit on the unit disc: Gauss nodes in r^2, uniform azimuths."""
     nodes, _ = np.polynomial.legendre.leggauss(_DEGREE // 2 + 2)
     radius = np.sqrt((nodes + 1) / 2)
     angle = np.pi * np.arange(2 * _DEGREE + 4) / (_DEGREE + 2)
@@ -74,10 +75,11 @@ def _nodes() -> np.ndarray:
 
 
 def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vector]:
-    """Where to launch the rays through stop points as polynomials of these, fitted over the disc
-    that holds `target`, 2 arrays (W, Q) in mm; the paraxial launch, where a ray of the fit fails.
+    """Fits polynomials of the stop point to the launch of aimed rays, over the disc that holds
+    `target`, 2 arrays (W, Q), mm.
 
-    Returns a function of stop points, 2 arrays (W, any number).
+    Returns a function from stop points to launches, 2 arrays (W, N) each, mm, for any N. It returns
+    the paraxial launch if a ray of the fit fails.
     """
     points = _nodes()
     radius = jnp.sqrt(jnp.max(dot(target, target)))
@@ -89,8 +91,8 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
     good = jnp.all(aimed.status == Status.OK)
 
     pairs = np.array([(i, d - i) for d in range(_DEGREE + 1) for i in range(d + 1)])
-    # First onto an orthogonal basis, by rising degree: the coefficients fall as fast as the
-    # numbers of the second matrix grow, and no digit is lost.
+    # Fit in an orthogonal basis of rising degree: its coefficients fall as fast as the entries of
+    # the inverse triangle grow, so that no digit is lost.
     basis, triangle = np.linalg.qr(np.prod(points.T[:, None] ** pairs, axis=-1))
     launch = jnp.stack(aimed.launch)
     parts = jnp.tensordot(jnp.asarray(basis.T, launch.dtype), launch, axes=(1, 2))
@@ -109,7 +111,7 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
 
 
 def _powers(x: Array) -> Array:
-    """x^0 to x^_DEGREE along a new first axis."""
+    """Powers x^0 to x^_DEGREE along a new first axis."""
     powers = [jnp.ones_like(x), x]
     while len(powers) <= _DEGREE:
         powers.append(powers[-1] * x)

@@ -1,13 +1,13 @@
-"""The Fermat system of a bundle of rays: optical path, its gradient, and the label of a ray.
+"""The Fermat equations of a bundle of rays: optical path, its gradient, and the label of a ray.
 
-A ray is labelled by its object point and by where it crosses the stop. Unknown are its hits on
-the L active surfaces, those that bend light, and on the sensor; the equations are dOP/dw_i = 0 on
-the active surfaces (paper Eqs. 2 and 3) and one more, the label: the straight line through the
-hits that enclose the stop, prolonged either way, crosses the stop at the wanted point. A stop
-that bends light itself is one of the surfaces, and the label is its hit.
+The object point and the crossing of the stop label a ray. The unknowns are its hits on the L
+active surfaces (refracting, reflecting or diffracting) and on the sensor. The equations are
+dOP/dw_i = 0 on the active surfaces (paper Eqs. 2 and 3) and the label: the straight line through
+the hits in front of and behind the stop, extended both ways, crosses the stop at the given point.
+If the stop is an active surface, the label is its hit.
 
-Arrays are laid out (row, wavelength, ray), rays last, so that every operation is one long
-elementwise loop. There are R = L + 1 rows, the sensor is the last.
+Arrays have the axes (row, wavelength, ray), so that every operation is one long elementwise loop.
+There are R = L + 1 rows; the sensor is the last.
 """
 
 import dataclasses
@@ -26,16 +26,16 @@ from .system import Diffraction, System, Vector, dot, rotate
 
 
 class Path(NamedTuple):
-    """A path drawn out: what its gradient, its differentials and its status are made of.
+    """Geometry of trial paths.
 
     hits: D arrays (R, W, Q), mm.
-    height: (R, W, Q), the sag in mm.
-    before, after: D + 1 arrays (R, W, Q), unit vectors in front of each row and behind it, along
-        that row's axes; behind the sensor light goes on as before.
+    height: (R, W, Q), sag, mm.
+    before, after: D + 1 arrays (R, W, Q), unit vectors in front of and behind each row, along the
+        axes of that row; behind the sensor as in front of it.
     slope: D arrays (R, W, Q), derivatives of the sag.
-    bend: D rows of D arrays (R, W, Q), second derivatives of the optical path by a hit while the
-        directions are held, 1/mm.
-    length: (R, W, Q), of the segments in front of the rows, mm; 0 for the first.
+    bend: D rows of D arrays (R, W, Q), second derivatives of the optical path by a hit for fixed
+        directions, 1/mm.
+    length: (R, W, Q), length of the segment in front of each row, mm; 0 for the first.
     shrink: (W, Q), 1 / |vergence P_1 - source|, see `geometry`.
     """
 
@@ -50,8 +50,8 @@ class Path(NamedTuple):
 
 
 def _segments(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vector]:
-    """First points, D + 1 arrays (W, Q), and the steps from each to the next, (L, W, Q). Steps
-    are sums of small differences: no digit is lost far from the origin."""
+    """First points, D + 1 arrays (W, Q), and the steps between neighbouring points, (L, W, Q), mm.
+    A step is a sum of small differences, so that no digit is lost far from the origin."""
     own = rotate(system.rows.rotation, (*hits, heights))
     origin = [a[..., None, None] for a in system.rows.origin(len(hits))]
     step = tuple((o[1:] - o[:-1]) + (p[1:] - p[:-1]) for o, p in zip(origin, own, strict=True))
@@ -61,9 +61,9 @@ def _segments(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vec
 def geometry(hits: Vector, system: System) -> Path:
     """Directions, lengths and sag derivatives of the paths through `hits`, D arrays (R, W, Q).
 
-    The first segment comes from P_0 = source / vergence. It is scaled by the vergence,
-    q = vergence P_1 - source, which has the same direction and stays finite and smooth when
-    the object goes to infinity.
+    The first segment starts at P_0 = source / vergence. Scaled by the vergence it is
+    q = vergence P_1 - source, which has the same direction and stays finite and smooth for an
+    object at infinity.
     """
     rotation = system.rows.rotation
     z, slope, bend = by_form(sag_derivatives, hits, system.rows.wide, system.forms)
@@ -85,8 +85,8 @@ def geometry(hits: Vector, system: System) -> Path:
 
 
 def added(hits: Vector, by: Diffraction) -> tuple[np.ndarray, tuple]:
-    """The diffractive rows, and what their phase adds to the optical path (N, W, Q) in mm, with its
-    derivatives by the hits, D arrays, and D rows of D arrays."""
+    """Indices (N,) of the diffractive rows, and the optical path that their phase adds, (N, W, Q),
+    mm, with its first derivatives by the hits, D arrays, and second, D rows of D arrays."""
     rows, wide = np.array(by.rows), Shape(*(a[..., None, None] for a in by.phase))
     waves = by_form(sag_derivatives, tuple(h[rows] for h in hits), wide, by.forms)
     return rows, jax.tree.map(lambda a: by.wave * a, waves)
@@ -104,8 +104,8 @@ def residual(path: Path, system: System) -> Vector:
 
 
 def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
-    """Hits and system of one row and the one before it, if there is one: all that a ray there
-    depends on."""
+    """Hits and system of one row and the row in front of it, if there is one. These determine the
+    ray in front of that row."""
     some = slice(max(row - 1, 0), row + 1)
     rows = jax.tree.map(lambda a: a[some], system.rows)
     part = dataclasses.replace(
@@ -120,8 +120,8 @@ def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
 
 
 def ray_at(path: Path, system: System, row: int) -> tuple[Vector, Vector]:
-    """Points of one row and unit vectors in front of it, D + 1 arrays (W, Q) each, along the axes
-    of the lens."""
+    """Points on one row (mm) and unit vectors in front of it, D + 1 arrays (W, Q) each, along the
+    axes of the lens."""
     rotation = None if system.rows.rotation is None else system.rows.rotation[row]
     origin = (a[row] for a in system.rows.origin(system.dim))
     own = rotate(rotation, (*(h[row] for h in path.hits), path.height[row]))
@@ -130,21 +130,24 @@ def ray_at(path: Path, system: System, row: int) -> tuple[Vector, Vector]:
 
 
 def label(path: Path, system: System) -> Vector:
-    """Where paths cross the stop: D arrays (W, Q), mm along its axes."""
+    """Crossings of the stop, D arrays (W, Q), mm along its axes."""
     if system.stop is None:
         return tuple(h[system.before] for h in path.hits)
     return cross(*system.at_stop, *ray_at(path, system, system.before))[0]
 
 
 def arrival(hits: Vector, system: System) -> Vector:
-    """Unit vectors, D + 1 arrays (W, Q), along the axes of the lens, of the rays on the sensor."""
+    """Directions of rays at the sensor: unit vectors, D + 1 arrays (W, Q), along the lens axes."""
     hits, part = up_to(hits, system, len(system.forms) - 1)
     return ray_at(geometry(hits, part), part, -1)[1]
 
 
 def met(crossing: Vector, target: Vector, hits: Vector, system: System) -> Array:
-    """Whether rays that cross the stop at `crossing` go through `target` to rounding, D arrays
-    (W, Q) in mm: (W, Q), bool. hits: on the rows, to which rounding is relative."""
+    """Mask (W, Q) of rays that pass their stop points to rounding.
+
+    crossing, target: D arrays (W, Q), crossings of the stop and stop points, mm.
+    hits: D arrays (R, W, Q), mm; rounding is relative to the largest.
+    """
     eps = float(jnp.finfo(hits[0].dtype).eps)
     miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
     scale = jnp.max(_width(hits, system), axis=0) + jnp.sqrt(dot(target, target))
@@ -152,7 +155,7 @@ def met(crossing: Vector, target: Vector, hits: Vector, system: System) -> Array
 
 
 def _width(hits: Vector, system: System) -> Array:
-    """How large the coordinates of hits are, (R, W, Q) in mm: what their rounding scales with."""
+    """Magnitude of the coordinates of hits, (R, W, Q), mm; their rounding scales with it."""
     width = jnp.sqrt(dot(hits, hits))
     offset = system.rows.offset
     return width if offset is None else width + jnp.max(jnp.abs(offset), axis=1)[:, None, None]
@@ -167,16 +170,16 @@ def _inverse(length: Array) -> Array:
 
 
 def optical_path(hits: Vector, system: System) -> Array:
-    """Optical path (W, Q) in mm from the object to the sensor (paper Eq. 2).
+    """Optical path (W, Q), mm, from the object to the sensor (paper Eq. 2).
 
-    Counted from the sphere round the object that passes through the first vertex (a plane
-    for an object at infinity), so that it stays finite for any distance.
+    It starts at the sphere about the object through the first vertex (a plane for an object at
+    infinity), so that it is finite for any distance. hits: D arrays (R, W, Q), mm.
     """
     heights = by_form(surface_sag, hits, system.rows.wide, system.forms)
     q, step = _segments(hits, heights, system)
     p = tuple(system.source)
     near = tuple(system.vergence * a - b for a, b in zip(q, p, strict=True))
-    # (|q - p/v| - |p/v|) without the cancellation, and without dividing by v
+    # |q - p/v| - |p/v| without cancellation and without a division by v
     far = _length(near) + _length(p)
     first = (system.vergence * dot(q, q) - 2 * dot(q, p)) / far
     lengths = jnp.concatenate([first[None], _length(step)])
@@ -187,12 +190,12 @@ def optical_path(hits: Vector, system: System) -> Array:
 
 
 def stationary(path: Path, system: System, target: Vector) -> Array:
-    """Whether these paths are rays, (W, Q), bool: forward, on surfaces that exist, through their
-    stop points `target`, D arrays (W, Q) in mm, and F = 0.
+    """Mask (W, Q) of the paths that are rays: F = 0, forward, inside the domain of each sag, and
+    through the stop points. target: D arrays (W, Q), stop points, mm.
 
-    F counts as 0 where every component is within 64 times what rounding the hits to the last
-    digit changes: for a camera in float64 some 1e-14 radians. Where that is more than 1e-6
-    radians (2e-2 in float32), the hits determine no direction, and the path is not accepted.
+    F counts as 0 if it is within 64 times the change by rounding of the hits, about 1e-14 radians
+    for a camera in float64. A path is not accepted if rounding turns it by more than 1e-6 radians
+    (2e-2 in float32).
     """
     eps = float(jnp.finfo(path.length.dtype).eps)
     senses = system.senses[:, None, None]
@@ -200,7 +203,7 @@ def stationary(path: Path, system: System, target: Vector) -> Array:
     size = _width(path.hits, system)
     widest = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
     near = _inverse(path.length).at[0].set(jnp.abs(system.vergence) * path.shrink)
-    angle = system.index * (1 + near * widest)  # by which rounding turns a segment
+    angle = system.index * (1 + near * widest)  # change of direction by rounding
     both = angle + jnp.concatenate([angle[1:], angle[-1:]])
     gradient = residual(path, system)
     bound = 64 * eps * both * jnp.sqrt(1 + dot(path.slope, path.slope))
@@ -212,5 +215,5 @@ def stationary(path: Path, system: System, target: Vector) -> Array:
 
 
 def _forward(direction: Vector, slope: Vector) -> Array:
-    """The product of a direction with the normal (-slope, 1) of a surface."""
+    """Dot product of a direction and the normal (-slope, 1) of a surface."""
     return direction[-1] - dot(slope, direction[:-1])

@@ -1,7 +1,7 @@
-"""Finding rays: a root of the Fermat equations and the label for every point of the stop.
+"""Ray finding: for each stop point, a root of the Fermat equations and the label.
 
-Rays are aimed, traced, and where that does not end on a path to rounding, polished; those that
-are missing are sought in a fan. Nothing here is differentiated: see `solve`.
+Rays are aimed and traced. A ray that misses its stop point by more than rounding is polished on
+the Fermat equations; a missing ray is searched for with a fan. For derivatives see `solve`.
 """
 
 from collections.abc import Callable
@@ -37,13 +37,13 @@ _MAX_STEPS = 16
 
 
 class Found(NamedTuple):
-    """Rays of a bundle.
+    """Rays found through the stop points of a bundle.
 
-    hits: D arrays (R, W, Q) in mm on the active surfaces and the sensor; 0 for failed rays.
-    arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along the axes of the lens; void for
-        failed rays.
+    hits: D arrays (R, W, Q), on the active surfaces and the sensor, mm; 0 for failed rays.
+    arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along the axes of the lens; undefined
+        for failed rays.
     status: (W, Q), int32, see `Status`.
-    steps: (), int32, steps of Newton's method that the bundle took, aiming included.
+    steps: (), int32, Newton steps of the bundle, aiming included.
     """
 
     hits: Vector
@@ -53,7 +53,12 @@ class Found(NamedTuple):
 
 
 class _State(NamedTuple):
-    """solved: (W, Q). still: (), how many steps in a row moved no ray. step: ()."""
+    """State of the polish.
+
+    solved: (W, Q), bool.
+    still: (), int32, steps in a row that moved no ray.
+    step: (), int32, steps so far.
+    """
 
     solved: Array
     still: Array
@@ -63,11 +68,14 @@ class _State(NamedTuple):
 class BlockNewton(optx.AbstractRootFinder):
     """Newton's method for a bundle of Fermat paths, with the propagation of `linear` as its solve.
 
-    Its arguments are (system, target, which rays are to move (W, Q)). These step together; one
-    whose correction is not finite stays where it is, so that it cannot spoil the others. Ends
-    when all of them are stationary to rounding (see `fermat.stationary`), or when two steps move
-    none by more than `atol` + `rtol` of its hits (after one, it is not seen where that ends): then
-    RESULTS.nonlinear_divergence, and the state tells which are solved.
+    The arguments of the equations are (system, target, mask (W, Q) of the rays that may move). All
+    rays step together; a ray whose correction is not finite keeps its hits. The search ends when
+    all rays are stationary to rounding (see `fermat.stationary`). It ends with
+    RESULTS.nonlinear_divergence when two steps in a row move no ray by more than `atol` + `rtol`
+    times its hits; the state then holds the mask of the solved rays.
+
+    rtol, atol: tolerances on the hits, relative and in mm.
+    norm: norm of a correction.
     """
 
     rtol: float
@@ -75,7 +83,7 @@ class BlockNewton(optx.AbstractRootFinder):
     norm: Callable = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        """The state before the first step; no step is taken if no ray is to move."""
+        """The state before the first step; there is no step if no ray may move."""
         return _State(~args[2], jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
     def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
@@ -87,7 +95,7 @@ class BlockNewton(optx.AbstractRootFinder):
         finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
         moves = finite & ~solved
         change = tuple(jnp.where(moves, c, 0) for c in change)
-        # Each relative to its own hit: a ray that runs off makes no other's correction small.
+        # Relative to each hit, so that a diverging ray does not hide the corrections of others.
         scale = self.rtol / self.atol
         size = self.norm(tuple(c / (1 + scale * abs(a)) for a, c in zip(y, change, strict=True)))
         y = tuple(a - c for a, c in zip(y, change, strict=True))
@@ -95,18 +103,19 @@ class BlockNewton(optx.AbstractRootFinder):
         return y, _State(solved, still, state.step + 1), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
-        """Whether all rays are stationary, or none moves any more."""
+        """True once all rays are stationary or none moves any more, and the result."""
         done, still = jnp.all(state.solved), state.still > 1
         results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         return done | still, optx.RESULTS.where(still & ~done, *results)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Nothing to add."""
+        """Returns the values unchanged."""
         return y, aux, {}
 
 
 def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tuple:
-    """Hits of the `active` rays (W, Q) made stationary; which rays are solved, and the steps."""
+    """Makes the hits of the `active` rays (W, Q) stationary. Returns the hits, the mask of solved
+    rays and the number of steps."""
 
     def equations(hits, args):
         system, target, _ = args
@@ -130,12 +139,12 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
 def find(
     system: System, target: Vector, launch: Vector | None = None, wanted: Array | None = None
 ) -> Found:
-    """The rays through stop points `target`, D arrays (W, Q) in mm; not differentiable.
+    """Finds the rays through stop points; not differentiable. Rays that aiming does not find are
+    searched for with a fan; rays that miss their stop points by more than rounding are polished.
 
-    launch: D arrays (W, Q) in mm, where to start instead of at the paraxial entrance pupil.
-    wanted: (W, Q), bool, the rays that are sought again if they are not found at once; all.
-    They are sought again in a fan; those that miss their stop points by more than rounding are
-    polished on the Fermat system.
+    target: D arrays (W, Q), stop points, mm.
+    launch: D arrays (W, Q), first guesses, mm; None for the paraxial launch.
+    wanted: (W, Q), bool, rays that are searched for with a fan; None for all.
     """
     sizes = beam_size(system, target)
     launch = paraxial_launch(system, target, sizes[1]) if launch is None else launch
@@ -153,9 +162,9 @@ def find(
 
 
 def find_aimed(system: System, target: Vector) -> Found:
-    """The rays that aiming alone brings through their stop points to rounding, see `aim_outwards`;
-    all others are UNCONVERGED, whether there is such a ray or not. A third of the program that
-    `find` is, and a tenth of its time where rays fail."""
+    """Finds rays by aiming alone, see `aim_outwards`; every ray that does not meet its stop point
+    to rounding is UNCONVERGED. The program is a third of that of `find`; where rays fail it takes a
+    tenth of the time. target: D arrays (W, Q), mm."""
     aimed = aim_outwards(system, target)
     hits, status = _verdict(system, aimed.launch, aimed.status)
     hits, crossing = split_stop(system, hits)
@@ -166,12 +175,12 @@ def find_aimed(system: System, target: Vector) -> Found:
 
 
 class _Search(NamedTuple):
-    """The state of a search.
+    """State of a search.
 
-    hits: D arrays in mm, see `snell.Trace`.
+    hits: D arrays, mm, see `snell.Trace`.
     status: (W, Q), int32.
-    left: (W, Q), int32, in how many more rounds each missing ray is aimed again.
-    fan: traced from round 1 on.
+    left: (W, Q), int32, rounds left for each missing ray.
+    fan: the fan, traced in round 1.
     round, steps: (), int32, rounds and Newton steps so far.
     """
 
@@ -184,12 +193,13 @@ class _Search(NamedTuple):
 
 
 def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted: Array) -> _Search:
-    """Round 0 aims all rays from their first launch. Round 1 aims those that are wanted and failed
-    from the nearest ray of a fan. Each later round aims the first few of those that are missing
-    from several rays of the fan each; after `rounds` rounds a ray has had all `STARTS` of them.
+    """Searches for rays in rounds. Round 0 aims all rays from their first guesses. Round 1 aims the
+    wanted rays that failed from the nearest ray of a fan. Each later round aims the first few
+    missing rays from several rays of the fan each; `rounds` rounds use all `STARTS` starts.
 
-    One loop with as many lanes as rays, so that the aiming is compiled once; and the fan costs
-    nothing while no ray is missing, also under `vmap`.
+    All rounds share one loop with as many lanes as rays: the aiming is compiled once, and the fan
+    costs nothing while no ray is missing, also under `vmap`. Arguments as in `find`; sizes as in
+    `aim`.
     """
     waves, rays = target[0].shape
     starts = min(STARTS, rays)
@@ -239,7 +249,7 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted
 
 
 class _Traced(NamedTuple):
-    """hits: D arrays, mm, see `snell.Trace`. status: (W, Q). steps: ()."""
+    """Aimed and traced rays: hits (D arrays, mm, see `snell.Trace`), status (W, Q), steps ()."""
 
     hits: Vector
     status: Array
@@ -249,15 +259,19 @@ class _Traced(NamedTuple):
 def _aimed(
     system: System, target: Vector, launch: Vector, sizes: tuple, upright: Array | bool
 ) -> tuple[_Traced, Array]:
-    """Rays aimed, see `aim`, and traced; and whether they are folded."""
+    """Aims and traces rays, arguments as in `aim`; and the mask (W, Q) of those beyond a fold."""
     aimed = aim(system, target, launch, sizes, upright)
     hits, status = _verdict(system, aimed.launch, aimed.status)
     return _Traced(hits, status, aimed.steps), aimed.folded
 
 
 def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Array]:
-    """Hits of rays, and their status where that of aiming them is OK. A ray that turns by more
-    than 1e-6 (float32: 2e-2) when its hits are rounded determines no path."""
+    """Traces rays: hits and status (W, Q). A ray whose direction changes by more than 1e-6 radians
+    (float32: 2e-2) when its hits are rounded is UNCONVERGED.
+
+    launch: D arrays (W, Q), mm.
+    status: (W, Q), status of the aiming, kept where it is not OK.
+    """
     trace = shoot(system, launch)
     eps = float(jnp.finfo(launch[0].dtype).eps)
     drowned = (trace.status == Status.OK) & (trace.rounding_angle > 4 / eps**0.5)
@@ -266,8 +280,9 @@ def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Arr
 
 
 def find_many(system: System, target: Vector) -> Found:
-    """`find`; a large bundle in tiles, its rays launched by polynomials and searched for only
-    where these miss. A stop point that is not finite is MISSED, and not sought."""
+    """Finds rays as `find` does. A large bundle is split into tiles; polynomials launch its rays,
+    and only tiles in which a ray misses are searched. A stop point that is not finite is MISSED
+    without a search. target: D arrays (W, Q), mm."""
     known = jnp.all(jnp.isfinite(jnp.stack(target)), axis=0)
     found = _find_many(system, tuple(jnp.where(known, a, 0) for a in target), known)
     return found._replace(

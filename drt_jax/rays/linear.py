@@ -1,11 +1,11 @@
-"""The linear system of all derivatives: how a path answers when the equations change.
+"""The linear system of all derivatives: the change of a path for a change of the equations.
 
-The Jacobian of the Fermat equations and the label, dE/dw, is banded: each equation knows three
-neighbouring hits. It is solved by propagation along the ray. Given the change dw_1 of the first
-hit, the equation of each surface yields the change of direction behind it, and that the next hit;
-the label then picks dw_1 among D + 1 such propagations. So O(surfaces) a ray, nothing is divided by
-the length of a segment, and every derivative mode, transposition among them, is JAX's own:
-propagation is linear in the right-hand side.
+The Jacobian of the Fermat equations and the label, dE/dw, is banded: each equation contains three
+neighbouring hits. Propagation along the ray solves it. Given the change dw_1 of the first hit, the
+equation of each surface yields the change of direction behind it, and that yields the change of
+the next hit. The label then determines dw_1 from D + 1 such propagations. The cost is O(surfaces)
+per ray, and nothing is divided by the length of a segment. Propagation is linear in the right-hand
+side, so that JAX transposes it and derives every derivative mode.
 """
 
 from collections.abc import Callable
@@ -22,14 +22,13 @@ from .system import System, Vector, divide, dot, rotate
 
 
 class RightSide(NamedTuple):
-    """The right-hand side: what the changes of a path have to make up for.
+    """Right-hand side of the linear system.
 
-    residual: D arrays (R, W, Q), change of the equations of each row; 0 for the sensor, which has
-        none.
-    point: D + 1 arrays (R, W, Q), how far surfaces move under fixed transverse coordinates, mm
+    residual: D arrays (R, W, Q), of the equations of each row; 0 for the sensor, which has none.
+    point: D + 1 arrays (R, W, Q), displacement of the surfaces at fixed transverse coordinates, mm
         along the axes of the lens.
-    direction: D + 1 arrays (W, Q), its change in front of the first row at a fixed point.
-    label: D arrays (W, Q), change of the crossing of the stop that hits have to make, mm.
+    direction: D + 1 arrays (W, Q), change of direction in front of the first row at a fixed point.
+    label: D arrays (W, Q), required change of the crossing of the stop, mm.
     """
 
     residual: Vector
@@ -39,16 +38,18 @@ class RightSide(NamedTuple):
 
 
 def shortfall(path: Path, system: System, target: Vector) -> RightSide:
-    """What a path that is no ray through `target`, D arrays (W, Q) in mm, falls short by: its hits
-    less the answer to this are one step of Newton's method."""
+    """Residual of trial paths. Subtract `solve` of it from the hits for one Newton step.
+
+    target: D arrays (W, Q), stop points, mm.
+    """
     miss = (a - b for a, b in zip(label(path, system), target, strict=True))
     still = tuple(jnp.zeros_like(a) for a in path.before)
     return RightSide(residual(path, system), still, tuple(a[0] for a in still), tuple(miss))
 
 
 class _Row(NamedTuple):
-    """What propagation needs of one row, of a `Path` and of a `System`. labels: whether the label
-    is made of its hit, or of the ray in front of it."""
+    """One row for the propagation, from a `Path` and a `System`. labels: True for the row whose
+    hit, or the ray in front of it, determines the label."""
 
     before: Vector
     after: Vector
@@ -62,8 +63,12 @@ class _Row(NamedTuple):
 
 
 class _Change(NamedTuple):
-    """Changes on the way: of a point on the ray, mm, and of the direction there, D + 1 arrays each,
-    along the axes of the lens; and what the label is made of, as far as that is known."""
+    """Changes during the propagation.
+
+    point: D + 1 arrays, change of a point on the ray, mm along the axes of the lens.
+    direction: D + 1 arrays, change of the direction there.
+    label: change of the hit or of the ray that determines the label; 0 in front of that row.
+    """
 
     point: Vector
     direction: Vector
@@ -73,9 +78,15 @@ class _Change(NamedTuple):
 def _step(
     row: _Row, active_stop: bool, good: Array, change: _Change, residual: Vector, moved: Vector
 ) -> tuple[_Change, Vector]:
-    """Onto a row and through it: the change behind it, and that of its hit, D arrays.
+    """Propagates a change to a row and through it.
 
-    active_stop: whether the stop is an active surface.
+    row: the row.
+    active_stop: True if the stop is an active surface.
+    good: (W, Q), as in `solve`.
+    change: the change in front of the row.
+    residual, moved: D and D + 1 arrays (W, Q), `residual` and `point` of the right-hand side.
+
+    Returns the change behind the row, and that of its hit, D arrays (W, Q), mm.
     """
     carried = (
         p + row.length * s - m
@@ -83,7 +94,7 @@ def _step(
     )
     *across, depth = rotate(row.rotation, tuple(carried), back=True)
     *turned, along = rotate(row.rotation, change.direction, back=True)
-    # Along the ray onto the tangent plane of the surface.
+    # Project along the ray onto the tangent plane of the surface.
     normal = jnp.where(good, row.before[-1] - dot(row.slope, row.before[:-1]), 1)
     slide = (depth - dot(row.slope, across)) / normal
     hit = tuple(c - slide * e for c, e in zip(across, row.before, strict=False))
@@ -93,7 +104,8 @@ def _step(
         row.index_before * (v + s * along) + dot(bend, hit) - f
         for v, s, bend, f in zip(turned, row.slope, row.bend, residual, strict=True)
     )
-    # The change of direction behind: its product with the tangents is known, with itself 0.
+    # Change of direction behind: its products with the tangents are known; that with the direction
+    # itself is 0.
     normal = jnp.where(good, row.after[-1] - dot(row.slope, row.after[:-1]), 1)
     along = -dot(row.after[:-1], pull) / (row.index_behind * normal)
     behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
@@ -103,17 +115,19 @@ def _step(
 
 
 def solve(path: Path, system: System, good: Array, rhs: RightSide) -> tuple[Vector, Vector]:
-    """How a path answers to a right-hand side: changes of the hits, D arrays (R, W, Q), and of the
-    direction at the sensor, D + 1 arrays (W, Q) along the axes of the lens. Linear in it.
+    """Solves the linear system: changes of the hits, D arrays (R, W, Q), mm, and of the direction
+    at the sensor, D + 1 arrays (W, Q), along the axes of the lens.
 
-    good: (W, Q), the rays of interest: what comes out for the others is finite if they are.
+    good: (W, Q), bool, rays of interest; the result for the others is arbitrary but finite, if
+        their paths are.
+    rhs: the right-hand side; the result is linear in it.
     """
     dim, zero, active_stop = len(rhs.label), jnp.zeros_like(rhs.label[0]), system.stop is None
     at = np.arange(len(system.forms)) == system.before
     path_rows = _Row(*path[2:7], system.index, system.behind, system.rows.rotation, at)
     still, none = (zero,) * (dim + 1), (zero,) * dim
     unknown = none if active_stop else (*still, *still)
-    # Changes from each unit change of the first hit, and those that the right-hand side makes.
+    # `free`: changes for each unit change of the first hit; `forced`: those of the right-hand side.
     units = [[jnp.full_like(zero, float(d == k)) for k in range(dim)] for d in range(dim)]
     first = jax.vmap(lambda hit: _first(path, system, hit))(tuple(map(jnp.stack, units)))
     free = _Change(*first, jax.tree.map(lambda a: jnp.stack([a] * dim), unknown))
@@ -130,7 +144,7 @@ def solve(path: Path, system: System, good: Array, rhs: RightSide) -> tuple[Vect
     crossing = _crossing(path, system)
     columns = jax.vmap(crossing)(through[0].label)
     wanted = tuple(s - c for s, c in zip(rhs.label, crossing(through[1].label), strict=True))
-    # Rays of no interest have a matrix that can be divided by.
+    # Rays that are not of interest get the unit matrix.
     rows = [
         [jnp.where(good, c, float(i == k)) for k, c in enumerate(row)]
         for i, row in enumerate(columns)
@@ -147,7 +161,7 @@ def solve(path: Path, system: System, good: Array, rhs: RightSide) -> tuple[Vect
 
 
 def _first(path: Path, system: System, hit: Vector) -> tuple[Vector, Vector]:
-    """Changes of the point and of the direction in front of it when the first hit moves."""
+    """Changes of the first point and of the direction in front of it for a change of its hit."""
     rotation = None if system.rows.rotation is None else system.rows.rotation[0]
     moved = rotate(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
     first = ray_at(path, system, 0)[1]
@@ -156,7 +170,8 @@ def _first(path: Path, system: System, hit: Vector) -> tuple[Vector, Vector]:
 
 
 def _crossing(path: Path, system: System) -> Callable[[Vector], Vector]:
-    """The change of the label, D arrays (W, Q), as a function of what it is made of."""
+    """Function from the change of the hit, or of the ray, that determines the label to the change
+    of the label, D arrays (W, Q), mm."""
     if system.stop is None:
         return lambda hit: hit
     line = ray_at(path, system, system.before)

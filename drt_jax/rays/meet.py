@@ -1,4 +1,4 @@
-"""Where straight lines meet a surface: the one intersection routine.
+"""Intersection of straight lines with surfaces: the only intersection routine.
 
 Source: Welford, Aberrations of Optical Systems (1986), ch. 4.
 """
@@ -16,18 +16,21 @@ from ..lens.surface import domain, sag_derivatives
 from ..numerics import safe_divide, safe_sqrt
 from .system import Placed, Vector, dot
 
-# Newton steps along a ray to a surface that is no conic; the last must be shorter than `_SETTLED`
-# of the ray's length or of 1 mm.
+# Newton steps along a ray to a surface that is not a conic; converged if the last step is shorter
+# than `_SETTLED` times 1 mm plus the length of the ray.
 _STEPS, _SETTLED = 20, 1e-7
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[Array, Array]:
-    """Length s at which p + s d meets a surface of a form at the origin, and whether it does.
+    """Length s at which p + s d meets a surface with its vertex at the origin, and a mask of those
+    that meet it. Differentiable in p, d and shape by the implicit function theorem.
 
-    p, d: D + 1 components along the axes of the surface; d of any length, s counts in it.
-    shape: of the surface. going: bool, rays that must settle; others may come out wrong.
-    Differentiable in p, d and shape by the implicit function theorem.
+    form: name of the form of the surface.
+    p: D + 1 components, a point in the axes of the surface, mm.
+    d: D + 1 components, a direction of any length; s is in units of that length.
+    shape: shape of the surface.
+    going: bool, rays whose iteration must converge; the others may come out wrong.
     """
     length, met = -safe_divide(p[-1], d[-1]), jnp.ones(p[0].shape, bool)  # to the vertex plane
     if form == "asphere":
@@ -37,12 +40,12 @@ def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[
         discriminant = linear**2 - square * constant
         root = safe_sqrt(discriminant)
         root = jnp.where(d[-1] < 0, -root, root)
-        # Of the two ways to write a root, the one that does not subtract what is alike.
+        # Of the two forms of the root, use the one without cancellation.
         alike = linear * root < 0
         above = jnp.where(alike, linear - root, constant)
         below = jnp.where(alike, square, linear + root)
         met = discriminant > 0
-        # Where the conic is missed, an asphere is sought from the vertex plane.
+        # Where the ray misses the conic, the search for the asphere starts at the vertex plane.
         length = jnp.where(met, safe_divide(above, below), length)
         if _plain(form, shape):
             return length, met & (1 - (1 + k) * c * (p[-1] + length * d[-1]) > RIM**0.5)
@@ -60,12 +63,13 @@ def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[
     _, length, met = jax.lax.while_loop(
         lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, start
     )
-    length = jnp.where(met, length, plane)  # what does not settle may be anything
+    length = jnp.where(met, length, plane)  # a length that has not converged may be anything
     return length, met & domain(_along(p, d, length)[:-1], shape, form)
 
 
 def quadratic(p: Vector, d: Vector, shape: Shape) -> Vector:
-    """Of square s^2 - 2 linear s + constant = 0, where p + s d meets a conic."""
+    """Coefficients (square, linear, constant) of square s^2 - 2 linear s + constant = 0, whose root
+    s is the length at which p + s d meets a conic."""
     c, k = shape.curvature, shape.conic
     flat = *d[:-1], (1 + k) * d[-1]
     square, linear = c * dot(flat, d), d[-1] - c * dot(flat, p)
@@ -77,12 +81,12 @@ def _along(p: Vector, d: Vector, length: Array) -> Vector:
 
 
 def _plain(form: str, shape: Shape) -> bool:
-    """Whether a surface is a conic without aspheric terms: a quadric."""
+    """True for a conic without aspheric terms, a quadric."""
     return form == "asphere" and not shape.coefficients.shape[0]
 
 
 def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple[Array, Array]:
-    """A function of the points p + s d that is 0 on the surface, and its derivative by s."""
+    """Value at p + s d of a function that is 0 on the surface, and its derivative by s."""
     *across, z = _along(p, d, length)
     if _plain(form, shape):
         quadric = tuple(shape.curvature * a for a in (*across, (1 + shape.conic) * z))
@@ -101,7 +105,11 @@ def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
 
 
 def meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:
-    """Where rays meet a surface: the point, a normal of any length along z, whether, and s."""
+    """Intersection of rays with a surface; arguments as in `reach`.
+
+    Returns the point (mm), a normal of any length with z above 0, the mask of those that meet the
+    surface, and the length s.
+    """
     length, met = reach(form, p, d, shape, going)
     own = _along(p, d, length)
     if _plain(form, shape):
@@ -114,10 +122,12 @@ def meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:
 
 
 def cross(surface: Placed, form: str, point: Vector, direction: Vector) -> tuple[Vector, Array]:
-    """Where straight lines, prolonged either way, cross one surface: D arrays, mm along its axes,
-    and whether they do.
+    """Intersection of straight lines, extended both ways, with one surface: D arrays, mm along its
+    axes, and a mask of those that intersect it.
 
-    point, direction: D + 1 arrays along the axes of the lens.
+    surface: the surface in its position.
+    form: name of its form.
+    point, direction: D + 1 arrays each, along the axes of the lens; point in mm.
     """
     p, d = surface.local(point, direction)
     length, met = reach(form, p, d, surface.shape, jnp.ones(p[0].shape, bool))

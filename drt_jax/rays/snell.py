@@ -1,7 +1,7 @@
-"""The sequential trace by Snell's law: what rays are aimed with.
+"""The sequential ray trace by Snell's law, which aiming uses.
 
-Its rays are labelled by where they cross the vertex plane of the first surface, their `launch`.
-Arrays have any shape: () for one ray, or (wavelength, ray) beside an index (wavelength, 1).
+The `launch` of a ray is the point where it crosses the vertex plane of the first row. Arrays have
+the shape () for one ray, or (wavelength, ray) with a refractive index (wavelength, 1).
 
 Source: Welford, Aberrations of Optical Systems (1986), ch. 4.
 """
@@ -21,17 +21,18 @@ from .meet import meet
 from .status import Status
 from .system import Placed, System, Vector, dot, rotate
 
-# A ray that leans more than this (cosine with the axis) is not followed.
+# Least cosine of a traced ray with the axis of a surface.
 _FLATTEST = 1e-4
 
 
 class Trace(NamedTuple):
-    """Rays traced one surface after the other.
+    """Traced rays.
 
-    hits: D arrays (R, ...), transverse coordinates on the rows in mm, and on a stop that is none
-        of them, which has its place among them: see `split_stop`. Void behind a failure.
+    hits: D arrays (R, ...), transverse coordinates on the rows, mm. If the stop is not a row, its
+        crossing is inserted at `system.before`, see `split_stop`. Undefined behind a failure.
     status: (...), int32, OK, MISSED or TIR.
-    rounding_angle: (...), the most that rounding the hits turns a segment by, in units of rounding.
+    rounding_angle: (...), largest change of direction of a segment by rounding of the hits,
+        radians in units of the rounding error.
     """
 
     hits: Vector
@@ -40,7 +41,7 @@ class Trace(NamedTuple):
 
 
 def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
-    """Traced hits as those on the rows of the system, D arrays (R, ...), and on the stop (...)."""
+    """Splits traced hits into those on the R rows, D arrays (R, ...), and on the stop (...), mm."""
     at = system.before
     crossing = tuple(h[at] for h in hits)
     if system.stop is None:
@@ -49,7 +50,7 @@ def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
 
 
 def _towards(system: System, point: Vector) -> Vector:
-    """Direction, of any length, of the light at a point before the lens."""
+    """Direction, of any length, of the light at a point in front of the lens."""
     return tuple(system.vergence * p - s for p, s in zip(point, system.source, strict=True))
 
 
@@ -61,8 +62,16 @@ def _begin(system: System, launch: Vector) -> tuple[Vector, Vector]:
 
 
 def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector) -> tuple[Vector, Array, Array]:
-    """Direction behind a surface by Snell's law in vector form; and by how much light comes from
-    its front, and gets through, both above 0. `kick`: what a phase adds to it, D arrays or none."""
+    """Refraction, reflection and diffraction by Snell's law in vector form.
+
+    d: D + 1 arrays, unit vector in front of the surface.
+    normal: D + 1 arrays of any length.
+    row: the surface.
+    kick: D arrays, change of direction by a phase; () for no phase.
+
+    Returns the direction behind the surface, D + 1 arrays; a number above 0 if light comes from the
+    front; and the squared cosine behind the surface, above 0 if light passes.
+    """
     front = jnp.minimum(d[-1] * row.sense - _FLATTEST, dot(normal, d) * row.sense)
     size, d = row.ratio**2, tuple(row.ratio * a for a in d)
     if kick:
@@ -76,8 +85,12 @@ def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector) -> tuple[Vecto
 
 
 class _Kick(NamedTuple):
-    """Of R rows, or one: kind: of the form of its phase, 0 for none. phase: its shape, (R,) and
-    (R, K). wave: (R, W, 1) or (R,), mm by which a wave of it turns light behind the row."""
+    """Phases of R rows, or of one.
+
+    kind: (R,), number of the form of the phase; 0 for none.
+    phase: its shape, (R,) and (R, K).
+    wave: (R, W, 1) or (R,), change of direction behind the row per wave/mm of phase slope, mm.
+    """
 
     kind: Any
     phase: Shape
@@ -99,7 +112,7 @@ def _kicks(system: System, kinds: list[str]) -> _Kick | None:
 
 
 def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
-    """The change of direction, D arrays; none without a phase."""
+    """Change of direction by a phase at a hit, D arrays; () if no row has a phase."""
     if row is None:
         return ()
     none = lambda hit, _: tuple(jnp.zeros_like(a) for a in hit)  # noqa: E731
@@ -109,16 +122,16 @@ def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
 
 
 class Row(NamedTuple):
-    """What a ray meets: an active surface, the stop or the sensor; or several, with a first axis.
+    """One step of the trace: an active surface, the stop or the sensor; several have a first axis.
 
-    first: whether it is the first.
+    first: True for the first row.
     active: False for a stop that only labels: the line is extended either way to it.
     bends: False if the ray continues unchanged.
-    surface: in its place.
+    surface: the surface in its position.
     kind: number of its form.
-    ratio: index before it / index behind it.
-    sense, leaving: 1 if light travels along z before it (behind it), -1 if against.
-    kick: of its phase; None if no row has a phase.
+    ratio: refractive index in front of it divided by that behind it.
+    sense, leaving: 1 if light travels towards +z in front of it, or behind it; -1 if towards -z.
+    kick: its phase; None if no row has a phase.
     """
 
     first: Any
@@ -133,13 +146,16 @@ class Row(NamedTuple):
 
 
 def _forms(system: System) -> tuple[list[str], list[str]]:
-    """The different forms of surfaces and of phases."""
+    """Sorted names of the forms of surfaces and of phases that occur."""
     by = system.diffraction
     return sorted({*system.forms, system.at_stop[1]}), sorted(set(by.forms)) if by else []
 
 
 def rows_met(system: System, to_stop: bool = False) -> Row:
-    """All that rays meet, or what they meet up to the stop and the stop, which then is crossed."""
+    """The steps of the trace, to the sensor or `to_stop`.
+
+    to_stop: True for the rows in front of the stop and the stop as a label, False for all rows.
+    """
     kinds, phases = _forms(system)
     count, at = len(system.forms), system.before
     senses = system.senses
@@ -173,8 +189,12 @@ def rows_met(system: System, to_stop: bool = False) -> Row:
 
 
 class _State(NamedTuple):
-    """Rays behind a row: point, direction: D + 1 arrays (...), along the axes of the lens. hit: D
-    arrays, on that row. status, rounding_angle: see `Trace`."""
+    """Rays behind a row.
+
+    point, direction: D + 1 arrays (...) along the axes of the lens; point in mm.
+    hit: D arrays (...), on that row, mm along its axes.
+    status, rounding_angle: (...), as in `Trace`.
+    """
 
     point: Vector
     direction: Vector
@@ -184,15 +204,16 @@ class _State(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """Of rays with all that they meet: the R rows, and a stop that is none of them in its place
-    among these, see `split_stop`. Along the axes of each; void behind a failure.
+    """Meetings of rays with each row, along the axes of that row; undefined behind a failure. If
+    the stop is not a row, its meeting is inserted at `system.before`, see `split_stop`.
 
-    point, direction: D + 1 arrays (R, ...), in front of it, a point in mm and a unit vector.
-    hit: D arrays (R, ...), where the ray, prolonged either way, crosses it, mm.
-    crosses: (R, ...), bool, whether it does.
+    point, direction: D + 1 arrays (R, ...), a point (mm) and unit vector in front of the row.
+    hit: D arrays (R, ...), where the ray, extended both ways, crosses the row, mm.
+    crosses: (R, ...), bool, whether the ray crosses the row.
     length: (R, ...), mm from the active surface before it, below 0 for a step back.
-    front, through: (R, ...), above 0 where light comes from its front, and gets through.
-    status: (R, ...), int32, so far, see `Trace`.
+    front: (R, ...), above 0 if light comes from the front of the row.
+    through: (R, ...), above 0 if light passes the row: no total internal reflection.
+    status: (R, ...), int32, status up to and with this row, see `Trace`.
     """
 
     point: Vector
@@ -206,14 +227,14 @@ class Meeting(NamedTuple):
 
 
 def _along_the_axis(going: Array, sense: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
-    """A failed ray goes on along the axis, so that its numbers and their derivatives are finite."""
+    """Moves failed rays onto the axis, where their numbers and derivatives are finite."""
     axis: Vector = (*(jnp.zeros_like(a) for a in d[:-1]), sense)
     p = tuple(jnp.where(going, a, 0) for a in p)
     return p, tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
 
 
 def _meet(system: System, row: "Row", state: _State, smooth: bool) -> tuple[Meeting, _State]:
-    """Rays that come to a row, and behind it. smooth: see `meetings`."""
+    """Meetings of rays with one row, and the rays behind it. smooth: as in `meetings`."""
     kinds, phases = _forms(system)
     going = state.status == Status.OK
     p, d = row.surface.local(state.point, state.direction)
@@ -236,8 +257,15 @@ def _follow(
     smooth: bool = False,
     forward: bool = True,
 ) -> tuple[_State, Any]:
-    """Rays behind the last row, and all that they met; or behind the stop, and None. smooth: see
-    `meetings`. forward: whether a ray fails that steps back to a row."""
+    """Traces rays.
+
+    launch: D arrays (...), mm on the vertex plane of the first row.
+    to_stop: True to trace to the stop alone.
+    smooth: as in `meetings`.
+    forward: True if a ray that steps back to a row fails.
+
+    Returns the rays behind the last row and the `Meeting` with all rows; None if `to_stop`.
+    """
 
     def step(state, row):
         meeting, behind = _meet(system, row, state, smooth)
@@ -263,26 +291,30 @@ def _follow(
 
 
 def shoot(system: System, launch: Vector) -> Trace:
-    """Trace rays to the sensor; `launch` D arrays in mm on the vertex plane of the first row."""
+    """Traces rays to the sensor. launch: D arrays, mm on the vertex plane of the first row."""
     state, met = _follow(system, launch)
     return Trace(met.hit, state.status, state.rounding_angle)
 
 
 def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
-    """`hits` and `status` of `Trace`, and between them the lengths (R - 1, ...) of the segments
-    from each active surface to the next and to the sensor, mm: a ray may step back, where
-    neighbours cross, by a length below 0. Differentiable; void rays are finite."""
+    """Traces rays that may step back where neighbouring surfaces cross; differentiable, and finite
+    for failed rays. launch: as in `shoot`.
+
+    Returns `hits` as in `Trace`; the lengths (R - 1, ...) of the segments from each active surface
+    to the next and to the sensor, mm, below 0 for a step back; and `status` as in `Trace`.
+    """
     state, met = _follow(system, launch, smooth=True, forward=False)
     return met.hit, split_stop(system, (met.length,))[0][0][1:], state.status
 
 
 def meetings(system: System, launch: Vector, smooth: bool = False) -> Meeting:
-    """What rays meet on their way to the sensor; `launch` as of `shoot`. smooth: failed rays go on
-    along the axis, and all derivatives are finite."""
+    """Meetings of rays with all rows. launch: as in `shoot`. smooth: True to move failed rays onto
+    the axis, so that all derivatives are finite."""
     return _follow(system, launch, smooth=smooth)[1]
 
 
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:
-    """Where rays cross the stop, D arrays in mm along its axes, and their status so far (...)."""
+    """Crossings of the stop, D arrays, mm along its axes, and the status there (...). launch: as in
+    `shoot`."""
     state, _ = _follow(system, launch, to_stop=True)
     return state.hit, state.status

@@ -1,8 +1,8 @@
 """Rays as roots of the Fermat system, with derivatives by the implicit function theorem.
 
-The search is never differentiated: at a root of E(w, p) = 0, the Fermat equations and the label,
-dw/dp = -(dE/dw)^-1 dE/dp (paper Eq. 4). `attach` gives known hits these derivatives in every
-mode; `solve_reverse` is the same as a `jax.custom_vjp`, which keeps nothing but the hits.
+The search is not differentiated. At a root of E(w, p) = 0, the Fermat equations and the label,
+dw/dp = -(dE/dw)^-1 dE/dp (paper Eq. 4). `attach` gives known hits these derivatives in every mode.
+`solve_reverse` is a `jax.custom_vjp` for reverse mode alone, which stores only the hits.
 """
 
 from collections.abc import Callable
@@ -27,17 +27,21 @@ from .system import System, Vector, dot, rotate
 def attach(
     system: System, target: Vector, hits: Vector, arrival: Vector, good: Array
 ) -> tuple[Vector, Vector]:
-    """Known hits and arrivals, see `Found`, with their derivatives by the system and the stop
-    points `target`, D arrays (W, Q) in mm, in every mode; `good`: (W, Q), the rays that have any.
+    """Returns hits and arrivals unchanged, with derivatives by the system and the stop points in
+    every mode.
+
+    target: D arrays (W, Q), stop points, mm.
+    hits, arrival: as in `Found`.
+    good: (W, Q), bool, rays that have derivatives.
     """
     return hits, arrival
 
 
 def _attach_jvp(primals: Any, tangents: Any) -> tuple:
     system, target, *known, good = primals
-    # Through the function itself, so that the hits carry derivatives of their own.
+    # Call the function itself, so that the hits have derivatives for higher orders.
     hits, arrival = attach(system, target, *known, good)
-    # Only what moves costs anything.
+    # Leaves without a tangent cost nothing.
     moving, turning = (
         [None if isinstance(t, SymbolicZero) else t for t in jax.tree.leaves(part)]
         for part in tangents[:2]
@@ -59,14 +63,14 @@ attach.defjvp(_attach_jvp, symbolic_zeros=True)
 
 
 def _right_side(path: Path, system: System, moving: list[Array | None]) -> linear.RightSide:
-    """What a path has to make up for when leaves of its system move (paper Eq. 4)."""
+    """Right-hand side of the linear system for tangents of leaves of the system (paper Eq. 4)."""
     leaves, structure = jax.tree.flatten(system)
     some = [k for k, change in enumerate(moving) if change is not None]
     directions = [rotate(system.rows.rotation, a) for a in (path.before, path.after)]
     first, line = (fermat.ray_at(path, system, row) for row in (0, system.before))
 
     def with_fixed_path(changed):
-        """The equations; hits and directions are fixed, these along the axes of the lens."""
+        """The equations for fixed hits, and for directions fixed along the axes of the lens."""
         new = dict(zip(some, changed, strict=True))
         own = jax.tree.unflatten(structure, [new.get(k, a) for k, a in enumerate(leaves)])
         rows = own.rows
@@ -91,29 +95,29 @@ def _right_side(path: Path, system: System, moving: list[Array | None]) -> linea
 
 
 def solve(system: System, target: Vector) -> Found:
-    """The rays through stop points `target`, D arrays (W, Q) in mm, differentiable in every mode
-    and to any order; failed rays have zero derivatives."""
+    """Finds the rays through stop points, differentiable in every mode and to any order; failed
+    rays have zero derivatives. target: D arrays (W, Q), stop points, mm."""
     return reattach(find_many(*jax.lax.stop_gradient((system, target))), system, target)
 
 
 def solve_aimed(system: System, target: Vector) -> Found:
-    """`solve` of `find_aimed`."""
+    """Finds rays as `solve` does, by aiming alone, see `find_aimed`."""
     return reattach(find_aimed(*jax.lax.stop_gradient((system, target))), system, target)
 
 
 def reattach(found: Found, system: System, target: Vector) -> Found:
-    """Known rays through stop points `target` with the derivatives of `attach`."""
+    """Gives rays through stop points `target` the derivatives of `attach`."""
     hits, arrival = attach(system, target, found.hits, found.arrival, found.status == Status.OK)
     return found._replace(hits=hits, arrival=arrival)
 
 
-# What finds the rays of a system through stop points.
+# A function that finds the rays of a system through stop points.
 Solver = Callable[[System, Vector], Found]
 
 
 @jax.custom_vjp
 def solve_reverse(system: System, target: Vector) -> Found:
-    """`solve` for reverse mode alone: nothing is kept but the hits, and a step is faster."""
+    """Finds rays as `solve` does, for reverse mode alone: faster, and stores only the hits."""
     return find_many(system, target)
 
 
@@ -124,7 +128,7 @@ def _forward(system: System, target: Vector) -> tuple[Found, tuple]:
 
 def _backward(saved: tuple, cotangent: Found) -> tuple[System, Vector]:
     system, target, hits, good = saved
-    void = jax.tree.map(jnp.zeros_like, cotangent.arrival)  # only its derivatives are asked for
+    void = jax.tree.map(jnp.zeros_like, cotangent.arrival)  # only its derivatives are used
 
     def attached(system, target):
         return attach(system, target, hits, void, good)

@@ -1,4 +1,4 @@
-"""A few flagged rays of a bundle in its many lanes: each is tried several times at once."""
+"""Packing of a few flagged rays into the lanes of a bundle, several trials per ray."""
 
 from typing import Any
 
@@ -8,11 +8,12 @@ from jax import Array
 
 
 class Lanes:
-    """The lanes of a bundle (W, Q), given to the first K of its flagged rays, N lanes to each: the
-    first N to the first of them. K = Q // N; lanes that are left over repeat the last.
+    """Assignment of the Q lanes of a bundle to the first K = Q // N flagged rays, N lanes each, in
+    the order of the rays. Remaining lanes repeat the last one.
 
-    flagged: (W, Q), bool. each: N, at most Q.
-    served: (W, Q), bool, the rays that have lanes.
+    flagged: (W, Q), bool, rays that need lanes.
+    each: N, lanes per ray, at most Q.
+    served: (W, Q), bool, rays that have lanes.
     """
 
     def __init__(self, flagged: Array, each: int):
@@ -21,15 +22,16 @@ class Lanes:
         self.served = flagged & (self._rank < self.few)
 
     def of_rays(self, tree: Any) -> Any:
-        """Of arrays (W, Q) what belongs to the rays that are served, (W, K); where fewer than K
-        are flagged, that of the last ray of the bundle."""
+        """Entries (W, K) of arrays (W, Q) that belong to the served rays; if fewer than K rays are
+        flagged, the last ray of the bundle fills up."""
         count = self.served.shape[1]
         order = jnp.where(self.served, count - jnp.arange(count, dtype=jnp.int32), 0)
         rays = count - jax.lax.top_k(order, self.few)[0]
         return jax.tree.map(lambda a: jnp.take_along_axis(a, rays, 1, mode="clip"), tree)
 
     def spread(self, tree: Any) -> Any:
-        """Arrays (W, K, N), or (W, K, 1) of what is the same in all lanes of a ray, as (W, Q)."""
+        """Spreads arrays (W, K, N) over the lanes, (W, Q); (W, K, 1) repeats in all lanes of a
+        ray."""
         waves, rays = self.served.shape
 
         def wide(a: Array) -> Array:
@@ -39,8 +41,8 @@ class Lanes:
         return jax.tree.map(wide, tree)
 
     def best(self, worth: Array) -> tuple[Array, Array]:
-        """The first lane (W, Q), int32, of those of each ray with the highest `worth` (W, Q), and
-        whether the ray is served and that is above 0."""
+        """The first lane with the highest worth of each ray, (W, Q), int32, and a mask of the
+        served rays whose highest worth is above 0. worth: (W, Q), of the lanes."""
         own = worth[:, : self.few * self.each].reshape(len(worth), self.few, self.each)
         slot = jnp.clip(self._rank, 0, self.few - 1)
         lane = jnp.take_along_axis(jnp.argmax(own, axis=-1).astype(jnp.int32), slot, axis=-1)

@@ -1,10 +1,10 @@
-"""What became of a ray."""
+"""Status codes of rays."""
 
 import enum
 
 
 class Status(enum.IntEnum):
-    """The first of MISSED and TIR along a ray; CLIPPED only if it is whole."""
+    """Status of a ray: the first failure along it; CLIPPED only if nothing else fails."""
 
     OK = 0
     MISSED = 1  # no forward intersection with a surface

@@ -1,8 +1,8 @@
-"""What a bundle of rays goes through: the active surfaces in their places, and the stop as a label.
+"""The traced system: the active surfaces in their positions, and the stop as a label.
 
-Vectors are tuples of components: D = 1 for rays in the meridional plane (y) or 2 (x, y), and z
-where a vector has it; each an array of one number a ray. XLA joins sums of components into few
-long loops, where a sum over an axis becomes a library call.
+Vectors are tuples of components: y for rays in the meridional plane (D = 1), x and y for others
+(D = 2), then z if the vector has D + 1 components. Each component is an array with one number per
+ray. XLA fuses sums of components into a few long loops; a sum over an axis becomes a library call.
 """
 
 import dataclasses
@@ -20,17 +20,17 @@ from ..lens.scene import Scene
 from ..numerics import safe_divide
 
 Vector = tuple[Array, ...]
-_MM = 1e-3  # of a micrometre
+_MM = 1e-3  # mm per um
 
 
 def dot(a: Any, b: Any) -> Array:
-    """Sum of products of two vectors of the same number of components."""
+    """Dot product of two vectors with the same number of components."""
     first, *others = (x * y for x, y in zip(a, b, strict=True))
     return sum(others, first)
 
 
 def determinant(rows: Any) -> Array:
-    """Of a 2 x 2 matrix; 1 for a single number, whose sign tells no fold."""
+    """Determinant of a 2 x 2 matrix; 1 for a 1 x 1 matrix, whose sign does not show a fold."""
     if len(rows) == 1:
         return jnp.ones_like(rows[0][0])
     (p, q), (r, s) = rows
@@ -38,7 +38,7 @@ def determinant(rows: Any) -> Array:
 
 
 def divide(rows: Any, b: Vector) -> Vector:
-    """x with rows x = b, of 1 or 2 unknowns; 0 where the matrix is singular."""
+    """Solution x of rows x = b for 1 or 2 unknowns; 0 where the matrix is singular."""
     if len(b) == 1:
         return (safe_divide(b[0], rows[0][0]),)
     (p, q), (r, s) = rows
@@ -48,9 +48,11 @@ def divide(rows: Any, b: Vector) -> Vector:
 
 
 def rotate(rotation: Array | None, vector: Vector, back: bool = False) -> Vector:
-    """A vector from the axes of its surface to those of the lens, or `back`.
+    """Rotates a vector from the axes of its surface to those of the lens.
 
-    rotation: (3, 3), or (R, 3, 3) for components (R, ...); None: the axes are the same.
+    rotation: (3, 3), or (R, 3, 3) for components (R, ...); None for the same axes.
+    vector: 3 components.
+    back: True for the opposite rotation, from the lens to the surface.
     """
     if rotation is None:
         return vector
@@ -61,15 +63,15 @@ def rotate(rotation: Array | None, vector: Vector, back: bool = False) -> Vector
 
 
 class Placed(NamedTuple):
-    """R surfaces in their places, or one: its arrays without the first axis.
+    """R surfaces in their positions; a single surface has arrays without the first axis.
 
-    vertex: (R,), z along the lens in mm.
-    curvature: (R,) in 1/mm.
+    vertex: (R,), z of the vertices along the axis of the lens, mm.
+    curvature: (R,), 1/mm.
     conic: (R,).
     coefficients: (R, K), see `lens.forms`.
-    offset: (R, 2), x and y of the vertices in mm; None for none.
-    rotation: (R, 3, 3) from the axes of the surfaces to those of the lens; None for none.
-    station: (R,), z of the vertices along an axis that turns with elements, mm; None: as `vertex`.
+    offset: (R, 2), x and y of the vertices, mm; None for none.
+    rotation: (R, 3, 3), from the axes of the surfaces to those of the lens; None for none.
+    station: (R,), z of the vertices before elements are moved, mm; None for `vertex`.
     """
 
     vertex: Array
@@ -82,31 +84,31 @@ class Placed(NamedTuple):
 
     @property
     def axial(self) -> Array:
-        """z of the vertices (R,) along the axis, mm, what paraxial optics knows of them."""
+        """z of the vertices (R,) for paraxial optics, mm."""
         return self.vertex if self.station is None else self.station
 
     @property
     def shape(self) -> Shape:
-        """Curvature, conic and coefficients (K, ...), to be broadcast against rays."""
+        """Curvature, conic and coefficients (K, ...), which broadcast against rays."""
         return Shape(self.curvature, self.conic, jnp.moveaxis(self.coefficients, -1, 0))
 
     @property
     def wide(self) -> Shape:
-        """The shape, to be broadcast against (surface, wavelength, ray)."""
+        """The shape with axes that broadcast against (surface, wavelength, ray)."""
         return Shape(*(a[..., None, None] for a in self.shape))
 
     def on(self, like: Array) -> Shape:
-        """The shape, each number broadcast to all rays (surface, wavelength, ray) by itself."""
+        """The shape with every number broadcast to (surface, wavelength, ray) as `like` has."""
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (*a.shape[:-3], *like.shape)), self.wide)
 
     def origin(self, dim: int) -> Vector:
-        """The vertices as vectors of `dim` + 1 components."""
+        """The vertices as vectors of `dim` + 1 components, mm along the axes of the lens."""
         zero = jnp.zeros_like(self.vertex)
         offset = (zero,) * dim if self.offset is None else tuple(jnp.moveaxis(self.offset, -1, 0))
         return *offset, self.vertex
 
     def local(self, point: Vector, direction: Vector) -> tuple[Vector, Vector]:
-        """A line along the axes of one surface, from its vertex."""
+        """Point (mm) and direction of a line in the axes of one surface, origin at its vertex."""
         origin = self.origin(len(point) - 1)
         shifted = tuple(p - o for p, o in zip(point, origin, strict=True))
         return rotate(self.rotation, shifted, back=True), rotate(
@@ -117,14 +119,15 @@ class Placed(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Diffraction:
-    """N rows that add phase.
+    """Phase functions on N rows of a system.
 
-    phase: (N,) and (K, N), as the shape of a sag, in waves.
-    wave: (N, W, 1), what a wave adds to the optical path in the order used, mm; (N,) for one ray.
+    phase: curvature and conic (N,), coefficients (K, N) of the phase, in waves.
+    wave: (N, W, 1), or (N,) for one ray: optical path added per wave of phase, order times
+        wavelength, mm.
 
     Static:
-    rows: which ones.
-    forms: of the phase.
+    rows: N indices of rows.
+    forms: N names of forms of the phase.
     """
 
     phase: Shape
@@ -136,20 +139,21 @@ class Diffraction:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class System:
-    """Everything that the path of a ray depends on; the differentiable arguments.
+    """All numbers that the path of a ray depends on; the differentiable arguments.
 
-    rows: the L active surfaces, those that bend light, and the sensor: R = L + 1.
-    stop: the stop in its place if it bends no light, else None.
-    index: (R, W, 1), of the medium in front of each row; (R,) for a single ray.
+    rows: the R = L + 1 rows: L active surfaces (refracting, reflecting or diffracting) and the
+        sensor.
+    stop: the stop in its position if it is not an active surface, else None.
+    index: (R, W, 1), or (R,) for a single ray: refractive index in front of each row.
     source: (D + 1,), the object point divided by its distance; its last component is -1.
-    vergence: (), 1/distance in 1/mm, 0 for infinity.
-    diffraction: None for none.
+    vergence: (), 1/distance, 1/mm; 0 for infinity.
+    diffraction: the rows with a phase; None for none.
 
     Static:
-    before: how many active surfaces lie before the stop.
-    forms: of the R rows.
-    stop_form: of the stop.
-    mirrors: whether each of the L active surfaces reflects.
+    before: number of active surfaces in front of the stop.
+    forms: R names of forms.
+    stop_form: name of the form of the stop.
+    mirrors: L booleans, True for a reflecting surface.
     """
 
     rows: Placed
@@ -170,7 +174,7 @@ class System:
 
     @property
     def at_stop(self) -> tuple[Placed, str]:
-        """The stop in its place, and its form, whether it bends light or not."""
+        """The stop, active or not, in its position, and the name of its form."""
         if self.stop is not None:
             return self.stop, self.stop_form
         row = self.before
@@ -178,19 +182,22 @@ class System:
 
     @property
     def behind(self) -> Array:
-        """Index (R, W, 1) of the medium behind each row; behind the sensor as before it."""
+        """Refractive index (R, W, 1) behind each row; behind the sensor as in front of it."""
         return jnp.concatenate([self.index[1:], self.index[-1:]])
 
     @property
     def senses(self) -> np.ndarray:
-        """1 or -1 (R,): light goes along or against the z axis before each row."""
+        """(R,), 1 where light travels towards +z in front of a row, -1 where towards -z."""
         turned = np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
         return turned.astype(self.index.dtype)
 
 
 def placed(lens: Lens, rows: Any) -> Placed:
-    """Surfaces of a lens by index: a list of them, or one. Those that bend no light do not bend
-    themselves, but where `Lens.curved` has them."""
+    """Surfaces of a lens in their positions.
+
+    rows: index of one surface, or a list of indices. The shape of a surface that is neither active
+        nor in `Lens.curved` has no derivative.
+    """
     rows = np.asarray(rows)
     vertex, offset, rotation = lens.places
     bends = np.isin(rows, [*lens.active, *lens.curved])
@@ -212,10 +219,13 @@ def placed(lens: Lens, rows: Any) -> Placed:
 
 
 def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
-    """The system of a lens and a scene for rays of `dim` components: 2, or 1 for the meridional
-    rays of an axial object in a lens with rotational symmetry."""
+    """The traced system of a lens and a scene.
+
+    dim: number of transverse components, 2; or 1 for the meridional rays of an axial object in a
+        lens with rotational symmetry.
+    """
     active, stop = lens.active, lens.stop
-    # Wavelengths without an index have one that is finite; their rays fail, see `Status`.
+    # A wavelength outside the range of a glass gets a finite index; its rays are NO_INDEX.
     waves = jnp.clip(scene.wavelengths, *lens.dispersion.range)
     rows = [*active, lens.count]
     tangent = scene.tangent[2 - dim :]

@@ -1,6 +1,7 @@
-"""Lens + scene + points on the stop -> rays with a status.
+"""From a lens, a scene and points on the stop to rays with a status.
 
-Three steps: `aims` says what is sought, a `Solver` finds it, `bundle_of` completes it.
+Three steps: `aims` makes the system and the stop points, a `Solver` finds the rays, `bundle_of`
+adds the other surfaces and the status.
 """
 
 import functools
@@ -26,13 +27,13 @@ from .system import System, Vector, placed, rotate, system_of
 
 
 class Bundle(NamedTuple):
-    """Rays in the array layout of `fermat`, rays last.
+    """Rays as arrays with rays on the last axis.
 
-    hits: D arrays (S + 1, W, Q) in mm, along the axes of each surface and the sensor.
+    hits: D arrays (S + 1, W, Q), mm along the axes of each surface and the sensor.
     status: (W, Q), int32, see `Status`.
     arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along its axes.
-    path: (W, Q), optical path in mm from the object, see `fermat.optical_path`.
-    steps: (), int32, steps of Newton's method.
+    path: (W, Q), optical path from the object, mm, see `fermat.optical_path`.
+    steps: (), int32, Newton steps.
     """
 
     hits: Vector
@@ -45,14 +46,14 @@ class Bundle(NamedTuple):
 class Rays(NamedTuple):
     """Traced rays.
 
-    points: (W, Q, S + 1, 3) in mm, where they cross the surfaces and the sensor, along the axes
-        of the lens, z from the first vertex; zeros for a ray that failed.
+    points: (W, Q, S + 1, 3), mm, intersections with the surfaces and the sensor, along the axes of
+        the lens, z from the first vertex; zeros for a failed ray.
     directions: (W, Q, S + 1, 3), unit vectors (direction cosines) in front of each surface and
-        the sensor.
-    path: (W, Q) in mm, the optical path from the object to the sensor, counted from the sphere
-        round the object (the plane wave) through the first vertex; 0 for a ray that failed.
+        the sensor; zeros for a failed ray.
+    path: (W, Q), mm, optical path to the sensor from the sphere about the object (for an object at
+        infinity the plane wave) through the first vertex; 0 for a failed ray.
     status: (W, Q), int32, see `Status`.
-    newton_steps: (), int32, steps of the whole bundle, aiming included.
+    newton_steps: (), int32, Newton steps of the whole bundle, aiming included.
     """
 
     points: Array
@@ -63,16 +64,22 @@ class Rays(NamedTuple):
 
 
 def _rows_behind(lens: Lens) -> list[int]:
-    """The row of the system that each surface and the sensor is, or that lies behind it."""
+    """For each surface and the sensor, the index of its row, or of the next row behind it."""
     return [sum(j < i for j in lens.active) for i in range(lens.count + 1)]
 
 
 def on_all_surfaces(
     lens: Lens, system: System, hits: Vector, stop: Vector, good: Array
 ) -> tuple[Vector, Array]:
-    """Hits on all surfaces from those on the rows of the system and on the stop, 0 for failed rays;
-    and which of the `good` rays (W, Q), straight and prolonged either way, meet all surfaces that
-    bend no light."""
+    """Adds the hits on the surfaces that are not active.
+
+    hits: D arrays (R, W, Q), on the rows of the system, mm.
+    stop: D arrays (W, Q), crossings of the stop, mm.
+    good: (W, Q), bool, rays that exist.
+
+    Returns hits on all surfaces, D arrays (S + 1, W, Q), 0 for failed rays, and the mask (W, Q) of
+    the good rays whose straight lines, extended both ways, meet all those surfaces.
+    """
     pieces, begin, behind = [], 0, _rows_behind(lens)
     for i in sorted({*range(lens.count)} - {*lens.active}):
         row, crossing = behind[i], stop
@@ -89,11 +96,11 @@ def on_all_surfaces(
 
 
 def aims(lens: Lens, scene: Scene, points: Vector) -> tuple[System, Vector]:
-    """The system of a bundle, and the stop points that its rays cross, D arrays (W, Q) in mm.
+    """The system of a bundle, and the stop points that its rays cross, D arrays (W, Q), mm.
 
-    points: D arrays (Q,) or (W, Q) on the unit disc of the stop, or any part of its plane; D = 1
-        for rays in the meridional (y, z) plane of a lens with rotational symmetry and an object
-        on its axis, else 2. One that is not finite stays so, and has no derivative.
+    points: D arrays (Q,) or (W, Q), in the plane of the stop in units of its semi-diameter; D = 1
+        for rays in the meridional (y, z) plane of a lens with rotational symmetry and an axial
+        object, else 2. A point that is not finite becomes inf, without a derivative.
     """
     radius, waves = lens.semi_diameter[lens.stop], scene.wavelengths.shape[0]
     finite = [(jnp.isfinite(p), jnp.where(jnp.isfinite(p), p, 0)) for p in points]
@@ -103,7 +110,11 @@ def aims(lens: Lens, scene: Scene, points: Vector) -> tuple[System, Vector]:
 
 
 def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: Found) -> Bundle:
-    """The bundle of the rays found through stop points; `system` and `target` as of `aims`."""
+    """Completes rays to a bundle: hits on all surfaces, clipping and the final status.
+
+    system, target: as `aims` returns them.
+    found: the rays that a `Solver` found.
+    """
     status = jnp.where(scene.possible, found.status, jnp.int32(Status.MISSED))
     known = lens.dispersion.knows(scene.wavelengths)[:, None]
     status = jnp.where(known, status, jnp.int32(Status.NO_INDEX))
@@ -117,9 +128,10 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
 
 
 def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:
-    """Trace rays in the array layout of `fermat`, rays last; points as of `aims`.
+    """Traces rays: `aims`, a solver and `bundle_of`.
 
-    solver: `solve`, for all modes of derivatives, or `solve_reverse`.
+    points: as in `aims`.
+    solver: `solve` for all derivative modes, or `solve_reverse`.
     """
     system, target = aims(lens, scene, points)
     return bundle_of(lens, scene, system, target, solver(system, target))
@@ -132,32 +144,32 @@ def trace_rays(
     wavelengths: Numbers,
     pupil: Numbers,
 ) -> Rays:
-    """Trace the rays that cross the stop at given points.
+    """Traces the rays that cross the stop at given points, aimed at the real stop for every
+    wavelength. Differentiable in every mode and to any order.
 
-    field: angle in radians along y, or (x, y), light along (tan x, tan y, 1); positive light
-        travels upwards (for a height in mm, see `field_of_height`).
-    distance: mm from the object plane to the first vertex, inf allowed.
-    wavelengths: (W,) in um.
+    field: angle along y or (x, y), radians: light along (tan x, tan y, 1), positive upwards. For a
+        height in mm see `field_of_height`.
+    distance: mm from the object plane to the first vertex, may be inf.
+    wavelengths: (W,), um.
     pupil: (Q, 2), x and y on the stop in units of its semi-diameter.
 
-    Rays are aimed at the real stop, for every wavelength. Differentiable in everything but the
-    status, in every mode and to any order. ValueError as `scene_of`; inside a trace, where values
-    are not known, rays of a wavelength outside the range of a glass have the status NO_INDEX, those
-    of a field of 90 degrees and more or of a distance not above 0 are MISSED.
+    ValueError as in `scene_of`. Inside `jit` or `vmap`, where values are not known, a wavelength
+    outside the range of a glass gives the status NO_INDEX; a field of 90 degrees or more, or a
+    distance that is not above 0, gives MISSED.
     """
     scene, points = scene_of(lens, field, distance, wavelengths), stop_points(lens, pupil)
     count, size = len(points), _padded(len(points))
     if count == size or known_values((lens, scene, points)) is None:
         return _trace(lens, scene, points)
-    # Bundles of nearly as many rays share a program: those that are not finite cost little.
+    # Padding lets bundles of similar size share a program; rays through inf cost little.
     library = np if concrete(points) else jnp
     filled = library.pad(points, ((0, size - count), (0, 0)), constant_values=np.inf)
     return _first(_trace(lens, scene, filled), count)
 
 
 def _padded(count: int) -> int:
-    """How many rays are traced for so many: 16 for fewer, then a multiple of an eighth of the next
-    power of 2; above 1024 no more than asked for, as time is arithmetic there."""
+    """Padded number of rays: at least 16, then a multiple of an eighth of the next power of 2;
+    above 1024 unchanged, where arithmetic takes the time."""
     if count > 1024:
         return count
     step = max(16, 1 << (count - 1).bit_length()) // 8
@@ -166,16 +178,16 @@ def _padded(count: int) -> int:
 
 @functools.partial(jax.jit, static_argnames="count")
 def _first(rays: Rays, count: int) -> Rays:
-    """The first rays of some."""
+    """The first `count` rays."""
     return jax.tree.map(lambda a: a[:, :count] if a.ndim else a, rays)
 
 
 def stop_points(lens: Lens, pupil: Numbers) -> Array:
-    """Points (Q, 2) of the stop as an array in the dtype of the lens. ValueError for none, and for
-    another shape."""
+    """Points (Q, 2) on the stop as an array in the dtype of the lens. ValueError for no points and
+    for another shape."""
     points = real_array("pupil", pupil, lens.curvature.dtype)
     if points.ndim != 2 or points.shape[1] != 2 or not len(points):
-        hint = "; turn it, pupil.T" if points.ndim == 2 and points.shape[0] == 2 else ""
+        hint = "; pass pupil.T" if points.ndim == 2 and points.shape[0] == 2 else ""
         raise ValueError(f"pupil: expected x and y of points, (Q, 2), got {points.shape}{hint}")
     return points
 

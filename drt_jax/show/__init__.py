@@ -18,5 +18,6 @@ from .analyses import (
     spots as spots,
 )
 from .figures import kernels as kernels, new as new
+from .glasses import glass_map as glass_map
 from .layout import Drawing as Drawing, draw as draw, lens_drawing as lens_drawing
 from .sheet import sheet as sheet

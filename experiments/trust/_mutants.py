@@ -23,11 +23,12 @@ _VALUES: tuple[Any, ...] = (
 )
 
 
-def mutated(text: str, rng: np.random.Generator) -> bytes:
-    """A file with one to four things wrong, or none."""
+def mutated(text: str, rng: np.random.Generator, trees: float = 0.6) -> bytes:
+    """A file with one to four things wrong, or none; `trees`: the share of changes of YAML's tree
+    among those of bytes."""
     content = text.encode("utf-8", "surrogatepass")
     for _ in range(rng.integers(1, 5)):
-        spoil = _TREES if rng.random() < 0.6 else _BYTES
+        spoil = _TREES if rng.random() < trees else _BYTES
         content = spoil[rng.integers(len(spoil))](content, rng)
     return content
 

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 import tempfile
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -19,6 +20,14 @@ from ._outcomes import Tally, judged
 from .runs import config as configs
 
 _LENSES = pathlib.Path(drt_jax.__file__).parent / "lens" / "catalogue" / "lenses"
+# Lines that .zmx files may have beside those that we write.
+_ZMX = (
+    *("TYPE COORDBRK", "TYPE SZERNSAG", "TYPE QED_TYPE", "TYPE BINARY_2", "TYPE XPOLYNOM", "STOP"),
+    *("TYPE TOROIDAL", "TYPE BICONICX", "TYPE TILTSURF", "PARM 1 .1", "PARM 3 20", "PARM 6 1"),
+    *("XDAT 1 4", "XDAT 2 20", "XDAT 3 .01", "XDAT 5 1e-3", "DISZ 0", "DISZ INFINITY", "SQAP 3 4"),
+    *("OBSC 0 1", "CLAP 1 9", "OBDC 1 2", "FLAP", "GLAS MIRROR", "GLAS ___BLANK 1 0 1.6 40 0"),
+    *("FNUM 2 1", "ENPD 5", "OBNA .1", "FTYP 2 0 1 1", "FTYP 1 1 3 9", "UNIT IN", "PWAV 9"),
+)
 # Programs of many structures exhaust what a process may map.
 _KEPT = 200
 
@@ -26,20 +35,52 @@ _KEPT = 200
 def prescriptions(count: int, rng: np.random.Generator) -> tuple[dict[str, Any], list[Lens]]:
     """A row of spoilt prescriptions: what loads is finite. And lenses that did load."""
     texts = [path.read_text() for path in sorted(_LENSES.glob("*.yaml"))]
-    tally, loaded = Tally("prescriptions"), list[Lens]()
+    loaded = list[Lens]()
+    spoilt = lambda: mutated(_one(texts, rng), rng)  # noqa: E731
+    return _tried("prescriptions", "lens.yaml", spoilt, count, loaded), loaded
+
+
+def lens_files(count: int, rng: np.random.Generator) -> dict[str, Any]:
+    """A row of spoilt .zmx files, lines of other files among theirs, in two encodings."""
     with tempfile.TemporaryDirectory() as folder:
-        path = pathlib.Path(folder) / "lens.yaml"
+        path = pathlib.Path(folder) / "lens.zmx"
+        texts = []
+        for name in ("cooke_triplet", "phone", "hubble", "singlet"):
+            drt_jax.save_lens(drt_jax.load_lens(name), path)
+            texts.append(path.read_text())
+
+    def content() -> bytes:
+        lines = _one(texts, rng).splitlines()
+        for _ in range(rng.integers(4)):
+            lines.insert(int(rng.integers(len(lines))), f"  {_one(_ZMX, rng)}")
+        own = mutated("\n".join(lines), rng, trees=0.0)
+        return own if rng.random() < 0.5 else own.decode("utf-8", "replace").encode("utf-16")
+
+    return _tried("lens files", "lens.zmx", content, count, [])
+
+
+def _one(items: Sequence[str], rng: np.random.Generator) -> str:
+    return items[rng.integers(len(items))]
+
+
+def _tried(
+    kind: str, name: str, spoilt: Callable[[], bytes], count: int, loaded: list[Lens]
+) -> dict[str, Any]:
+    """A row of files of this name; `loaded` takes the lenses."""
+    tally = Tally(kind)
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / name
         for k in tqdm(range(count), unit="lens", leave=False, dynamic_ncols=True):
             if k % _KEPT == 0:
                 jax.clear_caches()
-            path.write_bytes(content := mutated(texts[rng.integers(len(texts))], rng))
+            path.write_bytes(content := spoilt())
 
             def load() -> bool:
                 loaded.append(drt_jax.load_lens(path))
                 return finite(loaded[-1])
 
             tally.add((found := judged(load))[0], (found[1], content[:500]))
-    return tally.row, loaded
+    return tally.row
 
 
 def finite(lens: Lens) -> bool:

@@ -29,9 +29,9 @@ PARTS = ("files", "kills")
 class Config:
     """Settings of the experiment; see configs/faults.yaml.
 
-    files: how many prescriptions and settings are spoilt. traced: how many of the lenses that load
-    are traced. kills: how many runs are ended. parts: the names of those to try (files, kills),
-    empty for all. seed: of all random numbers.
+    files: how many prescriptions and settings are spoilt, and a quarter as many .zmx files.
+    traced: how many of the lenses that load are traced. kills: how many runs are ended. parts: the
+    names of those to try (files, kills), empty for all. seed: of all random numbers.
     """
 
     files: int = 10_000
@@ -48,12 +48,13 @@ class Config:
 
 def rows_of(config: Config, part: str) -> Iterator[dict[str, Any]]:
     """The rows of a part."""
-    some = np.random.default_rng([config.seed, PARTS.index(part)]).spawn(3)
+    some = np.random.default_rng([config.seed, PARTS.index(part)]).spawn(4)
     if part == "files":
         row, loaded = _spoilt.prescriptions(config.files // 2, some[0])
         yield row
         yield _spoilt.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
         yield _spoilt.settings(config.files - config.files // 2, some[1])
+        yield _spoilt.lens_files(config.files // 4, some[3])
     else:
         with tempfile.TemporaryDirectory() as folder:
             toy, third = _ended.Toy(pathlib.Path(folder)), config.kills // 3

@@ -1,16 +1,21 @@
-"""Lens files of another program against its own listings: right, refused, or silently wrong.
+"""Lens files of another program against its own listings: right, near, refused, or silently wrong.
 
-Each NAME.zmx of a folder is read; NAME.txt beside it is OpticStudio's listing. Right: focal length,
-f-numbers, entrance pupil and stop are those of the listing to its last digit. Writes results.json:
-`rows` hold `file`, `outcome` (right, refused, wrong, unlisted), `why` (the message, or what
-differs).
+Each NAME.zmx of a folder is read by us and, where they are installed, by Optiland and ray-optics,
+in the same run and by the same numbers; NAME.txt beside it is OpticStudio's listing. Right: focal
+length, f-number, entrance pupil and all indices of glasses are those of the listing to its last
+digit, near: to a thousandth, wrong: further off, without a word. Writes results.json: `rows` hold
+`file`, `reader`, `outcome`, `off` (the greatest part by which a number is off) and `why` (the
+message, or the number that is furthest off).
 """
 
+import contextlib
 import dataclasses
+import io
 import pathlib
 import re
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,8 +26,17 @@ from drt_jax import show
 from . import _command, _common, _plots
 from .runs.folder import Run
 
-OUTCOMES = ("right", "refused", "wrong", "unlisted")
+OUTCOMES = ("right", "near", "refused", "wrong", "unlisted", "absent")
 COLUMNS = OUTCOMES
+_NEAR = 1e-3
+_INDEX = 2e-9  # silica's constants have one digit more in some programs
+Read = tuple[list[float], list[float], float | None]
+_NUMBERS = (
+    "Effective Focal Length",
+    "Image Space F/#",
+    "Entrance Pupil Diameter",
+    "Entrance Pupil Position",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +49,46 @@ class Config:
     folder: str
 
 
+def _ours(path: str) -> Read:
+    system = drt_jax.load_system(path)
+    wave = np.array([system.wavelengths[system.primary]])
+    found = drt_jax.first_order(system.lens, system.distance, wave)
+    focal, pupil = float(found.effective_focal_length[0]), found.entrance_pupil
+    wide, place = 2 * float(pupil.semi_diameter[0]), float(pupil.position[0])
+    indices = np.asarray(system.lens.index(wave))[:, 0].tolist()
+    return [focal, focal / wide, wide, place], indices, system.distance
+
+
+def _optiland(path: str) -> Read:
+    from optiland.fileio import load_zemax_file
+
+    optic = load_zemax_file(path)
+    own = optic.paraxial
+    values = (own.f2(), own.FNO(), own.EPD(), own.EPL())
+    first = [float(np.ravel(value)[0]) for value in values]
+    return first, np.ravel(optic.n(optic.primary_wavelength)).tolist(), None
+
+
+def _rayoptics(path: str) -> Read:
+    from rayoptics.gui.appcmds import open_model
+
+    model = open_model(path)
+    own = model["analysis_results"]["parax_data"].fod
+    primary = model["osp"]["wvls"].reference_wvl
+    indices = [float(row[primary]) for row in model["seq_model"].rndx]
+    focal, wide = own.efl or np.inf, 2 * own.enp_radius  # 0 is its word for none
+    return [focal, focal / wide, wide, own.enp_dist], indices, None
+
+
+# [focal length, f-number, diameter and place of the entrance pupil], indices of all media, and how
+# far from the object that place is counted; None: as in the listing, from its surface 1.
+READERS: dict[str, Callable[[str], Read]] = {
+    "drt_jax": _ours,
+    "optiland": _optiland,
+    "rayoptics": _rayoptics,
+}
+
+
 def listed(content: str, key: str) -> tuple[float, float] | None:
     """A number of a listing and one of its last digit; None if it is not there."""
     found = re.search(rf"^{re.escape(key)}\s*:\s*([-+.\dEe]+)", content, re.MULTILINE)
@@ -44,71 +98,131 @@ def listed(content: str, key: str) -> tuple[float, float] | None:
     return float(found[1]), 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
 
 
-def first_order(system: drt_jax.System) -> dict[str, float]:
-    """What a listing has, by its names."""
-    wave = np.array([system.wavelengths[system.primary]])
-    found = drt_jax.first_order(system.lens, system.distance, wave)
-    focal, aperture = float(found.effective_focal_length[0]), float(found.numerical_aperture[0])
-    pupil = 2 * float(found.entrance_pupil.semi_diameter[0])
-    return {
-        "Effective Focal Length": focal,
-        "Image Space F/#": abs(focal) / pupil,
-        "Paraxial Working F/#": 0.5 / aperture if aperture else np.inf,
-        "Entrance Pupil Diameter": pupil,
-        "Stop Radius": float(system.lens.semi_diameter[system.lens.stop]),
-    }
+def listed_indices(content: str) -> list[float]:
+    """Of all glasses at the primary wavelength but for that behind the image, which no ray meets;
+    empty if they are not listed."""
+    table = content.partition("INDEX OF REFRACTION")[2]
+    head = re.search(r"^Surf .*?((?:\s+\d\.\d{8})+)", table, re.MULTILINE)
+    primary = re.search(r"^Primary Wavelength.*:\s*([\d.]+)", content, re.MULTILINE)
+    if not head or not primary:
+        return []
+    at = np.argmin(np.abs(np.array(head[1].split(), float) - float(primary[1])))
+    own = re.split(r"\n\s*\n", table[head.end() :])[0]  # other tables follow
+    rows = re.findall(r"^ +\d+ .*?((?:\s+\d\.\d{10})+)", own, re.MULTILINE)
+    return [float(row.split()[at]) for row in rows[:-1]]
 
 
-def outcome(path: pathlib.Path) -> dict[str, str]:
-    """One file. A focal length of 1e10 is what a listing writes for none."""
-    row = {"file": path.name}
+def differences(
+    content: str, first: list[float], indices: list[float], far: float | None
+) -> list[tuple]:
+    """(part by which it is off, whether it is right, in words) of each number of a listing. Signs
+    of focal lengths differ between programs where there are mirrors; a focal length of 1e10 is what
+    a listing writes for none."""
+    found = []
+    wide = (listed(content, _NUMBERS[2]) or (1.0,))[0]
+    finite = re.search(r"^ OBJ\s+\S+\s+\S+\s+([-+.\dEe]+)\s", content, re.MULTILINE)
+    if finite and far is not None:
+        first = [*first[:3], first[3] + far - float(finite[1])]
+    for key, value in zip(_NUMBERS, first):
+        number, step = listed(content, key) or (value, 0.0)
+        if key != _NUMBERS[3]:
+            value, number = abs(value), abs(number)
+        if min(abs(value), abs(number)) >= 1e7:
+            continue
+        off = abs(value - number)
+        size = max(abs(number), wide if key == _NUMBERS[3] else 0.0)
+        right = off <= max(1.01 * step, 1e-9 * size)
+        found.append((off / size, right, f"{key} {value:.7g}, listed {number:.7g}"))
+    both = indices, listed_indices(content)
+    glasses, wanted = ([abs(n) for n in row if abs(n) != 1] for row in both)
+    if not wanted:
+        return found
+    if len(glasses) != len(wanted):
+        return [*found, (np.inf, False, f"{len(glasses)} glasses, listed {len(wanted)}")]
+    for own, number in zip(glasses, wanted):
+        off = abs(own - number)
+        found.append((off, off <= _INDEX, f"index {own:.8g}, listed {number:.8g}"))
+    return found
+
+
+def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
+    """One file, read by one program, which says nothing."""
+    row = {"file": path.name, "reader": reader, "off": None}
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            found = first_order(drt_jax.load_system(path))
+            numbers = READERS[reader](str(path))
+    except ModuleNotFoundError as error:
+        if reader != "drt_jax" and error.name == reader:
+            return row | {"outcome": "absent", "why": f"{reader} is not installed"}
+        raise
     except drt_jax.LensError as error:
         return row | {"outcome": "refused", "why": str(error).removeprefix(str(path)).lstrip(", :")}
+    except Exception as error:  # what others raise, if not ours
+        if reader == "drt_jax":
+            raise
+        why = " ".join(f"{type(error).__name__}: {error}".split())[:100]
+        return row | {"outcome": "refused", "why": why}
+    if np.any(np.isnan(numbers[0])):
+        return row | {"outcome": "refused", "why": "the numbers are none: NaN"}
     listing = path.with_suffix(".txt")
     if not listing.is_file():
         return row | {"outcome": "unlisted", "why": "no listing"}
-    content, off = listing.read_text("latin-1"), []
-    for key, value in found.items():
-        number, step = listed(content, key) or (value, 0.0)
-        afocal = np.isinf(value) and abs(number) >= 1e7
-        if not (afocal or abs(value - number) <= max(1.01 * step, 1e-9 * abs(number))):
-            off.append(f"{key} {value:.9g}, listed {number:.9g}")
-    return row | {"outcome": "wrong" if off else "right", "why": "; ".join(off)}
+    found = differences(listing.read_text("latin-1"), *numbers)
+    off, _, why = max(found, key=lambda one: np.nan_to_num(one[0], nan=np.inf))
+    row["off"] = float(off) if np.isfinite(off) else None
+    if all(right for _, right, _ in found):
+        return row | {"outcome": "right", "why": ""}
+    return row | {"outcome": "near" if off <= _NEAR else "wrong", "why": why}
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Read each file."""
+    """Read each file by each program."""
     paths = sorted(pathlib.Path(config.folder).glob("*.zmx"))
     _common.require(len(paths) > 0, f"folder: no .zmx file in {config.folder}")
-    rows = _common.measured(run, "file", {p.name: lambda p=p: outcome(p) for p in paths})
+
+    def one(path: pathlib.Path) -> list[dict[str, Any]]:
+        return [outcome(path, reader) for reader in READERS]
+
+    rows = sum(_common.measured(run, "file", {p.name: lambda p=p: one(p) for p in paths}), [])
     for row in rows:
-        own = {name: np.array([float(row["outcome"] == name)]) for name in COLUMNS}
-        run.log(row["file"], 0, own)
+        if row["reader"] == "drt_jax":
+            own = {name: np.array([float(row["outcome"] == name)]) for name in COLUMNS}
+            run.log(row["file"], 0, own)
     return {"rows": rows, "seconds": run.seconds}
 
 
-def counts(rows: list[dict[str, Any]]) -> list[int]:
+def counts(rows: list[dict[str, Any]], reader: str) -> list[int]:
     """How many files came to each outcome."""
-    return [sum(row["outcome"] == name for row in rows) for name in OUTCOMES]
+    own = [row["outcome"] for row in rows if row["reader"] == reader]
+    return [own.count(name) for name in OUTCOMES]
+
+
+def _cell(row: dict[str, Any]) -> str:
+    wrong = row["outcome"] in ("near", "wrong") and row["off"] is not None
+    return f"{row['outcome']} ({row['off']:.0e})" if wrong else row["outcome"]
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Each file, and how many of each."""
-    rows = [[row[key] for key in ("file", "outcome", "why")] for row in results["rows"]]
+    """Each file by each program, and how many of each; what ours says of those it refuses, else
+    what another has wrong."""
+    rows = []
+    for (name,), group in _common.grouped(results["rows"], "file").items():
+        said = [f"{row['reader']}: {row['why']}" for row in group if row["outcome"] == "wrong"]
+        why = [group[0]["why"]] if group[0]["why"] else said[:1]
+        rows.append([name, *map(_cell, group), "".join(why)])
+    many = [[reader, *counts(results["rows"], reader)] for reader in READERS]
     return {
-        "files": _common.table(("file", "outcome", "why"), rows),
-        "files, counts": _common.table(OUTCOMES, [counts(results["rows"])]),
+        "files": _common.table(("file", *READERS, "why"), rows),
+        "files, counts": _common.table(("reader", *OUTCOMES), many),
     }
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draw how many of each."""
-    figure, axes = show.new(1, 1, 8, 2)
-    _plots.shares(axes, {"drt_jax": counts(results["rows"])}, OUTCOMES)
+    figure, axes = show.new(1, 1, 8, 2.4)
+    shares = {reader: counts(results["rows"], reader) for reader in READERS}
+    _plots.shares(axes, shares, OUTCOMES)
     figure.savefig(figures / "files.png")
 
 

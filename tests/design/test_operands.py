@@ -26,7 +26,7 @@ from drt_jax.design import (
 )
 from drt_jax.design.field_rays import relative_illumination
 from drt_jax.design.kinds import KINDS
-from drt_jax.lens.glass import glass_map_distance
+from drt_jax.lens.glasses import glass_map_distance
 
 from .test_variables import MODEL
 
@@ -388,7 +388,7 @@ def test_obscurations_need_another_rule():
         Variables.from_lens(lens, ["sensor"]), ["spot"], rule=Clipped(3, "none")
     )
     if lens.apertures is not None and any(lens.apertures.blocks):
-        with pytest.raises(ValueError, match="rule: Clipped subtracts"):
+        with pytest.raises(ValueError, match="rule: Clipped gives negative weights"):
             problem.merit(problem.variables.start)
 
 
@@ -407,8 +407,11 @@ def test_obscurations_need_another_rule():
         (dict(kind="centroid", target=np.inf), "operands: centroid: target: must be finite"),
         (dict(kind="length", target=3, high=4), "has a target and limits; make two operands"),
         (dict(kind="spot", high=0.1), "spot: takes no target and no limits; use rms_spot"),
-        (dict(kind="length", fields=(0,)), "length: fields: it has none; leave them out, it knows"),
-        (dict(kind="focal_length", distances=(0,)), "distances: it has none"),
+        (dict(kind="length", fields=(0,)), "length: does not depend on fields; remove fields"),
+        (
+            dict(kind="focal_length", distances=(0,)),
+            "does not depend on distances, only on wavelengths",
+        ),
         (dict(kind="spot", fields=0), "operands: spot: fields: expected whole numbers"),
         (dict(kind="spot", fields=("x",)), "operands: spot: fields: expected whole numbers"),
     ],

@@ -248,11 +248,11 @@ def test_tolerances_that_mean_nothing_are_refused(kind, settings, said):
     "tolerances, said",
     [
         ([], "none; name at least one"),
-        ([("shift", (2,))], "shift: no element 2 that could be off; there are 0, 1"),
-        ([("radius", (2,))], "radius: no surface 2 that could be off; there are 0, 1, 4, 5"),
-        ([("index", (2,))], "index: no surface 2 that could be off; there are 0, 1, 4"),
-        ([("tilt", ()), ("tilt", (1,))], "tilt of element 1, x stands twice; leave one out"),
-        ([("abbe", (1, 1))], "abbe of surface 1 stands twice; leave one out"),
+        ([("shift", (2,))], "shift: no element 2 can deviate; there are 0, 1"),
+        ([("radius", (2,))], "radius: no surface 2 can deviate; there are 0, 1, 4, 5"),
+        ([("index", (2,))], "index: no surface 2 can deviate; there are 0, 1, 4"),
+        ([("tilt", ()), ("tilt", (1,))], "tilt of element 1, x is named twice; remove one"),
+        ([("abbe", (1, 1))], "abbe of surface 1 is named twice; remove one"),
     ],
 )
 def test_parts_that_are_not_there_are_refused(tolerances, said):
@@ -265,12 +265,12 @@ def test_what_a_lens_has_none_of_is_refused_by_name():
     lens = drt_jax.load_lens({"name": "mirror", "surfaces": mirror, "sensor": -50.0})
     for kind, said in (
         ("index", "the lens has no glass"),
-        ("thickness", "there is one surface; none has a thickness behind it"),
+        ("thickness", "the lens has one surface, without a thickness behind it"),
     ):
         with pytest.raises(ValueError, match=f"^tolerances: {kind}: {said}"):
             perturbed(lens, Tolerance(kind, 1e-3))
     flat = dataclasses.replace(lens, curvature=0 * lens.curvature)
-    with pytest.raises(ValueError, match="no surface is curved; of planes, tolerance fringes"):
+    with pytest.raises(ValueError, match="no surface is curved; for planes use fringes"):
         perturbed(flat, Tolerance("radius", 1.0))
     with pytest.raises(ValueError, match=r"^beam_radius: expected \(1,\), got shape \(2,\)"):
         PerturbedLens.from_lens(lens, lens.semi_diameter, [Tolerance("tilt", 1.0)])

@@ -86,7 +86,9 @@ def toy_files(folder):
 
 
 def checked_files(results):
-    assert [row["outcome"] for row in results["rows"]] == ["refused", "right"]
+    """Ours, and of each peer that it is not there."""
+    outcomes = [row["outcome"] for row in results["rows"]]
+    assert outcomes == ["refused", "absent", "absent", "right", "absent", "absent"]
 
 
 def checked_benchmark(results):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import LensError, first_order, load_lens, load_system, save_lens
+from drt_jax import LensError, first_order, load_lens, load_system, sag, save_lens
 
 SHARED = pathlib.Path(__file__).resolve().parents[3] / "shared" / "data" / "lens_files"
 LISTED = pytest.mark.skipif(not SHARED.is_dir(), reason="listings lie beside the repository")
@@ -106,23 +106,109 @@ def test_types_of_surfaces(tmp_path, own, form, coefficients):
     np.testing.assert_allclose(lens.coefficients[0], coefficients, rtol=1e-15)
 
 
+def sags(folder, own, x, y):
+    """Heights of the first surface, of radius 50 mm, with this type and these lines."""
+    lens = read(folder, FRONT.replace("STANDARD", own), BACK).lens
+    return float(sag(lens, 0, x, y)), lens
+
+
+def test_extra_data_are_sags_over_their_radius(tmp_path):
+    """Closed forms at x = 1, y = 2 mm with a norm radius of 4 mm; beyond the count nothing."""
+    x, y, radius = 1.0, 2.0, 4.0
+    sphere, u = 50 - np.sqrt(50**2 - 5), np.sqrt(5) / 4
+    own = "|".join(f"XDAT {k + 1} {v}" for k, v in enumerate([3, radius, 0.1, 0.2, 0.3, 9]))
+    later = own.replace("XDAT 1 ", "PARM 13 ").replace("XDAT 2 ", "PARM 14 ")
+    for lines in (own, later):
+        found, _ = sags(tmp_path, f"XASPHERE|{lines}", x, y)
+        np.testing.assert_allclose(found, sphere + 0.1 * u**2 + 0.2 * u**4 + 0.3 * u**6)
+    found, _ = sags(tmp_path, f"XOSPHERE|{own}", x, y)
+    np.testing.assert_allclose(found, sphere + 0.1 * u + 0.2 * u**2 + 0.3 * u**3)
+    found, _ = sags(tmp_path, f"XPOLYNOM|{own}", x, y)
+    np.testing.assert_allclose(found, sphere + 0.1 * x / 4 + 0.2 * y / 4 + 0.3 * x * x / 16)
+    inch, _ = sags(tmp_path, f"XASPHERE|{own}", x, y)
+    system = read(tmp_path, FRONT.replace("STANDARD", f"XASPHERE|{own}"), BACK, UNIT="IN X")
+    np.testing.assert_allclose(sag(system.lens, 0, 25.4 * x, 25.4 * y), 25.4 * inch)
+
+
+def test_zernike_sag_with_powers_of_r(tmp_path):
+    """Astigmatism and coma in polar angles from x, as listings name them; powers of r beside."""
+    own = "SZERNSAG|PARM 0 1|PARM 1 .001|PARM 3 1e-6|XDAT 1 8|XDAT 2 4|XDAT 5 .01"
+    found, lens = sags(tmp_path, f"{own}|XDAT 8 .1|XDAT 10 .2", 1.0, 2.0)
+    angle, u = np.arctan2(2.0, 1.0), np.sqrt(5) / 4
+    wanted = 50 - np.sqrt(50**2 - 5) + 0.001 * 5 + 1e-6 * 5**3
+    wanted += 0.01 * 2 * u * np.sin(angle) + 0.1 * np.sqrt(6) * u**2 * np.cos(2 * angle)
+    wanted += 0.2 * np.sqrt(8) * (3 * u**3 - 2 * u) * np.cos(angle)
+    np.testing.assert_allclose(found, wanted, rtol=1e-13)
+    assert lens.forms[0] == "zernike"
+    beyond = FRONT.replace("STANDARD", own.replace("PARM 0 1", "PARM 0 0"))
+    assert "the end of the Zernike terms at 4 mm" in refused(tmp_path, beyond, BACK)
+    assert "parameter 9" in refused(tmp_path, FRONT.replace("STANDARD", own + "|PARM 9 1"), BACK)
+
+
+def test_forbes_aspheres(tmp_path):
+    """Q_0 of the slopes' family is 1, x (1 - x) / cos(conic); the other's first are 1, 6 x - 5 and
+    28 x^2 - 42 x + 15 times x^2."""
+    x2 = 5 / 16
+    cosine = np.sqrt(1 - 5 / 50**2)
+    sphere = 50 - np.sqrt(50**2 - 5)
+    own = "QED_TYPE|XDAT 1 {}|XDAT 2 3|XDAT 3 4|XDAT 4 .1"
+    found, lens = sags(tmp_path, own.format(0), 1.0, 2.0)
+    assert lens.forms[0] == "qbfs"
+    np.testing.assert_allclose(found, sphere + 0.1 * x2 * (1 - x2) / cosine)
+    found, _ = sags(tmp_path, own.format(1) + "|XDAT 5 .2|XDAT 6 .3", 1.0, 2.0)
+    strong = 0.1 + 0.2 * (6 * x2 - 5) + 0.3 * (28 * x2**2 - 42 * x2 + 15)
+    np.testing.assert_allclose(found, sphere + x2**2 * strong)
+
+
+def test_a_phase_in_radians_focuses(tmp_path):
+    """-pi R^2 / (L f) radians over R make a plane in air a lens of the focal length f at L."""
+    focal, wave, radius = 200.0, 0.55, 5.0
+    strength = -np.pi * radius**2 / (wave * 1e-3 * focal)
+    own = f"TYPE BINARY_2|STOP|CURV 0|PARM 0 1|XDAT 1 1|XDAT 2 {radius}|XDAT 3 {strength!r}"
+    lens = read(tmp_path, own + "|DISZ 48|DIAM 6 0").lens
+    found = first_order(lens, jnp.inf, jnp.array([wave])).effective_focal_length
+    np.testing.assert_allclose(found, focal)
+    twice = read(tmp_path, own.replace("PARM 0 1", "PARM 0 2") + "|DISZ 48|DIAM 6 0").lens
+    found = first_order(twice, jnp.inf, jnp.array([wave])).effective_focal_length
+    np.testing.assert_allclose(found, focal / 2)
+    assert "PARM 0, the order" in refused(tmp_path, own.replace("|PARM 0 1", "") + "|DISZ 48")
+
+
+def test_surfaces_that_touch_and_fields_of_90_degrees(tmp_path):
+    """A gap of 1e-6 mm stands where there is none, where light is bent; both are said."""
+    touching = FRONT.replace("STOP|", ""), BACK.replace("DISZ 48", "DISZ 0")
+    dummy = "TYPE STANDARD|STOP|CURV 0|DISZ 0|DIAM 5 0"
+    with pytest.warns(UserWarning, match="surfaces that touch stand 1e-06 mm apart: SURF 3, SURF"):
+        lens = read(tmp_path, *touching, dummy, *touching, YFLN="0 90").lens
+    np.testing.assert_allclose(lens.thickness, [4, 0, 1e-6, 4])
+    np.testing.assert_allclose(lens.sensor, 8 + 2e-6)
+    with pytest.warns(UserWarning, match="line 4: fields of 90 degrees and more cannot be traced"):
+        assert np.degrees(read(tmp_path, YFLN="0 90").fields[1, 1]) == 90
+    assert "line 4: a field angle of 90" in refused(tmp_path, YFLN="0 90", object="200")
+    message = refused(tmp_path, FRONT, BACK.replace("DISZ 48", "DISZ -1"))
+    assert message.startswith(", line 33: sensor: 3 mm lies before the vertex of surface 1")
+
+
 def test_apertures(tmp_path):
     """Floating and fixed rings, rectangles, obscurations, their centre; the stop's is its own."""
     clear = "|FLAP 0 6 0|OBDC 1 -2"
     ring = "TYPE STANDARD|CURV 0|DISZ 2|CLAP 1 5 0"
     square = "TYPE STANDARD|CURV 0|DISZ 2|SQAP 3 4 0|OBDC 0 0"
     dark = "TYPE STANDARD|CURV 0|DISZ 2|OBSC 0 2 0"
-    lens = read(tmp_path, FRONT, BACK + clear, ring, square, dark).lens
+    more = "TYPE STANDARD|CURV 0|DISZ 2|ELOB 1 2 0|ELAP 5 6 0|OEMA .5 0 0"
+    lens = read(tmp_path, FRONT, BACK + clear, ring, square, dark, more).lens
     own = lens.apertures
     np.testing.assert_array_equal(lens.semi_diameter[1:3], [np.inf, 5])
     kinds = [*zip(own.surfaces, own.kinds, own.blocks, strict=True)]
     assert set(kinds) == {
         *((1, "circle", False), (2, "circle", True)),
         *((3, "rectangle", False), (4, "circle", True)),
+        *((5, "ellipse", True), (5, "ellipse", False)),
     }
     half = dict(zip(kinds, own.half.tolist(), strict=True))
     assert half[1, "circle", False][0] == 6 and half[2, "circle", True][0] == 1
     assert half[3, "rectangle", False] == [3, 4]
+    assert half[5, "ellipse", True] == [1, 2] and half[5, "ellipse", False] == [5, 6]
     np.testing.assert_array_equal(own.centre[kinds.index((1, "circle", False))], [1, -2])
 
 
@@ -148,6 +234,19 @@ def test_coordinate_breaks_are_right_handed_and_have_an_order(tmp_path):
     place, across, rotation = undone.places
     np.testing.assert_allclose(rotation[-1], np.eye(3), atol=1e-15)
     np.testing.assert_allclose([*across[-1], place[-1]], [0, 0, 47], atol=1e-13)
+
+
+def test_the_hand_of_a_tilt_is_that_of_a_listing(tmp_path):
+    """Global coordinates of OpticStudio behind a mirror that is tilted by -4.5 degrees about x."""
+    mirror = "TYPE STANDARD|STOP|CURV -3.280839895013123e-4|DISZ -1524|GLAS MIRROR|DIAM 75"
+    tilt, shift = (
+        BREAK.format(0, 0, -4.5, 0, 0, 0, 0),
+        BREAK.format(0, -119.9414012007, 0, 0, 0, 0, 0),
+    )
+    place, across, rotation = read(tmp_path, tilt, mirror, shift, object="1524").lens.places
+    np.testing.assert_allclose([*across[-1], place[-1]], [0, -239.1433238, -1509.891523], atol=6e-7)
+    listed = [[1, 0, 0], [0, 0.9969173337, 0.0784590957], [0, -0.0784590957, 0.9969173337]]
+    np.testing.assert_allclose(rotation[-1], listed, atol=6e-11)
 
 
 def test_a_mirror_keeps_the_medium_and_a_tilted_one_folds(tmp_path):
@@ -191,14 +290,26 @@ def test_kinds_of_fields(tmp_path):
 
 def test_what_is_not_read_is_refused_by_line(tmp_path):
     assert re.match(
-        r", line 29: SURF 2: type PARAXIAL is not known",
+        r", line 29: SURF 2: type PARAXIAL is not known: an ideal thin lens",
         refused(tmp_path, FRONT, BACK.replace("STANDARD", "PARAXIAL")),
     )
-    message = refused(tmp_path, FRONT.replace("N-BK7", "S-BSL7"), BACK)
-    assert "line 26: SURF 1: unknown glass 'S-BSL7'" in message and "nd and vd" in message
-    assert "of SCHOTT alone" in refused(tmp_path, GCAT="OHARA")
+    message = refused(tmp_path, FRONT.replace("N-BK7", "S-BSX7"), BACK)
+    assert "line 26: SURF 1: unknown glass 'S-BSX7'" in message and "nd and vd" in message
+    assert "N-BK7 is known of SCHOTT" in refused(tmp_path, GCAT="OHARA")
     assert "line 4: fields of kind 7" in refused(tmp_path, FTYP="7 0 2 2")
     assert "cut short" in refused(tmp_path, FRONT, BACK, tail=("SURF 4", "  DISZ 3"))
+    assert "telecentric object space" in refused(tmp_path, FTYP="0 1 2 2")
+    assert "a coordinate break is no image" in refused(
+        tmp_path, FRONT, BACK, tail=("SURF 4", "  TYPE COORDBRK", "  DISZ 0")
+    )
+    toroid = FRONT.replace("STANDARD", "TOROIDAL|PARM 1 40|XDAT 1 4|XDAT 2 10|XDAT 3 0|XDAT 4 {}")
+    assert read(tmp_path, toroid.format(0), BACK).lens.forms[0] == "toroid"
+    assert "line 27: parameter 16 (XDAT 4) of SURF 1" in refused(
+        tmp_path, toroid.format(1e-3), BACK
+    )
+    for key in ("SQOB 1 2 0", "UDAP 1", "XDAT 1 2"):
+        even = f"{BACK}|{key}".replace("STANDARD", "EVENASPH")
+        assert "leaves it out" in refused(tmp_path, FRONT, even)
     spider = BACK + "|SPID .1 3"
     assert 'missing="warn" leaves it out' in refused(tmp_path, FRONT, spider)
     with pytest.warns(UserWarning, match="left out: SPID, a spider"):
@@ -261,6 +372,24 @@ def test_written_forms_glasses_and_apertures(tmp_path):
         )
 
 
+def test_written_series_and_phases(tmp_path):
+    """Extra data and radial phases, read back; and a sag that does not come from this reader."""
+    series = "XDAT 1 3|XDAT 2 4|XDAT 3 {0}|XDAT 4 -.2|XDAT 5 .3"
+    kinds = [f"{kind}|{series.format(0.1)}" for kind in ("XPOLYNOM", "SZERNSAG|PARM 0 1")]
+    kinds.append("XASPHERE|XDAT 1 9|XDAT 2 20|XDAT 4 .1|XDAT 11 .2")
+    kinds.append("QED_TYPE|XDAT 1 0|XDAT 2 2|XDAT 3 20|XDAT 4 .1|XDAT 5 .2")
+    kinds.append("BINARY_2|PARM 0 -1|PARM 2 1e-5|XDAT 1 2|XDAT 2 20|XDAT 3 700|XDAT 4 .3")
+    surfaces = [BACK.replace("STANDARD", kind).replace("48", "9") for kind in kinds]
+    lens = read(tmp_path, FRONT, *surfaces).lens
+    save_lens(lens, tmp_path / "own.zmx")
+    again = load_lens(tmp_path / "own.zmx")
+    same(lens, again)
+    np.testing.assert_array_equal(lens.phase.coefficients, again.phase.coefficients)
+    assert again.phase.order.tolist() == [-1]
+    linear = 0.1 * 1 / 4 - 0.2 * 2 / 4 + 0.3 * 1 / 16 - (50 - np.sqrt(50**2 - 5))
+    np.testing.assert_allclose(sag(again, 1, 1.0, 2.0), linear)
+
+
 def test_files_that_are_none(tmp_path):
     path, noise = tmp_path / "lens.zmx", np.random.default_rng(0)
     whole = text(FRONT, BACK).encode("utf-16")
@@ -306,10 +435,11 @@ def listed(content, key):
     return float(word), step
 
 
-# Of the 28, those whose glasses we have and whose surfaces do not touch.
+# Of the 28, those whose glasses we have.
 READ = (
     *("10281683", "1792917", "1843519", "2453260", "2645156", "528155", "5852515a", "6744570a"),
     *("7558005a", "7643216a", "7821720a", "7821720b", "895045a", "Dyson1959", "WIYN"),
+    *("1791276", "Yang2016a", "9201224", "Miyamoto1964"),
 )
 
 

@@ -17,27 +17,39 @@ WAVE = 0.5
 VARIANCES = {0.1: 0.00042233607320576864, -1.0: 0.042233607320576856}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("delta", VARIANCES)
-def test_the_exact_moment_of_defocus(delta):
-    """P11: a ray meets the sensor at delta h / (f - h^2 / (4 f)); so do beams moved to it."""
+@pytest.fixture(scope="module")
+def variances():
+    """Of the sensor's defocus: those of the moments with their derivative, and those of a beam
+    moved to it, in one program."""
     surface = {"radius": -100.0, "conic": -1.0, "mirror": True, "thickness": -50.0}
     lens = load_lens({"surfaces": [surface | {"stop": True, "semi_diameter": 20.0}]})
-    rule, scene = Gauss(24, "bilateral"), (0.0, np.inf, WAVE)
+    scene = 0.0, np.inf, WAVE
+
+    def of_moments(step):
+        moved = dataclasses.replace(lens, sensor=lens.sensor + step)
+        found = drt_jax.psf_moments(moved, *scene, rule=Gauss(24, "bilateral")).covariance[0]
+        return found, found
 
     @jax.jit
-    def variances(step):
-        moved = dataclasses.replace(lens, sensor=lens.sensor + step)
-        return drt_jax.psf_moments(moved, *scene, rule=rule).covariance[0]
+    def both(step):
+        beam = trace_beam(lens, scene_of(lens, *scene), beam_rule(20, "bilateral")).refocused(step)
+        moved = centroid_and_variances(beam.hits[:, -1], beam.weights)[1]
+        slope, found = jax.jacfwd(of_moments, has_aux=True)(step)
+        return found, slope, moved
 
+    return both
+
+
+@pytest.mark.parametrize("delta", VARIANCES)
+def test_the_exact_moment_of_defocus(variances, delta):
+    """P11: a ray meets the sensor at delta h / (f - h^2 / (4 f)); so do beams moved to it."""
     wanted = VARIANCES[delta]
     for step in (delta, -delta):  # the light runs backwards; only its size counts
-        np.testing.assert_allclose(variances(step), wanted * np.eye(2), rtol=1e-12, atol=1e-15)
-        slope = jax.jacfwd(variances)(step)
+        found, slope, (xx, xy, yy) = variances(step)
+        np.testing.assert_allclose(found, wanted * np.eye(2), rtol=1e-12, atol=1e-15)
         np.testing.assert_allclose(slope, 2 * wanted / step * np.eye(2), rtol=1e-11, atol=1e-14)
-    beam = trace_beam(lens, scene_of(lens, *scene), beam_rule(20, "bilateral")).refocused(delta)
-    xx, xy, yy = centroid_and_variances(beam.hits[:, -1], beam.weights)[1]
-    np.testing.assert_allclose([xx[0], xy[0], yy[0]], [wanted, 0, wanted], rtol=1e-12, atol=1e-15)
+        beam = [xx[0], xy[0], yy[0]]
+        np.testing.assert_allclose(beam, [wanted, 0, wanted], rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.slow

@@ -1,0 +1,103 @@
+"""Catalogues of glasses in Zemax's `.agf` form: those of the formulas that `Glass` has."""
+
+import os
+from collections.abc import Callable, Collection
+
+from ..inputs import InputError
+from ..lens.glass import Glass
+from .entry import LensError
+from .record import Missing, Record, short
+from .text import Words, words_of
+
+_Forms = tuple[list[float], list[float]]  # sellmeier and schott of `Glass`
+
+
+def _sellmeier(terms: int) -> Callable[[list[float]], _Forms]:
+    return lambda c: (c[: 2 * terms : 2] + c[1 : 2 * terms : 2], [1.0] + [0.0] * 5)
+
+
+def _powers(*order: int) -> Callable[[list[float]], _Forms]:
+    """Of coefficients whose place in `Glass.schott` is in `order`."""
+
+    def formula(c: list[float]) -> _Forms:
+        placed = dict(zip(order, c, strict=False))
+        schott = [placed.get(place, 0.0) for place in range(9)]
+        return [0.0] * 2, schott[: 9 if any(schott[6:]) else 6]
+
+    return formula
+
+
+# By Zemax's number: the formula, and how many coefficients it has. 12 has L^6 at last, which
+# `Glass` has not: it must be 0.
+_FORMULAS: dict[int, tuple[Callable[[list[float]], _Forms], int]] = {
+    1: (_powers(0, 1, 2, 3, 4, 5), 6),
+    2: (_sellmeier(3), 6),
+    6: (_sellmeier(4), 8),
+    8: (lambda c: ([c[1], c[2]], [c[0], -c[3], 0.0, 0.0, 0.0, 0.0]), 4),
+    9: (lambda c: ([c[1], c[3], c[2], c[4]], [c[0]] + [0.0] * 5), 5),
+    10: (_powers(0, 1, 2, 3, 4, 5, 7, 8), 8),
+    11: (_sellmeier(5), 10),
+    12: (_powers(0, 1, 2, 3, 4, 5, 6), 7),
+    13: (_powers(0, 1, 6, 2, 3, 4, 5, 7, 8), 9),
+}
+
+
+def load_agf(
+    path: str | os.PathLike, names: Collection[str] | None = None, missing: Missing = "error"
+) -> dict[str, Glass]:
+    """Glasses of a `.agf` file by name, at its temperatures, relative to air.
+
+    LensError, with the line, for what is no such file and for a glass whose formula is none of
+    Zemax's 1, 2, 6 and 8 to 13.
+
+    path: of at most 16 MB.
+    names: those that are wanted; None: all.
+    missing: "warn" leaves such glasses out and names them in one warning.
+    """
+    record = Record(str(path), missing)
+    try:
+        lines = words_of(path)
+    except InputError as error:
+        raise LensError(f"{path}: {error}") from None
+    blocks: list[dict[str, Words]] = []
+    for words in lines:
+        if words.key == "NM":
+            blocks.append({})
+        if blocks:
+            blocks[-1].setdefault(words.key, words)
+    if not blocks:
+        raise record.error(0, "no line begins with NM: is this a catalogue of glasses?")
+    found: dict[str, Glass] = {}
+    for block in blocks:
+        line, rest = block["NM"].line, block["NM"].rest
+        if len(rest) < 2:
+            raise record.error(line, "expected NM, a name and the number of a formula")
+        if names is not None and rest[0] not in names:
+            continue
+        glass = _glass(record, block)
+        if glass and found.setdefault(glass.name, glass) != glass:
+            record.lacks(line, f"{short(glass.name)}: another glass of this name")
+    record.say()
+    return found
+
+
+def _glass(record: Record, block: dict[str, Words]) -> Glass | None:
+    line, name, formula = block["NM"].line, block["NM"].rest[0], record.count(*block["NM"][::2], 1)
+    if formula not in _FORMULAS:
+        known = ", ".join(map(str, _FORMULAS))
+        record.lacks(line, f"{short(name)}: formula {formula} is not read, of {known}")
+        return None
+    for key in ("CD", "LD"):
+        if key not in block:
+            raise record.error(line, f"{short(name)}: its line {key} is missing")
+    makes, count = _FORMULAS[formula]
+    _, (at, _, rest, _) = block["LD"], block["CD"]
+    values = [record.number(at, rest, i, 0.0) for i in range(max(count, min(len(rest), 10)))]
+    if any(values[count:]):
+        record.lacks(at, f"{short(name)}: formula {formula} with more than {count} terms")
+        return None
+    sellmeier, schott = makes(values)
+    low, high = record.numbers(block["LD"].line, block["LD"].rest, 2)
+    if not 0 < low < high:
+        raise record.error(block["LD"].line, f"{short(name)}: no range: {low:g} to {high:g} um")
+    return Glass(name, tuple(sellmeier), tuple(schott), (low, high))

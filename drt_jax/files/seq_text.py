@@ -1,0 +1,137 @@
+"""Text of CODE V `.seq` files: commands with their qualifiers and values."""
+
+import os
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from ..inputs import InputError, one_line
+from .text import lines_of
+
+_LONGEST = 4000  # characters of a line
+_WIDEST = 100_000  # of a command over several lines
+_SURFACE_KEY = re.compile(r"S(\d{1,6}|O|I)?", re.IGNORECASE)
+_QUALIFIER = re.compile(r"([SZFWC])(\d{1,6}|[OISK])(\.\.(?:\d{1,6}|[OISK]))?", re.IGNORECASE)
+_LABEL = re.compile(r"L(['\"].*)", re.IGNORECASE | re.DOTALL)
+# Letters of qualifiers beside S and Z, by key; elsewhere F2 is a glass.
+_OTHERS = (
+    (re.compile("[XY](AN|OB|IM|RI)|V[UL][XY]|WTF"), "F"),
+    (re.compile("WL|WTW"), "W"),
+    (re.compile("SCO|HCO"), "C"),
+)
+USES = ("CLR", "EDG", "OBS", "HOL")
+_WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")
+
+# Names, drawing, variables and tolerances, ray aiming, what is computed: no rays.
+COSMETIC = frozenset(
+    """
+    LEN INI GO CWL SLB DER CLS DOR WID CUM THM POL PIK AUT VER INC
+    CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC XDC YDC ZDC ADC BDC CDC SCC HCC CCF
+    """.split()  # noqa: SIM905
+)
+SOLVES = frozenset(
+    """
+    PIM RED OAL HMY HMX HCY HCX UMY UMX UCY UCX IMY IMX ICY ICX APN APL CMY CMX EFL EFX EFY PIK
+    """.split()  # noqa: SIM905
+)
+# What changes rays and is not read.
+REFUSED = frozenset(
+    """
+    NSS GL1 GL2 INS DEL COP FLY SCA INV URN GRC GRI ARR CIG REG ELG SPL TRP GLB HOE HV1 HV2 HX1 HX2
+    HY1 HY2 HZ1 HZ2 XOD YOD ZOD MOD SWI AFI TEL USR UDS MIR
+    """.split()  # noqa: SIM905
+)
+
+
+class Command(NamedTuple):
+    """A command. line: where it begins. key: its first three letters, `S` with what follows for a
+    surface; as it stands where it was quoted. qualifiers: letter, first and last as they stand.
+    label, use: of an aperture, "" for none. values: the words behind."""
+
+    line: int
+    key: str
+    quoted: bool
+    qualifiers: tuple[tuple[str, str, str], ...]
+    label: str
+    use: str
+    values: list[str]
+
+    def of(self, letter: str) -> tuple[str, str] | None:
+        """First and last of a qualifier such as S3 or S3..5; None if it is not given."""
+        return next((q[1:] for q in self.qualifiers if q[0] == letter), None)
+
+
+def _cut(text: str) -> tuple[list[str], bool]:
+    """The parts of a line between `;`, up to `!`, and whether `&` continues it; quotes guard."""
+    if "'" not in text and '"' not in text:
+        text = text.partition("!")[0].rstrip()
+        more = text.endswith("&")
+        return text.removesuffix("&").split(";"), more
+    last, quote, start = {q: text.rfind(q) for q in "'\""}, "", 0
+    parts, end = [], len(text)
+    for i, letter in enumerate(text):
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "'\"":
+            quote = letter if last[letter] > i else ""
+        elif letter == ";":
+            parts.append(text[start:i])
+            start = i + 1
+        elif letter == "!":
+            end = i
+            break
+    rest = text[start:end].rstrip()
+    return [*parts, rest.removesuffix("&")], rest.endswith("&")
+
+
+def _parts(lines: list[str]) -> Iterator[tuple[int, str]]:
+    """The line and the text of each command."""
+    begun, waiting = 0, ""
+    for i, text in enumerate(lines):
+        if len(text) > _LONGEST:
+            raise InputError(f"line {i + 1}: {len(text)} characters are more than {_LONGEST}")
+        (first, *others), more = _cut(text)
+        parts = [(begun or i + 1, waiting + first), *((i + 1, other) for other in others)]
+        begun, waiting = parts.pop() if more else (0, "")
+        if len(waiting) > _WIDEST:
+            raise InputError(f"line {begun}: a command of more than {_WIDEST} characters")
+        yield from parts
+    if waiting:
+        yield begun, waiting
+
+
+def _bare(word: str) -> str:
+    """A word without the quotes around it."""
+    return word[1:-1] if len(word) > 1 and word[0] in "'\"" and word[-1] == word[0] else word
+
+
+def commands_of(path: str | os.PathLike) -> Iterator[Command]:
+    """The commands of a file in their order. InputError, with the line, for what is no text."""
+    for line, text in _parts(lines_of(path)):
+        words = _WORD.findall(text)
+        if not words:
+            continue
+        first, quoted = _bare(words[0]), words[0][0] in "'\""
+        if not quoted:
+            first = one_line(first.upper())
+            first = first if _SURFACE_KEY.fullmatch(first) else first[:3]
+        yield command_of(line, first, quoted, words[1:])
+
+
+def command_of(line: int, key: str, quoted: bool, words: list[str]) -> Command:
+    """A command of the words behind its key."""
+    qualifiers, label, use, rest = list[tuple[str, str, str]](), "", "", len(words)
+    letters = "SZ" + "".join(more for known, more in _OTHERS if known.fullmatch(key))
+    for at, word in enumerate(words):
+        found, named = _QUALIFIER.fullmatch(word), _LABEL.fullmatch(word)
+        if found and found[1].upper() in letters:
+            first = found[2].upper()
+            qualifiers.append((found[1].upper(), first, (found[3] or first).strip(".").upper()))
+        elif named:
+            label = _bare(named[1])
+        elif word.upper() in USES:
+            use = word.upper()
+        else:
+            rest = at
+            break
+    return Command(line, key, quoted, tuple(qualifiers), label, use, [*map(_bare, words[rest:])])

@@ -1,0 +1,255 @@
+"""A lens written as a CODE V `.seq` file: what `seq` reads, backwards."""
+
+import math
+import textwrap
+from typing import Any
+
+import numpy as np
+
+from ..lens.glass import ANY
+from ..lens.glasses import find_glass
+from ..lens.lens import Lens
+from ..lens.paraxial import entrance_pupil
+from .entry import LensError
+from .exact import degrees_of, number_for
+from .media_out import media_of_lens
+from .record import turns_of
+from .seq_glass import folded
+from .seq_places import KEYS
+from .seq_surfaces import LETTERS, noll_of_fringe
+from .write_zmx import gap_behind
+
+_KINDS = {"circle": ("CIR",), "rectangle": ("REX", "REY"), "ellipse": ("ELX", "ELY")}
+_STILL = 1e-12  # mm and radians, below which a surface stands on the axis of the one before it
+
+
+def seq_text(lens: Lens) -> str:
+    """The lines of a file with an object at infinity and the line d, or the middle of the range of
+    the glasses. LensError, with the remedy, for what such files do not hold or we do not write."""
+    low, high = lens.dispersion.range
+    wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
+    media, own = media_of_lens(lens)
+    private = {name: f"G{k + 1}" for k, name in enumerate(own)}
+    title = "".join(" " if c in "'\"" or not c.isprintable() else c for c in lens.name)
+    lines = ["RDM N", "LEN", f"TITLE '{' '.join(title.split())}'", f"EPD {_pupil(lens, wave)!r}"]
+    lines += ["DIM M", f"WL {_nanometres(wave)!r}", "REF 1", "WTW 1", "XAN 0.0", "YAN 0.0"]
+    if own:
+        lines.append("PRV")
+        for name, constants in own.items():
+            lines += _private(name, private[name], constants)
+        lines.append("END")
+    words = [_word(keys, private) for keys in media]
+    lines.append(f"SO 0.0 0.1e14 {words[0]}".rstrip())
+    places = _places(lens)
+    for i in range(lens.count):
+        word = "REFL" if lens.mirrors[i] else words[i + 1]
+        numbers = f"{float(lens.curvature[i])!r} {gap_behind(lens, i)!r}"
+        lines.append(f"S {numbers} {word}".rstrip())
+        lines += [f"  {line}" for line in _surface(lens, i) + places[i]]
+    lines.append(f"SI {float(lens.curvature[-1])!r} 0.0")
+    conic = float(lens.conic[-1])
+    lines += [f"  {line}" for line in [*(["CON", f"K {conic!r}"] if conic else []), *places[-1]]]
+    return "\n".join([*lines, "GO", ""])
+
+
+def _pupil(lens: Lens, wave: float) -> float:
+    """The diameter of the entrance pupil, mm."""
+    wide = 2 * float(entrance_pupil(lens, wave).semi_diameter[0])
+    if not (math.isfinite(wide) and wide > 0):
+        raise LensError("the lens has no entrance pupil of finite size: save as .yaml")
+    return wide
+
+
+def _nanometres(wave: float) -> float:
+    return number_for(wave, lambda value: value / 1000, round(wave * 1000, 9))
+
+
+def _private(name: str, called: str, constants: dict[str, Any]) -> list[str]:
+    """The lines of a glass with constants of its own."""
+    low, high = constants.get("range", ANY)
+    sellmeier, schott = constants.get("sellmeier"), constants.get("schott")
+    if sellmeier and schott:
+        raise LensError(f"glass {name}: .seq files hold no two formulas at once: save as .yaml")
+    if sellmeier:
+        half = len(sellmeier) // 2
+        pairs = zip(sellmeier[:half], sellmeier[half:], strict=True)
+        words = ["GMS", *(repr(value) for pair in pairs for value in pair)]
+    else:
+        words = ["LAU", *map(repr, schott or [1.0])]
+    text = textwrap.wrap(f"  '{called}' {' '.join(words)}", 100, break_on_hyphens=False)
+    return [
+        f"  PWL {_nanometres(high)!r} {_nanometres(low)!r}",
+        *(f"  {t} &" for t in text[:-1]),
+    ] + [f"  {text[-1]}"]
+
+
+def _word(keys: dict[str, Any], private: dict[str, str]) -> str:
+    """The word of a medium; "" for air."""
+    if "nd" in keys:
+        if keys.get("partial"):
+            raise LensError("a model glass off the normal line: use .yaml, or set partial to 0")
+        nd, vd = repr(keys["nd"]), repr(keys["vd"])
+        if nd[:2] != "1." or not vd[:2].isdecimal() or vd[2:3] != "." or "e" in nd + vd:
+            return f"{nd}:{vd}"
+        return f"{nd[2:].ljust(3, '0')}.{(vd[:2] + vd[3:]).ljust(3, '0')}"
+    name = keys.get("glass", "")
+    if not name or name in private:
+        return f"'{private[name]}'" if name else ""
+    maker = find_glass(name).maker
+    return folded(name.removesuffix(f"_{maker}")) + (f"_{maker}" if maker else "")
+
+
+def _surface(lens: Lens, i: int) -> list[str]:
+    lines = ["STO"] if i == lens.stop else []
+    semi = float(lens.semi_diameter[i])
+    lines += [f"CIR {semi!r}"] if math.isfinite(semi) else []
+    lines += _form(lens, i)
+    extra = lens.apertures
+    own = [] if extra is None else [k for k, s in enumerate(extra.surfaces) if s == i]
+    for n, k in enumerate(own):
+        assert extra is not None
+        label = f"{'OBS' if extra.blocks[k] else 'CLR'} L'A{n + 1}'"
+        half = np.asarray(extra.half[k]).tolist()
+        lines += [f"{key} {label} {v!r}" for key, v in zip(_KINDS[extra.kinds[k]], half)]
+        if extra.centre is not None:
+            centre = np.asarray(extra.centre[k]).tolist()
+            lines += [f"{key} {label} {v!r}" for key, v in zip(("ADX", "ADY"), centre)]
+    return lines + _phase(lens, i)
+
+
+def _powers(lens: Lens, i: int, row: list[float], keys: dict[int, str]) -> list[str]:
+    """Coefficients of r^2, r^4, ... by the keys of their powers."""
+    found = {2 * k + 2: value for k, value in enumerate(row) if value}
+    for power in found:
+        if power not in keys:
+            raise LensError(
+                f"surfaces[{i}].coefficients: .seq files hold no r^{power} here: save as .yaml"
+            )
+    return [f"{keys[power]} {value!r}" for power, value in found.items()]
+
+
+def _form(lens: Lens, i: int) -> list[str]:
+    """The kind of a surface and its coefficients."""
+    name, conic = lens.forms[i], float(lens.conic[i])
+    row = np.asarray(lens.coefficients[i], float).tolist()
+    even = {power: letter for letter, power in LETTERS.items()}
+    if name == "asphere":
+        terms = _powers(lens, i, row, even)
+        kind = ["ASP"] if terms else (["CON"] if conic else [])
+        return kind + ([f"K {conic!r}"] if kind else []) + terms
+    if name == "toroid":
+        head = ["YTO", f"CUX {row[0]!r}", f"K {conic!r}"]
+        return head + _powers(lens, i, row[1:], even)
+    if name == "biconic":
+        radial = dict(zip((4, 6, 8, 10), ("AR", "BR", "CR", "DR"), strict=True))
+        head = ["AAS", f"CUX {row[0]!r}", f"KY {conic!r}", f"KX {row[1]!r}"]
+        return head + _powers(lens, i, row[2:], radial)
+    used = max((k + 1 for k, value in enumerate(row) if value), default=0)
+    if name == "odd_asphere" and used <= 30:
+        terms = [f"SCO AR{k + 1} {value!r}" for k, value in enumerate(row) if value]
+        return ["SPS ODD 0.0", f"SCO K {conic!r}", *terms]
+    if name == "polynomial_xy" and used <= 65:
+        terms = [f"SCO C{k + 2} {value!r}" for k, value in enumerate(row) if value]
+        return ["SPS XYP 1.0", f"SCO K {conic!r}", *terms]
+    if name == "qbfs" and used <= 15:
+        terms = [f"SCO C{k + 3} {value!r}" for k, value in enumerate(row[1:]) if value]
+        return ["SPS QBF", f"SCO NRADIUS {row[0]!r}", f"SCO K {conic!r}", *terms]
+    if name == "zernike":
+        return _fringe(i, row, conic)
+    raise LensError(f"surfaces[{i}]: .seq files hold no form {name} of {used} here: save as .yaml")
+
+
+def _fringe(i: int, row: list[float], conic: float) -> list[str]:
+    known = {
+        noll: (k, math.sqrt((n + 1) * (2 if m else 1)))
+        for k in range(1, 38)
+        for noll, n, m in [noll_of_fringe(k)]
+    }
+    lines = ["SPS ZFR", f"SCO NRADIUS {row[0]!r}", f"SCO K {conic!r}"]
+    for number, value in enumerate(row[1:], 1):
+        if not value:
+            continue
+        if number not in known:
+            raise LensError(f"surfaces[{i}].coefficients: {number} is no fringe polynomial: .yaml")
+        fringe, norm = known[number]
+        own = number_for(value, norm.__rtruediv__, value * norm)
+        lines.append(f"SCO C{fringe + 3} {own!r}")
+    return lines
+
+
+def _phase(lens: Lens, i: int) -> list[str]:
+    """Gratings and radial phases."""
+    if lens.phase is None or i not in lens.phase.surfaces:
+        return []
+    at = lens.phase.surfaces.index(i)
+    order, form = float(lens.phase.order[at]), lens.phase.forms[at]
+    row = np.asarray(lens.phase.coefficients[at], float).tolist()
+    if form == "linear" and row[0]:
+        spacing = number_for(row[0], lambda value: 1 / value, 1 / row[0])
+        return ["DIF GRT", f"GRO {order!r}", f"GRS {spacing!r}"]
+    if form == "asphere":
+        wave = 587.5618 * 1e-6
+        terms = [
+            f"HCO C{k + 1} {number_for(a, lambda v: v / wave, a * wave)!r}"
+            for k, a in enumerate(row)
+            if a
+        ]
+        return ["DIF DOE", f"HOR {order!r}", "HWL 587.5618", "HCT R", *terms]
+    raise LensError(f"surfaces[{i}].phase: .seq files hold no {form} phase here: save as .yaml")
+
+
+def _places(lens: Lens) -> list[list[str]]:
+    """Decentres and tilts of each surface and the sensor: as they stand where no element moves
+    several surfaces, else of each surface against the one before it."""
+    if lens.elements is None:
+        zero = np.zeros((lens.count + 1, 3))
+        shift = zero[:, :2] if lens.decentre is None else np.asarray(lens.decentre, float)
+        tilt = zero if lens.tilt is None else np.asarray(lens.tilt, float)
+        return [
+            [*_moves([*s, 0.0], t), "DAR"] if np.any(s) or np.any(t) else []
+            for s, t in zip(shift.tolist(), tilt, strict=True)
+        ]
+    simple = _simple(lens)
+    if simple is not None:
+        return simple
+    z, across, turned = (np.asarray(part, float) for part in lens.places)
+    points = np.concatenate([across, z[:, None]], axis=1)
+    point, turn, found = np.zeros(3), np.eye(3), []
+    for i in range(lens.count + 1):
+        shift, own = turn.T @ (points[i] - point), turn.T @ turned[i]
+        tilt = np.radians(turns_of(own))
+        moved = np.abs(shift).max() > _STILL or np.abs(tilt).max() > _STILL
+        found.append(_moves(shift.tolist(), tilt) if moved else [])
+        if i < lens.count:
+            turn = turned[i] if moved else turn
+            point = (points[i] if moved else point + turn @ shift) + turn @ [
+                0,
+                0,
+                gap_behind(lens, i),
+            ]
+    return found
+
+
+def _simple(lens: Lens) -> list[list[str]] | None:
+    """The same where each element turns the axis at the vertex of its first surface and nothing
+    else is moved; None where it is not so."""
+    own, last = lens.elements, lens.count
+    assert own is not None
+    firsts = [first for first, _ in own.spans]
+    if np.any(lens.decentre if lens.decentre is not None else 0) or np.any(
+        lens.tilt if lens.tilt is not None else 0
+    ):
+        return None
+    at_vertex = not np.any(np.asarray(own.pivot)) and list(own.about) == firsts
+    if not at_vertex or len({*firsts}) < len(firsts) or {end for _, end in own.spans} != {last}:
+        return None
+    found: list[list[str]] = [[] for _ in range(last + 1)]
+    for g, first in enumerate(firsts):
+        found[first] = _moves(np.asarray(own.shift[g], float).tolist(), np.asarray(own.tilt[g]))
+    return found
+
+
+def _moves(shift: list[float], tilt: np.ndarray) -> list[str]:
+    a, b, c = (degrees_of(angle) for angle in tilt)
+    values = [*shift, 0.0 - a, 0.0 - b, c]
+    return [f"{key} {value!r}" for key, value in zip(KEYS, values, strict=True) if value]

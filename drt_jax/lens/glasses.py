@@ -1,0 +1,222 @@
+"""The table of the makers' glasses: by name and maker, by nd and vd, and the hull of its map.
+
+Written by tools/glasses.py, whose head tells sources and form; read when a glass is asked for.
+"""
+
+import difflib
+import functools
+import gzip
+import pathlib
+from collections.abc import Collection
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from .glass import FRAUNHOFER, POWERS, Glass
+
+_TABLE = pathlib.Path(__file__).parent / "catalogue" / "glasses.txt.gz"
+# In the plane of nd and vd a difference of 100 of vd counts as one of 1 of nd: the weights, 1 and
+# 1e-4 of squares, that Zemax has by default where it replaces model glasses.
+_PER_VD = 0.01
+
+
+class _Entry(NamedTuple):
+    """A line of the table: whether its name alone means it, maker, C, source, constants as text."""
+
+    plain: bool
+    maker: str
+    celsius: str
+    source: str
+    constants: str
+
+
+class Neighbour(NamedTuple):
+    """A glass of the table with nd, vd, and how far it is from what was asked for: in units of nd,
+    100 of vd as one."""
+
+    glass: Glass
+    nd: float
+    vd: float
+    distance: float
+
+
+@functools.cache
+def _table() -> dict[str, list[_Entry]]:
+    """All lines by name; the plain one first."""
+    table: dict[str, list[_Entry]] = {"air": [_Entry(True, "", "", "", "0.0001 1000000\t\t")]}
+    head = ["", "", ""]
+    for line in gzip.decompress(_TABLE.read_bytes()).decode().split("\n"):
+        if line.startswith("#"):
+            head = line[1:].split("\t")
+            continue
+        name, _, constants = line.partition("\t")
+        entry = _Entry(name.startswith("*"), head[0], head[1], head[2], constants)
+        entries = table.setdefault(name.removeprefix("*"), [])
+        entries.insert(0 if entry.plain else len(entries), entry)
+    return table
+
+
+@functools.cache
+def glass_makers() -> tuple[str, ...]:
+    """The makers of the table, and Zemax's catalogues MISC and INFRARED."""
+    found = {entry.maker for entries in _table().values() for entry in entries}
+    return tuple(sorted(found - {""}))
+
+
+def _glass(name: str, entry: _Entry) -> Glass:
+    """A glass by the shortest name that finds it."""
+    low_high, sellmeier, schott = (
+        tuple(map(float, part.split())) for part in entry.constants.split("\t")
+    )
+    entries = _table()[name]
+    alone = entry is entries[0] if entries[0].plain else not _differ(entries)
+    return Glass(
+        name if alone else f"{name}_{entry.maker}",
+        sellmeier or Glass.sellmeier,
+        schott or Glass.schott,
+        (low_high[0], low_high[1]),
+        maker=entry.maker,
+        source=f"{entry.source}; at {entry.celsius} C" if entry.celsius else entry.source,
+    )
+
+
+def _differ(entries: list[_Entry]) -> bool:
+    """Whether glasses of one name have different constants or ranges."""
+    return len({entry.constants for entry in entries}) > 1
+
+
+def _all() -> list[tuple[str, _Entry]]:
+    """All glasses but for air."""
+    return [(n, e) for n, entries in _table().items() for e in entries if n != "air"]
+
+
+@functools.cache
+def glass_names() -> tuple[str, ...]:
+    """Names that `find_glass` knows, NAME_MAKER where a name is not enough; plain ones first."""
+    ordered = sorted(_all(), key=lambda own: not own[1].plain)
+    return ("air", *dict.fromkeys(_glass(name, entry).name for name, entry in ordered))
+
+
+def find_glass(name: str, maker: str | None = None) -> Glass:
+    """The glass of a name, and maker. ValueError, listing near names, if there is none, and naming
+    the makers, if several have different glasses of this name.
+
+    Names are exact: SK16 and N-SK16 are two glasses. Without a maker, names of Schott's catalogue
+    of 2017 mean Schott's glass, SK2 and SK16 Hikari's. Source: `Glass.source`.
+
+    name: as the maker writes it; "SK16_SCHOTT" is SK16 of SCHOTT.
+    maker: of `glass_makers()`; None: any.
+    """
+    table = _table()
+    plain, _, after = name.rpartition("_")
+    if maker is None and name not in table and plain in table:
+        name, maker = plain, after
+    if maker is not None and maker.upper() not in glass_makers():
+        raise ValueError(
+            f"glass {name!r}: unknown maker {maker!r}; makers: {', '.join(glass_makers())}"
+        )
+    entries = table.get(name, [])
+    found = [entry for entry in entries if maker is None or entry.maker == maker.upper()]
+    of = ", ".join(entry.maker or "no maker" for entry in entries)
+    if not found and entries:
+        raise ValueError(f"glass {name!r} is not of {maker} but of {of}")
+    if not found:
+        near = near_names(name)
+        hint = f"near names: {', '.join(near)}" if near else "no near name"
+        raise ValueError(f"unknown glass {name!r}; {hint}")
+    if not found[0].plain and _differ(found):
+        raise ValueError(
+            f"glass {name!r} is of several makers, {of}, with different constants; give one, as "
+            f"{name}_{found[0].maker}"
+        )
+    return _glass(name, found[0])
+
+
+def plain_names() -> list[str]:
+    """Names of the table, without their makers."""
+    return [*_table()]
+
+
+def spellings(name: str) -> list[str]:
+    """Names of the table that differ by capitals alone."""
+    return [own for own in _table() if own.lower() == name.lower()]
+
+
+def near_names(name: str, count: int = 6) -> list[str]:
+    """Names that `find_glass` knows and that look like `name`."""
+    folded, name = dict.fromkeys(own.lower() for own in _table()), name.lower()
+    near = difflib.get_close_matches(name, folded, n=count, cutoff=0.5)
+    near += [known for known in folded if name in known and known not in near]
+    alike = [own for known in near[:count] for own in spellings(known)]
+    entries = ((own, entry) for own in alike for entry in _table()[own])
+    return [*dict.fromkeys(_glass(own, entry).name for own, entry in entries)][:count]
+
+
+def indices(glass: Glass, wavelengths: np.ndarray) -> np.ndarray:
+    """The index (W,) of a glass of the table at wavelengths (W,) in um, in float64, without JAX."""
+    square = np.square(wavelengths)
+    b, c = np.reshape(glass.sellmeier, (2, -1, 1))
+    powers = square[:, None] ** (np.array(POWERS[: len(glass.schott)]) / 2)
+    terms = np.sum(b * square / (square - c), axis=0)
+    return np.sqrt(terms + powers @ np.asarray(glass.schott, float))
+
+
+def map_point(glass: Glass) -> tuple[float, float] | None:
+    """nd and vd of a glass of the table; None where its range has not the lines F, d and C, or it
+    has no dispersion."""
+    if glass.range[0] > FRAUNHOFER[1] or glass.range[1] < FRAUNHOFER[2]:
+        return None
+    d, f, c = indices(glass, np.array(FRAUNHOFER[:3])).tolist()
+    return (d, (d - 1) / (f - c)) if f > c else None
+
+
+@functools.cache
+def _mapped() -> tuple[list[_Entry], list[Glass], np.ndarray]:
+    """Solids that are known at the lines F and C: entries, glasses, nd and vd (G, 2)."""
+    solids = [(entry, _glass(name, entry)) for name, entry in _all() if name.lower() != "water"]
+    found = [(*own, point) for own in solids if (point := map_point(own[1]))]
+    entries, glasses, points = zip(*found, strict=True)
+    return [*entries], [*glasses], np.array(points)
+
+
+def nearest_glasses(
+    nd: float, vd: float, makers: Collection[str] | None = None, count: int = 10
+) -> list[Neighbour]:
+    """Glasses next to nd and vd in the glass map, the nearest first.
+
+    The distance is that of nd and vd / 100. ValueError for unknown makers.
+
+    makers: of `glass_makers()`; None: of all.
+    count: how many, at most.
+    """
+    wanted = None if makers is None else {maker.upper() for maker in makers}
+    for maker in sorted((wanted or set()) - {*glass_makers()}):
+        raise ValueError(f"unknown maker {maker!r}; makers: {', '.join(glass_makers())}")
+    entries, glasses, points = _mapped()
+    away = np.hypot(points[:, 0] - nd, _PER_VD * (points[:, 1] - vd))
+    own = [
+        Neighbour(glasses[i], float(points[i, 0]), float(points[i, 1]), float(away[i]))
+        for i in np.argsort(away, kind="stable")
+        if wanted is None or entries[i].maker in wanted
+    ]
+    return own[:count]
+
+
+@functools.cache
+def _glass_map() -> np.ndarray:
+    """The edges of the convex hull of the plain glasses but for water, in nd and scaled vd: their
+    normals, outwards, and how far the origin lies behind them, (E, 3)."""
+    from scipy.spatial import ConvexHull  # takes half a second to import
+
+    entries, _, points = _mapped()
+    return ConvexHull(points[[entry.plain for entry in entries]] * (1, _PER_VD)).equations
+
+
+def glass_map_distance(model: Array) -> Array:
+    """How far glasses of nd and vd (G, 2) lie outside of the convex hull of the plain glasses, but
+    for water: (G,), from its farthest edge, negative within, in units of nd, 100 of vd as one."""
+    edges = jnp.asarray(_glass_map(), model.dtype)
+    scaled = model * jnp.array([[1, _PER_VD]], model.dtype)
+    return jnp.max(scaled @ edges[:, :2].T + edges[None, :, 2], axis=1)

@@ -1,0 +1,124 @@
+"""Catalogues of glasses in Zemax's form."""
+
+import re
+
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import LensError, load_agf
+from drt_jax.lens.glass import Glass
+from drt_jax.lens.glasses import find_glass, indices
+
+
+# Zemax's formulas with constants of no glass, and n^2 at 0.6 um as its manual writes them.
+def terms(*pairs):
+    return sum(b * 0.36 / (0.36 - c) for b, c in pairs)
+
+
+def powers(*pairs):
+    return sum(a * 0.6**power for power, a in pairs)
+
+
+LOW = (0, 2.2), (2, -0.01), (-2, 0.01), (-4, 0.002), (-6, -1e-4), (-8, 1e-5)
+B = (1, 0.01), (0.2, 0.02), (0.9, 100), (0.1, 0.03), (0.05, 0.04)
+FORMULAS = {
+    1: ("2.2 -.01 .01 .002 -1e-4 1e-5", powers(*LOW)),
+    2: ("1 .01 .2 .02 .9 100", 1 + terms(*B[:3])),
+    6: ("1 .01 .2 .02 .9 100 .1 .03", 1 + terms(*B[:4])),
+    8: ("1.3 1 .01 .02", 1.3 + terms(B[0]) - 0.02 * 0.36),
+    9: ("1.3 1 .01 .9 100", 1.3 + terms(B[0], B[2])),
+    10: ("2.2 -.01 .01 .002 -1e-4 1e-5 2e-6 -3e-7", powers(*LOW, (-10, 2e-6), (-12, -3e-7))),
+    11: ("1 .01 .2 .02 .9 100 .1 .03 .05 .04", 1 + terms(*B)),
+    12: ("2.2 -.01 .01 .002 -1e-4 1e-5 3e-3 0", powers(*LOW, (4, 3e-3))),
+    13: (
+        "2.2 -.01 3e-3 .01 .002 -1e-4 1e-5 2e-6 -3e-7",
+        powers(*LOW, (4, 3e-3), (-10, 2e-6), (-12, -3e-7)),
+    ),
+}
+
+
+def glass_of(name, formula, constants, limits="0.4 0.7"):
+    return (
+        f"NM {name} {formula} 517642 1.5 64 0 1\nCD {constants}\nTD 0 0 0 0 0 0 20\nLD {limits}\n"
+    )
+
+
+def test_every_formula(tmp_path):
+    path = tmp_path / "my.agf"
+    text = "CC a catalogue\n" + "".join(glass_of(f"G{f}", f, c) for f, (c, _) in FORMULAS.items())
+    path.write_text(text, "utf-16")
+    found = load_agf(path)
+    assert [*found] == [f"G{formula}" for formula in FORMULAS]
+    for formula, (_, square) in FORMULAS.items():
+        n = indices(found[f"G{formula}"], np.array([0.6]))[0]
+        np.testing.assert_allclose(n, square**0.5, rtol=1e-14, err_msg=str(formula))
+
+
+BAD = {
+    "no line begins with NM": "CC nothing\n",
+    "line 1: expected NM, a name": "NM\n",
+    "line 1: X: formula 3 is not read, of 1, 2, 6": glass_of("X", 3, "1 2 3"),
+    "line 2: X: formula 12 with more than 7 terms": glass_of("X", 12, "2 0 0 0 0 0 0 .1"),
+    "line 1: X: its line LD is missing": "NM X 2 0 1.5 60\nCD 1 .01 0 0 0 0\n",
+    "line 4: X: no range: 0.7 to 0.4": glass_of("X", 2, "1 .01", "0.7 0.4"),
+    "line 2: expected a number, got 'nan'": glass_of("X", 2, "1 nan"),
+    "line 5: X: another glass of this name": glass_of("X", 2, "1 .01") + glass_of("X", 2, "1 .02"),
+    "character 0 is no text": "\x01\x02",
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_what_is_no_catalogue_is_refused_in_a_line(tmp_path, message):
+    path = tmp_path / "my.agf"
+    path.write_text(BAD[message])
+    with pytest.raises(LensError, match=re.escape(message)) as error:
+        load_agf(path)
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+def test_a_prescription_names_its_catalogues(tmp_path):
+    """What it does not use may be of any formula; its glasses win over the table."""
+    mine = glass_of("MINE", 2, "1.2 .01") + glass_of("N-BK7", 2, "1.3 .01") + glass_of("X", 3, "1")
+    (tmp_path / "my.agf").write_text(mine)
+    path = tmp_path / "lens.yaml"
+    text = """
+catalogues: [my.agf]
+surfaces:
+  - {radius: 50, thickness: 4, glass: MINE, semi_diameter: 5, stop: true}
+  - {radius: -50, thickness: 4, glass: GLASS}
+  - {radius: 90, thickness: 90}
+"""
+    path.write_text(text.replace("GLASS", "N-BK7"))
+    lens = drt_jax.load_lens(path)
+    wanted = [(1 + b * 0.36 / 0.35) ** 0.5 for b in (1.2, 1.3)]
+    np.testing.assert_allclose(np.asarray(lens.index(0.6))[1:3].ravel(), wanted, rtol=1e-14)
+    drt_jax.save_lens(lens, tmp_path / "again.yaml")
+    again = drt_jax.load_lens(tmp_path / "again.yaml")
+    np.testing.assert_array_equal(again.index(0.6), lens.index(0.6))
+    path.write_text(text.replace("GLASS", "X"))
+    with pytest.raises(LensError, match=r"yaml, line 2: catalogues: .*my.agf, line 9: X: form"):
+        drt_jax.load_lens(path)
+    path.write_text(text.replace("[my.agf]", "my.agf"))
+    with pytest.raises(LensError, match="line 2: catalogues: expected a list of paths"):
+        drt_jax.load_lens(path)
+
+
+def test_glasses_of_a_maker_in_files(tmp_path):
+    """NAME_MAKER in a prescription; in `.zmx` the catalogues say it, as far as they can: of F2 and
+    Hikari's SK16 no order finds both, so one keeps its maker in its name."""
+    names = ("SK16", "F2", "S-BSM14", "SK16_SCHOTT")
+    for some in (names[:2], names[1:3], names[1:]):
+        surfaces = [
+            {"radius": 50 + i, "thickness": 9, "glass": name} for i, name in enumerate(some)
+        ]
+        surfaces[0] |= {"semi_diameter": 2, "stop": True}
+        lens = drt_jax.load_lens({"surfaces": [*surfaces, {"radius": -60, "thickness": 90}]})
+        for kind in ("yaml", "zmx"):
+            drt_jax.save_lens(lens, tmp_path / f"lens.{kind}")
+            again = drt_jax.load_lens(tmp_path / f"lens.{kind}")
+            assert again.glasses == lens.glasses
+            np.testing.assert_array_equal(again.index(0.55), lens.index(0.55))
+        text = (tmp_path / "lens.zmx").read_text()
+        assert ("_SCHOTT" in text) == (some == names[:2])
+    assert isinstance(find_glass("F2", "HIKARI"), Glass)
