@@ -95,8 +95,9 @@ def render_method(
         side = float(np.asarray(pixel))
         angles = _angles(lens, shape, far, side, focal, waves)
         grid = grid_method(lens, angles, far, waves, side, size, nodes, model, tolerance)
-        dtype, size = lens.curvature.dtype, (shape[0], shape[1])
-        method = RenderMethod(grid, jnp.asarray(focal, dtype), jnp.zeros(0, jnp.int32), size, size)
+        both = (shape[0], shape[1])
+        length = jnp.asarray(focal, lens.curvature.dtype)
+        method = RenderMethod(grid, length, jnp.zeros(0, jnp.int32), both, both)
         return chosen(lens, method, waves, tolerance)
 
 

@@ -95,8 +95,8 @@ def tiles_of(method: RenderMethod) -> tuple[int, int]:
 def _maps(grid: KernelGrid, method: RenderMethod) -> Maps:
     colours, far = grid.solid_angle.shape[-1], len(grid.vergences)
     few = len(method.places) > 0
-    corners = [np.arange(n + 1) * t for n, t in zip(tiles_of(method), method.tile, strict=True)]
-    where = controls(method) if few else tuple(corners)
+    y, x = (np.arange(n + 1) * t for n, t in zip(tiles_of(method), method.tile, strict=True))
+    where = controls(method) if few else (y, x)
 
     def one(index: Array) -> tuple[Array, Array, Array, Array | None]:
         part = index // colours, index % colours
