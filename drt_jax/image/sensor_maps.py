@@ -87,6 +87,7 @@ def controls(method: RenderMethod) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tiles_of(method: RenderMethod) -> tuple[int, int]:
+    """The number of tiles down and across the picture; the last of each may reach beyond it."""
     (height, width), (down, across) = method.shape, method.tile
     return -(-height // down), -(-width // across)
 

@@ -434,7 +434,7 @@ def test_what_is_not_read_is_refused_by_line(tmp_path):
     assert "XYZ (line 11)" in notes[1] and "line 14 on, is not read" in notes[0]
 
 
-def same(one, two):
+def assert_same(one, two):
     """Two lenses, but for the names of glasses, to 17 digits."""
     for key in ("curvature", "conic", "thickness", "semi_diameter", "sensor", "decentre", "tilt"):
         np.testing.assert_array_equal(getattr(one, key), getattr(two, key))
@@ -451,7 +451,7 @@ def same(one, two):
 def test_written_and_read_back(tmp_path, name):
     lens = load_lens(name)
     save_lens(lens, tmp_path / "own.seq")
-    same(lens, read_back(tmp_path))
+    assert_same(lens, read_back(tmp_path))
 
 
 def read_back(folder):
@@ -474,7 +474,7 @@ def test_written_forms_glasses_apertures_and_places(tmp_path):
     lens = read(tmp_path, prv, *lines).lens
     save_lens(lens, tmp_path / "own.seq")
     again = read_back(tmp_path)
-    same(lens, again)
+    assert_same(lens, again)
     for part in ("half", "centre"):
         np.testing.assert_array_equal(*(getattr(own.apertures, part) for own in (lens, again)))
     assert lens.apertures.kinds == again.apertures.kinds
@@ -523,10 +523,10 @@ def test_files_that_are_none(tmp_path):
     spoilt += [(b"\"'" * 1900 + b"\n") * 100, b"ZFR;SPS;HCO;SCO;REF x;STO;RET;WL;DIM;YAN\n" * 9]
     for content in spoilt:
         path.write_bytes(content)
-        began = time.perf_counter()
+        began = time.process_time()
         with pytest.raises(LensError) as error:
             load_lens(path)
-        assert time.perf_counter() - began < 2
+        assert time.process_time() - began < 2
         assert str(path) in str(error.value) and "\n" not in str(error.value)
         assert len(str(error.value)) <= 300
     own = text(

@@ -334,7 +334,7 @@ def test_model_glasses_without_dispersion_and_with(tmp_path):
     np.testing.assert_allclose(model.lens.index(0.55)[1], 1.5128031808, rtol=0, atol=2e-10)
 
 
-def same(one, two):
+def assert_same(one, two):
     """Two lenses, but for their names, to 17 digits; model glasses to the last digits of nd."""
     for key in ("curvature", "conic", "thickness", "semi_diameter", "sensor"):
         np.testing.assert_array_equal(getattr(one, key), getattr(two, key))
@@ -351,7 +351,7 @@ def same(one, two):
 def test_written_and_read_back(tmp_path, name):
     lens = load_lens(name)
     save_lens(lens, tmp_path / "lens.zmx")
-    same(lens, load_lens(tmp_path / "lens.zmx"))
+    assert_same(lens, load_lens(tmp_path / "lens.zmx"))
 
 
 def test_written_forms_glasses_and_apertures(tmp_path):
@@ -363,7 +363,7 @@ def test_written_forms_glasses_and_apertures(tmp_path):
     save_lens(lens, tmp_path / "own.zmx")
     assert "___BLANK 1 0 1.511 60.6 0.01" in (tmp_path / "own.zmx").read_text()
     again = load_lens(tmp_path / "own.zmx")
-    same(lens, again)
+    assert_same(lens, again)
     np.testing.assert_array_equal(lens.apertures.half, again.apertures.half)
     np.testing.assert_array_equal(lens.apertures.centre, again.apertures.centre)
     with pytest.raises(LensError, match="save as .yaml"):
@@ -383,7 +383,7 @@ def test_written_series_and_phases(tmp_path):
     lens = read(tmp_path, FRONT, *surfaces).lens
     save_lens(lens, tmp_path / "own.zmx")
     again = load_lens(tmp_path / "own.zmx")
-    same(lens, again)
+    assert_same(lens, again)
     np.testing.assert_array_equal(lens.phase.coefficients, again.phase.coefficients)
     assert again.phase.order.tolist() == [-1]
     linear = 0.1 * 1 / 4 - 0.2 * 2 / 4 + 0.3 * 1 / 16 - (50 - np.sqrt(50**2 - 5))
@@ -403,10 +403,10 @@ def test_files_that_are_none(tmp_path):
     spoilt += [bytes(10**5), b"x: 1\n", whole[:301], whole[: len(whole) // 2]]
     for content in spoilt:
         path.write_bytes(content)
-        began = time.perf_counter()
+        began = time.process_time()
         with pytest.raises(LensError) as error:
             load_lens(path)
-        assert time.perf_counter() - began < 2
+        assert time.process_time() - began < 2
         assert str(path) in str(error.value) and "\n" not in str(error.value)
         assert len(str(error.value)) <= 300
     for _ in range(150):  # a few bytes changed: refused in a line, or a lens
