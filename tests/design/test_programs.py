@@ -110,7 +110,7 @@ def test_a_function_is_an_operand():
 @pytest.mark.parametrize(
     "make, said",
     [
-        (lambda: Operand(coma, surfaces=(0,)), "operands: coma: surfaces: it has none"),
+        (lambda: Operand(coma, surfaces=(0,)), "operands: coma: does not depend on surfaces"),
         (lambda: Operand(coma, low=1, high=0), "operands: coma: low 1 is not below high 0"),
         (lambda: Operand(3), "operands: unknown kind 3"),
     ],
