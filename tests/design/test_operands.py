@@ -57,6 +57,7 @@ def triplet():
     return lens, rule, program(problem, kinds)(problem, variables.start)
 
 
+@pytest.mark.slow
 def test_spots(triplet):
     """Sums of squares are traces of covariances, of colours apart or together."""
     lens, rule, told = triplet
@@ -214,6 +215,7 @@ def flux(lens, field, count=400, h=1e-4):
     return area * abs(turned / moved)
 
 
+@pytest.mark.slow
 def test_illumination_is_what_a_beam_brings(triplet):
     lens, _, told = triplet
     light = np.array([flux(lens, field) for field in FIELDS])

@@ -77,6 +77,7 @@ def grid(rings):
     return drt_jax.Pattern(points, np.full(len(points), 1 / len(points)), "none")
 
 
+@pytest.mark.slow
 def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):
     """From both signs and from a plane plate; one program serves all three."""
     for first, second in ((1000, -1000), (-1000, 1000), ("inf", "inf")):
@@ -122,6 +123,7 @@ def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
         np.testing.assert_allclose(after, before, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_search_ends_as_soon_as_it_is_good(triplet):
     """By its merit and its limits together, at the first trial of which that is true."""
     whole = design.optimise(triplet, max_steps=40)
@@ -167,6 +169,7 @@ def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
     assert f"beyond by {worst.excess:.3g}" in str(worst)
 
 
+@pytest.mark.slow
 def test_each_limit_has_the_name_of_its_value(triplet):
     """Of each kind, the names of its values are those of their places in the arrays."""
     kinds = [kind for kind, value in design.OPERANDS.items() if not value.squared]
@@ -190,6 +193,7 @@ def test_each_limit_has_the_name_of_its_value(triplet):
         assert own[4] == "distance 0, field 1, wavelength 1"
 
 
+@pytest.mark.slow
 def test_a_limit_that_nothing_moves_is_refused(triplet):
     """Where it is exceeded: of those that need no rays with the problem, else with the search."""
     lens = triplet.variables.lens

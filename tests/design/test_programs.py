@@ -92,6 +92,7 @@ def test_lenses_of_other_names_stack():
     assert jax.tree.structure(mirror) != jax.tree.structure(lenses[1])
 
 
+@pytest.mark.slow
 def test_a_function_is_an_operand():
     """As residuals and as limits that are told by its name; with derivatives."""
     problem, found = searched(0)

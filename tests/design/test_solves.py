@@ -117,6 +117,7 @@ def best(lens, solve):
     return abs(total[1] / total[2] / 2 / lens.sensor)
 
 
+@pytest.mark.slow
 def test_best_focus_is_best():
     """Beside it the spots are larger, by as much as the parabola says; and `value` is beside it."""
     lens = load_lens("cooke_triplet")

@@ -55,6 +55,7 @@ def some_lens(some, seed=5):
     return some.lens_of(jnp.asarray(design.draw_perturbations(some, 1, seed)[0]))
 
 
+@pytest.mark.slow
 def test_squares_are_those_of_the_moments(singlet):
     """The spot of all colours about their centroid, from the moments of each."""
     problem, some = singlet
@@ -110,6 +111,7 @@ def test_tilt_of_the_sensor_is_where_a_scan_finds_it(singlet):
     assert best.fun == pytest.approx(1e3 * float(found.spot), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_stands_oblique_is_focused_along_the_axis(singlet):
     """Compensated lenses with their sensors really moved need no more compensation; the spots are
     the same."""

@@ -79,6 +79,7 @@ def test_a_lens_is_trained_off_the_axis(own):
     assert figures == {"figure_5a", "restored", "numbers", "designed"}
 
 
+@pytest.mark.slow
 def test_its_table_has_none_of_the_papers_numbers(own, capsys):
     drawn = {path.name: path.read_bytes() for path in (own / "figures").iterdir()}
     main("restore", "--report", "--out", own)
@@ -186,6 +187,7 @@ def test_gradient_of_the_joint_loss_by_a_curvature(name):
     assert min(errors) < 1e-3, errors
 
 
+@pytest.mark.slow
 def test_a_change_of_the_scale_moves_the_rays_as_a_millimetre_of_the_sensor_does():
     """Against differences of rays; a conic that would have to change by thousands does not."""
     some = lens("sensor", "curvature", "thickness 1", "conic 1")

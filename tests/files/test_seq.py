@@ -460,6 +460,7 @@ def read_back(folder):
         return load_lens(folder / "own.seq")
 
 
+@pytest.mark.slow
 def test_written_forms_glasses_apertures_and_places(tmp_path):
     prv = "PRV\nPWL 700 400\n'A' LAU 2.25 -.01 .01\n'B' GMS 1.1 .01 .2 90\nEND"
     lines = [

@@ -47,6 +47,7 @@ def moved(lens):
     return dataclasses.replace(lens, decentre=jnp.asarray(shift), tilt=jnp.asarray(tilt))
 
 
+@pytest.mark.slow
 def test_a_ball_with_the_stop_at_its_centre():
     """Chief rays are straight, so that y = L tan(field); both foci lie at n R / (2 (n - 1)) from
     the centre, on a sphere about it; the angle on the sensor is that of the field."""
@@ -82,6 +83,7 @@ def test_calibrated_focal_lengths():
     np.testing.assert_allclose(found.ideal[:, 0, 1], 20 * np.tan(angles), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_symmetric_lens_at_unit_magnification_has_no_distortion_and_no_lateral_colour():
     lens = load_lens(SYMMETRIC)
     angles = drt_jax.field_of_height(jnp.array([0.0, 20.0, 60.0]), 150.0)
@@ -186,6 +188,7 @@ def test_a_field_without_a_chief_ray_is_infinite_and_spoils_no_other():
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
 
 
+@pytest.mark.slow
 def test_the_distortion_focal_length_of_opticstudio():
     """Double Gauss 28 degree field, 0.5876 um, not aimed at the stop: the height of the chief ray
     at Hy = 1e-4 of 14 degrees gives 99.3320630 mm ("Distortion Focal Length", Zemax Community,
@@ -196,6 +199,7 @@ def test_the_distortion_focal_length_of_opticstudio():
     np.testing.assert_allclose(found.focal_length, 99.3320630, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_chief_ray_in_a_stop_at_the_first_vertex_is_found():
     """Of a bundle of one ray the search took steps of no size there, and lost it."""
     lens = load_lens("phone")

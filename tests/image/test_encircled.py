@@ -18,6 +18,7 @@ LENS = load_lens(MIRROR)
 ZEROS = np.array([1.2196698912665045, 2.2331306]) * WAVE * 1e-3 / (2 * APERTURE)
 
 
+@pytest.mark.slow
 def test_airys_pattern():
     """P10, and 1 - J0^2 - J1^2 elsewhere."""
     some = np.linspace(0, 6e-2, 7)

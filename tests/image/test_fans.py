@@ -29,6 +29,7 @@ FAN_UM = [
 ]
 
 
+@pytest.mark.slow
 def test_the_fan_that_opticstudio_prints():
     """To the last of its digits; odd in Py, and the same across."""
     found = drt_jax.ray_fans(load_lens(P01), 0.0, np.inf, 0.543, 21)
@@ -39,6 +40,7 @@ def test_the_fan_that_opticstudio_prints():
     np.testing.assert_allclose(found.tangential[..., 0], 0, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fields", [[0.0, 0.2], [[0.05, 0.2], [-0.1, 0.1]]])
 def test_fans_are_rays_and_wavefronts(fields):
     found = drt_jax.ray_fans(COOKE, fields, 900.0, WAVES, 5, reference=0)

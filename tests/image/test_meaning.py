@@ -48,6 +48,7 @@ def test_inside_a_trace_a_rule_is_asked_for(singlet, how, call):
 CLIPPED = pytest.param("double_gauss", np.radians(14), np.inf, marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, field, distance", [("singlet", 0.0, 1e4), CLIPPED])
 def test_eager_and_compiled_agree(name, field, distance):
     """Moments to 1e-12 and the gradient of the variances to 1e-10, at the default tolerance: an
@@ -102,6 +103,7 @@ def test_a_wavelength_without_an_index(singlet):
     assert np.any(gradient.curvature != 0)
 
 
+@pytest.mark.slow
 def test_rays_mean_the_same_inside(singlet):
     """Points, path and status of rays that arrive, are clipped and miss; and of no index."""
     lens = dataclasses.replace(singlet, semi_diameter=singlet.semi_diameter.at[1].set(4.0))

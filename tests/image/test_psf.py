@@ -49,6 +49,7 @@ def traced(lens, field, points):
     return np.asarray(found.points[:, :, -1, :2]), np.asarray(found.status) == 0
 
 
+@pytest.mark.slow
 def test_rays_are_the_histogram_of_traced_rays(double_gauss):
     lens, field, *_ = double_gauss
     found = drt_jax.psf(*double_gauss, PIXEL, SIZE, RAYS)
@@ -65,6 +66,7 @@ RIM = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5
 CUT = beam_rule(12, "bilateral", drt_jax.Clipped(8, "bilateral"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "rule"), [(0.0, beam_rule(12, "rotational")), (0.3, CUT)], ids=["axis", "clipped"]
 )
@@ -98,6 +100,7 @@ def test_sums_and_moments(field, rule):
     assert (field == 0) == bool(np.all(np.asarray(moments.throughput) > 1 - 1e-9))
 
 
+@pytest.mark.slow
 def test_waves_are_the_sum_of_plane_waves(double_gauss):
     lens, field, *_ = double_gauss
     found = drt_jax.psf(*double_gauss, PIXEL, SIZE, WAVE_MODEL)
@@ -148,6 +151,7 @@ def mirror_kernel(kind, lens, wavelength, pixel):
     return np.asarray(drt_jax.psf(lens, 0.0, np.inf, wavelength, pixel, SIZE, model).kernel[0])
 
 
+@pytest.mark.slow
 def test_waves_of_a_perfect_mirror_are_airys_pattern():
     pixel, wavelength = 2e-3, 0.5
     found = mirror_kernel("waves", paraboloid(), wavelength, pixel)
@@ -224,6 +228,7 @@ def test_defocus_is_the_sensor_moved(double_gauss):
     np.testing.assert_allclose(one.kernel, two.kernel, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_auto_says_how_good_the_gaussian_is(double_gauss):
     model = drt_jax.converged_psf(*double_gauss, PIXEL, SIZE, "auto", 0.2)
     # Here the Gaussian misses the waves by more than half of the light.
@@ -235,6 +240,7 @@ def test_auto_says_how_good_the_gaussian_is(double_gauss):
     assert difference(*map(np.asarray, pair)) < 0.25
 
 
+@pytest.mark.slow
 def test_a_model_serves_inside_jit_and_vmap(double_gauss):
     lens, _, far, waves = double_gauss
     fields = jnp.radians(jnp.array([[0.0, 5.0], [0.0, 12.0]]))
@@ -268,6 +274,7 @@ def test_what_is_no_kernel_is_refused(double_gauss, change, message):
         drt_jax.psf(*double_gauss, **named)
 
 
+@pytest.mark.slow
 def test_no_program_takes_several_matrices_to_lapack_at_once():
     """LAPACK's loop over matrices waits for XLA's threads in one of them: two of them never end."""
     lens, rule = drt_jax.load_lens("singlet"), beam_rule(4, "bilateral")

@@ -69,6 +69,7 @@ def test_a_few_kernels_give_back_those_that_they_span():
     np.testing.assert_allclose(jnp.sum(slope * aside), jnp.sum(weights * aside), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_pixel_collects_the_kernel_of_each_point_around_it():
     """Against a sum over points with kernels of their own, light and all, one by one in NumPy."""
     lens, method, margin = lens_of(), method_of(), 6
@@ -156,6 +157,7 @@ def test_points_land_where_their_centroids_are():
             np.testing.assert_allclose(centroid, wanted, atol=0.01)
 
 
+@pytest.mark.slow
 def test_no_seam_lies_between_tiles():
     """Tiles of another size give the same picture, and those that blend their corners nearly."""
     lens, method = lens_of(), method_of()

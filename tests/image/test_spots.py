@@ -31,6 +31,7 @@ def rules():
     return [drt_jax.light_rule(lens, *SCENE) for lens in (COOKE, RIM)]
 
 
+@pytest.mark.slow
 def test_cos4_of_a_small_hole():
     """What a pixel collects through a hole falls with the fourth power of the cosine."""
     plate = [{"curvature": 0, "index": 1.5, "thickness": 0.1}, {"curvature": 0, "thickness": 1.0}]
@@ -42,6 +43,7 @@ def test_cos4_of_a_small_hole():
     np.testing.assert_allclose(area, np.pi * (0.003 / 30) ** 2, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_cone_of_a_ball():
     """A ball with the stop at its centre focuses on a sphere about it: a pencil as wide as the stop
     is seen, cos(field), which a flat sensor sees as cos^2."""
@@ -55,6 +57,7 @@ def test_the_cone_of_a_ball():
     np.testing.assert_allclose(light[:, 0], np.cos(fields) ** 2, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_perfect_cone():
     """n = 1.5, R = 10, k = -1/n^2 has its focus at 30 mm, for any aperture: pi sin^2 of the angle
     at which the rim is seen, and the Airy radius 1.22 wavelength / (2 n sin)."""
@@ -72,6 +75,7 @@ def test_a_perfect_cone():
     np.testing.assert_allclose(drt_jax.vignetting(lens, 0.0, np.inf, 0.55, rule), 1, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clipped", [False, True], ids=["whole", "clipped"])
 def test_spots_are_those_of_the_moments(rules, clipped):
     lens, rule = (COOKE, RIM)[clipped], rules[clipped]
@@ -93,6 +97,7 @@ def test_spots_are_those_of_the_moments(rules, clipped):
         np.testing.assert_allclose(spot.rms_chief[k], np.sqrt(square + apart), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_light_of_random_rays(rules):
     """The area of directions within the hull of those that arrive, and how many do."""
     points = pupil.random_disc(40_000, 1)[0]
@@ -121,6 +126,7 @@ def test_the_illumination_that_designs_keep():
     np.testing.assert_allclose(found[:, 1], wanted, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_geometric_radii_and_pictures(rules):
     """A hexapolar pattern, and the rim of the stop; mirror images of half a pupil."""
     points, weights = pupil.hexapolar(4)
@@ -162,6 +168,7 @@ def slopes(lens, fields):
     return jax.value_and_grad(total, has_aux=True)(lens)
 
 
+@pytest.mark.slow
 def test_no_light_is_infinite_and_dark():
     """At 89 degrees; the other field is as it is alone, and no NaN leaves."""
     (_, (spot, light)), slope = slopes(COOKE, jnp.array([0.1, 1.55]))

@@ -54,6 +54,7 @@ def perfect(focus):
     )
 
 
+@pytest.mark.slow
 def test_the_transfer_function_of_a_perfect_circle():
     found = perfect(0.0)
     for way in range(2):
@@ -73,6 +74,7 @@ def test_the_transfer_function_of_an_annulus():
         np.testing.assert_allclose(found.mtf[0, way], ANNULUS, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_defocus_and_strehl():
     """|OTF| of a defocused circle by Hopkins (Proc. R. Soc. A 231, 91 (1955)), here summed over the
     common area of two pupils; the Strehl ratio is sinc^2 of the waves at the edge."""
@@ -102,6 +104,7 @@ def traced(field, wavelength):
     return np.asarray(rays.points)[0, :, -1, :2], weights
 
 
+@pytest.mark.slow
 def test_the_limit_of_short_wavelengths_is_that_of_rays():
     """And the rays' is the mean over many traced ones."""
     fields, frequencies = [0.0, 0.2], np.linspace(0, 20, 5)
@@ -115,6 +118,7 @@ def test_the_limit_of_short_wavelengths_is_that_of_rays():
     np.testing.assert_allclose(rays.limit, 1)
 
 
+@pytest.mark.slow
 def test_colours_add_up_about_one_point():
     """Lateral colour costs contrast: the sum of each wavelength's own, turned by where its light
     is."""
@@ -133,6 +137,7 @@ def test_colours_add_up_about_one_point():
     np.testing.assert_allclose(otf(4.5 * share), wanted, rtol=0, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_the_zernike_coefficients_that_opticstudio_prints():
     lens = load_lens(P01)
     found = np.asarray(drt_jax.zernike_standard(lens, 0.0, np.inf, 0.543))[0, 0]
@@ -183,6 +188,7 @@ def slopes(lens, field):
     return jax.value_and_grad(total, has_aux=True)(lens)
 
 
+@pytest.mark.slow
 def test_fringe_coefficients():
     """The same wavefront: terms of n, m are sqrt(n + 1) or sqrt(2 n + 2) times Noll's; the order as
     it is printed."""
@@ -197,6 +203,7 @@ def test_fringe_coefficients():
     np.testing.assert_allclose(fringe[7], np.sqrt(8) * standard[6], rtol=1e-6)  # coma along y
 
 
+@pytest.mark.slow
 def test_no_light_no_contrast():
     (_, found), slope = slopes(COOKE, jnp.array([0.0, 1.55]))
     models, ratio, terms = found
@@ -208,6 +215,7 @@ def test_no_light_no_contrast():
         np.testing.assert_allclose(one.mtf[..., 0], 1, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_by_lens_numbers():
     """Reverse mode against central differences, in a clipped pupil."""
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))

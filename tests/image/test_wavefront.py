@@ -91,6 +91,7 @@ def of_known(monkeypatch, found):
     return lambda lens, scene, points: module._wavefront.__wrapped__(lens, scene, points, None)
 
 
+@pytest.mark.slow
 def test_off_axis_against_snell(monkeypatch):
     """Paths summed up along the rays of the sequential trace from a plane wave, and the sphere
     met by solving its quadratic equation, in NumPy: 3e-9 waves of 300,000, 1e-14 of them."""
@@ -172,6 +173,7 @@ def test_gradients_in_both_modes_and_on_axis(monkeypatch):
         np.testing.assert_allclose(reverse, (high - low) / 2, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_failed_rays_have_a_status_and_change_no_other(monkeypatch):
     lens = load_lens("singlet")
     steep = dataclasses.replace(lens, semi_diameter=jnp.array([24.0, 15.0, jnp.inf, jnp.inf]))

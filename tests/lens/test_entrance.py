@@ -81,6 +81,7 @@ def test_all_else_of_the_lens_stays():
     np.testing.assert_array_equal(edge[0], [0, drt_jax.Status.CLIPPED])
 
 
+@pytest.mark.slow
 def test_the_pupil_follows_the_lens():
     """Derivatives through its place and size, beside differences."""
     lens = load_lens("cooke_triplet")

@@ -198,6 +198,7 @@ def test_distance_to_the_glass_map():
     assert found[-4] > 0.1 and found[-3] > 0.05 and found[-2] < -0.05 and found[-1] > 0.05
 
 
+@pytest.mark.slow
 def test_catalogue_glasses_made_model_glasses(tmp_path):
     """nd and nF - nC, so focal lengths at d, F - C stay; spots change by what a model glass is off;
     their nd and vd are leaves."""

@@ -217,6 +217,7 @@ IMMERSED = {
 }
 
 
+@pytest.mark.slow
 def test_image_space_in_water():
     """A thick lens before water: n' / f' is the power, and the Fermat rays end where Snell's do
     and, near the axis, in the paraxial focus."""

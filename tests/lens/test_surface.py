@@ -191,6 +191,7 @@ def jax_rows(shape):
     return Shape(shape.curvature[None], shape.conic[None], shape.coefficients[:, None])
 
 
+@pytest.mark.slow
 def test_forms_side_by_side_are_each_their_own():
     names = [
         "Forbes",

@@ -134,6 +134,7 @@ def test_gradients_follow_the_boundary(name):
         np.testing.assert_allclose(getattr(gradient, leaf)[k], difference, rtol=1e-6, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_rule_that_a_clipped_scene_needs():
     field, lens = SCENES["on axis"]
     assert isinstance(drt_jax.converged_rule(lens, field, FAR, GREEN, 1e-4), Clipped)

@@ -55,6 +55,7 @@ def test_sizes():
     assert tile_of(RAYS, len(WAVES)) == 1024 < RAYS and tile_of(PART, len(WAVES)) == PART
 
 
+@pytest.mark.slow
 def test_no_newton_step_remains(found):
     assert np.all(found.status == Status.OK)
     assert int(found.steps) == 0

@@ -55,6 +55,7 @@ def test_c18_stigmatic_surfaces(name, gap):
     np.testing.assert_allclose(slope, 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_c18_aplanatic_point():
     """Object in n = 1.5 at R (1 + 1/n): virtual image 25 mm before the vertex, sine ratio 1.5."""
     tangents = np.tan(np.radians([5.0, 20.0, -20.0]))

@@ -124,6 +124,7 @@ def test_sensor_and_plane_stop_do_not_bend():
         np.testing.assert_allclose(getattr(asked, name), getattr(gradient, name), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_what_a_file_bends_may_be_bent():
     """A curved stop that bends no light has its derivatives."""
     lens = load_lens({"surfaces": [STOP | {"radius": 40.0}, *PLATE]})

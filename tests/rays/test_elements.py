@@ -59,6 +59,7 @@ def test_the_whole_lens_turned_is_the_light_turned():
     np.testing.assert_allclose(own, theirs.points, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_tilted_plate_shifts_a_beam():
     plane = {"radius": INF, "thickness": 20.0}
     rows = [plane | {"stop": True, "semi_diameter": 2.0}, plane | {"index": 1.5}, plane]
@@ -73,6 +74,7 @@ def test_a_tilted_plate_shifts_a_beam():
     np.testing.assert_allclose(rays.directions[0, :, -1, 2], 1, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_sphere_turns_about_its_centre_without_effect():
     about = lens_with({"surfaces": [2, 2], "pivot": -129.9, "tilt": [2.0, 1.0, 0.0]})
     ours = trace_rays(about, 0.05, INF, 0.55, PUPIL)
@@ -80,6 +82,7 @@ def test_a_sphere_turns_about_its_centre_without_effect():
     np.testing.assert_allclose(ours.points, theirs.points, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_folding_mirror_changes_no_image():
     """A mirror at 45 degrees turns the axis of all that follows by 90 degrees; the light then goes
     against it."""
@@ -132,6 +135,7 @@ def test_coordinate_breaks_lie_where_another_program_puts_them():
     np.testing.assert_allclose(turned[2:], np.stack([np.eye(3)] * 2), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_the_chief_ray_of_a_grating_spectrometer_goes_where_another_program_found_it():
     """It solved the decentres for the chief ray at 550 nm to 13 digits."""
     rays = trace_rays(spectrometer(-1), 0.0, 181.3611490362, (0.45, 0.55, 0.65), [[0.0, 0.0]])

@@ -30,6 +30,7 @@ def aimed(lens, scene, points, off):
 ZERO = tuple(jnp.zeros((len(COLOURS), 5)) for _ in range(2))
 
 
+@pytest.mark.slow
 def test_aiming_from_crude_starts():
     """The same launch from 3 mm around; what cannot be reached says so, and spoils no other."""
     lens, scene, points, _ = problem("tilted")

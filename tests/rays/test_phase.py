@@ -28,6 +28,7 @@ def zone_plate(f, wavelength, terms, **where):
     return load_lens({"surfaces": [STOP, plate]})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [-2, 0, 1])
 @pytest.mark.parametrize("mirror", [False, True])
 def test_the_grating_equation_in_and_out_of_plane(order, mirror):
@@ -190,6 +191,7 @@ def test_a_hybrid_needs_one_radius_on_the_axis():
     np.testing.assert_allclose(short.covariance, long.covariance, rtol=1e-8, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_phase_of_nothing_changes_nothing():
     rows = [
         {"radius": 80.0, "thickness": 4.0, "glass": "SF5", "stop": True, "semi_diameter": 5.0},

@@ -184,6 +184,7 @@ def test_c08_rays(cases, lsst, name):
     np.testing.assert_allclose(np.abs(ours), np.abs(cosines[:-1]), atol=3e-10)
 
 
+@pytest.mark.slow
 def test_c08_whole_pupil(cases, lsst):
     """The plane of the entrance pupil touches the rim of the first mirror, within 1e-5 mm: every
     ray of the stop as the oracle has it, to 1e-8 mm of 12 m."""

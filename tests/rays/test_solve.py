@@ -127,6 +127,7 @@ def test_against_optimistix():
     assert_close(gradient(*given, weights), slopes, 1e-9)
 
 
+@pytest.mark.slow
 def test_against_the_unrolled_iteration():
     """Tangents through nine steps of Newton's method from hits near to the rays."""
     given = lens, scene, points, found = problem("tilted")
