@@ -116,7 +116,6 @@ def patch_grid(
     """Images in labelled rows.
 
     rows: images (H, W, 3), 0 to 1, by label.
-    titles: titles of the columns.
     notes: texts in the corners of the images, by label of the row.
     """
     figure, axes = new(len(rows), len(titles), 1.7, 1.75 + 0.3 / len(rows))
@@ -154,7 +153,6 @@ def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bo
     the 1st to the 99th percentile, and the largest sample as a point.
 
     samples: (N,) by family.
-    label: label of the axis.
     log: True for a logarithmic scale, without samples of 0.
     """
     shown = {name: np.asarray(values, float) for name, values in samples.items() if np.size(values)}
@@ -246,7 +244,6 @@ def ranks(axes: Axes, sizes: Sequence[float], found: Sequence[int]) -> Axes:
 def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]) -> Axes:
     """Groups of horizontal bars, the first on top.
 
-    names: names of the N groups.
     series: lengths (N,) by label; the first filled, the others as outlines.
     """
     places = np.arange(len(names))

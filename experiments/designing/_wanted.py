@@ -20,7 +20,6 @@ class Starts:
     per_cent, off_mm: of "made", standard deviations of curvatures and thicknesses.
     stages: trials of each search in each stage.
     keep: fraction of searches that survive a stage.
-    seed: seed of the random numbers.
     """
 
     count: int = 1
@@ -63,19 +62,16 @@ class Growth:
 class Config:
     """Settings of the experiment; see configs/design/.
 
-    name: name of the problem.
     lens: start, a bundled name or YAML path.
     variables, ties, solves, operands: see drt_jax.design.
     fields_deg: field angles along y.
     wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
     field_weights: weights of the squares of each field; empty for equal weights.
-    distance_mm: distance of the object.
     floating: True for clear apertures that follow the light, except the stop's; False for
         vignetting.
     order: order of the pupil rule of the search.
     tolerance: relative error of the spots, which fixes the rule for the last search.
     rings: above 0, rings of a hexapolar grid instead of both rules, as in other programs.
-    growth, starts: see there.
     trials: most trials of the last search.
     """
 

@@ -50,9 +50,7 @@ class Config:
     lens: bundled name or YAML path.
     tolerances: see drt_jax.design.
     fields_deg: pairs x, y.
-    distance_mm: distance of the object.
     wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
-    order: order of the pupil rule.
     compensator: adjusted in every lens.
     errors: "uniform" up to their sizes, or "normal" with half the sizes as standard deviation,
         truncated at the sizes.
@@ -60,7 +58,6 @@ class Config:
     count: lenses of Monte Carlo for each scale.
     draws: draws of the predictions.
     limits_um: spots for which the yield is reported.
-    seed: seed of all random numbers.
     """
 
     lens: str

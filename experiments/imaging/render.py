@@ -66,10 +66,8 @@ class Config:
     photo: a file, or "bundled".
     pixel_um: side of a pixel; 0 to spread the photograph over `field_deg`.
     field_deg: field angle of the corners.
-    model: model of the kernels.
     kernel: side of a kernel, pixels; 0 for what the blur needs.
     nodes: fields on one side of the axis.
-    layers: layers of a depth map.
     full_well, read_noise: electrons; a full well of 0 for no noise.
     """
 

@@ -38,7 +38,6 @@ class Training:
     """Length and speed of training.
 
     batches: steps of each job.
-    batch: patches in a batch.
     patch: side of a patch, pixels.
     variables: trained numbers of the lens, by kind, or kind and surface such as "curvature 0".
     optics_rate: Adam's learning rate of the sensor, mm; other rates follow from `Trained.scale`.
@@ -90,7 +89,6 @@ class Settings:
 
     starts_mm: sensor positions at the start of training.
     noise: standard deviation of the sensor noise, for values from 0 to 1.
-    seed: seed of patches, noise and network.
     """
 
     starts_mm: tuple[float, ...]

@@ -25,7 +25,6 @@ class Config(_training.JointSettings):
     """Settings of the experiment; see configs/restore.yaml.
 
     table_starts_mm: starts that are trained at each noise of table_noise.
-    distance_m: object distance.
     """
 
     table_starts_mm: tuple[float, ...]

@@ -41,7 +41,6 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
     """Reads a YAML file into a dataclass.
 
     cls: the dataclass; keys that the file does not have keep its defaults.
-    path: path of the file.
     overrides: such as "train.batch=8", applied afterwards, all at once.
 
     ConfigError, with the line, for a file that cannot be read, an unknown key (with the nearest

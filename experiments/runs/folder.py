@@ -38,14 +38,12 @@ class Run:
     """One run in one folder, with one or more jobs, such as starting points. No other process may
     open the folder until `close`, or the end of a `with` block.
 
-    folder: folder of the run.
     figures: folder of its figures.
     """
 
     def __init__(self, folder: pathlib.Path, config: Any, columns: tuple[str, ...], resume: bool):
         """Opens the folder.
 
-        folder: folder of the run, which is created.
         config: dataclass with all settings of the run.
         columns: columns of metrics.csv after `job` and `step`.
         resume: True to resume the run in the folder.

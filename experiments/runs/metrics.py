@@ -15,7 +15,6 @@ from .write import replace
 class Metrics:
     """The file. It always has its header; rows are appended whole or not at all.
 
-    path: path of the file.
     columns: columns between `job`, `step` and the last one, `check`.
     """
 

@@ -42,12 +42,10 @@ class Config:
     """Settings of the experiment; see configs/benchmark.yaml.
 
     repeats: timed turns of each program (fewer for long ones).
-    rays: rays of a peer.
     bundle: rays of the task of many rays.
     batch, patch: patches of the network's step, and their side, pixels.
     tasks: names of the tasks to run; empty for all.
     growth: True to measure how run time grows with the scene.
-    seed: seed of rays and images.
     """
 
     lens: str = "double_gauss"

@@ -61,14 +61,10 @@ class LensFields:
 class Config:
     """Settings of the experiment; see configs/lenses.yaml.
 
-    lenses: the lenses.
     parts: fields relative to the widest.
-    wavelengths_um: wavelengths.
     copies, fields: numbers of perturbed lenses and of fields traced at once.
     sweep: number of fields from the axis to the widest.
-    rays: rays of a peer.
     repeats: timed turns of each program.
-    seed: seed of the perturbations.
     """
 
     lenses: tuple[LensFields, ...]

@@ -25,7 +25,6 @@ class Family(NamedTuple):
     make: (generator, count, variant) -> scenes.
     variants: variants, each with the same number of scenes.
     share: number of scenes relative to a family of full size.
-    dtype: dtype of all arrays.
     """
 
     what: str

@@ -92,7 +92,6 @@ def _bisected(low: Array, high: Array, before: Callable[[Array], Array]) -> tupl
 class _Pupil(NamedTuple):
     """The region of integration in the plane of q, in polar coordinates about (0, height).
 
-    lens: the lens.
     scene: field, 1/distance, wavelength.
     height: (), y of the origin, mm.
     reach: (), radius beyond the region, mm.

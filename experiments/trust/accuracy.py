@@ -48,7 +48,6 @@ class AccuracyScene:
     distance_m: distance of the object, .inf for infinity.
     defocus_mm: sensor position less that of the best focus on axis at the distance.
     front_mm, rear_mm: semi-diameters of the first and last surface, 0 for the lens's own.
-    dtype: dtype of all arrays.
     orders: orders instead of those of the run.
     most_rays: largest pattern.
     """
@@ -105,12 +104,10 @@ class AccuracyScene:
 class Config:
     """Settings of the experiment; see configs/accuracy.yaml.
 
-    scenes: the scenes.
     orders: orders of the quadrature.
     rays: nominal sizes of the patterns.
     seeds: number of random patterns, of which the median counts.
     tolerances: tolerances of the rules that are tested.
-    wavelengths_um: wavelengths.
     """
 
     scenes: tuple[AccuracyScene, ...]

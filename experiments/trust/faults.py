@@ -33,7 +33,6 @@ class Config:
     traced: number of loaded lenses that are traced.
     kills: number of kills and stops of runs.
     parts: parts to run, of files and kills; empty for all.
-    seed: seed of all random numbers.
     """
 
     files: int = 10_000

@@ -40,10 +40,7 @@ _NUMBERS = (
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings of the experiment; see configs/files.yaml.
-
-    folder: folder of the files and listings.
-    """
+    """Settings of the experiment; see configs/files.yaml. folder: of files and listings."""
 
     folder: str
 

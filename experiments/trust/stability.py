@@ -33,7 +33,6 @@ class Config:
     """Settings of the experiment; see configs/stability.yaml.
 
     scenes: number of scenes of a family of full size; some have half.
-    seed: seed of all random numbers.
     families: names of the families to run; empty for all.
     """
 
