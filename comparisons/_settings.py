@@ -34,7 +34,7 @@ class Beside:
         limits = {"starts": (0, 1e5), "seconds": (1e-3, 1e5), "steps": (1, 1e6), "rate": (1e-6, 10)}
         _common.require_within("", self, **limits)
         _common.require_known("peers", self.peers, _PEERS)
-        _common.require(len(set(self.peers)) == len(self.peers), "peers: an item stands twice")
+        _common.require_different("peers", self.peers)
 
 
 def require_told(config: Any, peers: tuple[str, ...]) -> None:

@@ -15,21 +15,21 @@ __path__ += [
 
 
 def _heard_early(number: int, frame: Any) -> None:
-    """Ctrl-C while modules are imported, which takes seconds. Not an exception: that could come up
-    in the middle of any of them."""
+    """Ctrl-C during imports, which take seconds. Not an exception, which could rise inside any
+    module."""
     with contextlib.suppress(OSError):
         os.write(2, b"\nstopped; nothing was begun\n")
     os._exit(130)
 
 
 def hear(handler: Any) -> None:
-    """Have Ctrl-C heard by another handler of signals, if this is the program that runs. A signal
-    that is ignored stays so."""
+    """Sets the handler of Ctrl-C, if this is the program that runs. An ignored signal stays
+    ignored."""
     if _IS_PROGRAM:
         signal.signal(signal.SIGINT, handler)
 
 
-# While `python -m` looks for the module to run, its name is not yet known.
+# `-m` stands for the name of the module while Python looks for it.
 _IS_PROGRAM = sys.argv[:1] == ["-m"]
 _IS_PROGRAM &= signal.getsignal(signal.SIGINT) is signal.default_int_handler
 hear(_heard_early)

@@ -19,18 +19,22 @@ from .runs import config as configs
 from .runs.folder import Run, begun
 from .runs.interrupt import deferred_interrupt
 
-# Errors raised in these folders are about the input; others are faults to be shown whole.
+# Errors raised in these folders are about the input; others are faults, shown with a traceback.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
 
 
 class _Place:
-    """Where a command works: the folder, once it is known, and whether the run in it is its own."""
+    """Where a command works.
+
+    folder: run folder; None until it is known.
+    own: True if the run in it is the command's own.
+    """
 
     folder: pathlib.Path | None = None
     own = False
 
     def left(self) -> tuple[str, str]:
-        """What is there if the command ends now, and how to go on with it, in words."""
+        """What is left if the command ends now, and how to go on, as text."""
         if not (self.folder and self.own and (self.folder / "config.yaml").is_file()):
             return "nothing was begun", ""
         if (self.folder / "results.json").is_file():
@@ -38,8 +42,8 @@ class _Place:
         return "what it wrote is whole", f"go on with --resume --out {self.folder}"
 
     def stop(self, number: int, frame: Any) -> None:
-        """Ctrl-C: say what is left, and end. Not an exception, which gets lost where Python calls
-        back, in a finalizer say; all that is written is whole at any moment."""
+        """Ctrl-C: says what is left, and ends. Not an exception, which gets lost in a callback such
+        as a finalizer; written files are whole at any moment."""
         message = "; ".join(filter(None, ("stopped", *self.left())))
         with contextlib.suppress(Exception):
             sys.stdout.flush()
@@ -48,19 +52,18 @@ class _Place:
 
 
 def main(experiment: Any, argv: list[str] | None = None) -> None:
-    """Run an experiment, or with --report only draw and print the results of a run again.
+    """Runs an experiment; with --report only draws and prints the results of a run again.
 
-    experiment: a module with `Config`, the dataclass of its settings; `COLUMNS` of metrics.csv,
-        to which `columns` of the settings add, if they have some;
-        `run(config, run)`, which measures and returns results for `Run.finish`;
-        `tables(results)`, printed; and `draw(results, folder)` of figures.
-    argv: of the command line.
+    experiment: a module with `Config`, the dataclass of its settings, whose `columns`, if any, add
+        to `COLUMNS` of metrics.csv; `run(config, run)`, which returns results for `Run.finish`;
+        `tables(results)`, which are printed; and `draw(results, folder)` of figures.
+    argv: arguments of the command line.
     """
     place = _Place()
     try:
         hear(place.stop)
         bad = _do(experiment, argv, place)
-        hear(signal.SIG_IGN)  # nothing is left to stop
+        hear(signal.SIG_IGN)  # nothing to stop any more
         if not bad:
             return
         others = f" and {len(bad) - 3} others" if len(bad) > 3 else ""
@@ -82,7 +85,7 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
 
 
 def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
-    """What `main` does, and the names of results that are not finite."""
+    """Does the work of `main`, and returns the names of results that are not finite."""
     name = experiment.__spec__.name.split(".")[-1]
     options = _parser(name, experiment).parse_args(argv)
     set_up()
@@ -92,7 +95,7 @@ def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
     if not options.report:
         config = _config(name, experiment.Config, options, folder)
         columns = (*experiment.COLUMNS, *getattr(config, "columns", ()))
-        with deferred_interrupt() as asked:  # between nothing and a run there is no stop
+        with deferred_interrupt() as asked:  # no stop before the run is whole
             run = Run(folder, config, columns, options.resume)
             place.own = True
         with run:
@@ -144,8 +147,8 @@ def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:
     parent = pathlib.Path("runs") / name
     if not options.resume:
         return parent / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    held = [path.parent for path in parent.glob("*/config.yaml") if begun(path.parent)]
-    folders = sorted(path for path in held if not (path / "results.json").is_file())
+    runs = [path.parent for path in parent.glob("*/config.yaml") if begun(path.parent)]
+    folders = sorted(path for path in runs if not (path / "results.json").is_file())
     remedy = "no unfinished run; name a run folder with --out"
     _common.require(bool(folders), f"nothing to resume in {parent}: {remedy}")
     return folders[-1]

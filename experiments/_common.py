@@ -19,42 +19,47 @@ from .runs.config import ConfigError
 from .runs.folder import Run
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-# A turn of `medians` lasts at least so many seconds.
+# Shortest turn of `medians`, s.
 _TURN = 0.05
 
 
 def experiment(*names: str) -> Any:
-    """The module of the first of these names that is one's."""
+    """The experiment of the first name that has a module."""
     known = (f"experiments.{name}" for name in names)
     return importlib.import_module(next(filter(importlib.util.find_spec, known)))
 
 
 def settings_files() -> list[tuple[pathlib.Path, Any]]:
-    """The files of settings, and the experiment of each: that of its name, or else of its folder's.
-    What lies in a folder `lenses` is none."""
+    """Files of settings with their experiment, that of the file's name or else of its folder's.
+    Folders `lenses` hold other files."""
     paths = sorted((ROOT / "configs").rglob("*.yaml"))
     return [(p, experiment(p.stem, p.parent.name)) for p in paths if p.parent.name != "lenses"]
 
 
 def require(condition: bool, message: str) -> None:
-    """ConfigError with the message, which names the key, unless the condition holds."""
+    """Raises ConfigError with the message, which names the key, unless the condition holds."""
     if not condition:
         raise ConfigError(message)
+
+
+def require_different(name: str, values: Sequence[Any]) -> None:
+    """ConfigError for an item that is given twice."""
+    require(len(set(values)) == len(values), f"{name}: an item stands twice")
 
 
 def require_list(name: str, values: tuple[float, ...], low: float = 0.0) -> None:
     """ConfigError unless a list of settings has items, all different, finite and above `low`."""
     require(len(values) > 0, f"{name}: needs at least one item")
-    require(len(set(values)) == len(values), f"{name}: an item stands twice")
+    require_different(name, values)
     for value in values:
         require(low < value < math.inf, f"{name}: expected numbers above {low:g}, got {value!r}")
 
 
 def require_within(prefix: str, settings: Any, **limits: tuple[float, float]) -> None:
-    """ConfigError unless the settings of these names, of lists every item, lie within their limits,
-    both included.
+    """ConfigError unless the settings, or all their items, lie within limits, both included.
 
-    prefix: of the settings in messages, such as "train.".
+    prefix: prefix of the names in messages, such as "train.".
+    limits: lowest and highest value by name.
     """
     for name, (low, high) in limits.items():
         value = getattr(settings, name)
@@ -70,8 +75,8 @@ def require_known(name: str, values: tuple[str, ...], known: Iterable[str]) -> N
 
 
 def read_results(folder: pathlib.Path) -> dict[str, Any]:
-    """What `Run.finish` wrote into a run folder. ConfigError if the run is not finished, or its
-    results are damaged."""
+    """Reads what `Run.finish` wrote. ConfigError if the run is not finished or its results are
+    damaged."""
     path = folder / "results.json"
     require(path.is_file(), f"{folder}: no results.json in it: the run is not finished")
     results: dict[str, Any] = {}
@@ -80,14 +85,14 @@ def read_results(folder: pathlib.Path) -> dict[str, Any]:
         try:
             whole = json.loads(content) if part == path else np.load(io.BytesIO(content))
             results |= dict(whole)
-        except Exception as error:  # what reading a damaged archive can raise has no end
+        except Exception as error:  # a damaged archive may raise anything
             remedy = f"have it written again with --resume --out {folder}"
             raise ConfigError(f"{part}: the file is damaged; {remedy}") from error
     return results
 
 
 def measured(run: Run, unit: str, jobs: dict[str, Callable[[], Any]]) -> list[Any]:
-    """What each job returns, as JSON reads it back; from its checkpoint if there is one."""
+    """Results of jobs, as JSON reads them back; from a checkpoint if there is one."""
     found = []
     for job in (bar := tqdm(jobs, unit=unit, dynamic_ncols=True)):
         bar.set_description(job)
@@ -98,7 +103,7 @@ def measured(run: Run, unit: str, jobs: dict[str, Callable[[], Any]]) -> list[An
 
 
 def grouped(rows: Iterable[dict], *keys: str) -> dict[tuple, list[dict]]:
-    """Rows by their values of the keys, in the order of their first."""
+    """Rows by their values of the keys, in order of appearance."""
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
         groups.setdefault(tuple(row[key] for key in keys), []).append(row)
@@ -106,7 +111,7 @@ def grouped(rows: Iterable[dict], *keys: str) -> dict[tuple, list[dict]]:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A Markdown table that can be read as plain text too; nothing is shown for None."""
+    """A Markdown table that is legible as plain text; None is an empty cell."""
 
     def say(value: Any) -> str:
         if isinstance(value, float):
@@ -121,12 +126,12 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def rings(rays: int) -> int:
-    """How many hexapolar rings hold at most so many rays."""
+    """Number of hexapolar rings of at most `rays` rays."""
     return int((math.sqrt(12 * rays - 3) - 3) / 6)
 
 
 def panels(count: int, width: float, height: float) -> tuple[Any, Any]:
-    """A figure of so many panels in two columns, and their axes."""
+    """A figure with panels in two columns, and their axes."""
     columns = min(2, count)
     figure, axes = show.new(-(-count // columns), columns, width, height)
     for spare in np.ravel(axes)[count:]:
@@ -135,7 +140,7 @@ def panels(count: int, width: float, height: float) -> tuple[Any, Any]:
 
 
 def number(value: float | None, form: str) -> str:
-    """A result in words; one that was not finite is None."""
+    """A result as text; None stands for one that was not finite."""
     return "not finite" if value is None else format(value, form)
 
 
@@ -149,11 +154,11 @@ def duration(seconds: float | None) -> str:
 
 
 def medians(calls: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
-    """Median seconds of each call, made in turns after one that does not count; those that take
-    over a second are made three times.
+    """Median seconds of each call, in turns, after one call that does not count. Calls above a
+    second are made three times.
 
-    The first call of a turn does not count either: the threads of another program go on spinning
-    for a while, and would be counted against this one.
+    The first call of a turn does not count either, because threads of the program before may still
+    spin.
     """
     times: list[list[float]] = [[] for _ in calls]
     for call in calls:

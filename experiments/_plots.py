@@ -1,4 +1,4 @@
-"""What experiments draw of their results: arrays in, axes out."""
+"""Plots of the experiments' results: arrays in, axes out."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -28,7 +28,7 @@ def convergence(
     """Lines over training batches.
 
     traces: (x (N,), y (N,)) by label.
-    level: a horizontal mark and its label.
+    level: height and label of a horizontal line.
     """
     for label, (x, y) in traces.items():
         axes.plot(x, y, linewidth=1.1, label=label)
@@ -53,11 +53,10 @@ def error_curves(
     ylabel: str,
     note: tuple[float, float, str] | None = None,
 ) -> Axes:
-    """Errors over cost, both logarithmic: the median of the scenes as a line, and a band from the
-    best to the worst.
+    """Errors over cost, both logarithmic: a line for the median of the scenes, a band from the best
+    to the worst.
 
-    curves: (x (N,), errors (N, M) of M scenes) by label; errors that are not known (None) or 0
-        are left out.
+    curves: (x (N,), errors (N, M) of M scenes) by label, without errors of None or 0.
     note: x, y and a text that points there.
     """
     for k, (label, (x, errors)) in enumerate(curves.items()):
@@ -77,7 +76,7 @@ def error_curves(
         above = axes.annotate(text, point, (0, 22), textcoords="offset points", arrowprops=arrow)
         above.set(fontsize=8, ha="center")
     axes.set(xscale="log", yscale="log")
-    # Over less than a decade or so, labels between the powers of ten would overlap.
+    # More labels between the powers of ten would overlap.
     axes.xaxis.set_minor_locator(ticker.LogLocator(subs=(2, 5)))
     return _finished(axes, xlabel, ylabel)
 
@@ -96,8 +95,8 @@ def programs(axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], tit
 def sigma_over_depth(axes: Axes, depths: np.ndarray, curves: Mapping[str, np.ndarray]) -> Axes:
     """Blur over the object distance: the first curve dotted and pale, the others solid.
 
-    depths: (N,) in m.
-    curves: blur (N, 3) in um of R, G, B, by label.
+    depths: (N,), m.
+    curves: blur (N, 3) of R, G, B, by label, um.
     """
     for k, (label, sigma) in enumerate(curves.items()):
         for channel, colour in enumerate(("red", "green", "blue")):
@@ -117,8 +116,7 @@ def patch_grid(
     """Images in labelled rows.
 
     rows: images (H, W, 3), 0 to 1, by label.
-    titles: of the columns.
-    notes: texts for the corners of the images, by the label of their row.
+    notes: texts in the corners of the images, by label of the row.
     """
     figure, axes = new(len(rows), len(titles), 1.7, 1.75 + 0.3 / len(rows))
     axes = np.reshape(axes, (len(rows), len(titles)))
@@ -136,9 +134,9 @@ def patch_grid(
 
 
 def growth(axes: Axes, series: Mapping[str, Sequence[tuple[float, float]]]) -> Axes:
-    """Run time against a number of things, both logarithmic, and a line of slope one.
+    """Run time over numbers, both logarithmic, and a line of slope one.
 
-    series: (number, time in s) of each point, by what is counted.
+    series: (number, time in s) of each point, by name of the number.
     """
     for name, points in series.items():
         number, seconds = np.asarray(points, float).T
@@ -151,12 +149,11 @@ def growth(axes: Axes, series: Mapping[str, Sequence[tuple[float, float]]]) -> A
 
 
 def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bool = False) -> Axes:
-    """A box for each family, from the first to the third quartile with its median, whiskers from
+    """A box for each family from the first to the third quartile with the median, whiskers from
     the 1st to the 99th percentile, and the largest sample as a point.
 
     samples: (N,) by family.
-    label: of the axis.
-    log: a logarithmic scale, which leaves out samples of 0.
+    log: True for a logarithmic scale, without samples of 0.
     """
     shown = {name: np.asarray(values, float) for name, values in samples.items() if np.size(values)}
     if log:
@@ -176,13 +173,13 @@ def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bo
 
 
 def shares(axes: Axes, rows: Mapping[str, Sequence[float]], names: Sequence[str]) -> Axes:
-    """Bars of what parts of each row come to: the numbers of `names` by label, as shares."""
+    """Stacked bars of fractions. rows: counts of `names` by label."""
     labels = list(rows)
     parts = np.array([rows[label] for label in labels], float)
-    ends = np.cumsum(parts / np.maximum(parts.sum(axis=1, keepdims=True), 1), axis=1)
+    sums = np.cumsum(parts / np.maximum(parts.sum(axis=1, keepdims=True), 1), axis=1)
     for k, name in enumerate(names):
-        begin = ends[:, k - 1] if k else 0.0
-        axes.barh(labels, ends[:, k] - begin, left=begin, label=name)
+        begin = sums[:, k - 1] if k else 0.0
+        axes.barh(labels, sums[:, k] - begin, left=begin, label=name)
     axes.invert_yaxis()
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, ncols=len(names), loc="lower center", bbox_to_anchor=(0.5, 1.0))
@@ -196,13 +193,17 @@ _COLOURS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 def spots(
     axes: Axes, hits: Mapping[str, np.ndarray], covariance: np.ndarray, side: float, title: str
 ) -> Axes:
-    """A spot: hits (N, 2) in um about the centroid by colour, and the ellipse of one standard
-    deviation of `covariance` (2, 2), um^2. side: of the square shown, um."""
+    """A spot, and the ellipse of one standard deviation.
+
+    hits: (N, 2) about the centroid, by wavelength, um.
+    covariance: (2, 2), um^2.
+    side: side of the square shown, um.
+    """
     for (label, points), colour in zip(hits.items(), _COLOURS * len(hits)):
         axes.plot(points[:, 0], points[:, 1], ".", markersize=2, color=colour, label=label)
-    sizes, turned = np.linalg.eigh(covariance)
-    width, height = 2 * np.sqrt(np.maximum(sizes, 0))
-    angle = np.degrees(np.arctan2(turned[1, 0], turned[0, 0]))
+    variances, directions = np.linalg.eigh(covariance)
+    width, height = 2 * np.sqrt(np.maximum(variances, 0))
+    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
     axes.add_patch(Ellipse((0, 0), width, height, angle=angle, fill=False, color="black"))
     axes.set(xlim=(-side / 2, side / 2), ylim=(-side / 2, side / 2), aspect="equal")
     axes.set_title(title, fontsize=9)
@@ -211,8 +212,8 @@ def spots(
 
 
 def merits(axes: Axes, history: np.ndarray) -> Axes:
-    """How the root of the merit (um) fell over the trials, and by how much limits were exceeded;
-    history (T, 3): merit in mm^2, worst limit, Jacobians."""
+    """Root of the merit (um) and violation of the worst limit over the trials. history: (T, 3),
+    merit in mm^2, worst limit, Jacobians."""
     axes.semilogy(1e3 * np.sqrt(history[:, 0]), color="tab:blue")
     axes.set(xlabel="trial", ylabel="root of the merit (um)")
     axes.grid(alpha=0.3)
@@ -223,8 +224,7 @@ def merits(axes: Axes, history: np.ndarray) -> Axes:
 
 
 def searching(axes: Axes, best: np.ndarray) -> Axes:
-    """How the root of the best merit (um) of many starts fell; best (T,): in mm^2, after each tile
-    of searches."""
+    """Root of the best merit of many starts, um. best: (T,), after each tile of searches, mm^2."""
     axes.semilogy(np.arange(1, len(best) + 1), 1e3 * np.sqrt(best), color="tab:blue")
     axes.set(xlabel="tiles of 16 searches, by stages", ylabel="root of the best merit (um)")
     axes.grid(alpha=0.3, which="both")
@@ -232,7 +232,7 @@ def searching(axes: Axes, best: np.ndarray) -> Axes:
 
 
 def ranks(axes: Axes, sizes: Sequence[float], found: Sequence[int]) -> Axes:
-    """The distinct minima: the root of the merit (um) of each, and how often it was found."""
+    """The distinct minima. sizes: roots of their merits, um. found: how often each was found."""
     axes.bar(range(1, len(sizes) + 1), sizes, color="tab:blue")
     for k, (size, often) in enumerate(zip(sizes, found), 1):
         axes.text(k, size, str(often), ha="center", va="bottom", fontsize=7)
@@ -244,8 +244,7 @@ def ranks(axes: Axes, sizes: Sequence[float], found: Sequence[int]) -> Axes:
 def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]) -> Axes:
     """Groups of horizontal bars, the first on top.
 
-    names: of the groups, N. series: lengths (N,) by label; the first filled, the others as outlines
-    of it.
+    series: lengths (N,) by label; the first filled, the others as outlines.
     """
     places = np.arange(len(names))
     for k, (label, values) in enumerate(series.items()):
@@ -260,17 +259,16 @@ def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]
     return axes
 
 
-# Lines that may lie on each other, below one broad line of what is true.
+# Lines that may coincide, above a broad one for the truth.
 _TRUE: dict[str, Any] = {"color": "black", "alpha": 0.35, "linewidth": 4}
 _STYLES = ("-", "--", ":")
-_DOTS = {"color": "black", "linewidth": 2.2, "zorder": 4}  # on top of what they agree with
+_DOTS = {"color": "black", "linewidth": 2.2, "zorder": 4}  # on top of lines that they agree with
 
 
 def yields(
     axes: Axes, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, ylabel: str
 ) -> Axes:
-    """Shares of lenses, in per cent, over what they reach: the first curve broad, those that are
-    to be compared with it thin.
+    """Shares of lenses over the limit that they meet; the first curve broad, the others thin.
 
     curves: (x (N,), shares (N,) in per cent) by label.
     """
@@ -291,10 +289,11 @@ def histogram(
     marks: Mapping[str, float],
     xlabel: str,
 ) -> Axes:
-    """Shares of samples between edges, in per cent.
+    """Shares of samples between edges.
 
-    edges: (N + 1,). shares: (N,) by label; the first filled, the others as lines. marks: places of
-    vertical lines, by label.
+    edges: (N + 1,).
+    shares: (N,) by label, per cent; the first filled, the others as lines.
+    marks: positions of vertical lines, by label.
     """
     for k, (label, values) in enumerate(shares.items()):
         line: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}

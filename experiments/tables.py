@@ -1,7 +1,7 @@
-"""Write the tables of README.md and docs/ from the results in results/.
+"""Write the tables of README.md and docs/ from results/: `python -m experiments.tables`.
 
-A block between `<!-- table: NAME -->` and `<!-- end -->` is replaced by the table of that name, as
-the experiments print it: `python -m experiments.tables`.
+The table NAME of an experiment replaces the block between `<!-- table: NAME -->` and
+`<!-- end -->`.
 """
 
 import pathlib
@@ -19,7 +19,7 @@ def pages() -> list[pathlib.Path]:
 
 
 def all_tables() -> dict[str, str]:
-    """The tables of all experiments by name, from their committed results."""
+    """Tables of all experiments by name, from the committed results."""
     found = {}
     for path in sorted((_common.ROOT / "results").rglob("results.json")):
         experiment = _common.experiment(path.parent.name, path.parents[1].name)
@@ -28,7 +28,7 @@ def all_tables() -> dict[str, str]:
 
 
 def filled(text: str, tables: dict[str, str]) -> str:
-    """A page with its blocks replaced. ConfigError for a table that there is not."""
+    """A page with its blocks replaced. ConfigError for an unknown table."""
     for _, name, _ in _BLOCK.findall(text):
         _common.require_known("tables", (name,), tables)
     return _BLOCK.sub(lambda m: f"{m[1]}{tables[m[2]]}\n{m[3]}", text)

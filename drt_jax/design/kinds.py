@@ -40,8 +40,8 @@ class Kind(NamedTuple):
 def whole_numbers(what: str, given: Any) -> tuple[int, ...]:
     """Numbers of surfaces and the like as a tuple. ValueError, which begins with `what`, unless
     `given` is an iterable of whole numbers."""
-    wanted = given if isinstance(given, Iterable) and not isinstance(given, str) else [None]
-    found = tuple(wanted)
+    numbers = given if isinstance(given, Iterable) and not isinstance(given, str) else [None]
+    found = tuple(numbers)
     if all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in found):
         return tuple(map(int, found))
     raise ValueError(f"{what}: expected whole numbers from 0, such as (0, 2), got {shown(given)}")
@@ -115,8 +115,8 @@ def _write_sensor(lens: Lens, array: Array) -> Lens:
 
 def _write_thickness(lens: Lens, array: Array) -> Lens:
     """Writes thicknesses; the sensor keeps its distance from the last vertex."""
-    moved = dataclasses.replace(lens, thickness=array[:, 0])
-    return _write_sensor(moved, back_distance(lens)[None, None])
+    changed = dataclasses.replace(lens, thickness=array[:, 0])
+    return _write_sensor(changed, back_distance(lens)[None, None])
 
 
 def _glass(column: int) -> tuple[Callable, Callable]:

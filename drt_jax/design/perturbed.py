@@ -115,10 +115,10 @@ class PerturbedLens:
         assert elements is not None
         rows = np.array(self.groups)[at]
         if kind == "shift":
-            moved = replace(elements, shift=elements.shift.at[rows, axis].add(by))
+            elements = replace(elements, shift=elements.shift.at[rows, axis].add(by))
         else:
-            moved = replace(elements, tilt=elements.tilt.at[rows, axis].add(by * _MINUTE))
-        return replace(lens, elements=moved)
+            elements = replace(elements, tilt=elements.tilt.at[rows, axis].add(by * _MINUTE))
+        return replace(lens, elements=elements)
 
 
 def _with_elements(
@@ -155,8 +155,8 @@ def _with_cylinders(lens: Lens) -> Lens:
     round_ = np.array([form == "asphere" for form in lens.forms])
     own = jnp.stack([lens.curvature, lens.conic], axis=1)
     wide = jnp.concatenate([own, lens.coefficients], axis=1)
-    kept = jnp.concatenate([lens.coefficients, jnp.zeros_like(own)], axis=1)
-    wide = jnp.where(round_[:, None], wide, kept)
+    narrow = jnp.concatenate([lens.coefficients, jnp.zeros_like(own)], axis=1)
+    wide = jnp.where(round_[:, None], wide, narrow)
     forms = tuple("biconic" if r else form for r, form in zip(round_, lens.forms))
     return dataclasses.replace(lens, coefficients=wide, forms=forms)
 
@@ -167,8 +167,8 @@ def _bent(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
     coefficients = lens.coefficients
     if own.any():
         coefficients = coefficients.at[at[own], 0].add(across[own])
-    bent = lens.curvature.at[at].add(by)
-    return dataclasses.replace(lens, curvature=bent, coefficients=coefficients)
+    curvature = lens.curvature.at[at].add(by)
+    return dataclasses.replace(lens, curvature=curvature, coefficients=coefficients)
 
 
 def _rise(lens: Lens, at: np.ndarray, beam_radius: Array) -> Array:
@@ -178,8 +178,8 @@ def _rise(lens: Lens, at: np.ndarray, beam_radius: Array) -> Array:
     forms, zero = tuple(lens.forms[i] for i in at), jnp.zeros(len(at), lens.curvature.dtype)
 
     def height(y: Array, bend: Array) -> Array:
-        bent = shape._replace(curvature=shape.curvature + bend)
-        return by_form(surface_sag, (jnp.zeros_like(y), y), bent, forms)
+        changed = shape._replace(curvature=shape.curvature + bend)
+        return by_form(surface_sag, (jnp.zeros_like(y), y), changed, forms)
 
     rim = beam_radius[at], zero
     _, slope = jax.jvp(height, rim, (zero + 1, zero))

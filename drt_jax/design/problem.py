@@ -68,8 +68,8 @@ def _check_operands(
 def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
     """Weights (count,) with the mean 1. ValueError for a wrong shape or value."""
     found = np.asarray(given, float)
-    good = found.shape == (count,) and np.all(np.isfinite(found) & (found >= 0))
-    if not good or not np.any(found):
+    valid = found.shape == (count,) and np.all(np.isfinite(found) & (found >= 0))
+    if not valid or not np.any(found):
         raise ValueError(f"{what}: expected {count} numbers of 0 or above, not all 0")
     return found / found.mean()
 

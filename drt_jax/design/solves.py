@@ -144,11 +144,11 @@ class Solve:
             if now == 0 or not math.isfinite(now):
                 raise ValueError(f"solves: {self.kind}: the lens has none to keep; give its value")
             solve = dataclasses.replace(self, value=now)
-        wanted = condition.value(float(solve.value))
-        missed = float(_measure(solve.apply(lens), solve)) / wanted
+        target = condition.value(float(solve.value))
+        ratio = float(_measure(solve.apply(lens), solve)) / target
         change = float(solve.rate(lens, solve)) * step_of(lens, kind, row, term)
-        weak = not abs(change) > _TOLERANCE * abs(wanted)
-        if weak or not abs(missed - 1) < _TOLERANCE:
+        weak = not abs(change) > _TOLERANCE * abs(target)
+        if weak or not abs(ratio - 1) < _TOLERANCE:
             raise ValueError(
                 f"solves: {self.kind}: no {kind} of surface {row} gives {solve.value:g}; "
                 "is the beam in focus there? give another surface"

@@ -43,8 +43,8 @@ def sobol_starts(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
     ValueError, which names it, for a variable without bounds.
     """
     low, high = np.asarray(variables.low), np.asarray(variables.high)
-    for name, ends in zip(variables.names, zip(low, high)):
-        if not np.all(np.isfinite(ends)):
+    for name, bounds in zip(variables.names, zip(low, high)):
+        if not np.all(np.isfinite(bounds)):
             raise ValueError(f"variables: {name}: starts within bounds need low and high")
     power = int(np.ceil(np.log2(max(count, 2))))
     points = qmc.Sobol(len(low), seed=seed).random_base2(power)[:count]

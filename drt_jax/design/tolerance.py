@@ -57,8 +57,8 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
     each, times the root of the light; and centroids (2, V), mm."""
     waves = rays.wavelength_weights[None, :, None]
     light = (rays.weights * waves)[..., EXTRAS:]
-    good = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
-    light = jnp.where(good, light, 0)
+    passes = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
+    light = jnp.where(passes, light, 0)
     arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
     hits = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
     slopes = [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
@@ -66,7 +66,7 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
     root = safe_sqrt(weight)
 
     def scaled(values: list[Array]) -> tuple[Array, tuple[Array, ...]]:
-        known = tuple(jnp.where(good, value, 0) for value in values)
+        known = tuple(jnp.where(passes, value, 0) for value in values)
         parts, means = deviations(known, weight, rays.symmetry, (-2, -1))
         return jnp.stack([root * part for part in parts]).reshape(len(hits), len(light), -1), means
 
@@ -94,8 +94,8 @@ def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tupl
         offsets = offsets + growth * (moves @ levers)[None, :, None]
     light = rays.weights[..., EXTRAS:] > 0
     failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
-    good = ~failed & jnp.all(rays.throughput > 0, axis=1)
-    squares = jnp.where(good, jnp.sum(offsets**2, axis=(0, 2)), jnp.inf)
+    valid = ~failed & jnp.all(rays.throughput > 0, axis=1)
+    squares = jnp.where(valid, jnp.sum(offsets**2, axis=(0, 2)), jnp.inf)
     return AsBuilt(squares, moves), offsets
 
 
@@ -201,9 +201,9 @@ def _predict_all(problem: Problem, perturbed: PerturbedLens, compensator: Compen
         )
 
     (offsets, moves), push, squares = jax.linearize(rays, zero, has_aux=True)
-    moved, slopes = jax.lax.map(push, units)
+    derivatives, slopes = jax.lax.map(push, units)
     hessian = jax.lax.map(lambda unit: jax.jvp(jax.grad(measure), (zero,), (unit,))[1], units)
-    gradient, gauss = 2 * moved @ offsets, 2 * moved @ moved.T
+    gradient, gauss = 2 * derivatives @ offsets, 2 * derivatives @ derivatives.T
     return Predicted(jnp.mean(squares), gradient, gauss, hessian, moves, slopes)
 
 

@@ -250,8 +250,8 @@ class Variables:
         named twice, or is both a variable and solved; and as in `Lens.check`.
         """
         lens.check()
-        wanted = [Vary(v) if isinstance(v, str) else v for v in vary]
-        found = [(place, v) for v in wanted for place in v.places(lens)]
+        varied = [Vary(v) if isinstance(v, str) else v for v in vary]
+        found = [(place, v) for v in varied for place in v.places(lens)]
         following = [(p, f, t.line) for t in ties for p, f in t.pairs(lens)]
         solved = [Place(*solve.place(lens)) for solve in solves]
         taken = {*(f for _, f, _ in following), *solved}
@@ -283,15 +283,16 @@ class Variables:
         fixed = [(f, a * _number(lens, p) + b) for p, f, (a, b) in following if p not in index]
         lens = _with_numbers(_with_arrays(lens, {place.kind for place, _ in found}), fixed)
         dtype = lens.curvature.dtype
-        ends, scale = np.split(np.array([v.bounds(lens, place) for place, v in found]), [2], axis=1)
-        low, high = jnp.asarray(ends / scale, dtype).T
+        rows = np.array([v.bounds(lens, place) for place, v in found])
+        bounds, scale = np.split(rows, [2], axis=1)
+        low, high = jnp.asarray(bounds / scale, dtype).T
         tied = [(index[p], f, line) for p, f, line in following if p in index]
         lines = jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2)
         places, ties_ = tuple(place for place, _ in found), tuple(tie[:2] for tie in tied)
         scales = jnp.asarray(scale[:, 0], dtype)
         variables = cls(lens, low, high, scales, (), lines, places, ties_)
-        kept, start = fix_solves(variables.lens_of(variables.start), solves)
-        return dataclasses.replace(variables, lens=start, solves=kept)
+        fixed_solves, start = fix_solves(variables.lens_of(variables.start), solves)
+        return dataclasses.replace(variables, lens=start, solves=fixed_solves)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
-"""Moments to a tolerance: the rule of the pupil that a scene needs, found by trying it.
+"""Moments to a tolerance: the pupil rule that a scene needs, found by trials.
 
-What must know numbers is here. Inside `jax.jit` and `jax.vmap` the number of rays cannot follow
-from values: `psf_moments` and `focus_moments` then take the rule, made outside.
+A trace cannot choose a number of rays from values: inside `jax.jit` and `jax.vmap`, `psf_moments`
+and `focus_moments` take a rule that was made outside.
 """
 
 import itertools
@@ -31,16 +31,16 @@ from .spot import Moments
 from .tiles import trace_rule
 
 _MAX_ORDER = 40
-# A spot below 1 nm is a point: relative to it, rounding would never converge.
+# Smallest spot, mm: below 1 nm rounding would never converge.
 _SMALLEST = 1e-6
-# Where a pupil is clipped, the first order tried, and the step to the next.
+# First order for a clipped pupil, and the step to the next.
 _CLIPPED = 4, 2
-# The last digit of float64 is below this, that of float32 above.
+# The precision of float64 is below this, that of float32 above.
 _DOUBLE = 1e-12
-# The order of the rule that tells where light ends.
+# Order of the rule that finds where light ends.
 _DIAGNOSIS = 8
 
-# Relative error of the RMS spot size where none is asked for.
+# Default relative error of the RMS spot size.
 _TOLERANCE = 1e-6
 
 
@@ -52,21 +52,20 @@ def psf_moments(
     tolerance: float | None = None,
     rule: PupilRule | None = None,
 ) -> Moments:
-    """Centroid, covariance and throughput of the rays on the sensor: a record `Moments`.
+    """Centroid, covariance and throughput of the rays on the sensor. Paper section 4.3.
 
-    field: angle along y, or (x, y), in radians.
-    distance: mm from the object plane to the first vertex, inf allowed.
-    wavelengths: (W,) in um.
-    tolerance: relative error of the RMS spot size, 1e-6 by default; the rule follows from it. In
-        float32 spots of cameras are right to about 1e-3 of 4 um or of themselves: warns if that is
-        more.
-    rule: of the pupil, instead of a tolerance (not both); needed inside `jax.jit` and `jax.vmap`,
-        where `converged_rule`, called outside, makes it.
+    field: angle along y, or (x, y), radians.
+    distance: from the object plane to the first vertex, inf allowed, mm.
+    wavelengths: (W,), um.
+    tolerance: relative error of the RMS spot size, 1e-6 by default, which chooses the rule. In
+        float32 the error of a camera's spot is about 1e-3 of its size or of 4 um; warns if that is
+        above the tolerance.
+    rule: pupil rule instead of a tolerance; needed inside `jax.jit` and `jax.vmap`: make it outside
+        with `converged_rule`.
 
-    See `Moments`. Rays fill the stop uniformly. Differentiable in all arguments but the last two,
-    in every mode. ValueError as of `scene_of`, and if no ray of a wavelength arrives, which says
-    where its light ends; inside a trace, where that cannot be known, `throughput` is 0 and the
-    covariance inf then. Paper section 4.3.
+    Rays fill the stop uniformly. Differentiable in every mode, in the lens, field, distance and
+    wavelengths. ValueError as in `scene_of`, and if no ray of a wavelength arrives, with where its
+    light ends; inside a trace its `throughput` is then 0 and its covariance inf.
     """
     found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
     return found.at(lens.sensor)
@@ -80,12 +79,11 @@ def focus_moments(
     tolerance: float | None = None,
     rule: PupilRule | None = None,
 ) -> FocusMoments:
-    """Moments of the rays as functions of the sensor position, about `lens.sensor`; see
-    `FocusMoments`. The sensor is flat.
+    """Moments of the rays as functions of the sensor position; the sensor is flat.
 
-    Arguments as of `psf_moments`; the tolerance holds at any sensor position, and a rule for it
-    comes from `converged_focus_rule`. ValueError for an element that turns surfaces about the
-    sensor.
+    Arguments as in `psf_moments`, but the tolerance holds at every sensor position, and
+    `converged_focus_rule` makes the rule. ValueError also for an element that rotates surfaces
+    about the sensor.
     """
     check_sensor(lens)
     return _moments(lens, field, distance, wavelengths, tolerance, rule, best_focus)
@@ -98,17 +96,17 @@ def converged_rule(
     wavelengths: Numbers,
     tolerance: float = _TOLERANCE,
 ) -> PupilRule:
-    """The rule that keeps the RMS spot size on the sensor within `tolerance` (relative).
+    """The rule that keeps the relative error of the RMS spot size on the sensor within a tolerance,
+    for every field at every distance.
 
-    field: angle along y, or (x, y), in radians, or many pairs (F, 2). distance: mm, one or (Z,).
-    Other arguments as of `psf_moments`; all are known numbers. The one rule serves every field at
-    every distance, with the symmetry of them all.
+    field: angle along y, or (x, y), or many pairs (F, 2), radians.
+    distance: one or (Z,), mm.
+    wavelengths, tolerance: as in `psf_moments`.
 
-    A Gauss rule on the stop or, where rays are clipped or fail, one fitted to what is left. Orders
-    are compared on the scenes themselves: the first whose covariance differs from those of the next
-    two by at most `tolerance`, relative to its trace, which is about twice the error in the spot
-    size; two alone may agree by accident. Warns if no order does. ValueError inside a trace, or if
-    no ray arrives.
+    A Gauss rule on the stop; if rays are clipped or fail, a rule fitted to the rest. It is the
+    first order whose covariance, relative to its trace, differs from those of the next two orders
+    by at most the tolerance: two alone may agree by accident. Warns if no order does. ValueError
+    inside a trace, or if no ray arrives.
     """
     return _converge(lens, field, distance, wavelengths, tolerance, at_sensor).rule
 
@@ -120,20 +118,20 @@ def converged_focus_rule(
     wavelengths: Numbers,
     tolerance: float = _TOLERANCE,
 ) -> PupilRule:
-    """`converged_rule` for any sensor position: where the spot is smallest, it may be far smaller
-    than on the sensor, and the tolerance is relative to it. ValueError as of `focus_moments`."""
+    """`converged_rule` for every sensor position: the tolerance also holds where the spot is
+    smallest. ValueError as in `focus_moments`."""
     check_sensor(lens)
     return _converge(lens, field, distance, wavelengths, tolerance, best_focus).rule
 
 
 def at_sensor(spread: np.ndarray) -> list[np.ndarray]:
-    """Where the spot must be right: at the sensor, 0 mm from the reference."""
+    """Where the tolerance must hold: at the sensor, (W,) 0 mm from the reference."""
     return [np.zeros(spread.shape[1])]
 
 
 def best_focus(spread: np.ndarray) -> list[np.ndarray]:
-    """Where the spot must be right: at the sensor, and where that of each wavelength is smallest,
-    (W,) mm behind the reference."""
+    """Where the tolerance must hold: at the sensor, and where the spot of each wavelength is
+    smallest, (W,) mm behind the reference."""
     _, linear, square = np.sum(spread[..., :2], axis=-1)
     return [*at_sensor(spread), -linear / np.where(square > 0, 2 * square, 1)]
 
@@ -155,7 +153,7 @@ def _moments(
         trial = _converge(lens, field, distance, wavelengths, tolerance, places)
         if concrete((lens, scene)):
             return trial.moments[0]
-        # The rays are known; what is left is to weigh and to differentiate them.
+        # The rays are known: only weigh and differentiate them.
         return _weigh_known(lens, scene, trial.used, trial.found[0])
     found = _weigh(lens, scene, rule)
     throughput = known_values(found.throughput)
@@ -166,14 +164,14 @@ def _moments(
 
 @partial(jit, wanted=LARGE)
 def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> FocusMoments:
-    """The moments of a rule."""
+    """Moments of a rule."""
     points, weights = rule.points(lens, scene)
     return weigh(lens, rule, weights, trace_bundle(lens, scene, points))
 
 
 @jax.jit
 def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> FocusMoments:
-    """The moments of rays that are known, with their derivatives: nothing is searched for."""
+    """Moments of known rays with derivatives, without a search."""
     points, weights = rule.points(lens, scene)
     system, target = aims(lens, scene, points)
     bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
@@ -181,8 +179,13 @@ def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> Foc
 
 
 class _Trial(NamedTuple):
-    """rule: that meets the tolerance. used: the same as it was evaluated. moments, found: its
-    moments and its rays, of each scene."""
+    """A rule tried on scenes.
+
+    rule: the rule.
+    used: the rule with padding, as it was evaluated.
+    moments: its moments of each scene.
+    found: its rays of each scene.
+    """
 
     rule: Gauss | Clipped
     used: PupilRule
@@ -198,7 +201,7 @@ def _converge(
     tolerance: float,
     places: Callable,
 ) -> _Trial:
-    """The rule that meets the tolerance, and what it found."""
+    """The rule that meets the tolerance, as tried."""
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
     known = known_values((lens, field, distance, wavelengths))
@@ -208,7 +211,7 @@ def _converge(
             "the rule outside and pass it on, rule=drt_jax.converged_rule(lens, field, distance, "
             "wavelengths, tolerance)"
         )
-    # Outside of any trace, also where this is called inside one: what follows is all known.
+    # Outside of any trace, even if this is called inside one: all that follows is known.
     with jax.core.eval_context():
         lens, field, distance, wavelengths = known
         lens.check()
@@ -221,16 +224,16 @@ def _converge(
 
 
 def _each(values: Array, rank: int) -> list[Array]:
-    """The rows of an array of a rank; one row for any other."""
+    """Rows of an array of a rank; for another rank the array itself."""
     return [*values] if values.ndim == rank and values.size else [values]
 
 
 def _try_orders(
     lens: Lens, scenes: Sequence[Scene], symmetry: Symmetry, tolerance: float, places: Callable
 ) -> _Trial:
-    """The first of three orders that agree: of Gauss rules or, once a ray ends before the sensor,
-    of rules fitted to the light that is left."""
-    # A rule on the whole stop may step over an obscuration.
+    """The first of three orders that agree: of Gauss rules or, if a ray fails or is clipped, of
+    rules fitted to the rest of the light."""
+    # A rule on the whole stop may miss an obscuration.
     blocked = lens.apertures is not None and any(lens.apertures.blocks)
     solver: Solver = solve_aimed
     for clipped in (False, True)[blocked:]:
@@ -253,7 +256,7 @@ def _try_orders(
             rough = max(_rounding(lens, found) for found in trial.moments)
             if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
                 _warn_of_rounding(lens, rough, tolerance)
-                # Where rounding hides how far they are apart, the last is right to it.
+                # If rounding hides their difference, take the last.
                 return trials[-1 if 2 * rough > tolerance else 0]
         else:
             break
@@ -268,7 +271,7 @@ def _try_orders(
 def _rules(
     lens: Lens, symmetry: Symmetry, clipped: bool
 ) -> Iterator[tuple[Gauss | Clipped, PupilRule]]:
-    """Rules by rising order, each also filled up, so that orders share a few compiled programs."""
+    """Rules by rising order, each with a padded one, so that orders share compiled programs."""
     if not clipped:
         orders = range(2, _MAX_ORDER + 2)
         yield from ((Gauss(order, symmetry), _padded(order, symmetry)) for order in orders)
@@ -284,7 +287,7 @@ def _rules(
 def _try(
     lens: Lens, scenes: Sequence[Scene], rule: Gauss | Clipped, used: PupilRule, solver: Solver
 ) -> tuple[_Trial, bool, bool]:
-    """A rule on all scenes; whether any ray fails, and whether any is clipped."""
+    """Tries a rule on all scenes; also returns whether a ray fails and whether one is clipped."""
     parts = (trace_rule(lens, scene, used, solver) for scene in scenes)
     moments, found, failing, cut = zip(*parts, strict=True)
     return _Trial(rule, used, moments, found), any(failing), any(cut)
@@ -295,9 +298,9 @@ def _eps(lens: Lens) -> float:
 
 
 def _rounding(lens: Lens, found: FocusMoments) -> float:
-    """By what part of it the smallest spot may be wrong, as hits and lens are rounded to some last
-    digits of its length. Measured in float32 over 54 scenes of bundled lenses: an eighth of this
-    in the median, 0.93 of it at most; Hubble, 6 m long with a spot of 10 nm, is beyond it."""
+    """Relative rounding error of the smallest spot: hits are rounded relative to the length of the
+    lens. Measured in float32 over 54 scenes of bundled lenses: an eighth of this in the median, at
+    most 0.93 of it; more for Hubble, 6 m long with a spot of 10 nm."""
     size = np.sqrt(np.min(np.sum(np.asarray(found.spread)[0, :, :2], axis=-1)))
     return 2 * _eps(lens) * abs(float(lens.sensor)) / max(size, _SMALLEST)
 
@@ -313,10 +316,8 @@ def _warn_of_rounding(lens: Lens, rough: float, tolerance: float) -> None:
 
 @cache
 def _padded(order: int, symmetry: Symmetry) -> Pattern:
-    """A Gauss rule filled up with weightless rays, so that orders share a few compiled programs.
-
-    They run along the rim of the stop, where clear apertures clip first.
-    """
+    """A Gauss rule padded with weightless rays along the rim of the stop, where clear apertures
+    clip first, so that orders share a few compiled programs."""
     points, weights = gauss_points(order, symmetry)
     sizes = (_MAX_ORDER + 2,) if symmetry == "rotational" else (208, 416, 1768, 3696)
     missing = next(size for size in sizes if size >= weights.size + points.shape[1]) - weights.size
@@ -328,7 +329,7 @@ def _padded(order: int, symmetry: Symmetry) -> Pattern:
 
 
 def _change(before: _Trial, now: _Trial, places: Callable) -> float:
-    """Largest change of a covariance relative to its trace, at the `places` of the sensor."""
+    """Largest change of a covariance relative to its trace, at `places`, see `at_sensor`."""
     worst = 0.0
     for pair in zip(now.moments, before.moments, strict=True):
         spreads = [np.asarray(found.spread, float) for found in pair]
@@ -341,11 +342,12 @@ def _change(before: _Trial, now: _Trial, places: Callable) -> float:
 
 
 def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) -> None:
-    """ValueError for a wavelength of which nothing passed, (W,): where its light ends."""
+    """Raises ValueError that says where the light of a wavelength without throughput ends.
+    throughput: (W,)."""
     wavelength = int(np.argmin(np.asarray(throughput) > 0))
     lens, scene = known_values((lens, scene))
     with jax.core.eval_context():
-        # Of an eager gradient, whose values were not seen before.
+        # Checks the values of an eager gradient, which were not known before.
         scene_of(lens, scene.field, scene.distance, scene.wavelengths)
         rule = _padded(_DIAGNOSIS, symmetry)
         found = trace_rule(lens, scene, rule, solve).found

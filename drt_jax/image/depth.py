@@ -1,7 +1,6 @@
-"""Moments over a range of object distances, and the cheapest model for what is trained.
+"""Moments over a range of object distances, and the cheapest model for trained parameters.
 
-Where the object distance varies, the polynomials of `moments` are interpolated in 1/distance,
-in which they are smooth to infinity.
+`FocusMoments` are interpolated in 1/distance, in which they are smooth to infinity.
 """
 
 import dataclasses
@@ -22,17 +21,17 @@ from .moments import FocusMoments, moments
 from .spot import Moments
 
 _MAX_NODES = 64
-# By this part a distance may lie outside of its range: 1 / (1 / far) is not always far.
+# Relative amount by which a distance may exceed its range: 1 / (1 / far) is not always far.
 _ROUNDED = 1e-5
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class DepthMoments:
-    """`FocusMoments` as polynomials in 1/distance: no ray is traced for a new depth either.
+    """`FocusMoments` as polynomials in 1/distance.
 
-    near, far: the range in mm. series: a `FocusMoments` whose leaves carry a first axis of
-    Chebyshev coefficients in 1/distance.
+    near, far: (), range of the distance, mm.
+    series: `FocusMoments` whose leaves have a first axis of Chebyshev coefficients in 1/distance.
     """
 
     near: Array
@@ -40,8 +39,8 @@ class DepthMoments:
     series: FocusMoments
 
     def at(self, distance: Numbers) -> FocusMoments:
-        """The moments of an object at `distance` mm, within near and far. ValueError for a known
-        one that is not."""
+        """Moments of an object at a distance between near and far, (), mm. ValueError for a known
+        distance outside."""
         far = distance_array(distance, self.far.dtype)
         if concrete((distance, self.near, self.far)):
             place, near, end = np.array([distance, self.near, self.far], float).tolist()
@@ -65,10 +64,11 @@ def depth_moments(
     wavelengths: Numbers,
     tolerance: float = 1e-9,
 ) -> DepthMoments:
-    """Moments for any sensor position and any distance between `near` and `far`, in mm.
+    """Moments for every sensor position and every distance between `near` and `far`, mm.
 
-    As many Chebyshev nodes in 1/distance as bring the last coefficients of the moments below
-    `tolerance` relative to the first; each node is traced with as many rays as it needs.
+    The number of Chebyshev nodes in 1/distance doubles until the last coefficients of the moments
+    are below `tolerance` relative to the largest; each node has its own converged rule. Other
+    arguments as in `focus_moments`. ValueError inside a trace.
     """
     if not concrete((near, far)):
         raise ValueError("inside jax.jit or jax.vmap the nodes cannot follow: give near and far")
@@ -114,14 +114,13 @@ def moments_model(
     wavelengths: Numbers,
     tolerance: float = 1e-6,
 ) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], Moments]]:
-    """The cheapest exact model of the moments for what is trained.
+    """The cheapest exact model of the moments for trained parameters: their initial values, and a
+    function (values, distance) -> `Moments`. If only the sensor is trained, the function is a
+    polynomial in the sensor position and 1/distance; otherwise it traces the rays.
 
     trained: names of fields of `Lens`.
-    distances: (near, far) in mm, equal for one depth.
-
-    Returns the initial values of these fields, and a function (values, distance) -> `Moments`. If
-    only the sensor is trained, this function traces nothing: it is a polynomial in the sensor
-    position, and in 1/distance if the depth varies. Otherwise it traces the rays anew.
+    distances: nearest and farthest, mm; equal for one distance.
+    field, wavelengths, tolerance: as in `focus_moments`.
     """
     near, far = distances
     for distance in distances:
@@ -138,12 +137,11 @@ def moments_model(
             return at(distance).at(values.get("sensor", lens.sensor))
 
         return values, from_plane
-    ends = np.unique([near, far])
-    rule = converged_focus_rule(lens, field, ends, wavelengths, tolerance)
+    rule = converged_focus_rule(lens, field, np.unique([near, far]), wavelengths, tolerance)
 
     def retrace(values, distance):
-        moved = dataclasses.replace(lens, **values)
-        scene = scene_of(moved, field, distance, wavelengths)
-        return moments(moved, scene, rule, solve_reverse).at(moved.sensor)
+        changed = dataclasses.replace(lens, **values)
+        scene = scene_of(changed, field, distance, wavelengths)
+        return moments(changed, scene, rule, solve_reverse).at(changed.sensor)
 
     return values, retrace

@@ -1,4 +1,4 @@
-"""Why no light arrives: which surface stops it, and which surfaces cross."""
+"""Why no light arrives: the surface that stops it, and surfaces that cross."""
 
 import functools
 
@@ -26,17 +26,20 @@ _HOW = {
     Status.UNCONVERGED: "finds no way through the stop",
     Status.NO_INDEX: "has no index",
 }
-# What is said at most.
+# Most reasons in a message.
 _PARTS = 3
 
 
 def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, wavelength: int) -> str:
-    """What stops the light of a wavelength, in words: "87 % misses surface 3, ...".
+    """What stops the light of a wavelength, as text: "87% misses surface 3, ...". Outside of
+    traces.
 
-    rule: whose weights tell how much light a ray stands for. found: its rays. All is known.
+    rule: pupil rule.
+    found: rays of the rule.
+    wavelength: index of the wavelength.
     """
     _, weights = rule.points(lens, scene)
-    status, surface = (np.asarray(a) for a in _ends(lens, scene, rule, found))
+    status, surface = (np.asarray(a) for a in _last_surface(lens, scene, rule, found))
     weight = np.broadcast_to(np.asarray(weights, float), status.shape)[wavelength]
     names = {-1: "a surface", lens.count: "the sensor"}
     parts: dict[str, float] = {}
@@ -50,24 +53,24 @@ def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, wavelength:
 
 
 def crossed(lens: Lens) -> str:
-    """Which surfaces of a known lens cross, in words after a semicolon; nothing if none does."""
+    """The surfaces of a known lens that cross, as text after a semicolon; "" if none do."""
     pairs = [(pair, crossing(lens, pair)) for pair in neighbours_now(lens)]
     parts = [describe_crossing(lens, pair, place) for pair, place in pairs if place is not None]
     return "".join(f"; {part}" for part in parts[:_PARTS])
 
 
 def check_order(lens: Lens) -> None:
-    """ValueError for a known lens with the vertices of two neighbours in the wrong order."""
+    """ValueError if the vertices of two neighbours of a known lens are in the wrong order."""
     for pair in neighbours_now(lens):
         if pair.gap <= 0:
             raise ValueError(f"{describe_crossing(lens, pair, 0.0)}; light cannot go backwards")
 
 
 @functools.partial(jit, wanted=ONCE)
-def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Array, Array]:
-    """The status of known rays, and the surface (W, Q) where each ends, S for the sensor, -1 for
-    none: the first that clips it, or where the one does that paraxial optics launches towards its
-    point of the stop."""
+def _last_surface(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Array, Array]:
+    """Status (W, Q) of rays and the surface where each ends, (W, Q), int32; S for the sensor, -1
+    for none. It is the first surface that clips the ray; for other rays, where the paraxial launch
+    towards the stop point fails."""
     points, _ = rule.points(lens, scene)
     system, target = aims(lens, scene, points)
     bundle = bundle_of(lens, scene, system, target, found)
@@ -76,7 +79,7 @@ def _ends(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Arra
     if system.stop is not None:
         places.insert(system.before, lens.stop)
     failed = meetings(system, launch).status != Status.OK
-    ends = jnp.array(places, jnp.int32)[jnp.argmax(failed, axis=0)]
-    ends = jnp.where(jnp.any(failed, axis=0), ends, -1)
+    last = jnp.array(places, jnp.int32)[jnp.argmax(failed, axis=0)]
+    last = jnp.where(jnp.any(failed, axis=0), last, -1)
     clips = clipping_surface(lens, bundle.hits)
-    return bundle.status, jnp.where(bundle.status == Status.CLIPPED, clips, ends)
+    return bundle.status, jnp.where(bundle.status == Status.CLIPPED, clips, last)

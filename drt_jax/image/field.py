@@ -13,17 +13,15 @@ from ..numerics import Numbers, real_array, safe_divide
 from ..rays.trace import trace_bundle
 
 _STEPS = 20
-# Points of the stop: the chief ray's, and one beside it, as the search takes its steps from how
-# wide a beam is; without, a chief ray in a stop at the first vertex is not found.
+# Stop points: that of the chief ray, and one beside it, because the steps of the search follow from
+# the width of the beam. Without it the chief ray is not found if the stop is at the first vertex.
 CHIEF = np.array([[0.0, 0.0], [0.0, 0.1]])
 
 
 def image_point(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Where the chief rays, through the centre of the stop, meet the sensor: (W, 2) in mm, x and y
-    along its axes; 0 where they fail. Arguments as in `trace_rays`. Differentiable in every mode.
-
-    The centroid of a spot is another point: see `psf_moments`.
-    """
+    """Points of the chief rays on the sensor, (W, 2), x and y along its axes, mm; 0 where the ray
+    fails. The chief ray passes the centre of the stop. Arguments as in `trace_rays`. Differentiable
+    in every mode. The centroid of a spot is another point, see `psf_moments`."""
     return _image_point(lens, scene_of(lens, field, distance, wavelengths))
 
 
@@ -35,37 +33,39 @@ def _image_point(lens: Lens, scene: Scene) -> Array:
 
 
 def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Numbers) -> Array:
-    """The field (2,), radians along x and y, whose chief ray meets the sensor at `point`.
+    """The field (2,), along x and y, whose chief ray meets the sensor at a point, radians; inf if
+    none was found. Newton's method from the paraxial field; derivatives by the implicit function
+    theorem.
 
-    point: (2,) in mm along the axes of the sensor. distance: as in `trace_rays`. wavelength: one,
-    um. Newton's method from the paraxial field; derivatives by the implicit function theorem. inf
-    where no field was found.
+    point: (2,), along the axes of the sensor, mm.
+    distance: as in `trace_rays`.
+    wavelength: one, um.
     """
     scene = scene_of(lens, 0.0, distance, wavelength)
-    wanted = real_array("point", point, lens.curvature.dtype)
-    if wanted.shape != (2,):
-        raise ValueError(f"point: expected x and y, got shape {wanted.shape}")
+    target = real_array("point", point, lens.curvature.dtype)
+    if target.shape != (2,):
+        raise ValueError(f"point: expected x and y, got shape {target.shape}")
     if scene.wavelengths.size > 1:
         raise ValueError(f"wavelength: expected one, got {scene.wavelengths.size}")
-    return _field_of_image(lens, scene, wanted)
+    return _field_of_image(lens, scene, target)
 
 
 @jax.jit
-def _field_of_image(lens: Lens, scene: Scene, wanted: Array) -> Array:
-    dtype = wanted.dtype
+def _field_of_image(lens: Lens, scene: Scene, target: Array) -> Array:
+    dtype = target.dtype
     unit = image_height(lens, jnp.asarray(jnp.pi / 4, dtype), scene.distance, scene.wavelengths)[0]
-    start = jnp.arctan(safe_divide(wanted, jnp.broadcast_to(unit, (2,))))
+    start = jnp.arctan(safe_divide(target, jnp.broadcast_to(unit, (2,))))
     eps = float(jnp.finfo(dtype).eps)
 
     def miss(field, args):
-        lens, scene, wanted = args
-        return _image_point(lens, Scene(field, scene.distance, scene.wavelengths))[0] - wanted
+        lens, scene, target = args
+        return _image_point(lens, Scene(field, scene.distance, scene.wavelengths))[0] - target
 
     solution: optx.Solution = optx.root_find(
         miss,
         optx.Newton(rtol=16 * eps, atol=64 * eps),
         start,
-        args=(lens, scene, wanted),
+        args=(lens, scene, target),
         max_steps=_STEPS,
         throw=False,
     )

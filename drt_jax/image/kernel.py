@@ -13,20 +13,20 @@ from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
 
 Form = Literal["integrated", "sampled"]
 
-# A Gaussian narrower than this (in pixels) is a point: nothing on the grid can tell.
+# A Gaussian narrower than this (pixels) counts as a point.
 _POINT = 1e-4
 _ANGLES, _ANGLE_WEIGHTS = np.polynomial.legendre.leggauss(24)
 _MAX_CORRELATION = 1 - 1e-6
 # A pixel larger than this (mm) is more likely given in um.
 _LARGE_PIXEL = 1.0
-# A centroid beyond `_FAR` pixels, a variance beyond `_WIDE` pixels^2, lights no grid or lights it
-# evenly; a Gaussian is dark beyond `_DARK` sigma; a pixel has between 1 / `_FAR` and `_FAR` mm.
-# The squares of all these are numbers, in float32, too.
+# Limits whose squares are finite in float32: of centroids (pixels; of pixels, mm), of variances
+# (pixels^2) and of the distance from the centre of a Gaussian (sigma). Beyond them a kernel is dark
+# or even.
 _FAR, _WIDE, _DARK = 1e9, 1e15, 60.0
 
 
 class SeparableKernel(NamedTuple):
-    """A kernel that is an outer product: kernel[c, y, x] = column[c, y] row[c, x]; (C, K) each."""
+    """A kernel that is an outer product, kernel[c, y, x] = column[c, y] row[c, x]: (C, K) each."""
 
     column: Array
     row: Array
@@ -43,20 +43,20 @@ def gaussian_psf(
     size: int = 21,
     form: Form = "integrated",
 ) -> Array:
-    """Gaussian kernels [channel, y, x] of C channels, (C, size, size) in the dtype of `mean`.
+    """Gaussian kernels [channel, y, x] of C channels, (C, size, size), in the dtype of `mean`.
 
     mean: (C, 2), x and y from the centre of the grid, mm.
     covariance: (C, 2, 2), mm^2.
-    pixel: the side of a pixel, mm; warns of one above 1 mm, which may be meant in um.
+    pixel: (), side of a pixel, mm; warns above 1 mm, which may be meant in um.
     size: pixels along a side of the grid.
-    form: "integrated": each pixel collects what falls on its area, and the kernel is normalised
-        to sum 1. "sampled": Eq. 5 as printed, the density at the pixel centres, not normalised:
-        it sums to less than 1 for a wide blur and to anything for a narrow one.
+    form: "integrated" over the area of each pixel, and normalised to the sum 1; or "sampled" as in
+        Eq. 5, the density at the pixel centres, which is not normalised: the sum is below 1 for a
+        wide blur and may be anything for a narrow one.
 
-    As the blur shrinks to a point, and as it grows beyond the grid, values and derivatives stay
-    finite. ValueError for other shapes, and for known values that are not finite or a pixel that is
-    not above 0. Inside a trace, where values are not known, a channel of infinite covariance (no
-    ray arrived), or of other numbers of that kind, is black, and its derivatives are 0.
+    Values and derivatives stay finite as the blur shrinks to a point or grows beyond the grid.
+    ValueError for other shapes, for known values that are not finite, and for a pixel not above 0.
+    Inside a trace, a channel with such values (an infinite covariance if no ray arrives) is black,
+    with derivatives 0.
     """
     kernel = _gaussian(*_checked(mean, covariance, pixel, size, form), size, form)
     assert not isinstance(kernel, SeparableKernel)
@@ -70,12 +70,8 @@ def separable_psf(
     size: int = 21,
     form: Form = "integrated",
 ) -> SeparableKernel:
-    """`gaussian_psf` of Gaussians whose axes lie along the pixels, as a row and a column for each
-    channel: what a training step convolves with.
-
-    Arguments as there. The covariance is taken as diagonal, see `Moments.separable`. ValueError if
-    its xy elements are known and not 0.
-    """
+    """`gaussian_psf` for diagonal covariances, as a row and a column for each channel, see
+    `Moments.separable`. Arguments as there. ValueError also for a known xy other than 0."""
     centroid, matrix, side = _checked(mean, covariance, pixel, size, form)
     if concrete(covariance) and np.any(np.asarray(matrix)[:, [0, 1], [1, 0]]):
         raise ValueError("covariance: xy must be 0 for a separable kernel; use gaussian_psf")
@@ -85,8 +81,8 @@ def separable_psf(
 
 
 def gaussian_shares(mean: Array, covariance: Array, pixel: Array, size: int) -> Array:
-    """`gaussian_psf` of checked arrays, not normalised: what pixels collect adds to the part of the
-    light that falls on the grid."""
+    """`gaussian_psf` of checked arrays, not normalised: the sum is the fraction of the light that
+    falls on the grid."""
     kernel = _gaussian(mean, covariance, pixel, size, "integrated", whole=False)
     assert not isinstance(kernel, SeparableKernel)
     return kernel
@@ -95,8 +91,11 @@ def gaussian_shares(mean: Array, covariance: Array, pixel: Array, size: int) -> 
 def _gaussian(
     mean: Array, covariance: Array, side: Array, size: int, form: Form, whole: bool = True
 ) -> SeparableKernel | Array:
-    """The kernel; separable if the variances (C, 2) stand for the covariance. whole: whether an
-    integrated one adds to 1 on the grid."""
+    """The kernel.
+
+    covariance: (C, 2, 2); or variances (C, 2) for a separable kernel.
+    whole: True to normalise an integrated kernel to the sum 1.
+    """
     usable = (side > 1 / _FAR) & (side < _FAR)
     side = jnp.where(usable, side, 1)
     known = jnp.isfinite(mean), jnp.isfinite(covariance)
@@ -123,8 +122,8 @@ def _gaussian(
 def _checked(
     mean: Numbers, covariance: Numbers, pixel: Numbers, size: int, form: Form
 ) -> tuple[Array, Array, Array]:
-    """Centroids, covariances and pixel as arrays of one dtype, if the arguments of `gaussian_psf`
-    are what they must be."""
+    """Checks the arguments of `gaussian_psf`, and returns centroids, covariances and pixel as
+    arrays of one dtype."""
     if form not in get_args(Form):
         raise ValueError(f"form: expected 'integrated' or 'sampled', got {form!r}")
     floating = jnp.issubdtype(getattr(mean, "dtype", int), jnp.floating)
@@ -134,8 +133,8 @@ def _checked(
     channels = arrays[0].shape[:1]
     shapes = (*channels, 2), (*channels, 2, 2)
     texts = "(C, 2)", "(C, 2, 2) with the C of mean"
-    for name, array, wanted, text in zip(given, arrays, shapes, texts, strict=True):
-        if array.shape != wanted or array.size == 0:
+    for name, array, shape, text in zip(given, arrays, shapes, texts, strict=True):
+        if array.shape != shape or array.size == 0:
             raise ValueError(f"{name}: expected {text}, got shape {array.shape}")
         if concrete(given[name]) and not np.all(np.isfinite(np.asarray(given[name], float))):
             hint = "; no ray of that wavelength arrives" if name == "covariance" else ""
@@ -144,8 +143,8 @@ def _checked(
 
 
 def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> tuple[Array, int]:
-    """The side of a pixel (), mm, and how many there are along a grid. ValueError for what is none;
-    warns of a large pixel."""
+    """Checks the side of a pixel, (), mm, and the pixels along a side of a grid. Warns of a large
+    pixel."""
     if not isinstance(size, int | np.integer) or size < 1:
         raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
     side = real_array("pixel", pixel, dtype)
@@ -168,14 +167,15 @@ def _normalised(kernel: Array, axes: tuple[int, ...]) -> Array:
 
 
 def _standardise(offset: Array, variance: Array) -> tuple[Array, Array]:
-    """offset / sigma, and whether sigma is wide enough to tell from a point."""
+    """offset / sigma, and True where the Gaussian is wider than a point."""
     sigma = safe_sqrt(variance)[..., None]
     wide = sigma > _POINT
     return offset / jnp.where(wide, sigma, 1), wide
 
 
 def _cumulative(offset: Array, variance: Array) -> Array:
-    """Share of a Gaussian below `offset` (C, N) pixels from its centre; a step for a point."""
+    """Fraction of a Gaussian below an offset from its centre; a step for a point. offset: (C, N),
+    pixels."""
     z, wide = _standardise(offset, variance)
     step = jnp.heaviside(offset, 0.5)
     return jnp.where(wide, (1 + erf(z * 0.5**0.5)) / 2, step)
@@ -187,9 +187,9 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
     row, column = (jnp.diff(part, axis=-1) for part in below)
     if covariance.ndim == 2:
         return SeparableKernel(column, row)
-    # The bivariate normal distribution as the product of its marginals plus an integral over
-    # the correlation (Plackett 1954; Drezner and Wesolowsky 1990), then differences over the
-    # corners of each pixel.
+    # The bivariate normal distribution is the product of its marginals plus an integral over the
+    # correlation (Plackett 1954; Drezner and Wesolowsky 1990); differences over the corners of each
+    # pixel follow.
     (x, wide_x), (y, wide_y) = (_standardise(edges[:, i], diagonal[:, i]) for i in range(2))
     both = (wide_x & wide_y)[:, 0]
     scale = jnp.where(both, diagonal[:, 0] * diagonal[:, 1], 1)
@@ -207,7 +207,7 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
 
 
 def _sampled(offset: Array, covariance: Array) -> SeparableKernel | Array:
-    """Densities at the pixel centres; 0 for a point, which falls between them."""
+    """Densities at the pixel centres; 0 for a point."""
     if covariance.ndim == 2:
         z, wide = _standardise(offset, covariance)
         sigma = jnp.where(wide, safe_sqrt(covariance)[..., None], 1)

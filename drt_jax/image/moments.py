@@ -1,8 +1,7 @@
 """Centroid and covariance of the rays on the sensor, as functions of the sensor position.
 
-The paper computes both from 256 random rays for each sensor position. Here a rule of the pupil
-says which rays stand for all; and the rays behind the lens are traced once for all positions of
-the sensor, because the moments are exact polynomials in it.
+The paper traces 256 random rays for each sensor position. Here the rays of a pupil rule are traced
+once, because the moments are exact polynomials in the sensor position.
 """
 
 import dataclasses
@@ -24,14 +23,15 @@ from .spot import Moments, deviations, mean_products, normalised
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class FocusMoments:
-    """Moments of W wavelengths as polynomials in the sensor position: no ray is traced again.
+    """Moments of W wavelengths as polynomials in the sensor position. With d = sensor - reference:
+    centroid = mean + d slope, covariance = spread[0] + d spread[1] + d^2 spread[2].
 
-    With d = sensor - reference (mm): centroid = mean + d slope, covariance = spread[0] +
-    d spread[1] + d^2 spread[2].
-
-    reference: (), mm. mean, slope: (W, 2). spread: (3, W, C) with C = 2 for the variances (xx, yy)
-    when symmetry makes the axes principal, else C = 3 (xx, yy, xy).
-    throughput: (W,), the share of the light that reaches the sensor.
+    reference: (), mm.
+    mean: (W, 2), mm.
+    slope: (W, 2).
+    spread: (3, W, C) in mm^2, mm and 1, of xx, yy and xy, C = 3; without xy, C = 2, if symmetry
+        makes it 0.
+    throughput: (W,), fraction of the light through the stop that reaches the sensor.
     """
 
     reference: Array
@@ -41,7 +41,7 @@ class FocusMoments:
     throughput: Array
 
     def at(self, sensor: Numbers) -> Moments:
-        """The spot with the sensor at `sensor` mm."""
+        """The spot at a sensor position, (), mm."""
         return _at(self, jnp.asarray(sensor, self.reference.dtype))
 
 
@@ -59,11 +59,10 @@ def _at(moments: FocusMoments, sensor: Array) -> Moments:
 
 
 def moments(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver = solve) -> FocusMoments:
-    """Moments of the rays of a rule as functions of the sensor position, about `lens.sensor`.
+    """Moments of the rays of a rule, with the reference at `lens.sensor`. Paper section 4.3.
 
-    Weights are normalised over the light that arrives. Differentiable in everything but the
-    status of rays, in the modes of the `solver`. Paper section 4.3. ValueError as of
-    `check_sensor`.
+    Weights are normalised over the light that arrives. Differentiable, except in the status of
+    rays, in the modes of the `solver`. ValueError as in `check_sensor`.
     """
     check_sensor(lens)
     points, weights = rule.points(lens, scene)
@@ -71,8 +70,8 @@ def moments(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver = solve) -
 
 
 def check_sensor(lens: Lens) -> None:
-    """ValueError for an element that turns surfaces about the sensor: they move where it moves, and
-    moments are no polynomials in its position."""
+    """ValueError for an element that rotates surfaces about the sensor: it moves with the sensor,
+    so that the moments are not polynomials in its position."""
     if lens.elements is None:
         return
     for g, ((first, _), about) in enumerate(zip(lens.elements.spans, lens.elements.about)):
@@ -84,11 +83,11 @@ def check_sensor(lens: Lens) -> None:
 
 
 def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusMoments:
-    """Moments of traced rays; `weights` (1 or W, Q) are those of the rule."""
+    """Moments of traced rays. weights: (1 or W, Q), of the rule."""
     weight = weights * rule.transmission(lens, bundle)
     throughput = jnp.sum(weight, axis=-1)
     weight = normalised(weight)
-    # How the hits move with the sensor.
+    # Derivatives of the hits by the sensor position.
     slope = tuple(safe_divide(a, bundle.arrival[-1]) for a in bundle.arrival[:-1])
     motion = lens.sensor_motion
     if motion is not None:

@@ -11,12 +11,13 @@ from .kernel import SeparableKernel
 
 Convolve = Callable[[Array, SeparableKernel | Array], Array]
 
-# GPUs would round the factors of a float32 product to 10 bits.
+# Otherwise GPUs round the factors of a float32 product to 10 bits.
 _EXACT = jax.lax.Precision.HIGHEST
 
 
 def _banded(kernel: Array, outputs: int) -> Array:
-    """(C, N, N + K - 1): the matrix whose row i holds the flipped kernel from column i on."""
+    """Matrix (C, N, N + K - 1) with the flipped kernel in row i from column i on. kernel: (C, K).
+    outputs: N."""
     channels, taps = kernel.shape
     width = outputs + taps - 1
     row = jnp.pad(kernel[:, ::-1], ((0, 0), (0, outputs)))  # width + 1: each row shifts by one
@@ -25,7 +26,8 @@ def _banded(kernel: Array, outputs: int) -> Array:
 
 
 def _by_taps(scenes: Array, kernel: SeparableKernel) -> Array:
-    """Image by image, so that the taps run in the cache, and are not run again for what follows."""
+    """Image by image, so that the planes stay in the cache and XLA does not compute the taps
+    again."""
 
     def filtered(taps, planes, axis):
         count = planes.shape[axis] - taps.shape[1] + 1
@@ -39,7 +41,7 @@ def _by_taps(scenes: Array, kernel: SeparableKernel) -> Array:
 
 
 def _by_bands(scenes: Array, kernel: SeparableKernel) -> Array:
-    """Two products with banded matrices: each is one product for all images, forwards and back."""
+    """Two products with banded matrices, each one product for all images, forwards and back."""
     taps = kernel.row.shape[-1]
     down = _banded(kernel.column, scenes.shape[1] - taps + 1)
     across = _banded(kernel.row, scenes.shape[2] - taps + 1)
@@ -48,7 +50,7 @@ def _by_bands(scenes: Array, kernel: SeparableKernel) -> Array:
 
 
 def _check(scenes: Array, kernel: SeparableKernel | Array) -> None:
-    """ValueError unless the kernel fits into the scenes, and these are floating numbers."""
+    """ValueError unless the kernel fits into the scenes and these are floating numbers."""
     shape, dtype = jnp.shape(scenes), jnp.result_type(scenes)
     if not jnp.issubdtype(dtype, jnp.floating):
         remedy = "scenes.astype(jnp.float32) / 255" if dtype == jnp.uint8 else "floating numbers"
@@ -68,14 +70,13 @@ def _check(scenes: Array, kernel: SeparableKernel | Array) -> None:
 
 
 def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
-    """'Valid' convolution of each channel with its own kernel.
+    """'Valid' convolution of each channel with its own kernel, (B, H, W, C).
 
-    scenes: (B, H + K - 1, W + K - 1, C), with true context on all sides, so that the result
-        (B, H, W, C) has no border artefacts.
-    kernel: [channel, y, x]. A separable one is applied as two products with banded matrices,
-        a dense one by 2D convolution.
+    scenes: (B, H + K - 1, W + K - 1, C), with true context on all sides.
+    kernel: (C, K, K) [channel, y, x], or separable, which is applied as two products with banded
+        matrices.
 
-    ValueError for scenes that are no floating numbers, and for shapes that do not fit.
+    ValueError for scenes that are not floating numbers, and for shapes that do not fit.
     """
     _check(scenes, kernel)
     if isinstance(kernel, SeparableKernel):
@@ -92,11 +93,12 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
 
 
 def convolve_each(scenes: Array, kernels: Array) -> Array:
-    """'Valid' convolution of each image, and each of its channels, with a kernel of its own, as
-    `kernels_at` gives them, by Fourier transform: (B, H, W, C).
+    """'Valid' convolution of each channel of each image with its own kernel, by Fourier transform,
+    (B, H, W, C).
 
     scenes: (B, H + K - 1, W + K - 1, C), with true context on all sides.
-    kernels: (B, C, K, K) [image, channel, y, x]; cast to the dtype of the scenes.
+    kernels: (B, C, K, K) [image, channel, y, x], from `kernels_at`; cast to the dtype of the
+        scenes.
 
     ValueError for shapes that do not fit.
     """
@@ -111,8 +113,8 @@ def convolve_each(scenes: Array, kernels: Array) -> Array:
 
 
 def convolve_taps(scenes: Array, kernel: SeparableKernel | Array) -> Array:
-    """`convolve`, on a CPU with a separable kernel tap by tap: the faster form for values and
-    forward mode, ten times slower in reverse. Arguments and result as there."""
+    """`convolve`, tap by tap on a CPU with a separable kernel: faster for values and forward mode,
+    ten times slower in reverse mode. Arguments as there."""
     _check(scenes, kernel)
     if not isinstance(kernel, SeparableKernel):
         return convolve(scenes, kernel)
@@ -128,13 +130,13 @@ def sensor_layer(
 ) -> Array:
     """Sensor images (B, H, W, C): the convolved scenes plus white Gaussian noise.
 
-    scenes: (B, H + K - 1, W + K - 1, C), values 0 to 1.
-    kernel: [channel, y, x]; cast to the dtype of the scenes: here the optics meet the network.
-    noise: standard deviation, ().
+    scenes: (B, H + K - 1, W + K - 1, C), values from 0 to 1.
+    kernel: as in `convolve`; cast to the dtype of the scenes.
+    noise: (), standard deviation.
     key: a PRNG key.
     convolve: `convolve` or `convolve_taps`.
 
-    ValueError as `convolve`.
+    ValueError as in `convolve`.
     """
     _check(scenes, kernel)
     images = convolve(scenes, jax.tree.map(lambda array: array.astype(scenes.dtype), kernel))

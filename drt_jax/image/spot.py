@@ -1,6 +1,6 @@
-"""A spot: where the light of many rays is, and how far from there each ray is.
+"""A spot: the centroid of rays and their deviations from it.
 
-Where rays of a part of the pupil stand for all of it, what they leave out is their mirror image.
+Rays of a part of the pupil stand for their mirror images too.
 """
 
 import dataclasses
@@ -13,9 +13,9 @@ from ..numerics import safe_divide
 from ..pupil.rules import Symmetry
 from ..rays.system import Vector
 
-# Whether each component averages to 0, as the rest of the pupil has the opposite one.
+# True for components whose mean is 0 by symmetry.
 _MIRRORED = {"rotational": (True,), "bilateral": (True, False), "none": (False, False)}
-# Pairs of components whose products do not average to 0.
+# Pairs of components whose product does not have the mean 0 by symmetry.
 _PAIRS = {"rotational": ((0, 0),), "bilateral": ((0, 0), (1, 1))}
 
 
@@ -24,11 +24,10 @@ _PAIRS = {"rotational": ((0, 0),), "bilateral": ((0, 0), (1, 1))}
 class Moments:
     """The spot of W wavelengths.
 
-    mean: (W, 2), x and y of the centroid on the sensor, mm.
-    covariance: (W, 2, 2), mm^2; inf on the diagonal for a wavelength of which no light arrives.
-    throughput: (W,), the fraction of the light through the stop that reaches the sensor.
-    separable: static; True if symmetry makes the xy element 0, so that the Gaussian kernel is
-        separable, see `separable_psf`.
+    mean: (W, 2), centroid on the sensor, mm.
+    covariance: (W, 2, 2), mm^2; inf on the diagonal if no light of the wavelength arrives.
+    throughput: (W,), fraction of the light through the stop that reaches the sensor.
+    separable: static; True if symmetry makes xy 0, so that `separable_psf` applies.
     """
 
     mean: Array
@@ -38,7 +37,7 @@ class Moments:
 
 
 def normalised(weight: Array, axes: tuple[int, ...] = (-1,)) -> Array:
-    """Weights that add up to 1 over axes, or are all 0 there."""
+    """Weights divided by their sum over axes; 0 where that is 0."""
     total = jnp.sum(weight, axis=axes, keepdims=True)
     return safe_divide(weight, jnp.broadcast_to(total, weight.shape))
 
@@ -46,12 +45,12 @@ def normalised(weight: Array, axes: tuple[int, ...] = (-1,)) -> Array:
 def deviations(
     values: Vector, weight: Array, symmetry: Symmetry, axes: tuple[int, ...] = (-1,)
 ) -> tuple[Vector, Vector]:
-    """Hits, or slopes, less their means over axes, D arrays (..., Q), and the means, of which these
-    axes have length 1.
+    """Hits or slopes less their means, D arrays (..., Q), and the means, with length 1 along axes.
 
     values: D arrays (..., Q), D = 1 on the meridian.
-    weight: (..., Q), of the light, as of `normalised`.
-    symmetry: of the pupil rule whose rays these are.
+    weight: (..., Q), normalised over axes.
+    symmetry: of the pupil rule of the rays.
+    axes: axes of the means.
     """
 
     def mean(value: Array, mirrored: bool) -> Array:
@@ -63,8 +62,8 @@ def deviations(
 
 
 def mean_products(a: Vector, b: Vector, weight: Array, symmetry: Symmetry) -> Array:
-    """Means over all of the pupil of the symmetric products of deviations, (..., C): xx, yy and,
-    without symmetry, xy; with `a` for `b` the covariance. Arguments as of `deviations`."""
+    """Means of the products of deviations `a` and `b` over the whole pupil, (..., C): xx, yy and,
+    without symmetry, xy. With b = a the covariance. Arguments as in `deviations`."""
     pairs = _PAIRS.get(symmetry, ((0, 0), (1, 1), (0, 1)))
     found = [jnp.sum(weight * (a[i] * b[j] + b[i] * a[j]), axis=-1) / 2 for i, j in pairs]
     if symmetry == "rotational":  # over the full circle <xx> = <yy> = <rho^2> / 2

@@ -1,7 +1,5 @@
-"""The rays of a rule traced some at a time, so that rules of all sizes share a compiled program.
-
-All is known here: nothing of it runs inside `jax.jit`.
-"""
+"""Rays of a rule traced in tiles, so that rules of all sizes share a compiled program. Outside of
+traces only."""
 
 from functools import partial
 from typing import NamedTuple
@@ -22,13 +20,18 @@ from ..rays.system import Vector
 from ..rays.trace import Bundle, aims, bundle_of
 from .moments import FocusMoments, weigh
 
-# Rays of a tile, by the number of their coordinates on the stop. Gauss rules of 13 nodes fill one.
+# Rays of a tile, by their number of stop coordinates. A Gauss rule of 13 nodes fills one.
 _TILE = {1: 42, 2: 208}
 
 
 class Traced(NamedTuple):
-    """The rays of a rule. found: those on the active surfaces; of rays without weight, MISSED.
-    failing, cut: whether any ray fails, and whether any is clipped."""
+    """Traced rays of a rule.
+
+    moments: their moments.
+    found: rays on the active surfaces; MISSED for rays that were not traced.
+    failing: True if a ray fails.
+    cut: True if a ray is clipped.
+    """
 
     moments: FocusMoments
     found: Found
@@ -37,16 +40,17 @@ class Traced(NamedTuple):
 
 
 def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Traced:
-    """The rays of a rule, and their moments."""
+    """Traces the rays of a rule."""
     points, weights = _points(lens, scene, rule)
     waves, total = scene.wavelengths.size, weights.shape[-1]
-    # Of fitted rules most rays fill up only; of others, those without weight tell what is clipped.
+    # Rays without weight: padding in fitted rules; in other rules they show whether light is
+    # clipped.
     fitted = isinstance(rule, Clipped)
     rays = np.flatnonzero(np.any(np.asarray(weights), axis=0)) if fitted else np.arange(total)
     size, count = _TILE[len(points)], len(rays)
     tiles = np.resize(rays if count else 0, (max(-(-count // size), 1), size))
-    aimed = [np.broadcast_to(p, (waves, total)) for p in points]
-    parts = [_trace(lens, scene, tuple(p[:, tile] for p in aimed), solver) for tile in tiles]
+    every = [np.broadcast_to(p, (waves, total)) for p in points]
+    parts = [_trace(lens, scene, tuple(p[:, tile] for p in every), solver) for tile in tiles]
 
     def whole(*parts: Array) -> np.ndarray:  # (..., size) each -> (..., Q)
         arrays = [np.asarray(a) for a in parts]

@@ -1,10 +1,10 @@
-"""Optical path difference of the rays against a sphere round the image point.
+"""Optical path difference of the rays against a sphere about the image point.
 
-For a wavelength, the chief ray (through the centre of the stop) meets the sensor at C. The
-reference sphere has its centre at C and its radius R along the chief ray to the plane of the
-paraxial exit pupil, positive against the light. Written in kappa = 1 / R, so that a telecentric
-exit pupil (kappa = 0) is a point like any other: a ray with the unit direction d that meets
-the sensor at P = C + e met the sphere at the distance R + t before P, where
+For each wavelength, the chief ray (through the centre of the stop) meets the sensor at C, the
+centre of the reference sphere. Its radius R is measured along the chief ray, against the light,
+from C to the plane of the paraxial exit pupil. The formulas use kappa = 1 / R, which is 0 for a
+telecentric exit pupil. A ray with unit direction d that meets the sensor at P = C + e meets the
+sphere at the distance R + t in front of P, where
 
     t = e.d + kappa X / (1 + sqrt(1 + kappa^2 X)),    X = (e.d)^2 - e^2.
 
@@ -33,12 +33,11 @@ _MM = 1e-3  # per um
 class Wavefront(NamedTuple):
     """Optical path differences of rays.
 
-    opd: (W, Q) in waves, path of the chief ray less path of the ray, both to the reference
-        sphere: positive where the wavefront is ahead of the sphere; 0 for a ray that failed or is
-        clipped.
-    status: (W, Q), int32, see `Status`; where the chief ray of a wavelength failed, no ray has an
-        opd, and its status is its own or, if that is OK or CLIPPED, the chief ray's.
-    image: (W, 2) in mm, where the chief rays meet the sensor, along its axes; 0 if they failed.
+    opd: (W, Q), path of the chief ray less path of the ray, both to the reference sphere, waves:
+        positive where the wavefront is ahead of the sphere; 0 for a ray that fails or is clipped.
+    status: (W, Q), int32, see `Status`. If the chief ray of a wavelength fails, no ray has an opd,
+        and OK and CLIPPED become the status of the chief ray.
+    image: (W, 2), point of the chief ray on the sensor, along its axes, mm; 0 if the ray fails.
     """
 
     opd: Array
@@ -47,11 +46,9 @@ class Wavefront(NamedTuple):
 
 
 def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
-    """1 / distance (W,) from the paraxial exit pupil to the sensor, along the light, 1/mm.
-
-    Positive for a pupil that the light has passed before the sensor, 0 for a telecentric lens.
-    Tilts and decentres are left out. `wavelengths` (W,) in um.
-    """
+    """1 / distance from the paraxial exit pupil to the sensor along the light, (W,), 1/mm: positive
+    for a pupil in front of the sensor, 0 for a telecentric lens. Tilts and decentres are neglected.
+    wavelengths: (W,), um."""
     height, slope = chief_ray_at_image(lens, wavelengths)
     at_sensor = height + slope * (lens.sensor - lens.vertices[-2])
     return safe_divide(slope * jnp.asarray(lens.senses[-1], slope.dtype), at_sensor)
@@ -68,13 +65,13 @@ def wavefront(
     """Optical path difference of the rays that cross the stop at given points.
 
     field, distance, wavelengths (W,), pupil (Q, 2): as in `trace_rays`.
-    curvature: () or (W,) in 1/mm, kappa of the reference sphere along the axis, in place of
-        `reference_curvature`; needed for a lens folded by tilted mirrors, whose exit pupil the
-        paraxial trace cannot know.
+    curvature: () or (W,), kappa of the reference sphere along the axis, 1/mm, instead of
+        `reference_curvature`; needed for a lens folded by tilted mirrors, which the paraxial trace
+        cannot follow.
 
-    Differentiable like `trace_rays`; the reference sphere moves with the lens. ValueError as of
-    `trace_rays`, and for a known curvature that is not finite; inside a trace no ray has an opd
-    then, and those that are whole are UNCONVERGED.
+    Differentiable like `trace_rays`; the reference sphere moves with the lens. ValueError as in
+    `trace_rays`, and for a known curvature that is not finite; inside a trace rays that pass are
+    then UNCONVERGED and have no opd.
     """
     scene = scene_of(lens, field, distance, wavelengths)
     points = stop_points(lens, pupil)
@@ -101,8 +98,8 @@ def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) 
 def path_differences(
     lens: Lens, wavelengths: Array, bundle: Bundle, curvature: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Path differences (W, Q) in waves, status (W, Q) and image points (W, D) of traced rays, the
-    chief ray first; see `Wavefront` and `wavefront`."""
+    """Path differences (W, Q), waves, status (W, Q) and image points (W, D), mm, of traced rays,
+    the chief ray first. curvature: as in `wavefront`."""
     waves = jnp.clip(wavelengths, *lens.dispersion.range)
     whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     chief_ok = whole[:, :1]
@@ -113,7 +110,7 @@ def path_differences(
     curvature = jnp.where(finite, curvature, 0)
     sphere = chief_ok & jnp.broadcast_to(finite, waves.shape)[:, None]
     good = sphere & (bundle.status == Status.OK)
-    # cosine between the chief ray and the axis, along which the sensor moves
+    # Cosine between the chief ray and the direction in which the sensor moves.
     axis = lens.sensor_motion
     axis = jnp.array([0, 0, 1], bundle.path.dtype) if axis is None else axis
     arrival = tuple(a[:, 0] for a in bundle.arrival)
@@ -135,16 +132,16 @@ def path_differences(
 
 
 def rms_wavefront(wave: Wavefront, weights: Numbers) -> Array:
-    """Root mean square (W,) of the opd about its mean, in waves; 0 if no ray has one.
+    """Root mean square (W,) of the opd about its mean, waves; 0 if no ray has one. The tilt about
+    the chief ray is not removed.
 
-    `weights` (Q,) of the points, as from `pupil.disc`; failed and clipped rays count for
-    nothing. The tilt that the chief ray leaves is kept. ValueError for weights of another shape.
+    weights: (Q,), of the points, as from `pupil.disc`; rays that fail or are clipped count 0.
+        ValueError for another shape.
     """
-    share = real_array("weights", weights, wave.opd.dtype)
-    if share.shape != wave.opd.shape[1:]:
-        raise ValueError(f"weights: expected {wave.opd.shape[1:]}, got shape {share.shape}")
-    good = wave.status == Status.OK
-    weight = jnp.where(good, share, 0)
+    weight = real_array("weights", weights, wave.opd.dtype)
+    if weight.shape != wave.opd.shape[1:]:
+        raise ValueError(f"weights: expected {wave.opd.shape[1:]}, got shape {weight.shape}")
+    weight = jnp.where(wave.status == Status.OK, weight, 0)
     weight = safe_divide(weight, jnp.sum(weight, axis=1, keepdims=True))
     mean = jnp.sum(weight * wave.opd, axis=1, keepdims=True)
     return safe_sqrt(jnp.sum(weight * (wave.opd - mean) ** 2, axis=1))

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) as a pair (init, update), with a rate for each group."""
+"""Adam (Kingma and Ba 2015) as a pair (init, update), with a rate for each group of parameters."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -10,8 +10,11 @@ from jax import Array
 
 
 class AdamState(NamedTuple):
-    """steps: (), int32, updates so far.
-    first, second: moments of the gradient, shaped as the parameters."""
+    """State of the optimiser.
+
+    steps: (), int32, updates so far.
+    first, second: moments of the gradient, shaped as the parameters.
+    """
 
     steps: Array
     first: Any
@@ -24,12 +27,12 @@ def adam(
     """The optimiser as (init, update).
 
     rates: one learning rate, or one for each top-level key of the parameters, such as
-        {"optics": 1e-2, "network": 1e-3}, and for each key below it where that is a mapping too.
-        KeyError, in `update`, if a group has none.
-    b1, b2: how much of the first and second moment is kept in each step.
+        {"optics": 1e-2, "network": 1e-3}; a rate may be such a mapping itself. `update` raises
+        KeyError for a key without a rate.
+    b1, b2: decay rates of the first and second moment.
     eps: added to the root of the second moment.
 
-    init(parameters) -> state; update(gradients, state) -> (updates, state), the updates to be
+    init(parameters) -> state; update(gradients, state) -> (updates, state). The updates are to be
     added to the parameters. Every leaf keeps its dtype.
     """
 
@@ -47,9 +50,9 @@ def adam(
                 return {name: scaled(rate[name], first[name], second[name]) for name in first}
 
             def leaf(m: Array, v: Array) -> Array:
-                # 1 - b^steps, without the cancellation that costs float32 five digits
-                kept = [-jnp.expm1(steps.astype(m.dtype) * math.log(b)) for b in (b1, b2)]
-                return -rate * (m / kept[0]) / (jnp.sqrt(v / kept[1]) + eps)
+                # 1 - b^steps, without the cancellation that costs float32 five digits.
+                bias = [-jnp.expm1(steps.astype(m.dtype) * math.log(b)) for b in (b1, b2)]
+                return -rate * (m / bias[0]) / (jnp.sqrt(v / bias[1]) + eps)
 
             return jax.tree.map(leaf, first, second)
 
@@ -59,5 +62,5 @@ def adam(
 
 
 def apply_updates(parameters: Any, updates: Any) -> Any:
-    """`parameters` + `updates`, leaf by leaf, each in its own dtype."""
+    """Parameters + updates, leaf by leaf, each in its own dtype."""
     return jax.tree.map(lambda p, u: p + u.astype(p.dtype), parameters, updates)

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-# F(4x4, 3x3): 4x4 outputs from 6x6 inputs with 36 instead of 144 products for each pair of
-# channels, y = A^T [(G w G^T) * (B^T x B)] A. Lavin and Gray, CVPR 2016; at the points 0,
-# +-sqrt(1/2), +-sqrt(2) and infinity, which halve the rounding error of the usual 0, +-1, +-2.
+# F(4x4, 3x3): 4x4 outputs from 6x6 inputs take 36 instead of 144 products for each pair of
+# channels, y = A^T [(G w G^T) * (B^T x B)] A. Source: Lavin and Gray, CVPR 2016. The points 0,
+# +-sqrt(1/2), +-sqrt(2) and infinity halve the rounding error of the usual 0, +-1, +-2.
 _S, _T = math.sqrt(0.5), math.sqrt(2.0)
 _INPUT = (
     (1, 0, -2.5, 0, 1, 0),
@@ -27,18 +27,18 @@ _KERNEL = (
     (0, 0, 1),
 )
 _OUTPUT = tuple((*(p**k for p in (0.0, _S, -_S, _T, -_T)), float(k == 3)) for k in range(4))
-# Below this many channels the transforms cost more than the products they save, and small
-# images are not worth the ten seconds of compilation.
+# With fewer channels the transforms cost more than they save; for images of fewer pixels ten
+# seconds of compilation do not pay.
 _CHANNELS, _PIXELS = 32, 1024
 
 
 def convolve_3x3(images: Array, kernel: Array) -> Array:
-    """The convolution (B, H, W, out) of stride 1, with zeros beyond the edges.
+    """Convolution of stride 1, (B, H, W, out), with zeros beyond the edges.
 
     images: (B, H, W, in).
     kernel: (3, 3, in, out), of the same floating dtype.
 
-    In float32 the error is some 1e-6 of the largest value, as that of any convolution.
+    In float32 the error is about 1e-6 of the largest value, as of any convolution.
     """
     (height, width), (into, out) = images.shape[1:3], kernel.shape[2:]
     if height * width < _PIXELS:
@@ -55,7 +55,7 @@ def _direct(images: Array, kernel: Array) -> Array:
 
 
 def _gathered(images: Array, kernel: Array) -> Array:
-    """As fast as XLA's convolution of small images, which runs 25 times slower in a loop."""
+    """For small images: as fast as XLA's convolution, which is 25 times slower inside a loop."""
     height, width = images.shape[1:3]
 
     def one(image: Array) -> Array:
@@ -69,18 +69,19 @@ def _gathered(images: Array, kernel: Array) -> Array:
 def _winograd(images: Array, kernel: Array) -> Array:
     # (3, 3, in, out) -> 36 matrices (in, out).
     kernels = [k for row in _combined(_KERNEL, list(kernel)) for k in _combined(_KERNEL, list(row))]
-    # Image by image, so that what is transformed stays in the cache; and transformed again for
-    # the gradient, which costs less than to keep it.
+    # Image by image, so that the transforms stay in the cache. The gradient computes them again,
+    # which costs less than to keep them.
     return lax.map(jax.checkpoint(lambda image: _filtered(image, kernels)), images)
 
 
 def _combined(matrix: tuple, parts: list[Array]) -> list[Array]:
-    """Matrix times vector of arrays, written out: XLA makes one loop of each sum."""
+    """Product of a matrix and a vector of arrays, written out: XLA makes one loop of each sum."""
     return [sum(c * p for c, p in zip(row, parts) if c) for row in matrix]
 
 
 def _filtered(image: Array, kernels: list[Array]) -> Array:
-    """(H, W, in) -> (H, W, out). 36 products, not one over a batch: XLA runs them in parallel."""
+    """(H, W, in) -> (H, W, out), by 36 products, not one over a batch: XLA runs them in
+    parallel."""
     height, width = image.shape[0] // 4, image.shape[1] // 4
     padded = jnp.pad(image, ((1, 3), (1, 3), (0, 0)))
     rows = _combined(_INPUT, _taps(padded, 0))
@@ -94,8 +95,8 @@ def _filtered(image: Array, kernels: list[Array]) -> Array:
 
 
 def _taps(padded: Array, axis: int) -> list[Array]:
-    """The six inputs of every tile along `axis`: entries 4 t, ..., 4 t + 5. Through a split,
-    whose gradient is a concatenation; that of strided slices would be six scattered sums."""
+    """The six inputs of every tile along an axis: entries 4 t, ..., 4 t + 5. By a split, whose
+    gradient is a concatenation; strided slices would give six scattered sums."""
     count, shape = padded.shape[axis] // 4 - 1, padded.shape
     blocks = padded.reshape(*shape[:axis], count + 1, 4, *shape[axis + 1 :])
     phases = [part.squeeze(axis + 1) for part in lax.split(blocks, (1,) * 4, axis + 1)]

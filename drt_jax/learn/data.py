@@ -1,7 +1,7 @@
 """Image patches for training and testing: from the scikit-image wheel or from a folder.
 
-Patches are uint8 and larger than the image to be restored by the support of the blur, so that
-the sensor layer sees true context on all sides. Nothing is downloaded.
+Patches are uint8. They are larger than the image to be restored by the support of the blur, so that
+the sensor layer has true context on all sides. Nothing is downloaded.
 """
 
 import contextlib
@@ -21,31 +21,31 @@ from skimage import data
 from ..inputs import InputError, one_line, shown
 from .images import SUFFIXES, find_images, look, read
 
-# Colour and texture photographs that lie inside the scikit-image wheel.
+# Colour and texture photographs in the scikit-image wheel.
 _BUNDLED = (
     *("astronaut", "brick", "chelsea", "coffee", "grass", "gravel", "hubble_deep_field"),
     *("immunohistochemistry", "retina", "rocket", "stereo_motorcycle"),
 )
 _MOST_CROPS = 100_000
-# Bytes of patches that are kept in memory: many times what the set of the paper takes.
+# Most bytes of patches in memory: many times those of the paper's set.
 _MOST_MEMORY = 8 * 10**9
 _T = TypeVar("_T")
 _Source = str | pathlib.Path
 
 
 class DataError(InputError):
-    """Images that cannot be used; the message names the folder or file and the remedy."""
+    """Images cannot be used; the message names the folder or file and the remedy."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DataConfig:
     """Where patches come from.
 
-    root: "bundled", or a folder searched with its subfolders (DTD: its `images` folder).
-    crops_per_image: random crops an image.
-    test_fraction: share of the images, not of the crops, kept for testing.
-    memory_map: a folder on a disk with room, for sets that should not lie in memory; empty: in
-        memory, which takes up to 8 GB.
+    root: "bundled", or a folder with subfolders (for DTD its `images` folder).
+    crops_per_image: random crops of each image.
+    test_fraction: fraction of the images, not of the crops, for testing.
+    memory_map: folder on a disk for patches that do not fit in memory; empty to hold up to 8 GB in
+        memory.
     """
 
     root: str = "bundled"
@@ -65,9 +65,11 @@ class DataConfig:
 
 
 class Patches(NamedTuple):
-    """train, test: uint8 (N, P, P, 3), in memory or memory-mapped.
-    skipped: what was left out, a line for each file, folder, or other kind of image, with the
-    reason."""
+    """Image patches.
+
+    train, test: uint8 (N, P, P, 3), in memory or memory-mapped.
+    skipped: a line with the reason for each file, folder or kind of image that was skipped.
+    """
 
     train: np.ndarray
     test: np.ndarray
@@ -79,14 +81,14 @@ def load_patches(
 ) -> Patches:
     """Random square patches, split by image into train and test.
 
-    config: where they come from.
-    side: of a patch, in pixels.
+    config: source of the images.
+    side: side of a patch, pixels.
     seed: the same `config`, `side` and `seed` give the same patches.
-    progress: wraps the loops over the images (tqdm): one over headers, one over contents.
+    progress: wraps the two loops over the images, of headers and of contents (tqdm).
 
-    The split is one of the usable images; the others are skipped and named in the result, see
-    `images.read`. One image at a time is decoded. DataError for a folder that does not exist or
-    has fewer than two usable images, and for patches that take more room than there is.
+    Images that cannot be used are skipped and listed in the result, see `images.read`. Images are
+    decoded one at a time. DataError for a folder that does not exist or has fewer than two usable
+    images, and for patches that take more room than there is.
     """
     sources, skipped = _sources(config.root)
     fitting = [i for i in progress([*range(len(sources))]) if _fits(sources[i], side, skipped)]
@@ -114,7 +116,7 @@ def load_patches(
 
 
 def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
-    """Names of bundled photographs, or paths; and a line for whatever is left out."""
+    """Names of bundled photographs, or paths; and a line for each thing that is skipped."""
     if root == "bundled":
         return _BUNDLED, []
     folder = os.path.expanduser(root)
@@ -132,16 +134,16 @@ def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
 
 
 def _pixels(source: _Source) -> np.ndarray:
-    """The pixels uint8 (H, W, 3) of a file or of a bundled photograph."""
+    """Pixels, uint8 (H, W, 3), of a file or a bundled photograph."""
     if isinstance(source, pathlib.Path):
         return read(source)
     pixels = getattr(data, source)()
-    pixels = pixels[0] if isinstance(pixels, tuple) else pixels  # of a pair
+    pixels = pixels[0] if isinstance(pixels, tuple) else pixels  # a stereo pair
     return np.broadcast_to(pixels[..., None], (*pixels.shape, 3)) if pixels.ndim == 2 else pixels
 
 
 def _size(source: _Source) -> tuple[int, int]:
-    """Width and height in pixels."""
+    """Width and height, pixels."""
     if isinstance(source, pathlib.Path):
         return look(source)
     height, width = _pixels(source).shape[:2]
@@ -149,7 +151,8 @@ def _size(source: _Source) -> tuple[int, int]:
 
 
 def _fits(source: _Source, side: int, skipped: list[str]) -> bool:
-    """Whether an image is large enough, as far as its header tells; else a line more of why not."""
+    """True if the header of an image says that it is large enough; otherwise adds the reason to
+    `skipped`."""
     size = _tried(_size, source, skipped)
     if size and min(size) < side:
         skipped.append(one_line(f"{source}: {size[0]} x {size[1]} pixels, smaller than {side}"))
@@ -157,7 +160,7 @@ def _fits(source: _Source, side: int, skipped: list[str]) -> bool:
 
 
 def _tried(reader: Callable[..., _T], source: _Source, skipped: list[str]) -> _T | None:
-    """What a reader gives; where it raises, nothing, and a line more of why."""
+    """What a reader returns; if it raises, None, and adds the reason to `skipped`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -177,7 +180,7 @@ def _crops(pixels: np.ndarray, count: int, side: int, seed: list[int]) -> Iterat
 
 
 def _check_room(config: DataConfig, count: int, side: int) -> None:
-    """DataError where the patches of so many images take more room than there is."""
+    """DataError if the patches of `count` images take more room than there is."""
     needed, folder = 3 * side**2 * config.crops_per_image * count, config.memory_map
     what = f"{count} images x {config.crops_per_image} crops of {side} x {side} pixels"
     if not folder and needed > _MOST_MEMORY:
@@ -186,7 +189,7 @@ def _check_room(config: DataConfig, count: int, side: int) -> None:
             f"{_MOST_MEMORY / 1e9:.0f}; lower it, or give data.memory_map a folder on a large disk"
         )
     if folder:
-        needed = int(needed * (1 + config.test_fraction))  # those of the test are moved
+        needed = int(needed * (1 + config.test_fraction))  # test patches are moved
         with _room(folder):
             free = shutil.disk_usage(os.path.expanduser(folder)).free
         if needed > free:
@@ -198,7 +201,7 @@ def _check_room(config: DataConfig, count: int, side: int) -> None:
 
 @contextlib.contextmanager
 def _room(folder: str) -> Iterator[None]:
-    """A DataError for what goes wrong where the patches are kept."""
+    """Raises DataError for errors of the memory or the disk."""
     try:
         yield
     except MemoryError as error:
@@ -208,17 +211,15 @@ def _room(folder: str) -> Iterator[None]:
 
 
 def _file(folder: str, open_files: contextlib.ExitStack) -> IO[bytes]:
-    """In memory; or, in a folder, without a name, so that it vanishes with the process."""
+    """A file in memory; or one without a name in a folder, which vanishes with the process."""
     if not folder:
         return io.BytesIO()
     return open_files.enter_context(tempfile.TemporaryFile(dir=os.path.expanduser(folder)))
 
 
 def _part(pool: IO[bytes], kept: IO[bytes], is_test: np.ndarray, size: int) -> None:
-    """Move those of the crops in `pool` that are for the test to `kept`; the others close up.
-
-    Crop after crop, because both together may be larger than the memory. size: of a crop, bytes.
-    """
+    """Moves the test crops from `pool` to `kept`, and closes the gaps. Crop by crop, because both
+    together may be larger than the memory. size: bytes of a crop."""
     end = 0
     for k, moves in enumerate(is_test):
         pool.seek(k * size)
@@ -234,7 +235,7 @@ def _part(pool: IO[bytes], kept: IO[bytes], is_test: np.ndarray, size: int) -> N
 
 
 def _array(file: IO[bytes], side: int) -> np.ndarray:
-    """What a file of crops holds."""
+    """The crops in a file, (N, side, side, 3)."""
     if isinstance(file, io.BytesIO):
         return np.frombuffer(file.getbuffer(), np.uint8).reshape(-1, side, side, 3)
     file.flush()
@@ -242,12 +243,12 @@ def _array(file: IO[bytes], side: int) -> np.ndarray:
 
 
 def batches(patches: np.ndarray, size: int, seed: int, start: int = 0) -> Iterator[np.ndarray]:
-    """Endless batches (size, P, P, 3): a fresh permutation each epoch, the rest dropped.
+    """Endless batches (size, P, P, 3): a new permutation each epoch, without its incomplete batch.
 
     patches: uint8 (N, P, P, 3).
     size: patches in a batch; DataError if there are fewer.
-    seed, start: batch number k is a function of `seed` and k alone, so that a resumed run starts
-        at `start` and sees what an unbroken one would have seen.
+    seed: batch k depends only on it and k, so that a resumed run gets the same batches.
+    start: number of the first batch.
     """
     per_epoch = len(patches) // size
     if not per_epoch:

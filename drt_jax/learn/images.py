@@ -1,7 +1,7 @@
-"""Photographs as others store them: found in a folder, read upright with 8 bits a channel.
+"""Photographs: found in a folder, read upright with 8 bits per channel.
 
-Pillow reads and converts them. What it would misread is refused with the reason, from the header
-wherever that tells.
+Pillow reads and converts them. Images that it would misread are refused with the reason, from the
+header where that suffices.
 """
 
 import collections
@@ -13,32 +13,32 @@ import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
-# Other images, counted so that nobody misses them unawares.
+# Images of other kinds, which are counted and reported.
 _UNREAD = {
     *(".gif", ".webp", ".avif", ".heic", ".heif", ".jfif", ".jpe", ".jp2", ".j2k", ".jxl", ".svg"),
     *(".pbm", ".pgm", ".ppm", ".pnm", ".pfm", ".tga", ".ico", ".psd", ".exr", ".hdr", ".eps"),
     *(".raw", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"),
 }
-# What a file may be, whatever its name says: what is saved from web pages is often WebP. For
+# Formats that a file may have, whatever its name: images saved from web pages are often WebP. For
 # others Pillow may start a program (EPS).
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "GIF", "WEBP")
-# Of these kinds Pillow's conversion to RGB is right; those of 16 bits are shifted here.
+# Modes that Pillow converts to RGB rightly; 16 bits are shifted here.
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
-# Pillow decodes no more either; with its 4 bytes a pixel, this is 0.7 GB.
+# Pillow's own limit; at its 4 bytes per pixel this is 0.7 GB.
 MOST_PIXELS = 178_956_970
 
 
 def look(path: pathlib.Path) -> tuple[int, int]:
-    """Width and height of an image in a file, in pixels, from its header; raises as `read` does."""
+    """Width and height of an image from its header, pixels; raises as `read` does."""
     with _open(path) as image:
         return image.size
 
 
 def read(path: pathlib.Path) -> np.ndarray:
-    """The image in a file, the first one if it holds several: uint8 (H, W, 3), upright.
+    """The first image of a file, upright, uint8 (H, W, 3).
 
-    Any exception says why a file cannot be used: those of Pillow are of all kinds. What no regular
-    file is, a pipe say, is not opened; an image of over `MOST_PIXELS` pixels is not decoded.
+    An exception of any kind says why a file cannot be used. Only regular files are opened, not
+    pipes; an image above `MOST_PIXELS` pixels is not decoded.
     """
     with _open(path) as image:
         upright = ImageOps.exif_transpose(image)
@@ -48,7 +48,7 @@ def read(path: pathlib.Path) -> np.ndarray:
 
 
 def _open(path: pathlib.Path) -> Image.Image:
-    """An image of which the header is read."""
+    """Opens an image and reads its header."""
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError("not a regular file")
     try:
@@ -66,20 +66,20 @@ def _open(path: pathlib.Path) -> Image.Image:
 
 
 def _odd(image: Image.Image) -> str:
-    """Why the numbers of an image would be misread; nothing if they are not."""
+    """Why the values of an image would be misread; "" if they are not."""
     tags = getattr(image, "tag_v2", {})  # of a TIFF
     bits, is_deep = tags.get(258, (16,))[0], image.mode.startswith("I;16")
     is_plain = is_deep or image.mode in _MODES
     if is_plain and tags.get(339, (1,))[0] == 1 and not (is_deep and bits != 16):
-        # Of 16 bits Pillow does not turn round those in which white is 0.
+        # Pillow does not invert 16 bits in which 0 is white.
         return "16 bits in which 0 is white: not read" if is_deep and tags.get(262) == 0 else ""
     return f"numbers of kind {image.mode}: convert them to 8 or 16 bits a channel, without sign"
 
 
 def find_images(folder: str) -> tuple[list[pathlib.Path], list[str]]:
-    """Files with one of `SUFFIXES` in a folder and its subfolders, in the order of their paths, and
-    a line for whatever is left out: folders that are links (they may lead back) or cannot be read,
-    and images of other kinds, counted."""
+    """Files with one of `SUFFIXES` in a folder and its subfolders, sorted by path, and a line for
+    each thing skipped: folders that are links (they may lead back) or cannot be read, and images of
+    other kinds, counted."""
     found, left_out, counts = [], [], collections.Counter[str]()
     folders = [folder]
     while folders:

@@ -25,11 +25,11 @@ Imager = Callable[..., tuple[Array, Array, Array, Array]]
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """The sensor layer's constants.
+    """Constants of the sensor layer.
 
     pixel_um: side of a pixel, um.
     kernel: side of the kernel, pixels, odd.
-    form: of the kernel, see `image.kernel`.
+    form: form of the kernel, see `gaussian_psf`.
     """
 
     pixel_um: float = 4.4
@@ -49,17 +49,17 @@ def make_imager(
 ) -> Imager:
     """The chain moments -> PSF -> sensor layer -> network as one function.
 
-    blur: as `moments_model` returns it.
+    blur: a function of `moments_model`.
     restore: (parameters, images) -> images; None for a camera without a network.
-    camera: the constants of the sensor.
-    convolve: of `image.sensor`; `convolve_taps` for values and forward mode, which `make_step`
-        uses where a single number is trained.
+    camera: constants of the sensor layer.
+    convolve: `convolve`, or `convolve_taps` for values and forward mode, which `make_step` uses
+        where a single number is trained.
 
-    The result maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
-    distance mm, noise, key) to (truth, sensor image, restored image), float32 (B, H, W, C), and
-    the `deviation` (C,) of the blur in mm. The kernel is centred on the mean
-    centroid of the wavelengths that arrive: patches are registered. A wavelength that loses rays is
-    darker by what it loses, and black without any.
+    The function maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
+    distance in mm, noise, key) to the true, the sensor and the restored image, float32
+    (B, H, W, C), and the standard deviation (C,) of the blur in mm. The kernel is centred on the
+    mean centroid of the wavelengths that arrive, so that images are registered. Each channel is
+    multiplied by the throughput of its wavelength.
     """
     margin = camera.kernel // 2
 
@@ -74,8 +74,8 @@ def make_imager(
         pixel = camera.pixel_um * 1e-3
         psf = separable_psf if spot.separable else gaussian_psf
         kernel = psf(offset, spot.covariance, pixel, camera.kernel, camera.form)
-        light = jnp.expand_dims(spot.throughput.astype(jnp.float32), (0, 1, 2))
-        image = sensor_layer(scenes * light, kernel, noise, key, convolve)
+        throughput = jnp.expand_dims(spot.throughput.astype(jnp.float32), (0, 1, 2))
+        image = sensor_layer(scenes * throughput, kernel, noise, key, convolve)
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin
         truth = scenes[:, margin : end[0], margin : end[1]]
@@ -85,18 +85,16 @@ def make_imager(
 
 
 def blur_width(covariance: Array) -> Array:
-    """Standard deviation (C,) of a blur, root of the mean of the variances along x and y, from its
-    covariance (C, 2, 2)."""
+    """Standard deviation (C,) of a blur, the root of the mean of its variances along x and y, mm.
+    covariance: (C, 2, 2), mm^2."""
     return safe_sqrt(jnp.mean(jnp.diagonal(covariance, 0, 1, 2), axis=1))
 
 
 def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:
-    """((value, extras), gradient) of a loss.
-
-    loss: (parameters) -> (value, extras).
+    """((value, extras), gradient) of a loss (parameters) -> (value, extras).
 
     In forward mode where a single number is trained, such as the sensor position: it takes two
-    thirds of the time, and turns no images over (paper section 3 says when either mode pays).
+    thirds of the time, see paper section 3.
     """
     if count_parameters(parameters) > 1:
         return jax.value_and_grad(loss, has_aux=True)(parameters)
@@ -115,23 +113,22 @@ def make_step(
 ) -> tuple[Callable, Callable]:
     """Adam on the mean absolute error as (init, step).
 
-    imager: as `make_imager` returns it.
-    rates: learning rates of the groups "optics" (mm for the sensor; or by its numbers, each in its
-        unit) and "network".
-    depths: the object distance of each step is uniform between them, mm.
-    seed: noise and depth are functions of it and of the step index.
-    vectorised: over the first axis of all parameters, of N jobs.
+    imager: a function of `make_imager`.
+    rates: learning rates of "optics" and "network", see `adam`, in the unit of each parameter.
+    depths: limits of the object distance, uniform in each step, mm.
+    seed: noise and distance depend only on it and the step index.
+    vectorised: True for N jobs at once, along the first axis of all parameters.
 
     init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the
-    state donated. metrics: loss, sigma_um (mean over the wavelengths), depth_mm, and the optics'
-    parameters by name, that of "sensor" as sensor_mm, each () or, vectorised, (N,).
+    state donated. metrics: loss, sigma_um (mean over the wavelengths), depth_mm, and the parameters
+    of the optics by name, "sensor" as sensor_mm, each () or (N,).
     """
     init_adam, update = adam(rates)
     near, far = depths
 
     def init(parameters: dict[str, Any]) -> tuple[Any, Any]:
-        # A copy: the first step is given the buffers to overwrite. With its dtype spelt out,
-        # because a weakly typed start would have the step compiled again, and again.
+        # A copy, because the first step overwrites the buffers; with an explicit dtype, because
+        # weakly typed parameters would compile the step again.
         parameters = jax.tree.map(lambda p: jnp.array(p, jnp.asarray(p).dtype), parameters)
         make = jax.vmap(init_adam) if vectorised else init_adam
         return parameters, make(parameters)
@@ -168,16 +165,16 @@ def fit(
     report: Callable[[int, dict[str, np.ndarray], Any], None],
     stopped: Callable[[], bool] = lambda: False,
 ) -> Any:
-    """Run steps and return the final state.
+    """Runs steps and returns the final state.
 
-    step, state: as `make_step` gives them.
-    scenes: uint8 (B, P, P, C), a batch for each step.
-    noise: standard deviation, of values from 0 to 1.
-    steps: those to run.
-    every, report: after so many steps, and at the end, report(start, metrics, state) is called
-        with the metrics since `start` stacked on the first axis; between, nothing waits for the
-        device.
-    stopped: asked after each step whether to end early, with a report.
+    step, state: from `make_step`.
+    scenes: batches uint8 (B, P, P, C), one for each step.
+    noise: standard deviation, for values from 0 to 1.
+    steps: indices of the steps.
+    every: steps between reports; between them nothing waits for the device.
+    report: report(start, metrics, state), called every `every` steps and at the end, with the
+        metrics since step `start` stacked on the first axis.
+    stopped: called after each step; True ends early, with a report.
     """
     strength = np.float32(noise)
     pending: list[dict[str, Array]] = []
@@ -203,16 +200,17 @@ def evaluate(
     seed: int,
     batch: int = 32,
 ) -> dict[str, float]:
-    """Image quality over patches, by scikit-image, for values from 0 to 1, not clipped.
+    """Image quality over patches, by scikit-image, for values from 0 to 1, not clipped: mae and
+    rmse over all values, psnr (dB) and ssim as means over the patches, of the restored images; with
+    the prefix sensor_, of the images in front of the network.
 
-    imager: as `make_imager` returns it.
-    parameters: of its optics and network.
-    patches: uint8 (N, P, P, C), imaged `batch` at a time.
+    imager: a function of `make_imager`.
+    parameters: of optics and network.
+    patches: uint8 (N, P, P, C).
     distance: of the object, mm.
-    noise, seed: standard deviation, and what it is drawn from.
-
-    mae and rmse over all values, psnr (dB) and ssim as means over the patches, of the restored
-    images; the same with the prefix sensor_ for the images before the network.
+    noise: standard deviation.
+    seed: seed of the noise.
+    batch: patches imaged at a time.
     """
     rows: list[dict[str, float]] = []
     for start in range(0, len(patches), batch):

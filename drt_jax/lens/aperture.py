@@ -1,4 +1,4 @@
-"""Apertures beyond the round ones about the vertices: ellipses, rectangles, and obscurations."""
+"""Apertures other than circles about a vertex: ellipses, rectangles, decentres, obscurations."""
 
 import dataclasses
 
@@ -13,16 +13,16 @@ from ..numerics import safe_divide, safe_sqrt
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Apertures:
-    """A apertures on surfaces, each along the axes of its own.
+    """A apertures, each along the axes of its surface.
 
-    half: (A, 2) in mm, the half widths along x and y; of a circle the first is its radius, the
-        second means nothing.
-    centre: (A, 2) in mm from the vertex; None: all lie about their vertices.
+    half: (A, 2), half widths along x and y, mm; of a circle the first is the radius, the second is
+        not used.
+    centre: (A, 2), from the vertex, mm; None if all are centred on their vertices.
 
-    Static:
-    surfaces: the index of the surface of each.
+    Static, A of each:
+    surfaces: indices of the surfaces.
     kinds: "circle", "ellipse" or "rectangle".
-    blocks: whether it is an obscuration, which stops the light inside of it; else that outside.
+    blocks: True for an obscuration, which stops the light inside; False stops the light outside.
     """
 
     half: Array
@@ -33,17 +33,14 @@ class Apertures:
 
     @property
     def sizes(self) -> Array:
-        """Half widths (A, 2) along x and y, mm, those of circles both the radius."""
+        """Half widths (A, 2) along x and y, mm; of a circle both are the radius."""
         both = np.array([[0, 0 if kind == "circle" else 1] for kind in self.kinds])
         return jnp.take_along_axis(self.half, jnp.asarray(both), axis=1)
 
 
 def depths(apertures: Apertures, hits: tuple[Array, ...]) -> Array:
-    """How far inside of each aperture hits lie, (A, ...) in mm; negative outside.
-
-    To first order the distance from the edge. hits: D arrays (S + 1, ...) in mm on all surfaces,
-    D = 1 on the meridian.
-    """
+    """Distance of hits from the edge of each aperture, (A, ...), mm, to first order; negative
+    outside. hits: D arrays (S + 1, ...), on all surfaces, mm; D = 1 on the meridian."""
     found = []
     for k, (surface, kind) in enumerate(zip(apertures.surfaces, apertures.kinds, strict=True)):
         point = [hit[surface] for hit in hits]

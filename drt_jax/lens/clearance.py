@@ -1,4 +1,4 @@
-"""How far inside of the edges of a lens rays pass: what clips them, softly or not, and where."""
+"""Clearance: the distance of rays from the edges that clip them."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +10,12 @@ from .lens import Lens
 
 
 def clearance(lens: Lens, hits: tuple[Array, ...]) -> Array:
-    """How far inside of each edge hits lie, (E, ...) in mm; below 0 the edge stops the ray.
+    """Distance of hits from each of E edges, (E, ...), mm; below 0 the edge stops the ray.
 
-    The first S + 1 edges are the circles of `semi_diameter`, inf where there is none, and at the
-    stop, whose rim no point that is aimed at is outside of; then come `lens.apertures`.
-    hits: D arrays (S + 1, ...) in mm on all surfaces, D = 1 on the meridian.
+    The first S + 1 edges are the circles of `semi_diameter`; the clearance is inf where there is
+    none, and at the stop, because rays are aimed inside its rim. Then follow `lens.apertures`.
+
+    hits: D arrays (S + 1, ...), on all surfaces, mm; D = 1 on the meridian.
     """
     semi = lens.semi_diameter.at[lens.stop].set(jnp.inf)
     radius = safe_sqrt(sum((h**2 for h in hits[1:]), hits[0] ** 2))
@@ -27,8 +28,8 @@ def clearance(lens: Lens, hits: tuple[Array, ...]) -> Array:
 
 
 def clipping_surface(lens: Lens, hits: tuple[Array, ...]) -> Array:
-    """The first surface with an edge that stops rays, (...) int32; of rays that pass, the one with
-    the nearest edge. hits: as of `clearance`."""
+    """The first surface that clips each ray, (...), int32; for a ray that passes, the surface with
+    the nearest edge. hits: as in `clearance`."""
     extra, none = lens.apertures, lens.count + 1
     edges = clearance(lens, hits)
     stops = (edges < 0) | (edges == jnp.min(edges, axis=0, keepdims=True))

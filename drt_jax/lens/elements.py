@@ -1,4 +1,4 @@
-"""Elements: neighbouring surfaces that shift and tilt together, and turns of the axis."""
+"""Elements: surfaces that shift and tilt together, and coordinate breaks."""
 
 import dataclasses
 
@@ -10,19 +10,19 @@ from jax import Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Elements:
-    """G groups of neighbouring surfaces, each rigid; one that ends with the sensor turns the axis
-    of all that follows (a coordinate break).
+    """G rigid groups of neighbouring surfaces. A group that ends with the sensor is a coordinate
+    break: it moves all that follows.
 
-    A group is shifted, then tilted about its pivot. Groups may hold others, which come behind them
-    in this order and move within them.
+    A group is tilted about its pivot, then shifted. A group inside another stands behind it in this
+    order and moves with it.
 
-    shift: (G, 3) in mm, along x, y and z.
-    tilt: (G, 3) in radians, about x, then the turned y, then the turned z, right-handed.
-    pivot: (G,) in mm, along the axis from the vertex of the surface `about`.
+    shift: (G, 3), along x, y and z, mm.
+    tilt: (G, 3), about x, then the rotated y, then the rotated z, right-handed, radians.
+    pivot: (G,), along the axis from the vertex of the surface `about`, mm.
 
     Static:
-    spans: first and last surface of each; S is the sensor.
-    about: of each, the index of the surface.
+    spans: first and last surface of each group; S is the sensor.
+    about: index of the surface from which each pivot is measured.
     """
 
     shift: Array
@@ -32,8 +32,8 @@ class Elements:
     about: tuple[int, ...] = dataclasses.field(metadata={"static": True})
 
     def carry(self, axis: Array, point: Array, rotation: Array) -> tuple[Array, Array]:
-        """Vertices (S + 1, 3) in mm and rotations (S + 1, 3, 3) of the surfaces, moved; `axis`
-        (S + 1,): where the vertices lie on the axis without any move, mm."""
+        """Moves vertices (S + 1, 3), mm, and rotations (S + 1, 3, 3) of the surfaces with their
+        groups. axis: (S + 1,), z of the vertices on the undisturbed axis, mm."""
         for g in reversed(range(len(self.spans))):
             first, last = self.spans[g]
             own = slice(first, last + 1)
@@ -48,7 +48,8 @@ class Elements:
 
 
 def rotation_matrix(tilt: Array) -> Array:
-    """(3, 3) from the axes of a tilted surface to those of the lens; `tilt` (3,) in radians."""
+    """Rotation (3, 3) from the axes of a tilted surface to those of the lens. tilt: (3,), about x,
+    then the rotated y, then the rotated z, radians."""
     (cx, cy, cz), (sx, sy, sz) = jnp.cos(tilt), jnp.sin(tilt)
     one, zero = jnp.ones_like(cx), jnp.zeros_like(cx)
     about_x = jnp.array([[one, zero, zero], [zero, cx, -sx], [zero, sx, cx]])

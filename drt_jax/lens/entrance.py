@@ -14,16 +14,15 @@ from .paraxial import entrance_pupil
 def with_paraxial_pupil(lens: Lens, wavelength: Numbers = 0.5875618) -> Lens:
     """The lens with its paraxial entrance pupil as the stop.
 
-    Two planes that bend no light come first, surfaces 0 and 1: one at the first vertex, from where
-    z and distances are counted as before, and the pupil, in object space. At every field and
-    wavelength rays fill that pupil's plane uniformly, and the chief ray goes through its centre.
-    The real stop is a surface like others, without a rim: of its own apertures only
-    `Lens.apertures` clip.
+    Two dummy planes come first: surface 0 at the first vertex, so that z and distances do not
+    change, and surface 1, the pupil in object space. At every field and wavelength rays fill the
+    pupil uniformly, and the chief ray passes its centre. The real stop becomes an ordinary surface
+    without a semi-diameter: only `Lens.apertures` clip there.
 
-    wavelength: of the paraxial rays, the primary one, () in um.
+    wavelength: () of the paraxial rays, the primary one, um.
 
-    Differentiable: the pupil follows the lens. Tilts and decentres are left out. ValueError for a
-    pupil at infinity; inside a trace all rays fail then.
+    Differentiable: the pupil follows the lens. Tilts and decentres are neglected. ValueError for a
+    pupil at infinity; inside a trace all rays then fail.
     """
     pupil = entrance_pupil(lens, wavelength)
     place, radius = pupil.position[0], pupil.semi_diameter[0]

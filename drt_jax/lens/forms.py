@@ -1,10 +1,10 @@
 """The forms of surfaces: one function and one record in `FORMS` each.
 
-A point on a surface is its transverse coordinates w (paper Eq. 1): one (height in the
-meridional plane, y) or two (x, y), as a tuple of arrays or an array with the component axis
-first; the functions are elementwise in the rest. Each is (w, shape) -> (sag, argument), the
-surface existing where `argument` > 0. Slopes, curvatures at the vertex and the derivative rules
-follow from it by automatic differentiation, see `surface`.
+A point w on a surface has one transverse coordinate, y in the meridional plane, or two, x and y
+(paper Eq. 1): a tuple of arrays, or an array with the component axis first. A form is a function
+(w, shape) -> (sag, argument), elementwise in all other axes; the surface exists where `argument` is
+above 0. Slopes, vertex curvatures and derivatives follow by automatic differentiation, see
+`surface`.
 """
 
 import functools
@@ -17,12 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-# A square root is used up to the rim where the normal of a sphere leans within 0.57 degrees
-# (cos = 0.01) of 90 degrees. Beyond, it continues smoothly and stays positive, so that an
-# iteration which strays outside stays finite and can come back; a ray that ends there has
-# missed the surface.
+# Smallest argument of the square root: there the normal of a sphere leans 0.57 degrees (cos = 0.01)
+# short of 90 degrees. Beyond, the root continues smoothly and stays positive, so that an iteration
+# that strays outside stays finite and can come back; a ray that ends there misses the surface.
 RIM = 1e-4
-# Nearer to the axis than this (mm^2) an odd power of r is flat: its derivative at 0 is none.
+# Below this r^2 (mm^2) r counts as 0, because r has no derivative there.
 _AXIS = 1e-16
 
 # Transverse coordinates: D arrays, x and y or y alone.
@@ -30,8 +29,12 @@ Point = Sequence[Array] | Array
 
 
 class Shape(NamedTuple):
-    """Parameters of surfaces as arrays: curvature c (...) in 1/mm, conic k (...) and
-    coefficients (K, ...), whose meaning belongs to the form."""
+    """Parameters of surfaces.
+
+    curvature: (...), c, 1/mm.
+    conic: (...), k.
+    coefficients: (K, ...), a_0, a_1, ... of the form.
+    """
 
     curvature: Array
     conic: Array
@@ -39,12 +42,12 @@ class Shape(NamedTuple):
 
 
 def square(w: Point) -> Array:
-    """r^2 of points, the shape of `w[0]`, mm^2."""
+    """r^2 of points, shaped as `w[0]`, mm^2."""
     return sum((a * a for a in w[1:]), w[0] * w[0])
 
 
 def root(argument: Array) -> Array:
-    """Square root down to `RIM`; below, its smooth and positive continuation. Any shape."""
+    """Square root down to `RIM`, continued smoothly and positively below. Any shape."""
     inside = argument > RIM
     beyond = RIM**0.5 / (1 + (1 - jnp.where(inside, RIM, argument) / RIM) / 2)
     return jnp.where(inside, jnp.sqrt(jnp.where(inside, argument, 1)), beyond)
@@ -102,7 +105,7 @@ def biconic(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 
 def toroid(w: Point, shape: Shape) -> tuple[Array, Array]:
-    """A curve g(y) turned about an axis along y at the distance 1 / a_0 from the vertex.
+    """A curve g(y) rotated about an axis along y at the distance 1 / a_0 from the vertex.
 
     g is the conic of c and k plus a_1 y^2 + a_2 y^4 + ...; a_0 is the curvature in x.
     z = Rx - sign(Rx) sqrt((Rx - g)^2 - x^2) with Rx = 1 / a_0, written so that a_0 may be 0.
@@ -117,13 +120,13 @@ def toroid(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 
 def powers_xy(count: int) -> list[tuple[int, int]]:
-    """The powers (i, j) of x^i y^j that `count` coefficients stand for: x, y, x^2, x y, y^2, ..."""
+    """Powers (i, j) of x^i y^j of the first `count` coefficients: x, y, x^2, x y, y^2, ..."""
     pairs = [(degree - j, j) for degree in range(1, count + 1) for j in range(degree + 1)]
     return pairs[:count]
 
 
 def _polynomial(w: Point, terms: dict[tuple[int, int], Array]) -> Array:
-    """sum_ij a_ij x^i y^j of `terms`, a_ij by (i, j)."""
+    """sum_ij a_ij x^i y^j. terms: a_ij by (i, j)."""
     degree = max((i + j for i, j in terms), default=0)
     zero = jnp.zeros_like(w[0])
     # A polynomial in y for each power of x.
@@ -146,7 +149,8 @@ def linear(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 @functools.cache
 def _noll(count: int) -> tuple[list[tuple[int, int]], np.ndarray]:
-    """Powers (i, j), and how much of x^i y^j is in each of the first `count` Zernike polynomials.
+    """Powers (i, j), and the coefficient of x^i y^j in each of the first `count` Zernike
+    polynomials.
 
     Noll's order and norm (J. Opt. Soc. Am. 66, 207 (1976)): the mean square over the disc is 1,
     even numbers go with cos(m theta), odd ones with sin.
@@ -168,10 +172,10 @@ def _noll(count: int) -> tuple[list[tuple[int, int]], np.ndarray]:
 
 
 def zernike(w: Point, shape: Shape) -> tuple[Array, Array]:
-    """Conic and Zernike polynomials: ... + sum_j a_j Z_j(x / R, y / R), a_0 being R, in mm.
+    """Conic and Zernike polynomials: ... + sum_j a_j Z_j(x / R, y / R) with R = a_0 in mm.
 
-    Z_j in Noll's order and norm, theta from the x axis. As a polynomial in x and y it keeps 11 of
-    16 digits of a_j with the most terms that files may give, 91.
+    Z_j in Noll's order and norm, theta from the x axis. Summed as a polynomial in x and y, which
+    keeps 11 of 16 digits of a_j with 91 terms, the most that files may give.
     """
     z, argument = _conic(square(w), shape.curvature, shape.conic)
     if len(shape.coefficients) > 1:
@@ -184,7 +188,7 @@ def zernike(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 @functools.cache
 def _forbes(count: int) -> np.ndarray:
-    """(count, count), column m: Q_m as a sum of the auxiliary P_j, see `qbfs`."""
+    """Coefficients (count, count) of the auxiliary P_j in Q_m, column m, see `qbfs`."""
     f, g, h = [2.0, math.sqrt(19) / 2], [-0.5], []
     basis = np.eye(count)
     for m in range(count):
@@ -202,10 +206,11 @@ def _forbes(count: int) -> np.ndarray:
 def qbfs(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Conic and Forbes' polynomials Q_m along its normal, whose slopes are orthonormal on a sphere.
 
-    z = ... + u^2 (1 - u^2) s sum_m a_(m + 1) Q_m(u^2), u = r / a_0, a_0 in mm, and s, 1 / cosine of
-    the conic's slope, sqrt(1 - k c^2 r^2) / sqrt(1 - (1 + k) c^2 r^2). Summed by Clenshaw's
-    recurrence in P_0 = 2, P_1 = 6 - 8 x, P_(m + 1) = (2 - 4 x) P_m - P_(m - 1), which has no large
-    terms. Source: Forbes, Opt. Express 15, 5218 (2007) and 18, 19700 (2010), as in Zemax.
+    z = ... + x (1 - x) s sum_m a_(m + 1) Q_m(x), with x = (r / a_0)^2, a_0 in mm, and
+    s = sqrt(1 - k c^2 r^2) / sqrt(1 - (1 + k) c^2 r^2), 1 / cosine of the conic's slope. Summed by
+    Clenshaw's recurrence in P_0 = 2, P_1 = 6 - 8 x, P_(m + 1) = (2 - 4 x) P_m - P_(m - 1), which
+    has no large terms. Source: Forbes, Opt. Express 15, 5218 (2007) and 18, 19700 (2010), as in
+    Zemax.
     """
     r2 = square(w)
     z, argument = _conic(r2, shape.curvature, shape.conic)
@@ -222,18 +227,18 @@ def qbfs(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 
 def _inverse(radius: Array) -> Array:
-    """1 / radius; 0 where there is none, in padded rows."""
+    """1 / radius; 0 for the radius 0 of padded rows."""
     return jnp.where(radius == 0, 0, 1 / jnp.where(radius == 0, 1, radius))
 
 
 class Form(NamedTuple):
     """A kind of surface.
 
-    function: (w, shape) -> (sag in mm, argument), as described above.
-    symmetry: "rotational" about the z axis, "bilateral" (x -> -x leaves it alone) or "none".
-    powers: what files call the coefficients, in their order.
-    named: files have keys of their own for the first coefficients.
-    round: whether the conic is one of r, so that the surface ends at a rim.
+    function: (w, shape) -> (sag in mm, argument), see the top of this file.
+    symmetry: "rotational" about the z axis, "bilateral" for x -> -x, or "none".
+    powers: names of the coefficients in files, in order.
+    named: keys of their own for the first coefficients in files.
+    round: True if the conic is one of r, so that the surface ends at a rim.
     """
 
     function: Callable[[Point, Shape], tuple[Array, Array]]

@@ -10,15 +10,15 @@ from jax import Array
 
 from ..numerics import concrete, safe_divide, safe_sqrt
 
-# Of model glasses: the lines d, F, C, g in um, the powers of L in Conrady's formula, P_gF on
-# Schott's normal line as (constant, slope by vd), and where they are used: from line i to line t.
+# Model glasses: the lines d, F, C, g (um) and the powers of the wavelength L in Conrady's formula.
 FRAUNHOFER, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
+# P_gF on Schott's normal line (constant, slope by vd); range of model glasses, from line i to t.
 NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL, _FARTHEST = (1.0, 50.0), 0.2
-# Wavelengths in um of a medium without a range: 0.1 nm to 1 m.
+# Range (um) of a medium without one: 0.1 nm to 1 m.
 ANY = 1e-4, 1e6
-# Powers of L of `Glass.schott`, and the shortest wavelength of the last two, whose values are
-# too large for float32 below.
+# Powers of L in `Glass.schott`. The last two are too large for float32 below the shortest
+# wavelength.
 POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12), 0.01
 
 
@@ -26,17 +26,17 @@ POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12), 0.01
 class Glass:
     """Dispersion constants of one medium.
 
-    n^2 is the sum of both forms; a Sellmeier glass has a0 = 1, a medium of constant index n has
-    a0 = n^2.
+    n^2 is the sum of Sellmeier's and Schott's formulas. A Sellmeier glass has a0 = 1, a medium of
+    constant index n has a0 = n^2.
 
     name: as in a prescription.
-    sellmeier: (B1 .. BT, C1 .. CT), C in um^2, of any number of terms T.
-    schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8, or three more, of
+    sellmeier: (B1 .. BT, C1 .. CT), any number of terms T; C in um^2.
+    schott: (a0 .. a5), coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8, and up to three more, of
         L^4, L^-10, L^-12.
-    range: wavelengths in um for which they hold.
+    range: shortest and longest wavelength for which they hold, um.
     model: nd and vd of a model glass, see `model_glass`.
-    partial: how far a model glass lies above the normal line, in P_gF.
-    maker, source: of the table of glasses; "" where there is none.
+    partial: P_gF of a model glass less that of the normal line.
+    maker, source: in the table of glasses; "" for none.
     """
 
     name: str
@@ -54,16 +54,15 @@ class Glass:
 class Dispersion:
     """Dispersion constants of M media as arrays, so that an index can be differentiated.
 
-    T = 3 or the number of terms of the medium with the most, the others padded with zeros; so is
-    K = 6 or 9, the number of Schott's coefficients.
+    T, at least 3, is the largest number of Sellmeier terms, K the largest number of Schott's
+    coefficients; shorter rows end with zeros.
 
     strength: (M, T), Sellmeier's B.
-    resonance: (M, T), Sellmeier's C in um^2.
-    schott: (M, K), the coefficients of the powers of L that `Glass` has.
-    ranges: (M, 2), the shortest and the longest wavelength (um) for which each medium has known
-        constants.
-    model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None if there is none.
-    partial: (M,), how far model glasses lie above the normal line, in P_gF; None: all on it.
+    resonance: (M, T), Sellmeier's C, um^2.
+    schott: (M, K), see `Glass`.
+    ranges: (M, 2), shortest and longest wavelength at which each index is known, um.
+    model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None without any.
+    partial: (M,), P_gF of model glasses less that of the normal line; None if all are 0.
     """
 
     strength: Array
@@ -75,8 +74,8 @@ class Dispersion:
 
     @property
     def range(self) -> tuple[Any, Any]:
-        """The shortest and the longest wavelength, um, at which all media have a known index; the
-        first number is the larger one if there is none. Floats, or arrays () in a trace."""
+        """Shortest and longest wavelength at which the index of all media is known, um; the first
+        number is the larger one if there is none. Floats, or arrays () in a trace."""
         if concrete(self.ranges):
             low, high = np.asarray(self.ranges, float).T
             return float(low.max()), float(high.min())
@@ -84,13 +83,14 @@ class Dispersion:
         return jnp.max(low), jnp.min(high)
 
     def knows(self, wavelengths: Array) -> Array:
-        """Whether all media have a known index at each wavelength (um), bool; also in a trace."""
+        """True where the index of all media is known, bool; also in a trace. wavelengths: any
+        shape, um."""
         low, high = (jnp.asarray(end, wavelengths.dtype) for end in self.range)
         return (wavelengths >= low) & (wavelengths <= high)
 
     @classmethod
     def of(cls, media: list[Glass]) -> "Dispersion":
-        """The constants of `media`, in the default floating dtype."""
+        """The constants of media, in the default floating dtype."""
         halves = [np.asarray(m.sellmeier, float).reshape(2, -1) for m in media]
         terms = max(3, *(half.shape[1] for half in halves))
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
@@ -111,12 +111,13 @@ class Dispersion:
 
 
 def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
-    """A glass of which only nd and the Abbe number vd = (nd - 1) / (nF - nC) are known, and perhaps
-    how far its P_gF lies above Schott's normal line, `partial`.
+    """A glass of given nd and Abbe number vd = (nd - 1) / (nF - nC).
 
-    n = A + B / L + C / L^3.5 (Conrady) through nd, nF - nC and ng - nF = P_gF (nF - nC), with
+    Conrady's n = A + B / L + C / L^3.5 through nd, nF - nC and ng - nF = P_gF (nF - nC), with
     P_gF = 0.6438 - 0.001682 vd + partial. ValueError unless 1 < nd <= 4, 10 <= vd <= 120 and
     |partial| <= 0.2.
+
+    partial: P_gF less that of Schott's normal line.
     """
     if not (1 < nd <= 4 and 10 <= vd <= 120):
         raise ValueError(f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
@@ -127,14 +128,14 @@ def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
 
 
 def nd_and_vd(dispersion: Dispersion) -> Array:
-    """nd and the Abbe number vd (M, 2) of all media; vd 0 where there is no dispersion."""
+    """nd and Abbe number vd (M, 2) of all media; vd is 0 without dispersion."""
     lines = jnp.asarray(FRAUNHOFER[:3], dispersion.schott.dtype)
     nd, f, c = refractive_index(dispersion, lines).T
     return jnp.stack([nd, safe_divide(nd - 1, f - c)], axis=-1)
 
 
 def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
-    """The dispersion with model glasses of the same nd and vd in place of some media, bool (M,)."""
+    """Replaces media by model glasses of the same nd and vd. rows: (M,), bool, which."""
     mask, found = jnp.asarray(rows)[:, None], nd_and_vd(dispersion)
     one = jnp.eye(1, dispersion.schott.shape[1], dtype=found.dtype)
     none = jnp.asarray([_NO_MODEL], found.dtype)
@@ -149,7 +150,7 @@ def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
 
 
 def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Array:
-    """n - 1, (M, W), of model glasses (M, 2), `partial` (M,) above the normal line."""
+    """n - 1 of model glasses, (M, W). Arguments: see `Dispersion`."""
     d, f, c, g = np.power.outer(FRAUNHOFER, np.asarray(_CONRADY, float))
     formula = np.linalg.inv(np.stack([d, f - c, g - f])).T
     nd, vd = model[:, 0], model[:, 1]
@@ -161,13 +162,12 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
 
 
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
-    """Index of each medium at each wavelength, shape (M, W).
+    """Index of each medium at each wavelength, (M, W), relative to air, whose index is 1.
 
-    Relative to air, whose own index is taken as 1. Finite for any wavelength; 0 where the formula,
-    far outside its range, has no real root.
+    Finite for any wavelength; 0 where the formula has no real root, far outside its range.
 
     dispersion: of M media.
-    wavelengths: (W,) in um.
+    wavelengths: (W,), um.
     """
     wavelengths = jnp.clip(wavelengths, *ANY)
     b, c = dispersion.strength[..., None], dispersion.resonance[..., None]

@@ -1,6 +1,6 @@
-"""The table of the makers' glasses: by name and maker, by nd and vd, and the hull of its map.
+"""The table of the makers' glasses: by name and maker, by nd and vd, and the glass map.
 
-Written by tools/glasses.py, whose head tells sources and form; read when a glass is asked for.
+tools/glasses.py writes the table and describes its sources and form.
 """
 
 import difflib
@@ -17,13 +17,18 @@ from jax import Array
 from .glass import FRAUNHOFER, POWERS, Glass
 
 _TABLE = pathlib.Path(__file__).parent / "catalogue" / "glasses.txt.gz"
-# In the plane of nd and vd a difference of 100 of vd counts as one of 1 of nd: the weights, 1 and
-# 1e-4 of squares, that Zemax has by default where it replaces model glasses.
+# Distances in the glass map are in units of nd; 100 of vd count as 1 of nd: Zemax's default weights
+# (1 and 1e-4 of squares) where it replaces model glasses.
 _PER_VD = 0.01
 
 
 class _Entry(NamedTuple):
-    """A line of the table: whether its name alone means it, maker, C, source, constants as text."""
+    """A line of the table.
+
+    plain: True if the name without a maker means this glass.
+    celsius: temperature of its constants, as text.
+    constants: range, Sellmeier and Schott coefficients, as text.
+    """
 
     plain: bool
     maker: str
@@ -33,8 +38,8 @@ class _Entry(NamedTuple):
 
 
 class Neighbour(NamedTuple):
-    """A glass of the table with nd, vd, and how far it is from what was asked for: in units of nd,
-    100 of vd as one."""
+    """A glass of the table, its nd and vd, and its distance in the glass map, in units of nd with
+    100 of vd as 1."""
 
     glass: Glass
     nd: float
@@ -44,7 +49,7 @@ class Neighbour(NamedTuple):
 
 @functools.cache
 def _table() -> dict[str, list[_Entry]]:
-    """All lines by name; the plain one first."""
+    """All lines by name, the plain one first."""
     table: dict[str, list[_Entry]] = {"air": [_Entry(True, "", "", "", "0.0001 1000000\t\t")]}
     head = ["", "", ""]
     for line in gzip.decompress(_TABLE.read_bytes()).decode().split("\n"):
@@ -60,13 +65,13 @@ def _table() -> dict[str, list[_Entry]]:
 
 @functools.cache
 def glass_makers() -> tuple[str, ...]:
-    """The makers of the table, and Zemax's catalogues MISC and INFRARED."""
+    """Makers of the table, and Zemax's catalogues MISC and INFRARED."""
     found = {entry.maker for entries in _table().values() for entry in entries}
     return tuple(sorted(found - {""}))
 
 
 def _glass(name: str, entry: _Entry) -> Glass:
-    """A glass by the shortest name that finds it."""
+    """The glass of a line, under the shortest name that finds it."""
     low_high, sellmeier, schott = (
         tuple(map(float, part.split())) for part in entry.constants.split("\t")
     )
@@ -83,31 +88,31 @@ def _glass(name: str, entry: _Entry) -> Glass:
 
 
 def _differ(entries: list[_Entry]) -> bool:
-    """Whether glasses of one name have different constants or ranges."""
+    """True if glasses of one name have different constants or ranges."""
     return len({entry.constants for entry in entries}) > 1
 
 
 def _all() -> list[tuple[str, _Entry]]:
-    """All glasses but for air."""
+    """All glasses except air."""
     return [(n, e) for n, entries in _table().items() for e in entries if n != "air"]
 
 
 @functools.cache
 def glass_names() -> tuple[str, ...]:
-    """Names that `find_glass` knows, NAME_MAKER where a name is not enough; plain ones first."""
+    """Names of all glasses, NAME_MAKER where a name is ambiguous; plain ones first."""
     ordered = sorted(_all(), key=lambda own: not own[1].plain)
     return ("air", *dict.fromkeys(_glass(name, entry).name for name, entry in ordered))
 
 
 def find_glass(name: str, maker: str | None = None) -> Glass:
-    """The glass of a name, and maker. ValueError, listing near names, if there is none, and naming
-    the makers, if several have different glasses of this name.
+    """Finds a glass by name. ValueError for an unknown name, with near names, and for a name of
+    several makers with different glasses, with the makers.
 
     Names are exact: SK16 and N-SK16 are two glasses. Without a maker, names of Schott's catalogue
     of 2017 mean Schott's glass, SK2 and SK16 Hikari's. Source: `Glass.source`.
 
     name: as the maker writes it; "SK16_SCHOTT" is SK16 of SCHOTT.
-    maker: of `glass_makers()`; None: any.
+    maker: one of `glass_makers()`; None for any.
     """
     table = _table()
     plain, _, after = name.rpartition("_")
@@ -135,17 +140,17 @@ def find_glass(name: str, maker: str | None = None) -> Glass:
 
 
 def plain_names() -> list[str]:
-    """Names of the table, without their makers."""
+    """Names of the table without makers."""
     return [*_table()]
 
 
 def spellings(name: str) -> list[str]:
-    """Names of the table that differ by capitals alone."""
+    """Names of the table that differ from a name only in capitals."""
     return [own for own in _table() if own.lower() == name.lower()]
 
 
 def near_names(name: str, count: int = 6) -> list[str]:
-    """Names that `find_glass` knows and that look like `name`."""
+    """Names of glasses that look like `name`, at most `count`."""
     folded, name = dict.fromkeys(own.lower() for own in _table()), name.lower()
     near = difflib.get_close_matches(name, folded, n=count, cutoff=0.5)
     near += [known for known in folded if name in known and known not in near]
@@ -155,7 +160,7 @@ def near_names(name: str, count: int = 6) -> list[str]:
 
 
 def indices(glass: Glass, wavelengths: np.ndarray) -> np.ndarray:
-    """The index (W,) of a glass of the table at wavelengths (W,) in um, in float64, without JAX."""
+    """Index (W,) of a glass of the table in float64, without JAX. wavelengths: (W,), um."""
     square = np.square(wavelengths)
     b, c = np.reshape(glass.sellmeier, (2, -1, 1))
     powers = square[:, None] ** (np.array(POWERS[: len(glass.schott)]) / 2)
@@ -164,8 +169,8 @@ def indices(glass: Glass, wavelengths: np.ndarray) -> np.ndarray:
 
 
 def map_point(glass: Glass) -> tuple[float, float] | None:
-    """nd and vd of a glass of the table; None where its range has not the lines F, d and C, or it
-    has no dispersion."""
+    """nd and vd of a glass of the table; None if its range does not contain the lines F, d and C,
+    or it has no dispersion."""
     if glass.range[0] > FRAUNHOFER[1] or glass.range[1] < FRAUNHOFER[2]:
         return None
     d, f, c = indices(glass, np.array(FRAUNHOFER[:3])).tolist()
@@ -174,7 +179,7 @@ def map_point(glass: Glass) -> tuple[float, float] | None:
 
 @functools.cache
 def _mapped() -> tuple[list[_Entry], list[Glass], np.ndarray]:
-    """Solids that are known at the lines F and C: entries, glasses, nd and vd (G, 2)."""
+    """Entries, glasses, and nd and vd (G, 2) of all solids that have these."""
     solids = [(entry, _glass(name, entry)) for name, entry in _all() if name.lower() != "water"]
     found = [(*own, point) for own in solids if (point := map_point(own[1]))]
     entries, glasses, points = zip(*found, strict=True)
@@ -184,30 +189,29 @@ def _mapped() -> tuple[list[_Entry], list[Glass], np.ndarray]:
 def nearest_glasses(
     nd: float, vd: float, makers: Collection[str] | None = None, count: int = 10
 ) -> list[Neighbour]:
-    """Glasses next to nd and vd in the glass map, the nearest first.
+    """Glasses nearest to nd and vd in the glass map, the nearest first: the distance is that of nd
+    and vd / 100. ValueError for unknown makers.
 
-    The distance is that of nd and vd / 100. ValueError for unknown makers.
-
-    makers: of `glass_makers()`; None: of all.
-    count: how many, at most.
+    makers: some of `glass_makers()`; None for all.
+    count: most glasses.
     """
-    wanted = None if makers is None else {maker.upper() for maker in makers}
-    for maker in sorted((wanted or set()) - {*glass_makers()}):
+    only = None if makers is None else {maker.upper() for maker in makers}
+    for maker in sorted((only or set()) - {*glass_makers()}):
         raise ValueError(f"unknown maker {maker!r}; makers: {', '.join(glass_makers())}")
     entries, glasses, points = _mapped()
     away = np.hypot(points[:, 0] - nd, _PER_VD * (points[:, 1] - vd))
     own = [
         Neighbour(glasses[i], float(points[i, 0]), float(points[i, 1]), float(away[i]))
         for i in np.argsort(away, kind="stable")
-        if wanted is None or entries[i].maker in wanted
+        if only is None or entries[i].maker in only
     ]
     return own[:count]
 
 
 @functools.cache
 def _glass_map() -> np.ndarray:
-    """The edges of the convex hull of the plain glasses but for water, in nd and scaled vd: their
-    normals, outwards, and how far the origin lies behind them, (E, 3)."""
+    """Convex hull of the plain glasses except water in nd and vd / 100, (E, 3): outward normal of
+    each edge, and signed distance of the origin from it."""
     from scipy.spatial import ConvexHull  # takes half a second to import
 
     entries, _, points = _mapped()
@@ -215,8 +219,8 @@ def _glass_map() -> np.ndarray:
 
 
 def glass_map_distance(model: Array) -> Array:
-    """How far glasses of nd and vd (G, 2) lie outside of the convex hull of the plain glasses, but
-    for water: (G,), from its farthest edge, negative within, in units of nd, 100 of vd as one."""
+    """Distance (G,) of glasses from the convex hull of the plain glasses except water, negative
+    inside, in units of nd with 100 of vd as 1. model: (G, 2), nd and vd."""
     edges = jnp.asarray(_glass_map(), model.dtype)
     scaled = model * jnp.array([[1, _PER_VD]], model.dtype)
     return jnp.max(scaled @ edges[:, :2].T + edges[None, :, 2], axis=1)

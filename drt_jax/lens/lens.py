@@ -22,10 +22,11 @@ from .surface import surface_sag
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Labels:
-    """The names of a lens and of its media. Two are equal where the same surfaces lie between
-    different media and the same media are air, so that names compile nothing.
+    """Names of a lens and its media. Labels are equal if the same surfaces separate different media
+    and the same media are air: another name compiles nothing.
 
-    name: of the lens. glasses: of the S + 1 media.
+    name: name of the lens.
+    glasses: names of the S + 1 media.
     """
 
     name: str
@@ -33,8 +34,8 @@ class Labels:
 
     @functools.cached_property
     def structure(self) -> tuple[int, ...]:
-        """Of each medium: 0 that in front of the lens, -1 air, else the number of the glass, one
-        more at each boundary."""
+        """A number for each medium: 0 for the medium in front of the lens, -1 for air, otherwise
+        the number of the glass, one more at each boundary."""
         found, last = [0], 0
         for before, name in itertools.pairwise(self.glasses):
             solid = name not in ("air", self.glasses[0])
@@ -59,37 +60,36 @@ class Labels:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, repr=False)
 class Lens:
-    """S surfaces and, as the last row of every array over surfaces, the sensor.
+    """A lens of S surfaces. Every array over surfaces ends with a row for the sensor.
 
     All arrays are differentiable leaves of one floating dtype; `jax.grad` with respect to a
-    lens returns a `Lens`. Lengths in mm, z along the axis from the first vertex.
+    lens returns a `Lens`. z runs along the axis from the first vertex. None costs nothing.
 
-    curvature: (S + 1,) in 1/mm.
-    conic: (S + 1,), 0 a sphere, -1 a paraboloid.
-    coefficients: (S + 1, K), whose meaning is that of the surface's form (see `forms`;
-        asphere: of r^2, r^4, ... in mm^-1, mm^-3, ...).
-    thickness: (S - 1,) between the vertices of the surfaces, in mm; negative where a mirror has
-        turned the light, and where a stop that bends no light lies behind a vertex in front of it.
-    semi_diameter: (S + 1,) in mm, the clear aperture (inf: none), at the stop the aperture itself.
-    sensor: (), its z in mm.
-    dispersion: of the S + 1 media, the first before the first surface. Light keeps the constants
-        of the medium in front of a surface with the same medium on both sides.
-    decentre: (S + 1, 2), x and y in mm, each surface about its own place on the axis; None for a
-        centred lens, which costs nothing.
-    tilt: (S + 1, 3) in radians, about x, then the turned y, then the turned z, right-handed; None
-        likewise.
-    phase: of diffractive surfaces; None if there is none, which costs nothing.
-    elements: groups of surfaces that move together; None likewise.
-    apertures: other than the circles of `semi_diameter`, and obscurations; None for none.
+    curvature: (S + 1,), 1/mm.
+    conic: (S + 1,), 0 for a sphere, -1 for a paraboloid.
+    coefficients: (S + 1, K), of the surface's form, see `forms`; of an asphere those of r^2, r^4,
+        ... in mm^-1, mm^-3, ...
+    thickness: (S - 1,), between neighbouring vertices, mm; negative behind an odd number of
+        mirrors, and beside a dummy stop that lies out of order along z.
+    semi_diameter: (S + 1,), clear aperture, mm, inf for none; at the stop its own aperture.
+    sensor: (), z of the sensor, mm.
+    dispersion: of the S + 1 media, the first in front of the lens. A medium that continues behind a
+        surface keeps the constants of its first row.
+    decentre: (S + 1, 2), x and y, mm, of each surface from its place on the axis; None for all 0.
+    tilt: (S + 1, 3), about x, then the rotated y, then the rotated z, right-handed, radians; None
+        for all 0.
+    phase: of diffractive surfaces; None without any.
+    elements: groups of surfaces that move together; None without any.
+    apertures: other than the circles of `semi_diameter`, and obscurations; None without any.
 
     Static:
-    stop: the index of the stop surface.
-    labels: the names of the lens and of the S + 1 media, of which only the structure counts.
-    forms: a name in `forms.FORMS` for each of the S + 1 rows (empty: all aspheres).
-    mirrors: whether each of the S surfaces reflects (empty: none does).
-    curved: rows that bend no light but may be curved, S for the sensor; all others are planes of
-        which derivatives by curvature, conic and coefficients are 0. `load_lens` names those that a
-        prescription curves.
+    stop: index of the stop surface.
+    labels: names of the lens and of the S + 1 media.
+    forms: a name in `forms.FORMS` for each of the S + 1 rows; empty for all aspheres.
+    mirrors: True for each of the S surfaces that reflects; empty for none.
+    curved: rows that are not active but may be curved, S for the sensor; the other such rows are
+        planes, whose derivatives by curvature, conic and coefficients are 0. `load_lens` lists
+        those that a prescription curves.
     """
 
     curvature: Array
@@ -111,7 +111,7 @@ class Lens:
     curved: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
 
     def __repr__(self) -> str:
-        """In short; of a gradient too, and inside a trace."""
+        """A short description, also of a gradient and inside a trace."""
         what = f"{self.count} surfaces, the stop is number {self.stop}"
         sensor = self.sensor
         if concrete(sensor) and getattr(sensor, "shape", None) == ():
@@ -122,64 +122,60 @@ class Lens:
     def __post_init__(self) -> None:
         object.__setattr__(self, "forms", self.forms or ("asphere",) * (self.count + 1))
         object.__setattr__(self, "mirrors", self.mirrors or (False,) * self.count)
-        if not concrete(self.curvature):  # a program serves lenses of all names, and knows none
+        if not concrete(self.curvature):  # one program serves lenses of all names
             object.__setattr__(self, "labels", self.labels.unnamed)
 
     @property
     def name(self) -> str:
-        """Of the lens; empty in a trace and of what a program returns."""
+        """Name of the lens; empty in a trace and in what a program returns."""
         return self.labels.name
 
     @property
     def glasses(self) -> tuple[str, ...]:
-        """The names of the S + 1 media; "glass 1", ... in a trace and of what a program returns."""
+        """Names of the S + 1 media; "glass 1", ... in a trace and in what a program returns."""
         return self.labels.glasses
 
     @property
     def count(self) -> int:
-        """How many surfaces S there are, without the sensor."""
+        """Number of surfaces S, without the sensor."""
         return len(self.labels.glasses) - 1
 
     @property
     def active(self) -> tuple[int, ...]:
-        """The surfaces that bend light: mirrors, those between different media, and diffractive
-        ones."""
+        """The surfaces that refract, reflect or diffract."""
         media, added = self.glasses, () if self.phase is None else self.phase.surfaces
         bends = (m or a != b for m, a, b in zip(self.mirrors, media, media[1:]))
         return tuple(i for i, does in enumerate(bends) if does or i in added)
 
     @property
     def vertices(self) -> Array:
-        """z of the S vertices and the sensor along the axis, as if nothing were moved, shape
-        (S + 1,), mm; the first is 0."""
+        """z of the S vertices and the sensor on the undisturbed axis, (S + 1,), mm; the first is
+        0."""
         first = jnp.zeros_like(self.sensor)[None]
         return jnp.concatenate([first, jnp.cumsum(self.thickness), self.sensor[None]])
 
     @property
     def places(self) -> tuple[Array, Array | None, Array | None]:
-        """Where the S vertices and the sensor are: z (S + 1,) and x, y (S + 1, 2), None for 0, in
-        mm along the axes of the first surface's space, and the rotations (S + 1, 3, 3) from their
-        own axes to these, None for none."""
-        across, turned = self.decentre, None
+        """Positions of the S vertices and the sensor along the axes of the lens, z (S + 1,) and
+        x, y (S + 1, 2), mm, and rotations (S + 1, 3, 3) from the axes of each surface to those of
+        the lens. None for x, y of 0 and for no rotation."""
+        across, rotation = self.decentre, None
         if self.tilt is not None:
-            turned = jax.vmap(rotation_matrix)(self.tilt)
+            rotation = jax.vmap(rotation_matrix)(self.tilt)
         if self.elements is None:
-            return self.vertices, across, turned
+            return self.vertices, across, rotation
         z = self.vertices[:, None]
         across = jnp.zeros((len(z), 2), z.dtype) if across is None else across
-        turned = (
-            jnp.broadcast_to(jnp.eye(3, dtype=z.dtype), (len(z), 3, 3))
-            if turned is None
-            else turned
-        )
+        if rotation is None:
+            rotation = jnp.broadcast_to(jnp.eye(3, dtype=z.dtype), (len(z), 3, 3))
         point = jnp.concatenate([across, z], axis=1)
-        point, turned = self.elements.carry(self.vertices, point, turned)
-        return point[:, 2], point[:, :2], turned
+        point, rotation = self.elements.carry(self.vertices, point, rotation)
+        return point[:, 2], point[:, :2], rotation
 
     @property
     def sensor_motion(self) -> Array | None:
-        """How the vertex of the sensor moves with `sensor`, (3,) along the sensor's own axes, in mm
-        a mm; None for (0, 0, 1), where nothing turns it."""
+        """Derivative of the sensor's vertex by `sensor`, (3,) along the sensor's axes; None for
+        (0, 0, 1), where the sensor is not tilted."""
         rotation = self.places[2]
         if rotation is None:
             return None
@@ -193,27 +189,23 @@ class Lens:
 
     @property
     def shape(self) -> Shape:
-        """Curvature (S + 1,), conic (S + 1,) and coefficients (K, S + 1)."""
+        """Shape of the S + 1 rows; its coefficients are (K, S + 1)."""
         return Shape(self.curvature, self.conic, self.coefficients.T)
 
     @property
     def senses(self) -> np.ndarray:
-        """Direction (S + 1,) in which light goes before each surface and before the sensor: 1
-        along its own z axis, -1 against it after an odd number of mirrors."""
+        """Direction of light in front of each surface and the sensor, (S + 1,): 1 along the
+        surface's z axis, -1 against it after an odd number of mirrors."""
         return np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
 
     def index(self, wavelengths: Numbers) -> Array:
-        """Refractive index (S + 1, W) of every medium at `wavelengths` (W,), um.
-
-        ValueError as `checked_wavelengths`.
-        """
+        """Refractive index (S + 1, W) of every medium. wavelengths: (W,), um. ValueError as in
+        `checked_wavelengths`."""
         return refractive_index(self.dispersion, self.checked_wavelengths(wavelengths))
 
     def checked_wavelengths(self, wavelengths: Numbers) -> Array:
-        """`wavelengths`, one or a list, in um, as an array (W,).
-
-        ValueError for none, for another shape, and as `check_wavelengths`.
-        """
+        """Wavelengths as an array (W,), um. wavelengths: one or a list, um. ValueError for none,
+        for another shape, and as in `check_wavelengths`."""
         found = jnp.atleast_1d(real_array("wavelengths", wavelengths, self.curvature.dtype))
         if found.ndim != 1 or not found.size:
             raise ValueError(f"wavelengths: expected one or a list, got shape {found.shape}")
@@ -221,15 +213,13 @@ class Lens:
         return found
 
     def check_wavelengths(self, wavelengths: Numbers) -> None:
-        """ValueError if a known wavelength, (W,) or one in um, lies outside the range of a medium.
-
-        Inside a trace the values are not known and nothing is checked: see `Dispersion.knows`.
-        """
+        """ValueError for a wavelength outside the range of a medium. Inside a trace values are not
+        known and nothing is checked: see `Dispersion.knows`. wavelengths: one or (W,), um."""
         ranges = self.dispersion.ranges
         if not concrete((wavelengths, ranges)):
             return
         low, high = self.dispersion.range
-        # As the lens rounds: 0.7 is not beyond 0.7 in float32.
+        # Rounded to the dtype of the lens: 0.7 is not beyond 0.7 in float32.
         values = np.ravel(np.asarray(wavelengths, ranges.dtype)).astype(float).tolist()
         if all(low <= value <= high for value in values):
             return
@@ -241,9 +231,9 @@ class Lens:
                     raise ValueError(f"{outside}, {low:g} to {high:g} um")
 
     def check(self) -> None:
-        """ValueError, naming the array, unless those over surfaces have the shapes that stand above
-        and one floating dtype, and, where numbers are known, for a stop without a size. In a trace,
-        too; takes some microseconds."""
+        """ValueError, naming the array, for a shape other than those above, for more than one
+        floating dtype, and, as far as numbers are known, for a stop without a size. Also in a
+        trace; takes some microseconds."""
         rows, terms = self.count + 1, np.shape(self.coefficients)[1:2] or (0,)
         shapes: dict[str, tuple] = dict.fromkeys(("curvature", "conic", "semi_diameter"), (rows,))
         shapes |= {"coefficients": (rows, *terms), "thickness": (rows - 2,), "sensor": ()}
@@ -281,7 +271,8 @@ class Lens:
 def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:
     """Height of a surface above its vertex plane, mm, along its own axes.
 
-    surface: 0 to S - 1, or S for the sensor. x, y: mm, of shapes that broadcast together.
+    surface: 0 to S - 1, or S for the sensor.
+    x, y: mm, of shapes that broadcast.
     """
     x, y = jnp.broadcast_arrays(*(jnp.asarray(a, lens.curvature.dtype) for a in (x, y)))
     row = jax.tree.map(lambda a: a[..., surface], lens.shape)
@@ -289,13 +280,13 @@ def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:
 
 
 def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
-    """The lens with model glasses in place of others: their nd and vd are leaves, to be varied.
+    """Replaces glasses by model glasses, whose nd and vd are leaves that can be varied.
 
-    surfaces: behind which they begin, from 0; none: all. Indices at the lines d, and F less C, stay
-    as they are; what else changes is the error of a model glass, see docs/limits.md.
+    nd and nF - nC stay; the rest of the dispersion changes by the error of a model glass, see
+    docs/limits.md. ValueError for a surface behind which no glass begins and, as far as numbers are
+    known, for a glass without dispersion.
 
-    ValueError, which lists those that exist, for a surface behind which no glass begins; also, as
-    far as numbers are known, for a glass without dispersion.
+    surfaces: surfaces, from 0, behind which the glasses begin; empty for all.
     """
     media = lens.glasses
     there = [i for i in range(lens.count) if media[i + 1] not in ("air", media[i])]

@@ -1,4 +1,4 @@
-"""Which neighbouring surfaces of a lens cross, so that light would have to go backwards."""
+"""Neighbouring surfaces that cross, so that light would have to go backwards."""
 
 import itertools
 from typing import NamedTuple
@@ -10,16 +10,16 @@ from .forms import Shape
 from .lens import Lens
 from .surface import surface_sag
 
-# Neighbours that overlap by less at their rims touch (mm): apertures of prescriptions are rounded.
+# Overlap at the rims that counts as touching, mm: apertures of prescriptions are rounded.
 _TOUCH = 1e-4
 _sag = jax.jit(surface_sag, static_argnums=2)
 
 
 class Pair(NamedTuple):
-    """Two neighbours: surfaces that bend light, the second of the last being the sensor.
+    """Two neighbouring active surfaces, or the last one and the sensor.
 
     first, second: their indices; the sensor's is S.
-    gap: between their vertices, mm along the light.
+    gap: between their vertices along the light, mm.
     """
 
     first: int
@@ -30,13 +30,12 @@ class Pair(NamedTuple):
 def neighbours(lens: Lens, gaps: list[float], moved: list[bool]) -> list[Pair]:
     """The pairs of a lens that must keep their order.
 
-    The straight ray between two surfaces that bend light may cross a stop that bends none before
-    the first or behind the second, so that it may lie anywhere. A pair of which one is moved
-    without the other is left out: away from the axis, or at an angle to it, it may lie before its
-    neighbour there and behind it where the light goes.
+    A dummy stop may lie anywhere: the straight ray between its neighbours is prolonged to it. Pairs
+    that are decentred or tilted against each other are left out: their order on the axis may differ
+    from that along the light.
 
-    gaps: mm from each surface to the next and from the last to the sensor.
-    moved: of each surface and the sensor.
+    gaps: from each surface to the next, and from the last to the sensor, mm.
+    moved: True for each surface, and the sensor, that is decentred or tilted by itself.
     """
     groups = () if lens.elements is None else lens.elements.spans
     separated = lambda i, j: any((a <= i <= b) != (a <= j <= b) for a, b in groups)  # noqa: E731
@@ -50,7 +49,8 @@ def neighbours(lens: Lens, gaps: list[float], moved: list[bool]) -> list[Pair]:
 
 
 def heights(lens: Lens, pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distances from the axis up to the smaller semi-diameter, mm, and there the sags of both."""
+    """Heights from the axis up to the smaller semi-diameter, and the sags of both surfaces there,
+    mm."""
     semi = np.asarray(lens.semi_diameter)
     y = np.linspace(0, min(semi[pair.first], semi[pair.second]), 257, dtype=semi.dtype)
     arrays = [np.asarray(a) for a in (lens.curvature, lens.conic, lens.coefficients)]
@@ -62,8 +62,8 @@ def heights(lens: Lens, pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def crossing(lens: Lens, pair: Pair) -> float | None:
-    """From how far off the axis on, mm, two neighbours cross within both their apertures: 0 if
-    their vertices are in the wrong order, None if they do not cross."""
+    """Smallest height at which two neighbours cross inside both apertures, mm; 0 if their vertices
+    are in the wrong order, None if they do not cross."""
     if pair.gap <= 0:
         return 0.0
     rims = np.asarray(lens.semi_diameter)[[pair.first, pair.second]]
@@ -75,8 +75,8 @@ def crossing(lens: Lens, pair: Pair) -> float | None:
 
 
 def may_cross(lens: Lens) -> bool:
-    """Whether some neighbours, of a lens whose arrays are known, cross inside their apertures, or
-    may do so: without apertures, or away from the axis."""
+    """True if neighbours of a known lens cross inside their apertures or may do so: without
+    apertures, or decentred or tilted against each other."""
     pairs, semi = neighbours_now(lens), np.asarray(lens.semi_diameter)
     if len(pairs) < max(len(lens.active), 1):
         return True
@@ -85,7 +85,7 @@ def may_cross(lens: Lens) -> bool:
 
 
 def neighbours_now(lens: Lens) -> list[Pair]:
-    """`neighbours` of a lens as its arrays, all known, are now: after an optimiser's step, say."""
+    """`neighbours` from the arrays of a known lens, such as after an optimiser's step."""
     gaps = np.asarray(lens.thickness, float).tolist()
     moves = [np.asarray(a) for a in (lens.decentre, lens.tilt) if a is not None]
     moved = [any(bool(np.any(a[k] != 0)) for a in moves) for k in range(lens.count + 1)]
@@ -93,7 +93,7 @@ def neighbours_now(lens: Lens) -> list[Pair]:
 
 
 def describe_crossing(lens: Lens, pair: Pair, place: float) -> str:
-    """That two neighbours cross, in words; `place` as of `crossing`."""
+    """A sentence that two neighbours cross. place: height where they do, see `crossing`, mm."""
     second = "the sensor" if pair.second == lens.count else f"surface {pair.second}"
     where = f"from {place:.3g} mm off the axis on" if place else "on the axis"
     return f"surface {pair.first} and {second} cross {where}: {pair.gap:.4g} mm between them"

@@ -1,13 +1,13 @@
 """Gaussian optics: the y-u trace, focal length, pupils, image.
 
-A paraxial ray is its height y in mm and its slope u = dy/dz, at each surface. After an odd
-number of mirrors, the index and the distances are negative. Tilts and decentres are left out,
-and a surface or a phase without an axis is taken in its (y, z) section. Source of the formulae:
-Welford, Aberrations of Optical Systems (1986), ch. 3, 6, 8, 10.
+A paraxial ray has a height y (mm) and a slope u = dy/dz at each surface. Behind an odd number of
+mirrors, index and distances are negative. Tilts and decentres are neglected; of a surface or phase
+without rotational symmetry the (y, z) section counts. Source of the formulas: Welford, Aberrations
+of Optical Systems (1986), ch. 3, 6, 8, 10.
 
-ValueError for wavelengths, distances and fields as of `scene_of`. Inside a trace, where values are
-not known, the results for a wavelength outside the range of a glass, and for a distance that is
-not above 0, and heights for a field of 90 degrees and more, are inf.
+ValueError as in `scene_of`. Inside a trace, where values are not known, results are inf for a
+wavelength outside the range of a glass, for a distance not above 0 and for a field of 90 degrees
+and more.
 """
 
 import dataclasses
@@ -25,11 +25,11 @@ from .surface import vertex_curvature
 
 
 class Pupil(NamedTuple):
-    """An image of the stop; inf where the lens is telecentric.
+    """An image of the stop; inf for a telecentric lens.
 
-    position: (W,) in mm along z, of the entrance pupil from the first vertex, of the exit pupil
-        from the last.
-    semi_diameter: (W,) in mm.
+    position: (W,), along z, of the entrance pupil from the first vertex, of the exit pupil from the
+        last, mm.
+    semi_diameter: (W,), mm.
     """
 
     position: Array
@@ -37,20 +37,16 @@ class Pupil(NamedTuple):
 
 
 class FirstOrder(NamedTuple):
-    """What a design program lists first.
+    """First-order data, as the functions of the same names describe them.
 
-    focal_length: (W,) in mm, in image space, as `focal_length`.
-    back_focal_distance: (W,) in mm, as `back_focal_distance`.
-    front_focal_distance: (W,) in mm, as `front_focal_distance`.
-    image_distance: (W,) in mm, as `image_distance`.
-    f_number: (W,), as `f_number`.
-    numerical_aperture: (W,), as `numerical_aperture`.
-    magnification: (W,), as `lateral_magnification`.
+    focal_length, back_focal_distance, front_focal_distance, image_distance: (W,), mm.
+    f_number, numerical_aperture: (W,).
+    magnification: (W,), see `lateral_magnification`.
     entrance_pupil: the stop as seen from the object.
     exit_pupil: the stop as seen from the image.
-    petzval_radius: (W,) in mm, of the surface on which a flat object is imaged without
-        astigmatism; inf for none.
-    effective_focal_length: (W,) in mm, in air, as `effective_focal_length`.
+    petzval_radius: (W,), radius of the image of a flat object without astigmatism, mm; inf for a
+        flat one.
+    effective_focal_length: (W,), mm.
     """
 
     focal_length: Array
@@ -67,7 +63,7 @@ class FirstOrder(NamedTuple):
 
 
 def _quotient(numerator: Array, denominator: Array) -> Array:
-    """The quotient; inf, with derivative 0, where the denominator is 0."""
+    """Quotient; inf, with derivative 0, where the denominator is 0."""
     return jnp.where(denominator == 0, jnp.inf, safe_divide(numerator, denominator))
 
 
@@ -76,11 +72,11 @@ def trace_yu(
 ) -> tuple[Array, Array]:
     """Paraxial trace: heights on the S surfaces and slopes behind them, both (S, ...).
 
-    power: (S, ...) in 1/mm.
-    gaps: (S - 1,) in mm, of any sign.
-    index: (S + 1, ...) of the media, negative after an odd number of mirrors.
-    height: (...) in mm at the first vertex.
-    slope: (...) before it.
+    power: (S, ...), 1/mm.
+    gaps: (S - 1,), of any sign, mm.
+    index: (S + 1, ...), of the media, negative behind an odd number of mirrors.
+    height: (...), at the first vertex, mm.
+    slope: (...), in front of it.
     """
     shape = jnp.broadcast_shapes(height.shape, slope.shape, power.shape[1:], index.shape[1:])
 
@@ -97,21 +93,21 @@ def trace_yu(
     gaps = jnp.concatenate([jnp.zeros_like(gaps, shape=1), gaps])
     power, index = wide(power), wide(index)
     ray = jnp.broadcast_to(height, shape), jnp.broadcast_to(slope, shape)
-    # A loop over the surfaces, not unrolled: these arrays are tiny, compiling them is what costs.
+    # A loop over the surfaces, not unrolled: the arrays are tiny, compilation is what costs.
     return jax.lax.scan(step, ray, (gaps, power, index[:-1], index[1:]))[1]
 
 
 @dataclasses.dataclass(frozen=True)
 class ParaxialSystem:
-    """What paraxial rays see of a lens.
+    """A lens for paraxial rays.
 
-    curvature: (S,) in 1/mm.
-    power: (S, W) in 1/mm, of a surface and its phase.
-    gaps: (S - 1,) in mm.
-    index: (S + 1, W), negative after an odd number of mirrors.
-    aperture: (), the semi-diameter of the stop in mm.
-    known: (W,), bool, whether all media have an index.
-    stop: its index.
+    curvature: (S,), 1/mm.
+    power: (S, W), of each surface and its phase, 1/mm.
+    gaps: (S - 1,), mm.
+    index: (S + 1, W), negative behind an odd number of mirrors.
+    aperture: (), semi-diameter of the stop, mm.
+    known: (W,), bool, True if all media have an index.
+    stop: index of the stop surface.
     """
 
     curvature: Array
@@ -123,18 +119,21 @@ class ParaxialSystem:
     stop: int
 
     def masked(self, results: Any, good: Array | bool = True) -> Any:
-        """Results (..., W); inf where an index is not known, or what came in is not `good`, bool
-        of a shape that broadcasts."""
+        """Results with inf where an index is not known or the input is invalid.
+
+        results: arrays (..., W).
+        good: bool, of a shape that broadcasts, True for valid input.
+        """
 
         def masked(found):
-            sure = (jnp.broadcast_to(a, found.shape) for a in (self.known, good))
-            return jnp.where(jnp.logical_and(*sure), found, jnp.inf)
+            valid = (jnp.broadcast_to(a, found.shape) for a in (self.known, good))
+            return jnp.where(jnp.logical_and(*valid), found, jnp.inf)
 
         return jax.tree.map(masked, results)
 
 
 class ParaxialRay(NamedTuple):
-    """A paraxial ray: height in mm on each surface, slope before and behind it, each (S, W)."""
+    """A paraxial ray: height on each surface, mm, slope before and behind it, each (S, W)."""
 
     height: Array
     before: Array
@@ -142,7 +141,7 @@ class ParaxialRay(NamedTuple):
 
 
 def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
-    """What paraxial rays of `wavelengths` (W,), um, see of a lens."""
+    """The lens for paraxial rays. wavelengths: (W,), um."""
     lens.check()
     waves = lens.checked_wavelengths(wavelengths)
     index = lens.index(jnp.clip(waves, *lens.dispersion.range))
@@ -150,16 +149,16 @@ def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
     curvature = vertex_curvature(lens.shape, lens.forms, 1)[0][:-1]
     power = curvature[:, None] * jnp.diff(index, axis=0)
     if lens.phase is not None:
-        turned = vertex_curvature(lens.phase.shape, lens.phase.forms, 1)[0]
+        bend = vertex_curvature(lens.phase.shape, lens.phase.forms, 1)[0]
         wave = 1e-3 * lens.phase.order[:, None] * waves[None]
-        power = power.at[np.array(lens.phase.surfaces)].add(-wave * turned[:, None])
+        power = power.at[np.array(lens.phase.surfaces)].add(-wave * bend[:, None])
     aperture = lens.semi_diameter[lens.stop]
     known = lens.dispersion.knows(waves)
     return ParaxialSystem(curvature, power, lens.thickness, index, aperture, known, lens.stop)
 
 
 def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | float) -> ParaxialRay:
-    """The ray of the given height (mm) and slope, () or (W,), at the first vertex, before it."""
+    """Traces the ray of a height (mm) and slope, () or (W,), in front of the first vertex."""
     one = jnp.ones_like(system.index[0])
     start = one * height, one * slope
     heights, behind = trace_yu(system.power, system.gaps, system.index, *start)
@@ -167,9 +166,9 @@ def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | floa
 
 
 def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
-    """Height and slope (W,) of a ray through the centre of the stop, where n u = 1 there.
+    """Height (W,), mm, and slope (W,) of the ray through the centre of the stop with n u = 1 there.
 
-    `front`: at the first vertex, before it; else at the last vertex, behind it.
+    front: True for the ray in front of the first vertex, False for behind the last.
     """
     power, gaps, index, stop = system.power, system.gaps, system.index, system.stop
     if front:  # backwards: the same lens seen from behind
@@ -187,48 +186,46 @@ def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
 
 
 def chief_ray_at_image(lens: Lens, wavelengths: Numbers) -> tuple[Array, Array]:
-    """Height (W,) in mm and slope (W,), at the last vertex and behind it, of a ray through the
-    centre of the stop; of the size that makes n u = 1 at the stop. `wavelengths` in um."""
+    """`chief_ray` behind the last vertex. wavelengths: (W,), um."""
     return chief_ray(paraxial_system(lens, wavelengths), front=False)
 
 
 def _pupil(system: ParaxialSystem, front: bool) -> Pupil:
     height, slope = chief_ray(system, front)
-    # n u times the size of the pupil is the same in all media (Lagrange).
+    # n u times the size of the pupil is the Lagrange invariant.
     bend = jnp.abs(system.index[0 if front else -1] * slope)
     return system.masked(Pupil(_quotient(-height, slope), _quotient(system.aperture, bend)))
 
 
 def entrance_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
-    """The stop as seen from the object; position from the first vertex. `wavelengths` in um."""
+    """The stop as seen from the object. wavelengths: (W,), um."""
     return _pupil(paraxial_system(lens, wavelengths), front=True)
 
 
 def exit_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
-    """The stop as seen from the image; position from the last vertex. `wavelengths` in um."""
+    """The stop as seen from the image. wavelengths: (W,), um."""
     return _pupil(paraxial_system(lens, wavelengths), front=False)
 
 
 def marginal_ray(system: ParaxialSystem, vergence: Array) -> ParaxialRay:
-    """The ray from the axial object point at 1 / `vergence` () mm through the rim of the stop."""
+    """The ray from the axial object point through the rim of the stop. vergence: (), 1 / distance,
+    1/mm."""
     ray = trace_ray(system, 1.0, vergence)
     factor = safe_divide(system.aperture, ray.height[system.stop])
     return ParaxialRay(*(part * factor[None] for part in ray))
 
 
 def petzval_parts(system: ParaxialSystem) -> Array:
-    """Parts (S, W) of the Petzval sum, 1/mm."""
+    """Contributions (S, W) of the surfaces to the Petzval sum, 1/mm."""
     index = system.index
     return -system.curvature[:, None] * (1 / index[1:] - 1 / index[:-1])
 
 
 def first_order(lens: Lens, distance: Numbers, wavelengths: Numbers) -> FirstOrder:
-    """First-order data, see `FirstOrder`.
+    """First-order data. Focal length, focal distances and pupils do not depend on the distance.
 
-    Focal length, focal distances and pupils do not depend on the distance.
-
-    distance: from the object to the first vertex in mm, inf allowed.
-    wavelengths: (W,) in um.
+    distance: from the object to the first vertex, inf allowed, mm.
+    wavelengths: (W,), um.
     """
     system = paraxial_system(lens, wavelengths)
     far = distance_array(distance, lens.curvature.dtype)
@@ -255,66 +252,69 @@ def first_order(lens: Lens, distance: Numbers, wavelengths: Numbers) -> FirstOrd
 
 
 def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
-    """Focal length in image space (W,), n' over power, mm; inf for an afocal lens. `wavelengths`
-    (W,) in um. From the rear principal plane to the focus, along z: in water longer by its index
-    than `effective_focal_length`, and negative for a concave mirror, whose focus lies before it."""
+    """Focal length in image space (W,), n' / power, mm; inf for an afocal lens. Distance along z
+    from the rear principal plane to the focus: longer in water than `effective_focal_length`, by
+    the index, and negative for a concave mirror. wavelengths: (W,), um."""
     system = paraxial_system(lens, wavelengths)
     slope = trace_ray(system, 1.0, 0.0).behind[-1]
     return system.masked(_quotient(-jnp.ones_like(slope), slope))
 
 
 def effective_focal_length(lens: Lens, wavelengths: Numbers) -> Array:
-    """Effective focal length in air (W,), 1 over power, mm, whatever the medium of the image; inf
-    for an afocal lens. `wavelengths` (W,) in um. The EFL of design programs; positive for lenses
-    and mirrors that converge."""
+    """Effective focal length in air (W,), 1 / power, mm, whatever the medium of the image: the EFL
+    of design programs, positive for lenses and mirrors that converge; inf for an afocal lens.
+    wavelengths: (W,), um."""
     return first_order(lens, jnp.inf, wavelengths).effective_focal_length
 
 
 def back_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
-    """Last vertex to the image of an infinitely far object (W,), mm; inf for an afocal lens.
-    `wavelengths` (W,) in um."""
+    """Distance from the last vertex to the rear focus (W,), mm; inf for an afocal lens.
+    wavelengths: (W,), um."""
     system = paraxial_system(lens, wavelengths)
     ray = trace_ray(system, 1.0, 0.0)
     return system.masked(_quotient(-ray.height[-1], ray.behind[-1]))
 
 
 def front_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
-    """First vertex to the front focus (W,), mm, negative where it lies before the lens; inf
-    for an afocal lens. `wavelengths` (W,) in um."""
+    """Distance from the first vertex to the front focus (W,), mm, negative in front of the lens;
+    inf for an afocal lens. wavelengths: (W,), um."""
     return first_order(lens, jnp.inf, wavelengths).front_focal_distance
 
 
 def image_distance(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """First vertex to the paraxial image of an axial object at `distance` mm (W,), mm; inf
-    where that lies at infinity. `wavelengths` (W,) in um."""
+    """Distance from the first vertex to the paraxial image (W,), mm; inf for an image at infinity.
+
+    distance: from the object to the first vertex, inf allowed, mm.
+    wavelengths: (W,), um.
+    """
     return first_order(lens, distance, wavelengths).image_distance
 
 
 def numerical_aperture(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
     """Paraxial n u of the marginal ray at the image (W,), positive; 0 for an image at infinity.
-    `distance` from the object to the first vertex in mm, inf allowed; `wavelengths` (W,), um."""
+    Arguments as in `image_distance`."""
     return first_order(lens, distance, wavelengths).numerical_aperture
 
 
 def f_number(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity. For an
-    infinitely far object, focal length over diameter of the entrance pupil; else the working
-    f-number. `distance` from the object to the first vertex in mm; `wavelengths` (W,), um."""
+    """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity. For an object
+    at infinity the focal length over the diameter of the entrance pupil, else the working f-number.
+    Arguments as in `image_distance`."""
     return first_order(lens, distance, wavelengths).f_number
 
 
 def lateral_magnification(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Image height over object height (W,), negative where the image is upside down.
-    `distance` from the object to the first vertex in mm; inf gives 0. `wavelengths` (W,), um."""
+    """Image height / object height (W,), negative for an inverted image, 0 for an object at
+    infinity. Arguments as in `image_distance`."""
     return first_order(lens, distance, wavelengths).magnification
 
 
 def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Paraxial image height (..., W), mm, of the fields `field` (...), radians.
+    """Paraxial image height (..., W), mm; inf for an image at infinity.
 
-    As everywhere, light of a positive angle travels upwards, and the object lies below the
-    axis (`field_of_height` gives the angle of an object point). `distance` in mm, inf allowed;
-    `wavelengths` (W,) in um. inf for an image at infinity.
+    field: (...), radians; light of a positive angle travels upwards, from an object below the axis,
+        see `field_of_height`.
+    distance, wavelengths: as in `image_distance`.
     """
     system = paraxial_system(lens, wavelengths)
     far = distance_array(distance, lens.curvature.dtype)

@@ -1,4 +1,4 @@
-"""Diffractive structures: gratings, zone plates, metalenses, as phase that a surface adds."""
+"""Diffractive surfaces, such as gratings, zone plates and metalenses: phases added to rays."""
 
 import dataclasses
 
@@ -12,20 +12,20 @@ from .forms import Shape
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Phase:
-    """Structures on N surfaces, of any form, refracting or reflecting or between equal media.
+    """Phases on N surfaces, which may refract, reflect or neither.
 
-    Each adds order x wavelength x phi(w) to the optical path of a ray through the point w. The
-    phase phi, in waves, is written as the sag of a form in `surface.FORMS` is in mm, without
-    curvature and conic: "linear" is a grating of a_0 lines per mm, whose first order turns light
-    towards +y; "asphere" a radial phase, a zone plate of the focal length f at the wavelength L
-    with -1 / (2 f L) waves/mm^2, L in mm; or "polynomial_xy".
+    Each adds order * wavelength * phi(w) to the optical path of a ray through the point w. The
+    phase phi, in waves, has the formula of a sag without curvature and conic, see `forms`.
+    "linear": a grating of a_0 lines per mm; its first order turns light towards +y. "asphere": a
+    radial phase; a_0 = -1 / (2 f L) is a zone plate of focal length f at the wavelength L, both in
+    mm. Or "polynomial_xy".
 
-    coefficients: (N, K), of the forms, in waves per mm to their powers.
-    order: (N,), of diffraction: a whole number.
+    coefficients: (N, K), waves / mm^power.
+    order: (N,), order of diffraction, a whole number.
 
     Static:
-    surfaces: the indices of the N surfaces, rising.
-    forms: their N names.
+    surfaces: indices of the N surfaces, rising.
+    forms: names of the N forms.
     """
 
     coefficients: Array
@@ -35,6 +35,6 @@ class Phase:
 
     @property
     def shape(self) -> Shape:
-        """Of the phase as a sag: arrays (N,) and (K, N)."""
+        """Shape whose sag is the phase, N rows."""
         flat = jnp.zeros_like(self.order)
         return Shape(flat, flat, self.coefficients.T)

@@ -1,4 +1,4 @@
-"""The scene: from where light of which wavelengths enters a lens."""
+"""The scene: an object point and wavelengths."""
 
 import dataclasses
 from typing import Any
@@ -12,7 +12,7 @@ from ..numerics import Numbers, concrete, real_array
 from .lens import Lens
 
 _RIGHT = np.pi / 2
-# A distance is above 0 from here on, mm: the squares of 1 / distance are numbers, in float32, too.
+# Smallest distance, mm: the square of 1 / distance is still finite in float32.
 _NEAREST = 1e-6
 
 
@@ -21,10 +21,9 @@ _NEAREST = 1e-6
 class Scene:
     """An object point and its wavelengths, arrays of one floating dtype.
 
-    field: (2,) angles in radians along x and y, whose tangents add: light goes along (tan x, tan y,
-        1); positive light travels upwards.
-    distance: () from the object plane to the first vertex in mm, inf allowed.
-    wavelengths: (W,) in um.
+    field: (2,), angles along x and y, radians: light goes along (tan x, tan y, 1).
+    distance: (), from the object plane to the first vertex, inf allowed, mm.
+    wavelengths: (W,), um.
     """
 
     field: Array
@@ -33,46 +32,47 @@ class Scene:
 
     @property
     def possible(self) -> Array:
-        """Whether the object lies before the lens, () bool: angles below 90 degrees, and a distance
-        above 0. Known in a trace only when it runs; light from elsewhere then is MISSED."""
+        """True if the object lies in front of the lens, (), bool: angles below 90 degrees and a
+        distance above 0. In a trace, light from elsewhere is MISSED."""
         return jnp.all(ahead(self.field)) & in_front(self.distance)
 
     @property
     def tangent(self) -> Array:
-        """Tangents (2,) of the field; 0 for an angle of 90 degrees and beyond."""
+        """Tangents (2,) of the field; 0 for an angle of 90 degrees and more."""
         return jnp.tan(jnp.where(ahead(self.field), self.field, 0))
 
     @property
     def vergence(self) -> Array:
-        """1 / distance (), 1/mm; 0 for a distance that is not above 0."""
+        """1 / distance, (), 1/mm; 0 for a distance not above 0."""
         return vergence_of(self.distance)
 
 
 def ahead(angle: Array) -> Array:
-    """Whether light at an angle (...) in radians to the axis goes forwards, bool."""
+    """True where light at an angle to the axis (...), radians, goes forwards, bool."""
     return jnp.abs(angle) < _RIGHT
 
 
 def in_front(distance: Array) -> Array:
-    """Whether an object at a distance (...) in mm lies before the lens, bool; inf does."""
+    """True where an object at a distance (...), mm, lies in front of the lens, bool."""
     return distance >= _NEAREST
 
 
 def vergence_of(distance: Array) -> Array:
-    """1 / `distance` (...), 1/mm, also of inf; 0 for a distance in mm that is not above 0."""
+    """1 / distance (...), 1/mm; 0 for a distance not above 0."""
     before = in_front(distance)
     return jnp.where(before, 1 / jnp.where(before, distance, 1), 0)
 
 
 def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Scene:
-    """A scene in the dtype of the lens: one type for numbers, NumPy's and JAX's arrays.
+    """A scene in the dtype of the lens.
 
-    field: one angle (along y) or two (x, y) in radians: light goes along (tan x, tan y, 1).
-    distance: mm, inf allowed. wavelengths: (W,) or one, um.
+    field: one angle (along y) or two (x, y), radians: light goes along (tan x, tan y, 1).
+    distance: from the object plane to the first vertex, inf allowed, mm.
+    wavelengths: (W,) or one, um.
 
-    ValueError for other shapes, for what is no real number, and, as far as values are known, for an
-    angle of 90 degrees and more, a distance not above 0 (1e-6 mm), a wavelength outside the range
-    of a glass; also for a lens whose arrays do not fit together. See `Scene.possible`.
+    ValueError for other shapes, for what is no real number, for a lens whose arrays do not fit
+    together, and, as far as values are known, for an angle of 90 degrees and more, a distance below
+    1e-6 mm or a wavelength outside the range of a glass. See `Scene.possible`.
     """
     lens.check()
     dtype = lens.curvature.dtype
@@ -85,8 +85,8 @@ def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers
 
 
 def field_array(field: Numbers, dtype: Any) -> Array:
-    """Angles in radians (...) as an array. ValueError for what is no angle, and for a known one of
-    90 degrees and more."""
+    """Angles as an array (...), radians. ValueError for what is no angle, and for a known one of 90
+    degrees and more."""
     angles = real_array("field", field, dtype)
     for angle in _known(field):
         if not abs(angle) < _RIGHT:
@@ -98,8 +98,8 @@ def field_array(field: Numbers, dtype: Any) -> Array:
 
 
 def fields_array(fields: Numbers, dtype: Any) -> Array:
-    """Angles in radians of F fields, one, (F,) along y or (F, 2), as an array (F, 2). ValueError
-    for other shapes, and as of `field_array`."""
+    """Angles of F fields as an array (F, 2), radians. fields: one angle, (F,) along y, or (F, 2).
+    ValueError for other shapes, and as in `field_array`."""
     angles = jnp.atleast_1d(field_array(fields, dtype))
     if angles.ndim == 1:
         angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
@@ -109,8 +109,8 @@ def fields_array(fields: Numbers, dtype: Any) -> Array:
 
 
 def spectrum_of(weights: Numbers | None, scene: Scene, dtype: Any) -> Array:
-    """Weights (W,) of the light of a scene's wavelengths, of any sum; None: equal. ValueError for
-    another number of them."""
+    """Weights of the wavelengths of a scene as an array (W,), of any sum. weights: (W,), or None
+    for equal ones. ValueError for another shape."""
     count = scene.wavelengths.shape[0]
     if weights is None:
         return jnp.ones(count, dtype)
@@ -121,8 +121,8 @@ def spectrum_of(weights: Numbers | None, scene: Scene, dtype: Any) -> Array:
 
 
 def distance_array(distance: Numbers, dtype: Any) -> Array:
-    """A distance in mm as an array (). ValueError for other shapes, for what is no number, and for
-    a known one that is not above 0."""
+    """A distance as an array (), mm. ValueError for other shapes, for what is no number, and for a
+    known one not above 0."""
     far = real_array("distance", distance, dtype)
     if far.ndim:
         raise ValueError(f"distance: expected one number, got shape {far.shape}")
@@ -135,16 +135,19 @@ def distance_array(distance: Numbers, dtype: Any) -> Array:
 
 
 def _known(values: Numbers) -> list[float]:
-    """Those that are known."""
+    """The values as a list; empty inside a trace."""
     return np.ravel(np.asarray(values, float)).tolist() if concrete(values) else []
 
 
 def field_of_height(height: Numbers, distance: Numbers) -> Array:
-    """The field angle in radians of an object point `height` mm (...) above the axis.
+    """Field angle (...) of an object point, radians: negative above the axis, from where light
+    travels downwards.
 
-    `distance` () mm from the object plane to the first vertex, finite. Light from above the axis
-    travels downwards, so that the angle is negative. ValueError for a known distance that is not
-    above 0 or not finite; inside a trace the angle then is 90 degrees, from where no light comes.
+    height: (...), of the object point above the axis, mm.
+    distance: (), from the object plane to the first vertex, finite, mm.
+
+    ValueError for a known distance not above 0 or not finite; inside a trace the angle then is 90
+    degrees, from where no light comes.
     """
     heights = real_array("height", height, float)
     far = distance_array(distance, float)

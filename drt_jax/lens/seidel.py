@@ -1,6 +1,6 @@
-"""Third-order aberrations: the Seidel sums of a lens with an axis, and its paraxial colour.
+"""Third-order aberrations: Seidel sums and paraxial colour of a rotationally symmetric lens.
 
-Source of the formulae: Welford, Aberrations of Optical Systems (1986), ch. 8, 10.
+Source of the formulas: Welford, Aberrations of Optical Systems (1986), ch. 8, 10.
 """
 
 from typing import NamedTuple
@@ -26,20 +26,19 @@ from .surface import by_form, surface_sag
 
 
 class ThirdOrder(NamedTuple):
-    """Third-order aberrations at the paraxial image, the parts of the surfaces.
+    """Third-order aberrations at the paraxial image, the contribution of each surface.
 
-    Transverse, of the ray through the rim of the stop from the edge of the field; signed as
-    CODE V prints SA, TCO, TAS, SAS, PTB, DST, AX, LAT, PTZ.
+    Transverse, of the ray from the edge of the field through the rim of the stop. The signs are
+    those of CODE V's SA, TCO, TAS, SAS, PTB, DST, AX, LAT, PTZ.
 
-    spherical: (S, W) in mm.
-    tangential_coma: (S, W) in mm.
-    tangential_astigmatism: (S, W) in mm, of the tangential image, from the paraxial image plane.
-    sagittal_astigmatism: (S, W) in mm, of the sagittal image, likewise.
-    petzval_blur: (S, W) in mm.
-    distortion: (S, W) in mm.
-    axial_colour: (S, W) in mm, the shortest wavelength against the longest.
-    lateral_colour: (S, W) in mm, likewise.
-    petzval_curvature: (S, W) in 1/mm.
+    spherical: (S, W), mm.
+    tangential_coma: (S, W), mm.
+    tangential_astigmatism, sagittal_astigmatism: (S, W), blur of the tangential and the sagittal
+        image in the paraxial image plane, mm.
+    petzval_blur: (S, W), mm.
+    distortion: (S, W), mm.
+    axial_colour, lateral_colour: (S, W), between the shortest and the longest wavelength, mm.
+    petzval_curvature: (S, W), 1/mm.
     """
 
     spherical: Array
@@ -59,7 +58,8 @@ class ThirdOrder(NamedTuple):
 
 
 def _fourth_order(lens: Lens, vertex: Array) -> Array:
-    """Coefficient (S,) of r^4 in the sag, beyond the sphere of curvature `vertex` (S,), mm^-3."""
+    """Coefficient (S,) of r^4 in the sag less that of the sphere of curvature `vertex` (S,),
+    mm^-3."""
 
     def height(y):
         return by_form(surface_sag, (y,), lens.shape, lens.forms)
@@ -75,14 +75,14 @@ def _fourth_order(lens: Lens, vertex: Array) -> Array:
 def _seidel(
     system: ParaxialSystem, figure: Array, marginal: ParaxialRay, chief: ParaxialRay
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Seidel's five terms (S, W), mm. `figure` (S,): coefficients of r^4 beyond the sphere."""
+    """Seidel's five terms (S, W), mm. figure: (S,), see `_fourth_order`."""
     n, c = system.index, system.curvature[:, None]
     y, chief_y = marginal.height, chief.height
     a, chief_a = n[:-1] * (y * c + marginal.before), n[:-1] * (chief_y * c + chief.before)
     bend = y * (marginal.behind / n[1:] - marginal.before / n[:-1])
     invariant = n[0] * (chief.before[0] * y[0] - marginal.before[0] * chief_y[0])
     aspheric = 8 * figure[:, None] * (n[1:] - n[:-1])
-    # Welford's quotient of the chief and the marginal incidence, written without it.
+    # Welford's formula without its quotient of chief and marginal incidence.
     change, step = 1 / n[1:] - 1 / n[:-1], 1 / n[1:] ** 2 - 1 / n[:-1] ** 2
     s5 = chief_y * chief_a * c * change * (2 * y * chief_a - chief_y * a) - chief_a**3 * y * step
     return (
@@ -95,15 +95,16 @@ def _seidel(
 
 
 def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> ThirdOrder:
-    """Third-order aberrations of each surface, see `ThirdOrder`; `.total` sums them up.
+    """Third-order aberrations of each surface; `.total` sums them up.
 
-    Conics and the r^2 and r^4 terms of aspheres count; odd powers of r have no place in this
-    theory and are left out. Transverse aberrations are 0 for an image at infinity, colour is 0
-    for one wavelength. ValueError for a surface without rotational symmetry, and as of `paraxial`.
+    Conics and the r^2 and r^4 terms of aspheres count; odd powers of r have no place in this theory
+    and are neglected. Transverse aberrations are 0 for an image at infinity, colour is 0 for one
+    wavelength. ValueError for a surface that diffracts or has no rotational symmetry, and as in
+    `paraxial`.
 
-    field: () in radians, the edge of the field.
-    distance: from the object to the first vertex in mm, inf allowed.
-    wavelengths: (W,) in um.
+    field: (), edge of the field, radians.
+    distance: from the object to the first vertex, inf allowed, mm.
+    wavelengths: (W,), um.
     """
     others = sorted({form for form in lens.forms if FORMS[form].symmetry != "rotational"})
     if others:
@@ -119,7 +120,7 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
     n, c = system.index, system.curvature[:, None]
     marginal = marginal_ray(system, vergence)
     height, slope = chief_ray(system, front=True)
-    # Scaled to the field, the slope of the line from the object point to the first vertex.
+    # Scaled to the field: the slope of the line from the object point to the first vertex.
     scale = safe_divide(jnp.tan(jnp.where(forwards, angle, 0)), slope - vergence * height)
     chief = trace_ray(system, height * scale, slope * scale)
     figure = _fourth_order(lens, system.curvature)

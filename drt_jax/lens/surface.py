@@ -1,6 +1,6 @@
-"""The shape of a surface: sag, its slopes and second derivatives, and where it exists.
+"""Sag of a surface, its first and second derivatives, and where the surface exists.
 
-All by the form's function, see `forms`, where points and shapes are told.
+`forms` describes points, shapes and forms.
 """
 
 from collections.abc import Callable
@@ -15,11 +15,12 @@ from .forms import FORMS, RIM, Point, Shape, horner, root, square
 
 
 def by_form(function: Callable, w: Point, shape: Shape, forms: tuple[str, ...]) -> Any:
-    """`function(w, shape, form)` for arrays over surfaces, `forms[i]` being that of surface i.
+    """Calls `function(w, shape, form)` once for each form that occurs, with its surfaces, and puts
+    the results, trees of arrays (S, ...), in order of the surfaces.
 
-    `w` D arrays (S, ...), shape arrays (S, ...) and (K, S, ...), all of the same rank but for
-    the first axis of coefficients. The results of the forms that occur, trees of arrays (S, ...),
-    are put in order along the surface axis.
+    w: D arrays (S, ...).
+    shape: arrays (S, ...) of the rank of `w`, and coefficients (K, S, ...).
+    forms: form of each of the S surfaces.
     """
     kinds = sorted(set(forms))
     if len(kinds) <= 1:
@@ -34,23 +35,23 @@ def by_form(function: Callable, w: Point, shape: Shape, forms: tuple[str, ...]) 
 
 
 def surface_sag(w: Point, shape: Shape, form: str = "asphere") -> Array:
-    """Height above the vertex plane, mm, shape of `w[0]`; `w`: D arrays in mm."""
+    """Height above the vertex plane, mm, shaped as `w[0]`. w: D arrays, mm."""
     return FORMS[form].function(w, shape)[0]
 
 
 def domain(w: Point, shape: Shape, form: str = "asphere") -> Array:
-    """True where the surface exists at `w` (D arrays, mm); the shape of `w[0]`, bool."""
+    """True where the surface exists, bool, shaped as `w[0]`. w: D arrays, mm."""
     return FORMS[form].function(w, shape)[1] > RIM
 
 
 def sag_derivatives(
     w: Point, shape: Shape, form: str = "asphere"
 ) -> tuple[Array, tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
-    """Sag, its gradient and its Hessian by the transverse coordinates.
+    """Sag (mm), its gradient (D arrays) and its Hessian (1/mm, D rows of D) by the transverse
+    coordinates, all shaped as `w[0]`. w: D arrays, mm.
 
-    `w`: D arrays in mm. Returns an array, D of them and D rows of D, all shaped as `w[0]`. By
-    automatic differentiation of the form, so that a new one is one formula; but that of nearly
-    all surfaces, an asphere, has them written out with one root and one division.
+    By automatic differentiation; for an asphere, the form of nearly all surfaces, written out with
+    one root and one division.
     """
     w = tuple(w)
     if form == "asphere":
@@ -73,7 +74,7 @@ def _asphere_derivatives(w: tuple[Array, ...], shape: Shape) -> Any:
     r2 = square(w)
     argument = 1 - bent * r2
     inverse = 1 / jnp.sqrt(jnp.maximum(argument, RIM))
-    # z and its derivatives by r^2; beyond the rim, it goes on with the slope of the rim.
+    # z and its derivatives by r^2; beyond the rim, z continues with the slope at the rim.
     z, first = c * r2 / (1 + root(argument)), c / 2 * inverse
     second = jnp.where(argument > RIM, c * bent / 4 * inverse**3, 0)
     if shape.coefficients.shape[0]:
@@ -89,8 +90,8 @@ def _asphere_derivatives(w: tuple[Array, ...], shape: Shape) -> Any:
 
 
 def vertex_curvature(shape: Shape, forms: tuple[str, ...], dim: int) -> tuple[Array, ...]:
-    """Curvature of S surfaces at their vertices along each of `dim` components: `dim` arrays (S,),
-    1/mm; `shape` with arrays (S,) and (K, S)."""
+    """Vertex curvature along each of `dim` components: `dim` arrays (S,), 1/mm. shape: arrays (S,)
+    and (K, S)."""
     if set(forms) <= {"asphere"}:
         bend = shape.curvature + (2 * shape.coefficients[0] if len(shape.coefficients) else 0)
         return (bend,) * dim

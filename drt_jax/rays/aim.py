@@ -208,21 +208,21 @@ def aim_outwards(system: System, target: Vector) -> Aimed:
 
     def again(state: _Growth) -> _Growth:
         aimed, first = state.aimed, state.rounds == 0
-        good = aimed.status == Status.OK
+        ok = aimed.status == Status.OK
 
         def from_found(launch: Vector) -> Vector:
-            return nearest_found(launch, good, target)
+            return nearest_found(launch, ok, target)
 
         def from_fan(launch: Vector) -> Vector:
             fan = trace_fan(system, no_fan(system, waves, 1), launch, reach)
             return nearest_start(fan, target)
 
-        begin = run_if(~first & jnp.any(good), from_found, aimed.launch)
-        begin = run_if(~first & ~jnp.any(good), from_fan, begin)
-        begin = tuple(jnp.where(first | good, a, b) for a, b in zip(aimed.launch, begin))
+        begin = run_if(~first & jnp.any(ok), from_found, aimed.launch)
+        begin = run_if(~first & ~jnp.any(ok), from_fan, begin)
+        begin = tuple(jnp.where(first | ok, a, b) for a, b in zip(aimed.launch, begin))
         step = jnp.where(first, reach, reach / 8)
         new = aim(system, target, begin, (beam, step), upright)
-        found = ~good & (new.status == Status.OK)
+        found = ~ok & (new.status == Status.OK)
         taken = found | first
         launch = tuple(jnp.where(taken, a, b) for a, b in zip(new.launch, aimed.launch))
         status = jnp.where(taken, new.status, aimed.status)
@@ -238,17 +238,17 @@ def aim_outwards(system: System, target: Vector) -> Aimed:
     return jax.lax.while_loop(lambda state: state.more, again, begun).aimed
 
 
-def nearest_found(launch: Vector, good: Array, target: Vector) -> Vector:
-    """For each stop point, the launch of the nearest good ray of any wavelength, D arrays (W, Q),
-    mm; undefined if no ray is good.
+def nearest_found(launch: Vector, ok: Array, target: Vector) -> Vector:
+    """For each stop point, the launch of the nearest ray of any wavelength that was found, D arrays
+    (W, Q), mm; undefined if none was.
 
     launch: D arrays (W, Q), mm.
-    good: (W, Q), bool.
+    ok: (W, Q), bool, rays that were found.
     target: D arrays (W, Q), stop points of the rays, mm.
     """
     every = [a.reshape(-1) for a in target]
     gaps = (a[..., None] - b[None, None] for a, b in zip(target, every, strict=True))
-    far = jnp.where(good.reshape(-1)[None, None], sum(g * g for g in gaps), jnp.inf)
+    far = jnp.where(ok.reshape(-1)[None, None], sum(g * g for g in gaps), jnp.inf)
     nearest = jnp.argmin(far, axis=-1)
     return tuple(a.reshape(-1)[nearest] for a in launch)
 
@@ -275,17 +275,17 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
     stop, _ = system.at_stop
     # The surfaces in front of the stop; then a plane without power at the stop.
     shape = Shape(*(a[..., :before] for a in (rows.curvature, rows.conic, rows.coefficients.T)))
-    bent = jnp.stack(vertex_curvature(shape, system.forms[:before], dim), axis=-1)
-    bent = jnp.concatenate([bent, jnp.zeros((1, dim), dtype)])[:, None, :, None]
+    curvature = jnp.stack(vertex_curvature(shape, system.forms[:before], dim), axis=-1)
+    curvature = jnp.concatenate([curvature, jnp.zeros((1, dim), dtype)])[:, None, :, None]
     gaps = jnp.diff(jnp.append(rows.axial[:before], stop.axial))
     # Behind a mirror, distances and indices are both negative.
     index = system.index[: before + 1] * system.senses[: before + 1, None, None]
     index = jnp.moveaxis(jnp.concatenate([index, index[-1:]]), -1, 1)[:, None]
-    power = bent * jnp.diff(index, axis=0)
+    power = curvature * jnp.diff(index, axis=0)
     by = system.diffraction
     if by is not None:
-        for d, turned in enumerate(vertex_curvature(by.phase, by.forms, dim)):
-            added = -by.wave[..., 0] * turned[:, None]
+        for d, bend in enumerate(vertex_curvature(by.phase, by.forms, dim)):
+            added = -by.wave[..., 0] * bend[:, None]
             power = power.at[np.array(by.rows), 0, d].add(added, mode="drop")
     one = jnp.ones((2, dim, system.index.shape[1]), dtype)
     first = rows.axial[0] if before else stop.axial
@@ -297,11 +297,11 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
         jnp.moveaxis(a, 1, 0) for a in trace_yu(power, gaps, index, height, slope)
     )
     launch = []
-    for d, wanted in enumerate(target):
+    for d, point in enumerate(target):
         tangent = -system.source[d]
         if stop.offset is not None:
-            wanted = wanted + stop.offset[d]
-        amplitude = safe_divide(wanted - tangent * tilted[-1, d, :, None], axial[-1, d, :, None])
+            point = point + stop.offset[d]
+        amplitude = safe_divide(point - tangent * tilted[-1, d, :, None], axial[-1, d, :, None])
         start = amplitude * axial[0, d, :, None] + tangent * tilted[0, d, :, None]
         launch.append(start)
     # Transfer from z = `first` to the vertex plane of the first row.
@@ -362,8 +362,8 @@ def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
     trace = shoot(system, flat)
     _, there = split_stop(system, trace.hits)
-    good = trace.status == Status.OK
-    return Fan(launch, tuple(jnp.where(good, a, jnp.inf).reshape(shape) for a in there))
+    ok = trace.status == Status.OK
+    return Fan(launch, tuple(jnp.where(ok, a, jnp.inf).reshape(shape) for a in there))
 
 
 def nearest_start(fan: Fan, target: Vector) -> Vector:

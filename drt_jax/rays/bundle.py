@@ -85,10 +85,10 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
     radius = jnp.sqrt(jnp.max(dot(target, target)))
     waves = target[0].shape[0]
     scaled = radius * jnp.asarray(points, radius.dtype)
-    wanted = tuple(jnp.broadcast_to(p, (waves, p.size)) for p in scaled)
-    sizes, upright = beam_size(system, wanted), system.rows.rotation is None
-    aimed = aim(system, wanted, paraxial_launch(system, wanted, sizes[1]), sizes, upright)
-    good = jnp.all(aimed.status == Status.OK)
+    nodes = tuple(jnp.broadcast_to(p, (waves, p.size)) for p in scaled)
+    sizes, upright = beam_size(system, nodes), system.rows.rotation is None
+    aimed = aim(system, nodes, paraxial_launch(system, nodes, sizes[1]), sizes, upright)
+    all_ok = jnp.all(aimed.status == Status.OK)
 
     pairs = np.array([(i, d - i) for d in range(_DEGREE + 1) for i in range(d + 1)])
     # Fit in an orthogonal basis of rising degree: its coefficients fall as fast as the entries of
@@ -105,7 +105,7 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
         rows = jnp.einsum("ijdw,jwq->idwq", coefficients, y)
         fitted = sum((rows[i] * x[i][None] for i in range(1, _DEGREE + 1)), rows[0])
         start = paraxial_launch(system, target, sizes[1])
-        return tuple(jnp.where(good, f, s) for f, s in zip(fitted, start, strict=True))
+        return tuple(jnp.where(all_ok, f, s) for f, s in zip(fitted, start, strict=True))
 
     return at
 

@@ -207,11 +207,11 @@ def stationary(path: Path, system: System, target: Vector) -> Array:
     both = angle + jnp.concatenate([angle[1:], angle[-1:]])
     gradient = residual(path, system)
     bound = 64 * eps * both * jnp.sqrt(1 + dot(path.slope, path.slope))
-    good = (dot(gradient, gradient) <= bound**2) & (both <= 4 / eps**0.5)
-    good = good & by_form(domain, path.hits, system.rows.wide, system.forms)
-    good = good & (_forward(path.before, path.slope) * senses > 0)
-    good = good & (_forward(path.after, path.slope) * behind > 0)
-    return jnp.all(good, axis=0) & met(label(path, system), target, path.hits, system)
+    ok = (dot(gradient, gradient) <= bound**2) & (both <= 4 / eps**0.5)
+    ok = ok & by_form(domain, path.hits, system.rows.wide, system.forms)
+    ok = ok & (_forward(path.before, path.slope) * senses > 0)
+    ok = ok & (_forward(path.after, path.slope) * behind > 0)
+    return jnp.all(ok, axis=0) & met(label(path, system), target, path.hits, system)
 
 
 def _forward(direction: Vector, slope: Vector) -> Array:

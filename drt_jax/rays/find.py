@@ -137,25 +137,25 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
 
 
 def find(
-    system: System, target: Vector, launch: Vector | None = None, wanted: Array | None = None
+    system: System, target: Vector, launch: Vector | None = None, searched: Array | None = None
 ) -> Found:
     """Finds the rays through stop points; not differentiable. Rays that aiming does not find are
     searched for with a fan; rays that miss their stop points by more than rounding are polished.
 
     target: D arrays (W, Q), stop points, mm.
     launch: D arrays (W, Q), first guesses, mm; None for the paraxial launch.
-    wanted: (W, Q), bool, rays that are searched for with a fan; None for all.
+    searched: (W, Q), bool, rays that are searched for with a fan; None for all.
     """
     sizes = beam_size(system, target)
     launch = paraxial_launch(system, target, sizes[1]) if launch is None else launch
-    wanted = jnp.ones(target[0].shape, bool) if wanted is None else wanted
-    search = _search(system, target, launch, sizes, wanted)
-    good = search.status == Status.OK
+    searched = jnp.ones(target[0].shape, bool) if searched is None else searched
+    search = _search(system, target, launch, sizes, searched)
+    ok = search.status == Status.OK
     hits, crossing = split_stop(system, search.hits)
-    hits = tuple(jnp.where(good, a, 0) for a in hits)
-    rough = good & ~fermat.met(crossing, target, hits, system)
+    hits = tuple(jnp.where(ok, a, 0) for a in hits)
+    rough = ok & ~fermat.met(crossing, target, hits, system)
     hits, solved, steps = _polish(system, target, hits, rough)
-    status = jnp.where(good & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
+    status = jnp.where(ok & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
     hits = tuple(jnp.where(status == Status.OK, a, 0) for a in hits)
     steps = (search.steps + steps).astype(jnp.int32)
     return Found(hits, fermat.arrival(hits, system), status, steps)
@@ -168,9 +168,9 @@ def find_aimed(system: System, target: Vector) -> Found:
     aimed = aim_outwards(system, target)
     hits, status = _verdict(system, aimed.launch, aimed.status)
     hits, crossing = split_stop(system, hits)
-    good = (status == Status.OK) & fermat.met(crossing, target, hits, system)
-    hits = tuple(jnp.where(good, a, 0) for a in hits)
-    status = jnp.where(good, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
+    ok = (status == Status.OK) & fermat.met(crossing, target, hits, system)
+    hits = tuple(jnp.where(ok, a, 0) for a in hits)
+    status = jnp.where(ok, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
     return Found(hits, fermat.arrival(hits, system), status, aimed.steps)
 
 
@@ -192,9 +192,11 @@ class _Search(NamedTuple):
     steps: Array
 
 
-def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted: Array) -> _Search:
+def _search(
+    system: System, target: Vector, launch: Vector, sizes: tuple, searched: Array
+) -> _Search:
     """Searches for rays in rounds. Round 0 aims all rays from their first guesses. Round 1 aims the
-    wanted rays that failed from the nearest ray of a fan. Each later round aims the first few
+    `searched` rays that failed from the nearest ray of a fan. Each later round aims the first few
     missing rays from several rays of the fan each; `rounds` rounds use all `STARTS` starts.
 
     All rounds share one loop with as many lanes as rays: the aiming is compiled once, and the fan
@@ -216,10 +218,10 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted
 
         def from_several(given):
             fan, target, _ = given
-            wanted, left = lanes.of_rays((target, state.left))
+            points, left = lanes.of_rays((target, state.left))
             ranks = (rounds - left)[..., None] * starts + ray[None, None, :starts]
-            begin = starts_of(fan, wanted, ranks)
-            return fan, *lanes.spread((tuple(a[..., None] for a in wanted), begin))
+            begin = starts_of(fan, points, ranks)
+            return fan, *lanes.spread((tuple(a[..., None] for a in points), begin))
 
         given = run_if(state.round == 1, from_fan, (state.fan, target, launch))
         fan, own, begin = run_if(state.round > 1, from_several, given)
@@ -236,7 +238,7 @@ def _search(system: System, target: Vector, launch: Vector, sizes: tuple, wanted
         taken = (jnp.take_along_axis(h, lane[None], axis=-1) for h in new.hits)
         hits = tuple(jnp.where(found, a, b) for a, b in zip(taken, state.hits, strict=True))
         left = state.left - (lanes.served & ~whole).astype(jnp.int32)
-        left = jnp.where(state.round == 0, jnp.where(wanted, rounds, 0), left)
+        left = jnp.where(state.round == 0, jnp.where(searched, rounds, 0), left)
         left = jnp.where((found & (state.round > 0)) | (status == Status.OK), 0, left)
         return _Search(hits, status, left, fan, state.round + 1, state.steps + new.steps)
 
@@ -295,7 +297,7 @@ def _find_many(system: System, target: Vector, known: Array) -> Found:
     waves, rays = target[0].shape
     size = tile_of(rays, waves)
     if len(target) == 1 or size == rays:
-        return find(system, target, wanted=known)
+        return find(system, target, searched=known)
     launch_of = polynomial_launch(system, target)
 
     def tile(target, known):

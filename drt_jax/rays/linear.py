@@ -76,37 +76,37 @@ class _Change(NamedTuple):
 
 
 def _step(
-    row: _Row, active_stop: bool, good: Array, change: _Change, residual: Vector, moved: Vector
+    row: _Row, active_stop: bool, ok: Array, change: _Change, residual: Vector, shift: Vector
 ) -> tuple[_Change, Vector]:
     """Propagates a change to a row and through it.
 
     row: the row.
     active_stop: True if the stop is an active surface.
-    good: (W, Q), as in `solve`.
+    ok: (W, Q), as in `solve`.
     change: the change in front of the row.
-    residual, moved: D and D + 1 arrays (W, Q), `residual` and `point` of the right-hand side.
+    residual, shift: D and D + 1 arrays (W, Q), `residual` and `point` of the right-hand side.
 
     Returns the change behind the row, and that of its hit, D arrays (W, Q), mm.
     """
     carried = (
         p + row.length * s - m
-        for p, s, m in zip(change.point, change.direction, moved, strict=True)
+        for p, s, m in zip(change.point, change.direction, shift, strict=True)
     )
     *across, depth = rotate(row.rotation, tuple(carried), back=True)
-    *turned, along = rotate(row.rotation, change.direction, back=True)
+    *direction, along = rotate(row.rotation, change.direction, back=True)
     # Project along the ray onto the tangent plane of the surface.
-    normal = jnp.where(good, row.before[-1] - dot(row.slope, row.before[:-1]), 1)
+    normal = jnp.where(ok, row.before[-1] - dot(row.slope, row.before[:-1]), 1)
     slide = (depth - dot(row.slope, across)) / normal
     hit = tuple(c - slide * e for c, e in zip(across, row.before, strict=False))
     here = rotate(row.rotation, (*hit, dot(row.slope, hit)))
-    point = tuple(a + m for a, m in zip(here, moved, strict=True))
+    point = tuple(a + m for a, m in zip(here, shift, strict=True))
     pull = tuple(
         row.index_before * (v + s * along) + dot(bend, hit) - f
-        for v, s, bend, f in zip(turned, row.slope, row.bend, residual, strict=True)
+        for v, s, bend, f in zip(direction, row.slope, row.bend, residual, strict=True)
     )
     # Change of direction behind: its products with the tangents are known; that with the direction
     # itself is 0.
-    normal = jnp.where(good, row.after[-1] - dot(row.slope, row.after[:-1]), 1)
+    normal = jnp.where(ok, row.after[-1] - dot(row.slope, row.after[:-1]), 1)
     along = -dot(row.after[:-1], pull) / (row.index_behind * normal)
     behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
     made = hit if active_stop else (*point, *change.direction)
@@ -114,11 +114,11 @@ def _step(
     return _Change(point, rotate(row.rotation, (*behind, along)), made), hit
 
 
-def solve(path: Path, system: System, good: Array, rhs: RightSide) -> tuple[Vector, Vector]:
+def solve(path: Path, system: System, ok: Array, rhs: RightSide) -> tuple[Vector, Vector]:
     """Solves the linear system: changes of the hits, D arrays (R, W, Q), mm, and of the direction
     at the sensor, D + 1 arrays (W, Q), along the axes of the lens.
 
-    good: (W, Q), bool, rays of interest; the result for the others is arbitrary but finite, if
+    ok: (W, Q), bool, rays of interest; the result for the others is arbitrary but finite, if
         their paths are.
     rhs: the right-hand side; the result is linear in it.
     """
@@ -134,22 +134,22 @@ def solve(path: Path, system: System, good: Array, rhs: RightSide) -> tuple[Vect
 
     def step(changes, given):
         row, *given_here = given
-        alone = lambda change: _step(row, active_stop, good, change, none, still)  # noqa: E731
+        alone = lambda change: _step(row, active_stop, ok, change, none, still)  # noqa: E731
         free = jax.vmap(alone)(changes[0])
-        forced = _step(row, active_stop, good, changes[1], *given_here)
+        forced = _step(row, active_stop, ok, changes[1], *given_here)
         return (free[0], forced[0]), (free[1], forced[1])
 
     start = free, _Change(still, rhs.direction, unknown)
     through, hits = jax.lax.scan(step, start, (path_rows, rhs.residual, rhs.point))
     crossing = _crossing(path, system)
     columns = jax.vmap(crossing)(through[0].label)
-    wanted = tuple(s - c for s, c in zip(rhs.label, crossing(through[1].label), strict=True))
+    miss = tuple(s - c for s, c in zip(rhs.label, crossing(through[1].label), strict=True))
     # Rays that are not of interest get the unit matrix.
     rows = [
-        [jnp.where(good, c, float(i == k)) for k, c in enumerate(row)]
+        [jnp.where(ok, c, float(i == k)) for k, c in enumerate(row)]
         for i, row in enumerate(columns)
     ]
-    weights = divide(rows, wanted)
+    weights = divide(rows, miss)
 
     def joined(free, forced):
         columns = (free[..., k, :, :] for k in range(dim))
@@ -163,10 +163,10 @@ def solve(path: Path, system: System, good: Array, rhs: RightSide) -> tuple[Vect
 def _first(path: Path, system: System, hit: Vector) -> tuple[Vector, Vector]:
     """Changes of the first point and of the direction in front of it for a change of its hit."""
     rotation = None if system.rows.rotation is None else system.rows.rotation[0]
-    moved = rotate(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
+    point = rotate(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
     first = ray_at(path, system, 0)[1]
-    along, spread = dot(first, moved), system.vergence * path.shrink
-    return moved, tuple(spread * (m - e * along) for m, e in zip(moved, first, strict=True))
+    along, spread = dot(first, point), system.vergence * path.shrink
+    return point, tuple(spread * (m - e * along) for m, e in zip(point, first, strict=True))
 
 
 def _crossing(path: Path, system: System) -> Callable[[Vector], Vector]:

@@ -100,8 +100,8 @@ def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
     length, met = reach(form, *primals)
     gap = partial(_gap, form, length=length)
     _, change, rate = jax.jvp(gap, primals[:3], tangents[:3], has_aux=True)
-    moved = -safe_divide(change, rate)
-    return (length, met), (moved, np.zeros(met.shape, jax.dtypes.float0))
+    tangent = -safe_divide(change, rate)
+    return (length, met), (tangent, np.zeros(met.shape, jax.dtypes.float0))
 
 
 def meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:

@@ -80,8 +80,8 @@ def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector) -> tuple[Vecto
     shrink = 1 / jnp.sqrt(dot(normal, normal))
     cosine = dot(normal, d) * shrink
     square = 1 - (size - cosine**2)
-    bent = (row.leaving * safe_sqrt(square) - cosine) * shrink
-    return tuple(a + bent * n for a, n in zip(d, normal, strict=True)), front, square
+    change = (row.leaving * safe_sqrt(square) - cosine) * shrink
+    return tuple(a + change * n for a, n in zip(d, normal, strict=True)), front, square
 
 
 class _Kick(NamedTuple):
@@ -174,18 +174,18 @@ def rows_met(system: System, to_stop: bool = False) -> Row:
     if system.stop is None and not to_stop:
         return rows
     stop, form = system.at_stop
-    around = jax.tree.map(lambda a: a[at], rows)
+    near = jax.tree.map(lambda a: a[at], rows)
     active = np.bool_(system.stop is None)
-    label = around._replace(
+    label = near._replace(
         active=active, bends=np.False_, surface=stop, kind=np.int32(kinds.index(form))
     )
-    ends = jax.tree.map(lambda a: a[at:at] if to_stop else a[at:], rows)
+    tail = jax.tree.map(lambda a: a[at:at] if to_stop else a[at:], rows)
 
     def joined(front, row, back):
         library = jnp if isinstance(front, Array) else np
         return library.concatenate([front[:at], row[None], back])
 
-    return jax.tree.map(joined, rows, label, ends)
+    return jax.tree.map(joined, rows, label, tail)
 
 
 class _State(NamedTuple):
@@ -243,10 +243,10 @@ def _meet(system: System, row: "Row", state: _State, smooth: bool) -> tuple[Meet
     each = [partial(meet, kind) for kind in kinds]
     encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
     own, normal, crosses, length = encounter(p, d, row.surface.shape, going)
-    bent, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
+    direction, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
     hit, origin = own[:-1], row.surface.origin(len(own) - 1)
     point = tuple(a + o for a, o in zip(rotate(row.surface.rotation, own), origin, strict=True))
-    behind = state._replace(point=point, direction=rotate(row.surface.rotation, bent), hit=hit)
+    behind = state._replace(point=point, direction=rotate(row.surface.rotation, direction), hit=hit)
     return Meeting(p, d, hit, crosses, length, front, through, state.status), behind
 
 

@@ -25,38 +25,38 @@ from .system import System, Vector, dot, rotate
 
 @jax.custom_jvp
 def attach(
-    system: System, target: Vector, hits: Vector, arrival: Vector, good: Array
+    system: System, target: Vector, hits: Vector, arrival: Vector, ok: Array
 ) -> tuple[Vector, Vector]:
     """Returns hits and arrivals unchanged, with derivatives by the system and the stop points in
     every mode.
 
     target: D arrays (W, Q), stop points, mm.
     hits, arrival: as in `Found`.
-    good: (W, Q), bool, rays that have derivatives.
+    ok: (W, Q), bool, rays that have derivatives.
     """
     return hits, arrival
 
 
 def _attach_jvp(primals: Any, tangents: Any) -> tuple:
-    system, target, *known, good = primals
+    system, target, *known, ok = primals
     # Call the function itself, so that the hits have derivatives for higher orders.
-    hits, arrival = attach(system, target, *known, good)
+    hits, arrival = attach(system, target, *known, ok)
     # Leaves without a tangent cost nothing.
     moving, turning = (
         [None if isinstance(t, SymbolicZero) else t for t in jax.tree.leaves(part)]
         for part in tangents[:2]
     )
 
-    def tangent(hits, turning, good):
+    def tangent(hits, turning, ok):
         path = fermat.geometry(hits, system)
         rhs = _right_side(path, system, moving)
         label = (a if t is None else a + t for a, t in zip(rhs.label, turning, strict=True))
-        rhs = jax.tree.map(lambda a: jnp.where(good, a, 0), rhs._replace(label=tuple(label)))
-        moved = linear.solve(path, system, good, rhs)
-        return jax.tree.map(lambda a: jnp.where(good, a, 0), moved)
+        rhs = jax.tree.map(lambda a: jnp.where(ok, a, 0), rhs._replace(label=tuple(label)))
+        changes = linear.solve(path, system, ok, rhs)
+        return jax.tree.map(lambda a: jnp.where(ok, a, 0), changes)
 
-    tile = derivative_tile(len(good), len(system.forms))
-    return (hits, arrival), in_tiles(tangent, tile, hits, turning, good)
+    tile = derivative_tile(len(ok), len(system.forms))
+    return (hits, arrival), in_tiles(tangent, tile, hits, turning, ok)
 
 
 attach.defjvp(_attach_jvp, symbolic_zeros=True)
@@ -127,11 +127,11 @@ def _forward(system: System, target: Vector) -> tuple[Found, tuple]:
 
 
 def _backward(saved: tuple, cotangent: Found) -> tuple[System, Vector]:
-    system, target, hits, good = saved
+    system, target, hits, ok = saved
     void = jax.tree.map(jnp.zeros_like, cotangent.arrival)  # only its derivatives are used
 
     def attached(system, target):
-        return attach(system, target, hits, void, good)
+        return attach(system, target, hits, void, ok)
 
     return jax.vjp(attached, system, target)[1]((cotangent.hits, cotangent.arrival))
 

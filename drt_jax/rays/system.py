@@ -188,8 +188,8 @@ class System:
     @property
     def senses(self) -> np.ndarray:
         """(R,), 1 where light travels towards +z in front of a row, -1 where towards -z."""
-        turned = np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
-        return turned.astype(self.index.dtype)
+        senses = np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
+        return senses.astype(self.index.dtype)
 
 
 def placed(lens: Lens, rows: Any) -> Placed:

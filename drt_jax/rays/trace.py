@@ -69,16 +69,16 @@ def _rows_behind(lens: Lens) -> list[int]:
 
 
 def on_all_surfaces(
-    lens: Lens, system: System, hits: Vector, stop: Vector, good: Array
+    lens: Lens, system: System, hits: Vector, stop: Vector, exists: Array
 ) -> tuple[Vector, Array]:
     """Adds the hits on the surfaces that are not active.
 
     hits: D arrays (R, W, Q), on the rows of the system, mm.
     stop: D arrays (W, Q), crossings of the stop, mm.
-    good: (W, Q), bool, rays that exist.
+    exists: (W, Q), bool, rays that exist.
 
     Returns hits on all surfaces, D arrays (S + 1, W, Q), 0 for failed rays, and the mask (W, Q) of
-    the good rays whose straight lines, extended both ways, meet all those surfaces.
+    the rays that exist and whose straight lines, extended both ways, meet all those surfaces.
     """
     pieces, begin, behind = [], 0, _rows_behind(lens)
     for i in sorted({*range(lens.count)} - {*lens.active}):
@@ -87,12 +87,12 @@ def on_all_surfaces(
             some, part = fermat.up_to(hits, system, row)
             line = fermat.ray_at(fermat.geometry(some, part), part, -1)
             crossing, met = cross(placed(lens, i), lens.forms[i], *line)
-            good = good & met
+            exists = exists & met
         pieces += [tuple(h[begin:row] for h in hits), tuple(c[None] for c in crossing)]
         begin = row
     pieces.append(tuple(h[begin:] for h in hits))
     joined = (jnp.concatenate(part) for part in zip(*pieces, strict=True))
-    return tuple(jnp.where(good, a, 0) for a in joined), good
+    return tuple(jnp.where(exists, a, 0) for a in joined), exists
 
 
 def aims(lens: Lens, scene: Scene, points: Vector) -> tuple[System, Vector]:
@@ -118,9 +118,9 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
     status = jnp.where(scene.possible, found.status, jnp.int32(Status.MISSED))
     known = lens.dispersion.knows(scene.wavelengths)[:, None]
     status = jnp.where(known, status, jnp.int32(Status.NO_INDEX))
-    hits, good = on_all_surfaces(lens, system, found.hits, target, status == Status.OK)
-    status = jnp.where((status == Status.OK) & ~good, jnp.int32(Status.MISSED), status)
-    clipped = good & jnp.any(clearance(lens, hits) < 0, axis=0)
+    hits, exists = on_all_surfaces(lens, system, found.hits, target, status == Status.OK)
+    status = jnp.where((status == Status.OK) & ~exists, jnp.int32(Status.MISSED), status)
+    clipped = exists & jnp.any(clearance(lens, hits) < 0, axis=0)
     status = jnp.where(clipped, jnp.int32(Status.CLIPPED), status)
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = rotate(rotation, found.arrival, back=True)
@@ -197,7 +197,7 @@ def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     system, target = aims(lens, scene, (pupil[:, 0], pupil[:, 1]))
     found = solve(system, target)
     bundle = bundle_of(lens, scene, system, target, found)
-    good = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+    exists = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     rows = placed(lens, range(lens.count + 1))
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
     own = rotate(rows.rotation, (*bundle.hits, heights))
@@ -206,8 +206,8 @@ def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     behind = np.array(_rows_behind(lens))
 
     def stacked(vector):  # (3, S + 1, W, Q) -> (W, Q, S + 1, 3)
-        return jnp.where(good, jnp.stack(tuple(vector)), 0).transpose(2, 3, 1, 0)
+        return jnp.where(exists, jnp.stack(tuple(vector)), 0).transpose(2, 3, 1, 0)
 
     directions = stacked(d[behind] for d in direction)
-    path = jnp.where(good, bundle.path, 0)
+    path = jnp.where(exists, bundle.path, 0)
     return Rays(stacked(points), directions, path, bundle.status, bundle.steps)

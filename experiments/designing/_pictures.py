@@ -1,4 +1,4 @@
-"""What is drawn of a design: before and after, spots, merit, minima; from the lens files."""
+"""Figures of a design from its lens files: before and after, spots, merit, minima."""
 
 import math
 import pathlib
@@ -13,20 +13,20 @@ from drt_jax.show import layout
 
 from . import _common, _plots
 
-# Minima that are ranked; rings of the rays of a spot that is drawn.
+# Most ranked minima; rings of rays of a drawn spot.
 _RANKED, _RINGS = 30, 8
 
 
 def _drawing(results: dict[str, Any], path: pathlib.Path) -> layout.Drawing:
-    """A lens file drawn."""
+    """The drawing of a lens file."""
     waves, fields = results["wavelengths_um"], np.radians(results["fields_deg"])
     distance = results["distance_mm"] or math.inf
     return layout.draw(drt_jax.load_lens(path), fields, distance, waves[len(waves) // 2])
 
 
 def _spots(results: dict[str, Any], lens: drt_jax.Lens) -> list[tuple[list, np.ndarray]]:
-    """By field: hits in um about the centroid of all wavelengths, by wavelength, and their
-    covariance."""
+    """For each field, the hits of each wavelength about the centroid of all, um, and their
+    covariance, um^2."""
     pupil = hexapolar(_RINGS)[0]
     found = []
     for field in np.radians(results["fields_deg"]):
@@ -35,15 +35,15 @@ def _spots(results: dict[str, Any], lens: drt_jax.Lens) -> list[tuple[list, np.n
         moments = drt_jax.psf_moments(lens, *scene, results["tolerance"])
         mean = np.asarray(moments.mean).mean(axis=0)
         hits = 1e3 * (np.asarray(rays.points)[:, :, -1, :2] - mean)
-        good = np.asarray(rays.status) == 0
-        every = hits[good]
-        own = [h[g] for h, g in zip(hits, good)]
+        arrives = np.asarray(rays.status) == 0
+        every = hits[arrives]
+        own = [h[a] for h, a in zip(hits, arrives)]
         found.append((own, every.T @ every / max(len(every), 1)))
     return found
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw the lens before and after, its spots, the merit, and the minima."""
+    """Draws the lens before and after, its spots, the merit, and the minima."""
     folder = figures.parent
     drawings = [_drawing(results, folder / f"{name}.yaml") for name in ("start", "designed")]
     figure, axes = show.new(2, 1, 8, 3.2)
@@ -75,10 +75,10 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
 def _draw_minima(
     results: dict[str, Any], drawings: list[layout.Drawing], figures: pathlib.Path
 ) -> None:
-    some = results["starts"]
-    sizes = [1e3 * math.sqrt(merit) for merit in some["merits"][:_RANKED]]
+    starts = results["starts"]
+    sizes = [1e3 * math.sqrt(merit) for merit in starts["merits"][:_RANKED]]
     figure, ax = show.new(1, 1, 7, 3.6)
-    _plots.ranks(ax, sizes, some["found"][:_RANKED])
+    _plots.ranks(ax, sizes, starts["found"][:_RANKED])
     figure.savefig(figures / "minima.png")
     figure, axes = _common.panels(len(drawings), 6, 2.6)
     for ax, drawing, size in zip(np.ravel(axes), drawings, sizes):

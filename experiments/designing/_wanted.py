@@ -12,12 +12,14 @@ from . import _common
 
 @dataclasses.dataclass(frozen=True)
 class Starts:
-    """Where to start.
+    """Starts of the search.
 
-    count: how many searches. how: "around" the lens by `spread` times the variables' scales,
-    "within" their bounds, or from lenses "made" with curvatures off by `per_cent` and thicknesses
-    off by `off_mm` (standard deviations). stages: trials of each search in each stage; keep: the
-    part that goes on to the next. seed: of the random numbers.
+    count: number of searches.
+    how: "around" the lens, normal; "within" the bounds; or "made", from lenses as built.
+    spread: of "around", standard deviation in scales of the variables.
+    per_cent, off_mm: of "made", standard deviations of curvatures and thicknesses.
+    stages: trials of each search in each stage.
+    keep: fraction of searches that survive a stage.
     """
 
     count: int = 1
@@ -37,12 +39,13 @@ class Starts:
 
 @dataclasses.dataclass(frozen=True)
 class Growth:
-    """Design for a part of the fields and of the aperture first, then for more and more.
+    """Design for a part of field and aperture first, then for more.
 
-    first: part to begin with; 1: the whole at once. step: to the next part. good_um: root of the
-    mean squared RMS radius with which the next is tried at once, some four times that of the whole
-    in the end: a lens that is perfect for a part is spoilt for more, see docs/design.md.
-    trials: at most at each part; a step that is not good then is halved.
+    first: part at the start; 1 for no growth.
+    step: step to the next part.
+    trials: most trials at each part; a step that misses good_um then is halved.
+    good_um: root mean square of the RMS radii at which the next part begins, about four times that
+        of the final lens: a lens that is perfect for a part is bad for more, see docs/design.md.
     """
 
     first: float = 1.0
@@ -59,14 +62,17 @@ class Growth:
 class Config:
     """Settings of the experiment; see configs/design/.
 
-    name: of the problem.
-    lens: the start, a bundled name or a YAML path. fields_deg: along y. distance_mm: to the object.
-    floating: whether clear apertures but the stop's follow the light, instead of vignetting.
-    wavelengths_um, colour_weights: of the light, field_weights: of the squares; none: all alike.
-    variables, ties, solves, operands: see drt_jax.design. order: of the pupil's rule while
-    searching; the best lens is finished with as many rays as `tolerance`, relative, of its spots
-    needs. rings: above 0, a hexapolar grid of so many in place of both, as other programs sum.
-    trials: at most, of the last search.
+    lens: start, a bundled name or YAML path.
+    variables, ties, solves, operands: see drt_jax.design.
+    fields_deg: field angles along y.
+    wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
+    field_weights: weights of the squares of each field; empty for equal weights.
+    floating: True for clear apertures that follow the light, except the stop's; False for
+        vignetting.
+    order: order of the pupil rule of the search.
+    tolerance: relative error of the spots, which fixes the rule for the last search.
+    rings: above 0, rings of a hexapolar grid instead of both rules, as in other programs.
+    trials: most trials of the last search.
     """
 
     name: str
@@ -90,11 +96,7 @@ class Config:
 
     def __post_init__(self) -> None:
         limits = {"fields_deg": (-89, 89), "wavelengths_um": (1e-4, 1e6), "order": (1, 40)}
-        limits |= {
-            "rings": (0, 50),
-            "tolerance": (1e-12, 0.5),
-            "trials": (1, 1e5),
-        }
+        limits |= {"rings": (0, 50), "tolerance": (1e-12, 0.5), "trials": (1, 1e5)}
         _common.require_within("", self, **limits)
         for name in ("variables", "operands", "fields_deg", "wavelengths_um"):
             _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")

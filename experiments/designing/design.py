@@ -1,9 +1,9 @@
 """Design a lens: least squares on exact Jacobians, within limits, from one start or from many.
 
-Reads what varies, what is asked and where to start from the settings; writes the designed lens as
-designed.yaml, which load_lens reads back, the start and other minima beside it, pictures, and
-results.json: `rows` with `problem`, `merit_start`, `merit_end`, `spots_um`, `jacobians`, `rays`,
-`seconds`, `compile_s`. `python -m comparisons.design` adds what other optimisers come to.
+The settings name variables, operands and starts. Writes the designed lens as designed.yaml, which
+load_lens reads back, the start and other minima beside it, figures, and results.json: `rows` with
+`problem`, `merit_start`, `merit_end`, `spots_um`, `jacobians`, `rays`, `seconds`, `compile_s`.
+`python -m comparisons.design` adds results of other optimisers.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ from ._wanted import Config as Config, Starts
 from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
-_DRAWN = 6  # minima that are drawn
-# What a search took that was none.
+_DRAWN = 6  # most minima that are drawn
+# Counts and times without a search.
 _NOTHING = {"trials": 0, "jacobians": 0, "seconds": 0.0, "compile_s": 0.0}
 
 
@@ -51,7 +51,7 @@ def problem_of(config: Config, lens: drt_jax.Lens, order: int | None = None) -> 
 
 
 def _grid(rings: int) -> Pattern:
-    """Rays of equal weight on rings of equal distances, 6 k on the k-th, and one in the centre."""
+    """Rays of equal weight on equidistant rings, 6 k on ring k, and one in the centre."""
     points = [np.zeros((1, 2))]
     for k in range(1, rings + 1):
         angle = 2 * np.pi * np.arange(6 * k) / (6 * k)
@@ -61,8 +61,8 @@ def _grid(rings: int) -> Pattern:
 
 
 def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:
-    """RMS radii of the spots of all fields about the centroid of all colours, with as many rays as
-    the tolerance needs: by none of the code that designs."""
+    """RMS radii of the spots of all fields about the centroid of all wavelengths, to the tolerance,
+    without code of drt_jax.design."""
     weights = np.array(config.colour_weights or np.ones(len(config.wavelengths_um)))
     weights = weights / weights.sum()
     found = []
@@ -70,34 +70,35 @@ def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:
         moments = drt_jax.psf_moments(
             lens, field, config.distance_mm, config.wavelengths_um, config.tolerance
         )
-        mean, spread = np.asarray(moments.mean), np.asarray(moments.covariance)
-        apart = np.sum((mean - weights @ mean) ** 2, axis=1)
-        found.append(1e3 * math.sqrt(weights @ (np.trace(spread, axis1=1, axis2=2) + apart)))
+        mean, covariance = np.asarray(moments.mean), np.asarray(moments.covariance)
+        squares = np.sum((mean - weights @ mean) ** 2, axis=1)
+        squares = squares + np.trace(covariance, axis1=1, axis2=2)
+        found.append(1e3 * math.sqrt(weights @ squares))
     return found
 
 
 def order_of(config: Config, lens: drt_jax.Lens) -> int:
-    """The order of the pupil's rule that the spots of a lens need."""
+    """The order of the pupil rule that the spots of a lens need."""
     fields = np.radians([[0.0, field] for field in config.fields_deg])
     scene = fields, config.distance_mm, config.wavelengths_um, config.tolerance
     return getattr(drt_jax.converged_rule(lens, *scene), "order", config.order)
 
 
 class _Progress:
-    """A progress bar with the merit and the worst limit; and their rows for the metrics."""
+    """A progress bar with the merit and the worst limit."""
 
     def __init__(self, title: str, total: int):
         self._bar = tqdm(total=total, desc=title, unit="trial", dynamic_ncols=True)
 
     def searched(self, search: design.Search) -> None:
-        """After one trial."""
+        """Shows one trial."""
         self._bar.update()
         self._bar.set_postfix_str(
             f"merit={float(search.merit):.6g} worst limit={float(search.max_violation):+.2g}"
         )
 
     def tiles(self, done: int, total: int, best: float) -> None:
-        """After one tile of many starts."""
+        """Shows one tile of many starts."""
         self._bar.total = total
         self._bar.update(done - self._bar.n)
         self._bar.set_postfix_str(f"best={best:.6g}")
@@ -110,7 +111,7 @@ class _Progress:
 
 
 def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
-    """The lens designed for parts of the fields and the aperture, one after the other."""
+    """Designs the lens for growing parts of field and aperture. ConfigError if growth stops."""
     settings = config.growth
     target = len(config.fields_deg) * (1e-3 * settings.good_um) ** 2
     saved = run.kept("growth")
@@ -122,14 +123,14 @@ def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
             growth = grow_once(problem, growth, target, settings.trials, bar.searched)
         state = growth._asdict() | {"vector": growth.vector.tolist(), "failed": None}
         run.keep("growth", state)
-    said = f"growth: stops at {growth.done:.1%} of field and aperture, where no step leads to "
-    said += f"{settings.good_um:g} um: {_in_the_way(config, growth.failed)}"
-    _common.require(growth.done >= 1, said)
+    message = f"growth: stops at {growth.done:.1%} of field and aperture, where no step leads to "
+    message += f"{settings.good_um:g} um: {_reason(config, growth.failed)}"
+    _common.require(growth.done >= 1, message)
     return problem.variables.lens_of(jnp.asarray(growth.vector))
 
 
-def _in_the_way(config: Config, failed: design.Optimum | None) -> str:
-    """What keeps a part from being good, and the remedy."""
+def _reason(config: Config, failed: design.Optimum | None) -> str:
+    """Why growth stops, and the remedy."""
     if failed is None:
         return f"a step would be less than {SHORTEST:g}"
     size = 1e3 * math.sqrt(failed.merit / len(config.fields_deg))
@@ -138,36 +139,32 @@ def _in_the_way(config: Config, failed: design.Optimum | None) -> str:
     return f"{failed.worst_limit} is in the way; widen this limit or change the start"
 
 
-def starts_of(variables: design.Variables, some: Starts) -> np.ndarray:
-    """The vectors (K, N) to begin with."""
-    if some.count == 1:
+def starts_of(variables: design.Variables, starts: Starts) -> np.ndarray:
+    """Vectors (K, N) of the starts."""
+    count, seed = starts.count, starts.seed
+    if count == 1:
         return np.asarray(variables.start)[None]
-    if some.how == "made":
-        return design.as_built_starts(variables, some.count, some.per_cent, some.off_mm, some.seed)
-    if some.how == "around":
-        return design.normal_starts(variables, some.count, some.spread, some.seed)
-    return design.sobol_starts(variables, some.count, some.seed)
+    if starts.how == "made":
+        return design.as_built_starts(variables, count, starts.per_cent, starts.off_mm, seed)
+    if starts.how == "around":
+        return design.normal_starts(variables, count, starts.spread, seed)
+    return design.sobol_starts(variables, count, seed)
 
 
 def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
-    """The vectors that the starts came to, best first, and what that took."""
-    variables, some = problem.variables, config.starts
-    start = {
-        "vectors": [variables.start.tolist()],
-        "merits": [],
-        "no_worse": None,
-    }
-    if some.count == 1:
-        return start | _NOTHING
-    vectors = starts_of(variables, some)
-    with _Progress(f"{some.count} starts", 1) as bar:
-        found = design.many_starts(problem, vectors, some.stages, some.keep, bar.tiles)
+    """Vectors at the ends of the searches from the starts, best first, with counts and times."""
+    variables, starts = problem.variables, config.starts
+    if starts.count == 1:
+        return {"vectors": [variables.start.tolist()], "merits": [], "no_worse": None} | _NOTHING
+    vectors = starts_of(variables, starts)
+    with _Progress(f"{starts.count} starts", 1) as bar:
+        found = design.many_starts(problem, vectors, starts.stages, starts.keep, bar.tiles)
     _common.require(len(found.minima) > 0, "starts: no ray passes any of them; widen the bounds")
     return {
         "vectors": [minimum.vector.tolist() for minimum in found.minima],
         "merits": [minimum.merit for minimum in found.minima],
         "no_worse": int(np.sum(found.merits <= float(problem.merit(variables.start)))),
-        "count": some.count,
+        "count": starts.count,
         "found": [minimum.found for minimum in found.minima],
         "passed": int(np.isfinite(found.merits).sum()),
         "trials": found.steps,
@@ -179,7 +176,7 @@ def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
 
 
 def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> dict[str, Any]:
-    """The best vector brought to the optimum with as many rays as it needs."""
+    """Optimises the best vector with the rule that it needs."""
     with _Progress("least squares", config.trials) as bar:
         vector = jnp.asarray(found["vectors"][0])
         parts = [design.optimise(problem, vector, config.trials, bar.searched)]
@@ -206,7 +203,7 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Grow, search, finish; and write the lens."""
+    """Grows, searches, finishes, and writes the lens."""
     start = drt_jax.load_lens(config.lens)
     start = design.open_apertures(start) if config.floating else start
     first = problem_of(config, start)
@@ -254,8 +251,8 @@ def _save(
     vectors: list[list[float]],
     folder: pathlib.Path,
 ) -> None:
-    """Write the designed lens, the start and the minima that are drawn; clear apertures as wide as
-    the light, where they float."""
+    """Writes the designed lens, the start and the drawn minima; floating clear apertures as wide as
+    the beam."""
     lenses = {"start": start}
     for k, vector in enumerate(vectors):
         name = f"minimum_{k}" if k else "designed"
@@ -266,13 +263,13 @@ def _save(
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """The design in a row for each field, and what it took."""
-    (row,), some = results["rows"], results["starts"]
+    """Tables of the spots by field, and of counts and times."""
+    (row,), starts = results["rows"], results["starts"]
     fields = results["fields_deg"]
     peers = row.get("peer_spots_um") or [None] * len(fields)
     spots = [[field, um, peer] for field, um, peer in zip(fields, row["spots_um"], peers)]
     spots.append(["root of the sum of squares", *(_total(c) for c in (row["spots_um"], peers))])
-    took = [
+    rows = [
         ["merit, mm^2, start", row["merit_start"]],
         ["merit, mm^2, end", row["merit_end"]],
         ["worst limit exceeded by", row["worst_limit"]],
@@ -281,15 +278,15 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         ["seconds", row["seconds"]],
         ["compilation, s", row["compile_s"]],
     ]
-    if some["merits"]:
-        took += [["starts that pass light", some["passed"]], ["minima", len(some["merits"])]]
-        took += [["minima a minute", 60 * len(some["merits"]) / max(some["seconds"], 1e-9)]]
+    if starts["merits"]:
+        rows += [["starts that pass light", starts["passed"]], ["minima", len(starts["merits"])]]
+        rows += [["minima a minute", 60 * len(starts["merits"]) / max(starts["seconds"], 1e-9)]]
     if results["how"] == "made":
-        took.append(["starts no worse than the lens", f"{some['no_worse']} of {some['count']}"])
+        rows.append(["starts no worse than the lens", f"{starts['no_worse']} of {starts['count']}"])
     name = row["problem"]
     found = {
         f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
-        f"design, {name}": _common.table(("what", "value"), took),
+        f"design, {name}": _common.table(("what", "value"), rows),
     }
     if results.get("beside"):
         found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
@@ -297,7 +294,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def _peers_table(rows: list[dict[str, Any]], how: str) -> str:
-    """Other optimisers in a row each, see `comparisons`."""
+    """Table of other optimisers, see `comparisons`."""
     goal = "no worse than the lens" if how == "made" else "within 1% of the design"
     header = ["optimiser", f"starts {goal}", "merit, best", "median", "limit exceeded by"]
     header += ["Jacobians until then", "s until then", "s a start"]
@@ -305,8 +302,8 @@ def _peers_table(rows: list[dict[str, Any]], how: str) -> str:
     for row in rows:
         met = "not installed" if row["met"] is None else f"{row['met']} of {row['starts']}"
         worst = max((x for x in row["worst"] if x is not None), default=None)
-        ways = (_median(row[key]) for key in ("met_jacobians", "met_s", "seconds"))
-        lines.append([row["optimiser"], met, row["best"], row["median"], worst, *ways])
+        medians = (_median(row[key]) for key in ("met_jacobians", "met_s", "seconds"))
+        lines.append([row["optimiser"], met, row["best"], row["median"], worst, *medians])
     return _common.table(header, lines)
 
 
@@ -320,7 +317,7 @@ def _total(sizes: list[float | None]) -> float | None:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw the lens before and after, its spots, the merit, and the minima."""
+    """Draws the lens before and after, its spots, the merit, and the minima."""
     _pictures.draw(results, figures)
 
 

@@ -1,16 +1,16 @@
-"""What the errors of its parts do to a lens: sensitivities, predictions, Monte Carlo.
+"""Tolerances of a lens: sensitivities, predictions, Monte Carlo.
 
-Every lens is brought to focus, or what else compensates. A spot is the root of the mean over the
-fields of the squared RMS radius, of all colours about their centroid, in um. Writes results.json:
-`rows`, one for each error, with its `kind`, `place`, `size`, the change of the spot by it at minus
-and plus its size as predicted from second derivatives (`predicted_um`) and as traced (`traced_um`),
-and the `moves` of the compensators there (`predicted_moves`), mm and radians; `scales`, one for
-each scale of all sizes, with the spots of Monte Carlo and of each order of prediction; `worst`: the
-spot with all errors at their ends, where second derivatives have it largest. A lens of which a ray
-fails has no spot (null), and is as bad as can be.
+Every lens is compensated, by focus or focus and tilt. A spot is the root mean square over the
+fields of the RMS radius of all wavelengths about their centroid, um. Writes results.json: `rows`,
+one for each error, with its `kind`, `place`, `size`, the change of the spot at minus and plus this
+size as predicted from second derivatives (`predicted_um`) and as traced (`traced_um`), and the
+`moves` and `predicted_moves` of the compensators, mm and radians; `scales`, one for each scale of
+all sizes, with the spots of Monte Carlo and of each order of prediction; `worst`, the spot with all
+errors at the limits where second derivatives predict the largest. A lens with a failed ray has no
+spot (null), and counts as the worst.
 
 Orders of prediction, as functions of all errors: "first", q = spot^2 from its gradient; "rays",
-from first derivatives of all rays, whose squares are summed; "second", from all second derivatives.
+from the sum of squares with first derivatives of all rays; "second", from all second derivatives.
 Their means and percentiles are those of many draws, which cost nothing.
 """
 
@@ -47,12 +47,17 @@ _LEVELS = np.linspace(0, 1, 201)
 class Config:
     """Settings of the experiment; see configs/tolerance.yaml.
 
-    lens: bundled name or YAML path. tolerances: see drt_jax.design. fields_deg: pairs x, y.
-    distance_mm: to the object. wavelengths_um, colour_weights: of the light; no weights: all alike.
-    order: of the pupil's rule. compensator: adjusted in every lens. errors: uniform up to their
-    sizes, or normal with a deviation of half of them, cut off there. scales: of all sizes. count:
-    lenses of Monte Carlo, of each scale. draws: of the predictions. limits_um: of the spot, for the
-    yield.
+    lens: bundled name or YAML path.
+    tolerances: see drt_jax.design.
+    fields_deg: pairs x, y.
+    wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
+    compensator: adjusted in every lens.
+    errors: "uniform" up to their sizes, or "normal" with half the sizes as standard deviation,
+        truncated at the sizes.
+    scales: scales of all sizes.
+    count: lenses of Monte Carlo for each scale.
+    draws: draws of the predictions.
+    limits_um: spots for which the yield is reported.
     """
 
     lens: str
@@ -78,12 +83,13 @@ class Config:
             _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")
         _common.require_list("scales", self.scales)
         for pair in self.fields_deg:
-            good = len(pair) == 2 and all(-89 <= angle <= 89 for angle in pair)
-            _common.require(good, f"fields_deg: expected pairs x, y from -89 to 89, got {pair}")
+            valid = len(pair) == 2 and all(-89 <= angle <= 89 for angle in pair)
+            _common.require(valid, f"fields_deg: expected pairs x, y from -89 to 89, got {pair}")
 
 
 def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.PerturbedLens]:
-    """What judges the lens, with another order of the rule if one is given; and its errors."""
+    """The problem that evaluates the lens, and the lens with its errors. order: order of the pupil
+    rule; 0 for that of the settings."""
     lens = drt_jax.load_lens(config.lens)
 
     def problem_of(lens: drt_jax.Lens) -> design.Problem:
@@ -103,13 +109,13 @@ def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.Pert
 
 
 def derivatives(config: Config) -> dict[str, Any]:
-    """The fields of `design.Predicted` as lists, times, and how far the rule is off."""
+    """The fields of `design.Predicted` as lists, times, and the relative error of the rule."""
     problem, perturbed = prepare(config)
     spots = []
     for order in (config.order, min(config.order + 4, 40)):
-        some, _ = prepare(config, order)
+        other, _ = prepare(config, order)
         nominal = jax.jit(lambda p, lens: design.as_built(p, lens, config.compensator).spot)
-        spots.append(float(nominal(some, perturbed.lens)))
+        spots.append(float(nominal(other, perturbed.lens)))
     seconds = []
     for _ in range(2):
         begun = time.perf_counter()
@@ -140,76 +146,76 @@ def traced(
 
 
 def sensitivity(config: Config, found: dict[str, Any]) -> dict[str, Any]:
-    """Each error alone at both its ends, and all of them at their worst."""
+    """Each error alone at both limits, and all errors at the worst limits."""
     problem, perturbed = prepare(config)
     predicted, count = predicted_of(found), len(perturbed.deviations)
     worst = design.worst_case(perturbed, predicted)
     perturbations = np.concatenate(
         [-np.eye(count), np.eye(count), np.zeros((1, count)), worst[None]]
     )
-    made = traced(config, perturbations, "one error", problem, perturbed)
-    spots, nominal = _um(made.spot), float(_um(made.spot[-2]))
-    foretold = _um(predicted.at(perturbations, "second"), root=True) - float(
-        _um(predicted.nominal, True)
-    )
+    built = traced(config, perturbations, "one error", problem, perturbed)
+    spots, nominal = _um(built.spot), float(_um(built.spot[-2]))
+    changes = _um(predicted.at(perturbations, "second"), root=True)
+    changes = changes - float(_um(predicted.nominal, True))
     moves = np.asarray(predicted.moves) + perturbations @ np.asarray(predicted.move_slopes)
     variances = design.variances(perturbed, config.errors == "normal")
     share = np.diag(np.asarray(predicted.hessian)) * variances / 2
     rows = []
     for k, error in enumerate(perturbed.deviations):
-        ends = [k, count + k]
+        pair = [k, count + k]
         rows.append({
             "error": str(error), "kind": error.kind, "place": error.place, "axis": error.axis,
             "size": float(perturbed.sizes[k]), "unit": KINDS[error.kind].unit,
-            "predicted_um": foretold[ends].tolist(),
-            "traced_um": (spots[ends] - nominal).tolist(),
-            "predicted_moves": (moves[ends] - moves[-2]).tolist(),
-            "moves": (made.moves[ends] - made.moves[-2]).tolist(),
+            "predicted_um": changes[pair].tolist(),
+            "traced_um": (spots[pair] - nominal).tolist(),
+            "predicted_moves": (moves[pair] - moves[-2]).tolist(),
+            "moves": (built.moves[pair] - built.moves[-2]).tolist(),
             "growth_um2": 1e6 * float(share[k]),
         })  # fmt: skip
-    ends = {order: float(_um(predicted.at(worst, order), True)) for order in _ORDERS}
-    return {"rows": rows, "nominal_um": nominal, "worst": {"traced": float(spots[-1]), **ends}}
+    orders = {order: float(_um(predicted.at(worst, order), True)) for order in _ORDERS}
+    return {"rows": rows, "nominal_um": nominal, "worst": {"traced": float(spots[-1]), **orders}}
 
 
 def _um(mm: Any, root: bool = False) -> np.ndarray:
-    """In um; `root`: of squares in mm^2, negative ones taken as 0."""
+    """mm in um. root: True for squares in mm^2, of which negative ones count as 0."""
     return 1e3 * (np.sqrt(np.maximum(mm, 0)) if root else np.asarray(mm))
 
 
 def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -> dict[str, Any]:
-    """Spots of all lenses at one scale of the sizes, and as predicted; logs them."""
+    """Traced and predicted spots at one scale of the sizes; logs them."""
     problem, perturbed = prepare(config)
     predicted, normal = predicted_of(found), config.errors == "normal"
     perturbations = scale * design.draw_perturbations(perturbed, config.count, config.seed, normal)
     begun = time.perf_counter()
     design.monte_carlo(problem, perturbed, perturbations[:1], config.compensator)
     warm = time.perf_counter()
-    made = traced(config, perturbations, f"sizes x {scale:g}", problem, perturbed)
+    built = traced(config, perturbations, f"sizes x {scale:g}", problem, perturbed)
     seconds = time.perf_counter() - warm
-    spots, good = _um(made.spot), np.isfinite(made.spot)
-    _common.require(bool(good.any()), f"scales: {scale:g}: light passes through no lens; take less")
+    spots, whole = _um(built.spot), np.isfinite(built.spot)
+    message = f"scales: {scale:g}: light passes through no lens; take less"
+    _common.require(bool(whole.any()), message)
     draws = scale * design.draw_perturbations(perturbed, config.draws, config.seed + 1, normal)
     samples = {"traced": spots}
     samples |= {order: _um(predicted.at(draws, order), True) for order in _ORDERS}
-    ends = np.quantile(spots[good], [0, 0.999])
-    edges = np.linspace(0.98 * ends[0], 1.1 * ends[1], _BINS + 1)
+    low, high = np.quantile(spots[whole], [0, 0.999])
+    edges = np.linspace(0.98 * low, 1.1 * high, _BINS + 1)
     variances = scale**2 * design.variances(perturbed, normal)
     row: dict[str, Any] = {"scale": scale, "edges_um": edges.tolist(), "seconds": seconds}
-    row |= {"compile_s": warm - begun, "failed": int(np.sum(~good))}
-    row |= {"moves_deviation": np.std(made.moves[good], axis=0).tolist()}
+    row |= {"compile_s": warm - begun, "failed": int(np.sum(~whole))}
+    row |= {"moves_deviation": np.std(built.moves[whole], axis=0).tolist()}
     row["rays"] = design.rays_of(problem) * len(perturbations)
     for name, values in samples.items():
-        whole = values[np.isfinite(values)]
+        finite = values[np.isfinite(values)]
         ninth = np.quantile(values, 0.9, method="higher")
-        said: dict[str, Any] = {"mean_um": float(whole.mean()), "p90_um": float(ninth)}
-        said["yields"] = [float(np.mean(values <= limit)) for limit in config.limits_um]
-        said["quantiles_um"] = np.quantile(whole, _LEVELS).tolist()
-        said["shares"] = (100 / len(values) * np.histogram(whole, edges)[0]).tolist()
+        sums: dict[str, Any] = {"mean_um": float(finite.mean()), "p90_um": float(ninth)}
+        sums["yields"] = [float(np.mean(values <= limit)) for limit in config.limits_um]
+        sums["quantiles_um"] = np.quantile(finite, _LEVELS).tolist()
+        sums["shares"] = (100 / len(values) * np.histogram(finite, edges)[0]).tolist()
         if name != "traced":
             mean, deviation = predicted.moments(variances, name)
-            # Root sum of squares: q taken as normal.
-            said["rss_p90_um"] = float(_um(mean + 1.2815516 * deviation, True))
-        row[name] = said
+            # Root sum of squares: the distribution of q taken as normal.
+            sums["rss_p90_um"] = float(_um(mean + 1.2815516 * deviation, True))
+        row[name] = sums
     parts = {"mean_um": row["traced"]["mean_um"], "p90_um": row["traced"]["p90_um"]}
     run.log(
         f"sizes x {scale:g}",
@@ -233,39 +239,39 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def main_scale(results: dict[str, Any]) -> dict[str, Any]:
-    """The row of the sizes as they are, or of the first scale."""
+    """The row of scale 1, or of the first scale."""
     return next((row for row in results["scales"] if row["scale"] == 1), results["scales"][0])
 
 
 def known(spot: float | None) -> float:
-    """A spot, infinite where there is none."""
+    """A spot; inf for None."""
     return math.inf if spot is None else spot
 
 
 def merged(results: dict[str, Any]) -> list[dict]:
-    """The worst of each kind and part: of x and y, of minus and plus, the larger; largest first."""
+    """The largest change of each kind and part, of x and y, minus and plus; largest first."""
     found = []
     for (kind, place), some in _common.grouped(results["rows"], "kind", "place").items():
-        ends = [(known(end), row, k) for row in some for k, end in enumerate(row["traced_um"])]
-        change, worst, most = max(ends, key=lambda end: end[0])
+        changes = [(known(um), row, k) for row in some for k, um in enumerate(row["traced_um"])]
+        change, worst, most = max(changes, key=lambda change: change[0])
         name = f"{kind}, {KINDS[kind].whole} {place}"
         row = {"name": name, "size": f"{worst['size']:g} {worst['unit']}".strip()}
         row |= {"predicted_um": worst["predicted_um"][most], "traced_um": change}
-        row["move"] = max((abs(end[0]) for row in some for end in row["moves"] if end), default=0)
+        row["move"] = max((abs(m[0]) for row in some for m in row["moves"] if m), default=0)
         row["growth"] = sum(row["growth_um2"] for row in some)
         found.append(row)
     return sorted(found, key=lambda row: -row["traced_um"])
 
 
 def off_by(row: dict[str, Any], truth: float | None) -> list[str]:
-    """By how much the spots of all orders of prediction miss the traced one."""
+    """Relative errors of the predicted spots of all orders."""
     if truth is None:
         return [""] * len(_ORDERS)
     return [f"{100 * (row[order] / truth - 1):+.1f} %" for order in _ORDERS]
 
 
 def table_of_scales(results: dict[str, Any]) -> str:
-    """Spots by scale, traced, and by how much each order of prediction is off."""
+    """Table of traced spots by scale, and of the errors of each order of prediction."""
     header = ["sizes times", "spot", "traced (µm)", *_ORDERS]
     lines = []
     for row in results["scales"]:
@@ -285,7 +291,7 @@ def table_of_scales(results: dict[str, Any]) -> str:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Spots by scale, traced and predicted; yields; the worst errors; shares of the kinds."""
+    """Tables of spots by scale, yields, the worst errors, and shares of the kinds."""
     row, limits = main_scale(results), results["limits_um"]
     yields = [(name, *(f"{100 * part:.1f} %" for part in row[name]["yields"])) for name in _SAMPLES]
     worst = []
@@ -297,17 +303,17 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         (kind, len(some), f"{100 * sum(row['growth_um2'] for row in some) / whole:.1f} %")
         for (kind,), some in _common.grouped(results["rows"], "kind").items()
     ]
-    ends = ("as predicted (µm)", "as traced (µm)", "refocus (mm)")
+    columns = ("as predicted (µm)", "as traced (µm)", "refocus (mm)")
     return {
         "tolerance": table_of_scales(results),
         "tolerance, yield": _common.table(("spot at most", *(f"{x:g} µm" for x in limits)), yields),
-        "tolerance, worst": _common.table(("error", "at most", *ends), worst),
+        "tolerance, worst": _common.table(("error", "at most", *columns), worst),
         "tolerance, kinds": _common.table(("kind", "errors", "share of the mean growth"), kinds),
     }
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw the yield by scale, the worst errors, and how the spots are spread."""
+    """Draws the yield by scale, the worst errors, and a histogram of the spots."""
     figure, axes = _common.panels(len(results["scales"]), 5.2, 3.7)
     for ax, row in zip(axes, results["scales"]):
         parts = dict.fromkeys(_SAMPLES, 100 * _LEVELS)

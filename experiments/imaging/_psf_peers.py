@@ -1,7 +1,7 @@
-"""FFT and matrix Fourier PSFs of other programs, collected on our pixels; each may be missing.
+"""FFT and matrix Fourier PSFs of other programs on our pixels; each program may be missing.
 
-A peer gives samples of the irradiance. A pixel takes what a cubic spline through their running sum
-gains across it.
+A peer returns samples of the irradiance. A pixel collects the difference, across it, of a cubic
+spline through their running sum.
 """
 
 from collections.abc import Callable
@@ -21,39 +21,39 @@ _UM = 1e3  # per mm
 
 
 def collected(samples: np.ndarray, step: float, pixel: float, size: int) -> np.ndarray:
-    """What `size` x `size` pixels about the middle sample, [n // 2, n // 2], collect of samples
-    (n, n) that lie `step` mm apart: of all their light."""
+    """Fractions (size, size) of the light of samples (n, n) on pixels about the middle sample
+    [n // 2, n // 2]. step: distance of the samples, mm. pixel: side of a pixel, mm."""
     n = samples.shape[0]
     total = np.pad(np.cumsum(np.cumsum(samples, 0), 1), ((1, 0), (1, 0)))
     edges = (np.arange(n + 1) - n // 2 - 0.5) * step
     below = RectBivariateSpline(edges, edges, total / total[-1, -1])
-    wanted = (np.arange(size + 1) - size / 2) * pixel
-    return np.diff(np.diff(below(wanted, wanted), axis=0), axis=1)
+    borders = (np.arange(size + 1) - size / 2) * pixel
+    return np.diff(np.diff(below(borders, borders), axis=0), axis=1)
 
 
 def pupil(
     lens: drt_jax.Lens, field: float, wavelength: np.ndarray, rule: BeamRule, count: int
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """What prysm is given of one wavelength (1,), an object at infinity: the pupil function on a
-    square grid of direction cosines, its step, and the place (2,) mm about which it lies."""
+    """The input of prysm for one wavelength (1,) and an object at infinity: the pupil function on a
+    square grid of direction cosines, the step of the grid, and the centre (2,) of the image, mm."""
     scene = scene_of(lens, field, np.inf, wavelength)
     beam = trace_beam(lens, scene, rule)
     low, high = (np.asarray(a)[:, 0] for a in beam.directions_extent())
     middle, step = (low + high) / 2, float(np.max(high - low)) / count
     grid = jnp.asarray(middle[:, None]), jnp.full((2, 1), step)
-    made = pupil_function(lens, beam, scene.wavelengths, count)(*grid)
-    density, inside, phase = (np.asarray(a)[0] for a in made)
+    function = pupil_function(lens, beam, scene.wavelengths, count)
+    density, inside, phase = (np.asarray(a)[0] for a in function(*grid))
     centre = np.asarray(centroid_and_variances(beam.hits[:, -1], beam.weights)[0])[:, 0]
     side = (np.arange(count) - (count - 1) / 2) * step
     x, y = np.meshgrid(side, side)
     phase = phase + 2 * np.pi * _UM / wavelength[0] * (x * centre[0] + y * centre[1])
-    # Its exponent has the other sign.
+    # The exponent of prysm has the other sign.
     return np.sqrt(density) * inside * np.exp(-1j * phase), step, centre
 
 
 def optiland(numbers: _peers.Lens, pixel: float, size: int, rays: int, grid: int) -> Callable:
-    """call() -> (size, size): Optiland's FFT PSF of `rays` x `rays` rays in a grid of `grid`, about
-    the chief ray, of the first wavelength."""
+    """call() -> (size, size): Optiland's FFT PSF about the chief ray at the first wavelength. rays,
+    grid: rays and samples per side."""
     from optiland import backend
     from optiland.psf import FFTPSF
 
@@ -72,18 +72,18 @@ def optiland(numbers: _peers.Lens, pixel: float, size: int, rays: int, grid: int
 def prysm(
     pupil: np.ndarray, step: float, wavelength: float, pixel: float, size: int, fine: int = 9
 ) -> Callable:
-    """call() -> (size, size): prysm's matrix Fourier transform of a pupil function (N, N) on a grid
-    of direction cosines `step` apart, `fine` x `fine` samples a pixel."""
+    """call() -> (size, size): prysm's matrix Fourier transform of a pupil function (N, N). step:
+    step of its direction cosines. fine: samples per side of a pixel."""
     from prysm.propagation import Wavefront
 
-    # At a focal length of 1 mm a direction cosine is a place in mm.
+    # At a focal length of 1 mm a direction cosine is a position in mm.
     sample, across = pixel / fine, len(pupil)
 
     def amplitude(function: np.ndarray, samples: int) -> np.ndarray:
         wave = Wavefront(function, wavelength, step)
         return np.asarray(wave.focus_fixed_sampling(1.0, _UM * sample, samples).data)
 
-    # What it makes of the sum over a pupil, which is known at the middle, and the light of all.
+    # Prysm's scale, from the known sum over a pupil of ones, and the total light.
     unit = abs(amplitude(np.ones((across, across), complex), 1).item()) / across**2
     scale = (step * sample * _UM / (wavelength * unit)) ** 2 / np.sum(np.abs(pupil) ** 2)
 

@@ -1,14 +1,14 @@
-"""The image of a point by each model: what it takes, by how much it is wrong, how it looks.
+"""The image of a point by each model: run time, error and picture.
 
-For each lens and field, kernels by rays and by waves over the cells of their grids, and the
-Gaussian. `error` is against the model's own limit: of rays a histogram of very many traced ones, of
-waves a grid of very many cells; `off` is against the limit of waves. Both are sums of absolute
-differences of all pixels, of the worst colour. Optiland's FFT PSF and prysm's matrix Fourier
-transform stand beside them, for the middle colour, against the same limit of waves; prysm is given
-the pupil, and traces nothing. Writes results.json: `kernels` hold `lens`, `model`, `cells`,
-`value_s`, `gradient_s` (of a mean over the kernel, by every number of the lens), `error`, `off`;
-`peers`; `limits`: the share outside of the kernel, the noise of the histogram and the rays that
-arrive; `grids`: seconds of 9 x 9 fields; `transfer`: MTF and its limit; `photographs`, in figures.
+Kernels by rays and by waves with rising numbers of cells, and Gaussian ones, for each lens and
+field. `error` is against the limit of the model: a histogram of very many rays, or waves with very
+many cells; `off` is against the limit of waves. Both are sums of absolute differences of all
+pixels, of the worst wavelength. Optiland's FFT PSF and prysm's matrix Fourier transform are
+compared with the limit of waves at the middle wavelength; prysm traces nothing, but gets the pupil.
+Writes results.json: `kernels` hold `lens`, `model`, `cells`, `value_s`, `gradient_s` (of a mean
+over the kernel, by every number of the lens), `error`, `off`; `peers`; `views`: the light outside
+of the kernel, the noise of the histogram, the rays that arrive, seconds of 9 x 9 fields, MTF and
+its limit; `photographs`, in figures.
 """
 
 import dataclasses
@@ -35,14 +35,13 @@ from .runs.folder import Run
 
 COLUMNS = ("value_s", "gradient_s", "error", "off")
 MODELS = "gaussian", "rays", "waves"
-# Rays that are traced at once for a histogram, a power of 2 as Sobol's points want it.
+# Rays traced at once for a histogram.
 _ROUND = 2**17
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A lens and what it looks at. lens: bundled name or YAML path. field_deg: of the point, along
-    y. pixel_um: of the sensor."""
+    """A lens, a field angle along y, and the side of a pixel."""
 
     lens: str
     field_deg: float
@@ -54,7 +53,7 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class Photo:
-    """A lens that takes the photograph. pixel_um: of its sensor."""
+    """A lens that takes the photograph, and the side of its pixels."""
 
     lens: str
     pixel_um: float
@@ -65,7 +64,7 @@ class Photo:
 
 @dataclasses.dataclass(frozen=True)
 class Gallery:
-    """Points whose kernels are drawn. distances_m: in front of the first surface."""
+    """Object points whose kernels are drawn."""
 
     lens: str = "double_gauss"
     fields_deg: tuple[float, ...] = (0.0, 7.0, 14.0)
@@ -77,10 +76,15 @@ class Gallery:
 class Config:
     """Settings of the experiment; see configs/images.yaml.
 
-    views: what is measured. size: of a kernel in pixels. rays, waves: cells along a side of their
-    grids. limit: cells of the limit of waves. rounds: of 2^17 rays a colour of the histogram.
-    peers: samples along a side of their pupils. frequencies: of a transfer function up to the
-    pixels' Nyquist frequency. photographs: lenses that take one. photo_pixels: of its side.
+    views: lenses and object points.
+    photographs: lenses that take the photograph.
+    size: side of a kernel, pixels.
+    rays, waves: cells per side of the models' grids.
+    limit: cells per side for the limit of waves.
+    rounds: rounds of 2^17 rays a wavelength for the histogram.
+    peers: samples per side of the peers' pupils.
+    frequencies: number of frequencies of the MTF, up to the pixels' Nyquist frequency.
+    photo_pixels: side of the photograph.
     """
 
     views: tuple[View, ...]
@@ -110,7 +114,7 @@ class Config:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A view in numbers: radians and mm."""
+    """A view in radians and mm."""
 
     lens: Lens
     field: float
@@ -119,23 +123,23 @@ class Scene:
     size: int
 
     def model(self, kind: Any, tolerance: float = 1e-2) -> PsfModel:
-        """The model that the tolerance asks for."""
-        around = self.waves, self.pixel, self.size
-        return drt_jax.converged_psf(self.lens, self.field, math.inf, *around, kind, tolerance)
+        """The model of a kind converged to the tolerance."""
+        grid = self.waves, self.pixel, self.size
+        return drt_jax.converged_psf(self.lens, self.field, math.inf, *grid, kind, tolerance)
 
     def kernel(self, lens: Lens, model: PsfModel, centre: Any = None) -> jax.Array:
-        """(W, size, size)."""
-        around = self.waves, self.pixel, self.size, model
-        return drt_jax.psf(lens, self.field, math.inf, *around, centre=centre).kernel
+        """The kernel (W, size, size) of a lens."""
+        grid = self.waves, self.pixel, self.size
+        return drt_jax.psf(lens, self.field, math.inf, *grid, model, centre=centre).kernel
 
 
-def _apart(a: Any, b: Any) -> float:
+def _difference(a: Any, b: Any) -> float:
     return float(np.max(np.sum(np.abs(np.asarray(a) - np.asarray(b)), axis=(-2, -1))))
 
 
 def histogram(scene: Scene, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, float, int]:
-    """What pixels about `centre` (2,) mm collect of traced rays, (W, size, size), its noise (of
-    halves against each other) and how many rays of each colour arrive."""
+    """Histogram (W, size, size) of traced rays on pixels about `centre` (2,), mm, its noise (from
+    its two halves), and the smallest number of rays of a wavelength that arrive."""
     edges = (np.arange(scene.size + 1) - scene.size / 2) * scene.pixel
     points, trace = drt_jax.pupil.random_disc(_ROUND * rounds, 0)[0], drt_jax.trace_rays
     halves = np.zeros((2, len(scene.waves), scene.size, scene.size))
@@ -143,15 +147,14 @@ def histogram(scene: Scene, rounds: int, centre: np.ndarray) -> tuple[np.ndarray
     for k in range(rounds):
         some = points[k * _ROUND : (k + 1) * _ROUND]
         rays = trace(scene.lens, scene.field, math.inf, scene.waves, some)
-        good = np.asarray(rays.status) == drt_jax.Status.OK
+        arrives = np.asarray(rays.status) == drt_jax.Status.OK
         hits = np.asarray(rays.points[:, :, -1, :2]) - centre
-        for w, (ok, (x, y)) in enumerate(zip(good, np.moveaxis(hits, -1, 1))):
+        for w, (ok, (x, y)) in enumerate(zip(arrives, np.moveaxis(hits, -1, 1))):
             halves[k % 2, w] += np.histogram2d(y[ok], x[ok], (edges, edges))[0]
-        arrived[k % 2] += good.sum(axis=1)
+        arrived[k % 2] += arrives.sum(axis=1)
     whole = halves.sum(axis=0) / arrived.sum(axis=0)[:, None, None]
-    noise = (
-        _apart(*(h / n[:, None, None] for h, n in zip(halves, arrived))) / 2 if rounds > 1 else 2
-    )
+    pair = (h / n[:, None, None] for h, n in zip(halves, arrived))
+    noise = _difference(*pair) / 2 if rounds > 1 else 2
     return whole, noise, int(arrived.sum(axis=0).min())
 
 
@@ -161,8 +164,8 @@ def measure(config: Config, view: View) -> dict[str, Any]:
     field, pixel = math.radians(view.field_deg), 1e-3 * view.pixel_um
     scene = Scene(lens, field, pixel, np.array(config.wavelengths_um), config.size)
     rule = scene.model("waves", 1e-3).rule
-    around = scene.waves, pixel, config.size
-    finest = drt_jax.psf(lens, field, math.inf, *around, PsfModel("waves", rule, config.limit))
+    grid = scene.waves, pixel, config.size
+    finest = drt_jax.psf(lens, field, math.inf, *grid, PsfModel("waves", rule, config.limit))
     collected, noise, arrived = histogram(scene, config.rounds, np.asarray(finest.centre))
     limits = {"rays": collected, "waves": np.asarray(finest.kernel)}
     cells = {"gaussian": (0,), "rays": config.rays, "waves": config.waves}
@@ -171,18 +174,19 @@ def measure(config: Config, view: View) -> dict[str, Any]:
     for model in (PsfModel(kind, rule, n) for kind in MODELS for n in cells[kind]):
         kernel, *seconds = _timed(scene, model, config.repeats)
         own = limits.get(model.kind)
-        known = {"model": model.kind, "cells": model.cells, "off": _apart(kernel, limits["waves"])}
-        known |= dict(zip(("value_s", "gradient_s"), seconds))
-        rows.append(name | known | {"error": None if own is None else _apart(kernel, own)})
-    told = {"outside": float(np.max(finest.outside)), "noise": noise, "rays": arrived}
-    told |= {"rays_off": _apart(*limits.values()), "grid_s": field_grid(scene, config.repeats)}
+        row = {"model": model.kind, "cells": model.cells, "value_s": seconds[0]}
+        row |= {"gradient_s": seconds[1], "off": _difference(kernel, limits["waves"])}
+        rows.append(name | row | {"error": None if own is None else _difference(kernel, own)})
+    about = {"outside": float(np.max(finest.outside)), "noise": noise, "rays": arrived}
+    about |= {"rays_off": _difference(*limits.values())}
     lines, curves = contrast(config, lens, field, pixel)
-    told |= {"frequencies": lines, "transfer": curves}
-    return {"rows": rows, "view": name | told, "peers": _beside(config, scene, rule, name)}
+    about |= {"grid_s": field_grid(scene, config.repeats), "frequencies": lines}
+    about |= {"transfer": curves}
+    return {"rows": rows, "view": name | about, "peers": _beside(config, scene, rule, name)}
 
 
 def _timed(scene: Scene, model: PsfModel, repeats: int) -> tuple[np.ndarray, float, float]:
-    """A kernel, and seconds that it takes, alone and with the gradient of a mean over it."""
+    """A kernel, and seconds for it, alone and with the gradient of a weighted sum of it."""
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(scene.size, scene.size)))
 
     def mean(lens: Lens) -> jax.Array:
@@ -194,7 +198,7 @@ def _timed(scene: Scene, model: PsfModel, repeats: int) -> tuple[np.ndarray, flo
 
 
 def field_grid(scene: Scene, repeats: int) -> float:
-    """Seconds of the waves kernels of 9 x 9 fields, to the view's in the corners."""
+    """Seconds for wave kernels of 9 x 9 fields, with the field of the view in the corners."""
     side = math.atan(math.tan(max(scene.field, 1e-3)) / math.sqrt(2))
     fields, far = (side, side), [math.inf]
     method = drt_jax.grid_method(
@@ -206,7 +210,7 @@ def field_grid(scene: Scene, repeats: int) -> float:
 
 
 def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[list, list]:
-    """Frequencies up to Nyquist's, and MTF by waves and by rays and its limit, (3, 2, N)."""
+    """Frequencies up to Nyquist's, and the MTF by waves and by rays and its limit, (3, 2, N)."""
     lines = np.linspace(0, 0.5 / pixel, config.frequencies)
     scene = lens, [field], math.inf, np.array(config.wavelengths_um), lines
     by_waves, by_rays = (drt_jax.transfer(*scene, model) for model in ("waves", "rays"))
@@ -215,7 +219,7 @@ def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[li
 
 
 def _beside(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of what other programs make of the middle colour."""
+    """Rows of other programs, at the middle wavelength."""
     middle = scene.waves[[len(scene.waves) // 2]]
     one = dataclasses.replace(scene, waves=middle)
     chief = np.ravel(drt_jax.image_point(scene.lens, scene.field, math.inf, middle))
@@ -237,7 +241,7 @@ def _beside(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> li
             row = name | {"program": program, "samples": count, "note": ""}
             try:
                 call, truth = make(count)
-                error, seconds = _apart(call(), truth), _common.medians([call], 3)[0]
+                error, seconds = _difference(call(), truth), _common.medians([call], 3)[0]
                 rows.append(row | {"seconds": seconds, "error": error})
             except (ImportError, ValueError) as failure:
                 rows.append(row | {"seconds": None, "error": None, "note": str(failure)[:80]})
@@ -246,20 +250,20 @@ def _beside(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> li
 
 
 def gallery(config: Config) -> np.ndarray:
-    """Kernels (distances, fields, models, W, size, size) for the picture."""
-    what = config.gallery
-    lens, waves = drt_jax.load_lens(what.lens), np.array(config.wavelengths_um)
-    around = waves, 1e-3 * what.pixel_um, config.size
-    fields, distances = np.radians(what.fields_deg), [1e3 * d for d in what.distances_m]
+    """Kernels (distances, fields, models, W, size, size) of the gallery."""
+    points = config.gallery
+    lens, waves = drt_jax.load_lens(points.lens), np.array(config.wavelengths_um)
+    grid = waves, 1e-3 * points.pixel_um, config.size
+    fields, distances = np.radians(points.fields_deg), [1e3 * d for d in points.distances_m]
     many = np.stack([0 * fields, fields], axis=-1)
-    models = [drt_jax.converged_psf(lens, many, distances, *around, kind) for kind in MODELS]
-    made = [drt_jax.psf(lens, f, d, *around, m) for d in distances for f in fields for m in models]
-    kernels = np.stack([np.asarray(one.kernel, np.float32) for one in made])
+    models = [drt_jax.converged_psf(lens, many, distances, *grid, kind) for kind in MODELS]
+    found = [drt_jax.psf(lens, f, d, *grid, m) for d in distances for f in fields for m in models]
+    kernels = np.stack([np.asarray(one.kernel, np.float32) for one in found])
     return kernels.reshape(len(distances), len(fields), len(models), *kernels.shape[1:])
 
 
 def photograph(config: Config, view: Photo, figures: pathlib.Path) -> dict[str, Any]:
-    """What a lens makes of a photograph, written into figures."""
+    """Renders the photograph by a lens, writes it into figures, and returns its row."""
     count = config.photo_pixels
     picture = transform.resize(data.astronaut(), (count, count), anti_aliasing=True)
     pixels = np.round(255 * picture).astype(np.uint8)
@@ -279,7 +283,7 @@ def photograph(config: Config, view: Photo, figures: pathlib.Path) -> dict[str, 
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Measure the views, then take the pictures."""
+    """Measures the views, then takes the photographs."""
     jobs = {f"{v.lens} {v.field_deg:g}": partial(measure, config, v) for v in config.views}
     taken = {f"photo {v.lens}": v for v in config.photographs}
     jobs |= {name: partial(photograph, config, v, run.figures) for name, v in taken.items()}
@@ -299,7 +303,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Every model; the peers; the views; the photographs."""
+    """Tables of the models, the peers, the views and the photographs."""
 
     def short(error: float | None) -> str:
         return "" if error is None else f"{error:.1e}"
@@ -341,7 +345,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """The gallery, error over time, transfer functions, the photographs."""
+    """Draws the gallery, error over time, transfer functions and the photographs."""
     _draw_gallery(results, figures / "gallery.png")
     views = results["views"]
     figure, axes = show.new(2, len(views), 4.2, 3.4)
@@ -373,7 +377,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
 
 
 def _draw_gallery(results: dict[str, Any], path: pathlib.Path) -> None:
-    """Fields down, distances across, of each the three models, colours as they are."""
+    """Draws fields down and distances across, with the three models of each."""
     kernels, what = results["gallery_kernels"], results["gallery"]
     count, fields, models = kernels.shape[:3]
     figure, axes = show.new(fields, count * models, 1.3, 1.45)

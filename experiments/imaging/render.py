@@ -1,9 +1,9 @@
 """The photograph that a lens takes: `python -m experiments.render photo.jpg --set scene.lens=...`.
 
-The photograph is taken for what a pinhole of the lens's focal length sees, pixel for pixel of the
-sensor; nothing is enlarged or reduced. Its values are linearised by the curve of sRGB, and those of
-the result turned back. Outside of the photograph it goes on as at its edge. Writes ideal.png
-and photo.png, of the same size, and both side by side, into figures.
+The photograph stands for the image of a pinhole camera with the lens's focal length, pixel for
+pixel of the sensor. Its values are linearised by the curve of sRGB, and those of the result encoded
+again. Beyond its border the photograph continues as at its edge. Writes ideal.png and photo.png, of
+the same size, and both side by side, into figures.
 """
 
 import dataclasses
@@ -30,16 +30,22 @@ from .runs.config import ConfigError
 from .runs.folder import Run
 
 COLUMNS = ("seconds",)
-# Bytes for each value of a picture: the picture, the result, its light and what is on the way.
+# Bytes for each value of a picture: the picture, its light, the result and intermediate arrays.
 _BYTES = 40
-_BEYOND = 1e-3  # of the light outside the kernels, from where it is worth a warning
+_BEYOND = 1e-3  # fraction of light outside the kernels above which the table warns
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """lens: bundled name or YAML path. wavelengths_um: of R, G, B. distance_m: .inf, or a number.
-    depth: a picture of the size of the photograph whose white is `near_m` and whose black is
-    `distance_m`, even in 1 / distance; none: all at distance_m."""
+    """The lens and its scene.
+
+    lens: bundled name or YAML path.
+    wavelengths_um: wavelengths of R, G, B.
+    distance_m: distance of the object, .inf for infinity.
+    depth: picture of the size of the photograph, linear in 1 / distance, white for `near_m`, black
+        for `distance_m`; empty for all at distance_m.
+    near_m: nearest distance of `depth`.
+    """
 
     lens: str = "double_gauss"
     wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
@@ -57,10 +63,12 @@ class Scene:
 class Config:
     """Settings of the experiment; see configs/render.yaml.
 
-    photo: a file, or "bundled". pixel_um: 0 spreads the photograph over `field_deg` from the middle
-    to a corner. model: of the kernels. kernel: its side in pixels; 0: what the blur needs. nodes:
-    fields on one side of the axis. layers: of a depth map. full_well, read_noise: electrons; a full
-    well of 0 leaves noise out.
+    photo: a file, or "bundled".
+    pixel_um: side of a pixel; 0 to spread the photograph over `field_deg`.
+    field_deg: field angle of the corners.
+    kernel: side of a kernel, pixels; 0 for what the blur needs.
+    nodes: fields on one side of the axis.
+    full_well, read_noise: electrons; a full well of 0 for no noise.
     """
 
     photo: str = "bundled"
@@ -77,9 +85,9 @@ class Config:
 
     def __post_init__(self) -> None:
         least = (0.05, 1e4)
-        good = self.pixel_um == 0 or least[0] <= self.pixel_um <= least[1]
+        valid = self.pixel_um == 0 or least[0] <= self.pixel_um <= least[1]
         got = f"got {self.pixel_um!r}"
-        _common.require(good, f"pixel_um: expected {least[0]} to {least[1]:g}, or 0, {got}")
+        _common.require(valid, f"pixel_um: expected {least[0]} to {least[1]:g}, or 0, {got}")
         limits = {"field_deg": (0.01, 60), "kernel": (0, 255), "nodes": (2, 64), "layers": (2, 64)}
         _common.require_within("", self, **limits, full_well=(0, 1e9), read_noise=(0, 1e6))
         _common.require(self.kernel % 2 or not self.kernel, "kernel: expected an odd number, or 0")
@@ -93,14 +101,14 @@ def linear(pixels: np.ndarray) -> np.ndarray:
 
 
 def encoded(light: np.ndarray) -> np.ndarray:
-    """8-bit values of light, by the curve of sRGB; beyond 0 to 1 cut off."""
+    """8-bit values of light, clipped to 0 to 1, by the curve of sRGB."""
     level = np.clip(light, 0, 1)
     curve = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)
     return np.round(255 * curve).astype(np.uint8)
 
 
 def _read(key: str, name: str) -> np.ndarray:
-    """A picture, uint8 (H, W, 3). ConfigError for one that cannot be read, or is too large."""
+    """Reads a picture, uint8 (H, W, 3). ConfigError if it cannot be read or is too large."""
     if name == "bundled":
         return np.asarray(data.astronaut())
     path = pathlib.Path(name).expanduser()
@@ -119,7 +127,7 @@ def _read(key: str, name: str) -> np.ndarray:
 
 
 def _distance(config: Config, shape: tuple[int, int]) -> Any:
-    """mm: a number, or (H, W)."""
+    """Distance of the object, a number or (H, W), mm."""
     scene = config.scene
     if not scene.depth:
         return 1e3 * scene.distance_m
@@ -133,7 +141,7 @@ def _distance(config: Config, shape: tuple[int, int]) -> Any:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Render the photograph."""
+    """Renders the photograph."""
     pixels = _read("photo", config.photo)
     shape = pixels.shape[:2]
     lens = drt_jax.load_lens(config.scene.lens)
@@ -178,7 +186,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """What was done, and warnings."""
+    """Table of the picture, with warnings."""
     wide, high = results["sensor_mm"]
     outside = f"{100 * results['outside']:.2g} %"
     if results["outside"] > _BEYOND:
@@ -200,7 +208,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Both pictures side by side."""
+    """Draws both pictures side by side."""
     height, width = results["shape"]
     figure, axes = show.new(1, 2, 5, 5 * height / width + 0.3)
     for ax, name in zip(axes, ("ideal", "photo")):
@@ -210,7 +218,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
 
 
 def arguments(words: list[str]) -> list[str]:
-    """The words of a command line, of which the first may be a photograph."""
+    """Arguments of the command line; the first may be a photograph."""
     if not words or words[0].startswith("-"):
         return words
     quoted = words[0].replace("'", "''")

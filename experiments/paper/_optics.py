@@ -1,5 +1,4 @@
-"""The lens of the paper's experiments: what is photographed through it, and what of it is
-trained."""
+"""The lens of the paper's experiments: the scene, and the trained numbers."""
 
 import dataclasses
 import math
@@ -19,22 +18,23 @@ from drt_jax.rays.solve import solve_aimed
 from drt_jax.rays.status import Status
 from drt_jax.rays.trace import trace_bundle
 
-from ._common import require, require_known, require_within
+from ._common import require, require_different, require_known, require_within
 from .runs.config import ConfigError
 
-# Kinds of numbers that may be trained. Tilts and decentres would break the symmetry for which the
-# rays are chosen; semi-diameters would shrink to nothing, as that costs an image no light here.
+# Kinds of trained numbers. Tilts and decentres would break the symmetry of the pupil rule;
+# semi-diameters would shrink to nothing, because the loss does not count light.
 KINDS = ("sensor", "curvature", "conic", "coefficients", "thickness")
-_RINGS = 4  # of the rays by which numbers are compared
+_RINGS = 4  # rings of rays in `Trained.scale`
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What is photographed, and through which lens.
+    """The lens and what it photographs.
 
-    lens: bundled name or YAML path. wavelengths_um: of the three channels, R, G, B. tolerance:
-    relative error of the blur that fixes the number of rays. field: of the object in degrees, one
-    angle along y or (x, y).
+    lens: bundled name or YAML path.
+    wavelengths_um: wavelengths of the channels R, G, B.
+    tolerance: relative error of the blur, which fixes the number of rays.
+    field: angle of the object along y, or (x, y), degrees.
     """
 
     lens: str = "double_gauss"
@@ -50,31 +50,31 @@ class Scene:
         require(one, "scene.field: expected one angle in degrees, or [x, y]")
 
     def seen(self, distance: float) -> tuple[np.ndarray, float, tuple[float, ...]]:
-        """Field in radians, distance in mm and wavelengths, as functions of drt_jax take them."""
+        """Field (radians), distance (mm) and wavelengths (um): arguments of drt_jax's functions."""
         return np.radians(self.field), distance, self.wavelengths_um
 
 
 def check_variables(names: tuple[str, ...]) -> None:
-    """ConfigError for a list of variables that has none, one twice, or of no kind."""
+    """ConfigError for an empty list of variables, one given twice, or one of no kind."""
     what = "train.variables"
     require(len(names) > 0, f"{what}: needs at least one item")
-    require(len(set(names)) == len(names), f"{what}: an item stands twice")
+    require_different(what, names)
     for name in names:
         kind, _, row = name.partition(" ")
         require_known(what, (kind,), KINDS)
-        good = kind == name or (row.isdecimal() and kind != "sensor")
+        valid = kind == name or (row.isdecimal() and kind != "sensor")
         expected = f"{what}: expected a kind, or one and a surface, such as curvature 0"
-        require(good, f"{expected}, got {name!r}")
+        require(valid, f"{expected}, got {name!r}")
 
 
 def middle(near: float, far: float) -> float:
-    """The distance between two, in mm, in the middle of their reciprocals."""
+    """Harmonic mean of two distances, mm."""
     return near if near == far else 2 / (1 / near + 1 / far)
 
 
 def spot_of(scene: Scene, lens: drt_jax.Lens, distance: float) -> dict[str, float]:
-    """RMS radius in um of the spot of all colours about their mean centroid, and the least share of
-    the light of one that arrives, with the rays that this lens needs."""
+    """RMS radius of the spot of all wavelengths about their mean centroid, um, and the smallest
+    throughput of a wavelength, with a rule for this lens."""
     found = drt_jax.psf_moments(lens, *scene.seen(distance), scene.tolerance)
     mean, covariance = np.asarray(found.mean), np.asarray(found.covariance)
     squares = np.trace(covariance, axis1=1, axis2=2)
@@ -84,11 +84,12 @@ def spot_of(scene: Scene, lens: drt_jax.Lens, distance: float) -> dict[str, floa
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """A lens as a function of the numbers of it that are trained: values by name, each in the unit
-    of the lens. "sensor" is always among them, mm from the first vertex.
+    """A lens as a function of its trained numbers: values by name, each in the unit of the lens,
+    always with "sensor", mm from the first vertex.
 
-    lens: at the start. variables: the others, None if there are none. moves: whether the sensor is
-    trained.
+    lens: lens at the start.
+    variables: the other trained numbers; None without any.
+    moves: True if the sensor is trained.
     """
 
     lens: drt_jax.Lens
@@ -97,8 +98,8 @@ class Trained:
 
     @classmethod
     def of(cls, name: str, variables: tuple[str, ...]) -> "Trained":
-        """Of a lens by its name or path, and `train.variables`. ConfigError for a surface that the
-        lens has not."""
+        """From a lens by name or path, and `train.variables`. ConfigError for a surface that the
+        lens does not have."""
         lens, moves = drt_jax.load_lens(name), "sensor" in variables
         parts = [name.partition(" ") for name in variables if name != "sensor"]
         try:
@@ -109,11 +110,11 @@ class Trained:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of what is trained beside the sensor's position, such as "curvature 0"."""
+        """Names of the trained numbers besides the sensor, such as "curvature 0"."""
         return () if self.variables is None else self.variables.names
 
     def start(self, sensor: Any) -> dict[str, Array]:
-        """The values of the lens, with the sensor at (...) mm."""
+        """Values of the lens at the start. sensor: (...), position of the sensor, mm."""
         values = {"sensor": jnp.asarray(sensor)}
         if self.variables is not None:
             for name, number in zip(self.names, self.variables.start):
@@ -121,7 +122,7 @@ class Trained:
         return values
 
     def lens_of(self, values: Mapping[str, Any]) -> drt_jax.Lens:
-        """The lens of some values. The sensor stays where it is told, whatever moves before it."""
+        """The lens for values. The sensor is where `values` say, whatever the thicknesses are."""
         lens, dtype = self.lens, self.lens.curvature.dtype
         if self.variables is not None:
             numbers = [jnp.asarray(values[name], dtype) for name in self.names]
@@ -129,13 +130,13 @@ class Trained:
         return dataclasses.replace(lens, sensor=jnp.asarray(values["sensor"], dtype))
 
     def blur(self, scene: Scene, near: float, far: float) -> Callable:
-        """(values, distance in mm from `near` to `far`) to the moments, as of
-        `drt_jax.moments_model`; with the sensor alone no ray is traced inside."""
-        field, _, colours = scene.seen(near)
+        """Function (values, distance in mm between `near` and `far`) -> moments, by
+        `drt_jax.moments_model`; it traces no ray if only the sensor is trained."""
+        field, _, wavelengths = scene.seen(near)
         places = () if self.variables is None else self.variables.places
         leaves = tuple(sorted({"sensor", *(place.kind for place in places)}))
         model = drt_jax.moments_model(
-            self.lens, leaves, field, (near, far), colours, scene.tolerance
+            self.lens, leaves, field, (near, far), wavelengths, scene.tolerance
         )[1]
 
         @jax.jit
@@ -146,33 +147,34 @@ class Trained:
         return blur if places else model
 
     def scale(self, scene: Scene, distance: float) -> dict[str, float]:
-        """By name: the change, in the unit of the lens, that counts as 1 mm of the sensor. 0 for a
-        sensor that is not trained.
+        """Change of each number, by name and in the unit of the lens, that counts as 1 mm of the
+        sensor; 0 for a sensor that is not trained.
 
-        That which moves the rays on the sensor about their centroid as far as the sensor's does,
-        root of the mean square over pupil and colours, to first order, at the start; so one rate
-        in mm serves all units, and none spoils the focus faster than another. At most as many
-        typical steps of a design as 1 mm is of the sensor's: a conic of a nearly flat surface
-        would have to change by thousands.
+        It changes the ray deviations from the centroid as much as 1 mm of the sensor does (root
+        mean square over pupil and wavelengths, to first order, at the start), so that one rate in
+        mm serves all units and no number spoils the focus faster. It has at most as many typical
+        steps of a design as 1 mm of the sensor: the conic of a nearly flat surface would change by
+        thousands.
         """
         pupil = tuple(jnp.asarray(hexapolar(_RINGS)[0].T, self.lens.curvature.dtype))
 
         def hits(values: dict[str, Array]) -> tuple[Array, Array]:
             lens = self.lens_of(values)
-            given = drt_jax.scene_of(lens, *scene.seen(distance))
-            bundle = trace_bundle(lens, given, pupil, solve_aimed)
+            bundle = trace_bundle(
+                lens, drt_jax.scene_of(lens, *scene.seen(distance)), pupil, solve_aimed
+            )
             return jnp.stack([hit[-1] for hit in bundle.hits], axis=-1), bundle.status
 
         slopes, status = jax.jit(jax.jacfwd(hits, has_aux=True))(self.start(self.lens.sensor))
-        good = np.asarray(status == Status.OK)[..., None]
-        wide = {}
-        for name, slope in slopes.items():
-            moved = np.asarray(slope)
-            middle = np.sum(moved, axis=1, where=good) / np.sum(good, axis=1)
-            wide[name] = float(np.sqrt(np.mean((moved - middle[:, None]) ** 2, where=good)))
-            require(wide[name] > 0, f"train.variables: {name} moves no ray; leave it out")
+        passes = np.asarray(status == Status.OK)[..., None]
+        spread = {}
+        for name, derivative in slopes.items():
+            slope = np.asarray(derivative)
+            mean = np.sum(slope, axis=1, where=passes) / np.sum(passes, axis=1)
+            spread[name] = float(np.sqrt(np.mean((slope - mean[:, None]) ** 2, where=passes)))
+            require(spread[name] > 0, f"train.variables: {name} moves no ray; leave it out")
         found = {"sensor": float(self.moves)}
         for name, place in zip(self.names, self.variables.places if self.variables else ()):
             steps = step_of(self.lens, *place) / step_of(self.lens, "sensor", 0, 0)
-            found[name] = min(wide["sensor"] / wide[name], steps)
+            found[name] = min(spread["sensor"] / spread[name], steps)
         return found

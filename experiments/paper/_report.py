@@ -1,4 +1,4 @@
-"""Tables and pictures of the paper's experiments, from their results alone."""
+"""Tables and figures of the paper's experiments, from their results alone."""
 
 import pathlib
 from typing import Any
@@ -12,25 +12,25 @@ from . import _plots
 from ._common import number, panels, table
 from ._optics import Trained
 
-# Images of patches, in the order in which an imager returns them.
+# Images of patches, in the order of an imager.
 IMAGES = ("truth", "sensor", "restored")
 _UNITS = {"sensor": "mm", "thickness": "mm", "curvature": "1/mm"}
 
 
 def start_label(start: float) -> str:
-    """The job of a starting position of the sensor, mm."""
+    """Name of the job that starts at a sensor position, mm."""
     return f"start {start}"
 
 
 def start_lines(results: dict[str, Any], column: str, batches: int | None = None) -> dict:
-    """(batch, value) by start, for `_plots.convergence`, of the first `batches`."""
+    """(batch, value) by start of the first `batches`, for `_plots.convergence`."""
     rows = [values[:batches] for values in results[column]]
     labels = map(start_label, results["starts_mm"])
     return {label: (np.arange(len(row)), row) for label, row in zip(labels, rows)}
 
 
 def reached(results: dict[str, Any]) -> str:
-    """The planes at which the starts ended, in words."""
+    """Planes at which the starts ended, as text."""
     if None in results["final_mm"]:
         return "not finite"
     low, high = (f"{end(results['final_mm']):.3f}" for end in (min, max))
@@ -38,18 +38,18 @@ def reached(results: dict[str, Any]) -> str:
 
 
 def moves(results: dict[str, Any]) -> bool:
-    """Whether the sensor is trained."""
+    """True if the sensor is trained."""
     return "sensor" in results.get("variables", ["sensor"])
 
 
 def planes(results: dict[str, Any], paper: str, more: str = "") -> list[tuple[str, str, str]]:
-    """The row of a table about the plane that all starts reach, if the sensor alone moves."""
+    """Table row of the plane that all starts reach; none if more than the sensor is trained."""
     row = "plane that all starts reach", paper, reached(results) + more
     return [] if "numbers" in results else [row]
 
 
 def gaussian(results: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """The row of a table that says how far the Gaussian is from the kernel with diffraction."""
+    """Table row of the error of the Gaussian kernel against waves; none without it."""
     words = [
         f"{50 * row['misplaced']:.0f} % of the light, {row['contrast']:.2f} of the contrast at "
         f"{row['distance_m']:g} m"
@@ -60,29 +60,29 @@ def gaussian(results: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def beside(results: dict[str, Any], rows: list[tuple[str, str, str]]) -> str:
-    """A table of (what, the paper's, ours), without the paper's of what it does not have."""
+    """A table of (what, paper, ours); without the paper if it has no such numbers."""
     if results.get("paper", True):
         return table(("", "paper", "here"), rows)
     return table(("", "here"), [(what, here) for what, _, here in rows])
 
 
 def numbers_tables(name: str, results: dict[str, Any]) -> dict[str, str]:
-    """The table `name` of what became of the lens; none if the sensor alone is trained."""
+    """The table `name` of the trained numbers; none if only the sensor is trained."""
     if "numbers" not in results:
         return {}
-    told = {"rms_um": f"RMS radius um at {results['spot_mm'] / 1e3:.4g} m"}
-    told |= {"light": "least share of light", "loss": "mean loss, first and last batches"}
+    titles = {"rms_um": f"RMS radius um at {results['spot_mm'] / 1e3:.4g} m"}
+    titles |= {"light": "least share of light", "loss": "mean loss, first and last batches"}
     runs = results["numbers"]
     rows = []
     for key in runs[0][0]:
-        title = told.get(key, f"{key} {_UNITS.get(key.split()[0], '')}".strip())
-        ends = [[number(column[key], ".6g") for column in columns] for columns in runs]
-        rows.append((title, *(" to ".join(pair) for pair in ends)))
+        title = titles.get(key, f"{key} {_UNITS.get(key.split()[0], '')}".strip())
+        pairs = [[number(column[key], ".6g") for column in columns] for columns in runs]
+        rows.append((title, *(" to ".join(pair) for pair in pairs)))
     return {name: table(("", *map(start_label, results["starts_mm"])), rows)}
 
 
 def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
-    """Picture of the sensor position of all starts over training, if it is trained."""
+    """Figure of the sensor position of all starts over training, if it is trained."""
     if moves(results):
         figure, axes = show.new(width=7, height=4.5)
         _plots.convergence(axes, start_lines(results, "sensor_mm"), "sensor position (mm)")
@@ -90,8 +90,8 @@ def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
 
 
 def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
-    """Pictures numbers.png, of what is trained beside the sensor, and designed.png, of the lens of
-    the first start before and after; none if that is nothing."""
+    """Figures numbers.png, of the trained numbers, and designed.png, of the lens of the first start
+    before and after; none if only the sensor is trained."""
     if "numbers" not in results:
         return
     trained = Trained.of(results["lens"], tuple(results["variables"]))
@@ -116,7 +116,7 @@ def _draw(axes: Any, lens: drt_jax.Lens, results: dict[str, Any], distance: floa
 
 
 def draw_lens(results: dict[str, Any], distance: float, path: pathlib.Path) -> None:
-    """Picture of the lens with its beam from `distance` mm, at the angle of the field along y."""
+    """Figure of the lens with its beam from a distance in mm, at the field along y."""
     lens = drt_jax.load_lens(results["lens"])
     figure, axes = show.new(width=8, height=4)
     _draw(axes, lens, results, distance)
@@ -125,7 +125,7 @@ def draw_lens(results: dict[str, Any], distance: float, path: pathlib.Path) -> N
 
 
 def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path) -> None:
-    """Picture of the `images`, each but the truth with its RMSE."""
+    """Figure of the `images` of patches, with the RMSE of all but the truth."""
     rows = {name: np.float32(results[name]) for name in IMAGES}
     errors = {name: rows[name] - rows["truth"] for name in IMAGES[1:]}
     notes = {n: [f"{np.sqrt(np.mean(e**2)):.3f}" for e in some] for n, some in errors.items()}

@@ -1,4 +1,4 @@
-"""What the paper's experiments share: settings, and trained jobs."""
+"""Settings and training jobs of the paper's experiments."""
 
 import dataclasses
 import functools
@@ -27,21 +27,21 @@ from .runs.folder import Run
 from .runs.interrupt import deferred_interrupt
 from .runs.write import replace
 
-# So many files that were skipped are named on the terminal, all of more in the run's folder.
+# Most skipped files named on the terminal; the run folder names all.
 _NAMED = 20
-# Sum of the absolute errors of the pixels of kernels with diffraction.
+# Tolerance of wave kernels, the sum of absolute errors of their pixels.
 _KERNELS = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
 class Training:
-    """How long, and how fast.
+    """Length and speed of training.
 
-    batches: steps of each job. batch: patches in one. patch: their side in pixels. variables: the
-    numbers of the lens that are trained, by kind, or kind and surface such as "curvature 0".
-    optics_rate: Adam's learning rate of the sensor's position in mm; that of another number moves
-    the rays on the sensor as far, see `Trained.scale`. checkpoint_every: in batches, or when
-    metrics are next written.
+    batches: steps of each job.
+    patch: side of a patch, pixels.
+    variables: trained numbers of the lens, by kind, or kind and surface such as "curvature 0".
+    optics_rate: Adam's learning rate of the sensor, mm; other rates follow from `Trained.scale`.
+    checkpoint_every: batches between checkpoints, rounded up to reports of metrics.
     """
 
     batches: int
@@ -52,7 +52,7 @@ class Training:
     checkpoint_every: int = 200
 
     def __post_init__(self) -> None:
-        # 7: the window of the SSIM.
+        # 7 is the window of the SSIM.
         sizes = {"batch": (1, 4096), "patch": (7, 4096), "checkpoint_every": (1, math.inf)}
         rates = {f"{name}_rate": (0, 10) for name in self.rates}
         require_within("train.", self, batches=(1, math.inf), **sizes, **rates)
@@ -67,14 +67,14 @@ class Training:
 
 @dataclasses.dataclass(frozen=True)
 class JointTraining(Training):
-    """network_rate: Adam's learning rate of the network; the rest as in `Training`."""
+    """`Training` with a network. network_rate: Adam's learning rate of the network."""
 
     network_rate: float = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Net:
-    """RED-Net joins every `skip_every` pairs of layers; input_skip: whether also its ends."""
+    """Settings of `red_net`."""
 
     skip_every: int = 2
     input_skip: bool = True
@@ -87,8 +87,8 @@ class Net:
 class Settings:
     """Settings of all three experiments.
 
-    starts_mm: sensor positions from which training starts. noise: standard deviation of the
-    sensor's, for values from 0 to 1. seed: of the patches, the noise and the network.
+    starts_mm: sensor positions at the start of training.
+    noise: standard deviation of the sensor noise, for values from 0 to 1.
     """
 
     starts_mm: tuple[float, ...]
@@ -105,13 +105,13 @@ class Settings:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Of metrics.csv, beside those of the experiment: the trained numbers of the lens."""
+        """Further columns of metrics.csv: the trained numbers of the lens."""
         return Trained.of(self.scene.lens, self.train.variables).names
 
     @property
     def paper(self) -> bool:
-        """Whether the paper has numbers for this: its lens, colours and distances, and the sensor
-        alone that moves."""
+        """True if the paper has numbers for these settings: its lens, wavelengths and distances,
+        and only the sensor trained."""
         usual = {field.name: field.default for field in dataclasses.fields(self)}
         here = vars(self) | {"scene": dataclasses.replace(self.scene, tolerance=Scene.tolerance)}
         same = all(here[n] == usual[n] for n in ("scene", "distance_m", "depth_m") if n in usual)
@@ -120,7 +120,7 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JointSettings(Settings):
-    """Settings with a network; test_patches: how many of the test patches are used (0: all)."""
+    """Settings with a network. test_patches: number of test patches; 0 for all."""
 
     train: JointTraining
     test_patches: int = 0
@@ -130,17 +130,19 @@ class JointSettings(Settings):
 class Jobs:
     """The training jobs of a run.
 
-    lens: with the numbers that are trained. blur: its moments by them and the distance.
-    scenes, test: patches to train with, and to measure on.
-    restore, parameters: the network if the settings have one, and the number of its weights.
+    lens: lens with its trained numbers.
+    blur: function of `Trained.blur`.
+    scenes, test: training and test patches.
+    restore: network, None without one.
+    parameters: number of its weights.
     """
 
     def __init__(self, run: Run, config: Settings, near: float, far: float, *more: float) -> None:
-        """near, far: of the objects in training, mm; more: other distances at which to measure."""
+        """near, far: distances in training, mm. more: other distances of tests, mm."""
         self._run, self._config, self._depths = run, config, (near, far)
         self.lens = Trained.of(config.scene.lens, config.train.variables)
         self.blur = self.lens.blur(config.scene, min([near, *more]), max([far, *more]))
-        # The last values of each job that were found good.
+        # The last valid values of each job.
         self._good: dict[str, dict[str, float]] = {}
         self._network: dict[str, Any] = {}
         self.restore = None
@@ -165,14 +167,14 @@ class Jobs:
 
     @functools.cached_property
     def _scale(self) -> dict[str, float]:
-        """`Trained.scale` in the middle of the distances; none of the sensor alone."""
+        """`Trained.scale` at the middle distance; {} if only the sensor is trained."""
         names, distance = self.lens.names, middle(*self._depths)
         return self.lens.scale(self._config.scene, distance) if names else {}
 
     def steps(
         self, blur: Callable, several: bool = False, convolve: Callable = convolve
     ) -> tuple[Callable, tuple[Callable, Callable]]:
-        """The imager through a blur, and (init, step) for it, of several jobs at once or of one."""
+        """The imager of a blur and its (init, step), for one job, or several at once."""
         config = self._config
         imager = train.make_imager(blur, self.restore, config.camera, convolve)
         rates: dict[str, Any] = dict(config.train.rates)
@@ -189,11 +191,12 @@ class Jobs:
         noise: float,
         labels: tuple[str, ...] = (),
     ) -> dict[str, Any]:
-        """Train one job, or several at once with a label each, from its last checkpoint on.
+        """Trains one job, or several at once with a label each, from the last checkpoint on, and
+        returns the trained parameters. KeyboardInterrupt, after a checkpoint, if the user stops it.
 
-        steps: of `steps`. optics: its parameters at the start.
-        Returns the trained parameters. KeyboardInterrupt, after a checkpoint, if the user asked to
-        stop.
+        steps: from `steps`.
+        optics: parameters of the optics at the start.
+        noise: standard deviation of the noise.
         """
         run, setting, labels = self._run, self._config.train, labels or (job,)
         init, step = steps
@@ -220,7 +223,7 @@ class Jobs:
             print("\nstopping after this step; once more stops at once", file=sys.stderr)
 
         stream = batches(self.scenes, setting.batch, self._config.seed, first)
-        # Each report waits for the device: rarely where a step takes milliseconds.
+        # Each report waits for the device: seldom where a step takes milliseconds.
         every = 10 if jax.default_backend() == "cpu" else 113
         with bar, deferred_interrupt(stopping) as asked:
             state = train.fit(step, state, stream, noise, range(first, total), every, report, asked)
@@ -234,8 +237,8 @@ class Jobs:
     def _check(
         self, label: str, first: int, rows: dict[str, np.ndarray], values: dict[str, float]
     ) -> None:
-        """ConfigError for numbers that are not finite, and for a lens whose surfaces cross; the one
-        of the last report, which had none of this, is saved then."""
+        """ConfigError for numbers that are not finite and for surfaces that cross, after saving the
+        lens of the last valid report."""
         try:
             require_finite(label, first, rows["loss"])
             require_finite(label, first, rows["sigma_um"], "blur")
@@ -251,7 +254,7 @@ class Jobs:
         self._good[label] = values
 
     def _save_lens(self, label: str) -> pathlib.Path:
-        """Write the lens that a job has come to."""
+        """Writes the last valid lens of a job."""
         path = self._run.folder / "designed" / f"{label}.yaml"
         path.parent.mkdir(exist_ok=True)
         if self._good[label]:
@@ -259,9 +262,8 @@ class Jobs:
         return path
 
     def results(self, *columns: str) -> dict[str, Any]:
-        """What is kept of the training of all starts, which log as `start_label`: their final
-        sensor positions, averaged over the last tenth of the batches (at least 20, at most all),
-        and metrics by column (starts, batches)."""
+        """Results of all starts: final sensor positions, averaged over the last tenth of the
+        batches (at least 20, at most all), and metrics (starts, batches) by column."""
         config = self._config
         window = min(config.train.batches, max(20, config.train.batches // 10))
         traces = [self._run.metrics(start_label(start)) for start in config.starts_mm]
@@ -281,19 +283,19 @@ class Jobs:
         }
 
     def _gaussian(self) -> list[dict[str, float]]:
-        """How far the Gaussians of the first start's lens are from kernels with diffraction, for
-        the nearest and the farthest object; none where these do not converge."""
+        """Error of the Gaussian kernels of the first start's lens against waves, for the nearest
+        and the farthest object; [] where wave kernels do not converge."""
         config, camera = self._config, self._config.camera
         lens = self.lens.lens_of(self._good[start_label(config.starts_mm[0])])
         distances = sorted(set(self._depths))
-        field, _, colours = config.scene.seen(distances[0])
+        field, _, wavelengths = config.scene.seen(distances[0])
         pairs = np.reshape(field, (1, 2)) if np.size(field) == 2 else np.reshape(field, 1)
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
             try:
                 pixel = 1e-3 * camera.pixel_um
                 found = drt_jax.gaussian_error(
-                    lens, pairs, distances, colours, pixel, camera.kernel, _KERNELS
+                    lens, pairs, distances, wavelengths, pixel, camera.kernel, _KERNELS
                 )
             except (UserWarning, ValueError):
                 return []
@@ -301,16 +303,16 @@ class Jobs:
         return [{"distance_m": d / 1e3, "misplaced": m, "contrast": c} for d, m, c in columns]
 
     def _numbers(self, traces: list[dict[str, np.ndarray]], window: int) -> dict[str, Any]:
-        """What became of the lens: its numbers, loss and spot at each start and end, and the
-        changes (starts, numbers, batches) in units of `Trained.scale`, mm."""
+        """Trained numbers, loss and spot of each start, before and after, and changes of the
+        numbers (starts, numbers, batches) in units of `Trained.scale`, mm."""
         config, distance = self._config, middle(*self._depths)
         rows, changes = [], []
         for start, trace in zip(config.starts_mm, traces):
-            ends = [self.lens.start(start), self._good[start_label(start)]]
+            pair = [self.lens.start(start), self._good[start_label(start)]]
             losses = trace["loss"][:window], trace["loss"][-window:]
-            columns = [{name: float(number) for name, number in end.items()} for end in ends]
-            for column, end, loss in zip(columns, ends, losses):
-                column |= spot_of(config.scene, self.lens.lens_of(end), distance)
+            columns = [{name: float(number) for name, number in values.items()} for values in pair]
+            for column, values, loss in zip(columns, pair, losses):
+                column |= spot_of(config.scene, self.lens.lens_of(values), distance)
                 column["loss"] = float(np.mean(loss))
             rows.append(columns)
             changes.append([(trace[n] - trace[n][0]) / self._scale[n] for n in self.lens.names])
@@ -318,12 +320,12 @@ class Jobs:
 
 
 def values_of(parameters: dict[str, Any], k: int) -> dict[str, float]:
-    """The numbers of the lens of job k."""
+    """Trained numbers of the lens of job k."""
     return {name: float(np.ravel(value)[k]) for name, value in parameters["optics"].items()}
 
 
 def require_finite(label: str, first: int, losses: np.ndarray, what: str = "loss") -> None:
-    """ConfigError, with the batch, unless all losses of a job are finite; `first`: their batch."""
+    """ConfigError, with the batch, unless all losses of a job are finite. first: first batch."""
     lost = np.flatnonzero(~np.isfinite(losses))
     what = f"{label}: the {what} is not finite from batch {first + lost[:1].sum()} on"
     require(not lost.size, f"{what}; leave this start out, or lower the learning rates")
@@ -332,19 +334,19 @@ def require_finite(label: str, first: int, losses: np.ndarray, what: str = "loss
 def images(
     imager: Callable, parameters: Any, scenes: np.ndarray, distance: float, noise: float, seed: int
 ) -> dict[str, np.ndarray]:
-    """Truth, sensor and restored images of patches, for `draw_patches`."""
+    """True, sensor and restored images of patches, for `draw_patches`."""
     found = imager(parameters, scenes, distance, np.float32(noise), jax.random.key(seed))
     return {name: np.asarray(image, np.float16) for name, image in zip(IMAGES, found)}
 
 
 def thinned(patches: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` patches (0: all), spread evenly over the set."""
+    """At most `count` patches, evenly over the set; all for 0."""
     if not count or count >= len(patches):
         return patches
     return np.asarray(patches[np.linspace(0, len(patches) - 1, count).astype(int)])
 
 
 def textured(patches: np.ndarray, count: int) -> np.ndarray:
-    """`count` patches for a picture, spread evenly over the half with more contrast."""
+    """At most `count` patches for a figure, evenly over the half with more contrast."""
     contrast = np.std(patches.reshape(len(patches), -1), axis=1)
     return thinned(patches[np.argsort(contrast)[len(patches) // 2 :]], count)

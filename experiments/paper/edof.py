@@ -1,9 +1,9 @@
 """Section 6.3 of the paper: extended depth of field with a chromatic lens and a network.
 
 The object distance is random in each batch. Every starting position of the sensor is trained
-jointly with its network; one start also with the sensor fixed, for comparison. No ray is
-traced in the loop: the moments are interpolated in 1/distance. Draws the lens and figures 6a, 6b
-and 7, and writes table 2.
+jointly with its network; one start also with the sensor fixed, for comparison. The loop traces no
+ray: the moments are interpolated in 1/distance. Draws the lens and figures 6a, 6b and 7, and
+writes table 2.
 
 train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
 "curvature 0", of one. scene.field: degrees along y, or [x, y].
@@ -32,8 +32,9 @@ COLUMNS = ("loss", "sensor_mm", "sigma_um", "depth_mm")
 class Config(_training.JointSettings):
     """Settings of the experiment; see configs/edof.yaml.
 
-    fixed_mm: the start that is also trained with the sensor fixed; one of starts_mm. depth_m:
-    nearest and farthest object in training. table_depth_m, patch_depth_m: of table 2, figure 7.
+    fixed_mm: one of starts_mm, also trained with the sensor fixed.
+    depth_m: nearest and farthest object in training.
+    table_depth_m, patch_depth_m: distances of table 2 and figure 7.
     """
 
     fixed_mm: float
@@ -47,20 +48,20 @@ class Config(_training.JointSettings):
         for name in ("depth_m", "table_depth_m", "patch_depth_m"):
             _common.require_list(name, getattr(self, name))
             _common.require_within("", self, **{name: (1e-3, 1e9)})
-        ends = len(self.depth_m) == 2 and self.depth_m[0] < self.depth_m[1]
-        _common.require(ends, "depth_m: expected the nearest and the farthest distance in m")
+        ordered = len(self.depth_m) == 2 and self.depth_m[0] < self.depth_m[1]
+        _common.require(ordered, "depth_m: expected the nearest and the farthest distance in m")
         some = any(map(self.trained_at, self.table_depth_m))
         _common.require(some, "table_depth_m: none lies within depth_m")
         start = self.fixed_mm in self.starts_mm
         _common.require(start, f"fixed_mm: {self.fixed_mm} must be one of starts_mm")
 
     def trained_at(self, depth: float) -> bool:
-        """Whether a depth in m lies within those of training."""
+        """True if a depth in m lies within those of training."""
         return self.depth_m[0] <= depth <= self.depth_m[1]
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Train jointly and with the sensor fixed, and test over depth."""
+    """Trains jointly and with the sensor fixed, and tests over depth."""
     near, far = (1e3 * depth for depth in config.depth_m)
     more = (1e3 * depth for depth in (*config.table_depth_m, *config.patch_depth_m))
     jobs = _training.Jobs(run, config, near, far, *more)
@@ -111,7 +112,7 @@ def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[s
 
 
 def blur_over_depth(blur: Callable, lenses: tuple, near: float, far: float) -> dict[str, Any]:
-    """Blur in um along y of each colour, by depth in m, of lenses by their trained numbers."""
+    """Blur of each wavelength over depth, um. lenses: trained numbers of each lens."""
     grid = np.linspace(near, far, 121)
     sigma = jax.vmap(lambda d, v: train.blur_width(blur(v, d).covariance), in_axes=(0, None))
     curves = np.stack([1e3 * np.asarray(sigma(jnp.asarray(grid), values)) for values in lenses])
@@ -120,7 +121,7 @@ def blur_over_depth(blur: Callable, lenses: tuple, near: float, far: float) -> d
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Beside the paper, and table 2."""
+    """The comparison with the paper, and table 2."""
     mean, rows = results["mean_mae"], results["table"]
     pairs = [(row["depth_m"], row["fixed"]["mae"], row["joint"]["mae"]) for row in rows]
     better = [f"{d:g}" for d, a, b in pairs if None not in (a, b) and a < b]
@@ -143,7 +144,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw the lens and figures 6a, 6b and 7."""
+    """Draws the lens and figures 6a, 6b and 7."""
     far = 1e3 * results["depth_m"][1]
     _report.draw_lens(results, far, figures / "lens.png")
     _report.draw_numbers(results, figures)

@@ -1,8 +1,7 @@
 """Section 6.1 of the paper: focus a lens by gradient descent through the sensor layer alone.
 
-Several starting positions of the sensor are trained together, without a network. No ray is
-traced in the loop: the moments are polynomials in the sensor position. Draws the lens and
-figures 4a and 4b.
+Several starting positions of the sensor are trained together, without a network. The loop traces
+no ray: the moments are polynomials in the sensor position. Draws the lens and figures 4a and 4b.
 
 train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
 "curvature 0", of one. scene.field: degrees along y, or [x, y].
@@ -26,7 +25,7 @@ from . import _command, _common, _plots, _report, _training
 from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
-# Of the mean of many numbers in float32, relative, with some room.
+# Bound of the relative rounding error of a mean of many numbers in float32.
 _ROUNDING = 1e-5
 
 
@@ -42,16 +41,16 @@ class Config(_training.Settings):
 
 
 def best_focus(loss: Callable, scenes: np.ndarray, low: float, high: float) -> float:
-    """Sensor position between `low` and `high` mm of least `loss` (sensor, scenes), to a ten
-    thousandth of the interval: a dense search, four times. NaN if the loss has no minimum there:
-    if it is least at an end, nowhere less by more than rounding, or not finite somewhere."""
+    """Sensor position of the smallest `loss` (sensor, scenes) between `low` and `high`, mm, to a
+    ten thousandth of the interval, by four dense searches. NaN without a minimum inside: if an end
+    is smallest up to rounding, or the loss is not finite somewhere."""
     losses = jax.jit(lambda grid, scenes: jax.lax.map(lambda s: loss(s, scenes), grid))
     batch = min(32, len(scenes))
     parts = [scenes[i : i + batch] for i in range(0, len(scenes) - batch + 1, batch)]
     for turn in range(4):
         grid = np.linspace(low, high, 41)
         found = sum(np.asarray(losses(jnp.asarray(grid), part), float) for part in parts)
-        k = np.argmin(found)  # of a NaN if there is one
+        k = np.argmin(found)  # that of a NaN if there is one
         if not turn and not found[k] < (1 - _ROUNDING) * np.min(found[[0, -1]]):
             return math.nan
         best, low, high = grid[k], grid[max(k - 2, 0)], grid[min(k + 2, 40)]
@@ -59,7 +58,7 @@ def best_focus(loss: Callable, scenes: np.ndarray, low: float, high: float) -> f
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Train all starts together, and find the best focus independently."""
+    """Trains all starts together, and finds the best focus independently."""
     distance = 1e3 * config.distance_m
     jobs = _training.Jobs(run, config, distance, distance)
     imager, steps = jobs.steps(jobs.blur, several=True, convolve=convolve_taps)
@@ -67,7 +66,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     starts = jobs.lens.start(config.starts_mm)
     jobs.train("all starts", steps, starts, config.noise, labels)
     results = jobs.results("sensor_mm", "sigma_um") | {"distance_mm": distance}
-    if jobs.lens.names:  # there is no best focus of a lens that changes
+    if jobs.lens.names:  # a lens that changes has no best focus
         return results
 
     def loss(sensor, scenes):
@@ -77,16 +76,16 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
     every = *config.starts_mm, *results["final_mm"]
     low, high = min(every), max(every)
-    reach = (high - low) / 2  # all starts may lie on one side
+    margin = (high - low) / 2  # all starts may lie on one side
     scenes = _training.thinned(jobs.scenes, 512)
-    best = best_focus(loss, scenes, low - reach, high + reach)
+    best = best_focus(loss, scenes, low - margin, high + margin)
     near = [np.flatnonzero(np.abs(trace - best) <= 0.1) for trace in results["sensor_mm"]]
     first = [int(hits[0]) if hits.size else None for hits in near]
     return results | {"best_focus_mm": best, "batches_to_focus": first}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Beside the paper, and each start."""
+    """The comparison with the paper, and the trained numbers."""
     search, firsts = "", []
     if "best_focus_mm" in results:
         best = results["best_focus_mm"]
@@ -104,7 +103,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw the lens and figures 4a and 4b; 4a if the sensor is trained."""
+    """Draws the lens and figures 4a, if the sensor is trained, and 4b."""
     _report.draw_lens(results, results["distance_mm"], figures / "lens.png")
     _report.draw_numbers(results, figures)
     best = results.get("best_focus_mm")

@@ -1,7 +1,7 @@
 """Section 6.2 of the paper: focus a lens and train a restoration network, jointly.
 
-Each starting position of the sensor trains its own network; for the table of noise levels one
-more network for each level. Draws figure 5a and restored patches, and writes table 5b.
+Each starting position of the sensor trains its own network; the table of noise levels trains one
+more for each level. Draws figure 5a and restored patches, and writes table 5b.
 
 train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
 "curvature 0", of one. scene.field: degrees along y, or [x, y].
@@ -22,8 +22,10 @@ COLUMNS = ("loss", "sensor_mm", "sigma_um")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config(_training.JointSettings):
-    """Settings of the experiment; see configs/restore.yaml. starts_mm are trained at `noise`,
-    table_starts_mm at each of table_noise."""
+    """Settings of the experiment; see configs/restore.yaml.
+
+    table_starts_mm: starts that are trained at each noise of table_noise.
+    """
 
     table_starts_mm: tuple[float, ...]
     table_noise: tuple[float, ...]
@@ -38,7 +40,7 @@ class Config(_training.JointSettings):
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Train every start and noise level, and test."""
+    """Trains every start and noise level, and tests them."""
     distance = 1e3 * config.distance_m
     jobs = _training.Jobs(run, config, distance, distance)
     imager, steps = jobs.steps(jobs.blur)
@@ -66,7 +68,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Beside the paper, and table 5b."""
+    """The comparison with the paper, and table 5b."""
     first = results["test"][0]
     test = f"test MAE at noise {first['noise']:g}, after and before the network"
     errors = " and ".join(_common.number(first[name], ".4f") for name in ("mae", "sensor_mae"))
@@ -84,7 +86,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw figure 5a and restored patches."""
+    """Draws figure 5a and restored patches."""
     _report.draw_numbers(results, figures)
     _report.draw_sensor(results, figures / "figure_5a.png")
     _report.draw_patches(results, [""] * len(results["truth"]), figures / "restored.png")

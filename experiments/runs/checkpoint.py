@@ -1,4 +1,4 @@
-"""The state of a job in one file that says what it is, and whether it is whole."""
+"""The state of a job in one file, with a checksum."""
 
 import dataclasses
 import hashlib
@@ -16,8 +16,11 @@ from drt_jax.inputs import shown
 class Checkpoint:
     """The state of a job after some steps.
 
-    job: its name. step: how many steps. seconds: that the run has taken. settings: a digest of
-    those of the run. leaves: the arrays of the state.
+    job: name of the job.
+    step: number of steps.
+    seconds: time spent on the run.
+    settings: digest of the settings of the run.
+    leaves: arrays of the state.
     """
 
     job: str
@@ -27,7 +30,7 @@ class Checkpoint:
     leaves: list[np.ndarray]
 
     def packed(self) -> bytes:
-        """The file: an .npz of the leaves, all else as JSON, and a checksum of both."""
+        """The file: an .npz of the leaves, the rest as JSON, and a checksum of both."""
         about = json.dumps({name: vars(self)[name] for name in _ABOUT})
         entries: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(self.leaves)}
         checksum = _checksum(about, self.leaves)
@@ -36,8 +39,12 @@ class Checkpoint:
         return file.getvalue()
 
     def check(self, job: str, settings: str, most: float, forms: list | None) -> None:
-        """ValueError, which says why, unless this is of the job and the settings, is of no step
-        beyond `most`, and has finite leaves of these (shape, dtype); None: of any."""
+        """ValueError with the reason, unless the checkpoint belongs to the job and the settings and
+        its leaves are finite.
+
+        most: largest step.
+        forms: shape and dtype of each leaf; None for any.
+        """
         if self.job != job:
             raise ValueError(f"belongs to the job {shown(self.job)}")
         if self.settings != settings:
@@ -50,7 +57,7 @@ class Checkpoint:
             raise ValueError("holds numbers that are not finite")
 
     def finite(self) -> bool:
-        """Whether all numbers of the leaves are."""
+        """True if all numbers of the leaves are finite."""
         numbers = (leaf for leaf in self.leaves if np.issubdtype(leaf.dtype, np.inexact))
         return all(bool(np.all(np.isfinite(leaf))) for leaf in numbers)
 
@@ -59,13 +66,14 @@ _ABOUT = ("job", "step", "seconds", "settings")
 
 
 def unpacked(content: bytes) -> Checkpoint:
-    """The checkpoint of a file. ValueError, which says why, unless it is one and whole."""
+    """Reads a checkpoint from the content of a file. ValueError, with the reason, if it is none or
+    damaged."""
     try:
         with np.load(io.BytesIO(content)) as saved:
             about, checksum = str(saved["about"]), str(saved["checksum"])
             leaves = [saved[f"leaf{i}"] for i in range(len(saved.files) - 2)]
         found = Checkpoint(**json.loads(about), leaves=leaves)
-    except Exception as error:  # what reading a damaged archive can raise has no end
+    except Exception as error:  # a damaged archive may raise anything
         raise ValueError("is no checkpoint, or a damaged one") from error
     if _checksum(about, leaves) != checksum:
         raise ValueError("is damaged: its checksum is another")

@@ -1,4 +1,4 @@
-"""Strict configuration: YAML and overrides into a dataclass; nothing unknown, nothing guessed."""
+"""Strict configuration: YAML and overrides into a dataclass."""
 
 import dataclasses
 import difflib
@@ -15,23 +15,22 @@ import yaml
 from drt_jax.inputs import InputError, Lines, parse, read_yaml, shown
 
 T = TypeVar("T")
-# Of what is given: the largest whole number, the largest size of another that is finite, items of a
-# list, characters of a text.
+# Limits: whole numbers, size of other finite numbers, items of a list, characters of a text.
 _MOST, _LARGEST, _ITEMS, _LONGEST = 2**31 - 1, 1e12, 1000, 1000
 
 
 class ConfigError(InputError):
-    """A configuration that cannot be used; the message names the source, the key, the remedy."""
+    """A configuration cannot be used; the message names the source, the key and the remedy."""
 
 
 class _Source:
-    """Where settings come from, as messages name it: a file with its lines, or overrides by key."""
+    """Source of settings in messages: a file with lines, or overrides by key."""
 
     def __init__(self, name: str, lines: Lines, overrides: dict[str, str] | None = None):
         self._name, self._lines, self._overrides = name, lines, overrides or {}
 
     def error(self, key: str, message: str) -> ConfigError:
-        """What is wrong at a key."""
+        """The error at a key."""
         inside = ((name, f"{given}.") for given, name in self._overrides.items())
         found = [name for name, given in inside if f"{key}.".startswith(given)]
         name = found[-1] if found else self._name
@@ -39,14 +38,13 @@ class _Source:
 
 
 def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str] = ()) -> T:
-    """Read a YAML file into a dataclass.
+    """Reads a YAML file into a dataclass.
 
-    cls: the dataclass; keys left out of the file keep its defaults.
-    path: of the file.
-    overrides: like "train.batch=8", applied afterwards, all at once.
+    cls: the dataclass; keys that the file does not have keep its defaults.
+    overrides: such as "train.batch=8", applied afterwards, all at once.
 
     ConfigError, with the line, for a file that cannot be read, an unknown key (with the nearest
-    known one) or a value of the wrong type or beyond any use.
+    known one) or a value of a wrong type or size.
     """
     try:
         entry, lines = read_yaml(path)
@@ -73,16 +71,17 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
 
 
 def _merged(old: object, new: object) -> object:
-    """Nested keys and values, of which the new ones count."""
+    """Merges nested keys and values; the new ones win."""
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return new
     return old | {key: _merged(old.get(key), value) for key, value in new.items()}
 
 
 def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = None) -> Any:
-    """The dataclass `cls` with the values of `entry`, the others those of `old` or defaults.
+    """The dataclass `cls` with the values of `entry`; the others are those of `old` or defaults.
 
-    source: what messages name. prefix: the keys that lead here, each with a dot behind.
+    source: source in messages.
+    prefix: the keys that lead here, each followed by a dot.
     """
     here = prefix.rstrip(".")
     if not isinstance(entry, dict):
@@ -104,7 +103,7 @@ def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = Non
         raise source.error(here, f"missing keys: {', '.join(missing)}")
     try:
         return cls(**values) if old is None else dataclasses.replace(old, **values)
-    except ValueError as error:  # a dataclass that refuses its values; it names the key first
+    except ValueError as error:  # the message of a dataclass names the key first
         raise source.error(str(error).partition(":")[0], str(error)) from error
 
 
@@ -137,7 +136,7 @@ def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = Non
 
 
 def _limit(kind: Any, value: object) -> str:
-    """What a value of the right type had to keep within."""
+    """The limit that a value of the right type exceeds, as text."""
     if kind is int and type(value) is int:
         return f" from 0 to {_MOST}"
     if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
@@ -148,7 +147,7 @@ def _limit(kind: Any, value: object) -> str:
 
 
 def _number(value: int | float | str) -> float:
-    """NaN for what is none, and for a finite one that no float holds."""
+    """The number; NaN for what is none, and for a finite one too large for a float."""
     try:
         number = float(value)
     except (ValueError, OverflowError):
@@ -170,7 +169,7 @@ def _say(kind: Any) -> str:
 
 
 def describe(cls: Any, prefix: str = "") -> list[str]:
-    """A line "key: type" for each setting, for --help."""
+    """Lines "key: type" of the settings, for --help."""
     lines = []
     for name, kind in typing.get_type_hints(cls).items():
         if dataclasses.is_dataclass(kind):
@@ -181,6 +180,6 @@ def describe(cls: Any, prefix: str = "") -> list[str]:
 
 
 def dump_config(config: Any) -> str:
-    """The resolved configuration as YAML that `load_config` reads back."""
+    """The configuration as YAML that `load_config` reads back."""
     plain = json.loads(json.dumps(dataclasses.asdict(config)))  # tuples as lists
     return yaml.safe_dump(plain, sort_keys=False)

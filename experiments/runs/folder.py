@@ -1,8 +1,8 @@
 """The folder of a run: resolved config, metrics as they come, checkpoints, results, figures.
 
-Everything is written so that a run killed at any moment can go on: one process at a time works in
-the folder, a checkpoint replaces its predecessor in one step and is checked before it is used, and
-metrics that lie beyond it are dropped when the run resumes.
+A run killed at any moment can resume: one process at a time works in the folder, a checkpoint
+replaces its predecessor in one step and is checked before use, and resuming drops metrics beyond
+the checkpoint.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from .write import replace, sweep
 
 
 def begun(folder: pathlib.Path) -> bool:
-    """Whether a folder holds a run that has metrics, checkpoints or results."""
+    """True if a folder holds a run with metrics, checkpoints or results."""
     if any((folder / "checkpoints").glob("*.npz")) or (folder / "results.json").exists():
         return True
     metrics = folder / "metrics.csv"
@@ -35,23 +35,21 @@ def begun(folder: pathlib.Path) -> bool:
 
 
 class Run:
-    """One run in one folder; several jobs (starting points, say) may share it.
+    """One run in one folder, with one or more jobs, such as starting points. No other process may
+    open the folder until `close`, or the end of a `with` block.
 
-    folder: of the run. figures: the folder of its pictures.
-
-    No other process may open the folder until `close`, or the end of a `with` block.
+    figures: folder of its figures.
     """
 
     def __init__(self, folder: pathlib.Path, config: Any, columns: tuple[str, ...], resume: bool):
-        """Open the folder.
+        """Opens the folder.
 
-        folder: created if need be.
-        config: a dataclass, all settings of the run.
-        columns: of metrics.csv, after `job` and `step`.
-        resume: whether to go on with the run that the folder holds.
+        config: dataclass with all settings of the run.
+        columns: columns of metrics.csv after `job` and `step`.
+        resume: True to resume the run in the folder.
 
-        ConfigError if another process works in it, if it holds another run that has begun, or on
-        resuming a run with another configuration, damaged metrics, or one that does not exist.
+        ConfigError if another process works in the folder or, without `resume`, if it holds a run;
+        with `resume` if it holds none, one with other settings, or damaged metrics.
         """
         self.folder = folder
         self.figures = folder / "figures"
@@ -93,7 +91,7 @@ class Run:
         self._metrics.mend()
 
     def close(self) -> None:
-        """Leave the folder to others; nothing more may be written."""
+        """Unlocks the folder; nothing more may be written."""
         unlock, self._unlock = self._unlock, lambda: None
         unlock()
 
@@ -105,44 +103,42 @@ class Run:
 
     @property
     def seconds(self) -> float:
-        """Time spent on the run, in the processes before a resume too."""
+        """Time spent on the run, with that before resumes, s."""
         return self._earlier + time.perf_counter() - self._opened
 
     def log(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
-        """Append metrics of consecutive steps.
+        """Appends metrics of consecutive steps.
 
-        step: the first of them, 0 at the start of a job.
-        rows: (N,) values of N steps by column; a column that is not among them stays empty.
+        step: first step, 0 at the start of a job.
+        rows: (N,) values of N steps by column; other columns stay empty.
         """
         self._metrics.append(job, step, rows)
 
     def metrics(self, job: str) -> dict[str, np.ndarray]:
-        """The logged metrics of one job, arrays by column (with `step`); NaN where empty."""
+        """Logged metrics of one job, arrays by column, with `step`; NaN where empty."""
         return self._metrics.of(job)
 
     def save(self, job: str, step: int, tree: Any) -> None:
-        """Checkpoint: the state `tree` of `job` after `step` steps, which have been logged.
-
-        ConfigError if it is not finite; the checkpoint before it stays.
-        """
+        """Writes a checkpoint: the state `tree` of a job after `step` logged steps. ConfigError if
+        it is not finite; the checkpoint before it stays."""
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
         now = Checkpoint(job, step, self.seconds, self._settings, leaves)
         if not now.finite():
             remedy = "lower the learning rates; the last checkpoint is of an earlier step"
             raise ConfigError(f"{job}: numbers that are not finite after {step} steps; {remedy}")
-        self._metrics.sync()  # a checkpoint without its metrics would be of no use
+        self._metrics.sync()  # a checkpoint is useless without its metrics
         replace(self._path(job), now.packed())
         self._saved.add(job)
 
     def load(self, job: str, tree: Any, logged: tuple[str, ...], most: int) -> tuple[int, Any]:
-        """The last checkpoint of `job` as (step, state); (0, tree) if there is none.
+        """The last checkpoint of a job as (step, state); (0, tree) without one.
 
-        tree: a state of the same structure, shapes and dtypes.
-        logged: the names under which the job logs; their metrics beyond the checkpoint are dropped.
-        most: how many steps the job has.
+        tree: state of the same structure, shapes and dtypes.
+        logged: names under which the job logs; their metrics beyond the checkpoint are dropped.
+        most: number of steps of the job.
 
-        ConfigError, with the remedy, for a checkpoint that is damaged or of something else, and if
-        metrics before it are missing.
+        ConfigError, with the remedy, for a checkpoint that is damaged or does not belong to the
+        job, and if metrics before it are missing.
         """
         leaves, structure = jax.tree.flatten(tree)
         forms = [(np.shape(leaf), np.dtype(jnp.result_type(leaf))) for leaf in leaves]
@@ -152,22 +148,20 @@ class Run:
         return found.step, jax.tree.unflatten(structure, map(jnp.asarray, found.leaves))
 
     def keep(self, job: str, value: Any) -> None:
-        """Checkpoint of a job that is done: what it found, as JSON can hold it."""
+        """Writes the checkpoint of a finished job: its result, which JSON can hold."""
         text = np.frombuffer(json.dumps(value).encode(), np.uint8)
         self.save(job, len(self.metrics(job)["step"]), text)
 
     def kept(self, job: str) -> Any:
-        """What `keep` was given for a job; None, and its metrics dropped, if there is nothing.
-
-        ConfigError as by `load`.
-        """
+        """The result of a job from `keep`; without one None, and its metrics are dropped.
+        ConfigError as in `load`."""
         found = self._found(job, (job,), math.inf, None)
         return None if found is None else json.loads(found.leaves[0].tobytes())
 
     def _found(
         self, job: str, logged: tuple[str, ...], most: float, forms: list | None
     ) -> Checkpoint | None:
-        """The checkpoint of a job, checked, and metrics that end where it does."""
+        """The checked checkpoint of a job; drops metrics beyond it."""
         path = self._path(job)
         found: Checkpoint | None = None
         if path.is_file():
@@ -186,12 +180,9 @@ class Run:
         return self.folder / "checkpoints" / f"{urllib.parse.quote(job, safe=' ,')}.npz"
 
     def finish(self, results: dict[str, Any]) -> None:
-        """Write the results: arrays as results.npz, all else as results.json.
-
-        JSON knows no NaN and no infinity: they become null, and the names of what is not finite,
-        in either file, are listed under `not_finite`, which is there if there are any. The metrics
-        are put in the order of their jobs and steps.
-        """
+        """Writes the results, arrays as results.npz, the rest as results.json, and sorts the
+        metrics. JSON has no NaN and no infinity: they become null. `not_finite` lists the names of
+        results of either file that are not finite, if any."""
         self._metrics.order()
         arrays: dict[str, Any] = {n: a for n, a in results.items() if isinstance(a, np.ndarray)}
         bad = [name for name, array in arrays.items() if not np.all(np.isfinite(array))]
@@ -206,7 +197,7 @@ class Run:
 
 
 def _finite(value: Any, name: str, bad: list[str]) -> Any:
-    """A value for JSON with None for numbers that are not finite, whose names `bad` takes up."""
+    """A value for JSON with None for numbers that are not finite; adds their names to `bad`."""
     if isinstance(value, dict):
         return {key: _finite(item, f"{name}.{key}", bad) for key, item in value.items()}
     if isinstance(value, list | tuple):

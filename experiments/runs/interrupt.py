@@ -1,4 +1,4 @@
-"""Ctrl-C, heard where stopping is safe."""
+"""Ctrl-C that waits until stopping is safe."""
 
 import contextlib
 import signal
@@ -9,12 +9,10 @@ from typing import Any
 
 @contextlib.contextmanager
 def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C (or SIGTERM) into a question: yields a function that says whether
-    one came, to be asked where stopping is safe. A second one acts at once.
+    """Defers the first Ctrl-C (or SIGTERM): yields a function that returns True once one came. A
+    second one acts at once. An ignored signal, such as SIGINT under `nohup`, stays ignored.
 
-    notify: called when the first one comes.
-
-    A signal that is ignored, as SIGINT is under `nohup`, stays so.
+    notify: called at the first one.
     """
     asked = False
     # Only the main thread may handle signals; None: a handler from outside Python.

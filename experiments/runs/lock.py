@@ -13,12 +13,11 @@ if sys.platform != "win32":
 
 
 def lock(folder: pathlib.Path) -> Callable[[], None]:
-    """Take a folder for this process, and return the function that gives it back.
+    """Locks a folder for this process, and returns the function that unlocks it.
 
-    The system gives it back when the process ends, however it ends. Where it has no such locks, on
-    Windows and on some network file systems, nothing is locked.
-
-    ConfigError if another process has taken the folder.
+    The system unlocks it when the process ends, however it ends. Windows and some network file
+    systems have no such locks: nothing is locked there. ConfigError if another process has locked
+    the folder.
     """
     number = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
     try:
@@ -31,7 +30,7 @@ def lock(folder: pathlib.Path) -> Callable[[], None]:
 
 
 def _claim(number: int, folder: pathlib.Path) -> None:
-    """Lock an open file, and write into it who has it."""
+    """Locks an open file and writes the process into it."""
     try:
         fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

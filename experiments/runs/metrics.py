@@ -1,4 +1,4 @@
-"""metrics.csv: a row for each step of each job, appended as they come, each with a checksum."""
+"""metrics.csv: a row with a checksum for each step of each job."""
 
 import csv
 import io
@@ -13,9 +13,9 @@ from .write import replace
 
 
 class Metrics:
-    """The file, which has its header from the first moment on; rows come whole or not at all.
+    """The file. It always has its header; rows are appended whole or not at all.
 
-    path: of the file. columns: between `job` and `step` and, at the end, `check`.
+    columns: columns between `job`, `step` and the last one, `check`.
     """
 
     def __init__(self, path: pathlib.Path, columns: tuple[str, ...]):
@@ -23,12 +23,12 @@ class Metrics:
         self.columns = ("job", "step", *columns)
 
     def begin(self) -> None:
-        """Write the file anew, without rows."""
+        """Writes the file without rows."""
         self._write([])
 
     def mend(self) -> None:
-        """Make whole what a kill may leave: no file, or a piece of the header, becomes the header,
-        and a last line without its end is dropped. ConfigError for other damage."""
+        """Repairs what a kill may leave: writes a missing or partial header, and drops a last line
+        without its end. ConfigError for other damage."""
         content = self.path.read_bytes() if self.path.exists() else b""
         if self._text([]).startswith(content):
             self.begin()
@@ -37,10 +37,11 @@ class Metrics:
         self._rows()
 
     def append(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
-        """Add rows of consecutive steps.
+        """Appends rows of consecutive steps.
 
-        job: that they are of. step: the first. rows: (N,) values of N steps by column; a column
-        that is not among them stays empty, one that the file has not is left out.
+        job: job of the rows.
+        step: first step.
+        rows: (N,) values of N steps by column; other columns stay empty, unknown ones are ignored.
         """
         lines = []
         for i, values in enumerate(zip(*rows.values())):
@@ -50,23 +51,21 @@ class Metrics:
         with open(self.path, "r+b", buffering=0) as file:
             end = file.seek(0, os.SEEK_END)
             try:
-                while content:  # once, but on a disk that fills
+                while content:  # more than once on a disk that fills
                     content = content[file.write(content) :]
             except OSError:
                 file.truncate(end)
                 raise
 
     def of(self, job: str) -> dict[str, np.ndarray]:
-        """The rows of one job as arrays by column, `step` among them; NaN where empty."""
+        """The rows of one job as arrays by column, with `step`; NaN where empty."""
         rows = [row for row in self._rows() if row[0] == job]
         found = ([float(row[k] or "nan") for row in rows] for k in range(1, len(self.columns)))
         return dict(zip(self.columns[1:], map(np.array, found)))
 
     def cut(self, jobs: tuple[str, ...], step: int, remedy: str) -> None:
-        """Drop the rows of jobs from a step on.
-
-        ConfigError, with the remedy, unless each of them has the rows of all steps before it.
-        """
+        """Drops the rows of jobs from a step on. ConfigError, with the remedy, unless each job has
+        the rows of all steps before it."""
         rows = self._rows()
         kept = [row for row in rows if row[0] not in jobs or int(row[1]) < step]
         for job in jobs:
@@ -77,19 +76,18 @@ class Metrics:
             self._write(kept)
 
     def order(self) -> None:
-        """Put the rows in the order of jobs, each by its steps: however often a run was stopped
-        between, the file is the same."""
+        """Sorts the rows by job and step, so that stops of the run do not change the file."""
         rows = self._rows()
         place = {job: k for k, job in enumerate(dict.fromkeys(row[0] for row in rows))}
         self._write(sorted(rows, key=lambda row: (place[row[0]], int(row[1]))))
 
     def sync(self) -> None:
-        """Have the rows on the disk."""
+        """Flushes the rows to the disk."""
         with open(self.path, "rb+") as file:
             os.fsync(file.fileno())
 
     def _rows(self) -> list[list[str]]:
-        """All rows as text. ConfigError, with the line, for one that is not of this file."""
+        """All rows as text. ConfigError, with the line, for a damaged one."""
         content = self.path.read_bytes()
         try:
             text = content.decode()
@@ -128,5 +126,5 @@ class Metrics:
 
 
 def _check(row: list) -> str:
-    """The checksum of a row."""
+    """Checksum of a row."""
     return f"{zlib.crc32(','.join(map(str, row)).encode()):08x}"

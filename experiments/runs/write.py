@@ -8,12 +8,13 @@ _SCRATCH = ".drt_jax.partial"
 
 
 def replace(path: pathlib.Path, content: bytes) -> None:
-    """Write a file; at every moment there is the old one (or none), or the new one.
+    """Writes a file in one step: at every moment there is the old one (or none) or the new one.
 
-    path: of the file, whose folder is made if need be. content: all of it.
+    path: path of the file; its folder is created.
+    content: the whole content.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(secrets.token_hex(8) + _SCRATCH)  # none that another may write
+    scratch = path.with_name(secrets.token_hex(8) + _SCRATCH)  # of this call alone
     try:
         with open(scratch, "xb") as file:
             file.write(content)
@@ -25,6 +26,6 @@ def replace(path: pathlib.Path, content: bytes) -> None:
 
 
 def sweep(folder: pathlib.Path) -> None:
-    """Remove what a process that was killed in `replace` left in a folder."""
+    """Removes what a process killed in `replace` left in a folder."""
     for scratch in folder.glob("*" + _SCRATCH):
         scratch.unlink(missing_ok=True)

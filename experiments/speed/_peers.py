@@ -1,7 +1,7 @@
-"""Other programs doing the work that `benchmark` times: an optional extra, each may be missing.
+"""Other programs for the work of `benchmark`: an optional extra, each may be missing.
 
-A peer is given the lens as numbers and samples the pupil as its users would: hexapolar rings that
-hold about as many rays as asked for. Differences in definition are its error.
+A peer gets the lens as numbers and samples the pupil as its users would: with hexapolar rings of
+about as many rays. Differences in definition count as its error.
 """
 
 import itertools
@@ -17,9 +17,9 @@ from ._common import rings
 
 
 class Lens:
-    """A centred lens of aspheres as NumPy arrays, without its clear apertures, and a scene: gaps
-    (S,), the last to the sensor, indices (S + 1, W), field in radians, object distance. ValueError
-    for another form."""
+    """A centred lens of aspheres as NumPy arrays, without clear apertures, and a scene: gaps (S,),
+    the last to the sensor, index (S + 1, W), field in radians, distance in mm. ValueError for other
+    lenses."""
 
     def __init__(self, lens: drt_jax.Lens, field: float, distance: float, wavelengths) -> None:
         if set(lens.forms) != {"asphere"} or lens.phase or lens.elements or lens.tilt is not None:
@@ -37,7 +37,7 @@ class Lens:
 
 
 def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
-    """An Optiland lens for one wavelength, indices (S + 1,)."""
+    """An Optiland lens for one wavelength, um. index: (S + 1,)."""
     from optiland.materials import IdealMaterial
     from optiland.optic import Optic
 
@@ -67,9 +67,8 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
 
 
 def optiland_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
-    """(value, gradient) of the RMS spot radius sigma: value() -> ((W,),) in mm; gradient() -> (W,),
-    (W, 2 S), the latter by curvatures, thicknesses and the sensor position, NaN where there is
-    none."""
+    """(value, gradient) of the RMS spot radius sigma: value() -> ((W,),), mm; gradient() -> (W,),
+    (W, 2 S), by curvatures, thicknesses and the sensor position, NaN where unknown."""
     import torch
     from optiland import backend
 
@@ -134,8 +133,8 @@ def _batoid_optic(lens: Lens, curvature, gaps, index):
         kind = batoid.Mirror if not last and lens.mirrors[i] else kind
         shape = batoid.Plane() if last else _batoid_shape(lens, i, c)
         where = batoid.CoordSys(origin=[0, 0, place])
-        around = {"inMedium": media[i], "outMedium": media[min(i + 1, len(media) - 1)]}
-        items.append(kind(shape, name=f"s{i}", coordSys=where, **around))
+        both = {"inMedium": media[i], "outMedium": media[min(i + 1, len(media) - 1)]}
+        items.append(kind(shape, name=f"s{i}", coordSys=where, **both))
     return batoid.CompoundOptic(items, name="lens", inMedium=media[0], outMedium=media[-1])
 
 
@@ -148,15 +147,15 @@ def _batoid_hits(optic, points, velocities):
 
 
 def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
-    """As `optiland_spot`; the gradient by finite differences."""
+    """`optiland_spot` by batoid, with the gradient by finite differences."""
     points = pupil.hexapolar(rings(rays))[0]
     place, radius = lens.pupil
     toward = np.array([0.0, np.tan(lens.field), 1.0])
     through = np.column_stack([radius * points, np.full(len(points), place)])
-    # From the object point, or for an object at infinity along its direction.
+    # From the object point, or along the field for an object at infinity.
     direction = toward + through / lens.distance
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    # Onto a plane before the first surface.
+    # On a plane in front of the first surface.
     start = through + direction * ((-10.0 - radius - place) / direction[:, 2:])
 
     def sigma(curvature, gaps, k):
@@ -173,24 +172,24 @@ def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
 
     def gradient():
         (base,), h = value(), 1e-7 * np.eye(count)
-        bent = [value(curvature=lens.curvature + row)[0] for row in h]
-        moved = [value(gaps=lens.gaps + 1e-6 * row)[0] for row in shift]
-        slopes = np.concatenate([(bent - base) / 1e-7, (moved - base) / 1e-6])
+        by_curvature = [value(curvature=lens.curvature + row)[0] for row in h]
+        by_gap = [value(gaps=lens.gaps + 1e-6 * row)[0] for row in shift]
+        slopes = np.concatenate([(by_curvature - base) / 1e-7, (by_gap - base) / 1e-6])
         return base, slopes.T
 
     return value, gradient
 
 
 def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Callable:
-    """trace(): sensor hits (Q, 2) of rays through `points` (Q, 3) in front of the lens, unit
-    `directions` (Q, 3), at the first wavelength."""
+    """trace() -> hits (Q, 2) on the sensor at the first wavelength, mm. points: (Q, 3), in front of
+    the lens, mm. directions: (Q, 3), unit vectors."""
     optic = _batoid_optic(lens, lens.curvature, lens.gaps, lens.index[:, 0])
     return partial(_batoid_hits, optic, points, directions)
 
 
 def network_step(batch: int, patch: int, rate: float) -> Callable:
-    """step(): one Adam step of the same RED-Net in PyTorch, channels last, on the mean
-    absolute error of random images."""
+    """step(): one Adam step of the same RED-Net in PyTorch, channels last, on the mean absolute
+    error of random images."""
     import torch
     from torch import nn
 
@@ -201,15 +200,15 @@ def network_step(batch: int, patch: int, rate: float) -> Callable:
             self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairs)
 
         def forward(self, images):
-            features, kept = images, {}
+            features, skips = images, {}
             for i, layer in enumerate(self.layers):
                 features = layer(features)
-                if i >= 5 and 8 - i in kept:
-                    features = features + kept[8 - i]
+                if i >= 5 and 8 - i in skips:
+                    features = features + skips[8 - i]
                 if i < 9:
                     features = torch.relu(features)
                 if i < 4 and (4 - i) % 2 == 0:
-                    kept[i] = features
+                    skips[i] = features
             return images + features
 
     torch.manual_seed(0)

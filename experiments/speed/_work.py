@@ -1,4 +1,4 @@
-"""What `benchmark` measures with: compiled programs, rows, other processes, growing scenes."""
+"""Tools of `benchmark`: compiled programs, rows, other processes, growing scenes."""
 
 import os
 import re
@@ -25,7 +25,7 @@ from drt_jax.learn import train
 from . import _common
 
 Row = dict[str, Any]
-# What is known of a program that was `compiled`.
+# Measurements of `compiled`.
 MEASURED = ("compile_s", "peak_mb", "kernels")
 
 _FIRST = """
@@ -46,35 +46,35 @@ print(_work.bundle_seconds(benchmark.{config!r}))
 
 
 def hits(lens: Lens, field: Any, distance: Any, waves: Array, points: Array) -> tuple[Array, Array]:
-    """(W, Q, 2) on the sensor in mm, and status (W, Q), of rays through points (Q, 2)."""
+    """Hits (W, Q, 2) on the sensor, mm, and status (W, Q) of rays through points (Q, 2)."""
     rays = drt_jax.trace_rays(lens, field, distance, waves, points)
     return rays.points[:, :, -1, :2], rays.status
 
 
 def compiled(function: Callable, *arguments: Any) -> tuple[Callable, dict[str, float]]:
-    """A function, jitted or not, compiled for its arguments and called with no more; and what is
-    MEASURED: seconds that compiling took, tracing included, MiB that it holds, and of how many
-    kernels it consists (those in a loop once). What it donates, it is given as copies."""
+    """Compiles a function, jitted or not, for its arguments. Returns a call without arguments and
+    what is MEASURED: seconds of compilation with tracing, MiB of memory, and number of kernels
+    (those in a loop once). Donated arguments are copied for each call."""
     function = function if hasattr(function, "lower") else jax.jit(function)
     start = time.perf_counter()
     lowered = function.lower(*arguments)
     program = lowered.compile()
     seconds = time.perf_counter() - start
     memory = program.memory_analysis()
-    held = memory.temp_size_in_bytes + memory.output_size_in_bytes
+    size = memory.temp_size_in_bytes + memory.output_size_in_bytes
     kernels = len(re.findall(r" (?:fusion|dot|convolution|custom-call)\(", program.as_text()))
     donated = [info.donated for info in jax.tree.leaves(lowered.args_info)]
 
     def call():
         leaves, structure = jax.tree.flatten(arguments)
-        given = [jnp.array(a) if gone else a for a, gone in zip(leaves, donated)]
-        return jax.block_until_ready(program(*jax.tree.unflatten(structure, given)))
+        leaves = [jnp.array(a) if gone else a for a, gone in zip(leaves, donated)]
+        return jax.block_until_ready(program(*jax.tree.unflatten(structure, leaves)))
 
-    return call, dict(zip(MEASURED, (seconds, held / 2**20, kernels)))
+    return call, dict(zip(MEASURED, (seconds, size / 2**20, kernels)))
 
 
 def peer(name: str, make: Callable[[], tuple], how: str = "") -> dict[str, tuple | str]:
-    """(call, error) of a peer by its name and version, or how to install it by its name."""
+    """(call, error) of a peer by name and version; or how to install it, by name."""
     try:
         return {f"{name} {version(name)}{how}": make()}
     except ImportError as missing:
@@ -82,7 +82,7 @@ def peer(name: str, make: Callable[[], tuple], how: str = "") -> dict[str, tuple
 
 
 def row(task: str, seconds: float, **known: Any) -> Row:
-    """A row of results.json; what is not known is None."""
+    """A row of results.json; unknown values are None."""
     unknown = dict.fromkeys(("ours_error", *MEASURED, "peer_s", "ratio", "peer_error"))
     return {"task": task, "ours_s": seconds, "peer": "", "note": ""} | unknown | known
 
@@ -90,7 +90,7 @@ def row(task: str, seconds: float, **known: Any) -> Row:
 def rows_of(
     task: str, ours: tuple, error: float | None, peers: dict[str, tuple | str], repeats: int
 ) -> list[Row]:
-    """Rows of one task. ours: as `compiled` returns it. peers: as `peer` does."""
+    """Rows of one task. ours: from `compiled`. error: our error. peers: from `peer`."""
     ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
     call, measured = ours
     calls = [call, *(call for call, _ in ready.values())]
@@ -106,7 +106,8 @@ def rows_of(
 
 
 def in_a_new_process(code: str, environment: dict[str, str]) -> float:
-    """The number that Python code prints last, run without a cache but for `environment`."""
+    """The number that Python code prints last, run without a compilation cache unless `environment`
+    sets one."""
     clean = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     options = {"env": clean | environment, "cwd": _common.ROOT}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
@@ -115,31 +116,30 @@ def in_a_new_process(code: str, environment: dict[str, str]) -> float:
 
 
 def first_seconds(lens: str, field: float, distance: float) -> list[float]:
-    """Seconds from the start of a process to a first gradient: anew, and with programs kept."""
+    """Seconds from the start of a process to a gradient, without and with saved programs."""
     code = _FIRST.format(lens=lens, field=field, distance=distance)
     with tempfile.TemporaryDirectory() as folder:
-        kept = {"JAX_COMPILATION_CACHE_DIR": folder}
-        kept["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-        in_a_new_process(code, kept)
-        times = [[in_a_new_process(code, extra) for _ in range(3)] for extra in ({}, kept)]
+        cache = {"JAX_COMPILATION_CACHE_DIR": folder}
+        cache["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+        in_a_new_process(code, cache)
+        times = [[in_a_new_process(code, extra) for _ in range(3)] for extra in ({}, cache)]
     return [float(np.median(some)) for some in times]
 
 
 def bundle_seconds(config: Any) -> float:
-    """Seconds to trace the bundle of `benchmark` shared among the devices of this process, whose
-    number JAX fixes when it starts: see SPREAD."""
+    """Seconds to trace the bundle of `benchmark` on all devices of this process, see SPREAD."""
     mesh = jax.make_mesh((jax.device_count(),), ("rays",), axis_types=(AxisType.Auto,))
     trace, points = config.bundle_trace
-    ends = {"in_specs": PartitionSpec("rays"), "out_specs": PartitionSpec(None, "rays")}
-    trace = jax.jit(jax.shard_map(trace, mesh=mesh, check_vma=False, **ends))
-    points = jax.device_put(points, NamedSharding(mesh, ends["in_specs"]))
+    specs = {"in_specs": PartitionSpec("rays"), "out_specs": PartitionSpec(None, "rays")}
+    trace = jax.jit(jax.shard_map(trace, mesh=mesh, check_vma=False, **specs))
+    points = jax.device_put(points, NamedSharding(mesh, specs["in_specs"]))
     assert not np.any(np.asarray(trace(points)[1]))
     return _common.medians([lambda: trace(points)], config.repeats)[0]
 
 
 def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[str, int]:
-    """How many times a training step solves for rays, by what is trained: occurrences of
-    `attach` (`rays.solve`) in the jaxpr of a step."""
+    """Number of solves for rays in a training step, by what it trains: occurrences of `attach`
+    (`rays.solve`) in the jaxpr of the step."""
     near, far = distance / 2, distance
     cases = {
         "sensor trained, one depth": (("sensor",), (far, far)),
@@ -159,7 +159,7 @@ def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[
 
 
 def _plates(count: int) -> Lens:
-    """`count` surfaces of thin, weak lenses, the stop in the middle."""
+    """Thin, weak lenses with `count` surfaces, the stop in the middle."""
     plate = {"thickness": 0.1, "semi_diameter": 50.0}
     surfaces = [
         {"radius": 1e5 * (-1) ** i, "index": 1.0 if i % 2 else 1.5} | plate for i in range(count)
@@ -170,8 +170,8 @@ def _plates(count: int) -> Lens:
 
 
 def growth(lens: Lens, field: float, distance: float, repeats: int) -> dict[str, list]:
-    """Seconds of a trace over three decades of rays, surfaces and wavelengths: lists of
-    (number, seconds)."""
+    """Times of a trace over three decades of rays, surfaces and wavelengths: lists of (number,
+    seconds)."""
 
     def seconds(lens, rays, waves, angle=field):
         points = jnp.asarray(pupil.random_disc(rays, 0)[0])

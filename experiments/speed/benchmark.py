@@ -1,11 +1,11 @@
-"""Our run time beside that of other programs doing the same work in the same run.
+"""Run time of this and other programs for the same work in the same run.
 
 Calls alternate, and their medians are compared. Errors are relative: of the RMS spot radius sigma,
 or the worse of sigma and its derivatives by curvatures and thicknesses, against an integral over a
-sequential trace by Snell's law. Peers are an extra, `pip install -e '.[peers]'`; a missing one has
-a row that says so. Writes results.json, whose `rows` hold `task`, `ours_s`, `peer`, `peer_s`,
-`ratio` (theirs by ours), `ours_error`, `peer_error`, `compile_s`, `peak_mb` and `kernels` (ours);
-beside them `counts`, what a training step traces, and `work`, how run time grows with rays,
+sequential trace by Snell's law. Peers are an extra, `pip install -e '.[peers]'`; the row of a
+missing one says so. Writes results.json, whose `rows` hold `task`, `ours_s`, `peer`, `peer_s`,
+`ratio` (theirs / ours), `ours_error`, `peer_error`, `compile_s`, `peak_mb` and `kernels` (ours);
+`counts`, the solves for rays of a training step; and `work`, run time over numbers of rays,
 surfaces and wavelengths. Draws run time against error, and the growth.
 """
 
@@ -41,10 +41,11 @@ COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", *_work.MEASU
 class Config:
     """Settings of the experiment; see configs/benchmark.yaml.
 
-    repeats: timed turns of each program (fewer where they take long). rays: those a peer samples
-    a pupil with. bundle: rays of the task of many rays. batch, patch: of the network's step.
-    tasks: the names of those to run, empty for all. growth: whether to measure how run time grows
-    with the scene. seed: of the rays and images.
+    repeats: timed turns of each program (fewer for long ones).
+    bundle: rays of the task of many rays.
+    batch, patch: patches of the network's step, and their side, pixels.
+    tasks: names of the tasks to run; empty for all.
+    growth: True to measure how run time grows with the scene.
     """
 
     lens: str = "double_gauss"
@@ -61,7 +62,7 @@ class Config:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        # 7 rays: one hexapolar ring.
+        # One hexapolar ring has 7 rays.
         counts = {"repeats": (1, 1e4), "rays": (7, 1e6), "bundle": (1, 1e8), "batch": (1, 4096)}
         numbers = {"distance_m": (1e-3, 1e9), "field_deg": (0, 89.9), "wavelengths_um": (1e-4, 1e6)}
         _common.require_within("", self, patch=(7, 4096), **counts, **numbers)
@@ -69,21 +70,21 @@ class Config:
 
     @property
     def scene(self) -> tuple[Lens, float, float]:
-        """The lens, the field in radians, the distance in mm."""
+        """Lens, field (radians) and distance (mm)."""
         lens = drt_jax.load_lens(self.lens)
         return lens, math.radians(self.field_deg), 1e3 * self.distance_m
 
     @property
     def bundle_trace(self) -> tuple[Callable, Array]:
-        """What traces the task of many rays at one wavelength, and their points on the stop."""
+        """Function that traces many rays at one wavelength, and their stop points."""
         points = jnp.asarray(pupil.random_disc(self.bundle, self.seed)[0])
         waves = jnp.asarray(self.wavelengths_um[:1])
         return functools.partial(_work.hits, *self.scene, waves), points
 
 
 def spot_error(truth: list[Moments], count: int, values: Any, slopes: Any = None) -> float:
-    """The worst relative error of sigmas (W,), and if they are given of their derivatives (W, P),
-    as `gradient_error` of those known."""
+    """Largest relative error of sigma (W,) and, if given, of its finite derivatives (W, P), see
+    `gradient_error`."""
     exact = np.array([moments.sigma for moments in truth])
     worst = float(np.max(np.abs(np.asarray(values) / exact - 1)))
     if slopes is None:
@@ -93,10 +94,10 @@ def spot_error(truth: list[Moments], count: int, values: Any, slopes: Any = None
 
 
 def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
-    """sigma at all wavelengths, or it and its Jacobian, on axis or at the field."""
+    """sigma at all wavelengths, with or without its Jacobian, on axis or at the field."""
     lens, field, distance = config.scene
     field, waves = 0.0 if axial else field, jnp.asarray(config.wavelengths_um)
-    # On axis in focus the digits of the gradient cost no more; see docs/performance.md.
+    # On axis a smaller tolerance costs nothing.
     rule = drt_jax.converged_rule(lens, field, distance, waves, 1e-9 if axial else 1e-6)
     truth, count = reference(lens, field, distance, config.wavelengths_um), lens.count
 
@@ -166,7 +167,8 @@ def bundle_task(config: Config) -> list[Row]:
 
 
 def network_task(config: Config) -> list[Row]:
-    """One Adam step of optics and network; the network alone; all before it, there and back."""
+    """One Adam step of optics and network; of the network alone; and optics and sensor layer alone,
+    forwards and back."""
     rng = np.random.default_rng(config.seed)
     lens, _, distance = config.scene
     init, apply = network.red_net()
@@ -214,14 +216,13 @@ def network_task(config: Config) -> list[Row]:
 
 
 def first_task(config: Config) -> list[Row]:
-    """A new process: import, load a lens, trace, gradient; and the same once more, with the
-    compiled programs kept in a folder."""
+    """A new process: import, load a lens, trace, gradient; and again with saved programs."""
     _, field, distance = config.scene
     rows = []
     for angle, where in ((0.0, "on axis"), (field, f"{config.field_deg:g} degrees")):
         task = f"first sigma and gradient in a new process, {where}"
-        anew, kept = _work.first_seconds(config.lens, angle, distance)
-        rows += [_work.row(task, anew), _work.row(f"{task}, programs kept", kept)]
+        compiled_s, saved_s = _work.first_seconds(config.lens, angle, distance)
+        rows += [_work.row(task, compiled_s), _work.row(f"{task}, programs kept", saved_s)]
     return rows
 
 
@@ -237,8 +238,8 @@ TASKS = {
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Run the tasks one by one."""
-    # Programs kept from another run would hide what compiling takes.
+    """Runs the tasks one by one."""
+    # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
 
     def measure(name: str) -> list[Row]:
@@ -258,7 +259,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Every task beside its peers, and the rays of a training step."""
+    """Tables of the tasks with peers, and of the solves of a training step."""
 
     def error(value: float | None) -> str:
         return "" if value is None else f"{value:.0e}"
@@ -282,7 +283,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw run time against error, and how it grows."""
+    """Draws run time against error, and its growth."""
     if "work" in results:
         figure, axes = show.new(1, 1, 5.5, 4)
         _plots.growth(axes, results["work"])

@@ -1,14 +1,15 @@
-"""Ordinary lenses in milliseconds: what the first and the next calls take, and if they are right.
+"""Ordinary lenses: times and errors of the first and the next calls.
 
-Each lens at the fields asked for, an object at infinity, its clear apertures in place. Errors are
-of the RMS spot radius sigma, relative, the worst colour, against an integral over a sequential
-trace by Snell's law. Optiland and batoid trace the same lens without its clear apertures, as their
-users would; their error is against the same truth. Writes results.json: `rows` hold `lens`,
-`field_deg`, `rays` a colour, `passed` (share of light), `first_s` (the first call to a tolerance of
-1e-3, compiling included), `loose_s` and `tight_s` (to 1e-3 and 1e-6, warm), their `loose_error` and
-`tight_error`, `value_s` and `gradient_s` (with the rule of 1e-6, compiled: sigma of all colours,
-and its gradient by every number of the lens), `compile_s`, `peers`; `copies` the seconds of
-perturbed copies x fields under vmap; `sweeps` the spot over many fields, and how even it is.
+Each lens at some fields, for an object at infinity, with its clear apertures. Errors are relative,
+of the RMS spot radius sigma at the worst wavelength, against an integral over a sequential trace by
+Snell's law. Optiland and batoid trace the same lens without clear apertures, as their users would;
+their errors are against the same truth. Writes results.json: `rows` hold `lens`, `field_deg`,
+`rays` a wavelength, `passed` (throughput), `first_s` (first call to a tolerance of 1e-3, with
+compilation), `loose_s` and `tight_s` (to 1e-3 and 1e-6, warm), their `loose_error` and
+`tight_error`, `value_s` and `gradient_s` (with the rule of 1e-6, compiled: sigma of all
+wavelengths, and its gradient by every number of the lens), `compile_s`, `peers`; `copies`, the
+seconds of perturbed copies x fields under vmap; `sweeps`, the spot over many fields and its
+roughness.
 """
 
 import dataclasses
@@ -34,9 +35,9 @@ from .runs.folder import Run
 
 COLUMNS = ("first_s", "loose_s", "tight_s", "value_s", "gradient_s", "loose_error", "tight_error")
 _LOOSE, _TIGHT = 1e-3, 1e-6
-# Copies of a lens are perturbed by so much, relative.
+# Relative perturbation of copies.
 _SPREAD = 1e-4
-# Values and slopes below this (mm, or of the light) are rounding.
+# Values and slopes below this (mm, or throughput) are rounding.
 _NOTHING = 1e-9
 _SWEEP = "sigma", "centroid", "share of light"
 
@@ -45,7 +46,8 @@ _SWEEP = "sigma", "centroid", "share of light"
 class LensFields:
     """A lens and its widest field.
 
-    lens: bundled name or YAML path. field_deg: the edge of its field.
+    lens: bundled name or YAML path.
+    field_deg: widest field.
     """
 
     lens: str
@@ -59,10 +61,10 @@ class LensFields:
 class Config:
     """Settings of the experiment; see configs/lenses.yaml.
 
-    lenses: what is measured. parts: of the widest field. wavelengths_um: of the colours. copies,
-    fields: how many perturbed lenses and fields are traced at once. sweep: how many fields from
-    the axis to the widest one. rays: those a peer samples a pupil with. repeats: timed turns of
-    each program.
+    parts: fields relative to the widest.
+    copies, fields: numbers of perturbed lenses and of fields traced at once.
+    sweep: number of fields from the axis to the widest.
+    repeats: timed turns of each program.
     """
 
     lenses: tuple[LensFields, ...]
@@ -102,7 +104,7 @@ def _error(truth: np.ndarray, covariance: Array) -> float:
 
 
 def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
-    """A row of one lens at one field in radians: everything compiled anew."""
+    """A row of one lens at one field (radians); everything is compiled anew."""
     waves = np.array(config.wavelengths_um)
     converged = partial(drt_jax.psf_moments, lens, field, math.inf, waves)
     jax.clear_caches()
@@ -143,8 +145,8 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
 
 
 def _beside(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list[tuple]:
-    """(name, call, error, note) of each peer; no call for one that is missing or fails, no error
-    for one whose spot is not finite."""
+    """(name, call, error, note) of each peer; call is None if it is missing or fails, error if its
+    spot is not finite."""
     found = []
     for name, spot in (("optiland", _peers.optiland_spot), ("batoid", _peers.batoid_spot)):
         try:
@@ -160,7 +162,7 @@ def _beside(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list
 
 
 def perturbed(lens: Lens, count: int, seed: int) -> Lens:
-    """So many copies of a lens, curvatures, thicknesses and the sensor off by some 1e-4."""
+    """Copies of a lens with curvatures, thicknesses and sensor perturbed by about 1e-4."""
     rng = np.random.default_rng(seed)
     vary = lambda a: a[None] * (1 + _SPREAD * rng.normal(size=(count, *a.shape)))  # noqa: E731
     parts = {"curvature": vary(lens.curvature), "thickness": vary(lens.thickness)}
@@ -169,7 +171,7 @@ def perturbed(lens: Lens, count: int, seed: int) -> Lens:
 
 
 def copies(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) -> dict[str, float]:
-    """Seconds of perturbed copies at several fields under `vmap`, and to compile it."""
+    """Seconds of perturbed copies at several fields under `vmap`, and of its compilation."""
     waves = jnp.asarray(config.wavelengths_um)
     fields = jnp.linspace(0.0, widest, config.fields)
     batch = perturbed(lens, config.copies, config.seed)
@@ -184,23 +186,23 @@ def copies(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) -
 
 
 def sweep(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) -> dict[str, Any]:
-    """sigma in mm, the height of the centroid in mm and the share of light of one colour over the
-    fields in degrees, and how these change when curvatures and apertures grow alike."""
+    """sigma (mm), height of the centroid (mm) and throughput of one wavelength over the field, and
+    their derivatives by a common factor of curvatures and apertures."""
     waves = jnp.asarray(config.wavelengths_um[len(config.wavelengths_um) // 2 :][:1])
     fields = jnp.linspace(0.0, widest, config.sweep)
 
-    def spot(grown, field):
-        now = dataclasses.replace(
+    def spot(growth, field):
+        scaled = dataclasses.replace(
             lens,
-            curvature=lens.curvature * (1 + grown),
-            semi_diameter=lens.semi_diameter * (1 + grown),
+            curvature=lens.curvature * (1 + growth),
+            semi_diameter=lens.semi_diameter * (1 + growth),
         )
-        found = drt_jax.psf_moments(now, field, math.inf, waves, rule=rule)
+        found = drt_jax.psf_moments(scaled, field, math.inf, waves, rule=rule)
         sigma = jnp.sqrt(found.covariance[0, 0, 0] + found.covariance[0, 1, 1])
         return jnp.stack([sigma, found.mean[0, 1], found.throughput[0]])
 
     def both(field):
-        return jax.jvp(lambda grown: spot(grown, field), (jnp.zeros(()),), (jnp.ones(()),))
+        return jax.jvp(lambda growth: spot(growth, field), (jnp.zeros(()),), (jnp.ones(()),))
 
     values, slopes = jax.jit(jax.vmap(both))(fields)
     found = {"values": np.asarray(values.T), "slopes": np.asarray(slopes.T)}
@@ -210,13 +212,13 @@ def sweep(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) ->
 
 
 def _roughness(row: np.ndarray) -> float:
-    """By how much a value is off the parabola through its neighbours, of the largest of all: of the
-    order of the step where there is one, and nearly 0 for a smooth function."""
+    """Largest distance of a value from the parabola through its neighbours, relative to the largest
+    value: about the size of a step, nearly 0 for a smooth function."""
     return float(np.max(np.abs(np.diff(row, 3))) / 3 / max(np.max(np.abs(row)), _NOTHING))
 
 
 def lens_rows(config: Config, of: LensFields) -> dict[str, Any]:
-    """Everything about one lens."""
+    """All results of one lens."""
     lens = drt_jax.load_lens(of.lens)
     widest = math.radians(of.field_deg)
     rows = []
@@ -233,8 +235,8 @@ def lens_rows(config: Config, of: LensFields) -> dict[str, Any]:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Measure the lenses one by one."""
-    # Programs kept from another run would hide what compiling takes.
+    """Measures the lenses one by one."""
+    # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
 
     def one(of: LensFields) -> dict[str, Any]:
@@ -253,7 +255,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Every lens and field; copies under vmap, and steps over the field."""
+    """Tables of all lenses and fields, and of copies under vmap and roughness over the field."""
     lines = []
     for row in results["rows"]:
         times = (row[key] for key in ("first_s", "loose_s", "tight_s", "value_s", "gradient_s"))
@@ -275,7 +277,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw the spot over the field."""
+    """Draws the spot over the field."""
     for key, what in (("values", ""), ("slopes", "change of ")):
         figure, axes = show.new(1, 3, 4.5, 3.6)
         for ax, name, row in zip(axes, _SWEEP, range(3)):

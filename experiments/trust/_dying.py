@@ -1,7 +1,7 @@
-"""python -m experiments._dying N SECONDS MODULE ...: a module that kills itself as it writes.
+"""python -m experiments._dying N SECONDS MODULE ...: kills a module as it writes.
 
-The module runs as by `python -m MODULE ...`; SECONDS after it has opened, renamed or removed files
-of the folder behind --out for the N-th time, SIGKILL ends the process.
+Runs `python -m MODULE ...`. SECONDS after the N-th time that it opens, renames or removes a file in
+the folder of --out, SIGKILL ends the process.
 """
 
 import os
@@ -12,7 +12,7 @@ import threading
 
 
 def main() -> None:
-    """Run the module named on the command line, and die."""
+    """Runs the module of the command line."""
     turn, seconds, module = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
     sys.argv = [module, *sys.argv[4:]]
     folder = os.path.abspath(sys.argv[sys.argv.index("--out") + 1])

@@ -1,5 +1,5 @@
-"""Runs that are killed, stopped or started twice, and go on: their results are those of an unbroken
-run, bit for bit."""
+"""Runs that are killed, stopped or started twice resume to the results of an unbroken run, bit for
+bit."""
 
 import concurrent.futures
 import itertools
@@ -20,17 +20,17 @@ from tqdm import tqdm
 from ._common import ROOT
 from ._outcomes import Tally, clear
 
-# A run that is as short as one can be that trains, writes metrics and checkpoints, and draws.
+# A short run that trains, writes metrics and checkpoints, and draws.
 _TOY = ("train.batches=40", "train.batch=2", "train.patch=16", "train.checkpoint_every=5")
 _TOY += ("camera.kernel=9", "data.crops_per_image=2", "starts_mm=[133.0, 134.0]")
-# Seconds after which a run hangs, and in which an unbroken one ends; files it touches.
+# Seconds after which a run counts as hung, and that an unbroken one takes; files that it touches.
 _PATIENCE, _WHOLE, _TOUCHES = 240.0, 6.0, 60
-_KILLS = 8  # of one run, before it may end
+_KILLS = 8  # kills of one run before it may end
 _MODULE = "experiments.focus"
 
 
 class Ended:
-    """How a process ended: code, and what it said."""
+    """The end of a process: its exit code, its messages, and whether it hung."""
 
     def __init__(self, process: subprocess.Popen, seconds: float = _PATIENCE):
         try:
@@ -44,13 +44,13 @@ class Ended:
 
     @property
     def message(self) -> str:
-        """The last line, which stands behind those of progress bars."""
+        """The last line, behind progress bars."""
         lines = [line.strip() for line in re.split(r"[\r\n]+", self.text)]
         return next((line for line in reversed(lines) if line), "")
 
 
 def start(folder: pathlib.Path, *options: str, dying: tuple[str, ...] = ()) -> subprocess.Popen:
-    """A process of the toy run in a folder; `dying`: arguments of `_dying`."""
+    """Starts the toy run in a folder. dying: arguments of `_dying`."""
     module = ["experiments._dying", *dying, _MODULE] if dying else [_MODULE]
     settings = () if "--resume" in options else ("--set", *_TOY)
     command = [sys.executable, "-m", *module, "--out", str(folder), *options, *settings]
@@ -59,31 +59,32 @@ def start(folder: pathlib.Path, *options: str, dying: tuple[str, ...] = ()) -> s
 
 
 def resumed(folder: pathlib.Path) -> Ended:
-    """Go on with the run in a folder, or begin it where nothing was begun."""
+    """Resumes the run in a folder, or starts it where nothing was begun."""
     ended = Ended(start(folder, "--resume"))
     return Ended(start(folder)) if "nothing to resume" in ended.message else ended
 
 
 def result(folder: pathlib.Path) -> Any:
-    """What a run found: all of its results but the seconds, and its metrics."""
+    """Results of a run except the seconds, and its metrics."""
     results = json.loads((folder / "results.json").read_text())
     return results | {"seconds": None}, (folder / "metrics.csv").read_text()
 
 
 def difference(folder: pathlib.Path, truth: Any) -> str:
-    """The first thing in which what a run found differs from the truth; empty for none."""
-    (results, metrics), (true, wanted) = result(folder), truth
+    """The first difference of a run from the truth, as text; "" for none."""
+    (results, metrics), (true, true_metrics) = result(folder), truth
     for key in sorted({*results, *true}):
         if results.get(key) != true.get(key):
             return f"{key} is {results.get(key)}, not {true.get(key)}"
-    for k, pair in enumerate(itertools.zip_longest(metrics.splitlines(), wanted.splitlines())):
+    lines = itertools.zip_longest(metrics.splitlines(), true_metrics.splitlines())
+    for k, pair in enumerate(lines):
         if pair[0] != pair[1]:
             return f"metrics.csv, line {k + 1} is {pair[0]!r}, not {pair[1]!r}"
     return ""
 
 
 def outcome(ended: Ended, folder: pathlib.Path, truth: Any) -> str:
-    """Of a run that was let to end: whether its result is the true one or it refused to go on."""
+    """Outcome of a run that was not disturbed, see `_outcomes`."""
     if ended.hung:
         return "hang"
     if "Traceback" in ended.text:
@@ -94,7 +95,7 @@ def outcome(ended: Ended, folder: pathlib.Path, truth: Any) -> str:
 
 
 def side_by_side(kind: str, trials: list[Callable[[], list[tuple[str, str]]]]) -> dict[str, Any]:
-    """The row of a kind: what trials, two at a time, came to."""
+    """Runs trials, two at a time, and returns the row of their kind."""
     tally = Tally(kind)
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         running = [pool.submit(trial) for trial in trials]
@@ -106,11 +107,11 @@ def side_by_side(kind: str, trials: list[Callable[[], list[tuple[str, str]]]]) -
 
 
 class Toy:
-    """The toy run, its true result, and folders to try it in."""
+    """The toy run, its true result, and folders for trials."""
 
     def __init__(self, folder: pathlib.Path):
         self._folder = folder
-        self._numbers = itertools.count()  # of two threads, each takes its own
+        self._numbers = itertools.count()  # shared by two threads
         self.whole = self.new()
         ended = Ended(start(self.whole))
         if ended.code:
@@ -118,21 +119,21 @@ class Toy:
         self.truth = result(self.whole)
 
     def new(self) -> pathlib.Path:
-        """A folder of its own, which does not exist yet."""
+        """A new folder, which does not exist yet."""
         return self._folder / f"run {next(self._numbers)}"
 
     def ends(self, ways: list[Callable[[pathlib.Path], str]]) -> list[tuple[str, str]]:
-        """The outcome of each way in which one run is ended, each telling what went wrong at once
-        (empty: nothing); then the run goes on to its end."""
+        """Ends one run in several ways, resumes it to its end, and returns the outcome of each way.
+        ways: functions of the folder that return what went wrong, "" for nothing."""
         folder = self.new()
-        said = [way(folder) for way in ways]
+        faults = [way(folder) for way in ways]
         ended = resumed(folder)
-        found, told = outcome(ended, folder, self.truth), ended.message
+        found, message = outcome(ended, folder, self.truth), ended.message
         if found == "wrong" and ended.code == 0:
-            told = difference(folder, self.truth)
+            message = difference(folder, self.truth)
         found = "wrong" if found == "refused" else found
         shutil.rmtree(folder, ignore_errors=True)
-        return [("wrong", text) if text else (found, told) for text in said]
+        return [("wrong", fault) if fault else (found, message) for fault in faults]
 
 
 def _go_on(folder: pathlib.Path, **dying: Any) -> subprocess.Popen:
@@ -141,7 +142,7 @@ def _go_on(folder: pathlib.Path, **dying: Any) -> subprocess.Popen:
 
 
 def _after(seconds: float, *signals: signal.Signals) -> Callable[[pathlib.Path], str]:
-    """A way to end a run: signals, one after the other."""
+    """A way to end a run: signals after some seconds."""
 
     def end(folder: pathlib.Path) -> str:
         process = _go_on(folder)
@@ -163,7 +164,7 @@ def _after(seconds: float, *signals: signal.Signals) -> Callable[[pathlib.Path],
 
 
 def _at_touch(turn: int, seconds: float) -> Callable[[pathlib.Path], str]:
-    """A way to end a run: SIGKILL soon after it touched its folder so many times."""
+    """A way to end a run: SIGKILL some seconds after touch number `turn` of its folder."""
 
     def end(folder: pathlib.Path) -> str:
         ended = Ended(_go_on(folder, dying=(str(turn), str(seconds))))
@@ -190,7 +191,7 @@ def killed_at_writes(toy: Toy, count: int, rng: np.random.Generator) -> dict[str
 
 
 def stopped(toy: Toy, count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Runs stopped by Ctrl-C, by SIGTERM, and by two of them."""
+    """Runs stopped by Ctrl-C, by SIGTERM, or by Ctrl-C twice."""
     kinds = ((signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT,) * 2)
     ways = [_after(rng.uniform(0, _WHOLE), *kinds[k % 3]) for k in range(count)]
     return _chained(toy, "stopped by a signal", ways)
@@ -205,8 +206,8 @@ def two(toy: Toy, count: int) -> dict[str, Any]:
         time.sleep(0.7 * k)
         both = [Ended(start(folder)), Ended(first)]
         found = sorted(outcome(ended, folder, toy.truth) for ended in both)
-        good = found == ["refused", "survived"]
+        right = found == ["refused", "survived"]
         text = " / ".join(ended.message for ended in both)
-        return [("survived" if good else "wrong", f"{found}: {text}")]
+        return [("survived" if right else "wrong", f"{found}: {text}")]
 
     return side_by_side("two in a folder", [lambda k=k: trial(k) for k in range(count)])

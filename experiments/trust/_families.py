@@ -1,4 +1,4 @@
-"""Random scenes made to break a ray tracer, in families that share their static structure."""
+"""Families of random scenes made to break a ray tracer, each of one static structure."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -21,9 +21,10 @@ Make = Callable[[np.random.Generator, int, Any], Scenes]
 class Family(NamedTuple):
     """Scenes of a kind.
 
-    what: in words.
-    make: (generator, how many, variant) -> scenes; `variants`, among which they are shared out.
-    share: how many scenes for one of the other families.
+    what: description.
+    make: (generator, count, variant) -> scenes.
+    variants: variants, each with the same number of scenes.
+    share: number of scenes relative to a family of full size.
     """
 
     what: str
@@ -34,8 +35,8 @@ class Family(NamedTuple):
 
 
 def elements(change: Callable | None = None, f_number: tuple = (1.4, 16), **scenes: Any) -> Make:
-    """`two_elements`, changed in place by change(generator, parts, h, media); the rest as of
-    `scenes_of`. A variant is the index of the stop."""
+    """Scenes of `two_elements`, changed in place by change(generator, parts, h, media). scenes:
+    arguments of `scenes_of`. A variant is the index of the stop."""
 
     def make(rng, count, stop):
         parts, h, media = two_elements(rng, count, stop, f_number)
@@ -47,7 +48,7 @@ def elements(change: Callable | None = None, f_number: tuple = (1.4, 16), **scen
 
 
 def curvature(rng, parts, h, media):
-    """Through zero, exact and as good as; and near-hemispherical."""
+    """Zero or nearly zero; and nearly hemispherical."""
     shape = parts["curvature"].shape
     tiny = rng.choice([0.0, -0.0, 1e-300, -1e-16, 1e-12, -1e-9, 1e-6], shape)
     steep = rng.choice([-1, 1], shape) * rng.uniform(0.8, 1.02, shape) / h[:, None]
@@ -65,7 +66,7 @@ def conic(rng, parts, h, media):
 
 
 def asphere(rng, parts, h, media):
-    """Terms of r^2 and r^4 against each other."""
+    """Terms of r^2 and r^4 that compensate each other."""
     shape, h = parts["conic"].shape, h[:, None]
     rim = h * rng.uniform(-0.1, 0.1, shape) * rng.random(h.shape) ** 2
     a4, a2 = rim / h**4, -rng.random(shape) * rim / h**2
@@ -73,21 +74,21 @@ def asphere(rng, parts, h, media):
 
 
 def index(rng, parts, h, media):
-    """Neighbours equal or nearly so; some lenses all but vanish."""
+    """Neighbours equal or nearly so, so that some lenses have almost no power."""
     near = 1 + rng.choice([0.0, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2], media.shape)
     close = rng.random(media.shape) < 0.5
     media[:] = np.where(close, near * rng.choice([1.0, 1.5, 1.9], (len(h), 1)), media)
 
 
 def edge(rng, parts, h, media):
-    """Stops too wide for steep surfaces, and light that leaves glass at a slant."""
+    """Stops too wide for steep surfaces, and oblique light that leaves glass."""
     h *= rng.uniform(1, 2.5, h.shape)
     slanted = rng.random(h.shape) < 0.3
     media[:, 0] = np.where(slanted, rng.uniform(1.4, 1.9, h.shape), media[:, 0])
 
 
 def gaps(*sizes: float) -> Callable:
-    """Gaps of some sizes between surfaces, and before the sensor."""
+    """Gaps of given sizes between surfaces and in front of the sensor."""
 
     def change(rng, parts, h, media):
         gap = rng.choice(sizes, (len(h), 4))
@@ -107,7 +108,7 @@ def gaps(*sizes: float) -> Callable:
 
 
 def tilted(rng, parts, h, media):
-    """Surfaces and sensor."""
+    """Tilted and decentred surfaces and sensor."""
     size = rng.random((len(h), 1, 1))
     parts["tilt"] = np.radians(rng.uniform(-10, 10, (len(h), 6, 3))) * size
     parts["decentre"] = rng.uniform(-0.1, 0.1, (len(h), 6, 2)) * size * h[:, None, None]
@@ -127,7 +128,7 @@ def freeform(rng, parts, h, media):
 
 
 def focus(rng, count, stop):
-    """The sensor exactly at the paraxial focus; and stigmatic ellipsoids, whose spot is 0."""
+    """The sensor exactly at the paraxial focus; and stigmatic ellipsoids with a spot of 0."""
     parts, h, media = two_elements(rng, count, stop, (1, 16))
     scenes = scenes_of(rng, parts, h, stop, media, (0, 5))
     image = jax.vmap(lambda lens, d: drt_jax.image_distance(lens, d, jnp.array([WAVELENGTH]))[0])
@@ -150,7 +151,7 @@ def focus(rng, count, stop):
 
 
 def mirror(rng, count, stop):
-    """Concave and convex ones, facing each other."""
+    """Two concave or convex mirrors that face each other."""
     h = rng.uniform(5, 50, count)
     gap = h * rng.uniform(1.5, 6, count)
     first, second = -rng.uniform(0.05, 0.7, count) / h, -rng.uniform(-0.5, 1.2, count) / h
@@ -177,7 +178,7 @@ def folded(rng, count, stop):
 
 
 def phone(rng, count, elements):
-    """So many elements of a plastic, of f about 4 mm; the stop a label."""
+    """Phone lenses of `elements` plastic elements, f about 4 mm, with a dummy stop."""
     surfaces, f = 2 * elements, rng.uniform(3.5, 4.5, count)
     h = f / (2 * rng.uniform(1.6, 2.4, count))
     n = rng.choice(_PLASTICS, (count, elements))
@@ -188,11 +189,11 @@ def phone(rng, count, elements):
     thickness = rng.uniform(0.35, 0.7, (count, surfaces))
     thickness[:, ::2] = rng.uniform(0.15, 0.5, (count, elements))
     thickness[:, 0] = gap
-    # Where the beam of a wide field reaches the surfaces.
+    # Height of the beam of a wide field on the surfaces.
     place = np.cumsum(thickness, axis=1) - gap[:, None]
     height = h[:, None] + 0.45 * place
     c = rng.uniform(-0.5, 0.5, (count, surfaces)) / height
-    bend = 1 / (f * (n[:, 0] - 1))  # of a first element that is all of the lens
+    bend = 1 / (f * (n[:, 0] - 1))  # of a first element with the power of the lens
     c[:, 0] = bend / rng.uniform(0.9, 1.2, count)
     c[:, 1] = c[:, 0] - bend / rng.uniform(0.7, 1.1, count)
     powers = np.arange(2, 14, 2)
@@ -207,8 +208,8 @@ def phone(rng, count, elements):
 
 
 def offaxis(rng, count, stop):
-    """Three mirrors that fold the beam, tilted and decentred; the stop a label at the first or the
-    second, or the second itself."""
+    """Three mirrors that fold the beam, tilted and decentred; the stop is a dummy plane at the
+    first or the second, or the second itself."""
     h = rng.uniform(5, 30, count)
     reach = h[:, None] * rng.uniform(3, 8, (count, 3))
     angle, place = np.zeros(count), np.zeros((count, 4, 2))
@@ -241,7 +242,8 @@ def offaxis(rng, count, stop):
 
 
 def camera(rng, count, name):
-    """A bundled lens off by 3 %, with more aspheric terms of some um at the rim of the stop."""
+    """A bundled lens changed by 3 %, with further aspheric terms of some um at the rim of the
+    stop."""
     lens = drt_jax.load_lens(name)
     surfaces = lens.count
     batch = jax.tree.map(lambda a: np.broadcast_to(a, (count, *a.shape)), lens)
@@ -299,7 +301,7 @@ FAMILIES = {
 
 
 def draw(name: str, count: int, seed: int, variants: tuple | None = None) -> Iterator[Scenes]:
-    """The scenes of a family, one batch for each variant, always the same for a seed."""
+    """Scenes of a family, one batch for each variant, the same for the same seed."""
     family = FAMILIES[name]
     number = list(FAMILIES).index(name)
     variants = variants or family.variants

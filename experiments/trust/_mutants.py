@@ -1,4 +1,4 @@
-"""Files spoilt at random: bytes, words, and the tree of what they hold."""
+"""Random damage to files: to bytes, words, and the YAML tree."""
 
 import copy
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-# Words that a hostile or a careless hand puts into a file.
+# Words of a hostile or careless author.
 WORDS = (
     *("0", "-1", "1e-320", "1e308", "-1e39", ".inf", "-.inf", ".nan", "nan", "inf", "null", "~"),
     *("true", "no", "''", "'0x10'", "0x10", "1:30", "2001-99-99", "1_000", "1e", "--5", "9" * 400),
@@ -24,8 +24,8 @@ _VALUES: tuple[Any, ...] = (
 
 
 def mutated(text: str, rng: np.random.Generator, trees: float = 0.6) -> bytes:
-    """A file with one to four things wrong, or none; `trees`: the share of changes of YAML's tree
-    among those of bytes."""
+    """A file with one to four random changes. trees: fraction of changes to the YAML tree; the rest
+    are to bytes."""
     content = text.encode("utf-8", "surrogatepass")
     for _ in range(rng.integers(1, 5)):
         spoil = _TREES if rng.random() < trees else _BYTES
@@ -70,7 +70,7 @@ def _line_doubled(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _tree(content: bytes) -> Any:
-    """What a file holds; None where it is no YAML any more."""
+    """The YAML tree of a file; None if it is not YAML any more."""
     try:
         return yaml.safe_load(content) if len(content) < 50_000 else None
     except (yaml.YAMLError, ValueError, RecursionError):
@@ -90,7 +90,7 @@ def _places(tree: Any) -> list[tuple[Any, Any]]:
 
 
 def _of_tree(change: Any) -> Any:
-    """A change of (tree, container, key) as one of a file's bytes."""
+    """Turns a change of the tree into one of a file's bytes."""
 
     def changed(content: bytes, rng: np.random.Generator) -> bytes:
         tree = _tree(content)

@@ -1,4 +1,4 @@
-"""What becomes of hostile trials: refused in one line, survived and right, or one of the faults."""
+"""Outcomes of hostile trials: refused in one line, survived with a right result, or a fault."""
 
 import contextlib
 import signal
@@ -11,13 +11,13 @@ from drt_jax.inputs import InputError
 
 FAULTS = ("wrong", "traceback", "hang")
 OUTCOMES = ("refused", "survived", *FAULTS)
-# A message may have so many characters; a file may take so many seconds.
+# Most characters of a message, most seconds for a file.
 _LONGEST, _PATIENCE = 300, 5.0
 _EXAMPLES = 5
 
 
 class Tally:
-    """How many trials of a kind came to what."""
+    """Counts of the outcomes of a kind of trial."""
 
     def __init__(self, kind: str):
         self._kind = kind
@@ -25,14 +25,14 @@ class Tally:
         self._examples: list[str] = []
 
     def add(self, outcome: str, example: object) -> None:
-        """One more; the first few faults are kept as examples."""
+        """Counts an outcome; the first few faults become examples."""
         self._counts[outcome] += 1
         if outcome in FAULTS and len(self._examples) < _EXAMPLES:
             self._examples.append(f"{outcome}: {example!r}"[:1000])
 
     @property
     def row(self) -> dict[str, Any]:
-        """For results.json."""
+        """The row for results.json."""
         tried = sum(self._counts.values())
         return {"kind": self._kind, "tried": tried, **self._counts, "examples": self._examples}
 
@@ -43,7 +43,7 @@ class _Hang(BaseException):
 
 @contextlib.contextmanager
 def _patience(seconds: float) -> Iterator[None]:
-    """_Hang after a while; only in the main thread, where signals arrive."""
+    """Raises _Hang after some seconds; in the main thread only, where signals arrive."""
 
     def ring(number: int, frame: Any) -> None:
         raise _Hang
@@ -61,8 +61,7 @@ def _patience(seconds: float) -> Iterator[None]:
 
 
 def judged(call: Callable[[], bool], seconds: float = _PATIENCE) -> tuple[str, str]:
-    """The outcome of a call that tells whether its result is right, and what it said; it may take
-    so many seconds."""
+    """Outcome and message of a call that returns True for a right result. seconds: most time."""
     try:
         with _patience(seconds), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -76,5 +75,5 @@ def judged(call: Callable[[], bool], seconds: float = _PATIENCE) -> tuple[str, s
 
 
 def clear(message: str) -> bool:
-    """Whether a message is one line that a person can read at a glance."""
+    """True for a message of one short printable line."""
     return 0 < len(message) <= _LONGEST and message.isprintable()

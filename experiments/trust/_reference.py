@@ -1,11 +1,11 @@
 """Converged moments of a spot and their gradients from the sequential trace alone.
 
-Nothing of the Fermat solver is used, and no ray is aimed: the integral over the stop is written
-in the coordinates q where a ray crosses a plane before the lens, with the Jacobian |dp/dq| of
-the point p where Snell's law brings it on the stop. The region of integration is what the stop
-and the clear apertures leave of that plane. Its edge is found by bisection along half-lines
-from a point inside; where two apertures meet, it has a corner and a panel of Gauss nodes ends.
-Derivatives are those of the plain trace by automatic differentiation, the edge following the lens.
+No Fermat solver and no aiming: the integral over the stop uses the coordinates q in which a ray
+crosses a plane in front of the lens, with the Jacobian |dp/dq| of its stop point p by Snell's law.
+The region of integration is the part of that plane from which rays pass the stop and the clear
+apertures. Bisection along half-lines from a point inside finds its edge. Where two apertures meet,
+the edge has a corner and a panel of Gauss nodes ends. Derivatives are by automatic differentiation
+of the trace; the edge follows the lens.
 """
 
 import dataclasses
@@ -23,20 +23,22 @@ from drt_jax import Lens
 
 from .snell import trace_snell
 
-# The plane of q lies this far before the first vertex (mm).
+# Distance of the plane of q in front of the first vertex, mm.
 _LEAD = 5.0
 _PANELS, _CORNERS, _AZIMUTHS, _RADII = 6, 5, 12, 24
 _BISECTIONS = 50
-# Points along a diameter, half-lines along which the edge is searched for corners.
+# Points along a diameter; half-lines of the search for corners.
 _SCAN, _SEARCH = 1152, 121
 
 
 class Moments(NamedTuple):
-    """Of one colour, with derivatives by (curvatures, thicknesses and the sensor).
+    """Moments of one wavelength.
 
-    sigma: RMS spot radius, mm. centroid: its y, mm. gradient: (2, P) of both. error: change of
-    both values, relative to sigma, when every node moves. gradient_error: that of sigma's gradient,
-    relative to its norm.
+    sigma: RMS spot radius, mm.
+    centroid: y of the centroid, mm.
+    gradient: (2, P), derivatives of both by curvatures, thicknesses and the sensor.
+    error: change of both with other nodes, relative to sigma.
+    gradient_error: change of sigma's gradient with other nodes, relative to its norm.
     """
 
     sigma: float
@@ -47,19 +49,20 @@ class Moments(NamedTuple):
 
 
 def flatten(lens: Lens) -> Array:
-    """Curvatures, thicknesses and the sensor of a lens (or of a gradient) in one array (P,)."""
+    """Curvatures, thicknesses and sensor of a lens or gradient in one array (P,)."""
     return jnp.concatenate([lens.curvature[:-1], lens.thickness, lens.sensor[None]])
 
 
 def changed(lens: Lens, values: Array) -> Lens:
-    """The lens with `values` (P,) as in `flatten`."""
+    """The lens with values (P,) in the order of `flatten`."""
     curvature, thickness, sensor = jnp.split(values, [lens.count, len(values) - 1])
     curvature = lens.curvature.at[:-1].set(curvature)
     return dataclasses.replace(lens, curvature=curvature, thickness=thickness, sensor=sensor[0])
 
 
 def _trace(lens: Lens, scene: Array, q: Array) -> tuple[Array, Array]:
-    """Hits (S + 1, 2) of the ray through q (2,), mm; `scene`: field, 1/distance, wavelength."""
+    """Hits (S + 1, 2) of the ray through q (2,), mm, and whether it arrives. scene: field,
+    1/distance, wavelength."""
     field, vergence, wavelength = scene
     point = jnp.append(q, -_LEAD)
     toward = vergence * point + jnp.stack([0 * field, jnp.tan(field), 0 * field + 1])
@@ -68,25 +71,31 @@ def _trace(lens: Lens, scene: Array, q: Array) -> tuple[Array, Array]:
 
 
 def _excess(lens: Lens, scene: Array, q: Array) -> Array:
-    """(S,): r^2 over its limit, less 1, at the stop and the apertures; > 0 is outside."""
+    """r^2 / limit - 1 at the stop and the apertures, (S,); above 0 outside."""
     hits, ok = _trace(lens, scene, q)
     limit2 = lens.semi_diameter[:-1] ** 2
     return jnp.where(ok, jnp.sum(hits[:-1] ** 2, axis=1) / limit2 - 1, 1)
 
 
 def _bisected(low: Array, high: Array, before: Callable[[Array], Array]) -> tuple[Array, Array]:
-    """The ends of an interval narrowed to where `before` turns from true to false."""
+    """The interval narrowed to where `before` changes from True to False."""
 
-    def narrow(_, ends):
-        middle = (ends[0] + ends[1]) / 2
+    def narrow(_, interval):
+        low, high = interval
+        middle = (low + high) / 2
         first = before(middle)
-        return jnp.where(first, middle, ends[0]), jnp.where(first, ends[1], middle)
+        return jnp.where(first, middle, low), jnp.where(first, high, middle)
 
     return jax.lax.fori_loop(0, _BISECTIONS, narrow, (low, high))
 
 
 class _Pupil(NamedTuple):
-    """What a scene leaves of the plane of q, in polar coordinates about (0, height)."""
+    """The region of integration in the plane of q, in polar coordinates about (0, height).
+
+    scene: field, 1/distance, wavelength.
+    height: (), y of the origin, mm.
+    reach: (), radius beyond the region, mm.
+    """
 
     lens: Lens
     scene: Array
@@ -99,19 +108,19 @@ class _Pupil(NamedTuple):
         return jnp.stack([radius * jnp.cos(azimuth), up])
 
     def excess(self, azimuth: Array, radius: Array) -> Array:
-        """`_excess` at a point."""
+        """`_excess` of the ray through a point."""
         return _excess(self.lens, self.scene, self.point(azimuth, radius))
 
     def edge(self, azimuth: Array) -> tuple[Array, Array]:
-        """Where a half-line leaves the region, mm, and the surface whose aperture ends it."""
+        """Radius at which a half-line leaves the region, mm, and the surface that limits it."""
         start = jnp.zeros_like(self.reach)
         within = partial(self.excess, azimuth)
         low, high = _bisected(start, self.reach, lambda radius: jnp.all(within(radius) <= 0))
         return low, jnp.argmax(within(high))
 
     def corners(self) -> tuple[Array, Array]:
-        """Where the aperture that ends the region changes in each of `_SEARCH` - 1 intervals of
-        azimuth, and whether it does."""
+        """Azimuth at which the limiting aperture changes, in each of `_SEARCH` - 1 intervals, and
+        whether it does."""
         azimuth = jnp.linspace(-jnp.pi / 2, jnp.pi / 2, _SEARCH)
         aperture = jax.vmap(self.edge)(azimuth)[1]
 
@@ -121,20 +130,21 @@ class _Pupil(NamedTuple):
         found = jax.vmap(corner)(azimuth[:-1], azimuth[1:], aperture[:-1])
         return found, aperture[:-1] != aperture[1:]
 
-    def line(self, azimuth: Array, moved: Lens) -> tuple[Array, Array]:
-        """Spots (R, 2), mm, and areas (R,) of the nodes of a half-line. The edge follows `moved`,
-        a lens next to this one, by one Newton step."""
+    def line(self, azimuth: Array, varied: Lens) -> tuple[Array, Array]:
+        """Spots (R, 2), mm, and areas (R,) of the nodes of a half-line. The edge follows `varied`,
+        the lens of which derivatives are taken, by one Newton step."""
         radius, aperture = self.edge(azimuth)
         slope = jax.jvp(partial(self.excess, azimuth), (radius,), (jnp.ones_like(radius),))[1]
-        there = self._replace(lens=moved)
-        edge = radius - there.excess(azimuth, radius)[aperture] / slope[aperture]
+        pupil = self._replace(lens=varied)
+        edge = radius - pupil.excess(azimuth, radius)[aperture] / slope[aperture]
 
         def node(t, weight):
-            def ends(q):
-                hits = _trace(moved, self.scene, q)[0]
-                return hits[moved.stop], hits[-1]
+            def stop_and_sensor(q):
+                hits = _trace(varied, self.scene, q)[0]
+                return hits[varied.stop], hits[-1]
 
-            jacobian, spot = jax.jacfwd(ends, has_aux=True)(self.point(azimuth, edge * t))
+            point = self.point(azimuth, edge * t)
+            jacobian, spot = jax.jacfwd(stop_and_sensor, has_aux=True)(point)
             return spot, jnp.abs(jnp.linalg.det(jacobian)) * edge**2 * t * weight
 
         t, weight = np.polynomial.legendre.leggauss(_RADII)
@@ -143,30 +153,30 @@ class _Pupil(NamedTuple):
 
 @jax.jit
 def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Array, Array, Array]:
-    """sigma and the height of the centroid, their derivatives (2, P), and the number of corners,
-    or -1 if no ray passes; `part`: where between the ends of the region its middle is put."""
+    """sigma and the height of the centroid, their derivatives (2, P), and the number of corners, -1
+    if no ray passes. part: position of the origin along the height of the region, 0 to 1."""
     heights = jnp.linspace(-reach, reach, _SCAN)
     diameter = jnp.stack([jnp.zeros_like(heights), heights], axis=1)
     inside = jnp.all(jax.vmap(partial(_excess, lens, scene))(diameter) <= 0, axis=1)
     low = jnp.min(jnp.where(inside, heights, reach))
     high = jnp.max(jnp.where(inside, heights, -reach))
     pupil = _Pupil(lens, scene, low + part * (high - low), reach)
-    # Panels end at the corners; where there are fewer, some are empty.
+    # Panels end at the corners; with fewer corners some panels are empty.
     corners, changes = pupil.corners()
     corners = jnp.sort(jnp.where(changes, corners, jnp.pi / 2))[:_CORNERS]
     even = jnp.linspace(-jnp.pi / 2, jnp.pi / 2, _PANELS + 1)
-    ends = jnp.sort(jnp.concatenate([even, corners]))
+    edges = jnp.sort(jnp.concatenate([even, corners]))
     x, w = np.polynomial.legendre.leggauss(_AZIMUTHS)
-    half = jnp.diff(ends)[:, None] / 2
-    azimuth = (ends[:-1, None] + half * (1 + x)[None]).ravel()
+    half = jnp.diff(edges)[:, None] / 2
+    azimuth = (edges[:-1, None] + half * (1 + x)[None]).ravel()
     width = (half * w[None]).ravel()
 
     def values(parameters):
-        moved = changed(lens, parameters)
-        spot, area = jax.vmap(lambda angle: pupil.line(angle, moved))(azimuth)
+        varied = changed(lens, parameters)
+        spot, area = jax.vmap(lambda angle: pupil.line(angle, varied))(azimuth)
         area = area * width[:, None]
         area = area / jnp.sum(area)
-        # x -> -x: the other half is the mirror image. A sum of small numbers, for its rounding.
+        # The other half is the mirror image in x. A sum of small numbers rounds less.
         height = jax.lax.stop_gradient(spot[0, 0, 1])
         mean = height + jnp.sum(area * (spot[..., 1] - height))
         square = spot[..., 0] ** 2 + (spot[..., 1] - mean) ** 2
@@ -180,12 +190,14 @@ def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Arra
 def reference(
     lens: Lens, field: float, distance: float, wavelengths: Sequence[float]
 ) -> list[Moments]:
-    """Moments of each colour of a centred lens in float64. ValueError if no ray passes.
+    """Moments of each wavelength of a centred lens in float64. ValueError if no ray passes.
 
-    field: radians along y. distance: mm. wavelengths: um.
+    field: angle along y, radians.
+    distance: distance of the object, mm.
+    wavelengths: wavelengths, um.
     """
     semi = np.asarray(lens.semi_diameter)
-    # A steep beam crosses the plane far from where it meets the first surface.
+    # A steep beam crosses the plane far from its hits on the first surface.
     reach = (3 * float(np.max(semi[np.isfinite(semi)])) + 2 * _LEAD) * (1 + math.tan(abs(field)))
     results = []
     for wavelength in wavelengths:
@@ -205,8 +217,9 @@ def reference(
 def gradient_error(
     exact: np.ndarray, slopes: np.ndarray, surfaces: int, known: np.ndarray | bool = True
 ) -> float:
-    """Norm of the error of known slopes (..., P) over that of the truth, the worse of those by
-    curvatures of so many surfaces and by distances; NaN if the truth is 0."""
+    """Norm of the error of a gradient (..., P) over that of the truth, the worse of that by
+    curvatures of `surfaces` surfaces and that by distances; NaN if the truth is 0. known: (..., P),
+    bool, derivatives that count."""
     wrong, truth = np.where(known, slopes - exact, 0), np.where(known, exact, 0)
     groups = slice(0, surfaces), slice(surfaces, None)
     norms = [(np.linalg.norm(wrong[..., g]), np.linalg.norm(truth[..., g])) for g in groups]

@@ -1,4 +1,4 @@
-"""Random scenes of one static structure: lenses, fields, distances and points on the stop."""
+"""Random scenes of one static structure: lenses, fields, distances and stop points."""
 
 from typing import NamedTuple
 
@@ -9,14 +9,19 @@ import drt_jax
 from drt_jax.lens.glass import Dispersion
 from drt_jax.lens.lens import Labels
 
-RAYS = 8  # of each scene: the chief ray, three on the rim, the rest at random
+RAYS = 8  # rays of each scene: the chief ray, three at the rim, random ones
 WAVELENGTH = 0.55
 _FAR = (np.inf, 1e3, 200.0)
 
 
 class Scenes(NamedTuple):
-    """N scenes of one static structure: a lens whose leaves have a leading axis N, fields (N, 2)
-    in radians, distances (N,) in mm, pupil points (N, RAYS, 2) in the unit disc."""
+    """N scenes of one static structure.
+
+    lens: lens whose leaves have a first axis N.
+    field: (N, 2), radians.
+    distance: (N,), mm.
+    pupil: (N, RAYS, 2), points in the unit disc.
+    """
 
     lens: drt_jax.Lens
     field: np.ndarray
@@ -27,10 +32,11 @@ class Scenes(NamedTuple):
 def batch_of(parts, h, stop, media=None, **static):
     """A batch of lenses.
 
-    parts: arrays (N, ...) of S surfaces, to which the sensor is added; conic and coefficients may
-        be missing.
-    h: (N,), semi-diameter of the stop in mm; other surfaces have none.
-    media: (N, S + 1), constant indices, by default 1; static: other fields of the lens.
+    parts: arrays (N, ...) of S surfaces, without the sensor; conic and coefficients may be missing.
+    h: (N,), semi-diameter of the stop, mm; other surfaces have none.
+    stop: index of the stop.
+    media: (N, S + 1), constant indices; None for 1.
+    static: other fields of the lens.
     """
     count, surfaces = parts["curvature"].shape
     zero, none = np.zeros((count, surfaces)), np.zeros((count, surfaces, 0))
@@ -59,7 +65,7 @@ def pupil_points(rng, count):
 
 
 def fields(rng, count, low, high):
-    """Angles of `low` to `high` degrees in any direction; a third along y, as users ask for."""
+    """Angles of `low` to `high` degrees in any direction, a third of them along y."""
     size, turn = rng.uniform(low, high, count), 2 * np.pi * rng.random(count)
     turn = np.where(rng.random(count) < 1 / 3, np.pi / 2, turn)
     slope = np.tan(np.radians(size))
@@ -67,8 +73,8 @@ def fields(rng, count, low, high):
 
 
 def two_elements(rng, count, stop, f_number=(1.4, 16)):
-    """Two elements, or three cemented ones, of about the f-number, the stop at surface `stop`:
-    a plane in air or a refracting surface. Returns parts of `batch_of`, h and media."""
+    """Two elements, or three cemented ones, of about the f-number; the stop is a plane in air or a
+    refracting surface. Returns `parts`, `h` and `media` of `batch_of`."""
     h = np.exp(rng.uniform(np.log(1), np.log(20), count))
     number = np.exp(rng.uniform(*np.log(f_number), count))
     n = rng.uniform(1.4, 1.95, (count, 3))
@@ -80,7 +86,7 @@ def two_elements(rng, count, stop, f_number=(1.4, 16)):
     index = np.where(alone[:, None], apart, cemented)
     curvature = rng.uniform(-1, 1, (count, 5))
     curvature[:, stop] = np.where(alone, 0, curvature[:, stop])
-    # One linear step towards the wanted power, positive or negative.
+    # One linear step towards the target power, positive or negative.
     power = np.sum(curvature * np.diff(index, axis=1), axis=1)
     factor = rng.choice([1, 1, 1, -1], count) / (2 * h * number * power)
     curvature = curvature * factor[:, None]
@@ -94,8 +100,11 @@ def two_elements(rng, count, stop, f_number=(1.4, 16)):
 
 
 def scenes_of(rng, parts, h, stop, media=None, angles=(0, 15), distances=_FAR, **static):
-    """Scenes of `batch_of`, fields from and to so many degrees, a tenth of them 0, and distances
-    from a list in mm."""
+    """Scenes with lenses of `batch_of`.
+
+    angles: smallest and largest field, degrees; a tenth of the fields is 0.
+    distances: distances to draw from, mm.
+    """
     count = len(h)
     field = fields(rng, count, *angles)
     field[rng.random(count) < 0.1] = 0

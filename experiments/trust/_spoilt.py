@@ -1,4 +1,4 @@
-"""Prescriptions and settings spoilt at random: refused in one line, or right."""
+"""Randomly damaged prescriptions and settings: refused in one line, or right."""
 
 import dataclasses
 import pathlib
@@ -20,7 +20,7 @@ from ._outcomes import Tally, judged
 from .runs import config as configs
 
 _LENSES = pathlib.Path(drt_jax.__file__).parent / "lens" / "catalogue" / "lenses"
-# Lines that .zmx files may have beside those that we write.
+# Lines of .zmx files that we do not write.
 _ZMX = (
     *("TYPE COORDBRK", "TYPE SZERNSAG", "TYPE QED_TYPE", "TYPE BINARY_2", "TYPE XPOLYNOM", "STOP"),
     *("TYPE TOROIDAL", "TYPE BICONICX", "TYPE TILTSURF", "PARM 1 .1", "PARM 3 20", "PARM 6 1"),
@@ -28,12 +28,12 @@ _ZMX = (
     *("OBSC 0 1", "CLAP 1 9", "OBDC 1 2", "FLAP", "GLAS MIRROR", "GLAS ___BLANK 1 0 1.6 40 0"),
     *("FNUM 2 1", "ENPD 5", "OBNA .1", "FTYP 2 0 1 1", "FTYP 1 1 3 9", "UNIT IN", "PWAV 9"),
 )
-# Programs of many structures exhaust what a process may map.
+# Files between clearings of JAX's caches: too many programs exhaust the maps of a process.
 _KEPT = 200
 
 
 def prescriptions(count: int, rng: np.random.Generator) -> tuple[dict[str, Any], list[Lens]]:
-    """A row of spoilt prescriptions: what loads is finite. And lenses that did load."""
+    """Row of damaged prescriptions, of which those that load must be finite; and the lenses."""
     texts = [path.read_text() for path in sorted(_LENSES.glob("*.yaml"))]
     loaded = list[Lens]()
     spoilt = lambda: mutated(_one(texts, rng), rng)  # noqa: E731
@@ -41,7 +41,7 @@ def prescriptions(count: int, rng: np.random.Generator) -> tuple[dict[str, Any],
 
 
 def lens_files(count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """A row of spoilt .zmx files, lines of other files among theirs, in two encodings."""
+    """Row of damaged .zmx files with lines of other files, in two encodings."""
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "lens.zmx"
         texts = []
@@ -66,7 +66,7 @@ def _one(items: Sequence[str], rng: np.random.Generator) -> str:
 def _tried(
     kind: str, name: str, spoilt: Callable[[], bytes], count: int, loaded: list[Lens]
 ) -> dict[str, Any]:
-    """A row of files of this name; `loaded` takes the lenses."""
+    """Row of damaged files of a name; `loaded` gets the lenses."""
     tally = Tally(kind)
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / name
@@ -84,7 +84,7 @@ def _tried(
 
 
 def finite(lens: Lens) -> bool:
-    """Whether all numbers of a lens are, but for apertures that are open."""
+    """True if all numbers of a lens are finite, except open apertures."""
     open_ones = dataclasses.replace(lens, semi_diameter=lens.curvature * 0)
     if lens.apertures is not None:
         half = dataclasses.replace(lens.apertures, half=lens.apertures.half * 0)
@@ -94,7 +94,7 @@ def finite(lens: Lens) -> bool:
 
 
 def traced(lenses: list[Lens]) -> dict[str, Any]:
-    """A row of lenses that load: rays through them are finite, and tell what became of them."""
+    """Row of lenses that load: their rays must be finite and have a known status."""
     tally = Tally("lenses that load, traced")
     pupil = np.array([[0.0, 0.0], [0.0, 0.9], [0.5, -0.5], [0.0, -1.0]])
     for lens in tqdm(lenses, unit="lens", leave=False, dynamic_ncols=True):
@@ -114,8 +114,8 @@ def traced(lenses: list[Lens]) -> dict[str, Any]:
 
 
 def settings(count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """A row of spoilt settings of all experiments, half of them by --set: what is taken can be
-    written and read back."""
+    """Row of damaged settings of all experiments, half of them by --set: accepted ones must be the
+    same when written and read again."""
     kinds = settings_files()
     tally = Tally("settings")
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""What is measured on a batch of random scenes: finite numbers, Snell's law, rays not found."""
+"""The survey of a batch of random scenes: finite numbers, Snell's law, lost rays."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,17 +18,17 @@ from drt_jax.numerics import safe_sqrt
 from ._scenes import WAVELENGTH, Scenes
 from .snell import trace_snell
 
-_BATCH = 104  # scenes to a call: all batches of one structure share a compiled program
-_BOTH = 4  # one scene of so many of a float64 family is traced in float32 too
-_RULE = Gauss(2, "none")  # whose moments are differentiated
-_ROUNDINGS = 1000  # how many roundings of the hits two traces may be apart
-_GRID = 41  # launch points along each side of the search for a ray that was not found
+_BATCH = 104  # scenes of a call: all batches of one structure share a compiled program
+_BOTH = 4  # every 4th scene of a float64 family is traced in float32 too
+_RULE = Gauss(2, "none")  # rule of the differentiated moments
+_ROUNDINGS = 1000  # largest difference of two traces, roundings of the hits
+_GRID = 41  # launch points per side in the search for a failed ray
 _STARTS = 4  # candidates refined for each such ray
 _REFINE = 25
 _STOP_MISS = 1e-9  # mm
 
 
-# Few scenes, many programs: what takes long is to compile them.
+# Few scenes, many programs: compilation takes most of the time.
 _QUICK = {
     **LARGE,
     "xla_backend_optimization_level": 1,
@@ -37,7 +37,7 @@ _QUICK = {
 
 
 def _over_scenes(function: Callable) -> Callable:
-    """A function of one scene over any number, in batches of one size; NumPy arrays."""
+    """Maps a function of one scene over any number of scenes, in batches; NumPy arrays."""
     program = jit(jax.vmap(function), _QUICK)
 
     def run(*arguments):
@@ -58,28 +58,28 @@ def _sum(a):
 
 
 def _own(lens, i, vector):
-    """A vector (3,) along the axes of surface i."""
+    """A vector (3,) in the axes of surface i."""
     return vector if lens.tilt is None else rotation_matrix(lens.tilt[i]).T @ vector
 
 
 def _place(lens, i, point):
-    """A point (3,) along the axes of surface i, from its vertex."""
+    """A point (3,) in the axes of surface i, from its vertex."""
     across = jnp.zeros_like(point[:2]) if lens.decentre is None else lens.decentre[i]
     return _own(lens, i, point - jnp.append(across, lens.vertices[i]))
 
 
 def _entering(point, field, distance):
-    """Along the light at a point (3,) before the lens: from the object, over the distance."""
+    """Direction of the light at a point (3,) in front of the lens, not normalised."""
     return point / distance + jnp.append(jnp.tan(field), jnp.ones_like(distance))
 
 
 def _residual(lens, field, distance, pupil, points):
-    """How far traced points (S + 1, 3) of a ray are from a stationary path through its stop point,
-    over the bound of rounding on it: `_ROUNDINGS / 5` times what changing the last digit of a
-    coordinate changes.
+    """Residual of the traced points (S + 1, 3) of a ray as a stationary path through its stop
+    point, over the bound of rounding: `_ROUNDINGS / 5` times the change by the last digit of a
+    coordinate.
 
-    Along a stationary path, n e - n' e' is normal to each surface that bends light, e and e' being
-    the directions before and behind it, n and n' the indices.
+    Along a stationary path, n e - n' e' is normal to each active surface, with the directions e and
+    e' and the indices n and n' in front of and behind it.
     """
     active, stop = [*lens.active, lens.count], lens.stop
     index = lens.index(jnp.full(1, WAVELENGTH, points.dtype))[:, 0]
@@ -109,7 +109,7 @@ _plain = _over_scenes(_trace)
 
 @_over_scenes
 def _rays(lens, field, distance, pupil):
-    """Rays, the derivatives of a sum of them by everything, and their residuals."""
+    """Rays, the derivatives of a sum of them by lens and scene, and their residuals."""
 
     def scalar(lens, field, distance):
         rays = _trace(lens, field, distance, pupil)
@@ -122,12 +122,12 @@ def _rays(lens, field, distance, pupil):
 
 @_over_scenes
 def _moments(lens, field, distance):
-    """Moments and the derivatives of a sum of them by everything; 0 for the infinite covariance of
-    a colour of which no light passes."""
-    colour = jnp.full(1, WAVELENGTH, field.dtype)
+    """Moments and the derivatives of a sum of them by lens and scene; 0 for the infinite covariance
+    of a wavelength of which no light passes."""
+    wavelength = jnp.full(1, WAVELENGTH, field.dtype)
 
     def scalar(lens, field, distance):
-        found = drt_jax.psf_moments(lens, field, distance, colour, rule=_RULE)
+        found = drt_jax.psf_moments(lens, field, distance, wavelength, rule=_RULE)
         none = (found.throughput == 0)[:, None, None] & jnp.isposinf(found.covariance)
         covariance = jnp.where(none, 0, found.covariance)
         value = jnp.sum(found.mean) + jnp.sum(covariance) + safe_sqrt(covariance[0, 0, 0])
@@ -137,7 +137,7 @@ def _moments(lens, field, distance):
 
 
 def _shoot(lens, field, distance, point):
-    """The sequential trace of the ray through a point (3,) before the lens."""
+    """Sequential trace of the ray through a point (3,) in front of the lens."""
     direction = _entering(point, field, distance)
     wavelength = jnp.asarray(WAVELENGTH, point.dtype)
     return trace_snell(lens, wavelength, point, direction / jnp.linalg.norm(direction))
@@ -145,28 +145,27 @@ def _shoot(lens, field, distance, point):
 
 @_over_scenes
 def _retrace(lens, field, distance, points):
-    """How far the sequential trace through the first of the points (RAYS, S + 1, 3) of each ray
-    ends from the others, over their size and what the lens makes of a shift of the start; and
-    whether there is no such ray. One at the edge of what exists may fall to either side."""
+    """Difference of the points (RAYS, S + 1, 3) of each ray from a sequential trace through the
+    first of them, relative to their size and to the growth of a shift of the start; and whether
+    that trace fails although its neighbours arrive (at the edge of the beam either may fail)."""
 
     def one(points):
         size = 1 + jnp.max(jnp.abs(points))
         shift = 1e-7 * size * jnp.eye(3, k=-1)  # not at all, in x, in y
         hits, ok = jax.vmap(lambda s: _shoot(lens, field, distance, points[0] + s))(shift)
-        grown = jnp.max(jnp.abs(hits[1:] - hits[:1])) / (1e-7 * size)
+        growth = jnp.max(jnp.abs(hits[1:] - hits[:1])) / (1e-7 * size)
         off = jnp.max(jnp.abs(hits[0] - points))
-        return off / (size * (1 + jnp.nan_to_num(grown))), ~ok[0] & ok[1] & ok[2]
+        return off / (size * (1 + jnp.nan_to_num(growth))), ~ok[0] & ok[1] & ok[2]
 
     return jax.vmap(one)(points)
 
 
 @_over_scenes
 def _search(lens, field, distance, pupil):
-    """Whether Snell's law carries a ray to each stop point (RAYS,).
+    """True where a ray by Snell's law passes a stop point, (RAYS,).
 
-    A grid of launch points over the first surface; from the nearest that arrive, Newton's method
-    with halving. A ray counts if it meets the stop point within `_STOP_MISS` and if rays
-    beside it also reach the sensor.
+    Newton's method with halving starts from the nearest rays of a grid over the first surface. A
+    ray counts if it meets the stop point within `_STOP_MISS` and its neighbours reach the sensor.
     """
     stop, height = lens.stop, lens.semi_diameter[lens.stop]
 
@@ -178,9 +177,7 @@ def _search(lens, field, distance, pupil):
         def step(_, state):
             trial, best, last, found = state
             h = 1e-7 * (1 + jnp.max(jnp.abs(trial)))
-            at, ok = jax.vmap(crossing)(
-                trial[None] + h * jnp.eye(3, 2, k=-1)
-            )  # there, beside in x, in y
+            at, ok = jax.vmap(crossing)(trial[None] + h * jnp.eye(3, 2, k=-1))  # not, in x, in y
             miss = jnp.linalg.norm(at[0] - target)
             better = ok[0] & (miss <= best)
             newton = jnp.linalg.solve((at[1:] - at[:1]).T / h, target - at[0])
@@ -212,7 +209,7 @@ def _infinite(*found: Any) -> np.ndarray:
 
 
 def survey(scenes: Scenes) -> dict[str, np.ndarray]:
-    """Everything counted on some scenes: arrays over scenes (and rays), and numbers to be added."""
+    """The survey of scenes: arrays over scenes (and rays), and counts to be summed."""
     dtype = scenes.distance.dtype
     rays, slope, residual = _rays(*scenes)
     moments_slope, moments = _moments(*scenes[:3])

@@ -1,15 +1,15 @@
 """Run time against error of the spot size, its gradient and the centroid.
 
-Our quadrature by its order stands beside what other programs sum over: random rays (the paper's
-256 among them), a square grid, hexapolar rings and the Sobol sequence, traced by the same code.
+Compares our quadrature of rising order with the patterns of other programs, traced by the same
+code: random rays (also the paper's 256), a square grid, hexapolar rings and the Sobol sequence.
 The truth is an integral over the sequential Snell trace. Writes results.json, whose `curves` has
 a row for each scene, method and number of rays, and draws error over time and over rays.
 
-relative_error: of the RMS spot radius sigma, the worst colour. centroid_error: distance between
-the centroids over sigma, the worst colour. gradient_error: of the derivatives of sigma (mean of
-the colours) by all curvatures, and by all thicknesses and the sensor position: the norm of the
+relative_error: of the RMS spot radius sigma, the worst wavelength. centroid_error: distance of the
+centroids over sigma, the worst wavelength. gradient_error: of the derivatives of sigma (mean of
+the wavelengths) by all curvatures, and by all thicknesses and the sensor position: the norm of the
 difference over that of the reference, the worse of the two groups. seconds: median time of a
-compiled call; gradient_seconds: of one with its gradients in reverse mode.
+compiled call; gradient_seconds: of a call with gradients in reverse mode.
 """
 
 import dataclasses
@@ -35,18 +35,21 @@ from .runs.folder import Run
 
 _QUADRATURE = "quadrature"
 COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")
-# What the table shows: the default tolerance, and patterns of so many rays.
+# In the table: the default tolerance, and the sizes of patterns.
 _DEFAULT, _RANDOM, _MANY = 1e-6, 256, 16384
 
 
 @dataclasses.dataclass(frozen=True)
 class AccuracyScene:
-    """What is measured.
+    """A scene.
 
-    lens: bundled name or YAML path. field_deg: angle of the object point. distance_m: to the
-    object (.inf: infinity). defocus_mm: of the sensor, from the best focus on axis of an object
-    there. front_mm, rear_mm: semi-diameters of the first and last surface, 0 for the lens's own.
-    dtype: of everything. orders: instead of the run's. most_rays: the largest pattern.
+    lens: bundled name or YAML path.
+    field_deg: field angle of the object.
+    distance_m: distance of the object, .inf for infinity.
+    defocus_mm: sensor position less that of the best focus on axis at the distance.
+    front_mm, rear_mm: semi-diameters of the first and last surface, 0 for the lens's own.
+    orders: orders instead of those of the run.
+    most_rays: largest pattern.
     """
 
     lens: str = "double_gauss"
@@ -66,24 +69,24 @@ class AccuracyScene:
 
     @property
     def vignetted(self) -> bool:
-        """Whether apertures other than the stop are meant to limit the beam."""
+        """True if apertures other than the stop are meant to limit the beam."""
         return self.front_mm > 0 or self.rear_mm > 0
 
     @property
     def kind(self) -> tuple:
-        """Scenes of a kind, which stand together, share programs."""
+        """Scenes of a kind follow each other and share programs."""
         return self.lens, self.dtype, self.vignetted
 
     @property
     def panel(self) -> str:
-        """The panel of the figures that the scene belongs to."""
+        """The panel of the scene in figures."""
         if self.dtype == "float32":
             return "float32"
         return "vignetted" if self.vignetted else "off axis" if self.field_deg else "on axis"
 
     @property
     def label(self) -> str:
-        """A name of its own for results and progress."""
+        """The name of the scene in results and progress."""
         far = "inf" if math.isinf(self.distance_m) else f"{self.distance_m:g} m"
         words = [pathlib.Path(self.lens).stem, f"{self.field_deg:g} deg", far]
         words.append(f"{self.defocus_mm:+g} mm")
@@ -101,9 +104,10 @@ class AccuracyScene:
 class Config:
     """Settings of the experiment; see configs/accuracy.yaml.
 
-    scenes: what is measured. orders: of the quadrature. rays: nominal sizes of the patterns.
-    seeds: how many random patterns, of which the median counts. tolerances: to be kept.
-    wavelengths_um: of the colours.
+    orders: orders of the quadrature.
+    rays: nominal sizes of the patterns.
+    seeds: number of random patterns, of which the median counts.
+    tolerances: tolerances of the rules that are tested.
     """
 
     scenes: tuple[AccuracyScene, ...]
@@ -118,9 +122,8 @@ class Config:
         for name in ("orders", "rays", "tolerances", "wavelengths_um"):
             _common.require_list(name, getattr(self, name))
         _common.require(len(self.scenes) > 0, "scenes: needs at least one item")
-        labels = {scene.label for scene in self.scenes}
-        _common.require(len(labels) == len(self.scenes), "scenes: an item stands twice")
-        # 7 rays: one hexapolar ring.
+        _common.require_different("scenes", [scene.label for scene in self.scenes])
+        # One hexapolar ring has 7 rays.
         limits = {"rays": (7, 1e7), "seeds": (1, 1000), "tolerances": (1e-14, 0.5)}
         _common.require_within("", self, wavelengths_um=(1e-4, 1e6), **limits)
         every = [*self.orders, *(order for scene in self.scenes for order in scene.orders)]
@@ -129,7 +132,7 @@ class Config:
 
 @jax.jit
 def spot(*arguments: Any) -> tuple[Array, Array]:
-    """sigmas (W,) and centroids (W, 2) in mm, by the arguments of psf_moments and a rule."""
+    """sigma (W,) and centroids (W, 2), mm, from the arguments of psf_moments and a rule."""
     *scene, rule = arguments
     moments = drt_jax.psf_moments(*scene, rule=rule)
     mean, covariance = moments.mean, moments.covariance
@@ -138,8 +141,8 @@ def spot(*arguments: Any) -> tuple[Array, Array]:
 
 @jax.jit
 def spot_and_gradients(lens: Lens, *rest: Any) -> tuple[tuple[Array, Array], Array]:
-    """`spot`, and by reverse mode the derivatives (2, P) of the mean over the colours of sigma and
-    of the height of the centroid."""
+    """`spot`, and the derivatives (2, P) of sigma and of the height of the centroid, means over the
+    wavelengths, in reverse mode."""
 
     def means(lens):
         sigma, mean = found = spot(lens, *rest)
@@ -151,8 +154,8 @@ def spot_and_gradients(lens: Lens, *rest: Any) -> tuple[tuple[Array, Array], Arr
 
 
 def patterns(rays: int, seeds: int, dtype: Any) -> dict[str, list[PupilRule]]:
-    """What other programs sum over: at most `rays` points by each method, filled up with weightless
-    ones, so that all of one size share a program; of `random`, several."""
+    """Patterns of other programs by method, of at most `rays` points, padded with weightless ones
+    so that all share a program; `seeds` random ones."""
     sides = range(2 * math.isqrt(rays), 0, -1)
     side = next(n for n in sides if pupil.square_grid(n)[1].size <= rays)
 
@@ -179,7 +182,7 @@ def spot_errors(truth: list[Moments], sigma: Array, mean: Array) -> tuple[float,
 
 
 def row_of(arguments: tuple, truth: list[Moments], rules: Sequence[PupilRule]) -> dict:
-    """Columns of `curves` for rules of a kind and size: the median error, the time of the first."""
+    """A row of `curves` for rules of a kind and size: median error, time of the first."""
     exact = np.mean([moments.gradient for moments in truth], axis=0)
     found = []
     for rule in rules:
@@ -196,13 +199,13 @@ def row_of(arguments: tuple, truth: list[Moments], rules: Sequence[PupilRule]) -
 
 
 def count_rays(arguments: tuple, rule: PupilRule) -> int:
-    """How many rays of the first colour carry weight."""
+    """Number of rays of the first wavelength with a weight."""
     weights = drt_jax.pupil_points(*arguments, rule)[1]
     return int(np.count_nonzero(np.asarray(weights)[0]))
 
 
 def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple, list[Moments]]:
-    """Arguments of psf_moments, the lens focused on axis and clipped; and the reference."""
+    """Arguments of psf_moments, with the lens focused on axis and clipped, and the reference."""
     lens = drt_jax.load_lens(scene.lens)
     distance, field = 1e3 * scene.distance_m, math.radians(scene.field_deg)
     spread = drt_jax.focus_moments(lens, 0.0, distance, wavelengths, 1e-9).spread
@@ -214,7 +217,7 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
     lens = dataclasses.replace(lens, sensor=jnp.asarray(sensor, semi.dtype), semi_diameter=semi)
     lens = dataclasses.replace(lens, curved=(lens.stop,))  # gradients by every curvature
     truth = reference(lens, field, distance, wavelengths)
-    if not scene.field_deg:  # by symmetry; what the integral leaves is rounding
+    if not scene.field_deg:  # exactly 0 by symmetry
         flat = np.array([[1.0], [0.0]])
         truth = [m._replace(centroid=0.0, gradient=flat * m.gradient) for m in truth]
     arguments = lens, field, distance, np.array(wavelengths)
@@ -222,7 +225,7 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
 
 
 def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[dict]]:
-    """Rows of results.json for one scene; logs its curves."""
+    """Measures one scene, logs its curves, and returns its rows of results.json."""
     first = next(other for other in config.scenes if other.kind == scene.kind)
     if scene.vignetted or scene is first:
         jax.clear_caches()  # thousands of kernels exhaust what a process may map
@@ -236,26 +239,26 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
         for name, size, rules in kinds
     ]
     run.log(scene.label, 0, {c: np.array([row[c] for row in curves], float) for c in COLUMNS})
-    # A rule follows from known numbers: on axis, those of the field.
+    # A Python number on axis, whose symmetry is known.
     known = arguments[0], arguments[1] if scene.field_deg else 0.0, *arguments[2:]
-    kept = []
+    tolerances = []
     for tolerance in config.tolerances:
         rule = drt_jax.converged_rule(*known, tolerance)
         error = spot_errors(truth, *spot(*arguments, rule))[0]
         row = {"tolerance": tolerance, "order": rule.order, "rays": count_rays(arguments, rule)}
-        kept.append(row | {"relative_error": error})
+        tolerances.append(row | {"relative_error": error})
     exact = []
-    for colour, m in zip(config.wavelengths_um, truth):
-        row = {"wavelength_um": colour, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
+    for wavelength, m in zip(config.wavelengths_um, truth):
+        row = {"wavelength_um": wavelength, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
         row |= {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
         exact.append(row)
     about = {"scene": scene.label, "panel": scene.panel, "dtype": scene.dtype}
-    found = {"curves": curves, "tolerances": kept, "truth": exact}
+    found = {"curves": curves, "tolerances": tolerances, "truth": exact}
     return {key: [about | row for row in rows] for key, rows in found.items()}
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Measure all scenes, one after the other."""
+    """Measures all scenes."""
     jobs = {s.label: functools.partial(measure, config, s, run) for s in config.scenes}
     found = _common.measured(run, "scene", jobs)
     results = {key: sum((rows[key] for rows in found), []) for key in found[0]}
@@ -263,12 +266,12 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def middle(rows: list[dict], key: str) -> float:
-    """The median over scenes of a number that is known of all."""
+    """Median of a number over scenes."""
     return float(np.median([row[key] for row in rows]))
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Methods by panel, and what the promised tolerances cost and kept."""
+    """Tables of methods by panel, and of rays and errors by tolerance."""
     lines = []
     for (panel,), some in grouped(results["curves"], "panel").items():
         for method, rows in shown(grouped(some, "method", "size")):
@@ -276,23 +279,24 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
             rays, time = int(middle(rows, "rays")), _common.duration(middle(rows, "seconds"))
             lines.append((panel, method, rays, error, slope, time))
     header = "scenes", "method", "rays a colour", "error of sigma", "of its gradient", "a call"
-    promises, kept = results["tolerances"], []
-    for (panel,), some in grouped(promises, "panel").items():
+    tolerances, costs = results["tolerances"], []
+    for (panel,), some in grouped(tolerances, "panel").items():
         cells = [panel]
         for rows in grouped(some, "tolerance").values():
             worst, most = (max(row[k] for row in rows) for k in ("relative_error", "rays"))
             cells.append(f"{most}, {worst:.1e}")
-        kept.append(cells)
-    promised = [f"{tolerance:.0e}" for (tolerance,) in grouped(promises, "tolerance")]
+        costs.append(cells)
+    first = "most rays a colour, worst error"
+    columns = [f"{tolerance:.0e}" for (tolerance,) in grouped(tolerances, "tolerance")]
     return {
         "accuracy": _common.table(header, lines),
-        "accuracy, tolerances": _common.table(("most rays a colour, worst error", *promised), kept),
+        "accuracy, tolerances": _common.table((first, *columns), costs),
     }
 
 
 def shown(groups: dict[tuple, list[dict]]) -> list[tuple[str, list[dict]]]:
-    """Of rows by (method, size): the first two orders within the default tolerance, random rays as
-    in the paper, and the best of large patterns."""
+    """Selects from rows by (method, size): the first two orders within the default tolerance, the
+    paper's random rays, and the best large pattern."""
     errors = {kind: middle(rows, "relative_error") for kind, rows in groups.items()}
     rules = [kind for kind in groups if kind[0] == _QUADRATURE]
     chosen = [kind for kind in rules if errors[kind] < _DEFAULT][:2] or rules[-1:]
@@ -303,7 +307,7 @@ def shown(groups: dict[tuple, list[dict]]) -> list[tuple[str, list[dict]]]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw error over time and over rays, a panel for each group of scenes; median and range."""
+    """Draws error over time and over rays, median and range, a panel for each group of scenes."""
     groups = grouped(results["curves"], "panel")
     for name, x, y, xlabel, ylabel in (
         ("time_error", "seconds", "relative_error", "time of a call (ms)", "σ"),
@@ -322,11 +326,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
 
 
 def draw_panel(axes: Any, rows: list[dict], x: str, y: str, labels: tuple[str, str]) -> None:
-    """Column y over column x of the scenes of a panel, by method."""
+    """Draws column y over column x of the scenes of a panel, by method."""
     curves, note = {}, None
     for (method,), some in grouped(rows, "method").items():
         groups = sorted(grouped(some, "size").items())
-        # A size that few scenes have would bend the line of their median.
+        # Sizes of few scenes would bend the line of the median.
         most = max(len(group) for _, group in groups)
         groups = [(size, group) for (size,), group in groups if 2 * len(group) >= most]
         across = [middle(group, x) * (1e3 if x == "seconds" else 1) for _, group in groups]

@@ -1,9 +1,9 @@
-"""Hostile input and sudden ends: files spoilt at random, runs killed and stopped.
+"""Hostile input and sudden ends: files damaged at random, runs killed and stopped.
 
-Nothing may be used that cannot be trusted: what is spoilt is refused in one line of at most 300
-characters, or the result is right. Writes results.json: `rows` hold `kind`, `tried`, `refused`,
-`survived` (and right), `wrong` (a wrong result, or a message that is long or of several lines),
-`traceback`, `hang` (5 s for a file, minutes for a run), and `examples` of the last three.
+A damaged file must be refused in one line of at most 300 characters, or give a right result.
+Writes results.json: `rows` hold `kind`, `tried`, `refused`, `survived` (with a right result),
+`wrong` (a wrong result, or a message that is long or has several lines), `traceback`, `hang` (5 s
+for a file, minutes for a run), and `examples` of the last three.
 """
 
 import dataclasses
@@ -29,9 +29,10 @@ PARTS = ("files", "kills")
 class Config:
     """Settings of the experiment; see configs/faults.yaml.
 
-    files: how many prescriptions and settings are spoilt, and a quarter as many .zmx files.
-    traced: how many of the lenses that load are traced. kills: how many runs are ended. parts: the
-    names of those to try (files, kills), empty for all. seed: of all random numbers.
+    files: number of damaged prescriptions and settings; a quarter as many .zmx files.
+    traced: number of loaded lenses that are traced.
+    kills: number of kills and stops of runs.
+    parts: parts to run, of files and kills; empty for all.
     """
 
     files: int = 10_000
@@ -48,24 +49,24 @@ class Config:
 
 def rows_of(config: Config, part: str) -> Iterator[dict[str, Any]]:
     """The rows of a part."""
-    some = np.random.default_rng([config.seed, PARTS.index(part)]).spawn(4)
+    rngs = np.random.default_rng([config.seed, PARTS.index(part)]).spawn(4)
     if part == "files":
-        row, loaded = _spoilt.prescriptions(config.files // 2, some[0])
+        row, loaded = _spoilt.prescriptions(config.files // 2, rngs[0])
         yield row
         yield _spoilt.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
-        yield _spoilt.settings(config.files - config.files // 2, some[1])
-        yield _spoilt.lens_files(config.files // 4, some[3])
+        yield _spoilt.settings(config.files - config.files // 2, rngs[1])
+        yield _spoilt.lens_files(config.files // 4, rngs[3])
     else:
         with tempfile.TemporaryDirectory() as folder:
             toy, third = _ended.Toy(pathlib.Path(folder)), config.kills // 3
-            yield _ended.killed(toy, third, some[0])
-            yield _ended.killed_at_writes(toy, third, some[1])
-            yield _ended.stopped(toy, config.kills - 2 * third, some[2])
+            yield _ended.killed(toy, third, rngs[0])
+            yield _ended.killed_at_writes(toy, third, rngs[1])
+            yield _ended.stopped(toy, config.kills - 2 * third, rngs[2])
             yield _ended.two(toy, 3)
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Try each part."""
+    """Runs each part."""
 
     def one(part: str) -> list[dict[str, Any]]:
         rows = list(rows_of(config, part))
@@ -79,7 +80,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """What became of each kind, and examples of faults."""
+    """Table of the outcomes of each kind, and examples of faults."""
     rows = [[row[key] for key in ("kind", *COLUMNS)] for row in results["rows"]]
     found = {"faults": _common.table(("kind", *COLUMNS), rows)}
     faults = [f"{row['kind']}: {text}" for row in results["rows"] for text in row["examples"]]
@@ -87,7 +88,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw what became of each kind."""
+    """Draws the outcomes of each kind."""
     figure, axes = show.new(1, 1, 8, 3.6)
     rows = {row["kind"]: [row[name] for name in OUTCOMES] for row in results["rows"]}
     _plots.shares(axes, rows, OUTCOMES)

@@ -1,11 +1,10 @@
 """Lens files of another program against its own listings: right, near, refused, or silently wrong.
 
-Each NAME.zmx of a folder is read by us and, where they are installed, by Optiland and ray-optics,
-in the same run and by the same numbers; NAME.txt beside it is OpticStudio's listing. Right: focal
-length, f-number, entrance pupil and all indices of glasses are those of the listing to its last
-digit, near: to a thousandth, wrong: further off, without a word. Writes results.json: `rows` hold
-`file`, `reader`, `outcome`, `off` (the greatest part by which a number is off) and `why` (the
-message, or the number that is furthest off).
+drt_jax and, where installed, Optiland and ray-optics read each NAME.zmx of a folder in the same
+run; NAME.txt beside it is OpticStudio's listing. Right: focal length, f-number, entrance pupil and
+all indices of glasses agree with the listing to its last digit; near: to a thousandth; wrong: not,
+and without a message. Writes results.json: `rows` hold `file`, `reader`, `outcome`, `off` (the
+largest relative error of a number) and `why` (the message, or the number of that error).
 """
 
 import contextlib
@@ -41,10 +40,7 @@ _NUMBERS = (
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings of the experiment; see configs/files.yaml.
-
-    folder: of the files and listings.
-    """
+    """Settings of the experiment; see configs/files.yaml. folder: of files and listings."""
 
     folder: str
 
@@ -76,12 +72,12 @@ def _rayoptics(path: str) -> Read:
     own = model["analysis_results"]["parax_data"].fod
     primary = model["osp"]["wvls"].reference_wvl
     indices = [float(row[primary]) for row in model["seq_model"].rndx]
-    focal, wide = own.efl or np.inf, 2 * own.enp_radius  # 0 is its word for none
+    focal, wide = own.efl or np.inf, 2 * own.enp_radius  # 0 stands for none
     return [focal, focal / wide, wide, own.enp_dist], indices, None
 
 
-# [focal length, f-number, diameter and place of the entrance pupil], indices of all media, and how
-# far from the object that place is counted; None: as in the listing, from its surface 1.
+# [focal length, f-number, diameter and position of the entrance pupil], indices of all media, and
+# the distance from the object to the origin of that position; None for surface 1, as in listings.
 READERS: dict[str, Callable[[str], Read]] = {
     "drt_jax": _ours,
     "optiland": _optiland,
@@ -90,7 +86,7 @@ READERS: dict[str, Callable[[str], Read]] = {
 
 
 def listed(content: str, key: str) -> tuple[float, float] | None:
-    """A number of a listing and one of its last digit; None if it is not there."""
+    """A number of a listing and one unit of its last digit; None if it is not there."""
     found = re.search(rf"^{re.escape(key)}\s*:\s*([-+.\dEe]+)", content, re.MULTILINE)
     if not found:
         return None
@@ -99,8 +95,8 @@ def listed(content: str, key: str) -> tuple[float, float] | None:
 
 
 def listed_indices(content: str) -> list[float]:
-    """Of all glasses at the primary wavelength but for that behind the image, which no ray meets;
-    empty if they are not listed."""
+    """Indices of all listed glasses at the primary wavelength, without that behind the image; empty
+    if there are none."""
     table = content.partition("INDEX OF REFRACTION")[2]
     head = re.search(r"^Surf .*?((?:\s+\d\.\d{8})+)", table, re.MULTILINE)
     primary = re.search(r"^Primary Wavelength.*:\s*([\d.]+)", content, re.MULTILINE)
@@ -115,9 +111,8 @@ def listed_indices(content: str) -> list[float]:
 def differences(
     content: str, first: list[float], indices: list[float], far: float | None
 ) -> list[tuple]:
-    """(part by which it is off, whether it is right, in words) of each number of a listing. Signs
-    of focal lengths differ between programs where there are mirrors; a focal length of 1e10 is what
-    a listing writes for none."""
+    """(relative error, whether it is right, text) of each number of a listing. Signs are not
+    compared, because programs differ behind mirrors; listings write 1e10 for no focal length."""
     found = []
     wide = (listed(content, _NUMBERS[2]) or (1.0,))[0]
     finite = re.search(r"^ OBJ\s+\S+\s+\S+\s+([-+.\dEe]+)\s", content, re.MULTILINE)
@@ -134,19 +129,19 @@ def differences(
         right = off <= max(1.01 * step, 1e-9 * size)
         found.append((off / size, right, f"{key} {value:.7g}, listed {number:.7g}"))
     both = indices, listed_indices(content)
-    glasses, wanted = ([abs(n) for n in row if abs(n) != 1] for row in both)
-    if not wanted:
+    glasses, truth = ([abs(n) for n in row if abs(n) != 1] for row in both)
+    if not truth:
         return found
-    if len(glasses) != len(wanted):
-        return [*found, (np.inf, False, f"{len(glasses)} glasses, listed {len(wanted)}")]
-    for own, number in zip(glasses, wanted):
+    if len(glasses) != len(truth):
+        return [*found, (np.inf, False, f"{len(glasses)} glasses, listed {len(truth)}")]
+    for own, number in zip(glasses, truth):
         off = abs(own - number)
         found.append((off, off <= _INDEX, f"index {own:.8g}, listed {number:.8g}"))
     return found
 
 
 def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
-    """One file, read by one program, which says nothing."""
+    """Row of one file read by one program, whose output is dropped."""
     row = {"file": path.name, "reader": reader, "off": None}
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
@@ -158,7 +153,7 @@ def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
         raise
     except drt_jax.LensError as error:
         return row | {"outcome": "refused", "why": str(error).removeprefix(str(path)).lstrip(", :")}
-    except Exception as error:  # what others raise, if not ours
+    except Exception as error:  # other programs may raise anything
         if reader == "drt_jax":
             raise
         why = " ".join(f"{type(error).__name__}: {error}".split())[:100]
@@ -177,7 +172,7 @@ def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Read each file by each program."""
+    """Reads each file by each program."""
     paths = sorted(pathlib.Path(config.folder).glob("*.zmx"))
     _common.require(len(paths) > 0, f"folder: no .zmx file in {config.folder}")
 
@@ -193,7 +188,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def counts(rows: list[dict[str, Any]], reader: str) -> list[int]:
-    """How many files came to each outcome."""
+    """Number of files of each outcome."""
     own = [row["outcome"] for row in rows if row["reader"] == reader]
     return [own.count(name) for name in OUTCOMES]
 
@@ -204,22 +199,22 @@ def _cell(row: dict[str, Any]) -> str:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Each file by each program, and how many of each; what ours says of those it refuses, else
-    what another has wrong."""
+    """Tables of outcomes by file and program, and of their numbers. `why` is our message, else the
+    error of another program."""
     rows = []
     for (name,), group in _common.grouped(results["rows"], "file").items():
-        said = [f"{row['reader']}: {row['why']}" for row in group if row["outcome"] == "wrong"]
-        why = [group[0]["why"]] if group[0]["why"] else said[:1]
+        errors = [f"{row['reader']}: {row['why']}" for row in group if row["outcome"] == "wrong"]
+        why = [group[0]["why"]] if group[0]["why"] else errors[:1]
         rows.append([name, *map(_cell, group), "".join(why)])
-    many = [[reader, *counts(results["rows"], reader)] for reader in READERS]
+    totals = [[reader, *counts(results["rows"], reader)] for reader in READERS]
     return {
         "files": _common.table(("file", *READERS, "why"), rows),
-        "files, counts": _common.table(("reader", *OUTCOMES), many),
+        "files, counts": _common.table(("reader", *OUTCOMES), totals),
     }
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw how many of each."""
+    """Draws the number of files of each outcome."""
     figure, axes = show.new(1, 1, 8, 2.4)
     shares = {reader: counts(results["rows"], reader) for reader in READERS}
     _plots.shares(axes, shares, OUTCOMES)

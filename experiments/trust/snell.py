@@ -1,7 +1,7 @@
 """Classical sequential ray trace by Snell's law: the oracle and the baseline.
 
-Written from the textbook formulae (Welford, Aberrations of Optical Systems, ch. 4), sharing
-no formula with the Fermat solver but the sag. One ray at a time; `jax.vmap` for more.
+From the textbook (Welford, Aberrations of Optical Systems, ch. 4); it shares no formula with the
+Fermat solver except the sag. One ray at a time; `jax.vmap` for more.
 """
 
 from functools import partial
@@ -16,11 +16,12 @@ from drt_jax.lens.elements import rotation_matrix
 from drt_jax.lens.forms import Shape
 from drt_jax.lens.surface import domain, sag_derivatives
 
-_NEWTON_STEPS = 40  # a ray that all but grazes an asphere halves its distance in each
+_NEWTON_STEPS = 40  # a nearly grazing ray only halves its distance in each
 
 
 def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Array, Array]:
-    """Hit of the ray p + s d with the surface at the origin; its normal; whether there is one."""
+    """Hit of the ray p + s d on the surface at the origin, the normal there, and whether there is a
+    hit."""
     q = p - d * (p[2] / d[2])  # on the vertex plane
     met = jnp.array(True)
     c, k = shape.curvature, shape.conic
@@ -51,10 +52,14 @@ def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Arra
 class _Row(NamedTuple):
     """A surface or the sensor, or with a first axis all of them.
 
-    shape, form: what `_intersect` takes, the form by its place among those of the lens. origin,
-    axes: of the vertex, mm; from the surface's axes to those of the lens. active: whether it is an
-    active surface; the sensor counts as one. mirror: whether it reflects. sense: 1 or -1, light
-    goes along or against its z axis. ratio: the index in front by that behind.
+    shape: arguments of the sag.
+    form: index of the form among those of the lens.
+    origin: (3,), vertex, mm.
+    axes: (3, 3), rotation from the surface's axes to those of the lens.
+    active: True for an active surface or the sensor.
+    mirror: True for a mirror.
+    sense: 1 or -1 for light along or against the z axis.
+    ratio: index in front / index behind.
     """
 
     shape: Shape
@@ -84,7 +89,7 @@ def _rows(lens: Lens, wavelength: Array, forms: list[str]) -> _Row:
 
 
 def _bend(d: Array, normal: Array, row: _Row) -> tuple[Array, Array]:
-    """The direction behind a surface, and whether there is one and light came from its front."""
+    """Direction behind a surface, and whether it exists and light comes from the front."""
     cosine = normal @ d
     square = 1 - row.ratio**2 * (1 - cosine**2)
     along = row.sense * jnp.sqrt(jnp.maximum(square, 0)) - row.ratio * cosine
@@ -96,16 +101,14 @@ def _bend(d: Array, normal: Array, row: _Row) -> tuple[Array, Array]:
 def trace_snell(
     lens: Lens, wavelength: Array, point: Array, direction: Array
 ) -> tuple[Array, Array]:
-    """Trace one ray through a lens to its sensor.
+    """Traces one ray through a lens to its sensor. Returns the hits (S + 1, 3) along the axes of
+    the lens, z from the first vertex, mm, and True if the ray meets every surface, goes forwards
+    between active ones, and is not totally reflected. Surfaces that are not active are crossed by
+    the straight line, forwards or backwards.
 
-    A surface that bends no light is crossed by the straight line through the point before it,
-    forwards or backwards, and the ray goes on from that point.
-
-    wavelength: () in um. point: (3,) in mm, anywhere on the ray before the lens. direction: (3,), a
-    unit vector.
-    Returns the hits (S + 1, 3) in mm along the axes of the lens, z from the first vertex, and
-    whether the ray met every surface, went forwards from each that bends light to the next, and
-    was refracted or reflected there, bool.
+    wavelength: (), um.
+    point: (3,), anywhere on the ray in front of the lens, mm.
+    direction: (3,), unit vector.
     """
     forms = sorted(set(lens.forms))
     branches = [partial(_intersect, form=form) for form in forms]

@@ -1,9 +1,8 @@
-"""Thousands of random scenes made to break the tracer: are its numbers, its derivatives and its
-verdicts to be trusted?
+"""Thousands of random scenes made to break the tracer: can its rays, derivatives and statuses be
+trusted?
 
-Every ray that is reported good is compared with a sequential trace by Snell's law; for every ray
-that is not, that trace searches for one through the same point of the stop. Draws steps and errors
-by family.
+Compares every good ray with a sequential trace by Snell's law. For every failed ray, that trace
+searches for a ray through the same stop point. Draws steps and errors by family.
 """
 
 import dataclasses
@@ -22,10 +21,10 @@ from ._families import FAMILIES
 from ._survey import survey
 from .runs.folder import Run
 
-# Of each family in metrics.csv, and summed over all in results.json.
+# Columns of metrics.csv for each family, summed over all in results.json.
 COLUMNS = ("scenes", "rays", *(status.name.lower() for status in Status))
 COLUMNS += ("traceable", "nan_values", "nan_gradients", "disagree_with_snell")
-# Programs of more structures than this exhaust what a process may map.
+# Most structures: programs of more exhaust the maps of a process.
 _STRUCTURES = 6
 
 
@@ -33,8 +32,8 @@ _STRUCTURES = 6
 class Config:
     """Settings of the experiment; see configs/stability.yaml.
 
-    scenes: of a family of full size, some have half. seed: of all random numbers. families: the
-    names of those to run, empty for all.
+    scenes: number of scenes of a family of full size; some have half.
+    families: names of the families to run; empty for all.
     """
 
     scenes: int = 620
@@ -47,7 +46,7 @@ class Config:
 
 
 def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The row of a family in results.json, from its survey."""
+    """Row of a family in results.json, from its survey."""
     status, lost = found["status"], found["lost"]
     steps, errors = found["steps"], found["float32_error"]
     return {
@@ -73,10 +72,10 @@ def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def totals(rows: list[dict]) -> dict[str, float]:
-    """Sums over all families, and rates of rays that are lost."""
+    """Sums over all families, and rates of lost rays."""
     sums: dict[str, float] = {key: sum(row[key] for row in rows) for key in COLUMNS}
-    apart = [row for row in rows if row["name"] != "touching"]
-    for name, some in ("", rows), ("_but_touching", apart):
+    others = [row for row in rows if row["name"] != "touching"]
+    for name, some in ("", rows), ("_but_touching", others):
         lost, rays = (sum(row[key] for row in some) for key in ("traceable", "rays"))
         sums[f"traceable_per_10000{name}"] = 1e4 * lost / max(rays, 1)
     cameras = [row["float32_error_p99"] for row in rows if row["name"].startswith("camera")]
@@ -84,7 +83,7 @@ def totals(rows: list[dict]) -> dict[str, float]:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Draw and survey the families one by one."""
+    """Draws and surveys the families one by one."""
     known: set = set()
     names = config.families or FAMILIES
     jobs = {name: functools.partial(measure, config, name, run, known) for name in names}
@@ -101,8 +100,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def measure(config: Config, name: str, run: Run, known: set) -> dict[str, Any]:
-    """The row of a family, and samples of the steps of its scenes and of errors in float32 (mm);
-    logs the row. `known`: structures whose programs are kept."""
+    """Surveys a family and logs its row. Returns the row, the steps of each scene and the errors in
+    float32, mm. known: structures whose programs are in JAX's caches."""
     batches = list(_families.draw(name, config.scenes, config.seed))
     known.update((jax.tree.structure(batch), batch.distance.dtype) for batch in batches)
     if len(known) > _STRUCTURES:
@@ -115,7 +114,7 @@ def measure(config: Config, name: str, run: Run, known: set) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Each family, and the whole."""
+    """Tables of all families together, and of each."""
     header = ["family", "rays", "good", "lost", "not finite", "not Snell"]
     header += ["Newton steps, median and most", "float32 within, 99 %"]
     rows = []
@@ -143,15 +142,15 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draw steps and float32 errors by family."""
+    """Draws steps and float32 errors by family."""
     rows = results["families"]
     figure, axes = show.new(1, 2, 6, 5)
     for ax, samples, size, label in (
         (axes[0], results["newton_steps"], "scenes", "Newton steps of a scene"),
         (axes[1], 1e3 * results["float32_error_mm"], "float32_rays", "float32 error (µm)"),
     ):
-        ends = np.cumsum([row[size] for row in rows])[:-1]
-        families = dict(zip([row["name"] for row in rows], np.split(samples, ends)))
+        cuts = np.cumsum([row[size] for row in rows])[:-1]
+        families = dict(zip([row["name"] for row in rows], np.split(samples, cuts)))
         _plots.by_family(ax, families, label, log=size == "float32_rays")
     figure.savefig(figures / "families.png")
 
