@@ -28,7 +28,7 @@ from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_sensor, weigh
 from .spot import Moments
-from .tiles import trace_rule
+from .tiles import Traced, trace_rule, weigh_rule
 
 _MAX_ORDER = 40
 # Smallest spot, mm: below 1 nm rounding would never converge.
@@ -182,7 +182,7 @@ class _Trial(NamedTuple):
     """A rule tried on scenes.
 
     rule: the rule.
-    used: the rule with padding, as it was evaluated.
+    used: the rule as it was evaluated, with points of other orders and padding.
     moments: its moments of each scene.
     found: its rays of each scene.
     """
@@ -238,26 +238,26 @@ def _try_orders(
     solver: Solver = solve_aimed
     for clipped in (False, True)[blocked:]:
         trials: list[_Trial] = []
-        for rule, used in _rules(lens, symmetry, clipped):
-            trial, failing, cut = _try(lens, scenes, rule, used, solver)
+        for group in _groups(lens, symmetry, clipped):
+            trace = partial(_trace, lens, scenes, group[0][1])
+            rays, failing, cut = trace(solver)
             if failing and solver is solve_aimed and (clipped or not cut):
                 solver = solve  # some rays must be searched for
-                trial, failing, cut = _try(lens, scenes, rule, used, solver)
+                rays, failing, cut = trace(solver)
             if failing and solver is solve:
                 check_order(lens)
             if (failing or cut) and not clipped:
                 break
-            for scene, found in zip(scenes, trial.moments, strict=True):
-                if not np.all(np.asarray(found.throughput) > 0):
-                    _say_why(lens, scene, symmetry, found.throughput)
-            trials = [*trials, trial][-3:]
-            changes = (_change(trials[0], later, places) for later in trials[1:])
-            change = max(changes, default=np.inf)
-            rough = max(_rounding(lens, found) for found in trial.moments)
-            if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
-                _warn_of_rounding(lens, rough, tolerance)
-                # If rounding hides their difference, take the last.
-                return trials[-1 if 2 * rough > tolerance else 0]
+            for rule, used in group:
+                trial = _weighed(lens, scenes, rule, used, rays)
+                trials = [*trials, trial][-3:]
+                changes = (_change(trials[0], later, places) for later in trials[1:])
+                change = max(changes, default=np.inf)
+                rough = max(_rounding(lens, found) for found in trial.moments)
+                if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
+                    _warn_of_rounding(lens, rough, tolerance)
+                    # If rounding hides their difference, take the last.
+                    return trials[-1 if 2 * rough > tolerance else 0]
         else:
             break
     warnings.warn(
@@ -268,29 +268,43 @@ def _try_orders(
     return trials[-1]
 
 
-def _rules(
+def _groups(
     lens: Lens, symmetry: Symmetry, clipped: bool
-) -> Iterator[tuple[Gauss | Clipped, PupilRule]]:
-    """Rules by rising order, each with a padded one, so that orders share compiled programs."""
+) -> Iterator[list[tuple[Gauss | Clipped, PupilRule]]]:
+    """Rules by rising order, in groups that are traced at once. Each with the rule that is traced,
+    which is padded, so that all share compiled programs."""
     if not clipped:
-        orders = range(2, _MAX_ORDER + 2)
-        yield from ((Gauss(order, symmetry), _padded(order, symmetry)) for order in orders)
+        yield from _gauss_groups(symmetry)
         return
     first, step = _CLIPPED
     crossing = may_cross(lens)
     for order in range(first, _MAX_ORDER + step + 1, step):
         size = 20 if order <= 20 else _MAX_ORDER + 2
         rule, used = (Clipped(order, symmetry, n, crossing) for n in (order, size))
-        yield rule, used
+        yield [(rule, used)]
 
 
-def _try(
-    lens: Lens, scenes: Sequence[Scene], rule: Gauss | Clipped, used: PupilRule, solver: Solver
-) -> tuple[_Trial, bool, bool]:
-    """Tries a rule on all scenes; also returns whether a ray fails and whether one is clipped."""
-    parts = (trace_rule(lens, scene, used, solver) for scene in scenes)
-    moments, found, failing, cut = zip(*parts, strict=True)
-    return _Trial(rule, used, moments, found), any(failing), any(cut)
+def _trace(
+    lens: Lens, scenes: Sequence[Scene], used: PupilRule, solver: Solver
+) -> tuple[list[Traced], bool, bool]:
+    """The rays of a rule for all scenes, whether a ray fails, and whether one is clipped."""
+    rays = [trace_rule(lens, scene, used, solver) for scene in scenes]
+    return rays, any(one.failing for one in rays), any(one.cut for one in rays)
+
+
+def _weighed(
+    lens: Lens,
+    scenes: Sequence[Scene],
+    rule: Gauss | Clipped,
+    used: PupilRule,
+    rays: Sequence[Traced],
+) -> _Trial:
+    """The moments of a rule. ValueError if no light of a wavelength arrives."""
+    moments = tuple(weigh_rule(lens, used, one) for one in rays)
+    for scene, found in zip(scenes, moments, strict=True):
+        if not np.all(np.asarray(found.throughput) > 0):
+            _say_why(lens, scene, rule.symmetry, found.throughput)
+    return _Trial(rule, used, moments, tuple(one.found for one in rays))
 
 
 def _eps(lens: Lens) -> float:
@@ -315,17 +329,41 @@ def _warn_of_rounding(lens: Lens, rough: float, tolerance: float) -> None:
 
 
 @cache
-def _padded(order: int, symmetry: Symmetry) -> Pattern:
-    """A Gauss rule padded with weightless rays along the rim of the stop, where clear apertures
-    clip first, so that orders share a few compiled programs."""
-    points, weights = gauss_points(order, symmetry)
+def _gauss_groups(symmetry: Symmetry) -> list[list[tuple[Gauss | Clipped, PupilRule]]]:
+    """Gauss rules by rising order. Those that fit into half of the smallest size are traced at
+    once: one pattern has the points of all, and each rule its own weights. The rest is filled with
+    weightless rays along the rim of the stop, where clear apertures clip first, so that all share a
+    few compiled programs."""
     sizes = (_MAX_ORDER + 2,) if symmetry == "rotational" else (208, 416, 1768, 3696)
-    missing = next(size for size in sizes if size >= weights.size + points.shape[1]) - weights.size
+    groups: list[list[int]] = []
+    for order in range(2, _MAX_ORDER + 2):
+        points = [gauss_points(n, symmetry)[1].size for n in [*(groups[-1:] or [[]])[0], order]]
+        if len(points) > 1 and sum(points) <= sizes[0] / 2:
+            groups[-1].append(order)
+        else:
+            groups.append([order])
+    return [_padded(orders, symmetry, sizes) for orders in groups]
+
+
+def _padded(
+    orders: Sequence[int], symmetry: Symmetry, sizes: Sequence[int]
+) -> list[tuple[Gauss | Clipped, PupilRule]]:
+    """Rules of some orders on the points of all, padded to one of the sizes."""
+    points, weights = zip(*(gauss_points(order, symmetry) for order in orders), strict=True)
+    columns, total = points[0].shape[1], sum(w.size for w in weights)
+    missing = next(size for size in sizes if size >= total + columns) - total
     span = np.pi if symmetry == "bilateral" else 2 * np.pi
     angle = -np.pi / 2 + span * np.arange(missing) / max(missing - 1, 1)
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    filled = np.concatenate([points, rim if points.shape[1] == 2 else np.ones((missing, 1))])
-    return Pattern(filled, np.pad(weights, (0, missing)), symmetry)
+    filled = np.concatenate([*points, rim if columns == 2 else np.ones((missing, 1))])
+    rules: list[tuple[Gauss | Clipped, PupilRule]] = []
+    start = 0
+    for order, own in zip(orders, weights):
+        padded = np.zeros(total + missing)
+        padded[start : start + own.size] = own
+        rules.append((Gauss(order, symmetry), Pattern(filled, padded, symmetry)))
+        start += own.size
+    return rules
 
 
 def _change(before: _Trial, now: _Trial, places: Callable) -> float:
@@ -349,7 +387,7 @@ def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) 
     with jax.core.eval_context():
         # Checks the values of an eager gradient, which were not known before.
         scene_of(lens, scene.field, scene.distance, scene.wavelengths)
-        rule = _padded(_DIAGNOSIS, symmetry)
+        rule = Pattern(*gauss_points(_DIAGNOSIS, symmetry), symmetry)
         found = trace_rule(lens, scene, rule, solve).found
         raise ValueError(
             f"no ray at {float(scene.wavelengths[wavelength]):g} um reaches the sensor: "

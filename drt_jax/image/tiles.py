@@ -12,7 +12,7 @@ from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..pupil.clipped import Clipped
-from ..pupil.rules import PupilRule
+from ..pupil.rules import Pattern, PupilRule
 from ..rays.find import Found
 from ..rays.solve import Solver
 from ..rays.status import Status
@@ -27,20 +27,22 @@ _TILE = {1: 42, 2: 208}
 class Traced(NamedTuple):
     """Traced rays of a rule.
 
-    moments: their moments.
+    weights: of its rays, (1 or W, Q).
+    bundle: their hits.
     found: rays on the active surfaces; MISSED for rays that were not traced.
     failing: True if a ray fails.
     cut: True if a ray is clipped.
     """
 
-    moments: FocusMoments
+    weights: Array
+    bundle: Bundle
     found: Found
     failing: bool
     cut: bool
 
 
 def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Traced:
-    """Traces the rays of a rule."""
+    """Traces all rays of a rule, those of a pattern that have no weight, too."""
     points, weights = _points(lens, scene, rule)
     waves, total = scene.wavelengths.size, weights.shape[-1]
     # Rays without weight: padding in fitted rules; in other rules they show whether light is
@@ -66,8 +68,14 @@ def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Tra
     status = np.asarray(bundle.status)[:, rays]
     cut = status == Status.CLIPPED
     failing = np.any((status != Status.OK) & ~cut)
-    moments = _weigh(lens, rule, weights, bundle)
-    return Traced(moments, found, bool(failing), bool(np.any(cut)))
+    return Traced(weights, bundle, found, bool(failing), bool(np.any(cut)))
+
+
+def weigh_rule(lens: Lens, rule: PupilRule, traced: Traced) -> FocusMoments:
+    """Moments of traced rays: of the rule that they were traced for, or of a pattern of the same
+    points with weights of its own."""
+    weights = np.asarray(rule.weights)[None] if isinstance(rule, Pattern) else traced.weights
+    return _weigh(lens, rule, weights, traced.bundle)
 
 
 @partial(jit, wanted=LARGE)
