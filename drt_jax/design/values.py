@@ -250,10 +250,11 @@ def _incidence(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _glass_map(lens: Lens, rays: FieldRays) -> Array:
-    """Values of all surfaces; `Operand.placed` selects those where a model glass begins."""
+    """Values of all surfaces, 0 of real glasses (nd = 1, but for rounding); `Operand.placed` selects
+    those where a model glass began."""
     model = lens.dispersion.model
     assert model is not None, "Operand.check refuses it"
-    return glass_map_distance(model[1:])
+    return jnp.where(model[1:, 0] > 1.001, glass_map_distance(model[1:]), 0)
 
 
 _RAYS = ("fields", "wavelengths", "distances")

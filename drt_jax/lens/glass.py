@@ -133,19 +133,32 @@ def nd_and_vd(dispersion: Dispersion) -> Array:
     return jnp.stack([nd, safe_divide(nd - 1, f - c)], axis=-1)
 
 
+def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> Dispersion:
+    """The dispersion with the constants of another, of M media or of one, in place of some media,
+    bool (M,). It has as many terms as the one with more."""
+
+    def mixed(name: str, none: Any) -> Any:
+        both = getattr(dispersion, name), getattr(other, name)
+        if both == (None, None):
+            return None
+        old, new = (jnp.asarray(none) if a is None else a for a in both)
+        mask = np.reshape(rows, (-1, *(1,) * (new.ndim - 1)))
+        if new.ndim == 2:
+            width = max(old.shape[1], new.shape[1])
+            old, new = (jnp.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in (old, new))
+        return jnp.where(mask, new, old).astype(dispersion.schott.dtype)
+
+    nones = {"model": [_NO_MODEL], "partial": [0.0]}
+    names = (field.name for field in dataclasses.fields(Dispersion))
+    return Dispersion(**{name: mixed(name, nones.get(name)) for name in names})
+
+
 def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
     """The dispersion with model glasses of the same nd and vd in place of some media, bool (M,)."""
-    mask, found = jnp.asarray(rows)[:, None], nd_and_vd(dispersion)
-    one = jnp.eye(1, dispersion.schott.shape[1], dtype=found.dtype)
-    none = jnp.asarray([_NO_MODEL], found.dtype)
-    return Dispersion(
-        jnp.where(mask, 0, dispersion.strength),
-        jnp.where(mask, 0, dispersion.resonance),
-        jnp.where(mask, one, dispersion.schott),
-        jnp.where(mask, jnp.asarray([VISIBLE], found.dtype), dispersion.ranges),
-        jnp.where(mask, found, none if dispersion.model is None else dispersion.model),
-        None if dispersion.partial is None else jnp.where(mask[:, 0], 0, dispersion.partial),
-    )
+    found = nd_and_vd(dispersion)
+    none = jnp.zeros((1, 1), found.dtype)
+    models = Dispersion(none, none, none + 1, jnp.asarray([VISIBLE], found.dtype), found)
+    return with_media(dispersion, rows, models)
 
 
 def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Array:
