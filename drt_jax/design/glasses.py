@@ -11,14 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..lens.glass import Glass, nd_and_vd
-from ..lens.glasses import Neighbour, glass_makers, nearest_glasses
+from ..lens.glasses import Neighbour, nearest_glasses
 from ..lens.lens import Lens, with_glass
 from .kinds import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
 from .problem import Problem, quick
 
-# Media are one medium where nd and vd differ by less; a gain worth an exchange, relative.
-_SAME, _GAIN = (1e-5, 1e-2), 1e-3
+_ALL = 10_000  # more glasses than there are
+# Media are one medium where nd and vd differ by less.
+_SAME = (1e-5, 1e-2)
+# Least gain of an exchange, relative, and how many are tried before the search ends.
+_GAIN, _EXCHANGES = 1e-3, 3
 
 
 class Alternative(NamedTuple):
@@ -38,8 +41,8 @@ class Snap(NamedTuple):
     """A glass that was exchanged.
 
     surfaces: behind which it begins; several if their nd or vd are tied.
-    glass, replaced: its name, and that of the glass before it; "" for a model glass.
-    model: nd and vd of the medium that it replaced.
+    glass, replaced: its name, and that of the medium before it.
+    model: nd and vd of that medium.
     before, after: `Optimum.score` of the lens before, and after least squares of what still varies.
     """
 
@@ -96,29 +99,26 @@ def _places(problem: Problem) -> list[tuple[int, ...]]:
     return [tuple(r for r in first if first[r] == row) for row in sorted({*first.values()})]
 
 
-def _with_glass(problem: Problem, vector: np.ndarray, place: tuple[int, ...], glass: Glass):
+def _with_glass(
+    problem: Problem, vector: np.ndarray, place: tuple[int, ...], glass: Glass
+) -> tuple[Problem, np.ndarray]:
     """The problem and its vector (N,) with a glass in a place, whose nd and vd vary no more: as of
     media that are no model glass. Only numbers differ, so that one program serves all glasses."""
     variables = problem.variables
-    low, high, vector, scale = (
-        np.array(a, float) for a in (variables.low, variables.high, vector, variables.scale)
-    )
+    scale, dtype = np.asarray(variables.scale), variables.low.dtype
+    low, high, vector = (np.array(a) for a in (variables.low, variables.high, vector))
     for k, (kind, row, _) in enumerate(variables.places):
         if kind in ("index", "abbe") and row in place:
-            value = Glass("").model[kind == "abbe"]
-            low[k] = high[k] = vector[k] = value / scale[k]
-    dtype = variables.low.dtype
-    variables = dataclasses.replace(
-        variables,
-        lens=with_glass(variables.lens, glass, place),
-        low=jnp.asarray(low, dtype),
-        high=jnp.asarray(high, dtype),
-    )
-    return dataclasses.replace(problem, variables=variables), vector
+            low[k] = high[k] = vector[k] = Glass.model[kind == "abbe"] / scale[k]
+    ends = {"low": jnp.asarray(low, dtype), "high": jnp.asarray(high, dtype)}
+    lens = with_glass(variables.lens, glass, place)
+    own = dataclasses.replace(variables, lens=lens, **ends)
+    return dataclasses.replace(problem, variables=own), vector
 
 
-class _Search(NamedTuple):
-    """What is tried: glasses of makers that are accepted, `count` of them next to the medium in
+@dataclasses.dataclass(frozen=True)
+class _Search:
+    """What is tried: glasses of `makers` that `accept` takes, `count` of them next to the medium in
     each place, `steps` of least squares with each."""
 
     makers: Collection[str] | None
@@ -131,23 +131,31 @@ class _Search(NamedTuple):
         same constants, and none that this medium touches."""
         waves, media = np.asarray(problem.wavelengths), lens.glasses
         points = np.asarray(nd_and_vd(lens.dispersion))
-        ends = [
-            (r, next((k for k in range(r + 1, len(media)) if media[k] != media[r + 1]), r))
-            for r in place
-        ]
-        touched = points[np.ravel(ends)]
+        touched = list[int]()
+        for r in place:
+            behind = (k for k in range(r + 1, len(media)) if media[k] != media[r + 1])
+            touched += [r, next(behind, r)]
         found: dict[tuple, Neighbour] = {}
-        for near in nearest_glasses(*points[place[0] + 1].tolist(), self.makers, 10_000):
+        nd, vd = points[place[0] + 1].tolist()
+        for near in nearest_glasses(nd, vd, self.makers, _ALL):
             low, high = near.glass.range
-            same = np.all(np.abs(touched - (near.nd, near.vd)) < _SAME, axis=1)
-            if low <= waves.min() and waves.max() <= high and not same.any():
-                if self.accept(near.glass):
-                    found.setdefault((near.glass.sellmeier, near.glass.schott), near)
+            away = np.abs(points[touched] - (near.nd, near.vd))
+            fits = low <= waves.min() and waves.max() <= high and np.all(np.any(away > _SAME, 1))
+            if fits and self.accept(near.glass):
+                found.setdefault((near.glass.sellmeier, near.glass.schott), near)
             if len(found) == self.count:
                 break
+        if not found:
+            raise ValueError(
+                f"snap_glasses: no glass fits behind surface {place[0]}; accept more, or name "
+                "other makers"
+            )
         return [*found.values()]
 
-    def trial(self, problem: Problem, vector: np.ndarray, place: tuple[int, ...], near: Neighbour):
+    def trial(
+        self, problem: Problem, vector: np.ndarray, place: tuple[int, ...], near: Neighbour
+    ) -> _Trial:
+        """Some steps of least squares with a glass in a place."""
         own, start = _with_glass(problem, vector, place, near.glass)
         search = init_problem(quick(own), jnp.asarray(start, own.variables.low.dtype))
         for _ in range(self.steps):
@@ -160,10 +168,25 @@ class _Search(NamedTuple):
     ) -> list[_Trial]:
         """All trials in some places, the best first."""
         tasks = [(p, n) for p in places for n in self.neighbours(problem, found.lens, p)]
+        run = functools.partial(self.trial, problem, found.vector)
         with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-            run = functools.partial(self.trial, problem, found.vector)
-            trials = [*pool.map(lambda task: run(*task), tasks)]
-        return sorted(trials, key=lambda trial: trial.tried.score)
+            return sorted(pool.map(lambda task: run(*task), tasks), key=lambda t: t.tried.score)
+
+
+def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]:
+    """The glass of a trial in place of that of an optimum, with least squares of the rest."""
+    after = optimise(trial.problem, jnp.asarray(trial.vector), max_steps)
+    row = trial.place[0] + 1
+    nd, vd = np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()
+    replaced = found.lens.glasses[row]
+    own = trial.place, trial.tried.glass.name, replaced, (nd, vd), found.score, after.score
+    return Snap(*own), after
+
+
+def _promising(ranked: list[_Trial], lens: Lens) -> list[_Trial]:
+    """The trials that are better than trials of the glasses that are there."""
+    now = [t.tried.score for t in ranked if t.tried.glass.name == lens.glasses[t.place[0] + 1]]
+    return [t for t in ranked if t.tried.score < (1 - _GAIN) * min(now, default=np.inf)]
 
 
 def snap_glasses(
@@ -178,12 +201,12 @@ def snap_glasses(
 ) -> Snapped:
     """Replaces the model glasses of an optimum by real ones, one by one: each time that, of all
     glasses next to those that are left, which costs least, with least squares of what still varies.
-    Then exchanges real glasses for neighbours while that makes the lens better.
+    Then exchanges real glasses for neighbours, the best first, while that makes the lens better.
 
     found: of `optimise` for `problem`, which the operand `glass_map` keeps near real glasses.
     makers: of the glasses, see `glass_makers`; None: all.
     accept: whether to use a glass of theirs.
-    count: glasses tried in each place.
+    count: glasses tried in each place, the nearest in nd and vd.
     steps: of least squares with each.
     max_steps: as in `optimise`, after each snap.
     callback: called after each snap.
@@ -192,34 +215,27 @@ def snap_glasses(
     constants than those before. ValueError where the lens has no model glass, for an unknown maker,
     and where no glass fits.
     """
-    places, search = _places(problem), _Search(makers, accept, count, steps)
-    left, snaps = places, list[Snap]()
-    while True:
-        ranked = search.ranked(problem, found, left or places)
-        if not ranked:
-            raise ValueError("snap_glasses: no glass fits; accept more or name other makers")
-        best, own = ranked[0], {}
-        if not left:
-            for trial in ranked:
-                own.setdefault(trial.place[0], []).append(trial.tried)
-            names = {p[0]: found.lens.glasses[p[0] + 1] for p in places}
-            now = [t.tried.score for t in ranked if t.tried.glass.name == names[t.place[0]]]
-            if best.tried.score >= (1 - _GAIN) * max(now, default=np.inf):
-                break
-        after = optimise(best.problem, jnp.asarray(best.vector), max_steps)
-        if not left and after.score >= found.score:
-            break
-        row = best.place[0] + 1
-        snap = Snap(
-            best.place,
-            best.tried.glass.name,
-            "" if left else found.lens.glasses[row],
-            tuple(np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()),
-            found.score,
-            after.score,
-        )
+    places, search, snaps = _places(problem), _Search(makers, accept, count, steps), list[Snap]()
+    left = [*places]
+    while left:
+        best = search.ranked(problem, found, left)[0]
+        snap, found = _snap(best, found, max_steps)
+        left.remove(best.place)
+        problem = best.problem
         snaps.append(snap)
         callback(snap)
-        problem, found = best.problem, after
-        left = [place for place in left if place != best.place]
-    return Snapped(found.lens, found, snaps, own, problem)
+    better = True
+    while better:
+        ranked, better = search.ranked(problem, found, places), False
+        for trial in _promising(ranked, found.lens)[:_EXCHANGES]:
+            snap, after = _snap(trial, found, max_steps)
+            better = snap.after < (1 - _GAIN) * snap.before
+            if better:
+                problem, found = trial.problem, after
+                snaps.append(snap)
+                callback(snap)
+                break
+    alternatives = {p[0]: [t.tried for t in ranked if t.place == p] for p in places}
+    # nd and vd of media without a model are exact in the lens of the variables.
+    lens = dataclasses.replace(found.lens, dispersion=problem.variables.lens.dispersion)
+    return Snapped(lens, found._replace(lens=lens), snaps, alternatives, problem)

@@ -250,8 +250,8 @@ def _incidence(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _glass_map(lens: Lens, rays: FieldRays) -> Array:
-    """Values of all surfaces, 0 of real glasses (nd = 1, but for rounding); `Operand.placed` selects
-    those where a model glass began."""
+    """Values of all surfaces, 0 of real glasses, whose nd in the model is 1 to rounding;
+    `Operand.placed` selects those where a model glass begins."""
     model = lens.dispersion.model
     assert model is not None, "Operand.check refuses it"
     return jnp.where(model[1:, 0] > 1.001, glass_map_distance(model[1:]), 0)

@@ -17,9 +17,9 @@ NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL, _FARTHEST = (1.0, 50.0), 0.2
 # Wavelengths in um of a medium without a range: 0.1 nm to 1 m.
 ANY = 1e-4, 1e6
-# Powers of L of `Glass.schott`, and the shortest wavelength of the last two, whose values are
-# too large for float32 below.
-POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12), 0.01
+# Powers of L of `Glass.schott`, and the shortest wavelength of -10 and -12, whose values are too
+# large for float32 below.
+POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12, 6), 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Glass:
     name: as in a prescription.
     sellmeier: (B1 .. BT, C1 .. CT), C in um^2, of any number of terms T.
     schott: (a0 .. a5), the coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8, or three more, of
-        L^4, L^-10, L^-12.
+        L^4, L^-10, L^-12, or one more than these, of L^6.
     range: wavelengths in um for which they hold.
     model: nd and vd of a model glass, see `model_glass`.
     partial: how far a model glass lies above the normal line, in P_gF.
@@ -55,7 +55,7 @@ class Dispersion:
     """Dispersion constants of M media as arrays, so that an index can be differentiated.
 
     T = 3 or the number of terms of the medium with the most, the others padded with zeros; so is
-    K = 6 or 9, the number of Schott's coefficients.
+    K = 6, 9 or 10, the number of Schott's coefficients.
 
     strength: (M, T), Sellmeier's B.
     resonance: (M, T), Sellmeier's C in um^2.

@@ -7,9 +7,11 @@ results.json: `rows` with `problem`, `merit_start`, `merit_end`, `spots_um`, `ja
 """
 
 import dataclasses
+import fnmatch
 import math
 import pathlib
 import sys
+import time
 from typing import Any
 
 import jax.numpy as jnp
@@ -193,16 +195,55 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
         before = np.array([0, 0, history[-1, 2]])
         history = np.concatenate([history, part.history + before])
     seconds = sum(part.seconds for part in parts)
-    return {
-        "vector": parts[-1].vector.tolist(),
+    snapped = _snapped(
+        config, problem.with_order(order) if order > config.order else problem, parts
+    )
+    return snapped | {
         "merit_start": float(problem.merit(problem.variables.start)),
-        "merit_end": parts[-1].merit,
-        "worst": parts[-1].max_violation,
         "order": order,
         "history": history.tolist(),
         "seconds": seconds,
         "compile_s": sum(part.first for part in parts),
     }
+
+
+def _snapped(
+    config: Config, problem: design.Problem, parts: list[design.Optimum]
+) -> dict[str, Any]:
+    """The last optimum; with real glasses, if these are wanted, and what each has cost."""
+    some, end = config.glasses, parts[-1]
+    found: dict[str, Any] = {"glasses": {}, "snaps": [], "alternatives": {}}
+    if some.makers:
+        begun = time.perf_counter()
+        with tqdm(desc="glasses", unit="glass", dynamic_ncols=True) as bar:
+            snapped = design.snap_glasses(
+                problem,
+                end,
+                some.makers,
+                lambda glass: fnmatch.fnmatchcase(glass.name, some.names),
+                some.count,
+                some.steps,
+                callback=lambda snap: bar.update(),
+            )
+        end = snapped.optimum
+        found["snap_s"] = time.perf_counter() - begun
+        found["glasses"] = {i: end.lens.glasses[i + 1] for s in snapped.snaps for i in s.surfaces}
+        found["snaps"] = [snap._asdict() for snap in snapped.snaps]
+        found["alternatives"] = {
+            i: [[a.glass.name, a.score] for a in ranked]
+            for i, ranked in snapped.alternatives.items()
+        }
+    found |= {"merit_end": end.merit, "worst": end.max_violation}
+    return found | {"vector": end.vector.tolist()}
+
+
+def _designed(variables: design.Variables, end: dict[str, Any]) -> drt_jax.Lens:
+    """The lens of the end, with its glasses."""
+    lens = variables.lens
+    for surface, name in end["glasses"].items():
+        lens = drt_jax.with_glass(lens, drt_jax.find_glass(name), [int(surface)])
+    found = dataclasses.replace(variables, lens=lens).lens_of(jnp.asarray(end["vector"]))
+    return dataclasses.replace(found, dispersion=lens.dispersion) if end["glasses"] else found
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -220,7 +261,12 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     end = run.kept("finish")
     history = np.array(end["history"])
     run.log("least squares", 0, dict(zip(COLUMNS, history.T)))
-    _save(config, problem, start, [end["vector"], *found["vectors"][1:_DRAWN]], run.folder)
+    lenses = {"start": start, "designed": _designed(problem.variables, end)}
+    for k, vector in enumerate(found["vectors"][1:_DRAWN]):
+        lenses[f"minimum_{k + 1}"] = problem.variables.lens_of(jnp.asarray(vector))
+    for name, lens in lenses.items():
+        lens = design.fit_apertures(problem, lens) if config.floating else lens
+        drt_jax.save_lens(lens, run.folder / f"{name}.yaml")
     rays, before = design.rays_of(problem), run.kept("growth") or {"steps": 0, "first": 0.0}
     before = _NOTHING | before | {"trials": before["steps"], "compile_s": before["first"]}
     row = {
@@ -244,25 +290,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "tolerance": config.tolerance,
         "starts": {key: value for key, value in found.items() if key != "vectors"},
         "history": history.tolist(),
+        "glasses": {key: end[key] for key in ("snaps", "alternatives", "snap_s") if key in end},
     }
-
-
-def _save(
-    config: Config,
-    problem: design.Problem,
-    start: drt_jax.Lens,
-    vectors: list[list[float]],
-    folder: pathlib.Path,
-) -> None:
-    """Write the designed lens, the start and the minima that are drawn; clear apertures as wide as
-    the light, where they float."""
-    lenses = {"start": start}
-    for k, vector in enumerate(vectors):
-        name = f"minimum_{k}" if k else "designed"
-        lenses[name] = problem.variables.lens_of(jnp.asarray(vector))
-    for name, lens in lenses.items():
-        lens = design.fit_apertures(problem, lens) if config.floating else lens
-        drt_jax.save_lens(lens, folder / f"{name}.yaml")
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -291,9 +320,21 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
         f"design, {name}": _common.table(("what", "value"), took),
     }
+    if results["glasses"].get("snaps"):
+        found[f"design, {name}: glasses"] = _glasses_table(results["glasses"])
     if results.get("beside"):
         found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
     return found
+
+
+def _glasses_table(some: dict[str, Any]) -> str:
+    """Each glass that was exchanged in a row, with its cost and the next best in the end."""
+    header = ["behind surface", "nd", "vd", "becomes", "merit before", "after"]
+    rows = [
+        [", ".join(map(str, s["surfaces"])), *s["model"], s["glass"], s["before"], s["after"]]
+        for s in some["snaps"]
+    ]
+    return _common.table(header, rows)
 
 
 def _peers_table(rows: list[dict[str, Any]], how: str) -> str:
