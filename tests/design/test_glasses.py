@@ -59,7 +59,7 @@ def snapped():
     return (
         problem,
         found,
-        design.snap_glasses(problem, found, accept=accept, steps=30, max_steps=60),
+        design.snap_glasses(problem, found, accept=accept, max_steps=60),
     )
 
 
@@ -73,20 +73,25 @@ def test_no_other_glass_makes_a_thin_doublet_better():
     np.testing.assert_allclose(best.optimum.merit, size * thin(*pair)[0], rtol=5e-3)
     for place, other in ((0, lambda name: (name, pair[1])), (1, lambda name: (pair[0], name))):
         ranked = best.alternatives[place]
-        scores = [tried.score for tried in ranked]
-        wanted = [size * thin(*other(tried.glass.name))[0] for tried in ranked]
+        scores = np.array([tried.score for tried in ranked])
+        wanted, powers = np.transpose([thin(*other(tried.glass.name)) for tried in ranked])
         assert ranked[0].glass.name == pair[place] and len(ranked) == len(NAMES) - 1
-        np.testing.assert_allclose(scores, wanted, rtol=0.02)
-        assert np.all(np.array(wanted) >= 0.99 * wanted[0])
+        slim = np.abs(powers) < 10  # not so of nearly equal vd: elements are no longer thin
+        assert np.sum(slim) >= len(NAMES) - 2
+        np.testing.assert_allclose(scores[slim], size * wanted[slim], rtol=0.01)
+        assert np.all(scores >= scores[0]) and np.all(wanted >= 0.99 * wanted[0])
     f, d, c = np.array([indices(find_glass(name), WAVES) for name in pair]).T
     v, partial = (d - 1) / (f - c), (f - d) / (f - c)
     foci = np.asarray(drt_jax.focal_length(best.lens, WAVES))
-    power = thin(*pair)[1]  # of the crown, v1 / (v1 - v2) but for what the smallest spot adds
+    c0, c1, _, _ = np.asarray(best.lens.curvature)
+    power = FOCAL * (d[0] - 1) * (c0 - c1)  # of the crown
     shift = power * partial[0] / v[0] + (1 - power) * partial[1] / v[1]
-    np.testing.assert_allclose((foci[1] - foci[0]) / FOCAL, shift, rtol=5e-3)
-    np.testing.assert_allclose(power, v[0] / (v[0] - v[1]), rtol=0.02)
+    np.testing.assert_allclose((foci[1] - foci[0]) / FOCAL, shift, rtol=0.01)
+    np.testing.assert_allclose(power, thin(*pair)[1], rtol=1e-3)
+    # Where F and C meet: the smallest spots are next to that.
+    np.testing.assert_allclose(power, v[0] / (v[0] - v[1]), rtol=0.01)
     textbook = (partial[0] - partial[1]) / (v[0] - v[1])
-    np.testing.assert_allclose(shift, textbook, atol=2e-4)
+    assert abs(textbook) < 1 / 4500 and abs(shift - textbook) < 1e-4, (pair, textbook, shift)
 
 
 def test_costs_are_told():
