@@ -246,6 +246,16 @@ def _designed(variables: design.Variables, end: dict[str, Any]) -> drt_jax.Lens:
     return dataclasses.replace(found, dispersion=lens.dispersion) if end["glasses"] else found
 
 
+def _told(config: Config, lens: drt_jax.Lens, end: dict[str, Any]) -> dict[str, Any]:
+    """What the glasses cost, and where 0.7 of the aperture has its focus on the axis by wavelength,
+    from that of the last, over the focal length."""
+    told = {key: end[key] for key in ("snaps", "alternatives", "snap_s")}
+    waves = config.wavelengths_um
+    foci = np.asarray(drt_jax.axial_colour(lens, config.distance_mm, waves, (0.7,)).real)[:, 0]
+    focal = np.asarray(drt_jax.focal_length(lens, waves))
+    return told | {"foci": ((foci - foci[-1]) / focal).tolist()}
+
+
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Grow, search, finish; and write the lens."""
     start = drt_jax.load_lens(config.lens)
@@ -290,7 +300,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "tolerance": config.tolerance,
         "starts": {key: value for key, value in found.items() if key != "vectors"},
         "history": history.tolist(),
-        "glasses": {key: end[key] for key in ("snaps", "alternatives", "snap_s") if key in end},
+        "glasses": _told(config, lenses["designed"], end) if end["snaps"] else {},
     }
 
 
@@ -310,6 +320,8 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         ["seconds", row["seconds"]],
         ["compilation, s", row["compile_s"]],
     ]
+    if results.get("glasses"):
+        took.append(["seconds for the glasses", results["glasses"]["snap_s"]])
     if some["merits"]:
         took += [["starts that pass light", some["passed"]], ["minima", len(some["merits"])]]
         took += [["minima a minute", 60 * len(some["merits"]) / max(some["seconds"], 1e-9)]]
@@ -320,8 +332,11 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
         f"design, {name}": _common.table(("what", "value"), took),
     }
-    if results["glasses"].get("snaps"):
-        found[f"design, {name}: glasses"] = _glasses_table(results["glasses"])
+    if some := results.get("glasses"):
+        found[f"design, {name}: glasses"] = _glasses_table(some)
+        header, foci = ("wavelength, um", "focus of 0.7 of the aperture over focal length"), some["foci"]
+        rows = [*zip(results["wavelengths_um"], foci, strict=True)]
+        found[f"design, {name}: colour"] = _common.table(header, rows)
     if results.get("beside"):
         found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
     return found
