@@ -334,9 +334,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     }
     if some := results.get("glasses"):
         found[f"design, {name}: glasses"] = _glasses_table(some)
-        header, foci = ("wavelength, um", "focus of 0.7 of the aperture over focal length"), some["foci"]
-        rows = [*zip(results["wavelengths_um"], foci, strict=True)]
-        found[f"design, {name}: colour"] = _common.table(header, rows)
+        foci = zip(results["wavelengths_um"], some["foci"], strict=True)
+        header = ("wavelength, um", "focus of 0.7 of the aperture over focal length")
+        found[f"design, {name}: colour"] = _common.table(header, [*foci])
     if results.get("beside"):
         found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
     return found
