@@ -5,7 +5,6 @@ from .apertures import fit_apertures as fit_apertures, open_apertures as open_ap
 from .deviations import Tolerance as Tolerance, elements_of as elements_of
 from .field_rays import FieldRays as FieldRays
 from .glasses import (
-    Alternative as Alternative,
     Snap as Snap,
     Snapped as Snapped,
     snap_glasses as snap_glasses,

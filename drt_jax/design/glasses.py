@@ -12,7 +12,7 @@ import numpy as np
 
 from ..lens.glass import Glass, nd_and_vd
 from ..lens.glasses import Neighbour, nearest_glasses
-from ..lens.lens import Lens, with_glass
+from ..lens.lens import Lens, glass_rows, with_glass
 from .kinds import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
 from .problem import Problem, quick
@@ -22,19 +22,6 @@ _ALL = 10_000  # more glasses than there are
 _SAME = (1e-5, 1e-2)
 # Least gain of an exchange, relative, and how many are tried before the search ends.
 _GAIN, _EXCHANGES = 1e-3, 3
-
-
-class Alternative(NamedTuple):
-    """A glass tried in one place of a lens.
-
-    glass, nd, vd: of the table of glasses.
-    score: as `Optimum.score`, after the steps of a trial; inf where light fails.
-    """
-
-    glass: Glass
-    nd: float
-    vd: float
-    score: float
 
 
 class Snap(NamedTuple):
@@ -60,26 +47,28 @@ class Snapped(NamedTuple):
     lens: of real glasses, each with its own dispersion formula.
     optimum: its last optimisation; its lens is `lens`.
     snaps: in their order; exchanges of a real glass for another come last.
-    alternatives: for each place, by the first surface behind which its glass begins: what was tried
-        in the end, all other glasses as in `lens`, ranked. Trials of some steps meet limits only
-        nearly: compare with the glass itself, which stands among them.
+    alternatives: for each place, by the first surface behind which its glass begins: glasses tried
+        in the end, all others as in `lens`, with `Optimum.score` after the steps of a trial, the
+        best first; inf where light fails. Trials meet limits only nearly: compare with the glass
+        itself, which stands among them.
     problem: whose real glasses vary no more, to go on with from `optimum.vector`.
     """
 
     lens: Lens
     optimum: Optimum
     snaps: list[Snap]
-    alternatives: dict[int, list[Alternative]]
+    alternatives: dict[int, list[tuple[Neighbour, float]]]
     problem: Problem
 
 
 class _Trial(NamedTuple):
-    """A glass in one place: its problem, and the best vector found in some steps."""
+    """A glass in one place: its problem, the best vector found in some steps, and its score."""
 
     place: tuple[int, ...]
-    tried: Alternative
+    near: Neighbour
     problem: Problem
     vector: np.ndarray
+    score: float
 
 
 def _places(problem: Problem) -> list[tuple[int, ...]]:
@@ -110,9 +99,8 @@ def _with_glass(
     for k, (kind, row, _) in enumerate(variables.places):
         if kind in ("index", "abbe") and row in place:
             low[k] = high[k] = vector[k] = Glass.model[kind == "abbe"] / scale[k]
-    ends = {"low": jnp.asarray(low, dtype), "high": jnp.asarray(high, dtype)}
-    lens = with_glass(variables.lens, glass, place)
-    own = dataclasses.replace(variables, lens=lens, **ends)
+    lens, (least, most) = with_glass(variables.lens, glass, place), jnp.array([low, high], dtype)
+    own = dataclasses.replace(variables, lens=lens, low=least, high=most)
     return dataclasses.replace(problem, variables=own), vector
 
 
@@ -129,19 +117,14 @@ class _Search:
     def neighbours(self, problem: Problem, lens: Lens, place: tuple[int, ...]) -> list[Neighbour]:
         """Glasses next to the medium in a place of a lens, known at all wavelengths, no two of the
         same constants, and none that this medium touches."""
-        waves, media = np.asarray(problem.wavelengths), lens.glasses
-        points = np.asarray(nd_and_vd(lens.dispersion))
-        touched = list[int]()
-        for r in place:
-            behind = (k for k in range(r + 1, len(media)) if media[k] != media[r + 1])
-            touched += [r, next(behind, r)]
+        waves, points = np.asarray(problem.wavelengths), np.asarray(nd_and_vd(lens.dispersion))
+        rows, (nd, vd) = glass_rows(lens, place), points[place[0] + 1].tolist()
+        touched = points[~rows & (np.roll(rows, 1) | np.roll(rows, -1))]
         found: dict[tuple, Neighbour] = {}
-        nd, vd = points[place[0] + 1].tolist()
         for near in nearest_glasses(nd, vd, self.makers, _ALL):
             low, high = near.glass.range
-            away = np.abs(points[touched] - (near.nd, near.vd))
-            fits = low <= waves.min() and waves.max() <= high and np.all(np.any(away > _SAME, 1))
-            if fits and self.accept(near.glass):
+            other = np.all(np.any(np.abs(touched - (near.nd, near.vd)) > _SAME, axis=1))
+            if other and low <= waves.min() and waves.max() <= high and self.accept(near.glass):
                 found.setdefault((near.glass.sellmeier, near.glass.schott), near)
             if len(found) == self.count:
                 break
@@ -160,8 +143,7 @@ class _Search:
         search = init_problem(quick(own), jnp.asarray(start, own.variables.low.dtype))
         for _ in range(self.steps):
             search = take_step(quick(own), search)
-        tried = Alternative(near.glass, near.nd, near.vd, float(search.score))
-        return _Trial(place, tried, own, np.asarray(search.vector))
+        return _Trial(place, near, own, np.asarray(search.vector), float(search.score))
 
     def ranked(
         self, problem: Problem, found: Optimum, places: Sequence[tuple[int, ...]]
@@ -170,7 +152,7 @@ class _Search:
         tasks = [(p, n) for p in places for n in self.neighbours(problem, found.lens, p)]
         run = functools.partial(self.trial, problem, found.vector)
         with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-            return sorted(pool.map(lambda task: run(*task), tasks), key=lambda t: t.tried.score)
+            return sorted(pool.map(lambda task: run(*task), tasks), key=lambda trial: trial.score)
 
 
 def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]:
@@ -179,14 +161,14 @@ def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]
     row = trial.place[0] + 1
     nd, vd = np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()
     replaced = found.lens.glasses[row]
-    own = trial.place, trial.tried.glass.name, replaced, (nd, vd), found.score, after.score
+    own = trial.place, trial.near.glass.name, replaced, (nd, vd), found.score, after.score
     return Snap(*own), after
 
 
 def _promising(ranked: list[_Trial], lens: Lens) -> list[_Trial]:
     """The trials that are better than trials of the glasses that are there."""
-    now = [t.tried.score for t in ranked if t.tried.glass.name == lens.glasses[t.place[0] + 1]]
-    return [t for t in ranked if t.tried.score < (1 - _GAIN) * min(now, default=np.inf)]
+    now = [t.score for t in ranked if t.near.glass.name == lens.glasses[t.place[0] + 1]]
+    return [t for t in ranked if t.score < (1 - _GAIN) * min(now, default=np.inf)]
 
 
 def snap_glasses(
@@ -235,7 +217,7 @@ def snap_glasses(
                 snaps.append(snap)
                 callback(snap)
                 break
-    alternatives = {p[0]: [t.tried for t in ranked if t.place == p] for p in places}
+    alternatives = {p[0]: [(t.near, t.score) for t in ranked if t.place == p] for p in places}
     # nd and vd of media without a model are exact in the lens of the variables.
     lens = dataclasses.replace(found.lens, dispersion=problem.variables.lens.dispersion)
     return Snapped(lens, found._replace(lens=lens), snaps, alternatives, problem)

@@ -295,7 +295,7 @@ def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:
     return surface_sag((x, y), row, lens.forms[surface])
 
 
-def _glass_rows(lens: Lens, surfaces: Sequence[int]) -> np.ndarray:
+def glass_rows(lens: Lens, surfaces: Sequence[int]) -> np.ndarray:
     """The media, bool (S + 1,), of the glasses that begin behind some surfaces; none named: of all.
     ValueError, which lists those that exist, for a surface behind which no glass begins."""
     media = lens.glasses
@@ -322,7 +322,7 @@ def with_glass(lens: Lens, glass: Glass, surfaces: Sequence[int] = ()) -> Lens:
 
     ValueError as `with_model_glass`, and for a glass of the name of a medium that it touches.
     """
-    media, rows = lens.glasses, _glass_rows(lens, surfaces)
+    media, rows = lens.glasses, glass_rows(lens, surfaces)
     found = [glass.name if row else old for old, row in zip(media, rows)]
     for i in range(lens.count):
         if found[i] == found[i + 1] and media[i] != media[i + 1]:
@@ -339,7 +339,7 @@ def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
     ValueError, which lists those that exist, for a surface behind which no glass begins; also, as
     far as numbers are known, for a glass without dispersion.
     """
-    media, rows = lens.glasses, _glass_rows(lens, surfaces)
+    media, rows = lens.glasses, glass_rows(lens, surfaces)
     if concrete(lens.dispersion):
         abbe = np.asarray(nd_and_vd(lens.dispersion))[:, 1]
         for name in np.array(media)[rows & ~((abbe >= 10) & (abbe <= 120))]:

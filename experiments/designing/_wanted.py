@@ -71,9 +71,7 @@ class Glasses:
 
     def __post_init__(self) -> None:
         _common.require_within("glasses.", self, count=(1, 1e4), steps=(1, 1e4))
-        for maker in {*self.makers} - {*glass_makers()}:
-            known = ", ".join(glass_makers())
-            _common.require(False, f"glasses.makers: unknown {maker!r}; known: {known}")
+        _common.require_known("glasses.makers", self.makers, glass_makers())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -187,73 +187,55 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
         parts = [design.optimise(problem, vector, config.trials, bar.searched)]
         order = config.order if config.rings else order_of(config, parts[0].lens)
         if order > config.order:
-            rule = problem.with_order(order)
+            problem = problem.with_order(order)
             vector = jnp.asarray(parts[0].vector)
-            parts.append(design.optimise(rule, vector, config.trials, bar.searched))
+            parts.append(design.optimise(problem, vector, config.trials, bar.searched))
     history = parts[0].history
     for part in parts[1:]:
         before = np.array([0, 0, history[-1, 2]])
         history = np.concatenate([history, part.history + before])
-    seconds = sum(part.seconds for part in parts)
-    snapped = _snapped(
-        config, problem.with_order(order) if order > config.order else problem, parts
-    )
-    return snapped | {
-        "merit_start": float(problem.merit(problem.variables.start)),
+    end, glasses = _snapped(config, problem, parts[-1])
+    return {
+        "vector": end.vector.tolist(),
+        "merit_end": end.merit,
+        "worst": end.max_violation,
         "order": order,
         "history": history.tolist(),
-        "seconds": seconds,
+        "seconds": sum(part.seconds for part in parts),
         "compile_s": sum(part.first for part in parts),
+        "glasses": glasses,
     }
 
 
 def _snapped(
-    config: Config, problem: design.Problem, parts: list[design.Optimum]
-) -> dict[str, Any]:
-    """The last optimum; with real glasses, if these are wanted, and what each has cost."""
-    some, end = config.glasses, parts[-1]
-    found: dict[str, Any] = {"glasses": {}, "snaps": [], "alternatives": {}}
-    if some.makers:
-        begun = time.perf_counter()
-        with tqdm(desc="glasses", unit="glass", dynamic_ncols=True) as bar:
-            snapped = design.snap_glasses(
-                problem,
-                end,
-                some.makers,
-                lambda glass: fnmatch.fnmatchcase(glass.name, some.names),
-                some.count,
-                some.steps,
-                callback=lambda snap: bar.update(),
-            )
-        end = snapped.optimum
-        found["snap_s"] = time.perf_counter() - begun
-        found["glasses"] = {i: end.lens.glasses[i + 1] for s in snapped.snaps for i in s.surfaces}
-        found["snaps"] = [snap._asdict() for snap in snapped.snaps]
-        found["alternatives"] = {
-            i: [[a.glass.name, a.score] for a in ranked]
-            for i, ranked in snapped.alternatives.items()
-        }
-    found |= {"merit_end": end.merit, "worst": end.max_violation}
-    return found | {"vector": end.vector.tolist()}
+    config: Config, problem: design.Problem, found: design.Optimum
+) -> tuple[design.Optimum, dict[str, Any]]:
+    """The optimum, with real glasses if these are wanted, and what each of them has cost."""
+    some, begun = config.glasses, time.perf_counter()
+    if not some.makers:
+        return found, {}
+    accept = lambda glass: fnmatch.fnmatchcase(glass.name, some.names)  # noqa: E731
+    snapped = design.snap_glasses(problem, found, some.makers, accept, some.count, some.steps)
+    ranked = {i: [[a.glass.name, x] for a, x in own] for i, own in snapped.alternatives.items()}
+    told = {"snaps": [snap._asdict() for snap in snapped.snaps], "alternatives": ranked}
+    return snapped.optimum, told | {"snap_s": time.perf_counter() - begun}
 
 
 def _designed(variables: design.Variables, end: dict[str, Any]) -> drt_jax.Lens:
     """The lens of the end, with its glasses."""
-    lens = variables.lens
-    for surface, name in end["glasses"].items():
-        lens = drt_jax.with_glass(lens, drt_jax.find_glass(name), [int(surface)])
+    lens, snaps = variables.lens, end["glasses"].get("snaps", [])
+    for surface, name in {i: snap["glass"] for snap in snaps for i in snap["surfaces"]}.items():
+        lens = drt_jax.with_glass(lens, drt_jax.find_glass(name), [surface])
     found = dataclasses.replace(variables, lens=lens).lens_of(jnp.asarray(end["vector"]))
-    return dataclasses.replace(found, dispersion=lens.dispersion) if end["glasses"] else found
+    return dataclasses.replace(found, dispersion=lens.dispersion) if snaps else found
 
 
-def _told(config: Config, lens: drt_jax.Lens, end: dict[str, Any]) -> dict[str, Any]:
-    """What the glasses cost, and where 0.7 of the aperture has its focus on the axis by wavelength,
-    from that of the last, over the focal length."""
-    told = {key: end[key] for key in ("snaps", "alternatives", "snap_s")}
+def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
+    """Where light through 0.7 of the aperture crosses the axis by wavelength, from there of the
+    last, over the focal length."""
     waves = config.wavelengths_um
     foci = np.asarray(drt_jax.axial_colour(lens, config.distance_mm, waves, (0.7,)).real)[:, 0]
-    focal = np.asarray(drt_jax.focal_length(lens, waves))
-    return told | {"foci": ((foci - foci[-1]) / focal).tolist()}
+    return ((foci - foci[-1]) / np.asarray(drt_jax.focal_length(lens, waves))).tolist()
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -271,7 +253,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     end = run.kept("finish")
     history = np.array(end["history"])
     run.log("least squares", 0, dict(zip(COLUMNS, history.T)))
-    lenses = {"start": start, "designed": _designed(problem.variables, end)}
+    some, lenses = end["glasses"], {"start": start, "designed": _designed(problem.variables, end)}
     for k, vector in enumerate(found["vectors"][1:_DRAWN]):
         lenses[f"minimum_{k + 1}"] = problem.variables.lens_of(jnp.asarray(vector))
     for name, lens in lenses.items():
@@ -300,7 +282,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "tolerance": config.tolerance,
         "starts": {key: value for key, value in found.items() if key != "vectors"},
         "history": history.tolist(),
-        "glasses": _told(config, lenses["designed"], end) if end["snaps"] else {},
+        "glasses": some | {"foci": _foci(config, lenses["designed"])} if some else {},
     }
 
 
@@ -320,8 +302,10 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         ["seconds", row["seconds"]],
         ["compilation, s", row["compile_s"]],
     ]
-    if results.get("glasses"):
-        took.append(["seconds for the glasses", results["glasses"]["snap_s"]])
+    if glasses := results.get("glasses"):
+        took.append(["seconds for the glasses", glasses["snap_s"]])
+        foci = zip(results["wavelengths_um"], glasses["foci"], strict=True)
+        took += [[f"focus at {um:.4f} um, over the focal length", place] for um, place in foci]
     if some["merits"]:
         took += [["starts that pass light", some["passed"]], ["minima", len(some["merits"])]]
         took += [["minima a minute", 60 * len(some["merits"]) / max(some["seconds"], 1e-9)]]
@@ -332,23 +316,18 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
         f"design, {name}": _common.table(("what", "value"), took),
     }
-    if some := results.get("glasses"):
-        found[f"design, {name}: glasses"] = _glasses_table(some)
-        foci = zip(results["wavelengths_um"], some["foci"], strict=True)
-        header = ("wavelength, um", "focus of 0.7 of the aperture over focal length")
-        found[f"design, {name}: colour"] = _common.table(header, [*foci])
+    if glasses:
+        found[f"design, {name}: glasses"] = _glasses_table(glasses["snaps"])
     if results.get("beside"):
         found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
     return found
 
 
-def _glasses_table(some: dict[str, Any]) -> str:
-    """Each glass that was exchanged in a row, with its cost and the next best in the end."""
+def _glasses_table(snaps: list[dict[str, Any]]) -> str:
+    """Each glass that was exchanged in a row, with its cost."""
     header = ["behind surface", "nd", "vd", "becomes", "merit before", "after"]
-    rows = [
-        [", ".join(map(str, s["surfaces"])), *s["model"], s["glass"], s["before"], s["after"]]
-        for s in some["snaps"]
-    ]
+    keys = ("glass", "before", "after")
+    rows = [[", ".join(map(str, s["surfaces"])), *s["model"], *map(s.get, keys)] for s in snaps]
     return _common.table(header, rows)
 
 

@@ -73,9 +73,9 @@ def test_no_other_glass_makes_a_thin_doublet_better():
     np.testing.assert_allclose(best.optimum.merit, size * thin(*pair)[0], rtol=5e-3)
     for place, other in ((0, lambda name: (name, pair[1])), (1, lambda name: (pair[0], name))):
         ranked = best.alternatives[place]
-        scores = np.array([tried.score for tried in ranked])
-        wanted, powers = np.transpose([thin(*other(tried.glass.name)) for tried in ranked])
-        assert ranked[0].glass.name == pair[place] and len(ranked) == len(NAMES) - 1
+        scores = np.array([score for _, score in ranked])
+        wanted, powers = np.transpose([thin(*other(near.glass.name)) for near, _ in ranked])
+        assert ranked[0][0].glass.name == pair[place] and len(ranked) == len(NAMES) - 1
         slim = np.abs(powers) < 10  # not so of nearly equal vd: elements are no longer thin
         assert np.sum(slim) >= len(NAMES) - 2
         np.testing.assert_allclose(scores[slim], size * wanted[slim], rtol=0.01)
