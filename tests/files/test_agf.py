@@ -83,7 +83,8 @@ def test_what_is_no_catalogue_is_refused_in_a_line(tmp_path, message):
 
 def test_a_prescription_names_its_catalogues(tmp_path):
     """What it does not use may be of any formula; its glasses win over the table."""
-    mine = glass_of("MINE", 12, FORMULAS[12][0]) + glass_of("N-BK7", 2, "1.3 .01") + glass_of("X", 3, "1")
+    own = ("MINE", 12, FORMULAS[12][0]), ("N-BK7", 2, "1.3 .01"), ("X", 3, "1")
+    mine = "".join(glass_of(*one) for one in own)
     (tmp_path / "my.agf").write_text(mine)
     path = tmp_path / "lens.yaml"
     text = """
