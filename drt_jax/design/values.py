@@ -52,7 +52,7 @@ thicknesses between active surfaces, and in front of the sensor, by the surface 
 
 model glasses, by the surface where they begin
     glass_map [surface]: distance of (nd, vd) outside of the convex hull of the catalogue, negative
-        inside, in units of nd; a vd of 100 counts as an nd of 1. high=0 keeps them inside
+        inside, 0 of real ones, in units of nd, 100 of vd as one. high=0 keeps them inside
 """
 
 from collections.abc import Callable
