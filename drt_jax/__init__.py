@@ -100,7 +100,12 @@ from .lens.elements import Elements as Elements
 from .lens.entrance import with_paraxial_pupil as with_paraxial_pupil
 from .lens.glass import refractive_index as refractive_index
 from .lens.glasses import find_glass as find_glass, nearest_glasses as nearest_glasses
-from .lens.lens import Lens as Lens, sag as sag, with_model_glass as with_model_glass
+from .lens.lens import (
+    Lens as Lens,
+    sag as sag,
+    with_glass as with_glass,
+    with_model_glass as with_model_glass,
+)
 from .lens.paraxial import (
     FirstOrder as FirstOrder,
     Pupil as Pupil,

@@ -4,6 +4,11 @@ from . import least_squares as least_squares
 from .apertures import fit_apertures as fit_apertures, open_apertures as open_apertures
 from .deviations import Tolerance as Tolerance, elements_of as elements_of
 from .field_rays import FieldRays as FieldRays
+from .glasses import (
+    Snap as Snap,
+    Snapped as Snapped,
+    snap_glasses as snap_glasses,
+)
 from .growth import Growth as Growth, grow as grow, part_of as part_of
 from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit

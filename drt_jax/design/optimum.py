@@ -84,7 +84,7 @@ def step_problem(problem: Problem, search: Search) -> Search:
     return step(problem.evaluate, search, problem.variables.low, problem.variables.high)
 
 
-_step = jit(step_problem, LARGE)
+take_step = jit(step_problem, LARGE)
 
 
 def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem, Search]:
@@ -94,7 +94,7 @@ def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem
     if tried.solver is problem.solver or not failed or int(problem.failed(search.vector)) == failed:
         return tried, search
     again = search._replace(stale=jnp.bool_(True), done=jnp.bool_(False))
-    return problem, _step(problem, again)
+    return problem, take_step(problem, again)
 
 
 @jax.jit
@@ -112,7 +112,7 @@ def _mended(problem: Problem, search: Search) -> Search:
         done=jnp.bool_(False),
     )
     for _ in range(_MENDING):
-        stiff = _step(problem, stiff)
+        stiff = take_step(problem, stiff)
         if float(stiff.max_violation) <= 0 or bool(stiff.done):
             break
     return stiff if float(stiff.max_violation) <= 0 else search
@@ -123,7 +123,7 @@ def _refuse_fixed(problem: Problem, search: Search) -> None:
     excess = np.asarray(search.evaluation.constraints)
     slopes = np.asarray(search.jacobian)[-len(excess) or len(search.jacobian) :]
     if np.any((excess > 0) & (np.max(np.abs(slopes), axis=1, initial=0) * _FAR < excess)):
-        beside = _step(problem, init_problem(problem, problem.elsewhere(search.vector)))
+        beside = take_step(problem, init_problem(problem, problem.elsewhere(search.vector)))
         problem.refuse_fixed(excess, beside.evaluation.constraints)
 
 
@@ -174,13 +174,13 @@ def optimise(
     tried = quick(problem)
     search = init_problem(tried, jnp.clip(start, low, high))
     begun = time.perf_counter()
-    search = jax.block_until_ready(_step(tried, search))
+    search = jax.block_until_ready(take_step(tried, search))
     compiled = time.perf_counter()
     _refuse_fixed(tried, search)
     history = [[search.merit, search.max_violation, search.jacobians]]
     tried, search = _searched(problem, tried, search)
     for _ in range(max_steps - 1):
-        search = _step(tried, search)
+        search = take_step(tried, search)
         history.append([search.merit, search.max_violation, search.jacobians])
         callback(search)
         if search.jacobians > history[-2][2]:  # a better lens

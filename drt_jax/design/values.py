@@ -52,7 +52,7 @@ thicknesses between active surfaces, and in front of the sensor, by the surface 
 
 model glasses, by the surface where they begin
     glass_map [surface]: distance of (nd, vd) outside of the convex hull of the catalogue, negative
-        inside, in units of nd; a vd of 100 counts as an nd of 1. high=0 keeps them inside
+        inside, 0 of real ones, in units of nd, 100 of vd as one. high=0 keeps them inside
 """
 
 from collections.abc import Callable
@@ -250,10 +250,11 @@ def _incidence(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _glass_map(lens: Lens, rays: FieldRays) -> Array:
-    """Values of all surfaces; `Operand.placed` selects those where a model glass begins."""
+    """Values of all surfaces, 0 of real glasses, whose nd in the model is 1 to rounding;
+    `Operand.placed` selects those where a model glass begins."""
     model = lens.dispersion.model
     assert model is not None, "Operand.check refuses it"
-    return glass_map_distance(model[1:])
+    return jnp.where(model[1:, 0] > 1.001, glass_map_distance(model[1:]), 0)
 
 
 _RAYS = ("fields", "wavelengths", "distances")

@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection
 
 from ..inputs import InputError
 from ..lens.glass import Glass
+from ..lens.glasses import flaw
 from .entry import LensError
 from .record import Missing, Record, short
 from .text import Words, words_of
@@ -21,23 +22,39 @@ def _powers(*order: int) -> Callable[[list[float]], _Forms]:
 
     def formula(c: list[float]) -> _Forms:
         placed = dict(zip(order, c, strict=False))
-        schott = [placed.get(place, 0.0) for place in range(9)]
-        return [0.0] * 2, schott[: 9 if any(schott[6:]) else 6]
+        schott = [placed.get(place, 0.0) for place in range(10)]
+        return [0.0] * 2, schott[: 10 if schott[9] else 9 if any(schott[6:]) else 6]
 
     return formula
 
 
-# By Zemax's number: the formula, and how many coefficients it has. 12 has L^6 at last, which
-# `Glass` has not: it must be 0.
+def _pole(b: float, c: float) -> tuple[float, float, float]:
+    """Of b / (L^2 - c): a constant, Sellmeier's B of this c, the coefficient of L^-2."""
+    return (-b / c, b / c, 0.0) if c else (0.0, 0.0, b)
+
+
+def _sellmeier_2(c: list[float]) -> _Forms:
+    less, strength, inverse = _pole(c[3], c[4] ** 2)
+    return [c[1], strength, c[2] ** 2, c[4] ** 2], [1 + c[0] + less, 0.0, inverse, 0.0, 0.0, 0.0]
+
+
+def _handbook_1(c: list[float]) -> _Forms:
+    less, strength, inverse = _pole(c[1], c[2])
+    return [strength, c[2]], [c[0] + less, -c[3], inverse, 0.0, 0.0, 0.0]
+
+
+# By Zemax's number: the formula, and how many coefficients it has.
 _FORMULAS: dict[int, tuple[Callable[[list[float]], _Forms], int]] = {
     1: (_powers(0, 1, 2, 3, 4, 5), 6),
     2: (_sellmeier(3), 6),
+    4: (_sellmeier_2, 5),
     6: (_sellmeier(4), 8),
+    7: (_handbook_1, 4),
     8: (lambda c: ([c[1], c[2]], [c[0], -c[3], 0.0, 0.0, 0.0, 0.0]), 4),
     9: (lambda c: ([c[1], c[3], c[2], c[4]], [c[0]] + [0.0] * 5), 5),
     10: (_powers(0, 1, 2, 3, 4, 5, 7, 8), 8),
     11: (_sellmeier(5), 10),
-    12: (_powers(0, 1, 2, 3, 4, 5, 6), 7),
+    12: (_powers(0, 1, 2, 3, 4, 5, 6, 9), 8),
     13: (_powers(0, 1, 6, 2, 3, 4, 5, 7, 8), 9),
 }
 
@@ -48,7 +65,7 @@ def load_agf(
     """Glasses of a `.agf` file by name, at its temperatures, relative to air.
 
     LensError, with the line, for what is no such file and for a glass whose formula is none of
-    Zemax's 1, 2, 6 and 8 to 13.
+    Zemax's 1, 2, 4 and 6 to 13, or gives no index above 1 within its range.
 
     path: of at most 16 MB.
     names: those that are wanted; None: all.
@@ -100,4 +117,8 @@ def _glass(record: Record, block: dict[str, Words]) -> Glass | None:
     low, high = record.numbers(block["LD"].line, block["LD"].rest, 2)
     if not 0 < low < high:
         raise record.error(block["LD"].line, f"{short(name)}: no range: {low:g} to {high:g} um")
-    return Glass(name, tuple(sellmeier), tuple(schott), (low, high))
+    glass = Glass(name, tuple(sellmeier), tuple(schott), (low, high))
+    if wrong := flaw(glass):
+        record.lacks(at, f"{short(name)}: {wrong}")
+        return None
+    return glass

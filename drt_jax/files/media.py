@@ -2,12 +2,9 @@
 
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
-
 from ..inputs import shown
-from ..lens.glass import VISIBLE, Dispersion, Glass, model_glass, refractive_index
-from ..lens.glasses import find_glass
+from ..lens.glass import VISIBLE, Glass, model_glass
+from ..lens.glasses import find_glass, flaw
 from .entry import Entry
 
 _DENSEST = 10
@@ -29,8 +26,8 @@ def _own_glass(name: str, entry: Entry) -> Glass:
     if not isinstance(terms, list) or not terms or len(terms) % 2:
         raise entry.error("sellmeier", f"expected a list, all B and then all C, got {shown(terms)}")
     powers = entry.get("schott", [])
-    more = isinstance(powers, list) and len(powers) == 9
-    lengths = {"sellmeier": len(terms), "schott": 9 if more else 6}
+    more = isinstance(powers, list) and len(powers) in (9, 10)
+    lengths = {"sellmeier": len(terms), "schott": len(powers) if more else 6}
     constants: dict[str, Any] = {
         key: tuple(entry.vector(key, n)) for key, n in lengths.items() if key in entry
     }
@@ -38,15 +35,8 @@ def _own_glass(name: str, entry: Entry) -> Glass:
     if not 0 < low < high:
         raise entry.error("range", f"expected 0 < shortest < longest, got {low:g} and {high:g} um")
     glass = Glass(name, range=(low, high), **constants)
-    strength, resonance = np.reshape(glass.sellmeier, (2, -1))
-    for c in resonance[strength != 0]:
-        if low**2 <= c <= high**2:
-            raise entry.error("sellmeier", f"C = {c:g} um^2 lies within the range; narrow it")
-    waves = np.linspace(low, high, 257)
-    index = np.asarray(refractive_index(Dispersion.of([glass]), jnp.asarray(waves)))[0]
-    if not np.all(index > 1):
-        wave = waves[np.argmin(index > 1)]
-        raise entry.error("", f"no index above 1 at {wave:g} um; mend the constants or the range")
+    if wrong := flaw(glass):
+        raise entry.error("sellmeier" if "lies" in wrong else "", wrong)
     return glass
 
 

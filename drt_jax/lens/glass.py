@@ -17,9 +17,9 @@ NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL, _FARTHEST = (1.0, 50.0), 0.2
 # Range (um) of a medium without one: 0.1 nm to 1 m.
 ANY = 1e-4, 1e6
-# Powers of L in `Glass.schott`. The last two are too large for float32 below the shortest
-# wavelength.
-POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12), 0.01
+# Powers of L in `Glass.schott`. The two before the last are too large for float32 below the
+# shortest wavelength.
+POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12, 6), 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Glass:
 
     name: as in a prescription.
     sellmeier: (B1 .. BT, C1 .. CT), any number of terms T; C in um^2.
-    schott: (a0 .. a5), coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8, and up to three more, of
-        L^4, L^-10, L^-12.
+    schott: (a0 .. a5), coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8, and up to four more, of
+        L^4, L^-10, L^-12, L^6.
     range: shortest and longest wavelength for which they hold, um.
     model: nd and vd of a model glass, see `model_glass`.
     partial: P_gF of a model glass less that of the normal line.
@@ -134,19 +134,32 @@ def nd_and_vd(dispersion: Dispersion) -> Array:
     return jnp.stack([nd, safe_divide(nd - 1, f - c)], axis=-1)
 
 
+def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> Dispersion:
+    """The dispersion with the constants of another, of M media or of one, in place of some media,
+    bool (M,). It has as many terms as the one with more."""
+
+    def mixed(name: str, none: Any) -> Any:
+        both = getattr(dispersion, name), getattr(other, name)
+        if both == (None, None):
+            return None
+        old, new = (jnp.asarray(none) if a is None else a for a in both)
+        mask = np.reshape(rows, (-1, *(1,) * (new.ndim - 1)))
+        if new.ndim == 2:
+            width = max(old.shape[1], new.shape[1])
+            old, new = (jnp.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in (old, new))
+        return jnp.where(mask, new, old).astype(dispersion.schott.dtype)
+
+    nones = {"model": [_NO_MODEL], "partial": [0.0]}
+    names = (field.name for field in dataclasses.fields(Dispersion))
+    return Dispersion(**{name: mixed(name, nones.get(name)) for name in names})
+
+
 def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
     """Replaces media by model glasses of the same nd and vd. rows: (M,), bool, which."""
-    mask, found = jnp.asarray(rows)[:, None], nd_and_vd(dispersion)
-    one = jnp.eye(1, dispersion.schott.shape[1], dtype=found.dtype)
-    none = jnp.asarray([_NO_MODEL], found.dtype)
-    return Dispersion(
-        jnp.where(mask, 0, dispersion.strength),
-        jnp.where(mask, 0, dispersion.resonance),
-        jnp.where(mask, one, dispersion.schott),
-        jnp.where(mask, jnp.asarray([VISIBLE], found.dtype), dispersion.ranges),
-        jnp.where(mask, found, none if dispersion.model is None else dispersion.model),
-        None if dispersion.partial is None else jnp.where(mask[:, 0], 0, dispersion.partial),
-    )
+    found = nd_and_vd(dispersion)
+    none = jnp.zeros((1, 1), found.dtype)
+    models = Dispersion(none, none, none + 1, jnp.asarray([VISIBLE], found.dtype), found)
+    return with_media(dispersion, rows, models)
 
 
 def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Array:

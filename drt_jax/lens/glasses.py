@@ -168,6 +168,23 @@ def indices(glass: Glass, wavelengths: np.ndarray) -> np.ndarray:
     return np.sqrt(terms + powers @ np.asarray(glass.schott, float))
 
 
+def flaw(glass: Glass) -> str:
+    """Why the constants of a glass give no index above 1 within its range; empty if they do."""
+    low, high = glass.range
+    strength, resonance = np.reshape(glass.sellmeier, (2, -1))
+    for c in resonance[strength != 0]:
+        if low**2 <= c <= high**2:
+            return f"C = {c:g} um^2 lies within the range; narrow it"
+    waves = np.linspace(low, high, 257)
+    with np.errstate(all="ignore"):
+        wrong = waves[~(indices(glass, waves) > 1)]
+    return (
+        f"no index above 1 at {wrong[0]:g} um; mend the constants or the range"
+        if len(wrong)
+        else ""
+    )
+
+
 def map_point(glass: Glass) -> tuple[float, float] | None:
     """nd and vd of a glass of the table; None if its range does not contain the lines F, d and C,
     or it has no dispersion."""

@@ -15,7 +15,14 @@ from ..numerics import Numbers, concrete, real_array
 from .aperture import Apertures
 from .elements import Elements, rotation_matrix
 from .forms import Shape
-from .glass import Dispersion, nd_and_vd, refractive_index, with_models
+from .glass import (
+    Dispersion,
+    Glass,
+    nd_and_vd,
+    refractive_index,
+    with_media,
+    with_models,
+)
 from .phase import Phase
 from .surface import surface_sag
 
@@ -279,15 +286,9 @@ def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:
     return surface_sag((x, y), row, lens.forms[surface])
 
 
-def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
-    """Replaces glasses by model glasses, whose nd and vd are leaves that can be varied.
-
-    nd and nF - nC stay; the rest of the dispersion changes by the error of a model glass, see
-    docs/limits.md. ValueError for a surface behind which no glass begins and, as far as numbers are
-    known, for a glass without dispersion.
-
-    surfaces: surfaces, from 0, behind which the glasses begin; empty for all.
-    """
+def glass_rows(lens: Lens, surfaces: Sequence[int]) -> np.ndarray:
+    """The media, bool (S + 1,), of the glasses that begin behind some surfaces; empty for all.
+    ValueError, which lists those that exist, for a surface behind which no glass begins."""
     media = lens.glasses
     there = [i for i in range(lens.count) if media[i + 1] not in ("air", media[i])]
     rows = np.zeros(len(media), bool)
@@ -297,14 +298,43 @@ def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
             raise ValueError(f"surfaces: no glass begins behind surface {i}; there are {some}")
         end = next((k for k in range(i + 1, len(media)) if media[k] != media[i + 1]), len(media))
         rows[i + 1 : end] = True
+    return rows
+
+
+def _renamed(lens: Lens, dispersion: Dispersion, glasses: Sequence[str]) -> Lens:
+    labels = Labels(lens.name, tuple(glasses))
+    return dataclasses.replace(lens, dispersion=dispersion, labels=labels)
+
+
+def with_glass(lens: Lens, glass: Glass, surfaces: Sequence[int] = ()) -> Lens:
+    """Puts another glass, such as one of `find_glass`, in place of glasses, with its own constants.
+
+    surfaces: surfaces, from 0, behind which the glasses begin; empty for all.
+
+    ValueError as in `with_model_glass`, and for a glass of the name of a medium that it touches.
+    """
+    media, rows = lens.glasses, glass_rows(lens, surfaces)
+    found = [glass.name if row else old for old, row in zip(media, rows)]
+    for i in range(lens.count):
+        if found[i] == found[i + 1] and media[i] != media[i + 1]:
+            raise ValueError(f"glasses: {glass.name} on both sides of surface {i}; take another")
+    return _renamed(lens, with_media(lens.dispersion, rows, Dispersion.of([glass])), found)
+
+
+def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
+    """Replaces glasses by model glasses, whose nd and vd are leaves that can be varied.
+
+    nd and nF - nC stay; the rest of the dispersion changes by the error of a model glass, see
+    docs/limits.md. ValueError for a surface behind which no glass begins and, as far as numbers are
+    known, for a glass without dispersion.
+
+    surfaces: surfaces, from 0, behind which the glasses begin; empty for all.
+    """
+    media, rows = lens.glasses, glass_rows(lens, surfaces)
     if concrete(lens.dispersion):
         abbe = np.asarray(nd_and_vd(lens.dispersion))[:, 1]
         for name in np.array(media)[rows & ~((abbe >= 10) & (abbe <= 120))]:
             raise ValueError(f"glasses: {name} has no vd of 10 to 120; leave its surface out")
     names = (f"model {name.removeprefix('model ')}" for name in media)
-    glasses = tuple(new if row else old for new, old, row in zip(names, media, rows))
-    return dataclasses.replace(
-        lens,
-        dispersion=with_models(lens.dispersion, rows),
-        labels=Labels(lens.name, glasses),
-    )
+    glasses = [new if row else old for new, old, row in zip(names, media, rows)]
+    return _renamed(lens, with_models(lens.dispersion, rows), glasses)

@@ -6,6 +6,7 @@ from typing import Literal
 
 from drt_jax.design import Operand, Solve, Tie, Vary
 from drt_jax.design.growth import SHORTEST
+from drt_jax.lens.glasses import glass_makers
 
 from . import _common
 
@@ -59,6 +60,24 @@ class Growth:
 
 
 @dataclasses.dataclass(frozen=True)
+class Glasses:
+    """Real glasses in place of model glasses, in the end.
+
+    makers: of the glasses; none: model glasses stay. names: a pattern of names, such as "N-*".
+    count: glasses tried in each place. steps: of least squares with each.
+    """
+
+    makers: tuple[str, ...] = ()
+    names: str = "*"
+    count: int = 8
+    steps: int = 12
+
+    def __post_init__(self) -> None:
+        _common.require_within("glasses.", self, count=(1, 1e4), steps=(1, 1e4))
+        _common.require_known("glasses.makers", self.makers, glass_makers())
+
+
+@dataclasses.dataclass(frozen=True)
 class Config:
     """Settings of the experiment; see configs/design/.
 
@@ -93,6 +112,7 @@ class Config:
     growth: Growth = Growth()
     trials: int = 500
     starts: Starts = Starts()
+    glasses: Glasses = Glasses()
 
     def __post_init__(self) -> None:
         limits = {"fields_deg": (-89, 89), "wavelengths_um": (1e-4, 1e6), "order": (1, 40)}

@@ -7,9 +7,11 @@ load_lens reads back, the start and other minima beside it, figures, and results
 """
 
 import dataclasses
+import fnmatch
 import math
 import pathlib
 import sys
+import time
 from typing import Any
 
 import jax.numpy as jnp
@@ -182,24 +184,55 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
         parts = [design.optimise(problem, vector, config.trials, bar.searched)]
         order = config.order if config.rings else order_of(config, parts[0].lens)
         if order > config.order:
-            rule = problem.with_order(order)
+            problem = problem.with_order(order)
             vector = jnp.asarray(parts[0].vector)
-            parts.append(design.optimise(rule, vector, config.trials, bar.searched))
+            parts.append(design.optimise(problem, vector, config.trials, bar.searched))
     history = parts[0].history
     for part in parts[1:]:
         before = np.array([0, 0, history[-1, 2]])
         history = np.concatenate([history, part.history + before])
-    seconds = sum(part.seconds for part in parts)
+    end, glasses = _snapped(config, problem, parts[-1])
     return {
-        "vector": parts[-1].vector.tolist(),
-        "merit_start": float(problem.merit(problem.variables.start)),
-        "merit_end": parts[-1].merit,
-        "worst": parts[-1].max_violation,
+        "vector": end.vector.tolist(),
+        "merit_end": end.merit,
+        "worst": end.max_violation,
         "order": order,
         "history": history.tolist(),
-        "seconds": seconds,
+        "seconds": sum(part.seconds for part in parts),
         "compile_s": sum(part.first for part in parts),
+        "glasses": glasses,
     }
+
+
+def _snapped(
+    config: Config, problem: design.Problem, found: design.Optimum
+) -> tuple[design.Optimum, dict[str, Any]]:
+    """The optimum, with real glasses if these are wanted, and what each of them has cost."""
+    some, begun = config.glasses, time.perf_counter()
+    if not some.makers:
+        return found, {}
+    accept = lambda glass: fnmatch.fnmatchcase(glass.name, some.names)  # noqa: E731
+    snapped = design.snap_glasses(problem, found, some.makers, accept, some.count, some.steps)
+    ranked = {i: [[a.glass.name, x] for a, x in own] for i, own in snapped.alternatives.items()}
+    told = {"snaps": [snap._asdict() for snap in snapped.snaps], "alternatives": ranked}
+    return snapped.optimum, told | {"snap_s": time.perf_counter() - begun}
+
+
+def _designed(variables: design.Variables, end: dict[str, Any]) -> drt_jax.Lens:
+    """The lens of the end, with its glasses."""
+    lens, snaps = variables.lens, end["glasses"].get("snaps", [])
+    for surface, name in {i: snap["glass"] for snap in snaps for i in snap["surfaces"]}.items():
+        lens = drt_jax.with_glass(lens, drt_jax.find_glass(name), [surface])
+    found = dataclasses.replace(variables, lens=lens).lens_of(jnp.asarray(end["vector"]))
+    return dataclasses.replace(found, dispersion=lens.dispersion) if snaps else found
+
+
+def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
+    """Where light through 0.7 of the aperture crosses the axis by wavelength, from there of the
+    last, over the focal length."""
+    waves = config.wavelengths_um
+    foci = np.asarray(drt_jax.axial_colour(lens, config.distance_mm, waves, (0.7,)).real)[:, 0]
+    return ((foci - foci[-1]) / np.asarray(drt_jax.focal_length(lens, waves))).tolist()
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -217,7 +250,12 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     end = run.kept("finish")
     history = np.array(end["history"])
     run.log("least squares", 0, dict(zip(COLUMNS, history.T)))
-    _save(config, problem, start, [end["vector"], *found["vectors"][1:_DRAWN]], run.folder)
+    some, lenses = end["glasses"], {"start": start, "designed": _designed(problem.variables, end)}
+    for k, vector in enumerate(found["vectors"][1:_DRAWN]):
+        lenses[f"minimum_{k + 1}"] = problem.variables.lens_of(jnp.asarray(vector))
+    for name, lens in lenses.items():
+        lens = design.fit_apertures(problem, lens) if config.floating else lens
+        drt_jax.save_lens(lens, run.folder / f"{name}.yaml")
     rays, before = design.rays_of(problem), run.kept("growth") or {"steps": 0, "first": 0.0}
     before = _NOTHING | before | {"trials": before["steps"], "compile_s": before["first"]}
     row = {
@@ -241,25 +279,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "tolerance": config.tolerance,
         "starts": {key: value for key, value in found.items() if key != "vectors"},
         "history": history.tolist(),
+        "glasses": some | {"foci": _foci(config, lenses["designed"])} if some else {},
     }
-
-
-def _save(
-    config: Config,
-    problem: design.Problem,
-    start: drt_jax.Lens,
-    vectors: list[list[float]],
-    folder: pathlib.Path,
-) -> None:
-    """Writes the designed lens, the start and the drawn minima; floating clear apertures as wide as
-    the beam."""
-    lenses = {"start": start}
-    for k, vector in enumerate(vectors):
-        name = f"minimum_{k}" if k else "designed"
-        lenses[name] = problem.variables.lens_of(jnp.asarray(vector))
-    for name, lens in lenses.items():
-        lens = design.fit_apertures(problem, lens) if config.floating else lens
-        drt_jax.save_lens(lens, folder / f"{name}.yaml")
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -278,6 +299,10 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         ["seconds", row["seconds"]],
         ["compilation, s", row["compile_s"]],
     ]
+    if glasses := results.get("glasses"):
+        rows.append(["seconds for the glasses", glasses["snap_s"]])
+        foci = zip(results["wavelengths_um"], glasses["foci"], strict=True)
+        rows += [[f"focus at {um:.4f} um, over the focal length", place] for um, place in foci]
     if starts["merits"]:
         rows += [["starts that pass light", starts["passed"]], ["minima", len(starts["merits"])]]
         rows += [["minima a minute", 60 * len(starts["merits"]) / max(starts["seconds"], 1e-9)]]
@@ -288,9 +313,19 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
         f"design, {name}": _common.table(("what", "value"), rows),
     }
+    if glasses:
+        found[f"design, {name}: glasses"] = _glasses_table(glasses["snaps"])
     if results.get("beside"):
         found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
     return found
+
+
+def _glasses_table(snaps: list[dict[str, Any]]) -> str:
+    """Each glass that was exchanged in a row, with its cost."""
+    header = ["behind surface", "nd", "vd", "becomes", "merit before", "after"]
+    keys = ("glass", "before", "after")
+    rows = [[", ".join(map(str, s["surfaces"])), *s["model"], *map(s.get, keys)] for s in snaps]
+    return _common.table(header, rows)
 
 
 def _peers_table(rows: list[dict[str, Any]], how: str) -> str:

@@ -138,3 +138,23 @@ def test_bad_settings_get_one_line(setting, said, tmp_path, monkeypatch, capsys)
 @pytest.mark.parametrize("path", sorted((ROOT / "configs" / "design" / "lenses").glob("*.yaml")))
 def test_starts_load(path):
     assert drt_jax.load_lens(path).count > 1
+
+
+@pytest.mark.slow
+def test_glasses_become_real(tmp_path, monkeypatch):
+    """The lens that is written has them, and the merit that is told; none stays a model."""
+    monkeypatch.chdir(ROOT)
+    few = ["glasses.count=3", "glasses.steps=3", "trials=15", "tolerance=0.1", "order=3"]
+    main("apochromat", tmp_path / "run", *few)
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    lens = drt_jax.load_lens(tmp_path / "run" / "designed.yaml")
+    assert lens.dispersion.model is None
+    taken = {snap["surfaces"][0]: snap["glass"] for snap in results["glasses"]["snaps"]}
+    assert lens.glasses == ("air", taken[0], taken[1], "air")
+    assert results["rows"][0]["merit_end"] == results["glasses"]["snaps"][-1]["after"]
+    moments = drt_jax.psf_moments(lens, 0.0, np.inf, results["wavelengths_um"], 0.1)
+    mean, covariance = np.asarray(moments.mean), np.asarray(moments.covariance)
+    apart = np.sum((mean - mean.mean(axis=0)) ** 2, axis=1)
+    spot = np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2) + apart))
+    np.testing.assert_allclose(1e3 * spot, results["rows"][0]["spots_um"][0], rtol=1e-9)
+    assert results["glasses"]["foci"][-1] == 0

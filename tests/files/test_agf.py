@@ -25,12 +25,14 @@ B = (1, 0.01), (0.2, 0.02), (0.9, 100), (0.1, 0.03), (0.05, 0.04)
 FORMULAS = {
     1: ("2.2 -.01 .01 .002 -1e-4 1e-5", powers(*LOW)),
     2: ("1 .01 .2 .02 .9 100", 1 + terms(*B[:3])),
+    4: (".2 1 .1 .02 .2", 1.2 + terms(B[0]) + 0.02 / (0.36 - 0.04)),
     6: ("1 .01 .2 .02 .9 100 .1 .03", 1 + terms(*B[:4])),
+    7: ("2.3 .02 .04 .01", 2.3 + 0.02 / (0.36 - 0.04) - 0.01 * 0.36),
     8: ("1.3 1 .01 .02", 1.3 + terms(B[0]) - 0.02 * 0.36),
     9: ("1.3 1 .01 .9 100", 1.3 + terms(B[0], B[2])),
     10: ("2.2 -.01 .01 .002 -1e-4 1e-5 2e-6 -3e-7", powers(*LOW, (-10, 2e-6), (-12, -3e-7))),
     11: ("1 .01 .2 .02 .9 100 .1 .03 .05 .04", 1 + terms(*B)),
-    12: ("2.2 -.01 .01 .002 -1e-4 1e-5 3e-3 0", powers(*LOW, (4, 3e-3))),
+    12: ("2.2 -.01 .01 .002 -1e-4 1e-5 3e-3 4e-3", powers(*LOW, (4, 3e-3), (6, 4e-3))),
     13: (
         "2.2 -.01 3e-3 .01 .002 -1e-4 1e-5 2e-6 -3e-7",
         powers(*LOW, (4, 3e-3), (-10, 2e-6), (-12, -3e-7)),
@@ -58,8 +60,10 @@ def test_every_formula(tmp_path):
 BAD = {
     "no line begins with NM": "CC nothing\n",
     "line 1: expected NM, a name": "NM\n",
-    "line 1: X: formula 3 is not read, of 1, 2, 6": glass_of("X", 3, "1 2 3"),
-    "line 2: X: formula 12 with more than 7 terms": glass_of("X", 12, "2 0 0 0 0 0 0 .1"),
+    "line 1: X: formula 3 is not read, of 1, 2, 4": glass_of("X", 3, "1 2 3"),
+    "line 2: X: formula 12 with more than 8 terms": glass_of("X", 12, "2 0 0 0 0 0 0 .1 .1"),
+    "line 2: X: C = 0.25 um^2 lies within the range": glass_of("X", 2, "1 .25"),
+    "line 2: X: no index above 1 at 0.4 um": glass_of("X", 1, "1"),
     "line 1: X: its line LD is missing": "NM X 2 0 1.5 60\nCD 1 .01 0 0 0 0\n",
     "line 4: X: no range: 0.7 to 0.4": glass_of("X", 2, "1 .01", "0.7 0.4"),
     "line 2: expected a number, got 'nan'": glass_of("X", 2, "1 nan"),
@@ -79,7 +83,8 @@ def test_what_is_no_catalogue_is_refused_in_a_line(tmp_path, message):
 
 def test_a_prescription_names_its_catalogues(tmp_path):
     """What it does not use may be of any formula; its glasses win over the table."""
-    mine = glass_of("MINE", 2, "1.2 .01") + glass_of("N-BK7", 2, "1.3 .01") + glass_of("X", 3, "1")
+    own = ("MINE", 12, FORMULAS[12][0]), ("N-BK7", 2, "1.3 .01"), ("X", 3, "1")
+    mine = "".join(glass_of(*one) for one in own)
     (tmp_path / "my.agf").write_text(mine)
     path = tmp_path / "lens.yaml"
     text = """
@@ -91,7 +96,7 @@ surfaces:
 """
     path.write_text(text.replace("GLASS", "N-BK7"))
     lens = drt_jax.load_lens(path)
-    wanted = [(1 + b * 0.36 / 0.35) ** 0.5 for b in (1.2, 1.3)]
+    wanted = np.sqrt([FORMULAS[12][1], 1 + 1.3 * 0.36 / 0.35])
     np.testing.assert_allclose(np.asarray(lens.index(0.6))[1:3].ravel(), wanted, rtol=1e-14)
     drt_jax.save_lens(lens, tmp_path / "again.yaml")
     again = drt_jax.load_lens(tmp_path / "again.yaml")
