@@ -67,10 +67,12 @@ def limits_of(
 def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> list[str]:
     """Names of the `size` values of an operand, in their order."""
     known = kind_of(operand.kind)
-    parts: list[Iterable[str]] = []
+    parts: list[Iterable[str]] = [] if operand.at is None else [[f"at {float(operand.at):g}"]]
     for axis in known.axes:
         if axis == "zones":
             parts.append([f"zone {zone:g}" for zone in ZONES])
+        elif axis == "sections":
+            parts.append(["tangential", "sagittal"])
         elif axis == "value":
             parts.append([f"value {k}" if size > 1 else "" for k in range(size)])
         elif axis == "xy":
