@@ -67,7 +67,7 @@ def limits_of(
 def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> list[str]:
     """Names of the `size` values of an operand, in their order."""
     known = kind_of(operand.kind)
-    parts: list[Iterable[str]] = [] if operand.at is None else [[f"at {float(operand.at):g}"]]
+    parts: list[Iterable[str]] = []
     for axis in known.axes:
         if axis == "zones":
             parts.append([f"zone {zone:g}" for zone in ZONES])
@@ -88,4 +88,6 @@ def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> l
             numbers = (numbers or range(counts[name]))[axis == "later" :]
             one = counts[name] == 1
             parts.append(["" if one else f"{name[:-1]} {k}" for k in numbers])
+    if operand.at is not None:
+        parts.append([f"{known.at} {float(operand.at):g}"])
     return [", ".join(filter(None, words)) for words in itertools.product(*parts)]

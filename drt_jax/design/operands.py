@@ -75,7 +75,7 @@ class Operand:
                 raise ValueError(f"{what}: does not depend on {name}{only}; remove {name}")
         low = -math.inf if self.low is None else self.low
         high = math.inf if self.high is None else self.high
-        if (self.at is None) == known.at:
+        if (self.at is None) == bool(known.at):
             said = _NEEDED if known.at else "is of mtf and encircled_energy; leave it out"
             raise ValueError(f"{what}: at: {said}")
         if not concrete((low, high, self.weight, self.target, self.at)):

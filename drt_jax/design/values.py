@@ -102,7 +102,7 @@ class OperandKind(NamedTuple):
     per_mm: penalty per millimetre of miss for a failed ray, in the unit of the operand.
     order: axes of the values, see `axes`; () for the usual ones.
     rows: function of a lens, the surfaces that the function returns; None for `places`.
-    at: whether the function takes `Operand.at`.
+    at: the name of `Operand.at`, if the function takes it; else empty.
     """
 
     function: Function
@@ -113,7 +113,7 @@ class OperandKind(NamedTuple):
     per_mm: float = 1.0
     order: tuple[str, ...] = ()
     rows: Callable[[Lens], list[int]] | None = None
-    at: bool = False
+    at: str = ""
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -309,9 +309,9 @@ OPERANDS: dict[str, OperandKind] = {
     "numerical_aperture": OperandKind(_numerical_aperture, _RAYS),
     "relative_illumination": OperandKind(relative_illumination, ("fields", "distances")),
     "throughput": OperandKind(_throughput, _RAYS, order=_VIEWS),
-    "mtf": OperandKind(mtf, _RAYS, order=(*_VIEWS, "sections"), at=True),
+    "mtf": OperandKind(mtf, _RAYS, order=(*_VIEWS, "sections"), at="frequency"),
     "strehl": OperandKind(strehl, _RAYS, order=(*_VIEWS, "wavelengths")),
-    "encircled_energy": OperandKind(encircled_energy, _RAYS, order=_VIEWS, at=True),
+    "encircled_energy": OperandKind(encircled_energy, _RAYS, order=_VIEWS, at="radius"),
     "glass_centre": _gap(True, False),
     "glass_edge": _gap(True, True),
     "air_centre": _gap(False, False),

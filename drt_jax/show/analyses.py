@@ -129,6 +129,22 @@ def mtf(
     return axes
 
 
+def encircled_energy(
+    axes: Axes, radii: ArrayLike, parts: ArrayLike, names: Sequence[str], airy: float = 0
+) -> Axes:
+    """The part of the light (F, N) within circles of radii (N,) mm; airy: a radius in mm to be
+    marked."""
+    places = 1e3 * np.asarray(radii, float)
+    for part, name in zip(np.asarray(parts), names):
+        axes.plot(places, part, label=name)
+    if 0 < airy < np.inf:
+        axes.axvline(1e3 * airy, color="0.7", linewidth=0.8, zorder=0)
+    axes.set(xlim=(0, places.max()), ylim=(0, 1.02), xlabel="radius (um)")
+    axes.set_title("encircled energy", fontsize=8)
+    axes.legend(fontsize=6, loc="lower right", frameon=False)
+    return axes
+
+
 def gaussian_error(
     axes: Axes, found: GaussianError, fields: ArrayLike, distances: ArrayLike
 ) -> Axes:
