@@ -23,7 +23,7 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of
 from ..pupil.rules import PupilRule
 from . import analyses
-from .figures import new
+from .figures import FIELD_COLOURS, new
 from .layout import draw, lens_drawing
 
 # Fields of the curves, and of that of illumination; points of the fans; fields of spots and fans.
@@ -81,12 +81,13 @@ def sheet(
     analyses.field_curvature(axes["foci"], foci, line, waves)
     analyses.distortion(axes["bent"], bent, line, waves)
     analyses.lateral_colour(axes["colour"], colour, line, waves, 1e3 * spots.airy_radius[0])
-    later = slice(1 + len(some), None)
-    light = spots.solid_angle[:, middle] / spots.solid_angle[0, middle]
-    analyses.illumination(axes["light"], light[later], spots.throughput[later, middle], wide[later])
-    names = [f"{np.degrees(field):.3g}°" for field in some]
-    analyses.mtf(axes["mtf"], lines, contrast, best, names)
-    analyses.encircled_energy(axes["energy"], radii, energy, names, float(spots.airy_radius[0]))
+    later, cone = slice(1 + len(some), None), spots.solid_angle[:, middle]
+    light = cone[later] / cone[0], spots.throughput[later, middle]
+    analyses.illumination(axes["light"], *light, wide[later])
+    hues = [FIELD_COLOURS[[*fields].index(field) % len(FIELD_COLOURS)] for field in some]
+    given = [f"{np.degrees(field):.3g}°" for field in some], hues  # as the layout has them
+    analyses.mtf(axes["mtf"], lines, contrast, best, *given)
+    analyses.encircled_energy(axes["energy"], radii, energy, *given, float(spots.airy_radius[0]))
     axes["energy"].set_title(f"encircled energy ({model})", fontsize=8)
     axes["foci"].set_ylabel("field (degrees)")
     return figure
