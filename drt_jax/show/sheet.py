@@ -148,6 +148,7 @@ def _axes(count: int) -> tuple[Figure, dict[str, Any]]:
         each.tick_params(labelsize=6)
         each.xaxis.label.set_fontsize(7)
         each.yaxis.label.set_fontsize(7)
+        each.locator_params(axis="x", nbins=6 if each is not axes["layout"] else 10)
     return figure, axes
 
 
