@@ -84,25 +84,27 @@ def test_values_are_those_of_analyses(triplet):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rule", [Soft(6, "bilateral", 0.01), Clipped(6, "bilateral")])
-def test_a_clipped_pupil(rule):
+@pytest.mark.parametrize(
+    "rule, within", [(Soft(6, "bilateral", 0.01), 4e-3), (Clipped(6, "bilateral"), 2e-4)]
+)
+def test_a_clipped_pupil(rule, within):
     """Against the analyses with a finer rule; the light that fills the stop has other contrast."""
-    lens = load_lens("double_gauss")
-    variables, field = Variables.from_lens(lens, ["sensor"]), jnp.array([0.0, 0.24])
+    lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
+    variables, field = Variables.from_lens(lens, ["sensor"]), jnp.array([0.0, 0.25])
     values = [
         jax.jit(told)(Problem.from_variables(variables, ASKED, field, COLOURS, rule=r), lens)
         for r in (rule, Gauss(6, "bilateral"))
     ]
     fine = {"rule": Clipped(10, "bilateral")}
     scene = lens, field, np.inf, COLOURS
-    wanted = [
-        drt_jax.transfer(*scene, jnp.array([LINES]), **fine).mtf[..., 0],
-        drt_jax.strehl(*scene, **fine),
-        drt_jax.encircled_energy(*scene, jnp.array([RADIUS]), **fine)[:, 0],
-    ]
-    for ours, other, each in zip(values[0].values(), values[1].values(), wanted):
-        np.testing.assert_allclose(ours, np.ravel(each), rtol=0, atol=2e-3)
-        assert np.max(np.abs(other - np.ravel(each))) > 1e-2
+    wanted = {
+        "mtf": drt_jax.transfer(*scene, jnp.array([LINES]), **fine).mtf[..., 0],
+        "strehl": drt_jax.strehl(*scene, **fine),
+        "encircled_energy": drt_jax.encircled_energy(*scene, jnp.array([RADIUS]), **fine)[:, 0],
+    }
+    for name, each in wanted.items():
+        np.testing.assert_allclose(values[0][name], np.ravel(each), rtol=0, atol=within)
+        assert np.max(np.abs(values[1][name] - np.ravel(each))) > 5e-3
 
 
 @pytest.mark.slow
