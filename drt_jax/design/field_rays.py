@@ -50,6 +50,7 @@ class FieldRays:
     distance: (V,), mm.
     wavelengths: (W,), um.
     wavelength_weights: (W,), weights of the wavelengths, with the sum 1.
+    rule: the pupil rule of all views.
     bundle: the rays, with a first axis (V,) in every array.
     points: D arrays (V, W, Q), stop points in units of the semi-diameter of the stop.
     stop_weights: (V, W, Q), weights of the light through the stop, with the sum 1.
@@ -59,21 +60,25 @@ class FieldRays:
 
     Static:
     fields, distances: numbers of fields and of distances.
-    symmetry: part of the pupil that is traced, see `symmetry_of`.
     """
 
     field: Array
     distance: Array
     wavelengths: Array
     wavelength_weights: Array
+    rule: PupilRule
     fields: int = dataclasses.field(metadata={"static": True})
     distances: int = dataclasses.field(metadata={"static": True})
-    symmetry: Symmetry = dataclasses.field(metadata={"static": True})
     bundle: Bundle = None  # type: ignore[assignment]
     points: Vector = None  # type: ignore[assignment]
     stop_weights: Array = None  # type: ignore[assignment]
     weights: Array = None  # type: ignore[assignment]
     throughput: Array = None  # type: ignore[assignment]
+
+    @property
+    def symmetry(self) -> Symmetry:
+        """Part of the pupil that is traced, see `symmetry_of`."""
+        return self.rule.symmetry
 
     @property
     def arrives(self) -> Array:
@@ -135,14 +140,13 @@ class FieldRays:
         return dataclasses.replace(self, bundle=bundle, weights=self.stop_weights)
 
 
-def trace_views(lens: Lens, views: FieldRays, rule: PupilRule, solver: Solver) -> FieldRays:
+def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
     """Traces the rays of all views together.
 
-    views: views without rays.
-    rule: the pupil rule. ValueError for `Clipped`, if the lens has obscurations.
+    views: views without rays. ValueError for the rule `Clipped`, if the lens has obscurations.
     solver: a ray solver.
     """
-    extra = lens.apertures
+    extra, rule = lens.apertures, views.rule
     if extra is not None and any(extra.blocks) and isinstance(rule, Clipped):
         raise ValueError(
             "rule: Clipped gives negative weights for obscurations, which have no residuals; use "

@@ -71,6 +71,8 @@ def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> l
     for axis in known.axes:
         if axis == "zones":
             parts.append([f"zone {zone:g}" for zone in ZONES])
+        elif axis == "sections":
+            parts.append(["tangential", "sagittal"])
         elif axis == "value":
             parts.append([f"value {k}" if size > 1 else "" for k in range(size)])
         elif axis == "xy":
@@ -86,4 +88,6 @@ def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> l
             numbers = (numbers or range(counts[name]))[axis == "later" :]
             one = counts[name] == 1
             parts.append(["" if one else f"{name[:-1]} {k}" for k in numbers])
+    if operand.at is not None:
+        parts.append([f"{known.at} {float(operand.at):g}"])
     return [", ".join(filter(None, words)) for words in itertools.product(*parts)]

@@ -18,6 +18,7 @@ from .values import OPERANDS, kind_of
 
 # What an operand may name.
 _NUMBERS = ("fields", "wavelengths", "distances", "surfaces")
+_NEEDED = "missing; give the frequency of an mtf in cycles/mm, the radius of energy in mm"
 
 # As the keys of `OPERANDS`, which a test compares.
 OperandName = Literal[
@@ -25,17 +26,17 @@ OperandName = Literal[
     "rms_wavefront", "focal_length", "effective_focal_length", "back_focal_distance",
     "entrance_pupil", "f_number", "magnification", "total_track", "length", "back_distance",
     "distortion", "lateral_colour", "chief_ray_angle", "numerical_aperture",
-    "relative_illumination", "throughput", "glass_centre", "glass_edge", "air_centre",
-    "air_edge", "glass_map", "incidence_angle"
+    "relative_illumination", "throughput", "mtf", "strehl", "encircled_energy", "glass_centre",
+    "glass_edge", "air_centre", "air_edge", "glass_map", "incidence_angle"
 ]  # fmt: skip
 OperandFunction = Callable[[Lens, FieldRays], Array]
 
 
-@leaves("target", "low", "high", "weight")
+@leaves("target", "low", "high", "weight", "at")
 @dataclasses.dataclass(frozen=True)
 class Operand:
     """One operand of a merit function: a target, or limits that are met exactly. A pytree: target,
-    limits and weight are leaves; in a problem, a limit that is not given is None.
+    limits, weight and `at` are leaves; in a problem, a limit that is not given is None.
 
     kind: one of `OPERANDS`, see values.py for their meaning and units; or a function of a lens and
         its `FieldRays` that returns an array.
@@ -46,6 +47,7 @@ class Operand:
         for all.
     vignetting: for spots, wavefronts and functions. False counts clipped rays as if they passed, so
         that clipping light does not lower the merit.
+    at: of an mtf, the frequency on the sensor, cycles/mm; of encircled_energy, the radius, mm.
     """
 
     kind: OperandName | OperandFunction
@@ -58,6 +60,7 @@ class Operand:
     distances: tuple[int, ...] = ()
     surfaces: tuple[int, ...] = ()
     vignetting: bool = True
+    at: float | None = None
 
     def __post_init__(self) -> None:
         if not callable(self.kind) and self.kind not in OPERANDS:
@@ -72,8 +75,15 @@ class Operand:
                 raise ValueError(f"{what}: does not depend on {name}{only}; remove {name}")
         low = -math.inf if self.low is None else self.low
         high = math.inf if self.high is None else self.high
-        if not concrete((low, high, self.weight, self.target)):
+        if (self.at is None) == bool(known.at):
+            said = _NEEDED if known.at else "is of mtf and encircled_energy; leave it out"
+            raise ValueError(f"{what}: at: {said}")
+        if not concrete((low, high, self.weight, self.target, self.at)):
             return
+        if self.at is not None and not 0 < self.at < math.inf:
+            raise ValueError(f"{what}: at: must be above 0 and finite, got {self.at:g}")
+        if known.of_waves and not (self.target or self.limits):
+            raise ValueError(f"{what}: target: 0 is no light; give 1 for the best, or limits")
         if low == high:
             raise ValueError(f"{what}: low and high are both {low:g}; give it as the target")
         if not low < high:
@@ -131,9 +141,9 @@ class Operand:
         if self.kind == "glass_map" and not surfaces and places:
             surfaces = tuple(places(lens))
         placed = dataclasses.replace(self, surfaces=surfaces)
-        for name in ("target", "low", "high", "weight"):
+        for name in ("target", "low", "high", "weight", "at"):
             number = getattr(self, name)
-            there = name not in ("low", "high") or _is_limit(number)
+            there = name not in ("low", "high", "at") or _is_limit(number)
             array = jnp.asarray(number, lens.curvature.dtype) if there else None
             object.__setattr__(placed, name, array)
         return placed
@@ -151,7 +161,8 @@ class Operand:
         waves = self.wavelengths
         if "middle" in kind.axes and not waves:
             waves = (len(rays.wavelengths) // 2,)
-        values = kind.function(lens, rays.select(self.fields, self.distances, waves))
+        given = () if self.at is None else (self.at,)
+        values = kind.function(lens, rays.select(self.fields, self.distances, waves), *given)
         places = kind.rows or kind.places
         if not self.surfaces or places is None:
             return values

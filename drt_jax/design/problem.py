@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
 from ..lens.scene import distance_array, fields_array, vergence_of
@@ -28,6 +29,7 @@ from .limits import Limit, limits_of
 from .operands import Operand, OperandFunction, OperandName
 from .values import OPERANDS, kind_of
 from .variables import Variables
+from .waves import degree_of
 
 # Least miss that a failed ray counts for, in semi-diameters of the stop.
 _FAILED = 4.0
@@ -60,6 +62,11 @@ def _check_operands(
             raise ValueError(
                 f"operands: {operand.name}: vignetting: Clipped traces only what passes; take "
                 "Gauss or Soft"
+            )
+        if kind_of(operand.kind).of_waves and degree_of(rule) < 2:
+            raise ValueError(
+                f"operands: {operand.name}: rule: needs Gauss or Soft of the order 2 or more, or "
+                f"Clipped of the size 3 or more; got {shown(rule)}"
             )
     if not any(operand.weight for operand in operands):
         raise ValueError("operands: all have the weight 0; a merit needs at least one")
@@ -164,9 +171,9 @@ class Problem:
             jnp.repeat(self.distances, len(self.fields)),
             self.wavelengths,
             self.wavelength_weights,
+            self.rule,
             len(self.fields),
             len(self.distances),
-            self.rule.symmetry,
         )
 
     @property
@@ -274,13 +281,13 @@ class Problem:
 def trace_fields(problem: Problem, lens: Lens) -> FieldRays:
     """The rays of a lens from all fields and distances of a problem. Differentiable, in `jit` and
     `vmap` too."""
-    return trace_views(lens, problem.views(), problem.rule, problem.solver)
+    return trace_views(lens, problem.views(), problem.solver)
 
 
 def _rays(problem: Problem, lens: Lens) -> FieldRays:
     """The views of a lens, with rays if any operand needs them."""
     views = problem.views()
-    return trace_views(lens, views, problem.rule, problem.solver) if problem.traces else views
+    return trace_views(lens, views, problem.solver) if problem.traces else views
 
 
 def _constraints_of_each(problem: Problem, lens: Lens) -> list[Array]:

@@ -78,7 +78,7 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
 def _compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
     """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
     squares add up to those of the RMS radii, mm."""
-    rays = trace_views(lens, problem.views(), problem.rule, problem.solver)
+    rays = trace_views(lens, problem.views(), problem.solver)
     offsets, growth, (x, y) = _spots(rays)
     # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
     motion = lens.sensor_motion

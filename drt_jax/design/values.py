@@ -23,6 +23,14 @@ spots and wavefronts [distance, field]
     relative_illumination: from projected solid angles, relative to the first field; at the middle
         wavelength
 
+waves [distance, field], of all wavelengths together; target=1 for the best, see waves.py
+    mtf [and tangential, sagittal]: modulus of the transfer function at the frequency `at` on the
+        sensor, cycles/mm
+    strehl [and wavelength, each apart]: irradiance of the image of a point over that without
+        aberrations
+    encircled_energy: the part of the light within a circle of the radius `at`, mm, about the
+        centroid
+
 chief rays, through the centre of the stop
     distortion [distance, field, wavelength: middle]: (real - paraxial image height) / paraxial
         image height; 0 on the axis
@@ -77,9 +85,10 @@ from .field_rays import (
 )
 from .gaps import between, gaps
 from .kinds import back_distance, model_glasses
+from .waves import encircled_energy, mtf, strehl
 
-# A function of a lens and its rays that returns the values of an operand.
-Function = Callable[[Lens, FieldRays], Array]
+# A function of a lens and its rays, and of `Operand.at`, that returns the values of an operand.
+Function = Callable[..., Array]
 
 
 class OperandKind(NamedTuple):
@@ -93,6 +102,7 @@ class OperandKind(NamedTuple):
     per_mm: penalty per millimetre of miss for a failed ray, in the unit of the operand.
     order: axes of the values, see `axes`; () for the usual ones.
     rows: function of a lens, the surfaces that the function returns; None for `places`.
+    at: the name of `Operand.at`, if the function takes it; else empty.
     """
 
     function: Function
@@ -103,12 +113,13 @@ class OperandKind(NamedTuple):
     per_mm: float = 1.0
     order: tuple[str, ...] = ()
     rows: Callable[[Lens], list[int]] | None = None
+    at: str = ""
 
     @property
     def axes(self) -> tuple[str, ...]:
         """Axes of the values in their order: "xy", "distances" and "fields" (together one axis),
         "wavelengths", "middle" (wavelengths; the middle one if none is named), "later" (all but the
-        first), "surfaces", "zones", "rays"."""
+        first), "surfaces", "zones", "sections" (tangential, sagittal), "rays"."""
         ours = [name for name in ("distances", "fields", "surfaces") if name in self.names]
         return self.order or (*ours, *["middle"] * ("wavelengths" in self.names))
 
@@ -116,6 +127,11 @@ class OperandKind(NamedTuple):
     def of_spots(self) -> bool:
         """True for spots and wavefronts, to which `Operand.vignetting` applies."""
         return self.squared != "" or self.function in (_rms_spot, _rms_wavefront, _centroid)
+
+    @property
+    def of_waves(self) -> bool:
+        """True for shares of light, at best 1, that need polynomials of the pupil."""
+        return self.function in (mtf, strehl, encircled_energy)
 
     @property
     def of_all_views(self) -> bool:
@@ -294,6 +310,9 @@ OPERANDS: dict[str, OperandKind] = {
     "numerical_aperture": OperandKind(_numerical_aperture, _RAYS),
     "relative_illumination": OperandKind(relative_illumination, ("fields", "distances")),
     "throughput": OperandKind(_throughput, _RAYS, order=_VIEWS),
+    "mtf": OperandKind(mtf, _RAYS, order=(*_VIEWS, "sections"), at="frequency"),
+    "strehl": OperandKind(strehl, _RAYS, order=(*_VIEWS, "wavelengths")),
+    "encircled_energy": OperandKind(encircled_energy, _RAYS, order=_VIEWS, at="radius"),
     "glass_centre": _gap(True, False),
     "glass_edge": _gap(True, True),
     "air_centre": _gap(False, False),

@@ -32,7 +32,7 @@ from .zernike import Polynomials, fitted
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("points", "weights", "hits", "direction", "path", "index", "motion", "known"),
-    meta_fields=("degree", "clipped"),
+    meta_fields=("degree", "azimuths", "clipped"),
 )
 @dataclasses.dataclass(frozen=True)
 class Beam:
@@ -48,7 +48,9 @@ class Beam:
     index: (W,), refractive index before the sensor.
     motion: (3,), how the sensor's vertex moves in mm a mm of `Lens.sensor`, along its axes.
     known: (W, Q), whether the ray exists.
-    degree: of the polynomials. clipped: whether more than the rim of the stop bounds the light.
+    degree: of the polynomials. azimuths: the largest m of their terms cos(m a), one less than the
+        azimuths of rays on half a disc. clipped: whether more than the rim of the stop bounds the
+        light.
     """
 
     points: Array
@@ -60,6 +62,7 @@ class Beam:
     motion: Array
     known: Array
     degree: int
+    azimuths: int
     clipped: bool
 
     @property
@@ -106,11 +109,19 @@ class Beam:
         if not self.clipped:
             one = jnp.ones((2, self.path.shape[0]), self.path.dtype)
             return -one, one
-        return _extent(self.points, self.known, _margin(self.degree, self.clipped))
+        return _extent(self.points, self.known, self._margin())
 
     def directions_extent(self) -> tuple[Array, Array]:
         """The rectangle of direction cosines that the light lies in: two corners, (2, W)."""
-        return _extent(self.direction[:2], self.known, _margin(self.degree, self.clipped))
+        return _extent(self.direction[:2], self.known, self._margin())
+
+    def _margin(self) -> float:
+        """By what part the light may reach farther than the outermost rays: they lie inside of the
+        rim, and between two of their azimuths."""
+        order = self.degree // 2 + 1
+        outermost = np.polynomial.legendre.leggauss(order + self.clipped)[0][-1]
+        radius = (1 + outermost) / 2 if self.clipped else np.sqrt((1 + outermost) / 2)
+        return float(1.005 / (radius * np.cos(np.pi / (2 * self.azimuths + 2))))
 
     def _with_edges(self, values: list[Array]) -> Array:
         """The values, and hits on all surfaces of a beam that their edges clip, (D, W, Q)."""
@@ -121,7 +132,7 @@ class Beam:
         # Where light is taken away, rays stand for it as well as where it is.
         weights = jnp.where(self.known, jnp.abs(self.weights), 0)
         weights = jnp.where(self.throughput[:, None] > 0, weights, 1)
-        return fitted(points, values, weights, self.degree)
+        return fitted(points, values, weights, self.degree, self.azimuths)
 
 
 @jax.tree_util.register_dataclass
@@ -165,9 +176,10 @@ def beam_of(
     symmetry: Symmetry,
     degree: int,
     clipped: bool,
+    azimuths: int | None = None,
 ) -> Beam:
     """The beam of traced rays; `points` and `symmetry` are those of their rule, `weights` (W, Q)
-    theirs times what they transmit."""
+    theirs times what they transmit. azimuths: None for `degree`."""
     known = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     index = lens.index(scene.wavelengths)[-1]
     hits = [jnp.where(known, h, 0) for h in bundle.hits]
@@ -198,6 +210,7 @@ def beam_of(
         motion=_motion(lens),
         known=repeated(known),
         degree=degree,
+        azimuths=degree if azimuths is None else azimuths,
         clipped=clipped,
     )
     return _filled(beam)
@@ -218,15 +231,6 @@ def _filled(beam: Beam) -> Beam:
         direction=jnp.where(lit, beam.direction, jnp.concatenate([disc, disc[:1]])),
         known=beam.known | ~lit,
     )
-
-
-def _margin(degree: int, clipped: bool) -> float:
-    """By what part the light may reach farther than the outermost rays of `beam_rule`: they lie
-    inside of the rim, and between two of their azimuths."""
-    order = degree // 2 + 1
-    outermost = np.polynomial.legendre.leggauss(order + clipped)[0][-1]
-    radius = (1 + outermost) / 2 if clipped else np.sqrt((1 + outermost) / 2)
-    return float(1.005 / (radius * np.cos(np.pi / (2 * degree + 2))))
 
 
 def _extent(places: Array, known: Array, margin: float) -> tuple[Array, Array]:

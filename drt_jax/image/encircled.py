@@ -9,7 +9,6 @@ the radius; so the part is smooth in all numbers, 0 at R = 0 and 1 beyond the la
 
 import dataclasses
 import functools
-from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +17,12 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
-from ..numerics import Numbers, known_values, real_array, safe_divide, safe_sqrt
+from ..lens.scene import Scene
+from ..numerics import Numbers, known_values, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam, beam_rule, trace_beam
 from .ray_psf import below, ray_spots
-from .spots import light_rule
-from .transfer import Model, centre_of, through_focus
+from .transfer import Model, arrays_of, centre_of, through_focus
 from .wave_psf import autocorrelation, period, pupil_function
 
 _UM = 1e3  # per mm
@@ -55,24 +53,14 @@ def encircled_energy(
     of a trace, as many as keep what the grid repeats out of the largest circle. Other arguments,
     and errors, as of `transfer`.
     """
-    if model not in (known := get_args(Model)):
-        raise ValueError(f"model: expected one of {', '.join(known)}, got {model!r}")
-    dtype = lens.curvature.dtype
-    axis = scene_of(lens, 0.0, distance, wavelengths)
-    angles, circles = fields_array(fields, dtype), real_array("radii", radii, dtype)
-    if circles.ndim != 1:
-        raise ValueError(f"radii: expected (N,), got shape {circles.shape}")
-    spectrum = spectrum_of(wavelength_weights, axis, dtype)
-    rule = light_rule(lens, fields, distance, wavelengths) if rule is None else rule
-    steps = real_array("focus", focus, dtype)
-    if steps.ndim > 1:
-        raise ValueError(f"focus: expected one number or (Z,), got shape {steps.shape}")
+    scene = fields, distance, wavelengths
+    given = arrays_of(lens, scene, model, focus, wavelength_weights, rule, radii=radii)
     if cells is None:
         cells = _CELLS
-        known_now = known_values((lens, angles, axis, circles, rule, steps))
+        known_now = known_values((lens, *given))
         if model == "waves" and known_now is not None:
             cells = max(_CELLS, 64 * int(np.ceil(_cells(*known_now, degree) / 64)))
-    return _encircled(lens, angles, axis, circles, spectrum, steps, rule, model, degree, cells)
+    return _encircled(lens, *given, model, degree, cells)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames=("model", "degree", "cells"))
@@ -188,8 +176,9 @@ def _cells(
     fields: Array,
     axis: Scene,
     radii: Array,
-    rule: PupilRule,
+    spectrum: Array,
     focus: Array,
+    rule: PupilRule,
     degree: int,
 ) -> Array:
     """So many cells, (), that the spot and the circles fit into what the grid repeats."""

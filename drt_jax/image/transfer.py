@@ -80,20 +80,36 @@ def transfer(
 
     Differentiable in every mode. ValueError as of `scene_of`, and without a rule inside a trace.
     """
+    scene = fields, distance, wavelengths
+    given = arrays_of(lens, scene, model, focus, wavelength_weights, rule, frequencies=frequencies)
+    return _transfer(lens, *given, model, degree, cells)
+
+
+def arrays_of(
+    lens: Lens,
+    scene: tuple[Numbers, Numbers, Numbers],
+    model: Model,
+    focus: Numbers,
+    wavelength_weights: Numbers | None,
+    rule: PupilRule | None,
+    **places: Numbers,
+) -> tuple[Array, Scene, Array, Array, Array, PupilRule]:
+    """Arguments of `transfer` and of `encircled_energy`, checked, as arrays: fields (F, 2), scene
+    of the axis, the one of `places` (N,), by its name, spectrum (W,), focus () or (Z,), and the
+    rule. scene: fields, distance and wavelengths."""
     if model not in (known := get_args(Model)):
         raise ValueError(f"model: expected one of {', '.join(known)}, got {model!r}")
     dtype = lens.curvature.dtype
-    axis = scene_of(lens, 0.0, distance, wavelengths)
-    angles, lines = fields_array(fields, dtype), real_array("frequencies", frequencies, dtype)
-    if lines.ndim != 1:
-        raise ValueError(f"frequencies: expected (N,), got shape {lines.shape}")
+    axis, angles = scene_of(lens, 0.0, *scene[1:]), fields_array(scene[0], dtype)
+    ((name, given),) = places.items()
+    values, steps = real_array(name, given, dtype), real_array("focus", focus, dtype)
+    if values.ndim != 1:
+        raise ValueError(f"{name}: expected (N,), got shape {values.shape}")
     spectrum = spectrum_of(wavelength_weights, axis, dtype)
-    steps = real_array("focus", focus, dtype)
     if steps.ndim > 1:
         raise ValueError(f"focus: expected one number or (Z,), got shape {steps.shape}")
-    if rule is None:
-        rule = light_rule(lens, fields, distance, wavelengths)
-    return _transfer(lens, angles, axis, lines, spectrum, steps, rule, model, degree, cells)
+    rule = light_rule(lens, *scene) if rule is None else rule
+    return angles, axis, values, spectrum, steps, rule
 
 
 def strehl(

@@ -36,7 +36,9 @@ def wave_kernel(
     throughput that falls on the grid.
 
     wavelengths: (W,) um. centre: (2,) mm of the grid on the sensor. pixel: () mm. cells: of the
-    grid of directions, along a side; the kernel repeats every `period`.
+    grid of directions, along a side; the kernel repeats every `period`. Cells at an edge hold the
+    mean of their amplitude, so that of the light that edges send to x a part of (pi x / period)^2 /
+    3 is missing: Airy's in half a period by 1.5e-3 with 128 cells.
     """
     amplitude, step = pupil_function(lens, beam, wavelengths, cells)
     transfer = autocorrelation(amplitude)

@@ -129,9 +129,9 @@ def _to_chebyshev(degree: int) -> np.ndarray:
     return np.einsum("pab,ia,jb->pij", values, rows, rows)
 
 
-def fitted(points: Array, values: Array, weights: Array, degree: int) -> Polynomials:
+def fitted(points: Array, values: Array, weights: Array, degree: int, azimuths: int) -> Polynomials:
     """The polynomials that come nearest to values (D, W, Q) at points (2, W or 1, Q), in the least
-    squares with weights (W, Q), none below 0.
+    squares with weights (W, Q), none below 0. azimuths: the largest m of their terms.
 
     Their disc is that of an even body with the weights' centre and variances along x and y, so that
     the terms are nearly orthogonal; which disc it is changes nothing but rounding.
@@ -143,14 +143,17 @@ def fitted(points: Array, values: Array, weights: Array, degree: int) -> Polynom
     spread = jnp.sum(weights[None] * (points - centre[..., None]) ** 2, axis=-1)
     centre, scale = jax.lax.stop_gradient((centre, 2 * jnp.sqrt(spread)))
     basis = zernike((points - centre[..., None]) / scale[..., None], degree)
+    some = np.array([k for k, (_, m) in enumerate(noll_terms(degree)) if abs(m) <= azimuths])
+    terms, basis = len(basis), basis[some]
     weighted = basis * weights[None]
     normal = jnp.einsum("pwq,rwq->wpr", weighted, basis)
     right = jnp.einsum("pwq,dwq->wpd", weighted, values)
     least = _RIDGE * float(jnp.finfo(values.dtype).eps)
     diagonal = jnp.max(jnp.diagonal(normal, 0, 1, 2), axis=-1)[:, None, None]
     normal = normal + least * diagonal * jnp.eye(len(basis), dtype=values.dtype)[None]
-    found = jax.vmap(_solved)(normal, right)
-    return Polynomials(centre, scale, jnp.swapaxes(found, 1, 2), degree)
+    found = jnp.swapaxes(jax.vmap(_solved)(normal, right), 1, 2)
+    every = jnp.zeros((*found.shape[:2], terms), found.dtype).at[..., some].set(found)
+    return Polynomials(centre, scale, every, degree)
 
 
 def _solved(matrix: Array, right: Array) -> Array:

@@ -9,6 +9,7 @@ figure.savefig("lens.png")
 
 from .analyses import (
     distortion as distortion,
+    encircled_energy as encircled_energy,
     fan as fan,
     field_curvature as field_curvature,
     gaussian_error as gaussian_error,

@@ -4,6 +4,7 @@ wavelengths (W,) in um give each curve its colour: blue for the shortest, red fo
 fields (F,) are angles in radians. What is not finite is left out.
 """
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,7 @@ from ..image.chief import Distortion, FieldCurvature
 from ..image.fans import RayFans
 from ..image.gaussian_error import GaussianError
 from ..image.spots import Spots
+from .figures import FIELD_COLOURS
 
 
 def colours(wavelengths: ArrayLike) -> list[str]:
@@ -116,16 +118,39 @@ def mtf(
     curves: ArrayLike,
     limit: ArrayLike,
     names: Sequence[str],
+    hues: Sequence[str] = FIELD_COLOURS,
 ) -> Axes:
     """MTF (F, 2, N) over frequencies (N,) in cycles/mm, tangential and, dashed, sagittal, with the
-    diffraction limit (N,)."""
+    diffraction limit (N,). hues: colours of the fields."""
     axes.plot(frequencies, limit, ":", color="black", label="limit")
-    for k, (both, name) in enumerate(zip(np.asarray(curves), names)):
-        axes.plot(frequencies, both[0], color=f"C{k}", label=name)
-        axes.plot(frequencies, both[1], "--", color=f"C{k}")
+    for both, name, hue in zip(np.asarray(curves), names, itertools.cycle(hues)):
+        axes.plot(frequencies, both[0], color=hue, label=name)
+        axes.plot(frequencies, both[1], "--", color=hue)
     axes.set(ylim=(0, 1.02), xlabel="cycles/mm")
     axes.set_xlim(0, float(np.max(np.asarray(frequencies))))
+    axes.set_title("MTF, S dashed", fontsize=8)
     axes.legend(fontsize=6, frameon=False)
+    return axes
+
+
+def encircled_energy(
+    axes: Axes,
+    radii: ArrayLike,
+    parts: ArrayLike,
+    names: Sequence[str],
+    hues: Sequence[str] = FIELD_COLOURS,
+    airy: float = 0,
+) -> Axes:
+    """The part of the light (F, N) within circles of radii (N,) mm. hues: colours of the
+    fields. airy: a radius in mm to be marked."""
+    places = 1e3 * np.asarray(radii, float)
+    for part, name, hue in zip(np.asarray(parts), names, itertools.cycle(hues)):
+        axes.plot(places, part, color=hue, label=name)
+    if 0 < airy < np.inf:
+        axes.axvline(1e3 * airy, color="0.7", linewidth=0.8, zorder=0, label="Airy")
+    axes.set(xlim=(0, places.max()), ylim=(0, 1.02), xlabel="radius (um)")
+    axes.set_title("encircled energy", fontsize=8)
+    axes.legend(fontsize=6, loc="lower right", frameon=False)
     return axes
 
 

@@ -8,6 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+# Of fields, in the order in which they are given.
+FIELD_COLOURS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
+
 
 class _Figure(Figure):
     """A figure that a notebook can show."""

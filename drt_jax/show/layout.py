@@ -21,6 +21,7 @@ from ..lens.scene import Scene, scene_of
 from ..pupil.patterns import hexapolar
 from ..rays.status import Status
 from ..rays.trace import trace_rays
+from .figures import FIELD_COLOURS
 
 _POINTS = 161
 _RAYS = 600  # are traced at a time, so that all traces share one program
@@ -33,7 +34,6 @@ _ENDS = {
     Status.UNCONVERGED: "no path",
     Status.NO_INDEX: "no index",
 }
-_FIELDS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 
 
 class Drawing(NamedTuple):
@@ -236,11 +236,11 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
         axes.fill(*outline.T, facecolor="#cfe4f5", edgecolor="#30506b", linewidth=0.8)
     for mirror in drawing.mirrors:
         axes.plot(*mirror.T, color="#30506b", linewidth=2)
-    for fan, colour in zip(drawing.rays, itertools.cycle(_FIELDS)):
+    for fan, colour in zip(drawing.rays, itertools.cycle(FIELD_COLOURS)):
         for ray in fan:
             axes.plot(*ray.T, color=colour, linewidth=0.6)
     if len(drawing.fields) > 1:
-        for field, colour in zip(drawing.fields, itertools.cycle(_FIELDS)):
+        for field, colour in zip(drawing.fields, itertools.cycle(FIELD_COLOURS)):
             axes.plot([], [], color=colour, label=f"{math.degrees(field):.4g}°")
         axes.legend(
             title="field", fontsize=8, title_fontsize=8, loc="upper left", bbox_to_anchor=(1, 1)

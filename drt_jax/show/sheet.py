@@ -1,5 +1,6 @@
 """All analyses of a lens on one sheet."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,26 +8,30 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..compilation import ONCE, jit
+from ..image.beam import beam_rule, trace_beam
 from ..image.chief import distortion, field_curvature, lateral_colour
+from ..image.encircled import encircled
 from ..image.fans import RayFans, ray_fans
 from ..image.spots import Spots, light_rule, spot_diagram
-from ..image.transfer import transfer
+from ..image.transfer import Model, transfer_of
 from ..lens.lens import Lens
+from ..lens.scene import Scene, fields_array, scene_of
 from ..pupil.rules import PupilRule
 from . import analyses
-from .figures import new
+from .figures import FIELD_COLOURS, new
 from .layout import draw, lens_drawing
 
 # Fields of the curves, and of that of illumination; points of the fans; fields of spots and fans.
 _CURVE, _LIGHT, _FAN, _FIELDS = 31, 10, 33, 3
 # Frequencies of transfer functions end here, cycles/mm, or where waves do.
 _LINES = 200.0
-# Of the rule of the spots.
-_ORDER = 8
+# Of the rule of the spots; degree of polynomials; cells of transfer functions, of energy.
+_ORDER, _DEGREE, _CELLS, _LEAST, _MOST = 8, 10, 48, 128, 384
 
 
 def sheet(
@@ -37,8 +42,9 @@ def sheet(
     rule: PupilRule | None = None,
     say: Callable[[str], None] = lambda what: None,
 ) -> Figure:
-    """Layout, spots with the Airy circle and ray fans of three of the fields, field curvature,
-    distortion, lateral colour and illumination up to the largest of them: one figure.
+    """Layout; spots with the Airy circle, ray fans, transfer functions and encircled energy of
+    three of the fields; field curvature, distortion, lateral colour and illumination up to the
+    largest of them: one figure.
 
     fields: angles along y, radians. distance: mm, inf allowed. wavelengths: um, the middle one is
     the reference. rule: of the spots, for all fields; None: as of `spot_diagram`. say: is told what
@@ -61,11 +67,13 @@ def sheet(
     rule = light_rule(lens, wide, *scene, order=_ORDER) if rule is None else rule
     spots = _spots(lens, jnp.array(wide), jnp.asarray(distance, line.dtype), jnp.array(waves), rule)
     spots, fans = jax.tree.map(np.asarray, (spots, fans))
-    say("tracing transfer functions")
+    say("tracing waves")
     limit = 2e3 * np.sqrt(spots.solid_angle[0, middle] / np.pi) / waves[middle]
     lines = np.linspace(0, min(limit, _LINES) if limit > 0 else _LINES, _CURVE)
-    picked = jnp.array(some), jnp.asarray(distance, line.dtype), jnp.array(waves)
-    found = _transfers(lens, *picked, jnp.asarray(lines), rule=rule)
+    radii, model, cells = _circles(spots, len(some))
+    axis = scene_of(lens, 0.0, distance, waves)
+    picked = lens, fields_array(some, axis.wavelengths.dtype), axis
+    contrast, best, energy = _waves(*picked, jnp.asarray(lines), radii, rule, model, cells)
     say("drawing")
     figure, axes = _axes(len(some))
     lens_drawing(axes["layout"], draw(lens, fields, distance, wavelengths[middle]))
@@ -73,18 +81,56 @@ def sheet(
     analyses.field_curvature(axes["foci"], foci, line, waves)
     analyses.distortion(axes["bent"], bent, line, waves)
     analyses.lateral_colour(axes["colour"], colour, line, waves, 1e3 * spots.airy_radius[0])
-    later = slice(1 + len(some), None)
-    light = spots.solid_angle[:, middle] / spots.solid_angle[0, middle]
-    analyses.illumination(axes["light"], light[later], spots.throughput[later, middle], wide[later])
-    names = [f"{np.degrees(field):.3g}°" for field in some]
-    analyses.mtf(axes["mtf"], lines, found.mtf, found.limit[0, 0], names)
+    later, cone = slice(1 + len(some), None), spots.solid_angle[:, middle]
+    light = cone[later] / cone[0], spots.throughput[later, middle]
+    analyses.illumination(axes["light"], *light, wide[later])
+    hues = [FIELD_COLOURS[[*fields].index(field) % len(FIELD_COLOURS)] for field in some]
+    given = [f"{np.degrees(field):.3g}°" for field in some], hues  # as the layout has them
+    analyses.mtf(axes["mtf"], lines, contrast, best, *given)
+    analyses.encircled_energy(axes["energy"], radii, energy, *given, float(spots.airy_radius[0]))
+    axes["energy"].set_title(f"encircled energy ({model})", fontsize=8)
     axes["foci"].set_ylabel("field (degrees)")
     return figure
 
 
 _fans = jit(functools.partial(ray_fans, count=_FAN), ONCE)
 _spots = jit(spot_diagram, ONCE)
-_transfers = jit(functools.partial(transfer, degree=10, cells=48), ONCE)
+
+
+@functools.partial(jit, wanted=ONCE, static_argnames=("model", "cells"))
+def _waves(
+    lens: Lens,
+    fields: Array,
+    axis: Scene,
+    lines: Array,
+    radii: Array,
+    rule: PupilRule,
+    model: Model,
+    cells: int,
+) -> tuple[Array, Array, Array]:
+    """MTF (F, 2, N), its limit (N,) on the axis or the first field, and encircled energy (F, N)."""
+    made, waves = beam_rule(_DEGREE, rule.symmetry, rule), axis.wavelengths
+    spectrum = jnp.ones_like(waves)
+
+    def one(field: Array) -> tuple[Array, Array, Array]:
+        beam = trace_beam(lens, dataclasses.replace(axis, field=field), made)
+        given = lens, beam, waves
+        otf, limit = transfer_of(*given, lines, spectrum, "waves", _CELLS)
+        return jnp.abs(otf), limit[0], encircled(*given, radii, spectrum, model, cells)
+
+    contrast, limit, energy = jax.vmap(one)(fields)
+    return contrast, limit[0], energy
+
+
+def _circles(spots: Spots, shown: int) -> tuple[Array, Model, int]:
+    """Radii (N,) of the energy of `shown` fields, mm, its model and the cells of the pupil: rays
+    where waves need too many cells for a grid that holds the spots."""
+    airy = float(np.min(spots.airy_radius))
+    sizes = spots.radius[1 : 1 + shown]
+    reach = max(np.max(sizes, initial=0, where=np.isfinite(sizes)), 3 * min(airy, 1e-2))
+    cells = 64 * int(np.ceil(5 * reach / airy / 64)) if airy < np.inf else _MOST + 1
+    radii = jnp.linspace(0, reach, _CURVE)
+    return (radii, "rays", _LEAST) if cells > _MOST else (radii, "waves", max(cells, _LEAST))
 
 
 def _axes(count: int) -> tuple[Figure, dict[str, Any]]:
@@ -97,11 +143,12 @@ def _axes(count: int) -> tuple[Figure, dict[str, Any]]:
     for row, name in enumerate(("spots", "tangential", "sagittal"), 1):
         axes[name] = [at(row, k) for k in range(count)]
     axes |= {name: at(1, k) for k, name in enumerate(("foci", "bent", "colour"), 3)}
-    axes["light"], axes["mtf"] = at(slice(2, None), 3), at(slice(2, None), slice(4, None))
+    axes |= {name: at(slice(2, None), k) for k, name in enumerate(("light", "mtf", "energy"), 3)}
     for each in figure.axes:
         each.tick_params(labelsize=6)
         each.xaxis.label.set_fontsize(7)
         each.yaxis.label.set_fontsize(7)
+        each.locator_params(axis="x", nbins=6 if each is not axes["layout"] else 10)
     return figure, axes
 
 

@@ -51,7 +51,8 @@ def triplet():
     """The Cooke triplet, what all operands say of it, and the rule of its rays."""
     lens, rule = load_lens("cooke_triplet"), Gauss(4, "bilateral")
     variables = Variables.from_lens(lens, ["curvature"])
-    kinds = [kind for kind in OPERANDS if kind not in ("magnification", "glass_map")]
+    none = "magnification", "glass_map"
+    kinds = [k for k, value in OPERANDS.items() if k not in none and not value.of_waves]
     given = FIELDS, COLOURS, DISTANCES, rule, WEIGHTS
     problem = Problem.from_variables(variables, kinds, *given)
     return lens, rule, program(problem, kinds)(problem, variables.start)
@@ -414,6 +415,10 @@ def test_obscurations_need_another_rule():
             dict(kind="focal_length", distances=(0,)),
             "does not depend on distances, only on wavelengths",
         ),
+        (dict(kind="mtf", target=1), "mtf: at: missing; give the frequency of an mtf in cycles/mm"),
+        (dict(kind="mtf", target=1, at=-5), "mtf: at: must be above 0 and finite, got -5"),
+        (dict(kind="mtf", at=50), "mtf: target: 0 is no light; give 1 for the best, or limits"),
+        (dict(kind="spot", at=50), "spot: at: is of mtf and encircled_energy; leave it out"),
         (dict(kind="spot", fields=0), "operands: spot: fields: expected whole numbers"),
         (dict(kind="spot", fields=("x",)), "operands: spot: fields: expected whole numbers"),
     ],

@@ -178,7 +178,10 @@ def test_each_limit_has_the_name_of_its_value(triplet):
     for symmetry in ("bilateral", "none"):
         problem = design.Problem.from_variables(
             triplet.variables,
-            [Operand(kind, low=lows, weight=2.0) for kind in kinds],
+            [
+                Operand(kind, low=lows, weight=2.0, at=(design.OPERANDS[kind].at and 20.0) or None)
+                for kind in kinds
+            ],
             *([0.0, 0.2, 0.3], (0.48, 0.55, 0.65), (np.inf, 900.0), drt_jax.Gauss(2, symmetry)),
         )
         sizes = jax.eval_shape(

@@ -162,6 +162,7 @@ def test_waves_of_a_perfect_mirror_are_airys_pattern():
     airy = np.einsum("yixj,i,j->yx", airy.reshape(SIZE, 4, SIZE, 4), weights / 2, weights / 2)
     # f/25 by sines is what is left.
     assert np.abs(found - airy).max() < 1e-3 * airy.max()
+    assert abs(np.sum(found) - np.sum(airy)) < 1e-3
 
 
 def test_waves_come_to_rays_when_they_are_short():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import fresnel
 
 import drt_jax
 from drt_jax import Clipped, Gauss, Status, load_lens
@@ -74,11 +75,36 @@ def test_the_transfer_function_of_an_annulus():
         np.testing.assert_allclose(found.mtf[0, way], ANNULUS, rtol=0, atol=1e-3)
 
 
+def aspheric(coefficient, radius):
+    """The mirror with a sag of `coefficient` r^4 and a stop of a radius: one program for all."""
+    stop, mirror = MIRROR["surfaces"]
+    mirror = mirror | {"coefficients": {4: coefficient}}
+    return load_lens({"surfaces": [stop | {"semi_diameter": radius}, mirror]})
+
+
+def test_strehl_with_spherical_aberration():
+    """W r^4 waves in the paraxial focus, and with -W r^2 of defocus: by Fresnel's integrals
+    (Mahajan, Optical Imaging and Aberrations II (2011)); small ones by exp(-(2 pi sigma)^2)."""
+    radius = 10.0
+    square = 1 / (1 + (100 / radius - radius / 400) ** 2)
+    for waves in (0.1, 0.5, 1.0, 2.0):
+        lens = aspheric(waves * WAVE * 1e-3 / (2 * radius**4), radius)
+        focus = waves * WAVE * 1e-3 / (1 - np.sqrt(1 - square))
+        for step, width, sigma in ((0.0, 2, 2 / np.sqrt(45)), (-focus, 1, 1 / np.sqrt(180))):
+            moved = dataclasses.replace(lens, sensor=lens.sensor + step)
+            found = float(drt_jax.strehl(moved, 0.0, np.inf, WAVE, RULE)[0, 0])
+            wanted = sum(a**2 for a in fresnel(width * np.sqrt(waves))) / (width**2 * waves)
+            # Light is not quite even over the directions of a paraboloid that is bent.
+            assert abs(found - wanted) < (2e-4 if waves == 0.1 else 4e-3)
+            if waves == 0.1:
+                assert abs(found - np.exp(-((2 * np.pi * waves * sigma) ** 2))) < 2e-4
+
+
 @pytest.mark.slow
 def test_defocus_and_strehl():
     """|OTF| of a defocused circle by Hopkins (Proc. R. Soc. A 231, 91 (1955)), here summed over the
     common area of two pupils; the Strehl ratio is sinc^2 of the waves at the edge."""
-    lens = load_lens(MIRROR)
+    lens = aspheric(0.0, 1.0)
     side = (np.arange(2000) + 0.5) / 1000 - 1
     x, y = np.meshgrid(side, side)
     edges, parts = np.array([0.25, 0.5, 1.0]), PARTS[[1, 2, 4]]

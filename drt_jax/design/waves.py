@@ -1,0 +1,78 @@
+"""Operands of waves: transfer functions, Strehl ratios and encircled energy of rays that a problem
+has traced, by the polynomials of `image.beam`. No ray is added.
+
+`Gauss` has the light that fills the stop, whatever else clips it; `Soft` and `Clipped` have what
+apertures leave.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..image.beam import Beam, beam_of
+from ..image.encircled import encircled
+from ..image.transfer import strehl_of, transfer_of
+from ..lens.lens import Lens
+from ..lens.scene import Scene
+from ..numerics import Numbers, safe_sqrt
+from ..pupil.clipped import Clipped
+from ..pupil.rules import Gauss, PupilRule, Soft
+from ..rays.system import Vector
+from ..rays.trace import Bundle
+from .field_rays import EXTRAS, FieldRays
+
+# Cells of the pupil along a side: of transfer functions and Strehl ratios, of encircled energy.
+_CELLS, _ENERGY = 64, 128
+
+
+def degree_of(rule: PupilRule) -> int:
+    """The degree of the polynomials of the pupil that the rays of a rule give, see `beam_rule`; 0
+    for a rule of too low an order or of another kind."""
+    if isinstance(rule, Gauss | Soft):
+        return 2 * (rule.order - 1)
+    return 2 * max(rule.size - 2, 0) if isinstance(rule, Clipped) else 0
+
+
+def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Array]) -> Array:
+    """A function of the beam of each view, (V, ...)."""
+    full, degree = isinstance(rays.rule, Gauss), degree_of(rays.rule)
+    light = rays.stop_weights if full else rays.weights * rays.throughput[..., None]
+    light = jnp.where(rays.arrives, light, 0)
+    # The azimuths of `gauss_points` give no more terms.
+    azimuths = rays.rule.order if isinstance(rays.rule, Gauss | Soft) else degree
+
+    def one(field: Array, distance: Array, points: Vector, light: Array, bundle: Bundle) -> Array:
+        given = rays.symmetry, degree, not full, azimuths
+        scene = Scene(field, distance, rays.wavelengths)
+        return function(beam_of(lens, scene, points, light, bundle, *given))
+
+    # `steps` alone has no axis of rays, and no use here.
+    of_rays = rays.points, light, rays.bundle._replace(steps=light)
+    of_rays = jax.tree.map(lambda a: a[..., EXTRAS:], of_rays)
+    return jax.vmap(one)(rays.field, rays.distance, *of_rays)
+
+
+def mtf(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
+    """Modulus (V, 2) of the transfer function of all wavelengths at a frequency, cycles/mm:
+    tangential and sagittal."""
+    frequency = jnp.reshape(jnp.asarray(at, rays.wavelengths.dtype), 1)
+    given = rays.wavelengths, frequency, rays.wavelength_weights
+    of = lambda beam: transfer_of(lens, beam, *given, "waves", _CELLS)[0]  # noqa: E731
+    otf = _of_beams(lens, rays, of)[..., 0]
+    return safe_sqrt(otf.real**2 + otf.imag**2)
+
+
+def strehl(lens: Lens, rays: FieldRays) -> Array:
+    """Strehl ratio (V, W), see `image.transfer.strehl`."""
+    return _of_beams(lens, rays, lambda beam: strehl_of(lens, beam, rays.wavelengths, _CELLS))
+
+
+def encircled_energy(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
+    """The part (V,) of the light within a circle of a radius in mm about the centroid of all
+    wavelengths."""
+    radius = jnp.reshape(jnp.asarray(at, rays.wavelengths.dtype), 1)
+    given = rays.wavelengths, radius, rays.wavelength_weights
+    of = lambda beam: encircled(lens, beam, *given, "waves", _ENERGY)  # noqa: E731
+    return _of_beams(lens, rays, of)[:, 0]

@@ -1,0 +1,140 @@
+"""Operands of waves: closed forms of a perfect lens, analyses of the same lens, derivatives."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import Clipped, Gauss, Pattern, Soft, design, load_lens
+from drt_jax.compilation import LARGE, jit
+from drt_jax.design import Operand, Problem, Variables, Vary, trace_fields
+from drt_jax.image import transfer
+
+from ..image.test_encircled import ZEROS
+from ..image.test_transfer import CIRCLE, COOKE, LIMIT, MIRROR, PARTS, WAVE
+from .test_derivatives import assert_derivatives
+
+FIELDS, COLOURS, WEIGHTS = jnp.array([0.0, 0.2]), jnp.array([0.48, 0.6]), jnp.array([2.0, 1.0])
+LINES, RADIUS = 25.0, 0.01
+ASKED = [
+    Operand("mtf", 1.0, at=LINES),
+    Operand("strehl", 1.0),
+    Operand("encircled_energy", 1.0, at=RADIUS),
+]
+
+
+def told(problem, lens):
+    """Values of all operands by name."""
+    rays = trace_fields(problem, lens)
+    return {operand.name: operand.values(lens, rays) for operand in problem.operands}
+
+
+def test_a_perfect_lens_and_other_numbers_compile_nothing():
+    """A paraboloid: P10's transfer function of a circle and energy in Airy's rings."""
+    lens, program = load_lens(MIRROR), jax.jit(told)
+    variables = Variables.from_lens(lens, ["sensor"])
+    for part, wanted, zero, energy in zip(
+        PARTS[[2, 3]], [CIRCLE[2], CIRCLE[3]], ZEROS, [0.8378848691733143, 0.9099305350856731]
+    ):
+        asked = [
+            dataclasses.replace(operand, at=at)
+            for operand, at in zip(ASKED, (part * LIMIT, None, zero))
+        ]
+        found = program(Problem.from_variables(variables, asked, 0.0, WAVE, rule=4), lens)
+        np.testing.assert_allclose(found["mtf"], wanted, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(found["strehl"], 1, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found["encircled_energy"], energy, rtol=0, atol=3e-4)
+    assert program._cache_size() == 1
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    """A vector, and a program that tells values and derivatives there."""
+    vary = [Vary("curvature", (0, 3)), Vary("thickness", (1,)), "sensor"]
+    variables, rule = Variables.from_lens(COOKE, vary), Gauss(6, "bilateral")
+    problem = Problem.from_variables(
+        variables, ASKED, FIELDS, COLOURS, rule=rule, wavelength_weights=WEIGHTS
+    )
+    values = lambda x: told(problem, problem.variables.lens_of(x))  # noqa: E731
+    return variables.start, jit(lambda x: (values(x), jax.jacfwd(values)(x)), LARGE)
+
+
+def test_derivatives_are_those_of_differences(triplet):
+    """Those of the energy to what the polynomials of its Bessel function leave, 1e-7."""
+    x, both = triplet
+    assert_derivatives(lambda x: both(x)[0], both(x)[1], x, 1e-5)
+
+
+@pytest.mark.slow
+def test_values_are_those_of_analyses(triplet):
+    """The rays of the design and those of the analyses are others; the cells are the same."""
+    x, both = triplet
+    found, rule = both(x)[0], Gauss(6, "bilateral")
+    scene = COOKE, FIELDS, np.inf, COLOURS
+    given = {"wavelength_weights": WEIGHTS, "rule": rule}
+    wanted = drt_jax.transfer(*scene, jnp.array([LINES]), **given).mtf[..., 0]
+    np.testing.assert_allclose(found["mtf"], np.ravel(wanted), rtol=0, atol=4e-5)
+    wanted = drt_jax.strehl(*scene, rule=rule, cells=transfer._CELLS)
+    np.testing.assert_allclose(found["strehl"], np.ravel(wanted), rtol=0, atol=2e-4)
+    wanted = drt_jax.encircled_energy(*scene, jnp.array([RADIUS]), cells=128, **given)[:, 0]
+    np.testing.assert_allclose(found["encircled_energy"], wanted, rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "rule, within", [(Soft(6, "bilateral", 0.01), 4e-3), (Clipped(6, "bilateral"), 2e-4)]
+)
+def test_a_clipped_pupil(rule, within):
+    """Against the analyses with a finer rule; the light that fills the stop has other contrast."""
+    lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
+    variables, field = Variables.from_lens(lens, ["sensor"]), jnp.array([0.0, 0.25])
+    values = [
+        jax.jit(told)(Problem.from_variables(variables, ASKED, field, COLOURS, rule=r), lens)
+        for r in (rule, Gauss(6, "bilateral"))
+    ]
+    fine = {"rule": Clipped(10, "bilateral")}
+    scene = lens, field, np.inf, COLOURS
+    wanted = {
+        "mtf": drt_jax.transfer(*scene, jnp.array([LINES]), **fine).mtf[..., 0],
+        "strehl": drt_jax.strehl(*scene, **fine),
+        "encircled_energy": drt_jax.encircled_energy(*scene, jnp.array([RADIUS]), **fine)[:, 0],
+    }
+    for name, each in wanted.items():
+        np.testing.assert_allclose(values[0][name], np.ravel(each), rtol=0, atol=within)
+        assert np.max(np.abs(values[1][name] - np.ravel(each))) > 5e-3
+
+
+@pytest.mark.slow
+def test_contrast_designs_a_lens_of_more_contrast():
+    """The triplet at 50 cycles/mm, from where least squares on spots ends."""
+    lens, waves = COOKE, (0.486, 0.588, 0.656)
+    fields, rule = np.radians([0.0, 14.0, 20.0]), Gauss(5, "bilateral")
+    variables = Variables.from_lens(
+        lens, ["curvature", "sensor"], solves=[design.Solve("focal_length", 50.0, surface=5)]
+    )
+    spots = design.optimise(Problem.from_variables(variables, ["spot"], fields, waves, rule=rule))
+    sharp = Problem.from_variables(
+        variables, [Operand("mtf", 1.0, at=50.0)], fields, waves, rule=rule
+    )
+    best = design.optimise(sharp, spots.vector, max_steps=40)
+    before, after = (
+        np.asarray(drt_jax.transfer(found.lens, fields, np.inf, waves, [50.0]).mtf)
+        for found in (spots, best)
+    )
+    assert np.mean(after) > np.mean(before) + 0.05 and np.min(after) > np.min(before)
+
+
+def test_rules_that_give_no_polynomials_and_names_of_limits():
+    variables = Variables.from_lens(COOKE, ["sensor"])
+    limit = Operand("mtf", low=0.3, at=50.0, fields=(1,))
+    points, weights = drt_jax.pupil.disc(3, 6)
+    for rule in (Gauss(1, "none"), Pattern(points, weights), Clipped(2, "bilateral")):
+        with pytest.raises(ValueError, match="^operands: mtf: rule: needs Gauss or Soft of"):
+            Problem.from_variables(variables, [limit], FIELDS, rule=rule)
+    problem = Problem.from_variables(variables, [limit], FIELDS)
+    names = [str(each) for each in problem.limits(np.array([0.1, -0.1]))]
+    assert names[0] == "mtf of field 1, tangential, frequency 50: 0.2, low 0.3, beyond by 0.1"
+    assert names[1] == "mtf of field 1, sagittal, frequency 50: 0.4, low 0.3, within by 0.1"
