@@ -135,6 +135,7 @@ def test_dtypes_of_a_lens_that_do_not_fit_are_refused(kind):
             psf_moments(wrong, *SCENE)
 
 
+@pytest.mark.slow
 def test_a_lens_of_arrays_of_numpy_or_of_numbers_will_do():
     same = dataclasses.replace(jax.tree.map(np.asarray, LENS), sensor=float(LENS.sensor))
     ours, other = (psf_moments(lens, *SCENE, rule=RULE) for lens in (same, LENS))
@@ -247,6 +248,7 @@ def test_gaussian_optics_has_no_nan():
             drt_jax.field_of_height(1.0, distance)
 
 
+@pytest.mark.slow
 def test_reference_spheres_of_no_radius():
     for curvature in (np.inf, np.nan, [0.0, np.inf]):
         with pytest.raises(ValueError, match="curvature: "):
@@ -290,6 +292,7 @@ def test_a_lens_that_passes_no_ray_says_which_surface():
         assert "\n" not in text and len(text) < 300
 
 
+@pytest.mark.slow
 def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
     thin = changed(thickness=[2.0, 0.3])
     assert psf_moments(thin, 0.0, np.inf, GREEN).throughput[0] > 0.999

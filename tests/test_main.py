@@ -10,6 +10,7 @@ from drt_jax import back_focal_distance, load_lens, psf_moments
 from drt_jax.__main__ import main
 
 
+@pytest.mark.slow
 def test_a_lens_shows_itself(tmp_path, capsys):
     picture = tmp_path / "lens.png"
     words = ["show", "cooke_triplet", "--field", "0", "5", "--wavelengths", "0.55"]

@@ -63,6 +63,7 @@ def snapped():
     )
 
 
+@pytest.mark.slow
 def test_no_other_glass_makes_a_thin_doublet_better():
     """Every alternative has the spot of the closed form, and none in the end is smaller than that
     of the pair; the chromatic focal shift is the textbook's, (P1 - P2) / (v1 - v2)."""
@@ -94,6 +95,7 @@ def test_no_other_glass_makes_a_thin_doublet_better():
     assert abs(textbook) < 1 / 4500 and abs(shift - textbook) < 1e-4, (pair, textbook, shift)
 
 
+@pytest.mark.slow
 def test_costs_are_told():
     """Each snap begins where that before it ended; each merit is what the problem says."""
     _, found, best = snapped()

@@ -81,6 +81,7 @@ def test_spots(triplet):
         assert abs(told["centroid"][k] - centroid[1]) < 1e-12
 
 
+@pytest.mark.slow
 def test_wavefronts(triplet):
     lens, rule, told = triplet
     points, weights = (
@@ -110,6 +111,7 @@ def test_first_order(triplet):
     assert abs(told["total_track"][0] - ends - 42.20778) < 1e-12
 
 
+@pytest.mark.slow
 def test_chief_rays(triplet):
     """Distortion and lateral colour by `image_point`, angles by the direction cosines."""
     lens, _, told = triplet
@@ -147,6 +149,7 @@ def test_numerical_apertures(triplet):
     assert abs(told["numerical_aperture"][0] / paraxial - 1) < 1e-2
 
 
+@pytest.mark.slow
 def test_incidence(triplet):
     """The largest angle between directions and normals, these by differences of the sag."""
     lens, rule, told = triplet

@@ -137,6 +137,7 @@ def test_a_search_ends_as_soon_as_it_is_good(triplet):
     assert merit + worst**2 > good and found.ended == "target" and not found.converged
 
 
+@pytest.mark.slow
 def test_limits_are_kept_where_trials_are_used_up(triplet):
     """A search that is left before its multipliers have settled is mended by some more trials."""
     found = design.optimise(triplet, max_steps=10)

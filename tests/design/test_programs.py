@@ -61,6 +61,7 @@ def searched(k):
     return problem, design.optimise(problem, max_steps=3)
 
 
+@pytest.mark.slow
 def test_other_numbers_and_names_compile_nothing(caplog):
     searched(0)
     searched(1)  # the range of a glass, and the like, may be asked for the first time

@@ -40,6 +40,7 @@ def both(lens, scene, points):
     return find_aimed(system, target), find(system, target)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "factor", "degrees"), WIDE)
 def test_aiming_finds_what_the_full_search_finds(name, factor, degrees):
     lens = opened(name, factor)

@@ -174,6 +174,7 @@ def test_a_mirror_keeps_its_focus():
         assert abs(found.image_distance[0] / variables.lens_of(vector).sensor - 1) < 1e-11
 
 
+@pytest.mark.slow
 def test_the_patent_lens_keeps_its_data(shared):
     solves = [Solve("focal_length", 49.565, 11), Solve("f_number", 1.84), Solve("paraxial_focus")]
     lens = load_lens(shared / "patent_rf50.yaml")

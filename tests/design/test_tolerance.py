@@ -234,6 +234,7 @@ def test_errors_are_drawn_within_circles(normal):
     assert np.array_equal(off, design.draw_perturbations(some, 100_000, 0, normal))
 
 
+@pytest.mark.slow
 def test_monte_carlo_depends_on_neither_threads_nor_tiles(singlet, monkeypatch):
     off = design.draw_perturbations(singlet[1], 120, 2)
     told = []

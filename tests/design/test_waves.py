@@ -32,6 +32,7 @@ def told(problem, lens):
     return {operand.name: operand.values(lens, rays) for operand in problem.operands}
 
 
+@pytest.mark.slow
 def test_a_perfect_lens_and_other_numbers_compile_nothing():
     """A paraboloid: P10's transfer function of a circle and energy in Airy's rings."""
     lens, program = load_lens(MIRROR), jax.jit(told)
@@ -62,6 +63,7 @@ def triplet():
     return variables.start, jit(lambda x: (values(x), jax.jacfwd(values)(x)), LARGE)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(triplet):
     """Those of the energy to what the polynomials of its Bessel function leave, 1e-7."""
     x, both = triplet
@@ -127,6 +129,7 @@ def test_contrast_designs_a_lens_of_more_contrast():
     assert np.mean(after) > np.mean(before) + 0.05 and np.min(after) > np.min(before)
 
 
+@pytest.mark.slow
 def test_rules_that_give_no_polynomials_and_names_of_limits():
     variables = Variables.from_lens(COOKE, ["sensor"])
     limit = Operand("mtf", low=0.3, at=50.0, fields=(1,))

@@ -149,6 +149,7 @@ def test_names_with_spaces_and_other_signs(unbroken, tmp_path):
     assert left(tmp_path / "a b, ü 🔭 %s {x}" / "%2F") == unbroken
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_training_is_heard_or_stays_ignored(number, unbroken, tmp_path):
     """As a shell starts a program in the background of a script, or under `nohup`."""

@@ -90,7 +90,9 @@ def test_every_config_loads_strictly(path):
     assert load_config(kind, path) != load_config(kind, path, [other])
 
 
-@pytest.mark.parametrize("name", TOY)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "edof" else n for n in TOY]
+)
 def test_a_run_explains_itself(name, unbroken):
     folder = unbroken(name)
     results = json.loads((folder / "results.json").read_text())

@@ -46,7 +46,7 @@ STARTS = {
     ],
 }
 # Programs of many kinds.
-LONG = ("accuracy", "design", "images", "lenses", "render", "stability", "tolerance")
+LONG = ("accuracy", "benchmark", "design", "images", "lenses", "render", "stability", "tolerance")
 
 
 def runnable():

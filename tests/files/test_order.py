@@ -138,6 +138,7 @@ def test_only_neighbours_of_a_moved_surface_are_not_checked(key, value):
             load_lens(lens)
 
 
+@pytest.mark.slow
 def test_surfaces_that_cross_at_the_rim():
     """A rounded aperture: the lens loads with a warning, and light that comes there is lost."""
     rows = [

@@ -99,6 +99,7 @@ def test_use_of_a_lens(tmp_path):
     assert float(system.lens.semi_diameter[0]) == 5 and system.ray_aiming == "chief"
 
 
+@pytest.mark.slow
 def test_apertures_of_systems_and_kinds_of_fields(tmp_path):
     """EPD, FNO, NA, NAO by their definition: NA is NAO over the magnification, FNO 1 / (2 NA)."""
 
@@ -234,6 +235,7 @@ def test_a_zone_plate_focuses_as_its_optical_path_says(tmp_path):
     np.testing.assert_allclose(found.focal_length, [1000, 1100])  # 100 cm
 
 
+@pytest.mark.slow
 def test_fringe_polynomials(tmp_path):
     """Spherical aberration (9) is 6 r^4 - 6 r^2 + 1, 5 and 6 astigmatism, 8 coma along y."""
     shapes = {
@@ -275,6 +277,7 @@ def places(lens):
     return np.concatenate([across, np.asarray(z)[:, None]], axis=1), np.asarray(turned)
 
 
+@pytest.mark.slow
 def test_where_surfaces_stand(tmp_path):
     """Basic, BEN, REV, RET and DAR, against geometry; ray-optics 0.9.8 has the same places."""
     folded = read(tmp_path, FRONT, "S -50 20", "S 0 -30 REFL; ADE 45; BEN", "S 9 -1 F2", "S 0 -3")

@@ -443,6 +443,7 @@ READ = (
 )
 
 
+@pytest.mark.slow
 @LISTED
 @pytest.mark.parametrize("name", READ)
 def test_listed_first_order(name):

@@ -70,6 +70,7 @@ def test_a_ball_with_the_stop_at_its_centre():
         np.testing.assert_allclose(found, np.tan(angles[1:]) / angles[1:] - 1, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_calibrated_focal_lengths():
     """By least squares over the fields, or given."""
     lens, angles = load_lens(BALL), np.array([0.1, 0.3, 0.5])
@@ -93,6 +94,7 @@ def test_a_symmetric_lens_at_unit_magnification_has_no_distortion_and_no_lateral
     assert abs(drt_jax.distortion(lens, angles, np.inf, 0.55).relative[-1, 0]) > 5e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", [COOKE, moved(COOKE)], ids=["centred", "moved"])
 @pytest.mark.parametrize("distance", [np.inf, 900.0])
 def test_foci_and_heights_by_the_complex_step(lens, distance):

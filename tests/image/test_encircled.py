@@ -30,6 +30,7 @@ def test_airys_pattern():
     np.testing.assert_allclose(found[2:], 1 - j0(v) ** 2 - j1(v) ** 2, rtol=0, atol=3e-4)
 
 
+@pytest.mark.slow
 def test_an_even_disc_of_rays():
     """The paraboloid out of focus: a ray of height h is at d h / (f - h^2 / (4 f)), f = 100."""
     step, f = 1.0, 100.0

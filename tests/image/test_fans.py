@@ -60,6 +60,7 @@ def test_fans_are_rays_and_wavefronts(fields):
             np.testing.assert_allclose(getattr(found, f"{name}_path")[k], paths, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_foci_of_rays_by_colour():
     """The triplet's rays cross the axis where `trace_rays` has them, near it at the paraxial
     focus."""
@@ -94,6 +95,7 @@ def test_derivatives_and_failed_rays():
     check_slopes(both, lens, {"curvature": 1e-8, "thickness": 1e-6}, 1e-5)
 
 
+@pytest.mark.slow
 def test_clear_errors():
     for count in (1, 2.5, "5"):
         with pytest.raises(ValueError, match="count: expected at least 2, a whole number"):

@@ -27,11 +27,13 @@ def test_the_field_of_an_image_point_is_the_field_it_came_from():
     np.testing.assert_allclose(jax.jacfwd(field)(point) @ turned, np.eye(2), rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_chief_ray_is_that_through_the_centre_of_the_stop():
     rays = drt_jax.trace_rays(LENS, (0.05, 0.25), 1e4, [0.55], [[0.0, 0.0]])
     np.testing.assert_allclose(image((0.05, 0.25)), rays.points[0, 0, -1, :2], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_no_field_reaches_a_point_far_outside():
     assert not np.any(np.isfinite(field(jnp.array([0.0, 1e4]))))
 

@@ -88,6 +88,7 @@ def test_a_lens_that_passes_no_ray(singlet):
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_a_wavelength_without_an_index(singlet):
     """An error outside; inside, that colour looks as bad as can be, and moves no other."""
     for call in (psf_moments, drt_jax.converged_rule):

@@ -200,6 +200,7 @@ def test_a_rule_keeps_the_promised_tolerance(degrees):
         before = order
 
 
+@pytest.mark.slow
 def test_one_rule_serves_many_fields_and_distances():
     """It keeps the tolerance of each, has the order that the hardest needs, and the symmetry of
     all."""

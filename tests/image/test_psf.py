@@ -165,6 +165,7 @@ def test_waves_of_a_perfect_mirror_are_airys_pattern():
     assert abs(np.sum(found) - np.sum(airy)) < 1e-3
 
 
+@pytest.mark.slow
 def test_waves_come_to_rays_when_they_are_short():
     # A disc out of focus; no glass, so that the rays do not know the wavelength.
     lens = paraboloid(sensor=55.0)
@@ -220,6 +221,7 @@ def test_without_light_a_kernel_is_dark_and_its_slopes_are_nothing(double_gauss)
     assert all(np.all(np.asarray(leaf) == 0) for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_defocus_is_the_sensor_moved(double_gauss):
     lens, *rest = double_gauss
     moved = dataclasses.replace(lens, sensor=lens.sensor + 0.05)

@@ -40,6 +40,7 @@ def variances():
     return both
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delta", VARIANCES)
 def test_the_exact_moment_of_defocus(variances, delta):
     """P11: a ray meets the sensor at delta h / (f - h^2 / (4 f)); so do beams moved to it."""

@@ -128,6 +128,7 @@ def test_interpolation_is_exact_for_polynomials_and_goes_on_at_the_edge():
     np.testing.assert_allclose(found, [3 * 4.3 + 5.6**2, 27.0], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_an_even_picture_stays_even_but_for_the_illumination():
     lens, method = lens_of(), method_of()
     maps = sensor_maps.sensor_maps(lens, method, WAVES)

@@ -179,6 +179,7 @@ def test_no_light_is_infinite_and_dark():
         assert np.all(np.isfinite(part[0])) and np.all(np.isposinf(part[1])), name
 
 
+@pytest.mark.slow
 def test_derivatives_by_lens_numbers():
     """Reverse mode against central differences, with the rim itself among the numbers."""
     steps = {"curvature": 1e-8, "thickness": 1e-6, "semi_diameter": 1e-6}

@@ -82,6 +82,7 @@ def aspheric(coefficient, radius):
     return load_lens({"surfaces": [stop | {"semi_diameter": radius}, mirror]})
 
 
+@pytest.mark.slow
 def test_strehl_with_spherical_aberration():
     """W r^4 waves in the paraxial focus, and with -W r^2 of defocus: by Fresnel's integrals
     (Mahajan, Optical Imaging and Aberrations II (2011)); small ones by exp(-(2 pi sigma)^2)."""

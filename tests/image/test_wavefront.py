@@ -47,6 +47,7 @@ def paraboloid(gap):
 PERFECT = {"ellipsoid": (ellipsoid, 1.5, 30.0), "paraboloid": (paraboloid, 1.0, 50.0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PERFECT)
 def test_defocus_of_a_perfect_image(name):
     """Exit pupil before, behind and infinitely far from the sensor. A ray at the angle u leaves
@@ -201,6 +202,7 @@ def test_failed_rays_have_a_status_and_change_no_other(monkeypatch):
     np.testing.assert_allclose(rms_wavefront(wave, weights), np.std(good), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_failed_chief_ray(monkeypatch):
     """Light of a near object point inside n = 1.5: at the centre of the stop it is too steep for
     the plane behind it, lower it is not. Without a chief ray there is no reference sphere."""

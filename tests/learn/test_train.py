@@ -29,6 +29,7 @@ def scenes(seed=0, count=3):
     return np.random.default_rng(seed).integers(0, 255, (count, 24, 24, 3), dtype=np.uint8)
 
 
+@pytest.mark.slow
 def test_imager_is_the_chain_by_hand():
     imager = train.make_imager(blur(), None, CAMERA)
     sensor = jnp.array(133.2)

@@ -111,6 +111,7 @@ def test_a_file_may_ask_for_it(tmp_path):
         load_lens({"surfaces": MOVED, "pupil": "real"})
 
 
+@pytest.mark.slow
 def test_a_pupil_at_infinity_is_none():
     """A stop in the focus of what is in front of it: said, and inside a trace no ray is."""
     glass = {"index": 2.0, "thickness": 100.0}

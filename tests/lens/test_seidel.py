@@ -38,6 +38,7 @@ THIRD = {
 LONG = ("immersed", "mangin")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in THIRD]
 )

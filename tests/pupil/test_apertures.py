@@ -31,6 +31,7 @@ CLEAR = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CLEAR)
 def test_light_and_spot_of_a_clear_aperture(name):
     aperture, area, variances = CLEAR[name]
@@ -189,6 +190,7 @@ def test_a_rule_does_not_step_over_an_obscuration():
     np.testing.assert_allclose(share, 1)
 
 
+@pytest.mark.slow
 def test_soft_edges_tend_to_hard_ones():
     lens = beam(obscuration={"rectangle": [0.5, 0.4]}, aperture={"ellipse": [1.2, 0.9]})
     share = jax.jit(

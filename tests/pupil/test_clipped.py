@@ -151,6 +151,7 @@ def test_one_rule_for_a_clipped_field_and_the_axis():
         np.testing.assert_allclose(ours.covariance, exact.covariance, rtol=2e-4, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
     @jax.jit
     def passed(lens, width):

@@ -61,6 +61,7 @@ def test_no_newton_step_remains(found):
     assert int(found.steps) == 0
 
 
+@pytest.mark.slow
 def test_every_ray_obeys_snell_and_crosses_its_stop_point(lens, points, found):
     some = tuple(p[::30] for p in points)
     few = found._replace(hits=tuple(h[..., ::30] for h in found.hits), status=found.status[:, ::30])

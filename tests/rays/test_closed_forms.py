@@ -80,6 +80,7 @@ def test_c18_aplanatic_point():
     np.testing.assert_allclose(sines[:, 0] / sines[:, 1], 1.5, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_c19_plane_parallel_plate():
     """A ray at 30 degrees through 10 mm of n = 1.5 shifts by 3.8762756430420553 mm."""
     plate = [{"radius": INF, "index": 1.5, "thickness": 10.0}, {"radius": INF, "thickness": 20.0}]
@@ -107,6 +108,7 @@ def test_c19_ball_lens_and_thick_lens(front, back, thickness, wanted):
     np.testing.assert_allclose(-1e-4 / slope, wanted, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_c19_critical_angle():
     """From n = 1.5 into air a plane reflects totally from 41.810314895778596 degrees on."""
     lens = behind_stop(

@@ -39,6 +39,7 @@ def crossing(radius, points, directions):
     return hit, (square > 0) & (1 - hit[:, 2] / radius > 0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", [0.0, 0.3, 0.6, 0.8])
 @pytest.mark.parametrize("radius, semi_diameter", [(10.0, 9.9), (10.0, 8.5), (-10.0, 9.9)])
 def test_steep_dummy_before_the_stop(radius, semi_diameter, field):

@@ -163,6 +163,7 @@ HELD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HELD)
 def test_a_held_sensor_moves_as_its_elements_turn_it(name):
     """The polynomials in the sensor position, beside the lens with its sensor really moved."""

@@ -64,6 +64,7 @@ def polished(lens, scene, points, hits, active):
     return found.value, found.state.solved, found.stats["num_steps"], successful
 
 
+@pytest.mark.slow
 def test_newton_from_the_crudest_start():
     """Every hit at the stop point: all rays within 8 steps. Those that are not to move stay; one
     that has no solution tells, stays finite and leaves the others alone."""
@@ -88,6 +89,7 @@ def test_newton_from_the_crudest_start():
         np.testing.assert_allclose(mine[:, :, ~hard], wanted[:, :, ~hard], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_hits_that_rounding_would_turn_are_not_accepted():
     """Two equal surfaces a nanometre of a nanometre apart: rays exist, their directions drown."""
     lens, scene, points, _ = problem("meridional")
@@ -101,6 +103,7 @@ def test_hits_that_rounding_would_turn_are_not_accepted():
     assert np.all(search(apart, scene, points).status == Status.OK)
 
 
+@pytest.mark.slow
 def test_a_polish_that_takes_one_step_shorter_than_rounding_of_a_mm():
     """All surfaces within 0.2 um, in the stop's middle: hits of 1e-5 mm, of which 7e-17 is much."""
     bent = [{"radius": -61.193, "index": n, "thickness": t} for n, t in ((1.93, 1e-4), (1.9, 1e-6))]
@@ -161,6 +164,7 @@ def test_the_fan_under_vmap():
             np.testing.assert_allclose(mine[i], wanted, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_several_rays_that_are_sought():
     """Two of a bundle that the first aim does not find: each from its own nearest starts."""
     radius, gap = (-21.77, -9.051, 14.174, 9.3, "inf"), (2.219, 1.995, 6.392, 6.941, 22.718)

@@ -76,6 +76,7 @@ def test_c01_marginal_ray(cases, gap):
     np.testing.assert_allclose(angle, reference["angle_of_incidence_deg"], atol=5.1e-3)
 
 
+@pytest.mark.slow
 def test_c01_ray_errors_and_path_differences(cases):
     """Transverse errors to half a unit of the sixth decimal; OPD to 0.002 waves."""
     reference = cases["C01"]["reference"]
@@ -116,6 +117,7 @@ def test_c02_first_order_data(cases):
         np.testing.assert_allclose(n[lens.glasses.index(glass)], printed, atol=5.1e-7)
 
 
+@pytest.mark.slow
 def test_c02_paraxial_rays(cases):
     """Heights and slopes at each surface: half a unit of the sixth decimal; and the Fermat
     rays at a ten thousandth of the aperture have the heights of the paraxial marginal ray."""
@@ -247,6 +249,7 @@ def wyld(entry, line):
     return dataclasses.replace(lens, labels=labels)
 
 
+@pytest.mark.slow
 def test_c16_wyld_achromat(cases):
     """Eleven decimals are published: 1e-10 in the foci, some 1e-11 in slopes and differences."""
     entry, reference = cases["C16"]["prescription"], cases["C16"]["reference"]
@@ -292,6 +295,7 @@ def p01(cases):
     return load_lens({"surfaces": rows})
 
 
+@pytest.mark.slow
 def test_p01_ray_fan(cases, p01):
     """Transverse errors to 1e-10 um."""
     fan = np.array(cases["P01"]["reference"]["tangential_fan_py_ey_um"])
@@ -318,6 +322,7 @@ def test_p01_first_order(cases, p01):
     np.testing.assert_allclose(place, reference["exit_pupil_from_image"], atol=5.1e-6)
 
 
+@pytest.mark.slow
 def test_p01_wavefront(cases, p01):
     """Zernike coefficients and root mean square to half a unit of the last digit, which is 1e-8
     waves; the range, which is that of a 64 x 64 grid, to 1e-6 waves."""

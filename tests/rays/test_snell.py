@@ -163,6 +163,7 @@ def launches(rays=20):
     return tuple(jnp.asarray(np.broadcast_to(points, (2, 2, rays))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", [lens_with("between", True), freeform()], ids=["mirror", "forms"])
 @pytest.mark.parametrize("distance", [DISTANCE, np.inf])
 def test_a_trace_against_the_yardstick(lens, distance):

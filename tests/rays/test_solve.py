@@ -277,6 +277,7 @@ def test_failed_rays_have_no_derivatives_and_change_no_other():
             assert np.all(np.isfinite(tangent)) and np.all(np.asarray(tangent)[:, :, some] == 0)
 
 
+@pytest.mark.slow
 def test_float32_gradient_is_the_rounded_float64_one():
     lens, scene, points, found = problem("tilted")
     given = lens, scene, points, found, random_like(found.hits)

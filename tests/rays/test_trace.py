@@ -142,6 +142,7 @@ def test_forms_that_equal_others_have_the_same_gradients():
         assert_close(getattr(ours, name), getattr(theirs, name), 1e-9)
 
 
+@pytest.mark.slow
 def test_float32_hits_within_a_tenth_of_a_micrometre():
     """Also for an object 25 m away, off axis, where other tracers lose 24 um in float32."""
     lens = load_lens("double_gauss")
@@ -193,6 +194,7 @@ def with_dummy(lens, gap, curvature):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "gap, curvature", [(2, 0.01), pytest.param(7, 0.0, marks=pytest.mark.slow)]
 )
@@ -237,6 +239,7 @@ def test_failed_rays_carry_a_status_and_no_nan():
         assert np.all(np.isfinite(a)) and np.all(np.asarray(a)[status > 0] == 0)
 
 
+@pytest.mark.slow
 def test_failed_rays_change_no_gradient():
     """Rays that miss the exit face or are totally reflected there, or whose wavelength is outside
     the glass, beside those that pass; by the call that everyone uses, in reverse mode."""
@@ -290,6 +293,7 @@ def test_directions_and_paraxial_launch():
         np.testing.assert_allclose(rays.directions[0, :, 1:], steps, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_bundles_of_nearly_as_many_rays_share_a_program():
     """Outside of `jit`, in eager derivatives too: each ray is what it is in any bundle."""
 

@@ -36,6 +36,7 @@ def folded():
     return show.draw(load_lens(FOLDED), [0.0, 0.05])
 
 
+@pytest.mark.slow
 def test_a_folded_lens(folded):
     drawn = folded
     assert len(drawn.glass) == 1 and len(drawn.mirrors) == 1 and len(drawn.stop) == 2
@@ -52,6 +53,7 @@ def test_a_folded_lens(folded):
             assert low < end[0] < high
 
 
+@pytest.mark.slow
 def test_a_lens_without_apertures_is_drawn_to_its_rays():
     lens = load_lens(PHONE)
     semi = jnp.full_like(lens.semi_diameter, jnp.inf).at[0].set(1.0)
@@ -61,6 +63,7 @@ def test_a_lens_without_apertures_is_drawn_to_its_rays():
     np.testing.assert_allclose(np.max(drawn.glass[0][:, 1]), 1.1 * reach)
 
 
+@pytest.mark.slow
 def test_a_lens_is_drawn_to_its_clear_apertures_and_a_mirror_with_its_hole():
     faces = [{k: v for k, v in face.items() if k != "semi_diameter"} for face in FOLDED["surfaces"]]
     faces[0]["semi_diameter"] = 8
@@ -115,6 +118,7 @@ RIMS = {
 }
 
 
+@pytest.mark.slow
 def test_the_edges_of_a_vignetted_beam_are_drawn():
     """Its lower edge ray passes at the rim of the plane before the stop, its upper one at that of
     the surface behind it; both are rays more than the fan has."""
@@ -133,6 +137,7 @@ def test_the_edges_of_a_vignetted_beam_are_drawn():
         assert lower[1, 1] < path[1, 1] < upper[1, 1]
 
 
+@pytest.mark.slow
 def test_the_light_between_an_obscuration_and_the_rim_has_four_edges():
     faces = [dict(face) for face in RIMS["surfaces"]]
     faces[0]["obscuration"] = {"circle": 2.0}
@@ -141,6 +146,7 @@ def test_the_light_between_an_obscuration_and_the_rim_has_four_edges():
     np.testing.assert_allclose(ends, [-5.0, -2.0, 2.0, 5.0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_steep_ray_does_not_leave_the_picture():
     """It begins where it has come twice as far as the plane before the lens is away."""
     axial, steep = show.draw(load_lens("fisheye_8mm"), [0.0, 1.3], rays=3).rays

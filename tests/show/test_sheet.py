@@ -21,6 +21,7 @@ def test_colours_run_from_blue_to_red():
     assert len(analyses.colours([0.55])) == 1 and len(analyses.colours([0.5, 0.5])) == 2
 
 
+@pytest.mark.slow
 def test_curves_hold_the_numbers():
     bent = drt_jax.distortion(LENS, *SCENE)
     _, axes = show.new()
@@ -36,6 +37,7 @@ def test_curves_hold_the_numbers():
     assert sorted(styles) == ["-"] * 3 + ["--"] * 3
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_is_left_out():
     """A spot without light, a fan whose ends are clipped."""
     lens = dataclasses.replace(LENS, semi_diameter=LENS.semi_diameter.at[0].set(5.0))
