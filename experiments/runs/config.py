@@ -108,13 +108,16 @@ def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = Non
 
 
 def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = None) -> Any:
-    """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...], X | tuple[X, ...] or a
-    Literal."""
+    """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...], X | tuple[X, ...],
+    X | None or a Literal."""
     if dataclasses.is_dataclass(kind):
         return _build(kind, value, source, f"{key}.", old)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (types.UnionType, typing.Union):  # of one value and of a list
-        return _convert(arguments[isinstance(value, list | tuple)], value, source, key)
+    if origin in (types.UnionType, typing.Union):  # of one value, and of a list or nothing
+        if value is None and arguments[1] is type(None):
+            return None
+        listed = isinstance(value, list | tuple) and arguments[1] is not type(None)
+        return _convert(arguments[listed], value, source, key)
     if origin is tuple and isinstance(value, list | tuple) and len(value) <= _ITEMS:
         items = enumerate(value)
         return tuple(_convert(arguments[0], item, source, f"{key}[{i}]") for i, item in items)
@@ -164,7 +167,13 @@ def _say(kind: Any) -> str:
         return " or ".join(map(_say, arguments))
     if origin is Literal:
         return "one of " + ", ".join(map(str, arguments))
-    names = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+    names = {
+        float: "a number",
+        int: "a whole number",
+        bool: "true or false",
+        str: "text",
+        type(None): "null",
+    }
     return names.get(kind, getattr(kind, "__name__", str(kind)))
 
 
