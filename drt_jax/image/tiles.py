@@ -74,7 +74,7 @@ def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Tra
 def weigh_rule(lens: Lens, rule: PupilRule, traced: Traced) -> FocusMoments:
     """Moments of traced rays: of the rule that they were traced for, or of a pattern of the same
     points with weights of its own."""
-    weights = traced.weights
+    weights: Array | np.ndarray = traced.weights
     if isinstance(rule, Pattern):
         weights = np.asarray(rule.weights, lens.curvature.dtype)[None]
     return _weigh(lens, rule, weights, traced.bundle)
