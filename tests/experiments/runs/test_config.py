@@ -20,6 +20,7 @@ class Config:
     name: str = "x"
     fast: bool = False
     train: Inner = Inner()
+    at: float | None = None
 
 
 @pytest.fixture
@@ -33,7 +34,8 @@ def test_yaml_overrides_and_round_trip(path, tmp_path):
     config = load_config(
         Config, path, ["train.batch=8", "starts=[1]", "fast=true", "train={form: sampled}"]
     )
-    assert config == Config((1.0,), "x", True, Inner(8, 1e-4, "sampled"))
+    assert config == Config((1.0,), "x", True, Inner(8, 1e-4, "sampled"), None)
+    assert load_config(Config, path, ["at=2"]).at == 2.0
     assert isinstance(config.starts[0], float)
     (tmp_path / "resolved.yaml").write_text(dump_config(config))
     assert load_config(Config, tmp_path / "resolved.yaml") == config
@@ -47,6 +49,7 @@ BAD = {
     "train.batch=true": "train.batch: expected a whole number, got True",
     "train.rate=fast": "train.rate: expected a number, got 'fast'",
     "train.form=gauss": "train.form: expected one of integrated, sampled, got 'gauss'",
+    "at=[2]": r"at: expected a number, got \[2\]",
     "fast=1": "fast: expected true or false, got 1",
     "name=3": "name: expected text, got 3",
     "starts=5": "starts: expected a list, each item a number, got 5",
