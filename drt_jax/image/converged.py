@@ -6,8 +6,8 @@ and `focus_moments` take a rule that was made outside.
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from functools import cache, partial
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,7 +17,6 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.order import may_cross
 from ..lens.scene import Scene, field_array, scene_of
 from ..numerics import Numbers, concrete, known_values, real_array
 from ..pupil.clipped import Clipped
@@ -27,14 +26,12 @@ from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_sensor, weigh
+from .orders import rules_by_order
 from .spot import Moments
 from .tiles import Traced, trace_rule, weigh_rule
 
-_MAX_ORDER = 40
 # Smallest spot, mm: below 1 nm rounding would never converge.
 _SMALLEST = 1e-6
-# First order for a clipped pupil, and the step to the next.
-_CLIPPED = 4, 2
 # The precision of float64 is below this, that of float32 above.
 _DOUBLE = 1e-12
 # Order of the rule that finds where light ends.
@@ -238,7 +235,7 @@ def _try_orders(
     solver: Solver = solve_aimed
     for clipped in (False, True)[blocked:]:
         trials: list[_Trial] = []
-        for group in _groups(lens, symmetry, clipped):
+        for group in rules_by_order(lens, symmetry, clipped):
             trace = partial(_trace, lens, scenes, group[0][1])
             rays, failing, cut = trace(solver)
             if failing and solver is solve_aimed and (clipped or not cut):
@@ -266,22 +263,6 @@ def _try_orders(
         stacklevel=4,
     )
     return trials[-1]
-
-
-def _groups(
-    lens: Lens, symmetry: Symmetry, clipped: bool
-) -> Iterator[list[tuple[Gauss | Clipped, PupilRule]]]:
-    """Rules by rising order, in groups that are traced at once. Each with the rule that is traced,
-    which is padded, so that all share compiled programs."""
-    if not clipped:
-        yield from _gauss_groups(symmetry)
-        return
-    first, step = _CLIPPED
-    crossing = may_cross(lens)
-    for order in range(first, _MAX_ORDER + step + 1, step):
-        size = 20 if order <= 20 else _MAX_ORDER + 2
-        rule, used = (Clipped(order, symmetry, n, crossing) for n in (order, size))
-        yield [(rule, used)]
 
 
 def _trace(
@@ -326,44 +307,6 @@ def _warn_of_rounding(lens: Lens, rough: float, tolerance: float) -> None:
             f'{tolerance:.0e}: jax.config.update("jax_enable_x64", True) before the lens is loaded',
             stacklevel=5,
         )
-
-
-@cache
-def _gauss_groups(symmetry: Symmetry) -> list[list[tuple[Gauss | Clipped, PupilRule]]]:
-    """Gauss rules by rising order. Those that fit into half of the smallest size are traced at
-    once: one pattern has the points of all, and each rule its own weights. The rest is filled with
-    weightless rays along the rim of the stop, where clear apertures clip first, so that all share a
-    few compiled programs."""
-    sizes = (_MAX_ORDER + 2,) if symmetry == "rotational" else (208, 416, 1768, 3696)
-    groups: list[list[int]] = []
-    for order in range(2, _MAX_ORDER + 2):
-        points = [gauss_points(n, symmetry)[1].size for n in [*(groups[-1:] or [[]])[0], order]]
-        if len(points) > 1 and sum(points) <= sizes[0] / 2:
-            groups[-1].append(order)
-        else:
-            groups.append([order])
-    return [_padded(orders, symmetry, sizes) for orders in groups]
-
-
-def _padded(
-    orders: Sequence[int], symmetry: Symmetry, sizes: Sequence[int]
-) -> list[tuple[Gauss | Clipped, PupilRule]]:
-    """Rules of some orders on the points of all, padded to one of the sizes."""
-    points, weights = zip(*(gauss_points(order, symmetry) for order in orders), strict=True)
-    columns, total = points[0].shape[1], sum(w.size for w in weights)
-    missing = next(size for size in sizes if size >= total + columns) - total
-    span = np.pi if symmetry == "bilateral" else 2 * np.pi
-    angle = -np.pi / 2 + span * np.arange(missing) / max(missing - 1, 1)
-    rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    filled = np.concatenate([*points, rim if columns == 2 else np.ones((missing, 1))])
-    rules: list[tuple[Gauss | Clipped, PupilRule]] = []
-    start = 0
-    for order, own in zip(orders, weights):
-        padded = np.zeros(total + missing)
-        padded[start : start + own.size] = own
-        rules.append((Gauss(order, symmetry), Pattern(filled, padded, symmetry)))
-        start += own.size
-    return rules
 
 
 def _change(before: _Trial, now: _Trial, places: Callable) -> float:
