@@ -16,7 +16,7 @@ import numpy as np
 
 from .compilation import ONCE, jit
 from .files.write import save_lens
-from .files.yaml import lens_names, load_lens
+from .files.yaml import lens_names, load_lens, load_system
 from .image.converged import psf_moments
 from .image.spot import Moments
 from .lens.lens import Lens
@@ -43,10 +43,12 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
         "first-order data, spots over the field, share of light, warnings, and a sheet of analyses"
     )
     show = commands.add_parser("show", help=about, description=about)
-    show.add_argument("lens", help=f"YAML file or bundled name: {', '.join(lens_names())}")
-    show.add_argument("--field", type=float, nargs="+", default=[0, 7, 10], help="degrees")
-    show.add_argument("--distance", type=float, default=math.inf, help="to the object, mm")
-    show.add_argument("--wavelengths", type=float, nargs="+", default=_LINES, help="um")
+    names = ", ".join(lens_names())
+    show.add_argument("lens", help=f".yaml, .zmx or .seq file, or a bundled name: {names}")
+    own = "default: those of a .zmx or .seq file, else"
+    show.add_argument("--field", type=float, nargs="+", help=f"degrees; {own} 0 7 10")
+    show.add_argument("--distance", type=float, help=f"to the object, mm; {own} inf")
+    show.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {own} C, d and F")
     show.add_argument("--out", type=pathlib.Path, help="of the sheet; default: LENS.png here")
     show.set_defaults(run=run_show)
     about = "write a lens as a file of another program; says what is not in it"
@@ -207,16 +209,33 @@ def _warnings_on_stdout() -> Iterator[None]:
         yield
 
 
+def _view(options: argparse.Namespace) -> tuple[Lens, list[float], float, list[float]]:
+    """The lens, fields in degrees, the distance in mm and wavelengths in um: of the options or, if
+    they are silent, of a .zmx or .seq file. The middle wavelength is the primary one."""
+    fields, distance, waves = [0.0, 7.0, 10.0], math.inf, list(_LINES)
+    if pathlib.Path(options.lens).suffix.lower() in (".zmx", ".seq"):
+        system = load_system(options.lens)
+        lens, distance, primary = system.lens, system.distance, system.wavelengths[system.primary]
+        ends = [w for w in (system.wavelengths.max(), system.wavelengths.min()) if w != primary]
+        waves = [*map(float, (*ends[:1], primary, *ends[1:]))]
+        angles = system.fields
+        if angles is not None and np.any(angles[:, 1]) and not np.any(angles[:, 0]):
+            fields = np.unique(np.round(np.degrees(angles[:, 1]), 12)).tolist()
+    else:
+        lens = load_lens(options.lens)
+    distance = distance if options.distance is None else options.distance
+    return lens, options.field or fields, distance, options.wavelengths or waves
+
+
 def run_show(options: argparse.Namespace) -> None:
     """Print what a lens is, as it becomes known, and draw it."""
-    if not all(abs(field) < 90 for field in options.field):
+    if not all(abs(field) < 90 for field in options.field or ()):
         raise ValueError("--field: must be within 90 degrees")
-    if not options.distance > 0:
+    if options.distance is not None and not options.distance > 0:
         raise ValueError("--distance: must be above 0 mm")
-    distance, waves, fields = options.distance, list(options.wavelengths), options.field
-    middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
     with _warnings_on_stdout():
-        lens = load_lens(options.lens)
+        lens, fields, distance, waves = _view(options)
+        middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
         scene_of(lens, 0.0, distance, np.array(waves))  # refuses what is no scene
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
         _say(first_lines(lens, found, middle))

@@ -6,8 +6,8 @@ import signal
 import numpy as np
 import pytest
 
-from drt_jax import back_focal_distance, load_lens, psf_moments
-from drt_jax.__main__ import main
+from drt_jax import back_focal_distance, load_lens, psf_moments, save_lens
+from drt_jax.__main__ import _options, _view, main
 
 
 @pytest.mark.slow
@@ -122,6 +122,24 @@ def test_lens_files_are_converted(tmp_path, capsys):
     np.testing.assert_array_equal(first.curvature, last.curvature)
     np.testing.assert_array_equal(first.semi_diameter, last.semi_diameter)
     assert first.sensor == last.sensor == 52 and first.glasses == last.glasses
+
+
+def test_a_lens_file_is_shown_as_it_is_used(tmp_path):
+    """Its fields, distance and wavelengths, the primary one in the middle; options come first."""
+    path = tmp_path / "a.zmx"
+    save_lens(load_lens("singlet"), path)
+    used = path.read_text().replace("WAVM 1 0.5875618 1\n", "").replace("DISZ INFINITY", "DISZ 500")
+    waves = "".join(f"WAVM {k} {w} 1\n" for k, w in enumerate((0.5876, 0.4861, 0.7, 0.6563), 1))
+    used = re.sub("YFLN.*", "YFLN 3 0 -2 0 0 0 0 0 0 0 0 0", used).replace(
+        "PWAV 1", waves + "PWAV 1"
+    )
+    path.write_text(used.replace("FTYP 0 0 1 1", "FTYP 0 0 3 4"))
+    lens, *view = _view(_options(["show", str(path)]))
+    assert lens.count == 3 and view == [[-2, 0, 3], 500, [0.7, 0.5876, 0.4861]]
+    given = ["--field", "1", "--distance", "9e3", "--wavelengths", "0.5"]
+    assert _view(_options(["show", str(path), *given]))[1:] == ([1], 9e3, [0.5])
+    _, *view = _view(_options(["show", "singlet"]))
+    assert view == [[0, 7, 10], np.inf, [0.6562725, 0.5875618, 0.4861327]]
 
 
 def test_ctrl_c_is_one_line(monkeypatch, capsys):

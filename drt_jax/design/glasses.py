@@ -47,11 +47,10 @@ class Snapped(NamedTuple):
     lens: of real glasses, each with its own dispersion formula.
     optimum: its last optimisation; its lens is `lens`.
     snaps: in their order; exchanges of a real glass for another come last.
-    alternatives: for each place, by the first surface behind which its glass begins: glasses tried
-        in the end, all others as in `lens`, with `Optimum.score` after the steps of a trial, the
-        best first; inf where light fails. Trials meet limits only nearly: compare with the glass
-        itself, which stands among them.
-    problem: whose real glasses vary no more, to go on with from `optimum.vector`.
+    alternatives: by the first surface behind which a glass begins: glasses tried there, all others
+        as in `lens`, and `Optimum.score` after the steps of a trial, the best first; inf if light
+        fails. Trials meet limits only nearly: compare with the trial of the glass in `lens`.
+    problem: in it real glasses vary no more; go on from `optimum.vector`.
     """
 
     lens: Lens
@@ -106,8 +105,7 @@ def _with_glass(
 
 @dataclasses.dataclass(frozen=True)
 class _Search:
-    """What is tried: glasses of `makers` that `accept` takes, `count` of them next to the medium in
-    each place, `steps` of least squares with each."""
+    """Which glasses are tried, see `snap_glasses`."""
 
     makers: Collection[str] | None
     accept: Callable[[Glass], bool]
@@ -181,11 +179,14 @@ def snap_glasses(
     max_steps: int = 100,
     callback: Callable[[Snap], None] = lambda snap: None,
 ) -> Snapped:
-    """Replaces the model glasses of an optimum by real ones, one by one: each time that, of all
-    glasses next to those that are left, which costs least, with least squares of what still varies.
-    Then exchanges real glasses for neighbours, the best first, while that makes the lens better.
+    """Replaces the model glasses of an optimum by real ones.
 
-    found: of `optimise` for `problem`, which the operand `glass_map` keeps near real glasses.
+    Each round tries real glasses in all places that still have a model glass, keeps the one that
+    costs least, and optimises what still varies. At the end real glasses are exchanged for
+    neighbours as long as the lens gets better.
+
+    found: result of `optimise` for `problem`; the operand `glass_map` keeps its glasses near real
+        ones.
     makers: of the glasses, see `glass_makers`; None: all.
     accept: whether to use a glass of theirs.
     count: glasses tried in each place, the nearest in nd and vd.

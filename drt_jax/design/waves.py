@@ -1,8 +1,8 @@
 """Operands of waves: transfer functions, Strehl ratios and encircled energy of rays that a problem
 has traced, by the polynomials of `image.beam`. No ray is added.
 
-`Gauss` has the light that fills the stop, whatever else clips it; `Soft` and `Clipped` have what
-apertures leave.
+With the rule `Gauss` all light that fills the stop counts, clipped or not. With `Soft` and
+`Clipped` only light counts that passes the apertures.
 """
 
 from collections.abc import Callable

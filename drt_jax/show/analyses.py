@@ -105,7 +105,7 @@ def lateral_colour(
 def illumination(axes: Axes, light: ArrayLike, throughput: ArrayLike, fields: ArrayLike) -> Axes:
     """Relative illumination and throughput (F,) over the field."""
     axes.plot(_degrees(fields), light, color="black", label="relative illumination")
-    axes.plot(_degrees(fields), throughput, "--", color="tab:grey", label="unvignetted")
+    axes.plot(_degrees(fields), throughput, "--", color="tab:grey", label="throughput")
     axes.set(ylim=(0, 1.05), xlabel="field (degrees)")
     axes.set_xlim(*_range(fields))
     axes.legend(fontsize=6, loc="lower left", frameon=False)
