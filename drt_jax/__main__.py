@@ -46,9 +46,10 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     names = ", ".join(lens_names())
     show.add_argument("lens", help=f".yaml, .zmx or .seq file, or a bundled name: {names}")
     own = "default: those of a .zmx or .seq file, else"
+    ends = "default: the primary, longest and shortest of a .zmx or .seq file, else"
     show.add_argument("--field", type=float, nargs="+", help=f"degrees; {own} 0 7 10")
     show.add_argument("--distance", type=float, help=f"to the object, mm; {own} inf")
-    show.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {own} C, d and F")
+    show.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {ends} C, d and F")
     show.add_argument("--out", type=pathlib.Path, help="of the sheet; default: LENS.png here")
     show.set_defaults(run=run_show)
     about = "write a lens as a file of another program; says what is not in it"
@@ -221,6 +222,8 @@ def _view(options: argparse.Namespace) -> tuple[Lens, list[float], float, list[f
         angles = system.fields
         if angles is not None and np.any(angles[:, 1]) and not np.any(angles[:, 0]):
             fields = np.unique(np.round(np.degrees(angles[:, 1]), 12)).tolist()
+        elif options.field is None:
+            warnings.warn("the file has no fields along y alone: --field 0 7 10", stacklevel=2)
     else:
         lens = load_lens(options.lens)
     distance = distance if options.distance is None else options.distance

@@ -96,7 +96,8 @@ def assert_close(ours, wanted, rtol, floor=0.0):
 @pytest.fixture(autouse=True, scope="module")
 def room_for_programs():
     """Drops all compiled programs when they take 4 GB: the tests of all files share them until
-    then. What is kept is not looked through again for garbage."""
+    then, some 12,000 of the 65,530 pieces that Linux lets a process map. What is kept is not looked
+    through again for garbage."""
     yield
     sizes = pathlib.Path("/proc/self/statm")  # the second number: pages in memory
     if not sizes.exists() or int(sizes.read_text().split()[1]) * resource.getpagesize() > 4e9:

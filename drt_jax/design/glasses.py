@@ -17,7 +17,6 @@ from .kinds import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
 from .problem import Problem, quick
 
-_ALL = 10_000  # more glasses than there are
 # Media are one medium where nd and vd differ by less.
 _SAME = (1e-5, 1e-2)
 # Least gain of an exchange, relative, and how many are tried before the search ends.
@@ -90,8 +89,8 @@ def _places(problem: Problem) -> list[tuple[int, ...]]:
 def _with_glass(
     problem: Problem, vector: np.ndarray, place: tuple[int, ...], glass: Glass
 ) -> tuple[Problem, np.ndarray]:
-    """The problem and its vector (N,) with a glass in a place, whose nd and vd vary no more: as of
-    media that are no model glass. Only numbers differ, so that one program serves all glasses."""
+    """The problem and its vector (N,) with a glass in a place. Its nd and vd are fixed at those
+    that mark a real glass. Only numbers differ, so that one program serves all glasses."""
     variables = problem.variables
     scale, dtype = np.asarray(variables.scale), variables.low.dtype
     low, high, vector = (np.array(a) for a in (variables.low, variables.high, vector))
@@ -119,8 +118,8 @@ class _Search:
         rows, (nd, vd) = glass_rows(lens, place), points[place[0] + 1].tolist()
         touched = points[~rows & (np.roll(rows, 1) | np.roll(rows, -1))]
         found: dict[tuple, Neighbour] = {}
-        for near in nearest_glasses(nd, vd, self.makers, _ALL):
-            low, high = near.glass.range
+        for near in nearest_glasses(nd, vd, self.makers, None):
+            low, high = np.asarray(near.glass.range, waves.dtype)
             other = np.all(np.any(np.abs(touched - (near.nd, near.vd)) > _SAME, axis=1))
             if other and low <= waves.min() and waves.max() <= high and self.accept(near.glass):
                 found.setdefault((near.glass.sellmeier, near.glass.schott), near)
@@ -149,8 +148,10 @@ class _Search:
         """All trials in some places, the best first."""
         tasks = [(p, n) for p in places for n in self.neighbours(problem, found.lens, p)]
         run = functools.partial(self.trial, problem, found.vector)
+        first = run(*tasks[0])  # compiled once, not by all threads
         with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-            return sorted(pool.map(lambda task: run(*task), tasks), key=lambda trial: trial.score)
+            trials = [first, *pool.map(lambda task: run(*task), tasks[1:])]
+        return sorted(trials, key=lambda trial: trial.score)
 
 
 def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]:

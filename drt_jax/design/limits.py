@@ -78,8 +78,9 @@ def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> l
         elif axis == "xy":
             parts.append(["x", "y"] if counts["xy"] == 2 else [""])
         elif axis == "surfaces":
-            named, there = operand.surfaces, known.places(lens) if known.places else []
-            parts.append([f"surface {k}" for k in there if not named or k in named])
+            named, there = operand.surfaces, known.rows or known.places
+            surfaces = there(lens) if there else []
+            parts.append([f"surface {k}" for k in surfaces if not named or k in named])
         else:
             name = "wavelengths" if axis in ("middle", "later") else axis
             numbers = getattr(operand, name)

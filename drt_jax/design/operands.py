@@ -18,7 +18,7 @@ from .values import OPERANDS, kind_of
 
 # What an operand may name.
 _NUMBERS = ("fields", "wavelengths", "distances", "surfaces")
-_NEEDED = "missing; give the frequency of an mtf in cycles/mm, the radius of energy in mm"
+_NEEDED = "missing; give the frequency of an mtf in cycles/mm, the radius of encircled_energy in mm"
 
 # As the keys of `OPERANDS`, which a test compares.
 OperandName = Literal[

@@ -66,7 +66,7 @@ def _check_operands(
         if kind_of(operand.kind).of_waves and degree_of(rule) < 2:
             raise ValueError(
                 f"operands: {operand.name}: rule: needs Gauss or Soft of the order 2 or more, or "
-                f"Clipped of the size 3 or more; got {shown(rule)}"
+                f"Clipped of the order 3 or more; got {shown(rule)}"
             )
     if not any(operand.weight for operand in operands):
         raise ValueError("operands: all have the weight 0; a merit needs at least one")

@@ -23,13 +23,14 @@ spots and wavefronts [distance, field]
     relative_illumination: from projected solid angles, relative to the first field; at the middle
         wavelength
 
-waves [distance, field], of all wavelengths together; target=1 for the best, see waves.py
-    mtf [and tangential, sagittal]: modulus of the transfer function at the frequency `at` on the
-        sensor, cycles/mm
-    strehl [and wavelength, each apart]: irradiance of the image of a point over that without
+waves; target=1 for the best, see waves.py
+    mtf [distance, field, tangential or sagittal]: modulus of the transfer function of all
+        wavelengths at the frequency `at` on the sensor, cycles/mm
+    strehl [distance, field, wavelength]: irradiance of the image of a point over that without
         aberrations
-    encircled_energy: the part of the light within a circle of the radius `at`, mm, about the
-        centroid
+    encircled_energy [distance, field]: the part of the light of all wavelengths within a circle of
+        the radius `at`, mm, about the centroid; spot and circle must be narrower than
+        64 wavelengths / numerical aperture, some 140 um at f/2
 
 chief rays, through the centre of the stop
     distortion [distance, field, wavelength: middle]: (real - paraxial image height) / paraxial

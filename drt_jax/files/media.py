@@ -3,7 +3,7 @@
 from typing import Any
 
 from ..inputs import shown
-from ..lens.glass import VISIBLE, Glass, model_glass
+from ..lens.glass import POWERS, VISIBLE, Glass, model_glass
 from ..lens.glasses import find_glass, flaw
 from .entry import Entry
 
@@ -26,7 +26,7 @@ def _own_glass(name: str, entry: Entry) -> Glass:
     if not isinstance(terms, list) or not terms or len(terms) % 2:
         raise entry.error("sellmeier", f"expected a list, all B and then all C, got {shown(terms)}")
     powers = entry.get("schott", [])
-    more = isinstance(powers, list) and len(powers) in (9, 10)
+    more = isinstance(powers, list) and 6 < len(powers) <= len(POWERS)
     lengths = {"sellmeier": len(terms), "schott": len(powers) if more else 6}
     constants: dict[str, Any] = {
         key: tuple(entry.vector(key, n)) for key, n in lengths.items() if key in entry

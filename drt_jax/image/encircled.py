@@ -54,7 +54,7 @@ def encircled_energy(
     and errors, as of `transfer`.
     """
     scene = fields, distance, wavelengths
-    given = arrays_of(lens, scene, model, focus, wavelength_weights, rule, radii=radii)
+    given = arrays_of(lens, scene, model, focus, wavelength_weights, rule, "radii", radii)
     if cells is None:
         cells = _CELLS
         known_now = known_values((lens, *given))

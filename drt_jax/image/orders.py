@@ -44,9 +44,9 @@ def rules_by_order(lens: Lens, symmetry: Symmetry, clipped: bool) -> Iterator[li
 
 @cache
 def _gauss_group(first: int, symmetry: Symmetry) -> list[Tried]:
-    """The Gauss rule of an order, and those of the next orders as long as all fill at most half of
-    the smallest size. The pattern is padded with weightless rays along the rim of the stop, where
-    clear apertures clip first."""
+    """The Gauss rule of an order, and those of the next orders as long as all their points are at
+    most half of the smallest size. The pattern is padded with weightless rays along the rim of
+    the stop, where clear apertures clip first."""
     sizes, rules = _SIZES[symmetry], [gauss_points(first, symmetry)]
     total, order = rules[0][1].size, first + 1
     while total + (following := gauss_points(order, symmetry))[1].size <= sizes[0] / 2:

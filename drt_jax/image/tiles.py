@@ -42,7 +42,7 @@ class Traced(NamedTuple):
 
 
 def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Traced:
-    """Traces all rays of a rule, those of a pattern that have no weight, too."""
+    """Traces the rays of a rule; those without weight only of a pattern."""
     points, weights = _points(lens, scene, rule)
     waves, total = scene.wavelengths.size, weights.shape[-1]
     # Rays without weight: padding in fitted rules; in other rules they show whether light is

@@ -81,7 +81,9 @@ def transfer(
     Differentiable in every mode. ValueError as of `scene_of`, and without a rule inside a trace.
     """
     scene = fields, distance, wavelengths
-    given = arrays_of(lens, scene, model, focus, wavelength_weights, rule, frequencies=frequencies)
+    given = arrays_of(
+        lens, scene, model, focus, wavelength_weights, rule, "frequencies", frequencies
+    )
     return _transfer(lens, *given, model, degree, cells)
 
 
@@ -92,17 +94,17 @@ def arrays_of(
     focus: Numbers,
     wavelength_weights: Numbers | None,
     rule: PupilRule | None,
-    **places: Numbers,
+    name: str,
+    places: Numbers,
 ) -> tuple[Array, Scene, Array, Array, Array, PupilRule]:
     """Arguments of `transfer` and of `encircled_energy`, checked, as arrays: fields (F, 2), scene
-    of the axis, the one of `places` (N,), by its name, spectrum (W,), focus () or (Z,), and the
-    rule. scene: fields, distance and wavelengths."""
+    of the axis, places (N,), spectrum (W,), focus () or (Z,), and the rule. scene: fields, distance
+    and wavelengths. name: of the places, for messages."""
     if model not in (known := get_args(Model)):
         raise ValueError(f"model: expected one of {', '.join(known)}, got {model!r}")
     dtype = lens.curvature.dtype
     axis, angles = scene_of(lens, 0.0, *scene[1:]), fields_array(scene[0], dtype)
-    ((name, given),) = places.items()
-    values, steps = real_array(name, given, dtype), real_array("focus", focus, dtype)
+    values, steps = real_array(name, places, dtype), real_array("focus", focus, dtype)
     if values.ndim != 1:
         raise ValueError(f"{name}: expected (N,), got shape {values.shape}")
     spectrum = spectrum_of(wavelength_weights, axis, dtype)

@@ -37,8 +37,8 @@ def wave_kernel(
 
     wavelengths: (W,) um. centre: (2,) mm of the grid on the sensor. pixel: () mm. cells: of the
     grid of directions, along a side; the kernel repeats every `period`. Cells at an edge hold the
-    mean of their amplitude, so that of the light that edges send to x a part of (pi x / period)^2 /
-    3 is missing: Airy's in half a period by 1.5e-3 with 128 cells.
+    mean of their amplitude. So a kernel lacks a fraction (pi x / period)^2 / 3 of the light that
+    edges diffract to the distance x: with 128 cells 1.5e-3 of Airy's light within half a period.
     """
     amplitude, step = pupil_function(lens, beam, wavelengths, cells)
     transfer = autocorrelation(amplitude)

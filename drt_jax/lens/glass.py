@@ -135,12 +135,12 @@ def nd_and_vd(dispersion: Dispersion) -> Array:
 
 
 def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> Dispersion:
-    """The dispersion with the constants of another, of M media or of one, in place of some media,
-    bool (M,). It has as many terms as the one with more."""
+    """Replaces the media `rows`, bool (M,), by those of `other`, which has M media or one for all.
+    The result has as many terms as the dispersion with more."""
 
     def mixed(name: str, none: Any) -> Any:
         both = getattr(dispersion, name), getattr(other, name)
-        if both == (None, None):
+        if all(part is None for part in both):
             return None
         old, new = (jnp.asarray(none) if a is None else a for a in both)
         mask = np.reshape(rows, (-1, *(1,) * (new.ndim - 1)))

@@ -204,13 +204,13 @@ def _mapped() -> tuple[list[_Entry], list[Glass], np.ndarray]:
 
 
 def nearest_glasses(
-    nd: float, vd: float, makers: Collection[str] | None = None, count: int = 10
+    nd: float, vd: float, makers: Collection[str] | None = None, count: int | None = 10
 ) -> list[Neighbour]:
     """Glasses nearest to nd and vd in the glass map, the nearest first: the distance is that of nd
     and vd / 100. ValueError for unknown makers.
 
     makers: some of `glass_makers()`; None for all.
-    count: most glasses.
+    count: most glasses; None for all.
     """
     only = None if makers is None else {maker.upper() for maker in makers}
     for maker in sorted((only or set()) - {*glass_makers()}):

@@ -1,12 +1,13 @@
 """The settings of a design."""
 
 import dataclasses
+import fnmatch
 import math
 from typing import Literal
 
 from drt_jax.design import Operand, Solve, Tie, Vary
 from drt_jax.design.growth import SHORTEST
-from drt_jax.lens.glasses import glass_makers
+from drt_jax.lens.glasses import glass_makers, nearest_glasses
 
 from . import _common
 
@@ -75,6 +76,9 @@ class Glasses:
     def __post_init__(self) -> None:
         _common.require_within("glasses.", self, count=(1, 1e4), steps=(1, 1e4))
         _common.require_known("glasses.makers", self.makers, glass_makers())
+        names = (near.glass.name for near in nearest_glasses(1.6, 50, self.makers or None, None))
+        some = any(fnmatch.fnmatchcase(name, self.names) for name in names)
+        _common.require(some, f"glasses.names: no glass of these makers is like {self.names!r}")
 
 
 @dataclasses.dataclass(frozen=True)

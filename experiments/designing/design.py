@@ -212,8 +212,13 @@ def _snapped(
     if not some.makers:
         return found, {}
     accept = lambda glass: fnmatch.fnmatchcase(glass.name, some.names)  # noqa: E731
-    snapped = design.snap_glasses(problem, found, some.makers, accept, some.count, some.steps)
-    ranked = {i: [[a.glass.name, x] for a, x in own] for i, own in snapped.alternatives.items()}
+    given = some.makers, accept, some.count, some.steps
+    with tqdm(desc="glasses", unit="glass", dynamic_ncols=True) as bar:
+        snapped = design.snap_glasses(problem, found, *given, callback=lambda snap: bar.update())
+    ranked = {
+        i: [[near.glass.name, score if math.isfinite(score) else None] for near, score in own]
+        for i, own in snapped.alternatives.items()
+    }
     told = {"snaps": [snap._asdict() for snap in snapped.snaps], "alternatives": ranked}
     return snapped.optimum, told | {"snap_s": time.perf_counter() - begun}
 
@@ -228,8 +233,8 @@ def _designed(variables: design.Variables, end: dict[str, Any]) -> drt_jax.Lens:
 
 
 def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
-    """Where light through 0.7 of the aperture crosses the axis by wavelength, from there of the
-    last, over the focal length."""
+    """(W,), the focus of light through 0.7 of the aperture less that of the last wavelength, over
+    the focal length."""
     waves = config.wavelengths_um
     foci = np.asarray(drt_jax.axial_colour(lens, config.distance_mm, waves, (0.7,)).real)[:, 0]
     return ((foci - foci[-1]) / np.asarray(drt_jax.focal_length(lens, waves))).tolist()
@@ -239,6 +244,10 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Grows, searches, finishes, and writes the lens."""
     start = drt_jax.load_lens(config.lens)
     start = design.open_apertures(start) if config.floating else start
+    _common.require(
+        not config.glasses.makers or start.dispersion.model is not None,
+        f"glasses: {config.lens} has no model glass; give nd and vd in place of its glasses",
+    )
     first = problem_of(config, start)
     begin = grown(config, first, run) if config.growth.first < 1 else start
     problem = problem_of(config, begin)

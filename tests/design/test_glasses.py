@@ -51,6 +51,7 @@ def snapped():
     ]
     solves = [Solve("focal_length", FOCAL, surface=2, wavelengths=(WAVES[1],))]
     operands = [Operand("spot", weight=1e3), Operand("glass_map", high=0.0)]
+    operands.append(Operand("total_track", high=200.0))
     problem = design.Problem.from_variables(
         Variables.from_lens(lens, vary, solves=solves), operands, 0.0, WAVES, rule=2
     )
@@ -124,12 +125,27 @@ def test_real_glasses_keep_their_formula(tmp_path):
     assert "nd:" not in (tmp_path / "own.yaml").read_text()
 
 
+def test_limits_keep_their_names():
+    """Those of the map of glasses, which real ones meet exactly, and those behind them."""
+    best = snapped()[2]
+    maps, length = best.optimum.limits[:2], best.optimum.limits[2]
+    assert [(one.kind, one.where, one.value) for one in maps] == [
+        ("glass_map", "surface 0", 0),
+        ("glass_map", "surface 1", 0),
+    ]
+    assert length.kind == "total_track" and len(best.optimum.limits) == 3
+    np.testing.assert_allclose(length.value, float(best.lens.sensor), rtol=1e-12)
+
+
 def test_a_snap_compiles_nothing(caplog):
     problem, found, _ = snapped()
     caplog.clear()
-    with jax.log_compiles():
+    jax.config.update("jax_log_compiles", True)  # in all threads
+    try:
         accept = lambda glass: glass.name in NAMES[::-1]  # noqa: E731
         design.snap_glasses(problem, found, accept=accept, count=2, steps=2, max_steps=3)
+    finally:
+        jax.config.update("jax_log_compiles", False)
     compiled = [r.getMessage() for r in caplog.records if "ompil" in r.getMessage()]
     assert not compiled, compiled[:3]
 

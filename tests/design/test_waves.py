@@ -11,6 +11,7 @@ import drt_jax
 from drt_jax import Clipped, Gauss, Pattern, Soft, design, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import Operand, Problem, Variables, Vary, trace_fields
+from drt_jax.design.waves import degree_of
 from drt_jax.image import transfer
 
 from ..image.test_encircled import ZEROS
@@ -127,6 +128,11 @@ def test_contrast_designs_a_lens_of_more_contrast():
         for found in (spots, best)
     )
     assert np.mean(after) > np.mean(before) + 0.05 and np.min(after) > np.min(before)
+
+
+def test_padding_gives_no_degree():
+    """Rays of weight 0 fit no polynomials."""
+    assert degree_of(Clipped(4, "bilateral", 20)) == degree_of(Clipped(4, "bilateral")) == 4
 
 
 @pytest.mark.slow

@@ -124,6 +124,8 @@ def test_a_phone_lens_from_a_crude_start(tmp_path, monkeypatch):
         ("starts.how=anywhere", "one of around, within, made"),
         ("lens=nowhere.yaml", "nowhere.yaml"),
         ("growth.first=2", "growth.first: expected"),
+        ("glasses={makers: [SCHOTT], names: zz*}", "glasses.names: no glass of these makers is"),
+        ("glasses={makers: [SCHOTT]}", "has no model glass; give nd and vd"),
     ],
 )
 def test_bad_settings_get_one_line(setting, said, tmp_path, monkeypatch, capsys):

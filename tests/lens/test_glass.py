@@ -229,6 +229,16 @@ def test_catalogue_glasses_made_model_glasses(tmp_path):
     np.testing.assert_allclose(jitted.index(LINES), model.index(LINES), rtol=1e-14)
 
 
+def test_a_lens_of_arrays_of_numpy_exchanges_glasses():
+    """A model glass beside a real one, and a real one in its place."""
+    lens = jax.tree.map(np.asarray, drt_jax.load_lens("double_gauss"))
+    first = next(i for i, glass in enumerate(lens.glasses[1:]) if glass != "air")
+    model = jax.tree.map(np.asarray, drt_jax.with_model_glass(lens, [first]))
+    again = drt_jax.with_glass(model, find_glass(lens.glasses[first + 1]), [first])
+    np.testing.assert_allclose(again.index(LINES), lens.index(LINES), rtol=1e-14)
+    assert again.glasses == lens.glasses != model.glasses
+
+
 def test_some_glasses_made_model_glasses(tmp_path):
     """Of a stop inside a glass both sides; the others stay as they are."""
     lens = drt_jax.load_lens("cooke_triplet")
