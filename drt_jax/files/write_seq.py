@@ -70,6 +70,8 @@ def _private(name: str, called: str, constants: dict[str, Any]) -> list[str]:
     sellmeier, schott = constants.get("sellmeier"), constants.get("schott")
     if sellmeier and schott:
         raise LensError(f"glass {name}: .seq files hold no two formulas at once: save as .yaml")
+    if schott and len(schott) > 6:
+        raise LensError(f"glass {name}: .seq files hold powers from L^2 to L^-8: save as .yaml")
     if sellmeier:
         half = len(sellmeier) // 2
         pairs = zip(sellmeier[:half], sellmeier[half:], strict=True)

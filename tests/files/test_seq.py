@@ -503,6 +503,12 @@ def test_written_forms_glasses_apertures_and_places(tmp_path):
             ),
             tmp_path / "x.seq",
         )
+    more = {"own": {"schott": [2.59, -0.0154, 0.0102, 0.00158, -1.9e-4, 1e-5, 1e-5, 0, 0]}}
+    rows = [{"radius": 50, "thickness": 3, "glass": "own", "semi_diameter": 5, "stop": True}]
+    rows.append({"radius": -50})
+    lens = load_lens({"glasses": more, "surfaces": rows, "sensor": 50.0})
+    with pytest.raises(LensError, match=r"glass own: .* to L\^-8: save as .yaml"):
+        save_lens(lens, tmp_path / "more.seq")
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-8", "utf-8-sig", "latin-1"])
