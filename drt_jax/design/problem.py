@@ -63,10 +63,12 @@ def _check_operands(
                 f"operands: {operand.name}: vignetting: Clipped traces only what passes; take "
                 "Gauss or Soft"
             )
-        if kind_of(operand.kind).of_waves and degree_of(rule) < 2:
+        # Rays of weight 0 fit no polynomials, and inside `jit` only the size is known.
+        padded = isinstance(rule, Clipped) and rule.order != rule.size
+        if kind_of(operand.kind).of_waves and (padded or degree_of(rule) < 2):
             raise ValueError(
                 f"operands: {operand.name}: rule: needs Gauss or Soft of the order 2 or more, or "
-                f"Clipped of the order 3 or more; got {shown(rule)}"
+                f"Clipped of the order 3 or more, of size 0; got {shown(rule)}"
             )
     if not any(operand.weight for operand in operands):
         raise ValueError("operands: all have the weight 0; a merit needs at least one")

@@ -32,7 +32,7 @@ def degree_of(rule: PupilRule) -> int:
     for a rule of too low an order or of another kind."""
     if isinstance(rule, Gauss | Soft):
         return 2 * (rule.order - 1)
-    return 2 * max(rule.order - 2, 0) if isinstance(rule, Clipped) else 0
+    return 2 * max(rule.size - 2, 0) if isinstance(rule, Clipped) else 0
 
 
 def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Array]) -> Array:
