@@ -6,6 +6,7 @@ pixels, give the others.
 """
 
 import dataclasses
+import functools
 import warnings
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import scene_of, vergence_of
 from ..numerics import Numbers, concrete, known_values, real_array
@@ -212,7 +214,7 @@ def _nearest(tangents: np.ndarray, lit: np.ndarray) -> np.ndarray:
     return np.argmin(np.where(lit[:, None], apart[None], np.inf), axis=-1)
 
 
-@jax.jit
+@functools.partial(jit, wanted=LARGE)
 def _chief(lens: Lens, tangents: Array, distances: Array, wavelengths: Array) -> Array:
     def one(distance: Array, tangent: Array) -> Array:
         scene = scene_of(lens, jnp.arctan(tangent), distance, wavelengths)
@@ -235,7 +237,7 @@ def image_points(lens: Lens, tangents: Any, distances: Any, wavelengths: Any) ->
     )
 
 
-@jax.jit
+@functools.partial(jit, wanted=LARGE)
 def _spots(
     lens: Lens, tangents: Array, distances: Array, wavelengths: Array, rule: PupilRule
 ) -> Moments:
@@ -273,7 +275,7 @@ def kernel_grid(lens: Lens, method: GridMethod, wavelengths: Numbers) -> KernelG
     return _kernel_grid(lens, method, waves)
 
 
-@jax.jit
+@functools.partial(jit, wanted=LARGE)
 def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGrid:
     nodes, index, exchanged = _unique(method.half, method.symmetry)
     tangents = jnp.asarray(nodes, method.step.dtype) * method.step

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..compilation import LARGE, jit
+from ..compilation import LARGE, ONCE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene, field_array, scene_of
 from ..numerics import Numbers, known_values, real_array
@@ -227,7 +227,8 @@ def _traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
     return trace_beam(lens, scene, rule)
 
 
-_kernels = jit(_collected, LARGE, static_argnames=("size", "kind", "cells"))
+# Each number of cells is a program, which runs once a scene.
+_kernels = jit(_collected, ONCE, static_argnames=("size", "kind", "cells"))
 
 
 @dataclasses.dataclass(frozen=True)

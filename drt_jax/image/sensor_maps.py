@@ -257,9 +257,10 @@ def _source(method: RenderMethod, table: Array, wanted: Array) -> tuple[Array, A
         size = a * d - b * c
         return safe_divide(jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]), size[None, None])
 
-    u = jnp.clip(wanted, -half, half)
-    for _ in range(_NEWTON):
-        u = jnp.clip(u - inverse(u) @ (image(u) - wanted), -half - 1, half + 1)
+    def step(u: Array, _: None) -> tuple[Array, None]:
+        return jnp.clip(u - inverse(u) @ (image(u) - wanted), -half - 1, half + 1), None
+
+    u, _ = jax.lax.scan(step, jnp.clip(wanted, -half, half), length=_NEWTON)
     return u, inverse(u)
 
 

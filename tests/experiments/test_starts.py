@@ -30,7 +30,7 @@ STARTS = {
     "design": [*AXIAL, "fields_deg=[0]", "starts.count=1", "trials=2", "tolerance=0.1"],
     "images": [
         *(
-            "views=[{lens: singlet, field_deg: 2, pixel_um: 8}]",
+            "views=[{lens: singlet, field_deg: 0, pixel_um: 8}]",
             "size=9",
             "rays=[16]",
             "waves=[48]",
