@@ -15,10 +15,16 @@ CODE = {
 }
 
 
+# Pages that trace thousands of lenses: faster machine code pays.
+MANY = ("tolerances.md",)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page, blocks in CODE.items() if blocks])
 def test_code_runs(tmp_path, page):
-    flags = {"XLA_FLAGS": os.environ["XLA_FLAGS"], "JAX_PLATFORMS": "cpu"}
+    given = os.environ["XLA_FLAGS"]
+    given = given.replace("level=0", "level=1") if page in MANY else given
+    flags = {"XLA_FLAGS": given, "JAX_PLATFORMS": "cpu"}
     ran = subprocess.run(
         [sys.executable, "-W", "error", "-c", "\n".join(CODE[page])],
         cwd=tmp_path,
