@@ -20,8 +20,9 @@ import numpy as np
 from jax import Array
 
 from drt_jax import Lens
+from drt_jax.compilation import jit
 
-from .snell import trace_snell
+from .snell import QUICK, trace_snell
 
 # Distance of the plane of q in front of the first vertex, mm.
 _LEAD = 5.0
@@ -151,7 +152,7 @@ class _Pupil(NamedTuple):
         return jax.vmap(node)(jnp.asarray(1 + t) / 2, jnp.asarray(weight))
 
 
-@jax.jit
+@partial(jit, wanted=QUICK)
 def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Array, Array, Array]:
     """sigma and the height of the centroid, their derivatives (2, P), and the number of corners, -1
     if no ray passes. part: position of the origin along the height of the region, 0 to 1."""

@@ -9,14 +9,14 @@ import numpy as np
 
 import drt_jax
 from drt_jax import Gauss, Status
-from drt_jax.compilation import LARGE, jit
+from drt_jax.compilation import jit
 from drt_jax.lens.elements import rotation_matrix
 from drt_jax.lens.forms import Shape
 from drt_jax.lens.surface import sag_derivatives
 from drt_jax.numerics import safe_sqrt
 
 from ._scenes import WAVELENGTH, Scenes
-from .snell import trace_snell
+from .snell import QUICK, trace_snell
 
 _BATCH = 104  # scenes of a call: all batches of one structure share a compiled program
 _BOTH = 4  # every 4th scene of a float64 family is traced in float32 too
@@ -28,17 +28,9 @@ _REFINE = 25
 _STOP_MISS = 1e-9  # mm
 
 
-# Few scenes, many programs: compilation takes most of the time.
-_QUICK = {
-    **LARGE,
-    "xla_backend_optimization_level": 1,
-    "xla_llvm_disable_expensive_passes": True,
-}
-
-
 def _over_scenes(function: Callable) -> Callable:
     """Maps a function of one scene over any number of scenes, in batches; NumPy arrays."""
-    program = jit(jax.vmap(function), _QUICK)
+    program = jit(jax.vmap(function), QUICK)
 
     def run(*arguments):
         count, parts = len(jax.tree.leaves(arguments)[0]), []
