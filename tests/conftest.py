@@ -18,12 +18,7 @@ import pytest
 # Most of the time of a test is compilation, and machine code that is not optimised compiles three
 # times faster, and without the newer fusions of CPUs nearly twice as fast; what it computes is the
 # same. Read when a backend starts, here and in the workers.
-FLAGS = (
-    "--xla_backend_optimization_level=0",
-    "--xla_cpu_use_fusion_emitters=false",
-    "--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE",
-    "--xla_cpu_parallel_codegen_split_count=1",
-)
+FLAGS = ("--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false")
 
 
 def known(flag: str) -> bool:
