@@ -7,6 +7,7 @@ import numpy as np
 
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
+from .breaks_out import with_breaks
 from .entry import LensError
 from .glasses import written_names
 from .media_out import medium_of
@@ -45,8 +46,6 @@ _OTHERS = {"silica": "F_SILICA"}
 def zmx_text(lens: Lens) -> str:
     """The lines of a file with an object at infinity and the line d, or the middle of the range of
     the glasses. LensError, with the remedy, for what such files do not hold or we do not write."""
-    if lens.elements is not None or lens.tilt is not None or lens.decentre is not None:
-        raise LensError("elements, tilts and decentres are not written to .zmx: save as .yaml")
     low, high = lens.dispersion.range
     wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
     media = [medium_of(lens, i) or {} for i in range(lens.count + 1)]
@@ -55,10 +54,13 @@ def zmx_text(lens: Lens) -> str:
     head = {"name": " ".join(lens.name.split()), "wave": wave}
     lines = [_HEAD.format(makers=" ".join(makers), **head)]
     front = ["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY", *_glass(lens, 0, names)]
-    blocks = [front, *(_surface(lens, i, names) for i in range(lens.count))]
     curvature, conic = (float(a[-1]) for a in (lens.curvature, lens.conic))
-    blocks.append(["TYPE STANDARD", f"CURV {curvature!r}", f"CONI {conic!r}", "DISZ 0"])
-    for i, block in enumerate(blocks):
+    image = ["TYPE STANDARD", f"CURV {curvature!r}", f"CONI {conic!r}"]
+    surfaces = [*(_surface(lens, i, names) for i in range(lens.count)), image]
+    gaps = [gap_behind(lens, i) for i in range(lens.count)]
+    blocks, behind = with_breaks(lens, surfaces, gaps)
+    placed = ([*own, f"DISZ {gap!r}"] for own, gap in zip(blocks, [*behind, 0.0], strict=True))
+    for i, block in enumerate([front, *placed]):
         lines += [f"SURF {i}", *(f"  {line}" for line in block)]
     return "\n".join([*lines, "MNUM 1 1", ""])
 
@@ -77,7 +79,7 @@ def _surface(lens: Lens, i: int, names: Mapping[str, str]) -> list[str]:
     lines = ["STOP"] if i == lens.stop else []
     lines += [*_form(lens, i), f"CURV {float(lens.curvature[i])!r}"]
     lines += [f"CONI {float(lens.conic[i])!r}"] if lens.conic[i] else []
-    lines += [f"DISZ {gap_behind(lens, i)!r}", *_glass(lens, i + 1, names)]
+    lines += _glass(lens, i + 1, names)
     semi = float(lens.semi_diameter[i])
     if math.isfinite(semi):
         lines.append(f"DIAM {semi!r} 1 0 0 1")

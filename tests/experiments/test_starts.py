@@ -11,7 +11,7 @@ import pytest
 
 import experiments
 from drt_jax import first_order, load_lens, save_lens
-from experiments import _command, _peers, _psf_peers, _work, tables
+from experiments import _command, _peers, _psf_peers, _work, benchmark, tables
 
 from .test_experiments import TOY
 
@@ -160,6 +160,14 @@ def test_it_ends_with_results_tables_and_pictures(name, tmp_path, monkeypatch, c
     globals()[f"checked_{name}"](json.loads((tmp_path / "run" / "results.json").read_text()))
     assert "done in" in capsys.readouterr().out
     assert all(p.stat().st_size > 3000 for p in (tmp_path / "run" / "figures").iterdir())
+
+
+@pytest.mark.slow
+def test_benchmark_starts_new_processes():
+    first = _work._FIRST.format(lens="singlet", field=0.0, distance=1e4)
+    config = benchmark.Config(lens="singlet", bundle=64, repeats=1)
+    spread = _work.SPREAD.format(devices=1, config=config)
+    assert all(_work.in_a_new_process(code, {}) > 0 for code in (first, spread))
 
 
 def test_tables_has_nothing_to_write(capsys):
