@@ -181,7 +181,7 @@ Largest relative errors of our derivatives, in reverse / forward mode, in float6
 is the complex step (h = 1e-30) through an independent Snell trace (`tests/oracle.py`), which is
 itself proved against 50-digit central differences. Written by
 
-    python -m pytest tests/rays/test_derivatives.py --write-tables
+    python -m pytest tests/rays/test_derivatives.py -m "" --write-tables
 
 Colours {WAVELENGTHS[0]} and {WAVELENGTHS[1]} um; moments by `psf_moments(..., \
 rule=Gauss({ORDER}, symmetry))`, paths of {len(POINTS)} rays by
