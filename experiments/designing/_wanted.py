@@ -17,15 +17,15 @@ class Starts:
     """Starts of the search.
 
     count: number of searches.
-    how: "around" the lens, normal; "within" the bounds; or "made", from lenses as built.
-    spread: of "around", standard deviation in scales of the variables.
-    per_cent, off_mm: of "made", standard deviations of curvatures and thicknesses.
+    how: "normal", about the lens; "sobol", within the bounds; or "as_built", from lenses with errors.
+    spread: of "normal", standard deviation in scales of the variables.
+    per_cent, off_mm: of "as_built", standard deviations of curvatures and thicknesses.
     stages: trials of each search in each stage.
     keep: fraction of searches that survive a stage.
     """
 
     count: int = 1
-    how: Literal["around", "within", "made"] = "around"
+    how: Literal["normal", "sobol", "as_built"] = "normal"
     spread: float = 1.0
     per_cent: float = 1.0
     off_mm: float = 0.1

@@ -146,9 +146,9 @@ def starts_of(variables: design.Variables, starts: Starts) -> np.ndarray:
     count, seed = starts.count, starts.seed
     if count == 1:
         return np.asarray(variables.start)[None]
-    if starts.how == "made":
+    if starts.how == "as_built":
         return design.as_built_starts(variables, count, starts.per_cent, starts.off_mm, seed)
-    if starts.how == "around":
+    if starts.how == "normal":
         return design.normal_starts(variables, count, starts.spread, seed)
     return design.sobol_starts(variables, count, seed)
 
@@ -315,7 +315,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     if starts["merits"]:
         rows += [["starts that pass light", starts["passed"]], ["minima", len(starts["merits"])]]
         rows += [["minima a minute", 60 * len(starts["merits"]) / max(starts["seconds"], 1e-9)]]
-    if results["how"] == "made":
+    if results["how"] == "as_built":
         rows.append(["starts no worse than the lens", f"{starts['no_worse']} of {starts['count']}"])
     name = row["problem"]
     found = {
@@ -339,7 +339,7 @@ def _glasses_table(snaps: list[dict[str, Any]]) -> str:
 
 def _peers_table(rows: list[dict[str, Any]], how: str) -> str:
     """Table of other optimisers, see `comparisons`."""
-    goal = "no worse than the lens" if how == "made" else "within 1% of the design"
+    goal = "no worse than the lens" if how == "as_built" else "within 1% of the design"
     header = ["optimiser", f"starts {goal}", "merit, best", "median", "limit exceeded by"]
     header += ["Jacobians until then", "s until then", "s a start"]
     lines = []

@@ -121,7 +121,7 @@ def test_a_phone_lens_from_a_crude_start(tmp_path, monkeypatch):
         ("solves=[{kind: focal_length, value: 50}]", "give surface"),
         ("operands=[]", "operands: needs at least one item"),
         ("operands=[{kind: blur}]", "operands[0].kind: expected one of spot,"),
-        ("starts.how=anywhere", "one of around, within, made"),
+        ("starts.how=anywhere", "one of normal, sobol, as_built"),
         ("lens=nowhere.yaml", "nowhere.yaml"),
         ("growth.first=2", "growth.first: expected"),
         ("glasses={makers: [SCHOTT], names: zz*}", "glasses.names: no glass of these makers is"),
