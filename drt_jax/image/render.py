@@ -213,8 +213,8 @@ def render(
         Outside of the picture it goes on as at its edge.
     distance: mm, inf allowed, or a depth map (H, W) of the picture: layers, see `composed`.
     pixel: side of a pixel, mm. wavelengths: (C,) um.
-    method: of `render_method`, made outside; needed inside `jax.jit` and `jax.vmap`. By default it
-        is made here, with its own defaults.
+    method: of `render_method` for this distance and pixel, made outside; needed inside `jax.jit`
+        and `jax.vmap`. By default it is made here, with its own defaults.
     progress: wraps the loop over rows of tiles (tqdm), where all numbers are known.
 
     The result is the irradiance over that of the axis: 1 where a picture of 1 meets the axis. Light
@@ -230,12 +230,26 @@ def render(
         )
     if picture.shape[:2] != method.shape:
         raise ValueError(f"image: the method is for {method.shape}, got {picture.shape[:2]}")
-    if concrete(distance):
-        layer_distances(distance, method.shape, 2)
+    _check_method(method, distance, pixel)
     maps = sensor_maps(lens, method, wavelengths)
     if jnp.ndim(jnp.asarray(distance)) == 0:
         return _whole(maps, method, picture, progress)
     return composed(maps, method, picture, jnp.asarray(distance), progress)
+
+
+def _check_method(method: RenderMethod, distance: Numbers, pixel: Numbers) -> None:
+    """ValueError for known numbers that are not those of the method."""
+    if concrete(distance):
+        layer_distances(distance, method.shape, 2)
+    for name, given, own in (
+        ("pixel", pixel, method.grid.pixel),
+        ("distance", distance, method.grid.distances),
+    ):
+        if not concrete((given, own)) or np.ndim(np.asarray(given)):
+            continue
+        known = np.asarray(own)
+        if known.size > 1 or not np.isclose(np.asarray(given, known.dtype), known, 1e-5, 0).all():
+            raise ValueError(f"{name}: the method is for {own} mm, got {given}; make one for it")
 
 
 def _picture(image: Array, channels: int) -> Array:

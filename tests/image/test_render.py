@@ -169,6 +169,9 @@ def test_no_seam_lies_between_tiles():
     corners = dataclasses.replace(method, places=jnp.zeros(0, jnp.int32), tile=(6, 4))
     blended = drt_jax.render(lens, picture(), np.inf, PIXEL, WAVES, corners)
     assert 0 < np.max(np.abs(np.asarray(image) - np.asarray(blended))) < 1e-3
+    for changed in ((np.inf, 2 * PIXEL), (1e3, PIXEL)):
+        with pytest.raises(ValueError, match=r"(pixel|distance): the method is for .* make one"):
+            drt_jax.render(lens, picture(), *changed, WAVES, method)
 
 
 @pytest.mark.slow
