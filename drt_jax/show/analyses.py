@@ -19,6 +19,14 @@ from ..image.gaussian_error import GaussianError
 from ..image.spots import Spots
 from .figures import FIELD_COLOURS
 
+# RMS radii from the centroid beyond which stray rays do not widen a picture.
+_STRAY = 5.0
+
+
+def spot_radius(found: Spots) -> np.ndarray:
+    """The radii (F,) mm that pictures show: of the farthest ray, unless that is a stray one."""
+    return np.minimum(np.asarray(found.radius), _STRAY * np.asarray(found.rms))
+
 
 def colours(wavelengths: ArrayLike) -> list[str]:
     """A colour for each wavelength."""
@@ -33,7 +41,8 @@ def colours(wavelengths: ArrayLike) -> list[str]:
 def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: float = 0) -> Axes:
     """The spot of one of the fields about its centroid, in um, with the Airy circle.
 
-    half: half the width of the picture in um; 0 for as wide as the spot.
+    half: half the width of the picture in um; 0 for as wide as the spot, or as five times its RMS
+        radius if a ray strays farther, which the label says.
     """
     centroid = np.asarray(found.centroid)[field]
     points = 1e3 * (np.asarray(found.points)[field] - centroid)
@@ -43,10 +52,11 @@ def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: fl
         axes.plot(*rays[good].T, ".", markersize=1.5, color=colour)
     if np.isfinite(airy):
         axes.add_patch(Circle((0, 0), airy, fill=False, color="black", linewidth=0.8))
-        reach = 1.15 * max(1e3 * float(found.radius[field]), airy)
-        half = half or reach
+        shown, farthest = (1e3 * float(a[field]) for a in (spot_radius(found), found.radius))
+        half = half or 1.15 * max(shown, airy)
         axes.set(xlim=(-half, half), ylim=(-half, half))
         size = f"RMS {1e3 * float(found.rms[field]):.3g}, Airy {airy:.3g} um"
+        size += f", rays to {farthest:.3g}" if farthest > shown else ""
     else:
         size = "no light arrives"
     axes.set_aspect("equal")

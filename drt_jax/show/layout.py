@@ -93,13 +93,9 @@ def draw(
         for angle, hit in zip(angles, hits, strict=True)
     ]
     vignetted = [_path(ray, start, angle, distance) for ray, angle in ends]
-    profiles = np.linspace(*_extents(lens, 1.1 * reach), _POINTS, axis=-1)
+    profiles = np.linspace(*_extents(lens, 1.1 * _widths(lens, hits, reach)), _POINTS, axis=-1)
     faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
-    glass = [
-        np.concatenate([faces[i], faces[j][::-1], faces[i][:1]])
-        for i, j in itertools.pairwise(lens.active)
-        if lens.glasses[i + 1] != lens.glasses[0]
-    ]
+    glass = [np.concatenate([faces[i], faces[j][::-1], faces[i][:1]]) for i, j in _pieces(lens)]
     pierced = _pierced(lens, profiles)
     mirrors = [
         np.where(pierced[i, :, None], np.nan, faces[i]) for i in np.flatnonzero(lens.mirrors)
@@ -205,9 +201,29 @@ def beam_of(lens: Lens, field: float, distance: float, wavelength: float) -> Bea
     return Beam(clipping, ends, wide, math.sqrt(size), best, float(shift))
 
 
-def _extents(lens: Lens, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _pieces(lens: Lens) -> list[tuple[int, int]]:
+    """The two surfaces of each piece of glass."""
+    pairs = itertools.pairwise(lens.active)
+    return [(i, j) for i, j in pairs if lens.glasses[i + 1] != lens.glasses[0]]
+
+
+def _widths(lens: Lens, hits: list[np.ndarray], reach: float) -> np.ndarray:
+    """How far from the axis rays come (S,), mm, on both faces of a piece of glass: `reach` where
+    surfaces do not stand on one axis, or no ray comes."""
+    wide = np.full(lens.count, reach)
+    _, across, turned = lens.places
+    if across is not None or turned is not None or not sum(map(len, hits)):
+        return wide
+    wide[list(lens.active)] = np.max(np.abs(np.concatenate(hits)[:, :-1, 1]), axis=0)
+    pieces = _pieces(lens)
+    for i, j in pieces + pieces[::-1]:  # cemented ones all
+        wide[[i, j]] = np.max(wide[[i, j]])
+    return np.where(wide > 0, wide, reach)
+
+
+def _extents(lens: Lens, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest y (S,) of the surfaces, mm: of their semi-diameters or, where there is
-    none, of their clear apertures; `reach` where there is none either."""
+    none, of their clear apertures; `reach` (S,) where there is none either."""
     semi, extra = np.asarray(lens.semi_diameter)[:-1], lens.apertures
     low, high = -semi, semi.copy()
     if extra is not None:

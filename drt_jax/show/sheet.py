@@ -126,7 +126,7 @@ def _circles(spots: Spots, shown: int) -> tuple[Array, Model, int]:
     """Radii (N,) of the energy of `shown` fields, mm, its model and the cells of the pupil: rays
     where waves need too many cells for a grid that holds the spots."""
     airy = float(np.min(spots.airy_radius))
-    sizes = spots.radius[1 : 1 + shown]
+    sizes = analyses.spot_radius(spots)[1 : 1 + shown]
     reach = max(np.max(sizes, initial=0, where=np.isfinite(sizes)), 3 * min(airy, 1e-2))
     cells = 64 * int(np.ceil(5 * reach / airy / 64)) if airy < np.inf else _MOST + 1
     radii = jnp.linspace(0, reach, _CURVE)

@@ -52,10 +52,14 @@ def test_what_is_not_finite_is_left_out():
         points=jnp.full_like(found.points, jnp.inf),
         airy_radius=jnp.full_like(found.airy_radius, jnp.inf),
     )
-    for each, label in ((found, "RMS"), (dark, "no light arrives")):
+    stray = dataclasses.replace(found, radius=30 * found.rms)
+    assert np.all(analyses.spot_radius(stray) == 5 * np.asarray(found.rms))
+    assert np.array_equal(analyses.spot_radius(found), found.radius)
+    for each, label in ((found, "RMS"), (stray, "RMS"), (dark, "no light arrives")):
         figure, axes = show.new()
         show.spots(axes, each, 1, WAVES)
         assert axes.get_xlabel().startswith(label)
+        assert ("rays to" in axes.get_xlabel()) == (each is stray)
         assert figure._repr_png_()
 
 
