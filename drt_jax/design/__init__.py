@@ -38,3 +38,4 @@ from .tolerance import (
 )
 from .values import OPERANDS as OPERANDS
 from .variables import Tie as Tie, Variables as Variables, Vary as Vary
+from .waves import psf as psf

@@ -63,12 +63,10 @@ def _check_operands(
                 f"operands: {operand.name}: vignetting: Clipped traces only what passes; take "
                 "Gauss or Soft"
             )
-        # Rays of weight 0 fit no polynomials, and inside `jit` only the size is known.
-        padded = isinstance(rule, Clipped) and rule.order != rule.size
-        if kind_of(operand.kind).of_waves and (padded or degree_of(rule) < 2):
+        if kind_of(operand.kind).of_waves and degree_of(rule) < 2:
             raise ValueError(
                 f"operands: {operand.name}: rule: needs Gauss or Soft of the order 2 or more, or "
-                f"Clipped of the order 3 or more, of size 0; got {shown(rule)}"
+                f"Clipped of the order 3 or more; got {shown(rule)}"
             )
     if not any(operand.weight for operand in operands):
         raise ValueError("operands: all have the weight 0; a merit needs at least one")
@@ -151,6 +149,8 @@ class Problem:
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
             rule = Gauss(rule, symmetry if across else "none")
+        if isinstance(rule, Clipped):  # rays of weight 0 would serve nothing
+            rule = dataclasses.replace(rule, order=int(rule.order), size=0)
         _check_operands(asked, lens, len(angles), len(waves), np.asarray(far), rule)
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)
         equal = np.ones(len(waves)) if wavelength_weights is None else wavelength_weights

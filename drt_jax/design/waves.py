@@ -1,5 +1,5 @@
-"""Operands of waves: transfer functions, Strehl ratios and encircled energy of rays that a problem
-has traced, by the polynomials of `image.beam`. No ray is added.
+"""Operands of waves: transfer functions, Strehl ratios, encircled energy and kernels of rays that a
+problem has traced, by the polynomials of `image.beam`. No ray is added.
 
 With the rule `Gauss` all light that fills the stop counts, clipped or not. With `Soft` and
 `Clipped` only light counts that passes the apertures.
@@ -13,7 +13,10 @@ from jax import Array
 
 from ..image.beam import Beam, beam_of
 from ..image.encircled import encircled
+from ..image.kernel import check_pixels
+from ..image.psf import Kind, psf_of_beam
 from ..image.transfer import strehl_of, transfer_of
+from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import Numbers, safe_sqrt
@@ -29,7 +32,7 @@ _CELLS, _ENERGY = 64, 128
 
 def degree_of(rule: PupilRule) -> int:
     """The degree of the polynomials of the pupil that the rays of a rule give, see `beam_rule`; 0
-    for a rule of too low an order or of another kind."""
+    for a rule of too low an order or of another kind. Problems have no padded rules."""
     if isinstance(rule, Gauss | Soft):
         return 2 * (rule.order - 1)
     return 2 * max(rule.size - 2, 0) if isinstance(rule, Clipped) else 0
@@ -76,3 +79,27 @@ def encircled_energy(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
     given = rays.wavelengths, radius, rays.wavelength_weights
     of = lambda beam: encircled(lens, beam, *given, "waves", _ENERGY)  # noqa: E731
     return _of_beams(lens, rays, of)[:, 0]
+
+
+def psf(
+    lens: Lens,
+    rays: FieldRays,
+    pixel: Numbers,
+    size: int = 21,
+    model: Kind = "waves",
+    cells: int = _ENERGY,
+) -> Array:
+    """Kernels (V, W, size, size) of all views, see `drt_jax.psf`: for operands of your own.
+
+    pixel: mm. cells: of the grid of the pupil along a side; more for spots of many pixels, see
+    `converged_psf`. ValueError for a rule whose rays give no polynomials.
+    """
+    if degree_of(rays.rule) < 2:
+        raise ValueError(
+            f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
+        )
+    side, size = check_pixels(pixel, size, rays.wavelengths.dtype)
+    # Of a scene only its wavelengths are used.
+    scene = Scene(rays.field[0], rays.distance[0], rays.wavelengths)
+    given = side, None, size, model, cells
+    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, scene, beam, *given).kernel)

@@ -131,10 +131,10 @@ def _psf(
     cells: int,
 ) -> Psf:
     beam = trace_beam(lens, scene, rule).refocused(defocus)
-    return _collected(lens, scene, beam, pixel, centre, size, kind, cells)
+    return psf_of_beam(lens, scene, beam, pixel, centre, size, kind, cells)
 
 
-def _collected(
+def psf_of_beam(
     lens: Lens,
     scene: Scene,
     beam: Beam,
@@ -144,6 +144,7 @@ def _collected(
     kind: Kind,
     cells: int,
 ) -> Psf:
+    """`psf` of a beam. scene: its wavelengths. pixel: (), mm. centre: (2,) mm or None."""
     mean, (xx, xy, yy) = centroid_and_variances(beam.hits[:, -1], beam.weights)
     if centre is None:
         centre = jnp.mean(mean, axis=-1)
@@ -228,7 +229,7 @@ def _traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
 
 
 # Each number of cells is a program, which runs once a scene.
-_kernels = jit(_collected, ONCE, static_argnames=("size", "kind", "cells"))
+_kernels = jit(psf_of_beam, ONCE, static_argnames=("size", "kind", "cells"))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ class Starts:
     """Starts of the search.
 
     count: number of searches.
-    how: "normal", about the lens; "sobol", within the bounds; or "as_built", from lenses with errors.
+    how: "normal", about the lens; "sobol", within the bounds; "as_built", lenses with errors.
     spread: of "normal", standard deviation in scales of the variables.
     per_cent, off_mm: of "as_built", standard deviations of curvatures and thicknesses.
     stages: trials of each search in each stage.
