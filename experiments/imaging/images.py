@@ -28,6 +28,7 @@ from skimage import data, transform
 
 import drt_jax
 from drt_jax import Lens, PsfModel, show
+from drt_jax.compilation import LARGE, known_options
 
 from . import _command, _common, _peers, _psf_peers, _work, render
 from ._plots import error_curves
@@ -192,8 +193,10 @@ def _timed(scene: Scene, model: PsfModel, repeats: int) -> tuple[np.ndarray, flo
     def mean(lens: Lens) -> jax.Array:
         return jnp.sum(weights[None] * scene.kernel(lens, model))
 
-    value, _ = _work.compiled(partial(scene.kernel, model=model), scene.lens)
-    gradient, _ = _work.compiled(jax.value_and_grad(mean), scene.lens)
+    options = known_options(LARGE)  # as psf has them itself
+    functions = partial(scene.kernel, model=model), jax.value_and_grad(mean)
+    programs = (jax.jit(function, compiler_options=options) for function in functions)
+    value, gradient = (_work.compiled(program, scene.lens)[0] for program in programs)
     return np.asarray(value()), *_common.medians([value, gradient], repeats)
 
 
@@ -204,8 +207,7 @@ def field_grid(scene: Scene, repeats: int) -> float:
     method = drt_jax.grid_method(
         scene.lens, fields, far, scene.waves, scene.pixel, scene.size, 4, "waves", 1e-2
     )
-    grid = partial(drt_jax.kernel_grid, method=method, wavelengths=scene.waves)
-    call, _ = _work.compiled(lambda lens: grid(lens).kernels, scene.lens)
+    call = partial(drt_jax.kernel_grid, scene.lens, method, scene.waves)
     return _common.medians([call], repeats)[0]
 
 
