@@ -118,6 +118,7 @@ def strong(tmp_path_factory):
     return problem, variables.start.at[3].multiply(2.9)
 
 
+@pytest.mark.slow
 def test_rays_that_fail_have_a_smooth_merit(strong):
     """Finite; its gradient, forward and reverse, agrees with differences."""
     problem, x = strong

@@ -243,9 +243,8 @@ surfaces:
 """
 
 
-@pytest.mark.parametrize(
-    "semi, rule", [(100, 4), pytest.param(15, Clipped(6, "bilateral"), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("semi, rule", [(100, 4), (15, Clipped(6, "bilateral"))])
 def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
     """The fourth power of the cosine, times the light that passes a clear aperture far in front."""
     path = tmp_path / "weak.yaml"

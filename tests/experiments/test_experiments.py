@@ -91,7 +91,7 @@ def test_every_config_loads_strictly(path):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "edof" else n for n in TOY]
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "restore")) for n in TOY]
 )
 def test_a_run_explains_itself(name, unbroken):
     folder = unbroken(name)
@@ -177,6 +177,7 @@ def test_finished_run_resumes_at_once(unbroken, capsys):
     assert "dense search on the same loss" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_of_many_skipped_files_a_few_are_named_and_all_are_listed(tmp_path, capsys):
     generator = np.random.default_rng(0)
     (tmp_path / "photographs").mkdir()
