@@ -103,6 +103,7 @@ def grid_method(
     model: Kind | Literal["auto"] | PsfModel = "rays",
     tolerance: float = _TOLERANCE,
     together: bool = False,
+    norm: int = 1,
 ) -> GridMethod:
     """Choose how `kernel_grid` makes its kernels; all numbers are known.
 
@@ -111,7 +112,8 @@ def grid_method(
     wavelengths: (W,) um. pixel: mm.
     size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
     nodes: on one side of the axis along the longer side, 2 or more.
-    model, tolerance: of the kernels, as of `psf`; a name is made into a model for all fields.
+    model, tolerance, norm: of the kernels, as of `converged_psf`; a name is made into a model for
+        all fields.
     together: all colours about the mean of their centroids, so that kernels hold the lateral colour
         (of patches); else each about its own.
 
@@ -146,7 +148,8 @@ def grid_method(
             size = next((n for n in _SIZES if n >= need), _SIZES[-1])
         if isinstance(model, str):
             fields, ends = _some(tangents, far, arrives)
-            model = converged_psf(lens, fields, ends, wavelengths, pixel, size, model, tolerance)
+            scene = lens, fields, ends, wavelengths
+            model = converged_psf(*scene, pixel, size, model, tolerance, norm)
         array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
         nearest = jnp.asarray(_nearest(tangents, arrives), jnp.int32)
         return GridMethod(

@@ -69,7 +69,7 @@ class PsfModel:
 
     kind: "gaussian", "rays" or "waves". rule: of the rays. cells: of the grid of the pupil,
     along a side; 0 for a Gaussian. errors: for "auto", by kind, how far its kernel is from that of
-    the waves: the sum of the absolute differences of all pixels, of the worst wavelength.
+    the waves, of the worst wavelength: what the tolerance is for.
     """
 
     kind: Kind
@@ -172,8 +172,10 @@ def converged_psf(
     size: int = 21,
     model: Kind | Literal["auto"] = "auto",
     tolerance: float = _TOLERANCE,
+    norm: int = 1,
 ) -> PsfModel:
-    """The model whose kernels are within `tolerance`, the sum of the absolute errors of the pixels.
+    """The model whose kernels are within `tolerance`, the sum of the absolute errors of the pixels;
+    with `norm` 2 the root of the sum of their squares, by which a picture of white noise is off.
 
     field: angle along y, or (x, y), in radians, or many pairs (F, 2). distance: mm, one or (Z,).
     Other arguments as of `psf`; all are known numbers. The model serves every field at every
@@ -183,6 +185,8 @@ def converged_psf(
     """
     if model not in (names := (*get_args(Kind), "auto")):
         raise ValueError(f"model: expected one of {', '.join(names)}, got {model!r}")
+    if norm not in (1, 2):
+        raise ValueError(f"norm: expected 1 or 2, got {norm!r}")
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
     known = known_values((lens, field, distance, wavelengths, pixel))
@@ -217,7 +221,7 @@ def converged_psf(
                 stacklevel=2,
             )
         rule = beam_rule(degree, symmetry, clipped)
-        view = _View(lens, tuple(scenes), tuple(beams), side, size)
+        view = _View(lens, tuple(scenes), tuple(beams), side, size, norm)
         if model != "auto":
             return PsfModel(model, rule, view.cells(model, tolerance))
         return _cheapest(view, rule, tolerance)
@@ -241,6 +245,7 @@ class _View:
     beams: tuple[Beam, ...]
     pixel: Array
     size: int
+    norm: int
 
     def kernels(self, kind: Kind, cells: int) -> np.ndarray:
         """Those of all scenes and wavelengths, (scenes W, size, size)."""
@@ -261,7 +266,7 @@ class _View:
         before = None
         for cells in tried:
             now = self.kernels(kind, cells)
-            change = np.inf if before is None else difference(now, before)
+            change = np.inf if before is None else difference(now, before, self.norm)
             # The error falls with the square of the number of cells, which grows by 4/3 at least.
             if change <= 0.75 * tolerance:
                 return cells
@@ -283,9 +288,11 @@ class _View:
         return int(np.max(np.ceil(needed / np.asarray(period(beam, scene.wavelengths, 1)))))
 
 
-def difference(a: np.ndarray, b: np.ndarray) -> float:
-    """Sum of the absolute differences of kernels (..., size, size), the largest of them."""
-    return float(np.max(np.sum(np.abs(a - b), axis=(-2, -1))))
+def difference(a: np.ndarray, b: np.ndarray, norm: int = 1) -> float:
+    """Sum of the absolute differences of kernels (..., size, size), or with `norm` 2 the root of
+    the sum of their squares; the largest of them."""
+    total = np.sum(np.abs(a - b) ** norm, axis=(-2, -1))
+    return float(np.max(total ** (1 / norm)))
 
 
 def _degree(
@@ -345,6 +352,7 @@ def _cheapest(view: _View, rule: BeamRule, tolerance: float) -> PsfModel:
     ]
     kernels = [view.kernels(*one) for one in ladder]
     errors: dict[str, float]
-    errors = {kind: difference(k, kernels[-1]) for (kind, _), k in zip(ladder[:-1], kernels)}
+    pairs = zip(ladder[:-1], kernels)
+    errors = {kind: difference(k, kernels[-1], view.norm) for (kind, _), k in pairs}
     kind, cells = next(one for one in ladder if errors.get(one[0], 0.0) <= tolerance)
     return PsfModel(kind, rule, cells, errors)

@@ -70,8 +70,9 @@ def render_method(
     pixel: mm. wavelengths: (C,) um.
     size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
     nodes: fields on one side of the axis, along the longer side of the picture, see `grid_method`.
-    model, tolerance: of the kernels, as of `psf`; kernels are interpolated to the same number, see
-        `sensor_maps.chosen`.
+    model: of the kernels, as of `psf`. tolerance: of the kernels, and of what lies between those of
+        a grid: the root of the sum of the squared errors of pixels, by which a picture of white
+        noise of variance 1 is off.
 
     Warns of light beside kernels that are too small. ValueError inside a trace, for numbers that
     make no sense, and where no light arrives.
@@ -94,7 +95,8 @@ def render_method(
         far = layer_distances(distance, shape, layers)
         side = float(np.asarray(pixel))
         angles = _angles(lens, shape, far, side, focal, waves)
-        grid = grid_method(lens, angles, far, waves, side, size, nodes, model, tolerance)
+        given = lens, angles, far, waves, side, size, nodes, model, tolerance
+        grid = grid_method(*given, norm=2)
         both = (shape[0], shape[1])
         length = jnp.asarray(focal, lens.curvature.dtype)
         method = RenderMethod(grid, length, jnp.zeros(0, jnp.int32), both, both)
