@@ -6,6 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..lens.forms import FORMS
+from ..lens.glass import FRAUNHOFER
+from ..lens.glasses import find_glass, indices
 from ..lens.lens import Lens
 from .breaks_out import with_breaks
 from .entry import LensError
@@ -51,6 +53,7 @@ def zmx_text(lens: Lens) -> str:
     media = [medium_of(lens, i) or {} for i in range(lens.count + 1)]
     makers, names = written_names([own["glass"] for own in media if "glass" in own])
     names |= {name: other for name, other in _OTHERS.items() if name in names}
+    names = {name: f"{other} 0 0 {_numbers(name)}" for name, other in names.items()}
     head = {"name": " ".join(lens.name.split()), "wave": wave}
     lines = [_HEAD.format(makers=" ".join(makers), **head)]
     front = ["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY", *_glass(lens, 0, names)]
@@ -63,6 +66,15 @@ def zmx_text(lens: Lens) -> str:
     for i, block in enumerate([front, *placed]):
         lines += [f"SURF {i}", *(f"  {line}" for line in block)]
     return "\n".join([*lines, "MNUM 1 1", ""])
+
+
+def _numbers(name: str) -> str:
+    """nd and vd of a glass: what a program falls back on that does not know its name."""
+    glass = find_glass(name)
+    if glass.range[0] > FRAUNHOFER[1] or glass.range[1] < FRAUNHOFER[2]:
+        return "1.5 40"
+    d, f, c = indices(glass, np.array(FRAUNHOFER[:3])).tolist()
+    return f"{d:.7f} {(d - 1) / (f - c):.5f}" if f > c else "1.5 40"
 
 
 def gap_behind(lens: Lens, i: int) -> float:
@@ -139,7 +151,8 @@ def _times_turn(waves: float) -> float:
 
 
 def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
-    """The medium behind a surface, m from 1, or of the object; `names` of glasses in the file."""
+    """The medium behind a surface, m from 1, or of the object; names: what the file says of each
+    glass."""
     if m and lens.mirrors[m - 1]:
         return ["GLAS MIRROR 0 0 1.5 40"]
     keys = medium_of(lens, m)
@@ -148,8 +161,8 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
             f"glasses[{m}]: {lens.glasses[m]} has constants of its own, which a .zmx file does not "
             "hold: save as .yaml, or use with_model_glass"
         )
-    if "glass" in keys:
-        return [f"GLAS {names[keys['glass']]} 0 0 1.5 40"]
+    if "glass" in keys:  # air has no such line
+        return [] if keys["glass"] == "air" else [f"GLAS {names[keys['glass']]}"]
     if "index" in keys:
         return [f"GLAS ___BLANK 1 0 {keys['index']!r} 0 0"]
     if not keys:

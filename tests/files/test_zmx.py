@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from drt_jax import LensError, first_order, load_lens, load_system, sag, save_lens, trace_rays
+from drt_jax.lens.glass import nd_and_vd
 
 SHARED = pathlib.Path(__file__).resolve().parents[3] / "shared" / "data" / "lens_files"
 LISTED = pytest.mark.skipif(not SHARED.is_dir(), reason="listings lie beside the repository")
@@ -372,6 +373,11 @@ def test_written_and_read_back(tmp_path, name):
     lens = load_lens(name)
     save_lens(lens, tmp_path / "lens.zmx")
     assert_same(lens, load_lens(tmp_path / "lens.zmx"))
+    # What others fall back on that do not know a glass: nd and vd; and no glass of the name air.
+    said = re.findall(r"GLAS (?!MIRROR)\S+ \d 0 (\S+) (\S+)", (tmp_path / "lens.zmx").read_text())
+    known = np.asarray(nd_and_vd(lens.dispersion))
+    glass = known[:-1][known[:-1, 1] > 0]
+    np.testing.assert_allclose(np.array(said, float).reshape(-1, 2), glass, rtol=1e-3)
 
 
 def test_written_forms_glasses_and_apertures(tmp_path):

@@ -278,6 +278,29 @@ def test_what_is_no_kernel_is_refused(double_gauss, change, message):
 
 
 @pytest.mark.slow
+def test_the_norm_of_a_tolerance_and_where_the_search_ends(double_gauss, monkeypatch):
+    """The root of the sum of squares is smaller than the sum; a change that grows ends the search,
+    and is told."""
+    scene = *double_gauss, PIXEL, SIZE, "rays", 2e-2
+    assert drt_jax.converged_psf(*scene, 2).cells < drt_jax.converged_psf(*scene).cells
+    with pytest.raises(ValueError, match="norm: expected 1 or 2, got 3"):
+        drt_jax.converged_psf(*scene, 3)
+    made = module._View.kernels
+    noise = np.random.default_rng(0)
+    tried = []
+
+    def noisy(self, kind, cells):
+        tried.append(cells)
+        kernels = made(self, "gaussian", 0)
+        return kernels + len(tried) * noise.normal(size=kernels.shape)
+
+    monkeypatch.setattr(module._View, "kernels", noisy)
+    with pytest.warns(UserWarning, match="rays of 128 x 128 cells have converged to"):
+        assert drt_jax.converged_psf(*scene).cells == 128
+    assert tried[-1] == 128
+
+
+@pytest.mark.slow
 def test_no_program_takes_several_matrices_to_lapack_at_once():
     """LAPACK's loop over matrices waits for XLA's threads in one of them: two of them never end."""
     lens, rule = drt_jax.load_lens("singlet"), beam_rule(4, "bilateral")
