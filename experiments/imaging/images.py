@@ -371,7 +371,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     photos = [("ideal", "ideal")] + [
         (f"photo_{p['lens']}", p["lens"]) for p in results["photographs"]
     ]
-    figure, axes = show.new(1, len(photos), 3.6, 3.8)
+    figure, axes = show.new(1, len(photos), 3.6, 4.1)
     for ax, (name, title) in zip(np.ravel(axes), photos):
         ax.imshow(np.asarray(Image.open(figures / f"{name}.png")), interpolation="antialiased")
         ax.set(xticks=[], yticks=[], title=title)
