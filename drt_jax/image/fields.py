@@ -8,7 +8,7 @@ pixels, give the others.
 import dataclasses
 import functools
 import warnings
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -133,9 +133,7 @@ def grid_method(
         _check_counts(size, nodes)
         dtype = lens.curvature.dtype
         far = np.atleast_1d(np.asarray(distances, float))
-        wide = np.tan(np.abs(np.asarray(fields, float)))
-        if wide.shape != (2,) or not np.all(np.isfinite(wide)) or not np.max(wide) > 0:
-            raise ValueError(f"fields: expected two angles, one above 0, got {fields!r}")
+        wide = _widest(fields)
         step = float(np.max(wide)) / nodes
         across, down = (max(2, int(np.ceil(a / step - 1e-9))) for a in wide)
         half = down, across
@@ -149,8 +147,7 @@ def grid_method(
             need = _reach(found, arrives, pixel)
             size = next((n for n in _SIZES if n >= need), _SIZES[-1])
         if isinstance(model, str):
-            fields, ends = _some(tangents, far, np.asarray(found.throughput))
-            scene = lens, fields, ends, wavelengths
+            scene = lens, *_some(tangents, far, np.asarray(found.throughput)), wavelengths
             model = converged_psf(*scene, pixel, size, model, tolerance, norm)
         array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
         nearest = jnp.asarray(_nearest(tangents, arrives), jnp.int32)
@@ -165,6 +162,14 @@ def check_pixel(pixel: Numbers) -> None:
         side = np.asarray(pixel, float)
         if side.ndim or not 0 < side < np.inf:
             raise ValueError(f"pixel: must be above 0 mm, got {pixel!r}")
+
+
+def _widest(fields: Any) -> np.ndarray:
+    """The largest tangents (2,) of known fields."""
+    wide = np.tan(np.abs(np.asarray(fields, float)))
+    if wide.shape != (2,) or not np.all(np.isfinite(wide)) or not np.max(wide) > 0:
+        raise ValueError(f"fields: expected two angles, one above 0, got {fields!r}")
+    return cast(np.ndarray, wide)
 
 
 def _check_counts(size: Any, nodes: Any) -> None:

@@ -185,12 +185,7 @@ def converged_psf(
     how far the others are. Warns where no polynomials or no grid in reach meets the tolerance.
     ValueError inside a trace.
     """
-    if model not in (names := (*get_args(Kind), "auto")):
-        raise ValueError(f"model: expected one of {', '.join(names)}, got {model!r}")
-    if norm not in (1, 2):
-        raise ValueError(f"norm: expected 1 or 2, got {norm!r}")
-    if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
+    _check_asked(model, tolerance, norm)
     known = known_values((lens, field, distance, wavelengths, pixel))
     if known is None:
         raise ValueError(
@@ -229,6 +224,15 @@ def converged_psf(
         if model != "auto":
             return PsfModel(model, rule, view.cells(model, tolerance))
         return _cheapest(view, rule, tolerance)
+
+
+def _check_asked(model: str, tolerance: float, norm: int) -> None:
+    if model not in (names := (*get_args(Kind), "auto")):
+        raise ValueError(f"model: expected one of {', '.join(names)}, got {model!r}")
+    if not 0 < tolerance < 1:
+        raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
+    if norm not in (1, 2):
+        raise ValueError(f"norm: expected 1 or 2, got {norm!r}")
 
 
 @functools.partial(jit, wanted=LARGE)
