@@ -28,6 +28,9 @@ from ..rays.system import dot
 from ..rays.trace import Bundle, trace_bundle
 from .zernike import Polynomials, fitted
 
+# Directions along which the light of a clipped beam has ends.
+_SIDES = 16
+
 
 @functools.partial(
     jax.tree_util.register_dataclass,
@@ -114,6 +117,22 @@ class Beam:
     def directions_extent(self) -> tuple[Array, Array]:
         """The rectangle of direction cosines that the light lies in: two corners, (2, W)."""
         return _extent(self.direction[:2], self.known, self._margin())
+
+    def near(self, places: Array, middle: Array, step: Array, cells: int) -> Array:
+        """Whether points of a grid (W, N, N) [y, x] lie where light may come, next to the rays. Far
+        from all rays polynomials run away, and some come back to where apertures seem to pass them.
+
+        places: (2, W, Q) of the rays. middle, step: (2, W), of the grid.
+        """
+        side = jnp.asarray(np.arange(cells) - (cells - 1) / 2, step.dtype)
+        axes = middle[..., None] + step[..., None] * side[None, None]
+        found = jnp.ones((axes.shape[1], cells, cells), bool)
+        for angle in np.pi / _SIDES * np.arange(_SIDES):
+            x, y = np.cos(angle).item(), np.sin(angle).item()
+            low, high = _extent(x * places[0] + y * places[1], self.known, self._margin())
+            along = x * axes[0][:, None, :] + y * axes[1][:, :, None]
+            found &= (along >= low[:, None, None]) & (along <= high[:, None, None])
+        return found
 
     def _margin(self) -> float:
         """By what part the light may reach farther than the outermost rays: they lie inside of the
@@ -234,7 +253,7 @@ def _filled(beam: Beam) -> Beam:
 
 
 def _extent(places: Array, known: Array, margin: float) -> tuple[Array, Array]:
-    """Two corners (2, W) of what holds all light whose rays are at places (2, W, Q)."""
+    """Ends (..., W) of what holds all light whose rays are at places (..., W, Q)."""
     low = jnp.min(jnp.where(known, places, jnp.inf), axis=-1)
     high = jnp.max(jnp.where(known, places, -jnp.inf), axis=-1)
     middle, half = (low + high) / 2, margin * (high - low) / 2
@@ -277,17 +296,21 @@ def centroid_and_variances(hits: Array, weights: Array) -> tuple[Array, tuple[Ar
     return mean, (xx, xy, yy)
 
 
-def cover(lens: Lens, beam: Beam, stop: Array, hits: Array) -> Array:
+def cover(
+    lens: Lens, beam: Beam, stop: Array, hits: Array, places: Array, axes: tuple[Array, Array]
+) -> Array:
     """The part of each cell of a grid of rays that light fills, (W, N, N).
 
     stop: (2, W, N, N), where they cross the stop. hits: (2 S + 2, W, N, N) on all surfaces, of a
-    clipped beam.
+    clipped beam. places: (2, W, Q) of the beam's rays in the plane of the grid, its points or
+    directions. axes: the middle and the step of the grid, (2, W) each.
     """
     inside = _cover(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
     if beam.clipped:
         x, y = hits.reshape(2, -1, *stop.shape[1:])
         for edge in clearance(lens, (x, y)):
             inside = jnp.minimum(inside, _cover(jnp.where(jnp.isfinite(edge), edge, 1)))
+        inside = jnp.where(beam.near(places, *axes, stop.shape[-1]), inside, 0)
     return inside
 
 

@@ -36,8 +36,6 @@ _REACH = 4.5
 _LOST = 1e-2
 # Sum of the absolute errors of a kernel's pixels.
 _TOLERANCE = 5e-3
-# Throughput, as a part of the largest, of fields whose kernels have the accuracy asked for.
-_BRIGHT = 0.2
 # The order of the rule that finds where light arrives.
 _LOOK = 8
 # Nodes that interpolation takes a kernel from, along each axis.
@@ -147,7 +145,7 @@ def grid_method(
             need = _reach(found, arrives, pixel)
             size = next((n for n in _SIZES if n >= need), _SIZES[-1])
         if isinstance(model, str):
-            scene = lens, *_some(tangents, far, np.asarray(found.throughput)), wavelengths
+            scene = lens, *_some(tangents, far, arrives), wavelengths
             model = converged_psf(*scene, pixel, size, model, tolerance, norm)
         array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
         nearest = jnp.asarray(_nearest(tangents, arrives), jnp.int32)
@@ -266,14 +264,11 @@ def _look(lens: Lens, tangents: np.ndarray, far: np.ndarray, wavelengths: Any) -
     return _spots(lens, jnp.asarray(tangents, dtype), jnp.asarray(far, dtype), waves, rule)
 
 
-def _some(tangents: np.ndarray, far: np.ndarray, throughput: np.ndarray) -> tuple[Any, Any]:
+def _some(tangents: np.ndarray, far: np.ndarray, arrives: np.ndarray) -> tuple[Any, Any]:
     """Fields (F, 2), radians, and distances for which a model of kernels is chosen: the farthest of
-    which light arrives, one between, and the axis. throughput: (D, U, W). Slivers of a pupil take
-    many cells, and little light of a picture comes through them: they get what others need."""
-    light = np.min(throughput, axis=-1)
-    enough = light >= _BRIGHT * np.max(light)
-    every = np.all(enough, axis=0)
-    lit = tangents[every if np.any(every) else np.any(enough, axis=0)]
+    which light arrives, one between, and the axis."""
+    every = np.all(arrives, axis=0)
+    lit = tangents[every if np.any(every) else np.any(arrives, axis=0)]
     order = lit[np.argsort(np.sum(lit**2, axis=1))]
     some = order[[-1, len(order) // 2, 0]]
     # Turned a little out of the planes in which half of a pupil would do.

@@ -35,8 +35,6 @@ _TOLERANCE = 1e-2
 # Degrees of the polynomials and cells of the grids that are tried.
 _DEGREES = (4, 6, 8, 10, 12, 14, 16), (20, 24)
 _CELLS = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768)
-# Cells from which on a change that grows ends the search.
-_STALLED = 128
 _UM = 1e3  # per mm
 
 
@@ -218,8 +216,7 @@ def converged_psf(
                 stacklevel=2,
             )
         rule = beam_rule(degree, symmetry, clipped)
-        if clipped is not None and degree < degrees[-1]:  # in slivers high terms go astray
-            beams = [_traced(lens, scene, rule) for scene in scenes]
+        beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
         view = _View(lens, tuple(scenes), tuple(beams), side, size, norm)
         if model != "auto":
             return PsfModel(model, rule, view.cells(model, tolerance))
@@ -271,15 +268,13 @@ class _View:
             return 0
         first = _CELLS[0] if kind == "rays" else max(map(self._fewest, self.scenes, self.beams))
         tried = [n for n in _CELLS if n >= first] or [_CELLS[-1]]
-        before, change = None, np.inf
+        before = None
         for cells in tried:
-            now, last = self.kernels(kind, cells), change
+            now = self.kernels(kind, cells)
             change = np.inf if before is None else difference(now, before, self.norm)
             # The error falls with the square of the number of cells, which grows by 4/3 at least.
             if change <= 0.75 * tolerance:
                 return cells
-            if cells >= _STALLED and last < change < np.inf:  # more would cost time, and not help
-                break
             before = now
         warnings.warn(
             f"{kind} of {cells} x {cells} cells have converged to {change:.1e} only, not to "

@@ -241,7 +241,8 @@ def _of_rays(
     values, _, _ = functions.on_grid(start, step, side)
     places = jnp.asarray(np.stack(np.meshgrid(side, side)), values.dtype)[:, None]
     stop = middle[..., None, None] + half[..., None, None] * places
-    weight = cover(lens, beam, stop, values[2:])
+    axes = middle, half * (2 / cells)
+    weight = cover(lens, beam, stop, values[2:], beam.points, axes)
     weight = normalised(weight, (1, 2))
     hits = values[1::-1] - centre[::-1, None, None, None]  # y first
 
@@ -268,7 +269,8 @@ def pupil_function(
             [d[k] / functions.scale[i][:, None, None] for k in (1, 2)]
             for i, d in enumerate((by_x, by_y))
         )
-        inside = cover(lens, beam, values[1:3], values[3:])
+        axes = middle, step
+        inside = cover(lens, beam, values[1:3], values[3:], beam.direction[:2], axes)
         return jnp.abs(ax * by - ay * bx), inside, turns * values[0]
 
     return pupil

@@ -85,7 +85,8 @@ def pupil_function(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tu
     (_, ax, ay), (_, bx, by) = by_x[:3], by_y[:3]
     part = functions.scale[0] * functions.scale[1] * jnp.pi
     density = jnp.abs(ax * by - ay * bx) / part[:, None, None]
-    amplitude = safe_sqrt(density) * cover(lens, beam, stop, values[3:])
+    inside = cover(lens, beam, stop, values[3:], beam.direction[:2], (middle, step))
+    amplitude = safe_sqrt(density) * inside
     phase = path * (2 * jnp.pi * _UM / wavelengths)[:, None, None]
     return jax.lax.complex(amplitude * jnp.cos(phase), amplitude * jnp.sin(phase)), step
 

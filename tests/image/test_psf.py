@@ -101,6 +101,25 @@ def test_sums_and_moments(field, rule):
 
 
 @pytest.mark.slow
+def test_no_light_comes_from_beside_a_narrow_pupil():
+    """A corner of the camera lens, where it passes 29 % of the light: far from the rays, polynomials
+    of degree 12 seem to pass all apertures again. Against a histogram of 15,000 rays."""
+    lens, field, pixel = drt_jax.load_lens("camera_50mm"), np.array([0.3, 0.3]), 0.02
+    scene = lens, field, np.inf, (0.53,)
+    rule = beam_rule(12, "none", drt_jax.Clipped(6, "none"))
+    found = drt_jax.psf(*scene, pixel, SIZE, PsfModel("rays", rule, 96))
+    points, _ = patterns.sobol_disc(1 << 16)
+    rays = drt_jax.trace_rays(*scene, points)
+    good = np.asarray(rays.status)[0] == 0
+    place = (np.asarray(rays.points)[0, good, -1, :2] - np.asarray(found.centre)) / pixel
+    edges = np.arange(SIZE + 1) - SIZE / 2
+    truth = np.histogram2d(place[:, 1], place[:, 0], [edges, edges])[0] / np.sum(good)
+    np.testing.assert_allclose(found.throughput[0], np.mean(good), atol=3e-3)
+    np.testing.assert_allclose(found.outside[0], 1 - np.sum(truth), atol=5e-3)
+    assert np.sum(np.abs(np.asarray(found.kernel)[0] - truth)) < 0.04
+
+
+@pytest.mark.slow
 def test_waves_are_the_sum_of_plane_waves(double_gauss):
     lens, field, *_ = double_gauss
     found = drt_jax.psf(*double_gauss, PIXEL, SIZE, WAVE_MODEL)
@@ -278,26 +297,12 @@ def test_what_is_no_kernel_is_refused(double_gauss, change, message):
 
 
 @pytest.mark.slow
-def test_the_norm_of_a_tolerance_and_where_the_search_ends(double_gauss, monkeypatch):
-    """The root of the sum of squares is smaller than the sum; a change that grows ends the search,
-    and is told."""
+def test_the_norm_of_a_tolerance(double_gauss):
+    """The root of the sum of squares is smaller than the sum."""
     scene = *double_gauss, PIXEL, SIZE, "rays", 2e-2
     assert drt_jax.converged_psf(*scene, 2).cells < drt_jax.converged_psf(*scene).cells
     with pytest.raises(ValueError, match="norm: expected 1 or 2, got 3"):
         drt_jax.converged_psf(*scene, 3)
-    made = module._View.kernels
-    noise = np.random.default_rng(0)
-    tried = []
-
-    def noisy(self, kind, cells):
-        tried.append(cells)
-        kernels = made(self, "gaussian", 0)
-        return kernels + len(tried) * noise.normal(size=kernels.shape)
-
-    monkeypatch.setattr(module._View, "kernels", noisy)
-    with pytest.warns(UserWarning, match="rays of 128 x 128 cells have converged to"):
-        assert drt_jax.converged_psf(*scene).cells == 128
-    assert tried[-1] == 128
 
 
 @pytest.mark.slow
