@@ -22,6 +22,7 @@ from .files.yaml import (
     load_lens as load_lens,
     load_system as load_system,
 )
+from .image.beam_psf import Psf as Psf, PsfModel as PsfModel
 from .image.chief import (
     Distortion as Distortion,
     FieldCurvature as FieldCurvature,
@@ -52,7 +53,6 @@ from .image.field import field_of_image as field_of_image, image_point as image_
 from .image.fields import (
     GridMethod as GridMethod,
     KernelGrid as KernelGrid,
-    grid_method as grid_method,
     kernel_grid as kernel_grid,
     kernels_at as kernels_at,
 )
@@ -60,19 +60,21 @@ from .image.gaussian_error import (
     GaussianError as GaussianError,
     gaussian_error as gaussian_error,
 )
+from .image.grid_method import grid_method as grid_method
 from .image.kernel import (
     SeparableKernel as SeparableKernel,
     gaussian_psf as gaussian_psf,
     separable_psf as separable_psf,
 )
 from .image.moments import FocusMoments as FocusMoments, moments as moments
-from .image.psf import Psf as Psf, PsfModel as PsfModel, converged_psf as converged_psf, psf as psf
+from .image.psf import psf as psf
+from .image.psf_model import converged_psf as converged_psf
 from .image.render import (
     RenderMethod as RenderMethod,
     render as render,
-    render_method as render_method,
     sensor_noise as sensor_noise,
 )
+from .image.render_method import render_method as render_method
 from .image.sensor import (
     convolve as convolve,
     convolve_each as convolve_each,

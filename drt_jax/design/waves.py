@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..image.beam import Beam, beam_of
+from ..image.beam_psf import Kind, psf_of_beam
 from ..image.encircled import encircled
 from ..image.kernel import check_pixels
-from ..image.psf import Kind, psf_of_beam
 from ..image.transfer import strehl_of, transfer_of
 from ..inputs import shown
 from ..lens.lens import Lens

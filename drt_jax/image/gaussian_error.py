@@ -7,7 +7,9 @@ import numpy as np
 from ..lens.lens import Lens
 from ..lens.scene import fields_array
 from ..numerics import Numbers, known_values
-from .psf import PsfModel, converged_psf, difference, psf
+from .beam_psf import PsfModel
+from .psf import psf
+from .psf_model import converged_psf, difference
 
 _LINES = 64  # Frequencies on either side, at least.
 

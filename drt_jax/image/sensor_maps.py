@@ -20,7 +20,8 @@ from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..numerics import Numbers, safe_divide, safe_sqrt
 from .blur import SIDES
-from .fields import GridMethod, KernelGrid, kernel_grid, warn_of_loss
+from .fields import GridMethod, KernelGrid, kernel_grid
+from .grid_method import warn_of_loss
 from .interpolate import at_point, lagrange
 
 # Nodes that a place, and a kernel or its light, are interpolated from along each axis.

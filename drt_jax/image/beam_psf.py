@@ -1,0 +1,87 @@
+"""Kernels of a beam on the pixels, by each of three models."""
+
+import dataclasses
+import functools
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..lens.lens import Lens
+from ..lens.scene import Scene
+from .beam import Beam, BeamRule, centroid_and_variances
+from .kernel import gaussian_shares
+from .ray_psf import ray_kernel
+from .wave_psf import wave_kernel
+
+Kind = Literal["gaussian", "rays", "waves"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Psf:
+    """What pixels collect of the light of an object point, for W wavelengths.
+
+    kernel: (W, size, size), [wavelength, y, x]: adds to 1 - outside.
+    outside: (W,), the part of the light on the sensor that falls beside the kernel.
+    centre: (2,) mm, where the middle of the kernel lies on the sensor.
+    throughput: (W,), the part of the light through the stop that reaches the sensor.
+    solid_angle: (W,), area of the cone of light on the sensor in direction cosines: irradiance is
+        radiance times this; its ratio to the axis is the relative illumination.
+    """
+
+    kernel: Array
+    outside: Array
+    centre: Array
+    throughput: Array
+    solid_angle: Array
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("rule", "errors"),
+    meta_fields=("kind", "cells"),
+)
+@dataclasses.dataclass(frozen=True)
+class PsfModel:
+    """How kernels are made, see `converged_psf`.
+
+    kind: "gaussian", "rays" or "waves". rule: of the rays. cells: of the grid of the pupil,
+    along a side; 0 for a Gaussian. errors: for "auto", by kind, how far its kernel is from that of
+    the waves, of the worst wavelength: what the tolerance is for.
+    """
+
+    kind: Kind
+    rule: BeamRule
+    cells: int
+    errors: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+def psf_of_beam(
+    lens: Lens,
+    scene: Scene,
+    beam: Beam,
+    pixel: Array,
+    centre: Array | None,
+    size: int,
+    kind: Kind,
+    cells: int,
+) -> Psf:
+    """`psf` of a beam. scene: its wavelengths. pixel: (), mm. centre: (2,) mm or None."""
+    mean, (xx, xy, yy) = centroid_and_variances(beam.hits[:, -1], beam.weights)
+    if centre is None:
+        centre = jnp.mean(mean, axis=-1)
+    total = beam.throughput[:, None, None]
+    if kind == "gaussian":
+        covariance = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
+        kernel = gaussian_shares((mean - centre[:, None]).T, covariance, pixel, size)
+        kernel = jnp.where(total > 0, kernel, 0)
+    else:
+        if kind == "rays":
+            kernel = ray_kernel(lens, beam, centre, pixel, size, cells)
+        else:
+            kernel = wave_kernel(lens, beam, scene.wavelengths, centre, pixel, size, cells)
+        kernel = jnp.where(total > 0, kernel / jnp.where(total > 0, total, 1), 0)
+    outside = jnp.where(beam.throughput > 0, 1 - jnp.sum(kernel, axis=(1, 2)), 0)
+    return Psf(kernel, outside, centre, beam.throughput, beam.solid_angle())

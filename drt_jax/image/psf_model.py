@@ -1,0 +1,232 @@
+"""The model of kernels that a tolerance takes: its polynomials, and the cells of its grid."""
+
+import dataclasses
+import functools
+import itertools
+import warnings
+from typing import Literal, cast, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..compilation import LARGE, ONCE, jit
+from ..lens.lens import Lens
+from ..lens.scene import Scene, field_array, scene_of
+from ..numerics import Numbers, known_values, real_array
+from ..pupil.clipped import Clipped
+from ..pupil.rules import symmetry_of
+from .beam import Beam, BeamRule, beam_rule, trace_beam
+from .beam_psf import Kind, PsfModel, psf_of_beam
+from .converged import converged_rule
+from .kernel import check_pixels
+from .wave_psf import period
+from .zernike import zernike
+
+# Sum of the absolute errors of the pixels of a kernel.
+TOLERANCE = 1e-2
+# Degrees of the polynomials and cells of the grids that are tried.
+_DEGREES = (4, 6, 8, 10, 12, 14, 16), (20, 24)
+_CELLS = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768)
+_UM = 1e3  # per mm
+
+
+def converged_psf(
+    lens: Lens,
+    field: Numbers,
+    distance: Numbers,
+    wavelengths: Numbers,
+    pixel: Numbers,
+    size: int = 21,
+    model: Kind | Literal["auto"] = "auto",
+    tolerance: float = TOLERANCE,
+    norm: int = 1,
+) -> PsfModel:
+    """The model whose kernels are within `tolerance`, the sum of the absolute errors of the pixels;
+    with `norm` 2 the root of the sum of their squares, by which a picture of white noise is off.
+
+    field: angle along y, or (x, y), in radians, or many pairs (F, 2). distance: mm, one or (Z,).
+    Other arguments as of `psf`; all are known numbers. The model serves every field at every
+    distance. With "auto" it is the cheapest within the tolerance of the waves, and `errors` says
+    how far the others are. Warns where no polynomials or no grid in reach meets the tolerance.
+    ValueError inside a trace.
+    """
+    _check_asked(model, tolerance, norm)
+    known = known_values((lens, field, distance, wavelengths, pixel))
+    if known is None:
+        raise ValueError(
+            "inside jax.jit or jax.vmap the cost of a kernel cannot follow from a tolerance: make "
+            "the model outside and pass it on, model=drt_jax.converged_psf(...)"
+        )
+    with jax.core.eval_context():
+        lens, field, distance, wavelengths, pixel = known
+        dtype = lens.curvature.dtype
+        side, size = check_pixels(pixel, size, dtype)
+        fields = field_array(field, dtype)
+        distances = real_array("distance", distance, dtype)
+        pairs = itertools.product(
+            fields if fields.ndim == 2 else [fields], distances if distances.ndim else [distances]
+        )
+        scenes = [scene_of(lens, one, far, wavelengths) for one, far in pairs]
+        base = converged_rule(lens, field, distance, wavelengths, min(tolerance, 1e-3))
+        clipped = base if isinstance(base, Clipped) else None
+        symmetry = symmetry_of(lens, field)
+        for degrees in _DEGREES:
+            whole = beam_rule(degrees[-1], symmetry, clipped)
+            beams = [_traced(lens, scene, whole) for scene in scenes]
+            degree, error = _degree(beams, scenes, side, model != "gaussian", degrees, tolerance)
+            if error <= tolerance:
+                break
+        else:
+            warnings.warn(
+                f"polynomials of degree {degree} give back the rays to {error:.1e} only, not to "
+                f"{tolerance:.1e}",
+                stacklevel=2,
+            )
+        rule = beam_rule(degree, symmetry, clipped)
+        beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
+        view = _View(lens, tuple(scenes), tuple(beams), side, size, norm)
+        if model != "auto":
+            return PsfModel(model, rule, view.cells(model, tolerance))
+        return _cheapest(view, rule, tolerance)
+
+
+def _check_asked(model: str, tolerance: float, norm: int) -> None:
+    if model not in (names := (*get_args(Kind), "auto")):
+        raise ValueError(f"model: expected one of {', '.join(names)}, got {model!r}")
+    if not 0 < tolerance < 1:
+        raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
+    if norm not in (1, 2):
+        raise ValueError(f"norm: expected 1 or 2, got {norm!r}")
+
+
+@functools.partial(jit, wanted=LARGE)
+def _traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
+    return trace_beam(lens, scene, rule)
+
+
+# Each number of cells is a program, which runs once a scene.
+_kernels = jit(psf_of_beam, ONCE, static_argnames=("size", "kind", "cells"))
+
+
+@dataclasses.dataclass(frozen=True)
+class _View:
+    """Beams of scenes on pixels; all numbers are known."""
+
+    lens: Lens
+    scenes: tuple[Scene, ...]
+    beams: tuple[Beam, ...]
+    pixel: Array
+    size: int
+    norm: int
+
+    def kernels(self, kind: Kind, cells: int) -> np.ndarray:
+        """Those of all scenes and wavelengths, (scenes W, size, size)."""
+        made = (
+            _kernels(
+                self.lens, scene, beam, self.pixel, None, size=self.size, kind=kind, cells=cells
+            )
+            for scene, beam in zip(self.scenes, self.beams)
+        )
+        return np.concatenate([np.asarray(one.kernel) for one in made])
+
+    def cells(self, kind: Kind, tolerance: float) -> int:
+        """The fewest cells of a model whose kernels are within the tolerance."""
+        if kind == "gaussian":
+            return 0
+        first = _CELLS[0] if kind == "rays" else max(map(self._fewest, self.scenes, self.beams))
+        tried = [n for n in _CELLS if n >= first] or [_CELLS[-1]]
+        before = None
+        for cells in tried:
+            now = self.kernels(kind, cells)
+            change = np.inf if before is None else difference(now, before, self.norm)
+            # The error falls with the square of the number of cells, which grows by 4/3 at least.
+            if change <= 0.75 * tolerance:
+                return cells
+            before = now
+        warnings.warn(
+            f"{kind} of {cells} x {cells} cells have converged to {change:.1e} only, not to "
+            f"{tolerance:.1e}: the spot may be too large; take a larger tolerance",
+            stacklevel=4,
+        )
+        return cells
+
+    def _fewest(self, scene: Scene, beam: Beam) -> int:
+        """So many that neither the spot nor the window comes again within the window."""
+        hits = np.asarray(beam.hits[:, -1])
+        middle = np.mean(hits[:, np.asarray(beam.known)], axis=-1)
+        reach = np.max(np.where(np.asarray(beam.known), np.abs(hits - middle[:, None, None]), 0))
+        width = self.size * float(self.pixel)
+        needed = max(width, width / 2 + 1.1 * float(reach))
+        return int(np.max(np.ceil(needed / np.asarray(period(beam, scene.wavelengths, 1)))))
+
+
+def difference(a: np.ndarray, b: np.ndarray, norm: int = 1) -> float:
+    """Sum of the absolute differences of kernels (..., size, size), or with `norm` 2 the root of
+    the sum of their squares; the largest of them."""
+    total = np.sum(np.abs(a - b) ** norm, axis=(-2, -1))
+    return float(np.max(total ** (1 / norm)))
+
+
+def _degree(
+    beams: list[Beam],
+    scenes: list[Scene],
+    pixel: Array,
+    pictures: bool,
+    degrees: tuple[int, ...],
+    tolerance: float,
+) -> tuple[int, float]:
+    """The lowest degree whose polynomials give back the rays, which are more than its terms, and to
+    what part of the spot, or of a wave's radian."""
+    pairs = [(b, s, w) for b, s in zip(beams, scenes) for w in range(s.wavelengths.size)]
+    for degree in degrees:
+        error = max(_misfit(b, s, w, pixel, pictures, degree) for b, s, w in pairs)
+        if error <= tolerance:
+            break
+    return degree, error
+
+
+def _misfit(
+    beam: Beam, scene: Scene, wavelength: int, pixel: Array, pictures: bool, degree: int
+) -> float:
+    """The error of one wavelength's polynomials, see `_degree`."""
+    row = jax.tree.map(np.asarray, (beam.weights, beam.known, beam.path, beam.hits[:, -1]))
+    weight, known, path, hits = (a[..., wavelength, :] for a in row)
+    weight = np.sqrt(np.where(known, np.abs(weight), 0) / np.sum(np.abs(weight)))
+    spread = np.sqrt(np.sum((weight * (hits - _mean(hits, weight))) ** 2))
+    points, directions = (np.asarray(a[:2, wavelength]) for a in (beam.points, beam.direction))
+    error = _residual(points, hits, weight, degree) / max(float(spread), float(pixel))
+    if not pictures:
+        return error
+    # Twice the error of the field, which is that of the phase.
+    phase = path[None] * (4 * np.pi * _UM / float(scene.wavelengths[wavelength]))
+    return max(error, _residual(directions, phase, weight, degree))
+
+
+def _mean(hits: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    return cast(np.ndarray, np.sum(weight**2 * hits, axis=-1, keepdims=True))
+
+
+def _residual(points: np.ndarray, values: np.ndarray, weight: np.ndarray, degree: int) -> float:
+    """Root mean square of what polynomials of a degree leave of values (D, Q) at points (2, Q);
+    `weight` (Q,) is the root of the light."""
+    centre = _mean(points, weight)
+    scale = 2 * np.sqrt(np.sum(weight**2 * (points - centre) ** 2, axis=-1, keepdims=True))
+    basis = np.asarray(zernike(jnp.asarray((points - centre) / scale), degree))
+    matrix, right = (basis * weight).T, (values * weight).T
+    found = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    return float(np.sqrt(np.sum((matrix @ found - right) ** 2)))
+
+
+def _cheapest(view: _View, rule: BeamRule, tolerance: float) -> PsfModel:
+    """The first of the ladder within the tolerance of the waves."""
+    ladder: list[tuple[Kind, int]] = [
+        (kind, view.cells(kind, tolerance)) for kind in get_args(Kind)
+    ]
+    kernels = [view.kernels(*one) for one in ladder]
+    errors: dict[str, float]
+    pairs = zip(ladder[:-1], kernels)
+    errors = {kind: difference(k, kernels[-1], view.norm) for (kind, _), k in pairs}
+    kind, cells = next(one for one in ladder if errors.get(one[0], 0.0) <= tolerance)
+    return PsfModel(kind, rule, cells, errors)

@@ -1,0 +1,118 @@
+"""How a photograph is rendered: fields, kernels and tiles for a tolerance."""
+
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..lens.lens import Lens
+from ..lens.paraxial import effective_focal_length
+from ..numerics import Numbers, known_values
+from .beam_psf import Kind, PsfModel
+from .fields import image_points
+from .grid_method import check_pixel, grid_method
+from .sensor_maps import RenderMethod, chosen
+
+WAVELENGTHS = (0.6, 0.53, 0.48)
+# How much farther than the field of a pinhole that of a pixel is looked for, as a part of it.
+_TRIED = np.linspace(0, 2, 81)
+# The largest tangent of a field, that of 85 degrees.
+_WIDEST = 11.4
+
+
+def render_method(
+    lens: Lens,
+    shape: tuple[int, int],
+    distance: Numbers,
+    pixel: Numbers,
+    wavelengths: Numbers = WAVELENGTHS,
+    size: int | None = None,
+    nodes: int = 16,
+    layers: int = 8,
+    model: Kind | Literal["auto"] | PsfModel = "rays",
+    tolerance: float = 1e-3,
+) -> RenderMethod:
+    """Choose how `render` works; all numbers are known.
+
+    shape: of the picture, H and W.
+    distance: mm, one or a depth map (H, W), of which `layers` follow, equidistant in 1 / distance.
+    pixel: mm. wavelengths: (C,) um.
+    size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
+    nodes: fields on one side of the axis, along the longer side of the picture, see `grid_method`.
+    model: of the kernels, as of `psf`. tolerance: of the kernels, and of what lies between those of
+        a grid: the root of the sum of the squared errors of pixels, by which a picture of white
+        noise of variance 1 is off.
+
+    Warns of light beside kernels that are too small. ValueError inside a trace, for numbers that
+    make no sense, and where no light arrives.
+    """
+    known = known_values((lens, distance, pixel, wavelengths))
+    if known is None:
+        raise ValueError(
+            "inside jax.jit or jax.vmap fields and rays cannot be chosen: call render_method "
+            "outside, and pass on what it returns, method=..."
+        )
+    with jax.core.eval_context():
+        lens, distance, pixel, wavelengths = known
+        check_pixel(pixel)
+        if len(shape) != 2 or min(shape) < 1:
+            raise ValueError(f"shape: expected the height and width of a picture, got {shape}")
+        waves = lens.checked_wavelengths(wavelengths).reshape(-1)
+        focal = float(np.mean(np.asarray(effective_focal_length(lens, waves))))
+        if not 0 < abs(focal) < np.inf:
+            raise ValueError("lens: without a focal length it makes no picture")
+        far = layer_distances(distance, shape, layers)
+        side = float(np.asarray(pixel))
+        angles = _angles(lens, shape, far, side, focal, waves)
+        given = lens, angles, far, waves, side, size, nodes, model, tolerance
+        grid = grid_method(*given, norm=2)
+        both = (shape[0], shape[1])
+        length = jnp.asarray(focal, lens.curvature.dtype)
+        method = RenderMethod(grid, length, jnp.zeros(0, jnp.int32), both, both)
+        return chosen(lens, method, waves, tolerance)
+
+
+def layer_distances(distance: Numbers, shape: tuple[int, int], layers: int) -> np.ndarray:
+    """Distances (D,) mm of the layers of a known distance or depth map, the nearest first."""
+    far = np.asarray(distance, float)
+    if far.ndim and far.shape != tuple(shape):
+        raise ValueError(
+            f"distance: expected one number or a depth map of {shape[0]} x {shape[1]} pixels, as "
+            f"the picture, got {' x '.join(map(str, far.shape))}"
+        )
+    if not np.all(far > 0):
+        raise ValueError("distance: must be above 0 mm everywhere, inf for infinity")
+    ends = 1 / np.min(far), 1 / np.max(far)
+    if ends[0] == ends[1]:
+        return np.ravel(far)[:1]
+    with np.errstate(divide="ignore"):
+        return 1 / np.linspace(*ends, max(layers, 2))
+
+
+def _angles(
+    lens: Lens,
+    shape: tuple[int, int],
+    far: np.ndarray,
+    pixel: float,
+    focal: float,
+    wavelengths: Any,
+) -> np.ndarray:
+    """Fields (2,), radians along x and y, whose image points lie at the edges of the picture, or as
+    far outside as the lens has any."""
+    half = np.array([shape[1], shape[0]]) / 2 * pixel
+    corners = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * half
+    tangents = corners[:, None] * _TRIED[None, :, None] / abs(focal)
+    points = image_points(lens, tangents.reshape(-1, 2), far[[0, -1]], wavelengths)
+    points = points.reshape(2, *tangents.shape[:2], -1, 2)
+    there = np.isfinite(points)
+    units = corners / np.sum(corners**2, axis=1, keepdims=True)
+    radii = np.sum(np.where(there, points, 0) * units[None, :, None, None], axis=-1)
+    radii = np.where(np.all(there, axis=-1), np.abs(radii), np.nan)
+    farthest = 1.0
+    for ray in np.moveaxis(radii, 2, -1).reshape(-1, len(_TRIED)):
+        rising = np.concatenate([[True], np.diff(ray) > 0])  # False for a NaN, too
+        end = len(ray) if np.all(rising) else int(np.argmin(rising))
+        reached = np.flatnonzero(ray[:end] >= 1)
+        farthest = max(farthest, _TRIED[reached[0] if len(reached) else end - 1])
+    return np.arctan(np.minimum(half / abs(focal) * farthest, _WIDEST))
