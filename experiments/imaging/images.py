@@ -27,15 +27,14 @@ from PIL import Image
 from skimage import data, transform
 
 import drt_jax
-from drt_jax import Lens, PsfModel, show
+from drt_jax import Lens, PsfModel
 from drt_jax.compilation import LARGE, known_options
 
 from . import _command, _common, _peers, _psf_peers, _work, render
-from ._plots import error_curves
+from ._image_pictures import MODELS, draw as draw
 from .runs.folder import Run
 
 COLUMNS = ("value_s", "gradient_s", "error", "off")
-MODELS = "gaussian", "rays", "waves"
 # Rays traced at once for a histogram.
 _ROUND = 2**17
 
@@ -344,56 +343,6 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         "images, views": _common.table(columns, views),
         "images, photographs": _common.table(names, photos),
     }
-
-
-def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws the gallery, error over time, transfer functions and the photographs."""
-    _draw_gallery(results, figures / "gallery.png")
-    views = results["views"]
-    figure, axes = show.new(2, len(views), 4.2, 3.4)
-    for view, (above, below) in zip(views, np.reshape(axes, (2, -1)).T):
-        ours = [r for r in results["kernels"] if r["lens"] == view["lens"] and r["error"]]
-        theirs = [r for r in results["peers"] if r["lens"] == view["lens"] and r["error"]]
-        series = {
-            key[0]: ([r["value_s"] for r in rows], [[r["error"]] for r in rows])
-            for key, rows in _common.grouped(ours, "model").items()
-        }
-        series |= {
-            key[0]: ([r["seconds"] for r in rows], [[r["error"]] for r in rows])
-            for key, rows in _common.grouped(theirs, "program").items()
-        }
-        error_curves(above, series, "seconds", "error of the kernel (L1)")
-        above.set_title(f"{view['lens']}, {view['field_deg']:g} degrees", fontsize=9)
-        by_waves, by_rays, limit = np.asarray(view["transfer"])
-        lines = view["frequencies"]
-        show.mtf(below, lines, [by_waves, by_rays], limit[0], ("waves", "rays"))
-    figure.savefig(figures / "models.png")
-    photos = [("ideal", "ideal")] + [
-        (f"photo_{p['lens']}", p["lens"]) for p in results["photographs"]
-    ]
-    figure, axes = show.new(1, len(photos), 3.6, 4.1)
-    for ax, (name, title) in zip(np.ravel(axes), photos):
-        ax.imshow(np.asarray(Image.open(figures / f"{name}.png")), interpolation="antialiased")
-        ax.set(xticks=[], yticks=[], title=title)
-    figure.savefig(figures / "photographs.png")
-
-
-def _draw_gallery(results: dict[str, Any], path: pathlib.Path) -> None:
-    """Draws fields down and distances across, with the three models of each."""
-    kernels, what = results["gallery_kernels"], results["gallery"]
-    count, fields, models = kernels.shape[:3]
-    figure, axes = show.new(fields, count * models, 1.3, 1.45)
-    for row, ax in zip(range(fields), np.reshape(axes, (fields, -1))):
-        for k, one in enumerate(ax):
-            far, model = divmod(k, models)
-            picture = np.moveaxis(kernels[far, row, model], 0, -1)
-            one.imshow(np.sqrt(np.clip(picture / picture.max(), 0, 1)), origin="lower")
-            one.set(xticks=[], yticks=[])
-            if row == 0:
-                away = what["distances_m"][far]
-                one.set_title(f"{MODELS[model]}\n{away} m", fontsize=7)
-        ax[0].set_ylabel(f"{what['fields_deg'][row]:g} degrees", fontsize=7)
-    figure.savefig(path)
 
 
 if __name__ == "__main__":
