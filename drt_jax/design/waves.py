@@ -99,7 +99,5 @@ def psf(
             f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
         )
     side, size = check_pixels(pixel, size, rays.wavelengths.dtype)
-    # Of a scene only its wavelengths are used.
-    scene = Scene(rays.field[0], rays.distance[0], rays.wavelengths)
-    given = side, None, size, model, cells
-    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, scene, beam, *given).kernel)
+    waves, given = rays.wavelengths, (side, None, size, model, cells)
+    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, waves, beam, *given).kernel)

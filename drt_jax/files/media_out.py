@@ -48,9 +48,9 @@ def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
     schott = schott if any(schott[6:]) else schott[:6]
     if schott != [1, 0, 0, 0, 0, 0]:
         constants["schott"] = schott
-    known = np.asarray(dispersion.ranges[i]).tolist()
-    if known != [*ANY]:
-        constants["range"] = known
+    known = np.asarray(dispersion.ranges[i])
+    if not np.array_equal(known, np.asarray(ANY, known.dtype)):
+        constants["range"] = known.tolist()
     return constants
 
 

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..lens.forms import FORMS
-from ..lens.glass import FRAUNHOFER
-from ..lens.glasses import find_glass, indices
+from ..lens.glasses import find_glass, map_point
 from ..lens.lens import Lens
 from .breaks_out import with_breaks
 from .entry import LensError
@@ -70,11 +69,8 @@ def zmx_text(lens: Lens) -> str:
 
 def _numbers(name: str) -> str:
     """nd and vd of a glass: what a program falls back on that does not know its name."""
-    glass = find_glass(name)
-    if glass.range[0] > FRAUNHOFER[1] or glass.range[1] < FRAUNHOFER[2]:
-        return "1.5 40"
-    d, f, c = indices(glass, np.array(FRAUNHOFER[:3])).tolist()
-    return f"{d:.7f} {(d - 1) / (f - c):.5f}" if f > c else "1.5 40"
+    nd, vd = map_point(find_glass(name)) or (1.5, 40)
+    return f"{nd:.7f} {vd:.5f}"
 
 
 def gap_behind(lens: Lens, i: int) -> float:
@@ -161,8 +157,8 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
             f"glasses[{m}]: {lens.glasses[m]} has constants of its own, which a .zmx file does not "
             "hold: save as .yaml, or use with_model_glass"
         )
-    if "glass" in keys:  # air has no such line
-        return [] if keys["glass"] == "air" else [f"GLAS {names[keys['glass']]}"]
+    if "glass" in keys:
+        return [f"GLAS {names[keys['glass']]}"]
     if "index" in keys:
         return [f"GLAS ___BLANK 1 0 {keys['index']!r} 0 0"]
     if not keys:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..lens.lens import Lens
-from ..lens.scene import Scene
 from .beam import Beam, BeamRule, centroid_and_variances
 from .kernel import gaussian_shares
 from .ray_psf import ray_kernel
@@ -60,7 +59,7 @@ class PsfModel:
 
 def psf_of_beam(
     lens: Lens,
-    scene: Scene,
+    wavelengths: Array,
     beam: Beam,
     pixel: Array,
     centre: Array | None,
@@ -68,7 +67,7 @@ def psf_of_beam(
     kind: Kind,
     cells: int,
 ) -> Psf:
-    """`psf` of a beam. scene: its wavelengths. pixel: (), mm. centre: (2,) mm or None."""
+    """`psf` of a beam. wavelengths: (W,), um. pixel: (), mm. centre: (2,) mm or None."""
     mean, (xx, xy, yy) = centroid_and_variances(beam.hits[:, -1], beam.weights)
     if centre is None:
         centre = jnp.mean(mean, axis=-1)
@@ -81,7 +80,7 @@ def psf_of_beam(
         if kind == "rays":
             kernel = ray_kernel(lens, beam, centre, pixel, size, cells)
         else:
-            kernel = wave_kernel(lens, beam, scene.wavelengths, centre, pixel, size, cells)
+            kernel = wave_kernel(lens, beam, wavelengths, centre, pixel, size, cells)
         kernel = jnp.where(total > 0, kernel / jnp.where(total > 0, total, 1), 0)
     outside = jnp.where(beam.throughput > 0, 1 - jnp.sum(kernel, axis=(1, 2)), 0)
     return Psf(kernel, outside, centre, beam.throughput, beam.solid_angle())

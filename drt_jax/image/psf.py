@@ -74,4 +74,4 @@ def _psf(
     cells: int,
 ) -> Psf:
     beam = trace_beam(lens, scene, rule).refocused(defocus)
-    return psf_of_beam(lens, scene, beam, pixel, centre, size, kind, cells)
+    return psf_of_beam(lens, scene.wavelengths, beam, pixel, centre, size, kind, cells)

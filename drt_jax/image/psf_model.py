@@ -125,7 +125,14 @@ class _View:
         """Those of all scenes and wavelengths, (scenes W, size, size)."""
         made = (
             _kernels(
-                self.lens, scene, beam, self.pixel, None, size=self.size, kind=kind, cells=cells
+                self.lens,
+                scene.wavelengths,
+                beam,
+                self.pixel,
+                None,
+                size=self.size,
+                kind=kind,
+                cells=cells,
             )
             for scene, beam in zip(self.scenes, self.beams)
         )

@@ -1,9 +1,11 @@
 """Model glasses and those of the file, and the patent lens that is made of them."""
 
+import jax
 import numpy as np
 import pytest
 
 from drt_jax import first_order, load_lens
+from drt_jax.files.media_out import medium_of
 
 
 @pytest.mark.parametrize(
@@ -42,6 +44,12 @@ def test_glasses_of_the_file():
         0.365,
         1.014,
     )
+
+
+def test_air_has_no_name_in_a_file_of_float32_either():
+    lens = load_lens("singlet")
+    single = jax.tree.map(lambda a: a.astype(np.float32), lens)
+    assert [medium_of(own, i) for own in (lens, single) for i in (0, lens.count)] == [{}] * 4
 
 
 def test_the_patent_lens(shared):
