@@ -119,8 +119,9 @@ class Beam:
         return _extent(self.direction[:2], self.known, self._margin())
 
     def near(self, places: Array, middle: Array, step: Array, cells: int) -> Array:
-        """Whether points of a grid (W, N, N) [y, x] lie where light may come, next to the rays. Far
-        from all rays polynomials run away, and some come back to where apertures seem to pass them.
+        """Whether cells of a grid (W, N, N) [y, x] reach to where light may come, next to the rays.
+        Far from all rays polynomials run away, and some come back to where apertures seem to pass
+        them.
 
         places: (2, W, Q) of the rays. middle, step: (2, W), of the grid.
         """
@@ -131,7 +132,9 @@ class Beam:
             x, y = np.cos(angle).item(), np.sin(angle).item()
             low, high = _extent(x * places[0] + y * places[1], self.known, self._margin())
             along = x * axes[0][:, None, :] + y * axes[1][:, :, None]
-            found &= (along >= low[:, None, None]) & (along <= high[:, None, None])
+            cell = (abs(x) * step[0] + abs(y) * step[1]) / 2
+            ends = (low - cell)[:, None, None], (high + cell)[:, None, None]
+            found &= (along >= ends[0]) & (along <= ends[1])
         return found
 
     def _margin(self) -> float:
