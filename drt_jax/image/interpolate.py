@@ -38,18 +38,16 @@ def at_point(table: Array, place: Array, order: int) -> Array:
     return table
 
 
-def cubic(planes: Array, y: Array, x: Array) -> Array:
-    """Pictures (C, H, W) at the places y, x (C, ...), in pixels, by cubic convolution (Keys, IEEE
-    Trans. ASSP 29, 1153, 1981), of third order; beyond its edge a picture goes on as it ends."""
-    return jax.vmap(_cubic)(planes, y, x)
-
-
-def _cubic(plane: Array, y: Array, x: Array) -> Array:
-    height, width = plane.shape
+def cubic(picture: Array, y: Array, x: Array) -> Array:
+    """A picture (H, W, C) at the places y, x (C, ...) of each colour, in pixels, by cubic
+    convolution (Keys, IEEE Trans. ASSP 29, 1153, 1981), of third order; beyond its edge it goes on
+    as it ends."""
+    height, width, colours = picture.shape
     (row, down), (column, across) = (_keys(a, n) for a, n in ((y, height), (x, width)))
-    rows = [jnp.clip(row + k, 0, height - 1) * width for k in range(-1, 3)]
-    columns = [jnp.clip(column + k, 0, width - 1) for k in range(-1, 3)]
-    flat = plane.reshape(-1)
+    colour = jnp.arange(colours, dtype=row.dtype).reshape(-1, *[1] * (y.ndim - 1))
+    rows = [jnp.clip(row + k, 0, height - 1) * (width * colours) for k in range(-1, 3)]
+    columns = [jnp.clip(column + k, 0, width - 1) * colours + colour for k in range(-1, 3)]
+    flat = picture.reshape(-1)
     lines = []
     for start in rows:
         parts = [w * flat[start + c] for w, c in zip(across, columns, strict=True)]

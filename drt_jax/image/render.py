@@ -39,11 +39,10 @@ from .sensor_maps import (
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="lit")
-def _strip(maps: Maps, method: RenderMethod, planes: Array, row: Array, lit: bool) -> Array:
-    """A row of tiles of one distance, (height, n width, C): what the kernels make of the planes
-    (C, H, W); if `lit`, times the light."""
-    (tile, wide), margin, dtype = method.tile, method.grid.size // 2, planes.dtype
-    maps = jax.tree.map(lambda a: a.astype(dtype), maps)
+def _strip(maps: Maps, method: RenderMethod, picture: Array, row: Array, lit: bool) -> Array:
+    """A row of tiles of one distance, (height, n width, C): what the kernels make of a picture
+    (H, W, C) in the dtype of `maps`; if `lit`, times the light."""
+    (tile, wide), margin, dtype = method.tile, method.grid.size // 2, picture.dtype
     starts = (row * tile).astype(dtype), jnp.zeros((), dtype)
     lengths = tile, tiles_of(method)[1] * wide
     places, local = [], []
@@ -60,7 +59,7 @@ def _strip(maps: Maps, method: RenderMethod, planes: Array, row: Array, lit: boo
         return product("ym,cmn,xn->cyx", where[0], values, where[1])
 
     x, y = (between(maps.sources[..., k], places) for k in (0, 1))
-    warped = cubic(planes, y, x)
+    warped = cubic(picture, y, x)
     if maps.shares is None:
         kernels, shares, across = _corners(maps.kernels, method, row)
     else:
@@ -124,6 +123,7 @@ def render(
         raise ValueError(f"image: the method is for {method.shape}, got {picture.shape[:2]}")
     _check_method(method, distance, pixel)
     maps = sensor_maps(lens, method, wavelengths)
+    maps = jax.tree.map(lambda a: a.astype(picture.dtype), maps)
     if jnp.ndim(jnp.asarray(distance)) == 0:
         return _whole(maps, method, picture, progress)
     return composed(maps, method, picture, jnp.asarray(distance), progress)
@@ -168,16 +168,16 @@ def _whole(
 ) -> Any:
     """All rows of tiles of a picture (H, W, C), see `_strip`."""
     (height, width), tile, rows = method.shape, method.tile[0], tiles_of(method)[0]
+    picture = jnp.asarray(picture)
+    colours = picture.shape[-1]
     one = jax.tree.map(lambda a: a[layer], maps)
     if not concrete((maps, picture, method)):
-        planes = jnp.moveaxis(jnp.asarray(picture), -1, 0)
-        strip = jax.checkpoint(lambda row: _strip(one, method, planes, row, lit=lit))
+        strip = jax.checkpoint(lambda row: _strip(one, method, picture, row, lit=lit))
         found = jax.lax.map(strip, jnp.arange(rows, dtype=jnp.int32))
-        return found.reshape(rows * tile, -1, len(planes))[:height, :width]
-    planes = jnp.asarray(np.ascontiguousarray(np.moveaxis(np.asarray(picture), -1, 0)))
-    result = np.empty((height, width, len(planes)), planes.dtype)
+        return found.reshape(rows * tile, -1, colours)[:height, :width]
+    result = np.empty((height, width, colours), picture.dtype)
     for row in progress(range(rows)):
-        part = _strip(one, method, planes, jnp.asarray(row, jnp.int32), lit=lit)
+        part = _strip(one, method, picture, jnp.asarray(row, jnp.int32), lit=lit)
         inside = slice(row * tile, min((row + 1) * tile, height))
         result[inside] = np.asarray(part)[: height - row * tile, :width]
     return result

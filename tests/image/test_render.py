@@ -122,9 +122,9 @@ def test_interpolation_is_exact_for_polynomials_and_goes_on_at_the_edge():
     nodes = np.arange(10.0)
     matrix = np.asarray(interpolate.basis(places, 10, 4))
     np.testing.assert_allclose(matrix @ nodes**3, np.asarray(places) ** 3, atol=1e-10)
-    plane = jnp.asarray(np.add.outer(3 * nodes, nodes**2))[None]
+    picture = jnp.asarray(np.add.outer(3 * nodes, nodes**2))[..., None]
     y, x = jnp.array([[4.3, 20.0]]), jnp.array([[5.6, -9.0]])
-    found = np.asarray(interpolate.cubic(plane, y, x))[0]
+    found = np.asarray(interpolate.cubic(picture, y, x))[0]
     np.testing.assert_allclose(found, [3 * 4.3 + 5.6**2, 27.0], atol=1e-10)
 
 
