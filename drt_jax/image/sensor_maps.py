@@ -113,7 +113,7 @@ def _maps(grid: KernelGrid, method: RenderMethod) -> Maps:
 
 def _parts(seen: Array, places: Array) -> tuple[Array, Array]:
     """Kernels (R, K, K) and shares (R, My, Mx) of G (My, Mx, K, K): an orthonormal basis of the
-    kernels of `places`, and G projected on it, each scaled so that its sum stays."""
+    kernels of `places`, and G projected on it so that its sum stays and its centroid nearly."""
     down, across, size = seen.shape[:3]
     rows = seen.reshape(down * across, size * size)
     basis = jnp.zeros((len(places), rows.shape[1]), rows.dtype)
@@ -125,6 +125,14 @@ def _parts(seen: Array, places: Array) -> tuple[Array, Array]:
         there = length > _ALIKE * jnp.finfo(rows.dtype).eps * whole
         basis = basis.at[k].set(jnp.where(there, safe_divide(rest, length[None]), 0))
     shares = rows @ basis.T
+    # Shares change a little, so that the sum and the first moments, in pixels, stay: they decide
+    # where a point lands, and how moments vary over the picture what light it brings.
+    side = np.arange(size) - size // 2
+    x, y = (np.ravel(a) for a in np.meshgrid(side, side))
+    moments = jnp.asarray(np.stack([np.full_like(x, size), x, y], -1), rows.dtype)
+    own = basis @ moments
+    missing = rows @ moments - shares @ own
+    shares = shares + missing @ jnp.linalg.solve(jnp.eye(3, dtype=own.dtype) + own.T @ own, own.T)
     sums = jnp.sum(rows, axis=1), shares @ jnp.sum(basis, axis=1)
     shares = shares * safe_divide(*sums)[:, None]
     return basis.reshape(-1, size, size), shares.T.reshape(-1, down, across)
