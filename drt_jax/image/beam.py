@@ -9,6 +9,7 @@ ray.
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -308,25 +309,52 @@ def cover(
     clipped beam. places: (2, W, Q) of the beam's rays in the plane of the grid, its points or
     directions. axes: the middle and the step of the grid, (2, W) each.
     """
-    inside = _cover(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
-    if beam.clipped:
-        x, y = hits.reshape(2, -1, *stop.shape[1:])
-        for edge in clearance(lens, (x, y)):
-            inside = jnp.minimum(inside, _cover(jnp.where(jnp.isfinite(edge), edge, 1)))
-        inside = jnp.where(beam.near(places, *axes, stop.shape[-1]), inside, 0)
-    return inside
+    rim = _edge(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
+    if not beam.clipped:
+        return _filled_part(rim)
+    x, y = hits.reshape(2, -1, *stop.shape[1:])
+    edges = clearance(lens, (x, y))
+
+    def nearest(found: _Edge, depth: Array) -> tuple[_Edge, None]:
+        """Of each cell the edge that leaves the least of it; most edges cut no light."""
+        new = _edge(jnp.where(jnp.isfinite(depth), depth, 1))
+        deep, least = jax.lax.stop_gradient((_cells_deep(new), _cells_deep(found)))
+        cuts = (deep < jnp.minimum(least, 0.5)) & (least > -0.5)
+        pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(cuts, a, b), new, old)  # noqa: E731
+        return jax.lax.cond(jnp.any(cuts), pick, lambda _, old: old, new, found), None
+
+    inside = _filled_part(jax.lax.scan(nearest, rim, edges)[0])
+    return jnp.where(beam.near(places, *axes, stop.shape[-1]), inside, 0)
 
 
-def _cover(depth: Array) -> Array:
-    """The part of each cell, (W, N, N), inside of an edge, of which the cell's middle lies at
-    `depth`, in any unit: the edge is straight in a cell."""
+class _Edge(NamedTuple):
+    """How deep the middles of cells (W, N, N) lie inside of an edge, in any unit, and how much that
+    changes over a cell, down and across."""
+
+    depth: Array
+    down: Array
+    across: Array
+
+
+def _edge(depth: Array) -> _Edge:
     down, across = jnp.gradient(depth, axis=(-2, -1))
-    a = jnp.maximum(jnp.abs(down), jnp.abs(across))
-    b = jnp.minimum(jnp.abs(down), jnp.abs(across))
+    return _Edge(depth, jnp.abs(down), jnp.abs(across))
+
+
+def _cells_deep(edge: _Edge) -> Array:
+    """The depth over the sum of the changes: 0.5 for a cell that lies just inside, -0.5 outside."""
+    change = edge.down + edge.across
+    return jnp.where(change > 0, safe_divide(edge.depth, change), jnp.sign(edge.depth) * jnp.inf)
+
+
+def _filled_part(edge: _Edge) -> Array:
+    """The part of each cell, (W, N, N), inside of an edge, which is straight in a cell."""
+    a, b = jnp.maximum(edge.down, edge.across), jnp.minimum(edge.down, edge.across)
     # A unit square cut across by a line: its area is linear in between, a parabola at corners.
     whole, flat = (a + b) / 2, (a - b) / 2
-    t = jnp.clip(depth, -whole, whole)
+    t = jnp.clip(edge.depth, -whole, whole)
     corner = safe_divide((whole - jnp.abs(t)) ** 2, 2 * a * b)
     linear = 0.5 + safe_divide(t, a)
     part = jnp.where(jnp.abs(t) <= flat, linear, jnp.where(t > 0, 1 - corner, corner))
-    return jnp.where(jnp.abs(depth) < whole, part, (depth > 0).astype(depth.dtype))
+    inside = (edge.depth > 0).astype(t.dtype)
+    return jnp.where(jnp.abs(edge.depth) < whole, part, inside)

@@ -134,7 +134,7 @@ def _of_waves(
     """(W, N)."""
     amplitude, step = pupil_function(lens, beam, wavelengths, cells)
     # One half of all frequencies; the other has the conjugate values.
-    transfer = autocorrelation(amplitude)[..., :cells]
+    transfer = autocorrelation(amplitude)
     unit = step * (beam.index * _UM / wavelengths)[None]
     lags = np.fft.fftfreq(2 * cells, 1 / (2 * cells))
     fx = (unit[0][:, None] * jnp.asarray(lags[:cells], unit.dtype)[None])[:, None]

@@ -46,7 +46,7 @@ def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
     middle, half = (low + high) / 2, (high - low) / 2
     side = (np.arange(cells) - (cells - 1) / 2) * (2 / cells)
     start, step = (middle - functions.centre) / functions.scale, half / functions.scale
-    values, *slopes = functions.on_grid(start, step, side)
+    values, *slopes = functions.on_grid(start, step, side, slice(2))
     grid = jnp.asarray(np.stack(np.meshgrid(side, side))[:, None], half.dtype)
     stop = middle[..., None, None] + half[..., None, None] * grid
     axes = middle, half * (2 / cells)
@@ -54,7 +54,7 @@ def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
     weights = normalised(light) * beam.throughput[:, None]
     # How far the cell of a ray reaches on the sensor, along x and y.
     cell = (step * (2 / cells))[:, None, :, None, None]
-    reach = safe_sqrt(sum((s[:2] * c) ** 2 for s, c in zip(slopes, cell)))
+    reach = safe_sqrt(sum((s * c) ** 2 for s, c in zip(slopes, cell)))
     hits, width = values[:2].reshape(2, waves, -1), _CELLS * reach.reshape(2, waves, -1)
     return _corrected(hits, weights, width, beam), width, weights
 

@@ -238,7 +238,7 @@ def _of_rays(
     low, high = beam.extent()
     functions, middle, half = beam.over_stop(), (low + high) / 2, (high - low) / 2
     start, step = (middle - functions.centre) / functions.scale, half / functions.scale
-    values, _, _ = functions.on_grid(start, step, side)
+    values = functions.on_grid(start, step, side, slice(0))[0]
     places = jnp.asarray(np.stack(np.meshgrid(side, side)), values.dtype)[:, None]
     stop = middle[..., None, None] + half[..., None, None] * places
     axes = middle, half * (2 / cells)
@@ -264,9 +264,10 @@ def pupil_function(
 
     def pupil(middle: Array, step: Array) -> tuple[Array, Array, Array]:
         start = (middle - functions.centre) / functions.scale
-        values, by_x, by_y = functions.on_grid(start, step / functions.scale, side)
+        found = functions.on_grid(start, step / functions.scale, side, slice(1, 3))
+        values, by_x, by_y = found
         (ax, ay), (bx, by) = (
-            [d[k] / functions.scale[i][:, None, None] for k in (1, 2)]
+            [d[k] / functions.scale[i][:, None, None] for k in (0, 1)]
             for i, d in enumerate((by_x, by_y))
         )
         axes = middle, step

@@ -48,12 +48,14 @@ def wave_kernel(
     frequency = unit[..., None] * jnp.asarray(lags, unit.dtype)[None, None]
     place = (jnp.arange(size, dtype=pixel.dtype) - (size - 1) / 2) * pixel
     waves = []
-    for f, c in zip(frequency, centre):
+    for f, c in zip((frequency[0, :, :cells], frequency[1]), centre):
         f, x = f[:, None], (place + c)[None, :, None]
         phase = 2 * jnp.pi * f * x
         wave = jax.lax.complex(jnp.cos(phase), jnp.sin(phase))
         waves.append(wave * jnp.sinc(f * pixel).astype(wave.dtype))
     across, down = waves
+    # The lags that `transfer` leaves out have the conjugate values.
+    across = across * jnp.asarray(np.where(lags[:cells] > 0, 2, 1), across.dtype)[None, None]
     kernel = jnp.einsum("wyv,wvu,wxu->wyx", down, transfer, across).real
     cell = step[0] * step[1] * beam.index * _UM / wavelengths
     return kernel * (cell * pixel)[:, None, None] ** 2
@@ -78,11 +80,11 @@ def pupil_function(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tu
     middle, step = _grid(beam, cells)
     side = np.arange(cells) - (cells - 1) / 2
     values, by_x, by_y = functions.on_grid(
-        (middle - functions.centre) / functions.scale, step / functions.scale, side
+        (middle - functions.centre) / functions.scale, step / functions.scale, side, slice(1, 3)
     )
     path, stop = values[0], values[1:3]
     # The light of a part of the stop goes into a part of the directions.
-    (_, ax, ay), (_, bx, by) = by_x[:3], by_y[:3]
+    (ax, ay), (bx, by) = by_x, by_y
     part = functions.scale[0] * functions.scale[1] * jnp.pi
     density = jnp.abs(ax * by - ay * bx) / part[:, None, None]
     inside = cover(lens, beam, stop, values[3:], beam.direction[:2], (middle, step))
@@ -92,10 +94,11 @@ def pupil_function(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tu
 
 
 def autocorrelation(amplitude: Array) -> Array:
-    """Sums over the cells of products with those some cells away, (W, 2 N, 2 N), in the order of
-    `numpy.fft.fftfreq`: at a lag (v, u) of c[y + v, x + u] conj(c[y, x])."""
+    """Sums over the cells of products with those some cells away, at a lag (v, u) of
+    c[y + v, x + u] conj(c[y, x]): (W, 2 N, N), v in the order of `numpy.fft.fftfreq`, u from 0 to
+    N - 1. At (-v, -u) the sum is the conjugate."""
     cells = amplitude.shape[-1]
     pad = functools.partial(jnp.pad, pad_width=((0, 0), (0, cells), (0, cells)))
     spectrum = jnp.fft.fft2(pad(amplitude))
     power = spectrum.real**2 + spectrum.imag**2
-    return jnp.fft.ifft2(power.astype(spectrum.dtype))
+    return jnp.conj(jnp.fft.rfft2(power))[..., :cells] / (2 * cells) ** 2

@@ -89,19 +89,22 @@ class Polynomials:
         basis = zernike((points - self.centre[..., None]) / self.scale[..., None], self.degree)
         return jnp.einsum("wdp,pwq->dwq", self.coefficients, basis)
 
-    def on_grid(self, start: Array, step: Array, side: np.ndarray) -> tuple[Array, Array, Array]:
-        """The functions (D, W, N, N), [y, x], and their derivatives by u in x and in y, where u is
-        start + step side for both components: start, step (2, W), side (N,)."""
+    def on_grid(
+        self, start: Array, step: Array, side: np.ndarray, slopes: slice
+    ) -> tuple[Array, Array, Array]:
+        """The functions (D, W, N, N), [y, x], and the derivatives of `slopes` of them by u in x and
+        in y, where u is start + step side for both components: start, step (2, W), side (N,)."""
         dtype = self.coefficients.dtype
         square = jnp.asarray(_to_chebyshev(self.degree), dtype)
-        terms = jnp.einsum("wdp,pij->dwij", self.coefficients, square)
+        terms = jnp.einsum("wdp,pij->wdij", self.coefficients, square)
         u = start[..., None] + step[..., None] * jnp.asarray(side, dtype)[None, None]
         (x, dx), (y, dy) = (_chebyshev(part / _EDGE, self.degree) for part in u)
 
-        def product(a: Array, b: Array) -> Array:
-            return jnp.einsum("dwij,iwx,jwy->dwyx", terms, a, b)
+        def product(terms: Array, a: Array, b: Array) -> Array:
+            return jnp.moveaxis(jnp.einsum("wdij,iwx,jwy->wdyx", terms, a, b), 0, 1)
 
-        return product(x, y), product(dx, y) / _EDGE, product(x, dy) / _EDGE
+        some = terms[:, slopes] / _EDGE
+        return product(terms, x, y), product(some, dx, y), product(some, x, dy)
 
 
 def _chebyshev(t: Array, degree: int) -> tuple[Array, Array]:
