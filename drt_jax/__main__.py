@@ -18,7 +18,6 @@ from .compilation import ONCE, jit
 from .files.write import save_lens
 from .files.yaml import lens_names, load_lens, load_system
 from .image.converged import psf_moments
-from .image.spot import Moments
 from .lens.lens import Lens
 from .lens.order import may_cross
 from .lens.paraxial import FirstOrder, first_order
@@ -133,11 +132,10 @@ def _whole(beams: list[Beam]) -> bool:
     return not any(beam.clipping or beam.ends for beam in beams)
 
 
-def _moments_of(lens: Lens, scene: Scene, rule: PupilRule) -> Moments:
-    return psf_moments(lens, scene.field, scene.distance, scene.wavelengths, rule=rule)
-
-
-_moments, _first_order = jit(_moments_of, ONCE), jit(first_order, ONCE)
+_moments = jit(
+    lambda a, s, rule: psf_moments(a, s.field, s.distance, s.wavelengths, rule=rule), ONCE
+)
+_first_order = jit(first_order, ONCE)
 
 
 def _why(lens: Lens, scene: Scene, rule: PupilRule) -> str:

@@ -164,12 +164,6 @@ def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]
     return Snap(*own), after
 
 
-def _promising(ranked: list[_Trial], lens: Lens) -> list[_Trial]:
-    """The trials that are better than trials of the glasses that are there."""
-    now = [t.score for t in ranked if t.near.glass.name == lens.glasses[t.place[0] + 1]]
-    return [t for t in ranked if t.score < (1 - _GAIN) * min(now, default=np.inf)]
-
-
 def snap_glasses(
     problem: Problem,
     found: Optimum,
@@ -211,7 +205,11 @@ def snap_glasses(
     better = True
     while better:
         ranked, better = search.ranked(problem, found, places), False
-        for trial in _promising(ranked, found.lens)[:_EXCHANGES]:
+        # Better than trials of the glasses that are there.
+        names = found.lens.glasses
+        now = [t.score for t in ranked if t.near.glass.name == names[t.place[0] + 1]]
+        most = (1 - _GAIN) * min(now, default=np.inf)
+        for trial in [t for t in ranked if t.score < most][:_EXCHANGES]:
             snap, after = _snap(trial, found, max_steps)
             better = snap.after < (1 - _GAIN) * snap.before
             if better:

@@ -21,6 +21,7 @@ from .problem import Problem, quick
 _NEAR, _MENDING, _STIFF = 1e-3, 20, 1e4
 # A search has converged if the relative gain promised for a step with little damping is at most:
 _LEFT = 1e-6
+_promised_gain = jax.jit(promised_gain)
 # Largest change of a variable, in units of its scale.
 _FAR = 1e6
 
@@ -97,12 +98,6 @@ def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem
     return problem, take_step(problem, again)
 
 
-@jax.jit
-def _left(problem: Problem, search: Search) -> Array:
-    """Relative gain promised for a step with little damping."""
-    return promised_gain(search, problem.variables.low, problem.variables.high)
-
-
 def _mended(problem: Problem, search: Search) -> Search:
     """A search near another that meets all limits; the other if there is none."""
     stiff = search._replace(
@@ -143,7 +138,8 @@ def _why(problem: Problem, search: Search, target_merit: float) -> Ended:
         return "steps"
     if float(search.max_violation) > 0:
         return "limits"
-    return "converged" if float(_left(problem, search)) <= _LEFT else "stuck"
+    gain = _promised_gain(search, problem.variables.low, problem.variables.high)
+    return "converged" if float(gain) <= _LEFT else "stuck"
 
 
 def optimise(

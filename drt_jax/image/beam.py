@@ -215,7 +215,7 @@ def beam_of(
     mean = safe_divide(jnp.sum(path, axis=-1, keepdims=True), total)
     path = jnp.where(known, path - jax.lax.stop_gradient(mean), 0)
     turns, mirrors = _images(symmetry, degree)
-    images = len(turns) * len(mirrors)
+    images, motion = len(turns) * len(mirrors), lens.sensor_motion
 
     def spread(vector: Sequence[Array]) -> Array:
         return _spread(turns, mirrors, vector)
@@ -230,7 +230,7 @@ def beam_of(
         direction=jnp.concatenate([spread(arrival[:-1]), repeated(arrival[-1])[None]]),
         path=repeated(path),
         index=index,
-        motion=_motion(lens),
+        motion=jnp.array([0, 0, 1], index.dtype) if motion is None else motion,
         known=repeated(known),
         degree=degree,
         azimuths=degree if azimuths is None else azimuths,
@@ -262,11 +262,6 @@ def _extent(places: Array, known: Array, margin: float) -> tuple[Array, Array]:
     high = jnp.max(jnp.where(known, places, -jnp.inf), axis=-1)
     middle, half = (low + high) / 2, margin * (high - low) / 2
     return middle - half, middle + half
-
-
-def _motion(lens: Lens) -> Array:
-    motion = lens.sensor_motion
-    return jnp.array([0, 0, 1], lens.curvature.dtype) if motion is None else motion
 
 
 def _images(symmetry: Symmetry, degree: int) -> tuple[np.ndarray, tuple[int, ...]]:

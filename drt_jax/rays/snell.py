@@ -49,14 +49,9 @@ def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
     return tuple(jnp.concatenate([h[:at], h[at + 1 :]]) for h in hits), crossing
 
 
-def _towards(system: System, point: Vector) -> Vector:
-    """Direction, of any length, of the light at a point in front of the lens."""
-    return tuple(system.vergence * p - s for p, s in zip(point, system.source, strict=True))
-
-
 def _begin(system: System, launch: Vector) -> tuple[Vector, Vector]:
     point = *launch, jnp.broadcast_to(system.rows.vertex[0], launch[0].shape)
-    direction = _towards(system, point)
+    direction = tuple(system.vergence * p - s for p, s in zip(point, system.source, strict=True))
     shrink = 1 / jnp.sqrt(dot(direction, direction))
     return point, tuple(d * shrink for d in direction)
 

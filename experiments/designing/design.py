@@ -298,7 +298,8 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     fields = results["fields_deg"]
     peers = row.get("peer_spots_um") or [None] * len(fields)
     spots = [[field, um, peer] for field, um, peer in zip(fields, row["spots_um"], peers)]
-    spots.append(["root of the sum of squares", *(_total(c) for c in (row["spots_um"], peers))])
+    totals = (None if None in um else math.hypot(*um) for um in (row["spots_um"], peers))
+    spots.append(["root of the sum of squares", *totals])
     rows = [
         ["merit, mm^2, start", row["merit_start"]],
         ["merit, mm^2, end", row["merit_end"]],
@@ -354,10 +355,6 @@ def _peers_table(rows: list[dict[str, Any]], how: str) -> str:
 def _median(values: list[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
-
-
-def _total(sizes: list[float | None]) -> float | None:
-    return None if None in sizes else math.sqrt(sum(size**2 for size in sizes if size))
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
