@@ -100,6 +100,7 @@ def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
     # On axis a smaller tolerance costs nothing.
     rule = drt_jax.converged_rule(lens, field, distance, waves, 1e-9 if axial else 1e-6)
     truth, count = reference(lens, field, distance, config.wavelengths_um), lens.count
+    lens = dataclasses.replace(lens, curved=(lens.stop,))  # derivatives by every curvature
 
     def sigma(values):
         lens_now = changed(lens, values)
