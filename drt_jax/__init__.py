@@ -67,7 +67,7 @@ from .image.kernel import (
     separable_psf as separable_psf,
 )
 from .image.moments import FocusMoments as FocusMoments, moments as moments
-from .image.psf import psf as psf
+from .image.psf import psf as psf, psfs as psfs
 from .image.psf_model import converged_psf as converged_psf
 from .image.render import (
     RenderMethod as RenderMethod,

@@ -10,7 +10,7 @@ from typing import Any
 # One name, `experiments.<name>`, whichever folder an experiment lies in.
 __path__ += [
     str(pathlib.Path(__file__).parent / name)
-    for name in ("paper", "trust", "speed", "designing", "imaging")
+    for name in ("paper", "trust", "speed", "designing", "imaging", "together")
 ]
 
 

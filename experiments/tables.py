@@ -23,7 +23,10 @@ def all_tables() -> dict[str, str]:
     found = {}
     for path in sorted((_common.ROOT / "results").rglob("results.json")):
         experiment = _common.experiment(path.parent.name, path.parents[1].name)
-        found |= experiment.tables(_common.read_results(path.parent))
+        tables = experiment.tables(_common.read_results(path.parent))
+        # Those of configs/paper/ have the names of the shorter runs.
+        prefix = "paper: " if path.parents[1].name == "paper" else ""
+        found |= {prefix + name: table for name, table in tables.items()}
     return found
 
 

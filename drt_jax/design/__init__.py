@@ -10,6 +10,7 @@ from .glasses import (
     snap_glasses as snap_glasses,
 )
 from .growth import Growth as Growth, grow as grow, part_of as part_of
+from .held import held as held
 from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit
 from .operands import Operand as Operand

@@ -236,7 +236,7 @@ def _try_orders(
     for clipped in (False, True)[blocked:]:
         trials: list[_Trial] = []
         for group in rules_by_order(lens, symmetry, clipped):
-            trace = partial(_trace, lens, scenes, group[0][1])
+            trace = partial(_trace, lens, scenes, group.traced)
             rays, failing, cut = trace(solver)
             if failing and solver is solve_aimed and (clipped or not cut):
                 solver = solve  # some rays must be searched for
@@ -245,7 +245,7 @@ def _try_orders(
                 check_order(lens)
             if (failing or cut) and not clipped:
                 break
-            for rule, used in group:
+            for rule, used in group.rules:
                 trial = _weighed(lens, scenes, rule, used, rays)
                 trials = [*trials, trial][-3:]
                 changes = (_change(trials[0], later, places) for later in trials[1:])

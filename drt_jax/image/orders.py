@@ -1,29 +1,45 @@
 """Pupil rules by rising order, as they are tried until a tolerance is met."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
 from ..lens.lens import Lens
 from ..lens.order import may_cross
-from ..pupil.clipped import Clipped
-from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points
+from ..pupil.clipped import Clipped, ClippedGroup
+from ..pupil.rules import Gauss, Pattern, Symmetry, gauss_points
 
 _MAX_ORDER = 40
-# First order for a clipped pupil, and the step to the next.
-_CLIPPED = 4, 2
+# Orders for a clipped pupil: three at a time, as three must agree and one search finds the points
+# of all; and their sizes, so that groups share a program.
+_CLIPPED = (
+    ((4, 5, 6), (7, 8, 9)),
+    ((7, 8, 9), (7, 8, 9)),
+    ((10, 11, 12), (10, 11, 12)),
+    ((14, 17, 20), (14, 17, 20)),
+    ((24, 28, 32), (36, 39, 42)),
+    ((36, 39, 42), (36, 39, 42)),
+)
 # Numbers of rays that patterns are padded to, so that they share a few compiled programs.
 _SIZES = {"rotational": (_MAX_ORDER + 2,), "bilateral": (208, 416, 1768, 3696)}
 _SIZES["none"] = _SIZES["bilateral"]
 
-# A rule, and the rule that is traced for it.
-Tried = tuple[Gauss | Clipped, PupilRule]
+
+class Group(NamedTuple):
+    """Rules that are traced at once.
+
+    traced: has the points of all of them.
+    rules: each rule, and a rule with the points of `traced` in which only its own have weight.
+    """
+
+    traced: Pattern | ClippedGroup
+    rules: Sequence[tuple[Gauss | Clipped, Pattern | ClippedGroup]]
 
 
-def rules_by_order(lens: Lens, symmetry: Symmetry, clipped: bool) -> Iterator[list[Tried]]:
-    """Rules by rising order, in groups of which all are traced at once: one pattern has the points
-    of all Gauss rules of a group, and each rule its own weights.
+def rules_by_order(lens: Lens, symmetry: Symmetry, clipped: bool) -> Iterator[Group]:
+    """Rules by rising order, in groups.
 
     symmetry: of the rules, see `symmetry_of`.
     clipped: whether the rules are fitted to the light that apertures leave.
@@ -32,18 +48,20 @@ def rules_by_order(lens: Lens, symmetry: Symmetry, clipped: bool) -> Iterator[li
         order = 2
         while order <= _MAX_ORDER + 1:
             yield (group := _gauss_group(order, symmetry))
-            order = group[-1][0].order + 1
+            order = group.rules[-1][0].order + 1
         return
-    first, step = _CLIPPED
     crossing = may_cross(lens)
-    for order in range(first, _MAX_ORDER + step + 1, step):
-        size = 20 if order <= 20 else _MAX_ORDER + 2
-        rule, used = (Clipped(order, symmetry, n, crossing) for n in (order, size))
-        yield [(rule, used)]
+    for orders, sizes in _CLIPPED:
+        rules = [Clipped(n, symmetry, n, crossing) for n in orders]
+        traced, *own = (
+            ClippedGroup(np.array(orders, np.int32), np.int32(k), sizes, symmetry, crossing)
+            for k in range(-1, len(orders))
+        )
+        yield Group(traced, [*zip(rules, own)])
 
 
 @cache
-def _gauss_group(first: int, symmetry: Symmetry) -> list[Tried]:
+def _gauss_group(first: int, symmetry: Symmetry) -> Group:
     """The Gauss rule of an order, and those of the next orders as long as all their points are at
     most half of the smallest size. The pattern is padded with weightless rays along the rim of
     the stop, where clear apertures clip first."""
@@ -60,10 +78,9 @@ def _gauss_group(first: int, symmetry: Symmetry) -> list[Tried]:
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     rim = rim if columns == 2 else np.ones((missing, 1))
     points = np.concatenate([*(p for p, _ in rules), rim])
-    found: list[Tried] = []
-    start = 0
+    found, start = [], 0
     for k, (_, weights) in enumerate(rules):
         padded = np.pad(weights, (start, size - start - weights.size))
         found.append((Gauss(first + k, symmetry), Pattern(points, padded, symmetry)))
         start += weights.size
-    return found
+    return Group(found[0][1], found)

@@ -9,6 +9,8 @@ that of the waves. How many rays and cells a model takes follows from the tolera
 import functools
 from typing import Literal
 
+import jax
+import jax.numpy as jnp
 from jax import Array
 
 from ..compilation import LARGE, jit
@@ -75,3 +77,36 @@ def _psf(
 ) -> Psf:
     beam = trace_beam(lens, scene, rule).refocused(defocus)
     return psf_of_beam(lens, scene.wavelengths, beam, pixel, centre, size, kind, cells)
+
+
+def psfs(
+    lens: Lens,
+    fields: Numbers,
+    distances: Numbers,
+    wavelengths: Numbers,
+    pixel: Numbers,
+    size: int,
+    model: PsfModel,
+) -> Psf:
+    """`psf` of B object points, one after the other: each leaf with B as its first axis.
+
+    fields: (B, 2), radians. distances: (B,), mm, or one. wavelengths, pixel, size: as of `psf`.
+    model: from `converged_psf`, for all points.
+
+    For `jax.jit`; the gradient traces each point again and keeps the rays of one point at a time.
+    ValueError for other shapes; a point without light has the throughput 0.
+    """
+    dtype = lens.curvature.dtype
+    angles = real_array("fields", fields, dtype)
+    far = real_array("distances", distances, dtype)
+    if angles.ndim != 2 or angles.shape[1] != 2 or far.shape not in ((), angles.shape[:1]):
+        raise ValueError(
+            f"fields, distances: expected (B, 2) and (B,), got {angles.shape} and {far.shape}"
+        )
+    side, size = check_pixels(pixel, size, dtype)
+    given = side, None, jnp.zeros((), dtype), size, model.kind, model.cells
+
+    def one(point: tuple[Array, Array]) -> Psf:
+        return _psf(lens, scene_of(lens, *point, wavelengths), model.rule, *given)
+
+    return jax.lax.map(jax.checkpoint(one), (angles, jnp.broadcast_to(far, angles.shape[:1])))

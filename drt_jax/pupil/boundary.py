@@ -195,9 +195,14 @@ def newton_step(rays: Rays, target: Target) -> tuple[Array, Array]:
     return jnp.where(is_corner, corner, line), jnp.where(is_corner, target.pair, edge[None])
 
 
-def search(trace: Trace, start: Rays, target: Target, steps: Array) -> EdgeRays:
+def search(trace: Trace, start: Rays, target: Target, steps: Array, within: Array) -> EdgeRays:
     """Newton's method with at most `steps` steps from rays `start` to targets. After a failed ray,
-    the next one is launched halfway to the last ray that did not fail."""
+    the next one is launched halfway to the last ray that did not fail.
+
+    within: (), a ray meets its target if the next step is at most this, in units of the
+        semi-diameter of the stop. It takes that step by its linear model, which leaves an error of
+        about the square of the step.
+    """
     tiny = float(jnp.finfo(start.launch.dtype).eps) ** 0.5
 
     def step(state):
@@ -206,7 +211,7 @@ def search(trace: Trace, start: Rays, target: Target, steps: Array) -> EdgeRays:
         rays = jax.tree.map(lambda a, b: jnp.where(new.good & ~done, a, b), new, rays)
         change, pair = newton_step(rays, target)
         back = rays.launch - launch
-        settled = rays.good & (dot(change, change) <= tiny**2)
+        settled = rays.good & (dot(change, change) <= within**2)
         lost = ~new.good & (dot(back, back) <= tiny**2 * (1 + dot(launch, launch)))
         onward = rays.launch + displace(rays.d_launch, change)
         launch = jnp.where(new.good[None], onward, launch + back / 2)
@@ -217,7 +222,6 @@ def search(trace: Trace, start: Rays, target: Target, steps: Array) -> EdgeRays:
     state = (0, start, launch, no, change, pair, no)
     state = jax.lax.while_loop(lambda s: (s[0] < steps) & ~jnp.all(s[3]), step, state)
     _, rays, _, _, change, pair, settled = state
-    # Take the last step by the linear model; its error is of second order.
     return EdgeRays(extrapolated(rays, jnp.where(settled[None], change, 0)), pair, settled)
 
 

@@ -90,11 +90,17 @@ class RadialRule:
     """Spokes and their weights.
 
     symmetry: part of the pupil that is traced.
-    count: B, largest number of spokes.
+    most: (G,), largest number of spokes of each order.
     """
 
     symmetry: Symmetry
-    count: int
+    most: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """B, number of spokes: those of all orders, and some for the search alone."""
+        few = {"rotational": 0, "bilateral": 32, "none": 64}[self.symmetry]
+        return max(sum(self.most), few) + 1
 
     @property
     def range(self) -> float:
@@ -113,41 +119,52 @@ class RadialRule:
         return jnp.clip(index.astype(jnp.int32), 0, self.count - 1)
 
     def scouts(self) -> np.ndarray:
-        """Points (2, B) over the whole stop and a little beyond its rim."""
+        """Points (2, B) over the whole stop and a little beyond its rim; its centre for
+        "rotational"."""
         k = np.arange(self.count) + 0.5
         if self.symmetry == "none":
             angle = np.pi * (1 + 5**0.5) * k
             return 1.2 * np.sqrt(k / self.count) * np.stack([np.cos(angle), np.sin(angle)])
-        return np.stack([0 * k, 1.2 * (2 * k / self.count - 1)])
+        side = 1.2 * (self.symmetry == "bilateral")
+        return np.stack([0 * k, side * (2 * k / self.count - 1)])
 
     def nodes(self, frame: Frame, used: Array, corner: Array, exists: Array) -> tuple[Array, Array]:
-        """Azimuths (W, B) and weights (W, B) with the sum 1: Gauss nodes between corners, more
-        in a wider panel.
+        """Azimuths (W, B) and weights (W, B), the sum of each order 1: Gauss nodes between corners,
+        more in a wider panel. Spokes of no order have no weight.
 
         frame: the polar coordinates.
-        used: (), int32, number of nodes.
+        used: (G,), int32, number of nodes of each order.
         corner: (2, W, C), corners.
         exists: (W, C), bool, corners that exist.
         """
         low, full = -np.pi / 2, self.range
         if self.symmetry == "rotational":
-            one = jnp.ones((len(exists), 1), corner.dtype)
+            one = jnp.ones((len(exists), self.count), corner.dtype)
             return one * (np.pi / 2), one
         x, y = jnp.where(exists[None], frame.unstretched(corner), 1)
         angle = jnp.where(exists, (jnp.arctan2(y, x) - low) % (2 * np.pi), full)
         angle = jnp.sort(jnp.clip(angle, 0, full), axis=-1)
         ends = jnp.pad(angle, ((0, 0), (1, 1)), constant_values=((0, 0), (0, full)))
-        width = jnp.diff(ends, axis=-1)
-        need = jax.lax.stop_gradient(jnp.where(width > 0, width / np.pi + _EXTRA, 0))
-        need = jnp.cumsum(need, axis=-1)
-        last = jnp.round(used.astype(need.dtype) * need / need[:, -1:]).astype(jnp.int32)
-        slot = jnp.arange(self.count, dtype=jnp.int32)[None]
-        panel = jnp.sum(slot[..., None] >= last[:, None], axis=-1, dtype=jnp.int32)
-        # Slots behind the last panel have no nodes and no weight.
-        last = jnp.pad(last, ((0, 0), (1, 1)))
-        begin, end = (jnp.take_along_axis(last, panel + k, axis=-1) for k in (0, 1))
-        table = jnp.asarray(gauss(self.count), width.dtype)
-        node, weight = table[:, jnp.maximum(end - begin, 0), slot - begin]
-        panel = jnp.minimum(panel, width.shape[-1] - 1)
-        start, wide = (jnp.take_along_axis(a, panel, axis=-1) for a in (ends, width))
-        return low + start + wide * node, wide * weight / full
+        parts = zip(*(_between(ends, n, most) for n, most in zip(used, self.most)))
+        angle, weight = (jnp.concatenate(part, axis=1) for part in parts)
+        more = ((0, 0), (0, self.count - angle.shape[1]))
+        return low + jnp.pad(angle, more), jnp.pad(weight, more) / full
+
+
+def _between(ends: Array, used: Array, most: int) -> tuple[Array, Array]:
+    """Gauss nodes (W, most) in panels between `ends` (W, C + 2), and weights. used: (), int32,
+    number of nodes with weight."""
+    width = jnp.diff(ends, axis=-1)
+    need = jax.lax.stop_gradient(jnp.where(width > 0, width / np.pi + _EXTRA, 0))
+    need = jnp.cumsum(need, axis=-1)
+    last = jnp.round(used.astype(need.dtype) * need / need[:, -1:]).astype(jnp.int32)
+    slot = jnp.arange(most, dtype=jnp.int32)[None]
+    panel = jnp.sum(slot[..., None] >= last[:, None], axis=-1, dtype=jnp.int32)
+    # Slots behind the last panel have no nodes and no weight.
+    last = jnp.pad(last, ((0, 0), (1, 1)))
+    begin, end = (jnp.take_along_axis(last, panel + k, axis=-1) for k in (0, 1))
+    table = jnp.asarray(gauss(most), width.dtype)
+    node, weight = table[:, jnp.maximum(end - begin, 0), slot - begin]
+    panel = jnp.minimum(panel, width.shape[-1] - 1)
+    start, wide = (jnp.take_along_axis(a, panel, axis=-1) for a in (ends, width))
+    return start + wide * node, wide * weight

@@ -78,9 +78,11 @@ class Net:
 
     skip_every: int = 2
     input_skip: bool = True
+    layers: int = 5
+    channels: int = 64
 
     def __post_init__(self) -> None:
-        require_within("network.", self, skip_every=(0, 5))
+        require_within("network.", self, skip_every=(0, 5), layers=(1, 50), channels=(1, 1024))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ import importlib
 import json
 import pathlib
 import pkgutil
+import re
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import experiments
 from drt_jax import first_order, load_lens, save_lens
 from experiments import _command, _peers, _psf_peers, _work, benchmark, tables
+from experiments.runs.folder import Run
 
 from .test_experiments import TOY
 
@@ -39,6 +41,20 @@ STARTS = {
         *("limit=64", "rounds=2", "peers=[64]", "frequencies=5", "photo_pixels=48", "repeats=1"),
         *("gallery.lens=singlet", "gallery.fields_deg=[0]", "gallery.distances_m=[.inf]"),
     ],
+    "joint": [
+        *(
+            "lens=singlet",
+            "variables=[{kind: curvature}, {kind: sensor}]",
+            "solves=[]",
+            "limits=[]",
+        ),
+        *("spoil.per_cent=1", "field_deg=2", "camera={pixel_um: 100, kernel: 9, tolerance: 0.2}"),
+        *("network={layers: 1, channels: 4}", "seeds=1", "mtf_at=1", "data.crops_per_image=4"),
+        "arms=[focus,spots,mtf,joint,joint_from_spots,damped,frozen,tolerant]",
+        "train={batches: 12, batch: 2, patch: 8, points: 2, checkpoint_every: 5}",
+        "tolerances=[{kind: radius, size: 1}, {kind: tilt, size: 3}]",
+        "judge={rings: 2, patches: 1, waves: 2, cells: 32, builds: 3}",
+    ],
     "render": ["nodes=2", "kernel=9", "model=gaussian", "scene.lens=cooke_triplet", "pixel_um=20"],
     "tolerance": [
         *("lens=singlet", "tolerances=[{kind: radius, size: 1.0}]", "fields_deg=[[0, 0]]"),
@@ -46,7 +62,8 @@ STARTS = {
     ],
 }
 # Programs of many kinds.
-LONG = ("accuracy", "benchmark", "design", "images", "lenses", "render", "stability", "tolerance")
+LONG = ("accuracy", "benchmark", "design", "images", "joint", "lenses", "render", "stability")
+LONG += ("tolerance",)
 
 
 def runnable():
@@ -125,6 +142,64 @@ def checked_images(results):
 
 def checked_render(results):
     assert results["kernel"] == 9 and results["seconds"] > 0 == results["dark"]
+
+
+def checked_joint(results):
+    """Every arm trained and judged, and none left the lens that it may not change."""
+    rows = {row["arm"]: row for row in results["rows"]}
+    assert list(rows) == results["arms"] and len(rows) == 8
+    assert all(0 < row["mae"] < 0.6 and row["step_s"] > 0 for row in rows.values())
+    assert rows["spots"]["spot_um"] == pytest.approx(results["start_um"]["spots"])
+    assert rows["joint"]["spot_um"] != rows["spots"]["spot_um"] < results["start_um"]["spoilt"]
+    assert [len(loss) for loss in results["losses"]] == [12] * 8
+    assert [row["arm"] for row in results["builds"]] == ["spots", "joint_from_spots", "tolerant"]
+    assert all(row["low"] <= row["mean"] for row in results["builds"])
+
+
+@pytest.mark.slow
+def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatch):
+    own = [key for key in STARTS["joint"] if not key.startswith(("arms", "tolerances", "judge"))]
+    own += ["arms=[focus,damped]", "judge={rings: 2, patches: 1, waves: 1, cells: 32}"]
+    experiment, log, calls = importlib.import_module("experiments.joint"), Run.log, []
+
+    def stopping(self, *args):
+        log(self, *args)
+        calls.append(args)
+        if len(calls) == 4:  # in the middle of the second arm, after a checkpoint
+            raise KeyboardInterrupt
+
+    folders = tmp_path / "whole", tmp_path / "stopped"
+    _command.main(experiment, ["--out", str(folders[0]), "--set", *own])
+    monkeypatch.setattr(Run, "log", stopping)
+    with pytest.raises(SystemExit):
+        _command.main(experiment, ["--out", str(folders[1]), "--set", *own])
+    monkeypatch.undo()
+    _command.main(experiment, ["--out", str(folders[1]), "--resume"])
+    whole, resumed = (json.loads((f / "results.json").read_text()) for f in folders)
+    for row in [*whole["rows"], *resumed["rows"]]:
+        row.pop("step_s")
+    assert whole == resumed
+
+
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        ("camera.kernel=3", "camera.kernel: .* of the light of the spoilt lens falls beside"),
+        ("field_deg=70", "field_deg: "),
+        ("train.batch=3", "train.batch: expected a multiple of train.points"),
+        ("arms=[frozen]", "arms: frozen needs spots"),
+        ("variables=[{kind: conic, surfaces: [9]}]", "variables: conic: no surface 9"),
+        ("judge.builds=5", "tolerances: needs at least one item"),
+        ("depth_m=[5, 1]", "depth_m: expected the nearest and the farthest"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_in_a_line(change, told, tmp_path, capsys):
+    own = [key for key in STARTS["joint"] if not key.startswith(("arms", "tolerances", "judge"))]
+    with pytest.raises(SystemExit) as stopped:
+        experiment = importlib.import_module("experiments.joint")
+        _command.main(experiment, ["--out", str(tmp_path / "run"), "--set", *own, change])
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert stopped.value.code == 2 and re.search(told, message), message
 
 
 def checked_tolerance(results):

@@ -1,0 +1,251 @@
+"""Lens and network trained together over the field and over depth: kernels of object points that
+change in each step, sensor layer, network, and two optimisers of the lens."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from ..compilation import NETWORK, known_options
+from ..image.sensor import convolve_each
+from ..numerics import Numbers
+from .adam import adam, apply_updates
+
+# From optics and what is seen to kernels (P, C, K, K) and the light (P, C) on the sensor, relative
+# to a constant of the camera.
+Points = Callable[[Any, "Seen"], tuple[Array, Array]]
+# From optics before and after an update to optics that can be built.
+Hold = Callable[[Any, Any], Any]
+# Least light that the gain of the sensor makes up for; below it the image stays dark.
+_DARKEST = 0.02
+# Least mean residual in the curvature of the mean absolute error, for values from 0 to 1.
+_SMALLEST = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldImager:
+    """The chain kernels -> sensor layer -> network, for patches anywhere in the field.
+
+    points: kernels and light of object points, such as a function of `psfs`.
+    restore: (weights, images) -> images; None for a camera without a network.
+    """
+
+    points: Points
+    restore: Callable[[Any, Array], Array] | None = None
+
+    def sensor(self, optics: Any, scenes: Array, seen: "Seen", noise: Numbers, key: Array) -> Array:
+        """Sensor images float32 (B, H, W, C), with even brightness: where the lens loses light, the
+        gain raises the noise.
+
+        scenes: float32 (B, H + K - 1, W + K - 1, C), values from 0 to 1; patch b shows point
+            b P // B.
+        seen: the P points; B is a multiple of P.
+        noise: standard deviation of the noise where the light is 1.
+        key: a PRNG key.
+        """
+        count = seen.fields.shape[0]
+        if scenes.shape[0] % count:
+            raise ValueError(
+                f"scenes: {scenes.shape[0]} patches cannot be shared among {count} points: give a "
+                "multiple"
+            )
+        each = scenes.shape[0] // count
+        kernels, light = self.points(optics, seen)
+        image = convolve_each(scenes, kernels.repeat(each, axis=0))
+        gain = 1 / jnp.maximum(light, _DARKEST).astype(image.dtype)
+        white = jax.random.normal(key, image.shape, image.dtype)
+        grain = jnp.asarray(noise, image.dtype) * white
+        return image + gain.repeat(each, axis=0)[:, None, None, :] * grain
+
+    def __call__(
+        self, parameters: dict[str, Any], scenes: Array, seen: "Seen", noise: Numbers, key: Array
+    ) -> tuple[Array, Array, Array]:
+        """True, sensor and restored images, float32 (B, H, W, C).
+
+        parameters: "optics", and "network" for a network.
+        scenes: uint8 (B, H + K - 1, W + K - 1, C).
+        """
+        real = scenes.astype(jnp.float32) / 255
+        image = self.sensor(parameters["optics"], real, seen, noise, key)
+        return truth_of(real, image), image, self._restored(parameters, image)
+
+    def _restored(self, parameters: dict[str, Any], image: Array) -> Array:
+        restore = self.restore
+        return image if restore is None else restore(parameters.get("network"), image)
+
+
+class Seen(NamedTuple):
+    """Object points of a step.
+
+    fields: (P, 2), radians.
+    distances: (P,), mm.
+    deviations: of the parts of the lens as built, for `FieldImager.points`; None for the lens as
+        designed.
+    """
+
+    fields: Array
+    distances: Array
+    deviations: Any = None
+
+
+def truth_of(scenes: Array, image: Array) -> Array:
+    """The part of scenes (B, H + K - 1, W + K - 1, C) that images (B, H, W, C) show."""
+    margin = (scenes.shape[1] - image.shape[1]) // 2
+    height, width = image.shape[1:3]
+    return scenes[:, margin : margin + height, margin : margin + width]
+
+
+def draw_points(key: Array, count: int, field: float, depths: tuple[float, float]) -> Seen:
+    """Object points over a circular field: one in each of `count` rings of equal area, at any
+    azimuth, and evenly in 1 / distance, in another order.
+
+    key: a PRNG key.
+    count: number of points P.
+    field: largest angle, radians.
+    depths: nearest and farthest distance, mm; inf allowed.
+    """
+    ring, turn, depth, order = jax.random.split(key, 4)
+    kind = jnp.result_type(float)
+    part = (jnp.arange(count, dtype=kind) + jax.random.uniform(ring, (count,), kind)) / count
+    radius = np.tan(field) * jnp.sqrt(part)
+    angle = 2 * np.pi * jax.random.uniform(turn, (count,), kind)
+    tangents = radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    part = (jnp.arange(count, dtype=kind) + jax.random.uniform(depth, (count,), kind)) / count
+    near, far = (1 / d for d in depths)
+    vergence = jax.random.permutation(order, near + (far - near) * part)
+    distances = jnp.where(vergence > 0, 1 / jnp.where(vergence > 0, vergence, 1), jnp.inf)
+    return Seen(jnp.arctan(tangents), distances)
+
+
+def _kept(before: Any, after: Any) -> Any:
+    """A `Hold` that allows everything."""
+    return after
+
+
+def make_field_step(
+    imager: FieldImager,
+    rates: dict[str, Any],
+    draw: Callable[[Array], Seen],
+    seed: int,
+    hold: Hold = _kept,
+) -> tuple[Callable, Callable]:
+    """Adam on the mean absolute error, for lens and network, as (init, step) for `fit`.
+
+    imager: the camera.
+    rates: learning rates of "optics" and "network", see `adam`.
+    draw: points of a step from a PRNG key, such as a function of `draw_points`.
+    seed: points and noise depend only on it and the index of the step.
+    hold: keeps the optics within what can be built, see `design.held`.
+
+    init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the
+    state donated. metrics: loss, (). Parameters without "network" train the optics alone.
+    """
+    init_adam, update = adam(rates)
+
+    def init(parameters: dict[str, Any]) -> tuple[Any, Any]:
+        parameters = _copied(parameters)
+        return parameters, init_adam(parameters)
+
+    def step(state: tuple[Any, Any], scenes: Array, noise: Array, index: Array):
+        parameters, moments = state
+        noise_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
+        seen = draw(key)
+
+        def loss(parameters):
+            truth, _, restored = imager(parameters, scenes, seen, noise, noise_key)
+            return jnp.mean(jnp.abs(restored - truth))
+
+        error, gradients = jax.value_and_grad(loss)(parameters)
+        updates, moments = update(gradients, moments)
+        new = apply_updates(parameters, updates)
+        new["optics"] = hold(parameters["optics"], new["optics"])
+        return (new, moments), {"loss": error}
+
+    return init, jax.jit(step, donate_argnums=0, compiler_options=known_options(NETWORK))
+
+
+class _Newton(NamedTuple):
+    """Running means for the optics: gradient (N,) and curvature (N, N), of the same weights."""
+
+    gradient: Array
+    curvature: Array
+
+    def step(self, damping: float) -> Array:
+        """The full step (N,), with the curvature's diagonal raised by a part of it."""
+        diagonal = jnp.diag(self.curvature)
+        least = jnp.finfo(diagonal.dtype).eps * jnp.max(diagonal)
+        raised = self.curvature + jnp.diag(damping * diagonal + jnp.where(least > 0, least, 1))
+        return -jnp.linalg.solve(raised, self.gradient)
+
+
+def make_damped_step(
+    imager: FieldImager,
+    rates: dict[str, Any],
+    draw: Callable[[Array], Seen],
+    seed: int,
+    hold: Hold = _kept,
+    damping: float = 0.1,
+    memory: float = 0.9,
+) -> tuple[Callable, Callable]:
+    """As `make_field_step`, but the optics take damped least-squares steps.
+
+    rates: of "optics", the part of a full step; of "network", as before.
+    damping: added to the curvature, relative to its diagonal.
+    memory: decay of the running means of gradient and curvature.
+
+    The gradient is exact. The curvature is that of Gauss and Newton for the pixels in front of the
+    network: J^T J over the mean absolute residual, J forward through rays and kernels. The optics
+    are a dict of vectors.
+    """
+    init_adam, update = adam({"network": rates["network"]})
+
+    def init(parameters: dict[str, Any]) -> tuple[Any, Any, _Newton]:
+        parameters = _copied(parameters)
+        vector = ravel_pytree(parameters["optics"])[0]
+        empty = _Newton(0 * vector, jnp.zeros((vector.size,) * 2, vector.dtype))
+        return parameters, init_adam(_weights(parameters)), empty
+
+    def step(state: tuple[Any, Any, _Newton], scenes: Array, noise: Array, index: Array):
+        parameters, moments, means = state
+        noise_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
+        seen, real = draw(key), scenes.astype(jnp.float32) / 255
+        vector, optics_of = ravel_pytree(parameters["optics"])
+
+        def sensor(vector):
+            return imager.sensor(optics_of(vector), real, seen, noise, noise_key)
+
+        image, push = jax.linearize(sensor, vector)
+        slopes = jax.vmap(push)(jnp.eye(vector.size, dtype=vector.dtype))
+        truth = truth_of(real, image)
+
+        def loss(weights, image):
+            return jnp.mean(jnp.abs(imager._restored(weights, image) - truth))
+
+        weights = _weights(parameters)
+        error, (gradients, toward) = jax.value_and_grad(loss, (0, 1))(weights, image)
+        flat = slopes.reshape(vector.size, -1)
+        size = jnp.maximum(error, _SMALLEST) * flat.shape[1]
+        now = _Newton(flat @ toward.ravel(), flat @ flat.T / size)
+        means = jax.tree.map(lambda m, n: memory * m + (1 - memory) * n.astype(m.dtype), means, now)
+        moved = vector + rates["optics"] * means.step(damping)
+        updates, moments = update(gradients, moments)
+        new = apply_updates(weights, updates)
+        new["optics"] = hold(parameters["optics"], optics_of(moved))
+        return (new, moments, means), {"loss": error}
+
+    return init, jax.jit(step, donate_argnums=0, compiler_options=known_options(NETWORK))
+
+
+def _weights(parameters: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in parameters.items() if name != "optics"}
+
+
+def _copied(parameters: Any) -> Any:
+    """A copy, because the first step overwrites the buffers; with an explicit dtype, because
+    weakly typed parameters would compile the step again."""
+    return jax.tree.map(lambda p: jnp.array(p, jnp.asarray(p).dtype), parameters)

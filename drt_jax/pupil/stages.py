@@ -1,0 +1,218 @@
+"""The search for the boundary of a clipped pupil, in stages, without derivatives.
+
+Vectors are arrays with 2 components on the first axis and B rays per wavelength on the last.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..lens.lens import Lens
+from ..lens.scene import Scene
+from ..numerics import run_if
+from ..rays.aim import beam_size, nearest_start, no_fan, paraxial_launch, trace_fan
+from ..rays.system import System, system_of
+from . import boundary
+from .boundary import EdgeRays, Rays, Target
+from .radial import CORNERS, Frame, RadialRule, changes
+
+# Most steps of a search, and of the search for corners.
+_STEPS, _CORNER_STEPS = np.int32(48), np.int32(16)
+# How near rays must come to targets where other rays start, in units of the semi-diameter of the
+# stop.
+_ROUGHLY = 1e-3
+# Largest distance of a corner outside of other edges, in units of the semi-diameter of the stop.
+_BESIDE = 0.01
+
+
+class _Given(NamedTuple):
+    """Arguments of all stages of the search. used: (G,), int32, spokes of each order."""
+
+    lens: Lens
+    system: System
+    radial: RadialRule
+    used: Array
+
+
+class _State(NamedTuple):
+    """State of the search between its stages.
+
+    frame: polar coordinates about the point deepest inside.
+    passes: (W, 1), bool, whether light passes that point.
+    even: rays at the ends of even spokes.
+    corners: rays at C corners.
+    latest: result of the last stage.
+    """
+
+    frame: Frame
+    passes: Array
+    even: Rays
+    corners: EdgeRays
+    latest: EdgeRays
+
+
+# Start rays, B per wavelength, their targets, the largest number of steps, and how near to the
+# target a ray must come.
+_Task = tuple[Rays, Target, Any, Any]
+
+
+def _near(rays: Rays, roughly: bool = False) -> Array:
+    """How near rays must come to their targets: `roughly` if they are starts of other rays, else
+    within rounding, see `boundary.search`."""
+    kind = rays.point.dtype
+    return jnp.asarray(_ROUGHLY if roughly else jnp.finfo(kind).eps ** 0.5, kind)
+
+
+def target_of(rays: Rays, centre: Array, toward: Any = 0, pair: Any = 0) -> Target:
+    """Target of each ray: the `centre`, the end of the half-line `toward`, or the corner `pair`."""
+    full = lambda a, kind: jnp.broadcast_to(jnp.asarray(a, kind), rays.point.shape)  # noqa: E731
+    kind = rays.point.dtype
+    return Target(full(centre, kind), full(toward, kind), full(pair, jnp.int32))
+
+
+def _scouts(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """Stage 1: rays over the whole stop, from their paraxial launches."""
+    rays, radius = state.latest.rays, given.lens.semi_diameter[given.lens.stop]
+    pattern = jnp.asarray(given.radial.scouts(), radius.dtype)
+    points = jnp.zeros_like(rays.point) + radius * pattern[:, None]
+    launch = jnp.stack(paraxial_launch(given.system, tuple(points), 4 * radius))
+    rays = rays._replace(launch=launch)
+    return state, (rays, target_of(rays, rays.point), np.int32(1), _near(rays, True))
+
+
+def _rescue(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """Stage 2: for a wavelength without a ray that arrives, the ray of a fan that crosses the stop
+    nearest to its centre."""
+    system, rays = given.system, state.latest.rays
+    dark = ~jnp.any(rays.good, axis=-1)
+    zero = jnp.zeros_like(rays.point[0])
+    rim = zero, zero + given.lens.semi_diameter[given.lens.stop]
+
+    def sought(launch):
+        fan = trace_fan(system, no_fan(system, len(dark)), tuple(launch), beam_size(system, rim)[1])
+        best = nearest_start(fan, tuple(jnp.zeros_like(launch[:, :, :1])))
+        return jnp.where(dark[None, :, None], jnp.stack(best), launch)
+
+    rays = rays._replace(launch=run_if(jnp.any(dark), sought, rays.launch))
+    return state, (
+        rays,
+        target_of(rays, rays.point),
+        jnp.any(dark).astype(jnp.int32),
+        _near(rays, True),
+    )
+
+
+def _middle(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """Stage 3: all rays to the point deepest inside, by the linear model of the best ray."""
+    scouts = state.latest.rays
+    far = jnp.where(scouts.good, boundary.outside(scouts, scouts.point), jnp.inf)
+    best = jnp.argmin(far, axis=-1)[:, None]
+    pattern = jnp.asarray(given.radial.scouts(), far.dtype)
+    centre = boundary.middle(scouts.at(best), pattern)
+    rays = scouts.at(jnp.broadcast_to(best, far.shape))
+    return state, (rays, target_of(rays, centre), _STEPS, _near(rays, True))
+
+
+def _ends(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """Stage 4: rays to the ends of even spokes about that point."""
+    rays, _, settled = state.latest
+    ray = jax.tree.map(lambda a: a[..., :1], rays)
+    passes = settled[:, :1] & (boundary.outside(ray, ray.point) < 0)
+    frame = Frame(ray.point, boundary.stretch(ray))
+    target = target_of(rays, frame.centre, frame.toward(given.radial.even[None]))
+    near = _near(rays, given.radial.symmetry != "rotational")  # there it is the last stage
+    return state._replace(frame=frame, passes=passes), (rays, target, _STEPS, near)
+
+
+def _corners(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """Stage 5: the first `CORNERS` rays to the corners, where the nearest edge changes."""
+    radial, frame, even = given.radial, state.frame, state.latest.rays
+    line = target_of(even, frame.centre, frame.toward(radial.even[None]))
+    distance = boundary.edge_distance(even, line)
+    place, pair = changes(distance, radial.symmetry == "none")
+    more = (0, radial.count - CORNERS)
+    place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
+    rays = even.at(jnp.round(place).astype(jnp.int32))
+    angle = place * (radial.range / (radial.count - 1)) - np.pi / 2
+    line = target_of(rays, frame.centre, frame.toward(angle))
+    rays = boundary.extrapolated(rays, boundary.newton_step(rays, line)[0])
+    target = target_of(rays, frame.centre, pair=pair)
+    return state._replace(even=even), (rays, target, _CORNER_STEPS, _near(rays))
+
+
+def _nodes(given: _Given, state: _State) -> tuple[_State, _Task]:
+    """Stage 6: rays to the ends of the spokes of the rule, which lie between the corners."""
+    rays, pair, settled = jax.tree.map(lambda a: a[..., :CORNERS], state.latest)
+    beside = boundary.outside(rays, rays.point) < _BESIDE
+    exists = settled & beside & (pair[0] != pair[1])
+    angle, _ = given.radial.nodes(state.frame, given.used, rays.point, exists)
+    start = state.even.at(given.radial.nearest(angle))
+    target = target_of(start, state.frame.centre, state.frame.toward(angle))
+    return state._replace(corners=EdgeRays(rays, pair, exists)), (
+        start,
+        target,
+        _STEPS,
+        _near(start),
+    )
+
+
+def _nothing(given: _Given, crossing: bool) -> _State:
+    """The state before the first stage."""
+    lens, waves, kind = given.lens, given.system.index.shape[1], given.system.index.dtype
+    edges = lens.count + 1 + crossing * len(lens.active) + boundary.aperture_edges(lens)
+    zeros = functools.partial(jnp.zeros, dtype=kind)
+
+    def none(count):
+        point, no = zeros((2, waves, count)), jnp.zeros((waves, count), bool)
+        q, rates = zeros((2, edges, waves, count)), zeros((2, 2, waves, count))
+        rays = Rays(point, point, q, rates, jnp.stack([q, q]), no)
+        return EdgeRays(rays, point.astype(jnp.int32), no)
+
+    one, latest = none(1), none(given.radial.count)
+    corners = none(0 if given.radial.symmetry == "rotational" else CORNERS)
+    frame = Frame(one.rays.point, one.rays.d_launch)
+    return _State(frame, one.settled, latest.rays, corners, latest)
+
+
+class Plan(NamedTuple):
+    """The boundary, without derivatives.
+
+    frame, passes: as in `_State`.
+    edge: K = C + B rays, at C corners and at the ends of B spokes; derivatives exist where settled.
+    used: (G,), int32, number of spokes with weight of each order.
+    """
+
+    frame: Frame
+    passes: Array
+    edge: EdgeRays
+    used: Array
+
+    def spokes(self, radial: RadialRule, corner: Array) -> tuple[Array, Array]:
+        """Directions (2, W, B) of the spokes between corners (2, W, C), and weights (W, B)."""
+        exists = self.edge.settled[:, : corner.shape[-1]]
+        angle, share = radial.nodes(self.frame, self.used, corner, exists)
+        return self.frame.toward(angle), share
+
+
+def plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, crossing: bool) -> Plan:
+    """Finds the boundary of the pupil in stages. One loop runs all stages, so that the trace, which
+    takes long to compile, stands once in the program."""
+    given = _Given(lens, system_of(lens, scene), radial, used)
+    trace = functools.partial(boundary.trace, lens, given.system, crossing)
+    stages = [_scouts, _rescue, _middle, _ends, _corners, _nodes]
+    count = 4 if radial.symmetry == "rotational" else 6  # one radius has no corners
+    tasks = [functools.partial(stage, given) for stage in stages[:count]]
+
+    def run(stage, state):
+        state, task = jax.lax.switch(stage, tasks, state)
+        return state._replace(latest=boundary.search(trace, *task))
+
+    state = jax.lax.fori_loop(0, count, run, _nothing(given, crossing))
+    join = lambda a, b: jnp.concatenate([a, b], axis=-1)  # noqa: E731
+    edge = jax.tree.map(join, state.corners, state.latest)
+    edge = edge._replace(settled=edge.settled & state.passes)
+    return Plan(state.frame, state.passes, edge, used)

@@ -1,0 +1,203 @@
+"""The arms of a joint design: least squares, training, and the judge."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from tqdm import tqdm
+
+import drt_jax
+from drt_jax import design
+from drt_jax.learn import train
+from drt_jax.learn.data import batches
+from drt_jax.learn.field import FieldImager, Seen
+
+from . import _training
+from ._studio import SEED, Studio
+from .runs.folder import Run
+
+Arm = Literal["focus", "spots", "mtf", "joint", "joint_from_spots", "damped", "frozen", "tolerant"]
+ARMS = {
+    "focus": "(a) focus and network",
+    "spots": "(b) least squares on spots, then network",
+    "mtf": "(c) least squares on MTF, then network",
+    "joint": "(d) jointly from the spoilt lens",
+    "joint_from_spots": "(e) jointly from (b)",
+    "frozen": "(f) lens of (b) through its frozen network",
+    "damped": "(d) with least-squares steps of the lens",
+    "tolerant": "(e) with lenses as built",
+}
+# Steps between those of two seeds, which points and noise depend on.
+_APART = 10**7
+# Patches of a picture.
+_SHOWN = 5
+
+
+def run(config: Any, run: Run) -> dict[str, Any]:
+    """Finishes the lenses, trains and judges all arms."""
+    studio = Studio(config)
+    lenses = {"spoilt": studio.spoilt} | _finished(studio, run)
+    folder = run.folder / "lenses"
+    folder.mkdir(exist_ok=True)
+    imager = jax.jit(FieldImager(studio.judged_points, studio.restore).__call__)
+    rows, losses, shown, drawn = [], [], {}, ["spoilt"]
+    _save(studio, folder / "spoilt.yaml", studio.spoilt)
+    for arm in config.arms:
+        own = []
+        for seed in range(config.seeds):
+            job = f"{arm} {seed}"
+            parameters, seconds = _train(studio, run, arm, seed, lenses, job)
+            own.append(run.metrics(job)["loss"])
+            vector = parameters["optics"]["lens"]
+            _save(studio, folder / f"{job}.yaml", vector)
+            if run.kept(f"judged {job}") is None:
+                row = {"arm": arm, "seed": seed, "step_s": seconds}
+                row |= {"spot_um": studio.spot_um(vector)}
+                run.keep(f"judged {job}", row | _judged(studio, imager, parameters))
+            rows.append(run.kept(f"judged {job}"))
+            if not seed:
+                drawn.append(job)
+                shown |= _pictures(studio, imager, parameters, arm)
+        losses.append(np.mean(own, axis=0).tolist())
+    far = studio.depths[1]
+    return {
+        "name": config.name,
+        "rows": rows,
+        "arms": list(config.arms),
+        "losses": losses,
+        "start_um": {name: studio.spot_um(vector) for name, vector in lenses.items()},
+        "builds": _as_built(studio, run) if config.judge.builds else [],
+        "drawn": drawn,
+        "pictures": list(config.arms),
+        "pictures_deg": np.degrees(np.hypot(*np.asarray(studio.judged().fields).T)).tolist(),
+        "field_deg": config.field_deg,
+        "far_mm": far if math.isfinite(far) else None,
+        **shown,
+    }
+
+
+def _finished(studio: Studio, run: Run) -> dict[str, Array]:
+    """The vectors of the lens that least squares has finished, on spots and then on MTF."""
+    found, vector = {}, studio.spoilt
+    for name, problem in (("spots", studio.spots), ("mtf", studio.sharp)):
+        if name == "mtf" and "mtf" not in studio.config.arms:
+            continue
+        if run.kept(f"finish {name}") is None:
+            print(f"least squares: {name}", flush=True)
+            best = design.optimise(problem, vector)
+            run.keep(f"finish {name}", best.vector.tolist())
+        found[name] = vector = jnp.asarray(run.kept(f"finish {name}"))
+    return found
+
+
+def _train(
+    studio: Studio, run: Run, arm: str, seed: int, lenses: dict[str, Array], job: str
+) -> tuple[dict[str, Any], float]:
+    """Trained parameters of a job, from its last checkpoint on, and the seconds of a step."""
+    setting, noise = studio.config.train, studio.config.noise
+    total = setting.batches
+    if arm == "damped":
+        total = max(1, round(setting.damped_part * total))
+    weights = None
+    if arm == "frozen":
+        begin = studio.step("spots")[0](studio.start("spots", seed, lenses, None))
+        weights = run.load(f"spots {seed}", begin, (f"spots {seed}",), setting.batches)[1][0]
+        weights = weights["network"]
+    init, same = studio.step(arm)
+    # Points and noise of their own for each seed, by one program.
+    step = lambda *given: same(*given[:3], np.int32(given[3] + _APART * seed))  # noqa: E731
+    begin = init(studio.start(arm, seed, lenses, weights))
+    first, state = run.load(job, begin, (job,), total)
+    saved, started, counted = first, time.perf_counter(), [0, 0.0]
+    bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
+
+    def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
+        nonlocal saved, started
+        done = start + len(metrics["loss"])
+        run.log(job, start, metrics)
+        _training.require_finite(job, start, metrics["loss"])
+        bar.update(len(metrics["loss"]))
+        bar.set_postfix_str(f"loss={metrics['loss'][-1]:.4f}")
+        if done == total or done - saved >= setting.checkpoint_every:
+            run.save(job, done, state)
+            saved = done
+        now = time.perf_counter()
+        if start > first:  # the first report contains compilation
+            counted[0] += len(metrics["loss"])
+            counted[1] += now - started
+        started = now
+
+    stream = batches(studio.patches.train, setting.batch, seed, first)
+    with bar:
+        state = train.fit(step, state, stream, noise, range(first, total), 10, report)
+    return state[0], counted[1] / max(counted[0], 1)
+
+
+def _save(studio: Studio, path: Any, vector: Array) -> None:
+    """Writes a lens with apertures that follow the light."""
+    lens = studio.variables.lens_of(vector)
+    drt_jax.save_lens(design.fit_apertures(studio.spots, lens), path)
+
+
+def _test(studio: Studio, seen: Seen, each: int) -> np.ndarray:
+    return _training.thinned(studio.patches.test, each * len(seen.fields))
+
+
+def _judged(studio: Studio, imager: Callable, parameters: Any) -> dict[str, float]:
+    """Quality of the images of an arm, by the judge."""
+    seen, config = studio.judged(), studio.config
+    patches = _test(studio, seen, config.judge.patches)
+    return train.evaluate(imager, parameters, patches, seen, config.noise, 0, len(seen.fields))
+
+
+def _pictures(studio: Studio, imager: Callable, parameters: Any, arm: str) -> dict[str, Any]:
+    """The first images of the judge."""
+    seen, noise = studio.judged(), np.float32(studio.config.noise)
+    some = np.resize(
+        _training.textured(studio.patches.test, len(seen.fields)),
+        (len(seen.fields), *studio.patches.test.shape[1:]),
+    )
+    found = imager(parameters, some, seen, noise, jax.random.key(0))
+    keys = ("truth", "sensor", "restored")
+    return {f"{arm} {k}": np.asarray(a[:_SHOWN], np.float16) for k, a in zip(keys, found)}
+
+
+def _as_built(studio: Studio, run: Run) -> list[dict[str, Any]]:
+    """PSNR of lenses as built, of the arms with a finished lens, by rays at the judge's points."""
+    config, rows = studio.config, []
+    table = design.draw_perturbations(studio.built, config.judge.builds, SEED + 1)
+    imager = jax.jit(FieldImager(studio.points, studio.restore).__call__)
+    seen = studio.judged()
+    patches = _test(studio, seen, 1)
+    patches = np.resize(patches, (len(seen.fields), *patches.shape[1:]))
+    for arm in (a for a in ("spots", "joint_from_spots", "tolerant") if a in config.arms):
+        for seed in range(config.seeds):
+            job = f"built {arm} {seed}"
+            if run.kept(job) is None:
+                begin = studio.step(arm)[0](
+                    studio.start(
+                        arm,
+                        seed,
+                        {name: studio.spoilt for name in ("spoilt", "spots", "mtf")},
+                        None,
+                    )
+                )
+                name = f"{arm} {seed}"
+                state = run.load(name, begin, (name,), config.train.batches)[1]
+                decibels = []
+                for deviations in (np.zeros(table.shape[1]), *tqdm(table, desc=job, leave=False)):
+                    view = seen._replace(deviations=jnp.asarray(deviations))
+                    noise, key = np.float32(config.noise), jax.random.key(0)
+                    truth, _, image = imager(state[0], patches, view, noise, key)
+                    squares = np.mean(np.square(np.asarray(image - truth)), axis=(1, 2, 3))
+                    decibels.append(float(np.mean(-10 * np.log10(squares))))
+                row = {"arm": arm, "seed": seed, "designed": decibels[0]}
+                row |= {"mean": float(np.mean(decibels[1:]))}
+                run.keep(job, row | {"low": float(np.percentile(decibels[1:], 10))})
+            rows.append(run.kept(job))
+    return rows

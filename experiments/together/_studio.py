@@ -1,0 +1,235 @@
+"""What the arms of a joint design share: lens, camera, judge, steps."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from tqdm import tqdm
+
+import drt_jax
+from drt_jax import Lens, design
+from drt_jax.design.optimum import init_problem, take_step
+from drt_jax.design.problem import quick
+from drt_jax.learn.data import Patches, load_patches
+from drt_jax.learn.field import (
+    FieldImager,
+    Seen,
+    draw_points,
+    make_damped_step,
+    make_field_step,
+)
+
+from . import _common
+
+# Relative fields of least squares, and the order of its pupil rule.
+_FIELDS, _ORDER = np.array([0.0, 0.7, 1.0]), 6
+# Light beside a kernel that the spoilt lens may have.
+_BESIDE = 0.2
+# Lenses as built that training draws from, and their seed; the judge takes another.
+_BUILDS, SEED = 4096, 1
+# Golden angle, radians.
+_TURN = math.pi * (3 - math.sqrt(5))
+
+
+class Studio:
+    """What all arms of a run share.
+
+    variables: of the lens, with open apertures.
+    spots, sharp: problems of least squares, on spots and on MTF.
+    limits: problem whose limits hold in training.
+    spoilt: (N,), vector of the spoilt lens.
+    patches: training and test patches.
+    """
+
+    def __init__(self, config: Any) -> None:
+        self.config = config
+        self._steps: dict[str, tuple[Callable, Callable]] = {}
+        lens = design.open_apertures(drt_jax.load_lens(config.lens))
+        self.variables = self._variables(lens)
+        self.waves = np.array(config.wavelengths_um)
+        self.pixel, self.field = 1e-3 * config.camera.pixel_um, math.radians(config.field_deg)
+        self.depths = tuple(1e3 * d for d in config.depth_m)
+        contrast = design.Operand("mtf", target=1.0, at=config.mtf_at)
+        limits = tuple(config.limits)
+        self.spots, self.sharp = (self._problem((o, *limits)) for o in ("spot", contrast))
+        self.limits = self._problem(limits or ("spot",))
+        spoil = config.spoil
+        errors = spoil.per_cent, spoil.off_mm, spoil.seed
+        vector = design.as_built_starts(self.variables, 1, *errors)[0]
+        self.spoilt = jnp.clip(vector, self.variables.low, self.variables.high)
+        net = dataclasses.asdict(config.network)
+        self.rates = self._rates()
+        self.init, self.restore = drt_jax.red_net(**net)
+        side = config.train.patch + config.camera.kernel - 1
+        reading = functools.partial(tqdm, desc="reading images", leave=False)
+        self.patches: Patches = load_patches(config.data, side, 0, reading)
+        self.model = self._model()
+        axis = drt_jax.psf(
+            lens, 0.0, self.depths[1], self.waves, self.pixel, config.camera.kernel, self.model
+        )
+        self._axis = axis.solid_angle
+        if config.tolerances:
+            radius = self.spots.beam_radius(lens)
+            self.built = design.PerturbedLens.from_lens(lens, radius, config.tolerances)
+            self._whole = self._variables(self.built.lens)
+
+    def _variables(self, lens: Lens) -> design.Variables:
+        config, middle = self.config, (self.config.wavelengths_um[1],)
+        solves = [
+            dataclasses.replace(s, distance=1e3 * config.depth_m[1], wavelengths=middle)
+            for s in config.solves
+        ]
+        return design.Variables.from_lens(lens, config.variables, config.ties, solves)
+
+    def _problem(self, operands: tuple) -> design.Problem:
+        near, far = (1 / d for d in self.depths)
+        parts = np.unique(np.linspace(near, far, 1 if near == far else 3))
+        distances = [1 / p if p > 0 else math.inf for p in parts]
+        fields = _FIELDS * self.field
+        return design.Problem.from_variables(
+            self.variables, operands, fields, self.waves, distances, _ORDER
+        )
+
+    def _rates(self) -> Array:
+        """Adam's rate of each variable: at the spoilt lens it changes the spots by as much as all
+        others, `train.optics_rate`, root mean square over rays, fields and depths."""
+        tried = quick(self.spots)
+        search = take_step(tried, init_problem(tried, self.spoilt))
+        rows = search.residuals.size - search.evaluation.constraints.size
+        views = len(self.spots.fields) * len(self.spots.distances)
+        slopes = jnp.sqrt(jnp.sum(search.jacobian[:rows] ** 2, axis=0) / views)
+        slopes = jnp.maximum(slopes, 1e-3 * jnp.max(slopes))
+        return 1e-3 * self.config.train.optics_rate / slopes
+
+    def _model(self) -> drt_jax.PsfModel:
+        """The model of kernels, chosen for the spoilt lens. ConfigError for kernels that are too
+        small for its blur, and for fields of which no light arrives."""
+        config, lens = self.config, self.variables.lens_of(self.spoilt)
+        fields = np.array([[1e-4, 1e-4], [0.5, 0.5], [0.0, 1.0]]) * self.field
+        distances = sorted(set(self.depths))
+        size = config.camera.kernel
+        grid = self.waves, self.pixel, size
+        try:
+            model = drt_jax.converged_psf(
+                lens, fields, distances, *grid, "rays", config.camera.tolerance
+            )
+        except ValueError as error:
+            _common.require(False, f"field_deg: {error}")
+        worst = 0.0
+        for distance in distances:
+            found = drt_jax.psfs(lens, fields, distance, *grid, model)
+            worst = max(worst, float(np.max(found.outside)))
+        beside = f"{100 * worst:.0f} % of the light of the spoilt lens falls beside a kernel"
+        remedy = "give a larger one, larger pixels, or spoil the lens less"
+        _common.require(worst <= _BESIDE, f"camera.kernel: {beside} of {size} pixels: {remedy}")
+        return model
+
+    def lens_of(self, vector: Array, deviations: Array | None = None) -> Lens:
+        """The lens of a vector, as designed or with deviations."""
+        if deviations is None:
+            return self.variables.lens_of(vector)
+        lens = self._whole.lens_of(vector)
+        return dataclasses.replace(self.built, lens=lens).lens_of(deviations)
+
+    def points(self, optics: Any, seen: Seen) -> tuple[Array, Array]:
+        """Kernels and light of points, by rays."""
+        found = drt_jax.psfs(
+            self.lens_of(optics["lens"], seen.deviations),
+            *(seen.fields, seen.distances, self.waves, self.pixel),
+            *(self.config.camera.kernel, self.model),
+        )
+        return found.kernel, found.solid_angle / self._axis[None]
+
+    def judged_points(self, optics: Any, seen: Seen) -> tuple[Array, Array]:
+        """Kernels and light of points, by waves of several wavelengths a channel."""
+        judge = self.config.judge
+        off = np.linspace(-0.5, 0.5, judge.waves) if judge.waves > 1 else np.zeros(1)
+        waves = (self.waves[:, None] + judge.width_um * off).ravel()
+        model = dataclasses.replace(self.model, kind="waves", cells=judge.cells)
+        found = drt_jax.psfs(
+            self.lens_of(optics["lens"], seen.deviations),
+            *(seen.fields, seen.distances, waves, self.pixel),
+            *(self.config.camera.kernel, model),
+        )
+        shape = len(seen.fields), 3, judge.waves
+        light = found.solid_angle.reshape(shape)
+        kernel = found.kernel.reshape(*shape, *found.kernel.shape[2:])
+        mean = jnp.sum(light[..., None, None] * kernel, axis=2)
+        total = jnp.sum(light, axis=2)
+        part = jnp.where(total > 0, total, 1)[..., None, None]
+        return mean / part, total / judge.waves / self._axis[None]
+
+    def judged(self) -> Seen:
+        """The points of the judge: rings of equal area at all depths."""
+        judge = self.config.judge
+        ring = (np.arange(judge.rings) + 0.5) / judge.rings
+        angle = _TURN * np.arange(judge.rings)
+        tangents = np.tan(self.field) * np.sqrt(ring)[:, None]
+        tangents = tangents * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        near, far = (1 / d for d in self.depths)
+        middle = (np.arange(judge.depths) + 0.5) / judge.depths
+        vergences = near + (far - near) * middle
+        distances = np.array([1 / v if v > 0 else math.inf for v in vergences])
+        fields = np.tile(np.arctan(tangents), (judge.depths, 1))
+        return Seen(jnp.asarray(fields), jnp.asarray(distances.repeat(judge.rings)))
+
+    def drawn(self, key: Array) -> Seen:
+        """The points of a step."""
+        return draw_points(key, self.config.train.points, self.field, self.depths)
+
+    def drawn_as_built(self, key: Array) -> Seen:
+        """The points of a step, through one lens as built."""
+        table = jnp.asarray(design.draw_perturbations(self.built, _BUILDS, SEED))
+        own = jax.random.randint(jax.random.fold_in(key, 1), (), 0, _BUILDS)
+        return self.drawn(key)._replace(deviations=table[own])
+
+    def hold(self, before: Any, after: Any) -> Any:
+        """The optics within limits; numbers that do not move stay."""
+        moves = before.get("moves", True)
+        vector = jnp.where(moves, after["lens"], before["lens"])
+        return before | {"lens": design.held(self.limits, before["lens"], vector)}
+
+    def step(self, arm: str) -> tuple[Callable, Callable]:
+        """(init, step) of an arm; arms that differ in numbers alone share a program."""
+        kind = {"focus": "joint", "joint_from_spots": "joint", "mtf": "spots"}.get(arm, arm)
+        if kind not in self._steps:
+            self._steps[kind] = self._made(kind)
+        return self._steps[kind]
+
+    def _made(self, kind: str) -> tuple[Callable, Callable]:
+        setting, held = self.config.train, self.hold
+        optics = {"lens": self.rates, "moves": 0.0}
+        rates = {"optics": optics, "network": setting.network_rate}
+        points, restore, make, draw = self.points, self.restore, make_field_step, self.drawn
+        if kind == "spots":  # neither derivatives nor limits of a lens that stays
+            points = lambda optics, seen: self.points(jax.lax.stop_gradient(optics), seen)  # noqa: E731
+            held = lambda before, after: before  # noqa: E731
+        if kind == "frozen":
+            restore = lambda w, image: self.restore(jax.lax.stop_gradient(w), image)  # noqa: E731
+        if kind == "damped":
+            rates, make = rates | {"optics": setting.damped_rate}, make_damped_step
+        if kind == "tolerant":
+            draw = self.drawn_as_built
+        return make(FieldImager(points, restore), rates, draw, 0, held)
+
+    def start(self, arm: str, seed: int, lenses: dict[str, Array], weights: Any) -> dict[str, Any]:
+        """The parameters of an arm at the start."""
+        begin = {"focus": "spoilt", "joint": "spoilt", "damped": "spoilt", "mtf": "mtf"}
+        optics = {"lens": lenses[begin.get(arm, "spots")]}
+        if arm != "damped":
+            names = self.variables.names
+            moves = [arm != "focus" or name == "sensor" for name in names]
+            optics["moves"] = jnp.asarray(np.array(moves, float))
+        network = weights if arm == "frozen" else self.init(jax.random.key(seed))
+        return {"optics": optics, "network": network}
+
+    def spot_um(self, vector: Array) -> float:
+        """RMS radius of the spots of all fields and depths, um."""
+        views = len(self.spots.fields) * len(self.spots.distances)
+        return 1e3 * math.sqrt(float(self.spots.merit(vector)) / views)

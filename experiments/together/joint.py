@@ -1,0 +1,230 @@
+"""Design a lens and its network together, over field and depth, against a finished lens.
+
+All arms begin with the same spoilt lens: `focus` trains its sensor and the network; `spots` and
+`mtf` finish the lens by least squares, then train the network; `joint` trains all variables and
+the network from the spoilt lens, `joint_from_spots` from the finished one; `damped` is `joint`
+with least-squares steps of the lens; `frozen` trains the lens of `spots` through its network;
+`tolerant` is `joint_from_spots` with lenses as built. Every arm has the same data, steps and
+starts of the network. Another model of the picture judges them: waves, more fields, more
+wavelengths, images that no arm has seen. Writes lenses/ARM SEED.yaml.
+"""
+
+import dataclasses
+import math
+import pathlib
+import sys
+from typing import Any, get_args
+
+import numpy as np
+
+from drt_jax import load_lens, show
+from drt_jax.design import Operand, Solve, Tie, Tolerance, Vary
+from drt_jax.learn.data import DataConfig
+
+from . import _command, _common, _plots, _report, _training
+from ._arms import ARMS, Arm, run as run
+from .runs.folder import Run as Run
+
+COLUMNS = ("loss",)
+_MEASURES = ("mae", "rmse", "psnr", "ssim")
+
+
+@dataclasses.dataclass(frozen=True)
+class Spoil:
+    """Errors of the lens that all arms begin with: standard deviations of all curvatures, per cent,
+    and thicknesses, mm."""
+
+    per_cent: float = 2.0
+    off_mm: float = 0.05
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _common.require_within("spoil.", self, per_cent=(0, 50), off_mm=(0, 100))
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """Sensor. pixel_um: side of a pixel. kernel: side of the kernels, pixels, odd. tolerance: sum
+    of the errors of a kernel's pixels in training."""
+
+    pixel_um: float = 6.0
+    kernel: int = 21
+    tolerance: float = 0.03
+
+    def __post_init__(self) -> None:
+        limits = {"pixel_um": (0.05, 1e4), "kernel": (3, 255), "tolerance": (1e-4, 0.5)}
+        _common.require_within("camera.", self, **limits)
+        _common.require(self.kernel % 2 == 1, "camera.kernel: expected an odd number")
+
+
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """Length and speed of training.
+
+    points: object points of a step, which share the batch.
+    optics_rate: Adam's rate of each variable, as the change of the spots by a step, um.
+    damped_rate: part of a full least-squares step that `damped` takes.
+    damped_part: part of the batches that `damped` gets, for equal time.
+    """
+
+    batches: int = 400
+    batch: int = 8
+    patch: int = 32
+    points: int = 4
+    optics_rate: float = 0.1
+    damped_rate: float = 0.1
+    damped_part: float = 1.0
+    network_rate: float = 1e-3
+    checkpoint_every: int = 200
+
+    def __post_init__(self) -> None:
+        sizes = {"batches": (1, 1e7), "batch": (1, 4096), "patch": (7, 4096), "points": (1, 4096)}
+        rates = {name: (0, 10) for name in ("optics_rate", "damped_rate", "network_rate")}
+        _common.require_within("train.", self, **sizes, **rates, damped_part=(1e-3, 10))
+        shared = self.batch % self.points == 0
+        _common.require(shared, "train.batch: expected a multiple of train.points")
+
+
+@dataclasses.dataclass(frozen=True)
+class Judge:
+    """The independent model of the picture.
+
+    rings: fields, each at another azimuth. depths: distances, even in 1 / distance.
+    waves: wavelengths of each channel. cells: of the wave kernels, along a side.
+    patches: for each point. builds: lenses as built, for arms of `tolerances`.
+    """
+
+    rings: int = 8
+    depths: int = 1
+    waves: int = 3
+    width_um: float = 0.04
+    cells: int = 128
+    patches: int = 4
+    builds: int = 0
+
+    def __post_init__(self) -> None:
+        limits = {"rings": (1, 64), "depths": (1, 64), "waves": (1, 15), "width_um": (0, 1)}
+        limits |= {"cells": (16, 1024), "patches": (1, 1000), "builds": (0, 1e4)}
+        _common.require_within("judge.", self, **limits)
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment; see configs/joint.yaml.
+
+    lens: before it is spoilt, a bundled name or YAML path.
+    variables, ties, solves, limits: as in experiments.design; `limits` hold in least squares and
+        in training.
+    field_deg: largest field angle; fields cover the disc.
+    depth_m: nearest and farthest object, .inf for infinity.
+    mtf_at: cycles/mm, of the arm `mtf`.
+    arms: of the experiment's description.
+    seeds: starts of the network, with data and noise of their own.
+    tolerances: of parts of the lens, for `tolerant` and judge.builds.
+    """
+
+    name: str
+    lens: str
+    variables: tuple[Vary, ...]
+    limits: tuple[Operand, ...] = ()
+    ties: tuple[Tie, ...] = ()
+    solves: tuple[Solve, ...] = ()
+    spoil: Spoil = Spoil()
+    field_deg: float = 10.0
+    depth_m: tuple[float, ...] = (math.inf, math.inf)
+    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
+    camera: Camera = Camera()
+    noise: float = 0.01
+    mtf_at: float = 30.0
+    network: _training.Net = _training.Net()
+    train: Training = Training()
+    arms: tuple[Arm, ...] = ("focus", "spots", "joint")
+    seeds: int = 3
+    tolerances: tuple[Tolerance, ...] = ()
+    judge: Judge = Judge()
+    data: DataConfig = DataConfig()
+
+    def __post_init__(self) -> None:
+        limits = {"field_deg": (1e-3, 80), "noise": (0, 10), "mtf_at": (1e-3, 1e4)}
+        _common.require_within("", self, **limits, seeds=(1, 100), wavelengths_um=(0.1, 100))
+        three = len(self.wavelengths_um) == 3
+        _common.require(three, "wavelengths_um: expected three, for R, G, B")
+        ordered = len(self.depth_m) == 2 and 0 < self.depth_m[0] <= self.depth_m[1]
+        _common.require(ordered, "depth_m: expected the nearest and the farthest distance in m")
+        _common.require(len(self.variables) > 0, "variables: needs at least one item")
+        _common.require_different("arms", self.arms)
+        _common.require_known("arms", self.arms, get_args(Arm))
+        needs = {"frozen": "spots", "joint_from_spots": "spots", "tolerant": "spots"}
+        for arm, other in needs.items():
+            both = arm not in self.arms or other in self.arms
+            _common.require(both, f"arms: {arm} needs {other}")
+        builds = "tolerant" in self.arms or self.judge.builds
+        given = bool(self.tolerances) or not builds
+        _common.require(given, "tolerances: needs at least one item for lenses as built")
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Errors of all arms, and their differences from the finished lens."""
+    name, header = results["name"], ["arm", "seeds", "MAE", "RMSE", "PSNR dB", "SSIM"]
+    header += ["PSNR dB before the network", "PSNR dB less that of spots", "spot um", "ms a step"]
+    rows = []
+    groups = _common.grouped(results["rows"], "arm")
+    base = {row["seed"]: row["psnr"] for row in groups.get(("spots",), [])}
+    for (arm,), own in groups.items():
+        ahead = [row["psnr"] - base[row["seed"]] for row in own if row["seed"] in base]
+        cells = [_spread([row[m] for row in own], m) for m in _MEASURES]
+        more = _spread([row["sensor_psnr"] for row in own], "psnr")
+        spot = _spread([row["spot_um"] for row in own], "spot")
+        speed = f"{1e3 * float(np.median([row['step_s'] for row in own])):.3g}"
+        ahead_text = _spread(ahead, "psnr") if ahead and arm != "spots" else ""
+        rows.append([ARMS[arm], len(own), *cells, more, ahead_text, spot, speed])
+    found = {f"joint, {name}": _common.table(header, rows)}
+    if results["builds"]:
+        header = ["arm", "PSNR dB as designed", "mean as built", "10th percentile"]
+        lines = []
+        for (arm,), own in _common.grouped(results["builds"], "arm").items():
+            parts = [[row[key] for row in own] for key in ("designed", "mean", "low")]
+            lines.append([ARMS[arm], *(_spread(part, "psnr") for part in parts)])
+        found[f"joint, {name}: as built"] = _common.table(header, lines)
+    return found
+
+
+def _spread(values: list[float], measure: str) -> str:
+    """Mean and standard deviation as text."""
+    digits = {"psnr": 2, "spot": 2}.get(measure, 4)
+    text = f"{np.mean(values):.{digits}f}"
+    return f"{text} ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else text
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Draws losses, lenses, and patches through each lens before and after the network."""
+    figure, axes = show.new(width=7, height=4.5)
+    lines = {ARMS[arm]: _smooth(loss) for arm, loss in zip(results["arms"], results["losses"])}
+    _plots.convergence(axes, lines, "mean absolute error")
+    axes.set_yscale("log")
+    figure.savefig(figures / "losses.png")
+    drawn = results["drawn"]
+    figure, axes = show.new(len(drawn), 1, 8, 2.6)
+    for ax, name in zip(np.ravel(axes), drawn):
+        lens = load_lens(figures.parent / "lenses" / f"{name}.yaml")
+        fields = np.radians([0.0, 0.7 * results["field_deg"], results["field_deg"]])
+        distance = results["far_mm"] or math.inf
+        show.lens_drawing(ax, show.draw(lens, fields, distance))
+        ax.set_title(name, fontsize=9)
+    figure.savefig(figures / "lenses.png")
+    for arm in results["pictures"]:
+        parts = {key: results[f"{arm} {key}"] for key in _report.IMAGES}
+        titles = [f"{field:.1f} deg" for field in results["pictures_deg"]]
+        _report.draw_patches(parts, titles, figures / f"patches {arm}.png")
+
+
+def _smooth(loss: list[float | None]) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and means of the loss over a twentieth of the training."""
+    values = np.array(loss, float)
+    width = max(1, len(values) // 20)
+    count = len(values) // width
+    return (np.arange(count) + 0.5) * width, values[: count * width].reshape(count, width).mean(1)
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__])

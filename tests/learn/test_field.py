@@ -1,0 +1,148 @@
+"""Lens and network together over the field: points, sensor, gradients, both optimisers."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax import design
+from drt_jax.learn.field import (
+    FieldImager,
+    Seen,
+    draw_points,
+    make_damped_step,
+    make_field_step,
+)
+
+WAVES, PIXEL, SIZE, FIELD = (0.6, 0.53, 0.48), 16e-3, 9, np.radians(10)
+SEEN = Seen(jnp.radians(jnp.array([[1.0, 2.0], [-3.0, 7.0]])), jnp.array([jnp.inf, 3e4]))
+KINDS = ["curvature", "conic", "coefficients", "thickness", "sensor", "index"]
+
+
+def scenes(count=4, side=20):
+    return np.random.default_rng(0).integers(0, 256, (count, side, side, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """A triplet of model glass with all kinds of numbers, and a small network."""
+    lens = drt_jax.load_lens(
+        {
+            "name": "triplet of aspheres",
+            "surfaces": [
+                {"radius": 22, "thickness": 3.3, "nd": 1.62, "vd": 60, "semi_diameter": 8,
+                 "conic": -0.1, "coefficients": {4: 1e-7, 6: 1e-10}},
+                {"radius": -435, "thickness": 6, "semi_diameter": 8},
+                {"radius": -22, "thickness": 1, "nd": 1.62, "vd": 36, "semi_diameter": 5,
+                 "stop": True},
+                {"radius": 20, "thickness": 4.75, "semi_diameter": 5},
+                {"radius": 79, "thickness": 3, "nd": 1.62, "vd": 60, "semi_diameter": 7},
+                {"radius": -18.4, "semi_diameter": 7},
+            ],
+            "sensor": 60.2,
+        }
+    )  # fmt: skip
+    where = drt_jax.back_focal_distance(lens, WAVES[1])[0] + jnp.sum(lens.thickness)
+    lens = dataclasses.replace(lens, sensor=where - 0.1)
+    vary = [design.Vary(kind, (0,)) for kind in KINDS if kind != "sensor"] + ["sensor"]
+    variables = design.Variables.from_lens(lens, vary)
+    fields = np.array([[1e-4, 1e-4], [0.05, 0.1], [0, FIELD]])
+    model = drt_jax.converged_psf(lens, fields, np.inf, WAVES, PIXEL, SIZE, "rays", 0.03)
+
+    def points(optics, seen):
+        lens = variables.lens_of(optics["lens"])
+        grid = WAVES, PIXEL, SIZE, model
+        found = drt_jax.psfs(lens, seen.fields, seen.distances, *grid)
+        return found.kernel, found.solid_angle / 0.048
+
+    init, restore = drt_jax.red_net(1, 4)
+    return variables, FieldImager(points, restore), init(jax.random.key(0))
+
+
+def test_points_cover_the_field_and_the_depths():
+    draw = jax.vmap(lambda key: draw_points(key, 4, FIELD, (1e3, np.inf)))
+    seen = draw(jax.random.split(jax.random.key(1), 500))
+    part = np.sum(np.tan(seen.fields) ** 2, axis=-1) / np.tan(FIELD) ** 2
+    # One point in each ring of equal area; over all, evenly in area, azimuth and 1 / distance.
+    np.testing.assert_array_equal(np.floor(4 * part), np.broadcast_to(np.arange(4), part.shape))
+    assert np.mean(part) == pytest.approx(0.5, abs=0.01)
+    assert np.max(abs(np.mean(np.tan(seen.fields), axis=(0, 1)))) < 0.05 * np.tan(FIELD)
+    near = 1e3 / np.asarray(seen.distances)
+    assert 0 <= near.min() < 0.01 and 0.99 < near.max() <= 1
+    assert np.mean(near) == pytest.approx(0.5, abs=0.01)
+    assert abs(np.corrcoef(part.ravel(), near.ravel())[0, 1]) < 0.1
+
+
+def test_the_kernels_of_many_points_are_those_of_each(camera):
+    variables, imager, _ = camera
+    kernels, light = imager.points({"lens": variables.start}, SEEN)
+    lens = variables.lens_of(variables.start)
+    fields = np.array([[1e-4, 1e-4], [0.05, 0.1], [0, FIELD]])
+    model = drt_jax.converged_psf(lens, fields, np.inf, WAVES, PIXEL, SIZE, "rays", 0.03)
+    for k in range(2):
+        one = drt_jax.psf(lens, SEEN.fields[k], SEEN.distances[k], WAVES, PIXEL, SIZE, model)
+        np.testing.assert_allclose(kernels[k], one.kernel, atol=1e-12)
+        np.testing.assert_allclose(0.048 * light[k], one.solid_angle, rtol=1e-12)
+    with pytest.raises(ValueError, match=r"fields, distances: expected \(B, 2\)"):
+        drt_jax.psfs(lens, SEEN.fields[0], 1.0, WAVES, PIXEL, SIZE, model)
+
+
+def test_noise_rises_where_the_light_falls(camera):
+    kernels = jnp.zeros((2, 3, SIZE, SIZE)).at[:, :, SIZE // 2, SIZE // 2].set(1.0)
+    light = jnp.array([[1.0] * 3, [0.25] * 3])
+    imager = FieldImager(lambda optics, seen: (kernels, light))
+    given = scenes(2, 72), SEEN, 0.01, jax.random.key(2)
+    truth, image, restored = imager({"optics": {}}, *given)
+    np.testing.assert_array_equal(image, restored)
+    spread = np.std(image - truth, axis=(1, 2, 3))
+    np.testing.assert_allclose(spread, [0.01, 0.04], rtol=0.05)
+    with pytest.raises(ValueError, match="3 patches cannot be shared among 2 points"):
+        imager({"optics": {}}, scenes(3), *given[1:])
+
+
+def loss_of(imager, weights):
+    given = scenes(), SEEN, 0.01, jax.random.key(3)
+
+    def loss(vector):
+        truth, _, restored = imager({"optics": {"lens": vector}, "network": weights}, *given)
+        return jnp.mean((restored - truth) ** 2)
+
+    return loss
+
+
+def test_the_loss_has_the_derivative_of_finite_differences_by_every_kind_of_number(camera):
+    # Through network, sensor, kernels and rays; the sensor layer rounds to float32.
+    variables, imager, weights = camera
+    loss = jax.jit(loss_of(imager, weights))
+    start, gradient = variables.start, jax.grad(loss)(variables.start)
+    for k, (name, slope) in enumerate(zip(variables.names, gradient, strict=True)):
+        step = 3e-4 / abs(float(slope))  # all change the loss by as much
+        move = step * np.eye(start.size)[k]
+        values = [float(loss(start + n * move)) for n in (-2, -1, 1, 2)]
+        expected = (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * step)
+        assert float(slope) == pytest.approx(expected, rel=5e-3), name
+
+
+def test_both_optimisers_descend_and_hold_the_lens(camera):
+    variables, imager, weights = camera
+    start = variables.start.at[-1].add(60.0)  # out of focus
+    first = []
+    for make, rate in ((make_field_step, 0.5), (make_damped_step, 0.3)):
+        held = []
+        hold = lambda before, after: {"lens": jnp.clip(after["lens"], start - 20, start + 20)}  # noqa: E731
+        rates = {"optics": rate, "network": 1e-3}
+        init, step = make(imager, rates, lambda key: SEEN, 0, hold)
+        state = init({"optics": {"lens": start}, "network": weights})
+        losses = []
+        for k in range(25):
+            state, metrics = step(state, scenes(), np.float32(0.0), np.int32(k))
+            losses.append(float(metrics["loss"]))
+        held.append(np.asarray(state[0]["optics"]["lens"] - start))
+        first.append(losses[0])
+        assert losses[-1] < 0.9 * losses[0]
+        assert np.max(np.abs(held)) <= 20
+        assert held[-1][-1] < 0  # the sensor comes back
+    assert first[0] == pytest.approx(first[1], rel=1e-5)
