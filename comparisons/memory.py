@@ -88,7 +88,9 @@ def _measure(way: str) -> None:
     rise = _peak() - before
     started = time.perf_counter()
     value = call()
-    print(f"{way}: {rise:.0f} MB, {time.perf_counter() - started:.2f} s, {value:.6f} mm", flush=True)
+    print(
+        f"{way}: {rise:.0f} MB, {time.perf_counter() - started:.2f} s, {value:.6f} mm", flush=True
+    )
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from .glasses import (
     snap_glasses as snap_glasses,
 )
 from .growth import Growth as Growth, grow as grow, part_of as part_of
-from .held import held as held
 from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit
 from .operands import Operand as Operand
@@ -40,3 +39,4 @@ from .tolerance import (
 from .values import OPERANDS as OPERANDS
 from .variables import Tie as Tie, Variables as Variables, Vary as Vary
 from .waves import psf as psf
+from .within_limits import within_limits as within_limits

@@ -18,7 +18,7 @@ from .adam import adam, apply_updates
 
 # From optics and what is seen to kernels (P, C, K, K) and the light (P, C) on the sensor, relative
 # to a constant of the camera.
-Points = Callable[[Any, "Seen"], tuple[Array, Array]]
+Points = Callable[[Any, "ObjectPoints"], tuple[Array, Array]]
 # From optics before and after an update to optics that can be built.
 Hold = Callable[[Any, Any], Any]
 # Least light that the gain of the sensor makes up for; below it the image stays dark.
@@ -38,7 +38,9 @@ class FieldImager:
     points: Points
     restore: Callable[[Any, Array], Array] | None = None
 
-    def sensor(self, optics: Any, scenes: Array, seen: "Seen", noise: Numbers, key: Array) -> Array:
+    def sensor(
+        self, optics: Any, scenes: Array, seen: "ObjectPoints", noise: Numbers, key: Array
+    ) -> Array:
         """Sensor images float32 (B, H, W, C), with even brightness: where the lens loses light, the
         gain raises the noise.
 
@@ -63,7 +65,12 @@ class FieldImager:
         return image + gain.repeat(each, axis=0)[:, None, None, :] * grain
 
     def __call__(
-        self, parameters: dict[str, Any], scenes: Array, seen: "Seen", noise: Numbers, key: Array
+        self,
+        parameters: dict[str, Any],
+        scenes: Array,
+        seen: "ObjectPoints",
+        noise: Numbers,
+        key: Array,
     ) -> tuple[Array, Array, Array]:
         """True, sensor and restored images, float32 (B, H, W, C).
 
@@ -79,7 +86,7 @@ class FieldImager:
         return image if restore is None else restore(parameters.get("network"), image)
 
 
-class Seen(NamedTuple):
+class ObjectPoints(NamedTuple):
     """Object points of a step.
 
     fields: (P, 2), radians.
@@ -100,7 +107,7 @@ def truth_of(scenes: Array, image: Array) -> Array:
     return scenes[:, margin : margin + height, margin : margin + width]
 
 
-def draw_points(key: Array, count: int, field: float, depths: tuple[float, float]) -> Seen:
+def draw_points(key: Array, count: int, field: float, depths: tuple[float, float]) -> ObjectPoints:
     """Object points over a circular field: one in each of `count` rings of equal area, at any
     azimuth, and evenly in 1 / distance, in another order.
 
@@ -119,7 +126,7 @@ def draw_points(key: Array, count: int, field: float, depths: tuple[float, float
     near, far = (1 / d for d in depths)
     vergence = jax.random.permutation(order, near + (far - near) * part)
     distances = jnp.where(vergence > 0, 1 / jnp.where(vergence > 0, vergence, 1), jnp.inf)
-    return Seen(jnp.arctan(tangents), distances)
+    return ObjectPoints(jnp.arctan(tangents), distances)
 
 
 def _kept(before: Any, after: Any) -> Any:
@@ -130,7 +137,7 @@ def _kept(before: Any, after: Any) -> Any:
 def make_field_step(
     imager: FieldImager,
     rates: dict[str, Any],
-    draw: Callable[[Array], Seen],
+    draw: Callable[[Array], ObjectPoints],
     seed: int,
     hold: Hold = _kept,
 ) -> tuple[Callable, Callable]:
@@ -140,7 +147,7 @@ def make_field_step(
     rates: learning rates of "optics" and "network", see `adam`.
     draw: points of a step from a PRNG key, such as a function of `draw_points`.
     seed: points and noise depend only on it and the index of the step.
-    hold: keeps the optics within what can be built, see `design.held`.
+    hold: keeps the optics within what can be built, see `design.within_limits`.
 
     init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the
     state donated. metrics: loss, (). Parameters without "network" train the optics alone.
@@ -186,7 +193,7 @@ class _Newton(NamedTuple):
 def make_damped_step(
     imager: FieldImager,
     rates: dict[str, Any],
-    draw: Callable[[Array], Seen],
+    draw: Callable[[Array], ObjectPoints],
     seed: int,
     hold: Hold = _kept,
     damping: float = 0.1,

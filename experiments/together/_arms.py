@@ -15,7 +15,7 @@ import drt_jax
 from drt_jax import design
 from drt_jax.learn import train
 from drt_jax.learn.data import batches
-from drt_jax.learn.field import FieldImager, Seen
+from drt_jax.learn.field import FieldImager, ObjectPoints
 
 from . import _training
 from ._studio import SEED, Studio
@@ -144,7 +144,7 @@ def _save(studio: Studio, path: Any, vector: Array) -> None:
     drt_jax.save_lens(design.fit_apertures(studio.spots, lens), path)
 
 
-def _test(studio: Studio, seen: Seen, each: int) -> np.ndarray:
+def _test(studio: Studio, seen: ObjectPoints, each: int) -> np.ndarray:
     return _training.thinned(studio.patches.test, each * len(seen.fields))
 
 

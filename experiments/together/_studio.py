@@ -19,7 +19,7 @@ from drt_jax.design.problem import quick
 from drt_jax.learn.data import Patches, load_patches
 from drt_jax.learn.field import (
     FieldImager,
-    Seen,
+    ObjectPoints,
     draw_points,
     make_damped_step,
     make_field_step,
@@ -137,7 +137,7 @@ class Studio:
         lens = self._whole.lens_of(vector)
         return dataclasses.replace(self.built, lens=lens).lens_of(deviations)
 
-    def points(self, optics: Any, seen: Seen) -> tuple[Array, Array]:
+    def points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
         """Kernels and light of points, by rays."""
         found = drt_jax.psfs(
             self.lens_of(optics["lens"], seen.deviations),
@@ -146,7 +146,7 @@ class Studio:
         )
         return found.kernel, found.solid_angle / self._axis[None]
 
-    def judged_points(self, optics: Any, seen: Seen) -> tuple[Array, Array]:
+    def judged_points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
         """Kernels and light of points, by waves of several wavelengths a channel."""
         judge = self.config.judge
         off = np.linspace(-0.5, 0.5, judge.waves) if judge.waves > 1 else np.zeros(1)
@@ -165,7 +165,7 @@ class Studio:
         part = jnp.where(total > 0, total, 1)[..., None, None]
         return mean / part, total / judge.waves / self._axis[None]
 
-    def judged(self) -> Seen:
+    def judged(self) -> ObjectPoints:
         """The points of the judge: rings of equal area at all depths."""
         judge = self.config.judge
         ring = (np.arange(judge.rings) + 0.5) / judge.rings
@@ -177,13 +177,13 @@ class Studio:
         vergences = near + (far - near) * middle
         distances = np.array([1 / v if v > 0 else math.inf for v in vergences])
         fields = np.tile(np.arctan(tangents), (judge.depths, 1))
-        return Seen(jnp.asarray(fields), jnp.asarray(distances.repeat(judge.rings)))
+        return ObjectPoints(jnp.asarray(fields), jnp.asarray(distances.repeat(judge.rings)))
 
-    def drawn(self, key: Array) -> Seen:
+    def drawn(self, key: Array) -> ObjectPoints:
         """The points of a step."""
         return draw_points(key, self.config.train.points, self.field, self.depths)
 
-    def drawn_as_built(self, key: Array) -> Seen:
+    def drawn_as_built(self, key: Array) -> ObjectPoints:
         """The points of a step, through one lens as built."""
         table = jnp.asarray(design.draw_perturbations(self.built, _BUILDS, SEED))
         own = jax.random.randint(jax.random.fold_in(key, 1), (), 0, _BUILDS)
@@ -193,7 +193,7 @@ class Studio:
         """The optics within limits; numbers that do not move stay."""
         moves = before.get("moves", True)
         vector = jnp.where(moves, after["lens"], before["lens"])
-        return before | {"lens": design.held(self.limits, before["lens"], vector)}
+        return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
     def step(self, arm: str) -> tuple[Callable, Callable]:
         """(init, step) of an arm; arms that differ in numbers alone share a program."""

@@ -11,14 +11,14 @@ import drt_jax
 from drt_jax import design
 from drt_jax.learn.field import (
     FieldImager,
-    Seen,
+    ObjectPoints,
     draw_points,
     make_damped_step,
     make_field_step,
 )
 
 WAVES, PIXEL, SIZE, FIELD = (0.6, 0.53, 0.48), 16e-3, 9, np.radians(10)
-SEEN = Seen(jnp.radians(jnp.array([[1.0, 2.0], [-3.0, 7.0]])), jnp.array([jnp.inf, 3e4]))
+SEEN = ObjectPoints(jnp.radians(jnp.array([[1.0, 2.0], [-3.0, 7.0]])), jnp.array([jnp.inf, 3e4]))
 KINDS = ["curvature", "conic", "coefficients", "thickness", "sensor", "index"]
 
 

@@ -24,7 +24,7 @@ def problem():
 
 @pytest.fixture(scope="module")
 def hold(problem):
-    return jax.jit(lambda before, after: design.held(problem, before, after))
+    return jax.jit(lambda before, after: design.within_limits(problem, before, after))
 
 
 def test_an_update_within_all_limits_stays_as_it_is(problem, hold):
@@ -50,10 +50,10 @@ def test_it_slides_along_a_limit(problem):
     track = design.Problem.from_variables(problem.variables, LIMITS[-1:])
     start = problem.variables.start
     push = jnp.asarray([name == "sensor" for name in problem.variables.names], start.dtype)
-    edge = design.held(track, start, start + 110 * push)
+    edge = design.within_limits(track, start, start + 110 * push)
     assert float(track.evaluate(edge).constraints[0]) == pytest.approx(0, abs=1e-4)
     side = jnp.zeros_like(start).at[0].set(1e-3)
-    moved = design.held(track, edge, edge + push + side)
+    moved = design.within_limits(track, edge, edge + push + side)
     assert float(moved[0] - edge[0]) == pytest.approx(1e-3, rel=1e-6)
     assert float(track.evaluate(moved).constraints[0]) <= 1e-4
 

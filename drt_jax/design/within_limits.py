@@ -1,4 +1,4 @@
-"""A lens in training held within the limits of a problem."""
+"""Keeps a lens in training within the limits of a problem."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ class _Turn(NamedTuple):
     done: Array
 
 
-def held(problem: Problem, before: Array, after: Array) -> Array:
+def within_limits(problem: Problem, before: Array, after: Array) -> Array:
     """The vector (N,) that an optimiser goes on with: `after`, changed as little as needed.
 
     problem: its bounds and limits count, its merit does not.
