@@ -124,7 +124,7 @@ def _surface(reader: _Reader, command: Command) -> None:
 
 
 def _number(reader: _Reader, command: Command) -> float | None:
-    """The value of a command; None for a solve, whose value another command gives."""
+    """The value of a command; None for a solve, whose value is given elsewhere."""
     words = command.values
     if words and words[0][:3].upper() in SOLVES:
         reader.solves.append(command.line)
