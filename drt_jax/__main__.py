@@ -29,10 +29,10 @@ from .show.layout import Beam, beam_of
 from .show.sheet import sheet
 
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
-# Of the rules for the spots; by how much of their size these may differ between both.
+# Orders of the two rules for the spots; a larger relative difference of spot size is reported.
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
 _MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
-_DEFOCUS = 3.0  # times the smallest spot is out of focus
+_DEFOCUS = 3.0  # times the smallest spot; a larger spot is out of focus
 
 
 def _options(argv: list[str] | None) -> argparse.Namespace:
@@ -65,7 +65,7 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
 
 
 def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[str]:
-    """First-order data of a lens at one wavelength in um."""
+    """Lines with the first-order data of a lens at one wavelength, um."""
     yield f"{lens.name}: {lens.count} surfaces, the stop is number {lens.stop}"
     yield f"  wavelength           {wavelength:g} um"
     air = float(found.effective_focal_length)
@@ -83,7 +83,7 @@ def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[st
 
 
 def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[str]:
-    """What is odd about the spot on the axis: a sensor that is not in focus."""
+    """A warning if the spot on the axis shows that the sensor is out of focus."""
     airy = 1.22e-3 * wavelength * float(found.f_number)
     if axial.spot > max(_DEFOCUS * axial.best, airy):
         way = "further" if axial.shift > 0 else "nearer"
@@ -97,7 +97,7 @@ def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[s
 def field_lines(
     lens: Lens, fields: list[float], distance: float, wavelengths: list[float], beams: list[Beam]
 ) -> Iterator[str]:
-    """A table of spots over fields in degrees, and what is odd about it."""
+    """A table of spots over fields in degrees, with warnings."""
     spots = [f"spot at {wavelength:.3f}" for wavelength in wavelengths]
     yield _row("field", "image height", *spots, "light", "surfaces that clip")
     yield _row("deg", "mm", *("RMS um" for _ in spots), "%", "")
@@ -124,7 +124,7 @@ def field_lines(
 
 
 def _widest(lens: Lens, angles: list[float]) -> Symmetry:
-    """The symmetry of all fields together."""
+    """The symmetry of the least symmetric field, which is valid for all fields."""
     return max((symmetry_of(lens, a) for a in angles), key=get_args(Symmetry).index)
 
 
@@ -139,7 +139,7 @@ _first_order = jit(first_order, ONCE)
 
 
 def _why(lens: Lens, scene: Scene, rule: PupilRule) -> str:
-    """Why no light of a scene arrives."""
+    """The reason why no light of a scene arrives."""
     try:
         psf_moments(lens, scene.field, scene.distance, scene.wavelengths, rule=rule)
     except ValueError as error:
@@ -148,7 +148,7 @@ def _why(lens: Lens, scene: Scene, rule: PupilRule) -> str:
 
 
 def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
-    """A rule for a beam that fills the stop, or not; those of all orders share a program."""
+    """A pupil rule. whole: the beam fills the stop. All orders share one compiled program."""
     if not whole:
         return Clipped(order, symmetry, _ORDERS[-1], may_cross(lens))
     points, weights = gauss_points(order, symmetry)
@@ -157,7 +157,7 @@ def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
 
 
 def aperture_lines(lens: Lens, beams: list[Beam]) -> Iterator[str]:
-    """Clear apertures that stop nothing, as wide as they are."""
+    """Warnings about clear apertures that are so wide that they clip nothing."""
     needed = np.max([beam.wide for beam in beams], axis=0)
     for i, semi in enumerate(np.asarray(lens.semi_diameter)[:-1]):
         if math.isfinite(semi) and semi > 1.8 * needed[i] > 0:
@@ -173,7 +173,7 @@ def _row(first: str, *cells: str) -> str:
 
 
 def _say(lines: Iterable[str]) -> None:
-    """Lines on stdout, each as soon as it is known."""
+    """Write each line to stdout as soon as it is known."""
     for line in lines:
         _wait("")
         sys.stdout.write(f"{line}\n")
@@ -181,14 +181,14 @@ def _say(lines: Iterable[str]) -> None:
 
 
 def _wait(what: str) -> None:
-    """What is being done, on the last line of a terminal; nothing elsewhere."""
+    """Show the current task on the last line of a terminal; elsewhere write nothing."""
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\033[K{what}")
         sys.stderr.flush()
 
 
 def run_convert(options: argparse.Namespace) -> None:
-    """Write a lens in another format, and print what the new file does not say."""
+    """Write a lens in another format, and print which data the new file leaves out."""
     ends, kind = (".yaml", ".yml", ".zmx", ".seq"), pathlib.Path(options.lens).suffix.lower()
     if options.out.suffix.lower() not in ends:
         raise ValueError(f"{options.out}: expected a name that ends in {', '.join(ends)}")
@@ -209,8 +209,8 @@ def _warnings_on_stdout() -> Iterator[None]:
 
 
 def _view(options: argparse.Namespace) -> tuple[Lens, list[float], float, list[float]]:
-    """The lens, fields in degrees, the distance in mm and wavelengths in um: of the options or, if
-    they are silent, of a .zmx or .seq file. The middle wavelength is the primary one."""
+    """The lens, fields in degrees, the distance in mm and wavelengths in um. Options override the
+    values of a .zmx or .seq file. The middle wavelength is the primary one."""
     fields, distance, waves = [0.0, 7.0, 10.0], math.inf, list(_LINES)
     if pathlib.Path(options.lens).suffix.lower() in (".zmx", ".seq"):
         system = load_system(options.lens)
@@ -229,7 +229,7 @@ def _view(options: argparse.Namespace) -> tuple[Lens, list[float], float, list[f
 
 
 def run_show(options: argparse.Namespace) -> None:
-    """Print what a lens is, as it becomes known, and draw it."""
+    """Print the data of a lens as they are computed, and draw its sheet."""
     if not all(abs(field) < 90 for field in options.field or ()):
         raise ValueError("--field: must be within 90 degrees")
     if options.distance is not None and not options.distance > 0:
@@ -237,7 +237,7 @@ def run_show(options: argparse.Namespace) -> None:
     with _warnings_on_stdout():
         lens, fields, distance, waves = _view(options)
         middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
-        scene_of(lens, 0.0, distance, np.array(waves))  # refuses what is no scene
+        scene_of(lens, 0.0, distance, np.array(waves))  # ValueError for an invalid scene
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
         _say(first_lines(lens, found, middle))
         _wait("tracing; another kind of lens is compiled first, for half a minute or less")
@@ -253,7 +253,7 @@ def run_show(options: argparse.Namespace) -> None:
 
 
 def set_up() -> None:
-    """What a command line chooses, and a library does not: float64, and compiled programs kept in
+    """Change settings that a library must not change: float64, and compiled programs are kept in
     JAX_COMPILATION_CACHE_DIR or the user's cache."""
     jax.config.update("jax_enable_x64", True)
     if not jax.config.values["jax_compilation_cache_dir"]:
@@ -263,7 +263,7 @@ def set_up() -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command line; errors are one line, and the exit status 2, or 130 after Ctrl-C."""
+    """Run the command line. An error prints one line; exit status 2, 1 (file) or 130 (Ctrl-C)."""
     try:
         set_up()
         options = _options(argv)

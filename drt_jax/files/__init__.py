@@ -1,1 +1,1 @@
-"""Lenses from and to files."""
+"""Read lenses from files and write them to files."""

@@ -1,4 +1,4 @@
-"""Catalogues of glasses in Zemax's `.agf` form: those of the formulas that `Glass` has."""
+"""Glass catalogues in Zemax's `.agf` format, for the dispersion formulas that `Glass` holds."""
 
 import os
 from collections.abc import Callable, Collection
@@ -18,7 +18,7 @@ def _sellmeier(terms: int) -> Callable[[list[float]], _Forms]:
 
 
 def _powers(*order: int) -> Callable[[list[float]], _Forms]:
-    """Of coefficients whose place in `Glass.schott` is in `order`."""
+    """The formula whose coefficient k stands at place `order[k]` of `Glass.schott`."""
 
     def formula(c: list[float]) -> _Forms:
         placed = dict(zip(order, c, strict=False))
@@ -29,7 +29,7 @@ def _powers(*order: int) -> Callable[[list[float]], _Forms]:
 
 
 def _pole(b: float, c: float) -> tuple[float, float, float]:
-    """Of b / (L^2 - c): a constant, Sellmeier's B of this c, the coefficient of L^-2."""
+    """Split b / (L^2 - c) into a constant, Sellmeier's B for this c and a coefficient of L^-2."""
     return (-b / c, b / c, 0.0) if c else (0.0, 0.0, b)
 
 
@@ -43,7 +43,7 @@ def _handbook_1(c: list[float]) -> _Forms:
     return [strength, c[2]], [c[0] + less, -c[3], inverse, 0.0, 0.0, 0.0]
 
 
-# By Zemax's number: the formula, and how many coefficients it has.
+# Zemax's number of a formula: its conversion to `Glass`, and its number of coefficients.
 _FORMULAS: dict[int, tuple[Callable[[list[float]], _Forms], int]] = {
     1: (_powers(0, 1, 2, 3, 4, 5), 6),
     2: (_sellmeier(3), 6),
@@ -62,14 +62,14 @@ _FORMULAS: dict[int, tuple[Callable[[list[float]], _Forms], int]] = {
 def load_agf(
     path: str | os.PathLike, names: Collection[str] | None = None, missing: Missing = "error"
 ) -> dict[str, Glass]:
-    """Glasses of a `.agf` file by name, at its temperatures, relative to air.
+    """Read the glasses of a `.agf` file by name: at the file's temperatures, relative to air.
 
-    LensError, with the line, for what is no such file and for a glass whose formula is none of
-    Zemax's 1, 2, 4 and 6 to 13, or gives no index above 1 within its range.
+    LensError, with the line, if this is no such file, or if a glass has another formula than
+    Zemax's 1, 2, 4 and 6 to 13, or has no index above 1 somewhere within its range.
 
-    path: of at most 16 MB.
-    names: those that are wanted; None: all.
-    missing: "warn" leaves such glasses out and names them in one warning.
+    path: a file of at most 16 MB.
+    names: the glasses to read; None reads all.
+    missing: "warn" leaves out such glasses and names them in one warning.
     """
     record = Record(str(path), missing)
     try:

@@ -1,4 +1,4 @@
-"""What ends the light on a surface of a prescription: semi-diameter, apertures and obscurations."""
+"""What clips rays at the surfaces of a prescription: semi-diameters, apertures, obscurations."""
 
 import math
 from typing import NamedTuple
@@ -8,12 +8,12 @@ from ..lens.forms import FORMS
 from .entry import Entry, array
 
 _KINDS = ("circle", "ellipse", "rectangle")
-_MOST = 6  # obscurations of a lens: n of them take 2^n times the rays
-_MANY = 20  # apertures of a surface
+_MOST = 6  # obscurations per lens: n of them need 2^n times as many rays
+_MANY = 20  # apertures per surface
 
 
 class _Aperture(NamedTuple):
-    """One entry. half, centre: mm, along x and y; centre empty if it is not given."""
+    """One aperture or obscuration. half, centre: mm along x and y; centre is empty if not given."""
 
     entry: Entry
     kind: str
@@ -22,7 +22,7 @@ class _Aperture(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """How far from the vertex it reaches at most, mm."""
+        """The largest distance of its edge from the vertex, mm."""
         x, y = (abs(c) for c in self.centre or (0.0, 0.0))
         if self.kind == "rectangle":
             return math.hypot(x + self.half[0], y + self.half[1])
@@ -30,7 +30,7 @@ class _Aperture(NamedTuple):
 
 
 def _read(surface: Entry, key: str) -> list[_Aperture]:
-    """Those that `aperture` or `obscuration` tells: a mapping or a list of them."""
+    """The shapes under `aperture` or `obscuration`: the key holds one mapping or a list of them."""
     given = surface.get(key, [])
     many = isinstance(given, list)
     if many and len(given) > _MANY:
@@ -57,8 +57,8 @@ def _check_reach(surface: Entry, entry: Entry, key: str, reach: float) -> None:
 
 
 def semi_diameter(surface: Entry) -> float:
-    """The clear aperture about the vertex, mm, which lies on the surface; of the stop it is finite:
-    where none is given, the circle round its apertures."""
+    """The clear semi-diameter about the vertex, mm, within the extent of the surface. The stop's is
+    finite: if it is not given, it is the circle around the stop's smallest aperture."""
     semi = surface.number("semi_diameter", math.inf, finite=False)
     if semi <= 0:
         raise surface.error("semi_diameter", "must be positive")
@@ -72,7 +72,7 @@ def semi_diameter(surface: Entry) -> float:
 
 
 def apertures_of(surfaces: list[Entry]) -> Apertures | None:
-    """All apertures and obscurations; None if there are none."""
+    """All apertures and obscurations of the surfaces; None if there are none."""
     found = []
     for i, surface in enumerate(surfaces):
         for key in ("aperture", "obscuration"):

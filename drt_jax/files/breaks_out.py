@@ -1,4 +1,4 @@
-"""Decentres and tilts of a lens as the coordinate breaks of a `.zmx` file."""
+"""Convert decentres and tilts of a lens to the coordinate breaks of a `.zmx` file."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,8 @@ from .exact import degrees_of
 
 
 class _Move(NamedTuple):
-    """Surfaces `first` to `last` tilted about the axis at `pivot`, mm from surface `about`, and
-    shifted, mm; tilt in degrees."""
+    """A shift (mm) and a tilt (degrees) of surfaces `first` to `last`. They turn about the point on
+    the axis at `pivot`, mm from surface `about`."""
 
     first: int
     last: int
@@ -21,7 +21,7 @@ class _Move(NamedTuple):
 
 
 def _moves(lens: Lens) -> list[_Move]:
-    """Of elements and of single surfaces; one that holds another comes first."""
+    """The moves of elements and of single surfaces; outer moves precede the moves inside them."""
     found, single = [], lens.count + 1
     if (own := lens.elements) is not None:
         rows = (np.asarray(a, float).tolist() for a in (own.pivot, own.shift, own.tilt))
@@ -38,7 +38,7 @@ def _moves(lens: Lens) -> list[_Move]:
 
 
 def _break(move: _Move, back: bool) -> list[str]:
-    """A coordinate break, or the one that undoes it: tilts in reverse, then the decentre."""
+    """A coordinate break; with `back` its inverse: tilts in reverse order, then the decentre."""
     numbers = [*move.shift[:2], *move.tilt]
     values = [0.0 - value for value in numbers] if back else numbers
     lines = [f"PARM {k} {value!r}" for k, value in enumerate(values, 1) if value]
@@ -48,15 +48,15 @@ def _break(move: _Move, back: bool) -> list[str]:
 def with_breaks(
     lens: Lens, surfaces: list[list[str]], gaps: list[float]
 ) -> tuple[list[list[str]], list[float]]:
-    """Surfaces and the image (S + 1), each its lines, with the breaks among them, and the thickness
-    behind each but the image; gaps: (S,), mm, behind surfaces. The thickness in front of the first
-    is that of an object at infinity and is left out."""
+    """Insert the coordinate breaks among the blocks of lines of the S surfaces and the image.
+    Returns all blocks, and the thickness (mm) behind each one but the image; the thickness in front
+    of the first, from an object at infinity, is left out. gaps: (S,), mm, behind the surfaces."""
     moves, axis = _moves(lens), [0.0, *np.cumsum(gaps).tolist()]
     blocks: list[list[str]] = []
     behind: list[float] = []
     for i, surface in enumerate(surfaces):
         before, gap = (i - 1, gaps[i - 1]) if i else (0, 0.0)
-        at = 0.0  # from surface `before`, along the axis that it stands on
+        at = 0.0  # mm from surface `before`, along the axis of that surface
         ends = [(move, True) for move in reversed(moves) if move.last == i - 1]
         for move, back in ends + [(move, False) for move in moves if move.first == i]:
             known = {before: 0.0, i: gap}

@@ -1,4 +1,4 @@
-"""The elements of a prescription: which surfaces move together, and about what."""
+"""The elements of a prescription: groups of surfaces that move together about a pivot."""
 
 import itertools
 
@@ -13,14 +13,14 @@ _KEYS = ("surfaces", "about", "pivot", "shift", "tilt")
 
 
 def elements_of(top: Entry, count: int) -> Elements | None:
-    """The elements of a lens of `count` surfaces; None if there is none."""
+    """The elements of a lens of `count` surfaces; None if there are none."""
     listed = top.get("elements", [])
     if not isinstance(listed, list):
         raise top.error("elements", "expected a list")
     if len(listed) > _MOST:
         raise top.error("elements", f"{len(listed)} are more than {_MOST}")
     entries = [Entry(entry, f"elements[{g}]", _KEYS) for g, entry in enumerate(listed)]
-    # One that holds another comes first.
+    # Outer elements precede the elements inside them.
     spans = {id(entry): _span(entry, count) for entry in entries}
     entries.sort(key=lambda entry: (spans[id(entry)][0], -spans[id(entry)][1]))
     if not entries:
@@ -51,7 +51,7 @@ def _span(entry: Entry, count: int) -> tuple[int, int]:
 
 
 def _row(entry: Entry, key: str, value: object, count: int) -> int:
-    """A surface by its index, or the sensor."""
+    """The index of a surface; `count` for the sensor."""
     row = count if value == "sensor" else value
     if type(row) is not int or not 0 <= row <= count:
         raise entry.error(

@@ -1,4 +1,4 @@
-"""A mapping of a file, checked as it is read: every error names the place and the remedy."""
+"""Checked reading of the mappings of a file: each error names the place and the remedy."""
 
 import difflib
 import math
@@ -12,8 +12,8 @@ from jax import Array
 
 from ..inputs import InputError, shown
 
-# What numbers may be, beyond any lens and far from what overflows: lengths in mm and most others,
-# curvatures and conics, coefficients and radii.
+# The largest magnitudes of numbers, beyond any lens and far below overflow: LONG of lengths in mm
+# and most others, STEEP of curvatures and conics, WIDE of coefficients and radii.
 LONG, STEEP, WIDE = 1e9, 1e6, 1e30
 _LONGEST = 100  # characters of a name
 
@@ -23,11 +23,11 @@ class LensError(InputError):
 
 
 class Entry(dict[Any, Any]):
-    """A mapping in a prescription, and what its place is called in messages.
+    """A mapping of a prescription, with its name for messages.
 
     values: the mapping.
-    place: such as "surfaces[0]"; empty for the prescription itself.
-    keys: those that it may have.
+    place: its name, such as "surfaces[0]"; empty for the prescription itself.
+    keys: the keys that it may have.
     """
 
     def __init__(self, values: object, place: str, keys: Sequence[Any]):
@@ -45,11 +45,11 @@ class Entry(dict[Any, Any]):
                 raise LensError(message.removeprefix("top: "), self.name(word))
 
     def name(self, key: object) -> str:
-        """What the entry `key` or, if that is empty, the mapping is called in messages."""
+        """The name in messages of the entry `key`, or of the mapping if `key` is empty."""
         return ".".join(filter(None, (self.place, str(key))))
 
     def error(self, key: object, message: str) -> LensError:
-        """An error of the entry `key` or, if that is empty, of the mapping."""
+        """An error about the entry `key`, or about the mapping if `key` is empty."""
         name = self.name(key)
         return LensError(": ".join(filter(None, (name, message))), name)
 
@@ -60,8 +60,8 @@ class Entry(dict[Any, Any]):
         finite: bool = True,
         most: float = LONG,
     ) -> float:
-        """A number of at most this size, given as such or as text: YAML 1.1 reads 1e-3 and inf as
-        text."""
+        """A number of magnitude at most `most`; `finite=False` allows inf. It may be given as text,
+        because YAML 1.1 reads 1e-3 and inf as text."""
         value: Any = self.get(key, default)
         try:
             number = math.nan if isinstance(value, bool) else float(value)
@@ -78,7 +78,7 @@ class Entry(dict[Any, Any]):
         return number
 
     def text(self, key: str, default: str) -> str:
-        """Text, or a whole number as such, of at most 100 characters."""
+        """Text of at most 100 characters; a whole number is converted to text."""
         value = self.get(key, default)
         if isinstance(value, bool) or not isinstance(value, str | int):
             raise self.error(key, f"expected text, got {shown(value)}")
@@ -89,7 +89,7 @@ class Entry(dict[Any, Any]):
         return str(value)
 
     def vector(self, key: str, length: int) -> list[float]:
-        """A list of `length` numbers; empty if there is none."""
+        """A list of `length` numbers; empty if the key is not given."""
         values = self.get(key)
         if values is None:
             return []
@@ -99,14 +99,14 @@ class Entry(dict[Any, Any]):
         return [each.number(i) for i in range(length)]
 
     def flag(self, key: str) -> bool:
-        """True or false; false if it is not given."""
+        """True or false; false if the key is not given."""
         value = self.get(key, False)
         if not isinstance(value, bool):
             raise self.error(key, "expected true or false")
         return value
 
     def curvature(self, suffix: str = "") -> float:
-        """The curvature (1/mm) that `radius` or `curvature`, followed by `suffix`, tells."""
+        """The curvature (1/mm) from the key `radius` or `curvature`, followed by `suffix`."""
         radius, curvature = f"radius{suffix}", f"curvature{suffix}"
         if (radius in self) == (curvature in self):
             raise self.error("", f"give either {radius} (inf for a plane) or {curvature}")
@@ -119,10 +119,10 @@ class Entry(dict[Any, Any]):
 
 
 def array(values: object) -> Array:
-    """Numbers as an array of the default floating dtype; in this way nothing is compiled."""
+    """Numbers as an array of the default floating dtype, made without any compilation."""
     return jax.device_put(np.asarray(values, jnp.result_type(float)))
 
 
 def table(rows: list[list[float]], width: int) -> Array:
-    """Rows of numbers as an array (rows, `width`), zeros behind what they lack."""
+    """Rows of numbers as an array (rows, `width`); zeros fill up short rows."""
     return array([[*row, *[0.0] * (width - len(row))] for row in rows])

@@ -1,4 +1,4 @@
-"""Numbers of written files that are read as the very numbers that they stand for."""
+"""Numbers for written files that read back as exactly the numbers they stand for."""
 
 from collections.abc import Callable
 
@@ -7,11 +7,11 @@ import numpy as np
 
 
 def number_for(target: float, read: Callable[[float], float], guess: float) -> float:
-    """The number next to `guess` of which `read` makes `target`, or what is nearest to it."""
+    """The number near `guess` that `read` maps to `target`, or as close to it as possible."""
     near = (guess + np.arange(-8, 9) * np.spacing(abs(guess))).tolist()
     return min([guess, *near], key=lambda number: abs(read(number) - target))
 
 
 def degrees_of(angle: np.floating | float) -> float:
-    """The number of degrees that is read as this angle in radians, or the next to it."""
+    """The angle in degrees that reads back as `angle` (radians), or as close as possible."""
     return number_for(float(angle), lambda d: float(jnp.radians(d)), float(np.degrees(angle)))

@@ -1,4 +1,4 @@
-"""The types of surfaces of `.zmx` files: their parameters as entries of a prescription."""
+"""Surface types of `.zmx` files: conversion of their parameters to prescription entries."""
 
 import math
 from collections.abc import Callable
@@ -9,15 +9,15 @@ import numpy as np
 from ..lens.forms import powers_xy
 from .record import Breaking, Record, Row, turned_back
 
-EXTRA = 13  # the parameter that XDAT 1 is
-_QCON = 11  # terms: the powers of the last lose 8 of 16 digits
+EXTRA = 13  # the parameter number of XDAT 1
+_QCON = 11  # most Qcon terms: as powers, the last one loses 8 of 16 digits
 
 
 class Surface(NamedTuple):
-    """A surface of a file before its type is looked at. unit: mm of its unit of length.
+    """A surface of a file before its type is interpreted. unit: the file's unit of length, mm.
 
-    parameters: (line, value) by number, as they stand there; extra data begin with number 13.
-    semi: what DIAM says, mm.
+    parameters: (line, value) by number, values as in the file; XDAT begins at number 13.
+    semi: the value of DIAM, mm.
     """
 
     record: Record
@@ -31,26 +31,26 @@ class Surface(NamedTuple):
         return self.parameters.get(number, (0, 0.0))[1]
 
     def put(self, key: str, value: object) -> None:
-        """An entry, on the line of the surface."""
+        """Set an entry; its line is that of the surface."""
         self.row.put(key, value, self.row.line)
 
     def only(self, *known: int) -> None:
-        """Refuse other parameters that are not 0."""
+        """Refuse nonzero parameters whose number is not in `known`."""
         for number, (line, value) in self.parameters.items():
             if value and number not in known:
                 extra = f" (XDAT {number - EXTRA + 1})" if number >= EXTRA else ""
                 self.record.lacks(line, f"parameter {number}{extra} of {self.row.name}")
 
     def powers(self, numbers: dict[int, int]) -> None:
-        """Coefficients by power of length, from parameters."""
+        """Set the coefficients. numbers: the power of the height by number of the parameter."""
         found = {p: self.value(k) * self.unit ** (1 - p) for k, p in numbers.items()}
         found = {p: a for p, a in found.items() if a}
         if found:
             self.put("coefficients", found)
 
     def series(self, first: int = EXTRA) -> tuple[float, list[float]]:
-        """The radius, mm, and the values, as they stand there, of a series in parts of it: from
-        parameter `first` on their number, the radius, then each; those beyond mean nothing."""
+        """The norm radius (mm) of a series, and its values as in the file. From parameter `first`
+        on, the file holds the number of values, the radius and the values; others are ignored."""
         count, radius = self.value(first), self.value(first + 1) * self.unit
         line = self.parameters.get(first, (self.row.line, 0))[0]
         if count % 1 or not 0 <= count <= 300:
@@ -61,7 +61,7 @@ class Surface(NamedTuple):
         return radius, found
 
     def spread(self, radius: float, found: dict[Any, tuple[float, int]]) -> dict[Any, float]:
-        """Coefficients by key, from values and the powers of the radius that they go with."""
+        """Coefficients by key: each value of `found` over the given power of the radius."""
         with np.errstate(all="ignore"):
             terms = {k: float(v / np.float64(radius) ** p) for k, (v, p) in found.items() if v}
         for key, value in terms.items():
@@ -70,7 +70,7 @@ class Surface(NamedTuple):
         return terms
 
     def curvature(self, number: int) -> float:
-        """1 / a radius, 0 for none, in 1/mm."""
+        """The curvature (1/mm) of a parameter that holds a radius; 0 if that is 0."""
         radius = self.value(number) * self.unit
         return 1 / radius if abs(radius) > 1e-12 else 0.0
 
@@ -91,7 +91,7 @@ def _odd(surface: Surface) -> None:
 
 
 def _toroid(surface: Surface) -> None:
-    # Extra data: how many Zernike terms, their radius, and the terms, which must be 0.
+    # XDAT holds the number of Zernike terms, their radius and the terms, which must be 0.
     none = range(EXTRA, 400) if not surface.value(EXTRA) else (EXTRA, EXTRA + 1)
     surface.only(*range(9), *none)
     surface.put("form", "toroid")
@@ -113,7 +113,7 @@ def _tilted(surface: Surface) -> None:
 
 
 def _extended(surface: Surface, form: str, keys: Callable[[int], tuple[Any, int]]) -> None:
-    """A conic and a series over a norm radius; keys: of term k, its key and its power."""
+    """A conic plus a series over a norm radius; `keys(k)` gives the key and power of term k."""
     surface.only(*range(EXTRA, 400))
     radius, found = surface.series()
     terms = {keys(k)[0]: (a * surface.unit, keys(k)[1]) for k, a in enumerate(found)}
@@ -127,7 +127,7 @@ def _extended_xy(k: int) -> tuple[str, int]:
 
 
 def _binary(surface: Surface) -> None:
-    """An even asphere with a phase in radians: order (a_1 u^2 + a_2 u^4 + ...)."""
+    """An even asphere with the phase order (a_1 u^2 + a_2 u^4 + ...) in radians."""
     surface.only(*range(9), *range(EXTRA, 400))
     surface.powers({k: 2 * k for k in range(1, 9)})
     radius, found = surface.series()
@@ -140,8 +140,8 @@ def _binary(surface: Surface) -> None:
 
 
 def _forbes(surface: Surface) -> None:
-    """Forbes' aspheres: type 0, slopes are orthonormal (Qbfs), or 1, u^4 P_m^(0,4)(2 u^2 - 1)
-    (Qcon), which is a polynomial in u^2."""
+    """Forbes' aspheres. Type 0 is Qbfs, with orthonormal slopes. Type 1 is Qcon, with terms
+    u^4 P_m^(0,4)(2 u^2 - 1), which become polynomials in u^2."""
     surface.only(*range(EXTRA, 400))
     radius, found = surface.series(EXTRA + 1)
     found = [a * surface.unit for a in found]
@@ -166,8 +166,8 @@ def _forbes(surface: Surface) -> None:
 
 
 def _zernike(surface: Surface) -> None:
-    """Conic, even powers of r and Noll's Zernike polynomials, into which the powers go: u^2k is
-    sum_s (2 s + 1) k!^2 / ((k - s)! (k + s + 1)!) R_2s(u)."""
+    """Conic, even powers of r and Noll's Zernike polynomials. The powers are converted to Zernike
+    terms: u^2k = sum_s (2 s + 1) k!^2 / ((k - s)! (k + s + 1)!) R_2s(u)."""
     surface.only(0, *range(1, 9), *range(EXTRA, 400))
     radius, found = surface.series()
     terms = {k + 1: a * surface.unit for k, a in enumerate(found) if a}
@@ -193,7 +193,7 @@ def _zernike(surface: Surface) -> None:
 
 
 def _grating(surface: Surface, lines: int = 1, order: int = 2) -> None:
-    """Lines a um along x; the order turns light as ours of the same sign."""
+    """A grating with lines along x, given per um; the order has the same sign as ours."""
     surface.only(*range(1, order + 1))
     if surface.value(lines) and surface.value(order):
         per_mm = {"y": 1e3 * surface.value(lines)}
@@ -226,8 +226,8 @@ TYPES: dict[str, Callable[[Surface], None]] = {
 
 
 def breaking(surface: Surface, thickness: float) -> Breaking:
-    """A coordinate break: decentre, then tilt about x, y, z; with the order flag tilt about z, y,
-    x, then decentre along the new axes."""
+    """A coordinate break: a decentre, then tilts about x, y, z. With the order flag: tilts about z,
+    y, x, then a decentre along the new axes."""
     surface.only(*range(1, 7))
     shift = tuple(surface.value(k) * surface.unit for k in (1, 2))
     tilt: Any = tuple(surface.value(k) for k in (3, 4, 5))
@@ -243,8 +243,8 @@ def breaking(surface: Surface, thickness: float) -> Breaking:
 def clipping(
     record: Record, row: Row, found: list[tuple[int, str, list[float]]], centre: list[float]
 ) -> None:
-    """Apertures and obscurations, each a line, a keyword and two lengths in mm, about a centre;
-    DIAM alone clips nothing, nor does what lies beyond the end of a surface."""
+    """Set apertures and obscurations about a centre. found: line, keyword and two lengths (mm) of
+    each. DIAM alone clips nothing, nor does an aperture beyond the end of the surface."""
     for line, kind, (one, two) in found:
         shape: dict[str, object] = {"centre": centre} if any(centre) else {}
         if kind in ("SQAP", "ELAP", "ELOB"):

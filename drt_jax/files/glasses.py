@@ -1,4 +1,4 @@
-"""Glasses of lens files of other programs: names of their catalogues in ours."""
+"""Glasses of other programs' lens files: lookup of their names in our catalogues."""
 
 import re
 from collections.abc import Sequence
@@ -7,15 +7,15 @@ from ..lens.glass import Glass
 from ..lens.glasses import find_glass, glass_makers, spellings
 from .record import Record, Row, short
 
-# What other programs call substances whose constants in their catalogues are the same.
+# Other programs' names of materials whose constants equal ours.
 _SAME = {"F_SILICA": "silica", "SILICA": "silica"}
 _NIKON = {"NIKON": "HIKARI"}
 
 
 def in_catalogues(name: str, catalogues: Sequence[str]) -> Glass | None:
-    """The glass of a name, in capitals or not, in the first of these catalogues that has it.
+    """The glass of a name, in any case, from the first of these catalogues that has it; or None.
 
-    catalogues: makers in capitals, with or without what comes behind, as in OHARA_210226_CATALOG.
+    catalogues: makers in capitals; a suffix as in OHARA_210226_CATALOG is ignored.
     """
     for catalogue in catalogues:
         word = re.split(r"[^A-Z]", catalogue, maxsplit=1)[0]
@@ -23,7 +23,7 @@ def in_catalogues(name: str, catalogues: Sequence[str]) -> Glass | None:
         for own in spellings(name) if maker in glass_makers() else ():
             try:
                 return find_glass(own, maker)
-            except ValueError:  # of others
+            except ValueError:  # the glass is of another maker
                 continue
     return None
 
@@ -31,8 +31,8 @@ def in_catalogues(name: str, catalogues: Sequence[str]) -> Glass | None:
 def named_glass(
     record: Record, row: Row, line: int, name: str, makers: Sequence[str]
 ) -> dict[str, str]:
-    """The entry of a glass, by its name in the catalogues of these makers; empty: of any. LensError
-    for one that we have not from one of them."""
+    """The prescription entry of a glass, found by name in the catalogues of these makers, or of all
+    makers if `makers` is empty. LensError if none of them has it."""
     own = _SAME.get(name.upper(), name)
     found = in_catalogues(own, makers)
     try:
@@ -55,8 +55,8 @@ def named_glass(
 
 
 def written_names(names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """Catalogues that have all these glasses, and the name of each there: NAME_MAKER, which other
-    programs do not know, where an earlier catalogue has another glass of this name."""
+    """Catalogues that hold all these glasses, and the name of each glass there. If an earlier
+    catalogue has another glass of this name, it is NAME_MAKER, which other programs do not know."""
     glasses = {name: find_glass(name) for name in names}
     makers = {glass.maker for glass in glasses.values()} - {"", "SCHOTT"}
     order, written = [*sorted(makers), "SCHOTT"], {}

@@ -12,7 +12,7 @@ MEDIUM_KEYS = ("glass", "index", "nd", "vd", "partial")
 
 
 def _own_glasses(top: Entry) -> dict[str, Glass]:
-    """The glasses that the prescription itself tells, by name."""
+    """The glasses that the prescription itself defines, by name."""
     names = top.get("glasses", {})
     entries = Entry(names, "glasses", list(names) if isinstance(names, dict) else ["NAME"])
     keys = ("sellmeier", "schott", "range")
@@ -55,7 +55,7 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
         value = entry.number("index")
         if not 1 <= value <= _DENSEST:
             raise entry.error("index", f"{value:g} is not between 1 and {_DENSEST}")
-        if value == 1:  # the same medium as air, so that a surface between both bends no light
+        if value == 1:  # the same medium as air: a surface between the two refracts nothing
             return find_glass("air")
         return Glass(f"index {value!r}", schott=(value**2, 0.0, 0.0, 0.0, 0.0, 0.0))
     if "glass" not in entry:
@@ -63,7 +63,7 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
     name = entry.text("glass", "air")
     if name in own:
         return own[name]
-    if len(name) == 6 and name.isdecimal():  # the code of a glass: (nd - 1) 1000 and 10 vd
+    if len(name) == 6 and name.isdecimal():  # a glass code: 1000 (nd - 1), then 10 vd
         return _model_glass(entry, "glass", 1 + int(name[:3]) / 1000, int(name[3:]) / 10)
     try:
         return find_glass(name)
@@ -79,7 +79,7 @@ def _model_glass(entry: Entry, key: str, *values: float) -> Glass:
 
 
 def media_of(top: Entry, surfaces: list[Entry]) -> list[Glass]:
-    """The medium in front of the lens, and that behind each surface."""
+    """The medium in front of the lens, then the medium behind each surface."""
     own = _own_glasses(top)
     media = [_medium(Entry(top.get("object", {}), "object", MEDIUM_KEYS), own)]
     for surface in surfaces:

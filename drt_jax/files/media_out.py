@@ -1,4 +1,4 @@
-"""Media of a lens as entries of a prescription."""
+"""Convert the media of a lens to entries of a prescription."""
 
 import math
 from typing import Any
@@ -12,7 +12,7 @@ from .entry import LensError
 
 
 def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
-    """Keys of a medium; None if its constants are its own."""
+    """Prescription keys of medium i; None if only its constants describe it."""
     own = constants_of(lens.dispersion, i)
     if lens.dispersion.model is not None and lens.dispersion.model[i, 0] != 1:
         if own.keys() - {"range"}:
@@ -25,7 +25,7 @@ def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
         return {}
     if own.keys() == {"schott"} and not any(own["schott"][1:]):
         return {"index": math.sqrt(own["schott"][0])}
-    unnamed = lens.glasses[i] in lens.labels.unnamed.glasses  # returned by a program
+    unnamed = lens.glasses[i] in lens.labels.unnamed.glasses  # returned by a jitted function
     for name in glass_names() if unnamed else [lens.glasses[i]]:
         try:
             glass = find_glass(name)
@@ -38,7 +38,7 @@ def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
 
 
 def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
-    """What tells medium i among the glasses of a prescription; nothing for air."""
+    """The constants of medium i as a prescription's `glasses` hold them; empty for air."""
     parts = (dispersion.strength, dispersion.resonance, dispersion.schott)
     strength, resonance, schott = (np.asarray(part[i]).tolist() for part in parts)
     terms = max((k + 1 for k, pair in enumerate(zip(strength, resonance)) if any(pair)), default=0)
@@ -55,7 +55,7 @@ def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
 
 
 def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Keys of each medium, none for air, and the glasses whose constants the file has to tell."""
+    """Keys of each medium, none for air, and the glasses that the file has to define."""
     plain = [medium_of(lens, i) for i in range(lens.count + 1)]
     described = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
     media: list[dict[str, Any]] = []
@@ -65,7 +65,7 @@ def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
             keys = media[-1]
         elif keys is None or keys.get("glass") in described:
             own = constants_of(lens.dispersion, i)
-            while glasses.setdefault(name, own) != own:  # another medium of this name
+            while glasses.setdefault(name, own) != own:  # another medium has this name
                 name += "*"
             keys = {"glass": name}
         media.append(keys)

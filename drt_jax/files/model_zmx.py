@@ -1,8 +1,8 @@
-"""Model glasses of `.zmx` files: the constants of OpticStudio's formula as nd, vd and partial.
+"""Model glasses of `.zmx` files: conversion between OpticStudio's formula and `model_glass`.
 
-OpticStudio's indices (1.9e-10 off in 170 of its listings) are n = 1 + (nd - 1) + (nd - 1) / vd
-((M1 + P M2) . (1, 1/L, 1/L^3.5)), Conrady's formula through lines rounded to four decimals, with
-P = 0.6438 - 0.001682 vd + dP. Ours is the same through the lines themselves.
+OpticStudio's indices are n = 1 + (nd - 1) + (nd - 1) / vd ((M1 + P M2) . (1, 1/L, 1/L^3.5)) with
+P = 0.6438 - 0.001682 vd + dP, within 1.9e-10 of 170 listings. This is Conrady's formula through
+spectral lines rounded to four decimals; ours is the same formula through the exact lines.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ _M2 = np.array([8.84931, -6.91677, 0.454415])
 
 
 def to_ours(nd: float, vd: float, above: float) -> tuple[float, float, float]:
-    """nd, vd and partial of our model glass from those of a file."""
+    """nd, vd and partial of our model glass from nd, vd and dP of a file."""
     mean = (nd - 1) / vd
     terms = mean * (_M1 + (_NORMAL[0] + _NORMAL[1] * vd + above) * _M2)
     terms[0] += nd
@@ -25,7 +25,7 @@ def to_ours(nd: float, vd: float, above: float) -> tuple[float, float, float]:
 
 
 def to_theirs(nd: float, vd: float, above: float) -> tuple[float, float, float]:
-    """nd, vd and dP of a file from those of our model glass."""
+    """nd, vd and dP of a file from nd, vd and partial of our model glass."""
     lines = np.array(_LINES)[:, None] ** _POWERS
     mean = (nd - 1) / vd
     wanted = np.array([nd - 1, mean, (_NORMAL[0] + _NORMAL[1] * vd + above) * mean])

@@ -1,4 +1,4 @@
-"""Whether the surfaces of a lens follow one another as light goes."""
+"""Check that the surfaces of a lens follow one another along the light."""
 
 import warnings
 
@@ -8,18 +8,18 @@ from ..lens.lens import Lens
 from ..lens.order import crossing, heights, neighbours
 from .entry import LensError
 
-# Apertures of prescriptions are rounded: neighbours may cross from this part of the smaller
-# semi-diameter on.
+# Prescriptions round semi-diameters: neighbours may cross beyond this fraction of the smaller
+# semi-diameter.
 _RIM = 0.9
-# The direction of a ray between vertices closer than this (mm) drowns in rounding.
+# Between vertices closer than this (mm), rounding errors hide the direction of a ray.
 CLOSEST = 1e-6
 
 
 def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
-    """LensError where light would go backwards, or neighbours overlap in both their apertures; only
-    a warning where they do so near the rim, where light then goes backwards and is lost.
+    """LensError if light would go backwards, or if neighbours overlap within both their apertures.
+    If they overlap only near the rim, a warning: light goes backwards there and is lost.
 
-    gaps, moved: see `lens.order.neighbours`, which tells who are neighbours.
+    gaps, moved: see `lens.order.neighbours`, which returns the neighbours.
     """
     pairs = neighbours(lens, gaps, moved)
     for i, j, gap in pairs:

@@ -1,4 +1,4 @@
-"""What lens files of other programs have in common: a prescription with the lines it came from."""
+"""Common parts of the readers of other programs' files: a prescription with line numbers."""
 
 import dataclasses
 import math
@@ -15,16 +15,16 @@ from .order import CLOSEST
 from .specs import build_lens
 
 Missing = Literal["error", "warn"]
-_FAR = 1e10  # mm, from where on a distance of a file is infinite
-_LARGEST = 1e9  # of lengths, angles and curvatures
-_TINY = 1e-6  # mm, of the stop until its size is known
+_FAR = 1e10  # mm; from this on, a distance of a file is infinite
+_LARGEST = 1e9  # largest length, angle or curvature
+_TINY = 1e-6  # mm, semi-diameter of the stop until its size is known
 _MEDIUM = ("glass", "index", "nd", "vd", "partial")
 
 
 @dataclasses.dataclass
 class Breaking:
     """A coordinate break: shift in mm, tilt in degrees about x, the turned y and the turned z, and
-    the distance to what follows, mm."""
+    thickness, the distance to the next surface or break, mm."""
 
     line: int
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -34,7 +34,7 @@ class Breaking:
 
 @dataclasses.dataclass
 class Row:
-    """A surface of a file: entry as of a prescription, name in messages, its line."""
+    """A surface of a file. name: in messages. entry: as in a prescription. lines: of its keys."""
 
     name: str
     line: int
@@ -43,13 +43,13 @@ class Row:
     thickness: float = 0.0
 
     def put(self, key: str, value: object, line: int) -> None:
-        """An entry and its line."""
+        """Set an entry and its line."""
         self.entry[key] = value
         self.lines[key] = line
 
     @property
     def plain(self) -> bool:
-        """Whether it is a plane in air that does nothing."""
+        """Whether it is a plane in air that has no effect."""
         return set(self.entry) <= {"curvature"} and not self.entry.get("curvature")
 
 
@@ -57,10 +57,10 @@ class Row:
 class Record:
     """A file as it is read. Lengths in mm.
 
-    path, missing: as of `load_lens`. name: of the lens. source: what makes the object's medium.
-    parts: surfaces and coordinate breaks in their order, the image the last surface.
-    glasses: of the file itself, as of a prescription.
-    notes: what is read otherwise than it stands there.
+    path, missing: see `load_lens`. name: of the lens. distance: of the object. medium: keys of the
+    object's medium. parts: surfaces and coordinate breaks in order; the image is the last surface.
+    glasses: those that the file itself defines, as in a prescription.
+    notes: what is left out or read differently from the file.
     """
 
     path: str
@@ -73,24 +73,24 @@ class Record:
     notes: list[str] = dataclasses.field(default_factory=list)
 
     def error(self, line: int, message: str) -> LensError:
-        """An error of a line of the file; 0: of the file."""
+        """An error about a line of the file; line 0: about the whole file."""
         return LensError(f"{self.path}{f', line {line}' if line else ''}: {message}")
 
     def lacks(self, line: int, message: str) -> None:
-        """LensError for what the package has not, or a note where it may be left out."""
+        """LensError for a feature that the package lacks, or a note if it may be left out."""
         if self.missing == "error":
             raise self.error(line, f'{message}; missing="warn" leaves it out')
         self.notes.append(f"line {line}: left out: {message}")
 
     def say(self) -> None:
-        """One warning of all notes."""
+        """Issue one warning that lists all notes."""
         if self.notes:
             warnings.warn(f"{self.path}: {'; '.join(self.notes)}", stacklevel=4)
 
     def number(
         self, line: int, words: list[str], at: int = 0, default: float | None = None
     ) -> float:
-        """A number among words, finite."""
+        """Word `at` as a finite number; `default` if there is no such word."""
         if at >= len(words):
             if default is None:
                 raise self.error(line, f"a number is missing: word {at + 2} of the line")
@@ -104,25 +104,25 @@ class Record:
         return value
 
     def bounded(self, line: int, words: list[str], at: int = 0) -> float:
-        """A number whose square is one, too: at most 1e9."""
+        """A number of magnitude at most 1e9, so that its square does not overflow."""
         value = self.number(line, words, at)
         if abs(value) > _LARGEST:
             raise self.error(line, f"{value:g} is not within {_LARGEST:g}; which unit?")
         return value
 
     def count(self, line: int, words: list[str], at: int = 0, default: int | None = None) -> int:
-        """A whole number among words."""
+        """Word `at` as a whole number; `default` if there is no such word."""
         value = self.number(line, words, at, default)
         if value % 1 or abs(value) > 1e9:
             raise self.error(line, f"expected a whole number, got {value:g}")
         return int(value)
 
     def numbers(self, line: int, words: list[str], count: int) -> list[float]:
-        """The first numbers, so many."""
+        """The first `count` words as numbers."""
         return [self.number(line, words, i) for i in range(count)]
 
     def lens(self, semi_diameter: float | None) -> Lens:
-        """The lens; its stop has no size yet unless `semi_diameter` (mm) is given."""
+        """Build the lens; without `semi_diameter` (mm), the size of its stop is a placeholder."""
         self._spaced()
         top, lines, names = self._prescription(semi_diameter or _TINY)
         image = [part for part in self.parts if isinstance(part, Row)][-1]
@@ -134,7 +134,7 @@ class Record:
         return _with_image(lens, image)
 
     def _spaced(self) -> None:
-        """Put the least gap between surfaces that touch, of those that bend light, and say so."""
+        """Separate touching surfaces that bend light by the least gap, and add a note."""
         medium, sense, last, before, found = self.medium, 1, False, None, list[str]()
         gap = 0.0
         for part in self.parts:
@@ -156,7 +156,7 @@ class Record:
             self.notes.append(f"surfaces that touch stand {CLOSEST:g} mm apart: {some}")
 
     def _prescription(self, semi_diameter: float) -> tuple[dict[str, Any], Lines, list[str]]:
-        """As `build_lens` takes it, the line of each key, the name of each surface."""
+        """The mapping for `build_lens`, the line of each key and the name of each surface."""
         surfaces: list[dict[str, Any]] = []
         elements: list[dict[str, Any]] = []
         lines, names, waiting = Lines(), list[str](), list[Breaking]()
@@ -210,7 +210,7 @@ class Record:
 
 
 def _with_image(lens: Lens, image: Row) -> Lens:
-    """The lens with the curved sensor of a file."""
+    """The lens with the curvature and conic of the file's image on its sensor."""
     curvature, conic = image.entry.get("curvature", 0.0), image.entry.get("conic", 0.0)
     if not curvature:
         return lens
@@ -223,12 +223,12 @@ def _with_image(lens: Lens, image: Row) -> Lens:
 
 
 def distance_of(value: float) -> float:
-    """A distance of a file, inf from 1e10 mm on."""
+    """A distance of a file, mm; inf from 1e10 mm on."""
     return math.inf if value >= _FAR else value
 
 
 def rotation_of(tilt: tuple[float, float, float]) -> np.ndarray:
-    """The rotation (3, 3) of tilts in degrees about x, the turned y and the turned z."""
+    """The rotation matrix (3, 3) of tilts in degrees about x, the turned y and the turned z."""
     x, y, z = _turns(tilt)
     return x @ y @ z
 
@@ -242,7 +242,7 @@ def _turns(tilt: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray, np
 
 
 def turns_of(turn: np.ndarray) -> tuple[float, float, float]:
-    """A rotation (3, 3) as tilts in degrees about x, the turned y and the turned z."""
+    """Tilts in degrees about x, the turned y and the turned z of a rotation matrix (3, 3)."""
     return (
         math.degrees(math.atan2(-turn[1, 2], turn[2, 2])),
         math.degrees(math.asin(max(-1.0, min(1.0, turn[0, 2])))),
@@ -251,13 +251,13 @@ def turns_of(turn: np.ndarray) -> tuple[float, float, float]:
 
 
 def turned_back(tilt: tuple[float, float, float]) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """The rotation of tilts in degrees about z, the turned y and the turned x, and the same as
-    tilts about x, y and z."""
+    """The rotation matrix (3, 3) of tilts in degrees about z, the turned y and the turned x, and
+    the same rotation as tilts about x, the turned y and the turned z."""
     x, y, z = _turns(tilt)
     turn = z @ y @ x
     return turn, tilt if np.count_nonzero(tilt) <= 1 else turns_of(turn)
 
 
 def short(text: str) -> str:
-    """Words of a file in a message or a name."""
+    """Text of a file on one line of at most 60 characters, for messages and names."""
     return one_line(text)[:60]

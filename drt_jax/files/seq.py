@@ -1,4 +1,4 @@
-"""Lens files of CODE V, `.seq`: what each command means, see docs/lens_files.md."""
+"""Read lens files of CODE V, `.seq`; docs/lens_files.md says what each command means."""
 
 import math
 from collections.abc import Callable
@@ -25,7 +25,7 @@ _APERTURES: dict[str, ApertureKind] = {
 
 
 class _Reader:
-    """A file as it is read."""
+    """The state of reading one file."""
 
     def __init__(self, path: str, missing: Missing):
         self.record, self.use, self.fields = Record(path, missing), Use(), Fields()
@@ -37,7 +37,7 @@ class _Reader:
         self.unknown: dict[str, int] = {}
 
     def at(self, line: int, name: str) -> int:
-        """The index of a surface that a qualifier names, 0 for the object."""
+        """The index of the surface that a qualifier names; 0 is the object."""
         if name == "I" and self.complete:
             return len(self.surfaces) - 1
         known = {"O": 0, "S": self.stop or 1}.get(name, int(name) if name.isdecimal() else -1)
@@ -46,7 +46,7 @@ class _Reader:
         return known
 
     def targets(self, command: Command) -> list[Surface]:
-        """The surfaces that a command is about: those named, or the last one."""
+        """The surfaces that a command applies to: those it names, or else the last one."""
         named = command.of("S")
         if not self.surfaces:
             raise self.record.error(command.line, f"{short(command.key)} before any surface")
@@ -79,7 +79,7 @@ def _unit(reader: _Reader, command: Command) -> None:
 
 
 def _air(reader: _Reader, command: Command) -> None:
-    """Temperature in C and pressure in mm of mercury."""
+    """Compare temperature (C) or pressure (mm Hg) with that of our indices."""
     ours, unit = (20, "C") if command.key == "TEM" else (760, "mm Hg")
     value, line = reader.record.number(command.line, command.values), command.line
     if abs(value - ours) > ours / 4:
@@ -99,7 +99,7 @@ def _checks_apertures(reader: _Reader, command: Command) -> None:
 
 
 def _surface(reader: _Reader, command: Command) -> None:
-    """S, SO, SI or S with a number: a new surface, or one that is there, again."""
+    """S, SO, SI or S with a number: begin a new surface, or change an existing one."""
     record, line, name = reader.record, command.line, command.key[1:]
     if name == "S" or (reader.complete and name != "I" and not name.isdecimal()):
         raise record.error(line, f"{command.key}: a surface behind the image")
@@ -124,7 +124,7 @@ def _surface(reader: _Reader, command: Command) -> None:
 
 
 def _number(reader: _Reader, command: Command) -> float | None:
-    """The value of a command; None for a solve, whose value stands elsewhere."""
+    """The value of a command; None for a solve, whose value is given elsewhere."""
     words = command.values
     if words and words[0][:3].upper() in SOLVES:
         reader.solves.append(command.line)
@@ -159,7 +159,7 @@ def _thickness(reader: _Reader, command: Command, surface: Surface) -> None:
 
 
 def _glass(reader: _Reader, command: Command, surface: Surface) -> None:
-    """A glass, AIR, REFL or REFR, the last also behind a glass."""
+    """A glass, AIR, REFL or REFR; REFR may also follow a glass."""
     record, line = reader.record, command.line
     modes = [word.upper()[:4] for word in command.values if word.upper()[:4] in ("REFL", "REFR")]
     names = [word for word in command.values if word.upper()[:4] not in ("REFL", "REFR")]
@@ -206,7 +206,7 @@ def _move(reader: _Reader, command: Command, surface: Surface) -> None:
 
 
 def _return(reader: _Reader, command: Command) -> None:
-    """RET Sn of the last surface, or RET Sk Sn."""
+    """RET Sn for the last surface, or RET Sk Sn for surface k."""
     named = [q for q in command.qualifiers if q[0] == "S"]
     if not 1 <= len(named) <= 2:
         raise reader.record.error(command.line, "RET: expected the surface to return to, as RET S2")
@@ -233,7 +233,7 @@ def _diffract(reader: _Reader, command: Command, surface: Surface) -> None:
 
 
 def _zoom(reader: _Reader, command: Command) -> None:
-    """`ZOO 3`; or a command with a value for each position, of which the first is taken."""
+    """`ZOO 3`, or a command with a value for each zoom position; the first value is used."""
     record, line, words = reader.record, command.line, command.values
     if words and words[0].isdecimal():
         if record.count(line, words) > 1:
@@ -274,10 +274,10 @@ _OF_SURFACES: dict[str, Callable[[_Reader, Command, Surface], None]] = {
 
 
 def _dispatch(reader: _Reader, command: Command) -> None:
-    """One command, outside of the private catalogue."""
+    """Execute a command from outside the private catalogue."""
     key, zoom = command.key, command.of("Z")
     if zoom and zoom[0] != "1":
-        return  # of another zoom position, see `_zoom`
+        return  # for another zoom position, see `_zoom`
     if key == "S" or key in ("SO", "SI") or (key[0] == "S" and key[1:].isdecimal()):
         _surface(reader, command)
     elif key in FIELD_KEYS or key in WAVE_KEYS:
@@ -296,7 +296,7 @@ def _dispatch(reader: _Reader, command: Command) -> None:
 
 
 def read_seq(path: str, missing: Missing) -> tuple[Record, Use]:
-    """A `.seq` file as a record of its surfaces and of their use. LensError with the line."""
+    """Read a `.seq` file into a record of its surfaces and their use. LensError with the line."""
     reader, private, ended = _Reader(path, missing), False, False
     try:
         for own in commands_of(path):
@@ -320,7 +320,7 @@ def read_seq(path: str, missing: Missing) -> tuple[Record, Use]:
 
 
 def _finish(reader: _Reader) -> None:
-    """What follows from all commands together."""
+    """Do the checks and conversions that need all commands."""
     record, use, surfaces = reader.record, reader.use, reader.surfaces
     if not surfaces:
         raise record.error(0, "no surface, SO, S or SI: is it a .seq file?")
@@ -355,7 +355,7 @@ def _finish(reader: _Reader) -> None:
 
 
 def _parts(reader: _Reader) -> None:
-    """Object, surfaces and image, in mm."""
+    """Convert object, surfaces and image to parts of the record, in mm."""
     record, unit, (first, *others) = reader.record, reader.unit, reader.surfaces
     if first.curvature or first.terms or first.place.moved or first.place.kind:
         raise record.error(first.row.line, "SO: an object that is not flat on the axis")

@@ -1,4 +1,4 @@
-"""Apertures of `.seq` files: each of a surface, a use and a label, of several commands."""
+"""Apertures of `.seq` files: commands with the same surface, use and label describe one."""
 
 import dataclasses
 from typing import Any
@@ -14,26 +14,26 @@ _MOST = 50
 
 @dataclasses.dataclass
 class Clips:
-    """What clips on a surface: by use and label, sizes by key, in units of the file."""
+    """Apertures of a surface. found: by use and label, (line, size in the file's unit) by key."""
 
     found: dict[tuple[str, str], dict[str, tuple[int, float]]] = dataclasses.field(
         default_factory=dict
     )
 
     def take(self, record: Record, command: Command) -> None:
-        """One of `KEYS`."""
+        """Read a command of `KEYS`."""
         own = self.found.setdefault((command.use or "CLR", command.label), {})
         if len(self.found) > _MOST:
             raise record.error(command.line, f"more than {_MOST} apertures of a surface")
         own[command.key] = command.line, record.bounded(command.line, command.values)
 
     def entries(self, record: Record, row: Row, unit: float, stop: bool) -> float | None:
-        """Write them as entries of a prescription; the radius of a circle about the vertex of the
-        stop, mm, which `lens_of` may take for the stop itself."""
+        """Write the apertures as prescription entries. Return the radius (mm) of a circle about the
+        vertex of the stop, which `lens_of` may take for the stop itself; None if there is none."""
         size = None
         for (use, label), sizes in self.found.items():
             if use == "EDG":
-                continue  # the rim of the glass, which clips nothing
+                continue  # the rim of the glass clips nothing
             shapes = self._shapes(record, row, unit, sizes)
             if use == "HOL" and shapes:
                 line = next(iter(sizes.values()))[0]
@@ -48,10 +48,10 @@ class Clips:
     def _shapes(
         self, record: Record, row: Row, unit: float, sizes: dict[str, tuple[int, float]]
     ) -> list[tuple[int, dict[str, Any]]]:
-        """Each shape with its line."""
+        """The shapes, each with its line."""
         value = {key: size for key, (_, size) in sizes.items()}
         centre = [value.get("ADX", 0.0) * unit, value.get("ADY", 0.0) * unit]
-        turned = "tilt" in row.entry  # the axes of an XTO lie along y and -x
+        turned = "tilt" in row.entry  # the axes of an XTO surface lie along y and -x
         centre = [centre[1], -centre[0]] if turned else centre
         found = []
         for letter in dict.fromkeys(key[0] for key in sizes if key[0] in _KINDS):
@@ -74,7 +74,7 @@ class Clips:
         radius, centred = shape.get("circle"), "centre" not in shape
         rim = (row.entry.get("conic", 0.0) + 1) * (row.entry["curvature"] * (radius or 0)) ** 2
         if centred and row.entry.get("form") is None and rim >= 1:
-            return None  # beyond the end of the surface
+            return None  # it lies beyond the end of the surface
         plain = not label and not row.entry.get("stop") and "semi_diameter" not in row.entry
         if radius and centred and plain:
             row.put("semi_diameter", radius, line)

@@ -17,14 +17,14 @@ _MOST = 1000
 
 
 class Fields:
-    """Lists by key as they are read, each with the line of its last command."""
+    """The numbers by key as they are read, with the line of each key's last command."""
 
     def __init__(self) -> None:
         self.lists: dict[str, list[float]] = {}
         self.lines: dict[str, int] = {}
 
     def take(self, record: Record, command: Command) -> None:
-        """A whole list, or with F or W a number of it."""
+        """Read a whole list, or one number of it if a qualifier F or W names its place."""
         key, line = command.key, command.line
         at = command.of("F") or command.of("W")
         values = record.numbers(line, command.values, max(len(command.values), 1))
@@ -44,11 +44,11 @@ class Fields:
 
     @property
     def wavelengths(self) -> list[float]:
-        """In um."""
+        """The wavelengths, um."""
         return [value / 1000 for value in self.lists.get("WL", [])]
 
     def finish(self, record: Record, use: Use, unit: float) -> None:
-        """Fields and wavelengths as `System` has them."""
+        """Write fields and wavelengths into `use`, as `System` holds them."""
         waves = self.wavelengths
         if waves and min(waves) <= 0:
             raise record.error(self.lines["WL"], f"a wavelength of {1000 * min(waves):g} nm")

@@ -13,14 +13,14 @@ from .seq_text import Command
 _CODE = re.compile(r"(\d{3,17})\.(\d{3,18})")
 _SHORT_CODE = re.compile(r"\d{6}")
 _PAIR = re.compile(r"(\d\.\d{1,17}):(\d{2,3}(?:\.\d{1,17})?)")
-_POWERS = (0, -2, 2, -4, -6, -8)  # of L in Schott's formula, as further indices need them
+_POWERS = (0, -2, 2, -4, -6, -8)  # of L in Schott's formula; each further index adds one
 _SCHOTT = (0, 2, -2, -4, -6, -8)
-_SAME = 1e-9  # um, wavelengths of a table
+_SAME = 1e-9  # um, tolerance for equal wavelengths
 _MOST = 1000
 
 
 def code_of(word: str) -> tuple[float, float] | None:
-    """nd and vd of a code: 517642, 517.642, 516800.641700 or 1.5168:64.17; None for a name."""
+    """nd and vd of a code as 517642, 517.642, 516800.641700 or 1.5168:64.17; None for a name."""
     found = _CODE.fullmatch(word)
     if found:
         return float(f"1.{found[1]}"), float(f"{found[2][:2]}.{found[2][2:]}")
@@ -31,12 +31,12 @@ def code_of(word: str) -> tuple[float, float] | None:
 
 
 def folded(name: str) -> str:
-    """A name of a glass as CODE V has it: without hyphens, in capitals."""
+    """The name of a glass as CODE V writes it: without hyphens, in capitals."""
     return re.sub(r"[^A-Z0-9]", "", name.upper())
 
 
 class Glasses:
-    """The private catalogue of a file, and the names of makers' glasses."""
+    """The private catalogue of a file, and lookup of makers' glasses by name."""
 
     def __init__(self, record: Record):
         self.record, self.waves = record, list[float]()
@@ -45,7 +45,7 @@ class Glasses:
         self.used: dict[str, dict[str, Any]] = {}
 
     def take(self, command: Command) -> None:
-        """A line of the private catalogue."""
+        """Read a line of the private catalogue."""
         if command.key == "PWL" and not command.quoted:
             values = self.record.numbers(command.line, command.values, len(command.values))
             if not values or not 0.1 <= min(values) <= max(values) <= 1e9:
@@ -60,7 +60,7 @@ class Glasses:
         self.waves_of[command.key.upper()] = self.waves
 
     def medium(self, row: Row, line: int, word: str, system: list[float]) -> dict[str, Any]:
-        """The entries of the medium that a word tells; `system`: wavelengths of the file, um."""
+        """The entries of the medium that a word names; `system`: wavelengths of the file, um."""
         if word.upper() in ("", "AIR"):
             return {}
         if word.upper() in self.tables:
@@ -87,7 +87,7 @@ class Glasses:
         return dict(named_glass(self.record, row, line, known[0] if known else name, makers))
 
     def _private(self, name: str, system: list[float]) -> str:
-        """The name of a private glass among those of the prescription, which is made."""
+        """Add a private glass to the glasses of the prescription; return its name there."""
         if name not in self.used:
             command, waves = self.tables[name], self.waves_of[name]
             words = command.values
@@ -115,8 +115,8 @@ class Glasses:
         return own | {"schott": values}
 
     def _table(self, command: Command, waves: list[float], system: list[float]) -> dict[str, Any]:
-        """Schott's formula: through all of up to six indices; else through those at the file's
-        wavelengths, and by least squares near to the others of their neighbourhood."""
+        """Schott's formula for a table. It passes through all of up to six indices; else through up
+        to five at the file's wavelengths, with a least-squares fit to those near them."""
         record, line, name = self.record, command.line, short(command.key)
         if not waves or len(command.values) != len(waves):
             many = f"{len(command.values)} indices for {len(waves)} wavelengths of PWL"
@@ -131,7 +131,7 @@ class Glasses:
         terms = len(at) if len(at) <= 6 else min(6, 4 + len(held))
         powers = np.power.outer(at, _POWERS[:terms]).astype(float)
         wanted, scale = indices**2, np.abs(powers).max(axis=0)
-        # The least squares among the solutions that pass through what is held.
+        # Least squares among the solutions that pass through the held indices.
         rows = powers / scale
         solution = np.linalg.lstsq(rows[held], wanted[held])[0] if held else np.zeros(terms)
         free = np.linalg.svd(rows[held])[2][len(held) :].T if held else np.eye(terms)
@@ -150,8 +150,8 @@ class Glasses:
 
 
 def _near(table: list[tuple[float, float]], system: list[float]) -> list[tuple[float, float]]:
-    """The part of a table between the file's wavelengths, and as much of it on both sides as makes
-    eight."""
+    """The rows of a table between the file's wavelengths, extended on both sides until there are at
+    least eight."""
     inside = [k for k, (wave, _) in enumerate(table) if min(system) <= wave <= max(system)]
     above = sum(wave < min(system) for wave, _ in table)
     first, end = (

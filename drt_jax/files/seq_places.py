@@ -1,7 +1,7 @@
-"""Decentres and tilts of `.seq` files: as coordinate breaks before and behind a surface.
+"""Decentres and tilts of `.seq` files: conversion to coordinate breaks around a surface.
 
-ADE and BDE turn left-handed about x and the turned y, CDE right-handed about the turned z: rays
-that CODE V lists through three tilted mirrors settle the hand of ADE.
+ADE and BDE turn left-handed about x and the turned y, CDE right-handed about the turned z. Rays
+that CODE V lists through three tilted mirrors confirm the sense of ADE.
 """
 
 import dataclasses
@@ -18,8 +18,8 @@ Triple = tuple[float, float, float]
 
 @dataclasses.dataclass
 class Place:
-    """How a surface is moved. values: by key, in units of the file. kind: one of `KINDS` or "".
-    target: the surface of RET. line: of the last command."""
+    """Decentre and tilt of a surface. values: by key, in units of the file. kind: one of `KINDS` or
+    "". target: the surface that RET returns to. line: of the last command."""
 
     values: dict[str, float] = dataclasses.field(default_factory=dict)
     kind: str = ""
@@ -28,11 +28,11 @@ class Place:
 
     @property
     def moved(self) -> bool:
-        """Whether it is anywhere else than on the axis."""
+        """Whether the surface is decentred or tilted."""
         return any(self.values.values())
 
     def take(self, record: Record, command: Command) -> None:
-        """One of `KEYS` or of `KINDS`; RET is given its target by the reader."""
+        """Read a command of `KEYS` or `KINDS`; the reader sets the target of RET."""
         self.line = command.line
         if command.key in KEYS:
             self.values[command.key] = record.bounded(command.line, command.values)
@@ -42,14 +42,14 @@ class Place:
         self.kind = command.key
 
     def of(self, unit: float) -> tuple[Triple, Triple]:
-        """Shift in mm, tilt in degrees as ours: right-handed about x, y and z."""
+        """Shift in mm and tilt in degrees in our sense: right-handed about x, y and z."""
         x, y, z, a, b, c = (self.values.get(key, 0.0) for key in KEYS)
         return (x * unit, y * unit, z * unit), (0.0 - a, 0.0 - b, c)
 
 
 @dataclasses.dataclass
 class Frames:
-    """Where surfaces come to lie: the origin (3,) and the rotation (3, 3) of the axis at each."""
+    """The axis at each surface: its origin `point` (3,), mm, and its rotation `turn` (3, 3)."""
 
     record: Record
     unit: float
@@ -58,7 +58,7 @@ class Frames:
     before: list[tuple[np.ndarray, np.ndarray, bool]] = dataclasses.field(default_factory=list)
 
     def parts(self, row: Row, place: Place, image: bool) -> list[Row | Breaking]:
-        """A surface with the breaks before and behind it; its thickness goes to the last."""
+        """A surface with the breaks before and behind it; the last part takes its thickness."""
         (shift, tilt), kind, line = place.of(self.unit), place.kind, place.line
         own: list[Row | Breaking] = [row]
         if kind == "RET":
@@ -94,7 +94,7 @@ class Frames:
         return own
 
     def _back(self, place: Place) -> Breaking:
-        """From the axis here to that of an earlier surface."""
+        """The break from the axis here to the axis of an earlier surface."""
         if place.moved:
             raise self.record.error(place.line, "RET with a decentre or tilt of its own")
         if not 1 <= place.target <= len(self.before):

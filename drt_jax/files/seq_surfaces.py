@@ -1,4 +1,4 @@
-"""The kinds of surfaces of `.seq` files: their coefficients as entries of a prescription."""
+"""Kinds of surfaces of `.seq` files: conversion of their coefficients to prescription entries."""
 
 import dataclasses
 import math
@@ -9,7 +9,7 @@ from .seq_apertures import Clips
 from .seq_places import Place
 from .seq_text import Command
 
-LETTERS = dict(zip("ABCDEFGHJ", range(4, 22, 2), strict=True))  # powers of r; there is no I
+LETTERS = dict(zip("ABCDEFGHJ", range(4, 22, 2), strict=True))  # powers of r; CODE V has no I
 _ANAMORPHIC = {f"{letter}R": power for letter, power in zip("ABCD", (4, 6, 8, 10), strict=True)}
 _LOPSIDED = tuple(f"{letter}P" for letter in "ABCD")
 COEFFICIENTS = ("K", *LETTERS, "KX", "KY", *_ANAMORPHIC, *_LOPSIDED, "CUF")
@@ -20,11 +20,11 @@ _SPECIAL_TERMS, _LEAST = 99, 1e-6
 
 @dataclasses.dataclass
 class Surface:
-    """A surface as its commands are read, numbers in units of the file.
+    """A surface as its commands are read; numbers are in units of the file.
 
-    curvature, curvature_x: 1/unit, the second with its line, None if it is not given. kind: one of
-    `KINDS`. special: of SPS. terms: coefficients by key, those of SPS as C1, .... phase: what
-    `DIFFRACTIVE` told. glass: (line, word).
+    curvature, curvature_x: 1/unit; curvature_x with its line, or None if it is not given. kind: one
+    of `KINDS`. special: the type of SPS. terms: coefficients by key; keys of SPS are C1, C2, ....
+    phase: values of `DIFFRACTIVE` by key. glass: (line, word).
     """
 
     row: Row
@@ -45,7 +45,7 @@ class Surface:
         return self.terms.get(key, (0, 0.0))[1]
 
     def shape(self, record: Record, command: Command) -> None:
-        """One of `KINDS`."""
+        """Read a command of `KINDS`."""
         self.kind, self.kind_line, self.special = command.key, command.line, ""
         if command.key != "SPS":
             return
@@ -97,7 +97,7 @@ class Surface:
             self.row.put("coefficients", found, self.kind_line)
 
     def _toroid(self, record: Record, unit: float) -> None:
-        """A curve in y turned about an axis along y; XTO: of x, our own turned by 90 degrees."""
+        """A curve in y rotated about an axis along y; XTO: in x, ours turned by 90 degrees."""
         row, line = self.row, self.kind_line
         across, along = (self.curvature_x or (0, 0.0))[1] / unit, self.curvature / unit
         turned = self.kind == "XTO" or (self.kind == "CYL" and across != 0)
@@ -123,7 +123,7 @@ class Surface:
         row.put("coefficients", {p: a for p, a in found.items() if a}, line)
 
     def _special(self, record: Record, first: int, count: int, *others: str) -> dict[int, float]:
-        """Coefficients that are not 0 of the numbers from `first` on, counted from 0."""
+        """The nonzero ones of `count` coefficients from number `first` on, keyed from 0."""
         found = {}
         for key, (line, value) in self.terms.items():
             number = int(key[1:]) - first if key[1:].isdecimal() and key[0] == "C" else -1
@@ -134,7 +134,7 @@ class Surface:
         return {k: value for k, value in found.items() if value}
 
     def radius(self, record: Record, default: float = 0.0) -> float:
-        """The radius to which coefficients belong, in units of the file."""
+        """The norm radius of the coefficients, in units of the file."""
         value = self.term("NRADIUS") or default
         if not _LEAST <= value <= 1 / _LEAST:
             raise record.error(
@@ -200,7 +200,7 @@ def _forbes(surface: Surface, record: Record, unit: float) -> None:
 
 
 def _fringe(surface: Surface, record: Record, unit: float) -> None:
-    """Fringe polynomials, 1 at the rim, as ours, whose mean square is 1."""
+    """Convert fringe polynomials, which are 1 at the rim, to ours, whose mean square is 1."""
     surface.terms.setdefault("NRADIUS", surface.terms.get("C3", (0, 0.0)))
     found, terms = surface._special(record, 4, 37, "C1", "C3"), dict[int, float]()
     for k, value in found.items():
@@ -212,22 +212,22 @@ def _fringe(surface: Surface, record: Record, unit: float) -> None:
 
 
 def noll_of_fringe(fringe: int) -> tuple[int, int, int]:
-    """Noll's number, n and |m| of a fringe polynomial from 1 to 37."""
+    """Noll's number, n and |m| of a fringe polynomial; fringe: its number, 1 to 37."""
     if fringe == 37:
         n, m, sine = 12, 0, False
     else:
         half = math.isqrt(fringe - 1)  # (n + m) / 2
-        left = fringe - half * half - 1  # of this group, from the highest m down
+        left = fringe - half * half - 1  # place in this group, from the highest m down
         m = half - left // 2
         n, sine = 2 * half - m, m > 0 and left % 2 == 1
-    first = n * (n + 1) // 2 + m + (0 if m else 1)  # of the two with this m
+    first = n * (n + 1) // 2 + m + (0 if m else 1)  # the lowest number of this n and m
     if not m:
         return first, n, m
     return next(j for j in (first, first + 1) if (j % 2 == 1) == sine), n, m
 
 
 _SPECIAL: dict[str, tuple[str, Callable[[Surface, Record, float], None]]] = {
-    "ODD": ("C1", _odd),  # where the conic stands, and how the others are read
+    "ODD": ("C1", _odd),  # the key of the conic, the reader of the others
     "XYP": ("C1", _polynomial),
     "QBF": ("C17", _forbes),
     "ZFR": ("C1", _fringe),
@@ -235,7 +235,7 @@ _SPECIAL: dict[str, tuple[str, Callable[[Surface, Record, float], None]]] = {
 
 
 def special_key(surface: Surface, record: Record, command: Command) -> str:
-    """The key of a coefficient of SCO: C5, NRADIUS, or by the names K and AR5 as the same."""
+    """The key of a coefficient of SCO, as C5 or NRADIUS; the names K and AR5 are converted."""
     number = command.of("C")
     name = f"C{number[0]}" if number else (command.values.pop(0).upper() if command.values else "")
     if name == "K" and surface.special in _SPECIAL:

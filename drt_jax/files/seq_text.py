@@ -1,4 +1,4 @@
-"""Text of CODE V `.seq` files: commands with their qualifiers and values."""
+"""Parsing of CODE V `.seq` files: commands with their qualifiers and values."""
 
 import os
 import re
@@ -9,11 +9,11 @@ from ..inputs import InputError, one_line
 from .text import lines_of
 
 _LONGEST = 4000  # characters of a line
-_WIDEST = 100_000  # of a command over several lines
+_WIDEST = 100_000  # characters of a command over several lines
 _SURFACE_KEY = re.compile(r"S(\d{1,6}|O|I)?", re.IGNORECASE)
 _QUALIFIER = re.compile(r"([SZFWC])(\d{1,6}|[OISK])(\.\.(?:\d{1,6}|[OISK]))?", re.IGNORECASE)
 _LABEL = re.compile(r"L(['\"].*)", re.IGNORECASE | re.DOTALL)
-# Letters of qualifiers beside S and Z, by key; elsewhere F2 is a glass.
+# Letters of qualifiers beside S and Z, by key; with other keys, F2 is a glass.
 _OTHERS = (
     (re.compile("[XY](AN|OB|IM|RI)|V[UL][XY]|WTF"), "F"),
     (re.compile("WL|WTW"), "W"),
@@ -22,7 +22,7 @@ _OTHERS = (
 USES = ("CLR", "EDG", "OBS", "HOL")
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")
 
-# Names, drawing, variables and tolerances, ray aiming, what is computed: no rays.
+# Ignored: names, drawing, variables, tolerances, ray aiming, analyses. None changes rays.
 COSMETIC = frozenset(
     """
     LEN INI GO CWL SLB DER CLS DOR WID CUM THM POL PIK AUT VER INC
@@ -34,7 +34,7 @@ SOLVES = frozenset(
     PIM RED OAL HMY HMX HCY HCX UMY UMX UCY UCX IMY IMX ICY ICX APN APL CMY CMX EFL EFX EFY PIK
     """.split()  # noqa: SIM905
 )
-# What changes rays and is not read.
+# Commands that change rays and are refused.
 REFUSED = frozenset(
     """
     NSS GL1 GL2 INS DEL COP FLY SCA INV URN GRC GRI ARR CIG REG ELG SPL TRP GLB HOE HV1 HV2 HX1 HX2
@@ -44,9 +44,9 @@ REFUSED = frozenset(
 
 
 class Command(NamedTuple):
-    """A command. line: where it begins. key: its first three letters, `S` with what follows for a
-    surface; as it stands where it was quoted. qualifiers: letter, first and last as they stand.
-    label, use: of an aperture, "" for none. values: the words behind."""
+    """A command. line: where it begins. key: its first three letters; `S` and its suffix for a
+    surface; the whole word if it is quoted. qualifiers: letter, first and last as in the file.
+    label, use: of an aperture, "" for none. values: the words that follow."""
 
     line: int
     key: str
@@ -62,7 +62,7 @@ class Command(NamedTuple):
 
 
 def _cut(text: str) -> tuple[list[str], bool]:
-    """The parts of a line between `;`, up to `!`, and whether `&` continues it; quotes guard."""
+    """Split a line at `;` up to `!`, outside quotes; also return whether `&` continues it."""
     if "'" not in text and '"' not in text:
         text = text.partition("!")[0].rstrip()
         more = text.endswith("&")
@@ -85,7 +85,7 @@ def _cut(text: str) -> tuple[list[str], bool]:
 
 
 def _parts(lines: list[str]) -> Iterator[tuple[int, str]]:
-    """The line and the text of each command."""
+    """The line number and the text of each command."""
     begun, waiting = 0, ""
     for i, text in enumerate(lines):
         if len(text) > _LONGEST:
@@ -106,7 +106,7 @@ def _bare(word: str) -> str:
 
 
 def commands_of(path: str | os.PathLike) -> Iterator[Command]:
-    """The commands of a file in their order. InputError, with the line, for what is no text."""
+    """The commands of a file in order. InputError if it is no text or a line is too long."""
     for line, text in _parts(lines_of(path)):
         words = _WORD.findall(text)
         if not words:
@@ -119,7 +119,7 @@ def commands_of(path: str | os.PathLike) -> Iterator[Command]:
 
 
 def command_of(line: int, key: str, quoted: bool, words: list[str]) -> Command:
-    """A command of the words behind its key."""
+    """Make a command from its key and the words that follow it."""
     qualifiers, label, use, rest = list[tuple[str, str, str]](), "", "", len(words)
     letters = "SZ" + "".join(more for known, more in _OTHERS if known.fullmatch(key))
     for at, word in enumerate(words):

@@ -1,4 +1,4 @@
-"""Prescriptions: a lens built from a mapping, its entries checked before anything is traced."""
+"""Build a lens from a prescription, a mapping; its entries are checked before any tracing."""
 
 import dataclasses
 import math
@@ -21,7 +21,7 @@ from .order import check_order
 
 _D_LINE = 0.5875618  # um
 _MOST = 5000  # surfaces
-_FOCUS = "focus"  # of a sensor
+_FOCUS = "focus"  # value of `sensor`
 _TOP_KEYS = (
     *("name", "source", "focal_length", "glasses", "object", "surfaces", "elements"),
     *("sensor", "sensor_tilt", "sensor_decentre", "pupil"),
@@ -41,7 +41,7 @@ def _form(entry: Entry) -> str:
 
 
 def _coefficients(surface: Entry) -> list[float]:
-    """Those of a surface, or of its phase."""
+    """The coefficients of a surface, or of its phase."""
     form = _form(surface)
     first, powers = FORMS[form].named, FORMS[form].powers
     for key in ("radius_x", "curvature_x", "conic_x", "norm_radius"):
@@ -61,7 +61,7 @@ def _coefficients(surface: Entry) -> list[float]:
 
 
 def _phase(surfaces: list[Entry]) -> Phase | None:
-    """The diffractive structures, if any."""
+    """The diffractive phases of the surfaces; None if there are none."""
     keys = ("form", "order", "norm_radius", "coefficients")
     at = {i: s for i, s in enumerate(surfaces) if "phase" in s}
     given = [Entry(s["phase"], s.name("phase"), keys) for s in at.values()]
@@ -94,13 +94,13 @@ def _gaps(top: Entry, surfaces: list[Entry]) -> list[float]:
             "sensor",
         )
     if top.get("sensor") == _FOCUS:
-        return [*gaps, 0.0]  # until it is known, see `_focused`
+        return [*gaps, 0.0]  # a placeholder, see `_focused`
     end = top.number("sensor") - sum(gaps) if "sensor" in top else surfaces[-1].number("thickness")
     return [*gaps, end]
 
 
 def _focused(lens: Lens, wavelength: float) -> Lens:
-    """The lens with its sensor in the paraxial focus of an object at infinity."""
+    """The lens with its sensor at the paraxial focus for an object at infinity."""
     place = image_distance(lens, math.inf, wavelength)[0]
     if not math.isfinite(float(place)):
         raise LensError("sensor: focus: there is none, light leaves parallel; give mm", "sensor")
@@ -108,14 +108,14 @@ def _focused(lens: Lens, wavelength: float) -> Lens:
 
 
 def build_lens(values: object, name: str = "lens") -> Lens:
-    """A lens from a mapping with the keys of a prescription.
+    """Build a lens from a mapping with the keys of a prescription.
 
-    If a tilt or a decentre is given anywhere, be it zero, those of all surfaces are arrays of
-    the lens, which can be varied; else they are None and the lens has its axis. The arrays have
-    JAX's default floating dtype. LensError, naming the key, for what makes no lens.
+    If any surface or the sensor has a tilt or a decentre, even zero, the lens has arrays of both
+    for all surfaces, which can be varied; else they are None and the lens is centred. The arrays
+    have JAX's default floating dtype. LensError, naming the key, if the values make no lens.
 
     values: the mapping.
-    name: of the lens, where the mapping gives none.
+    name: the name of the lens if the mapping gives none.
     """
     top = Entry(values, "", _TOP_KEYS)
     entries = top.get("surfaces")
@@ -127,7 +127,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     stops = [i for i, surface in enumerate(surfaces) if surface.flag("stop")]
     if len(stops) != 1:
         raise LensError(f"surfaces: {len(stops)} have stop: true, exactly one must", "surfaces")
-    # The last row of each is the sensor.
+    # The last row of each list is that of the sensor.
     coefficients = [*map(_coefficients, surfaces), []]
     decentre = [*(s.vector("decentre", 2) for s in surfaces), top.vector("sensor_decentre", 2)]
     tilt = [*(s.vector("tilt", 3) for s in surfaces), top.vector("sensor_tilt", 3)]
@@ -167,7 +167,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
 
 
 def _with_pupil(top: Entry, lens: Lens, wavelength: float) -> Lens:
-    """The lens with the pupil that a prescription asks for."""
+    """The lens with the pupil that the prescription asks for: `stop` or `paraxial`."""
     pupil = top.text("pupil", "stop")
     if pupil not in ("stop", "paraxial"):
         raise top.error("pupil", f"expected stop or paraxial, got {shown(pupil)}")
@@ -175,7 +175,7 @@ def _with_pupil(top: Entry, lens: Lens, wavelength: float) -> Lens:
 
 
 def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:
-    """Warn where the lens has another, in image space or in air."""
+    """Warn if the focal length differs from `stated` (mm) both in image space and in air."""
     found = float(focal_length(lens, wavelength)[0])
     air = float(effective_focal_length(lens, wavelength)[0])
     if not min(abs(found - stated), abs(air - stated)) <= 0.02 * abs(stated):

@@ -1,4 +1,4 @@
-"""What a lens is used for, as files of other programs tell: fields, wavelengths, aperture."""
+"""The use of a lens according to another program's file: fields, wavelengths, aperture."""
 
 import dataclasses
 import math
@@ -15,7 +15,7 @@ from ..lens.scene import field_of_height
 from .record import Record
 
 ApertureKind = Literal["pupil diameter", "f-number", "working f-number", "object NA", "image NA"]
-_SAME = 1e-9  # of a size of the stop that a file tells twice
+_SAME = 1e-9  # relative tolerance of a stop size that a file gives twice
 FieldKind = Literal["angle", "object height", "paraxial image height", "real image height"]
 
 
@@ -23,21 +23,21 @@ FieldKind = Literal["angle", "object height", "paraxial image height", "real ima
 class System:
     """A lens and how a file uses it.
 
-    lens: its stop as wide as the aperture of the file asks.
-    distance: from the object to the first vertex, mm, inf allowed.
-    fields: (F, 2) in radians along x and y, see `Scene`; None where the file tells real image
-        heights: `field_of_image(lens, height, ...)` finds the field of each.
-    heights: (F, 2), the fields as they stand in the file: degrees, or mm.
-    field_kind: what `heights` are.
+    lens: the lens; its stop is as wide as the aperture of the file requires.
+    distance: from the object to the first vertex, mm; may be inf.
+    fields: (F, 2), radians along x and y, see `Scene`; None if the file gives real image heights,
+        for which `field_of_image(lens, height, ...)` finds the fields.
+    heights: (F, 2), the fields as in the file: degrees, or mm.
+    field_kind: the kind of `heights`.
     field_weights: (F,).
-    vignetting: (F, 5), of each field the shift of the pupil in x and y, its compression in x and y,
-        in parts of its radius, and its turn in radians: x' = shift + (1 - compression) x.
-    wavelengths: (W,) in um. wavelength_weights: (W,). primary: the index of the primary one.
-    aperture: the value that the file gives for `aperture_kind`; None for the size of the stop.
-    ray_aiming: how the other program launches rays: at the paraxial entrance pupil, `off` (see
-        `with_paraxial_pupil`), or as here at the stop; CODE V, `chief`, so that the chief ray meets
-        the centre of the stop, the others about it over an entrance pupil of paraxial width.
-    notes: what the file has and the lens has not, or reads otherwise.
+    vignetting: (F, 5), per field the shift of the pupil in x and y and its compression in x and y,
+        as fractions of its radius, and its rotation in radians: x' = shift + (1 - compression) x.
+    wavelengths: (W,), um. wavelength_weights: (W,). primary: the index of the primary wavelength.
+    aperture: the file's value for `aperture_kind`; None if the aperture is the size of the stop.
+    ray_aiming: where the other program aims rays. `off`: at the paraxial entrance pupil, see
+        `with_paraxial_pupil`. `chief` (CODE V): the chief ray at the centre of the stop, the others
+        around it over an entrance pupil of paraxial width. Otherwise at the stop, as here.
+    notes: features of the file that the lens lacks or that are read differently.
     """
 
     lens: Lens
@@ -58,7 +58,7 @@ class System:
 
 @dataclasses.dataclass
 class Use:
-    """What `System` needs, as it is read; line: of the aperture."""
+    """The values for `System` as they are read. line: of the aperture."""
 
     line: int = 0
     aperture: float | None = None
@@ -77,7 +77,7 @@ class Use:
 
 
 def lens_of(record: Record, use: Use) -> Lens:
-    """The lens of a file, its stop as wide as the aperture asks."""
+    """The lens of a file, with its stop as wide as the aperture requires."""
     if not use.wavelengths:
         raise record.error(0, "no wavelength is given")
     if not 0 <= use.primary < len(use.wavelengths):
@@ -117,23 +117,23 @@ def system_of(record: Record, use: Use) -> System:
     )
 
 
-@jax.jit  # one program in place of hundreds of small ones
+@jax.jit  # compiles one program instead of hundreds of small ones
 def _paraxial(lens: Lens, distance: Array, wave: Array) -> tuple[FirstOrder, Array, Array]:
-    """First-order data, the image height of a field of 45 degrees, mm, and the indices of the media
-    of object and image."""
+    """First-order data, the image height (mm) of a field of 45 degrees, and the refractive indices
+    of object space and image space."""
     height = image_height(lens, jnp.full_like(distance, math.pi / 4), distance, wave)
     return first_order(lens, distance, wave), height, lens.index(wave)[jnp.array([0, -1])]
 
 
 def _first(record: Record, lens: Lens, wave: float) -> tuple[FirstOrder, float, list[float]]:
-    """The same as numbers, of one wavelength."""
+    """The results of `_paraxial` for one wavelength, as numbers."""
     found = _paraxial(lens, *map(jnp.asarray, (record.distance, wave)))
     first, height, index = jax.tree.map(lambda a: np.asarray(a)[..., 0], found)
     return first, float(height), index.tolist()
 
 
 def _opened(record: Record, use: Use, lens: Lens, wave: float) -> Lens:
-    """The lens with its stop as wide as the aperture asks, by paraxial optics."""
+    """The lens with its stop as wide as the aperture requires in paraxial optics."""
     semi, value = float(lens.semi_diameter[lens.stop]), float(use.aperture or 0)
     first, _, (front, last) = _first(record, lens, wave)
     place, radius = map(float, first.entrance_pupil)
@@ -151,7 +151,7 @@ def _opened(record: Record, use: Use, lens: Lens, wave: float) -> Lens:
         wide = abs(math.tan(math.asin(sine)) * (far + place))
     elif kind == "image NA" and math.isinf(far):
         wide = abs(float(first.effective_focal_length)) * value
-    elif kind == "image NA":  # the object's, over the magnification
+    elif kind == "image NA":  # the object NA is the image NA times the magnification
         sine = value * abs(float(first.magnification)) / front
         if not sine < 1:
             raise record.error(use.line, f"there is no image NA of {value:g}")
@@ -167,8 +167,8 @@ def _opened(record: Record, use: Use, lens: Lens, wave: float) -> Lens:
 
 
 def _without_rim(lens: Lens) -> Lens:
-    """The lens without the first clear circle about the vertex of its stop, whose size the stop
-    has: twice, it would clip by rounding."""
+    """The lens without the first clear circle about the vertex of its stop. The stop has the same
+    size, and clipping twice would lose rays by rounding."""
     own = lens.apertures
     if own is None:
         return lens
@@ -190,7 +190,7 @@ def _without_rim(lens: Lens) -> Lens:
 def _angles(
     record: Record, use: Use, lens: Lens, heights: np.ndarray, wave: float
 ) -> np.ndarray | None:
-    """Fields in radians (F, 2); None for real image heights."""
+    """The fields (F, 2), radians; None for real image heights."""
     far, line = record.distance, use.field_line
     if use.field_kind == "angle":
         beyond = bool(np.any(np.abs(heights) >= 90))

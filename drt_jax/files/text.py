@@ -1,4 +1,4 @@
-"""Text of lens files of other programs: bounded, in the encodings that occur, in lines of words."""
+"""Read the text of other programs' lens files: size limits, encodings, lines split into words."""
 
 import codecs
 import os
@@ -9,7 +9,7 @@ from ..inputs import InputError, one_line, read_bytes
 
 LARGEST = 2**24  # bytes of a file
 _MOST = 400_000  # lines
-_LONGEST = 4000  # characters of a line that are read
+_LONGEST = 4000  # characters read of a line
 _BOMS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF16_LE, "utf-16"),
@@ -18,7 +18,7 @@ _BOMS = (
 
 
 class Words(NamedTuple):
-    """A line of a file: its number, from 1, its first word and the others, and whether it was
+    """A line of a file: its number from 1, its first word, the other words, and whether it is
     indented."""
 
     line: int
@@ -28,8 +28,8 @@ class Words(NamedTuple):
 
 
 def decoded(content: bytes) -> str:
-    """Text of a file: its byte order mark decides, else UTF-8, else Latin-1. InputError, with the
-    byte, for what is no text."""
+    """The text of a file: its byte order mark or UTF-16's zero bytes decide, else UTF-8, else
+    Latin-1. InputError, with the byte or character, if it is no text."""
     known = [name for mark, name in _BOMS if content.startswith(mark)]
     head = content[:1000]
     if not known and head[1::2].count(0) > len(head) // 4:
@@ -53,7 +53,7 @@ def decoded(content: bytes) -> str:
 
 
 def lines_of(path: str | os.PathLike) -> list[str]:
-    """The lines of a file of at most 16 MB. InputError for what cannot be read."""
+    """The lines of a file of at most 16 MB. InputError if it cannot be read."""
     lines = decoded(read_bytes(path, LARGEST, "lens file")).splitlines()
     if len(lines) > _MOST:
         raise InputError(f"{len(lines)} lines are more than {_MOST}; is it the right file?")
@@ -61,7 +61,7 @@ def lines_of(path: str | os.PathLike) -> list[str]:
 
 
 def words_of(path: str | os.PathLike) -> list[Words]:
-    """Lines in words, without empty ones; of notes that are long, the beginning."""
+    """The lines of a file split into words, without empty lines; long notes are cut."""
     found = []
     for i, text in enumerate(lines_of(path)):
         if len(text) > _LONGEST and re.match(r"\s*[A-Z]{4}\s+[-+.\d]", text):

@@ -1,4 +1,4 @@
-"""A lens written as a prescription: what `specs` reads, backwards."""
+"""Write a lens as a prescription, the inverse of `specs`."""
 
 import math
 import pathlib
@@ -19,15 +19,15 @@ from .write_zmx import zmx_text
 
 
 def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
-    """Write a lens as a YAML prescription, or as a file of Zemax or CODE V where the path ends in
-    `.zmx` or `.seq`; `load_lens` makes the same lens of it, to the last digit (of tilts, which
-    files hold in degrees, and of model glasses and radii in `.zmx`, to the last but one).
+    """Write a lens as a YAML prescription, or as a file of Zemax or CODE V if the path ends in
+    `.zmx` or `.seq`. `load_lens` reads the same lens from it, to the last digit (tilts, which files
+    hold in degrees, and model glasses and radii in `.zmx`: to the last digit but one).
 
-    Constants of a glass that are not those of the catalogue stand in the file, where a second
-    medium of the same name that has other constants is called name*.
+    The file contains the constants of glasses that differ from the catalogue's. A second medium of
+    the same name with other constants is called name*.
 
-    path: of the file, which is replaced. LensError for what a prescription cannot hold, such as a
-    curved sensor, or if the file cannot be written.
+    path: of the file, which is overwritten. LensError if a prescription cannot hold the lens, such
+    as a curved sensor, or if the file cannot be written.
     """
     other = {".zmx": zmx_text, ".seq": seq_text}.get(pathlib.Path(path).suffix.lower())
     if other is not None:
@@ -62,7 +62,7 @@ def _surface(lens: Lens, i: int, behind: dict[str, Any]) -> dict[str, Any]:
         entry["form"] = lens.forms[i]
     named, rest = _coefficients(lens.forms[i], lens.coefficients[i])
     entry |= named
-    # Zeros of one surface keep the number of columns.
+    # Zeros of one surface preserve the number of columns.
     if rest and (any(rest.values()) or (i == 0 and not np.any(lens.coefficients))):
         entry["coefficients"] = rest
     if i < lens.count - 1:
@@ -79,7 +79,7 @@ def _surface(lens: Lens, i: int, behind: dict[str, Any]) -> dict[str, Any]:
 
 
 def _coefficients(name: str, row: Array) -> tuple[dict, dict]:
-    """Those of a form that have keys of their own, and the others by what files call them."""
+    """The coefficients of a form with keys of their own, and the others by their names in files."""
     form, values = FORMS[name], np.asarray(row).tolist()
     named = dict(zip(form.named, values, strict=False))
     return named, dict(zip(form.powers, values[len(form.named) :], strict=False))
@@ -96,7 +96,7 @@ def _element(elements: Elements, g: int) -> dict[str, Any]:
 
 
 def _phase(lens: Lens, i: int) -> dict[str, Any]:
-    """The key of a diffractive surface."""
+    """The entry `phase` of a diffractive surface; empty for others."""
     if lens.phase is None or i not in lens.phase.surfaces:
         return {}
     row = lens.phase.surfaces.index(i)

@@ -1,4 +1,4 @@
-"""A lens written as a CODE V `.seq` file: what `seq` reads, backwards."""
+"""Write a lens as a CODE V `.seq` file, the inverse of `seq`."""
 
 import math
 import textwrap
@@ -20,12 +20,12 @@ from .seq_surfaces import LETTERS, noll_of_fringe
 from .write_zmx import gap_behind
 
 _KINDS = {"circle": ("CIR",), "rectangle": ("REX", "REY"), "ellipse": ("ELX", "ELY")}
-_STILL = 1e-12  # mm and radians, below which a surface stands on the axis of the one before it
+_STILL = 1e-12  # mm, radians: below this a surface stands on the axis of the one before it
 
 
 def seq_text(lens: Lens) -> str:
-    """The lines of a file with an object at infinity and the line d, or the middle of the range of
-    the glasses. LensError, with the remedy, for what such files do not hold or we do not write."""
+    """The text of a file with an object at infinity and the d line or, if the glasses exclude it,
+    the middle of their range. LensError, with the remedy, for features that are not written."""
     low, high = lens.dispersion.range
     wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
     media, own = media_of_lens(lens)
@@ -65,7 +65,7 @@ def _nanometres(wave: float) -> float:
 
 
 def _private(name: str, called: str, constants: dict[str, Any]) -> list[str]:
-    """The lines of a glass with constants of its own."""
+    """The lines of a private glass, which the file defines by its constants."""
     low, high = constants.get("range", ANY)
     sellmeier, schott = constants.get("sellmeier"), constants.get("schott")
     if sellmeier and schott:
@@ -86,7 +86,7 @@ def _private(name: str, called: str, constants: dict[str, Any]) -> list[str]:
 
 
 def _word(keys: dict[str, Any], private: dict[str, str]) -> str:
-    """The word of a medium; "" for air."""
+    """The word for a medium; "" for air."""
     if "nd" in keys:
         if keys.get("partial"):
             raise LensError("a model glass off the normal line: use .yaml, or set partial to 0")
@@ -120,7 +120,7 @@ def _surface(lens: Lens, i: int) -> list[str]:
 
 
 def _powers(lens: Lens, i: int, row: list[float], keys: dict[int, str]) -> list[str]:
-    """Coefficients of r^2, r^4, ... by the keys of their powers."""
+    """The lines of the coefficients of r^2, r^4, ...; keys: the key of each power."""
     found = {2 * k + 2: value for k, value in enumerate(row) if value}
     for power in found:
         if power not in keys:
@@ -131,7 +131,7 @@ def _powers(lens: Lens, i: int, row: list[float], keys: dict[int, str]) -> list[
 
 
 def _form(lens: Lens, i: int) -> list[str]:
-    """The kind of a surface and its coefficients."""
+    """The lines of a surface's kind and of its coefficients."""
     name, conic = lens.forms[i], float(lens.conic[i])
     row = np.asarray(lens.coefficients[i], float).tolist()
     even = {power: letter for letter, power in LETTERS.items()}
@@ -180,7 +180,7 @@ def _fringe(i: int, row: list[float], conic: float) -> list[str]:
 
 
 def _phase(lens: Lens, i: int) -> list[str]:
-    """Gratings and radial phases."""
+    """The lines of a grating or a radial phase."""
     if lens.phase is None or i not in lens.phase.surfaces:
         return []
     at = lens.phase.surfaces.index(i)
@@ -201,8 +201,8 @@ def _phase(lens: Lens, i: int) -> list[str]:
 
 
 def _places(lens: Lens) -> list[list[str]]:
-    """Decentres and tilts of each surface and the sensor: as they stand where no element moves
-    several surfaces, else of each surface against the one before it."""
+    """The lines of decentre and tilt of each surface and the sensor: the values of the lens if it
+    has no elements, else those relative to the surface before."""
     if lens.elements is None:
         zero = np.zeros((lens.count + 1, 3))
         shift = zero[:, :2] if lens.decentre is None else np.asarray(lens.decentre, float)
@@ -233,8 +233,8 @@ def _places(lens: Lens) -> list[list[str]]:
 
 
 def _simple(lens: Lens) -> list[list[str]] | None:
-    """The same where each element turns the axis at the vertex of its first surface and nothing
-    else is moved; None where it is not so."""
+    """The lines of `_places` if each element turns the axis at the vertex of its first surface and
+    nothing else is moved; otherwise None."""
     own, last = lens.elements, lens.count
     assert own is not None
     firsts = [first for first, _ in own.spans]

@@ -1,4 +1,4 @@
-"""A lens written as a `.zmx` file: what `zmx` reads, backwards."""
+"""Write a lens as a `.zmx` file, the inverse of `zmx`."""
 
 import math
 from collections.abc import Mapping
@@ -28,13 +28,13 @@ YFLN 0 0 0 0 0 0 0 0 0 0 0 0
 FWGN 1 1 1 1 1 1 1 1 1 1 1 1
 WAVM 1 {wave!r} 1
 PWAV 1"""
-_TYPES = {  # of a form: the type, the parameters of coefficients, the first of which is a radius
+_TYPES = {  # by form: type, parameters of the coefficients, whether the first is a radius
     "asphere": ("EVENASPH", range(1, 9), False),
     "odd_asphere": ("ODDASPHE", range(1, 9), False),
     "toroid": ("TOROIDAL", range(1, 9), True),
     "biconic": ("BICONICX", range(1, 3), True),
 }
-_SERIES = {  # of a form: the type whose extra data are its coefficients, what comes before them
+_SERIES = {  # by form: type whose XDAT hold the coefficients, the values before them
     "asphere": ("XASPHERE", ()),
     "odd_asphere": ("XOSPHERE", ()),
     "polynomial_xy": ("XPOLYNOM", ()),
@@ -45,8 +45,8 @@ _OTHERS = {"silica": "F_SILICA"}
 
 
 def zmx_text(lens: Lens) -> str:
-    """The lines of a file with an object at infinity and the line d, or the middle of the range of
-    the glasses. LensError, with the remedy, for what such files do not hold or we do not write."""
+    """The text of a file with an object at infinity and the d line or, if the glasses exclude it,
+    the middle of their range. LensError, with the remedy, for features that are not written."""
     low, high = lens.dispersion.range
     wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
     media = [medium_of(lens, i) or {} for i in range(lens.count + 1)]
@@ -68,13 +68,13 @@ def zmx_text(lens: Lens) -> str:
 
 
 def _numbers(name: str) -> str:
-    """nd and vd of a glass: what a program falls back on that does not know its name."""
+    """nd and vd of a glass, for programs that do not know its name."""
     nd, vd = map_point(find_glass(name)) or (1.5, 40)
     return f"{nd:.7f} {vd:.5f}"
 
 
 def gap_behind(lens: Lens, i: int) -> float:
-    """The thickness behind a surface; of the last, that which makes the sum exact."""
+    """The thickness (mm) behind a surface; the last one makes their sum equal `lens.sensor`."""
     gaps = np.asarray(lens.thickness, float).tolist()
     if i < lens.count - 1:
         return gaps[i]
@@ -106,14 +106,14 @@ def _form(lens: Lens, i: int) -> list[str]:
     if name in _SERIES and (not kind or (used and used[-1] >= len(numbers))):
         kind, before = _SERIES[name]
         size, terms = (row[0], row[1:]) if FORMS[name].named else (1.0, row)
-        goes_on = ["PARM 0 1"] if name == "zernike" else []  # beyond the radius
+        goes_on = ["PARM 0 1"] if name == "zernike" else []  # terms extend beyond the radius
         return [f"TYPE {kind}", *goes_on, *_extra(*before, len(terms), size, *terms)]
     if not kind or (used and used[-1] >= len(numbers)):
         what = f"form {name}" + (f" with {used[-1] + 1} coefficients" if kind else "")
         raise LensError(f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
     if radius and row[0]:
         row[0] = 1 / row[0]
-    # The last one keeps the number of columns.
+    # The last coefficient, even 0, preserves the number of columns.
     return [
         f"TYPE {kind}",
         *(f"PARM {n} {value!r}" for n, value in zip(numbers, row, strict=False)),
@@ -125,7 +125,7 @@ def _extra(*values: float) -> list[str]:
 
 
 def _phase(lens: Lens, i: int, row: list[float]) -> list[str]:
-    """A grating on a conic, or a radial phase, in radians over 1 mm, on an even asphere."""
+    """A grating on a conic, or a radial phase (radians, norm radius 1 mm) on an even asphere."""
     assert lens.phase is not None
     at = lens.phase.surfaces.index(i)
     order, form = float(lens.phase.order[at]), lens.phase.forms[at]
@@ -140,15 +140,15 @@ def _phase(lens: Lens, i: int, row: list[float]) -> list[str]:
 
 
 def _times_turn(waves: float) -> float:
-    """Radians that, divided by 2 pi, are these waves to the last digit where there are such."""
+    """The radians that, divided by 2 pi, give `waves` to the last digit, or the nearest to it."""
     turn = 2 * math.pi
     near = [waves * turn, *(math.nextafter(waves * turn, end) for end in (-math.inf, math.inf))]
     return min(near, key=lambda value: abs(value / turn - waves))
 
 
 def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
-    """The medium behind a surface, m from 1, or of the object; names: what the file says of each
-    glass."""
+    """The line of medium m: 0 is the object's, m is behind surface m - 1. names: the words of the
+    file for each glass."""
     if m and lens.mirrors[m - 1]:
         return ["GLAS MIRROR 0 0 1.5 40"]
     keys = medium_of(lens, m)
@@ -165,7 +165,7 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
         return []
     ours = keys["nd"], keys["vd"], keys.get("partial", 0.0)
     theirs = to_theirs(*ours)
-    for digits in range(3, 17):  # as short as it was
+    for digits in range(3, 17):  # the fewest digits that read back
         short = (round(theirs[0], digits), round(theirs[1], digits), round(theirs[2], digits))
         if to_ours(*short) == ours:
             theirs = short

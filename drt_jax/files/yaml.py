@@ -1,4 +1,4 @@
-"""Lenses from files: the bundled ones, and your own in YAML and in the formats of others."""
+"""Load lenses: the bundled ones, YAML prescriptions, and files of Zemax and CODE V."""
 
 import pathlib
 from collections.abc import Mapping
@@ -28,13 +28,13 @@ def lens_names() -> list[str]:
 def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") -> Lens:
     """Read a lens.
 
-    The arrays have JAX's default floating dtype: float64 where the caller enabled it. LensError
-    for a missing file, an unknown key or glass, or numbers that make no lens, with the line.
+    The arrays have JAX's default floating dtype: float64 if the caller enabled it. LensError, with
+    the line, for a missing file, an unknown key or glass, or numbers that make no lens.
 
     source: a bundled name (see `lens_names`), the path of a YAML prescription of at most 1 MB or
         of a Zemax `.zmx` or CODE V `.seq` file, see `load_system`, or a mapping with the keys of a
         prescription.
-    missing: as of `load_system`.
+    missing: see `load_system`.
     """
     with jax.core.eval_context():  # a lens loaded inside a jitted function is a constant
         if isinstance(source, Mapping):
@@ -64,8 +64,8 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
 
 
 def _with_catalogues(top: Any, folder: pathlib.Path) -> Any:
-    """A prescription with those of its glasses that its `catalogues` have, in `glasses`; these win
-    over the table, and the prescription's own over these."""
+    """Add to `glasses` of a prescription the glasses that it uses from its `catalogues`. They take
+    precedence over the built-in table, and the prescription's own glasses over them."""
     if not isinstance(top, dict) or "catalogues" not in top:
         return top
     paths, surfaces = top["catalogues"], top.get("surfaces")
@@ -91,12 +91,12 @@ def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
     """Read a lens with its fields, wavelengths and aperture from a Zemax `.zmx` or CODE V
     `.seq` file of at most 16 MB; see docs/lens_files.md.
 
-    What is read otherwise than it stands there, solves as the values beside them say, is told in
-    one warning and in `System.notes`. LensError, in one line with the line of the file, for what
-    is not read.
+    One warning and `System.notes` list what is read differently from the file, such as solves,
+    which are read as the values beside them. LensError, in one line with the line of the file, for
+    a feature that is not read.
 
-    missing: "error" refuses what we have not; "warn" leaves it out where rays can go on without,
-        and says so.
+    missing: "error" refuses features that the package lacks; "warn" leaves them out, and lists
+        them, if rays can be traced without them.
     """
     kind = pathlib.Path(path).suffix.lower()
     if kind not in _READERS:
@@ -110,7 +110,7 @@ def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
 
 
 def _read(path: str | pathlib.Path, missing: Missing) -> tuple[Record, Use]:
-    """A file of another program."""
+    """Read a file of another program."""
     if missing not in ("error", "warn"):
         raise ValueError(f'missing: expected "error" or "warn", got {shown(missing)}')
     return _READERS[pathlib.Path(path).suffix.lower()](str(path), missing)

@@ -1,4 +1,4 @@
-"""Lens files of Zemax OpticStudio, `.zmx`: what each keyword means, see docs/lens_files.md."""
+"""Read lens files of Zemax OpticStudio, `.zmx`; docs/lens_files.md explains the keywords."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ from .text import Words, words_of
 _UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0}
 _SURFACES = 5000
 _MOST = 1000  # fields or wavelengths
-# Drawing, names, tolerances, what is computed, coatings and polarisation: no rays.
+# Ignored: drawing, names, tolerances, analyses, coatings, polarisation. None changes rays.
 _COSMETIC = frozenset(
     """
     VERS MODE PFIL LANG GFAC PUSH SDMA ROPD PICB POLS GLRS GSTD NSCD COFN NOTE AUTH
@@ -26,7 +26,7 @@ _COSMETIC = frozenset(
     """.split()  # noqa: SIM905
 )
 _SOLVES = ("PPAR", "PZUP", "MAZH")
-# What changes rays and is not read, unless all its numbers are 0.
+# Keywords that change rays and are refused, unless all their numbers are 0.
 _REFUSED = {
     "SQOB": "a rectangular obscuration of unknown columns",
     "SPID": "a spider",
@@ -54,7 +54,7 @@ class _Block:
 
 
 class _Reader:
-    """A file as it is read."""
+    """The state of reading one file."""
 
     def __init__(self, path: str, missing: Missing):
         self.record, self.use = Record(path, missing), Use()
@@ -123,7 +123,7 @@ def _fields(reader: _Reader, words: Words) -> None:
 
 
 def _column(reader: _Reader, words: Words) -> None:
-    """Of all fields; those beyond the number of fields mean nothing."""
+    """Read one number per field; numbers beyond the number of fields are ignored."""
     count = min(len(words.rest), _MOST)
     reader.columns[words.key] = reader.record.numbers(words.line, words.rest, count)
 
@@ -176,7 +176,7 @@ def _stop(reader: _Reader, words: Words) -> None:
 def _curvature(reader: _Reader, words: Words) -> None:
     value = reader.record.number(words.line, words.rest) / reader.unit
     reader.block.row.put("curvature", value, words.line)
-    if len(words.rest) > 1 and words.rest[1] not in ("0", "1"):  # 1: a variable
+    if len(words.rest) > 1 and words.rest[1] not in ("0", "1"):  # 1 is a variable
         reader.solves.append(words.line)
 
 
@@ -273,7 +273,7 @@ def _configurations(reader: _Reader, words: Words) -> None:
 
 
 def read_zmx(path: str, missing: Missing) -> tuple[Record, Use]:
-    """A `.zmx` file as a record of its surfaces and of their use. LensError with the line."""
+    """Read a `.zmx` file into a record of its surfaces and their use. LensError with the line."""
     try:
         lines = words_of(path)
     except InputError as error:
@@ -309,7 +309,7 @@ def read_zmx(path: str, missing: Missing) -> tuple[Record, Use]:
 
 
 def _finish(reader: _Reader, whole: bool) -> None:
-    """What follows from all lines together."""
+    """Do the checks and conversions that need all lines."""
     record, use = reader.record, reader.use
     first, last = reader.blocks[0], reader.blocks[-1]
     if len(reader.blocks) < 3 or last.thickness or last.infinite:
@@ -372,7 +372,7 @@ def _part(reader: _Reader, block: _Block, image: bool) -> Row | Breaking:
 
 
 def _use(reader: _Reader) -> None:
-    """Fields and wavelengths: the first of the columns, in their order."""
+    """Write fields and wavelengths into `use`: the first entries of each column, in order."""
     record, use, (fields, waves) = reader.record, reader.use, reader.counts
     for i in range(1, waves + 1):
         if i not in reader.waves:

@@ -1,4 +1,4 @@
-"""Kernels of a beam on the pixels, by each of three models."""
+"""PSF kernels of a beam on the pixels, by one of three models."""
 
 import dataclasses
 import functools
@@ -20,14 +20,14 @@ Kind = Literal["gaussian", "rays", "waves"]
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Psf:
-    """What pixels collect of the light of an object point, for W wavelengths.
+    """Light of an object point on the pixels, for W wavelengths.
 
-    kernel: (W, size, size), [wavelength, y, x]: adds to 1 - outside.
-    outside: (W,), the part of the light on the sensor that falls beside the kernel.
-    centre: (2,) mm, where the middle of the kernel lies on the sensor.
-    throughput: (W,), the part of the light through the stop that reaches the sensor.
-    solid_angle: (W,), area of the cone of light on the sensor in direction cosines: irradiance is
-        radiance times this; its ratio to the axis is the relative illumination.
+    kernel: (W, size, size), [wavelength, y, x], with the sum 1 - outside.
+    outside: (W,), fraction of the light on the sensor that falls outside the kernel.
+    centre: (2,) mm, the centre of the kernel on the sensor.
+    throughput: (W,), fraction of the light through the stop that reaches the sensor.
+    solid_angle: (W,), area of the cone of light on the sensor in direction cosines. Irradiance is
+        radiance times this area. Its ratio to the area on the axis is the relative illumination.
     """
 
     kernel: Array
@@ -44,11 +44,11 @@ class Psf:
 )
 @dataclasses.dataclass(frozen=True)
 class PsfModel:
-    """How kernels are made, see `converged_psf`.
+    """A PSF model with its rays and its grid, see `converged_psf`.
 
-    kind: "gaussian", "rays" or "waves". rule: of the rays. cells: of the grid of the pupil,
-    along a side; 0 for a Gaussian. errors: for "auto", by kind, how far its kernel is from that of
-    the waves, of the worst wavelength: what the tolerance is for.
+    kind: "gaussian", "rays" or "waves". rule: of the rays. cells: number of cells along a side of
+    the pupil grid; 0 for "gaussian". errors: with "auto", for each kind the difference of its
+    kernel from that of "waves" at the worst wavelength, which is compared with the tolerance.
     """
 
     kind: Kind

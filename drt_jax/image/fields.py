@@ -1,8 +1,8 @@
-"""Kernels over the whole field and over depth: a small grid of object points, made once.
+"""Kernels over the whole field and over depth, computed once on a small grid of object points.
 
-The nodes are equidistant in the tangents of the field, along x and y, and in 1 / distance. Where a
-lens has an axis, an eighth of them is traced; mirroring and exchange of x and y, which are exact on
-pixels, give the others.
+The nodes are equidistant in the tangents of the field angles along x and y, and in 1 / distance.
+For a rotationally symmetric lens an eighth of the nodes is traced. Mirroring and swapping x and y,
+which are exact on pixels, give the others.
 """
 
 import dataclasses
@@ -26,20 +26,20 @@ from .beam_psf import PsfModel
 from .interpolate import lagrange
 from .psf import psf
 
-# Nodes that interpolation takes a kernel from, along each axis.
+# Number of nodes along each axis from which a kernel is interpolated.
 _ORDER = 4
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GridMethod:
-    """How the kernels over the field are made: what `grid_method` chose, to be passed on.
+    """Settings of the kernels over the field, made by `grid_method` for `kernel_grid`.
 
-    step: (), between nodes, tangent of the field. distances: (D,) mm, equidistant in 1 / distance.
-    pixel: (), mm. model: of the kernels, see `converged_psf`.
-    nearest: (D, U), the traced node with light that is nearest to each.
-    half: nodes on either side of the axis, y and x. size: of a kernel, pixels. symmetry: of the
-    lens. together: see `grid_method`.
+    step: (), spacing of the nodes, tangent. distances: (D,) mm, equidistant in 1 / distance.
+    pixel: (), side, mm. model: PSF model of the kernels, see `converged_psf`.
+    nearest: (D, U), index of the traced node with light that is nearest to each traced node.
+    half: number of nodes on each side of the axis, along y and x. size: side of a kernel, pixels.
+    symmetry: that of the lens. together: see `grid_method`.
     """
 
     step: Array
@@ -56,15 +56,15 @@ class GridMethod:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class KernelGrid:
-    """What a lens makes of points at D distances, Ny x Nx fields and W wavelengths.
+    """PSF kernels of a lens at D distances, Ny x Nx fields and W wavelengths.
 
-    step: (), between nodes, tangent of the field; the middle node is the axis.
+    step: (), spacing of the nodes, tangent of the field angle; the middle node is the axis.
     vergences: (D,) 1/mm, of the objects.
-    points: (D, Ny, Nx, W, 2) mm, the centroids on the sensor: the middles of the kernels.
-    solid_angle: (D, Ny, Nx, W), of the light on the sensor, in direction cosines: irradiance =
-        radiance x solid_angle.
-    outside: (D, Ny, Nx, W), the part of the light that falls beside a kernel.
-    kernels: (D, Ny, Nx, W, K, K) [y, x], adding up to 1 - outside; 0 where no light arrives.
+    points: (D, Ny, Nx, W, 2) mm, centres of the kernels on the sensor: the centroids of the light.
+    solid_angle: (D, Ny, Nx, W), solid angle of the light on the sensor, as an area in direction
+        cosines: irradiance = radiance x solid_angle.
+    outside: (D, Ny, Nx, W), fraction of the light that falls outside a kernel.
+    kernels: (D, Ny, Nx, W, K, K) [y, x], with the sum 1 - outside; 0 where no light arrives.
     """
 
     step: Array
@@ -76,13 +76,13 @@ class KernelGrid:
 
     @property
     def half(self) -> tuple[int, int]:
-        """Nodes on either side of the axis, y and x."""
+        """Number of nodes on each side of the axis, along y and x."""
         return self.kernels.shape[1] // 2, self.kernels.shape[2] // 2
 
 
 def unique_nodes(half: tuple[int, int], symmetry: Symmetry) -> tuple[np.ndarray, ...]:
-    """Nodes (U, 2), x and y in steps, that are traced; which of them (Ny, Nx) each node of the grid
-    is, and whether x and y are exchanged there."""
+    """Traced nodes (U, 2), x and y in steps. For each node of the grid (Ny, Nx): the index of its
+    traced node, and whether x and y are swapped there."""
     y, x = np.meshgrid(*(np.arange(-n, n + 1) for n in half), indexing="ij")
     exchanged = np.zeros(x.shape, bool)
     if symmetry != "none":
@@ -110,8 +110,8 @@ def _chief(lens: Lens, tangents: Array, distances: Array, wavelengths: Array) ->
 
 
 def image_points(lens: Lens, tangents: Any, distances: Any, wavelengths: Any) -> np.ndarray:
-    """Where the chief rays of fields (U, 2), tangents, meet the sensor from distances (D,) mm:
-    (D, U, W, 2) mm; inf where they fail. Known numbers."""
+    """Points on the sensor (D, U, W, 2) mm of the chief rays of fields (U, 2), tangents, at
+    distances (D,) mm; inf where a chief ray fails. Known numbers."""
     dtype = lens.curvature.dtype
     waves = jnp.atleast_1d(real_array("wavelengths", wavelengths, dtype))
     return np.asarray(
@@ -120,8 +120,8 @@ def image_points(lens: Lens, tangents: Any, distances: Any, wavelengths: Any) ->
 
 
 def kernel_grid(lens: Lens, method: GridMethod, wavelengths: Numbers) -> KernelGrid:
-    """The kernels of a lens over field and depth. Differentiable in the lens; inside `jax.jit`,
-    too. `wavelengths` (W,), um."""
+    """The kernels of a lens over field and depth. Works inside `jax.jit` and is differentiable in
+    the lens. wavelengths: (W,), um."""
     waves = jnp.atleast_1d(lens.checked_wavelengths(wavelengths))
     return _kernel_grid(lens, method, waves)
 
@@ -134,7 +134,7 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
     def one(given: tuple[Array, Array]) -> tuple[Array, ...]:
         return _record(lens, method, given[1], given[0], wavelengths)
 
-    # One after the other: the rays of a kernel are many, and all at once would not fit the cache.
+    # One point at a time: the rays of all kernels together would not fit into the cache.
     pairs = (len(method.distances), len(nodes))
     every = (
         jnp.repeat(method.distances, pairs[1]),
@@ -143,7 +143,7 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
     found = jax.lax.map(jax.checkpoint(one), every)
     found = tuple(a.reshape(*pairs, *a.shape[1:]) for a in found)
     points, solid_angle, outside, kernels = found
-    # Beyond the light a point lies as much too near or far as the nearest that there is.
+    # A node without light gets the ratio of point to tangent of the nearest node with light.
     finite = jnp.isfinite(points)
     points = jnp.where(finite, points, 0)
     near = jnp.take_along_axis(points, method.nearest[:, :, None, None], axis=1)
@@ -177,8 +177,8 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
 def _record(
     lens: Lens, method: GridMethod, tangent: Array, distance: Array, wavelengths: Array
 ) -> tuple[Array, ...]:
-    """Point (W, 2), solid angle, share outside (W,) and kernel (W, K, K) of an object point."""
-    # About a centroid: off the middle, a point smaller than a pixel would be rounded.
+    """Centre (W, 2), solid angle and outside (W,), and kernel (W, K, K) of an object point."""
+    # A centroid is the centre: off centre, a spot smaller than a pixel would be rounded.
 
     def some(waves: Array) -> tuple[Array, ...]:
         field = jnp.arctan(tangent)
@@ -193,14 +193,14 @@ def _record(
 
 
 def kernels_at(grid: KernelGrid, fields: Numbers, distances: Numbers) -> Array:
-    """Kernels (B, W, K, K) of B object points, interpolated.
+    """Interpolate the kernels (B, W, K, K) of B object points.
 
-    fields: (B, 2) angles along x and y, radians, within the grid; beyond it the kernels at its edge
-        go on. distances: (B,) mm, or one; inf allowed.
+    fields: (B, 2) angles along x and y, radians; outside the grid the kernels of its edge apply.
+    distances: (B,) mm, or one; inf allowed.
 
-    In field by polynomials through the four nearest nodes along each axis, in 1 / distance through
-    as many of its nodes. Differentiable in the grid, the fields and the distances. ValueError for
-    other shapes.
+    Interpolation uses polynomials through the four nearest nodes along x, y and 1 / distance, or
+    all nodes if there are fewer. Differentiable in the grid, the fields and the distances.
+    ValueError for other shapes.
     """
     dtype = grid.kernels.dtype
     angles = real_array("fields", fields, dtype)

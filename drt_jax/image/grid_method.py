@@ -1,4 +1,4 @@
-"""Which fields, rays and pixels the kernels over the field take."""
+"""The choice of nodes, PSF model and kernel size for the kernels over the field."""
 
 import functools
 import warnings
@@ -21,15 +21,15 @@ from .moments import moments
 from .psf_model import converged_psf
 from .spot import Moments
 
-# Sides of kernels that are tried, pixels.
+# Kernel sides to try, pixels.
 _SIZES = (9, 13, 17, 21, 25, 33, 41, 49, 65, 97, 129)
-# Standard deviations of the blur that a kernel reaches to each side.
+# Half the side of a kernel, in standard deviations of the blur.
 _REACH = 4.5
-# The part of the light beside a kernel from which a picture is worth a warning.
+# Warn if a larger fraction of the light falls outside a kernel.
 _LOST = 1e-2
-# Sum of the absolute errors of a kernel's pixels.
+# Default tolerance: the sum of the absolute errors of a kernel's pixels.
 _TOLERANCE = 5e-3
-# The order of the rule that finds where light arrives.
+# Order of the rule that tests from which fields light arrives.
 _LOOK = 8
 
 
@@ -46,19 +46,18 @@ def grid_method(
     together: bool = False,
     norm: int = 1,
 ) -> GridMethod:
-    """Choose how `kernel_grid` makes its kernels; all numbers are known.
+    """Choose the settings of `kernel_grid`. All arguments are known numbers.
 
     fields: the largest angles (2,) along x and y, radians.
-    distances: (D,) mm, of which 1 / distance is equidistant, rising or falling; inf allowed.
-    wavelengths: (W,) um. pixel: mm.
-    size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
-    nodes: on one side of the axis along the longer side, 2 or more.
-    model, tolerance, norm: of the kernels, as of `converged_psf`; a name is made into a model for
-        all fields.
-    together: all colours about the mean of their centroids, so that kernels hold the lateral colour
-        (of patches); else each about its own.
+    distances: (D,) mm, inf allowed; 1 / distance is equidistant, rising or falling.
+    wavelengths: (W,) um. pixel: side of a pixel, mm.
+    size: side of a kernel, pixels, odd; the default reaches 4.5 standard deviations to each side.
+    nodes: number of nodes from the axis to the largest angle, 2 or more.
+    model, tolerance, norm: as in `converged_psf`; a name is converged to one model for all fields.
+    together: True centres the kernels of all wavelengths on the mean of their centroids, so that
+        they contain the lateral colour (for patches); False centres each on its own centroid.
 
-    ValueError inside a trace, for numbers that make no sense, and where no light arrives at all.
+    ValueError inside a trace, for invalid numbers, and if no light arrives from any field.
     """
     known = known_values((lens, fields, distances, wavelengths, pixel))
     if known is None:
@@ -96,7 +95,7 @@ def grid_method(
 
 
 def check_pixel(pixel: Numbers) -> None:
-    """ValueError for a known side of a pixel that is not above 0 mm."""
+    """ValueError if the side of a pixel is known and is not above 0 mm."""
     if concrete(pixel):
         side = np.asarray(pixel, float)
         if side.ndim or not 0 < side < np.inf:
@@ -104,7 +103,7 @@ def check_pixel(pixel: Numbers) -> None:
 
 
 def _widest(fields: Any) -> np.ndarray:
-    """The largest tangents (2,) of known fields."""
+    """Tangents (2,) of the largest field angles along x and y. Known numbers."""
     wide = np.tan(np.abs(np.asarray(fields, float)))
     if wide.shape != (2,) or not np.all(np.isfinite(wide)) or not np.max(wide) > 0:
         raise ValueError(f"fields: expected two angles, one above 0, got {fields!r}")
@@ -120,14 +119,14 @@ def _check_counts(size: Any, nodes: Any) -> None:
 
 
 def _reach(found: Moments, arrives: np.ndarray, pixel: Any) -> int:
-    """The side of kernels that are wide enough for spots (D, U, W), where light arrives (D, U)."""
+    """The kernel side, pixels, that is wide enough for the spots (D, U, W) with light (D, U)."""
     sigma = np.sqrt(np.diagonal(np.asarray(found.covariance), 0, -2, -1))[arrives]
     return int(np.ceil(_REACH * np.max(sigma) / float(np.asarray(pixel)))) * 2 + 1
 
 
 def warn_of_loss(lens: Lens, method: GridMethod, grid: KernelGrid, wavelengths: Any) -> None:
-    """A warning if kernels are too small for the blur: what share is lost and the size that would
-    do. Known numbers."""
+    """Warn if kernels are too small for the blur. The warning gives the lost fraction of the light
+    and the size that is needed. Known numbers."""
     lost = np.max(np.asarray(grid.outside), initial=0.0)
     if lost > _LOST:
         tangents = unique_nodes(method.half, method.symmetry)[0] * float(method.step)
@@ -142,7 +141,7 @@ def warn_of_loss(lens: Lens, method: GridMethod, grid: KernelGrid, wavelengths: 
 
 
 def _nearest(tangents: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    """For each node (U, 2), at each distance, the nearest that is `lit` (D, U)."""
+    """For each node (U, 2) and distance, the index of the nearest node with light, `lit` (D, U)."""
     apart = np.sum((tangents[:, None] - tangents[None]) ** 2, axis=-1)
     return np.argmin(np.where(lit[:, None], apart[None], np.inf), axis=-1)
 
@@ -159,7 +158,7 @@ def _spots(
 
 
 def _look(lens: Lens, tangents: np.ndarray, far: np.ndarray, wavelengths: Any) -> Moments:
-    """Spots of all fields (U, 2), tangents, from all distances: where light arrives."""
+    """Spots of all fields (U, 2), tangents, at all distances; they show where light arrives."""
     dtype = lens.curvature.dtype
     waves = jnp.atleast_1d(real_array("wavelengths", wavelengths, dtype))
     rule = Gauss(_LOOK, "none")
@@ -167,12 +166,12 @@ def _look(lens: Lens, tangents: np.ndarray, far: np.ndarray, wavelengths: Any) -
 
 
 def _some(tangents: np.ndarray, far: np.ndarray, arrives: np.ndarray) -> tuple[Any, Any]:
-    """Fields (F, 2), radians, and distances for which a model of kernels is chosen: the farthest of
-    which light arrives, one between, and the axis."""
+    """Fields (F, 2), radians, and distances for the choice of a PSF model: the farthest field with
+    light, a middle one and the axis; the first and the last distance."""
     every = np.all(arrives, axis=0)
     lit = tangents[every if np.any(every) else np.any(arrives, axis=0)]
     order = lit[np.argsort(np.sum(lit**2, axis=1))]
     some = order[[-1, len(order) // 2, 0]]
-    # Turned a little out of the planes in which half of a pupil would do.
+    # A small shift off the symmetry planes, where the rule would use half a pupil only.
     angles = np.arctan(some + 1e-6 * max(np.max(np.abs(some)), 1e-3))
     return angles, np.unique([far[0], far[-1]])

@@ -1,9 +1,9 @@
-"""The point spread function on the pixels, by the model that a scene needs.
+"""The point spread function on the pixels, by one of three models.
 
-A ladder of three: "gaussian", with the moments of the rays, as in the paper; "rays", the light of
-all rays; "waves", with diffraction. "auto" takes the first whose kernel is within a tolerance of
-that of the waves. How many rays and cells a model takes follows from the tolerance, outside of
-`jax.jit`: `converged_psf` makes the model, a value that `psf` then takes anywhere.
+"gaussian" uses the moments of the rays, as in the paper; "rays" uses the light of all rays; "waves"
+adds diffraction. "auto" takes the first of these whose kernel is within the tolerance of "waves".
+`converged_psf` chooses the number of rays and cells from the tolerance, outside of `jax.jit`. The
+model that it returns is a value, which `psf` takes anywhere.
 """
 
 import functools
@@ -37,15 +37,15 @@ def psf(
 ) -> Psf:
     """The point spread function on `size` x `size` pixels, see `Psf`.
 
-    field, distance, wavelengths (W,): as of `psf_moments`. pixel: the side of a pixel, mm.
-    model: a name or, inside `jax.jit` and `jax.vmap`, what `converged_psf` made.
-    tolerance: of a model that is named: sum of the absolute errors of a kernel's pixels, 1e-2 by
+    field, distance, wavelengths (W,): as in `psf_moments`. pixel: the side of a pixel, mm.
+    model: a name, or a model from `converged_psf` (needed inside `jax.jit` and `jax.vmap`).
+    tolerance: only with a name: the sum of the absolute errors of a kernel's pixels, 1e-2 by
         default.
-    centre: (2,) mm on the sensor; by default the mean of the wavelengths' centroids.
-    defocus: () mm by which the sensor stands behind its place: no ray is traced for it.
+    centre: (2,) mm, of the kernel on the sensor; by default the mean of the wavelengths' centroids.
+    defocus: (), mm by which the sensor is moved back; this needs no new ray trace.
 
-    Light fills the stop evenly. Differentiable in all numbers, in every mode. ValueError as of
-    `scene_of`, for a pixel that is not above 0, and where no ray arrives.
+    Light fills the stop uniformly. Differentiable in all numbers, in every mode. ValueError as in
+    `scene_of`, for a pixel that is not above 0, and if no ray arrives.
     """
     scene = scene_of(lens, field, distance, wavelengths)
     pixel_, size = check_pixels(pixel, size, lens.curvature.dtype)
@@ -88,13 +88,13 @@ def psfs(
     size: int,
     model: PsfModel,
 ) -> Psf:
-    """`psf` of B object points, one after the other: each leaf with B as its first axis.
+    """`psf` of B object points, one after the other. Each leaf of the result has B as first axis.
 
-    fields: (B, 2), radians. distances: (B,), mm, or one. wavelengths, pixel, size: as of `psf`.
-    model: from `converged_psf`, for all points.
+    fields: (B, 2), radians. distances: (B,), mm, or one. wavelengths, pixel, size: as in `psf`.
+    model: one model from `converged_psf` for all points.
 
-    For `jax.jit`; the gradient traces each point again and keeps the rays of one point at a time.
-    ValueError for other shapes; a point without light has the throughput 0.
+    For use in `jax.jit`. The gradient traces each point again and keeps the rays of one point at a
+    time. ValueError for other shapes. A point without light has the throughput 0.
     """
     dtype = lens.curvature.dtype
     angles = real_array("fields", fields, dtype)

@@ -1,4 +1,4 @@
-"""The model of kernels that a tolerance takes: its polynomials, and the cells of its grid."""
+"""The choice of a PSF model from a tolerance: its polynomials and the cells of its grid."""
 
 import dataclasses
 import functools
@@ -24,9 +24,9 @@ from .kernel import check_pixels
 from .wave_psf import period
 from .zernike import zernike
 
-# Sum of the absolute errors of the pixels of a kernel.
+# Default tolerance: the sum of the absolute errors of a kernel's pixels.
 TOLERANCE = 1e-2
-# Degrees of the polynomials and cells of the grids that are tried.
+# Polynomial degrees to try, first of a coarse, then of a fine trace; cells of a grid to try.
 _DEGREES = (4, 6, 8, 10, 12, 14, 16), (20, 24)
 _CELLS = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768)
 _UM = 1e3  # per mm
@@ -43,13 +43,13 @@ def converged_psf(
     tolerance: float = TOLERANCE,
     norm: int = 1,
 ) -> PsfModel:
-    """The model whose kernels are within `tolerance`, the sum of the absolute errors of the pixels;
-    with `norm` 2 the root of the sum of their squares, by which a picture of white noise is off.
+    """A PSF model whose kernels are within `tolerance`, the sum of the absolute errors of the
+    pixels; with `norm` 2 the root of the sum of their squares: the error of a white-noise picture.
 
     field: angle along y, or (x, y), in radians, or many pairs (F, 2). distance: mm, one or (Z,).
-    Other arguments as of `psf`; all are known numbers. The model serves every field at every
-    distance. With "auto" it is the cheapest within the tolerance of the waves, and `errors` says
-    how far the others are. Warns where no polynomials or no grid in reach meets the tolerance.
+    Other arguments as in `psf`; all are known numbers. The model is valid for every field at every
+    distance. "auto" takes the cheapest model within the tolerance of "waves", and `errors` gives
+    the differences of the others. Warns if no degree or no grid that is tried meets the tolerance.
     ValueError inside a trace.
     """
     _check_asked(model, tolerance, norm)
@@ -106,13 +106,13 @@ def _traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
     return trace_beam(lens, scene, rule)
 
 
-# Each number of cells is a program, which runs once a scene.
+# Each number of cells needs its own compiled program, which runs once per scene.
 _kernels = jit(psf_of_beam, ONCE, static_argnames=("size", "kind", "cells"))
 
 
 @dataclasses.dataclass(frozen=True)
 class _View:
-    """Beams of scenes on pixels; all numbers are known."""
+    """The beams of scenes, and the pixels of the kernels. All numbers are known."""
 
     lens: Lens
     scenes: tuple[Scene, ...]
@@ -122,7 +122,7 @@ class _View:
     norm: int
 
     def kernels(self, kind: Kind, cells: int) -> np.ndarray:
-        """Those of all scenes and wavelengths, (scenes W, size, size)."""
+        """Kernels of all scenes and wavelengths, (scenes W, size, size)."""
         made = (
             _kernels(
                 self.lens,
@@ -139,7 +139,7 @@ class _View:
         return np.concatenate([np.asarray(one.kernel) for one in made])
 
     def cells(self, kind: Kind, tolerance: float) -> int:
-        """The fewest cells of a model whose kernels are within the tolerance."""
+        """The smallest number of cells for which the kernels are within the tolerance."""
         if kind == "gaussian":
             return 0
         first = _CELLS[0] if kind == "rays" else max(map(self._fewest, self.scenes, self.beams))
@@ -148,7 +148,7 @@ class _View:
         for cells in tried:
             now = self.kernels(kind, cells)
             change = np.inf if before is None else difference(now, before, self.norm)
-            # The error falls with the square of the number of cells, which grows by 4/3 at least.
+            # The error falls with the square of the number of cells; a step is 4/3 or more.
             if change <= 0.75 * tolerance:
                 return cells
             before = now
@@ -160,7 +160,7 @@ class _View:
         return cells
 
     def _fewest(self, scene: Scene, beam: Beam) -> int:
-        """So many that neither the spot nor the window comes again within the window."""
+        """The fewest cells for which no periodic copy of spot or window overlaps the window."""
         hits = np.asarray(beam.hits[:, -1])
         middle = np.mean(hits[:, np.asarray(beam.known)], axis=-1)
         reach = np.max(np.where(np.asarray(beam.known), np.abs(hits - middle[:, None, None]), 0))
@@ -170,8 +170,8 @@ class _View:
 
 
 def difference(a: np.ndarray, b: np.ndarray, norm: int = 1) -> float:
-    """Sum of the absolute differences of kernels (..., size, size), or with `norm` 2 the root of
-    the sum of their squares; the largest of them."""
+    """The largest difference of kernels (..., size, size): the sum of the absolute differences of
+    their pixels or, with `norm` 2, the root of the sum of the squares."""
     total = np.sum(np.abs(a - b) ** norm, axis=(-2, -1))
     return float(np.max(total ** (1 / norm)))
 
@@ -184,8 +184,8 @@ def _degree(
     degrees: tuple[int, ...],
     tolerance: float,
 ) -> tuple[int, float]:
-    """The lowest degree whose polynomials give back the rays, which are more than its terms, and to
-    what part of the spot, or of a wave's radian."""
+    """The lowest degree whose polynomials fit the rays, and the error of the fit, relative to the
+    spot or, for the phase, in radians. There are more rays than terms."""
     pairs = [(b, s, w) for b, s in zip(beams, scenes) for w in range(s.wavelengths.size)]
     for degree in degrees:
         error = max(_misfit(b, s, w, pixel, pictures, degree) for b, s, w in pairs)
@@ -197,7 +197,7 @@ def _degree(
 def _misfit(
     beam: Beam, scene: Scene, wavelength: int, pixel: Array, pictures: bool, degree: int
 ) -> float:
-    """The error of one wavelength's polynomials, see `_degree`."""
+    """The error of the fit at one wavelength, see `_degree`."""
     row = jax.tree.map(np.asarray, (beam.weights, beam.known, beam.path, beam.hits[:, -1]))
     weight, known, path, hits = (a[..., wavelength, :] for a in row)
     weight = np.sqrt(np.where(known, np.abs(weight), 0) / np.sum(np.abs(weight)))
@@ -206,7 +206,7 @@ def _misfit(
     error = _residual(points, hits, weight, degree) / max(float(spread), float(pixel))
     if not pictures:
         return error
-    # Twice the error of the field, which is that of the phase.
+    # The error of the wave field is the phase error; it counts twice.
     phase = path[None] * (4 * np.pi * _UM / float(scene.wavelengths[wavelength]))
     return max(error, _residual(directions, phase, weight, degree))
 
@@ -216,8 +216,8 @@ def _mean(hits: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _residual(points: np.ndarray, values: np.ndarray, weight: np.ndarray, degree: int) -> float:
-    """Root mean square of what polynomials of a degree leave of values (D, Q) at points (2, Q);
-    `weight` (Q,) is the root of the light."""
+    """RMS residual of a fit of polynomials of a degree to values (D, Q) at points (2, Q); `weight`
+    (Q,) is the square root of the light."""
     centre = _mean(points, weight)
     scale = 2 * np.sqrt(np.sum(weight**2 * (points - centre) ** 2, axis=-1, keepdims=True))
     basis = np.asarray(zernike(jnp.asarray((points - centre) / scale), degree))
@@ -227,7 +227,7 @@ def _residual(points: np.ndarray, values: np.ndarray, weight: np.ndarray, degree
 
 
 def _cheapest(view: _View, rule: BeamRule, tolerance: float) -> PsfModel:
-    """The first of the ladder within the tolerance of the waves."""
+    """The first model, from cheap to exact, that is within the tolerance of "waves"."""
     ladder: list[tuple[Kind, int]] = [
         (kind, view.cells(kind, tolerance)) for kind in get_args(Kind)
     ]

@@ -1,4 +1,4 @@
-"""Pictures: numbers and lenses in, figures out. Alone imports matplotlib.
+"""Figures of lenses and of results. No other folder imports matplotlib.
 
 from drt_jax import show
 

@@ -1,7 +1,7 @@
-"""Pictures of analyses over the field: what `drt_jax` computes in, axes out.
+"""Plots of analyses over the field. Each function draws a result of `drt_jax` on axes.
 
-wavelengths (W,) in um give each curve its colour: blue for the shortest, red for the longest.
-fields (F,) are angles in radians. What is not finite is left out.
+wavelengths (W,) in um set the colour of each curve: blue for the shortest, red for the longest.
+fields (F,) are angles in radians. Values that are not finite are left out.
 """
 
 import itertools
@@ -19,12 +19,12 @@ from ..image.gaussian_error import GaussianError
 from ..image.spots import Spots
 from .figures import FIELD_COLOURS
 
-# RMS radii from the centroid beyond which stray rays do not widen a picture.
+# Rays farther than this many RMS radii from the centroid are stray and do not widen a plot.
 _STRAY = 5.0
 
 
 def spot_radius(found: Spots) -> np.ndarray:
-    """The radii (F,) mm that pictures show: of the farthest ray, unless that is a stray one."""
+    """The radii (F,) mm of the plots: that of the farthest ray, at most `_STRAY` RMS radii."""
     return np.minimum(np.asarray(found.radius), _STRAY * np.asarray(found.rms))
 
 
@@ -41,8 +41,8 @@ def colours(wavelengths: ArrayLike) -> list[str]:
 def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: float = 0) -> Axes:
     """The spot of one of the fields about its centroid, in um, with the Airy circle.
 
-    half: half the width of the picture in um; 0 for as wide as the spot, or as five times its RMS
-        radius if a ray strays farther, which the label says.
+    half: half the width of the plot, um; 0 takes the radius of the spot, at most five RMS radii.
+        If a ray lies farther out, the label gives its distance.
     """
     centroid = np.asarray(found.centroid)[field]
     points = 1e3 * (np.asarray(found.points)[field] - centroid)
@@ -67,8 +67,8 @@ def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: fl
 def fan(
     axes: Axes, found: RayFans, field: int, wavelengths: ArrayLike, sagittal: bool = False
 ) -> Axes:
-    """Transverse errors of one of the fields along the y axis of the stop or, sagittal, the x axis,
-    in um."""
+    """Transverse ray errors of one field, um, along the y axis of the stop or, with `sagittal`,
+    along the x axis."""
     errors, component = (found.sagittal, 0) if sagittal else (found.tangential, 1)
     for curve, colour in zip(np.asarray(errors)[field, ..., component], colours(wavelengths)):
         axes.plot(found.pupil, 1e3 * _finite(curve), color=colour)
@@ -80,7 +80,7 @@ def fan(
 def field_curvature(
     axes: Axes, found: FieldCurvature, fields: ArrayLike, wavelengths: ArrayLike
 ) -> Axes:
-    """Foci over the field in mm from the sensor: tangential lines, dashed for sagittal ones."""
+    """Foci over the field, mm from the sensor: solid lines are tangential, dashed sagittal."""
     for k, colour in enumerate(colours(wavelengths)):
         for foci, style in zip(found, ("-", "--")):
             curve = np.asarray(foci)[:, k]
@@ -101,8 +101,8 @@ def distortion(axes: Axes, found: Distortion, fields: ArrayLike, wavelengths: Ar
 def lateral_colour(
     axes: Axes, found: ArrayLike, fields: ArrayLike, wavelengths: ArrayLike, airy: float = 0
 ) -> Axes:
-    """Lateral colour (F, W, 2) mm along y over the field, in um; airy: a radius in um to be
-    shaded."""
+    """Lateral colour along y over the field, um. found: (F, W, 2) mm. airy: radius of the shaded
+    band, um."""
     curves = 1e3 * np.asarray(found)[..., 1].T
     if 0 < airy < np.inf:
         axes.axvspan(-airy, airy, color="0.92")
@@ -130,8 +130,8 @@ def mtf(
     names: Sequence[str],
     hues: Sequence[str] = FIELD_COLOURS,
 ) -> Axes:
-    """MTF (F, 2, N) over frequencies (N,) in cycles/mm, tangential and, dashed, sagittal, with the
-    diffraction limit (N,). hues: colours of the fields."""
+    """MTF (F, 2, N) over frequencies (N,) in cycles/mm, with the diffraction limit (N,): solid
+    lines are tangential, dashed sagittal. hues: colours of the fields."""
     axes.plot(frequencies, limit, ":", color="black", label="limit")
     for both, name, hue in zip(np.asarray(curves), names, itertools.cycle(hues)):
         axes.plot(frequencies, both[0], color=hue, label=name)
@@ -151,8 +151,8 @@ def encircled_energy(
     hues: Sequence[str] = FIELD_COLOURS,
     airy: float = 0,
 ) -> Axes:
-    """The part of the light (F, N) within circles of radii (N,) mm. hues: colours of the
-    fields. airy: a radius in mm to be marked."""
+    """Encircled energy: the fraction of the light (F, N) within circles of radii (N,) mm. hues:
+    colours of the fields. airy: radius of the marked line, mm."""
     places = 1e3 * np.asarray(radii, float)
     for part, name, hue in zip(np.asarray(parts), names, itertools.cycle(hues)):
         axes.plot(places, part, color=hue, label=name)
@@ -167,8 +167,8 @@ def encircled_energy(
 def gaussian_error(
     axes: Axes, found: GaussianError, fields: ArrayLike, distances: ArrayLike
 ) -> Axes:
-    """By how much Gaussian kernels are wrong over field (F,) and distance (D,) mm, as numbers and
-    colours: the share of light in the wrong pixels, half of what is `misplaced`, in per cent."""
+    """The error of Gaussian kernels over field (F,) and distance (D,) mm, as numbers and colours:
+    the light in wrong pixels, in per cent, which is half of `misplaced`."""
     share = 50 * np.asarray(found.misplaced)
     axes.imshow(share.T, vmin=0, vmax=100, cmap="magma_r", aspect="auto", origin="lower")
     for place, value in np.ndenumerate(share):

@@ -1,4 +1,4 @@
-"""A figure, and kernels: arrays in, axes out."""
+"""New figures, and plots of PSF kernels."""
 
 import io
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-# Of fields, in the order in which they are given.
+# Colours of the fields, in the order of the fields.
 FIELD_COLOURS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
 
 
@@ -24,12 +24,12 @@ class _Figure(Figure):
 def new(
     rows: int = 1, columns: int = 1, width: float = 6.0, height: float = 4.0
 ) -> tuple[Figure, Any]:
-    """A figure and its axes (rows, columns), without those that are 1.
+    """A figure and its array of axes (rows, columns), without dimensions of length 1.
 
     width, height: of each panel, in inches.
 
-    Made without pyplot, so that no window opens and no global state changes; write it with
-    `figure.savefig(path)`. A notebook shows it where it is the last line of a cell.
+    It is made without pyplot: no window opens and no global state changes. Write it with
+    `figure.savefig(path)`. A notebook shows it if it is the last line of a cell.
     """
     figure = _Figure(figsize=(width * columns, height * rows), layout="constrained", dpi=150)
     return figure, figure.subplots(rows, columns)
@@ -40,7 +40,7 @@ def kernels(axes: Sequence[Axes], kernel: np.ndarray, titles: Sequence[str]) -> 
 
     axes: one for each channel.
     kernel: (C, K, K).
-    titles: of the channels.
+    titles: one for each channel.
     """
     for ax, values, title in zip(axes, kernel, titles):
         ax.imshow(values, vmin=0, vmax=np.max(kernel), cmap="magma", origin="lower")

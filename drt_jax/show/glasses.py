@@ -1,4 +1,4 @@
-"""`python -m drt_jax glass NAME`: what a glass of the table is, its neighbours, the glass map."""
+"""`python -m drt_jax glass NAME`: data of a glass of the table, its neighbours, the glass map."""
 
 import argparse
 import pathlib
@@ -11,11 +11,11 @@ from ..lens.glass import FRAUNHOFER, NORMAL_LINE, Glass
 from ..lens.glasses import find_glass, indices, map_point, near_names, nearest_glasses
 from .figures import new
 
-_NEAR, _ALL = 6, 10_000  # of the lists, and of the map
+_NEAR, _ALL = 6, 10_000  # most glasses in a list, and in the map
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    """What the command line takes."""
+    """Add the arguments of the command line."""
     parser.add_argument("name", nargs="?", help="as the maker writes it, or NAME_MAKER")
     parser.add_argument("--near", metavar="ND,VD", help="glasses next to these in the glass map")
     parser.add_argument("--makers", nargs="+", help="of neighbours, such as SCHOTT OHARA")
@@ -23,7 +23,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def told(options: argparse.Namespace) -> Iterator[str]:
-    """The lines that answer a command line, and its picture. ValueError where it makes no sense."""
+    """Lines of output of the command, which also writes the map. ValueError for wrong options."""
     if (options.name is None) == (options.near is None):
         raise ValueError("give the name of a glass or --near ND,VD, one of both")
     if options.near is None:
@@ -58,7 +58,7 @@ def _pair(text: str) -> tuple[float, float]:
 
 
 def glass_lines(glass: Glass) -> Iterator[str]:
-    """What is known of a glass of the table, in lines."""
+    """Lines with the data of a glass of the table."""
     yield f"{glass.name}{f' ({glass.maker})' if glass.maker else ''}"
     low, high = glass.range
     lines = {f"{name}, {1e3 * w:.2f} nm": w for name, w in zip("dFCg", FRAUNHOFER, strict=True)}
@@ -82,9 +82,9 @@ def glass_lines(glass: Glass) -> Iterator[str]:
 def glass_map(
     axes: Axes, point: Sequence[float], name: str, makers: Collection[str] | None = None
 ) -> Axes:
-    """nd over vd of all glasses of the table, with one of them marked.
+    """Plot nd over vd of the glasses of the table, with a mark at one point.
 
-    point: nd and vd of the mark. name: what it says. makers: of the glasses; None: all.
+    point: nd and vd of the mark. name: label of the mark. makers: of the glasses; None for all.
     """
     found = nearest_glasses(point[0], point[1], makers, _ALL)
     for maker in sorted({near.glass.maker for near in found}):

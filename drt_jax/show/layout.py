@@ -1,5 +1,5 @@
-"""A lens in section: its outlines and rays as polylines in the (z, y) plane, and their picture;
-and what its apertures do to the beam of a field.
+"""Layout drawing: the outlines and rays of a lens as polylines in the (z, y) plane. Also the
+clipping of the beam of a field by the apertures.
 """
 
 import itertools
@@ -24,10 +24,10 @@ from ..rays.trace import trace_rays
 from .figures import FIELD_COLOURS
 
 _POINTS = 161
-_RAYS = 600  # are traced at a time, so that all traces share one program
-_RINGS, _RIM = 10, 240  # of the rays that fill the stop, and how many more lie on its rim
-_SCANS = 3  # of the meridian for the edges of a beam, each between the edges of the last
-# How rays end that do not come to the sensor, but for those that an aperture clips.
+_RAYS = 600  # rays per trace, so that all traces share one compiled program
+_RINGS, _RIM = 10, 240  # rings of rays that fill the stop, and number of rays on its rim
+_SCANS = 3  # scans of the meridian for the edges of a beam; each refines the last one
+# Words for rays that do not reach the sensor, other than those clipped by an aperture.
 _ENDS = {
     Status.MISSED: "some miss",
     Status.TIR: "total reflection",
@@ -37,15 +37,15 @@ _ENDS = {
 
 
 class Drawing(NamedTuple):
-    """Polylines (N, 2) of (z, y) in mm, the section x = 0.
+    """Polylines (N, 2) of (z, y) in mm, in the section x = 0.
 
     glass: closed outlines of the elements.
-    mirrors: their faces; NaN where an obscuration lies on one.
-    stop: its two blades, also where it pokes through a surface.
-    sensor: its face.
-    rays: a list for each field: of an even fan of the stop, from rim to rim, those that arrive, and
-        where a beam is vignetted, the rays at its edges.
-    vignetted: rays of the fans that do not arrive, as far as the surface that clips them.
+    mirrors: faces of the mirrors; NaN where an obscuration covers one.
+    stop: the two blades of the stop, drawn even where the stop cuts through a surface.
+    sensor: the face of the sensor.
+    rays: a list for each field: the arriving rays of an even fan from rim to rim of the stop and,
+        of a vignetted beam, the rays at its edges.
+    vignetted: clipped rays of the fans, up to the surface that clips them.
     fields: the angles of the fields, radians.
     """
 
@@ -70,10 +70,10 @@ def draw(
     fields: angles along y, radians.
     distance: from the object to the first vertex, mm.
     wavelength: um.
-    rays: how many for each field; those that do not exist are left out.
+    rays: number of rays for each field; rays that do not exist are left out.
     """
     angles = [float(angle) for angle in np.atleast_1d(fields)]
-    # A surface that bends no light is no corner of a ray, nor a face of glass.
+    # A surface that does not bend light is neither a corner of a ray nor a face of glass.
     corners = [*lens.active, lens.count]
     hits, ends = [], []
     for angle in angles:
@@ -137,15 +137,15 @@ _trace = jit(_rays, ONCE)
 
 
 def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> _Traced:
-    """Rays of one wavelength through points (Q, 2) of the stop, of its radius."""
+    """Rays of one wavelength through points (Q, 2) of the stop, in units of its radius."""
     filled = np.resize(pupil, (-(-len(pupil) // _RAYS) * _RAYS, 2))
     found = _trace(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
     return _Traced(*(np.asarray(a)[: len(pupil)] for a in found))
 
 
 def _fan(lens: Lens, scene: Scene, rays: int) -> _Traced:
-    """An even fan of meridional rays, and then those at the edges of what passes, where the
-    stop's rim is not the edge."""
+    """An even fan of meridional rays, then the rays at the edges of the light that passes, where
+    the rim of the stop is not the edge."""
 
     def traced(heights):
         return _traced(lens, scene, np.stack([0 * heights, heights], axis=-1))
@@ -164,13 +164,13 @@ def _fan(lens: Lens, scene: Scene, rays: int) -> _Traced:
 
 
 class Beam(NamedTuple):
-    """What becomes of the light of one field and wavelength that fills the stop.
+    """Clipping and spot of the light of one field and wavelength that fills the stop.
 
-    clipping: the surfaces whose apertures are the first to stop some of it.
-    ends: how else some of it ends, in words.
-    wide: (S + 1,), how far from the vertices light comes that arrives, mm; 0 if none does.
-    spot: RMS radius on the sensor, mm; nan if no light arrives. best, shift: the least that any
-        distance of the sensor gives, and how far that is behind it, mm.
+    clipping: surfaces whose apertures clip rays that no earlier surface clips.
+    ends: other failures of rays, in words.
+    wide: (S + 1,), largest distance of arriving rays from each vertex, mm; 0 if none arrives.
+    spot: RMS radius on the sensor, mm; nan if no light arrives. best, shift: the smallest RMS
+        radius at any sensor position, and how far that position is behind the sensor, mm.
     """
 
     clipping: list[int]
@@ -182,7 +182,7 @@ class Beam(NamedTuple):
 
 
 def beam_of(lens: Lens, field: float, distance: float, wavelength: float) -> Beam:
-    """The beam of a field in radians from a distance in mm, of a wavelength in um."""
+    """The beam of a field in radians, for a distance in mm and a wavelength in um."""
     rim = np.linspace(0, 2 * np.pi, _RIM)
     pupil = np.concatenate([hexapolar(_RINGS)[0], np.stack([np.sin(rim), np.cos(rim)], axis=-1)])
     scene = scene_of(lens, field, distance, wavelength)
@@ -208,22 +208,22 @@ def _pieces(lens: Lens) -> list[tuple[int, int]]:
 
 
 def _widths(lens: Lens, hits: list[np.ndarray], reach: float) -> np.ndarray:
-    """How far from the axis rays come (S,), mm, on both faces of a piece of glass: `reach` where
-    surfaces do not stand on one axis, or no ray comes."""
+    """Largest ray heights (S,), mm; both faces of a piece of glass get the larger one. `reach` if
+    surfaces are decentred or tilted, or where no ray arrives."""
     wide = np.full(lens.count, reach)
     _, across, turned = lens.places
     if across is not None or turned is not None or not sum(map(len, hits)):
         return wide
     wide[list(lens.active)] = np.max(np.abs(np.concatenate(hits)[:, :-1, 1]), axis=0)
     pieces = _pieces(lens)
-    for i, j in pieces + pieces[::-1]:  # cemented ones all
+    for i, j in pieces + pieces[::-1]:  # both ways, so that cemented pieces get one width
         wide[[i, j]] = np.max(wide[[i, j]])
     return np.where(wide > 0, wide, reach)
 
 
 def _extents(lens: Lens, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest y (S,) of the surfaces, mm: of their semi-diameters or, where there is
-    none, of their clear apertures; `reach` (S,) where there is none either."""
+    """Lowest and highest y (S,) of the surfaces, mm: from the semi-diameter, else from the clear
+    aperture, else from `reach` (S,)."""
     semi, extra = np.asarray(lens.semi_diameter)[:-1], lens.apertures
     low, high = -semi, semi.copy()
     if extra is not None:
@@ -237,7 +237,7 @@ def _extents(lens: Lens, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pierced(lens: Lens, y: np.ndarray) -> np.ndarray:
-    """Whether points (S, N) at x = 0 of all surfaces lie inside of an obscuration on them."""
+    """True for points (S, N) of the surfaces, at x = 0, inside an obscuration on the surface."""
     found = np.zeros(y.shape, bool)
     if lens.apertures is not None:
         inside = np.asarray(depths(lens.apertures, (jnp.zeros(y.shape), jnp.asarray(y)))) > 0
@@ -247,7 +247,7 @@ def _pierced(lens: Lens, y: np.ndarray) -> np.ndarray:
 
 
 def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
-    """The polylines that `draw` gives, on the axes of a figure."""
+    """Draw the polylines of `draw` on the axes of a figure."""
     for outline in drawing.glass:
         axes.fill(*outline.T, facecolor="#cfe4f5", edgecolor="#30506b", linewidth=0.8)
     for mirror in drawing.mirrors:
@@ -272,7 +272,7 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
 
 
 def _placed(lens: Lens, i: int, y: np.ndarray, z: ArrayLike) -> np.ndarray:
-    """(z, y) along the axes of the lens of points on surface i (or the sensor)."""
+    """(z, y), along the axes of the lens, of points on surface i (or the sensor)."""
     vertex, across, turned = jax.tree.map(lambda a: np.asarray(a[i]), lens.places)
     points = np.stack([np.zeros_like(y), y, z], axis=-1)
     if turned is not None:
@@ -281,8 +281,8 @@ def _placed(lens: Lens, i: int, y: np.ndarray, z: ArrayLike) -> np.ndarray:
 
 
 def _path(corners: np.ndarray, start: float, angle: float, distance: float) -> np.ndarray:
-    """(z, y) of a ray from the plane `start` before the lens, or from where steep ones have come
-    twice as far, through its corners."""
+    """(z, y) of a ray through its corners, from the plane `start` before the lens. The first
+    segment of a steep ray is cut to twice the distance to that plane."""
     z, y = corners[0]
     slope = (y / distance + np.tan(angle)) / (z / distance + 1)
     step = (z - start) * min(1.0, 2 / math.hypot(1.0, slope))
@@ -296,7 +296,7 @@ def _blades(face: np.ndarray, reach: float) -> list[np.ndarray]:
 
 
 def _sensor(lens: Lens, paths: list[list[np.ndarray]], reach: float) -> np.ndarray:
-    """As wide as the rays that meet it, about its centre."""
+    """The face of the sensor about its centre, as wide as the rays that meet it."""
     middle = _placed(lens, lens.count, np.zeros(1), np.zeros(1))
     ends = [float(np.linalg.norm(path[-1] - middle)) for fan in paths for path in fan]
     wide = max(1.1 * max(ends, default=0.0), 0.3 * reach)

@@ -26,11 +26,11 @@ from . import analyses
 from .figures import FIELD_COLOURS, new
 from .layout import draw, lens_drawing
 
-# Fields of the curves, and of that of illumination; points of the fans; fields of spots and fans.
+# Fields of a curve, fields of the illumination curve, points of a fan, fields with spots and fans.
 _CURVE, _LIGHT, _FAN, _FIELDS = 31, 10, 33, 3
-# Frequencies of transfer functions end here, cycles/mm, or where waves do.
+# Highest frequency of transfer functions, cycles/mm, unless the diffraction limit is lower.
 _LINES = 200.0
-# Of the rule of the spots; degree of polynomials; cells of transfer functions, of energy.
+# Order of the spot rule, degree of polynomials, cells for MTF, least and most cells for energy.
 _ORDER, _DEGREE, _CELLS, _LEAST, _MOST = 8, 10, 48, 128, 384
 
 
@@ -42,13 +42,13 @@ def sheet(
     rule: PupilRule | None = None,
     say: Callable[[str], None] = lambda what: None,
 ) -> Figure:
-    """Layout; spots with the Airy circle, ray fans, transfer functions and encircled energy of
-    three of the fields; field curvature, distortion, lateral colour and illumination up to the
-    largest of them: one figure.
+    """One figure: layout; spots with the Airy circle, ray fans, transfer functions and encircled
+    energy of three of the fields; field curvature, distortion, lateral colour and illumination up
+    to the largest field.
 
     fields: angles along y, radians. distance: mm, inf allowed. wavelengths: um, the middle one is
-    the reference. rule: of the spots, for all fields; None: as of `spot_diagram`. say: is told what
-    is being done.
+    the reference. rule: pupil rule of the spots, for all fields; None: as in `spot_diagram`. say:
+    called with the name of each step.
     """
     angles = sorted({float(angle) for angle in fields})
     some = [angles[k] for k in sorted({0, len(angles) // 2, len(angles) - 1})][:_FIELDS]
@@ -62,7 +62,7 @@ def sheet(
     say("tracing fans")
     fans = _fans(lens, jnp.array(some), jnp.asarray(distance, line.dtype), jnp.array(waves))
     say("tracing spots")
-    # The axis, fields of the pictures, and of the curve of illumination.
+    # The axis, the fields of the spots, and the fields of the illumination curve.
     wide = np.array([0.0, *some, *line[:: _CURVE // _LIGHT]])
     rule = light_rule(lens, wide, *scene, order=_ORDER) if rule is None else rule
     spots = _spots(lens, jnp.array(wide), jnp.asarray(distance, line.dtype), jnp.array(waves), rule)
@@ -85,7 +85,7 @@ def sheet(
     light = cone[later] / cone[0], spots.throughput[later, middle]
     analyses.illumination(axes["light"], *light, wide[later])
     hues = [FIELD_COLOURS[[*fields].index(field) % len(FIELD_COLOURS)] for field in some]
-    given = [f"{np.degrees(field):.3g}°" for field in some], hues  # as the layout has them
+    given = [f"{np.degrees(field):.3g}°" for field in some], hues  # as in the layout
     analyses.mtf(axes["mtf"], lines, contrast, best, *given)
     analyses.encircled_energy(axes["energy"], radii, energy, *given, float(spots.airy_radius[0]))
     axes["energy"].set_title(f"encircled energy ({model})", fontsize=8)
@@ -108,7 +108,7 @@ def _waves(
     model: Model,
     cells: int,
 ) -> tuple[Array, Array, Array]:
-    """MTF (F, 2, N), its limit (N,) on the axis or the first field, and encircled energy (F, N)."""
+    """MTF (F, 2, N), its limit (N,) at the first field, and encircled energy (F, N)."""
     made, waves = beam_rule(_DEGREE, rule.symmetry, rule), axis.wavelengths
     spectrum = jnp.ones_like(waves)
 
@@ -123,8 +123,8 @@ def _waves(
 
 
 def _circles(spots: Spots, shown: int) -> tuple[Array, Model, int]:
-    """Radii (N,) of the energy of `shown` fields, mm, its model and the cells of the pupil: rays
-    where waves need too many cells for a grid that holds the spots."""
+    """Radii (N,), mm, model and cells of the pupil for the encircled energy of `shown` fields. The
+    model is "rays" if "waves" would need too many cells for a grid that holds the spots."""
     airy = float(np.min(spots.airy_radius))
     sizes = analyses.spot_radius(spots)[1 : 1 + shown]
     reach = max(np.max(sizes, initial=0, where=np.isfinite(sizes)), 3 * min(airy, 1e-2))
@@ -134,7 +134,7 @@ def _circles(spots: Spots, shown: int) -> tuple[Array, Model, int]:
 
 
 def _axes(count: int) -> tuple[Figure, dict[str, Any]]:
-    """A figure, and axes by name; those of fields are lists."""
+    """A figure and its axes by name; panels with one plot per field are lists."""
     figure, first = new(width=14, height=10)
     first.remove()
     grid = figure.add_gridspec(4, 6, height_ratios=[1.5, 1, 0.8, 0.8])
