@@ -15,8 +15,8 @@ _MAX_ORDER = 40
 # Orders for a clipped pupil: three at a time, as three must agree and one search finds the points
 # of all; and their sizes, so that groups share a program.
 _CLIPPED = (
-    ((4, 5, 6), (7, 8, 9)),
-    ((7, 8, 9), (7, 8, 9)),
+    ((4, 5, 6), (10, 11, 12)),
+    ((7, 8, 9), (10, 11, 12)),
     ((10, 11, 12), (10, 11, 12)),
     ((14, 17, 20), (14, 17, 20)),
     ((24, 28, 32), (36, 39, 42)),

@@ -64,7 +64,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
                 drawn.append(job)
                 shown |= _pictures(studio, imager, parameters, arm)
         losses.append(np.mean(own, axis=0).tolist())
-    far = studio.depths[1]
+    far, degrees = studio.depths[1], np.degrees(np.hypot(*np.asarray(studio.judged().fields).T))
     return {
         "name": config.name,
         "rows": rows,
@@ -74,7 +74,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
         "builds": _as_built(studio, run) if config.judge.builds else [],
         "drawn": drawn,
         "pictures": list(config.arms),
-        "pictures_deg": np.degrees(np.hypot(*np.asarray(studio.judged().fields).T)).tolist(),
+        "pictures_deg": degrees[_shown(len(degrees))].tolist(),
         "field_deg": config.field_deg,
         "far_mm": far if math.isfinite(far) else None,
         **shown,
@@ -156,7 +156,7 @@ def _judged(studio: Studio, imager: Callable, parameters: Any) -> dict[str, floa
 
 
 def _pictures(studio: Studio, imager: Callable, parameters: Any, arm: str) -> dict[str, Any]:
-    """The first images of the judge."""
+    """Some images of the judge, evenly over its points."""
     seen, noise = studio.judged(), np.float32(studio.config.noise)
     some = np.resize(
         _training.textured(studio.patches.test, len(seen.fields)),
@@ -164,7 +164,13 @@ def _pictures(studio: Studio, imager: Callable, parameters: Any, arm: str) -> di
     )
     found = imager(parameters, some, seen, noise, jax.random.key(0))
     keys = ("truth", "sensor", "restored")
-    return {f"{arm} {k}": np.asarray(a[:_SHOWN], np.float16) for k, a in zip(keys, found)}
+    own = _shown(len(seen.fields))
+    return {f"{arm} {k}": np.asarray(a, np.float16)[own] for k, a in zip(keys, found)}
+
+
+def _shown(count: int) -> np.ndarray:
+    """Numbers of the points of a picture."""
+    return np.unique(np.linspace(0, count - 1, _SHOWN).astype(int))
 
 
 def _as_built(studio: Studio, run: Run) -> list[dict[str, Any]]:

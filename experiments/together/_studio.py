@@ -135,7 +135,11 @@ class Studio:
         if deviations is None:
             return self.variables.lens_of(vector)
         lens = self._whole.lens_of(vector)
-        return dataclasses.replace(self.built, lens=lens).lens_of(deviations)
+        built = dataclasses.replace(self.built, lens=lens).lens_of(deviations)
+        if not self.config.refocus:
+            return built
+        focus = [drt_jax.back_focal_distance(one, self.waves[1])[0] for one in (lens, built)]
+        return dataclasses.replace(built, sensor=built.sensor + focus[1] - focus[0])
 
     def points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
         """Kernels and light of points, by rays."""

@@ -121,6 +121,7 @@ class Config:
     arms: of the experiment's description.
     seeds: starts of the network, with data and noise of their own.
     tolerances: of parts of the lens, for `tolerant` and judge.builds.
+    refocus: True if the sensor of a lens as built follows its paraxial focus.
     """
 
     name: str
@@ -141,6 +142,7 @@ class Config:
     arms: tuple[Arm, ...] = ("focus", "spots", "joint")
     seeds: int = 3
     tolerances: tuple[Tolerance, ...] = ()
+    refocus: bool = False
     judge: Judge = Judge()
     data: DataConfig = DataConfig()
 
@@ -204,18 +206,22 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     axes.set_yscale("log")
     figure.savefig(figures / "losses.png")
     drawn = results["drawn"]
-    figure, axes = show.new(len(drawn), 1, 8, 2.6)
+    rows = -(-len(drawn) // 3)
+    figure, axes = show.new(rows, 3, 5, 3)
+    for ax in np.ravel(axes)[len(drawn) :]:
+        ax.set_axis_off()
+    fields = np.radians([0.0, 0.7 * results["field_deg"], results["field_deg"]])
     for ax, name in zip(np.ravel(axes), drawn):
         lens = load_lens(figures.parent / "lenses" / f"{name}.yaml")
-        fields = np.radians([0.0, 0.7 * results["field_deg"], results["field_deg"]])
-        distance = results["far_mm"] or math.inf
-        show.lens_drawing(ax, show.draw(lens, fields, distance))
-        ax.set_title(name, fontsize=9)
+        show.lens_drawing(ax, show.draw(lens, fields, results["far_mm"] or math.inf))
+        ax.set_title(ARMS.get(name.split()[0], name), fontsize=9)
+        ax.get_legend().remove()
     figure.savefig(figures / "lenses.png")
     for arm in results["pictures"]:
         parts = {key: results[f"{arm} {key}"] for key in _report.IMAGES}
-        titles = [f"{field:.1f} deg" for field in results["pictures_deg"]]
-        _report.draw_patches(parts, titles, figures / f"patches {arm}.png")
+        fields = results["pictures_deg"][: len(parts["truth"])]
+        titles = [f"{field:.1f} deg" for field in fields]
+        _report.draw_patches(parts, titles, figures / f"patches_{arm}.png")
 
 
 def _smooth(loss: list[float | None]) -> tuple[np.ndarray, np.ndarray]:

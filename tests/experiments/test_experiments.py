@@ -84,7 +84,8 @@ def unbroken(tmp_path_factory):
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_config_loads_strictly(path):
     kind = CONFIGS[path].Config
-    others = {"seed": "99", "repeats": "99", "folder": "elsewhere", "starts": "{seed: 99}"}
+    others = {"seed": "99", "repeats": "99", "seeds": "99", "folder": "elsewhere"}
+    others |= {"starts": "{seed: 99}"}
     name = next(name for name in others if name in kind.__dataclass_fields__)
     other = "starts.seed=99" if name == "starts" else f"{name}={others[name]}"
     assert load_config(kind, path) != load_config(kind, path, [other])
