@@ -64,7 +64,6 @@ class Studio:
         vector = design.as_built_starts(self.variables, 1, *errors)[0]
         self.spoilt = jnp.clip(vector, self.variables.low, self.variables.high)
         net = dataclasses.asdict(config.network)
-        self.rates = self._rates()
         self.init, self.restore = drt_jax.red_net(**net)
         side = config.train.patch + config.camera.kernel - 1
         reading = functools.partial(tqdm, desc="reading images", leave=False)
@@ -96,7 +95,8 @@ class Studio:
             self.variables, operands, fields, self.waves, distances, _ORDER
         )
 
-    def _rates(self) -> Array:
+    @functools.cached_property
+    def rates(self) -> Array:
         """Adam's rate of each variable: at the spoilt lens it changes the spots by as much as all
         others, `train.optics_rate`, root mean square over rays, fields and depths."""
         tried = quick(self.spots)

@@ -48,12 +48,12 @@ STARTS = {
             "solves=[]",
             "limits=[]",
         ),
-        *("spoil.per_cent=1", "field_deg=2", "camera={pixel_um: 100, kernel: 9, tolerance: 0.2}"),
+        *("spoil.per_cent=1", "field_deg=2", "camera={pixel_um: 20, kernel: 9, tolerance: 0.2}"),
         *("network={layers: 1, channels: 4}", "seeds=1", "mtf_at=1", "data.crops_per_image=4"),
         "arms=[focus,spots,joint_from_spots,damped,frozen,tolerant]",
         "train={batches: 12, batch: 2, patch: 8, points: 2, checkpoint_every: 5}",
         "tolerances=[{kind: radius, size: 1}, {kind: tilt, size: 3}]",
-        "judge={rings: 2, patches: 1, waves: 2, cells: 32, builds: 3}",
+        "judge={rings: 2, patches: 1, waves: 2, cells: 64, builds: 3}",
     ],
     "render": ["nodes=2", "kernel=9", "model=gaussian", "scene.lens=cooke_triplet", "pixel_um=20"],
     "tolerance": [
@@ -148,7 +148,7 @@ def checked_joint(results):
     """Every arm trained and judged, and none left the lens that it may not change."""
     rows = {row["arm"]: row for row in results["rows"]}
     assert list(rows) == results["arms"] and len(rows) == 6
-    assert all(0 < row["mae"] < 0.6 and row["step_s"] > 0 for row in rows.values())
+    assert all(0 < row["mae"] < 0.6 and row["step_s"] > 0 for row in rows.values()), rows
     assert rows["spots"]["spot_um"] == pytest.approx(results["start_um"]["spots"])
     assert rows["tolerant"]["spot_um"] != rows["spots"]["spot_um"] < results["start_um"]["spoilt"]
     assert [len(loss) for loss in results["losses"]] == [12] * 6
@@ -183,8 +183,10 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
 @pytest.mark.parametrize(
     "change, told",
     [
-        ("camera.kernel=3", "camera.kernel: .* of the light of the spoilt lens falls beside"),
-        ("field_deg=70", "field_deg: "),
+        (
+            "camera={pixel_um: 4, kernel: 9, tolerance: 0.2}",
+            "camera.kernel: .* of the light of the spoilt lens falls beside a kernel of 9 pixels",
+        ),
         ("train.batch=3", "train.batch: expected a multiple of train.points"),
         ("arms=[frozen]", "arms: frozen needs spots"),
         ("variables=[{kind: conic, surfaces: [9]}]", "variables: conic: no surface 9"),
