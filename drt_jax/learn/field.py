@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
@@ -119,8 +118,8 @@ def draw_points(key: Array, count: int, field: float, depths: tuple[float, float
     ring, turn, depth, order = jax.random.split(key, 4)
     kind = jnp.result_type(float)
     part = (jnp.arange(count, dtype=kind) + jax.random.uniform(ring, (count,), kind)) / count
-    radius = np.tan(field) * jnp.sqrt(part)
-    angle = 2 * np.pi * jax.random.uniform(turn, (count,), kind)
+    radius = jnp.tan(jnp.asarray(field, kind)) * jnp.sqrt(part)
+    angle = 2 * jnp.pi * jax.random.uniform(turn, (count,), kind)
     tangents = radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     part = (jnp.arange(count, dtype=kind) + jax.random.uniform(depth, (count,), kind)) / count
     near, far = (1 / d for d in depths)
