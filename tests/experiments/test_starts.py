@@ -183,9 +183,10 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
 @pytest.mark.parametrize(
     "change, told",
     [
-        (
+        pytest.param(
             "camera={pixel_um: 4, kernel: 9, tolerance: 0.2}",
             "camera.kernel: .* of the light of the spoilt lens falls beside a kernel of 9 pixels",
+            marks=pytest.mark.slow,
         ),
         ("train.batch=3", "train.batch: expected a multiple of train.points"),
         ("arms=[frozen]", "arms: frozen needs spots"),

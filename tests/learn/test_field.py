@@ -126,6 +126,7 @@ def test_the_loss_has_the_derivative_of_finite_differences_by_every_kind_of_numb
         assert float(slope) == pytest.approx(expected, rel=5e-3), name
 
 
+@pytest.mark.slow
 def test_both_optimisers_descend_within_what_holds_the_lens(camera):
     variables, imager, weights = camera
     start = variables.start.at[-1].add(6.0)  # 0.3 mm out of focus
