@@ -16,7 +16,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import scene_of, vergence_of
+from ..lens.scene import points_arrays, scene_of, vergence_of
 from ..numerics import Numbers, real_array
 from ..pupil.rules import Symmetry
 from ..rays.solve import solve_aimed
@@ -203,13 +203,7 @@ def kernels_at(grid: KernelGrid, fields: Numbers, distances: Numbers) -> Array:
     ValueError for other shapes.
     """
     dtype = grid.kernels.dtype
-    angles = real_array("fields", fields, dtype)
-    far = real_array("distances", distances, dtype)
-    if angles.ndim != 2 or angles.shape[1] != 2 or far.shape not in ((), angles.shape[:1]):
-        raise ValueError(
-            f"fields, distances: expected (B, 2) and (B,), got {angles.shape} and {far.shape}"
-        )
-    far = jnp.broadcast_to(far, angles.shape[:1])
+    angles, far = points_arrays(fields, distances, dtype)
     return jax.vmap(_kernel_at, (None, 0, 0))(grid, jnp.tan(angles), vergence_of(far))
 
 

@@ -15,7 +15,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene, scene_of
+from ..lens.scene import Scene, points_arrays, scene_of
 from ..numerics import Numbers, real_array
 from .beam import BeamRule, trace_beam
 from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
@@ -97,16 +97,11 @@ def psfs(
     time. ValueError for other shapes. A point without light has the throughput 0.
     """
     dtype = lens.curvature.dtype
-    angles = real_array("fields", fields, dtype)
-    far = real_array("distances", distances, dtype)
-    if angles.ndim != 2 or angles.shape[1] != 2 or far.shape not in ((), angles.shape[:1]):
-        raise ValueError(
-            f"fields, distances: expected (B, 2) and (B,), got {angles.shape} and {far.shape}"
-        )
+    angles, far = points_arrays(fields, distances, dtype)
     side, size = check_pixels(pixel, size, dtype)
     given = side, None, jnp.zeros((), dtype), size, model.kind, model.cells
 
     def one(point: tuple[Array, Array]) -> Psf:
         return _psf(lens, scene_of(lens, *point, wavelengths), model.rule, *given)
 
-    return jax.lax.map(jax.checkpoint(one), (angles, jnp.broadcast_to(far, angles.shape[:1])))
+    return jax.lax.map(jax.checkpoint(one), (angles, far))

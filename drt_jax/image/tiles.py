@@ -11,7 +11,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..pupil.clipped import Clipped, ClippedGroup
+from ..pupil.clipped import ClippedGroup, Fitted
 from ..pupil.rules import Pattern, PupilRule
 from ..rays.find import Found
 from ..rays.solve import Solver
@@ -47,7 +47,7 @@ def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Tra
     waves, total = scene.wavelengths.size, weights.shape[-1]
     # Rays without weight: padding in fitted rules; in other rules they show whether light is
     # clipped.
-    fitted = isinstance(rule, Clipped | ClippedGroup)
+    fitted = isinstance(rule, Fitted)
     rays = np.flatnonzero(np.any(np.asarray(weights), axis=0)) if fitted else np.arange(total)
     size, count = _TILE[len(points)], len(rays)
     tiles = np.resize(rays if count else 0, (max(-(-count // size), 1), size))

@@ -159,8 +159,7 @@ def make_field_step(
 
     def step(state: tuple[Any, Any], scenes: Array, noise: Array, index: Array):
         parameters, moments = state
-        noise_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
-        seen = draw(key)
+        seen, noise_key = _drawn(draw, seed, index)
 
         def loss(parameters):
             truth, _, restored = imager(parameters, scenes, seen, noise, noise_key)
@@ -218,8 +217,7 @@ def make_damped_step(
 
     def step(state: tuple[Any, Any, _Newton], scenes: Array, noise: Array, index: Array):
         parameters, moments, means = state
-        noise_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
-        seen, real = draw(key), scenes.astype(jnp.float32) / 255
+        (seen, noise_key), real = _drawn(draw, seed, index), scenes.astype(jnp.float32) / 255
         vector, optics_of = ravel_pytree(parameters["optics"])
 
         def sensor(vector):
@@ -245,6 +243,14 @@ def make_damped_step(
         return (new, moments, means), {"loss": error}
 
     return init, jax.jit(step, donate_argnums=0, compiler_options=known_options(NETWORK))
+
+
+def _drawn(
+    draw: Callable[[Array], ObjectPoints], seed: int, index: Array
+) -> tuple[ObjectPoints, Array]:
+    """The points of a step, and the key of its noise."""
+    noise_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
+    return draw(key), noise_key
 
 
 def _weights(parameters: dict[str, Any]) -> dict[str, Any]:

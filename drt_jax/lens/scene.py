@@ -155,3 +155,15 @@ def field_of_height(height: Numbers, distance: Numbers) -> Array:
         raise ValueError("distance: at infinity an object has a field, but no height")
     good = in_front(far) & (far < jnp.inf)
     return jnp.where(good, -jnp.arctan(heights / jnp.where(good, far, 1)), _RIGHT)
+
+
+def points_arrays(fields: Numbers, distances: Numbers, dtype: jnp.dtype) -> tuple[Array, Array]:
+    """Fields (B, 2), radians, and distances (B,), mm, of B object points; one distance serves all.
+    ValueError for other shapes."""
+    angles = real_array("fields", fields, dtype)
+    far = real_array("distances", distances, dtype)
+    if angles.ndim != 2 or angles.shape[1] != 2 or far.shape not in ((), angles.shape[:1]):
+        raise ValueError(
+            f"fields, distances: expected (B, 2) and (B,), got {angles.shape} and {far.shape}"
+        )
+    return angles, jnp.broadcast_to(far, angles.shape[:1])

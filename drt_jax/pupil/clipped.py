@@ -80,9 +80,18 @@ def _along(line: Array, toward: Array) -> Array:
     return safe_divide(dot(toward, line), dot(toward, toward))
 
 
+class Fitted(PupilRule):
+    """A rule whose weights contain the clipping."""
+
+    def transmission(self, lens: Lens, bundle: Bundle) -> Array:
+        """1 for all rays (W, Q) that exist."""
+        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        return whole.astype(bundle.path.dtype)
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Clipped(PupilRule):
+class Clipped(Fitted):
     """Gauss rules between the corners of the boundary and along the radii to it. Each obscuration
     doubles the number of rays: the light inside of it is subtracted.
 
@@ -109,14 +118,10 @@ class Clipped(PupilRule):
         orders = jnp.asarray([self.order], jnp.int32)
         return _open(lens, scene, orders, (self.size,), self.symmetry, self.crossing)[0]
 
-    def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """1 for all rays (W, Q) that exist: the weights contain the clipping."""
-        return _exists(bundle)
-
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class ClippedGroup(PupilRule):
+class ClippedGroup(Fitted):
     """Rules `Clipped` of several orders, whose points one search finds.
 
     orders: (G,), int32.
@@ -148,15 +153,6 @@ class ClippedGroup(PupilRule):
         chosen = jnp.asarray(self.chosen, jnp.int32)
         own = (chosen < 0) | (order == chosen)
         return jnp.where(own[None], weights, 0)
-
-    def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """1 for all rays (W, Q) that exist: the weights contain the clipping."""
-        return _exists(bundle)
-
-
-def _exists(bundle: Bundle) -> Array:
-    whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
-    return whole.astype(bundle.path.dtype)
 
 
 def _spokes(lens: Lens, symmetry: Symmetry, order: Any) -> Any:

@@ -32,6 +32,8 @@ ARMS = {
     "damped": "(d) with least-squares steps of the lens",
     "tolerant": "(e) with lenses as built",
 }
+# Arms that begin with the finished lens, of which lenses as built are judged.
+_BUILT = "spots", "joint_from_spots", "tolerant"
 # Steps between those of two seeds, which points and noise depend on.
 _APART = 10**7
 # Patches of a picture.
@@ -47,11 +49,16 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     imager = jax.jit(FieldImager(studio.judged_points, studio.restore).__call__)
     rows, losses, shown, drawn = [], [], {}, ["spoilt"]
     _save(studio, folder / "spoilt.yaml", studio.spoilt)
-    for arm in config.arms:
+    trained: dict[tuple[str, int], Any] = {}
+    arms = [arm for arm in ARMS if arm in config.arms]  # `frozen` after `spots`
+    for arm in arms:
         own = []
         for seed in range(config.seeds):
             job = f"{arm} {seed}"
-            parameters, seconds = _train(studio, run, arm, seed, lenses, job)
+            weights = trained["spots", seed]["network"] if arm == "frozen" else None
+            begin = studio.start(arm, seed, lenses, weights)
+            parameters, seconds = _train(studio, run, arm, seed, begin)
+            trained[arm, seed] = parameters
             own.append(run.metrics(job)["loss"])
             vector = parameters["optics"]["lens"]
             _save(studio, folder / f"{job}.yaml", vector)
@@ -68,12 +75,12 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     return {
         "name": config.name,
         "rows": rows,
-        "arms": list(config.arms),
+        "arms": arms,
         "losses": losses,
         "start_um": {name: studio.spot_um(vector) for name, vector in lenses.items()},
-        "builds": _as_built(studio, run) if config.judge.builds else [],
+        "builds": _as_built(studio, run, trained) if config.judge.builds else [],
         "drawn": drawn,
-        "pictures": list(config.arms),
+        "pictures": arms,
         "pictures_deg": degrees[_shown(len(degrees))].tolist(),
         "field_deg": config.field_deg,
         "far_mm": far if math.isfinite(far) else None,
@@ -96,23 +103,18 @@ def _finished(studio: Studio, run: Run) -> dict[str, Array]:
 
 
 def _train(
-    studio: Studio, run: Run, arm: str, seed: int, lenses: dict[str, Array], job: str
+    studio: Studio, run: Run, arm: str, seed: int, begin: dict[str, Any]
 ) -> tuple[dict[str, Any], float]:
-    """Trained parameters of a job, from its last checkpoint on, and the seconds of a step."""
-    setting, noise = studio.config.train, studio.config.noise
+    """Trained parameters of a job, from its last checkpoint or from `begin` on, and the seconds of
+    a step."""
+    setting, noise, job = studio.config.train, studio.config.noise, f"{arm} {seed}"
     total = setting.batches
     if arm == "damped":
         total = max(1, round(setting.damped_part * total))
-    weights = None
-    if arm == "frozen":
-        begin = studio.step("spots")[0](studio.start("spots", seed, lenses, None))
-        weights = run.load(f"spots {seed}", begin, (f"spots {seed}",), setting.batches)[1][0]
-        weights = weights["network"]
     init, same = studio.step(arm)
     # Points and noise of their own for each seed, by one program.
     step = lambda *given: same(*given[:3], np.int32(given[3] + _APART * seed))  # noqa: E731
-    begin = init(studio.start(arm, seed, lenses, weights))
-    first, state = run.load(job, begin, (job,), total)
+    first, state = run.load(job, init(begin), (job,), total)
     saved, started, counted = first, time.perf_counter(), [0, 0.0]
     bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
 
@@ -173,37 +175,32 @@ def _shown(count: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, _SHOWN).astype(int))
 
 
-def _as_built(studio: Studio, run: Run) -> list[dict[str, Any]]:
-    """PSNR of lenses as built, of the arms with a finished lens, by rays at the judge's points."""
-    config, rows = studio.config, []
-    table = design.draw_perturbations(studio.built, config.judge.builds, SEED + 1)
+def _as_built(studio: Studio, run: Run, trained: dict[tuple[str, int], Any]) -> list[dict]:
+    """PSNR of lenses as built, by rays at the points of the judge."""
     imager = jax.jit(FieldImager(studio.points, studio.restore).__call__)
-    seen = studio.judged()
+    rows = []
+    for (arm, seed), parameters in trained.items():
+        if arm not in _BUILT:
+            continue
+        job = f"built {arm} {seed}"
+        if run.kept(job) is None:
+            first, *others = _decibels(studio, imager, parameters, job)
+            row = {"arm": arm, "seed": seed, "designed": first, "mean": float(np.mean(others))}
+            run.keep(job, row | {"low": float(np.percentile(others, 10))})
+        rows.append(run.kept(job))
+    return rows
+
+
+def _decibels(studio: Studio, imager: Callable, parameters: Any, job: str) -> list[float]:
+    """PSNR of the lens as designed, then of each lens as built."""
+    count, seen, found = studio.config.judge.builds, studio.judged(), []
+    table = design.draw_perturbations(studio.built, count, SEED + 1)
     patches = _test(studio, seen, 1)
     patches = np.resize(patches, (len(seen.fields), *patches.shape[1:]))
-    for arm in (a for a in ("spots", "joint_from_spots", "tolerant") if a in config.arms):
-        for seed in range(config.seeds):
-            job = f"built {arm} {seed}"
-            if run.kept(job) is None:
-                begin = studio.step(arm)[0](
-                    studio.start(
-                        arm,
-                        seed,
-                        {name: studio.spoilt for name in ("spoilt", "spots", "mtf")},
-                        None,
-                    )
-                )
-                name = f"{arm} {seed}"
-                state = run.load(name, begin, (name,), config.train.batches)[1]
-                decibels = []
-                for deviations in (np.zeros(table.shape[1]), *tqdm(table, desc=job, leave=False)):
-                    view = seen._replace(deviations=jnp.asarray(deviations))
-                    noise, key = np.float32(config.noise), jax.random.key(0)
-                    truth, _, image = imager(state[0], patches, view, noise, key)
-                    squares = np.mean(np.square(np.asarray(image - truth)), axis=(1, 2, 3))
-                    decibels.append(float(np.mean(-10 * np.log10(squares))))
-                row = {"arm": arm, "seed": seed, "designed": decibels[0]}
-                row |= {"mean": float(np.mean(decibels[1:]))}
-                run.keep(job, row | {"low": float(np.percentile(decibels[1:], 10))})
-            rows.append(run.kept(job))
-    return rows
+    noise, key = np.float32(studio.config.noise), jax.random.key(0)
+    for deviations in (np.zeros(table.shape[1]), *tqdm(table, desc=job, leave=False)):
+        view = seen._replace(deviations=jnp.asarray(deviations))
+        truth, _, image = imager(parameters, patches, view, noise, key)
+        squares = np.mean(np.square(np.asarray(image - truth)), axis=(1, 2, 3))
+        found.append(float(np.mean(-10 * np.log10(squares))))
+    return found

@@ -208,16 +208,17 @@ class Studio:
 
     def _made(self, kind: str) -> tuple[Callable, Callable]:
         setting, held = self.config.train, self.hold
-        optics = {"lens": self.rates, "moves": 0.0}
-        rates = {"optics": optics, "network": setting.network_rate}
+        rates: dict[str, Any] = {"optics": 0.0, "network": setting.network_rate}
         points, restore, make, draw = self.points, self.restore, make_field_step, self.drawn
         if kind == "spots":  # neither derivatives nor limits of a lens that stays
             points = lambda optics, seen: self.points(jax.lax.stop_gradient(optics), seen)  # noqa: E731
             held = lambda before, after: before  # noqa: E731
+        elif kind == "damped":
+            rates["optics"], make = setting.damped_rate, make_damped_step
+        else:
+            rates["optics"] = {"lens": self.rates, "moves": 0.0}
         if kind == "frozen":
             restore = lambda w, image: self.restore(jax.lax.stop_gradient(w), image)  # noqa: E731
-        if kind == "damped":
-            rates, make = rates | {"optics": setting.damped_rate}, make_damped_step
         if kind == "tolerant":
             draw = self.drawn_as_built
         return make(FieldImager(points, restore), rates, draw, 0, held)
