@@ -17,7 +17,7 @@ import drt_jax
 from drt_jax.image.diagnose import crossed
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
-from drt_jax.learn.data import DataConfig, batches, load_patches
+from drt_jax.learn.data import DataConfig, Patches, batches, load_patches
 
 from ._common import require, require_list, require_within
 from ._optics import Scene, Trained, check_variables, middle, spot_of
@@ -149,16 +149,7 @@ class Jobs:
         self._network: dict[str, Any] = {}
         self.restore = None
         side = config.train.patch + config.camera.kernel - 1
-        reading = functools.partial(tqdm, desc="reading images", leave=False)
-        patches = load_patches(config.data, side, config.seed, reading)
-        for line in patches.skipped[:_NAMED]:
-            print(f"skipped {line}", file=sys.stderr)
-        if len(patches.skipped) > _NAMED:
-            listed = run.folder / "skipped.txt"
-            replace(listed, "".join(f"{line}\n" for line in patches.skipped).encode())
-            print(f"skipped {len(patches.skipped)} in all, named in {listed}", file=sys.stderr)
-        counts = f"{len(patches.train)} training and {len(patches.test)} test patches"
-        print(f"{counts} of {side} x {side}")
+        patches = read_patches(config.data, side, config.seed, run.folder)
         self.scenes = patches.train
         if isinstance(config, JointSettings):
             self.test = thinned(patches.test, config.test_patches)
@@ -319,6 +310,22 @@ class Jobs:
             rows.append(columns)
             changes.append([(trace[n] - trace[n][0]) / self._scale[n] for n in self.lens.names])
         return {"numbers": rows, "changes_mm": np.array(changes), "spot_mm": distance}
+
+
+def read_patches(config: DataConfig, side: int, seed: int, folder: pathlib.Path) -> Patches:
+    """Patches of images, with a bar. Prints how many there are and which files were skipped; a long
+    list goes into skipped.txt of the folder."""
+    reading = functools.partial(tqdm, desc="reading images", leave=False)
+    patches = load_patches(config, side, seed, reading)
+    for line in patches.skipped[:_NAMED]:
+        print(f"skipped {line}", file=sys.stderr)
+    if len(patches.skipped) > _NAMED:
+        listed = folder / "skipped.txt"
+        replace(listed, "".join(f"{line}\n" for line in patches.skipped).encode())
+        print(f"skipped {len(patches.skipped)} in all, named in {listed}", file=sys.stderr)
+    counts = f"{len(patches.train)} training and {len(patches.test)} test patches"
+    print(f"{counts} of {side} x {side}")
+    return patches
 
 
 def values_of(parameters: dict[str, Any], k: int) -> dict[str, float]:

@@ -42,7 +42,8 @@ _SHOWN = 5
 
 def run(config: Any, run: Run) -> dict[str, Any]:
     """Finishes the lenses, trains and judges all arms."""
-    studio = Studio(config)
+    side = config.train.patch + config.camera.kernel - 1
+    studio = Studio(config, _training.read_patches(config.data, side, 0, run.folder))
     lenses = {"spoilt": studio.spoilt} | _finished(studio, run)
     folder = run.folder / "lenses"
     folder.mkdir(exist_ok=True)

@@ -10,13 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from tqdm import tqdm
 
 import drt_jax
 from drt_jax import Lens, design
 from drt_jax.design.optimum import init_problem, take_step
 from drt_jax.design.problem import quick
-from drt_jax.learn.data import Patches, load_patches
+from drt_jax.learn.data import Patches
 from drt_jax.learn.field import (
     FieldImager,
     ObjectPoints,
@@ -47,8 +46,8 @@ class Studio:
     patches: training and test patches.
     """
 
-    def __init__(self, config: Any) -> None:
-        self.config = config
+    def __init__(self, config: Any, patches: Patches) -> None:
+        self.config, self.patches = config, patches
         self._steps: dict[str, tuple[Callable, Callable]] = {}
         lens = design.open_apertures(drt_jax.load_lens(config.lens))
         self.variables = self._variables(lens)
@@ -65,9 +64,6 @@ class Studio:
         self.spoilt = jnp.clip(vector, self.variables.low, self.variables.high)
         net = dataclasses.asdict(config.network)
         self.init, self.restore = drt_jax.red_net(**net)
-        side = config.train.patch + config.camera.kernel - 1
-        reading = functools.partial(tqdm, desc="reading images", leave=False)
-        self.patches: Patches = load_patches(config.data, side, 0, reading)
         self.model = self._model()
         axis = drt_jax.psf(
             lens, 0.0, self.depths[1], self.waves, self.pixel, config.camera.kernel, self.model
