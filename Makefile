@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 OUT := runs/demo-$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: install demo check test test-slow test-all test-versions
+.PHONY: install demo check test test-slow test-all test-versions site
 install: .venv/installed
 
 .venv/installed: pyproject.toml
@@ -24,7 +24,7 @@ check: install
 	$(BIN)/mypy
 
 # Programs that one run of the tests has compiled serve the next.
-test test-slow test-all test-versions: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.compiled
+test test-slow test-all test-versions site: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.compiled
 
 test: install
 	$(BIN)/python -m pytest
@@ -39,3 +39,8 @@ test-all: install
 # A part of the tests with other releases of Python and JAX, where there are such Pythons.
 test-versions: install
 	$(BIN)/python .ci/versions.py
+
+# The pages of docs/ with their notebooks, which are run: docs/_build/html/index.html.
+site: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	$(BIN)/sphinx-build -q -W --keep-going -j 2 docs docs/_build/html

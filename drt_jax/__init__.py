@@ -10,9 +10,10 @@ Conventions, everywhere in the package:
   paraboloid;
 - axes in the order (field, wavelength, ray, surface, xyz) and (batch, y, x, channel);
 - dtypes follow the inputs: enable float64 with `jax.config.update("jax_enable_x64", True)`
-  before loading a lens; the library changes no global setting.
+  before loading a lens; the library changes no global setting by itself.
 """
 
+from .compilation import keep_programs as keep_programs
 from .files.agf import load_agf as load_agf
 from .files.entry import LensError as LensError
 from .files.system import System as System
@@ -98,6 +99,7 @@ from .image.wavefront import (
 from .learn.adam import adam as adam, apply_updates as apply_updates
 from .learn.network import red_net as red_net
 from .lens.aperture import Apertures as Apertures
+from .lens.edit import flipped as flipped, scaled as scaled
 from .lens.elements import Elements as Elements
 from .lens.entrance import with_paraxial_pupil as with_paraxial_pupil
 from .lens.glass import refractive_index as refractive_index

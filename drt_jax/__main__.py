@@ -4,7 +4,6 @@ writes a lens file in the format of another program; `glass N-BK7`: what a glass
 import argparse
 import contextlib
 import math
-import os
 import pathlib
 import sys
 import warnings
@@ -14,7 +13,7 @@ from typing import get_args
 import jax
 import numpy as np
 
-from .compilation import ONCE, jit
+from .compilation import ONCE, jit, keep_programs
 from .files.write import save_lens
 from .files.yaml import lens_names, load_lens, load_system
 from .image.converged import psf_moments
@@ -253,13 +252,11 @@ def run_show(options: argparse.Namespace) -> None:
 
 
 def set_up() -> None:
-    """Change settings that a library must not change: float64, and compiled programs are kept in
-    JAX_COMPILATION_CACHE_DIR or the user's cache."""
+    """Change settings that a library must not change: float64, and compiled programs are kept
+    where there is a place for them."""
     jax.config.update("jax_enable_x64", True)
-    if not jax.config.values["jax_compilation_cache_dir"]:
-        home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "drt_jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    with contextlib.suppress(OSError):
+        keep_programs()
 
 
 def main(argv: list[str] | None = None) -> None:

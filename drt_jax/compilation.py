@@ -1,7 +1,12 @@
-"""Options of XLA for programs that are slow to compile. XLA refuses an option that its release does
-not know, and drops old ones, so each is tried once on a trivial program when it is needed."""
+"""Options of XLA for programs that are slow to compile, and a folder that keeps what is compiled.
+
+XLA refuses an option that its release does not know, and drops old ones, so each is tried once on a
+trivial program when it is needed.
+"""
 
 import functools
+import os
+import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -16,6 +21,25 @@ LARGE = {"xla_cpu_use_fusion_emitters": False}
 ONCE = {**LARGE, "xla_backend_optimization_level": 0}
 # A choice of passes with which a RED-Net step takes a tenth less time (docs/performance.md).
 NETWORK = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_FAST_COMPILE"}
+
+
+def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path:
+    """Keep compiled programs on disk, so that the next process need not compile them, and return
+    their folder. Changes JAX's settings; call it before the first program is compiled.
+
+    folder: None: that which JAX_COMPILATION_CACHE_DIR or an earlier call names, else `drt_jax` in
+        the user's cache. OSError if it cannot be made.
+    """
+    chosen = folder or jax.config.values["jax_compilation_cache_dir"]
+    if not chosen:
+        home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+        folder = chosen = pathlib.Path(home) / "drt_jax"
+    if folder:  # programs that compile quickly, too
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    path = pathlib.Path(chosen).absolute()
+    path.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    return path
 
 
 def known_options(wanted: Mapping[str, Any]) -> dict[str, Any]:

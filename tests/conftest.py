@@ -15,10 +15,15 @@ import jax
 import numpy as np
 import pytest
 
-# Most of the time of a test is compilation, and machine code that is not optimised compiles three
-# times faster, and without the newer fusions of CPUs nearly twice as fast; what it computes is the
-# same. Read when a backend starts, here and in the workers.
-FLAGS = ("--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false")
+# Most of the time of a test is compilation. Machine code that is not optimised compiles three times
+# faster, without the newer fusions of CPUs nearly twice as fast, and in one piece instead of many
+# in parallel a tenth faster, since both cores are busy anyway. What it computes is the same. Read
+# when a backend starts, here and in the workers.
+FLAGS = (
+    "--xla_backend_optimization_level=0",
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_parallel_codegen_split_count=1",
+)
 
 
 def known(flag: str) -> bool:

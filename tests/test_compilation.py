@@ -33,6 +33,30 @@ def test_a_program_with_options_is_part_of_another(outer):
     np.testing.assert_allclose(found, 6 if outer in (jax.grad, jax.jacfwd) else 17)
 
 
+@pytest.mark.parametrize("given", ["", "named"])
+def test_programs_are_kept_for_the_next_process(tmp_path, given):
+    """In the user's cache, or in a folder that is named; a second process compiles nothing anew."""
+    argument = str(tmp_path / "named") if given else None
+    code = (
+        "import jax, jax.numpy as jnp, drt_jax\n"
+        f"print(drt_jax.keep_programs({argument!r}))\n"
+        "jax.jit(lambda x: jnp.sin(x) + 41)(1.0)"
+    )
+    gone = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
+    environment = {k: v for k, v in os.environ.items() if k not in gone}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path / "home"), "JAX_PLATFORMS": "cpu"}
+    kept = []
+    for _ in range(2):
+        said = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, env=environment
+        )
+        assert said.returncode == 0, said.stderr
+        folder = tmp_path / given if given else tmp_path / "home" / "drt_jax"
+        assert said.stdout.strip() == str(folder)
+        kept.append({path.name for path in folder.iterdir() if path.name.endswith("-cache")})
+    assert kept[0] and kept[0] == kept[1]
+
+
 def test_importing_starts_no_backend():
     """A user may still choose one, or begin `jax.distributed`."""
     code = (

@@ -107,7 +107,10 @@ def test_no_module_imports_itself_by_a_detour():
 
 @pytest.mark.parametrize("name", [name for name in MODULES if name != "__main__"])
 def test_the_library_is_silent_and_changes_no_global_setting(name):
-    calls = [n.func for n in ast.walk(ast.parse(MODULES[name].read_text())) if type(n) is ast.Call]
+    tree = ast.parse(MODULES[name].read_text())
+    # What a user asks for by name.
+    tree.body = [n for n in tree.body if getattr(n, "name", "") != "keep_programs"]
+    calls = [node.func for node in ast.walk(tree) if type(node) is ast.Call]
     for call in map(ast.unparse, calls):
         assert call != "print" and not call.endswith("config.update")
 

@@ -40,10 +40,12 @@ _ALIKE = 8
 class RenderMethod:
     """How a picture is rendered: what `render_method` chose, to be passed on.
 
-    grid: fields, distances and rays of the kernels. focal: () mm, of the pinhole that sees the
-    ideal picture. places: (R,), of those in `controls`, row by row, whose kernels stand for all;
-    none: those at the corners of tiles do.
-    shape: of the picture, tile: of its tiles, height and width.
+    grid: fields, distances and rays of the kernels.
+    focal: () mm, of the pinhole that sees the ideal picture.
+    places: (R,), of those in `controls`, row by row, whose kernels stand for all; none: those at
+        the corners of tiles do.
+    shape: of the picture, height and width.
+    tile: of its tiles, height and width.
     """
 
     grid: GridMethod

@@ -124,7 +124,7 @@ def strehl(
     cells: int = 2 * _CELLS,
 ) -> Array:
     """Strehl ratio (F, W): the irradiance of the image of a point over that without aberrations in
-    the same pupil, |integral of P|^2 / (integral of |P|)^2 over direction cosines.
+    the same pupil, `|integral of P|^2 / (integral of |P|)^2` over direction cosines.
 
     At the place where the wavefront has no tilt, in the mean square over the pupil: the peak of an
     image of a quarter of a wave or better. 0 where no light arrives. Arguments as of `transfer`.

@@ -202,7 +202,7 @@ def evaluate(
 ) -> dict[str, float]:
     """Image quality over patches, by scikit-image, for values from 0 to 1, not clipped: mae and
     rmse over all values, psnr (dB) and ssim as means over the patches, of the restored images; with
-    the prefix sensor_, of the images in front of the network.
+    the prefix `sensor_`, of the images in front of the network.
 
     imager: a function of `make_imager`.
     parameters: of optics and network.

@@ -99,12 +99,13 @@ def test_kernels_are_those_of_psf():
         return jnp.sum(1 - kernels[:, :, 4, 4]), kernels
 
     x = variables.start
-    slope, kernels = jit(jax.grad(beside, has_aux=True), LARGE)(x)
+    both = jit(jax.value_and_grad(beside, has_aux=True), LARGE)
+    (_, kernels), slope = both(x)
     for field, own in zip(FIELDS, kernels):
         wanted = drt_jax.psf(COOKE, field, np.inf, COLOURS, 4e-3, 9, "waves", 1e-3).kernel
         assert np.max(np.sum(np.abs(own - wanted), axis=(1, 2))) < 5e-3
     step = 1e-5
-    ends = [jit(beside, LARGE)(x + h)[0] for h in (step, -step)]
+    ends = [both(x + h)[0][0] for h in (step, -step)]
     np.testing.assert_allclose(slope[0], (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
     with pytest.raises(ValueError, match="^rule: needs Gauss, Soft or Clipped of"):
         low = Problem.from_variables(variables, ["spot"], FIELDS, rule=1)
@@ -119,15 +120,15 @@ def test_a_clipped_pupil(rule, within):
     """Against the analyses with a finer rule; the light that fills the stop has other contrast."""
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
     variables, field = Variables.from_lens(lens, ["sensor"]), jnp.array([0.0, 0.25])
+    asked = [ASKED[0], ASKED[2]]
     values = [
-        jax.jit(told)(Problem.from_variables(variables, ASKED, field, COLOURS, rule=r), lens)
+        jax.jit(told)(Problem.from_variables(variables, asked, field, COLOURS, rule=r), lens)
         for r in (rule, Gauss(6, "bilateral"))
     ]
     fine = {"rule": Clipped(10, "bilateral")}
     scene = lens, field, np.inf, COLOURS
     wanted = {
         "mtf": drt_jax.transfer(*scene, jnp.array([LINES]), **fine).mtf[..., 0],
-        "strehl": drt_jax.strehl(*scene, **fine),
         "encircled_energy": drt_jax.encircled_energy(*scene, jnp.array([RADIUS]), **fine)[:, 0],
     }
     for name, each in wanted.items():
@@ -138,8 +139,8 @@ def test_a_clipped_pupil(rule, within):
 @pytest.mark.slow
 def test_contrast_designs_a_lens_of_more_contrast():
     """The triplet at 50 cycles/mm, from where least squares on spots ends."""
-    lens, waves = COOKE, (0.486, 0.588, 0.656)
-    fields, rule = np.radians([0.0, 14.0, 20.0]), Gauss(5, "bilateral")
+    lens, waves = COOKE, (0.588,)
+    fields, rule = np.radians([0.0, 14.0, 20.0]), Gauss(4, "bilateral")
     variables = Variables.from_lens(
         lens, ["curvature", "sensor"], solves=[design.Solve("focal_length", 50.0, surface=5)]
     )

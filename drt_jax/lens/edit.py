@@ -1,0 +1,124 @@
+"""The same lens at another size, and the other way round."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..numerics import Numbers, real_array
+from .forms import FORMS
+from .lens import Labels, Lens
+from .phase import Phase
+
+# How the named coefficients of forms change with size (a power of it) and with the sign of a sag.
+_NAMED = {"curvature_x": (-1, -1), "conic_x": (0, 1), "norm_radius": (1, 1)}
+
+
+def _degree(power: int | str) -> int:
+    """Degree of a term in the coordinates, by its name in files: 4, "y" or "x1y2"."""
+    if isinstance(power, int):
+        return power
+    return sum(map(int, re.findall(r"\d+", power))) or 1
+
+
+def _terms(form: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The powers of the size by which `count` coefficients of a form change, and their signs if the
+    sag changes sign."""
+    record = FORMS[form]
+    by_radius = "norm_radius" in record.named  # coefficients are heights, mm
+    free = count - len(record.named)
+    plain = [(1 if by_radius else 1 - _degree(power), -1) for power in record.powers[:free]]
+    powers, signs = zip(*[_NAMED[name] for name in record.named], *plain, (0, 1))
+    return np.array(powers[:count]), np.array(signs[:count])
+
+
+def _resized(coefficients: Array, forms: tuple[str, ...], factor: Array) -> Array:
+    """Coefficients (N, K) of forms, or of phases, of which all lengths are `factor` times as
+    long."""
+    powers = np.array([_terms(form, coefficients.shape[1])[0] for form in forms])
+    return coefficients * factor ** jnp.asarray(powers, factor.dtype)
+
+
+def scaled(lens: Lens, factor: Numbers) -> Lens:
+    """The lens with all lengths times a factor: rays keep their angles, and all errors in mm grow
+    by the factor. Gratings and other phases keep the angles, too.
+
+    factor: (), above 0; differentiable. ValueError for another.
+    """
+    size = real_array("factor", factor, lens.curvature.dtype)
+    if size.shape or not np.all(size > 0):
+        raise ValueError(f"factor: expected one number above 0, got {factor}")
+    moved = lens.decentre, lens.phase, lens.elements, lens.apertures
+    decentre, phase, elements, apertures = moved
+    if phase is not None:
+        own = _resized(phase.coefficients, phase.forms, size)
+        phase = dataclasses.replace(phase, coefficients=own)
+    if elements is not None:
+        shift, pivot = elements.shift * size, elements.pivot * size
+        elements = dataclasses.replace(elements, shift=shift, pivot=pivot)
+    if apertures is not None:
+        centre = None if apertures.centre is None else apertures.centre * size
+        apertures = dataclasses.replace(apertures, half=apertures.half * size, centre=centre)
+    return dataclasses.replace(
+        lens,
+        curvature=lens.curvature / size,
+        coefficients=_resized(lens.coefficients, lens.forms, size),
+        thickness=lens.thickness * size,
+        semi_diameter=lens.semi_diameter * size,
+        sensor=lens.sensor * size,
+        decentre=None if decentre is None else decentre * size,
+        phase=phase,
+        elements=elements,
+        apertures=apertures,
+    )
+
+
+def flipped(lens: Lens) -> Lens:
+    """The lens the other way round: light takes each path backwards. The sensor stays as far behind
+    the last vertex as it was. ValueError for a lens with mirrors, elements or a tilted sensor.
+    """
+    moved = [lens.decentre, lens.tilt]
+    oblique = any(a is not None and np.any(np.asarray(a)[-1] != 0) for a in moved)
+    if any(lens.mirrors) or lens.elements is not None or oblique:
+        raise ValueError("lens: with mirrors, elements or a tilted sensor cannot be flipped")
+    count = lens.count
+    order = np.array([*range(count)[::-1], count])
+    other = {i: count - 1 - i for i in range(count)} | {count: count}
+    signs = np.array([_terms(form, lens.coefficients.shape[1])[1] for form in lens.forms])
+    signs[-1], turn = 1, np.array([*[-1] * count, 1])  # the sensor keeps its shape
+    dtype = lens.curvature.dtype
+    tilt = lens.tilt
+    if tilt is not None:
+        tilt = (tilt * jnp.array([[-1, -1, 1]], dtype))[order]
+    phase, apertures = lens.phase, lens.apertures
+    if phase is not None:
+        phase = Phase(
+            phase.coefficients[::-1],
+            phase.order[::-1],
+            tuple(other[i] for i in phase.surfaces[::-1]),
+            phase.forms[::-1],
+        )
+    if apertures is not None:
+        places = tuple(other[i] for i in apertures.surfaces)
+        apertures = dataclasses.replace(apertures, surfaces=places)
+    return dataclasses.replace(
+        lens,
+        curvature=(lens.curvature * jnp.asarray(turn, dtype))[order],
+        conic=lens.conic[order],
+        coefficients=(lens.coefficients * jnp.asarray(signs, dtype))[order],
+        thickness=lens.thickness[::-1],
+        semi_diameter=lens.semi_diameter[order],
+        dispersion=jax.tree.map(lambda a: a[::-1], lens.dispersion),
+        decentre=None if lens.decentre is None else lens.decentre[order],
+        tilt=tilt,
+        phase=phase,
+        apertures=apertures,
+        stop=other[lens.stop],
+        labels=Labels(lens.name, lens.glasses[::-1]),
+        forms=tuple(lens.forms[i] for i in order),
+        mirrors=lens.mirrors[::-1],
+        curved=tuple(sorted(other[i] for i in lens.curved)),
+    )

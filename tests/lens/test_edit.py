@@ -1,0 +1,105 @@
+"""A lens at another size and the other way round."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import drt_jax
+from drt_jax.lens.edit import _terms
+from drt_jax.lens.forms import FORMS, Shape
+from drt_jax.lens.surface import surface_sag
+
+WAVE = 0.5875618
+# Coefficients of each form: what has a name, then a few terms.
+SOME = {name: [0.3, -0.2, 0.1, 0.05, -0.02, 0.01] for name in FORMS}
+SOME |= {"biconic": [0.04, -0.5, 2e-3], "toroid": [0.04, 2e-3], "linear": [0.2]}
+SOME |= {name: [4.0, 0.03, -0.02, 0.01, 0.02] for name in ("zernike", "qbfs")}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_sag_grows_with_the_lens_and_turns_with_it(form):
+    coefficients = np.array(SOME[form])
+    powers, signs = _terms(form, len(coefficients))
+    x, y, factor = jnp.array([0.3, -0.5, 0.7]), jnp.array([0.6, 0.2, -0.4]), 1.7
+
+    def height(curvature, values, size=1.0):
+        shape = Shape(jnp.asarray(curvature), jnp.asarray(-0.4), jnp.asarray(values))
+        return np.asarray(surface_sag((size * x, size * y), shape, form))
+
+    own = height(0.06, coefficients)
+    larger = height(0.06 / factor, coefficients * factor**powers, factor)
+    np.testing.assert_allclose(larger, factor * own, rtol=1e-12)
+    np.testing.assert_allclose(height(-0.06, coefficients * signs), -own, rtol=1e-12)
+
+
+DOUBLET = {
+    "surfaces": [
+        {"radius": 60.0, "thickness": 6.0, "glass": "N-BK7", "semi_diameter": 12.0,
+         "conic": -0.3, "coefficients": {4: 1e-6}, "tilt": [0.4, 0.2, 0.0]},
+        {"radius": -45.0, "thickness": 2.5, "glass": "N-SF5", "semi_diameter": 12.0},
+        {"radius": -130.0, "thickness": 4.0, "semi_diameter": 12.0, "decentre": [0.1, -0.2],
+         "phase": {"coefficients": {2: -0.2}},
+         "aperture": {"rectangle": [9, 8], "centre": [0.2, 0.1]}},
+        {"radius": float("inf"), "thickness": 90.0, "semi_diameter": 6.0, "stop": True},
+    ]
+}  # fmt: skip
+LENS = drt_jax.load_lens(DOUBLET)
+
+
+def test_light_takes_the_same_path_backwards():
+    """From where each ray met the sensor, through its point on the stop."""
+    other, last = drt_jax.flipped(LENS), LENS.vertices[-2]
+    points = np.array([[0.3, 0.8], [-0.7, 0.2], [0.0, 0.0]])
+    rays = drt_jax.trace_rays(LENS, (0.02, 0.05), np.inf, WAVE, points)
+    assert not np.any(rays.status)
+    # z from what is the first vertex now.
+    hits = (np.asarray(rays.points)[0] - [0, 0, last]) * [1, 1, -1]
+    distance = LENS.sensor - last
+    for point, path in zip(points, hits):
+        field = drt_jax.field_of_height(path[-1, :2], distance)
+        found = drt_jax.trace_rays(other, field, distance, WAVE, point[None])
+        assert not np.any(found.status)
+        own = np.asarray(found.points)[0, 0, : LENS.count]
+        np.testing.assert_allclose(own, path[-2::-1], atol=1e-10)
+
+
+def test_twice_flipped_is_the_lens():
+    again = drt_jax.flipped(drt_jax.flipped(LENS))
+    assert jax.tree.structure(again) == jax.tree.structure(LENS)
+    for one, two in zip(jax.tree.leaves(again), jax.tree.leaves(LENS)):
+        np.testing.assert_array_equal(one, two)
+    assert again.glasses == LENS.glasses and again.stop == LENS.stop
+    plain = drt_jax.load_lens("double_gauss")
+    front = -drt_jax.front_focal_distance(plain, WAVE)
+    np.testing.assert_allclose(
+        drt_jax.back_focal_distance(drt_jax.flipped(plain), WAVE), front, rtol=1e-12
+    )
+
+
+def test_rays_of_a_larger_lens_keep_their_angles():
+    """All hits are as much larger; so is the focal length, and its derivative by the factor."""
+    points, factor = np.array([[0.3, 0.8], [-0.7, 0.2]]), 2.5
+    scene = (0.02, 0.05), 700.0
+    one = drt_jax.trace_rays(LENS, *scene, WAVE, points)
+    two = drt_jax.trace_rays(
+        drt_jax.scaled(LENS, factor), scene[0], factor * scene[1], WAVE, points
+    )
+    assert not np.any(one.status) and not np.any(two.status)
+    np.testing.assert_allclose(two.points, factor * one.points, atol=1e-10)
+    np.testing.assert_allclose(two.directions, one.directions, atol=1e-12)
+    length = lambda f: drt_jax.focal_length(drt_jax.scaled(LENS, f), WAVE)[0]  # noqa: E731
+    np.testing.assert_allclose(jax.grad(length)(factor), length(1.0), rtol=1e-12)
+
+
+def test_what_cannot_be_done_is_refused_in_a_line():
+    for factor in (0.0, -1.0, np.nan, [1.0, 2.0]):
+        with pytest.raises(ValueError, match=r"^factor: expected one number above 0"):
+            drt_jax.scaled(LENS, factor)
+    with pytest.raises(ValueError, match="^lens: with mirrors"):
+        drt_jax.flipped(drt_jax.load_lens("hubble"))
+    tilted = dataclasses.replace(LENS, tilt=LENS.tilt.at[-1].set(0.1))
+    with pytest.raises(ValueError, match="tilted sensor"):
+        drt_jax.flipped(tilted)
