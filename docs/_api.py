@@ -82,10 +82,14 @@ def with_fields(app, what, name, thing, options, lines: list[str]) -> None:
 
 
 def _whole(lines: list[str]) -> Iterator[str]:
-    """Lines of a docstring, each with the indented ones that go on with it."""
+    """Lines of a docstring, each with those that go on with it: indented, or behind a line that
+    names something and ends without a full stop."""
     whole: list[str] = []
     for line in lines:
-        if line.startswith("    ") and whole and whole[-1] and not whole[-1].endswith("::"):
+        last = whole[-1] if whole else ""
+        named = ": " in last and not last.startswith(("- ", "|", "    "))
+        open_ended = named and last[-1] not in ".:|" and not line.startswith(("- ", "|"))
+        if last and line and (line.startswith("    ") or open_ended) and not last.endswith("::"):
             whole[-1] += " " + line.strip()
         else:
             whole.append(line)
