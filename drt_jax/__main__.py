@@ -25,7 +25,8 @@ from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
 from .show import glasses
 from .show.layout import Beam, beam_of
-from .show.sheet import sheet
+from .show.page import Part, page
+from .show.sheet import panels, sheet
 
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 # Orders of the two rules for the spots; a larger relative difference of spot size is reported.
@@ -48,7 +49,9 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     show.add_argument("--field", type=float, nargs="+", help=f"degrees; {own} 0 7 10")
     show.add_argument("--distance", type=float, help=f"to the object, mm; {own} inf")
     show.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {ends} C, d and F")
-    show.add_argument("--out", type=pathlib.Path, help="of the sheet; default: LENS.png here")
+    show.add_argument("--html", action="store_true", help="a page of tables and figures instead")
+    ends = "of the sheet or page; default: LENS.png or LENS.html here"
+    show.add_argument("--out", type=pathlib.Path, help=ends)
     show.set_defaults(run=run_show)
     about = "write a lens as a file of another program; says what is not in it"
     convert = commands.add_parser("convert", help=about, description=about)
@@ -63,22 +66,34 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def first_lines(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[str]:
-    """Lines with the first-order data of a lens at one wavelength, um."""
-    yield f"{lens.name}: {lens.count} surfaces, the stop is number {lens.stop}"
-    yield f"  wavelength           {wavelength:g} um"
+def first_rows(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[tuple[str, str]]:
+    """The first-order data of a lens at one wavelength, um: names and values."""
+    yield "wavelength", f"{wavelength:g} um"
     air = float(found.effective_focal_length)
     both = "" if math.isclose(air, abs(found.focal_length)) else f" ({air:.6g} mm in air)"
-    yield f"  focal length         {found.focal_length:.6g} mm{both}, f/{found.f_number:.4g}"
-    yield f"  back focal distance  {found.back_focal_distance:.6g} mm"
+    yield "focal length", f"{found.focal_length:.6g} mm{both}, f/{found.f_number:.4g}"
+    yield "back focal distance", f"{found.back_focal_distance:.6g} mm"
     for name, image_of, end in (
         ("entrance", found.entrance_pupil, "first"),
         ("exit    ", found.exit_pupil, "last"),
     ):
         place = f"at {image_of.position + 0.0:.5g} mm from the {end} vertex"
-        yield f"  {name} pupil       {2 * image_of.semi_diameter:.5g} mm wide, {place}"
-    yield f"  sensor               {float(lens.sensor):.6g} mm from the first vertex"
-    yield f"  paraxial focus       {found.image_distance:.6g} mm from the first vertex"
+        yield f"{name} pupil", f"{2 * image_of.semi_diameter:.5g} mm wide, {place}"
+    yield "sensor", f"{float(lens.sensor):.6g} mm from the first vertex"
+    yield "paraxial focus", f"{found.image_distance:.6g} mm from the first vertex"
+
+
+def surface_rows(lens: Lens) -> Iterator[tuple[str, ...]]:
+    """The prescription of a lens, a row for each surface."""
+    yield "surface", "radius mm", "conic", "form", "thickness mm", "medium", "semi-diameter mm"
+    gaps = [*np.asarray(lens.thickness), float(lens.sensor - lens.vertices[-2])]
+    numbers = zip(*map(np.asarray, (lens.curvature, lens.conic, lens.semi_diameter)))
+    for i, ((curvature, conic, semi), gap) in enumerate(zip(numbers, gaps)):
+        radius = f"{1 / curvature:.6g}" if curvature else "plane"
+        medium = "mirror" if lens.mirrors[i] else lens.glasses[i + 1]
+        name = f"{i}, stop" if i == lens.stop else str(i)
+        shape = "" if not np.any(lens.coefficients[i]) else lens.forms[i]
+        yield name, radius, f"{conic:.5g}", shape, f"{gap:.6g}", medium, f"{semi:.5g}"
 
 
 def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[str]:
@@ -93,13 +108,13 @@ def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[s
         )
 
 
-def field_lines(
+def field_rows(
     lens: Lens, fields: list[float], distance: float, wavelengths: list[float], beams: list[Beam]
-) -> Iterator[str]:
-    """A table of spots over fields in degrees, with warnings."""
+) -> Iterator[tuple[str, ...] | str]:
+    """A table of spots over fields in degrees, and warnings as lines between its rows."""
     spots = [f"spot at {wavelength:.3f}" for wavelength in wavelengths]
-    yield _row("field", "image height", *spots, "light", "surfaces that clip")
-    yield _row("deg", "mm", *("RMS um" for _ in spots), "%", "")
+    yield "field", "image height", *spots, "light", "surfaces that clip"
+    yield "deg", "mm", *("RMS um" for _ in spots), "%", ""
     angles, middle = [math.radians(field) for field in fields], len(wavelengths) // 2
     symmetry, whole = _widest(lens, angles), _whole(beams)
     for field, angle, beam in zip(fields, angles, beams):
@@ -107,13 +122,13 @@ def field_lines(
         rough, found = (_moments(lens, scene, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
         light = 100 * float(found.throughput[middle])
         if not light > 0:
-            yield _row(f"{field:.4g}", f"! {_why(lens, scene, Gauss(8, symmetry))}")
+            yield f"{field:.4g}", f"! {_why(lens, scene, Gauss(8, symmetry))}"
             continue
         cut = "; ".join(filter(None, (", ".join(map(str, beam.clipping)), *beam.ends))) or "none"
         squares = [np.trace(np.asarray(m.covariance), axis1=1, axis2=2) for m in (found, rough)]
         sizes = [f"{1e3 * math.sqrt(square):.4g}" for square in squares[0]]
         height = round(float(found.mean[middle, 1]), 9) + 0.0  # no -0
-        yield _row(f"{field:.4g}", f"{height:.5g}", *sizes, f"{light:.2f}", cut)
+        yield f"{field:.4g}", f"{height:.5g}", *sizes, f"{light:.2f}", cut
         change = np.max(np.abs(squares[1] / squares[0] - 1)) / 2
         if change > _TOLERANCE:
             yield f"  ! these spots are known to {change:.1g} of their size only"
@@ -171,12 +186,19 @@ def _row(first: str, *cells: str) -> str:
     return f"{first:>6}" + "".join(f"{cell:>15}" for cell in numbers) + f"   {last}".rstrip()
 
 
-def _say(lines: Iterable[str]) -> None:
-    """Write each line to stdout as soon as it is known."""
+def _say(lines: Iterable[tuple[str, ...] | str]) -> list[tuple[str, ...] | str]:
+    """Write each line, or row of a table, to stdout as soon as it is known; return them."""
+    said = []
     for line in lines:
-        _wait("")
-        sys.stdout.write(f"{line}\n")
-        sys.stdout.flush()
+        said.append(line)
+        _tell(line if isinstance(line, str) else _row(*line))
+    return said
+
+
+def _tell(line: str) -> None:
+    _wait("")
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 def _wait(what: str) -> None:
@@ -203,7 +225,7 @@ def run_convert(options: argparse.Namespace) -> None:
 def _warnings_on_stdout() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        warnings.showwarning = lambda message, *_, **__: _say([f"  ! {message}"])
+        warnings.showwarning = lambda message, *_, **__: _tell(f"  ! {message}")
         yield
 
 
@@ -238,16 +260,28 @@ def run_show(options: argparse.Namespace) -> None:
         middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
         scene_of(lens, 0.0, distance, np.array(waves))  # ValueError for an invalid scene
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
-        _say(first_lines(lens, found, middle))
+        about = f"{lens.count} surfaces, the stop is number {lens.stop}"
+        first = [*first_rows(lens, found, middle)]
+        _say([f"{lens.name}: {about}", *(f"  {name:<19}  {value}" for name, value in first)])
         _wait("tracing; another kind of lens is compiled first, for half a minute or less")
         axial, *beams = (beam_of(lens, angle, distance, middle) for angle in (0.0, *angles))
-        _say([*focus_lines(found, middle, axial), ""])
-        _say(field_lines(lens, fields, distance, waves, beams))
-        _say(aperture_lines(lens, beams))
-        out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}.png")
+        notes = _say([*focus_lines(found, middle, axial), ""])
+        table = _say(field_rows(lens, fields, distance, waves, beams))
+        notes += _say(aperture_lines(lens, beams))
+        kind = ".html" if options.html else ".png"
+        out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}{kind}")
         symmetry, cut = _widest(lens, angles), not _whole(beams)
         rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
-        sheet(lens, angles, distance, waves, rule, _wait).savefig(out)
+        given = lens, angles, distance, waves, rule, _wait
+        if options.html:
+            rows = [row for row in table if not isinstance(row, str)]
+            lines = [line for line in (*notes, *table) if isinstance(line, str) and line]
+            told: list[tuple[str, Part]] = [("First-order data", first), ("Spots", rows)]
+            told += [("Warnings", "\n".join(lines))] if lines else []
+            told += [("Surfaces", [*surface_rows(lens)]), *panels(*given).items()]
+            out.write_text(page(f"{lens.name}: {about}", told), encoding="utf-8")
+        else:
+            sheet(*given).savefig(out)
     _say([f"drawn in {out}"])
 
 

@@ -12,12 +12,14 @@ import traceback
 from typing import Any
 
 import drt_jax
+from drt_jax import show
 from drt_jax.__main__ import set_up
 
 from . import _common, hear
 from .runs import config as configs
 from .runs.folder import Run, begun
 from .runs.interrupt import deferred_interrupt
+from .runs.write import replace
 
 # Errors raised in these folders are about the input; others are faults, shown with a traceback.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
@@ -105,11 +107,25 @@ def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
             run.finish(experiment.run(config, run))
     results, figures = _common.read_results(folder), folder / "figures"
     figures.mkdir(exist_ok=True)
-    print("\n\n".join(experiment.tables(results).values()))
+    tables = experiment.tables(results)
+    print("\n\n".join(tables.values()))
     experiment.draw(results, figures)
-    print(f"results in {folder / 'results.json'}, figures in {figures}")
+    report = folder / "report.html"
+    replace(report, _report(name, tables, figures, folder / "config.yaml").encode())
+    print(f"results in {folder / 'results.json'}, all on one page in {report}")
     print(f"done in {time.perf_counter() - started:.0f} s")
     return results.get("not_finite", [])
+
+
+def _report(
+    name: str, tables: dict[str, str], figures: pathlib.Path, settings: pathlib.Path
+) -> str:
+    """A page with the tables, figures and settings of a run."""
+    pictures = sorted(figures.glob("*.png"))
+    parts = [*tables.items(), *((path.stem.replace("_", " "), path) for path in pictures)]
+    if settings.is_file():
+        parts.append(("Settings", settings.read_text()))
+    return show.page(name, parts)
 
 
 def _parser(name: str, experiment: Any) -> argparse.ArgumentParser:

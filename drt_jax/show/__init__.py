@@ -21,4 +21,5 @@ from .analyses import (
 from .figures import kernels as kernels, new as new
 from .glasses import glass_map as glass_map
 from .layout import Drawing as Drawing, draw as draw, lens_drawing as lens_drawing
-from .sheet import sheet as sheet
+from .page import page as page
+from .sheet import panels as panels, sheet as sheet

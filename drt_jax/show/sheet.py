@@ -32,6 +32,19 @@ _CURVE, _LIGHT, _FAN, _FIELDS = 31, 10, 33, 3
 _LINES = 200.0
 # Order of the spot rule, degree of polynomials, cells for MTF, least and most cells for energy.
 _ORDER, _DEGREE, _CELLS, _LEAST, _MOST = 8, 10, 48, 128, 384
+# Analyses by the names of their axes.
+_TITLES = {
+    "layout": "Layout",
+    "spots": "Spots",
+    "tangential": "Ray fans, tangential",
+    "sagittal": "Ray fans, sagittal",
+    "mtf": "Modulation transfer function",
+    "energy": "Encircled energy",
+    "foci": "Field curvature",
+    "bent": "Distortion",
+    "colour": "Lateral colour",
+    "light": "Illumination",
+}
 
 
 def sheet(
@@ -50,6 +63,42 @@ def sheet(
     the reference. rule: pupil rule of the spots, for all fields; None: as in `spot_diagram`. say:
     called with the name of each step.
     """
+    count, draw_on = _analysed(lens, fields, distance, wavelengths, rule, say)
+    figure, axes = _axes(count)
+    draw_on(axes)
+    return figure
+
+
+def panels(
+    lens: Lens,
+    fields: Sequence[float] = (0.0,),
+    distance: float = float("inf"),
+    wavelengths: Sequence[float] = (0.5875618,),
+    rule: PupilRule | None = None,
+    say: Callable[[str], None] = lambda what: None,
+) -> dict[str, Figure]:
+    """What `sheet` shows, from the same arguments, as a figure for each analysis, by title."""
+    count, draw_on = _analysed(lens, fields, distance, wavelengths, rule, say)
+    figures, axes = {}, {}
+    for name, title in _TITLES.items():
+        several = name in ("spots", "tangential", "sagittal")
+        size = (3.2, 3.2) if several else (8.0, 4.0) if name == "layout" else (5.0, 4.0)
+        figures[title], own = new(1, count if several else 1, *size)
+        axes[name] = [*np.ravel(own)] if several else own
+    draw_on(axes)
+    return figures
+
+
+def _analysed(
+    lens: Lens,
+    fields: Sequence[float],
+    distance: float,
+    wavelengths: Sequence[float],
+    rule: PupilRule | None,
+    say: Callable[[str], None],
+) -> tuple[int, Callable[[dict[str, Any]], None]]:
+    """The number of fields that have spots, and a function that draws all analyses on axes, which
+    are named as in `_TITLES`."""
     angles = sorted({float(angle) for angle in fields})
     some = [angles[k] for k in sorted({0, len(angles) // 2, len(angles) - 1})][:_FIELDS]
     waves, middle = np.array(wavelengths, float), len(wavelengths) // 2
@@ -75,22 +124,26 @@ def sheet(
     picked = lens, fields_array(some, axis.wavelengths.dtype), axis
     contrast, best, energy = _waves(*picked, jnp.asarray(lines), radii, rule, model, cells)
     say("drawing")
-    figure, axes = _axes(len(some))
-    lens_drawing(axes["layout"], draw(lens, fields, distance, wavelengths[middle]))
-    _per_field(axes, spots, fans, some, waves)
-    analyses.field_curvature(axes["foci"], foci, line, waves)
-    analyses.distortion(axes["bent"], bent, line, waves)
-    analyses.lateral_colour(axes["colour"], colour, line, waves, 1e3 * spots.airy_radius[0])
-    later, cone = slice(1 + len(some), None), spots.solid_angle[:, middle]
-    light = cone[later] / cone[0], spots.throughput[later, middle]
-    analyses.illumination(axes["light"], *light, wide[later])
-    hues = [FIELD_COLOURS[[*fields].index(field) % len(FIELD_COLOURS)] for field in some]
-    given = [f"{np.degrees(field):.3g}°" for field in some], hues  # as in the layout
-    analyses.mtf(axes["mtf"], lines, contrast, best, *given)
-    analyses.encircled_energy(axes["energy"], radii, energy, *given, float(spots.airy_radius[0]))
-    axes["energy"].set_title(f"encircled energy ({model})", fontsize=8)
-    axes["foci"].set_ylabel("field (degrees)")
-    return figure
+
+    def draw_on(axes: dict[str, Any]) -> None:
+        lens_drawing(axes["layout"], draw(lens, fields, distance, wavelengths[middle]))
+        _per_field(axes, spots, fans, some, waves)
+        analyses.field_curvature(axes["foci"], foci, line, waves)
+        analyses.distortion(axes["bent"], bent, line, waves)
+        analyses.lateral_colour(axes["colour"], colour, line, waves, 1e3 * spots.airy_radius[0])
+        later, cone = slice(1 + len(some), None), spots.solid_angle[:, middle]
+        light = cone[later] / cone[0], spots.throughput[later, middle]
+        analyses.illumination(axes["light"], *light, wide[later])
+        hues = [FIELD_COLOURS[[*fields].index(field) % len(FIELD_COLOURS)] for field in some]
+        given = [f"{np.degrees(field):.3g}°" for field in some], hues  # as in the layout
+        analyses.mtf(axes["mtf"], lines, contrast, best, *given)
+        analyses.encircled_energy(
+            axes["energy"], radii, energy, *given, float(spots.airy_radius[0])
+        )
+        axes["energy"].set_title(f"encircled energy ({model})", fontsize=8)
+        axes["foci"].set_ylabel("field (degrees)")
+
+    return len(some), draw_on
 
 
 _fans = jit(functools.partial(ray_fans, count=_FAN), ONCE)

@@ -1,0 +1,80 @@
+"""One self-contained HTML page of tables, text and figures, for any screen."""
+
+import base64
+import html
+import io
+import pathlib
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+
+# Rows of a table, the header first; text; a figure; or the file of a PNG picture.
+Part = Sequence[Sequence[str]] | str | Figure | pathlib.Path
+# Vector graphics above this size, in characters, are drawn as pixels instead.
+_LARGEST = 600_000
+_STYLE = """
+:root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif }
+body { max-width: 60rem; margin: 0 auto; padding: 1rem }
+h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem }
+figure { margin: 0; background: white } figure :is(img, svg) { width: 100%; height: auto }
+.wide { overflow-x: auto } pre { overflow-x: auto; font-size: .85rem }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums }
+th, td { padding: .2rem .7rem; text-align: left; white-space: nowrap }
+tr { border-bottom: 1px solid #8885 }
+"""
+
+
+def page(title: str, parts: Sequence[tuple[str, Part]]) -> str:
+    """A page of HTML that needs no other file.
+
+    parts: headings, each with rows of a table, text, a Markdown table, a figure or a PNG file.
+    """
+    body = [f"<h1>{html.escape(title)}</h1>"]
+    for heading, part in parts:
+        body += [f"<h2>{html.escape(heading)}</h2>", _shown(part)]
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+    head += f"<title>{html.escape(title)}</title><style>{_STYLE}</style>"
+    return (
+        f"<!doctype html>\n<html><head>{head}</head>\n<body>\n"
+        + "\n".join(body)
+        + "\n</body></html>\n"
+    )
+
+
+def _shown(part: Part) -> str:
+    if isinstance(part, Figure):
+        return f"<figure>{_drawn(part)}</figure>"
+    if isinstance(part, pathlib.Path):
+        return f"<figure>{_picture(part.read_bytes())}</figure>"
+    if not isinstance(part, str):
+        return _table(part)
+    lines = part.strip().splitlines()
+    if all(line.startswith("|") for line in lines):
+        cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+        return _table([cells[0], *cells[2:]])
+    return f"<pre>{html.escape(part)}</pre>"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    tags = ["th", *["td"] * (len(rows) - 1)]
+    lines = (
+        "<tr>" + "".join(f"<{tag}>{html.escape(str(cell))}</{tag}>" for cell in row) + "</tr>"
+        for tag, row in zip(tags, rows)
+    )
+    return '<div class="wide"><table>' + "\n".join(lines) + "</table></div>"
+
+
+def _drawn(figure: Figure) -> str:
+    """A figure as vector graphics, or as pixels if these are smaller."""
+    written = io.StringIO()
+    figure.savefig(written, format="svg", metadata={"Date": None})
+    text = written.getvalue()
+    if len(text) <= _LARGEST:
+        return text[text.index("<svg") :]
+    pixels = io.BytesIO()
+    figure.savefig(pixels, format="png")
+    return _picture(pixels.getvalue())
+
+
+def _picture(content: bytes) -> str:
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(content).decode()}">'

@@ -1,0 +1,87 @@
+"""Pages of HTML: what they hold, and how they look in a browser."""
+
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from drt_jax import load_lens, show
+from drt_jax.__main__ import main, surface_rows
+
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+)
+WIDTHS = (1280, 500)
+
+
+def test_a_page_holds_tables_text_figures_and_pictures_and_needs_no_other_file(tmp_path):
+    figure, axes = show.new()
+    axes.plot([0, 1], [1, 0])
+    figure.savefig(tmp_path / "line.png")
+    text = show.page(
+        "A < B",
+        [
+            ("Rows", [("name", "value"), ("n & k", "1.5")]),
+            ("Markdown", "| a | b |\n|---|---|\n| 1 | 2 |"),
+            ("Words", "if x < 3:\n  stop"),
+            ("Figure", figure),
+            ("Picture", tmp_path / "line.png"),
+        ],
+    )
+    assert "<h1>A &lt; B</h1>" in text and "<td>n &amp; k</td><td>1.5</td>" in text
+    assert "<th>a</th><th>b</th>" in text and "<td>1</td><td>2</td>" in text and "---" not in text
+    assert "<pre>if x &lt; 3:\n  stop</pre>" in text and text.count("<svg") == 1
+    assert 'src="data:image/png;base64,' in text
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', text)
+
+
+def test_a_figure_of_many_points_is_drawn_as_pixels():
+    figure, axes = show.new()
+    axes.plot(*np.random.default_rng(0).random((2, 20_000)), ".")
+    text = show.page("Many", [("Points", figure)])
+    assert "<svg" not in text and len(text) < 600_000
+
+
+def test_the_prescription_is_that_of_the_lens():
+    header, *rows = surface_rows(load_lens("cooke_triplet"))
+    assert len(rows) == 6 and all(len(row) == len(header) for row in rows)
+    assert rows[0][:3] == ("0", "22.0136", "0") and rows[3][0] == "3, stop"
+    assert [row[5] for row in rows] == ["SK16", "air", "F2", "air", "SK16", "air"]
+    assert next(row for row in [*surface_rows(load_lens("hubble"))][1:] if row[5] == "mirror")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not BROWSER, reason="no browser: apt-get install chromium")
+def test_a_browser_shows_the_sheet_at_two_widths(tmp_path, capsys):
+    """Every analysis is drawn, and nothing but tables reaches beyond the screen."""
+    page = tmp_path / "lens.html"
+    words = ["show", "cooke_triplet", "--html", "--field", "0", "14", "20", "--out", str(page)]
+    main(words)
+    assert capsys.readouterr().out.endswith(f"drawn in {page}\n")
+    text = page.read_text()
+    for title in ("First-order data", "Surfaces", "Layout", "Spots", "Lateral colour"):
+        assert f"<h2>{title}</h2>" in text
+    told = "<script>document.body.dataset.wide = document.documentElement.scrollWidth</script>"
+    measured = tmp_path / "measured.html"
+    measured.write_text(text.replace("</body>", told + "</body>"))
+    for width in WIDTHS:
+        size, shot = f"--window-size={width},3000", tmp_path / f"{width}.png"
+        dom = browse(size, "--dump-dom", measured.as_uri())
+        assert int(re.search(r'data-wide="(\d+)"', dom)[1]) <= width
+        browse(size, f"--screenshot={shot}", page.as_uri())
+        seen = np.asarray(Image.open(shot).convert("L"))
+        assert seen.shape[1] == width
+        assert np.mean(seen < 128) > 0.005  # text and curves
+        drawn = np.any(seen < 250, axis=1)
+        assert np.mean(drawn[:2000]) > 0.5
+
+
+def browse(*words: str) -> str:
+    flags = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars")
+    ran = subprocess.run(
+        [BROWSER, *flags, *words], capture_output=True, text=True, timeout=120, check=True
+    )
+    return ran.stdout
