@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import datetime
 import os
 import pathlib
@@ -148,12 +149,20 @@ def _parser(name: str, experiment: Any) -> argparse.ArgumentParser:
 
 
 def _config(name: str, kind: type, options: argparse.Namespace, folder: pathlib.Path) -> Any:
-    source = options.config or _common.ROOT / "configs" / f"{name}.yaml"
+    source = options.config or _common.CONFIGS / f"{name}.yaml"
     if options.resume and not options.config:
         source = folder / "config.yaml"
         missing = f"{folder}: nothing to resume: no config.yaml in it"
         _common.require(source.is_file(), missing)
-    return configs.load_config(kind, source, options.set)
+    config = configs.load_config(kind, source, options.set)
+    lens = getattr(config, "lens", None)
+    if (
+        isinstance(lens, str)
+        and not pathlib.Path(lens).exists()
+        and (_common.BASE / lens).is_file()
+    ):
+        config = dataclasses.replace(config, lens=str(_common.BASE / lens))  # from elsewhere
+    return config
 
 
 def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:

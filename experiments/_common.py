@@ -19,6 +19,10 @@ from .runs.config import ConfigError
 from .runs.folder import Run
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
+# Settings, at the top of a checkout; in a wheel within this package.
+_BASES = (ROOT, ROOT / "experiments")
+BASE = next((base for base in _BASES if (base / "configs").is_dir()), ROOT)
+CONFIGS = BASE / "configs"
 # Shortest turn of `medians`, s.
 _TURN = 0.05
 
@@ -32,7 +36,7 @@ def experiment(*names: str) -> Any:
 def settings_files() -> list[tuple[pathlib.Path, Any]]:
     """Files of settings with their experiment, that of the file's name or else of its folder's.
     Folders `lenses` hold other files."""
-    paths = sorted((ROOT / "configs").rglob("*.yaml"))
+    paths = sorted(CONFIGS.rglob("*.yaml"))
     return [(p, experiment(p.stem, p.parent.name)) for p in paths if p.parent.name != "lenses"]
 
 
