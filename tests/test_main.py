@@ -6,8 +6,14 @@ import signal
 import numpy as np
 import pytest
 
-from drt_jax import back_focal_distance, load_lens, psf_moments, save_lens
+from drt_jax import back_focal_distance, load_lens, psf_moments, save_lens, show
 from drt_jax.__main__ import _options, _view, main
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Words without the sheet, which takes longer than they do; see tests/show/test_sheet.py."""
+    monkeypatch.setattr("drt_jax.__main__.sheet", lambda *_: show.new()[0])
 
 
 @pytest.mark.slow
@@ -38,7 +44,7 @@ surfaces:
 
 
 @pytest.mark.slow
-def test_a_rim_that_shaves_the_axial_beam_is_named_wherever_it_matters(tmp_path, capsys):
+def test_a_rim_that_shaves_the_axial_beam_is_named_wherever_it_matters(tmp_path, capsys, undrawn):
     """0.8 % were cut by "none", and a warning said that apertures cut. Spots are those of
     `psf_moments`, cells do not run together, and what is far from focus is said."""
     (tmp_path / "mine.yaml").write_text(RIM)
@@ -72,7 +78,7 @@ def test_what_is_known_is_said_before_the_rays_are_traced(monkeypatch, tmp_path,
 
 
 @pytest.mark.slow
-def test_what_looks_odd(tmp_path, capsys):
+def test_what_looks_odd(tmp_path, capsys, undrawn):
     """A near object, out of focus; a field from which no light comes."""
     words = ["show", "singlet", "--field", "0", "80", "--wavelengths", "0.55"]
     main([*words, "--distance", "200", "--out", str(tmp_path / "lens.png")])
@@ -81,7 +87,7 @@ def test_what_looks_odd(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_words_for_apertures_and_focal_length(tmp_path, capsys):
+def test_words_for_apertures_and_focal_length(tmp_path, capsys, undrawn):
     """A diameter for a semi-diameter; an aperture that cuts; a wrong sign."""
     lens = """
     focal_length: 100

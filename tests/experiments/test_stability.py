@@ -12,7 +12,7 @@ from drt_jax import Status
 from experiments import _survey
 
 pytestmark = pytest.mark.slow
-SCENES = 24
+SCENES = 16
 # One static structure, so that a few compiled programs serve all: five surfaces, the stop third.
 NAMES = ("curvature", "asphere", "index", "edge", "close", "touching", "distance", "focus", "field")
 # Stops that are labels: one structure. `test_starts` has the family "offaxis". Rims that fail (the
