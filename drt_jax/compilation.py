@@ -37,7 +37,8 @@ def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path:
     if folder:  # programs that compile quickly, too
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     path = pathlib.Path(chosen).absolute()
-    path.mkdir(parents=True, exist_ok=True)
+    if not path.is_dir():
+        path.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_compilation_cache_dir", str(path))
     return path
 

@@ -20,7 +20,6 @@ from . import _common, hear
 from .runs import config as configs
 from .runs.folder import Run, begun
 from .runs.interrupt import deferred_interrupt
-from .runs.write import replace
 
 # Errors raised in these folders are about the input; others are faults, shown with a traceback.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
@@ -112,7 +111,8 @@ def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
     print("\n\n".join(tables.values()))
     experiment.draw(results, figures)
     report = folder / "report.html"
-    replace(report, _report(name, tables, figures, folder / "config.yaml").encode())
+    page = _report(name, tables, figures, folder / "config.yaml")
+    report.write_text(page, encoding="utf-8")  # like the figures, drawn again by --report
     print(f"results in {folder / 'results.json'}, all on one page in {report}")
     print(f"done in {time.perf_counter() - started:.0f} s")
     return results.get("not_finite", [])

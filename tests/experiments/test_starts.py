@@ -147,7 +147,7 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
 
     def stopping(self, job, step, rows):
         log(self, job, step, rows)
-        if job.startswith("damped") and step == 5:  # after its first checkpoint
+        if job.startswith("damped") and step == 10:  # after its first checkpoint
             raise KeyboardInterrupt
 
     folders = tmp_path / "whole", tmp_path / "stopped"
