@@ -69,6 +69,12 @@ class Studio:
             lens, 0.0, self.depths[1], self.waves, self.pixel, config.camera.kernel, self.model
         )
         self._axis = axis.solid_angle
+        # Kernels of waves repeat after as many periods of the finest fringe as there are cells.
+        fringe = 5e-4 * self.waves / np.sqrt(np.asarray(axis.solid_angle) / np.pi)
+        least = math.ceil(1.1 * config.camera.kernel * self.pixel / np.min(fringe))
+        room = f"camera.kernel: {config.camera.kernel} pixels of {config.camera.pixel_um:g} um"
+        remedy = f"{room} need {least} cells of waves: raise judge.cells or give a smaller kernel"
+        _common.require(config.judge.cells >= least, remedy)
         if config.tolerances:
             radius = self.spots.beam_radius(lens)
             self.built = design.PerturbedLens.from_lens(lens, radius, config.tolerances)

@@ -171,6 +171,11 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
             "camera.kernel: .* of the light of the spoilt lens falls beside a kernel of 9 pixels",
             marks=pytest.mark.slow,
         ),
+        pytest.param(
+            "judge={rings: 2, patches: 1, waves: 2, cells: 16}",
+            r"camera.kernel: 9 pixels of 20 um need \d+ cells of waves: raise judge.cells",
+            marks=pytest.mark.slow,
+        ),
         ("train.batch=3", "train.batch: expected a multiple of train.points"),
         ("arms=[frozen]", "arms: frozen needs spots"),
         ("variables=[{kind: conic, surfaces: [9]}]", "variables: conic: no surface 9"),
