@@ -26,7 +26,7 @@ myst_heading_anchors = 3
 
 # Notebooks are text; each asserts its headline number, and one that raises fails the build.
 nb_execution_mode = "force"
-nb_execution_timeout = 300
+nb_execution_timeout = 900  # s a cell; a busy machine compiles slowly
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
