@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..numerics import Numbers, real_array
+from ..numerics import Numbers, concrete, real_array
 from .forms import FORMS
 from .lens import Labels, Lens
 from .phase import Phase
@@ -29,10 +29,11 @@ def _terms(form: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     sag changes sign."""
     record = FORMS[form]
     by_radius = "norm_radius" in record.named  # coefficients are heights, mm
-    free = count - len(record.named)
-    plain = [(1 if by_radius else 1 - _degree(power), -1) for power in record.powers[:free]]
-    powers, signs = zip(*[_NAMED[name] for name in record.named], *plain, (0, 1))
-    return np.array(powers[:count]), np.array(signs[:count])
+    terms = [_NAMED[name] for name in record.named]
+    terms += [(1 if by_radius else 1 - _degree(power), -1) for power in record.powers[:count]]
+    terms += [(0, 1)] * count  # of forms with fewer terms the rest is 0
+    powers, signs = np.array(terms[:count], int).reshape(count, 2).T
+    return powers, signs
 
 
 def _resized(coefficients: Array, forms: tuple[str, ...], factor: Array) -> Array:
@@ -46,13 +47,12 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
     """The lens with all lengths times a factor: rays keep their angles, and all errors in mm grow
     by the factor. Gratings and other phases keep the angles, too.
 
-    factor: (), above 0; differentiable. ValueError for another.
+    factor: (), above 0; differentiable. ValueError for another, where it is known.
     """
     size = real_array("factor", factor, lens.curvature.dtype)
-    if size.shape or not np.all(size > 0):
+    if size.shape or (concrete(size) and not size > 0):
         raise ValueError(f"factor: expected one number above 0, got {factor}")
-    moved = lens.decentre, lens.phase, lens.elements, lens.apertures
-    decentre, phase, elements, apertures = moved
+    phase, elements, apertures = lens.phase, lens.elements, lens.apertures
     if phase is not None:
         own = _resized(phase.coefficients, phase.forms, size)
         phase = dataclasses.replace(phase, coefficients=own)
@@ -69,7 +69,7 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
         thickness=lens.thickness * size,
         semi_diameter=lens.semi_diameter * size,
         sensor=lens.sensor * size,
-        decentre=None if decentre is None else decentre * size,
+        decentre=None if lens.decentre is None else lens.decentre * size,
         phase=phase,
         elements=elements,
         apertures=apertures,
@@ -77,22 +77,20 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
 
 
 def flipped(lens: Lens) -> Lens:
-    """The lens the other way round: light takes each path backwards. The sensor stays as far behind
-    the last vertex as it was. ValueError for a lens with mirrors, elements or a tilted sensor.
+    """The lens the other way round: light takes each path backwards. The sensor is not turned, and
+    stays as far behind the last vertex as it was. ValueError for a lens with mirrors or elements.
     """
-    moved = [lens.decentre, lens.tilt]
-    oblique = any(a is not None and np.any(np.asarray(a)[-1] != 0) for a in moved)
-    if any(lens.mirrors) or lens.elements is not None or oblique:
-        raise ValueError("lens: with mirrors, elements or a tilted sensor cannot be flipped")
+    if any(lens.mirrors) or lens.elements is not None:
+        raise ValueError("lens: with mirrors or elements it cannot be flipped")
     count = lens.count
     order = np.array([*range(count)[::-1], count])
     other = {i: count - 1 - i for i in range(count)} | {count: count}
     signs = np.array([_terms(form, lens.coefficients.shape[1])[1] for form in lens.forms])
-    signs[-1], turn = 1, np.array([*[-1] * count, 1])  # the sensor keeps its shape
+    signs[-1], turn = 1, np.array([*[-1] * count, 1])  # the sensor keeps its shape and place
     dtype = lens.curvature.dtype
     tilt = lens.tilt
-    if tilt is not None:
-        tilt = (tilt * jnp.array([[-1, -1, 1]], dtype))[order]
+    if tilt is not None:  # about x and y the other way
+        tilt = (tilt * jnp.asarray(np.stack([turn, turn, turn**2], axis=1), dtype))[order]
     phase, apertures = lens.phase, lens.apertures
     if phase is not None:
         phase = Phase(

@@ -69,7 +69,7 @@ class Studio:
             lens, 0.0, self.depths[1], self.waves, self.pixel, config.camera.kernel, self.model
         )
         self._axis = axis.solid_angle
-        # Kernels of waves repeat after as many periods of the finest fringe as there are cells.
+        # With n cells a kernel of waves repeats after n times half a wavelength over the aperture.
         fringe = 5e-4 * self.waves / np.sqrt(np.asarray(axis.solid_angle) / np.pi)
         least = math.ceil(1.1 * config.camera.kernel * self.pixel / np.min(fringe))
         room = f"camera.kernel: {config.camera.kernel} pixels of {config.camera.pixel_um:g} um"
