@@ -86,6 +86,8 @@ def panels(
         figures[title], own = new(1, count if several else 1, *size)
         axes[name] = [*np.ravel(own)] if several else own
     draw_on(axes)
+    for name in ("bent", "colour"):  # on the sheet they stand beside the field curvature
+        axes[name].set_ylabel("field (degrees)")
     return figures
 
 
