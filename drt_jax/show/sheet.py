@@ -79,7 +79,8 @@ def panels(
 ) -> dict[str, Figure]:
     """What `sheet` shows, from the same arguments, as a figure for each analysis, by title."""
     count, draw_on = _analysed(lens, fields, distance, wavelengths, rule, say)
-    figures, axes = {}, {}
+    figures: dict[str, Figure] = {}
+    axes: dict[str, Any] = {}
     for name, title in _TITLES.items():
         several = name in ("spots", "tangential", "sagittal")
         size = (3.2, 3.2) if several else (8.0, 4.0) if name == "layout" else (5.0, 4.0)
