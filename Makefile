@@ -15,7 +15,7 @@ install: .venv/installed
 demo: install
 	$(BIN)/python -m experiments.focus --out $(OUT)/focus
 	$(BIN)/python -m experiments.edof --config configs/demo/edof.yaml --out $(OUT)/edof
-	@echo "Demo finished: pictures in $(OUT)/focus/figures and $(OUT)/edof/figures"
+	@echo "Demo finished: open $(OUT)/focus/report.html and $(OUT)/edof/report.html"
 
 # Style and types.
 check: install
