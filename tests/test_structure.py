@@ -19,6 +19,7 @@ FLOORS = (
     "inputs",
     "numerics",
     "compilation",
+    "devices",
     "lens",
     "rays",
     "pupil",

@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
+from ..devices import copied, gathered, shared, split
 from ..numerics import Numbers
 from .least_squares import Search
 from .optimum import init_problem, step_problem
@@ -108,9 +110,14 @@ class Starts(NamedTuple):
 _begin = jax.jit(jax.vmap(init_problem, (None, 0)))
 
 
-@partial(jit, wanted=LARGE)
-def _advance(problem: Problem, searches: Search, steps: Array) -> Search:
-    """Takes `steps` steps of a tile of searches, fewer if all are done."""
+@partial(jit, wanted=LARGE, static_argnames="mesh")
+def _advance(problem: Problem, steps: Array, searches: Search, mesh: Mesh | None) -> Search:
+    """Takes `steps` steps of a tile of searches; a device whose searches are all done takes
+    fewer."""
+    return shared(_advanced_here, mesh, 2)(problem, steps, searches)
+
+
+def _advanced_here(problem: Problem, steps: Array, searches: Search) -> Search:
     both = jax.vmap(step_problem, (None, 0))
 
     def more(state: tuple[Array, Search]) -> Array:
@@ -127,15 +134,18 @@ def many_starts(
     survivors: float = 0.5,
     callback: Callable[[int, int, float], None] = lambda done, total, best: None,
     threads: int | None = None,
+    mesh: Mesh | None = None,
 ) -> Starts:
     """Searches from many starts with successive halving (Jamieson and Talwalkar 2016). A search
-    that fails is ranked last. The result does not depend on threads or tiles.
+    that fails is ranked last. The result does not depend on threads, tiles or devices.
 
     starts: (K, N).
     steps: steps of every search in each stage.
     survivors: fraction that continues to the next stage, at least a tile of 16.
     callback: called with the tiles done, all tiles, and the best score so far.
     threads: number of threads; None for one per core.
+    mesh: devices that share the searches, of `devices.device_mesh`; each tile then is one for every
+        device, and `threads` is not used. None for the default device.
     """
     begun = time.perf_counter()
     vectors = np.asarray(starts, float)
@@ -148,16 +158,15 @@ def many_starts(
     for _ in steps[1:]:
         sizes.append(min(sizes[-1], max(_TILE, math.ceil(survivors * sizes[-1]))))
     alive, best, tried = np.arange(len(vectors)), list[float](), quick(problem)
-    total = sum(-(-size // _TILE) for size in sizes)
-    for _ in _advanced(tried, state, [np.resize(alive, _TILE)], 0, threads):
+    total = sum(-(-size // _tile(mesh)) for size in sizes)
+    for _ in _advanced(tried, state, alive[:1], 0, threads, mesh):
         compiled = time.perf_counter() - begun
     for size, more in zip(sizes, steps):
         alive = alive[np.argsort(_score(state, alive), kind="stable")[:size]]
-        tiles = [alive[k : k + _TILE] for k in range(0, len(alive), _TILE)]
-        for _ in _advanced(tried, state, tiles, more, threads):
+        for _ in _advanced(tried, state, alive, more, threads, mesh):
             best.append(float(np.min(_score(state, alive))))
             callback(len(best), total, best[-1])
-    for _ in _searched(problem, state, alive, steps[-1], threads):
+    for _ in _advanced(problem, state, _missed(problem, state, alive), steps[-1], threads, mesh):
         best.append(float(np.min(_score(state, alive))))
     total_steps, jacobians = (int(np.sum(a)) for a in (state.steps, state.jacobians))
     minima = distinct(_rows(state, alive), alive)
@@ -173,37 +182,48 @@ def many_starts(
     )
 
 
-def _searched(
-    problem: Problem, state: Search, alive: np.ndarray, steps: int, threads: int | None
-) -> Iterator[None]:
-    """Continues, as `_advanced`, the searches in which the full ray search finds rays that aiming
-    did not."""
+def _missed(problem: Problem, state: Search, alive: np.ndarray) -> np.ndarray:
+    """The searches in which the full ray search finds rays that aiming did not; they are marked to
+    go on."""
     failed = np.asarray(state.evaluation.failed)[alive]
-    missed = [
+    rows = [
         row
         for row, count in zip(alive[failed > 0], failed[failed > 0])
         if int(problem.failed(jnp.asarray(state.vector[row]))) < count
     ]
-    if missed:
-        state.stale[missed], state.done[missed] = True, False
-        tiles = [np.array(missed[k : k + _TILE]) for k in range(0, len(missed), _TILE)]
-        yield from _advanced(problem, state, tiles, steps, threads)
+    state.stale[rows], state.done[rows] = True, False
+    return np.array(rows, int)
+
+
+def _tile(mesh: Mesh | None) -> int:
+    return _TILE * (mesh.size if mesh else 1)
 
 
 def _advanced(
-    problem: Problem, state: Search, tiles: list[np.ndarray], steps: int, threads: int | None
+    problem: Problem,
+    state: Search,
+    searches: np.ndarray,
+    steps: int,
+    threads: int | None,
+    mesh: Mesh | None,
 ) -> Iterator[None]:
-    """Advances tiles of searches (rows of `state`) in place; yields after each tile."""
+    """Advances searches (rows of `state`) in place, in tiles; yields after each tile."""
+    size = _tile(mesh)
+    tiles = [searches[k : k + size] for k in range(0, len(searches), size)]
+    problem = copied(mesh, problem)
 
     def run(rows: np.ndarray) -> None:
-        whole = np.resize(rows, _TILE)  # a tile that is not full repeats its rows
-        new = _advance(problem, jax.tree.map(jnp.asarray, _rows(state, whole)), jnp.int32(steps))
-        for old, array in zip(jax.tree.leaves(state), jax.tree.leaves(new), strict=True):
-            old[rows] = np.asarray(array)[: len(rows)]
+        whole = np.resize(rows, size)  # a tile that is not full repeats its rows
+        old = split(mesh, jax.tree.map(jnp.asarray, _rows(state, whole)))
+        new = gathered(_advance(problem, np.int32(steps), old, mesh))
+        for array, part in zip(jax.tree.leaves(state), jax.tree.leaves(new), strict=True):
+            array[rows] = part[: len(rows)]
 
-    run(tiles[0])  # compiled once, not by all threads
-    yield
-    with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+    for tile in tiles[:1]:  # compiled once, not by all threads
+        run(tile)
+        yield
+    # Devices that share a tile take the tiles in one order.
+    with concurrent.futures.ThreadPoolExecutor(1 if mesh else threads or os.cpu_count()) as pool:
         for _ in pool.map(run, tiles[1:]):
             yield
 

@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from ..compilation import LARGE, ONCE, jit
+from ..devices import copied, gathered, shared, split
 from ..image.spot import deviations, normalised
 from ..inputs import shown
 from ..lens.lens import Lens
@@ -294,13 +296,16 @@ def monte_carlo(
     compensator: Compensator,
     callback: Callable[[int], None] = lambda done: None,
     threads: int | None = None,
+    mesh: Mesh | None = None,
 ) -> AsBuilt:
     """Traces lenses with given deviations; arrays (K, V) and (K, C). The result does not depend on
-    threads or tiles. Where aiming misses a ray, the full ray search decides whether it exists.
+    threads, tiles or devices. Where aiming misses a ray, the full ray search decides whether it exists.
 
     perturbation: (K, P), deviations in units of their largest.
     callback: called with the number of lenses done.
     threads: number of threads; None for one per core.
+    mesh: devices that share the lenses, of `devices.device_mesh`; each tile then is one for every
+        device, and `threads` is not used. None for the default device.
 
     ValueError as in `as_built`.
     """
@@ -308,13 +313,12 @@ def monte_carlo(
     width = len(perturbed.deviations)
     if np.ndim(perturbation) != 2 or np.shape(perturbation)[1] != width or not len(perturbation):
         raise ValueError(f"perturbation: expected (K, {width}), got shape {np.shape(perturbation)}")
-    found = _in_tiles(quick(problem), perturbed, perturbation, compensator, callback, threads)
+    how = compensator, threads, mesh
+    found = _in_tiles(quick(problem), perturbed, perturbation, callback, *how)
     # What aiming does not find, the full search may.
     failed = np.flatnonzero(~np.all(np.isfinite(found.squares), axis=1))
     if len(failed):
-        again = _in_tiles(
-            problem, perturbed, perturbation[failed], compensator, lambda done: None, threads
-        )
+        again = _in_tiles(problem, perturbed, perturbation[failed], lambda done: None, *how)
         for array, rows in zip(found, again):
             array[failed] = rows
     return found
@@ -324,22 +328,26 @@ def _in_tiles(
     problem: Problem,
     perturbed: PerturbedLens,
     perturbation: np.ndarray,
-    compensator: Compensator,
     callback: Callable[[int], None],
+    compensator: Compensator,
     threads: int | None,
+    mesh: Mesh | None,
 ) -> AsBuilt:
     """`monte_carlo` with the solver of the problem."""
-    tiles = [perturbation[k : k + _TILE] for k in range(0, len(perturbation), _TILE)]
-    width = perturbation.shape[1]
+    size, width = _TILE * (mesh.size if mesh else 1), perturbation.shape[1]
+    tiles = [perturbation[k : k + size] for k in range(0, len(perturbation), size)]
+    problem, perturbed = copied(mesh, (problem, perturbed))
 
     def run(rows: np.ndarray) -> AsBuilt:
-        whole = np.resize(rows, (_TILE, width))  # a tile that is not full repeats its rows
-        found = _many(problem, perturbed, jnp.asarray(whole, perturbed.sizes.dtype), compensator)
-        return jax.tree.map(lambda a: np.asarray(a)[: len(rows)], found)
+        whole = np.resize(rows, (size, width))  # a tile that is not full repeats its rows
+        whole = split(mesh, whole.astype(perturbed.sizes.dtype))
+        found = gathered(_many(problem, perturbed, whole, compensator, mesh))
+        return jax.tree.map(lambda a: a[: len(rows)], found)
 
     parts, done = [run(tiles[0])], len(tiles[0])  # compiled once, not by all threads
     callback(done)
-    with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+    # Devices that share a tile take the tiles in one order.
+    with concurrent.futures.ThreadPoolExecutor(1 if mesh else threads or os.cpu_count()) as pool:
         for part in pool.map(run, tiles[1:]):
             parts.append(part)
             done += len(part.squares)
@@ -348,11 +356,16 @@ def _in_tiles(
 
 
 def _many_of(
-    problem: Problem, perturbed: PerturbedLens, perturbation: Array, compensator: Compensator
+    problem: Problem,
+    perturbed: PerturbedLens,
+    perturbation: Array,
+    compensator: Compensator,
+    mesh: Mesh | None,
 ) -> AsBuilt:
-    return jax.vmap(lambda one: _compensated(problem, perturbed.lens_of(one), compensator)[0])(
-        perturbation
-    )
+    def one(problem: Problem, perturbed: PerturbedLens, row: Array) -> AsBuilt:
+        return _compensated(problem, perturbed.lens_of(row), compensator)[0]
+
+    return shared(jax.vmap(one, (None, None, 0)), mesh, 2)(problem, perturbed, perturbation)
 
 
-_many = jit(_many_of, LARGE, static_argnums=3)
+_many = jit(_many_of, LARGE, static_argnums=(3, 4))

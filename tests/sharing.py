@@ -1,0 +1,96 @@
+"""What eight devices share, beside one: run by test_devices.py in a process with virtual devices;
+prints the largest differences as JSON."""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import drt_jax
+from drt_jax import design, devices
+from drt_jax.learn import train
+
+jax.config.update("jax_enable_x64", True)
+LENS = "cooke_triplet"
+COLOURS = (0.6, 0.53, 0.48)
+
+
+def apart(one, other):
+    """Largest difference of the arrays of two trees, relative to the largest number of each."""
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return max(
+        float(np.max(np.abs(a - b)) / max(np.max(np.abs(a)), 1e-30))
+        for a, b in ((np.asarray(a, float), np.asarray(b, float)) for a, b in pairs)
+    )
+
+
+def problem_of(lens):
+    variables = design.Variables.from_lens(lens, [design.Vary("curvature"), "sensor"])
+    fields = np.radians([0.0, 1.0])
+    return design.Problem.from_variables(variables, ["spot"], fields, (0.5876,), jnp.inf, 3)
+
+
+def monte_carlo(mesh):
+    lens = drt_jax.load_lens(LENS)
+    problem, sizes = problem_of(lens), [design.Tolerance("shift", 0.02), design.Tolerance("radius", 0.2)]
+    perturbed = design.PerturbedLens.from_lens(lens, problem.beam_radius(lens), sizes)
+    problem = problem_of(perturbed.lens)
+    rows = design.draw_perturbations(perturbed, 430, 0)  # eight tiles of 50, and some more
+    return design.monte_carlo(problem, perturbed, rows, "focus", mesh=mesh)
+
+
+def starts(mesh):
+    problem = problem_of(drt_jax.load_lens(LENS))
+    vectors = design.normal_starts(problem.variables, 40, 1.0)
+    return design.many_starts(problem, vectors, (3, 3), mesh=mesh).merits
+
+
+def kernels(mesh):
+    lens = drt_jax.load_lens(LENS)
+    fields = np.radians(np.stack([np.linspace(0, 1, 16), np.linspace(0, 2, 16)], axis=-1))
+    model = drt_jax.converged_psf(lens, fields[::5], jnp.inf, COLOURS, 0.01, 11, "rays", 0.05)
+
+    def grid(lens, fields):
+        return drt_jax.psfs(lens, fields, jnp.inf, COLOURS, 0.01, 11, model).kernel
+
+    return jax.jit(devices.shared(grid, mesh, 1))(lens, fields)
+
+
+def rays(mesh):
+    lens = drt_jax.load_lens(LENS)
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (64, 2))
+
+    def hits(lens, points):
+        found = drt_jax.trace_rays(lens, 0.1, jnp.inf, COLOURS, points)
+        return jnp.moveaxis(found.points[..., -1, :2], 1, 0)  # (Q, W, 2): rays first
+
+    return jax.jit(devices.shared(hits, mesh, 1))(lens, points)
+
+
+def training(mesh):
+    """Losses, and the state after some steps."""
+    weights, restore = drt_jax.red_net(layers=2, channels=32)
+    lens = drt_jax.load_lens(LENS)
+    blur = drt_jax.moments_model(lens, ("sensor",), 0.0, (25e3, 25e3), COLOURS, 1e-3)[1]
+    camera = train.Camera(kernel=9)
+    imager = train.make_imager(blur, devices.shared(restore, mesh, 1), camera)
+    init, step = train.make_step(imager, {"optics": 1e-3, "network": 1e-3}, (25e3, 25e3), 0)
+    start = {"optics": {"sensor": lens.sensor}, "network": weights(jax.random.key(0))}
+    state, losses = devices.copied(mesh, init(start)), []
+    images = np.random.default_rng(0).integers(0, 255, (5, 8, 40, 40, 3), np.uint8)
+    for k, scenes in enumerate(images):
+        scenes = devices.split(mesh, scenes)
+        state, metrics = step(state, scenes, np.float32(0.01), np.int32(k))
+        losses.append(float(metrics["loss"]))
+    if mesh is not None:  # each device has its part of the images and all of the weights
+        assert {part.data.shape for part in scenes.addressable_shards} == {(1, 40, 40, 3)}
+        assert all(leaf.is_fully_replicated for leaf in jax.tree.leaves(state))
+    return np.array(losses), devices.gathered(state)
+
+
+if __name__ == "__main__":
+    jobs = {job.__name__: job for job in (monte_carlo, starts, kernels, rays, training)}
+    found = {name: apart(jobs[name](None), jobs[name](devices.device_mesh(8))) for name in jobs}
+    json.dump(found, sys.stdout)
