@@ -1,11 +1,11 @@
 """Tries drt_jax with other releases of Python and of what it needs.
 
-    python .ci/versions.py [3.12-newest 3.11-oldest ...]
+    python .ci/versions.py [3.12-newest 3.11-oldest ...] [--write]
 
 Each gets an environment, `.venv-py3.12-newest`, kept for the next time, and runs README's examples
 and a cross-section of the tests there. "newest" is what pip installs; "oldest" is what the lower
 bounds of pyproject.toml name or, where that has no wheel for this Python, the next that has. What
-has no interpreter is skipped, and the end says so.
+has no interpreter is skipped, and the end says so. --write puts the outcome into docs/versions.md.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ import tomllib
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 # The newest on 3.11 is what the other tests run with.
 WAYS = ("3.11-oldest", "3.12-newest", "3.13-newest")
+PROGRAMS = ("Python", "JAX", "NumPy", "optimistix")
 TESTS = (
     "tests/test_readme.py",
     "tests/test_compilation.py",
@@ -35,6 +36,7 @@ TESTS = (
     "tests/learn/test_train.py::test_training_moves_the_sensor_to_focus_and_compiles_once",
     "tests/learn/test_images.py",
     "tests/experiments/runs",
+    "tests/test_devices.py",
 )
 
 
@@ -106,8 +108,12 @@ def tried(way: str) -> str:
     python = environment(way, base)
     # Programs may be shared: that of another release is another program.
     cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(python.parent.parent / "compiled"))
-    names = "import jax, numpy; print('JAX', jax.__version__, 'NumPy', numpy.__version__)"
+    names = (
+        "import jax, numpy, optimistix, sys; print(sys.version.split()[0], *(m.__version__ for m"
+    )
+    names += " in (jax, numpy, optimistix)))"
     said = subprocess.run([python, "-c", names], capture_output=True, text=True).stdout.strip()
+    said = " ".join(f"{name} {text}" for name, text in zip(PROGRAMS, said.split()))
     print(f"{way}: {said}", flush=True)
     start = time.monotonic()
     command = [python, "-m", "pytest", "-m", "", "--durations=5", *TESTS]
@@ -118,7 +124,19 @@ def tried(way: str) -> str:
     return f"{word}, {said}, {time.monotonic() - start:.0f} s"
 
 
+def write(results: dict[str, str]) -> None:
+    """Puts the outcome of each way into the table of docs/versions.md."""
+    page = ROOT / "docs" / "versions.md"
+    rows = [f"| {way} | {' | '.join(result.split(', ', 2))} |" for way, result in results.items()]
+    head = "| way | outcome | with | tests |\n|--|--|--|--|\n"
+    table = head + "\n".join(rows) + "\n"
+    page.write_text(re.sub(r"(?m)(^\|.*\n)+", lambda found: table, page.read_text()))
+
+
 if __name__ == "__main__":
-    results = {way: tried(way) for way in sys.argv[1:] or WAYS}
+    ways = [word for word in sys.argv[1:] if word != "--write"] or WAYS
+    results = {way: tried(way) for way in ways}
     print("\n".join(f"{way}: {result}" for way, result in results.items()))
+    if "--write" in sys.argv:
+        write(results)
     sys.exit(any(result.startswith("FAILED") for result in results.values()))

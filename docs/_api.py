@@ -16,9 +16,10 @@ ROOMS = {
     "learn": "Network and training",
     "show": "Pictures",
     "compilation": "Keeping compiled programs",
+    "devices": "Sharing work among devices",
 }
 # Modules with public names, by what a user imports.
-MODULES = ("drt_jax", "drt_jax.pupil", "drt_jax.design", "drt_jax.show")
+MODULES = ("drt_jax", "drt_jax.pupil", "drt_jax.design", "drt_jax.show", "drt_jax.devices")
 MODULES += ("drt_jax.learn.data", "drt_jax.learn.field", "drt_jax.learn.train")
 
 

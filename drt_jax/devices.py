@@ -29,8 +29,7 @@ def device_mesh(count: int) -> Mesh:
         where = "here" if processes == 1 else "in each process"
         raise ValueError(
             f"devices: {each} of kind {kind} are asked, {here} {'is' if here == 1 else 'are'} "
-            f"{where}: lower it"
-            + (f", or set JAX_NUM_CPU_DEVICES={each}" if kind == "cpu" else "")
+            f"{where}: lower it" + (f", or set JAX_NUM_CPU_DEVICES={each}" if kind == "cpu" else "")
         )
     own: dict[int, list[jax.Device]] = {}
     for device in jax.devices():
@@ -55,9 +54,9 @@ def shared(function: Callable, mesh: Mesh | None, whole: int = 0) -> Callable:
 
     def call(*arguments: Any) -> Any:
         specs = tuple(copy if k < whole else rows for k in range(len(arguments)))
-        return jax.shard_map(
-            function, mesh=mesh, in_specs=specs, out_specs=rows, check_vma=False
-        )(*arguments)
+        return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=rows, check_vma=False)(
+            *arguments
+        )
 
     return call
 

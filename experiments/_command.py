@@ -12,11 +12,13 @@ import time
 import traceback
 from typing import Any
 
+import jax
+
 import drt_jax
 from drt_jax import show
 from drt_jax.__main__ import set_up
 
-from . import _common, hear
+from . import _common, _sharing, hear
 from .runs import config as configs
 from .runs.folder import Run, begun
 from .runs.interrupt import deferred_interrupt
@@ -77,6 +79,11 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
         what, remedy = place.left()
         wrong = f"{error.filename or place.folder}: {error.strerror or error}"
         code, message = 1, f"error: {wrong}; {what}: mend this, then {remedy or 'start again'}"
+    except jax.errors.JaxRuntimeError:
+        if jax.process_count() == 1:
+            raise
+        lost = "another process of the run has ended", *place.left()
+        _sharing.leave("error: " + "; ".join(filter(None, lost)), 1)
     except ValueError as error:
         raised = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)
         if not any(raised.is_relative_to(ours) for ours in _OURS):
@@ -90,21 +97,17 @@ def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
     """Does the work of `main`, and returns the names of results that are not finite."""
     name = experiment.__spec__.name.split(".")[-1]
     options = _parser(name, experiment).parse_args(argv)
+    if options.processes:
+        _sharing.join(options.processes)
     set_up()
     started = time.perf_counter()
     place.folder = folder = _folder(name, options)
     place.own = options.resume or options.report
     if not options.report:
-        config = _config(name, experiment.Config, options, folder)
-        columns = (*experiment.COLUMNS, *getattr(config, "columns", ()))
-        with deferred_interrupt() as asked:  # no stop before the run is whole
-            run = Run(folder, config, columns, options.resume)
-            place.own = True
-        with run:
-            if asked():
-                raise KeyboardInterrupt
-            print(f"{name}: run folder {folder}")
-            run.finish(experiment.run(config, run))
+        with _sharing.own_folder(folder, options.resume) as own:
+            _run(name, experiment, options, place, own)
+        if own != folder:  # the first process goes on alone
+            return []
     results, figures = _common.read_results(folder), folder / "figures"
     figures.mkdir(exist_ok=True)
     tables = experiment.tables(results)
@@ -116,6 +119,22 @@ def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
     print(f"results in {folder / 'results.json'}, all on one page in {report}")
     print(f"done in {time.perf_counter() - started:.0f} s")
     return results.get("not_finite", [])
+
+
+def _run(
+    name: str, experiment: Any, options: argparse.Namespace, place: _Place, folder: pathlib.Path
+) -> None:
+    """Runs an experiment in a folder."""
+    config = _config(name, experiment.Config, options, folder)
+    columns = (*experiment.COLUMNS, *getattr(config, "columns", ()))
+    with deferred_interrupt() as asked:  # no stop before the run is whole
+        run = Run(folder, config, columns, options.resume)
+        place.own = True
+    with run:
+        if asked():
+            raise KeyboardInterrupt
+        print(f"{name}: run folder {folder}")
+        run.finish(experiment.run(config, run))
 
 
 def _report(
@@ -143,6 +162,7 @@ def _parser(name: str, experiment: Any) -> argparse.ArgumentParser:
     add("--out", metavar="DIR", help=f"run folder (default: a new one in runs/{name})")
     latest = f"the latest unfinished one in runs/{name}"
     add("--resume", action="store_true", help=f"go on with the run in --out (default: {latest})")
+    add("--processes", metavar="WHICH", help=_sharing.HELP)
     again = "run nothing: draw and print the results in --out again"
     add("--report", action="store_true", help=again)
     return parser

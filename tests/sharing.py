@@ -13,7 +13,7 @@ from drt_jax import design, devices
 from drt_jax.learn import train
 
 jax.config.update("jax_enable_x64", True)
-LENS = "cooke_triplet"
+LENS = "singlet"
 COLOURS = (0.6, 0.53, 0.48)
 
 
@@ -34,7 +34,10 @@ def problem_of(lens):
 
 def monte_carlo(mesh):
     lens = drt_jax.load_lens(LENS)
-    problem, sizes = problem_of(lens), [design.Tolerance("shift", 0.02), design.Tolerance("radius", 0.2)]
+    problem, sizes = (
+        problem_of(lens),
+        [design.Tolerance("shift", 0.02), design.Tolerance("radius", 0.2)],
+    )
     perturbed = design.PerturbedLens.from_lens(lens, problem.beam_radius(lens), sizes)
     problem = problem_of(perturbed.lens)
     rows = design.draw_perturbations(perturbed, 430, 0)  # eight tiles of 50, and some more

@@ -299,7 +299,8 @@ def monte_carlo(
     mesh: Mesh | None = None,
 ) -> AsBuilt:
     """Traces lenses with given deviations; arrays (K, V) and (K, C). The result does not depend on
-    threads, tiles or devices. Where aiming misses a ray, the full ray search decides whether it exists.
+    threads, tiles or devices. Where aiming misses a ray, the full ray search decides whether it
+    exists.
 
     perturbation: (K, P), deviations in units of their largest.
     callback: called with the number of lenses done.

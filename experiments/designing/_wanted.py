@@ -96,6 +96,7 @@ class Config:
     tolerance: relative error of the spots, which fixes the rule for the last search.
     rings: above 0, rings of a hexapolar grid instead of both rules, as in other programs.
     trials: most trials of the last search.
+    devices: that share the searches from many starts, see docs/devices.md.
     """
 
     name: str
@@ -117,10 +118,12 @@ class Config:
     trials: int = 500
     starts: Starts = Starts()
     glasses: Glasses = Glasses()
+    devices: int = dataclasses.field(default=1, compare=False)
 
     def __post_init__(self) -> None:
         limits = {"fields_deg": (-89, 89), "wavelengths_um": (1e-4, 1e6), "order": (1, 40)}
         limits |= {"rings": (0, 50), "tolerance": (1e-12, 0.5), "trials": (1, 1e5)}
+        limits |= {"devices": (1, 1e4)}
         _common.require_within("", self, **limits)
         for name in ("variables", "operands", "fields_deg", "wavelengths_um"):
             _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")

@@ -22,7 +22,7 @@ import drt_jax
 from drt_jax import Pattern, design
 from drt_jax.design.growth import SHORTEST, grow_once, start_growth
 
-from . import _command, _common, _pictures
+from . import _command, _common, _pictures, _sharing
 from ._wanted import Config as Config, Starts
 from .runs.folder import Run
 
@@ -159,8 +159,10 @@ def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
     if starts.count == 1:
         return {"vectors": [variables.start.tolist()], "merits": [], "no_worse": None} | _NOTHING
     vectors = starts_of(variables, starts)
+    mesh = _sharing.mesh_of(config.devices)
     with _Progress(f"{starts.count} starts", 1) as bar:
-        found = design.many_starts(problem, vectors, starts.stages, starts.keep, bar.tiles)
+        how = starts.stages, starts.keep, bar.tiles
+        found = design.many_starts(problem, vectors, *how, mesh=mesh)
     _common.require(len(found.minima) > 0, "starts: no ray passes any of them; widen the bounds")
     return {
         "vectors": [minimum.vector.tolist() for minimum in found.minima],

@@ -33,7 +33,7 @@ from drt_jax import design, show
 from drt_jax.design.deviations import KINDS
 from drt_jax.design.tolerance import Order
 
-from . import _command, _common, _plots
+from . import _command, _common, _plots, _sharing
 from .runs.folder import Run
 
 COLUMNS = ("mean_um", "p90_um", "seconds")
@@ -58,6 +58,7 @@ class Config:
     count: lenses of Monte Carlo for each scale.
     draws: draws of the predictions.
     limits_um: spots for which the yield is reported.
+    devices: that share the lenses of Monte Carlo, see docs/devices.md.
     """
 
     lens: str
@@ -74,10 +75,12 @@ class Config:
     draws: int = 100000
     limits_um: tuple[float, ...] = ()
     seed: int = 0
+    devices: int = dataclasses.field(default=1, compare=False)
 
     def __post_init__(self) -> None:
         limits = {"wavelengths_um": (1e-4, 1e6), "order": (1, 40), "scales": (1e-3, 1e3)}
         limits |= {"count": (1, 1e7), "draws": (1, 1e7), "limits_um": (1e-6, 1e6)}
+        limits |= {"devices": (1, 1e4)}
         _common.require_within("", self, **limits)
         for name in ("tolerances", "fields_deg", "wavelengths_um", "scales"):
             _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")
@@ -142,6 +145,7 @@ def traced(
             perturbations,
             config.compensator,
             lambda done: bar.update(done - bar.n),
+            mesh=_sharing.mesh_of(config.devices),
         )
 
 
@@ -187,7 +191,8 @@ def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -
     predicted, normal = predicted_of(found), config.errors == "normal"
     perturbations = scale * design.draw_perturbations(perturbed, config.count, config.seed, normal)
     begun = time.perf_counter()
-    design.monte_carlo(problem, perturbed, perturbations[:1], config.compensator)
+    mesh = _sharing.mesh_of(config.devices)
+    design.monte_carlo(problem, perturbed, perturbations[:1], config.compensator, mesh=mesh)
     warm = time.perf_counter()
     built = traced(config, perturbations, f"sizes x {scale:g}", problem, perturbed)
     seconds = time.perf_counter() - warm

@@ -10,10 +10,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 import drt_jax
+from drt_jax.devices import copied, gathered, shared, split
 from drt_jax.image.diagnose import crossed
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
@@ -22,6 +24,7 @@ from drt_jax.learn.data import DataConfig, Patches, batches, load_patches
 from ._common import require, require_list, require_within
 from ._optics import Scene, Trained, check_variables, middle, spot_of
 from ._report import IMAGES, start_label
+from ._sharing import mesh_of, require_shared
 from .runs.config import ConfigError
 from .runs.folder import Run
 from .runs.interrupt import deferred_interrupt
@@ -122,11 +125,20 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JointSettings(Settings):
-    """Settings with a network. test_patches: number of test patches; 0 for all."""
+    """Settings with a network.
+
+    test_patches: number of test patches; 0 for all.
+    devices: that share each batch, see docs/devices.md; another number goes on with the same run.
+    """
 
     train: JointTraining
     test_patches: int = 0
     network: Net = Net()
+    devices: int = dataclasses.field(default=1, compare=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_shared(self.devices, "train.batch", self.train.batch)
 
 
 class Jobs:
@@ -147,6 +159,7 @@ class Jobs:
         # The last valid values of each job.
         self._good: dict[str, dict[str, float]] = {}
         self._network: dict[str, Any] = {}
+        self._mesh = mesh_of(getattr(config, "devices", 1))
         self.restore = None
         side = config.train.patch + config.camera.kernel - 1
         patches = read_patches(config.data, side, config.seed, run.folder)
@@ -169,12 +182,15 @@ class Jobs:
     ) -> tuple[Callable, tuple[Callable, Callable]]:
         """The imager of a blur and its (init, step), for one job, or several at once."""
         config = self._config
-        imager = train.make_imager(blur, self.restore, config.camera, convolve)
+        plain, spread = (
+            train.make_imager(blur, restore, config.camera, convolve)
+            for restore in (self.restore, shared(self.restore, self._mesh, 1))
+        )
         rates: dict[str, Any] = dict(config.train.rates)
         if self._scale:
             rates["optics"] = {n: rates["optics"] * size for n, size in self._scale.items()}
-        step = train.make_step(imager, rates, self._depths, config.seed, vectorised=several)
-        return jax.jit(imager), step
+        step = train.make_step(spread, rates, self._depths, config.seed, vectorised=several)
+        return jax.jit(plain), step
 
     def train(
         self,
@@ -215,13 +231,16 @@ class Jobs:
         def stopping() -> None:
             print("\nstopping after this step; once more stops at once", file=sys.stderr)
 
-        stream = batches(self.scenes, setting.batch, self._config.seed, first)
+        patches = batches(self.scenes, setting.batch, self._config.seed, first)
+        stream = (split(self._mesh, scenes) for scenes in patches)
         # Each report waits for the device: seldom where a step takes milliseconds.
         every = 10 if jax.default_backend() == "cpu" else 113
         with bar, deferred_interrupt(stopping) as asked:
+            state = copied(self._mesh, state)
             state = train.fit(step, state, stream, noise, range(first, total), every, report, asked)
             if asked():
                 raise KeyboardInterrupt
+        state = jax.tree.map(jnp.asarray, gathered(state))
         for k, label in enumerate(labels):
             self._good[label] = values_of(state[0], k)
             self._save_lens(label)

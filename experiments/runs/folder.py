@@ -56,7 +56,10 @@ class Run:
         self._metrics = Metrics(folder / "metrics.csv", columns)
         self._earlier, self._opened = 0.0, time.perf_counter()
         self._saved: set[str] = set()  # the jobs with a checkpoint of this process
-        settings = json.dumps(dataclasses.asdict(config), sort_keys=True)
+        # But for settings that say how a run is done, not what comes out.
+        about = {f.name for f in dataclasses.fields(config) if f.compare}
+        compared = {n: v for n, v in dataclasses.asdict(config).items() if n in about}
+        settings = json.dumps(compared, sort_keys=True)
         self._settings = hashlib.sha256(settings.encode()).hexdigest()
         if resume and not (folder / "config.yaml").is_file():
             raise ConfigError(f"{folder}: nothing to resume: no config.yaml in it")

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import design
+from drt_jax.devices import copied, gathered, split
 from drt_jax.learn import train
 from drt_jax.learn.data import batches
 from drt_jax.learn.field import FieldImager, ObjectPoints
@@ -135,10 +136,12 @@ def _train(
             counted[1] += now - started
         started = now
 
-    stream = batches(studio.patches.train, setting.batch, seed, first)
+    patches = batches(studio.patches.train, setting.batch, seed, first)
+    stream = (split(studio.mesh, scenes) for scenes in patches)
     with bar:
+        state = copied(studio.mesh, state)
         state = train.fit(step, state, stream, noise, range(first, total), 10, report)
-    return state[0], counted[1] / max(counted[0], 1)
+    return jax.tree.map(jnp.asarray, gathered(state[0])), counted[1] / max(counted[0], 1)
 
 
 def _save(studio: Studio, path: Any, vector: Array) -> None:

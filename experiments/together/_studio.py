@@ -15,6 +15,7 @@ import drt_jax
 from drt_jax import Lens, design
 from drt_jax.design.optimum import init_problem, take_step
 from drt_jax.design.problem import quick
+from drt_jax.devices import shared
 from drt_jax.learn.data import Patches
 from drt_jax.learn.field import (
     FieldImager,
@@ -25,6 +26,7 @@ from drt_jax.learn.field import (
 )
 
 from . import _common
+from ._sharing import mesh_of
 
 # Relative fields of least squares, and the order of its pupil rule.
 _FIELDS, _ORDER = np.array([0.0, 0.7, 1.0]), 6
@@ -44,6 +46,7 @@ class Studio:
     limits: problem whose limits hold in training.
     spoilt: (N,), vector of the spoilt lens.
     patches: training and test patches.
+    mesh: devices that share a batch; None for one.
     """
 
     def __init__(self, config: Any, patches: Patches) -> None:
@@ -64,6 +67,7 @@ class Studio:
         self.spoilt = jnp.clip(vector, self.variables.low, self.variables.high)
         net = dataclasses.asdict(config.network)
         self.init, self.restore = drt_jax.red_net(**net)
+        self.mesh = mesh_of(config.devices)
         self.model = self._model()
         axis = drt_jax.psf(
             lens, 0.0, self.depths[1], self.waves, self.pixel, config.camera.kernel, self.model
@@ -211,7 +215,8 @@ class Studio:
     def _made(self, kind: str) -> tuple[Callable, Callable]:
         setting, held = self.config.train, self.hold
         rates: dict[str, Any] = {"optics": 0.0, "network": setting.network_rate}
-        points, restore, make, draw = self.points, self.restore, make_field_step, self.drawn
+        points, make, draw = self.points, make_field_step, self.drawn
+        restore = shared(self.restore, self.mesh, 1)
         if kind == "spots":  # neither derivatives nor limits of a lens that stays
             points = lambda optics, seen: self.points(jax.lax.stop_gradient(optics), seen)  # noqa: E731
             held = lambda before, after: before  # noqa: E731
@@ -220,7 +225,8 @@ class Studio:
         else:
             rates["optics"] = {"lens": self.rates, "moves": 0.0}
         if kind == "frozen":
-            restore = lambda w, image: self.restore(jax.lax.stop_gradient(w), image)  # noqa: E731
+            still = restore
+            restore = lambda w, image: still(jax.lax.stop_gradient(w), image)  # noqa: E731
         if kind == "tolerant":
             draw = self.drawn_as_built
         return make(FieldImager(points, restore), rates, draw, 0, held)

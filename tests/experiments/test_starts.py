@@ -23,6 +23,7 @@ STARTS = {
     "faults": ["parts=[files]", "files=30", "traced=1"],
     "files": ["folder={toy}"],
     "benchmark": ["tasks=[axial]", "growth=false", "repeats=1", "lens=singlet"],
+    "devices": ["counts=[1]", "patch=8", "steps=2", "network={layers: 1, channels: 4}"],
     "lenses": [
         "lenses=[{lens: singlet, field_deg: 3}]",
         *("parts=[0]", "copies=1", "fields=1", "sweep=8", "repeats=1"),
@@ -109,6 +110,13 @@ def checked_benchmark(results):
     assert all(row["ours_s"] > 0 and row["ours_error"] < 1e-8 for row in results["rows"])
     solves = list(results["counts"].values())
     assert solves[:2] == [0, 0] and solves[2] > 0
+
+
+def checked_devices(results):
+    """One device alone adds nothing up."""
+    (row,) = results["rows"]
+    assert row["step_s"] > 0 == row["loss_apart"] == row["carried_bytes"]
+    assert results["weights"] == 9 * 3 * 4 + 4 + 9 * 4 * 3 + 3
 
 
 def checked_lenses(results):

@@ -1,5 +1,6 @@
 """Pages of HTML: what they hold, and how they look in a browser."""
 
+import pathlib
 import re
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
 )
 WIDTHS = (1280, 500)
+KEPT = pathlib.Path(__file__).parents[2] / "results" / "pages"
 
 
 def test_a_page_holds_tables_text_figures_and_pictures_and_needs_no_other_file(tmp_path):
@@ -55,8 +57,9 @@ def test_the_prescription_is_that_of_the_lens():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="no browser: apt-get install chromium")
-def test_a_browser_shows_the_sheet_at_two_widths(tmp_path, capsys):
-    """Every analysis is drawn, and nothing but tables reaches beyond the screen."""
+def test_a_browser_shows_the_sheet_at_two_widths(tmp_path, capsys, write_tables):
+    """Every analysis is drawn, and nothing but tables reaches beyond the screen. With
+    --write-tables the pictures are kept in results/pages."""
     page = tmp_path / "lens.html"
     words = ["show", "cooke_triplet", "--html", "--field", "0", "14", "20", "--out", str(page)]
     main(words)
@@ -77,6 +80,11 @@ def test_a_browser_shows_the_sheet_at_two_widths(tmp_path, capsys):
         assert np.mean(seen < 128) > 0.005  # text and curves
         drawn = np.any(seen < 250, axis=1)
         assert np.mean(drawn[:2000]) > 0.5
+        if write_tables:
+            KEPT.mkdir(exist_ok=True)
+            Image.open(shot).convert("P", palette=Image.Palette.ADAPTIVE).save(
+                KEPT / f"cooke_triplet_{width}.png", optimize=True
+            )
 
 
 def browse(*words: str) -> str:
