@@ -22,7 +22,7 @@ from ..lens.scene import Scene
 from ..numerics import safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import disc, half_disc, meridian
-from ..pupil.rules import Pattern, PupilRule, Symmetry
+from ..pupil.rules import Pattern, PupilRule, Symmetry, fits
 from ..rays.solve import Solver, solve
 from ..rays.status import Status
 from ..rays.system import dot
@@ -184,8 +184,9 @@ def trace_beam(lens: Lens, scene: Scene, rule: BeamRule, solver: Solver = solve)
     """The beam of an object point. Differentiable in the modes of the solver."""
     points, weights = rule.rule.points(lens, scene)
     bundle = trace_bundle(lens, scene, points, solver)
-    weights = weights * rule.rule.transmission(lens, bundle)
     symmetry: Symmetry = rule.rule.symmetry
+    weights = jnp.where(fits(symmetry, scene.field), weights, 0)
+    weights = weights * rule.rule.transmission(lens, bundle)
     clipped = isinstance(rule.rule, Clipped)
     return beam_of(lens, scene, points, weights, bundle, symmetry, rule.degree, clipped)
 

@@ -20,7 +20,16 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, field_array, scene_of
 from ..numerics import Numbers, concrete, known_values, real_array
 from ..pupil.clipped import Clipped
-from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
+from ..pupil.rules import (
+    Gauss,
+    Pattern,
+    PupilRule,
+    Symmetry,
+    fits,
+    gauss_points,
+    require_fit,
+    symmetry_of,
+)
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.trace import aims, bundle_of, trace_bundle
@@ -152,6 +161,7 @@ def _moments(
             return trial.moments[0]
         # The rays are known: only weigh and differentiate them.
         return _weigh_known(lens, scene, trial.used, trial.found[0])
+    require_fit(rule.symmetry, scene.field)
     found = _weigh(lens, scene, rule)
     throughput = known_values(found.throughput)
     if throughput is not None and not np.all(np.asarray(throughput) > 0):
@@ -163,6 +173,7 @@ def _moments(
 def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> FocusMoments:
     """Moments of a rule."""
     points, weights = rule.points(lens, scene)
+    weights = jnp.where(fits(rule.symmetry, scene.field), weights, 0)
     return weigh(lens, rule, weights, trace_bundle(lens, scene, points))
 
 

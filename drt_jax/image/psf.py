@@ -17,6 +17,7 @@ from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene, points_arrays, scene_of
 from ..numerics import Numbers, real_array
+from ..pupil.rules import require_fit
 from .beam import BeamRule, trace_beam
 from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
 from .kernel import check_pixels
@@ -45,7 +46,9 @@ def psf(
     defocus: (), mm by which the sensor is moved back; this needs no new ray trace.
 
     Light fills the stop uniformly. Differentiable in all numbers, in every mode. ValueError as in
-    `scene_of`, for a pixel that is not above 0, and if no ray arrives.
+    `scene_of`, for a pixel that is not above 0, if no ray arrives, and for a field that a model is
+    not made for: one of fields along y alone has half a pupil. Where it is not known, inside
+    `jax.jit`, such a field is dark.
     """
     scene = scene_of(lens, field, distance, wavelengths)
     pixel_, size = check_pixels(pixel, size, lens.curvature.dtype)
@@ -60,6 +63,7 @@ def psf(
         raise ValueError(f"centre: expected x and y in mm, got shape {middle.shape}")
     step = real_array("defocus", defocus, dtype)
     rule, kind, cells = model.rule, model.kind, model.cells
+    require_fit(rule.rule.symmetry, scene.field)
     return _psf(lens, scene, rule, pixel_, middle, step, size, kind, cells)
 
 
@@ -94,10 +98,12 @@ def psfs(
     model: one model from `converged_psf` for all points.
 
     For use in `jax.jit`. The gradient traces each point again and keeps the rays of one point at a
-    time. ValueError for other shapes. A point without light has the throughput 0.
+    time. ValueError for other shapes, and as in `psf` for fields that the model is not made for. A
+    point without light has the throughput 0.
     """
     dtype = lens.curvature.dtype
     angles, far = points_arrays(fields, distances, dtype)
+    require_fit(model.rule.rule.symmetry, angles)
     side, size = check_pixels(pixel, size, dtype)
     given = side, None, jnp.zeros((), dtype), size, model.kind, model.cells
 

@@ -258,6 +258,16 @@ def test_inside_a_trace_the_rule_must_be_given():
         jax.jit(lambda field: drt_jax.symmetry_of(LENS, field))(0.1)
 
 
+@pytest.mark.parametrize("symmetry, field", [("rotational", 0.05), ("bilateral", (0.05, 0.05))])
+def test_a_rule_of_a_part_of_the_pupil_is_not_used_where_it_does_not_stand_for_all(symmetry, field):
+    """A ValueError where the field is known; no light where it is not."""
+    rule = drt_jax.Gauss(2, symmetry)
+    with pytest.raises(ValueError, match="the rule is made for"):
+        psf_moments(LENS, field, FAR, RGB, rule=rule)
+    found = jax.jit(lambda f: psf_moments(LENS, f, FAR, RGB, rule=rule))(jnp.array(field))
+    assert np.all(found.throughput == 0) and not np.any(np.isnan(found.covariance))
+
+
 def test_a_rule_with_a_tolerance_is_refused():
     rule = drt_jax.Gauss(2, "rotational")
     for call in (psf_moments, focus_moments):

@@ -286,6 +286,11 @@ def test_a_model_serves_inside_jit_and_vmap(double_gauss):
     np.testing.assert_allclose(kernels(fields)[1], alone, atol=1e-12)
     with pytest.raises(ValueError, match="make the model outside"):
         jax.jit(lambda f: drt_jax.psf(lens, f, far, waves, PIXEL).kernel)(fields[0])
+    # It is made for fields along y: elsewhere half of the pupil is not all of it.
+    beside = jnp.radians(jnp.array([4.0, 3.0]))
+    assert not np.any(kernels(jnp.stack([beside, fields[0]]))[0])
+    with pytest.raises(ValueError, match="the rule is made for fields along y"):
+        drt_jax.psfs(lens, beside[None], far, waves, PIXEL, SIZE, model)
 
 
 @pytest.mark.parametrize(
