@@ -19,7 +19,7 @@ from experiments import _command, restore
 from experiments.runs.config import load_config
 from experiments.runs.folder import Run
 
-HERE = pathlib.Path(__file__).parent
+HERE, PIXEL = pathlib.Path(__file__).parent, "brightest pixel"
 TOY = [
     *("starts_mm=[133.5]", "table_starts_mm=[133.5]", "table_noise=[0.01]", "test_patches=4"),
     *("scene.tolerance=1e-3", "camera.kernel=5", "data.crops_per_image=6"),
@@ -29,10 +29,10 @@ TOY = [
 ]
 
 
-def started(*words, count=1):
+def started(*words, count=1, **own):
     """A process with `count` virtual devices."""
     parts = [str(HERE.parent), os.environ.get("PYTHONPATH", "")]
-    own = {"JAX_NUM_CPU_DEVICES": str(count), "PYTHONPATH": os.pathsep.join(filter(None, parts))}
+    own |= {"JAX_NUM_CPU_DEVICES": str(count), "PYTHONPATH": os.pathsep.join(filter(None, parts))}
     pipe = subprocess.PIPE
     return subprocess.Popen(
         [sys.executable, *words], env=os.environ | own, stdout=pipe, stderr=pipe, text=True
@@ -98,6 +98,20 @@ def test_eight_devices_compute_what_one_does():
     assert found.pop("training") < 1e-4  # of weights, after five steps of Adam
     assert found.pop("starts") < 1e-9
     assert set(found) == {"monte_carlo", "kernels", "rays"} and max(found.values()) < 1e-13
+
+
+@pytest.mark.slow
+def test_without_what_suits_cpus_and_in_float32_the_numbers_are_the_same():
+    """As another kind of device computes them: spots, slopes, rays, a kernel, an optimum, lenses as
+    built, training."""
+    double, single = (
+        json.loads(ended(started(str(HERE / "plainly.py"), JAX_ENABLE_X64=x)).splitlines()[-1])
+        for x in "10"
+    )
+    assert double.keys() == single.keys()
+    assert abs(single.pop(PIXEL) / double.pop(PIXEL) - 1) < 0.05  # to the tolerance of the model
+    for name, value in double.items():
+        assert abs(single[name] - value) <= 1e-3 * abs(value), name
 
 
 def free_port():

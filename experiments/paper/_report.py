@@ -14,6 +14,9 @@ from ._optics import Trained
 
 # Images of patches, in the order of an imager.
 IMAGES = ("truth", "sensor", "restored")
+# Errors are drawn so many times as large.
+_GAIN = 4
+_ERROR = f"error x {_GAIN}"
 _UNITS = {"sensor": "mm", "thickness": "mm", "curvature": "1/mm"}
 
 
@@ -125,8 +128,20 @@ def draw_lens(results: dict[str, Any], distance: float, path: pathlib.Path) -> N
 
 
 def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path) -> None:
-    """Figure of the `images` of patches, with the RMSE of all but the truth."""
+    """Figure of the `images` of patches, with the RMSE of all but the truth, and of the errors
+    that are left."""
     rows = {name: np.float32(results[name]) for name in IMAGES}
     errors = {name: rows[name] - rows["truth"] for name in IMAGES[1:]}
-    notes = {n: [f"{np.sqrt(np.mean(e**2)):.3f}" for e in some] for n, some in errors.items()}
+    notes = {name: rmse_of(some) for name, some in errors.items()}
+    rows[_ERROR] = error_map(errors["restored"])
     _plots.patch_grid(rows, titles, notes).savefig(path)
+
+
+def rmse_of(errors: np.ndarray) -> list[str]:
+    """Root mean square of the errors of each patch, as text."""
+    return [f"{np.sqrt(np.mean(error**2)):.3f}" for error in errors]
+
+
+def error_map(errors: np.ndarray) -> np.ndarray:
+    """Errors of images (N, H, W, C) as images: grey where there is none."""
+    return 0.5 + _GAIN * errors

@@ -225,6 +225,18 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         fields = results["pictures_deg"][: len(parts["truth"])]
         titles = [f"{field:.1f} deg" for field in fields]
         _report.draw_patches(parts, titles, figures / f"patches_{arm}.png")
+    _draw_errors(results, figures / "errors.png")
+
+
+def _draw_errors(results: dict[str, Any], path: pathlib.Path) -> None:
+    """Draws what is wrong with the restored images of all arms, each of the same patches."""
+    arms = results["pictures"]
+    truth = np.float32(results[f"{arms[0]} truth"])
+    errors = {arm: np.float32(results[f"{arm} restored"]) - truth for arm in arms}
+    maps = {arm.replace("_", "\n"): _report.error_map(error) for arm, error in errors.items()}
+    notes = {arm.replace("_", "\n"): _report.rmse_of(error) for arm, error in errors.items()}
+    titles = [f"{field:.1f} deg" for field in results["pictures_deg"][: len(truth)]]
+    _plots.patch_grid({"truth": truth} | maps, titles, notes).savefig(path)
 
 
 def _smooth(loss: list[float | None]) -> tuple[np.ndarray, np.ndarray]:
