@@ -58,28 +58,29 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     side = config.patch + train.Camera.kernel - 1
     most = config.images * max(config.counts)
     scenes = seeds.integers(0, 255, (most, side, side, 3), np.uint8)
-    jobs = [_job(config, count, scenes[: count * config.images]) for count in config.counts]
-    times: list[list[float]] = [[] for _ in jobs]
+    jobs = [_Job(config, count, scenes[: count * config.images]) for count in config.counts]
+    ways = [way for job in jobs for way in (job.shared, job.alone)]
+    times: list[list[float]] = [[] for _ in ways]
     for _ in tqdm(range(config.steps), unit="step", leave=False):
-        for step, taken in zip(jobs, times):
-            step()  # threads of the program before may still spin
+        for way, taken in zip(ways, times):
+            way()  # threads of the program before may still spin
             begun = time.perf_counter()
-            step()
+            way()
             taken.append(time.perf_counter() - begun)
+    seconds = np.reshape([np.median(taken) for taken in times], (-1, 2)).tolist()
     rows = []
-    for count, step, taken in zip(config.counts, jobs, times):
-        seconds = float(np.median(taken))
-        row = {"devices": count, "images": count * config.images, "step_s": seconds}
-        rows.append(row | {"image_s": seconds / (count * config.images), **step.about})
+    for count, job, (shared_s, alone_s) in zip(config.counts, jobs, seconds):
+        row = {"devices": count, "images": count * config.images, **job.about}
+        rows.append(row | {"step_s": shared_s, "alone_s": alone_s})
     device = jax.devices()[0]
     return {"rows": rows, "device": device.device_kind, "weights": jobs[0].weights}
 
 
-class _job:
-    """Steps of training on some devices.
+class _Job:
+    """Steps of training on some devices, and on one with the same images.
 
-    about: bytes that all devices add up, and the difference of the first loss from that of one
-        device with the same images, relative.
+    shared, alone: functions that take a step and return its loss.
+    about: bytes that all devices add up in a step, and the relative difference of the first loss.
     weights: of the network.
     """
 
@@ -93,26 +94,24 @@ class _job:
         self.weights = train.count_parameters(weights)
         start = {"optics": {"sensor": lens.sensor}, "network": weights}
 
-        def made(mesh: Any) -> tuple[Any, Any, np.ndarray]:
+        def made(mesh: Any) -> tuple[Any, Any]:
             imager = train.make_imager(blur, shared(restore, mesh, 1), train.Camera())
             rates = {"optics": 1e-3, "network": 1e-3}
             begin, step = train.make_step(imager, rates, (25e3, 25e3), 0)
-            return copied(mesh, begin(start)), step, split(mesh, scenes)
+            state = [copied(mesh, begin(start))]
+            rest = split(mesh, scenes), np.float32(0.01), np.int32(0)
 
-        noise, first = np.float32(0.01), np.int32(0)
-        state, alone, own = made(None)
-        reference = float(alone(state, own, noise, first)[1]["loss"])
-        self._state, self._step, self._scenes = made(mesh)
-        lowered = self._step.lower(self._state, self._scenes, noise, first)
+            def take() -> float:
+                state[0], found = step(state[0], *rest)
+                return float(found["loss"])
+
+            return take, step.lower(state[0], *rest)
+
+        self.alone, _ = made(None)
+        self.shared, lowered = made(mesh)
         carried = _carried(lowered.compile().as_text())
-        loss = self()
-        self.about = {"carried_bytes": carried, "loss_apart": abs(loss / reference - 1)}
-
-    def __call__(self) -> float:
-        """The loss of a step."""
-        given = self._scenes, np.float32(0.01), np.int32(0)
-        self._state, found = self._step(self._state, *given)
-        return float(found["loss"])
+        apart = abs(self.shared() / self.alone() - 1)
+        self.about = {"carried_bytes": carried, "loss_apart": apart}
 
 
 def _carried(program: str) -> int:
@@ -126,25 +125,28 @@ def _carried(program: str) -> int:
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """The table of counts."""
-    header = ["devices", "images a step", "s a step", "ms an image", "against one device"]
+    header = ["devices", "images a step", "s a step", "s a step of one device"]
     header += ["MB added up a step", "loss apart"]
-    rows, one = [], results["rows"][0]["image_s"]
+    rows = []
     for row in results["rows"]:
-        cells = [row["devices"], row["images"], row["step_s"], 1e3 * row["image_s"]]
-        cells += [row["image_s"] / one, 1e-6 * row["carried_bytes"], f"{row['loss_apart']:.1e}"]
-        rows.append(cells)
+        cells = [row[name] for name in ("devices", "images", "step_s", "alone_s")]
+        rows.append([*cells, 1e-6 * row["carried_bytes"], f"{row['loss_apart']:.1e}"])
     return {f"devices, {results['device']}": _common.table(header, rows)}
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws the time of an image over the number of devices."""
     figure, axes = show.new(width=6, height=4)
-    counts = [row["devices"] for row in results["rows"]]
-    axes.plot(counts, [1e3 * row["image_s"] for row in results["rows"]], "o-")
+    rows = results["rows"]
+    counts = [row["devices"] for row in rows]
+    for key, label in (("step_s", "shared"), ("alone_s", "one device, as many images")):
+        axes.plot(counts, [1e3 * row[key] / row["images"] for row in rows], "o-", label=label)
     axes.set_xscale("log", base=2)
+    axes.set_xticks(counts, counts)
     axes.set_ylim(0)
     axes.set_xlabel("devices")
     axes.set_ylabel("time of an image, ms")
+    axes.legend()
     figure.savefig(figures / "scaling.png")
 
 
