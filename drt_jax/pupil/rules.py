@@ -27,6 +27,8 @@ from . import patterns
 # Part of the pupil that is traced: one radius, the half x > 0, or the whole disc.
 Symmetry = Literal["rotational", "bilateral", "none"]
 MAX_ORDER = 42
+# Components of a field that a symmetry wants to be 0, from the first on.
+_ACROSS = {"rotational": 2, "bilateral": 1, "none": 0}
 # Largest angle off a plane of symmetry that counts as in it, radians.
 _OFF = 1e-3
 
@@ -65,13 +67,13 @@ def fits(symmetry: Symmetry, field: Numbers) -> Array:
     """Whether the part of the pupil that a rule of a symmetry traces stands for the whole at
     fields (..., 2), radians: bool (...). Smaller angles than `_OFF` pass, so that differences at a
     plane of symmetry can be taken."""
-    across = {"rotational": 2, "bilateral": 1, "none": 0}[symmetry]  # axes of the symmetry
-    return ~jnp.any(jnp.abs(jnp.asarray(field)[..., :across]) > _OFF, axis=-1)
+    return ~jnp.any(jnp.abs(jnp.asarray(field)[..., : _ACROSS[symmetry]]) > _OFF, axis=-1)
 
 
 def require_fit(symmetry: Symmetry, field: Numbers) -> None:
     """ValueError for known fields (..., 2) that a rule of a symmetry does not fit."""
-    if concrete(field) and not np.all(fits(symmetry, field)):
+    # NumPy, because inside of a trace even what JAX computes of known numbers is not known.
+    if concrete(field) and np.any(np.abs(np.asarray(field)[..., : _ACROSS[symmetry]]) > _OFF):
         where = {"rotational": "the axis", "bilateral": "fields along y"}[symmetry]
         raise ValueError(
             f"the rule is made for {where}, where a part of the pupil stands for all of it; the "

@@ -289,8 +289,9 @@ def test_a_model_serves_inside_jit_and_vmap(double_gauss):
     # It is made for fields along y: elsewhere half of the pupil is not all of it.
     beside = jnp.radians(jnp.array([4.0, 3.0]))
     assert not np.any(kernels(jnp.stack([beside, fields[0]]))[0])
-    with pytest.raises(ValueError, match="the rule is made for fields along y"):
-        drt_jax.psfs(lens, beside[None], far, waves, PIXEL, SIZE, model)
+    for call in (drt_jax.psfs, lambda *all: jax.jit(lambda: drt_jax.psfs(*all))()):
+        with pytest.raises(ValueError, match="the rule is made for fields along y"):
+            call(lens, beside[None], far, waves, PIXEL, SIZE, model)
 
 
 @pytest.mark.parametrize(
