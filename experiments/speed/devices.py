@@ -34,19 +34,19 @@ class Config:
 
     counts: of devices, the first 1.
     images: of each device in a step. patch: side of an image, pixels.
-    steps: timed for each count.
+    repeats: steps that are timed for each count.
     """
 
     counts: tuple[int, ...] = (1, 2, 4, 8)
     images: int = 2
     patch: int = 64
-    steps: int = 20
+    repeats: int = 20
     lens: str = "double_gauss"
     wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
     network: _training.Net = _training.Net()
 
     def __post_init__(self) -> None:
-        limits = {"counts": (1, 4096), "images": (1, 4096), "patch": (7, 4096), "steps": (1, 1e6)}
+        limits = {"counts": (1, 4096), "images": (1, 4096), "patch": (7, 4096), "repeats": (1, 1e6)}
         _common.require_within("", self, **limits)
         _common.require_different("counts", self.counts)
         _common.require(self.counts[:1] == (1,), "counts: expected 1 first, to compare with")
@@ -61,7 +61,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     jobs = [_Job(config, count, scenes[: count * config.images]) for count in config.counts]
     ways = [way for job in jobs for way in (job.shared, job.alone)]
     times: list[list[float]] = [[] for _ in ways]
-    for _ in tqdm(range(config.steps), unit="step", leave=False):
+    for _ in tqdm(range(config.repeats), unit="step", leave=False):
         for way, taken in zip(ways, times):
             way()  # threads of the program before may still spin
             begun = time.perf_counter()

@@ -23,7 +23,7 @@ STARTS = {
     "faults": ["parts=[files]", "files=30", "traced=1"],
     "files": ["folder={toy}"],
     "benchmark": ["tasks=[axial]", "growth=false", "repeats=1", "lens=singlet"],
-    "devices": ["counts=[1]", "patch=8", "steps=2", "network={layers: 1, channels: 4}"],
+    "devices": ["counts=[1]", "patch=8", "repeats=2", "network={layers: 1, channels: 4}"],
     "lenses": [
         "lenses=[{lens: singlet, field_deg: 3}]",
         *("parts=[0]", "copies=1", "fields=1", "sweep=8", "repeats=1"),
