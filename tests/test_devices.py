@@ -102,8 +102,8 @@ def test_eight_devices_compute_what_one_does():
 
 @pytest.mark.slow
 def test_without_what_suits_cpus_and_in_float32_the_numbers_are_the_same():
-    """As another kind of device computes them: spots, slopes, rays, a kernel, an optimum, lenses as
-    built, training."""
+    """As another kind of device computes them: spots, slopes, rays, a kernel, lenses as built,
+    training."""
     double, single = (
         json.loads(ended(started(str(HERE / "plainly.py"), JAX_ENABLE_X64=x)).splitlines()[-1])
         for x in "10"
