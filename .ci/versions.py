@@ -36,7 +36,7 @@ TESTS = (
     "tests/learn/test_train.py::test_training_moves_the_sensor_to_focus_and_compiles_once",
     "tests/learn/test_images.py",
     "tests/experiments/runs",
-    "tests/test_devices.py::test_eight_devices_compute_what_one_does",
+    "tests/test_devices.py::test_a_mesh_of_one_shares_all",
 )
 
 
