@@ -1,6 +1,7 @@
 """What eight devices share, beside one: run by test_devices.py in a process with virtual devices;
 prints the largest differences as JSON."""
 
+import dataclasses
 import json
 import sys
 
@@ -10,7 +11,7 @@ import numpy as np
 
 import drt_jax
 from drt_jax import design, devices
-from drt_jax.learn import train
+from drt_jax.learn import field, train
 
 jax.config.update("jax_enable_x64", True)
 LENS = "singlet"
@@ -93,7 +94,38 @@ def training(mesh):
     return np.array(losses), devices.gathered(state)
 
 
+def joint_training(mesh):
+    """Losses and states of lens and network over the field, by Adam and by damped steps."""
+    lens, pixel = drt_jax.load_lens(LENS), 0.02
+    field_of = np.array([[0.01, 0.01]])
+    model = drt_jax.converged_psf(lens, field_of, 5e3, COLOURS, pixel, 9, "gaussian", 0.05)
+    weights, restore = drt_jax.red_net(layers=1, channels=32)
+    images = np.random.default_rng(0).integers(0, 255, (3, 8, 40, 40, 3), np.uint8)
+
+    def points(optics, seen):
+        moved = dataclasses.replace(lens, sensor=optics["sensor"])
+        found = drt_jax.psfs(moved, *seen[:2], COLOURS, pixel, 9, model)
+        return found.kernel, jnp.ones((4, 3))
+
+    def trained(make, rate):
+        convolve = devices.shared(drt_jax.convolve_each, mesh)
+        camera = field.FieldImager(points, devices.shared(restore, mesh, 1), convolve)
+        rates = {"optics": rate, "network": 1e-3}
+        draw = lambda key: field.draw_points(key, 4, 0.02, (5e3, jnp.inf))  # noqa: E731
+        init, step = make(camera, rates, draw, 0)
+        start = {"optics": {"sensor": lens.sensor}, "network": weights(jax.random.key(0))}
+        state, losses = devices.copied(mesh, init(start)), []
+        for k, scenes in enumerate(images):
+            scenes = devices.split(mesh, scenes)
+            state, metrics = step(state, scenes, np.float32(0.01), np.int32(k))
+            losses.append(float(metrics["loss"]))
+        return np.array(losses), devices.gathered(state[0])
+
+    return trained(field.make_field_step, 1e-2), trained(field.make_damped_step, 0.3)
+
+
 if __name__ == "__main__":
-    jobs = {job.__name__: job for job in (monte_carlo, starts, kernels, rays, training)}
+    jobs = monte_carlo, starts, kernels, rays, training, joint_training
+    jobs = {job.__name__: job for job in jobs}
     found = {name: apart(jobs[name](None), jobs[name](devices.device_mesh(8))) for name in jobs}
     json.dump(found, sys.stdout)

@@ -6,7 +6,7 @@ and `focus_moments` take a rule that was made outside.
 
 import itertools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -37,7 +37,7 @@ from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_sensor, weigh
 from .orders import rules_by_order
 from .spot import Moments
-from .tiles import Traced, trace_rule, weigh_rule
+from .tiles import Traced, trace_rule, weigh_rules
 
 # Smallest spot, mm: below 1 nm rounding would never converge.
 _SMALLEST = 1e-6
@@ -158,7 +158,7 @@ def _moments(
         tolerance = _TOLERANCE if tolerance is None else tolerance
         trial = _converge(lens, field, distance, wavelengths, tolerance, places)
         if concrete((lens, scene)):
-            return trial.moments[0]
+            return jax.tree.map(jnp.asarray, trial.moments[0])
         # The rays are known: only weigh and differentiate them.
         return _weigh_known(lens, scene, trial.used, trial.found[0])
     require_fit(rule.symmetry, scene.field)
@@ -256,8 +256,7 @@ def _try_orders(
                 check_order(lens)
             if (failing or cut) and not clipped:
                 break
-            for rule, used in group.rules:
-                trial = _weighed(lens, scenes, rule, used, rays)
+            for trial in _weighed(lens, scenes, group.rules, rays):
                 trials = [*trials, trial][-3:]
                 changes = (_change(trials[0], later, places) for later in trials[1:])
                 change = max(changes, default=np.inf)
@@ -285,18 +284,18 @@ def _trace(
 
 
 def _weighed(
-    lens: Lens,
-    scenes: Sequence[Scene],
-    rule: Gauss | Clipped,
-    used: PupilRule,
-    rays: Sequence[Traced],
-) -> _Trial:
-    """The moments of a rule. ValueError if no light of a wavelength arrives."""
-    moments = tuple(weigh_rule(lens, used, one) for one in rays)
-    for scene, found in zip(scenes, moments, strict=True):
-        if not np.all(np.asarray(found.throughput) > 0):
-            _say_why(lens, scene, rule.symmetry, found.throughput)
-    return _Trial(rule, used, moments, tuple(one.found for one in rays))
+    lens: Lens, scenes: Sequence[Scene], rules: Sequence, rays: Sequence[Traced]
+) -> Iterator[_Trial]:
+    """Rules of a group with their moments. ValueError if no light of a wavelength arrives."""
+    found = tuple(one.found for one in rays)
+    for start in range(0, len(rules), 3):
+        some = rules[start : start + 3]
+        each = [weigh_rules(lens, [used for _, used in some], one) for one in rays]
+        for (rule, used), *moments in zip(some, *each, strict=True):
+            for scene, one in zip(scenes, moments, strict=True):
+                if not np.all(one.throughput > 0):
+                    _say_why(lens, scene, rule.symmetry, one.throughput)
+            yield _Trial(rule, used, tuple(moments), found)
 
 
 def _eps(lens: Lens) -> float:

@@ -1,6 +1,7 @@
 """Rays of a rule traced in tiles, so that rules of all sizes share a compiled program. Outside of
 traces only."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -34,7 +35,7 @@ class Traced(NamedTuple):
     cut: True if a ray is clipped.
     """
 
-    weights: Array
+    weights: np.ndarray
     bundle: Bundle
     found: Found
     failing: bool
@@ -43,12 +44,12 @@ class Traced(NamedTuple):
 
 def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Traced:
     """Traces the rays of a rule; those without weight only of a pattern."""
-    points, weights = _points(lens, scene, rule)
+    points, weights = jax.tree.map(np.asarray, _points(lens, scene, rule))
     waves, total = scene.wavelengths.size, weights.shape[-1]
     # Rays without weight: padding in fitted rules; in other rules they show whether light is
     # clipped.
     fitted = isinstance(rule, Fitted)
-    rays = np.flatnonzero(np.any(np.asarray(weights), axis=0)) if fitted else np.arange(total)
+    rays = np.flatnonzero(np.any(weights, axis=0)) if fitted else np.arange(total)
     size, count = _TILE[len(points)], len(rays)
     tiles = np.resize(rays if count else 0, (max(-(-count // size), 1), size))
     every = [np.broadcast_to(p, (waves, total)) for p in points]
@@ -71,15 +72,20 @@ def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Tra
     return Traced(weights, bundle, found, bool(failing), bool(np.any(cut)))
 
 
-def weigh_rule(lens: Lens, rule: PupilRule, traced: Traced) -> FocusMoments:
-    """Moments of traced rays: of the rule that they were traced for, or of a pattern of the same
-    points with weights of its own."""
-    weights: Array | np.ndarray = traced.weights
-    if isinstance(rule, Pattern):
-        weights = np.asarray(rule.weights, lens.curvature.dtype)[None]
-    if isinstance(rule, ClippedGroup):
-        weights = rule.weigh(lens, weights)
-    return _weigh(lens, rule, weights, traced.bundle)
+def weigh_rules(lens: Lens, rules: Sequence[PupilRule], traced: Traced) -> list[FocusMoments]:
+    """Moments of traced rays by up to three rules with the points of the rule that they were traced
+    for: orders of the group, or patterns."""
+    kind = lens.curvature.dtype
+    weights = [
+        rule.weigh(lens, traced.weights)
+        if isinstance(rule, ClippedGroup)
+        else np.asarray(rule.weights, kind)[None]
+        for rule in rules
+    ]
+    # Three, so that they share a program.
+    stacked = np.stack([*weights, *[weights[-1]] * (3 - len(rules))])
+    found = jax.tree.map(np.asarray, _weigh(lens, rules[0], stacked, traced.bundle))
+    return [jax.tree.map(lambda a: a[k], found) for k in range(len(rules))]
 
 
 @partial(jit, wanted=LARGE)
@@ -94,4 +100,4 @@ def _trace(lens: Lens, scene: Scene, points: Vector, solver: Solver) -> tuple[Bu
     return bundle_of(lens, scene, system, target, found), found
 
 
-_weigh = jit(weigh, LARGE)
+_weigh = jit(jax.vmap(weigh, (None, None, 0, None)), LARGE)

@@ -32,10 +32,12 @@ class FieldImager:
 
     points: kernels and light of object points, such as a function of `psfs`.
     restore: (weights, images) -> images; None for a camera without a network.
+    convolve: as `convolve_each`, such as `devices.shared(convolve_each, mesh)`.
     """
 
     points: Points
     restore: Callable[[Any, Array], Array] | None = None
+    convolve: Callable[[Array, Array], Array] = convolve_each
 
     def sensor(
         self, optics: Any, scenes: Array, seen: "ObjectPoints", noise: Numbers, key: Array
@@ -57,7 +59,7 @@ class FieldImager:
             )
         each = scenes.shape[0] // count
         kernels, light = self.points(optics, seen)
-        image = convolve_each(scenes, kernels.repeat(each, axis=0))
+        image = self.convolve(scenes, kernels.repeat(each, axis=0))
         gain = 1 / jnp.maximum(light, _DARKEST).astype(image.dtype)
         white = jax.random.normal(key, image.shape, image.dtype)
         grain = jnp.asarray(noise, image.dtype) * white

@@ -145,14 +145,13 @@ class ClippedGroup(Fitted):
         )
         return tuple(points), self.weigh(lens, weights)
 
-    def weigh(self, lens: Lens, weights: Array | np.ndarray) -> Array:
-        """Weights (W, Q) of all orders, 0 for orders that are not chosen."""
+    def weigh(self, lens: Lens, weights: Any) -> Any:
+        """Weights (W, Q) of all orders, a NumPy or JAX array, 0 for orders that are not chosen."""
         sets = 1 if lens.apertures is None else 2 ** sum(lens.apertures.blocks)
         counts = [sets * n * _most(lens, self.symmetry, n) for n in self.sizes]
         order = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        chosen = jnp.asarray(self.chosen, jnp.int32)
-        own = (chosen < 0) | (order == chosen)
-        return jnp.where(own[None], weights, 0)
+        own = (self.chosen < 0) | (order == self.chosen)
+        return weights * own.astype(weights.dtype)[None]
 
 
 def _spokes(lens: Lens, symmetry: Symmetry, order: Any) -> Any:

@@ -217,6 +217,7 @@ class Studio:
         rates: dict[str, Any] = {"optics": 0.0, "network": setting.network_rate}
         points, make, draw = self.points, make_field_step, self.drawn
         restore = shared(self.restore, self.mesh, 1)
+        convolve = shared(drt_jax.convolve_each, self.mesh)
         if kind == "spots":  # neither derivatives nor limits of a lens that stays
             points = lambda optics, seen: self.points(jax.lax.stop_gradient(optics), seen)  # noqa: E731
             held = lambda before, after: before  # noqa: E731
@@ -229,7 +230,7 @@ class Studio:
             restore = lambda w, image: still(jax.lax.stop_gradient(w), image)  # noqa: E731
         if kind == "tolerant":
             draw = self.drawn_as_built
-        return make(FieldImager(points, restore), rates, draw, 0, held)
+        return make(FieldImager(points, restore, convolve), rates, draw, 0, held)
 
     def start(self, arm: str, seed: int, lenses: dict[str, Array], weights: Any) -> dict[str, Any]:
         """The parameters of an arm at the start."""

@@ -21,7 +21,7 @@ from drt_jax import load_lens, show
 from drt_jax.design import Operand, Solve, Tie, Tolerance, Vary
 from drt_jax.learn.data import DataConfig
 
-from . import _command, _common, _plots, _report, _training
+from . import _command, _common, _plots, _report, _sharing, _training
 from ._arms import ARMS, Arm, run as run
 from .runs.folder import Run as Run
 
@@ -122,7 +122,7 @@ class Config:
     seeds: starts of the network, with data and noise of their own.
     tolerances: of parts of the lens, for `tolerant` and judge.builds.
     refocus: True if the sensor of a lens as built follows its paraxial focus.
-    devices: 1; several do not work here yet, see docs/devices.md.
+    devices: that share each batch, see docs/devices.md; another number goes on with the same run.
     """
 
     name: str
@@ -149,9 +149,7 @@ class Config:
     devices: int = dataclasses.field(default=1, compare=False)
 
     def __post_init__(self) -> None:
-        # XLA's Fourier transforms of split images fail on a CPU.
-        one = "devices: joint runs on one device, restore and edof on several"
-        _common.require(self.devices == 1, one)
+        _sharing.require_shared(self.devices, "train.batch", self.train.batch)
         limits = {"field_deg": (1e-3, 80), "noise": (0, 10), "mtf_at": (1e-3, 1e4)}
         _common.require_within("", self, **limits, seeds=(1, 100), wavelengths_um=(0.1, 100))
         three = len(self.wavelengths_um) == 3
