@@ -72,19 +72,20 @@ def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Tra
     return Traced(weights, bundle, found, bool(failing), bool(np.any(cut)))
 
 
-def weigh_rules(lens: Lens, rules: Sequence[PupilRule], traced: Traced) -> list[FocusMoments]:
+def weigh_rules(
+    lens: Lens, rules: Sequence[Pattern | ClippedGroup], traced: Traced
+) -> list[FocusMoments]:
     """Moments of traced rays by up to three rules with the points of the rule that they were traced
     for: orders of the group, or patterns."""
-    kind = lens.curvature.dtype
-    weights = [
-        rule.weigh(lens, traced.weights)
-        if isinstance(rule, ClippedGroup)
-        else np.asarray(rule.weights, kind)[None]
-        for rule in rules
-    ]
+
+    def own(rule: Pattern | ClippedGroup) -> np.ndarray:
+        if isinstance(rule, ClippedGroup):
+            return rule.weigh(lens, traced.weights)
+        return np.asarray(rule.weights, lens.curvature.dtype)[None]
+
     # Three, so that they share a program.
-    stacked = np.stack([*weights, *[weights[-1]] * (3 - len(rules))])
-    found = jax.tree.map(np.asarray, _weigh(lens, rules[0], stacked, traced.bundle))
+    weights = np.stack([own(rules[min(k, len(rules) - 1)]) for k in range(3)])
+    found = jax.tree.map(np.asarray, _weigh(lens, rules[0], weights, traced.bundle))
     return [jax.tree.map(lambda a: a[k], found) for k in range(len(rules))]
 
 

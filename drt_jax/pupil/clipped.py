@@ -150,7 +150,8 @@ class ClippedGroup(Fitted):
         sets = 1 if lens.apertures is None else 2 ** sum(lens.apertures.blocks)
         counts = [sets * n * _most(lens, self.symmetry, n) for n in self.sizes]
         order = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        own = (self.chosen < 0) | (order == self.chosen)
+        chosen: Any = self.chosen
+        own = (chosen < 0) | (order == chosen)
         return weights * own.astype(weights.dtype)[None]
 
 
