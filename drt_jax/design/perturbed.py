@@ -78,6 +78,14 @@ class PerturbedLens:
         largest = jnp.asarray([*sizes.values()], dtype)
         return cls(lens, jnp.asarray(beam_radius, dtype), largest, tuple(sizes), spans, groups)
 
+    @property
+    def parts(self) -> list[list[int]]:
+        """Indices of the deviations of each part: one, or the components x and y."""
+        parts: dict[tuple, list[int]] = {}
+        for k, error in enumerate(self.deviations):
+            parts.setdefault(error[:2], []).append(k)
+        return list(parts.values())
+
     def lens_of(self, perturbation: Array) -> Lens:
         """The lens with a perturbation (P,): deviations in units of their largest. Works in `jit`,
         `vmap` and under differentiation."""

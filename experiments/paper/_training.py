@@ -1,12 +1,11 @@
-"""Settings and training jobs of the paper's experiments."""
+"""Training jobs of the paper's experiments."""
 
-import dataclasses
 import functools
-import math
 import pathlib
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import jax
@@ -19,126 +18,20 @@ from drt_jax.devices import copied, gathered, shared, split
 from drt_jax.image.diagnose import crossed
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
-from drt_jax.learn.data import DataConfig, Patches, batches, load_patches
+from drt_jax.learn.data import batches
 
-from ._common import require, require_list, require_within
-from ._optics import Scene, Trained, check_variables, middle, spot_of
-from ._report import IMAGES, start_label
-from ._sharing import mesh_of, require_shared
+from ._common import require
+from ._optics import Trained, middle, spot_of
+from ._patches import read_patches, thinned
+from ._report import start_label
+from ._settings import JointSettings, Settings
+from ._sharing import mesh_of
 from .runs.config import ConfigError
 from .runs.folder import Run
 from .runs.interrupt import deferred_interrupt
-from .runs.write import replace
 
-# Most skipped files named on the terminal; the run folder names all.
-_NAMED = 20
 # Tolerance of wave kernels, the sum of absolute errors of their pixels.
 _KERNELS = 0.05
-
-
-@dataclasses.dataclass(frozen=True)
-class Training:
-    """Length and speed of training.
-
-    batches: steps of each job.
-    patch: side of a patch, pixels.
-    variables: trained numbers of the lens, by kind, or kind and surface such as "curvature 0".
-    optics_rate: Adam's learning rate of the sensor, mm; other rates follow from `Trained.scale`.
-    checkpoint_every: batches between checkpoints, rounded up to reports of metrics.
-    """
-
-    batches: int
-    batch: int = 16
-    patch: int = 64
-    variables: tuple[str, ...] = ("sensor",)
-    optics_rate: float = 1e-3
-    checkpoint_every: int = 200
-
-    def __post_init__(self) -> None:
-        # 7 is the window of the SSIM.
-        sizes = {"batch": (1, 4096), "patch": (7, 4096), "checkpoint_every": (1, math.inf)}
-        rates = {f"{name}_rate": (0, 10) for name in self.rates}
-        require_within("train.", self, batches=(1, math.inf), **sizes, **rates)
-        check_variables(self.variables)
-
-    @property
-    def rates(self) -> dict[str, float]:
-        """Learning rates of the groups of parameters."""
-        rates = {name: rate for name, rate in vars(self).items() if name.endswith("_rate")}
-        return {name.removesuffix("_rate"): rate for name, rate in rates.items()}
-
-
-@dataclasses.dataclass(frozen=True)
-class JointTraining(Training):
-    """`Training` with a network. network_rate: Adam's learning rate of the network."""
-
-    network_rate: float = 1e-3
-
-
-@dataclasses.dataclass(frozen=True)
-class Net:
-    """Settings of `red_net`."""
-
-    skip_every: int = 2
-    input_skip: bool = True
-    layers: int = 5
-    channels: int = 64
-
-    def __post_init__(self) -> None:
-        require_within("network.", self, skip_every=(0, 5), layers=(1, 50), channels=(1, 1024))
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Settings:
-    """Settings of all three experiments.
-
-    starts_mm: sensor positions at the start of training.
-    noise: standard deviation of the sensor noise, for values from 0 to 1.
-    """
-
-    starts_mm: tuple[float, ...]
-    train: Training
-    noise: float = 0.01
-    seed: int = 0
-    scene: Scene = Scene()
-    camera: train.Camera = train.Camera()
-    data: DataConfig = DataConfig()
-
-    def __post_init__(self) -> None:
-        require_list("starts_mm", self.starts_mm)
-        require_within("", self, starts_mm=(1e-3, 1e6), noise=(0, 10))
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Further columns of metrics.csv: the trained numbers of the lens."""
-        return Trained.of(self.scene.lens, self.train.variables).names
-
-    @property
-    def paper(self) -> bool:
-        """True if the paper has numbers for these settings: its lens, wavelengths and distances,
-        and only the sensor trained."""
-        usual = {field.name: field.default for field in dataclasses.fields(self)}
-        here = vars(self) | {"scene": dataclasses.replace(self.scene, tolerance=Scene.tolerance)}
-        same = all(here[n] == usual[n] for n in ("scene", "distance_m", "depth_m") if n in usual)
-        return same and self.train.variables == ("sensor",)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class JointSettings(Settings):
-    """Settings with a network.
-
-    test_patches: number of test patches; 0 for all.
-    devices: that share each batch, see docs/devices.md; another number goes on with the same run.
-    """
-
-    train: JointTraining
-    test_patches: int = 0
-    network: Net = Net()
-    devices: int = dataclasses.field(default=1, compare=False)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_shared(self.devices, "train.batch", self.train.batch)
 
 
 class Jobs:
@@ -166,7 +59,7 @@ class Jobs:
         self.scenes = patches.train
         if isinstance(config, JointSettings):
             self.test = thinned(patches.test, config.test_patches)
-            init, self.restore = drt_jax.red_net(**dataclasses.asdict(config.network))
+            init, self.restore = drt_jax.red_net(**asdict(config.network))
             self._network["network"] = weights = init(jax.random.key(config.seed))
             self.parameters = network.count_parameters(weights)
             print(f"RED-Net with {self.parameters} parameters")
@@ -331,22 +224,6 @@ class Jobs:
         return {"numbers": rows, "changes_mm": np.array(changes), "spot_mm": distance}
 
 
-def read_patches(config: DataConfig, side: int, seed: int, folder: pathlib.Path) -> Patches:
-    """Patches of images, with a bar. Prints how many there are and which files were skipped; a long
-    list goes into skipped.txt of the folder."""
-    reading = functools.partial(tqdm, desc="reading images", leave=False)
-    patches = load_patches(config, side, seed, reading)
-    for line in patches.skipped[:_NAMED]:
-        print(f"skipped {line}", file=sys.stderr)
-    if len(patches.skipped) > _NAMED:
-        listed = folder / "skipped.txt"
-        replace(listed, "".join(f"{line}\n" for line in patches.skipped).encode())
-        print(f"skipped {len(patches.skipped)} in all, named in {listed}", file=sys.stderr)
-    counts = f"{len(patches.train)} training and {len(patches.test)} test patches"
-    print(f"{counts} of {side} x {side}")
-    return patches
-
-
 def values_of(parameters: dict[str, Any], k: int) -> dict[str, float]:
     """Trained numbers of the lens of job k."""
     return {name: float(np.ravel(value)[k]) for name, value in parameters["optics"].items()}
@@ -357,24 +234,3 @@ def require_finite(label: str, first: int, losses: np.ndarray, what: str = "loss
     lost = np.flatnonzero(~np.isfinite(losses))
     what = f"{label}: the {what} is not finite from batch {first + lost[:1].sum()} on"
     require(not lost.size, f"{what}; leave this start out, or lower the learning rates")
-
-
-def images(
-    imager: Callable, parameters: Any, scenes: np.ndarray, distance: float, noise: float, seed: int
-) -> dict[str, np.ndarray]:
-    """True, sensor and restored images of patches, for `draw_patches`."""
-    found = imager(parameters, scenes, distance, np.float32(noise), jax.random.key(seed))
-    return {name: np.asarray(image, np.float16) for name, image in zip(IMAGES, found)}
-
-
-def thinned(patches: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` patches, evenly over the set; all for 0."""
-    if not count or count >= len(patches):
-        return patches
-    return np.asarray(patches[np.linspace(0, len(patches) - 1, count).astype(int)])
-
-
-def textured(patches: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` patches for a figure, evenly over the half with more contrast."""
-    contrast = np.std(patches.reshape(len(patches), -1), axis=1)
-    return thinned(patches[np.argsort(contrast)[len(patches) // 2 :]], count)

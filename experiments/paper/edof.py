@@ -22,14 +22,14 @@ import numpy as np
 from drt_jax import show
 from drt_jax.learn import train
 
-from . import _command, _common, _plots, _report, _training
+from . import _command, _common, _optics, _patches, _plots, _report, _settings, _training
 from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um", "depth_mm")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Config(_training.JointSettings):
+class Config(_settings.JointSettings):
     """Settings of the experiment; see configs/edof.yaml.
 
     fixed_mm: one of starts_mm, also trained with the sensor fixed.
@@ -41,7 +41,7 @@ class Config(_training.JointSettings):
     depth_m: tuple[float, ...] = (10.0, 50.0)
     table_depth_m: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0)
     patch_depth_m: tuple[float, ...] = (10.0, 20.0, 30.0, 40.0, 50.0)
-    scene: _training.Scene = _training.Scene(lens="double_gauss_addon")
+    scene: _optics.Scene = _optics.Scene(lens="double_gauss_addon")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,10 +97,10 @@ def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[s
             row[name] = train.evaluate(*model, test, 1e3 * depth, noise, config.seed)
         rows.append(row)
     inside = [row for row in rows if config.trained_at(row["depth_m"])]
-    chosen = _training.textured(test, len(config.patch_depth_m))
+    chosen = _patches.textured(test, len(config.patch_depth_m))
     for k, depth in enumerate(config.patch_depth_m):
         some = chosen[k % len(chosen)][None]
-        parts.append(_training.images(*models["joint"], some, 1e3 * depth, noise, k))
+        parts.append(_patches.images(*models["joint"], some, 1e3 * depth, noise, k))
     return {
         **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
         "patch_depth_m": list(config.patch_depth_m),

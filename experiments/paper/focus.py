@@ -21,7 +21,7 @@ import numpy as np
 from drt_jax import show
 from drt_jax.image.sensor import convolve_taps
 
-from . import _command, _common, _plots, _report, _training
+from . import _command, _common, _patches, _plots, _report, _settings, _training
 from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
@@ -30,7 +30,7 @@ _ROUNDING = 1e-5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Config(_training.Settings):
+class Config(_settings.Settings):
     """Settings of the experiment; see configs/focus.yaml."""
 
     distance_m: float = 25.0
@@ -77,7 +77,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     every = *config.starts_mm, *results["final_mm"]
     low, high = min(every), max(every)
     margin = (high - low) / 2  # all starts may lie on one side
-    scenes = _training.thinned(jobs.scenes, 512)
+    scenes = _patches.thinned(jobs.scenes, 512)
     best = best_focus(loss, scenes, low - margin, high + margin)
     near = [np.flatnonzero(np.abs(trace - best) <= 0.1) for trace in results["sensor_mm"]]
     first = [int(hits[0]) if hits.size else None for hits in near]

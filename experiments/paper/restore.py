@@ -14,14 +14,14 @@ from typing import Any
 
 from drt_jax.learn import train
 
-from . import _command, _common, _report, _training
+from . import _command, _common, _patches, _report, _settings, _training
 from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Config(_training.JointSettings):
+class Config(_settings.JointSettings):
     """Settings of the experiment; see configs/restore.yaml.
 
     table_starts_mm: starts that are trained at each noise of table_noise.
@@ -57,10 +57,10 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         found = trained[start, noise]
         row = {"noise": noise, "start_mm": start, "sensor_mm": float(found["optics"]["sensor"])}
         rows.append(row | train.evaluate(imager, found, jobs.test, distance, noise, config.seed))
-    some, noise = _training.textured(jobs.test, 6), table[0][1]
+    some, noise = _patches.textured(jobs.test, 6), table[0][1]
     return {
         **jobs.results("sensor_mm"),
-        **_training.images(imager, trained[table[0]], some, distance, noise, 1),
+        **_patches.images(imager, trained[table[0]], some, distance, noise, 1),
         "parameters": jobs.parameters,
         "test": rows,
         "test_patches": len(jobs.test),

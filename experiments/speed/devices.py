@@ -21,7 +21,7 @@ from drt_jax import show
 from drt_jax.devices import copied, shared, split
 from drt_jax.learn import train
 
-from . import _command, _common, _sharing, _training
+from . import _command, _common, _settings, _sharing
 from .runs.folder import Run
 
 COLUMNS = ()
@@ -43,7 +43,7 @@ class Config:
     repeats: int = 20
     lens: str = "double_gauss"
     wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
-    network: _training.Net = _training.Net()
+    network: _settings.Net = _settings.Net()
 
     def __post_init__(self) -> None:
         limits = {"counts": (1, 4096), "images": (1, 4096), "patch": (7, 4096), "repeats": (1, 1e6)}

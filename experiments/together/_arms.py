@@ -18,7 +18,7 @@ from drt_jax.learn import train
 from drt_jax.learn.data import batches
 from drt_jax.learn.field import FieldImager, ObjectPoints
 
-from . import _training
+from . import _patches, _training
 from ._studio import SEED, Studio
 from .runs.folder import Run
 
@@ -44,7 +44,7 @@ _SHOWN = 5
 def run(config: Any, run: Run) -> dict[str, Any]:
     """Finishes the lenses, trains and judges all arms."""
     side = config.train.patch + config.camera.kernel - 1
-    studio = Studio(config, _training.read_patches(config.data, side, 0, run.folder))
+    studio = Studio(config, _patches.read_patches(config.data, side, 0, run.folder))
     lenses = {"spoilt": studio.spoilt} | _finished(studio, run)
     folder = run.folder / "lenses"
     folder.mkdir(exist_ok=True)
@@ -151,7 +151,7 @@ def _save(studio: Studio, path: Any, vector: Array) -> None:
 
 
 def _test(studio: Studio, seen: ObjectPoints, each: int) -> np.ndarray:
-    return _training.thinned(studio.patches.test, each * len(seen.fields))
+    return _patches.thinned(studio.patches.test, each * len(seen.fields))
 
 
 def _judged(studio: Studio, imager: Callable, parameters: Any) -> dict[str, float]:
@@ -165,7 +165,7 @@ def _pictures(studio: Studio, imager: Callable, parameters: Any, arm: str) -> di
     """Some images of the judge, evenly over its points."""
     seen, noise = studio.judged(), np.float32(studio.config.noise)
     some = np.resize(
-        _training.textured(studio.patches.test, len(seen.fields)),
+        _patches.textured(studio.patches.test, len(seen.fields)),
         (len(seen.fields), *studio.patches.test.shape[1:]),
     )
     found = imager(parameters, some, seen, noise, jax.random.key(0))

@@ -21,7 +21,7 @@ from drt_jax import load_lens, show
 from drt_jax.design import Operand, Solve, Tie, Tolerance, Vary
 from drt_jax.learn.data import DataConfig
 
-from . import _command, _common, _plots, _report, _sharing, _training
+from . import _command, _common, _plots, _report, _settings, _sharing
 from ._arms import ARMS, Arm, run as run
 from .runs.folder import Run as Run
 
@@ -138,7 +138,7 @@ class Config:
     camera: Camera = Camera()
     noise: float = 0.01
     mtf_at: float = 30.0
-    network: _training.Net = _training.Net()
+    network: _settings.Net = _settings.Net()
     train: Training = Training()
     arms: tuple[Arm, ...] = ("focus", "spots", "joint")
     seeds: int = 3

@@ -1,0 +1,120 @@
+"""A lens as built: its spots after the sensor has been adjusted.
+
+Squared radii are quadratic in the position of the sensor, so that a small linear system gives the
+compensation of every lens.
+"""
+
+from typing import Literal, NamedTuple, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..image.spot import deviations, normalised
+from ..inputs import shown
+from ..lens.lens import Lens
+from ..numerics import concrete, safe_divide, safe_sqrt
+from ..rays.status import Status
+from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
+from .problem import Problem
+
+# Adjustment of every lens: the distance of the sensor, or also its tilts about x and y.
+Compensator = Literal["none", "focus", "focus and tilt"]
+_STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
+_SYMMETRIES = ("rotational", "bilateral", "none")  # from the least of the pupil to all of it
+
+
+class AsBuilt(NamedTuple):
+    """A lens as built, after compensation.
+
+    squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
+    moves: (C,), compensation: shift of the sensor, mm, then its tilts about x and -y, radians.
+    """
+
+    squares: Array
+    moves: Array
+
+    @property
+    def spot(self) -> Array:
+        """The root of q, (), mm."""
+        return jnp.sqrt(jnp.mean(self.squares, axis=-1))
+
+
+def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
+    """Distances from the centroid, mm, and how they grow with the sensor's distance, (D, V, W Q)
+    each, times the root of the light; and centroids (2, V), mm."""
+    waves = rays.wavelength_weights[None, :, None]
+    light = (rays.weights * waves)[..., EXTRAS:]
+    passes = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
+    light = jnp.where(passes, light, 0)
+    arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
+    hits = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
+    slopes = [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
+    weight = normalised(light, (-2, -1))
+    root = safe_sqrt(weight)
+
+    def scaled(values: list[Array]) -> tuple[Array, tuple[Array, ...]]:
+        known = tuple(jnp.where(passes, value, 0) for value in values)
+        parts, means = deviations(known, weight, rays.symmetry, (-2, -1))
+        return jnp.stack([root * part for part in parts]).reshape(len(hits), len(light), -1), means
+
+    (offsets, means), (growth, _) = scaled(hits), scaled(slopes)
+    centre = jnp.stack(means)[..., 0, 0]
+    return offsets, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
+
+
+def compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
+    """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
+    squares add up to those of the RMS radii, mm."""
+    rays = trace_views(lens, problem.views(), problem.solver)
+    offsets, growth, (x, y) = _spots(rays)
+    # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
+    motion = lens.sensor_motion
+    normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
+    levers = jnp.stack([normal, y, x])[: _STEPS[compensator]]
+    moves = jnp.zeros(0, x.dtype)
+    if len(levers):
+        square = jnp.sum(growth**2, axis=(0, 2))
+        matrix = (levers * square[None]) @ levers.T
+        lit = matrix[0, 0] > 0
+        matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
+        moves = jnp.linalg.solve(matrix, -levers @ jnp.sum(offsets * growth, axis=(0, 2)))
+        offsets = offsets + growth * (moves @ levers)[None, :, None]
+    light = rays.weights[..., EXTRAS:] > 0
+    failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
+    valid = ~failed & jnp.all(rays.throughput > 0, axis=1)
+    squares = jnp.where(valid, jnp.sum(offsets**2, axis=(0, 2)), jnp.inf)
+    return AsBuilt(squares, moves), offsets
+
+
+def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
+    """Evaluates a lens at the fields of a problem after compensation. Works in `jit`, `vmap` and
+    under differentiation.
+
+    ValueError for an unknown compensator, for one that the fields do not determine, and for a rule
+    with more symmetry than the lens.
+    """
+    check(problem, lens, compensator)
+    return compensated(problem, lens, compensator)[0]
+
+
+def require_known(what: str, word: object, known: tuple[str, ...]) -> None:
+    if word not in known:
+        raise ValueError(f"{what}: unknown {shown(word)}; known: {', '.join(known)}")
+
+
+def check(problem: Problem, lens: Lens, compensator: str) -> None:
+    require_known("compensator", compensator, get_args(Compensator))
+    has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
+    if _SYMMETRIES.index(has) < _SYMMETRIES.index(needs):
+        raise ValueError(
+            f'rule: "{has}" leaves out part of the pupil, but deviations break the symmetry; '
+            f'use one of symmetry "{needs}", such as Gauss(6, "{needs}")'
+        )
+    if compensator == "focus and tilt" and concrete(problem.fields):
+        tangents = np.tan(np.asarray(problem.fields, float))
+        if np.linalg.matrix_rank(np.c_[np.ones(len(tangents)), tangents]) < 3:
+            raise ValueError(
+                "compensator: focus and tilt: the fields lie on a line, about which any tilt is "
+                "as good; add fields beside it"
+            )
