@@ -14,7 +14,8 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..numerics import safe_divide, safe_sqrt
-from .beam import Beam, centroid_and_variances, cover, means
+from .beam import Beam, centroid_and_variances, means
+from .cover import cover
 from .spot import normalised
 
 # Half the width of a spot: in pixels at least, and in cells of the grid.

@@ -22,7 +22,8 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
 from ..numerics import Numbers, real_array, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
-from .beam import Beam, beam_rule, cover, trace_beam
+from .beam import Beam, beam_rule, trace_beam
+from .cover import cover
 from .spot import normalised
 from .spots import light_rule
 

@@ -18,7 +18,8 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..numerics import safe_sqrt
-from .beam import Beam, cover
+from .beam import Beam
+from .cover import cover
 
 _UM = 1e3  # per mm
 

@@ -15,19 +15,9 @@ from jax import Array
 
 from ..numerics import run_if
 from . import fermat, linear
-from .aim import (
-    STARTS,
-    Fan,
-    aim,
-    aim_outwards,
-    beam_size,
-    nearest_start,
-    no_fan,
-    paraxial_launch,
-    starts_of,
-    trace_fan,
-)
+from .aim import aim, aim_outwards, beam_size, paraxial_launch
 from .bundle import in_tiles, polynomial_launch, tile_of
+from .fan import STARTS, Fan, nearest_start, no_fan, starts_of, trace_fan
 from .snell import shoot, split_stop
 from .sparse import Lanes
 from .status import Status

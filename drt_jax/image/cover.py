@@ -1,0 +1,72 @@
+"""The part of each cell of a grid of rays that light fills."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..lens.clearance import clearance
+from ..lens.lens import Lens
+from ..numerics import safe_divide, safe_sqrt
+from .beam import Beam
+
+
+def cover(
+    lens: Lens, beam: Beam, stop: Array, hits: Array, places: Array, axes: tuple[Array, Array]
+) -> Array:
+    """The part of each cell that light fills, (W, N, N).
+
+    stop: (2, W, N, N), where they cross the stop. hits: (2 S + 2, W, N, N) on all surfaces, of a
+    clipped beam. places: (2, W, Q) of the beam's rays in the plane of the grid, its points or
+    directions. axes: the middle and the step of the grid, (2, W) each.
+    """
+    rim = _edge(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
+    if not beam.clipped:
+        return _filled_part(rim)
+    x, y = hits.reshape(2, -1, *stop.shape[1:])
+    edges = clearance(lens, (x, y))
+
+    def nearest(found: _Edge, depth: Array) -> tuple[_Edge, None]:
+        """Of each cell the edge that leaves the least of it; most edges cut no light."""
+        new = _edge(jnp.where(jnp.isfinite(depth), depth, 1))
+        deep, least = jax.lax.stop_gradient((_cells_deep(new), _cells_deep(found)))
+        cuts = (deep < jnp.minimum(least, 0.5)) & (least > -0.5)
+        pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(cuts, a, b), new, old)  # noqa: E731
+        return jax.lax.cond(jnp.any(cuts), pick, lambda _, old: old, new, found), None
+
+    inside = _filled_part(jax.lax.scan(nearest, rim, edges)[0])
+    return jnp.where(beam.near(places, *axes, stop.shape[-1]), inside, 0)
+
+
+class _Edge(NamedTuple):
+    """How deep the middles of cells (W, N, N) lie inside of an edge, in any unit, and how much that
+    changes over a cell, down and across."""
+
+    depth: Array
+    down: Array
+    across: Array
+
+
+def _edge(depth: Array) -> _Edge:
+    down, across = jnp.gradient(depth, axis=(-2, -1))
+    return _Edge(depth, jnp.abs(down), jnp.abs(across))
+
+
+def _cells_deep(edge: _Edge) -> Array:
+    """The depth over the sum of the changes: 0.5 for a cell that lies just inside, -0.5 outside."""
+    change = edge.down + edge.across
+    return jnp.where(change > 0, safe_divide(edge.depth, change), jnp.sign(edge.depth) * jnp.inf)
+
+
+def _filled_part(edge: _Edge) -> Array:
+    """The part of each cell, (W, N, N), inside of an edge, which is straight in a cell."""
+    a, b = jnp.maximum(edge.down, edge.across), jnp.minimum(edge.down, edge.across)
+    # A unit square cut across by a line: its area is linear in between, a parabola at corners.
+    whole, flat = (a + b) / 2, (a - b) / 2
+    t = jnp.clip(edge.depth, -whole, whole)
+    corner = safe_divide((whole - jnp.abs(t)) ** 2, 2 * a * b)
+    linear = 0.5 + safe_divide(t, a)
+    part = jnp.where(jnp.abs(t) <= flat, linear, jnp.where(t > 0, 1 - corner, corner))
+    inside = (edge.depth > 0).astype(t.dtype)
+    return jnp.where(jnp.abs(edge.depth) < whole, part, inside)

@@ -1,0 +1,101 @@
+"""A fan of rays over the first surface: starts for rays that aiming does not find."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from .snell import shoot, split_stop
+from .status import Status
+from .system import System, Vector, dot
+
+# The fan has `_TILES` tiles per side, each with `_FAN` rays per side. The starts for a stop point
+# are the nearest ray of each of its `STARTS` nearest tiles.
+_TILES, _FAN, STARTS = 15, 5, 24
+
+
+def _fan(dim: int, rays: int) -> np.ndarray:
+    """Launch points (D, tiles, rays of a tile) between -1 and 1, denser in the middle. rays: number
+    of rays per side of a tile."""
+    side = np.linspace(-1, 1, _TILES * rays)
+    side = (side * (0.3 + 0.7 * side**2)).reshape(_TILES, rays)
+    places = np.meshgrid(*[np.arange(side.size)] * dim, indexing="ij")
+    points = side.ravel()[np.stack(places)].reshape(dim, *(_TILES, rays) * dim)
+    tiles = (0, *range(1, 2 * dim, 2), *range(2, 2 * dim + 1, 2))
+    return points.transpose(tiles).reshape(dim, _TILES**dim, rays**dim)
+
+
+class Fan(NamedTuple):
+    """A fan of rays over the first surface.
+
+    launch: D arrays (tiles, rays of a tile), mm.
+    there: D arrays (W, tiles, rays of a tile), crossing of the stop by rays that reach the sensor,
+        mm; inf for the others.
+    """
+
+    launch: Vector
+    there: Vector
+
+
+def no_fan(system: System, waves: int, rays: int = _FAN) -> Fan:
+    """A fan before it is traced, its launch points scaled to -1 to 1.
+
+    waves: number of wavelengths.
+    rays: number of rays per side of a tile.
+    """
+    points = jnp.asarray(_fan(system.dim, rays), system.index.dtype)
+    nowhere = jnp.full((waves, *points.shape[1:]), jnp.inf, points.dtype)
+    return Fan(tuple(points), (nowhere,) * system.dim)
+
+
+def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
+    """Traces a fan.
+
+    fan: the fan of `no_fan`.
+    tried: D arrays (W, Q), launches already tried, mm; the fan reaches beyond them.
+    width: (), radius of the beam on the first surface, mm; the fan reaches twice as far.
+
+    Pass `fan` and `tried` through the loop carry: XLA hoists loop-invariant work out of a loop and
+    would trace the fan even when no ray is missing.
+    """
+    reach = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
+    launch = tuple(reach * a for a in fan.launch)
+    shape = fan.there[0].shape
+    flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
+    trace = shoot(system, flat)
+    _, there = split_stop(system, trace.hits)
+    ok = trace.status == Status.OK
+    return Fan(launch, tuple(jnp.where(ok, a, jnp.inf).reshape(shape) for a in there))
+
+
+def nearest_start(fan: Fan, target: Vector) -> Vector:
+    """One launch for each stop point, D arrays (W, Q), mm. Each tile offers its ray that crosses
+    the stop nearest to the centre of the stop; the nearest of these is taken.
+
+    fan: a traced fan.
+    target: D arrays (W, Q), stop points, mm.
+    """
+    central = jnp.argmin(dot(fan.there, fan.there), axis=-1)  # (W, tiles)
+    there = (jnp.take_along_axis(a, central[..., None], axis=-1)[..., 0] for a in fan.there)
+    gaps = (a[..., None] - b[:, None] for a, b in zip(target, there, strict=True))
+    tile = jnp.argmin(sum(g * g for g in gaps), axis=-1)
+    return tuple(a[tile, jnp.take_along_axis(central, tile, axis=-1)] for a in fan.launch)
+
+
+def starts_of(fan: Fan, target: Vector, ranks: Array) -> Vector:
+    """N launches for each of K stop points, D arrays (W, K, N), mm: the nearest ray of each of the
+    tiles of given ranks.
+
+    fan: a traced fan.
+    target: D arrays (W, K), stop points, mm.
+    ranks: (W, K, N), int32, ranks of tiles by distance to the stop point, 0 for the nearest.
+    """
+    gaps = (a[:, :, None, None] - b[:, None] for a, b in zip(target, fan.there, strict=True))
+    far = sum(g * g for g in gaps)  # (W, K, tiles, rays)
+    near, which = jnp.min(far, axis=-1), jnp.argmin(far, axis=-1)
+    order = jax.lax.top_k(-near, min(STARTS, near.shape[-1]))[1]
+    order = jnp.take_along_axis(order, ranks, axis=-1, mode="clip")
+    chosen = jnp.take_along_axis(which, order, axis=-1)
+    return tuple(a[order, chosen] for a in fan.launch)
