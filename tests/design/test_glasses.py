@@ -114,6 +114,7 @@ def test_costs_are_told():
     )
 
 
+@pytest.mark.slow
 def test_real_glasses_keep_their_formula(tmp_path):
     """Far outside of F to C too, where nd and vd do not tell the index; and in a file."""
     lens = snapped()[2].lens

@@ -12,8 +12,9 @@ from scipy import optimize
 
 import drt_jax
 from drt_jax import design
-from drt_jax.design import PerturbedLens, Problem, Tolerance, Variables, tolerance
+from drt_jax.design import PerturbedLens, Problem, Tolerance, Variables, compensate
 from drt_jax.design.deviations import KINDS
+from drt_jax.design.prediction import Order
 from drt_jax.pupil.rules import Gauss
 
 SINGLET = drt_jax.load_lens("singlet")
@@ -45,10 +46,10 @@ def singlet():
 
 @pytest.fixture(scope="module")
 def predicted(singlet):
-    return tolerance.predict(*singlet, "focus")
+    return design.predict(*singlet, "focus")
 
 
-_made = jax.jit(tolerance.as_built, static_argnums=2)
+_made = jax.jit(design.as_built, static_argnums=2)
 
 
 def some_lens(some, seed=5):
@@ -99,7 +100,7 @@ def test_tilt_of_the_sensor_is_where_a_scan_finds_it(singlet):
     def spot(moves):
         tilt = lens.tilt.at[-1, :2].add(jnp.stack([moves[1], -moves[2]]))
         moved = dataclasses.replace(lens, sensor=lens.sensor + moves[0], tilt=tilt)
-        return 1e3 * tolerance.as_built(problem, moved, "none").spot
+        return 1e3 * design.as_built(problem, moved, "none").spot
 
     scales = np.array([0.1, 0.05, 0.05])
     best = optimize.minimize(
@@ -162,7 +163,7 @@ def test_gradient_and_hessian_are_those_of_differences(singlet, predicted):
 @pytest.mark.slow
 def test_what_rays_know_of_second_derivatives_are_their_products(singlet, predicted):
     problem, some = singlet
-    residuals = jax.jit(lambda off: tolerance._compensated(problem, some.lens_of(off), "focus")[1])
+    residuals = jax.jit(lambda off: compensate.compensated(problem, some.lens_of(off), "focus")[1])
     units = jnp.eye(len(some.deviations))
     rows = [np.ravel(residuals(1e-4 * u) - residuals(-1e-4 * u)) / 2e-4 for u in units]
     products = 2 * np.array(rows) @ np.array(rows).T / len(FIELDS)
@@ -198,7 +199,7 @@ def test_orders_that_are_unknown_are_refused(word):
     some = design.Predicted(1.0, np.ones(2), 2 * whole, 6 * whole, np.zeros(1), np.zeros((2, 1)))
     off = np.array([[1.0, -1.0], [0.5, 0.5]])
     values = {"first": [1, 2], "rays": [3, 2.5], "second": [7, 3.5]}
-    assert set(values) == set(get_args(tolerance.Order))
+    assert set(values) == set(get_args(Order))
     for order, q in values.items():
         np.testing.assert_allclose(some.at(off, order), q)
     ways = (
@@ -218,7 +219,7 @@ def test_nothing_drawn_is_worse_than_the_worst_case(singlet, predicted):
     many = np.asarray(predicted.at(design.draw_perturbations(some, 20_000, 1), "second"))
     for order in ("first", "second"):
         off = design.worst_case(some, predicted, order)
-        for part in tolerance._parts(some):
+        for part in some.parts:
             assert np.linalg.norm(off[part]) == pytest.approx(1)
         assert float(predicted.at(off, "second")) > np.max(many)
 
@@ -227,9 +228,9 @@ def test_nothing_drawn_is_worse_than_the_worst_case(singlet, predicted):
 def test_errors_are_drawn_within_circles(normal):
     some = perturbed(Tolerance("shift", 1.0), Tolerance("radius", 1.0), Tolerance("tilt", 1.0))
     off = design.draw_perturbations(some, 100_000, 0, normal)
-    for part in tolerance._parts(some):
+    for part in some.parts:
         assert 0.99 < np.max(np.linalg.norm(off[:, part], axis=1)) <= 1
-    assert [len(part) for part in tolerance._parts(some)] == [2, 1, 2]
+    assert [len(part) for part in some.parts] == [2, 1, 2]
     np.testing.assert_allclose(off.var(axis=0), design.variances(some, normal), rtol=0.02)
     assert np.array_equal(off, design.draw_perturbations(some, 100_000, 0, normal))
 

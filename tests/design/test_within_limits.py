@@ -34,7 +34,10 @@ def test_an_update_within_all_limits_stays_as_it_is(problem, hold):
     np.testing.assert_array_equal(hold(start, after), after)
 
 
-@pytest.mark.parametrize("far", [3.0, 30.0, 1e4])
+_SLOW = [pytest.param(far, marks=pytest.mark.slow) for far in (3.0, 30.0)]
+
+
+@pytest.mark.parametrize("far", [*_SLOW, 1e4])
 def test_a_wild_update_is_led_back_onto_the_limits(problem, hold, far):
     start = problem.variables.start
     after = start + far * jnp.asarray(np.random.default_rng(3).normal(size=start.size))

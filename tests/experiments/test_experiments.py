@@ -196,7 +196,7 @@ def test_of_many_skipped_files_a_few_are_named_and_all_are_listed(tmp_path, caps
     assert len(listed) == 30 and all("8 x 8 pixels, smaller than 24" in line for line in listed)
 
 
-@pytest.mark.parametrize("name", TOY)
+@pytest.mark.parametrize("name", ["focus", "restore", pytest.param("edof", marks=pytest.mark.slow)])
 def test_pictures_are_drawn_again_without_the_run(name, unbroken, tmp_path, monkeypatch, capsys):
     """From the results alone: the same pictures to the last byte, and the same tables."""
     folder = tmp_path / "copy"

@@ -399,6 +399,7 @@ def read_back(tmp_path, lens):
     return load_lens(tmp_path / "own.zmx")
 
 
+@pytest.mark.slow
 def test_written_breaks(tmp_path):
     """Breaks that move all that follows, with their numbers; elements that end, and decentres and
     tilts of single surfaces, to rounding: the same places, and rays through them."""

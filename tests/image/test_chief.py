@@ -130,6 +130,7 @@ def test_foci_and_heights_by_the_complex_step(lens, distance):
                 np.testing.assert_allclose(found.tangential[k, w], values, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_small_fields_by_petzval():
     """(3 sagittal - tangential) / 2 is the sag of the Petzval surface (Welford, ch. 8), to the
     square of the field."""

@@ -141,6 +141,7 @@ def test_an_even_picture_stays_even_but_for_the_illumination():
     assert light.max() <= 1.01 and light.min() > 0.3
 
 
+@pytest.mark.slow
 def test_points_land_where_their_centroids_are():
     lens, method = lens_of(), method_of()
     focal = float(method.focal)

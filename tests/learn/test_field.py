@@ -77,6 +77,7 @@ def test_points_cover_the_field_and_the_depths():
     assert abs(np.corrcoef(part.ravel(), near.ravel())[0, 1]) < 0.1
 
 
+@pytest.mark.slow
 def test_the_kernels_of_many_points_are_those_of_each(camera):
     variables, imager, _ = camera
     kernels, light = imager.points({"lens": variables.start}, SEEN)

@@ -128,6 +128,7 @@ def hostile(seed):
     return lens, dataclasses.replace(scene, field=jnp.asarray(generator.uniform(-0.9, 0.9, 2)))
 
 
+@pytest.mark.slow
 def test_hostile_lenses():
     """Nothing is ever not finite; what is found crosses the stop at its point; and the fan finds
     rays that the first aim does not, beside those that it does."""

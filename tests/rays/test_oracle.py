@@ -82,6 +82,7 @@ def exact_indices(scene):
     return n
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, rays", [("freeform", 2), ("folded", 1)])
 def test_oracle_against_50_digits(name, rays):
     """Along a random direction in each array: paths and sensor points, 1e-12."""
