@@ -126,6 +126,7 @@ def test_real_glasses_keep_their_formula(tmp_path):
     assert "nd:" not in (tmp_path / "own.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_limits_keep_their_names():
     """Those of the map of glasses, which real ones meet exactly, and those behind them."""
     best = snapped()[2]
@@ -138,6 +139,7 @@ def test_limits_keep_their_names():
     np.testing.assert_allclose(length.value, float(best.lens.sensor), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_snap_compiles_nothing(caplog):
     problem, found, _ = snapped()
     caplog.clear()
@@ -151,6 +153,7 @@ def test_a_snap_compiles_nothing(caplog):
     assert not compiled, compiled[:3]
 
 
+@pytest.mark.slow
 def test_what_cannot_snap_is_refused():
     problem, found, _ = snapped()
     for given, said in (

@@ -199,6 +199,7 @@ def test_the_same_inside_jit_and_differentiable_by_the_lens():
         np.testing.assert_allclose(slope[k], wanted, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_kernels_of_patches_come_from_the_grid():
     made = grid()
     half = np.array(made.half[::-1])

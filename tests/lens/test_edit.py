@@ -47,6 +47,7 @@ DOUBLET = {
 LENS = drt_jax.load_lens(DOUBLET)
 
 
+@pytest.mark.slow
 def test_light_takes_the_same_path_backwards():
     """From where each ray met the sensor, through its point on the stop."""
     other, last = drt_jax.flipped(LENS), LENS.vertices[-2]
