@@ -47,6 +47,7 @@ TOY = {
         "test_patches=3",
     ],
 }
+NAMES = ["focus", *(pytest.param(name, marks=pytest.mark.slow) for name in TOY if name != "focus")]
 KEYS = {
     "focus": {"starts_mm", "final_mm", "best_focus_mm", "batches_to_focus", "seconds"},
     "restore": {"parameters", "starts_mm", "final_mm", "test"},
@@ -91,9 +92,7 @@ def test_every_config_loads_strictly(path):
     assert load_config(kind, path) != load_config(kind, path, [other])
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "restore")) for n in TOY]
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_run_explains_itself(name, unbroken):
     folder = unbroken(name)
     results = json.loads((folder / "results.json").read_text())
@@ -115,7 +114,7 @@ def test_a_run_explains_itself(name, unbroken):
         assert {"mae", "rmse"} <= set(results["table"][0]["fixed"])
 
 
-@pytest.mark.parametrize("name", ["focus", "restore"])
+@pytest.mark.parametrize("name", NAMES[:2])
 def test_an_interrupted_run_resumes_to_the_same_numbers(
     name, unbroken, tmp_path, monkeypatch, capsys
 ):
@@ -196,7 +195,7 @@ def test_of_many_skipped_files_a_few_are_named_and_all_are_listed(tmp_path, caps
     assert len(listed) == 30 and all("8 x 8 pixels, smaller than 24" in line for line in listed)
 
 
-@pytest.mark.parametrize("name", ["focus", "restore", pytest.param("edof", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", NAMES)
 def test_pictures_are_drawn_again_without_the_run(name, unbroken, tmp_path, monkeypatch, capsys):
     """From the results alone: the same pictures to the last byte, and the same tables."""
     folder = tmp_path / "copy"
