@@ -95,7 +95,7 @@ def test_what_cannot_be_shared_is_refused_in_a_line(words, message, tmp_path, ca
 def test_eight_devices_compute_what_one_does():
     """Monte Carlo, searches, kernels and rays in float64; losses and weights in float32."""
     found = json.loads(ended(started(str(HERE / "sharing.py"), count=8)).splitlines()[-1])
-    # Of weights, after some steps of Adam.
+    # Of weights, after some steps.
     assert found.pop("training") < 1e-4 and found.pop("joint_training") < 1e-4
     assert found.pop("starts") < 1e-9
     assert set(found) == {"monte_carlo", "kernels", "rays"} and max(found.values()) < 1e-13

@@ -1,7 +1,8 @@
 """A lens as built: its spots after the sensor has been adjusted.
 
-Squared radii are quadratic in the position of the sensor, so that a small linear system gives the
-compensation of every lens.
+The measure q of a lens is the mean over its fields of the squared RMS radius of the polychromatic
+spot, after optimal compensation. Squared radii are quadratic in the position of the sensor, so that
+a small linear system gives the compensation of every lens.
 """
 
 from typing import Literal, NamedTuple, get_args
@@ -65,7 +66,7 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
 
 def compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
     """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
-    squares add up to those of the RMS radii, mm."""
+    squares add up to those of the RMS radii, mm. `check` comes first."""
     rays = trace_views(lens, problem.views(), problem.solver)
     offsets, growth, (x, y) = _spots(rays)
     # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
@@ -99,11 +100,13 @@ def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
 
 
 def require_known(what: str, word: object, known: tuple[str, ...]) -> None:
+    """ValueError, with the known words, for another."""
     if word not in known:
         raise ValueError(f"{what}: unknown {shown(word)}; known: {', '.join(known)}")
 
 
 def check(problem: Problem, lens: Lens, compensator: str) -> None:
+    """ValueError as in `as_built`."""
     require_known("compensator", compensator, get_args(Compensator))
     has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
     if _SYMMETRIES.index(has) < _SYMMETRIES.index(needs):

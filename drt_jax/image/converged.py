@@ -19,7 +19,7 @@ from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene, field_array, scene_of
 from ..numerics import Numbers, concrete, known_values, real_array
-from ..pupil.clipped import Clipped
+from ..pupil.clipped import Clipped, ClippedGroup
 from ..pupil.rules import (
     Gauss,
     Pattern,
@@ -37,7 +37,7 @@ from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_sensor, weigh
 from .orders import rules_by_order
 from .spot import Moments
-from .tiles import Traced, trace_rule, weigh_rules
+from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
 
 # Smallest spot, mm: below 1 nm rounding would never converge.
 _SMALLEST = 1e-6
@@ -191,7 +191,7 @@ class _Trial(NamedTuple):
 
     rule: the rule.
     used: the rule as it was evaluated, with points of other orders and padding.
-    moments: its moments of each scene.
+    moments: its moments of each scene, NumPy arrays.
     found: its rays of each scene.
     """
 
@@ -284,12 +284,15 @@ def _trace(
 
 
 def _weighed(
-    lens: Lens, scenes: Sequence[Scene], rules: Sequence, rays: Sequence[Traced]
+    lens: Lens,
+    scenes: Sequence[Scene],
+    rules: Sequence[tuple[Gauss | Clipped, Pattern | ClippedGroup]],
+    rays: Sequence[Traced],
 ) -> Iterator[_Trial]:
     """Rules of a group with their moments. ValueError if no light of a wavelength arrives."""
     found = tuple(one.found for one in rays)
-    for start in range(0, len(rules), 3):
-        some = rules[start : start + 3]
+    for start in range(0, len(rules), AT_ONCE):
+        some = rules[start : start + AT_ONCE]
         each = [weigh_rules(lens, [used for _, used in some], one) for one in rays]
         for (rule, used), *moments in zip(some, *each, strict=True):
             for scene, one in zip(scenes, moments, strict=True):

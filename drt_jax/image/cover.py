@@ -15,11 +15,12 @@ from .beam import Beam
 def cover(
     lens: Lens, beam: Beam, stop: Array, hits: Array, places: Array, axes: tuple[Array, Array]
 ) -> Array:
-    """The part of each cell that light fills, (W, N, N).
+    """The part of each cell of a grid of rays that light fills, (W, N, N).
 
-    stop: (2, W, N, N), where they cross the stop. hits: (2 S + 2, W, N, N) on all surfaces, of a
-    clipped beam. places: (2, W, Q) of the beam's rays in the plane of the grid, its points or
-    directions. axes: the middle and the step of the grid, (2, W) each.
+    stop: (2, W, N, N), where the rays of the grid cross the stop, in its semi-diameters.
+    hits: (2 S + 2, W, N, N), where they meet all surfaces, mm, of a clipped beam.
+    places: (2, W, Q), of the beam's rays in the plane of the grid, its points or directions.
+    axes: the middle and the step of the grid, (2, W) each.
     """
     rim = _edge(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
     if not beam.clipped:

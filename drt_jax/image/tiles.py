@@ -21,6 +21,8 @@ from ..rays.system import Vector
 from ..rays.trace import Bundle, aims, bundle_of
 from .moments import FocusMoments, weigh
 
+# Rules that are weighed at once: the orders of a clipped group.
+AT_ONCE = 3
 # Rays of a tile, by their number of stop coordinates. A Gauss rule of 13 nodes fills one.
 _TILE = {1: 42, 2: 208}
 
@@ -75,16 +77,16 @@ def trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> Tra
 def weigh_rules(
     lens: Lens, rules: Sequence[Pattern | ClippedGroup], traced: Traced
 ) -> list[FocusMoments]:
-    """Moments of traced rays by up to three rules with the points of the rule that they were traced
-    for: orders of the group, or patterns."""
+    """Moments, as NumPy arrays, of traced rays by up to `AT_ONCE` rules with the points of the rule
+    that they were traced for: orders of the group, or patterns."""
 
     def own(rule: Pattern | ClippedGroup) -> np.ndarray:
         if isinstance(rule, ClippedGroup):
-            return rule.weigh(lens, traced.weights)
+            return np.where(rule.own(lens)[None], traced.weights, 0)
         return np.asarray(rule.weights, lens.curvature.dtype)[None]
 
-    # Three, so that they share a program.
-    weights = np.stack([own(rules[min(k, len(rules) - 1)]) for k in range(3)])
+    # Always as many, so that they share a program.
+    weights = np.stack([own(rules[min(k, len(rules) - 1)]) for k in range(AT_ONCE)])
     found = jax.tree.map(np.asarray, _weigh(lens, rules[0], weights, traced.bundle))
     return [jax.tree.map(lambda a: a[k], found) for k in range(len(rules))]
 

@@ -32,7 +32,7 @@ class FieldImager:
 
     points: kernels and light of object points, such as a function of `psfs`.
     restore: (weights, images) -> images; None for a camera without a network.
-    convolve: as `convolve_each`, such as `devices.shared(convolve_each, mesh)`.
+    convolve: (scenes, kernels) -> images as `convolve_each`, or that shared by devices.
     """
 
     points: Points

@@ -143,16 +143,14 @@ class ClippedGroup(Fitted):
         (*points, weights) = (
             jnp.concatenate(arrays, axis=-1) for arrays in zip(*((*p, w) for p, w in parts))
         )
-        return tuple(points), self.weigh(lens, weights)
+        return tuple(points), jnp.where(self.own(lens)[None], weights, 0)
 
-    def weigh(self, lens: Lens, weights: Any) -> Any:
-        """Weights (W, Q) of all orders, a NumPy or JAX array, 0 for orders that are not chosen."""
+    def own(self, lens: Lens) -> Any:
+        """Rays of the chosen order, (Q,), bool; NumPy if `chosen` is known."""
         sets = 1 if lens.apertures is None else 2 ** sum(lens.apertures.blocks)
         counts = [sets * n * _most(lens, self.symmetry, n) for n in self.sizes]
-        order = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        chosen: Any = self.chosen
-        own = (chosen < 0) | (order == chosen)
-        return weights * own.astype(weights.dtype)[None]
+        order, chosen = np.repeat(np.arange(len(counts), dtype=np.int32), counts), self.chosen
+        return (order == chosen) | (chosen < 0)  # type: ignore[operator]
 
 
 def _spokes(lens: Lens, symmetry: Symmetry, order: Any) -> Any:

@@ -114,7 +114,7 @@ def test_a_run_explains_itself(name, unbroken):
         assert {"mae", "rmse"} <= set(results["table"][0]["fixed"])
 
 
-@pytest.mark.parametrize("name", NAMES[:2])
+@pytest.mark.parametrize("name", ["focus", pytest.param("restore", marks=pytest.mark.slow)])
 def test_an_interrupted_run_resumes_to_the_same_numbers(
     name, unbroken, tmp_path, monkeypatch, capsys
 ):

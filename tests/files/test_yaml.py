@@ -51,7 +51,8 @@ BUNDLED = {
 }
 # Traced by other tests (these), or like another that is.
 TRACED = {"cooke_triplet", "double_gauss", "double_gauss_addon", "singlet", "hubble"}
-LARGER = {"phone_tele", "heliar_100mm", "dagor_240mm", "telephoto_300mm"} | {
+LARGER = {
+    *("phone_tele", "heliar_100mm", "dagor_240mm", "telephoto_300mm"),
     *("camera_50mm", "hypergon_100mm", "phone", "fisheye_8mm"),
 }
 # Down the stop along y, nearly to its edge (apertures of patents are rounded), and its side.
