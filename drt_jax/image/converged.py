@@ -19,7 +19,7 @@ from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene, field_array, scene_of
 from ..numerics import Numbers, concrete, known_values, real_array
-from ..pupil.clipped import Clipped, ClippedGroup
+from ..pupil.clipped import Clipped
 from ..pupil.rules import (
     Gauss,
     Pattern,
@@ -35,7 +35,7 @@ from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_sensor, weigh
-from .orders import rules_by_order
+from .orders import Group, rules_by_order
 from .spot import Moments
 from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
 
@@ -256,7 +256,7 @@ def _try_orders(
                 check_order(lens)
             if (failing or cut) and not clipped:
                 break
-            for trial in _weighed(lens, scenes, group.rules, rays):
+            for trial in _weighed(lens, scenes, group, rays):
                 trials = [*trials, trial][-3:]
                 changes = (_change(trials[0], later, places) for later in trials[1:])
                 change = max(changes, default=np.inf)
@@ -284,15 +284,12 @@ def _trace(
 
 
 def _weighed(
-    lens: Lens,
-    scenes: Sequence[Scene],
-    rules: Sequence[tuple[Gauss | Clipped, Pattern | ClippedGroup]],
-    rays: Sequence[Traced],
+    lens: Lens, scenes: Sequence[Scene], group: Group, rays: Sequence[Traced]
 ) -> Iterator[_Trial]:
     """Rules of a group with their moments. ValueError if no light of a wavelength arrives."""
     found = tuple(one.found for one in rays)
-    for start in range(0, len(rules), AT_ONCE):
-        some = rules[start : start + AT_ONCE]
+    for start in range(0, len(group.rules), AT_ONCE):
+        some = group.rules[start : start + AT_ONCE]
         each = [weigh_rules(lens, [used for _, used in some], one) for one in rays]
         for (rule, used), *moments in zip(some, *each, strict=True):
             for scene, one in zip(scenes, moments, strict=True):
