@@ -60,20 +60,32 @@ def _known(name: str, value: Any) -> bool:
     return True
 
 
-def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
+def jit_outside(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
     """`jax.jit(function, **keywords)` with the options that the backend knows, asked at the first
-    call. Without any inside of another program or of a derivative, where JAX takes none: these
-    are its `program(False)`."""
+    call. For calls outside of other programs and of derivatives, inside of which JAX takes none."""
 
     @functools.cache
-    def program(outside: bool) -> Callable:
-        options = known_options(wanted) if outside else None
-        return jax.jit(function, compiler_options=options, **keywords)
+    def program() -> Callable:
+        return jax.jit(function, compiler_options=known_options(wanted), **keywords)
 
     @functools.wraps(function)
     def run(*args: Any, **named: Any) -> Any:
-        # Inside `jax.jit` a new array is a tracer, too.
-        return program(concrete((args, named, jnp.zeros(()))))(*args, **named)
+        return program()(*args, **named)
 
     run.program = program  # type: ignore[attr-defined]
+    return run
+
+
+def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
+    """`jit_outside` for calls inside of other programs and of derivatives, too, where it is
+    `jax.jit(function, **keywords)`."""
+    outside = jit_outside(function, wanted, **keywords)
+    inside = jax.jit(function, **keywords)
+
+    @functools.wraps(outside)
+    def run(*args: Any, **named: Any) -> Any:
+        # Inside `jax.jit` a new array is a tracer, too.
+        known = concrete((args, named, jnp.zeros(())))
+        return (outside if known else inside)(*args, **named)
+
     return run

@@ -4,13 +4,23 @@ along their first axis, everything else is copied to every device.
 Source of the terms: JAX's pages on `jax.sharding` and `jax.shard_map`.
 """
 
-from collections.abc import Callable
+import concurrent.futures
+import os
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+
+def in_turn(run: Callable, tasks: Sequence, threads: int | None = None) -> Iterator:
+    """`run(task)` of each task, in order: the first alone, so that one thread compiles it, then by
+    threads, by default one for each CPU core."""
+    yield from map(run, tasks[:1])
+    with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        yield from pool.map(run, tasks[1:])
 
 
 def device_mesh(count: int) -> Mesh:

@@ -51,6 +51,12 @@ def shown(value: object) -> str:
         return f"a {type(value).__name__} of too many digits"
 
 
+def require_one_of(what: str, value: object, known: Iterable[str]) -> None:
+    """ValueError, with the known words, for a value that is none of them."""
+    if value not in (words := [*known]):
+        raise ValueError(f"{what}: expected one of {', '.join(words)}, got {shown(value)}")
+
+
 class Lines(dict[str, int]):
     """The line of each key of a file, keys such as "surfaces[0].radius"."""
 

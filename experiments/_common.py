@@ -134,9 +134,9 @@ def rings(rays: int) -> int:
     return int((math.sqrt(12 * rays - 3) - 3) / 6)
 
 
-def panels(count: int, width: float, height: float) -> tuple[Any, Any]:
-    """A figure with panels in two columns, and their axes."""
-    columns = min(2, count)
+def panels(count: int, width: float, height: float, columns: int = 2) -> tuple[Any, Any]:
+    """A figure with panels in columns, and their axes."""
+    columns = min(columns, count)
     figure, axes = show.new(-(-count // columns), columns, width, height)
     for spare in np.ravel(axes)[count:]:
         spare.set_visible(False)

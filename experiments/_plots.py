@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from drt_jax.show import new
+from drt_jax.show.figures import FIELD_COLOURS
 
 
 def _finished(axes: Axes, xlabel: str, ylabel: str, columns: int = 1) -> Axes:
@@ -19,30 +20,18 @@ def _finished(axes: Axes, xlabel: str, ylabel: str, columns: int = 1) -> Axes:
     return axes
 
 
-def convergence(
+def curves(
     axes: Axes,
-    traces: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    series: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    xlabel: str,
     ylabel: str,
     level: tuple[float, str] | None = None,
 ) -> Axes:
-    """Lines over training batches.
-
-    traces: (x (N,), y (N,)) by label.
-    level: height and label of a horizontal line.
-    """
-    for label, (x, y) in traces.items():
-        axes.plot(x, y, linewidth=1.1, label=label)
-    if level is not None:
-        axes.axhline(level[0], color="black", linestyle=":", linewidth=1, label=level[1])
-    return _finished(axes, "training batch", ylabel)
-
-
-def curves(
-    axes: Axes, series: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, ylabel: str
-) -> Axes:
-    """Lines: (x (N,), y (N,)) by label."""
+    """Lines: (x (N,), y (N,)) by label. level: height and label of a horizontal line."""
     for k, (label, (x, y)) in enumerate(series.items()):
         axes.plot(x, y, linewidth=1.1, linestyle="-" if k < 10 else "--", label=label)
+    if level is not None:
+        axes.axhline(level[0], color="black", linestyle=":", linewidth=1, label=level[1])
     return _finished(axes, xlabel, ylabel)
 
 
@@ -187,9 +176,6 @@ def shares(axes: Axes, rows: Mapping[str, Sequence[float]], names: Sequence[str]
     return axes
 
 
-_COLOURS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
-
-
 def spots(
     axes: Axes, hits: Mapping[str, np.ndarray], covariance: np.ndarray, side: float, title: str
 ) -> Axes:
@@ -199,7 +185,7 @@ def spots(
     covariance: (2, 2), um^2.
     side: side of the square shown, um.
     """
-    for (label, points), colour in zip(hits.items(), _COLOURS * len(hits)):
+    for (label, points), colour in zip(hits.items(), FIELD_COLOURS * len(hits)):
         axes.plot(points[:, 0], points[:, 1], ".", markersize=2, color=colour, label=label)
     variances, directions = np.linalg.eigh(covariance)
     width, height = 2 * np.sqrt(np.maximum(variances, 0))
@@ -276,10 +262,7 @@ def yields(
         style: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
         style |= _DOTS if k % 3 == 2 else {}
         axes.plot(x, share, label=label, **(style if k else _TRUE))
-    axes.set(xlabel=xlabel, ylabel=ylabel)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    return axes
+    return _finished(axes, xlabel, ylabel)
 
 
 def histogram(

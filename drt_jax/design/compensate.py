@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from ..image.spot import deviations, normalised
-from ..inputs import shown
+from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..numerics import concrete, safe_divide, safe_sqrt
 from ..rays.status import Status
@@ -99,15 +99,9 @@ def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
     return compensated(problem, lens, compensator)[0]
 
 
-def require_known(what: str, word: object, known: tuple[str, ...]) -> None:
-    """ValueError, with the known words, for another."""
-    if word not in known:
-        raise ValueError(f"{what}: unknown {shown(word)}; known: {', '.join(known)}")
-
-
 def check(problem: Problem, lens: Lens, compensator: str) -> None:
     """ValueError as in `as_built`."""
-    require_known("compensator", compensator, get_args(Compensator))
+    require_one_of("compensator", compensator, get_args(Compensator))
     has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
     if _SYMMETRIES.index(has) < _SYMMETRIES.index(needs):
         raise ValueError(

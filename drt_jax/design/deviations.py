@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require_one_of
 from ..lens.lens import Lens
 
 # Forms whose first coefficient is the curvature along x.
@@ -70,8 +71,7 @@ class Tolerance:
     which: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"tolerances: unknown kind {self.kind!r}; known: {', '.join(KINDS)}")
+        require_one_of("tolerances: kind", self.kind, KINDS)
         most = KINDS[self.kind].most
         if not 0 < self.size < most:
             below = "" if math.isinf(most) else f" and below {most:g}"

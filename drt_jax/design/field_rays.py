@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..image.spots import direction_determinant
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene
@@ -19,7 +20,7 @@ from ..rays import fermat
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach
 from ..rays.status import Status
-from ..rays.system import Vector, determinant, divide, dot, system_of
+from ..rays.system import Vector, dot, system_of
 from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 
 # The first rays of every view, without weight: the chief ray, and those through the top, bottom and
@@ -250,13 +251,4 @@ def _solid_angles(
     if len(points) == 1:  # on the axis, as the first field
         return jnp.ones_like(points[0])
     _, push = jax.linearize(arriving, points, field)
-    zero, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
-    (hit_x, line_x), (hit_y, line_y) = (push(zero, unit) for unit in units)
-    columns = []
-    for k in range(2):
-        unit = tuple(jnp.full_like(p, float(j == k)) for j, p in enumerate(points))
-        hit, line = push(unit, jnp.zeros_like(field))
-        back = divide(tuple(zip(hit_x, hit_y)), hit)
-        parts = zip(line, line_x, line_y)
-        columns.append([a - back[0] * b - back[1] * c for a, b, c in parts])
-    return determinant(columns)
+    return direction_determinant(push, points, field, fixed=True)

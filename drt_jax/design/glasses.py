@@ -1,15 +1,13 @@
 """Real glasses in place of model glasses, one by one, the least costly first."""
 
-import concurrent.futures
 import dataclasses
-import functools
-import os
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..devices import in_turn
 from ..lens.glass import Glass, nd_and_vd
 from ..lens.glasses import Neighbour, nearest_glasses
 from ..lens.lens import Lens, glass_rows, with_glass
@@ -147,10 +145,7 @@ class _Search:
     ) -> list[_Trial]:
         """All trials in some places, the best first."""
         tasks = [(p, n) for p in places for n in self.neighbours(problem, found.lens, p)]
-        run = functools.partial(self.trial, problem, found.vector)
-        first = run(*tasks[0])  # compiled once, not by all threads
-        with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-            trials = [first, *pool.map(lambda task: run(*task), tasks[1:])]
+        trials = in_turn(lambda task: self.trial(problem, found.vector, *task), tasks)
         return sorted(trials, key=lambda trial: trial.score)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import shown
+from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..numerics import concrete, leaves, safe_sqrt
 from .field_rays import FieldRays
@@ -63,9 +63,8 @@ class Operand:
     at: float | None = None
 
     def __post_init__(self) -> None:
-        if not callable(self.kind) and self.kind not in OPERANDS:
-            some = ", ".join(OPERANDS)
-            raise ValueError(f"operands: unknown kind {shown(self.kind)}; known: {some}")
+        if not callable(self.kind):
+            require_one_of("operands: kind", self.kind, OPERANDS)
         what, known = f"operands: {self.name}", kind_of(self.kind)
         for name in _NUMBERS:
             numbers = whole_numbers(f"{what}: {name}", getattr(self, name))

@@ -174,6 +174,7 @@ def optimise(
     compiled = time.perf_counter()
     _refuse_fixed(tried, search)
     history = [[search.merit, search.max_violation, search.jacobians]]
+    callback(search)
     tried, search = _searched(problem, tried, search)
     for _ in range(max_steps - 1):
         search = take_step(tried, search)

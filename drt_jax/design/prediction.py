@@ -8,8 +8,9 @@ import numpy as np
 from jax import Array
 
 from ..compilation import ONCE, jit
+from ..inputs import require_one_of
 from ..numerics import concrete
-from .compensate import Compensator, check, compensated, require_known
+from .compensate import Compensator, check, compensated
 from .perturbed import PerturbedLens
 from .problem import Problem, quick
 
@@ -40,7 +41,7 @@ class Predicted(NamedTuple):
     def matrix(self, order: Order) -> Array:
         """Matrix (P, P) of an order: 0 for "first", `gauss` for "rays", `hessian` for "second".
         ValueError for another order."""
-        require_known("order", order, get_args(Order))
+        require_one_of("order", order, get_args(Order))
         if order == "first":
             return 0 * self.hessian
         return self.gauss if order == "rays" else self.hessian

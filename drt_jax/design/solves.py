@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from ..image.moments import moments
-from ..inputs import shown
+from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil, marginal_ray, paraxial_system, trace_ray
 from ..lens.scene import scene_of, vergence_of
@@ -73,9 +73,7 @@ class Solve:
     wavelengths: tuple[float, ...] = (0.5875618,)
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(_Name):
-            known = ", ".join(get_args(_Name))
-            raise ValueError(f"solves: unknown kind {shown(self.kind)}; known: {known}")
+        require_one_of("solves: kind", self.kind, get_args(_Name))
         if not math.isfinite(self.value):
             raise ValueError(f"solves: {self.kind}: value: must be finite, got {self.value:g}")
         if self.aperture and self.value < 0:

@@ -1,9 +1,7 @@
 """Many starts: parallel searches with successive halving, and a ranking of their minima."""
 
-import concurrent.futures
 import dataclasses
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -17,7 +15,7 @@ from jax.sharding import Mesh
 from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
-from ..devices import copied, gathered, shared, split
+from ..devices import copied, gathered, in_turn, shared, split
 from ..numerics import Numbers
 from .least_squares import Search
 from .optimum import init_problem, step_problem
@@ -219,13 +217,8 @@ def _advanced(
         for array, part in zip(jax.tree.leaves(state), jax.tree.leaves(new), strict=True):
             array[rows] = part[: len(rows)]
 
-    for tile in tiles[:1]:  # compiled once, not by all threads
-        run(tile)
-        yield
     # Devices that share a tile take the tiles in one order.
-    with concurrent.futures.ThreadPoolExecutor(1 if mesh else threads or os.cpu_count()) as pool:
-        for _ in pool.map(run, tiles[1:]):
-            yield
+    yield from in_turn(run, tiles, 1 if mesh else threads)
 
 
 def _score(state: Search, rows: np.ndarray) -> np.ndarray:

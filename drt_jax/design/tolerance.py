@@ -1,7 +1,5 @@
 """Tolerances: random deviations of a lens, and Monte Carlo with them."""
 
-import concurrent.futures
-import os
 from collections.abc import Callable
 
 import jax
@@ -10,7 +8,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from ..compilation import LARGE, jit
-from ..devices import copied, gathered, shared, split
+from ..devices import copied, gathered, in_turn, shared, split
 from .compensate import AsBuilt, Compensator, check, compensated
 from .perturbed import PerturbedLens
 from .problem import Problem, quick
@@ -107,14 +105,12 @@ def _in_tiles(
         found = gathered(_many(problem, perturbed, whole, compensator, mesh))
         return jax.tree.map(lambda a: a[: len(rows)], found)
 
-    parts, done = [run(tiles[0])], len(tiles[0])  # compiled once, not by all threads
-    callback(done)
+    parts, done = [], 0
     # Devices that share a tile take the tiles in one order.
-    with concurrent.futures.ThreadPoolExecutor(1 if mesh else threads or os.cpu_count()) as pool:
-        for part in pool.map(run, tiles[1:]):
-            parts.append(part)
-            done += len(part.squares)
-            callback(done)
+    for part in in_turn(run, tiles, 1 if mesh else threads):
+        parts.append(part)
+        done += len(part.squares)
+        callback(done)
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import shown
+from ..inputs import require_one_of
 from ..lens.lens import Lens
 from .kinds import KINDS, VariableKind, lift_of, step_of, whole_numbers, word_terms
 from .solves import Solve, fix_solves
@@ -39,11 +39,6 @@ class Place(NamedTuple):
     def __str__(self) -> str:
         term = f"[{self.term}]" if self.kind in ("coefficients", "tilt", "decentre") else ""
         return self.kind if self.kind == "sensor" else f"{self.kind} {self.row}{term}"
-
-
-def _known_kind(what: str, kind: str) -> None:
-    if kind not in KINDS:
-        raise ValueError(f"{what}: unknown kind {shown(kind)}; known: {', '.join(KINDS)}")
 
 
 def _places(
@@ -96,7 +91,7 @@ class Vary:
     semi_diameter: float = 0.0
 
     def __post_init__(self) -> None:
-        _known_kind("variables", self.kind)
+        require_one_of("variables: kind", self.kind, KINDS)
         self._check_sag()
         for name in ("surfaces", "terms"):
             numbers = whole_numbers(f"variables: {self.kind}: {name}", getattr(self, name))
@@ -162,10 +157,8 @@ class Tie:
     shift: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.how not in get_args(_How):
-            known = ", ".join(get_args(_How))
-            raise ValueError(f"ties: unknown how {shown(self.how)}; known: {known}")
-        _known_kind("ties", self.kind)
+        require_one_of("ties: how", self.how, get_args(_How))
+        require_one_of("ties: kind", self.kind, KINDS)
         numbers = whole_numbers("ties: surfaces", self.surfaces)
         object.__setattr__(self, "surfaces", numbers)
         if len(numbers) < 2 or len(set(numbers)) < len(numbers):

@@ -75,10 +75,6 @@ class Surface(NamedTuple):
         return 1 / radius if abs(radius) > 1e-12 else 0.0
 
 
-def _standard(surface: Surface) -> None:
-    pass
-
-
 def _even(surface: Surface) -> None:
     surface.only(*range(1, 9))
     surface.powers({k: 2 * k for k in range(1, 9)})
@@ -208,7 +204,7 @@ def _toroidal_grating(surface: Surface) -> None:
 
 
 TYPES: dict[str, Callable[[Surface], None]] = {
-    "STANDARD": _standard,
+    "STANDARD": lambda surface: None,
     "EVENASPH": _even,
     "ODDASPHE": _odd,
     "TOROIDAL": _toroid,

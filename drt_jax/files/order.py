@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 from ..lens.lens import Lens
-from ..lens.order import crossing, heights, neighbours
+from ..lens.order import crossings, heights, neighbours
 from .entry import LensError
 
 # Prescriptions round semi-diameters: neighbours may cross beyond this fraction of the smaller
@@ -40,16 +40,15 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
             f"surfaces[{i}].thickness",
         )
     semi = np.asarray(lens.semi_diameter)
-    for pair in pairs:
-        i, j, gap = pair
+    rows = zip(pairs, heights(lens, pairs)[1], crossings(lens, pairs), strict=True)
+    for (i, j, gap), sags, place in rows:
         rim = min(semi[i], semi[j])
         if j == lens.count or np.isinf(rim):
             continue
-        finite = [bool(np.all(np.isfinite(sag))) for sag in heights(lens, pair)[1:]]
+        finite = [bool(np.all(np.isfinite(sag))) for sag in sags]
         if not all(finite):
             at = f"surfaces[{j if finite[0] else i}]"
             raise LensError(f"{at}: not finite within {rim:g} mm of the axis; which unit?", at)
-        place = crossing(lens, pair)
         if place is None:
             continue
         message = (

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import re
 import warnings
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -81,6 +82,17 @@ class Record:
         if self.missing == "error":
             raise self.error(line, f'{message}; missing="warn" leaves it out')
         self.notes.append(f"line {line}: left out: {message}")
+
+    def note_unread(self, solves: list[int], unknown: Mapping[str, int], what: str) -> None:
+        """Notes of lines with solves, and of words that are not known. what: kind of the words."""
+        if solves:
+            some = ", ".join(map(str, solves[:5])) + (", ..." if len(solves) > 5 else "")
+            self.notes.append(
+                f"solves and pickups are read as the values beside them, lines {some}"
+            )
+        if unknown:
+            some = ", ".join(f"{key} (line {line})" for key, line in [*unknown.items()][:8])
+            self.notes.append(f"{what} that are not known: {some}")
 
     def say(self) -> None:
         """Issue one warning that lists all notes."""

@@ -182,10 +182,6 @@ def _stop(reader: _Reader, command: Command) -> None:
     reader.stop = reader.at(command.line, named[0]) if named else len(reader.surfaces) - 1
 
 
-def _shape(reader: _Reader, command: Command, surface: Surface) -> None:
-    surface.shape(reader.record, command)
-
-
 def _coefficient(reader: _Reader, command: Command, surface: Surface) -> None:
     value = reader.record.number(command.line, command.values)
     surface.terms[command.key] = command.line, value
@@ -195,10 +191,6 @@ def _special(reader: _Reader, command: Command, surface: Surface) -> None:
     command = command._replace(values=[*command.values])
     key = seq_surfaces.special_key(surface, reader.record, command)
     surface.terms[key] = command.line, reader.record.number(command.line, command.values)
-
-
-def _clip(reader: _Reader, command: Command, surface: Surface) -> None:
-    surface.clips.take(reader.record, command)
 
 
 def _move(reader: _Reader, command: Command, surface: Surface) -> None:
@@ -265,9 +257,9 @@ _SYSTEM: dict[str, Callable[[_Reader, Command], None]] = {
 _OF_SURFACES: dict[str, Callable[[_Reader, Command, Surface], None]] = {
     **dict.fromkeys(("RDY", "CUY", "RDX", "CUX"), _curvature),
     **{"THI": _thickness, "GLA": _glass, "RMD": _glass, "SCO": _special},
-    **dict.fromkeys(seq_surfaces.KINDS, _shape),
+    **dict.fromkeys(seq_surfaces.KINDS, lambda r, command, s: s.shape(r.record, command)),
     **dict.fromkeys(seq_surfaces.COEFFICIENTS, _coefficient),
-    **dict.fromkeys(seq_apertures.KEYS, _clip),
+    **dict.fromkeys(seq_apertures.KEYS, lambda r, command, s: s.clips.take(r.record, command)),
     **dict.fromkeys((*seq_places.KEYS, "DAR", "BEN", "REV"), _move),
     **dict.fromkeys(seq_surfaces.DIFFRACTIVE, _diffract),
 }
@@ -334,12 +326,7 @@ def _finish(reader: _Reader) -> None:
         raise record.error(0, "the stop is no surface of the lens")
     if not reader.stop:
         record.notes.append("no STO: the stop is surface 1")
-    if reader.solves:
-        some = ", ".join(map(str, reader.solves[:5])) + (", ..." if len(reader.solves) > 5 else "")
-        record.notes.append(f"solves and pickups are read as the values beside them, lines {some}")
-    if reader.unknown:
-        some = ", ".join(f"{key} (line {line})" for key, line in [*reader.unknown.items()][:8])
-        record.notes.append(f"commands that are not known: {some}")
+    record.note_unread(reader.solves, reader.unknown, "commands")
     if not reader.fields.wavelengths:
         raise record.error(0, "no wavelength is given: WL, in nm")
     if use.aperture_kind is None:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 
+from ..lens.forms import fringe_terms, noll_terms
 from .record import Record, Row, short
 from .seq_apertures import Clips
 from .seq_places import Place
@@ -213,17 +214,8 @@ def _fringe(surface: Surface, record: Record, unit: float) -> None:
 
 def noll_of_fringe(fringe: int) -> tuple[int, int, int]:
     """Noll's number, n and |m| of a fringe polynomial; fringe: its number, 1 to 37."""
-    if fringe == 37:
-        n, m, sine = 12, 0, False
-    else:
-        half = math.isqrt(fringe - 1)  # (n + m) / 2
-        left = fringe - half * half - 1  # place in this group, from the highest m down
-        m = half - left // 2
-        n, sine = 2 * half - m, m > 0 and left % 2 == 1
-    first = n * (n + 1) // 2 + m + (0 if m else 1)  # the lowest number of this n and m
-    if not m:
-        return first, n, m
-    return next(j for j in (first, first + 1) if (j % 2 == 1) == sine), n, m
+    n, m = fringe_terms()[fringe - 1]
+    return noll_terms(n).index((n, m)) + 1, n, abs(m)
 
 
 _SPECIAL: dict[str, tuple[str, Callable[[Surface, Record, float], None]]] = {

@@ -10,6 +10,7 @@ from ..lens.glasses import find_glass, map_point
 from ..lens.lens import Lens
 from .breaks_out import with_breaks
 from .entry import LensError
+from .exact import number_for
 from .glasses import written_names
 from .media_out import medium_of
 from .model_zmx import to_ours, to_theirs
@@ -79,8 +80,7 @@ def gap_behind(lens: Lens, i: int) -> float:
     if i < lens.count - 1:
         return gaps[i]
     before, sensor = sum(gaps), float(lens.sensor)
-    near = sensor - before + np.arange(-8, 9) * np.spacing(abs(sensor - before))
-    return float(near[np.argmin(np.abs(sum(gaps) + near - sensor))])
+    return number_for(sensor, lambda gap: before + gap, sensor - before)
 
 
 def _surface(lens: Lens, i: int, names: Mapping[str, str]) -> list[str]:
@@ -135,15 +135,9 @@ def _phase(lens: Lens, i: int, row: list[float]) -> list[str]:
     if form != "asphere" or lens.forms[i] != "asphere" or any(row[8:]):
         raise LensError(f"surfaces[{i}].phase: not written to .zmx on this surface: save as .yaml")
     powers = [f"PARM {k + 1} {value!r}" for k, value in enumerate(row[:8])]
-    whole = [_times_turn(value) for value in own]
-    return ["TYPE BINARY_2", f"PARM 0 {order!r}", *powers, *_extra(len(own), 1.0, *whole)]
-
-
-def _times_turn(waves: float) -> float:
-    """The radians that, divided by 2 pi, give `waves` to the last digit, or the nearest to it."""
     turn = 2 * math.pi
-    near = [waves * turn, *(math.nextafter(waves * turn, end) for end in (-math.inf, math.inf))]
-    return min(near, key=lambda value: abs(value / turn - waves))
+    whole = [number_for(value, lambda radians: radians / turn, value * turn) for value in own]
+    return ["TYPE BINARY_2", f"PARM 0 {order!r}", *powers, *_extra(len(own), 1.0, *whole)]
 
 
 def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:

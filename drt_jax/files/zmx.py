@@ -318,12 +318,7 @@ def _finish(reader: _Reader, whole: bool) -> None:
         raise record.error(last.row.line, "SURF without DISZ: is the file cut short?")
     if not whole:
         record.notes.append("no MNUM behind the surfaces: is the file cut short?")
-    if reader.solves:
-        some = ", ".join(map(str, reader.solves[:5])) + (", ..." if len(reader.solves) > 5 else "")
-        record.notes.append(f"solves and pickups are read as the values beside them, lines {some}")
-    if reader.unknown:
-        some = ", ".join(f"{key} (line {line})" for key, line in [*reader.unknown.items()][:8])
-        record.notes.append(f"keywords that are not known: {some}")
+    record.note_unread(reader.solves, reader.unknown, "keywords")
     if first.row.entry.get("curvature") or first.kind != "STANDARD":
         raise record.error(first.row.line, "SURF 0: an object that is not flat")
     if first.thickness is None:

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of
 from ..lens.surface import surface_sag
@@ -136,8 +137,7 @@ def distortion(
 
     Else as `field_curvature`.
     """
-    if mapping not in (known := get_args(Mapping)):
-        raise ValueError(f"mapping: expected one of {', '.join(known)}, got {mapping!r}")
+    require_one_of("mapping", mapping, get_args(Mapping))
     if isinstance(focal_length, str) and focal_length != "fitted":
         raise ValueError(f"focal_length: expected mm, None or 'fitted', got {focal_length!r}")
     dtype = lens.curvature.dtype

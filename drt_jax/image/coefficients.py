@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..lens.forms import fringe_terms, noll_terms
 from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of
 from ..numerics import Numbers
@@ -23,7 +24,7 @@ from ..pupil.patterns import disc
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
 from .wavefront import path_differences
-from .zernike import noll_terms, zernike
+from .zernike import zernike
 
 # Nodes along a radius, and azimuths: no term up to the degree 24 is taken for another.
 _ORDER, _AZIMUTHS = 13, 26
@@ -60,16 +61,6 @@ def zernike_fringe(
     return (
         _coefficients(lens, fields, distance, wavelengths, tuple(rows.tolist())) * scale[None, None]
     )
-
-
-def fringe_terms() -> list[tuple[int, int]]:
-    """(n, m) of the 37 fringe terms, m below 0 for the sines."""
-    found: list[tuple[int, int]] = []
-    for half in range(6):
-        for m in range(half, -1, -1):
-            n = 2 * half - m
-            found += [(n, 0)] if m == 0 else [(n, m), (n, -m)]
-    return [*found, (12, 0)]
 
 
 def _checked(count: int, most: int) -> int:

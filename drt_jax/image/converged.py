@@ -114,7 +114,8 @@ def converged_rule(
     by at most the tolerance: two alone may agree by accident. Warns if no order does. ValueError
     inside a trace, or if no ray arrives.
     """
-    return _converge(lens, field, distance, wavelengths, tolerance, at_sensor).rule
+    seen = field, distance, wavelengths
+    return _converge(scenes_of, lens, seen, tolerance, at_sensor).rule
 
 
 def converged_focus_rule(
@@ -127,7 +128,8 @@ def converged_focus_rule(
     """`converged_rule` for every sensor position: the tolerance also holds where the spot is
     smallest. ValueError as in `focus_moments`."""
     check_sensor(lens)
-    return _converge(lens, field, distance, wavelengths, tolerance, best_focus).rule
+    seen = field, distance, wavelengths
+    return _converge(scenes_of, lens, seen, tolerance, best_focus).rule
 
 
 def at_sensor(spread: np.ndarray) -> list[np.ndarray]:
@@ -153,14 +155,16 @@ def _moments(
 ) -> FocusMoments:
     if not (tolerance is None or rule is None):
         raise ValueError("tolerance and rule: give one of them; a rule has its own precision")
-    scene = scene_of(lens, field, distance, wavelengths)
     if rule is None:
         tolerance = _TOLERANCE if tolerance is None else tolerance
-        trial = _converge(lens, field, distance, wavelengths, tolerance, places)
-        if concrete((lens, scene)):
+        seen = field, distance, wavelengths
+        trial = _converge(_scene, lens, seen, tolerance, places)
+        if concrete((lens, seen)):
             return jax.tree.map(jnp.asarray, trial.moments[0])
         # The rays are known: only weigh and differentiate them.
+        scene = scene_of(lens, field, distance, wavelengths)
         return _weigh_known(lens, scene, trial.used, trial.found[0])
+    scene = scene_of(lens, field, distance, wavelengths)
     require_fit(rule.symmetry, scene.field)
     found = _weigh(lens, scene, rule)
     throughput = known_values(found.throughput)
@@ -201,18 +205,36 @@ class _Trial(NamedTuple):
     found: tuple[Found, ...]
 
 
+def _scene(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> list[Scene]:
+    return [scene_of(lens, field, distance, wavelengths)]
+
+
+def scenes_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> list[Scene]:
+    """A scene of each field at each distance."""
+    lens.check()
+    dtype = lens.curvature.dtype
+    fields = _each(field_array(field, dtype), 2)
+    distances = _each(real_array("distance", distance, dtype), 1)
+    return [scene_of(lens, *pair, wavelengths) for pair in itertools.product(fields, distances)]
+
+
+def _each(values: Array, rank: int) -> list[Array]:
+    """Rows of an array of a rank; for another rank the array itself."""
+    return [*values] if values.ndim == rank and values.size else [values]
+
+
 def _converge(
+    make: Callable[..., list[Scene]],
     lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
+    seen: tuple[Numbers, Numbers, Numbers],
     tolerance: float,
     places: Callable,
 ) -> _Trial:
-    """The rule that meets the tolerance, as tried."""
+    """The rule that meets the tolerance, as tried, for the scenes that `make` makes of fields,
+    distances and wavelengths `seen`."""
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
-    known = known_values((lens, field, distance, wavelengths))
+    known = known_values((lens, seen))
     if known is None:
         raise ValueError(
             "inside jax.jit or jax.vmap the number of rays cannot follow from a tolerance: make "
@@ -221,19 +243,9 @@ def _converge(
         )
     # Outside of any trace, even if this is called inside one: all that follows is known.
     with jax.core.eval_context():
-        lens, field, distance, wavelengths = known
-        lens.check()
-        dtype = lens.curvature.dtype
-        fields = _each(field_array(field, dtype), 2)
-        distances = _each(real_array("distance", distance, dtype), 1)
-        pairs = itertools.product(fields, distances)
-        scenes = [scene_of(lens, one, far, wavelengths) for one, far in pairs]
-        return _try_orders(lens, scenes, symmetry_of(lens, field), tolerance, places)
-
-
-def _each(values: Array, rank: int) -> list[Array]:
-    """Rows of an array of a rank; for another rank the array itself."""
-    return [*values] if values.ndim == rank and values.size else [values]
+        lens, seen = known
+        symmetry = symmetry_of(lens, seen[0])
+        return _try_orders(lens, make(lens, *seen), symmetry, tolerance, places)
 
 
 def _try_orders(

@@ -19,6 +19,7 @@ from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
 from .moments import FocusMoments, moments
 from .spot import Moments
+from .zernike import chebyshev
 
 _MAX_NODES = 64
 # Relative amount by which a distance may exceed its range: 1 / (1 / far) is not always far.
@@ -49,10 +50,7 @@ class DepthMoments:
         low, high = 1 / self.far, 1 / self.near
         x = (2 * vergence_of(far) - high - low) / (high - low)
         count = self.series.mean.shape[0]
-        terms = [jnp.ones_like(x), x]
-        while len(terms) < count:
-            terms.append(2 * x * terms[-1] - terms[-2])
-        basis = jnp.stack(terms[:count])
+        basis = chebyshev(x, count - 1)[0]
         return jax.tree.map(lambda c: jnp.tensordot(basis, c, axes=1), self.series)
 
 

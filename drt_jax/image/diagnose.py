@@ -9,7 +9,7 @@ from jax import Array
 from ..compilation import ONCE, jit
 from ..lens.clearance import clipping_surface
 from ..lens.lens import Lens
-from ..lens.order import crossing, describe_crossing, neighbours_now
+from ..lens.order import crossings, describe_crossing, neighbours_now
 from ..lens.scene import Scene
 from ..pupil.rules import PupilRule
 from ..rays.aim import beam_size, paraxial_launch
@@ -54,8 +54,9 @@ def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, wavelength:
 
 def crossed(lens: Lens) -> str:
     """The surfaces of a known lens that cross, as text after a semicolon; "" if none do."""
-    pairs = [(pair, crossing(lens, pair)) for pair in neighbours_now(lens)]
-    parts = [describe_crossing(lens, pair, place) for pair, place in pairs if place is not None]
+    pairs = neighbours_now(lens)
+    places = zip(pairs, crossings(lens, pairs), strict=True)
+    parts = [describe_crossing(lens, pair, place) for pair, place in places if place is not None]
     return "".join(f"; {part}" for part in parts[:_PARTS])
 
 

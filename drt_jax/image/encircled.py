@@ -23,7 +23,7 @@ from ..pupil.rules import PupilRule
 from .beam import Beam, beam_rule, trace_beam
 from .ray_psf import below, ray_spots
 from .transfer import Model, arrays_of, centre_of, through_focus
-from .wave_psf import autocorrelation, period, pupil_function
+from .wave_psf import amplitudes, autocorrelation, period
 
 _UM = 1e3  # per mm
 _DEGREE, _CELLS = 14, 128
@@ -132,7 +132,7 @@ def _of_waves(
     lens: Lens, beam: Beam, wavelengths: Array, radii: Array, centre: Array, cells: int
 ) -> Array:
     """(W, N)."""
-    amplitude, step = pupil_function(lens, beam, wavelengths, cells)
+    amplitude, step = amplitudes(lens, beam, wavelengths, cells)
     # One half of all frequencies; the other has the conjugate values.
     transfer = autocorrelation(amplitude)
     unit = step * (beam.index * _UM / wavelengths)[None]

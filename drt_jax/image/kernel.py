@@ -9,7 +9,9 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import erf
 
-from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
+from ..inputs import require_one_of
+from ..numerics import Numbers, concrete, real_array, safe_sqrt
+from .spot import normalised
 
 Form = Literal["integrated", "sampled"]
 
@@ -113,9 +115,9 @@ def _gaussian(
         edges = jnp.arange(size + 1, dtype=dtype)[None, None] - size / 2
         kernel = _integrated(edges - mean[..., None], covariance)
         if whole and isinstance(kernel, SeparableKernel):
-            kernel = SeparableKernel(*(_normalised(part, (-1,)) for part in kernel))
+            kernel = SeparableKernel(*(normalised(part, (-1,)) for part in kernel))
         elif whole:
-            kernel = _normalised(jnp.asarray(kernel), (-2, -1))
+            kernel = normalised(jnp.asarray(kernel), (-2, -1))
     return jax.tree.map(lambda k: jnp.where(jnp.expand_dims(void, range(1, k.ndim)), 0, k), kernel)
 
 
@@ -124,8 +126,7 @@ def _checked(
 ) -> tuple[Array, Array, Array]:
     """Checks the arguments of `gaussian_psf`, and returns centroids, covariances and pixel as
     arrays of one dtype."""
-    if form not in get_args(Form):
-        raise ValueError(f"form: expected 'integrated' or 'sampled', got {form!r}")
+    require_one_of("form", form, get_args(Form))
     floating = jnp.issubdtype(getattr(mean, "dtype", int), jnp.floating)
     dtype = jnp.result_type(mean) if floating else jnp.result_type(float)
     given: dict[str, Numbers] = {"mean": mean, "covariance": covariance}
@@ -160,10 +161,6 @@ def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> 
             um = f"if it is {known:g} um, give {1e-3 * known:g}"
             warnings.warn(f"pixel: {known:g} mm is a large one; {um}", stacklevel=stacklevel)
     return side, int(size)
-
-
-def _normalised(kernel: Array, axes: tuple[int, ...]) -> Array:
-    return safe_divide(kernel, jnp.sum(kernel, axis=axes, keepdims=True))
 
 
 def _standardise(offset: Array, variance: Array) -> tuple[Array, Array]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 import warnings
 from typing import Literal, cast, get_args
 
@@ -12,14 +11,15 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, ONCE, jit
+from ..inputs import require_one_of
 from ..lens.lens import Lens
-from ..lens.scene import Scene, field_array, scene_of
-from ..numerics import Numbers, known_values, real_array
+from ..lens.scene import Scene
+from ..numerics import Numbers, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import symmetry_of
 from .beam import Beam, BeamRule, beam_rule, trace_beam
 from .beam_psf import Kind, PsfModel, psf_of_beam
-from .converged import converged_rule
+from .converged import converged_rule, scenes_of
 from .kernel import check_pixels
 from .wave_psf import period
 from .zernike import zernike
@@ -63,12 +63,7 @@ def converged_psf(
         lens, field, distance, wavelengths, pixel = known
         dtype = lens.curvature.dtype
         side, size = check_pixels(pixel, size, dtype)
-        fields = field_array(field, dtype)
-        distances = real_array("distance", distance, dtype)
-        pairs = itertools.product(
-            fields if fields.ndim == 2 else [fields], distances if distances.ndim else [distances]
-        )
-        scenes = [scene_of(lens, one, far, wavelengths) for one, far in pairs]
+        scenes = scenes_of(lens, field, distance, wavelengths)
         base = converged_rule(lens, field, distance, wavelengths, min(tolerance, 1e-3))
         clipped = base if isinstance(base, Clipped) else None
         symmetry = symmetry_of(lens, field)
@@ -93,8 +88,7 @@ def converged_psf(
 
 
 def _check_asked(model: str, tolerance: float, norm: int) -> None:
-    if model not in (names := (*get_args(Kind), "auto")):
-        raise ValueError(f"model: expected one of {', '.join(names)}, got {model!r}")
+    require_one_of("model", model, (*get_args(Kind), "auto"))
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
     if norm not in (1, 2):

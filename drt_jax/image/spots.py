@@ -15,6 +15,7 @@ follows; Slater, Remote Sensing (1980), for the cone at a point of the sensor.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import jax
@@ -23,6 +24,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.order import may_cross
 from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
@@ -225,8 +227,7 @@ def _light(
     point: Point,
 ) -> _Light:
     """The light of the axis and of all fields."""
-    if point not in (known := get_args(Point)):
-        raise ValueError(f"point: expected one of {', '.join(known)}, got {point!r}")
+    require_one_of("point", point, get_args(Point))
     angles = fields_array(fields, lens.curvature.dtype)
     axis = scene_of(lens, 0.0, distance, wavelengths)
     if rule is None:
@@ -256,7 +257,7 @@ def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: boo
         return (hit, line), (bundle.status, rule.transmission(lens, bundle))
 
     (hit, _), push, (status, passes) = jax.linearize(arriving, points, field, has_aux=True)
-    area = np.pi * jnp.abs(_determinant(push, points, field, fixed))[:, :count]
+    area = np.pi * jnp.abs(direction_determinant(push, points, field, fixed))[:, :count]
     weight = weights * passes[:, :count]
     throughput, cone = jnp.sum(weight, axis=-1), jnp.sum(weight * area, axis=-1)
     arrives = status == Status.OK
@@ -291,9 +292,10 @@ def _whole_rule(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Arra
     return tuple(jnp.concatenate(pair, axis=-1) for pair in joined), weights
 
 
-def _determinant(push, points: Vector, field: Array, fixed: bool) -> Array:
-    """|dl / dp| (W, Q), of the object point or, `fixed`, of the point on the sensor: where that
-    stays the field moves by -h_f^-1 h_p, so that it is l_p - l_f h_f^-1 h_p."""
+def direction_determinant(push: Callable, points: Vector, field: Array, fixed: bool) -> Array:
+    """Determinants dl / dp (W, Q), of the object point or, `fixed`, of the point on the sensor:
+    where that stays the field moves by -h_f^-1 h_p, so that it is l_p - l_f h_f^-1 h_p.
+    push: derivatives of hits and directions by points and field."""
     zero, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
     sides = [tuple(jnp.full_like(p, float(j == k)) for j, p in enumerate(points)) for k in range(2)]
     columns = []

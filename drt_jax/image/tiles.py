@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from ..compilation import LARGE, jit
+from ..compilation import LARGE, jit_outside
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..pupil.clipped import ClippedGroup, Fitted
@@ -91,16 +91,16 @@ def weigh_rules(
     return [jax.tree.map(lambda a: a[k], found) for k in range(len(rules))]
 
 
-@partial(jit, wanted=LARGE)
+@partial(jit_outside, wanted=LARGE)
 def _points(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
     return rule.points(lens, scene)
 
 
-@partial(jit, wanted=LARGE, static_argnames="solver")
+@partial(jit_outside, wanted=LARGE, static_argnames="solver")
 def _trace(lens: Lens, scene: Scene, points: Vector, solver: Solver) -> tuple[Bundle, Found]:
     system, target = aims(lens, scene, points)
     found = solver(system, target)
     return bundle_of(lens, scene, system, target, found), found
 
 
-_weigh = jit(jax.vmap(weigh, (None, None, 0, None)), LARGE)
+_weigh = jit_outside(jax.vmap(weigh, (None, None, 0, None)), LARGE)

@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
 from ..numerics import Numbers, real_array, safe_divide, safe_sqrt
@@ -26,6 +27,7 @@ from .beam import Beam, beam_rule, trace_beam
 from .cover import cover
 from .spot import normalised
 from .spots import light_rule
+from .wave_psf import pupil_function
 
 Model = Literal["waves", "rays"]
 _UM = 1e3  # per mm
@@ -101,8 +103,7 @@ def arrays_of(
     """Arguments of `transfer` and of `encircled_energy`, checked, as arrays: fields (F, 2), scene
     of the axis, places (N,), spectrum (W,), focus () or (Z,), and the rule. scene: fields, distance
     and wavelengths. name: of the places, for messages."""
-    if model not in (known := get_args(Model)):
-        raise ValueError(f"model: expected one of {', '.join(known)}, got {model!r}")
+    require_one_of("model", model, get_args(Model))
     dtype = lens.curvature.dtype
     axis, angles = scene_of(lens, 0.0, *scene[1:]), fields_array(scene[0], dtype)
     values, steps = real_array(name, places, dtype), real_array("focus", focus, dtype)
@@ -253,29 +254,6 @@ def _of_rays(
 
     otf = jnp.moveaxis(jax.lax.map(at, frequencies), (0, 1, 2), (2, 1, 0))
     return otf, jnp.ones(otf.shape, hits.dtype)
-
-
-def pupil_function(
-    lens: Lens, beam: Beam, wavelengths: Array, cells: int
-) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
-    """A function of the middle and the step of a grid of directions, (2, W) each: the light a unit
-    of directions, the part of cells that it fills, and phases, (W, N, N)."""
-    functions, side = beam.over_directions(), np.arange(cells) - (cells - 1) / 2
-    turns = (2 * jnp.pi * _UM / wavelengths)[:, None, None]
-
-    def pupil(middle: Array, step: Array) -> tuple[Array, Array, Array]:
-        start = (middle - functions.centre) / functions.scale
-        found = functions.on_grid(start, step / functions.scale, side, slice(1, 3))
-        values, by_x, by_y = found
-        (ax, ay), (bx, by) = (
-            [d[k] / functions.scale[i][:, None, None] for k in (0, 1)]
-            for i, d in enumerate((by_x, by_y))
-        )
-        axes = middle, step
-        inside = cover(lens, beam, values[1:3], values[3:], beam.direction[:2], axes)
-        return jnp.abs(ax * by - ay * bx), inside, turns * values[0]
-
-    return pupil
 
 
 def _of_waves(

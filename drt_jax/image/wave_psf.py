@@ -10,6 +10,7 @@ Express 15, 15935 (2007) for the product.
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +42,7 @@ def wave_kernel(
     mean of their amplitude. So a kernel lacks a fraction (pi x / period)^2 / 3 of the light that
     edges diffract to the distance x: with 128 cells 1.5e-3 of Airy's light within half a period.
     """
-    amplitude, step = pupil_function(lens, beam, wavelengths, cells)
+    amplitude, step = amplitudes(lens, beam, wavelengths, cells)
     transfer = autocorrelation(amplitude)
     lags = np.fft.fftfreq(2 * cells, 1 / (2 * cells))
     # Waves of the differences of two directions, cycles a mm: (2, W, 2 N).
@@ -74,24 +75,36 @@ def _grid(beam: Beam, cells: int) -> tuple[Array, Array]:
     return (low + high) / 2, (high - low) / cells
 
 
-def pupil_function(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tuple[Array, Array]:
+def pupil_function(
+    lens: Lens, beam: Beam, wavelengths: Array, cells: int
+) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
+    """A function of the middle and the step of a grid of directions, (2, W) each: pi times the
+    light a unit of directions, the part of cells that it fills, and phases, (W, N, N)."""
+    functions, side = beam.over_directions(), np.arange(cells) - (cells - 1) / 2
+    turns = (2 * jnp.pi * _UM / wavelengths)[:, None, None]
+
+    def pupil(middle: Array, step: Array) -> tuple[Array, Array, Array]:
+        start = (middle - functions.centre) / functions.scale
+        found = functions.on_grid(start, step / functions.scale, side, slice(1, 3))
+        values, by_x, by_y = found
+        (ax, ay), (bx, by) = (
+            [d[k] / functions.scale[i][:, None, None] for k in (0, 1)]
+            for i, d in enumerate((by_x, by_y))
+        )
+        axes = middle, step
+        inside = cover(lens, beam, values[1:3], values[3:], beam.direction[:2], axes)
+        return jnp.abs(ax * by - ay * bx), inside, turns * values[0]
+
+    return pupil
+
+
+def amplitudes(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tuple[Array, Array]:
     """Amplitudes (W, cells, cells) [y, x] on a regular grid of direction cosines, whose squares are
     the light a unit of their area, and the step of the grid, (2, W)."""
-    functions = beam.over_directions()
     middle, step = _grid(beam, cells)
-    side = np.arange(cells) - (cells - 1) / 2
-    values, by_x, by_y = functions.on_grid(
-        (middle - functions.centre) / functions.scale, step / functions.scale, side, slice(1, 3)
-    )
-    path, stop = values[0], values[1:3]
-    # The light of a part of the stop goes into a part of the directions.
-    (ax, ay), (bx, by) = by_x, by_y
-    part = functions.scale[0] * functions.scale[1] * jnp.pi
-    density = jnp.abs(ax * by - ay * bx) / part[:, None, None]
-    inside = cover(lens, beam, stop, values[3:], beam.direction[:2], (middle, step))
-    amplitude = safe_sqrt(density) * inside
-    phase = path * (2 * jnp.pi * _UM / wavelengths)[:, None, None]
-    return jax.lax.complex(amplitude * jnp.cos(phase), amplitude * jnp.sin(phase)), step
+    light, inside, phase = pupil_function(lens, beam, wavelengths, cells)(middle, step)
+    size = safe_sqrt(light / jnp.pi) * inside
+    return jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase)), step
 
 
 def autocorrelation(amplitude: Array) -> Array:

@@ -20,7 +20,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.paraxial import chief_ray_at_image
+from ..lens.paraxial import chief_ray, paraxial_system
 from ..lens.scene import Scene, scene_of
 from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
 from ..rays.status import Status
@@ -49,7 +49,7 @@ def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
     """1 / distance from the paraxial exit pupil to the sensor along the light, (W,), 1/mm: positive
     for a pupil in front of the sensor, 0 for a telecentric lens. Tilts and decentres are neglected.
     wavelengths: (W,), um."""
-    height, slope = chief_ray_at_image(lens, wavelengths)
+    height, slope = chief_ray(paraxial_system(lens, wavelengths), front=False)
     at_sensor = height + slope * (lens.sensor - lens.vertices[-2])
     return safe_divide(slope * jnp.asarray(lens.senses[-1], slope.dtype), at_sensor)
 

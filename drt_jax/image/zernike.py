@@ -15,20 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..lens.forms import noll_terms
+
 # Normal equations are solved to this many last digits of their largest element.
 _RIDGE = 16
-
-
-@functools.cache
-def noll_terms(degree: int) -> tuple[tuple[int, int], ...]:
-    """(n, m) of the terms up to a degree in Noll's order, m below 0 for the sines."""
-    terms: list[tuple[int, int]] = []
-    for n in range(degree + 1):
-        for m in range(n % 2, n + 1, 2):
-            # An even number stands for a cosine, and the first of a pair is number len + 1.
-            pair = [0] if m == 0 else [m, -m] if len(terms) % 2 else [-m, m]
-            terms += [(n, k) for k in pair]
-    return tuple(terms)
 
 
 def zernike(points: Array, degree: int) -> Array:
@@ -95,10 +85,10 @@ class Polynomials:
         """The functions (D, W, N, N), [y, x], and the derivatives of `slopes` of them by u in x and
         in y, where u is start + step side for both components: start, step (2, W), side (N,)."""
         dtype = self.coefficients.dtype
-        square = jnp.asarray(_to_chebyshev(self.degree), dtype)
+        square = jnp.asarray(_tochebyshev(self.degree), dtype)
         terms = jnp.einsum("wdp,pij->wdij", self.coefficients, square)
         u = start[..., None] + step[..., None] * jnp.asarray(side, dtype)[None, None]
-        (x, dx), (y, dy) = (_chebyshev(part / _EDGE, self.degree) for part in u)
+        (x, dx), (y, dy) = (chebyshev(part / _EDGE, self.degree) for part in u)
 
         def product(terms: Array, a: Array, b: Array) -> Array:
             return jnp.moveaxis(jnp.einsum("wdij,iwx,jwy->wdyx", terms, a, b), 0, 1)
@@ -107,7 +97,7 @@ class Polynomials:
         return product(terms, x, y), product(some, dx, y), product(some, x, dy)
 
 
-def _chebyshev(t: Array, degree: int) -> tuple[Array, Array]:
+def chebyshev(t: Array, degree: int) -> tuple[Array, Array]:
     """T_k(t) and their derivatives, (degree + 1, ...)."""
     values, slopes = [jnp.ones_like(t), t], [jnp.zeros_like(t), jnp.ones_like(t)]
     for _ in range(degree - 1):
@@ -121,7 +111,7 @@ _EDGE = 1.25
 
 
 @functools.cache
-def _to_chebyshev(degree: int) -> np.ndarray:
+def _tochebyshev(degree: int) -> np.ndarray:
     """(P, degree + 1, degree + 1): each term as a sum of products T_i(x / _EDGE) T_j(y / _EDGE)."""
     nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
     rows = np.polynomial.chebyshev.chebvander(nodes, degree).T * 2 / (degree + 1)

@@ -64,3 +64,9 @@ def adam(
 def apply_updates(parameters: Any, updates: Any) -> Any:
     """Parameters + updates, leaf by leaf, each in its own dtype."""
     return jax.tree.map(lambda p, u: p + u.astype(p.dtype), parameters, updates)
+
+
+def copied(parameters: Any) -> Any:
+    """A copy, because the first step overwrites the buffers; with an explicit dtype, because
+    weakly typed parameters would compile the step again."""
+    return jax.tree.map(lambda p: jnp.array(p, jnp.asarray(p).dtype), parameters)

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from ..compilation import NETWORK, known_options
 from ..image.sensor import convolve_each
 from ..numerics import Numbers
-from .adam import adam, apply_updates
+from .adam import adam, apply_updates, copied
 
 # From optics and what is seen to kernels (P, C, K, K) and the light (P, C) on the sensor, relative
 # to a constant of the camera.
@@ -156,7 +156,7 @@ def make_field_step(
     init_adam, update = adam(rates)
 
     def init(parameters: dict[str, Any]) -> tuple[Any, Any]:
-        parameters = _copied(parameters)
+        parameters = copied(parameters)
         return parameters, init_adam(parameters)
 
     def step(state: tuple[Any, Any], scenes: Array, noise: Array, index: Array):
@@ -212,7 +212,7 @@ def make_damped_step(
     init_adam, update = adam({"network": rates["network"]})
 
     def init(parameters: dict[str, Any]) -> tuple[Any, Any, _Newton]:
-        parameters = _copied(parameters)
+        parameters = copied(parameters)
         vector = ravel_pytree(parameters["optics"])[0]
         empty = _Newton(0 * vector, jnp.zeros((vector.size,) * 2, vector.dtype))
         return parameters, init_adam(_weights(parameters)), empty
@@ -257,9 +257,3 @@ def _drawn(
 
 def _weights(parameters: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in parameters.items() if name != "optics"}
-
-
-def _copied(parameters: Any) -> Any:
-    """A copy, because the first step overwrites the buffers; with an explicit dtype, because
-    weakly typed parameters would compile the step again."""
-    return jax.tree.map(lambda p: jnp.array(p, jnp.asarray(p).dtype), parameters)

@@ -15,7 +15,7 @@ from ..image.kernel import Form, gaussian_psf, separable_psf
 from ..image.sensor import Convolve, convolve, sensor_layer
 from ..image.spot import Moments
 from ..numerics import Numbers, safe_divide, safe_sqrt
-from .adam import adam, apply_updates
+from .adam import adam, apply_updates, copied
 from .network import count_parameters
 
 Blur = Callable[[dict[str, Array], Array], Moments]
@@ -127,9 +127,7 @@ def make_step(
     near, far = depths
 
     def init(parameters: dict[str, Any]) -> tuple[Any, Any]:
-        # A copy, because the first step overwrites the buffers; with an explicit dtype, because
-        # weakly typed parameters would compile the step again.
-        parameters = jax.tree.map(lambda p: jnp.array(p, jnp.asarray(p).dtype), parameters)
+        parameters = copied(parameters)
         make = jax.vmap(init_adam) if vectorised else init_adam
         return parameters, make(parameters)
 

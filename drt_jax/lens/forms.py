@@ -148,6 +148,28 @@ def linear(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 
 @functools.cache
+def noll_terms(degree: int) -> tuple[tuple[int, int], ...]:
+    """(n, m) of the terms up to a degree in Noll's order, m below 0 for the sines."""
+    terms: list[tuple[int, int]] = []
+    for n in range(degree + 1):
+        for m in range(n % 2, n + 1, 2):
+            # An even number stands for a cosine, and the first of a pair is number len + 1.
+            pair = [0] if m == 0 else [m, -m] if len(terms) % 2 else [-m, m]
+            terms += [(n, k) for k in pair]
+    return tuple(terms)
+
+
+def fringe_terms() -> list[tuple[int, int]]:
+    """(n, m) of the 37 fringe terms, m below 0 for the sines."""
+    found: list[tuple[int, int]] = []
+    for half in range(6):
+        for m in range(half, -1, -1):
+            n = 2 * half - m
+            found += [(n, 0)] if m == 0 else [(n, m), (n, -m)]
+    return [*found, (12, 0)]
+
+
+@functools.cache
 def _noll(count: int) -> tuple[list[tuple[int, int]], np.ndarray]:
     """Powers (i, j), and the coefficient of x^i y^j in each of the first `count` Zernike
     polynomials.
@@ -155,11 +177,12 @@ def _noll(count: int) -> tuple[list[tuple[int, int]], np.ndarray]:
     Noll's order and norm (J. Opt. Soc. Am. 66, 207 (1976)): the mean square over the disc is 1,
     even numbers go with cos(m theta), odd ones with sin.
     """
-    orders = sorted((n, abs(m)) for n in range(count) for m in range(-n, n + 1, 2))
-    pairs = [(0, 0), *powers_xy(sum(range(2, orders[count - 1][0] + 2)))]
+    degree = next(n for n in range(count) if (n + 1) * (n + 2) >= 2 * count)
+    pairs = [(0, 0), *powers_xy(sum(range(2, degree + 2)))]
     table = np.zeros((len(pairs), count))
-    for k, (n, m) in enumerate(orders[:count]):
-        norm, sine = math.sqrt((n + 1) * (2 if m else 1)), m > 0 and k % 2 == 0
+    for k, (n, sign) in enumerate(noll_terms(degree)[:count]):
+        m, sine = abs(sign), sign < 0
+        norm = math.sqrt((n + 1) * (2 if m else 1))
         for s in range((n - m) // 2 + 1):
             radial = (-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, (n - m) // 2 - s)
             rest = (n - m) // 2 - s  # r^(n - 2 s) is (x^2 + y^2)^rest r^m

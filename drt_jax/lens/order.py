@@ -1,7 +1,8 @@
 """Neighbouring surfaces that cross, so that light would have to go backwards."""
 
 import itertools
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -12,6 +13,8 @@ from .surface import surface_sag
 
 # Overlap at the rims that counts as touching, mm: apertures of prescriptions are rounded.
 _TOUCH = 1e-4
+# Heights where sags are compared, and surfaces at once: so lenses share compiled programs.
+_HEIGHTS, _TOGETHER = 257, 32
 _sag = jax.jit(surface_sag, static_argnums=2)
 
 
@@ -48,30 +51,39 @@ def neighbours(lens: Lens, gaps: list[float], moved: list[bool]) -> list[Pair]:
     ]
 
 
-def heights(lens: Lens, pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heights from the axis up to the smaller semi-diameter, and the sags of both surfaces there,
-    mm."""
+def heights(lens: Lens, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
+    """Heights (P, Y) from the axis up to the smaller semi-diameter of each of P pairs, and the sags
+    (P, 2, Y) of both surfaces there, mm. Pairs without apertures have heights 0 alone."""
+    rows = np.array([pair[:2] for pair in pairs], int).reshape(-1, 2)
     semi = np.asarray(lens.semi_diameter)
-    y = np.linspace(0, min(semi[pair.first], semi[pair.second]), 257, dtype=semi.dtype)
-    arrays = [np.asarray(a) for a in (lens.curvature, lens.conic, lens.coefficients)]
-    front, back = (
-        np.asarray(_sag((0 * y, y), Shape(*(a[k] for a in arrays)), lens.forms[k]))
-        for k in pair[:2]
-    )
-    return y, front, back
+    rim = np.min(semi[rows], axis=1)
+    y = np.linspace(0, np.where(np.isinf(rim), 0, rim), _HEIGHTS, axis=1, dtype=semi.dtype)
+    arrays: list[Any] = [
+        np.asarray(a)[..., None] for a in (lens.curvature, lens.conic, lens.coefficients)
+    ]
+    sags = np.zeros((*rows.shape, _HEIGHTS), semi.dtype)
+    forms = np.array(lens.forms)[rows]
+    for form in set(lens.forms):
+        places = np.argwhere(forms == form)
+        for start in range(0, len(places), _TOGETHER):
+            pair, end = np.resize(places[start : start + _TOGETHER], (_TOGETHER, 2)).T
+            curvature, conic, terms = arrays
+            k = rows[pair, end]
+            shape = Shape(curvature[k], conic[k], np.moveaxis(terms[k], 1, 0))
+            sags[pair, end] = _sag((0 * y[pair], y[pair]), shape, form)
+    return y, sags
 
 
-def crossing(lens: Lens, pair: Pair) -> float | None:
-    """Smallest height at which two neighbours cross inside both apertures, mm; 0 if their vertices
-    are in the wrong order, None if they do not cross."""
-    if pair.gap <= 0:
-        return 0.0
-    rims = np.asarray(lens.semi_diameter)[[pair.first, pair.second]]
-    if pair.second == lens.count or np.all(np.isinf(rims)):
-        return None
-    y, front, back = heights(lens, pair)
-    crossed = lens.senses[pair.second] * (front - back) - pair.gap > _TOUCH
-    return float(y[np.argmax(crossed)]) if np.any(crossed) else None
+def crossings(lens: Lens, pairs: Sequence[Pair]) -> list[float | None]:
+    """For each pair the smallest height at which the neighbours cross inside both apertures, mm; 0
+    if their vertices are in the wrong order, None if they do not cross."""
+    semi, found = np.asarray(lens.semi_diameter), []
+    for pair, y, (front, back) in zip(pairs, *heights(lens, pairs), strict=True):
+        crossed = lens.senses[pair.second] * (front - back) - pair.gap > _TOUCH
+        limited = pair.second < lens.count and not np.all(np.isinf(semi[[*pair[:2]]]))
+        place = float(y[np.argmax(crossed)]) if limited and np.any(crossed) else None
+        found.append(0.0 if pair.gap <= 0 else place)
+    return found
 
 
 def may_cross(lens: Lens) -> bool:
@@ -81,7 +93,7 @@ def may_cross(lens: Lens) -> bool:
     if len(pairs) < max(len(lens.active), 1):
         return True
     open_ones = (np.all(np.isinf(semi[list(pair[:2])])) for pair in pairs[:-1])
-    return any(open_ones) or any(crossing(lens, pair) is not None for pair in pairs)
+    return any(open_ones) or any(p is not None for p in crossings(lens, pairs))
 
 
 def neighbours_now(lens: Lens) -> list[Pair]:
@@ -93,7 +105,7 @@ def neighbours_now(lens: Lens) -> list[Pair]:
 
 
 def describe_crossing(lens: Lens, pair: Pair, place: float) -> str:
-    """A sentence that two neighbours cross. place: height where they do, see `crossing`, mm."""
+    """A sentence that two neighbours cross. place: height where they do, see `crossings`, mm."""
     second = "the sensor" if pair.second == lens.count else f"surface {pair.second}"
     where = f"from {place:.3g} mm off the axis on" if place else "on the axis"
     return f"surface {pair.first} and {second} cross {where}: {pair.gap:.4g} mm between them"

@@ -185,11 +185,6 @@ def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
     return (-height, slope) if front else (height, slope)
 
 
-def chief_ray_at_image(lens: Lens, wavelengths: Numbers) -> tuple[Array, Array]:
-    """`chief_ray` behind the last vertex. wavelengths: (W,), um."""
-    return chief_ray(paraxial_system(lens, wavelengths), front=False)
-
-
 def _pupil(system: ParaxialSystem, front: bool) -> Pupil:
     height, slope = chief_ray(system, front)
     # n u times the size of the pupil is the Lagrange invariant.

@@ -97,10 +97,14 @@ class RadialRule:
     most: tuple[int, ...]
 
     @property
+    def together(self) -> int:
+        """Number of rays that are searched for at once, and of even spokes."""
+        return {"rotational": sum(self.most), "bilateral": 33, "none": 65}[self.symmetry]
+
+    @property
     def count(self) -> int:
-        """B, number of spokes: those of all orders, and some for the search alone."""
-        few = {"rotational": 0, "bilateral": 32, "none": 64}[self.symmetry]
-        return max(sum(self.most), few) + 1
+        """B, number of spokes: those of all orders, and up to a multiple of `together`."""
+        return -(-sum(self.most) // self.together) * self.together
 
     @property
     def range(self) -> float:
@@ -111,22 +115,22 @@ class RadialRule:
     def even(self) -> np.ndarray:
         """Azimuths (B,) of even spokes, with both ends; that of "rotational" is +y."""
         axial = self.symmetry == "rotational"
-        return np.linspace(-np.pi / 2 + axial * np.pi, self.range - np.pi / 2, self.count)
+        return np.linspace(-np.pi / 2 + axial * np.pi, self.range - np.pi / 2, self.together)
 
     def nearest(self, angle: Array) -> Array:
         """Index of the even spoke that is nearest to an azimuth, int32."""
-        index = jnp.round((angle + np.pi / 2) * ((self.count - 1) / self.range))
-        return jnp.clip(index.astype(jnp.int32), 0, self.count - 1)
+        index = jnp.round((angle + np.pi / 2) * ((self.together - 1) / self.range))
+        return jnp.clip(index.astype(jnp.int32), 0, self.together - 1)
 
     def scouts(self) -> np.ndarray:
         """Points (2, B) over the whole stop and a little beyond its rim; its centre for
         "rotational"."""
-        k = np.arange(self.count) + 0.5
+        k = np.arange(self.together) + 0.5
         if self.symmetry == "none":
             angle = np.pi * (1 + 5**0.5) * k
-            return 1.2 * np.sqrt(k / self.count) * np.stack([np.cos(angle), np.sin(angle)])
+            return 1.2 * np.sqrt(k / k.size) * np.stack([np.cos(angle), np.sin(angle)])
         side = 1.2 * (self.symmetry == "bilateral")
-        return np.stack([0 * k, side * (2 * k / self.count - 1)])
+        return np.stack([0 * k, side * (2 * k / k.size - 1)])
 
     def nodes(self, frame: Frame, used: Array, corner: Array, exists: Array) -> tuple[Array, Array]:
         """Azimuths (W, B) and weights (W, B), the sum of each order 1: Gauss nodes between corners,

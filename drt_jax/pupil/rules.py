@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require_one_of
 from ..lens.clearance import clearance
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
@@ -199,8 +200,7 @@ def check_rule(order: int, symmetry: Symmetry) -> None:
     whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
     if not whole or not 1 <= order <= MAX_ORDER:
         raise ValueError(f"order: expected a whole number from 1 to {MAX_ORDER}, got {order!r}")
-    if symmetry not in (known := get_args(Symmetry)):
-        raise ValueError(f"symmetry: expected one of {', '.join(known)}, got {symmetry!r}")
+    require_one_of("symmetry", symmetry, get_args(Symmetry))
 
 
 def pupil_points(

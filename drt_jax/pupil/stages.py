@@ -46,7 +46,8 @@ class _State(NamedTuple):
     passes: (W, 1), bool, whether light passes that point.
     even: rays at the ends of even spokes.
     corners: rays at C corners.
-    latest: result of the last stage.
+    latest: result of the last stage, `radial.together` rays.
+    ends: rays at the ends of the spokes of the rule.
     """
 
     frame: Frame
@@ -54,6 +55,7 @@ class _State(NamedTuple):
     even: Rays
     corners: EdgeRays
     latest: EdgeRays
+    ends: EdgeRays
 
 
 # Start rays, B per wavelength, their targets, the largest number of steps, and how near to the
@@ -75,7 +77,7 @@ def target_of(rays: Rays, centre: Array, toward: Any = 0, pair: Any = 0) -> Targ
     return Target(full(centre, kind), full(toward, kind), full(pair, jnp.int32))
 
 
-def _scouts(given: _Given, state: _State) -> tuple[_State, _Task]:
+def _scouts(given: _Given, state: _State, _: Array) -> tuple[_State, _Task]:
     """Stage 1: rays over the whole stop, from their paraxial launches."""
     rays, radius = state.latest.rays, given.lens.semi_diameter[given.lens.stop]
     pattern = jnp.asarray(given.radial.scouts(), radius.dtype)
@@ -85,7 +87,7 @@ def _scouts(given: _Given, state: _State) -> tuple[_State, _Task]:
     return state, (rays, target_of(rays, rays.point), np.int32(1), _near(rays, True))
 
 
-def _rescue(given: _Given, state: _State) -> tuple[_State, _Task]:
+def _rescue(given: _Given, state: _State, _: Array) -> tuple[_State, _Task]:
     """Stage 2: for a wavelength without a ray that arrives, the ray of a fan that crosses the stop
     nearest to its centre."""
     system, rays = given.system, state.latest.rays
@@ -107,7 +109,7 @@ def _rescue(given: _Given, state: _State) -> tuple[_State, _Task]:
     )
 
 
-def _middle(given: _Given, state: _State) -> tuple[_State, _Task]:
+def _middle(given: _Given, state: _State, _: Array) -> tuple[_State, _Task]:
     """Stage 3: all rays to the point deepest inside, by the linear model of the best ray."""
     scouts = state.latest.rays
     far = jnp.where(scouts.good, boundary.outside(scouts, scouts.point), jnp.inf)
@@ -118,7 +120,7 @@ def _middle(given: _Given, state: _State) -> tuple[_State, _Task]:
     return state, (rays, target_of(rays, centre), _STEPS, _near(rays, True))
 
 
-def _ends(given: _Given, state: _State) -> tuple[_State, _Task]:
+def _ends(given: _Given, state: _State, _: Array) -> tuple[_State, _Task]:
     """Stage 4: rays to the ends of even spokes about that point."""
     rays, _, settled = state.latest
     ray = jax.tree.map(lambda a: a[..., :1], rays)
@@ -129,36 +131,35 @@ def _ends(given: _Given, state: _State) -> tuple[_State, _Task]:
     return state._replace(frame=frame, passes=passes), (rays, target, _STEPS, near)
 
 
-def _corners(given: _Given, state: _State) -> tuple[_State, _Task]:
+def _corners(given: _Given, state: _State, _: Array) -> tuple[_State, _Task]:
     """Stage 5: the first `CORNERS` rays to the corners, where the nearest edge changes."""
     radial, frame, even = given.radial, state.frame, state.latest.rays
     line = target_of(even, frame.centre, frame.toward(radial.even[None]))
     distance = boundary.edge_distance(even, line)
     place, pair = changes(distance, radial.symmetry == "none")
-    more = (0, radial.count - CORNERS)
+    more = (0, radial.together - CORNERS)
     place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
     rays = even.at(jnp.round(place).astype(jnp.int32))
-    angle = place * (radial.range / (radial.count - 1)) - np.pi / 2
+    angle = place * (radial.range / (radial.together - 1)) - np.pi / 2
     line = target_of(rays, frame.centre, frame.toward(angle))
     rays = boundary.extrapolated(rays, boundary.newton_step(rays, line)[0])
     target = target_of(rays, frame.centre, pair=pair)
     return state._replace(even=even), (rays, target, _CORNER_STEPS, _near(rays))
 
 
-def _nodes(given: _Given, state: _State) -> tuple[_State, _Task]:
-    """Stage 6: rays to the ends of the spokes of the rule, which lie between the corners."""
+def _nodes(given: _Given, state: _State, part: Array) -> tuple[_State, _Task]:
+    """Stage 6 and later: rays to the ends of the spokes of the rule, which lie between the corners,
+    a part of them in each stage."""
+    radial = given.radial
     rays, pair, settled = jax.tree.map(lambda a: a[..., :CORNERS], state.latest)
     beside = boundary.outside(rays, rays.point) < _BESIDE
-    exists = settled & beside & (pair[0] != pair[1])
-    angle, _ = given.radial.nodes(state.frame, given.used, rays.point, exists)
-    start = state.even.at(given.radial.nearest(angle))
+    latest = EdgeRays(rays, pair, settled & beside & (pair[0] != pair[1]))
+    corners = jax.tree.map(lambda a, b: jnp.where(part == 0, a, b), latest, state.corners)
+    angle, _ = radial.nodes(state.frame, given.used, corners.rays.point, corners.settled)
+    angle = jax.lax.dynamic_slice_in_dim(angle, part * radial.together, radial.together, axis=-1)
+    start = state.even.at(radial.nearest(angle))
     target = target_of(start, state.frame.centre, state.frame.toward(angle))
-    return state._replace(corners=EdgeRays(rays, pair, exists)), (
-        start,
-        target,
-        _STEPS,
-        _near(start),
-    )
+    return state._replace(corners=corners), (start, target, _STEPS, _near(start))
 
 
 def _nothing(given: _Given, crossing: bool) -> _State:
@@ -173,10 +174,10 @@ def _nothing(given: _Given, crossing: bool) -> _State:
         rays = Rays(point, point, q, rates, jnp.stack([q, q]), no)
         return EdgeRays(rays, point.astype(jnp.int32), no)
 
-    one, latest = none(1), none(given.radial.count)
+    one, latest, ends = none(1), none(given.radial.together), none(given.radial.count)
     corners = none(0 if given.radial.symmetry == "rotational" else CORNERS)
     frame = Frame(one.rays.point, one.rays.d_launch)
-    return _State(frame, one.settled, latest.rays, corners, latest)
+    return _State(frame, one.settled, latest.rays, corners, latest, ends)
 
 
 class Plan(NamedTuple):
@@ -207,13 +208,18 @@ def plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, crossing: bo
     stages = [_scouts, _rescue, _middle, _ends, _corners, _nodes]
     count = 4 if radial.symmetry == "rotational" else 6  # one radius has no corners
     tasks = [functools.partial(stage, given) for stage in stages[:count]]
+    parts, last = radial.count // radial.together, np.int32(count - 1)
 
     def run(stage, state):
-        state, task = jax.lax.switch(stage, tasks, state)
-        return state._replace(latest=boundary.search(trace, *task))
+        part = jnp.maximum(stage - last, 0)
+        state, task = jax.lax.switch(jnp.minimum(stage, last), tasks, state, part)
+        latest = boundary.search(trace, *task)
+        into = functools.partial(jax.lax.dynamic_update_slice_in_dim, axis=-1)
+        ends = jax.tree.map(lambda a, b: into(a, b, part * radial.together), state.ends, latest)
+        return state._replace(latest=latest, ends=ends)
 
-    state = jax.lax.fori_loop(0, count, run, _nothing(given, crossing))
+    state = jax.lax.fori_loop(0, count - 1 + parts, run, _nothing(given, crossing))
     join = lambda a, b: jnp.concatenate([a, b], axis=-1)  # noqa: E731
-    edge = jax.tree.map(join, state.corners, state.latest)
+    edge = jax.tree.map(join, state.corners, state.ends)
     edge = edge._replace(settled=edge.settled & state.passes)
     return Plan(state.frame, state.passes, edge, used)

@@ -20,16 +20,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     views = results["views"]
     figure, axes = show.new(2, len(views), 4.2, 3.4)
     for view, (above, below) in zip(views, np.reshape(axes, (2, -1)).T):
-        ours = [r for r in results["kernels"] if r["lens"] == view["lens"] and r["error"]]
-        theirs = [r for r in results["peers"] if r["lens"] == view["lens"] and r["error"]]
-        series = {
-            key[0]: ([r["value_s"] for r in rows], [[r["error"]] for r in rows])
-            for key, rows in _common.grouped(ours, "model").items()
-        }
-        series |= {
-            key[0]: ([r["seconds"] for r in rows], [[r["error"]] for r in rows])
-            for key, rows in _common.grouped(theirs, "program").items()
-        }
+        series = {}
+        for table, by, cost in (("kernels", "model", "value_s"), ("peers", "program", "seconds")):
+            rows = [r for r in results[table] if r["lens"] == view["lens"] and r["error"]]
+            for (name, *_), own in _common.grouped(rows, by).items():
+                series[name] = [r[cost] for r in own], [[r["error"]] for r in own]
         error_curves(above, series, "seconds", "error of the kernel (L1)")
         above.set_title(f"{view['lens']}, {view['field_deg']:g} degrees", fontsize=9)
         by_waves, by_rays, limit = np.asarray(view["transfer"])

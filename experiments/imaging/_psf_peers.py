@@ -12,7 +12,7 @@ from scipy.interpolate import RectBivariateSpline
 
 import drt_jax
 from drt_jax.image.beam import BeamRule, centroid_and_variances, trace_beam
-from drt_jax.image.transfer import pupil_function
+from drt_jax.image.wave_psf import pupil_function
 from drt_jax.lens.scene import scene_of
 
 from . import _peers

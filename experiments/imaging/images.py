@@ -29,6 +29,7 @@ from skimage import data, transform
 import drt_jax
 from drt_jax import Lens, PsfModel
 from drt_jax.compilation import LARGE, known_options
+from drt_jax.image.psf_model import difference
 
 from . import _command, _common, _peers, _psf_peers, _work, render
 from ._image_pictures import MODELS, draw as draw
@@ -133,10 +134,6 @@ class Scene:
         return drt_jax.psf(lens, self.field, math.inf, *grid, model, centre=centre).kernel
 
 
-def _difference(a: Any, b: Any) -> float:
-    return float(np.max(np.sum(np.abs(np.asarray(a) - np.asarray(b)), axis=(-2, -1))))
-
-
 def histogram(scene: Scene, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, float, int]:
     """Histogram (W, size, size) of traced rays on pixels about `centre` (2,), mm, its noise (from
     its two halves), and the smallest number of rays of a wavelength that arrive."""
@@ -154,7 +151,7 @@ def histogram(scene: Scene, rounds: int, centre: np.ndarray) -> tuple[np.ndarray
         arrived[k % 2] += arrives.sum(axis=1)
     whole = halves.sum(axis=0) / arrived.sum(axis=0)[:, None, None]
     pair = (h / n[:, None, None] for h, n in zip(halves, arrived))
-    noise = _difference(*pair) / 2 if rounds > 1 else 2
+    noise = difference(*pair) / 2 if rounds > 1 else 2
     return whole, noise, int(arrived.sum(axis=0).min())
 
 
@@ -175,10 +172,10 @@ def measure(config: Config, view: View) -> dict[str, Any]:
         kernel, *seconds = _timed(scene, model, config.repeats)
         own = limits.get(model.kind)
         row = {"model": model.kind, "cells": model.cells, "value_s": seconds[0]}
-        row |= {"gradient_s": seconds[1], "off": _difference(kernel, limits["waves"])}
-        rows.append(name | row | {"error": None if own is None else _difference(kernel, own)})
+        row |= {"gradient_s": seconds[1], "off": difference(kernel, limits["waves"])}
+        rows.append(name | row | {"error": None if own is None else difference(kernel, own)})
     about = {"outside": float(np.max(finest.outside)), "noise": noise, "rays": arrived}
-    about |= {"rays_off": _difference(*limits.values())}
+    about |= {"rays_off": difference(*limits.values())}
     lines, curves = contrast(config, lens, field, pixel)
     about |= {"grid_s": field_grid(scene, config.repeats), "frequencies": lines}
     about |= {"transfer": curves}
@@ -242,7 +239,7 @@ def _beside(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> li
             row = name | {"program": program, "samples": count, "note": ""}
             try:
                 call, truth = make(count)
-                error, seconds = _difference(call(), truth), _common.medians([call], 3)[0]
+                error, seconds = difference(call(), truth), _common.medians([call], 3)[0]
                 rows.append(row | {"seconds": seconds, "error": error})
             except (ImportError, ValueError) as failure:
                 rows.append(row | {"seconds": None, "error": None, "note": str(failure)[:80]})

@@ -26,7 +26,7 @@ def start_label(start: float) -> str:
 
 
 def start_lines(results: dict[str, Any], column: str, batches: int | None = None) -> dict:
-    """(batch, value) by start of the first `batches`, for `_plots.convergence`."""
+    """(batch, value) by start of the first `batches`, for `_plots.curves`."""
     rows = [values[:batches] for values in results[column]]
     labels = map(start_label, results["starts_mm"])
     return {label: (np.arange(len(row)), row) for label, row in zip(labels, rows)}
@@ -88,7 +88,8 @@ def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
     """Figure of the sensor position of all starts over training, if it is trained."""
     if moves(results):
         figure, axes = show.new(width=7, height=4.5)
-        _plots.convergence(axes, start_lines(results, "sensor_mm"), "sensor position (mm)")
+        lines = start_lines(results, "sensor_mm")
+        _plots.curves(axes, lines, "training batch", "sensor position (mm)")
         figure.savefig(path)
 
 
@@ -102,7 +103,7 @@ def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
     figure, axes = panels(len(labels), 6, 4)
     for ax, label, changes in zip(axes, labels, results["changes_mm"]):
         lines = {n: (np.arange(len(row)), row) for n, row in zip(trained.names, changes)}
-        _plots.convergence(ax, lines, "change, as mm of the sensor")
+        _plots.curves(ax, lines, "training batch", "change, as mm of the sensor")
         ax.set_title(label, fontsize=9)
     figure.savefig(folder / "numbers.png")
     figure, axes = show.new(2, 1, 8, 3)

@@ -113,8 +113,10 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)", None),
     )[not _report.moves(results) :]:
         figure, (left, right) = show.new(1, 2, 5.5, 4)
-        _plots.convergence(left, _report.start_lines(results, column), label, level)
-        _plots.convergence(right, _report.start_lines(results, column, 100), label, level)
+        lines = _report.start_lines(results, column)
+        _plots.curves(left, lines, "training batch", label, level)
+        lines = _report.start_lines(results, column, 100)
+        _plots.curves(right, lines, "training batch", label, level)
         right.set_title("the first 100 batches", fontsize=9)
         figure.savefig(figures / f"{name}.png")
 

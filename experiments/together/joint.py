@@ -205,14 +205,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws losses, lenses, and patches through each lens before and after the network."""
     figure, axes = show.new(width=7, height=4.5)
     lines = {ARMS[arm]: _smooth(loss) for arm, loss in zip(results["arms"], results["losses"])}
-    _plots.convergence(axes, lines, "mean absolute error")
+    _plots.curves(axes, lines, "training batch", "mean absolute error")
     axes.set_yscale("log")
     figure.savefig(figures / "losses.png")
     drawn = results["drawn"]
-    rows = -(-len(drawn) // 3)
-    figure, axes = show.new(rows, 3, 5, 3)
-    for ax in np.ravel(axes)[len(drawn) :]:
-        ax.set_axis_off()
+    figure, axes = _common.panels(len(drawn), 5, 3, columns=3)
     fields = np.radians([0.0, 0.7 * results["field_deg"], results["field_deg"]])
     for ax, name in zip(np.ravel(axes), drawn):
         lens = load_lens(figures.parent / "lenses" / f"{name}.yaml")

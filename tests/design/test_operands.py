@@ -400,7 +400,7 @@ def test_obscurations_need_another_rule():
 @pytest.mark.parametrize(
     "arguments, said",
     [
-        (dict(kind="blur"), "operands: unknown kind 'blur'; known: spot,"),
+        (dict(kind="blur"), "operands: kind: expected one of spot,"),
         (dict(kind="rms_spot", low=1, high=0), "operands: rms_spot: low 1 is not below high 0"),
         (dict(kind="rms_spot", low=1, high=1), "both 1; give it as the target"),
         (dict(kind="rms_spot", low=np.nan), "low nan is not below"),

@@ -232,7 +232,7 @@ def leaves(lens):
 @pytest.mark.parametrize(
     "kind, settings, said",
     [
-        ("radii", {}, "unknown kind 'radii'; known: radius, fringes"),
+        ("radii", {}, "kind: expected one of radius, fringes"),
         ("radius", {"size": 0.0}, "radius: size: must be above 0 and below 100, got 0"),
         ("radius", {"size": 100.0}, "radius: size: must be above 0 and below 100, got 100"),
         ("shift", {"size": -1.0}, "shift: size: must be above 0, got -1"),

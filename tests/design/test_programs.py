@@ -114,7 +114,7 @@ def test_a_function_is_an_operand():
     [
         (lambda: Operand(coma, surfaces=(0,)), "operands: coma: does not depend on surfaces"),
         (lambda: Operand(coma, low=1, high=0), "operands: coma: low 1 is not below high 0"),
-        (lambda: Operand(3), "operands: unknown kind 3"),
+        (lambda: Operand(3), "operands: kind: expected one of .*, got 3"),
     ],
 )
 def test_functions_that_do_not_fit(make, said):

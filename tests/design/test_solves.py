@@ -226,7 +226,7 @@ def test_more_solves_than_variables():
 @pytest.mark.parametrize(
     "make, said",
     [
-        (lambda: Solve("focus"), "solves: unknown kind 'focus'; known: focal_length"),
+        (lambda: Solve("focus"), "solves: kind: expected one of focal_length"),
         (lambda: Solve("f_number", np.inf), "solves: f_number: value: must be finite"),
         (lambda: Solve("entrance_pupil", -2), "entrance_pupil: value: must be above 0"),
         (lambda: Solve("best_focus", fields=()), "solves: best_focus: fields: none"),

@@ -209,7 +209,7 @@ def test_orders_that_are_unknown_are_refused(word):
         lambda: design.worst_case(perturbed(Tolerance("radius", 1.0)), some, word),
     )
     for way in ways:
-        with pytest.raises(ValueError, match="order: unknown .*; known: first, rays, second"):
+        with pytest.raises(ValueError, match="order: expected one of first, rays, second"):
             way()
 
 
@@ -279,7 +279,7 @@ def test_half_a_pupil_is_enough_where_nothing_is_moved():
 def test_what_cannot_be_is_refused_by_name(singlet):
     problem, some = singlet
     off = np.zeros((1, len(some.deviations)))
-    with pytest.raises(ValueError, match="^compensator: unknown 'zoom'; known: none, focus"):
+    with pytest.raises(ValueError, match="^compensator: expected one of none, focus"):
         design.predict(problem, some, "zoom")
     line = problem_of(some.lens, FIELDS[:3])
     with pytest.raises(ValueError, match="^compensator: focus and tilt: the fields lie on a line"):

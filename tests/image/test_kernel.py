@@ -175,7 +175,7 @@ def test_what_is_no_blur_is_refused(name):
 
 
 def test_other_bad_requests():
-    with pytest.raises(ValueError, match="'integrated' or 'sampled', got 'gauss'"):
+    with pytest.raises(ValueError, match="form: expected one of integrated, sampled, got 'gauss'"):
         gaussian_psf(jnp.zeros((1, 2)), WIDE, 1.0, 5, "gauss")
     for size in (0, 2.5, -3, "21"):
         with pytest.raises(ValueError, match="size: expected a whole number of pixels"):

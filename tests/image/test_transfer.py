@@ -13,7 +13,7 @@ import drt_jax
 from drt_jax import Clipped, Gauss, Status, load_lens
 from drt_jax.image import coefficients, transfer
 from drt_jax.image.beam import beam_of
-from drt_jax.image.coefficients import fringe_terms
+from drt_jax.lens.forms import fringe_terms
 from drt_jax.lens.scene import scene_of
 from drt_jax.rays.trace import trace_bundle
 

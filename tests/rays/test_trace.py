@@ -300,10 +300,10 @@ def test_bundles_of_nearly_as_many_rays_share_a_program():
     def arrive(field, count):
         return trace_rays(SINGLET, field, jnp.inf, RGB, HEIGHTS[:count]).points[:, :, -1, 1]
 
-    many, programs = arrive(0.1, 20), _trace.program(True)._cache_size()
+    many, programs = arrive(0.1, 20), _trace.program()._cache_size()
     for count in (17, 18, 19):
         assert_close(arrive(0.1, count), many[:, :count], 1e-13)
-    assert _trace.program(True)._cache_size() <= programs + 1  # 18 rays, and 20
+    assert _trace.program()._cache_size() <= programs + 1  # 18 rays, and 20
     few, slopes = jax.jvp(lambda field: arrive(field, 19), (0.1,), (1.0,))
     _, inside = jax.jit(lambda f: jax.jvp(lambda f: arrive(f, 19), (f,), (1.0,)))(0.1)
     assert few.shape == (3, 19)
