@@ -61,7 +61,8 @@ def known_values(tree: Any) -> Any:
     What follows from a scene, such as how many rays it needs, is not differentiated itself but
     must be decided in an eager `jax.grad`, too: there `stop_gradient` leaves the values.
     """
-    values = tree if concrete(tree) else jax.lax.stop_gradient(tree)
+    still = lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.core.Tracer) else a  # noqa: E731
+    values = jax.tree.map(still, tree)
     return values if concrete(values) else None
 
 

@@ -72,6 +72,12 @@ LENSES = {
         "N-BK7, semi_diameter: 8, coefficients: {398: 1e30}",
         "not finite within",
     ),
+    "both unbounded": (
+        "51.68, thickness: 4.0, glass: N-BK7}\n  - {radius: -51.68,",
+        "inf, thickness: 4.0, glass: N-BK7, semi_diameter: 8, coefficients: {398: 1e30}}\n"
+        "  - {radius: inf, semi_diameter: 8, coefficients: {398: 1e30},",
+        "surfaces[0]: not finite within",
+    ),
     "not UTF-8": ("singlet", "\udcff", "byte 6 is no UTF-8 text"),
 }
 

@@ -158,7 +158,7 @@ def _moments(
     if rule is None:
         tolerance = _TOLERANCE if tolerance is None else tolerance
         seen = field, distance, wavelengths
-        trial = _converge(_scene, lens, seen, tolerance, places)
+        trial = _converge(lambda *one: [scene_of(*one)], lens, seen, tolerance, places)
         if concrete((lens, seen)):
             return jax.tree.map(jnp.asarray, trial.moments[0])
         # The rays are known: only weigh and differentiate them.
@@ -205,10 +205,6 @@ class _Trial(NamedTuple):
     found: tuple[Found, ...]
 
 
-def _scene(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> list[Scene]:
-    return [scene_of(lens, field, distance, wavelengths)]
-
-
 def scenes_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> list[Scene]:
     """A scene of each field at each distance."""
     lens.check()
@@ -244,8 +240,8 @@ def _converge(
     # Outside of any trace, even if this is called inside one: all that follows is known.
     with jax.core.eval_context():
         lens, seen = known
-        symmetry = symmetry_of(lens, seen[0])
-        return _try_orders(lens, make(lens, *seen), symmetry, tolerance, places)
+        scenes = make(lens, *seen)
+        return _try_orders(lens, scenes, symmetry_of(lens, seen[0]), tolerance, places)
 
 
 def _try_orders(

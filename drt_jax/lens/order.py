@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -13,8 +13,10 @@ from .surface import surface_sag
 
 # Overlap at the rims that counts as touching, mm: apertures of prescriptions are rounded.
 _TOUCH = 1e-4
-# Heights where sags are compared, and surfaces at once: so lenses share compiled programs.
-_HEIGHTS, _TOGETHER = 257, 32
+# Number of heights where sags are compared.
+_HEIGHTS = 257
+# Surfaces of a form in a call, filled up by repeats, so that all lenses share a program.
+_TOGETHER = 32
 _sag = jax.jit(surface_sag, static_argnums=2)
 
 
@@ -56,30 +58,27 @@ def heights(lens: Lens, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
     (P, 2, Y) of both surfaces there, mm. Pairs without apertures have heights 0 alone."""
     rows = np.array([pair[:2] for pair in pairs], int).reshape(-1, 2)
     semi = np.asarray(lens.semi_diameter)
+    sags = np.zeros((*rows.shape, _HEIGHTS), semi.dtype)
     rim = np.min(semi[rows], axis=1)
     y = np.linspace(0, np.where(np.isinf(rim), 0, rim), _HEIGHTS, axis=1, dtype=semi.dtype)
-    arrays: list[Any] = [
-        np.asarray(a)[..., None] for a in (lens.curvature, lens.conic, lens.coefficients)
-    ]
-    sags = np.zeros((*rows.shape, _HEIGHTS), semi.dtype)
-    forms = np.array(lens.forms)[rows]
+    terms = np.asarray(lens.coefficients).T
+    shape = Shape(*(np.asarray(a)[..., None] for a in (lens.curvature, lens.conic, terms)))  # type: ignore[arg-type]
     for form in set(lens.forms):
-        places = np.argwhere(forms == form)
+        places = np.argwhere(np.array(lens.forms)[rows] == form)
         for start in range(0, len(places), _TOGETHER):
-            pair, end = np.resize(places[start : start + _TOGETHER], (_TOGETHER, 2)).T
-            curvature, conic, terms = arrays
-            k = rows[pair, end]
-            shape = Shape(curvature[k], conic[k], np.moveaxis(terms[k], 1, 0))
-            sags[pair, end] = _sag((0 * y[pair], y[pair]), shape, form)
+            which, end = np.resize(places[start : start + _TOGETHER], (_TOGETHER, 2)).T
+            own = jax.tree.map(lambda a, k=rows[which, end]: a[..., k, :], shape)
+            sags[which, end] = _sag((0 * y[which], y[which]), own, form)
     return y, sags
 
 
 def crossings(lens: Lens, pairs: Sequence[Pair]) -> list[float | None]:
     """For each pair the smallest height at which the neighbours cross inside both apertures, mm; 0
     if their vertices are in the wrong order, None if they do not cross."""
-    semi, found = np.asarray(lens.semi_diameter), []
+    semi, senses, found = np.asarray(lens.semi_diameter), lens.senses, []
     for pair, y, (front, back) in zip(pairs, *heights(lens, pairs), strict=True):
-        crossed = lens.senses[pair.second] * (front - back) - pair.gap > _TOUCH
+        with np.errstate(invalid="ignore"):  # sags may be inf, or no number
+            crossed = senses[pair.second] * (front - back) - pair.gap > _TOUCH
         limited = pair.second < lens.count and not np.all(np.isinf(semi[[*pair[:2]]]))
         place = float(y[np.argmax(crossed)]) if limited and np.any(crossed) else None
         found.append(0.0 if pair.gap <= 0 else place)

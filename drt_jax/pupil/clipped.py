@@ -58,6 +58,10 @@ def _follow_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any)
 
     def step(lens, scene):  # one Newton step, by the linear models of these rays
         (crossed, q), _ = trace(lens, scene, launch)
+        # What does not exist does not move: its slopes may be infinite, and in reverse mode 0 times
+        # inf is no number.
+        crossed = jnp.where(follows, crossed, jax.lax.stop_gradient(rays.point))
+        q = jnp.where(follows, q, jax.lax.stop_gradient(rays.q))
         moved = rays._replace(point=crossed, q=q)
         # A corner stays on both edges.
         corner = (crossed + boundary.corner_step(moved, pair))[..., corners]
@@ -221,7 +225,7 @@ def _inside(
     length = _along(end - plan.frame.centre, toward)
     area = jnp.where(plan.passes, share * length**2 * determinant(plan.frame.shape), 0)
     axial, centre, found = symmetry == "rotational", plan.frame.centre[..., None], []
-    stops = np.cumsum(most)  # the spokes behind the last stop serve the search alone
+    stops = np.cumsum(most)  # the spokes behind the last stop only fill up the search
     for k, (start, stop) in enumerate(zip(stops - most, stops)):
         node, weight = jnp.asarray(gauss(sizes[k]), length.dtype)[:, orders[k]]
         # For "rotational" r^2 is the variable, as without clipping.

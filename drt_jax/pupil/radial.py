@@ -78,6 +78,7 @@ class Frame(NamedTuple):
 
     def toward(self, angle: Array | np.ndarray) -> Array:
         """Directions (2, W, B) of spokes at azimuths (W, B), radians from the x axis."""
+        angle = jnp.asarray(angle, self.shape.dtype)
         return displace(self.shape, jnp.stack([jnp.cos(angle), jnp.sin(angle)]))
 
     def unstretched(self, point: Array) -> Array:
@@ -103,7 +104,7 @@ class RadialRule:
 
     @property
     def count(self) -> int:
-        """B, number of spokes: those of all orders, and up to a multiple of `together`."""
+        """B, number of spokes: those of all orders, filled up to a multiple of `together`."""
         return -(-sum(self.most) // self.together) * self.together
 
     @property
@@ -113,7 +114,7 @@ class RadialRule:
 
     @property
     def even(self) -> np.ndarray:
-        """Azimuths (B,) of even spokes, with both ends; that of "rotational" is +y."""
+        """Azimuths (`together`,) of even spokes, with both ends; that of "rotational" is +y."""
         axial = self.symmetry == "rotational"
         return np.linspace(-np.pi / 2 + axial * np.pi, self.range - np.pi / 2, self.together)
 
@@ -123,7 +124,7 @@ class RadialRule:
         return jnp.clip(index.astype(jnp.int32), 0, self.together - 1)
 
     def scouts(self) -> np.ndarray:
-        """Points (2, B) over the whole stop and a little beyond its rim; its centre for
+        """Points (2, `together`) over the whole stop and a little beyond its rim; its centre for
         "rotational"."""
         k = np.arange(self.together) + 0.5
         if self.symmetry == "none":

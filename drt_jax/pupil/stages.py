@@ -47,7 +47,8 @@ class _State(NamedTuple):
     even: rays at the ends of even spokes.
     corners: rays at C corners.
     latest: result of the last stage, `radial.together` rays.
-    ends: rays at the ends of the spokes of the rule.
+    ends: rays at the ends of the spokes of the rule, written in parts by the last stages; before
+        them, the first part holds what other stages leave.
     """
 
     frame: Frame

@@ -36,10 +36,11 @@ def read_patches(config: DataConfig, side: int, seed: int, folder: pathlib.Path)
 
 
 def images(
-    imager: Callable, parameters: Any, scenes: np.ndarray, distance: float, noise: float, seed: int
+    imager: Callable, parameters: Any, scenes: np.ndarray, where: Any, noise: float, seed: int
 ) -> dict[str, np.ndarray]:
-    """True, sensor and restored images of patches, for `draw_patches`."""
-    found = imager(parameters, scenes, distance, np.float32(noise), jax.random.key(seed))
+    """True, sensor and restored images of patches, for `draw_patches`. where: the distance, or
+    the object points, that `imager` takes."""
+    found = imager(parameters, scenes, where, np.float32(noise), jax.random.key(seed))
     return {name: np.asarray(image, np.float16) for name, image in zip(IMAGES, found)}
 
 

@@ -163,15 +163,13 @@ def _judged(studio: Studio, imager: Callable, parameters: Any) -> dict[str, floa
 
 def _pictures(studio: Studio, imager: Callable, parameters: Any, arm: str) -> dict[str, Any]:
     """Some images of the judge, evenly over its points."""
-    seen, noise = studio.judged(), np.float32(studio.config.noise)
+    seen = studio.judged()
     some = np.resize(
         _patches.textured(studio.patches.test, len(seen.fields)),
         (len(seen.fields), *studio.patches.test.shape[1:]),
     )
-    found = imager(parameters, some, seen, noise, jax.random.key(0))
-    keys = ("truth", "sensor", "restored")
-    own = _shown(len(seen.fields))
-    return {f"{arm} {k}": np.asarray(a, np.float16)[own] for k, a in zip(keys, found)}
+    found = _patches.images(imager, parameters, some, seen, studio.config.noise, 0)
+    return {f"{arm} {name}": a[_shown(len(seen.fields))] for name, a in found.items()}
 
 
 def _shown(count: int) -> np.ndarray:
