@@ -79,13 +79,13 @@ def jit_outside(function: Callable, wanted: Mapping[str, Any], **keywords: Any) 
 def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
     """`jit_outside` for calls inside of other programs and of derivatives, too, where it is
     `jax.jit(function, **keywords)`."""
-    outside = jit_outside(function, wanted, **keywords)
-    inside = jax.jit(function, **keywords)
+    outside, inside = jit_outside(function, wanted, **keywords), jax.jit(function, **keywords)
 
-    @functools.wraps(outside)
+    @functools.wraps(function)
     def run(*args: Any, **named: Any) -> Any:
         # Inside `jax.jit` a new array is a tracer, too.
         known = concrete((args, named, jnp.zeros(())))
         return (outside if known else inside)(*args, **named)
 
+    run.program = outside.program  # type: ignore[attr-defined]
     return run
