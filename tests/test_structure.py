@@ -38,13 +38,9 @@ ALLOWED = {
     "show": set(),
 }
 ALLOWED_ALL = {"show.layout", "show.analyses", "show.sheet", "show.glasses"}
-# Of 8,200 that were the aim before apertures, phases and elements came, 11,200 before what comes
-# from outside was checked throughout, 13,900 before whole lenses are designed and toleranced,
-# 18,000 before other optimisers ran beside a design, 18,500 before what misled was mended (issue 22
-# brings it down), 19,350 before the analyses over the field, 25,500 before CODE V's files, 29,200
-# before lens and network were trained together, 30,500 before pages of HTML, one command for all,
-# and lenses that are scaled and flipped, 30,900 before many devices.
-HOUSE = 31_360
+# Lines of code: no blank, comment, docstring or import is counted. 18,609 before what outside
+# trials found was mended (off-axis mirrors, afocal systems, polygons, float32).
+HOUSE = 19_900
 # Outside packages that belong to some modules or floors alone.
 ONLY = {
     "optimistix": {"rays.aim", "rays.find", "image.field"},
@@ -134,14 +130,28 @@ def test_importing_the_package_draws_nothing_in():
     assert not {"matplotlib", "skimage", "experiments"} & set(loaded.stdout.split())
 
 
+def code(path):
+    """Numbers of the lines of a file that are code: no blank, comment, docstring or import."""
+    text = path.read_text()
+    free = {k for k, line in enumerate(text.splitlines(), 1) if not line.split("#")[0].strip()}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            free |= set(range(node.lineno, node.end_lineno + 1))
+        documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        if documented and ast.get_docstring(node) is not None:
+            free |= set(range(node.body[0].lineno, node.body[0].end_lineno + 1))
+    return set(range(1, len(text.splitlines()) + 1)) - free
+
+
 @pytest.mark.parametrize("path", OURS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_nothing_grows_too_large(path):
-    text = path.read_text()
-    assert len(text.splitlines()) <= 400
-    for node in ast.walk(ast.parse(text)):
+    lines = code(path)
+    assert len(lines) <= 300
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef):
-            assert node.end_lineno - node.lineno < 60, node.name
+            own = lines & set(range(node.lineno, node.end_lineno + 1))
+            assert len(own) < 60, node.name
 
 
 def test_the_house_is_small():
-    assert sum(len(path.read_text().splitlines()) for path in OURS) < HOUSE
+    assert sum(len(code(path)) for path in OURS) < HOUSE
