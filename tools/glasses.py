@@ -47,7 +47,10 @@ COLLECTIONS = (
     ("SUMITA", "nzhagen/zemaxglass", "bb2486d", "AGF_files/sumita.agf", "Sumita's catalogue"),
     ("MISC", "nzhagen/zemaxglass", "bb2486d", "AGF_files/misc.agf", "Zemax's catalogue MISC"),
     ("INFRARED", "nzhagen/zemaxglass", "bb2486d", "AGF_files/infrared.agf", "Zemax's INFRARED"),
+    ("CORNING", "nzhagen/zemaxglass", "bb2486d", "AGF_files/corning.agf", "Corning's catalogue"),
 )
+# Of Corning's catalogue, fused silica 7980 alone is still made.
+ONLY = {"CORNING": ["C79-80"]}
 ORDER = {0: 0, 2: 1, -2: 2, -4: 3, -6: 4, -8: 5, 4: 6, -10: 7, -12: 8}
 LINES = np.square([0.5875618, 0.4861327, 0.6562725])
 
@@ -162,7 +165,7 @@ def obsolete(collections: pathlib.Path):
         source = f"{text}; as in github.com/{repository}, commit {commit}, {file}"
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            found = load_agf(collections / repository / file, missing="warn")
+            found = load_agf(collections / repository / file, ONLY.get(maker), missing="warn")
         for warning in told:
             print(f"left out: {warning.message}")
         celsius = temperatures(collections / repository / file)

@@ -8,7 +8,7 @@ from ..lens.glass import Glass
 from ..lens.glasses import flaw
 from .entry import LensError
 from .record import Missing, Record, short
-from .text import Words, words_of
+from .text import Words, lines_of, words_of
 
 _Forms = tuple[list[float], list[float]]  # sellmeier and schott of `Glass`
 
@@ -73,7 +73,7 @@ def load_agf(
     """
     record = Record(str(path), missing)
     try:
-        lines = words_of(path)
+        lines = words_of(lines_of(path))
     except InputError as error:
         raise LensError(f"{path}: {error}") from None
     blocks: list[dict[str, Words]] = []

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..lens.forms import powers_xy
+from ..lens.forms import noll_of_fringe, powers_xy
 from .record import Breaking, Record, Row, turned_back
 
 EXTRA = 13  # the parameter number of XDAT 1
@@ -39,7 +39,8 @@ class Surface(NamedTuple):
         for number, (line, value) in self.parameters.items():
             if value and number not in known:
                 extra = f" (XDAT {number - EXTRA + 1})" if number >= EXTRA else ""
-                self.record.lacks(line, f"parameter {number}{extra} of {self.row.name}")
+                what = f"parameter {number}{extra} of {self.row.name} is not read"
+                raise self.record.error(line, what)
 
     def powers(self, numbers: dict[int, int]) -> None:
         """Set the coefficients. numbers: the power of the height by number of the parameter."""
@@ -122,6 +123,16 @@ def _extended_xy(k: int) -> tuple[str, int]:
     return f"x{i}y{j}", i + j
 
 
+def _extended_even(surface: Surface) -> None:
+    """An extended asphere. Some programs write an even asphere under this name, with its
+    coefficients in PARM 1 to 8 and no XDAT."""
+    if not surface.value(EXTRA) and any(surface.value(k) for k in range(1, 9)):
+        name = surface.row.name
+        surface.record.notes.append(f"{name}: XASPHERE with PARM and no XDAT is an even asphere")
+        return _even(surface)
+    _extended(surface, "asphere", lambda k: (2 * k + 2, 2 * k + 2))
+
+
 def _binary(surface: Surface) -> None:
     """An even asphere with the phase order (a_1 u^2 + a_2 u^4 + ...) in radians."""
     surface.only(*range(9), *range(EXTRA, 400))
@@ -161,18 +172,26 @@ def _forbes(surface: Surface) -> None:
     surface.put("coefficients", surface.spread(radius, {p: (a, p) for p, a in total.items()}))
 
 
-def _zernike(surface: Surface) -> None:
-    """Conic, even powers of r and Noll's Zernike polynomials. The powers are converted to Zernike
-    terms: u^2k = sum_s (2 s + 1) k!^2 / ((k - s)! (k + s + 1)!) R_2s(u)."""
+def _zernike(surface: Surface, fringe: bool = False) -> None:
+    """Conic, even powers of r and Zernike polynomials, Noll's or `fringe`, which are 1 at the rim.
+    The powers are converted to Zernike terms:
+    u^2k = sum_s (2 s + 1) k!^2 / ((k - s)! (k + s + 1)!) R_2s(u)."""
     surface.only(0, *range(1, 9), *range(EXTRA, 400))
     radius, found = surface.series()
     terms = {k + 1: a * surface.unit for k, a in enumerate(found) if a}
+    if fringe and max(terms, default=0) > 37:
+        what = f"{surface.row.name}: fringe terms end with 37 here"
+        raise surface.record.error(surface.row.line, what)
+    if fringe:
+        nolls = {k: noll_of_fringe(k) for k in terms}
+        terms = {nolls[k][0]: a / nolls[k][1] for k, a in terms.items()}
     if not terms:
         surface.powers({k: 2 * k for k in range(1, 9)})
         return
     if not surface.value(0) and surface.semi > radius * (1 + 1e-9):
         line = surface.row.line
-        surface.record.lacks(line, f"the end of the Zernike terms at {radius:g} mm; ours go on")
+        what = f"{surface.row.name}: Zernike terms that end at {radius:g} mm are not read"
+        raise surface.record.error(line, f"{what}; set PARM 0, extrapolate, to 1")
     for k in range(1, 9):
         height = surface.value(k) * surface.unit * (radius / surface.unit) ** (2 * k)
         for s in range(k + 1 if height else 0):
@@ -186,6 +205,27 @@ def _zernike(surface: Surface) -> None:
     surface.put("form", "zernike")
     surface.put("norm_radius", radius)
     surface.put("coefficients", terms)
+
+
+def _irregular(surface: Surface) -> None:
+    """A conic with Zs u^4 + Za v^2 + Zc u^2 v, where u and v are r and y over the semi-diameter;
+    decentred, then tilted about x and y, by itself."""
+    surface.only(*range(1, 9))
+    shift, tilt, bends = ([surface.value(k) for k in own] for own in ((1, 2), (3, 4), (5, 6, 7)))
+    row = surface.row
+    if any(bends[1:]) and surface.value(8):
+        raise surface.record.error(row.line, f"{row.name}: IRREGULA with an angle, PARM 8")
+    if any(bends) and not surface.semi:
+        raise surface.record.error(row.line, f"{row.name}: IRREGULA without DIAM")
+    if any(shift) or any(tilt):
+        surface.put("decentre", [value * surface.unit for value in shift])
+        surface.put("tilt", [*tilt, 0.0])
+    if any(bends):
+        one, two, three = (value * surface.unit for value in bends)
+        terms = {"x4y0": (one, 4), "x2y2": (2 * one, 4), "x0y4": (one, 4), "x0y2": (two, 2)}
+        surface.put("form", "polynomial_xy")
+        all_terms = terms | {"x2y1": (three, 3), "x0y3": (three, 3)}
+        surface.put("coefficients", surface.spread(surface.semi, all_terms))
 
 
 def _grating(surface: Surface, lines: int = 1, order: int = 2) -> None:
@@ -212,12 +252,14 @@ TYPES: dict[str, Callable[[Surface], None]] = {
     "TILTSURF": _tilted,
     "DGRATING": _grating,
     "TOROGRAT": _toroidal_grating,
-    "XASPHERE": lambda surface: _extended(surface, "asphere", lambda k: (2 * k + 2, 2 * k + 2)),
+    "XASPHERE": _extended_even,
     "XOSPHERE": lambda surface: _extended(surface, "odd_asphere", lambda k: (k + 1, k + 1)),
     "XPOLYNOM": lambda surface: _extended(surface, "polynomial_xy", _extended_xy),
     "BINARY_2": _binary,
     "QED_TYPE": _forbes,
     "SZERNSAG": _zernike,
+    "FZERNSAG": lambda surface: _zernike(surface, fringe=True),
+    "IRREGULA": _irregular,
 }
 
 
@@ -243,9 +285,9 @@ def clipping(
     each. DIAM alone clips nothing, nor does an aperture beyond the end of the surface."""
     for line, kind, (one, two) in found:
         shape: dict[str, object] = {"centre": centre} if any(centre) else {}
-        if kind in ("SQAP", "ELAP", "ELOB"):
-            shape["rectangle" if kind == "SQAP" else "ellipse"] = [one, two]
-            key = "obscuration" if kind == "ELOB" else "aperture"
+        if kind in ("SQAP", "SQOB", "ELAP", "ELOB"):
+            shape["rectangle" if kind[:2] == "SQ" else "ellipse"] = [one, two]
+            key = "obscuration" if kind[2:] == "OB" else "aperture"
             row.put(key, [*row.entry.get(key, []), shape], line)
             continue
         if kind == "OBSC" and one > 0:

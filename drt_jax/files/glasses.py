@@ -1,7 +1,8 @@
 """Glasses of other programs' lens files: lookup of their names in our catalogues."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ..lens.glass import Glass
 from ..lens.glasses import find_glass, glass_makers, spellings
@@ -9,6 +10,7 @@ from .record import Record, Row, short
 
 # Other programs' names of materials whose constants equal ours.
 _SAME = {"F_SILICA": "silica", "SILICA": "silica"}
+_PLAIN: dict[str, dict[str, Any]] = {"AIR": {}, "N15": {"index": 1.5}}  # of Zemax's MISC
 _NIKON = {"NIKON": "HIKARI"}
 
 
@@ -29,15 +31,29 @@ def in_catalogues(name: str, catalogues: Sequence[str]) -> Glass | None:
 
 
 def named_glass(
-    record: Record, row: Row, line: int, name: str, makers: Sequence[str]
-) -> dict[str, str]:
-    """The prescription entry of a glass, found by name in the catalogues of these makers, or of all
-    makers if `makers` is empty. LensError if none of them has it."""
+    record: Record,
+    row: Row,
+    line: int,
+    name: str,
+    makers: Sequence[str],
+    beside: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The prescription entries of a glass, found by name in the catalogues of these makers, or of
+    all makers if `makers` is empty. If no catalogue knows the name: `beside`, the keys that the
+    file gives beside it, with a note; LensError without any, or if other makers alone have it."""
+    if name.upper() in _PLAIN:
+        return _PLAIN[name.upper()]
     own = _SAME.get(name.upper(), name)
     found = in_catalogues(own, makers)
     try:
         alone = find_glass(own)
     except ValueError as error:
+        if not found and beside and not spellings(own):
+            numbers = " ".join(f"{key} {value:.7g}" for key, value in beside.items())
+            record.notes.append(
+                f"line {line}: {row.name}: no catalogue has {short(name)}: {numbers}, as beside it"
+            )
+            return dict(beside)
         if not found:
             raise record.error(
                 line, f"{row.name}: {error}; give nd and vd as a model glass in the file"

@@ -5,7 +5,11 @@ P = 0.6438 - 0.001682 vd + dP, within 1.9e-10 of 170 listings. This is Conrady's
 spectral lines rounded to four decimals; ours is the same formula through the exact lines.
 """
 
+from typing import Any
+
 import numpy as np
+
+from .record import Record, Row
 
 _POWERS = np.array([0.0, -1.0, -3.5])
 _LINES = (0.5875618, 0.4861327, 0.6562725, 0.4358343)
@@ -35,3 +39,15 @@ def to_theirs(nd: float, vd: float, above: float) -> tuple[float, float, float]:
     index, mean, part = np.linalg.solve(own, terms)
     abbe = index / mean
     return float(1 + index), float(abbe), float(part / mean - _NORMAL[0] - _NORMAL[1] * abbe)
+
+
+def model_keys(
+    record: Record, row: Row, line: int, nd: float, vd: float, above: float
+) -> dict[str, Any]:
+    """The keys of a medium of nd, vd and dP in a file; vd 0 is a constant index. LensError for
+    numbers that no glass has."""
+    if not vd:
+        return {"index": nd}
+    if not (1 < nd <= 4 and 10 <= vd <= 120):
+        raise record.error(line, f"{row.name}: no model glass has nd {nd:g} and vd {vd:g}")
+    return dict(zip(("nd", "vd", "partial"), to_ours(nd, vd, above), strict=True))

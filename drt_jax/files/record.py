@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -86,12 +86,12 @@ class Record:
     def note_unread(self, solves: list[int], unknown: Mapping[str, int], what: str) -> None:
         """Notes of lines with solves, and of words that are not known. what: kind of the words."""
         if solves:
-            some = ", ".join(map(str, solves[:5])) + (", ..." if len(solves) > 5 else "")
+            some = listed(map(str, solves), 5)
             self.notes.append(
                 f"solves and pickups are read as the values beside them, lines {some}"
             )
         if unknown:
-            some = ", ".join(f"{key} (line {line})" for key, line in [*unknown.items()][:8])
+            some = listed([f"{key} (line {line})" for key, line in unknown.items()], 8)
             self.notes.append(f"{what} that are not known: {some}")
 
     def say(self) -> None:
@@ -164,7 +164,7 @@ class Record:
                 last, gap = True, 0.0
             before, gap = part, gap + part.thickness
         if found:
-            some = ", ".join(found[:8]) + (", ..." if len(found) > 8 else "")
+            some = listed(found, 8)
             self.notes.append(f"surfaces that touch stand {CLOSEST:g} mm apart: {some}")
 
     def _prescription(self, semi_diameter: float) -> tuple[dict[str, Any], Lines, list[str]]:
@@ -232,6 +232,12 @@ def _with_image(lens: Lens, image: Row) -> Lens:
         conic=lens.conic.at[-1].set(conic),
         curved=(*lens.curved, lens.count),
     )
+
+
+def listed(words: Iterable[str], most: int) -> str:
+    """Words as a list of at most `most`, and how many more there are."""
+    found = [*words]
+    return ", ".join(found[:most]) + (f" and {n} more" if (n := len(found) - most) > 0 else "")
 
 
 def distance_of(value: float) -> float:

@@ -3,9 +3,7 @@
 import math
 from collections.abc import Callable
 
-from ..inputs import InputError
 from . import seq_apertures, seq_places, seq_surfaces
-from .entry import LensError
 from .record import Missing, Record, Row, distance_of, short
 from .seq_fields import FIELD_KEYS, WAVE_KEYS, Fields
 from .seq_glass import Glasses
@@ -287,26 +285,22 @@ def _dispatch(reader: _Reader, command: Command) -> None:
         reader.unknown.setdefault(short(key), command.line)
 
 
-def read_seq(path: str, missing: Missing) -> tuple[Record, Use]:
-    """Read a `.seq` file into a record of its surfaces and their use. LensError with the line."""
+def read_seq(path: str, missing: Missing, lines: list[str]) -> tuple[Record, Use]:
+    """Read the lines of a `.seq` file into a record of its surfaces and their use. LensError with
+    the line. path: its name in messages."""
     reader, private, ended = _Reader(path, missing), False, False
-    try:
-        for own in commands_of(path):
-            if ended:
-                note = f"what follows the GO of the lens, from line {own.line} on, is not read"
-                reader.record.notes.append(note)
-                break
-            ended = reader.complete and own.key == "GO" and not own.quoted
-            if own.key in ("PRV", "END") and not own.quoted:
-                private = own.key == "PRV"
-            elif private:
-                reader.glasses.take(own)
-            elif own.key:
-                _dispatch(reader, own)
-    except LensError:
-        raise
-    except InputError as error:
-        raise LensError(f"{path}: {error}") from error
+    for own in commands_of(lines):
+        if ended:
+            note = f"what follows the GO of the lens, from line {own.line} on, is not read"
+            reader.record.notes.append(note)
+            break
+        ended = reader.complete and own.key == "GO" and not own.quoted
+        if own.key in ("PRV", "END") and not own.quoted:
+            private = own.key == "PRV"
+        elif private:
+            reader.glasses.take(own)
+        elif own.key:
+            _dispatch(reader, own)
     _finish(reader)
     return reader.record, reader.use
 

@@ -1,10 +1,9 @@
 """Kinds of surfaces of `.seq` files: conversion of their coefficients to prescription entries."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 
-from ..lens.forms import fringe_terms, noll_terms
+from ..lens.forms import noll_of_fringe
 from .record import Record, Row, short
 from .seq_apertures import Clips
 from .seq_places import Place
@@ -205,17 +204,11 @@ def _fringe(surface: Surface, record: Record, unit: float) -> None:
     surface.terms.setdefault("NRADIUS", surface.terms.get("C3", (0, 0.0)))
     found, terms = surface._special(record, 4, 37, "C1", "C3"), dict[int, float]()
     for k, value in found.items():
-        number, n, m = noll_of_fringe(k + 1)
-        terms[number] = value * unit / math.sqrt((n + 1) * (2 if m else 1))
+        number, rim = noll_of_fringe(k + 1)
+        terms[number] = value * unit / rim
     surface.row.put("form", "zernike", surface.kind_line)
     surface.row.put("norm_radius", surface.radius(record) * unit, surface.kind_line)
     surface.row.put("coefficients", terms, surface.kind_line)
-
-
-def noll_of_fringe(fringe: int) -> tuple[int, int, int]:
-    """Noll's number, n and |m| of a fringe polynomial; fringe: its number, 1 to 37."""
-    n, m = fringe_terms()[fringe - 1]
-    return noll_terms(n).index((n, m)) + 1, n, abs(m)
 
 
 _SPECIAL: dict[str, tuple[str, Callable[[Surface, Record, float], None]]] = {

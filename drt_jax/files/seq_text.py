@@ -1,12 +1,10 @@
 """Parsing of CODE V `.seq` files: commands with their qualifiers and values."""
 
-import os
 import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
 from ..inputs import InputError, one_line
-from .text import lines_of
 
 _LONGEST = 4000  # characters of a line
 _WIDEST = 100_000  # characters of a command over several lines
@@ -105,9 +103,9 @@ def _bare(word: str) -> str:
     return word[1:-1] if len(word) > 1 and word[0] in "'\"" and word[-1] == word[0] else word
 
 
-def commands_of(path: str | os.PathLike) -> Iterator[Command]:
-    """The commands of a file in order. InputError if it is no text or a line is too long."""
-    for line, text in _parts(lines_of(path)):
+def commands_of(lines: list[str]) -> Iterator[Command]:
+    """The commands of a file in order. InputError if a line is too long."""
+    for line, text in _parts(lines):
         words = _WORD.findall(text)
         if not words:
             continue

@@ -14,7 +14,9 @@ from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..lens.scene import field_of_height
 from .record import Record
 
-ApertureKind = Literal["pupil diameter", "f-number", "working f-number", "object NA", "image NA"]
+ApertureKind = Literal[
+    "pupil diameter", "f-number", "working f-number", "object NA", "object cone angle", "image NA"
+]
 _SAME = 1e-9  # relative tolerance of a stop size that a file gives twice
 FieldKind = Literal["angle", "object height", "paraxial image height", "real image height"]
 
@@ -144,6 +146,13 @@ def _opened(record: Record, use: Use, lens: Lens, wave: float) -> Lens:
         wide = value / 2
     elif kind == "f-number":
         wide = abs(float(first.effective_focal_length)) / value / 2
+    elif kind == "object cone angle":  # in degrees
+        if value >= 90:
+            what = f"an object cone of {value:g} degrees from the axis"
+            raise record.error(use.line, f"{what}: light that starts backwards is not traced")
+        if math.isinf(far):
+            raise record.error(use.line, "an object cone of an object at infinity")
+        wide = abs(math.tan(math.radians(value)) * (far + place))
     elif kind == "object NA":
         sine = value / front
         if not (sine < 1 and math.isfinite(far)):

@@ -60,10 +60,10 @@ def lines_of(path: str | os.PathLike) -> list[str]:
     return lines
 
 
-def words_of(path: str | os.PathLike) -> list[Words]:
+def words_of(lines: list[str]) -> list[Words]:
     """The lines of a file split into words, without empty lines; long notes are cut."""
     found = []
-    for i, text in enumerate(lines_of(path)):
+    for i, text in enumerate(lines):
         if len(text) > _LONGEST and re.match(r"\s*[A-Z]{4}\s+[-+.\d]", text):
             raise InputError(f"line {i + 1}: {len(text)} characters are more than {_LONGEST}")
         words = text[:_LONGEST].split()

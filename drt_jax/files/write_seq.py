@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..lens.forms import noll_of_fringe
 from ..lens.glass import ANY
 from ..lens.glasses import find_glass
 from ..lens.lens import Lens
@@ -16,7 +17,7 @@ from .media_out import media_of_lens
 from .record import turns_of
 from .seq_glass import folded
 from .seq_places import KEYS
-from .seq_surfaces import LETTERS, noll_of_fringe
+from .seq_surfaces import LETTERS
 from .write_zmx import gap_behind
 
 _KINDS = {"circle": ("CIR",), "rectangle": ("REX", "REY"), "ellipse": ("ELX", "ELY")}
@@ -162,11 +163,7 @@ def _form(lens: Lens, i: int) -> list[str]:
 
 
 def _fringe(i: int, row: list[float], conic: float) -> list[str]:
-    known = {
-        noll: (k, math.sqrt((n + 1) * (2 if m else 1)))
-        for k in range(1, 38)
-        for noll, n, m in [noll_of_fringe(k)]
-    }
+    known = {noll: (k, rim) for k in range(1, 38) for noll, rim in [noll_of_fringe(k)]}
     lines = ["SPS ZFR", f"SCO NRADIUS {row[0]!r}", f"SCO K {conic!r}"]
     for number, value in enumerate(row[1:], 1):
         if not value:

@@ -14,6 +14,7 @@ from .record import Missing, Record
 from .seq import read_seq
 from .specs import build_lens
 from .system import System, Use, lens_of, system_of
+from .text import lines_of
 from .zmx import read_zmx
 
 _BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
@@ -41,7 +42,7 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
             return build_lens(_with_catalogues(dict(source), pathlib.Path()))
         path = pathlib.Path(source)
         if path.suffix.lower() in _READERS:
-            record, use = _read(path, missing)
+            record, use = read_record(path, missing)
             lens = lens_of(record, use)
             record.say()
             return lens
@@ -103,14 +104,20 @@ def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
         known = ", ".join(_READERS)
         raise LensError(f"{path}: fields and wavelengths are read from {known}; use load_lens")
     with jax.core.eval_context():
-        record, use = _read(path, missing)
+        record, use = read_record(path, missing)
         system = system_of(record, use)
     record.say()
     return system
 
 
-def _read(path: str | pathlib.Path, missing: Missing) -> tuple[Record, Use]:
+def read_record(path: str | pathlib.Path, missing: Missing = "error") -> tuple[Record, Use]:
     """Read a file of another program."""
     if missing not in ("error", "warn"):
         raise ValueError(f'missing: expected "error" or "warn", got {shown(missing)}')
-    return _READERS[pathlib.Path(path).suffix.lower()](str(path), missing)
+    try:
+        lines = lines_of(path)
+        return _READERS[pathlib.Path(path).suffix.lower()](str(path), missing, lines)
+    except LensError:
+        raise
+    except InputError as error:
+        raise LensError(f"{path}: {error}") from error

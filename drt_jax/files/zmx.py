@@ -3,42 +3,42 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import get_args
+from typing import Any
 
-from ..inputs import InputError
 from .entry import LensError
 from .forms_zmx import EXTRA, TYPES, Surface, breaking, clipping
 from .glasses import named_glass
-from .model_zmx import to_ours
+from .model_zmx import model_keys
 from .record import Breaking, Missing, Record, Row, distance_of, short
-from .system import FieldKind, Use
+from .system import Use
 from .text import Words, words_of
+from .zmx_head import KEYS, Head
 
-_UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0}
 _SURFACES = 5000
-_MOST = 1000  # fields or wavelengths
 # Ignored: drawing, names, tolerances, analyses, coatings, polarisation. None changes rays.
 _COSMETIC = frozenset(
     """
     VERS MODE PFIL LANG GFAC PUSH SDMA ROPD PICB POLS GLRS GSTD NSCD COFN NOTE AUTH
     IWDP HYPR LUID EERA FIMP HIDE MIRR SLAB POPS COMM BLNK PRIM COAT VPAR VDSZ VCON
-    MEMA OEMA OMMA SSID STUD DBDT
+    MEMA OEMA OMMA SSID STUD DBDT FENF FCOM FSVY SCOL CSUM TCED
     """.split()  # noqa: SIM905
 )
-_SOLVES = ("PPAR", "PZUP", "MAZH")
-# Keywords that change rays and are refused, unless all their numbers are 0.
+_SOLVES = ("PPAR", "PZUP", "MAZH", "CHZH", "EDGE", "PKUP")
+# Apertures that are refused.
 _REFUSED = {
-    "SQOB": "a rectangular obscuration of unknown columns",
     "SPID": "a spider",
+    "USAP": "a user aperture",
+    "USOB": "a user obscuration",
+    "UDAD": "points of a user aperture",
     "UDAP": "an aperture from a file",
     "UDOB": "an obscuration from a file",
-    "SCBD": "tilts and decentres beside coordinate breaks",
 }
 
 
 @dataclasses.dataclass
 class _Block:
-    """A surface as its lines are read."""
+    """A surface as its lines are read. moves: the parameters of a coordinate break in front of the
+    surface (1) and behind it (2)."""
 
     row: Row
     kind: str = "STANDARD"
@@ -50,20 +50,23 @@ class _Block:
     floating: int = 0
     apertures: list[tuple[int, str, list[float]]] = dataclasses.field(default_factory=list)
     centre: list[float] = dataclasses.field(default_factory=list)
-    mirror: bool = False
+    moves: dict[int, dict[int, tuple[int, float]]] = dataclasses.field(default_factory=dict)
 
 
 class _Reader:
     """The state of reading one file."""
 
     def __init__(self, path: str, missing: Missing):
-        self.record, self.use = Record(path, missing), Use()
-        self.unit, self.makers = 1.0, list[str]()
-        self.counts, self.columns = (1, 1), dict[str, list[float]]()
-        self.waves: dict[int, tuple[float, float]] = {}
+        self.record = Record(path, missing)
+        self.head = Head(self.record)
         self.blocks: list[_Block] = []
         self.solves: list[int] = []
         self.unknown: dict[str, int] = {}
+
+    @property
+    def unit(self) -> float:
+        """The file's unit of length, mm."""
+        return self.head.unit
 
     def length(self, words: Words, at: int = 0) -> float:
         return self.record.number(words.line, words.rest, at) * self.unit
@@ -71,88 +74,6 @@ class _Reader:
     @property
     def block(self) -> _Block:
         return self.blocks[-1]
-
-
-def _unit(reader: _Reader, words: Words) -> None:
-    name = words.rest[0].upper() if words.rest else ""
-    if name not in _UNITS:
-        raise reader.record.error(
-            words.line, f"UNIT {short(name)}: expected one of {', '.join(_UNITS)}"
-        )
-    reader.unit = _UNITS[name]
-
-
-def _name(reader: _Reader, words: Words) -> None:
-    reader.record.name = short(" ".join(words.rest))
-
-
-def _makers(reader: _Reader, words: Words) -> None:
-    reader.makers = [name.upper() for name in words.rest]
-
-
-def _aperture(reader: _Reader, words: Words) -> None:
-    record, use, line = reader.record, reader.use, words.line
-    use.line = line
-    if words.key == "FLOA":
-        use.aperture, use.aperture_kind = None, None
-        return
-    value, flag = (record.number(line, words.rest, i, [None, 0.0][i]) for i in (0, 1))
-    if words.key == "ENPD":
-        use.aperture, use.aperture_kind = value * reader.unit, "pupil diameter"
-    elif words.key == "FNUM":
-        use.aperture, use.aperture_kind = value, "working f-number" if flag else "f-number"
-    else:
-        value = math.sin(math.radians(value)) if flag else value
-        use.aperture, use.aperture_kind = value, "object NA"
-
-
-def _fields(reader: _Reader, words: Words) -> None:
-    record, line = reader.record, words.line
-    kind, telecentric, fields, waves = (
-        record.count(line, words.rest, i, d) for i, d in enumerate((None, 0, 1, 1))
-    )
-    kinds: tuple[FieldKind, ...] = get_args(FieldKind)
-    if not 0 <= kind < len(kinds):
-        raise record.error(line, f"fields of kind {kind}; give angles or heights")
-    if telecentric:
-        record.lacks(line, "telecentric object space: all rays go through the stop here")
-    if not (1 <= fields <= _MOST and 1 <= waves <= _MOST):
-        raise record.error(line, f"{fields} fields and {waves} wavelengths")
-    reader.use.field_kind, reader.use.field_line = kinds[kind], line
-    reader.counts = fields, waves
-
-
-def _column(reader: _Reader, words: Words) -> None:
-    """Read one number per field; numbers beyond the number of fields are ignored."""
-    count = min(len(words.rest), _MOST)
-    reader.columns[words.key] = reader.record.numbers(words.line, words.rest, count)
-
-
-def _wave(reader: _Reader, words: Words) -> None:
-    record, line = reader.record, words.line
-    i = record.count(line, words.rest)
-    if not 1 <= i <= _MOST:
-        raise record.error(line, f"wavelength number {i}")
-    value = record.number(line, words.rest, 1)
-    if not value > 0:
-        raise record.error(line, f"a wavelength of {value:g} um")
-    reader.waves[i] = value, record.number(line, words.rest, 2, 1.0)
-
-
-def _primary(reader: _Reader, words: Words) -> None:
-    reader.use.primary = reader.record.count(words.line, words.rest) - 1
-    reader.use.primary_line = words.line
-
-
-def _aiming(reader: _Reader, words: Words) -> None:
-    mode = reader.record.count(words.line, words.rest, 1, 0)
-    reader.use.ray_aiming = {0: "off", 1: "paraxial"}.get(mode, "real")
-
-
-def _environment(reader: _Reader, words: Words) -> None:
-    values = [reader.record.number(words.line, words.rest, i, d) for i, d in enumerate((20, 1, 0))]
-    if values[2] and values[:2] != [20, 1]:
-        reader.record.lacks(words.line, f"{values[0]:g} C and {values[1]:g} atm; ours are 20 and 1")
 
 
 def _surface(reader: _Reader, words: Words) -> None:
@@ -207,23 +128,29 @@ def _glass(reader: _Reader, words: Words) -> None:
     if name.upper() == "MIRROR":
         row.put("mirror", True, line)
         return
-    if name != "___BLANK":
-        if name.isdecimal() and len(name) == 6:
-            index, abbe, above = 1 + int(name[:3]) / 1000, int(name[3:]) / 10, 0.0
-        else:
-            for key, value in named_glass(record, row, line, name, reader.makers).items():
-                row.put(key, value, line)
-            return
+    found: dict[str, Any] = {}
+    if name.isdecimal() and len(name) == 6:
+        found = model_keys(record, row, line, 1 + int(name[:3]) / 1000, int(name[3:]) / 10, 0.0)
+    elif name == "___BLANK":
+        nd, vd, above = (record.number(line, rest, i, d) for i, d in ((3, None), (4, None), (5, 0)))
+        found = model_keys(record, row, line, nd, vd, above)
     else:
-        index, abbe = (record.number(line, rest, i) for i in (3, 4))
-        above = record.number(line, rest, 5, 0.0)
-    if not abbe:
-        row.put("index", index, line)
-        return
-    if not (1 < index <= 4 and 10 <= abbe <= 120):
-        raise record.error(line, f"{row.name}: no model glass has nd {index:g} and vd {abbe:g}")
-    for part, own in zip(("nd", "vd", "partial"), to_ours(index, abbe, above), strict=True):
-        row.put(part, own, line)
+        found = named_glass(
+            record, row, line, name, reader.head.makers, _beside(record, row, line, rest)
+        )
+    for key, value in found.items():
+        row.put(key, value, line)
+
+
+def _beside(record: Record, row: Row, line: int, rest: list[str]) -> dict[str, Any]:
+    """The keys of the model glass of nd and vd behind a name; empty if they are none, such as the
+    placeholder 1.5 and 40 of OpticStudio."""
+    try:
+        nd, vd, above = (record.number(line, rest, i, 0.0) for i in (3, 4, 5))
+        known = nd > 1 and (nd, vd) != (1.5, 40)
+        return model_keys(record, row, line, nd, vd, above) if known else {}
+    except LensError:
+        return {}
 
 
 def _diameter(reader: _Reader, words: Words) -> None:
@@ -244,24 +171,32 @@ def _centre(reader: _Reader, words: Words) -> None:
 
 
 def _refused(reader: _Reader, words: Words) -> None:
-    numbers = [word for word in words.rest if word.replace(".", "").replace("0", "")]
-    if numbers:
+    if words.key in ("USAP", "USOB") or any(word.strip("+-.0") for word in words.rest):
         reader.record.lacks(words.line, f"{words.key}, {_REFUSED[words.key]}")
 
 
-_COLUMNS = ("XFLN", "YFLN", "FWGN", "VDXN", "VDYN", "VCXN", "VCYN", "VANN")
-_HEADER: dict[str, Callable[[_Reader, Words], None]] = {
-    **dict.fromkeys(("ENPD", "FNUM", "OBNA", "FLOA"), _aperture),
-    **dict.fromkeys(_COLUMNS, _column),
-    **{"UNIT": _unit, "NAME": _name, "GCAT": _makers, "FTYP": _fields, "WAVM": _wave},
-    **{"PWAV": _primary, "RAIM": _aiming, "ENVD": _environment},
-}
+def _moves(reader: _Reader, words: Words) -> None:
+    """SCBD: tilt and decentre in front of a surface (1) or behind it (2), with order, a pickup
+    and five numbers; a coordinate return (3) is a solve."""
+    record, line, rest = reader.record, words.line, words.rest
+    where = record.count(line, rest)
+    if where == 3:
+        reader.solves.append(line)
+        return
+    if where not in (1, 2):
+        raise record.error(line, f"SCBD {where}: expected 1, 2 or 3")
+    own = {k + 1: (line, record.number(line, rest, 3 + k)) for k in range(5)}
+    if any(value for _, value in own.values()):
+        reader.block.moves[where] = own | {6: (line, record.count(line, rest, 1))}
+
+
 _SURFACE: dict[str, Callable[[_Reader, Words], None]] = {
     **{"TYPE": _type, "STOP": _stop, "CURV": _curvature, "CONI": _conic, "DISZ": _thickness},
     **dict.fromkeys(("PARM", "XDAT"), _parameter),
     **{"GLAS": _glass, "DIAM": _diameter, "FLAP": _floating, "OBDC": _centre},
-    **dict.fromkeys(("CLAP", "SQAP", "ELAP", "OBSC", "ELOB"), _clip),
+    **dict.fromkeys(("CLAP", "SQAP", "ELAP", "OBSC", "SQOB", "ELOB"), _clip),
     **dict.fromkeys(_REFUSED, _refused),
+    "SCBD": _moves,
 }
 
 
@@ -272,15 +207,13 @@ def _configurations(reader: _Reader, words: Words) -> None:
         reader.record.notes.append(f"line {words.line}: of {count} configurations number {now}")
 
 
-def read_zmx(path: str, missing: Missing) -> tuple[Record, Use]:
-    """Read a `.zmx` file into a record of its surfaces and their use. LensError with the line."""
-    try:
-        lines = words_of(path)
-    except InputError as error:
-        raise LensError(f"{path}: {error}") from error
+def read_zmx(path: str, missing: Missing, lines: list[str]) -> tuple[Record, Use]:
+    """Read the lines of a `.zmx` file into a record of its surfaces and their use. LensError with
+    the line. path: its name in messages."""
+    found = words_of(lines)
     reader, tail, behind = _Reader(path, missing), False, False
-    indented = any(w.indented for w in lines if w.key in ("TYPE", "CURV", "DISZ"))
-    for words in lines:
+    indented = any(w.indented for w in found if w.key in ("TYPE", "CURV", "DISZ"))
+    for words in found:
         if words.key == "SURF":
             if tail:
                 raise reader.record.error(words.line, "a surface behind the merit function")
@@ -290,8 +223,8 @@ def read_zmx(path: str, missing: Missing) -> tuple[Record, Use]:
         elif words.key == "MNUM":
             tail, behind = True, True
             _configurations(reader, words)
-        elif not reader.blocks and words.key in _HEADER:
-            _HEADER[words.key](reader, words)
+        elif not reader.blocks and words.key in KEYS:
+            KEYS[words.key](reader.head, words)
         elif reader.blocks and not tail and words.key in _SURFACE:
             _SURFACE[words.key](reader, words)
         elif reader.blocks and indented and not words.indented:
@@ -304,13 +237,13 @@ def read_zmx(path: str, missing: Missing) -> tuple[Record, Use]:
                 reader.unknown.setdefault(short(words.key), words.line)
     if not reader.blocks:
         raise LensError(f"{path}: no line begins with SURF: is it a .zmx file?")
-    _finish(reader, behind or not any(words.key == "VERS" for words in lines))
-    return reader.record, reader.use
+    _finish(reader, behind or not any(words.key == "VERS" for words in found))
+    return reader.record, reader.head.use
 
 
 def _finish(reader: _Reader, whole: bool) -> None:
     """Do the checks and conversions that need all lines."""
-    record, use = reader.record, reader.use
+    record, use = reader.record, reader.head.use
     first, last = reader.blocks[0], reader.blocks[-1]
     if len(reader.blocks) < 3 or last.thickness or last.infinite:
         raise record.error(last.row.line, "the last SURF is no image: is the file cut short?")
@@ -319,10 +252,17 @@ def _finish(reader: _Reader, whole: bool) -> None:
     if not whole:
         record.notes.append("no MNUM behind the surfaces: is the file cut short?")
     record.note_unread(reader.solves, reader.unknown, "keywords")
-    if first.row.entry.get("curvature") or first.kind != "STANDARD":
+    if first.row.entry.get("curvature") or first.kind != "STANDARD" or first.moves:
         raise record.error(first.row.line, "SURF 0: an object that is not flat")
     if first.thickness is None:
         raise record.error(first.row.line, "SURF 0 without DISZ, the distance of the object")
+    stops = [block for block in reader.blocks if block.row.entry.get("stop")]
+    if not stops:
+        stops = [next(block for block in reader.blocks[1:] if block.kind != "COORDBRK")]
+        stops[0].row.put("stop", True, stops[0].row.line)
+        record.notes.append(f"no STOP: the stop is {stops[0].row.name}")
+    if len(stops) > 1 or stops[0] in (first, last):
+        raise record.error(0, f"{len(stops)} surfaces have STOP; exactly one in the lens must")
     record.distance = distance_of(first.thickness)
     record.medium = {
         key: value
@@ -330,15 +270,13 @@ def _finish(reader: _Reader, whole: bool) -> None:
         if key in ("glass", "index", "nd", "vd", "partial")
     }
     for block in reader.blocks[1:]:
-        record.parts.append(_part(reader, block, block is last))
-    stops = [block for block in reader.blocks if block.row.entry.get("stop")]
-    if len(stops) != 1 or stops[0] in (first, last):
-        raise record.error(0, f"{len(stops)} surfaces have STOP; exactly one in the lens must")
+        record.parts += _parts(reader, block, block is last)
     use.stop = stops[0].semi
-    _use(reader)
+    reader.head.finish()
 
 
-def _part(reader: _Reader, block: _Block, image: bool) -> Row | Breaking:
+def _parts(reader: _Reader, block: _Block, image: bool) -> list[Row | Breaking]:
+    """A surface with the breaks in front of it and behind it, or a coordinate break."""
     record, row = reader.record, block.row
     if block.infinite:
         raise record.error(block.infinite, f"{row.name}: an infinite thickness; give a length")
@@ -348,7 +286,7 @@ def _part(reader: _Reader, block: _Block, image: bool) -> Row | Breaking:
         if image or row.entry.get("stop"):
             what = "image" if image else "stop"
             raise record.error(row.line, f"{row.name}: a coordinate break is no {what}")
-        return breaking(surface, row.thickness)
+        return [breaking(surface, row.thickness)]
     if block.kind not in TYPES or (image and block.kind not in ("STANDARD", "EVENASPH")):
         where = " of the image" if image else f"; known: COORDBRK, {', '.join(TYPES)}"
         if block.kind == "PARAXIAL":
@@ -363,28 +301,11 @@ def _part(reader: _Reader, block: _Block, image: bool) -> Row | Breaking:
     if block.floating:
         block.apertures.insert(0, (block.floating, "CLAP", [0.0, block.semi]))
     clipping(record, row, block.apertures, block.centre)
-    return row
-
-
-def _use(reader: _Reader) -> None:
-    """Write fields and wavelengths into `use`: the first entries of each column, in order."""
-    record, use, (fields, waves) = reader.record, reader.use, reader.counts
-    for i in range(1, waves + 1):
-        if i not in reader.waves:
-            raise record.error(use.field_line, f"WAVM {i} of {waves} is missing")
-    used = [reader.waves[i] for i in range(1, waves + 1)]
-    use.wavelengths, use.wavelength_weights = ([pair[k] for pair in used] for k in (0, 1))
-
-    def column(key: str, default: float) -> list[float]:
-        values = reader.columns.get(key, [default] * fields)
-        if len(values) < fields:
-            raise record.error(use.field_line, f"{key} has {len(values)} of {fields} fields")
-        return values[:fields]
-
-    unit = 1.0 if use.field_kind == "angle" else reader.unit
-    x, y = ([v * unit for v in column(key, 0.0)] for key in ("XFLN", "YFLN"))
-    use.heights = [*zip(x, y, strict=True)]
-    use.field_weights = column("FWGN", 1.0)
-    parts = [column(key, 0.0) for key in ("VDXN", "VDYN", "VCXN", "VCYN", "VANN")]
-    parts[4] = [math.radians(value) for value in parts[4]]
-    use.vignetting = [[*row] for row in zip(*parts, strict=True)]
+    parts: list[Row | Breaking] = [row]
+    moves = {k: surface._replace(parameters=own) for k, own in block.moves.items()}
+    if 1 in moves:
+        parts.insert(0, breaking(moves[1], 0.0))
+    if 2 in moves and not image:
+        parts.append(breaking(moves[2], row.thickness))
+        row.thickness = 0.0
+    return parts

@@ -169,6 +169,13 @@ def fringe_terms() -> list[tuple[int, int]]:
     return [*found, (12, 0)]
 
 
+def noll_of_fringe(fringe: int) -> tuple[int, float]:
+    """Noll's number of a fringe term, which is 1 at the rim where Noll's is the second number
+    returned. fringe: its number, 1 to 37."""
+    n, m = fringe_terms()[fringe - 1]
+    return noll_terms(n).index((n, m)) + 1, math.sqrt((n + 1) * (2 if m else 1))
+
+
 @functools.cache
 def _noll(count: int) -> tuple[list[tuple[int, int]], np.ndarray]:
     """Powers (i, j), and the coefficient of x^i y^j in each of the first `count` Zernike

@@ -11,8 +11,8 @@ import pytest
 
 from drt_jax import LensError, first_order, load_lens, load_system, sag, save_lens
 from drt_jax.files.record import Breaking
-from drt_jax.files.seq import read_seq
 from drt_jax.files.seq_glass import code_of
+from drt_jax.files.yaml import read_record
 
 from .. import oracle
 
@@ -32,7 +32,7 @@ def written(folder, *lines, **others):
 
 def record(folder, *lines, missing="error", **others):
     """What is read, without a lens of it."""
-    return read_seq(str(written(folder, *lines, **others)), missing)
+    return read_record(written(folder, *lines, **others), missing)
 
 
 def entry(folder, *lines, at=0, **others):
@@ -515,7 +515,7 @@ def test_written_forms_glasses_apertures_and_places(tmp_path):
 def test_encodings(tmp_path, encoding):
     path = tmp_path / "lens.seq"
     path.write_bytes(text(FRONT, BACK).replace("a lens", "für 5 µm").encode(encoding))
-    assert read_seq(str(path), "error")[0].name == "für 5 µm"
+    assert read_record(path)[0].name == "für 5 µm"
 
 
 def test_files_that_are_none(tmp_path):
@@ -548,6 +548,6 @@ def test_files_that_are_none(tmp_path):
             spoilt[place] = noise.choice(list(b"0 9.-;&!'\"SAZ\n\xff\x00e"))
         path.write_bytes(spoilt[: noise.integers(len(spoilt) // 2, 2 * len(spoilt))])
         try:
-            read_seq(str(path), "error")
+            read_record(path)
         except LensError as error:
             assert "\n" not in str(error) and str(path) in str(error)

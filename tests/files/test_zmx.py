@@ -83,6 +83,8 @@ def test_units(tmp_path):
     """Lengths in inches, coefficients in their powers; never wavelengths."""
     even = FRONT.replace("STANDARD", "EVENASPH") + "|PARM 1 .001|PARM 2 1e-5"
     mm, inch = read(tmp_path, even, BACK), read(tmp_path, even, BACK, UNIT="IN X")
+    metres = [read(tmp_path, even, BACK, UNIT=word).lens for word in ("METER X", "M X")]
+    assert metres[0].sensor == metres[1].sensor == 1000 * mm.lens.sensor
     scale = 25.4
     np.testing.assert_allclose(inch.lens.curvature, mm.lens.curvature / scale, rtol=1e-15)
     np.testing.assert_allclose(inch.lens.sensor, mm.lens.sensor * scale, rtol=1e-15)
@@ -142,8 +144,52 @@ def test_zernike_sag_with_powers_of_r(tmp_path):
     np.testing.assert_allclose(found, wanted, rtol=1e-13)
     assert lens.forms[0] == "zernike"
     beyond = FRONT.replace("STANDARD", own.replace("PARM 0 1", "PARM 0 0"))
-    assert "the end of the Zernike terms at 4 mm" in refused(tmp_path, beyond, BACK)
+    for missing in ("error", "warn"):  # what changes rays is never left out
+        message = refused(tmp_path, beyond, BACK, missing=missing)
+        assert "Zernike terms that end at 4 mm" in message
     assert "parameter 9" in refused(tmp_path, FRONT.replace("STANDARD", own + "|PARM 9 1"), BACK)
+
+
+def test_fringe_zernike_sag(tmp_path):
+    """Born and Wolf's fringe terms, 1 at the rim: 4 is defocus, 5 and 6 astigmatism, 8 coma."""
+    own = (
+        "FZERNSAG|PARM 0 1|PARM 2 1e-5|XDAT 1 9|XDAT 2 4|XDAT 3 .03|XDAT 6 .1|XDAT 8 .2|XDAT 10 .3"
+    )
+    x, y = 1.0, 2.0
+    u2, angle = 5 / 16, np.arctan2(y, x)
+    wanted = 50 - np.sqrt(50**2 - 5) + 1e-5 * 25 + 0.03 + 0.1 * (2 * u2 - 1)
+    wanted += 0.2 * u2 * np.sin(2 * angle) + 0.3 * (3 * u2 - 2) * np.sqrt(u2) * np.sin(angle)
+    found, _ = sags(tmp_path, f"{own}|XDAT 10 .3", x, y)
+    np.testing.assert_allclose(found, wanted, rtol=1e-13)
+    assert "fringe terms end with 37" in refused(
+        tmp_path, FRONT.replace("STANDARD", "FZERNSAG|XDAT 1 38|XDAT 2 9|XDAT 40 1"), BACK
+    )
+
+
+def test_an_irregular_surface(tmp_path):
+    """Zs u^4 + Za v^2 + Zc u^2 v over the semi-diameter of 6 mm, decentred and tilted by itself."""
+    own = "IRREGULA|PARM 1 -1|PARM 2 .5|PARM 3 2|PARM 4 -3|PARM 5 .01|PARM 6 -.02|PARM 7 .03"
+    found, lens = sags(tmp_path, own, 1.0, 2.0)
+    u2, v = 5 / 36, 2 / 6
+    wanted = 50 - np.sqrt(50**2 - 5) + 0.01 * u2**2 - 0.02 * v**2 + 0.03 * u2 * v
+    np.testing.assert_allclose(found, wanted, rtol=1e-13)
+    np.testing.assert_array_equal(lens.decentre[:2], [[-1, 0.5], [0, 0]])
+    np.testing.assert_allclose(np.degrees(lens.tilt[:2]), [[2, -3, 0], [0, 0, 0]])
+    angled = FRONT.replace("STANDARD", own + "|PARM 8 30")
+    assert "an angle, PARM 8" in refused(tmp_path, angled, BACK)
+
+
+def test_an_even_asphere_under_another_name(tmp_path):
+    """PARM without XDAT on an XASPHERE, as some programs write it, is said; both are refused."""
+    lines = "|PARM 1 .001|PARM 2 1e-5|PARM 8 1e-20"
+    for missing in ("error", "warn"):
+        with pytest.warns(UserWarning, match="SURF 1: XASPHERE with PARM .* is an even asphere"):
+            own = FRONT.replace("STANDARD", f"XASPHERE{lines}")
+            lens = read(tmp_path, own, BACK, missing=missing).lens
+        even = read(tmp_path, FRONT.replace("STANDARD", f"EVENASPH{lines}"), BACK).lens
+        np.testing.assert_array_equal(lens.coefficients, even.coefficients)
+        both = FRONT.replace("STANDARD", f"XASPHERE{lines}|XDAT 1 1|XDAT 2 9|XDAT 3 .1")
+        assert "parameter 1 of SURF 1 is not read" in refused(tmp_path, both, BACK, missing=missing)
 
 
 def test_forbes_aspheres(tmp_path):
@@ -237,6 +283,25 @@ def test_coordinate_breaks_are_right_handed_and_have_an_order(tmp_path):
     np.testing.assert_allclose([*across[-1], place[-1]], [0, 0, 47], atol=1e-13)
 
 
+@pytest.mark.parametrize("order", [0, 1])
+def test_tilts_of_surfaces_are_coordinate_breaks(tmp_path, order):
+    """Of SCBD in front of a mirror and behind it, whatever `missing`; zeros are none."""
+    bare = "TYPE STANDARD|STOP|CURV 0|DISZ {}|GLAS MIRROR|DIAM 5"
+    numbers = "1 2 30 -20 10"
+    own = f"{bare.format(-20)}|SCBD 1 {order} 0 {numbers}|SCBD 2 {1 - order} 2 .1 0 -40 0 5"
+    zeros = BACK + "|SCBD 2 1 2 -0.000E+000 -0. -0. -0. -0."
+    first, second = (
+        BREAK.format(*numbers.split(), order, 0),
+        BREAK.format(0.1, 0, -40, 0, 5, 1 - order, -20),
+    )
+    front = FRONT.replace("|STOP", "")
+    wanted = read(tmp_path, front, BACK, first, bare.format(0), second).lens.places
+    for missing in ("error", "warn"):
+        found = read(tmp_path, front, zeros, own, missing=missing).lens.places
+        for one, two in zip(wanted, found, strict=True):
+            np.testing.assert_allclose(one, two, rtol=0, atol=1e-14)
+
+
 def test_the_hand_of_a_tilt_is_that_of_a_listing(tmp_path):
     """Global coordinates of OpticStudio behind a mirror that is tilted by -4.5 degrees about x."""
     mirror = "TYPE STANDARD|STOP|CURV -3.280839895013123e-4|DISZ -1524|GLAS MIRROR|DIAM 75"
@@ -277,6 +342,70 @@ def test_apertures_of_systems_by_their_definition(tmp_path):
         np.testing.assert_allclose(found.entrance_pupil.semi_diameter, edge)
     np.testing.assert_allclose(first(FLOA="").entrance_pupil.semi_diameter, 6)
 
+    np.testing.assert_allclose(
+        first(OBNA="60 1", object="200").entrance_pupil.semi_diameter, np.tan(np.pi / 3) * 200
+    )
+    for angle in (90, 160, 180):
+        message = refused(tmp_path, ENPD=None, OBNA=f"{angle} 1", object="200")
+        assert f"an object cone of {angle} degrees" in message
+    assert "an object at infinity" in refused(tmp_path, ENPD=None, OBNA="10 1")
+
+
+def test_a_cone_in_a_medium_is_an_angle(tmp_path):
+    """Half a cone of 30 degrees in glass: its tangent, not that of an NA of sin 30 degrees."""
+    path = tmp_path / "lens.zmx"
+    own = text(FRONT, BACK, ENPD=None, OBNA="30 1", object="200")
+    path.write_text(own.replace("DISZ 200", "DISZ 200|GLAS N-BK7".replace("|", "\n")))
+    system = load_system(path)
+    assert system.aperture_kind == "object cone angle" and system.aperture == 30
+    np.testing.assert_allclose(system.lens.semi_diameter[0], np.tan(np.pi / 6) * 200)
+
+
+OLD = {
+    **{"XFLD": "0 1", "YFLD": "0 5", "FWGT": "1 2", "ZVDX": "0 0", "ZVDY": "0 .1"},
+    **{"ZVCX": "0 .2", "ZVCY": "0 .3", "ZVAN": "0 90", "WAVL": ".48 .55", "WWGT": "1 3"},
+}
+
+
+def test_headers_of_older_versions(tmp_path):
+    """They are duplicates where the newer ones stand beside, wrong or not; else they are read."""
+    spoilt = dict.fromkeys(OLD, "7 7") | {"WAVN": "7 7", "WWGN": "7 7"}
+    new = read(tmp_path, **spoilt)
+    assert not new.notes
+    none = dict.fromkeys(("XFLN", "YFLN", "FWGN", "VDXN", "VDYN", "VCXN", "VCYN", "VANN"))
+    path = tmp_path / "old.zmx"
+    for counts in ("0 0 2 2", "0"):  # the oldest tell no numbers of fields and wavelengths
+        own = text(FRONT, BACK, **(none | OLD | {"FTYP": counts}))
+        path.write_text("\n".join(line for line in own.split("\n") if line not in WAVES))
+        old = load_system(path)
+        for key in ("heights", "field_weights", "vignetting", "wavelengths", "wavelength_weights"):
+            np.testing.assert_array_equal(getattr(old, key), getattr(new, key))
+
+
+def test_more_than_twelve_fields(tmp_path):
+    """Twelve in each column, one in each line FEFD: x, y, weight and five vignetting factors."""
+    columns = {"XFLN": "0 " * 12, "YFLN": " ".join(map(str, range(12))), "FWGN": "1 " * 12}
+    columns |= {"VCYN": "0 " * 12, "VANN": None, "VDXN": None, "VDYN": None, "VCXN": None}
+    columns |= {"MODE": "SEQ", "NAME": "many", "SDMA": "0 1 0", "ROPD": "2"}
+    path = tmp_path / "lens.zmx"
+    more = "FENF 14 14\nFEFD 0 12 1 0 0 0 0 0\nFEFD .5 13 2 .1 .2 .3 .4 90\nSURF 0"
+    own = text(FRONT, BACK, FTYP="0 0 14 2 0 0 0 14", **columns)
+    path.write_text(own.replace("SURF 0", more))
+    system = load_system(path)
+    np.testing.assert_array_equal(system.heights[:, 1], np.arange(14))
+    assert system.heights[-1, 0] == 0.5 and system.field_weights.tolist() == [1] * 13 + [2]
+    np.testing.assert_allclose(system.vignetting[-1], [0.1, 0.2, 0.3, 0.4, np.pi / 2])
+    assert not np.any(system.vignetting[:-1]) and system.notes == ()
+    path.write_text(own)
+    with pytest.raises(LensError, match="XFLN has 12 of 14 fields"):
+        load_system(path)
+
+
+def test_a_file_without_a_stop(tmp_path):
+    with pytest.warns(UserWarning, match="no STOP: the stop is SURF 1"):
+        system = read(tmp_path, FRONT.replace("|STOP", ""), BACK)
+    assert system.lens.stop == 0 and float(system.lens.semi_diameter[0]) == 5
+
 
 def test_kinds_of_fields(tmp_path):
     system = read(tmp_path, object="200", FTYP="1 0 2 2")
@@ -308,13 +437,32 @@ def test_what_is_not_read_is_refused_by_line(tmp_path):
     assert "line 27: parameter 16 (XDAT 4) of SURF 1" in refused(
         tmp_path, toroid.format(1e-3), BACK
     )
-    for key in ("SQOB 1 2 0", "UDAP 1", "XDAT 1 2"):
-        even = f"{BACK}|{key}".replace("STANDARD", "EVENASPH")
-        assert "leaves it out" in refused(tmp_path, FRONT, even)
+    for key in ("USAP 0 0 0", "UDAP 1", "UDAD 1 -.5 -10 0"):
+        assert "leaves it out" in refused(tmp_path, FRONT, f"{BACK}|{key}")
     spider = BACK + "|SPID .1 3"
     assert 'missing="warn" leaves it out' in refused(tmp_path, FRONT, spider)
     with pytest.warns(UserWarning, match="left out: SPID, a spider"):
         assert "SPID" in read(tmp_path, FRONT, spider, missing="warn").notes[0]
+
+
+def test_glasses_of_no_catalogue(tmp_path):
+    """nd and vd beside an unknown name are those of a model glass, and said; 1.5 and 40 are what
+    OpticStudio writes for none. Corning 7980, the constant N15, and air."""
+    glass = "|GLAS N-BK7 0 0 1.5 40"
+    with pytest.warns(UserWarning, match="SURF 1: no catalogue has XYZ9: nd 1.6.* vd 60.3"):
+        known = read(tmp_path, FRONT.replace(glass, "|GLAS XYZ9 0 0 1.6204 60.3 0"), BACK).lens
+    model = read(tmp_path, FRONT.replace(glass, "|GLAS ___BLANK 1 0 1.6204 60.3 0"), BACK).lens
+    np.testing.assert_array_equal(known.index(0.5), model.index(0.5))
+    for numbers in ("0 0 1.5 40", "", "0 0 0 0", "0 0 1.6 3"):
+        own = FRONT.replace(glass, f"|GLAS XYZ9 {numbers}")
+        assert "unknown glass 'XYZ9'" in refused(tmp_path, own, BACK)
+    lens = read(tmp_path, FRONT.replace("N-BK7", "C79-80"), BACK, GCAT="SCHOTT CORNING").lens
+    # Corning's sheet of 7980: nF, nd, nC at 22 C.
+    np.testing.assert_allclose(
+        lens.index([0.4861327, 0.5875618, 0.6562725])[1], [1.463132, 1.458467, 1.456370], atol=1e-6
+    )
+    lens = read(tmp_path, FRONT.replace("N-BK7", "N15"), BACK + "|GLAS AIR", "|".join([BACK])).lens
+    np.testing.assert_array_equal(lens.index([0.45, 0.7]), [[1, 1], [1.5, 1.5], [1, 1], [1, 1]])
 
 
 def test_what_is_read_otherwise_is_said(tmp_path):
@@ -325,6 +473,9 @@ def test_what_is_read_otherwise_is_said(tmp_path):
     assert all(
         word in message for word in ("3 configurations number 2", "lines 33", "ABCD (line 34)")
     )
+    many = "".join(f"|ABC{k} 7" for k in range(11))
+    with pytest.warns(UserWarning, match=r"ABC7 \(line 40\) and 3 more"):
+        read(tmp_path, FRONT, BACK + many)
 
 
 def test_model_glasses_without_dispersion_and_with(tmp_path):
