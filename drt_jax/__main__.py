@@ -253,8 +253,6 @@ def run_show(options: argparse.Namespace) -> None:
     """Print the data of a lens as they are computed, and draw its sheet."""
     if not all(abs(field) < 90 for field in options.field or ()):
         raise ValueError("--field: must be within 90 degrees")
-    if options.distance is not None and not options.distance > 0:
-        raise ValueError("--distance: must be above 0 mm")
     with _warnings_on_stdout():
         lens, fields, distance, waves = _view(options)
         middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]

@@ -163,7 +163,7 @@ def test_ctrl_c_is_one_line(monkeypatch, capsys):
     [
         (["show", "nothing"], "no bundled lens 'nothing'"),
         (["show", "singlet", "--field", "90"], "--field: must be within 90 degrees"),
-        (["show", "singlet", "--distance", "0"], "--distance: must be above 0"),
+        (["show", "singlet", "--distance", "0"], "distance: must be 1e-06 mm or more"),
         (["show", "singlet", "--wavelengths", "9"], "outside the range"),
         (["convert", "singlet", "lens.txt"], "lens.txt: expected a name that ends in .yaml"),
     ],

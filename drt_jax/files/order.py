@@ -17,7 +17,8 @@ CLOSEST = 1e-6
 
 def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
     """LensError if light would go backwards, or if neighbours overlap within both their apertures.
-    If they overlap only near the rim, a warning: light goes backwards there and is lost.
+    If they overlap only near the rim, a warning: light goes backwards there and is lost. A warning,
+    too, for a sensor in front of the last surface, where the image is virtual.
 
     gaps, moved: see `lens.order.neighbours`, which returns the neighbours.
     """
@@ -28,11 +29,17 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
         if gap >= CLOSEST:
             continue
         if j == lens.count:
-            raise LensError(
-                f"sensor: {float(lens.sensor):g} mm lies before the vertex of surface {i} at "
-                f"{float(lens.vertices[i]):g} mm{turned}",
-                "sensor",
-            )
+            where = f"{float(lens.sensor):g} mm"
+            at = f"the vertex of surface {i} at {float(lens.vertices[i]):g} mm"
+            if i in lens.active and gap > -CLOSEST:
+                raise LensError(f"sensor: {where} touches {at}; move it by {CLOSEST} mm", "sensor")
+            if i in lens.active:
+                warnings.warn(
+                    f"sensor: {where} lies before {at}{turned}: rays are prolonged backwards to a "
+                    "virtual image",
+                    stacklevel=2,
+                )
+            continue
         reach = "" if j == i + 1 else f" up to surface {j}, in sum"
         raise LensError(
             f"surfaces[{i}].thickness{reach}: must be {'positive' if forwards else 'negative'}"

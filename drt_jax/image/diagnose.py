@@ -63,7 +63,7 @@ def crossed(lens: Lens) -> str:
 def check_order(lens: Lens) -> None:
     """ValueError if the vertices of two neighbours of a known lens are in the wrong order."""
     for pair in neighbours_now(lens):
-        if pair.gap <= 0:
+        if pair.gap <= 0 and pair.second < lens.count:
             raise ValueError(f"{describe_crossing(lens, pair, 0.0)}; light cannot go backwards")
 
 

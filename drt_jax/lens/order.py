@@ -74,14 +74,15 @@ def heights(lens: Lens, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
 
 def crossings(lens: Lens, pairs: Sequence[Pair]) -> list[float | None]:
     """For each pair the smallest height at which the neighbours cross inside both apertures, mm; 0
-    if their vertices are in the wrong order, None if they do not cross."""
+    if their vertices are in the wrong order, None if they do not cross. A sensor crosses nothing:
+    where it lies in front of the last surface, the image is virtual."""
     semi, senses, found = np.asarray(lens.semi_diameter), lens.senses, []
     for pair, y, (front, back) in zip(pairs, *heights(lens, pairs), strict=True):
         with np.errstate(invalid="ignore"):  # sags may be inf, or no number
             crossed = senses[pair.second] * (front - back) - pair.gap > _TOUCH
         limited = pair.second < lens.count and not np.all(np.isinf(semi[[*pair[:2]]]))
         place = float(y[np.argmax(crossed)]) if limited and np.any(crossed) else None
-        found.append(0.0 if pair.gap <= 0 else place)
+        found.append(0.0 if pair.gap <= 0 and pair.second < lens.count else place)
     return found
 
 

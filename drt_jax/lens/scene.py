@@ -12,7 +12,8 @@ from ..numerics import Numbers, concrete, real_array
 from .lens import Lens
 
 _RIGHT = np.pi / 2
-# Smallest distance, mm: the square of 1 / distance is still finite in float32.
+# Smallest distance of an object, in front or behind, mm: the square of 1 / distance is still finite
+# in float32.
 _NEAREST = 1e-6
 
 
@@ -22,7 +23,8 @@ class Scene:
     """An object point and its wavelengths, arrays of one floating dtype.
 
     field: (2,), angles along x and y, radians: light goes along (tan x, tan y, 1).
-    distance: (), from the object plane to the first vertex, inf allowed, mm.
+    distance: (), from the object plane to the first vertex, inf allowed, mm. Below 0 for a virtual
+        object: light that converges towards a point behind the first vertex.
     wavelengths: (W,), um.
     """
 
@@ -32,9 +34,9 @@ class Scene:
 
     @property
     def possible(self) -> Array:
-        """True if the object lies in front of the lens, (), bool: angles below 90 degrees and a
-        distance above 0. In a trace, light from elsewhere is MISSED."""
-        return jnp.all(ahead(self.field)) & in_front(self.distance)
+        """True if light comes from the object, (), bool: angles below 90 degrees and a distance
+        other than 0. In a trace, light from elsewhere is MISSED."""
+        return jnp.all(ahead(self.field)) & apart(self.distance)
 
     @property
     def tangent(self) -> Array:
@@ -43,7 +45,7 @@ class Scene:
 
     @property
     def vergence(self) -> Array:
-        """1 / distance, (), 1/mm; 0 for a distance not above 0."""
+        """1 / distance, (), 1/mm; 0 for a distance of 0."""
         return vergence_of(self.distance)
 
 
@@ -52,27 +54,28 @@ def ahead(angle: Array) -> Array:
     return jnp.abs(angle) < _RIGHT
 
 
-def in_front(distance: Array) -> Array:
-    """True where an object at a distance (...), mm, lies in front of the lens, bool."""
-    return distance >= _NEAREST
+def apart(distance: Array) -> Array:
+    """True where an object at a distance (...), mm, does not lie at the first vertex, bool."""
+    return jnp.abs(distance) >= _NEAREST
 
 
 def vergence_of(distance: Array) -> Array:
-    """1 / distance (...), 1/mm; 0 for a distance not above 0."""
-    before = in_front(distance)
-    return jnp.where(before, 1 / jnp.where(before, distance, 1), 0)
+    """1 / distance (...), 1/mm; 0 for a distance of 0."""
+    good = apart(distance)
+    return jnp.where(good, 1 / jnp.where(good, distance, 1), 0)
 
 
 def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Scene:
     """A scene in the dtype of the lens.
 
     field: one angle (along y) or two (x, y), radians: light goes along (tan x, tan y, 1).
-    distance: from the object plane to the first vertex, inf allowed, mm.
+    distance: from the object plane to the first vertex, inf allowed, mm; below 0 for a virtual
+        object, see `Scene`.
     wavelengths: (W,) or one, um.
 
     ValueError for other shapes, for what is no real number, for a lens whose arrays do not fit
-    together, and, as far as values are known, for an angle of 90 degrees and more, a distance below
-    1e-6 mm or a wavelength outside the range of a glass. See `Scene.possible`.
+    together, and, as far as values are known, for an angle of 90 degrees and more, a distance
+    within 1e-6 mm of 0 or a wavelength outside the range of a glass. See `Scene.possible`.
     """
     lens.check()
     dtype = lens.curvature.dtype
@@ -122,14 +125,15 @@ def spectrum_of(weights: Numbers | None, scene: Scene, dtype: Any) -> Array:
 
 def distance_array(distance: Numbers, dtype: Any) -> Array:
     """A distance as an array (), mm. ValueError for other shapes, for what is no number, and for a
-    known one not above 0."""
+    known one within 1e-6 mm of 0."""
     far = real_array("distance", distance, dtype)
     if far.ndim:
         raise ValueError(f"distance: expected one number, got shape {far.shape}")
     for value in _known(distance):
-        if not value >= _NEAREST:
+        if not abs(value) >= _NEAREST:
             raise ValueError(
-                f"distance: must be above 0 mm, inf for an object at infinity; got {value:g}"
+                f"distance: must be {_NEAREST:g} mm or more, inf for an object at infinity, below "
+                f"0 for light that converges to a point behind the first vertex; got {value:g}"
             )
     return far
 
@@ -146,14 +150,14 @@ def field_of_height(height: Numbers, distance: Numbers) -> Array:
     height: (...), of the object point above the axis, mm.
     distance: (), from the object plane to the first vertex, finite, mm.
 
-    ValueError for a known distance not above 0 or not finite; inside a trace the angle then is 90
+    ValueError for a known distance of 0 or not finite; inside a trace the angle then is 90
     degrees, from where no light comes.
     """
     heights = real_array("height", height, float)
     far = distance_array(distance, float)
-    if np.inf in _known(distance):
+    if np.inf in np.abs(_known(distance)):
         raise ValueError("distance: at infinity an object has a field, but no height")
-    good = in_front(far) & (far < jnp.inf)
+    good = apart(far) & (jnp.abs(far) < jnp.inf)
     return jnp.where(good, -jnp.arctan(heights / jnp.where(good, far, 1)), _RIGHT)
 
 

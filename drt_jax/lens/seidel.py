@@ -21,7 +21,7 @@ from .paraxial import (
     petzval_parts,
     trace_ray,
 )
-from .scene import ahead, distance_array, field_array, in_front, vergence_of
+from .scene import ahead, apart, distance_array, field_array, vergence_of
 from .surface import by_form, surface_sag
 
 
@@ -141,4 +141,4 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
         lateral_colour=2 * half * colour * (chief.height * c + chief.before),
         petzval_curvature=-n[-1:] * petzval_parts(system),
     )
-    return system.masked(found, forwards & in_front(far))
+    return system.masked(found, forwards & apart(far))

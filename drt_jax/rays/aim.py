@@ -301,8 +301,8 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
         amplitude = safe_divide(point - tangent * tilted[-1, d, :, None], axial[-1, d, :, None])
         start = amplitude * axial[0, d, :, None] + tangent * tilted[0, d, :, None]
         launch.append(start)
-    # Transfer from z = `first` to the vertex plane of the first row.
-    depth, near = rows.vertex[0] - first, 1 / (v * first + 1)
+    # Transfer from z = `first` to the launch plane.
+    depth, near = system.launch_plane - first, 1 / (v * first + 1)
     launch = [a + depth * near * (v * a - s) for a, s in zip(launch, system.source, strict=False)]
     far = safe_sqrt(dot(launch, launch))
     shrink = jnp.minimum(1, 4 * width / jnp.maximum(far, width))

@@ -35,7 +35,8 @@ class Path(NamedTuple):
     slope: D arrays (R, W, Q), derivatives of the sag.
     bend: D rows of D arrays (R, W, Q), second derivatives of the optical path by a hit for fixed
         directions, 1/mm.
-    length: (R, W, Q), length of the segment in front of each row, mm; 0 for the first.
+    length: (R, W, Q), length of the segment in front of each row, mm; 0 for the first, and below 0
+        for a sensor in front of the last surface.
     shrink: (W, Q), 1 / |vergence P_1 - source|, see `geometry`.
     """
 
@@ -72,6 +73,10 @@ def geometry(hits: Vector, system: System) -> Path:
     front = (jnp.concatenate([f[None], s]) for f, s in zip(first, step, strict=True))
     chain = tuple(jnp.concatenate([s, s[-1:]]) for s in front)
     length = _length(chain)
+    if len(system.forms) > 1:
+        to, off = (tuple(c[k] for c in chain) for k in (-3, -2))
+        way = _way(to, off, tuple(s[-2] for s in slope), system)
+        length = jnp.concatenate([length[:-2], way[None] * length[-2:]])
     shrink = _inverse(length)
     direction = tuple(s * shrink for s in chain)
     before = rotate(rotation, tuple(d[:-1] for d in direction), back=True)
@@ -82,6 +87,19 @@ def geometry(hits: Vector, system: System) -> Path:
         rows, (_, _, more) = added(hits, system.diffraction)
         bend = jax.tree.map(lambda a, b: a.at[rows].add(b), bend, more)
     return Path(hits, z, before, after, slope, bend, length[:-1].at[0].set(0), shrink[0])
+
+
+def _way(before: Vector, after: Vector, slope: Vector, system: System) -> Array:
+    """1 where the sensor lies ahead of the last surface, -1 where light only seems to come from it.
+    Light leaves a mirror to the side from which it came, and another surface to the other side.
+
+    before, after: D + 1 arrays, steps to the last surface and from there to the sensor.
+    slope: D arrays, of the last surface.
+    """
+    rotation = None if system.rows.rotation is None else system.rows.rotation[-2]
+    sides = (_forward(rotate(rotation, a, back=True), slope) for a in (before, after))
+    ahead = (next(sides) * next(sides) < 0) == system.mirrors[-1]
+    return jnp.where(ahead, 1, -1).astype(after[0].dtype)
 
 
 def added(hits: Vector, by: Diffraction) -> tuple[np.ndarray, tuple]:
@@ -104,9 +122,9 @@ def residual(path: Path, system: System) -> Vector:
 
 
 def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
-    """Hits and system of one row and the row in front of it, if there is one. These determine the
-    ray in front of that row."""
-    some = slice(max(row - 1, 0), row + 1)
+    """Hits and system of one row and the two rows in front of it, as far as there are. These
+    determine the ray in front of that row."""
+    some = slice(max(row - 2, 0), row + 1)
     rows = jax.tree.map(lambda a: a[some], system.rows)
     part = dataclasses.replace(
         system,
@@ -114,6 +132,7 @@ def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
         index=system.index[some],
         diffraction=None,
         forms=system.forms[some],
+        mirrors=system.mirrors[some.start : row],
         before=min(system.before, 1),
     )
     return tuple(h[some] for h in hits), part
@@ -183,6 +202,12 @@ def optical_path(hits: Vector, system: System) -> Array:
     far = _length(near) + _length(p)
     first = (system.vergence * dot(q, q) - 2 * dot(q, p)) / far
     lengths = jnp.concatenate([first[None], _length(step)])
+    if len(system.forms) > 1:
+        shape = Shape(*(a[..., -2, :, :] for a in system.rows.wide))
+        slope = sag_derivatives(tuple(h[-2] for h in hits), shape, system.forms[-2])[1]
+        to = near if len(step[0]) == 1 else tuple(s[-2] for s in step)
+        way = _way(to, tuple(s[-1] for s in step), slope, system)
+        lengths = jnp.concatenate([lengths[:-1], way[None] * lengths[-1:]])
     path = jnp.sum(system.index * lengths, axis=0)
     if system.diffraction is None:
         return path
@@ -198,19 +223,21 @@ def stationary(path: Path, system: System, target: Vector) -> Array:
     (2e-2 in float32).
     """
     eps = float(jnp.finfo(path.length.dtype).eps)
-    senses = system.senses[:, None, None]
-    behind = np.where(np.append(system.mirrors, False)[:, None, None], -senses, senses)
     size = _width(path.hits, system)
     widest = jnp.maximum(size, jnp.concatenate([size[:1], size[:-1]]))
-    near = _inverse(path.length).at[0].set(jnp.abs(system.vergence) * path.shrink)
+    near = _inverse(abs(path.length)).at[0].set(jnp.abs(system.vergence) * path.shrink)
     angle = system.index * (1 + near * widest)  # change of direction by rounding
     both = angle + jnp.concatenate([angle[1:], angle[-1:]])
     gradient = residual(path, system)
     bound = 64 * eps * both * jnp.sqrt(1 + dot(path.slope, path.slope))
     ok = (dot(gradient, gradient) <= bound**2) & (both <= 4 / eps**0.5)
     ok = ok & by_form(domain, path.hits, system.rows.wide, system.forms)
-    ok = ok & (_forward(path.before, path.slope) * senses > 0)
-    ok = ok & (_forward(path.after, path.slope) * behind > 0)
+    arrives, leaves = (_forward(d, path.slope) for d in (path.before, path.after))
+    turns = np.append(system.mirrors, False)[:, None, None]
+    ok = ok & jnp.where(turns, arrives * leaves < 0, arrives * leaves > 0)
+    if system.rows.rotation is None:
+        ok = ok & (arrives * system.senses[:, None, None] > 0)
+        ok = ok.at[-1].set(ok[-1] & (path.length[-1] * system.sensor_way >= 0))
     return jnp.all(ok, axis=0) & met(label(path, system), target, path.hits, system)
 
 

@@ -22,33 +22,60 @@ _STEPS, _SETTLED = 20, 1e-7
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[Array, Array]:
-    """Length s at which p + s d meets a surface with its vertex at the origin, and a mask of those
-    that meet it. Differentiable in p, d and shape by the implicit function theorem.
+def reach(
+    form: str, p: Vector, d: Vector, shape: Shape, going: Array, side: Array, least: Array | None
+) -> tuple[Array, Array]:
+    """Length s at which the line p + s d crosses a surface with its vertex at the origin, and a
+    mask of those that cross it. Differentiable in p, d and shape by the implicit function theorem.
+
+    A line crosses a conic twice: once towards +z of the surface, which is where its normal
+    (-slope, 1) has a positive product with d, and once towards -z. `side` says which of them is
+    meant, so that neighbouring rays get neighbouring points however the surface is tilted. If
+    that one does not lie on the sheet of the vertex at s > `least`, and the other one does, it is
+    the other one. The crossing of a surface that is no conic is looked for from that of its conic;
+    the caller checks its side and whether it lies ahead.
 
     form: name of the form of the surface.
     p: D + 1 components, a point in the axes of the surface, mm.
     d: D + 1 components, a direction of any length; s is in units of that length.
     shape: shape of the surface.
     going: bool, rays whose iteration must converge; the others may come out wrong.
+    side: 1 for the crossing towards +z, -1 for that towards -z.
+    least: smallest s, in units of the length of d; None for the crossing of `side` wherever it is.
     """
-    length, met = -safe_divide(p[-1], d[-1]), jnp.ones(p[0].shape, bool)  # to the vertex plane
-    if form == "asphere":
-        # c (x^2 + y^2 + (1 + k) z^2) = 2 z at p + s d: square s^2 - 2 linear s + constant = 0
-        c, k = shape.curvature, shape.conic
-        square, linear, constant = quadratic(p, d, shape)
-        discriminant = linear**2 - square * constant
-        root = safe_sqrt(discriminant)
-        root = jnp.where(d[-1] < 0, -root, root)
+    # c (x^2 + y^2 + (1 + k) z^2) = 2 z at p + s d: square s^2 - 2 linear s + constant = 0
+    c, k = shape.curvature, shape.conic
+    square, linear, constant = quadratic(p, d, shape)
+    discriminant = linear**2 - square * constant
+
+    def crossing(root: Array) -> tuple[Array, Array]:
         # Of the two forms of the root, use the one without cancellation.
         alike = linear * root < 0
         above = jnp.where(alike, linear - root, constant)
         below = jnp.where(alike, square, linear + root)
-        met = discriminant > 0
-        # Where the ray misses the conic, the search for the asphere starts at the vertex plane.
-        length = jnp.where(met, safe_divide(above, below), length)
-        if _plain(form, shape):
-            return length, met & (1 - (1 + k) * c * (p[-1] + length * d[-1]) > RIM**0.5)
+        length = safe_divide(above, below)
+        return length, 1 - (1 + k) * c * (p[-1] + length * d[-1]) > RIM**0.5
+
+    root, met = side * safe_sqrt(discriminant), discriminant > 0
+    length, on_sheet = crossing(root)
+    if least is not None:
+        other, also = crossing(-root)
+
+        def good(length: Array, on_sheet: Array, side: Array) -> Array:
+            # A plane has one crossing only: the formula gives another from the wrong side.
+            return on_sheet & (length > least) & ((linear - square * length) * side > 0)
+
+        turned = good(other, also, -side) & ~good(length, on_sheet, side)
+        length, on_sheet = jnp.where(turned, other, length), jnp.where(turned, also, on_sheet)
+    if _plain(form, shape):
+        return length, met & on_sheet
+    # Newton's method starts at the conic, or at the vertex plane, where that is nearer.
+    plane = -safe_divide(p[-1], d[-1])
+    if form == "asphere":
+        start = jnp.where(met, length, plane)
+    else:
+        gaps = (abs(_gap(form, p, d, shape, s)[0]) for s in (length, plane))
+        start = jnp.where(met & on_sheet & jnp.less(*gaps), length, plane)
     size = jnp.sqrt(dot(d, d))
     settled = max(_SETTLED, 16 * float(jnp.finfo(length.dtype).eps))
 
@@ -58,10 +85,9 @@ def reach(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple[
         small = jnp.abs(change) * size <= settled * (1 + jnp.abs(length) * size)
         return count + 1, length + change, small
 
-    start = 0, length, jnp.zeros(length.shape, bool)
-    plane = length
+    begin = 0, start, jnp.zeros(start.shape, bool)
     _, length, met = jax.lax.while_loop(
-        lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, start
+        lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, begin
     )
     length = jnp.where(met, length, plane)  # a length that has not converged may be anything
     return length, met & domain(_along(p, d, length)[:-1], shape, form)
@@ -104,13 +130,21 @@ def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
     return (length, met), (tangent, np.zeros(met.shape, jax.dtypes.float0))
 
 
-def meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:
+def meet(
+    form: str,
+    p: Vector,
+    d: Vector,
+    shape: Shape,
+    going: Array,
+    side: Array,
+    least: Array | None,
+) -> tuple:
     """Intersection of rays with a surface; arguments as in `reach`.
 
     Returns the point (mm), a normal of any length with z above 0, the mask of those that meet the
     surface, and the length s.
     """
-    length, met = reach(form, p, d, shape, going)
+    length, met = reach(form, p, d, shape, going, side, least)
     own = _along(p, d, length)
     if _plain(form, shape):
         c = shape.curvature
@@ -119,6 +153,11 @@ def meet(form: str, p: Vector, d: Vector, shape: Shape, going: Array) -> tuple:
         _, slope, _ = sag_derivatives(own[:-1], shape, form)
         normal = *(-a for a in slope), jnp.ones_like(own[-1])
     return own, normal, met, length
+
+
+def near_side(d: Vector) -> Array:
+    """The `side` of `reach` from which a straight line crosses a surface near its vertex."""
+    return jnp.where(d[-1] < 0, -1, 1).astype(d[-1].dtype)
 
 
 def cross(surface: Placed, form: str, point: Vector, direction: Vector) -> tuple[Vector, Array]:
@@ -130,5 +169,6 @@ def cross(surface: Placed, form: str, point: Vector, direction: Vector) -> tuple
     point, direction: D + 1 arrays each, along the axes of the lens; point in mm.
     """
     p, d = surface.local(point, direction)
-    length, met = reach(form, p, d, surface.shape, jnp.ones(p[0].shape, bool))
+    all_of_them = jnp.ones(p[0].shape, bool)
+    length, met = reach(form, p, d, surface.shape, all_of_them, near_side(d), None)
     return _along(p, d, length)[:-1], met

@@ -1,7 +1,13 @@
 """The sequential ray trace by Snell's law, which aiming uses.
 
-The `launch` of a ray is the point where it crosses the vertex plane of the first row. Arrays have
-the shape () for one ray, or (wavelength, ray) with a refractive index (wavelength, 1).
+The `launch` of a ray is the point where it crosses a plane across the axis of the lens, that of
+`System.launch_plane`. Arrays have the shape () for one ray, or (wavelength, ray) with a refractive
+index (wavelength, 1).
+
+A ray runs forwards. On each row it takes the crossing from the side from which light is expected
+to arrive (`Row.side`), if that lies ahead on the sheet of the surface; otherwise, in a lens with
+tilted surfaces, the crossing from the other side, if that does: an off-axis mirror may be
+prescribed with its axis either way.
 
 Source: Welford, Aberrations of Optical Systems (1986), ch. 4.
 """
@@ -17,11 +23,11 @@ from jax import Array
 from ..lens.forms import Shape
 from ..lens.surface import sag_derivatives
 from ..numerics import safe_divide, safe_sqrt
-from .meet import meet
+from .meet import meet, near_side
 from .status import Status
 from .system import Placed, System, Vector, dot, rotate
 
-# Least cosine of a traced ray with the axis of a surface.
+# Least cosine of a traced ray with the normal of a surface: 0.006 degrees from grazing.
 _FLATTEST = 1e-4
 
 
@@ -49,33 +55,39 @@ def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
     return tuple(jnp.concatenate([h[:at], h[at + 1 :]]) for h in hits), crossing
 
 
-def _begin(system: System, launch: Vector) -> tuple[Vector, Vector]:
-    point = *launch, jnp.broadcast_to(system.rows.vertex[0], launch[0].shape)
+def _begin(system: System, launch: Vector) -> tuple[Vector, Vector, Array]:
+    """Points (mm) and unit vectors of rays on the launch plane, and their distance from the object
+    times the vergence."""
+    point = *launch, jnp.broadcast_to(system.launch_plane, launch[0].shape)
     direction = tuple(system.vergence * p - s for p, s in zip(point, system.source, strict=True))
-    shrink = 1 / jnp.sqrt(dot(direction, direction))
-    return point, tuple(d * shrink for d in direction)
+    size = jnp.sqrt(dot(direction, direction))
+    shrink = 1 / size
+    return point, tuple(d * shrink for d in direction), size
 
 
-def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector) -> tuple[Vector, Array, Array]:
+def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector, side: Array | None) -> tuple:
     """Refraction, reflection and diffraction by Snell's law in vector form.
 
     d: D + 1 arrays, unit vector in front of the surface.
     normal: D + 1 arrays of any length.
     row: the surface.
     kick: D arrays, change of direction by a phase; () for no phase.
+    side: 1 if light must cross towards +z of the surface, -1 towards -z; None for any.
 
-    Returns the direction behind the surface, D + 1 arrays; a number above 0 if light comes from the
-    front; and the squared cosine behind the surface, above 0 if light passes.
+    Returns the direction behind the surface, D + 1 arrays; a number above 0 if light comes from
+    that side; and the squared cosine behind the surface, above 0 if light passes.
     """
-    front = jnp.minimum(d[-1] * row.sense - _FLATTEST, dot(normal, d) * row.sense)
+    shrink = 1 / jnp.sqrt(dot(normal, normal))
+    cosine = dot(normal, d) * shrink
+    side = jnp.where(cosine < 0, -1, 1).astype(cosine.dtype) if side is None else side
+    front = cosine * side - _FLATTEST
     size, d = row.ratio**2, tuple(row.ratio * a for a in d)
     if kick:
         d = *(a + b for a, b in zip(d, kick, strict=False)), d[-1]
         size = dot(d, d)
-    shrink = 1 / jnp.sqrt(dot(normal, normal))
     cosine = dot(normal, d) * shrink
     square = 1 - (size - cosine**2)
-    change = (row.leaving * safe_sqrt(square) - cosine) * shrink
+    change = (side * row.turn * safe_sqrt(square) - cosine) * shrink
     return tuple(a + change * n for a, n in zip(d, normal, strict=True)), front, square
 
 
@@ -119,24 +131,26 @@ def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
 class Row(NamedTuple):
     """One step of the trace: an active surface, the stop or the sensor; several have a first axis.
 
-    first: True for the first row.
+    first, last: True for the first row, and for the sensor.
     active: False for a stop that only labels: the line is extended either way to it.
     bends: False if the ray continues unchanged.
     surface: the surface in its position.
     kind: number of its form.
     ratio: refractive index in front of it divided by that behind it.
-    sense, leaving: 1 if light travels towards +z in front of it, or behind it; -1 if towards -z.
+    side: 1 if light is expected to cross towards +z of it, -1 towards -z.
+    turn: -1 for a mirror, else 1.
     kick: its phase; None if no row has a phase.
     """
 
     first: Any
+    last: Any
     active: Any
     bends: Any
     surface: Placed
     kind: Any
     ratio: Array
-    sense: Any
-    leaving: Any
+    side: Any
+    turn: Any
     kick: _Kick | None
 
 
@@ -153,17 +167,17 @@ def rows_met(system: System, to_stop: bool = False) -> Row:
     """
     kinds, phases = _forms(system)
     count, at = len(system.forms), system.before
-    senses = system.senses
     forms = np.array([kinds.index(form) for form in system.forms])
     rows = Row(
         np.arange(count) == 0,
+        np.arange(count) == count - 1,
         np.ones(count, bool),
         np.ones(count, bool),
         system.rows,
         forms.astype(np.int32),
         system.index / system.behind,
-        senses,
-        np.where([*system.mirrors, False], -senses, senses),
+        system.sides,
+        np.where([*system.mirrors, False], -1, 1).astype(system.index.dtype),
         _kicks(system, phases),
     )
     if system.stop is None and not to_stop:
@@ -172,7 +186,11 @@ def rows_met(system: System, to_stop: bool = False) -> Row:
     near = jax.tree.map(lambda a: a[at], rows)
     active = np.bool_(system.stop is None)
     label = near._replace(
-        active=active, bends=np.False_, surface=stop, kind=np.int32(kinds.index(form))
+        last=np.False_,
+        active=active,
+        bends=np.False_,
+        surface=stop,
+        kind=np.int32(kinds.index(form)),
     )
     tail = jax.tree.map(lambda a: a[at:at] if to_stop else a[at:], rows)
 
@@ -221,28 +239,11 @@ class Meeting(NamedTuple):
     status: Array
 
 
-def _along_the_axis(going: Array, sense: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
+def _along_the_axis(going: Array, side: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
     """Moves failed rays onto the axis, where their numbers and derivatives are finite."""
-    axis: Vector = (*(jnp.zeros_like(a) for a in d[:-1]), sense)
+    axis: Vector = (*(jnp.zeros_like(a) for a in d[:-1]), side)
     p = tuple(jnp.where(going, a, 0) for a in p)
     return p, tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
-
-
-def _meet(system: System, row: "Row", state: _State, smooth: bool) -> tuple[Meeting, _State]:
-    """Meetings of rays with one row, and the rays behind it. smooth: as in `meetings`."""
-    kinds, phases = _forms(system)
-    going = state.status == Status.OK
-    p, d = row.surface.local(state.point, state.direction)
-    if smooth:
-        p, d = _along_the_axis(going, row.sense, p, d)
-    each = [partial(meet, kind) for kind in kinds]
-    encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
-    own, normal, crosses, length = encounter(p, d, row.surface.shape, going)
-    direction, front, through = _refract(d, normal, row, _kick(phases, row.kick, own[:-1]))
-    hit, origin = own[:-1], row.surface.origin(len(own) - 1)
-    point = tuple(a + o for a, o in zip(rotate(row.surface.rotation, own), origin, strict=True))
-    behind = state._replace(point=point, direction=rotate(row.surface.rotation, direction), hit=hit)
-    return Meeting(p, d, hit, crosses, length, front, through, state.status), behind
 
 
 def _follow(
@@ -254,24 +255,55 @@ def _follow(
 ) -> tuple[_State, Any]:
     """Traces rays.
 
-    launch: D arrays (...), mm on the vertex plane of the first row.
+    launch: D arrays (...), mm on the launch plane.
     to_stop: True to trace to the stop alone.
     smooth: as in `meetings`.
     forward: True if a ray that steps back to a row fails.
 
     Returns the rays behind the last row and the `Meeting` with all rows; None if `to_stop`.
     """
+    kinds, phases = _forms(system)
+    each = [partial(meet, kind) for kind in kinds]
+    tilted = system.rows.rotation is not None
+    point, direction, far = _begin(system, launch)
+
+    def ahead(row, length):
+        """Whether a length leads forwards: away from the object, which lies `far` / vergence behind
+        the launch, or from the row before. The sensor may lie in front of the last surface, where
+        light only seems to come from."""
+        beyond = jnp.where(row.first, system.vergence * length + far, length)
+        beyond = jnp.where(row.last, tilted | (beyond * system.sensor_way > 0), beyond > 0)
+        return beyond | (not forward)
+
+    def least(row):
+        """The smallest length of the crossing of a tilted surface."""
+        start = jnp.where(system.vergence > 0, -safe_divide(far, system.vergence), -jnp.inf)
+        anywhere = row.last | ~row.active
+        return jnp.where(row.first, start, jnp.where(anywhere, -jnp.inf, 0))
 
     def step(state, row):
-        meeting, behind = _meet(system, row, state, smooth)
-        ahead = (meeting.length > 0) | row.first | (not forward)
-        met = meeting.crosses & (~row.active | ((meeting.front > 0) & ahead))
+        going = state.status == Status.OK
+        p, d = row.surface.local(state.point, state.direction)
+        if smooth:
+            p, d = _along_the_axis(going, row.side, p, d)
+        side = jnp.where(row.active, row.side, near_side(d))
+        encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
+        given = p, d, row.surface.shape, going, side
+        own, normal, crosses, length = encounter(*given, least(row) if tilted else None)
+        kick = _kick(phases, row.kick, own[:-1])
+        direction, front, through = _refract(d, normal, row, kick, None if tilted else side)
+        hit, origin = own[:-1], row.surface.origin(len(own) - 1)
+        point = tuple(a + o for a, o in zip(rotate(row.surface.rotation, own), origin, strict=True))
+        direction = rotate(row.surface.rotation, direction)
+        behind = state._replace(point=point, direction=direction, hit=hit)
+        meeting = Meeting(p, d, hit, crosses, length, front, through, state.status)
+        met = crosses & (~row.active | ((front > 0) & ahead(row, length)))
         passes = (meeting.through > 0) | ~row.bends
         here = jnp.where(met, jnp.where(passes, Status.OK, Status.TIR), Status.MISSED)
-        status = jnp.where(state.status == Status.OK, here.astype(jnp.int32), state.status)
+        status = jnp.where(going, here.astype(jnp.int32), state.status)
         wide = jnp.maximum(dot(meeting.hit, meeting.hit), dot(state.hit, state.hit))
         wide = jax.lax.stop_gradient(jnp.sqrt(wide))  # has no derivative on the axis
-        angle = safe_divide(wide, jnp.where(row.first, 0, meeting.length))
+        angle = safe_divide(wide, jnp.where(row.first, 0, abs(meeting.length)))
         angle = jnp.maximum(jnp.where(status == Status.OK, angle, 0), state.rounding_angle)
         behind = behind._replace(status=status, rounding_angle=angle)
         if to_stop:
@@ -280,13 +312,13 @@ def _follow(
         return behind, meeting._replace(status=status)
 
     zero = jnp.zeros_like(launch[0])
-    none, begin = jnp.zeros(zero.shape, jnp.int32), _begin(system, launch)
-    start = _State(*begin, (zero,) * len(launch), none, zero)
+    none = jnp.zeros(zero.shape, jnp.int32)
+    start = _State(point, direction, (zero,) * len(launch), none, zero)
     return jax.lax.scan(step, start, rows_met(system, to_stop))
 
 
 def shoot(system: System, launch: Vector) -> Trace:
-    """Traces rays to the sensor. launch: D arrays, mm on the vertex plane of the first row."""
+    """Traces rays to the sensor. launch: D arrays, mm on the launch plane."""
     state, met = _follow(system, launch)
     return Trace(met.hit, state.status, state.rounding_angle)
 
@@ -296,10 +328,16 @@ def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
     for failed rays. launch: as in `shoot`.
 
     Returns `hits` as in `Trace`; the lengths (R - 1, ...) of the segments from each active surface
-    to the next and to the sensor, mm, below 0 for a step back; and `status` as in `Trace`.
+    to the next and to the sensor, mm, below 0 for a step back, which no step to a sensor in front
+    of the last surface is; and `status` as in `Trace`.
     """
     state, met = _follow(system, launch, smooth=True, forward=False)
-    return met.hit, split_stop(system, (met.length,))[0][0][1:], state.status
+    lengths = split_stop(system, (met.length,))[0][0][1:]
+    if len(lengths):
+        last = lengths[-1:]
+        last = last * system.sensor_way if system.rows.rotation is None else abs(last)
+        lengths = jnp.concatenate([lengths[:-1], last])
+    return met.hit, lengths, state.status
 
 
 def meetings(system: System, launch: Vector, smooth: bool = False) -> Meeting:

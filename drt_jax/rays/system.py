@@ -186,6 +186,35 @@ class System:
         return jnp.concatenate([self.index[1:], self.index[-1:]])
 
     @property
+    def launch_plane(self) -> Array:
+        """z of the plane on which rays are launched, (), mm: that through the first row's vertex,
+        unless that lies so near to the object, or behind it, that no ray is known by its point
+        there; then that through the first surface of the lens, z = 0."""
+        first = self.rows.vertex[0]
+        return jnp.where(1 + self.vergence * first > 0.5, first, 0)
+
+    @property
+    def sensor_way(self) -> Array:
+        """1, or -1 for a sensor in front of the last surface, which shows a virtual image; ()."""
+        rows = self.rows.vertex
+        if len(self.forms) == 1:
+            return jnp.ones_like(rows[0])
+        return jnp.where((rows[-1] - rows[-2]) * self.senses[-1] < 0, -1, 1).astype(rows.dtype)
+
+    @property
+    def sides(self) -> Array:
+        """(R,), 1 for rows that light is expected to cross towards +z of their own axes, -1 towards
+        -z: by the number of mirrors in front; the first row by the side on which the object lies,
+        seen from its vertex, as its axis may be tilted by more than 90 degrees."""
+        sides = jnp.asarray(self.senses)
+        rotation = self.rows.rotation
+        if rotation is None:
+            return sides
+        vertex = jnp.stack([a[0] for a in self.rows.origin(self.dim)])
+        along = jnp.dot(self.vergence * vertex - self.source, rotation[0, :, 2])
+        return sides.at[0].set(jnp.where(along < 0, -1, 1).astype(sides.dtype))
+
+    @property
     def senses(self) -> np.ndarray:
         """(R,), 1 where light travels towards +z in front of a row, -1 where towards -z."""
         senses = np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])

@@ -90,12 +90,8 @@ BACKWARDS = {
         r"surfaces\[0\].thickness: 4 mm makes surfaces 0 and 2 cross at .* mm from the axis",
     ),
     "sensor, behind the stop": (
-        (FRONT, 1.0, BACK, -2.0, STOP, 1.0),
-        "sensor: 0 mm lies before the vertex of surface 1 at 1 mm",
-    ),
-    "sensor before a lone stop": (
-        (STOP, -1.0),
-        "sensor: -1 mm lies before the vertex of surface 0",
+        (FRONT, 1.0, BACK, -2.0, STOP, 2.0),
+        "sensor: 1 mm touches the vertex of surface 1 at 1 mm; move it",
     ),
 }
 
@@ -105,6 +101,15 @@ def test_surfaces_that_bend_light_keep_their_order(name):
     surfaces, message = BACKWARDS[name]
     with pytest.raises(LensError, match=message):
         load_lens(in_order(*surfaces))
+
+
+def test_a_sensor_in_front_of_the_last_surface_shows_a_virtual_image():
+    """Behind a lone stop, which bends no light, it may lie anywhere."""
+    with pytest.warns(UserWarning, match="sensor: 0 mm lies before the vertex of surface 1 at 1"):
+        load_lens(in_order(FRONT, 1.0, BACK, -2.0, STOP, 1.0))
+    with pytest.warns(UserWarning, match="as a mirror has turned the light: rays are prolonged"):
+        load_lens(in_order(STOP, 5.0, MIRROR, 10.0))
+    load_lens(in_order(STOP, -1.0))
 
 
 @pytest.mark.parametrize("key, zeros", [("decentre", [0, 0]), ("tilt", [0, 0, 0])])
@@ -117,7 +122,7 @@ def test_zeros_that_are_written_are_variables_and_turn_off_no_check(key, zeros):
         load_lens(in_order(STOP | still, 0.0, FRONT | still, -1.0, BACK, 20.0))
     with pytest.raises(LensError, match="cross at"):
         load_lens(in_order(STOP, 0.0, WIDE, 1.0, BACK | {"semi_diameter": 10} | still, 20.0))
-    with pytest.raises(LensError, match="sensor: 0 mm lies before"):
+    with pytest.warns(UserWarning, match="sensor: 0 mm lies before"):
         load_lens({**in_order(STOP, 0.0, FRONT, 1.0, BACK, -1.0), f"sensor_{key}": zeros})
 
 

@@ -62,11 +62,11 @@ class Met(NamedTuple):
 @functools.partial(jax.jit, static_argnums=0)
 def along_a_way(form, p, d, shape, way, places):
     """All that is asked of a form: one program."""
-    going = jnp.ones(p[0].shape, bool)
+    going, side = jnp.ones(p[0].shape, bool), jnp.sign(d[-1])
 
     def at(h):
         moved = jax.tree.map(lambda a, v: a + h * v, (p, d, shape), way)
-        return meet.reach(form, *moved, going)[0]
+        return meet.reach(form, *moved, going, side, None)[0]
 
     def slope(h):
         value, first = jax.jvp(at, (h,), (jnp.ones_like(h),))
@@ -76,7 +76,7 @@ def along_a_way(form, p, d, shape, way, places):
         first, second, value = jax.jvp(slope, (h,), (jnp.ones_like(h),), has_aux=True)
         return value, first, second
 
-    length, met = meet.reach(form, p, d, shape, going)
+    length, met = meet.reach(form, p, d, shape, going, side, None)
     *across, z = (a + length * b for a, b in zip(p, d, strict=True))
     miss = surface_sag(across, shape, form) - z
     return Met(*jax.vmap(both)(places), met, miss, domain(across, shape, form))
@@ -149,7 +149,7 @@ def test_lines_that_meet_nothing():
     d = tuple(np.array(a) for a in ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0]))
     for terms in (0, 1):
         wider = shape._replace(coefficients=np.zeros((terms, 3)))
-        length, met = reach("asphere", p, d, wider, np.ones(3, bool))
+        length, met = reach("asphere", p, d, wider, np.ones(3, bool), np.ones(3), None)
         assert np.all(np.isfinite(length)) and not np.any(met[:2])
 
 
