@@ -3,22 +3,29 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from ..lens.aperture import Apertures
 from ..lens.forms import FORMS
+from ..lens.polygon import CORNERS, convex_pieces, tidied
 from .entry import Entry, array
 
-_KINDS = ("circle", "ellipse", "rectangle")
+_KINDS = ("circle", "ellipse", "rectangle", "polygon")
 _MOST = 6  # obscurations per lens: n of them need 2^n times as many rays
+_TERMS = 64  # and with polygons of several convex pieces: as many times as many rays
 _MANY = 20  # apertures per surface
 
 
 class _Aperture(NamedTuple):
-    """One aperture or obscuration. half, centre: mm along x and y; centre is empty if not given."""
+    """One aperture or obscuration. half, centre: mm along x and y; centre is empty if not given.
+    corners: (N, 2), mm from the centre, and pieces of a polygon; empty for others."""
 
     entry: Entry
     kind: str
     half: list[float]
     centre: list[float]
+    corners: np.ndarray
+    pieces: tuple[tuple[int, ...], ...]
 
     @property
     def reach(self) -> float:
@@ -26,6 +33,8 @@ class _Aperture(NamedTuple):
         x, y = (abs(c) for c in self.centre or (0.0, 0.0))
         if self.kind == "rectangle":
             return math.hypot(x + self.half[0], y + self.half[1])
+        if self.kind == "polygon":
+            return float(np.max(np.hypot(*(self.corners + (self.centre or 0)).T)))
         return math.hypot(x, y) + max(self.half)
 
 
@@ -42,11 +51,28 @@ def _read(surface: Entry, key: str) -> list[_Aperture]:
         if len(kinds) != 1:
             raise entry.error("", f"give one of {', '.join(_KINDS)}")
         (kind,) = kinds
+        centre = entry.vector("centre", 2)
+        if kind == "polygon":
+            found.append(_Aperture(entry, kind, [1.0, 1.0], centre, *_polygon(entry)))
+            continue
         half = [entry.number(kind)] * 2 if kind == "circle" else entry.vector(kind, 2)
         if not half or min(half) <= 0:
             raise entry.error(kind, "must be positive, in mm")
-        found.append(_Aperture(entry, kind, half, entry.vector("centre", 2)))
+        found.append(_Aperture(entry, kind, half, centre, np.zeros((0, 2)), ()))
     return found
+
+
+def _polygon(entry: Entry) -> tuple[np.ndarray, tuple[tuple[int, ...], ...]]:
+    """Corners (N, 2), mm, and convex pieces of the entry `polygon`."""
+    rows = entry["polygon"]
+    if not isinstance(rows, list | tuple) or not 3 <= len(rows) <= CORNERS:
+        raise entry.error("polygon", f"expected 3 to {CORNERS} corners [x, y], mm, in their order")
+    each = Entry(dict(enumerate(rows)), entry.name("polygon"), range(len(rows)))
+    try:
+        corners = tidied(np.array([each.vector(i, 2) for i in each]))
+        return corners, convex_pieces(corners)
+    except ValueError as error:
+        raise entry.error("polygon", str(error)) from None
 
 
 def _check_reach(surface: Entry, entry: Entry, key: str, reach: float) -> None:
@@ -85,11 +111,24 @@ def apertures_of(surfaces: list[Entry]) -> Apertures | None:
         raise blocked[_MOST].error("", f"a lens has {_MOST} obscurations at most; join some")
     if not found:
         return None
-    centres = [own.centre for *_, own in found]
-    return Apertures(
+    centres, most = [own.centre for *_, own in found], max(len(own.corners) for *_, own in found)
+    corners = [
+        [*own.corners.tolist(), *[[0.0, 0.0]] * (most - len(own.corners))] for *_, own in found
+    ]
+    apertures = Apertures(
         array([own.half for *_, own in found]),
         array([centre or [0.0, 0.0] for centre in centres]) if any(centres) else None,
+        array(corners) if most else None,
         surfaces=tuple(i for i, *_ in found),
         kinds=tuple(own.kind for *_, own in found),
         blocks=tuple(blocks for _, blocks, _ in found),
+        pieces=tuple(own.pieces for *_, own in found),
     )
+    times = len(apertures.terms()[0])
+    if times > _TERMS:
+        raise surfaces[0].error(
+            "",
+            f"the apertures of the lens need {times} sets of rays, {_TERMS} at most: give "
+            "polygons fewer inward corners, or join obscurations",
+        )
+    return apertures

@@ -113,6 +113,8 @@ def _apertures(lens: Lens, i: int) -> dict[str, Any]:
     for k in np.flatnonzero(np.array(extra.surfaces) == i):
         half = np.asarray(extra.half[k]).tolist()
         own = {extra.kinds[k]: half[0] if extra.kinds[k] == "circle" else half}
+        if extra.kinds[k] == "polygon":
+            own["polygon"] = np.asarray(extra.outline(int(k))).tolist()
         if extra.centre is not None:
             own["centre"] = np.asarray(extra.centre[k]).tolist()
         found.setdefault("obscuration" if extra.blocks[k] else "aperture", []).append(own)

@@ -111,6 +111,10 @@ def _surface(lens: Lens, i: int) -> list[str]:
     own = [] if extra is None else [k for k, s in enumerate(extra.surfaces) if s == i]
     for n, k in enumerate(own):
         assert extra is not None
+        if extra.kinds[k] == "polygon":
+            raise LensError(
+                f"surfaces[{i}]: .seq files hold no polygon here: save as .yaml or .zmx"
+            )
         label = f"{'OBS' if extra.blocks[k] else 'CLR'} L'A{n + 1}'"
         half = np.asarray(extra.half[k]).tolist()
         lines += [f"{key} {label} {v!r}" for key, v in zip(_KINDS[extra.kinds[k]], half)]

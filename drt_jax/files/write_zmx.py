@@ -179,6 +179,14 @@ def _apertures(lens: Lens, i: int) -> list[str]:
     kind, blocks = extra.kinds[k], extra.blocks[k]
     if kind == "circle":
         lines = [f"OBSC 0 {x!r} 0" if blocks else f"CLAP 0 {x!r} 0"]
+    elif kind == "polygon":
+        corners = np.asarray(extra.outline(k), float).tolist()
+        if [0, 0] in corners:
+            raise LensError(
+                f"surfaces[{i}]: a corner 0 0 ends a polygon in .zmx files: save as .yaml"
+            )
+        lines = [f"{'USOB' if blocks else 'USAP'} 0 0 0", 'UDAD 0 "POLYGON.UDA" 1']
+        lines += [f"UDAD {n} {x!r} {y!r} 0" for n, (x, y) in enumerate(corners, 1)]
     elif kind == "rectangle" and not blocks:
         lines = [f"SQAP {x!r} {y!r} 0"]
     else:

@@ -13,6 +13,7 @@ from .record import Breaking, Missing, Record, Row, distance_of, short
 from .system import Use
 from .text import Words, words_of
 from .zmx_head import KEYS, Head
+from .user_zmx import LINES, UserAperture
 
 _SURFACES = 5000
 # Ignored: drawing, names, tolerances, analyses, coatings, polarisation. None changes rays.
@@ -27,9 +28,6 @@ _SOLVES = ("PPAR", "PZUP", "MAZH", "CHZH", "EDGE", "PKUP")
 # Apertures that are refused.
 _REFUSED = {
     "SPID": "a spider",
-    "USAP": "a user aperture",
-    "USOB": "a user obscuration",
-    "UDAD": "points of a user aperture",
     "UDAP": "an aperture from a file",
     "UDOB": "an obscuration from a file",
 }
@@ -51,6 +49,7 @@ class _Block:
     apertures: list[tuple[int, str, list[float]]] = dataclasses.field(default_factory=list)
     centre: list[float] = dataclasses.field(default_factory=list)
     moves: dict[int, dict[int, tuple[int, float]]] = dataclasses.field(default_factory=dict)
+    user: UserAperture = dataclasses.field(default_factory=UserAperture)
 
 
 class _Reader:
@@ -171,7 +170,7 @@ def _centre(reader: _Reader, words: Words) -> None:
 
 
 def _refused(reader: _Reader, words: Words) -> None:
-    if words.key in ("USAP", "USOB") or any(word.strip("+-.0") for word in words.rest):
+    if any(word.strip("+-.0") for word in words.rest):
         reader.record.lacks(words.line, f"{words.key}, {_REFUSED[words.key]}")
 
 
@@ -195,6 +194,7 @@ _SURFACE: dict[str, Callable[[_Reader, Words], None]] = {
     **dict.fromkeys(("PARM", "XDAT"), _parameter),
     **{"GLAS": _glass, "DIAM": _diameter, "FLAP": _floating, "OBDC": _centre},
     **dict.fromkeys(("CLAP", "SQAP", "ELAP", "OBSC", "SQOB", "ELOB"), _clip),
+    **dict.fromkeys(LINES, lambda r, words: r.block.user.take(r.record, r.unit, words)),
     **dict.fromkeys(_REFUSED, _refused),
     "SCBD": _moves,
 }
@@ -298,9 +298,9 @@ def _parts(reader: _Reader, block: _Block, image: bool) -> list[Row | Breaking]:
     TYPES[block.kind](surface)
     if image and row.entry.get("coefficients"):
         raise record.error(row.line, f"{row.name}: an aspheric image")
-    if block.floating:
-        block.apertures.insert(0, (block.floating, "CLAP", [0.0, block.semi]))
-    clipping(record, row, block.apertures, block.centre)
+    rim = [(block.floating, "CLAP", [0.0, block.semi])] if block.floating else []
+    clipping(record, row, rim + block.apertures, block.centre)
+    block.user.put(record, row, block.centre)
     parts: list[Row | Breaking] = [row]
     moves = {k: surface._replace(parameters=own) for k, own in block.moves.items()}
     if 1 in moves:

@@ -2,8 +2,9 @@
 
 Every edge, the rim of the stop included, is a quadric: a ray passes if |q| <= 1, where q is its hit
 on that surface, relative to the centre of the edge, in units of its half widths. A rectangle is two
-edges, each with one component of q. Where neighbouring surfaces cross, the length of a ray from one
-to the next is 0; with `crossing`, this is an edge too.
+edges, each with one component of q; a side of a polygon is one with a component across the side.
+Where neighbouring surfaces cross, the length of a ray from one to the next is 0; with `crossing`,
+this is an edge too.
 
 Rays are launched, not aimed. A trace yields the derivative of q by the stop point, also outside of
 all edges, where rays may step back to a surface. By this linear model, every half-line on the stop
@@ -18,7 +19,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
@@ -109,8 +109,9 @@ def picked(values: Array, edge: Array) -> Array:
 
 def aperture_edges(lens: Lens) -> int:
     """Number of edges of the apertures other than the semi-diameters."""
-    kinds = () if lens.apertures is None else lens.apertures.kinds
-    return sum(2 if kind == "rectangle" else 1 for kind in kinds)
+    extra = lens.apertures
+    count = {} if extra is None else {"rectangle": 2, "polygon": extra.most}
+    return sum(count.get(kind, 1) for kind in (() if extra is None else extra.kinds))
 
 
 def trace(
@@ -130,14 +131,8 @@ def trace(
         span = jnp.sum(abs(lens.thickness)) + abs(lens.sensor) + lens.semi_diameter[lens.stop]
         q.append(jnp.stack([ways / (_LONGEST * span) - 1, 0 * ways]))
     if lens.apertures is not None:
-        extra = lens.apertures
-        axes = [np.eye(2) if kind == "rectangle" else np.ones((1, 2)) for kind in extra.kinds]
-        own = np.repeat(np.arange(len(axes)), [len(rows) for rows in axes])
-        scale = jnp.asarray(np.concatenate(axes), hit.dtype) / extra.sizes[own]
-        line = hit[:, np.array(extra.surfaces)[own]]
-        if extra.centre is not None:
-            line = line - extra.centre[own].T[..., None, None]
-        q.append(scale.T[..., None, None] * line)
+        matrix, centre, own = lens.apertures.edges()
+        q.append(jnp.einsum("eij,jewb->iewb", matrix, hit[:, own] - centre.T[..., None, None]))
     return (hit[:, lens.stop] / lens.semi_diameter[lens.stop], jnp.concatenate(q, axis=1)), good
 
 

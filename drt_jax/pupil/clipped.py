@@ -11,7 +11,6 @@ Vectors are arrays with 2 components on the first axis and B rays per wavelength
 
 import dataclasses
 import functools
-import itertools
 from typing import Any
 
 import jax
@@ -27,7 +26,7 @@ from ..rays.system import Vector, determinant, dot, system_of
 from ..rays.trace import Bundle
 from . import boundary
 from .boundary import displace
-from .radial import RadialRule, gauss
+from .radial import CORNERS, RadialRule, gauss
 from .rules import PupilRule, Symmetry, check_rule
 from .stages import Plan, plan as find_boundary, target_of
 
@@ -151,7 +150,7 @@ class ClippedGroup(Fitted):
 
     def own(self, lens: Lens) -> Any:
         """Rays of the chosen order, (Q,), bool; NumPy if `chosen` is known."""
-        sets = 1 if lens.apertures is None else 2 ** sum(lens.apertures.blocks)
+        sets = 1 if lens.apertures is None else len(lens.apertures.terms()[0])
         counts = [sets * n * _most(lens, self.symmetry, n) for n in self.sizes]
         order, chosen = np.repeat(np.arange(len(counts), dtype=np.int32), counts), self.chosen
         return (order == chosen) | (chosen < 0)  # type: ignore[operator]
@@ -177,24 +176,16 @@ def _open(
     symmetry: Symmetry,
     crossing: bool,
 ) -> list[tuple[Vector, Array]]:
-    """Points and weights of each of G orders.
-
-    Light passes inside of all clear apertures and outside of all obscurations. By inclusion and
-    exclusion, this is a sum over sets of obscurations of the light inside of all of a set, with
-    negative weights for an odd number.
-    """
+    """Points and weights of each of G orders: those of the `terms` of the apertures."""
     given, extra = (scene, orders, sizes, symmetry, crossing), lens.apertures
-    if extra is None or not any(extra.blocks):
+    if extra is None or not (extra.most or any(extra.blocks)):
         return _inside(lens, *given)
-    inside = np.array(list(itertools.product(*([True, False][: 1 + b] for b in extra.blocks))))
-    sign = 1 - 2 * (np.sum(inside & np.array(extra.blocks), axis=1) % 2)
+    sign, *terms = extra.terms()
 
-    def part(inside):
-        half = jnp.where(inside[:, None], extra.half, jnp.inf)
-        apertures = dataclasses.replace(extra, half=half)
-        return _inside(dataclasses.replace(lens, apertures=apertures), *given)
+    def part(shapes, corners):
+        return _inside(dataclasses.replace(lens, apertures=extra.part(shapes, corners)), *given)
 
-    def total(points, weight):  # from (W, 2^obscurations, Q)
+    def total(points, weight):  # from (W, T, Q)
         weight = weight * jnp.asarray(sign, weight.dtype)[None, :, None]
         points, weight = jax.tree.map(lambda a: a.reshape(len(a), -1), (points, weight))
         # A total within rounding counts as no light.
@@ -202,7 +193,7 @@ def _open(
         lit = jnp.sum(weight, axis=-1, keepdims=True) > least
         return points, jnp.where(lit, weight, 0)
 
-    return [total(*one) for one in jax.vmap(part, out_axes=1)(jnp.asarray(inside))]
+    return [total(*one) for one in jax.vmap(part, out_axes=1)(*map(jnp.asarray, terms))]
 
 
 def _inside(
@@ -215,7 +206,9 @@ def _inside(
 ) -> list[tuple[Vector, Array]]:
     """Points and weights of the light inside of all apertures and obscurations, as in `_open`."""
     most = tuple(_most(lens, symmetry, size) for size in sizes)
-    radial = RadialRule(symmetry, most)
+    extra = lens.apertures
+    sides = 0 if extra is None else extra.most * extra.kinds.count("polygon")
+    radial = RadialRule(symmetry, most, CORNERS + 2 * sides)
     used = jnp.asarray(_spokes(lens, symmetry, orders), jnp.int32)
     plan = find_boundary(*jax.lax.stop_gradient((lens, scene)), radial, used, crossing)
     plan = jax.lax.stop_gradient(plan)

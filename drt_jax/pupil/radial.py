@@ -16,9 +16,9 @@ from ..numerics import safe_divide
 from .boundary import displace, inverse, picked
 from .rules import Symmetry
 
-# `CORNERS`: most corners of a boundary. `_PARTS`: parts into which each interval between two even
-# spokes is divided to find them. The nodes of a panel between corners are proportional to its width
-# in units of pi, plus `_EXTRA`.
+# `CORNERS`: most corners of a boundary without polygons. `_PARTS`: parts into which each interval
+# between two even spokes is divided to find them. The nodes of a panel between corners are
+# proportional to its width in units of pi, plus `_EXTRA`.
 CORNERS, _PARTS, _EXTRA = 8, 32, 0.15
 
 
@@ -30,12 +30,13 @@ def _taps() -> np.ndarray:
     return np.array([np.prod((t - others) / (knot - others), axis=0) for knot, others in rows])
 
 
-def changes(distance: Array, closed: bool) -> tuple[Array, Array]:
+def changes(distance: Array, closed: bool, most: int) -> tuple[Array, Array]:
     """Corners of a boundary, where the nearest edge along even spokes changes: positions (W, C) in
     intervals between spokes, and both edges (2, W, C), equal where there is no corner.
 
     distance: (E, W, B), `edge_distance` along even spokes.
     closed: True if the first spoke is also the last; False if the pupil is mirrored at both.
+    most: C, number of places for corners.
     """
     last = distance.shape[-1] - 1
     index = np.arange(last)[:, None] + np.arange(-2, 4)
@@ -47,7 +48,7 @@ def changes(distance: Array, closed: bool) -> tuple[Array, Array]:
     ends = jnp.stack([distance[..., :-1], distance[..., 1:]])
     ends = ends.reshape(2, *distance.shape[:2], -1)
     first = jnp.argmin(ends, axis=1).astype(jnp.int32)
-    find = functools.partial(jnp.nonzero, size=CORNERS, fill_value=0)
+    find = functools.partial(jnp.nonzero, size=most, fill_value=0)
     place = jax.vmap(lambda change: find(change)[0])(first[0] != first[1])
     pair = jnp.take_along_axis(first, place[None], axis=-1)
     near = picked(jnp.take_along_axis(ends, place[None, None], axis=-1), pair)
@@ -92,10 +93,17 @@ class RadialRule:
 
     symmetry: part of the pupil that is traced.
     most: (G,), largest number of spokes of each order.
+    wanted: number of places for corners, of which there are `corners`.
     """
 
     symmetry: Symmetry
     most: tuple[int, ...]
+    wanted: int = CORNERS
+
+    @property
+    def corners(self) -> int:
+        """C, number of places for corners: no more than rays that are searched for at once."""
+        return 0 if self.symmetry == "rotational" else min(self.wanted, self.together)
 
     @property
     def together(self) -> int:

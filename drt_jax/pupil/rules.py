@@ -53,7 +53,7 @@ def symmetry_of(lens: Lens, field: Numbers) -> Symmetry:
     forms = (*lens.forms, *(() if lens.phase is None else lens.phase.forms))
     kinds = {FORMS[form].symmetry for form in forms}
     if extra is not None and {*extra.kinds} != {"circle"}:
-        kinds.add("bilateral")
+        kinds.add("none" if "polygon" in extra.kinds else "bilateral")
     # True if nothing is shifted along x or rotated about y or z, out of the plane x = 0.
     sideways = zip(moves, ([0], [1, 2], [0], [1, 2], [0]), strict=True)
     still = not any(np.any(np.asarray(a)[:, k]) for a, k in sideways if a is not None)

@@ -19,7 +19,7 @@ from ..rays.fan import nearest_start, no_fan, trace_fan
 from ..rays.system import System, system_of
 from . import boundary
 from .boundary import EdgeRays, Rays, Target
-from .radial import CORNERS, Frame, RadialRule, changes
+from .radial import Frame, RadialRule, changes
 
 # Most steps of a search, and of the search for corners.
 _STEPS, _CORNER_STEPS = np.int32(48), np.int32(16)
@@ -133,12 +133,12 @@ def _ends(given: _Given, state: _State, _: Array) -> tuple[_State, _Task]:
 
 
 def _corners(given: _Given, state: _State, _: Array) -> tuple[_State, _Task]:
-    """Stage 5: the first `CORNERS` rays to the corners, where the nearest edge changes."""
+    """Stage 5: the first C rays to the corners, where the nearest edge changes."""
     radial, frame, even = given.radial, state.frame, state.latest.rays
     line = target_of(even, frame.centre, frame.toward(radial.even[None]))
     distance = boundary.edge_distance(even, line)
-    place, pair = changes(distance, radial.symmetry == "none")
-    more = (0, radial.together - CORNERS)
+    place, pair = changes(distance, radial.symmetry == "none", radial.corners)
+    more = (0, radial.together - radial.corners)
     place, pair = jnp.pad(place, ((0, 0), more)), jnp.pad(pair, ((0, 0), (0, 0), more))
     rays = even.at(jnp.round(place).astype(jnp.int32))
     angle = place * (radial.range / (radial.together - 1)) - np.pi / 2
@@ -152,7 +152,7 @@ def _nodes(given: _Given, state: _State, part: Array) -> tuple[_State, _Task]:
     """Stage 6 and later: rays to the ends of the spokes of the rule, which lie between the corners,
     a part of them in each stage."""
     radial = given.radial
-    rays, pair, settled = jax.tree.map(lambda a: a[..., :CORNERS], state.latest)
+    rays, pair, settled = jax.tree.map(lambda a: a[..., : radial.corners], state.latest)
     beside = boundary.outside(rays, rays.point) < _BESIDE
     latest = EdgeRays(rays, pair, settled & beside & (pair[0] != pair[1]))
     corners = jax.tree.map(lambda a, b: jnp.where(part == 0, a, b), latest, state.corners)
@@ -176,7 +176,7 @@ def _nothing(given: _Given, crossing: bool) -> _State:
         return EdgeRays(rays, point.astype(jnp.int32), no)
 
     one, latest, ends = none(1), none(given.radial.together), none(given.radial.count)
-    corners = none(0 if given.radial.symmetry == "rotational" else CORNERS)
+    corners = none(given.radial.corners)
     frame = Frame(one.rays.point, one.rays.d_launch)
     return _State(frame, one.settled, latest.rays, corners, latest, ends)
 

@@ -465,6 +465,45 @@ def test_glasses_of_no_catalogue(tmp_path):
     np.testing.assert_array_equal(lens.index([0.45, 0.7]), [[1, 1], [1.5, 1.5], [1, 1], [1, 1]])
 
 
+SLIT = "|".join(
+    f"UDAD {line}" for line in ('0 "MY SLIT.UDA" 1', "1 -.5 -9 0", "2 .5 -9 0", "3 0 9 0")
+)
+
+
+def test_user_apertures_are_polygons(tmp_path):
+    """Their corners, in the file's unit, about the vertex or OBDC; written files are read back."""
+    front, back = f"{FRONT}|USAP 0 0 0|{SLIT}", f"{BACK}|OBDC .1 .2|{SLIT}|UDAD 4 0 0 0|USOB 0 0 0"
+    lens = read(tmp_path, front, back, UNIT="CM").lens
+    clips = lens.apertures
+    assert (clips.kinds, clips.surfaces) == (("polygon", "polygon"), (0, 1))
+    assert clips.blocks == (False, True)
+    np.testing.assert_allclose(clips.outline(0), [[-5, -90], [5, -90], [0, 90]])
+    np.testing.assert_allclose(clips.outline(1), clips.outline(0))
+    np.testing.assert_allclose(clips.centre, [[0, 0], [1, 2]])
+    for name in ("lens.zmx", "lens.yaml"):
+        save_lens(lens, tmp_path / name)
+        again = load_lens(tmp_path / name).apertures
+        assert again.blocks == clips.blocks and again.pieces == clips.pieces
+        np.testing.assert_array_equal(again.corners, clips.corners)
+        np.testing.assert_array_equal(again.centre, clips.centre)
+    with pytest.raises(LensError, match="hold no polygon"):
+        save_lens(lens, tmp_path / "lens.seq")
+
+
+def test_user_apertures_that_are_not_known_are_refused(tmp_path):
+    for lines, why in (
+        ("USAP 0 0 0", "SURF 1: a user aperture with no UDAD lines"),
+        (SLIT, "UDAD lines without USAP or USOB"),
+        (f"USAP 1 0 0|{SLIT}", "USAP: expected zeros"),
+        (f"USAP 0 0 0|{SLIT}|UDAD 4 0 0 0|UDAD 5 1 1 0", "two polygons"),
+        (f"USAP 0 0 0|{SLIT}|UDAD 5 1 1 0", "expected corners 1, 2"),
+        (f"USAP 0 0 0|{SLIT}|UDAD 4 1 1 2", "expected corners 1, 2"),
+        ("USAP 0 0 0|UDAD 0 SLIT.UDA 2", "a scale other than 1"),
+        (f"USAP 0 0 0|{SLIT}|UDAD 4 9 0 0|UDAD 5 -9 0 0", "sides cross"),
+    ):
+        assert why in refused(tmp_path, f"{FRONT}|{lines}", BACK)
+
+
 def test_what_is_read_otherwise_is_said(tmp_path):
     own = BACK + "|PZUP 1 -1 0 0|ABCD 7"
     with pytest.warns(UserWarning) as said:

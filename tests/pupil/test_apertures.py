@@ -1,6 +1,7 @@
 """Apertures of other shapes, and obscurations, against areas, geometry and sums of many rays."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -211,3 +212,67 @@ def test_symmetry():
         jax.jit(lambda lens: jnp.zeros(len(drt_jax.symmetry_of(lens, 0.0))))(
             beam(aperture=CLEAR["slit"][0])
         )
+
+
+def inside_of(corners, radius):
+    """Area and integrals of x and y of a polygon (N, 2) within a circle, by Green's theorem: along
+    its sides, and along the arcs between, each a ray from the centre apart."""
+    total, nodes, weights = np.zeros(3), *np.polynomial.legendre.leggauss(40)
+    for a, b in zip(corners, np.roll(corners, -1, axis=0)):
+        d = b - a
+        roots = np.roots([d @ d, 2 * a @ d, a @ a - radius**2])
+        cuts = [t for t in np.real(roots) if np.all(np.isreal(roots)) and 0 < t < 1]
+        ends = np.array([a + t * d for t in (0, *sorted(cuts), 1)])
+        for p, q in itertools.pairwise(ends):
+            if np.hypot(*(p + q)) < 2 * radius:  # a triangle from the centre
+                area = np.array([p[0] * q[1] - p[1] * q[0]]) / 2
+                total += np.append(area, area * (p + q) / 3)
+                continue
+            start, end = np.arctan2(*p[::-1]), np.arctan2(*q[::-1])
+            half = ((end - start + np.pi) % (2 * np.pi) - np.pi) / 2
+            angle = start + half * (1 + nodes)
+            lines = np.stack(
+                [0 * angle + 1 / 2, radius / 3 * np.cos(angle), radius / 3 * np.sin(angle)]
+            )
+            total += lines @ weights * half * radius**2
+    return total
+
+
+def seen_through(corners):
+    """Share of the light and its mean on the stop, behind an L with a triangle in it."""
+    outer, inner = (inside_of(c, R) for c in corners)
+    total = outer - inner
+    return np.append(total[0] / (np.pi * R**2), total[1:] / total[0])
+
+
+@pytest.mark.slow
+def test_polygons_whole_and_with_inward_corners():
+    """An L that the rim cuts, decentred, and a triangle across the line between its pieces; light,
+    mean, and how they move with all corners, by differences of closed forms."""
+    shift = np.array([0.1, -0.2])
+    outer = np.array([[-1.5, -1.0], [2.6, -1.2], [2.5, 0.2], [0.1, 0.0], [0.0, 2.2], [-1.4, 1.9]])
+    inner = np.array([[-0.9, -0.6], [0.7, -0.8], [-0.9, 0.7]])
+    lens = beam(
+        aperture={"polygon": outer.tolist(), "centre": shift.tolist()},
+        obscuration={"polygon": inner.tolist(), "centre": shift.tolist()},
+    )
+    rule = Clipped(10, drt_jax.symmetry_of(lens, 0.0))
+
+    @jax.jit
+    def found(corners):
+        own = dataclasses.replace(lens.apertures, corners=corners)
+        moved = dataclasses.replace(lens, apertures=own)
+        points, weights = drt_jax.pupil_points(moved, 0.0, jnp.inf, GREEN, rule)
+        share = jnp.sum(weights[0])
+        return jnp.append(share, weights[0] @ points[0] * R / share)
+
+    known = [outer + shift, inner + shift]
+    corners = lens.apertures.corners
+    way = np.random.default_rng(0).normal(size=(2, 6, 2))
+    value, slope = jax.jit(lambda c: jax.jvp(found, (c,), (jnp.asarray(way),)))(corners)
+    np.testing.assert_allclose(value, seen_through(known), rtol=1e-9)
+
+    def at(step):
+        return seen_through([c + step * w[: len(c)] for c, w in zip(known, way)])
+
+    np.testing.assert_allclose(slope, (at(1e-5) - at(-1e-5)) / 2e-5, rtol=1e-6, atol=1e-8)
