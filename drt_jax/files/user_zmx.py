@@ -19,7 +19,7 @@ class UserAperture:
     corners: list[list[float]] = dataclasses.field(default_factory=list)
 
     def take(self, record: Record, unit: float, words: Words) -> None:
-        """Read a line of `LINES`. UDAD: number, x, y, 0 of a corner; number 0 is that of a line with
+        """Read a line of `LINES`. UDAD: number, x, y, 0 of a corner; number 0 is of a line with
         the name of a file, whose scale comes last. unit: mm. LensError for other numbers."""
         line, key, rest = words.line, words.key, words.rest
         if key != "UDAD":

@@ -12,8 +12,8 @@ from .model_zmx import model_keys
 from .record import Breaking, Missing, Record, Row, distance_of, short
 from .system import Use
 from .text import Words, words_of
-from .zmx_head import KEYS, Head
 from .user_zmx import LINES, UserAperture
+from .zmx_head import KEYS, Head
 
 _SURFACES = 5000
 # Ignored: drawing, names, tolerances, analyses, coatings, polarisation. None changes rays.
