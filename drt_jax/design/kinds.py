@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from ..inputs import shown
-from ..lens.forms import FORMS
+from ..lens.forms import FORMS, Shape
 from ..lens.lens import Lens
 from ..lens.surface import surface_sag
 
@@ -24,7 +24,7 @@ class Kind(NamedTuple):
     read: function of a lens, its array (rows, terms).
     write: function of a lens and an array (rows, terms), the lens with that array.
     step: (power, factor), typical change factor x h^power for a semi-diameter h of the stop, mm; of
-        coefficients, the change of the sag at h, mm.
+        coefficients, the change of the sag at h, mm, and of a phase that of the phase, waves.
     limits: least and largest meaningful value.
     """
 
@@ -50,6 +50,26 @@ def whole_numbers(what: str, given: Any) -> tuple[int, ...]:
 def back_distance(lens: Lens) -> Array:
     """Distance from the last vertex to the sensor along the axis, (), mm."""
     return lens.sensor - jnp.sum(lens.thickness)
+
+
+def diffractive(lens: Lens) -> list[int]:
+    """Surfaces with a phase."""
+    return [] if lens.phase is None else list(lens.phase.surfaces)
+
+
+def _read_phase(lens: Lens) -> Array:
+    """Coefficients of the phases, zeros on other surfaces."""
+    phase: Any = lens.phase
+    if phase is None:
+        return jnp.zeros((0, 0))
+    none = jnp.zeros((lens.count, phase.coefficients.shape[1]), phase.coefficients.dtype)
+    return none.at[np.array(phase.surfaces)].set(phase.coefficients)
+
+
+def _write_phase(lens: Lens, array: Array) -> Lens:
+    phase: Any = lens.phase
+    own = dataclasses.replace(phase, coefficients=array[np.array(phase.surfaces)])
+    return dataclasses.replace(lens, phase=own)
 
 
 def _all(lens: Lens) -> list[int]:
@@ -151,7 +171,7 @@ def _terms(lens: Lens) -> int:
 # As the keys of `KINDS`, which a test compares.
 VariableKind = Literal[
     "curvature", "conic", "coefficients", "thickness", "sensor", "index", "abbe", "tilt",
-    "decentre", "semi_diameter"
+    "decentre", "semi_diameter", "phase"
 ]  # fmt: skip
 KINDS: dict[str, Kind] = {
     "curvature": Kind(_active, _all, _one, *_leaf("curvature"), (-1, 0.02)),
@@ -173,7 +193,18 @@ KINDS: dict[str, Kind] = {
     "semi_diameter": Kind(
         _finite, _finite, _one, *_leaf("semi_diameter"), (1, 0.05), (1e-6, np.inf)
     ),
+    # 10 h waves at h: a tenth of what a plate of f/4 has in green light.
+    "phase": Kind(
+        diffractive,
+        diffractive,
+        lambda lens: _read_phase(lens).shape[1],
+        _read_phase,
+        _write_phase,
+        (1, 10.0),
+    ),
 }
+# Kinds with the coefficients of a form.
+SERIES = ("coefficients", "phase")
 
 
 def beam(lens: Lens) -> float:
@@ -185,17 +216,29 @@ def step_of(lens: Lens, kind: str, row: int, term: int) -> float:
     """Typical change of a variable, in its unit."""
     power, factor = KINDS[kind].step
     step = factor * beam(lens) ** power
-    return step / lift_of(lens, row, term, beam(lens)) if kind == "coefficients" else step
+    return step / lift_of(lens, kind, row, term, beam(lens)) if kind in SERIES else step
 
 
-def lift_of(lens: Lens, row: int, term: int, away: float) -> float:
-    """Largest change of the sag per unit of a coefficient, mm, at `away` mm from the axis."""
-    shape = jax.tree.map(lambda a: a[..., row, None], lens.shape)
+def _series(lens: Lens, kind: str, row: int) -> tuple[str, Shape]:
+    """The form and the shape of a surface, or of its phase."""
+    phase: Any = lens.phase
+    if kind == "phase":
+        row = phase.surfaces.index(row)
+        form, shape = phase.forms[row], phase.shape
+    else:
+        form, shape = lens.forms[row], lens.shape
+    return form, jax.tree.map(lambda a: a[..., row, None], shape)
+
+
+def lift_of(lens: Lens, kind: str, row: int, term: int, away: float) -> float:
+    """Largest change of the sag, mm, or of the phase, waves, per unit of a coefficient at `away` mm
+    from the axis. kind: one of `SERIES`."""
+    name, shape = _series(lens, kind, row)
     angle, dtype = np.pi * np.arange(8) / 8, lens.curvature.dtype
     points = tuple(jnp.asarray(away * f(angle), dtype) for f in (np.cos, np.sin))
 
     def height(coefficients: Array) -> Array:
-        return surface_sag(points, shape._replace(coefficients=coefficients), lens.forms[row])
+        return surface_sag(points, shape._replace(coefficients=coefficients), name)
 
     old = shape.coefficients
     _, lifted = jax.jvp(height, (old,), (jnp.zeros_like(old).at[term].set(1),))
@@ -203,12 +246,12 @@ def lift_of(lens: Lens, row: int, term: int, away: float) -> float:
 
 
 def word_terms(lens: Lens, kind: str, row: int) -> list[int]:
-    """Terms of a row that vary if none are named: all, except the coefficient of r^2, which the
-    curvature replaces, or, if there is one, the norm radius."""
+    """Terms of a row that vary if none are named: all, except the coefficient of r^2 of a surface,
+    which the curvature replaces, or, if there is one, the norm radius."""
     count = KINDS[kind].terms(lens)
-    if kind != "coefficients":
+    if kind not in SERIES:
         return list(range(count))
-    form = FORMS[lens.forms[row]]
-    left_out = "norm_radius" if "norm_radius" in form.named else 2
+    form = FORMS[_series(lens, kind, row)[0]]
+    left_out = "norm_radius" if "norm_radius" in form.named else 2 * (kind == "coefficients")
     labels = (*form.named, *form.powers)[:count]
     return [term for term, label in enumerate(labels) if label != left_out]

@@ -13,7 +13,7 @@ from jax import Array
 
 from ..inputs import require_one_of
 from ..lens.lens import Lens
-from .kinds import KINDS, VariableKind, lift_of, step_of, whole_numbers, word_terms
+from .kinds import KINDS, SERIES, VariableKind, lift_of, step_of, whole_numbers, word_terms
 from .solves import Solve, fix_solves
 
 _How = Literal["equal", "opposite", "cemented"]
@@ -23,6 +23,7 @@ _STEP_OF_SAG = 0.03
 _SHAPE = ("curvature", "conic", "coefficients")
 _NONE = {
     "coefficients": "the lens has none; write them into its prescription, zeros too",
+    "phase": "the lens has none; write one into its prescription, zeros too",
     "thickness": "the lens has one surface; its distance to the sensor is the kind sensor",
     "index": "the lens has no model glass; write nd and vd into its prescription",
     "abbe": "the lens has no model glass; write nd and vd into its prescription",
@@ -37,7 +38,7 @@ class Place(NamedTuple):
     term: int
 
     def __str__(self) -> str:
-        term = f"[{self.term}]" if self.kind in ("coefficients", "tilt", "decentre") else ""
+        term = f"[{self.term}]" if self.kind in (*SERIES, "tilt", "decentre") else ""
         return self.kind if self.kind == "sensor" else f"{self.kind} {self.row}{term}"
 
 
@@ -68,17 +69,18 @@ class Vary:
 
     kind: "curvature", "conic", "coefficients", "thickness" (behind a surface; the sensor keeps its
         distance from the last vertex), "sensor" (its distance from the last vertex), "index" and
-        "abbe" of the model glass that begins behind a surface, "tilt", "decentre", "semi_diameter".
+        "abbe" of the model glass that begins behind a surface, "tilt", "decentre", "semi_diameter",
+        "phase" (coefficients of diffractive surfaces, waves / mm^power, see `Phase`).
     surfaces: numbers of surfaces from 0; () for all that have one (curvature, conic, coefficients,
-        tilt, decentre: active surfaces; semi_diameter: finite ones).
+        tilt, decentre: active surfaces; semi_diameter: finite ones; phase: those with one).
     terms: numbers of coefficients, or components of a tilt or decentre, from 0; () for all except
-        the coefficient of r^2, which the curvature replaces, and a norm radius.
+        the coefficient of r^2 of a surface, which the curvature replaces, and a norm radius.
     low, high: bounds in the units of the lens.
     scale: typical change in the units of the lens; 0 to choose it by the kind, the semi-diameter of
         the stop and `sag`.
     sag, semi_diameter: for coefficients, mm, instead of low and high: each coefficient changes the
         sag by at most `sag` at `semi_diameter` from the axis, the largest beam of the design. This
-        leaves low powers free and keeps high ones small.
+        leaves low powers free and keeps high ones small. For a phase `sag` is in waves.
     """
 
     kind: VariableKind
@@ -120,7 +122,7 @@ class Vary:
         if given == (0, 0):
             return
         what = "variables: sag and semi_diameter"
-        if self.kind != "coefficients":
+        if self.kind not in SERIES:
             raise ValueError(f"{what}: are of coefficients, not of {self.kind}; give low and high")
         if not all(0 < number < np.inf for number in given):
             raise ValueError(f"{what}: give both, above 0 mm, got {given[0]:g} and {given[1]:g}")
@@ -131,7 +133,7 @@ class Vary:
         """Low, high and scale of one variable, in the units of the lens."""
         if not self.sag:
             return self.low, self.high, self.scale or step_of(lens, *place)
-        most = self.sag / lift_of(lens, place.row, place.term, self.semi_diameter)
+        most = self.sag / lift_of(lens, self.kind, place.row, place.term, self.semi_diameter)
         return -most, most, self.scale or _STEP_OF_SAG * most
 
     def places(self, lens: Lens) -> list[Place]:

@@ -92,6 +92,21 @@ def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):
         np.testing.assert_allclose(1 / found.lens.curvature[:2], [25.2924, 255.796], rtol=2e-6)
 
 
+@pytest.mark.slow
+def test_a_diffractive_plate_learns_to_focus():
+    """From no phase to that of a focus, (f - sqrt(f^2 + r^2)) / wavelength: a Fresnel lens."""
+    f, green = 100.0, 0.55
+    phase = {"coefficients": {2: 0.0, 4: 0.0, 6: 0.0}}
+    plate = {"radius": "inf", "semi_diameter": 8.0, "stop": True, "phase": phase}
+    lens = drt_jax.load_lens({"surfaces": [plate], "sensor": f})
+    variables = Variables.from_lens(lens, ["phase"])
+    found = design.optimise(design.Problem.from_variables(variables, ["spot"], 0.0, green, rule=6))
+    assert found.merit < 1e-16 and found.jacobians <= 20
+    series = np.array([-1 / (2 * f), 1 / (8 * f**3), -1 / (16 * f**5)]) * 1e3 / green
+    error = np.abs(found.lens.phase.coefficients[0] / series - 1)
+    assert np.all(error < (1e-7, 1e-4, 0.02))  # the term of r^8 is missing
+
+
 @pytest.fixture(scope="module")
 def triplet():
     lens = drt_jax.load_lens("cooke_triplet")

@@ -18,7 +18,7 @@ surfaces:
      coefficients: {4: 1.0e-5, 6: 2.0e-8}}
   - {radius: 19.0, thickness: 2.5}
   - {radius: inf, thickness: 2.5, stop: true, semi_diameter: 4.0}
-  - {radius: 75.0, thickness: 3.0, nd: 1.62, vd: 60.0}
+  - {radius: 75.0, thickness: 3.0, nd: 1.62, vd: 60.0, phase: {coefficients: {2: 0.0, 4: 0.1}}}
   - {radius: -17.0, thickness: 38.0}
 """
 # Of each kind the numbers that its word means: (rows, terms).
@@ -33,6 +33,7 @@ ALL = {
     "tilt": ([0, 1, 2, 3, 5, 6], [0, 1, 2]),
     "decentre": ([0, 1, 2, 3, 5, 6], [0, 1]),
     "semi_diameter": ([0, 4], [0]),
+    "phase": ([5], [0, 1]),
 }
 
 
@@ -125,6 +126,12 @@ def test_scales_are_what_moves_the_light(lens):
     """A step of any coefficient lifts its surface by the same at the beam's edge."""
     variables = Variables.from_lens(lens, [Vary("coefficients", (2,))])
     np.testing.assert_allclose(variables.scale, [0.04 / 4.0**4, 0.04 / 4.0**6], rtol=1e-12)
+    # And any of a phase turns light by as many waves there; bounds by waves at 3 mm.
+    variables = Variables.from_lens(lens, ["phase"])
+    np.testing.assert_allclose(variables.scale, [40 / 4.0**2, 40 / 4.0**4], rtol=1e-12)
+    variables = Variables.from_lens(lens, [Vary("phase", sag=50.0, semi_diameter=3.0)])
+    bounds = variables.numbers(variables.low), variables.numbers(variables.high)
+    np.testing.assert_allclose(bounds, [[-50 / 9, -50 / 81], [50 / 9, 50 / 81]], rtol=1e-12)
 
 
 @pytest.mark.parametrize("form", ["asphere", "zernike", "qbfs"])
