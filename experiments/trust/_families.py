@@ -10,6 +10,7 @@ import numpy as np
 
 import drt_jax
 
+from ._offaxis import Walk, conic_mirror, local_mirror, relay
 from ._scenes import WAVELENGTH, Scenes, batch_of, fields, pupil_points, scenes_of, two_elements
 
 _FREEFORM = ("biconic", "toroid", "odd_asphere", "polynomial_xy", "asphere", "asphere")
@@ -264,6 +265,12 @@ def camera(rng, count, name):
     return Scenes(batch, fields(rng, count, 0, widest), far, pupil_points(rng, count))
 
 
+# Mirrors of a walk, and whether the stop is a plane between the first two.
+_WALKS = (1, False), (2, False), (2, True)
+_SPHERES = Walk(local_mirror, (0.2, 10), width=0.01)
+_TOROIDS = _SPHERES._replace(form="toroid")
+_SLENDER = Walk(conic_mirror, (2, 10), width=0.01, least=0.015)
+_TURNED = "paraboloids that turn light by 30 to 150 degrees, from a focus to parallel and back"
 _CAMERAS = ("double_gauss", "cooke_triplet", "singlet")
 _RIMS = ("camera_50mm", "phone", "telephoto_300mm")
 _WIDEST = {"singlet": 5.0, "double_gauss": 14.0, "phone": 32.0, "telephoto_300mm": 4.0}  # degrees
@@ -297,6 +304,12 @@ FAMILIES = {
     "phone": Family(_PHONE, phone, (3, 4, 5), 0.5),
     "offaxis": Family(_MIRRORS, offaxis, ("first", "second", "itself"), 0.5),
     "rims": Family("camera, phone and tele lenses off by 3 %, their rims failing", camera, _RIMS),
+    "turned": Family(_TURNED, Walk(conic_mirror, parallel=True), _WALKS),
+    "foci": Family("ellipsoids and hyperboloids that do so", Walk(conic_mirror), _WALKS),
+    "relay": Family("Offner and Dyson relays", relay, ("offner", "dyson"), 0.5),
+    "grazing": Family("spheres met at 85 to 89.9 degrees", _SPHERES, _WALKS[:2], 0.5),
+    "toroids": Family("toroids met at 85 to 89.9 degrees", _TOROIDS, _WALKS[:2], 0.5),
+    "slender": Family("conics about the beam, met at 85 to 89 degrees", _SLENDER, _WALKS[:2], 0.5),
 }
 
 

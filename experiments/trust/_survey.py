@@ -131,8 +131,8 @@ def _moments(lens, field, distance):
 def _shoot(lens, field, distance, point):
     """Sequential trace of the ray through a point (3,) in front of the lens."""
     direction = _entering(point, field, distance)
-    wavelength = jnp.asarray(WAVELENGTH, point.dtype)
-    return trace_snell(lens, wavelength, point, direction / jnp.linalg.norm(direction))
+    wavelength, size = jnp.asarray(WAVELENGTH, point.dtype), jnp.linalg.norm(direction)
+    return trace_snell(lens, wavelength, point, direction / size, size * distance)
 
 
 @_over_scenes

@@ -26,24 +26,42 @@ QUICK = {
 _NEWTON_STEPS = 40  # a nearly grazing ray only halves its distance in each
 
 
-def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Array, Array]:
-    """Hit of the ray p + s d on the surface at the origin, the normal there, and whether there is a
-    hit."""
-    q = p - d * (p[2] / d[2])  # on the vertex plane
-    met = jnp.array(True)
+def _to_conic(q: Array, d: Array, shape: Shape, side: Array, start: Array) -> Array:
+    """Length s at which q + s d meets a conic with its vertex at the origin; NaN if it does not.
+
+    A line crosses a quadric twice at most. Of the crossings on the sheet of the vertex that lie not
+    before `start`, the first in the direction of `side` is taken, or else the other.
+
+    side: 1 to cross the surface towards +z, -1 towards -z.
+    """
     c, k = shape.curvature, shape.conic
-    if form in ("asphere", "odd_asphere"):
-        quadratic = c * (1 + k * d[2] ** 2)
-        linear = d[2] - c * (q[0] * d[0] + q[1] * d[1])
-        constant = c * (q[0] ** 2 + q[1] ** 2)
-        discriminant = linear**2 - quadratic * constant
-        root = jnp.sign(d[2]) * jnp.sqrt(jnp.maximum(discriminant, 0))
-        met = discriminant >= 0
-        ahead = constant / (linear + root)
-        if shape.coefficients.shape[0]:  # a ray that misses the conic may meet the asphere
-            ahead, met = jnp.where(met, ahead, 0), jnp.array(True)
-        q = q + d * ahead
-    if shape.coefficients.shape[0]:
+    flat = jnp.stack([d[0], d[1], (1 + k) * d[2]])
+    square, linear = c * (flat @ d), d[2] - c * (flat @ q)
+    constant = c * (q @ q + k * q[2] ** 2) - 2 * q[2]
+    discriminant = linear**2 - square * constant
+    top = linear + jnp.copysign(jnp.sqrt(discriminant), linear)
+    s = jnp.stack([constant / top, top / square])
+    sheet = 1 - (1 + k) * c * (q[2] + s * d[2]) > 0
+    fits = jnp.isfinite(s) & sheet & (s >= start)
+    meant = fits & (side * (linear - square * s) >= 0)
+    best = jnp.argmin(jnp.where(jnp.where(jnp.any(meant), meant, fits), s, jnp.inf))
+    return jnp.where(jnp.any(fits), s[best], jnp.nan)
+
+
+def _intersect(
+    p: Array, d: Array, shape: Shape, side: Array, start: Array, form: str
+) -> tuple[Array, Array, Array]:
+    """First hit of the ray p + s d, s >= start, on the surface at the origin from a side (see
+    `_to_conic`), the normal there, and whether there is a hit."""
+    near = p @ d
+    q = p - near * d  # nearest to the vertex
+    ahead = _to_conic(q, d, shape, side, start + near)
+    met = jnp.isfinite(ahead)
+    more = shape.coefficients.shape[0] > 0
+    # A ray that misses the conic may meet the asphere: it starts from the vertex plane.
+    q = q + d * jnp.where(met, ahead, -q[2] / d[2] if more else 0)
+    if more:
+        met = jnp.array(True)
 
         def closer(_, q):
             z, slope, _ = sag_derivatives(q[:2], shape, form)
@@ -53,7 +71,7 @@ def _intersect(p: Array, d: Array, shape: Shape, form: str) -> tuple[Array, Arra
     z, slope, _ = sag_derivatives(q[:2], shape, form)
     met = met & domain(q[:2], shape, form) & (jnp.abs(z - q[2]) < 1e-6 * (1 + jnp.abs(z)))
     normal = jnp.stack([-slope[0], -slope[1], jnp.ones_like(z)])
-    return q, normal / jnp.linalg.norm(normal), met
+    return q, normal / jnp.linalg.norm(normal), met & ((q - p) @ d >= start)
 
 
 class _Row(NamedTuple):
@@ -65,7 +83,7 @@ class _Row(NamedTuple):
     axes: (3, 3), rotation from the surface's axes to those of the lens.
     active: True for an active surface or the sensor.
     mirror: True for a mirror.
-    sense: 1 or -1 for light along or against the z axis.
+    sense: 1 or -1 for light along or against the z axis of a lens without tilts.
     ratio: index in front / index behind.
     """
 
@@ -95,27 +113,31 @@ def _rows(lens: Lens, wavelength: Array, forms: list[str]) -> _Row:
     )
 
 
-def _bend(d: Array, normal: Array, row: _Row) -> tuple[Array, Array]:
-    """Direction behind a surface, and whether it exists and light comes from the front."""
+def _bend(d: Array, normal: Array, row: _Row, side: Array) -> tuple[Array, Array]:
+    """Direction behind a surface, and whether it exists and light crosses it towards `side` (1, -1;
+    0 for either)."""
     cosine = normal @ d
     square = 1 - row.ratio**2 * (1 - cosine**2)
-    along = row.sense * jnp.sqrt(jnp.maximum(square, 0)) - row.ratio * cosine
+    along = jnp.sign(cosine) * jnp.sqrt(jnp.maximum(square, 0)) - row.ratio * cosine
     refracted, reflected = row.ratio * d + normal * along, d - 2 * cosine * normal
-    whole = (row.mirror | (square >= 0)) & (row.sense * cosine > 0)
+    whole = (row.mirror | (square >= 0)) & (side * cosine >= 0)
     return jnp.where(row.mirror, reflected, refracted), whole
 
 
 def trace_snell(
-    lens: Lens, wavelength: Array, point: Array, direction: Array
+    lens: Lens, wavelength: Array, point: Array, direction: Array, begun: Array | float = jnp.inf
 ) -> tuple[Array, Array]:
     """Traces one ray through a lens to its sensor. Returns the hits (S + 1, 3) along the axes of
     the lens, z from the first vertex, mm, and True if the ray meets every surface, goes forwards
-    between active ones, and is not totally reflected. Surfaces that are not active are crossed by
-    the straight line, forwards or backwards.
+    from the object to the first active surface and between active ones, and is not totally
+    reflected. Without tilts light crosses surfaces the way that the number of mirrors says; with
+    tilts, either. Surfaces that are not active are crossed by the straight line, forwards or
+    backwards.
 
     wavelength: (), um.
     point: (3,), anywhere on the ray in front of the lens, mm.
     direction: (3,), unit vector.
+    begun: (), mm along the ray from the object to `point`, inf for an object at infinity.
     """
     forms = sorted(set(lens.forms))
     branches = [partial(_intersect, form=form) for form in forms]
@@ -123,17 +145,17 @@ def trace_snell(
     def cross(ray, row):
         point, direction, begun, ok = ray
         p, d = row.axes.T @ (point - row.origin), row.axes.T @ direction
-        hit, normal, met = jax.lax.switch(row.form, branches, p, d, row.shape)
-        ahead = ~begun | (row.sense * (hit - p)[2] >= 0)
-        bent, whole = _bend(d, normal, row)
+        side = jnp.where(row.active, row.sense, jnp.sign(d[2]))
+        start = jnp.where(row.active, -begun, -jnp.inf)
+        hit, normal, met = jax.lax.switch(row.form, branches, p, d, row.shape, side, start)
+        bent, whole = _bend(d, normal, row, side if lens.tilt is None else 0 * side)
         hit = row.axes @ hit + row.origin
-        behind = (
-            jnp.where(row.active, hit, point),
-            jnp.where(row.active, row.axes @ bent, direction),
-        )
-        return (*behind, begun | row.active, ok & met & (~row.active | (ahead & whole))), hit
+        behind = hit, row.axes @ bent, jnp.zeros_like(begun)
+        behind = jax.tree.map(partial(jnp.where, row.active), behind, (point, direction, begun))
+        return (*behind, ok & met & (~row.active | whole)), hit
 
-    start = point, direction, jnp.array(False), jnp.array(True)
+    begun = jnp.broadcast_to(jnp.asarray(begun, point.dtype), ())
+    start = point, direction, begun, jnp.array(True)
     wavelength = jnp.asarray(wavelength, point.dtype)
     (*_, ok), hits = jax.lax.scan(cross, start, _rows(lens, wavelength, forms))
     return hits, ok

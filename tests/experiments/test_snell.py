@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from experiments._families import draw
 from experiments.snell import trace_snell
 
 from drt_jax import load_lens
@@ -73,3 +74,41 @@ def test_an_asphere_whose_conic_is_missed():
         trials.append(trace(lens, WAVE, start, direction))
     assert np.all(trials[0][1]) and np.all(trials[1][1]) and not np.any(trials[2][1])
     np.testing.assert_allclose(trials[0][0], trials[1][0], atol=1e-13)
+
+
+def _point_source(lens, distance, pupil):
+    """Rays of a point source on the axis through points of a stop in the first plane."""
+    stop = jnp.append(lens.semi_diameter[0] * pupil, 0.0)
+    step = stop / distance + ALONG
+    size = jnp.linalg.norm(step)
+    return trace_snell(lens, WAVE, stop, step / size, size * distance)
+
+
+sources = jax.jit(jax.vmap(jax.vmap(_point_source, (None, None, 0))))
+
+
+def test_conics_far_off_axis_image_their_foci():
+    """The families "turned" and "foci" of `experiments.stability`, mirrors that turn the beam by 30
+    to 150 degrees: the chief ray meets the middle of the sensor, and so do all rays where it stands
+    at a focus. From its focus a paraboloid is met at R / (1 - cosine), R its vertex radius and the
+    cosine that of the ray with the direction in which all rays leave."""
+    for name in ("turned", "foci"):
+        for scenes in draw(name, 300, 5, ((1, False), (2, False))):
+            hits, ok = (np.asarray(a) for a in sources(scenes.lens, scenes.distance, scenes.pupil))
+            assert np.mean(ok) > 0.99 and np.all(ok[:, 0])
+            sensor = np.column_stack([scenes.lens.decentre[:, -1], scenes.lens.sensor])
+            miss = hits[:, :, -1] - sensor[:, None]
+            far = np.max(np.where(ok, np.linalg.norm(miss, axis=-1), 0), axis=1)
+            assert np.max(np.linalg.norm(miss[:, 0], axis=-1)) < 1e-10
+            assert np.mean(far < 1e-8) > 0.25
+            if name == "foci" or scenes.lens.count > 2:
+                continue
+            from_focus = np.isfinite(scenes.distance)
+            way = hits[from_focus][:, :, 1] + scenes.distance[from_focus, None, None] * [0, 0, 1]
+            length = np.linalg.norm(way, axis=-1)
+            leaving = (hits[:, :1, 2] - hits[:, :1, 1])[from_focus]
+            leaving = leaving / np.linalg.norm(leaving, axis=-1, keepdims=True)
+            radius = 1 / np.abs(scenes.lens.curvature[from_focus, 1])[:, None]
+            expected = radius / (1 - np.sum(way * leaving, -1) / length)
+            good = ok[from_focus]
+            np.testing.assert_allclose(length[good], expected[good], rtol=1e-10)
