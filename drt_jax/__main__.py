@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from .compilation import ONCE, jit, keep_programs
+from .files.system import System
 from .files.write import save_lens
 from .files.yaml import lens_names, load_lens, load_system
 from .image.converged import psf_moments
@@ -210,14 +211,12 @@ def _wait(what: str) -> None:
 
 def run_convert(options: argparse.Namespace) -> None:
     """Write a lens in another format, and print which data the new file leaves out."""
-    ends, kind = (".yaml", ".yml", ".zmx", ".seq"), pathlib.Path(options.lens).suffix.lower()
-    if options.out.suffix.lower() not in ends:
-        raise ValueError(f"{options.out}: expected a name that ends in {', '.join(ends)}")
+    kind = pathlib.Path(options.lens).suffix.lower()
+    load = load_system if kind in (".zmx", ".seq") else load_lens
     with _warnings_on_stdout():
-        lens = load_lens(options.lens, options.missing)
-    save_lens(lens, options.out)
-    if kind in (".zmx", ".seq"):
-        _say(["  ! fields, wavelengths and vignetting are not written: see load_system"])
+        found = load(options.lens, options.missing)
+        save_lens(found, options.out)
+    lens = found.lens if isinstance(found, System) else found
     _say([f"{lens.name or 'the lens'}, {lens.count} surfaces, is written to {options.out}"])
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..lens.aperture import Apertures
 from ..lens.forms import FORMS
+from ..lens.lens import Lens
 from ..lens.polygon import CORNERS, convex_pieces, tidied
 from .entry import Entry, array
 
@@ -132,3 +133,29 @@ def apertures_of(surfaces: list[Entry]) -> Apertures | None:
             "polygons fewer inward corners, or join obscurations",
         )
     return apertures
+
+
+class Shape(NamedTuple):
+    """An aperture that clips a surface. blocks: True for an obscuration. size: half widths in x and
+    y, twice the radius of a circle, or x and y of the corners of a polygon one after the other.
+    centre: x and y. All in mm."""
+
+    blocks: bool
+    kind: str
+    size: list[float]
+    centre: list[float]
+
+
+def shapes_of(lens: Lens, i: int) -> list[Shape]:
+    """The apertures of a surface. Its semi-diameter is a circle like others, that of the stop is
+    the size of the stop and no aperture."""
+    own, semi, found = lens.apertures, float(lens.semi_diameter[i]), list[Shape]()
+    if math.isfinite(semi) and i != lens.stop:
+        found.append(Shape(False, "circle", [semi, semi], [0.0, 0.0]))
+    for k in () if own is None else np.flatnonzero(np.array(own.surfaces) == i).tolist():
+        assert own is not None
+        kind, middle = own.kinds[k], np.zeros(2) if own.centre is None else own.centre[k]
+        size = own.outline(k) if kind == "polygon" else own.sizes[k]
+        numbers = np.ravel(np.asarray(size, float)).tolist()
+        found.append(Shape(own.blocks[k], kind, numbers, np.asarray(middle, float).tolist()))
+    return found

@@ -49,8 +49,8 @@ def with_breaks(
     lens: Lens, surfaces: list[list[str]], gaps: list[float]
 ) -> tuple[list[list[str]], list[float]]:
     """Insert the coordinate breaks among the blocks of lines of the S surfaces and the image.
-    Returns all blocks, and the thickness (mm) behind each one but the image; the thickness in front
-    of the first, from an object at infinity, is left out. gaps: (S,), mm, behind the surfaces."""
+    Returns all blocks, and the thickness (mm) in front of each one; in front of the first it counts
+    from the first vertex before it is moved. gaps: (S,), mm, behind the surfaces."""
     moves, axis = _moves(lens), [0.0, *np.cumsum(gaps).tolist()]
     blocks: list[list[str]] = []
     behind: list[float] = []
@@ -66,4 +66,4 @@ def with_breaks(
             at = start + move.pivot + (move.shift[2] if back else 0.0)
         behind.append(gap - at)
         blocks.append(surface)
-    return blocks, behind[1:]
+    return blocks, behind

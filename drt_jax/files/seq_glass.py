@@ -128,25 +128,38 @@ class Glasses:
         held = [k for k in range(len(at)) if any(abs(at[k] - w) < _SAME for w in system)][:5]
         if len(at) <= 6:
             held = [*range(len(at))]
-        terms = len(at) if len(at) <= 6 else min(6, 4 + len(held))
-        powers = np.power.outer(at, _POWERS[:terms]).astype(float)
-        wanted, scale = indices**2, np.abs(powers).max(axis=0)
-        # Least squares among the solutions that pass through the held indices.
-        rows = powers / scale
-        solution = np.linalg.lstsq(rows[held], wanted[held])[0] if held else np.zeros(terms)
-        free = np.linalg.svd(rows[held])[2][len(held) :].T if held else np.eye(terms)
-        if free.size:
-            rest = wanted - rows @ solution
-            solution = solution + free @ np.linalg.lstsq(rows @ free, rest)[0]
-        off = np.abs(np.sqrt(np.maximum(rows @ solution, 0)) - indices).max()
+        constants, off = schott_through(at, indices, held)
         record.notes.append(
             f"line {line}: {name}: Schott's formula through the indices of the table"
             + (f", {off:.1g} off at most" if off > _SAME else "; between them CODE V may differ")
         )
-        known = dict(zip(_POWERS[:terms], (solution / scale).tolist(), strict=True))
         low, high = float(at.min()), float(at.max())
         ends = [low, high] if low < high else [low * (1 - _SAME), high * (1 + _SAME)]
-        return {"schott": [known.get(p, 0.0) for p in _SCHOTT], "range": ends}
+        return {"schott": constants, "range": ends}
+
+
+def schott_through(
+    at: np.ndarray, indices: np.ndarray, held: list[int]
+) -> tuple[list[float], float]:
+    """Schott's formula through indices: its six constants, and how far it is off at most.
+
+    at: wavelengths, um. held: which of them it passes through; the others by least squares.
+    """
+    terms = len(at) if len(at) <= 6 else min(6, 4 + len(held))
+    powers = np.power.outer(at, _POWERS[:terms]).astype(float)
+    wanted, scale = indices**2, np.abs(powers).max(axis=0)
+    # Least squares among the solutions that pass through the held indices.
+    rows = powers / scale
+    solution = np.linalg.lstsq(rows[held], wanted[held])[0] if held else np.zeros(terms)
+    free = np.linalg.svd(rows[held])[2][len(held) :].T if held else np.eye(terms)
+    if free.size:
+        rest = wanted - rows @ solution
+        solution = solution + free @ np.linalg.lstsq(rows @ free, rest)[0]
+    if held:  # what rounding has left
+        solution = solution + np.linalg.lstsq(rows[held], (wanted - rows @ solution)[held])[0]
+    off = np.abs(np.sqrt(np.maximum(rows @ solution, 0)) - indices).max()
+    known = dict(zip(_POWERS[:terms], (solution / scale).tolist(), strict=True))
+    return [known.get(p, 0.0) for p in _SCHOTT], float(off)
 
 
 def _near(table: list[tuple[float, float]], system: list[float]) -> list[tuple[float, float]]:

@@ -58,6 +58,18 @@ class System:
     notes: tuple[str, ...] = ()
 
 
+def system_for(lens: Lens) -> System:
+    """A lens with an object at infinity on the axis and the d line or, if the glasses exclude it,
+    the middle of their range."""
+    low, high = lens.dispersion.range
+    wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
+    none, one = np.zeros((1, 2)), np.ones(1)
+    waves = np.array([wave])
+    return System(
+        *(lens, math.inf, none, none, "angle", one, np.zeros((1, 5)), waves, one, 0, None, None)
+    )
+
+
 @dataclasses.dataclass
 class Use:
     """The values for `System` as they are read. line: of the aperture."""

@@ -2,6 +2,7 @@
 
 import math
 import pathlib
+import warnings
 from typing import Any
 
 import numpy as np
@@ -10,28 +11,60 @@ from jax import Array
 
 from ..lens.elements import Elements
 from ..lens.forms import FORMS
+from ..lens.glass import FRAUNHOFER
 from ..lens.lens import Lens
+from .compare import difference
 from .entry import LensError
 from .exact import degrees_of
 from .media_out import media_of_lens
+from .system import System, system_for
 from .write_seq import seq_text
 from .write_zmx import zmx_text
+from .yaml import known_ending, lens_in
 
 
-def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
+def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
     """Write a lens as a YAML prescription, or as a file of Zemax or CODE V if the path ends in
     `.zmx` or `.seq`. `load_lens` reads the same lens from it, to the last digit (tilts, which files
     hold in degrees, and model glasses and radii in `.zmx`: to the last digit but one).
 
-    The file contains the constants of glasses that differ from the catalogue's. A second medium of
-    the same name with other constants is called name*.
+    The text is read back before it becomes a file: if curvatures, thicknesses, places, indices at
+    the wavelengths, the stop or apertures differ beyond rounding, nothing is written. The file
+    contains the constants of glasses that differ from the catalogue's. A second medium of the same
+    name with other constants is called name*.
 
-    path: of the file, which is overwritten. LensError if a prescription cannot hold the lens, such
-    as a curved sensor, or if the file cannot be written.
+    lens: a lens; or a `System`, whose fields, wavelengths, vignetting and distance of the object
+        stand in `.zmx` and `.seq` files, with the size of the stop; a lens alone is written with an
+        axial field at infinity and the d line. A warning tells what `.yaml` has not.
+    path: of the file, which is overwritten; it ends in `.yaml`, `.yml`, `.zmx` or `.seq`.
+
+    LensError for another ending, if the file cannot hold the lens, such as a prescription a curved
+    sensor, if `load_lens` would refuse it, or if the file cannot be written.
     """
-    other = {".zmx": zmx_text, ".seq": seq_text}.get(pathlib.Path(path).suffix.lower())
-    if other is not None:
-        return _write(other(lens), path)
+    kind = known_ending(path)
+    system = lens if isinstance(lens, System) else system_for(lens)
+    if kind in (".yaml", ".yml") and isinstance(lens, System):
+        warnings.warn(f"{path}: fields, wavelengths and vignetting are not written", stacklevel=2)
+    text = {".zmx": zmx_text, ".seq": seq_text}.get(kind, _yaml_text)(system)
+    low, high = system.lens.dispersion.range
+    waves = dict.fromkeys([*FRAUNHOFER[:3], *system.wavelengths.tolist()])
+    known = [wave for wave in waves if low <= wave <= high]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            again = lens_in(text, path)
+    except LensError as error:
+        raise LensError(f"{error}; not written, as it could not be read back") from error
+    if found := difference(system.lens, again, known):
+        raise LensError(f"{path}: not written: what is read back differs: {found}")
+    try:
+        pathlib.Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LensError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _yaml_text(system: System) -> str:
+    lens = system.lens
     if np.any([np.asarray(a)[-1] for a in (lens.curvature, lens.conic)]):
         raise LensError("sensor: a prescription has none that is curved")
     top: dict[str, Any] = {"name": lens.name} if lens.name else {}
@@ -43,15 +76,7 @@ def save_lens(lens: Lens, path: str | pathlib.Path) -> None:
         top["elements"] = [_element(lens.elements, g) for g in range(len(lens.elements.spans))]
     top["sensor"] = float(lens.sensor)
     top |= {f"sensor_{key}": value for key, value in _place(lens, lens.count).items()}
-    text = yaml.safe_dump(top, sort_keys=False, default_flow_style=None, width=1000)
-    _write(text, path)
-
-
-def _write(text: str, path: str | pathlib.Path) -> None:
-    try:
-        pathlib.Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise LensError(f"{path}: cannot be written: {error.strerror}") from error
+    return yaml.safe_dump(top, sort_keys=False, default_flow_style=None, width=1000)
 
 
 def _surface(lens: Lens, i: int, behind: dict[str, Any]) -> dict[str, Any]:

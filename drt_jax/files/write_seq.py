@@ -2,12 +2,22 @@
 
 import math
 import textwrap
-from typing import Any
+import warnings
+from collections.abc import Iterable
+from typing import Any, get_args
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..lens.forms import noll_of_fringe
-from ..lens.glass import ANY
+from ..lens.glass import (
+    ANY,
+    FRAUNHOFER,
+    VISIBLE,
+    Dispersion,
+    model_glass,
+    refractive_index,
+)
 from ..lens.glasses import find_glass
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil
@@ -15,32 +25,45 @@ from .entry import LensError
 from .exact import degrees_of, number_for
 from .media_out import media_of_lens
 from .record import turns_of
-from .seq_glass import folded
+from .seq_glass import folded, schott_through
 from .seq_places import KEYS
 from .seq_surfaces import LETTERS
+from .system import FieldKind, System
 from .write_zmx import gap_behind
 
 _KINDS = {"circle": ("CIR",), "rectangle": ("REX", "REY"), "ellipse": ("ELX", "ELY")}
 _STILL = 1e-12  # mm, radians: below this a surface stands on the axis of the one before it
 
 
-def seq_text(lens: Lens) -> str:
-    """The text of a file with an object at infinity and the d line or, if the glasses exclude it,
-    the middle of their range. LensError, with the remedy, for features that are not written."""
-    low, high = lens.dispersion.range
-    wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
+def seq_text(system: System) -> str:
+    """The text of a file. LensError, with the remedy, for features that are not written; a warning
+    tells how far a model glass differs that becomes a private one."""
+    lens, worst = system.lens, 0.0
     media, own = media_of_lens(lens)
+    for i, keys in enumerate(media):
+        made, off = _made(keys, system.wavelengths)
+        own |= {f" {i}": made} if made else {}
+        media[i], worst = {"glass": f" {i}"} if made else keys, max(worst, off)
+    if worst:
+        warnings.warn(
+            "model glasses are private ones of .seq: their indices are the same at the wavelengths "
+            f"in use and at F, d, C; from {VISIBLE[0]:g} to {VISIBLE[1]:g} um they differ by "
+            f"{worst:.1g} at most",
+            stacklevel=3,
+        )
     private = {name: f"G{k + 1}" for k, name in enumerate(own)}
     title = "".join(" " if c in "'\"" or not c.isprintable() else c for c in lens.name)
-    lines = ["RDM N", "LEN", f"TITLE '{' '.join(title.split())}'", f"EPD {_pupil(lens, wave)!r}"]
-    lines += ["DIM M", f"WL {_nanometres(wave)!r}", "REF 1", "WTW 1", "XAN 0.0", "YAN 0.0"]
+    pupil = _pupil(lens, float(system.wavelengths[system.primary]))
+    lines = ["RDM N", "LEN", f"TITLE '{' '.join(title.split())}'", f"EPD {pupil!r}", "DIM M"]
+    lines += _use(system)
     if own:
         lines.append("PRV")
         for name, constants in own.items():
             lines += _private(name, private[name], constants)
         lines.append("END")
     words = [_word(keys, private) for keys in media]
-    lines.append(f"SO 0.0 0.1e14 {words[0]}".rstrip())
+    far = repr(float(system.distance)) if math.isfinite(system.distance) else "0.1e14"
+    lines.append(f"SO 0.0 {far} {words[0]}".rstrip())
     places = _places(lens)
     for i in range(lens.count):
         word = "REFL" if lens.mirrors[i] else words[i + 1]
@@ -51,6 +74,47 @@ def seq_text(lens: Lens) -> str:
     conic = float(lens.conic[-1])
     lines += [f"  {line}" for line in [*(["CON", f"K {conic!r}"] if conic else []), *places[-1]]]
     return "\n".join([*lines, "GO", ""])
+
+
+def _use(system: System) -> list[str]:
+    """The lines of wavelengths, fields and vignetting."""
+    kind = dict(zip(get_args(FieldKind), ("AN", "OB", "IM", "RI"), strict=True))[system.field_kind]
+    dx, dy, cx, cy, turn = system.vignetting.T
+    if np.any(turn * np.any(system.vignetting[:, :4], axis=1)):
+        raise LensError("vignetting: .seq files hold no rotation: save as .zmx")
+    columns = {
+        "WL": [_nanometres(wave) for wave in system.wavelengths.tolist()],
+        "WTW": system.wavelength_weights.tolist(),
+        "REF": [system.primary + 1],
+        f"X{kind}": system.heights[:, 0].tolist(),
+        f"Y{kind}": system.heights[:, 1].tolist(),
+        "WTF": system.field_weights.tolist(),
+    }
+    edges = {"VUX": cx - dx, "VLX": cx + dx, "VUY": cy - dy, "VLY": cy + dy}
+    columns |= {key: edge.tolist() for key, edge in edges.items() if np.any(edge)}
+    return [line for key, row in columns.items() for line in _wrapped(key, map(repr, row))]
+
+
+def _wrapped(key: str, words: Iterable[str]) -> list[str]:
+    """A command on lines that `&` continues."""
+    text = textwrap.wrap(f"{key} {' '.join(words)}", 100, break_on_hyphens=False)
+    return [*(f"{part} &" for part in text[:-1]), text[-1]]
+
+
+def _made(keys: dict[str, Any], waves: np.ndarray) -> tuple[dict[str, Any], float]:
+    """The constants of a private glass for a constant index, or for a model glass off the normal
+    line, through its indices at the wavelengths in use and the lines F, d, C; and how far its index
+    is off elsewhere. Empty for other media."""
+    if "index" in keys:
+        return {"schott": [keys["index"] ** 2]}, 0.0
+    if not keys.get("partial"):
+        return {}, 0.0
+    glass = Dispersion.of([model_glass(keys["nd"], keys["vd"], keys["partial"])])
+    held = [*dict.fromkeys([*waves.tolist(), *FRAUNHOFER[:3]])][:5]
+    at = np.array([*held, *np.linspace(*VISIBLE, 99)])
+    indices = np.asarray(refractive_index(glass, jnp.asarray(at)), float)[0]
+    constants, off = schott_through(at, indices, [*range(len(held))])
+    return {"schott": constants, "range": [*VISIBLE]}, off
 
 
 def _pupil(lens: Lens, wave: float) -> float:
@@ -79,18 +143,13 @@ def _private(name: str, called: str, constants: dict[str, Any]) -> list[str]:
         words = ["GMS", *(repr(value) for pair in pairs for value in pair)]
     else:
         words = ["LAU", *map(repr, schott or [1.0])]
-    text = textwrap.wrap(f"  '{called}' {' '.join(words)}", 100, break_on_hyphens=False)
-    return [
-        f"  PWL {_nanometres(high)!r} {_nanometres(low)!r}",
-        *(f"  {t} &" for t in text[:-1]),
-    ] + [f"  {text[-1]}"]
+    text = _wrapped(f"'{called}'", words)
+    return [f"  {line}" for line in (f"PWL {_nanometres(high)!r} {_nanometres(low)!r}", *text)]
 
 
 def _word(keys: dict[str, Any], private: dict[str, str]) -> str:
     """The word for a medium; "" for air."""
     if "nd" in keys:
-        if keys.get("partial"):
-            raise LensError("a model glass off the normal line: use .yaml, or set partial to 0")
         nd, vd = repr(keys["nd"]), repr(keys["vd"])
         if nd[:2] != "1." or not vd[:2].isdecimal() or vd[2:3] != "." or "e" in nd + vd:
             return f"{nd}:{vd}"

@@ -2,18 +2,22 @@
 
 import math
 from collections.abc import Mapping
+from typing import get_args
 
 import numpy as np
 
 from ..lens.forms import FORMS
 from ..lens.glasses import find_glass, map_point
 from ..lens.lens import Lens
+from .apertures import Shape, shapes_of
 from .breaks_out import with_breaks
 from .entry import LensError
 from .exact import number_for
 from .glasses import written_names
 from .media_out import medium_of
 from .model_zmx import to_ours, to_theirs
+from .system import FieldKind, System
+from .zmx_head import BESIDE, COLUMNS
 
 _HEAD = """VERS 150514 0 0
 MODE SEQ
@@ -22,13 +26,8 @@ UNIT MM X W X CM MR CPMM
 FLOA
 ENVD 2.0E+1 1 0
 GCAT {makers}
-RAIM 0 2 1 1 0 0 0 0 0
-FTYP 0 0 1 1 0 0 0
-XFLN 0 0 0 0 0 0 0 0 0 0 0 0
-YFLN 0 0 0 0 0 0 0 0 0 0 0 0
-FWGN 1 1 1 1 1 1 1 1 1 1 1 1
-WAVM 1 {wave!r} 1
-PWAV 1"""
+RAIM 0 {aiming} 1 1 0 0 0 0 0"""
+_AIMING = {"off": 0, "paraxial": 1}
 _TYPES = {  # by form: type, parameters of the coefficients, whether the first is a radius
     "asphere": ("EVENASPH", range(1, 9), False),
     "odd_asphere": ("ODDASPHE", range(1, 9), False),
@@ -43,29 +42,45 @@ _SERIES = {  # by form: type whose XDAT hold the coefficients, the values before
     "qbfs": ("QED_TYPE", (0,)),
 }
 _OTHERS = {"silica": "F_SILICA"}
+_KEYS = {"rectangle": ("SQAP", "SQOB"), "ellipse": ("ELAP", "ELOB")}  # clear, blocking
 
 
-def zmx_text(lens: Lens) -> str:
-    """The text of a file with an object at infinity and the d line or, if the glasses exclude it,
-    the middle of their range. LensError, with the remedy, for features that are not written."""
-    low, high = lens.dispersion.range
-    wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
+def zmx_text(system: System) -> str:
+    """The text of a file. LensError, with the remedy, for features that are not written."""
+    lens = system.lens
     media = [medium_of(lens, i) or {} for i in range(lens.count + 1)]
     makers, names = written_names([own["glass"] for own in media if "glass" in own])
     names |= {name: other for name, other in _OTHERS.items() if name in names}
     names = {name: f"{other} 0 0 {_numbers(name)}" for name, other in names.items()}
-    head = {"name": " ".join(lens.name.split()), "wave": wave}
-    lines = [_HEAD.format(makers=" ".join(makers), **head)]
-    front = ["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY", *_glass(lens, 0, names)]
+    head = {"name": " ".join(lens.name.split()), "makers": " ".join(makers)}
+    lines = [_HEAD.format(**head, aiming=_AIMING.get(system.ray_aiming, 2)), *_use(system)]
     curvature, conic = (float(a[-1]) for a in (lens.curvature, lens.conic))
     image = ["TYPE STANDARD", f"CURV {curvature!r}", f"CONI {conic!r}"]
     surfaces = [*(_surface(lens, i, names) for i in range(lens.count)), image]
     gaps = [gap_behind(lens, i) for i in range(lens.count)]
-    blocks, behind = with_breaks(lens, surfaces, gaps)
+    blocks, (first, *behind) = with_breaks(lens, surfaces, gaps)
+    far = system.distance + first
+    place = repr(far) if math.isfinite(far) else "INFINITY"
+    front = ["TYPE STANDARD", "CURV 0.0", f"DISZ {place}", *_glass(lens, 0, names)]
     placed = ([*own, f"DISZ {gap!r}"] for own, gap in zip(blocks, [*behind, 0.0], strict=True))
     for i, block in enumerate([front, *placed]):
         lines += [f"SURF {i}", *(f"  {line}" for line in block)]
     return "\n".join([*lines, "MNUM 1 1", ""])
+
+
+def _use(system: System) -> list[str]:
+    """The lines of fields and wavelengths; each field from the 13th on has a line of its own."""
+    kind, waves = get_args(FieldKind).index(system.field_kind), system.wavelengths.tolist()
+    turned = system.vignetting * [1, 1, 1, 1, 180 / math.pi]
+    fields = np.hstack([system.heights, system.field_weights[:, None], turned]).tolist()
+    short = [[0.0, 0.0, 1.0, *[0.0] * 5]] * (BESIDE - len(fields))
+    lines = [f"FTYP {kind} 0 {len(fields)} {len(waves)} 0 0 0"]
+    for key, column in zip(COLUMNS, zip(*fields[:BESIDE], *short, strict=True), strict=True):
+        lines.append(f"{key} {' '.join(map(repr, column))}")
+    lines += [f"FEFD {' '.join(map(repr, row))}" for row in fields[BESIDE:]]
+    for i, pair in enumerate(zip(waves, system.wavelength_weights.tolist(), strict=True)):
+        lines.append(f"WAVM {i + 1} {' '.join(map(repr, pair))}")
+    return [*lines, f"PWAV {system.primary + 1}"]
 
 
 def _numbers(name: str) -> str:
@@ -89,9 +104,7 @@ def _surface(lens: Lens, i: int, names: Mapping[str, str]) -> list[str]:
     lines += [f"CONI {float(lens.conic[i])!r}"] if lens.conic[i] else []
     lines += _glass(lens, i + 1, names)
     semi = float(lens.semi_diameter[i])
-    if math.isfinite(semi):
-        lines.append(f"DIAM {semi!r} 1 0 0 1")
-        lines += [f"FLAP 0 {semi!r} 0"] if i != lens.stop else []
+    lines += [f"DIAM {semi!r} 1 0 0 1"] if math.isfinite(semi) else []
     return lines + _apertures(lens, i)
 
 
@@ -168,29 +181,27 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
 
 
 def _apertures(lens: Lens, i: int) -> list[str]:
-    extra = lens.apertures
-    own = [] if extra is None else [k for k, s in enumerate(extra.surfaces) if s == i]
-    if not own or extra is None:
+    """The lines of the aperture: one shape, or a circle within another."""
+    shapes = sorted(shapes_of(lens, i))  # clear ones before those that block
+    if not shapes:
         return []
-    (k,) = own if len(own) == 1 else (None,)
-    if k is None or (math.isfinite(float(lens.semi_diameter[i])) and i != lens.stop):
-        raise LensError(f"surfaces[{i}]: a .zmx surface has one aperture: save as .yaml")
-    x, y = np.asarray(extra.sizes[k], float).tolist()
-    kind, blocks = extra.kinds[k], extra.blocks[k]
-    if kind == "circle":
-        lines = [f"OBSC 0 {x!r} 0" if blocks else f"CLAP 0 {x!r} 0"]
-    elif kind == "polygon":
-        corners = np.asarray(extra.outline(k), float).tolist()
-        if [0, 0] in corners:
+    (blocks, kind, size, centre), *others = shapes
+    inner = others[0].size[0] if others else 0.0
+    ring = Shape(True, "circle", [inner] * 2, centre)
+    if others and not (kind == "circle" and not blocks and others == [ring]):
+        raise LensError(
+            f"surfaces[{i}]: a .zmx surface has one aperture, or a circle in one: save as .yaml"
+        )
+    if kind == "polygon":
+        corners = [*zip(size[::2], size[1::2], strict=True)]
+        if (0, 0) in corners:
             raise LensError(
                 f"surfaces[{i}]: a corner 0 0 ends a polygon in .zmx files: save as .yaml"
             )
         lines = [f"{'USOB' if blocks else 'USAP'} 0 0 0", 'UDAD 0 "POLYGON.UDA" 1']
         lines += [f"UDAD {n} {x!r} {y!r} 0" for n, (x, y) in enumerate(corners, 1)]
-    elif kind == "rectangle" and not blocks:
-        lines = [f"SQAP {x!r} {y!r} 0"]
+    elif kind == "circle":
+        lines = [f"{'OBSC' if blocks else 'CLAP'} {inner!r} {size[0]!r} 0"]
     else:
-        raise LensError(f"surfaces[{i}]: this aperture is not written to .zmx: save as .yaml")
-    if extra.centre is not None:
-        lines.append("OBDC " + " ".join(map(repr, np.asarray(extra.centre[k], float).tolist())))
-    return lines
+        lines = [f"{_KEYS[kind][blocks]} {size[0]!r} {size[1]!r} 0"]
+    return [*lines, f"OBDC {centre[0]!r} {centre[1]!r}"] if any(centre) else lines

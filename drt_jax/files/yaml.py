@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from ..inputs import InputError, read_yaml, shown
+from ..inputs import InputError, parse, read_text, shown
 from ..lens.lens import Lens
 from .agf import load_agf
 from .entry import LensError
@@ -19,6 +19,7 @@ from .zmx import read_zmx
 
 _BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
 _READERS = {".zmx": read_zmx, ".seq": read_seq}
+_ENDINGS = (".yaml", ".yml", *_READERS)
 
 
 def lens_names() -> list[str]:
@@ -41,27 +42,49 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
         if isinstance(source, Mapping):
             return build_lens(_with_catalogues(dict(source), pathlib.Path()))
         path = pathlib.Path(source)
-        if path.suffix.lower() in _READERS:
+        if str(source) in lens_names():
+            path = _BUNDLED / f"{source}.yaml"
+        elif not path.suffix:
+            raise LensError(
+                f"no bundled lens {shown(str(source))}; bundled: {', '.join(lens_names())}; for a "
+                f"file of your own give a path that ends in {', '.join(_ENDINGS)}"
+            )
+        if known_ending(path) in _READERS:
             record, use = read_record(path, missing)
             lens = lens_of(record, use)
             record.say()
             return lens
-        if path.suffix.lower() not in (".yaml", ".yml"):
-            if str(source) not in lens_names():
-                raise LensError(
-                    f"no bundled lens {shown(str(source))}; bundled: {', '.join(lens_names())}; "
-                    "for a file of your own give a path that ends in .yaml or "
-                    f"{', '.join(_READERS)}"
-                )
-            path = _BUNDLED / f"{source}.yaml"
         try:
-            values, lines = read_yaml(path)
+            return _lens_of_yaml(read_text(path), path)
+        except LensError:
+            raise
         except InputError as error:
             raise LensError(f"{path}: {error}") from error
-        try:
-            return build_lens(_with_catalogues(values, path.parent), path.stem)
-        except LensError as error:
-            raise LensError(f"{path}{lines.of(error.key)}: {error}", error.key) from None
+
+
+def known_ending(path: str | pathlib.Path) -> str:
+    """The ending of a path, in small letters. LensError for one of no kind of file here."""
+    kind = pathlib.Path(path).suffix.lower()
+    if kind not in _ENDINGS:
+        raise LensError(f"{path}: expected a name that ends in {', '.join(_ENDINGS)}")
+    return kind
+
+
+def lens_in(text: str, path: str | pathlib.Path) -> Lens:
+    """The lens of the text of a file. LensError as of `load_lens`. path: its name."""
+    kind = known_ending(path)
+    if kind in _READERS:
+        return lens_of(*_READERS[kind](str(path), "error", text.splitlines()))
+    return _lens_of_yaml(text, pathlib.Path(path))
+
+
+def _lens_of_yaml(text: str, path: pathlib.Path) -> Lens:
+    """The lens of a prescription. InputError for what is no YAML."""
+    values, lines = parse(text)
+    try:
+        return build_lens(_with_catalogues(values, path.parent), path.stem)
+    except LensError as error:
+        raise LensError(f"{path}{lines.of(error.key)}: {error}", error.key) from None
 
 
 def _with_catalogues(top: Any, folder: pathlib.Path) -> Any:

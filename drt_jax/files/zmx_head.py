@@ -12,13 +12,13 @@ from .text import Words
 
 _UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0, "METER": 1000.0}
 _MOST = 1000  # fields or wavelengths
-_COLUMNS = ("XFLN", "YFLN", "FWGN", "VDXN", "VDYN", "VCXN", "VCYN", "VANN")
+COLUMNS = ("XFLN", "YFLN", "FWGN", "VDXN", "VDYN", "VCXN", "VCYN", "VANN")
 # Lists of older versions, which later ones write beside their own; read where those are absent.
 _OLD = dict(
-    zip(("XFLD", "YFLD", "FWGT", "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN"), _COLUMNS, strict=True)
+    zip(("XFLD", "YFLD", "FWGT", "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN"), COLUMNS, strict=True)
 )
 _WAVES = (("WAVN", "WWGN"), ("WAVL", "WWGT"))
-_BESIDE = 12  # fields in a column; each further one has a line FEFD
+BESIDE = 12  # fields in a column; each further one has a line FEFD
 
 
 @dataclasses.dataclass
@@ -49,15 +49,15 @@ class Head:
                 self.waves[i + 1] = _positive(record, use.field_line, value), weight
         for old, key in _OLD.items():
             self.columns.setdefault(key, self.columns.get(old, []))
-        known = max(map(len, (self.columns[key] for key in _COLUMNS[:2])))
-        fields = self.counts[0] or (min(known, _BESIDE) or 1) + len(self.more)
+        known = max(map(len, (self.columns[key] for key in COLUMNS[:2])))
+        fields = self.counts[0] or (min(known, BESIDE) or 1) + len(self.more)
         waves = self.counts[1] or max(self.waves, default=1)
         for i in range(1, waves + 1):
             if i not in self.waves:
                 raise record.error(use.field_line, f"WAVM {i} of {waves} is missing")
         used = [self.waves[i] for i in range(1, waves + 1)]
         use.wavelengths, use.wavelength_weights = ([pair[k] for pair in used] for k in (0, 1))
-        x, y, use.field_weights, *parts = (self._column(key, fields) for key in _COLUMNS)
+        x, y, use.field_weights, *parts = (self._column(key, fields) for key in COLUMNS)
         unit = 1.0 if use.field_kind == "angle" else self.unit
         use.heights = [(a * unit, b * unit) for a, b in zip(x, y, strict=True)]
         parts[4] = [math.radians(value) for value in parts[4]]
@@ -66,9 +66,9 @@ class Head:
     def _column(self, key: str, fields: int) -> list[float]:
         """The numbers of all fields; those of a column that the file does not have are 1 for
         weights, else 0."""
-        k, found = _COLUMNS.index(key), self.columns[key]
-        found = found or [float(key == "FWGN")] * (min(fields, _BESIDE) if self.more else fields)
-        found = found[:_BESIDE] + [row[k] for row in self.more] if self.more else found
+        k, found = COLUMNS.index(key), self.columns[key]
+        found = found or [float(key == "FWGN")] * (min(fields, BESIDE) if self.more else fields)
+        found = found[:BESIDE] + [row[k] for row in self.more] if self.more else found
         if len(found) < fields:
             what = f"{key} has {len(found)} of {fields} fields"
             raise self.record.error(self.use.field_line, what)
@@ -136,7 +136,7 @@ def _column(head: Head, words: Words) -> None:
 
 def _further(head: Head, words: Words) -> None:
     if len(head.more) < _MOST:
-        head.more.append(head.record.numbers(words.line, words.rest, len(_COLUMNS)))
+        head.more.append(head.record.numbers(words.line, words.rest, len(COLUMNS)))
 
 
 def _wave(head: Head, words: Words) -> None:
@@ -166,7 +166,7 @@ def _environment(head: Head, words: Words) -> None:
 
 KEYS: dict[str, Callable[[Head, Words], None]] = {
     **dict.fromkeys(("ENPD", "FNUM", "OBNA", "FLOA"), _aperture),
-    **dict.fromkeys((*_COLUMNS, *_OLD, *sum(_WAVES, ())), _column),
+    **dict.fromkeys((*COLUMNS, *_OLD, *sum(_WAVES, ())), _column),
     **{"UNIT": _unit, "NAME": _name, "GCAT": _makers, "FTYP": _fields, "WAVM": _wave},
     **{"PWAV": _primary, "RAIM": _aiming, "ENVD": _environment, "FEFD": _further},
 }

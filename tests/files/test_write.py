@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import LensError, lens_names, load_lens, save_lens
+from drt_jax import LensError, lens_names, load_lens, load_system, save_lens
+from drt_jax.__main__ import main
+from drt_jax.files import write
+from drt_jax.files.system import system_for
 
 ODD = {
     "name": "odd",
@@ -149,3 +152,173 @@ def test_what_a_prescription_cannot_hold(tmp_path):
     with pytest.raises(LensError, match="cannot be written"):
         save_lens(lens, tmp_path / "nowhere" / "lens.yaml")
     assert not any(tmp_path.iterdir()) and jnp.all(jnp.isfinite(lens.curvature))
+
+
+KINDS = (".yaml", ".zmx", ".seq")
+FRONT = {"radius": 50.0, "thickness": 5.0, "semi_diameter": 5.0, "stop": True}
+BACK = {"radius": -50.0, "thickness": 47.45, "semi_diameter": 5.0}
+
+
+def singlet(**keys):
+    return load_lens({"surfaces": [FRONT | keys, BACK]})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_constant_index_is_a_glass_of_every_file(kind, tmp_path):
+    """n = 1.5 is not air; and it is written again from what is read."""
+    lens = singlet(index=1.5)
+    save_lens(lens, tmp_path / f"one{kind}")
+    for other in KINDS:
+        save_lens(load_lens(tmp_path / f"one{kind}"), tmp_path / f"two{other}")
+        again = load_lens(tmp_path / f"two{other}")
+        np.testing.assert_array_equal(again.index([0.45, 0.7]), [[1, 1], [1.5, 1.5], [1, 1]])
+        np.testing.assert_array_equal(again.curvature, lens.curvature)
+
+
+def test_a_model_glass_of_another_dispersion_is_a_private_glass(tmp_path):
+    """The same indices at F, d, C; elsewhere no more off than is said."""
+    lens = singlet(nd=1.6204, vd=60.3, partial=0.02)
+    with pytest.warns(UserWarning, match="0.365 to 1.014 um they differ by .* at most") as said:
+        save_lens(lens, tmp_path / "own.seq")
+    again = load_lens(tmp_path / "own.seq")
+    lines, all_waves = [0.4861327, 0.5875618, 0.6562725], np.linspace(0.366, 1.013, 50)
+    np.testing.assert_allclose(again.index(lines), lens.index(lines), rtol=0, atol=1e-12)
+    worst = float(str(said[0].message).rpartition(" at most")[0].rpartition(" ")[2])
+    off = np.abs(np.asarray(again.index(all_waves) - lens.index(all_waves))).max()
+    assert worst / 2 < off < 1.5 * worst < 1e-4
+
+
+def test_what_is_read_back_otherwise_is_not_written(tmp_path, monkeypatch):
+    """An error names the difference, and the file that was there stays."""
+    lens = singlet(index=1.5)
+    others = {
+        "curvature[1] -0.02": dataclasses.replace(lens, curvature=lens.curvature.at[1].mul(1.001)),
+        "thickness[0] 5": dataclasses.replace(lens, thickness=lens.thickness + 1e-6),
+        "sensor 52.45": dataclasses.replace(lens, sensor=lens.sensor + 0.01),
+        "index[1, 0] 1.5": singlet(index=1.51),
+        "stop 0": load_lens({"surfaces": [{**FRONT, "index": 1.5, "stop": False}, BACK | STOP]}),
+        "apertures": dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[1].set(4.0)),
+        "stop's semi_diameter 5": dataclasses.replace(
+            lens, semi_diameter=lens.semi_diameter.at[0].set(4.0)
+        ),
+    }
+    for kind in KINDS:
+        path = tmp_path / f"lens{kind}"
+        path.write_text("before")
+        for name, other in others.items():
+            if name == "sensor 52.45" and kind != ".yaml":
+                continue  # there it is a thickness
+            text = {".zmx": write.zmx_text, ".seq": write.seq_text}.get(kind, write._yaml_text)
+            wrong = text(system_for(other))
+            place = "zmx_text" if kind == ".zmx" else "seq_text" if kind == ".seq" else "_yaml_text"
+            with monkeypatch.context() as patch:
+                patch.setattr(write, place, lambda system, wrong=wrong: wrong)
+                with pytest.raises(LensError) as error:
+                    save_lens(lens, path)
+            assert f"not written: what is read back differs: {name}" in str(error.value)
+            assert path.read_text() == "before"
+        wrong_way = dataclasses.replace(lens, thickness=-lens.thickness)
+        with pytest.raises(LensError, match="must be positive.*not written"):
+            save_lens(wrong_way, path)
+        assert path.read_text() == "before"
+
+
+@pytest.mark.parametrize("path", ["lens.len", "lens", "lens.txt", "lens.zmx.gz"])
+def test_endings_of_no_kind_of_file(path, tmp_path):
+    lens = singlet(index=1.5)
+    with pytest.raises(LensError, match=r"ends in .yaml, .yml, .zmx, .seq"):
+        save_lens(lens, tmp_path / path)
+    with pytest.raises(LensError, match=r"ends in .yaml, .yml, .zmx, .seq"):
+        load_lens(tmp_path / path)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rings_and_other_apertures(kind, tmp_path):
+    """A circle in a circle is the annular aperture of .zmx; one shape on each other surface."""
+    plane = {"curvature": 0.0, "thickness": 2.0}
+    shapes = [
+        {"semi_diameter": 4.0, "obscuration": {"circle": 1.0}},
+        {
+            "aperture": {"circle": 4.0, "centre": [1, 2]},
+            "obscuration": {"circle": 1.0, "centre": [1, 2]},
+        },
+        {"aperture": {"ellipse": [3.0, 4.0]}},
+        {"obscuration": {"ellipse": [1.0, 2.0]}},
+        {"obscuration": {"rectangle": [1.0, 2.0], "centre": [0, 0.5]}},
+    ]
+    rows = [{**FRONT, "index": 1.5, "obscuration": {"circle": 1.0}}, BACK]
+    lens = load_lens({"surfaces": [*rows, *(plane | own for own in shapes)]})
+    save_lens(lens, tmp_path / f"own{kind}")
+    again = load_lens(tmp_path / f"own{kind}")
+    assert (again.apertures.kinds, again.apertures.blocks) == (
+        lens.apertures.kinds,
+        lens.apertures.blocks,
+    )
+    np.testing.assert_array_equal(again.apertures.half, lens.apertures.half)
+    np.testing.assert_array_equal(again.apertures.centre, lens.apertures.centre)
+    np.testing.assert_array_equal(again.semi_diameter, lens.semi_diameter)
+    if kind == ".zmx":
+        text = (tmp_path / "own.zmx").read_text()
+        assert text.count("CLAP 1.0 4.0 0") == 2 and "OBDC 1.0 2.0" in text
+        off = {"semi_diameter": 4.0, "obscuration": {"circle": 1.0, "centre": [0, 1]}}
+        lens = load_lens({"surfaces": [*rows, plane | off]})
+        with pytest.raises(LensError, match="one aperture, or a circle in one: save as .yaml"):
+            save_lens(lens, tmp_path / "two.zmx")
+
+
+USES = {
+    "angle": ("inf", [[0, 0], [1, 5]]),
+    "object height": ("200", [[0, 0], [1, 5]]),
+    "paraxial image height": ("inf", [[0, k] for k in range(15)]),
+    "real image height": ("inf", [[0, 0], [1, 5]]),
+}
+
+
+@pytest.mark.parametrize("kind", [".zmx", ".seq"])
+@pytest.mark.parametrize("field_kind", USES)
+def test_a_lens_with_its_fields_and_wavelengths(kind, field_kind, tmp_path):
+    """What `load_system` reads is written: distance, fields, weights, vignetting, wavelengths."""
+    far, heights = USES[field_kind]
+    count = len(heights)
+    vignetting = np.random.default_rng(0).uniform(0, 0.2, (count, 5))
+    vignetting[:, 4] = 0.5 if kind == ".zmx" else 0
+    system = dataclasses.replace(
+        system_for(singlet(glass="N-BK7")),
+        distance=float(far),
+        field_kind=field_kind,
+        heights=np.array(heights, float),
+        field_weights=np.arange(1.0, count + 1),
+        vignetting=vignetting,
+        wavelengths=np.array([0.48, 0.65, 0.55]),
+        wavelength_weights=np.array([1.0, 2.0, 0.5]),
+        primary=1,
+        ray_aiming="off",
+    )
+    save_lens(system, tmp_path / f"own{kind}")
+    again = load_system(tmp_path / f"own{kind}")
+    for key in ("heights", "field_weights", "wavelengths", "wavelength_weights"):
+        np.testing.assert_allclose(getattr(again, key), getattr(system, key), rtol=1e-15)
+    np.testing.assert_allclose(again.vignetting, vignetting, rtol=0, atol=1e-15)
+    assert (again.distance, again.primary, again.field_kind) == (float(far), 1, field_kind)
+    assert again.ray_aiming == ("off" if kind == ".zmx" else "chief")
+    np.testing.assert_allclose(again.lens.semi_diameter, system.lens.semi_diameter, rtol=1e-12)
+    if kind == ".seq" and field_kind == "angle":
+        turned = dataclasses.replace(system, vignetting=vignetting + 0.1)
+        with pytest.raises(LensError, match="vignetting: .seq files hold no rotation"):
+            save_lens(turned, tmp_path / "turned.seq")
+        with pytest.warns(UserWarning, match="fields, wavelengths and vignetting are not written"):
+            save_lens(system, tmp_path / "own.yaml")
+
+
+def test_convert_keeps_fields_and_wavelengths(tmp_path, capsys):
+    system = dataclasses.replace(
+        system_for(singlet(glass="N-BK7")),
+        heights=np.array([[0, 0], [0, 7.0]]),
+        field_weights=np.ones(2),
+        vignetting=np.zeros((2, 5)),
+    )
+    save_lens(system, tmp_path / "one.zmx")
+    main(["convert", str(tmp_path / "one.zmx"), str(tmp_path / "two.seq")])
+    np.testing.assert_array_equal(load_system(tmp_path / "two.seq").heights, system.heights)
+    assert "2 surfaces, is written" in capsys.readouterr().out

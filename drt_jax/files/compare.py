@@ -1,0 +1,93 @@
+"""Compare a lens with what is read back from the text that stands for it."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ..lens.lens import Lens
+from .apertures import shapes_of
+
+_KINDS = ("circle", "ellipse", "rectangle", "polygon")
+_CLOSE = 1e-9  # relative, and in mm; rounding of float32 is larger
+
+
+def difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) -> str:
+    """The first difference of a lens `two`, read back, from `one`, beyond rounding, as text; empty
+    if there is none. Places count from the first surface: a file need not tell where that stands.
+
+    waves: wavelengths where indices are compared, um. indices: how far they may differ.
+    """
+    for name in ("count", "stop", "mirrors", "forms"):
+        a, b = getattr(one, name), getattr(two, name)
+        if a != b:
+            return f"{name} {a}, read back {b}"
+    close = max(_CLOSE, 256 * float(np.finfo(np.asarray(one.curvature).dtype).eps))
+    for name, a, b, least in _numbers(one, two, waves, indices):
+        if a.shape != b.shape:
+            return f"{name}: {len(a)} of them, read back {len(b)}"
+        with np.errstate(invalid="ignore"):  # inf - inf
+            off = (a != b) & ~(np.abs(a - b) <= np.maximum(least, close * np.abs(a)))
+        if np.any(off):
+            at = tuple(np.argwhere(off)[0])
+            place = f"[{', '.join(map(str, at))}]" if at else ""
+            return f"{name}{place} {a[at]:.10g}, read back {b[at]:.10g}"
+    return ""
+
+
+def _numbers(one: Lens, two: Lens, waves: list[float], indices: float) -> Iterator[Any]:
+    """Arrays of both lenses with their name and the absolute tolerance."""
+    both = one, two
+    size = _CLOSE * max(1.0, abs(float(one.sensor)))
+    # Elements that move along the axis become thicknesses in files of other programs.
+    spaced = one.elements is None and two.elements is None
+    for name in ("curvature", "conic", *(("thickness", "sensor") if spaced else ())):
+        parts = [np.asarray(getattr(own, name), float) for own in both]
+        yield name, *parts, size if name in ("thickness", "sensor") else 0.0
+    yield "coefficients", *_padded(*(np.asarray(own.coefficients, float) for own in both)), 0.0
+    yield "stop's semi_diameter", *(_at(own.semi_diameter, own.stop) for own in both), 0.0
+    yield "apertures", *map(_apertures, both), size
+    yield "index", *(np.asarray(own.index(waves), float) for own in both), max(_CLOSE, indices)
+    rows = ["decentre", "vertex", "rotation"]
+    for name, *parts in zip(rows, *map(_places, both), strict=True):
+        yield name, *parts, size if name != "rotation" else 1e-8
+    phases = [own.phase for own in both]
+    if any(phase is not None for phase in phases):
+        yield "phase", *_padded(*map(_phase, phases)), 0.0
+
+
+def _at(values: Any, row: int) -> np.ndarray:
+    return np.asarray(values, float)[row]
+
+
+def _padded(one: np.ndarray, two: np.ndarray) -> list[np.ndarray]:
+    """Rows of coefficients filled up to one length by zeros."""
+    width = max(one.shape[1], two.shape[1])
+    return [np.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in (one, two)]
+
+
+def _places(lens: Lens) -> list[np.ndarray]:
+    z, across, turned = lens.places
+    rows = lens.count + 1
+    return [
+        np.zeros((rows, 2)) if across is None else np.asarray(across, float),
+        np.asarray(z - z[0], float),
+        np.tile(np.eye(3), (rows, 1, 1)) if turned is None else np.asarray(turned, float),
+    ]
+
+
+def _apertures(lens: Lens) -> np.ndarray:
+    """Rows of surface, whether it blocks, number of the kind, centre and size, sorted; short rows
+    are filled up by zeros."""
+    shapes = [(i, shape) for i in range(lens.count) for shape in shapes_of(lens, i)]
+    rows = [[i, own.blocks, _KINDS.index(own.kind), *own.centre, *own.size] for i, own in shapes]
+    wide = max(map(len, rows), default=0)
+    return np.array([[*row, *[0.0] * (wide - len(row))] for row in sorted(rows)], float)
+
+
+def _phase(phase: Any) -> np.ndarray:
+    """Rows of surface, order and coefficients."""
+    if phase is None:
+        return np.zeros((0, 2))
+    order = np.asarray(phase.order, float)[:, None]
+    return np.hstack([np.array(phase.surfaces)[:, None], order, np.asarray(phase.coefficients)])
