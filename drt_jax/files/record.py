@@ -58,8 +58,9 @@ class Row:
 class Record:
     """A file as it is read. Lengths in mm.
 
-    path, missing: see `load_lens`. name: of the lens. distance: of the object. medium: keys of the
-    object's medium. parts: surfaces and coordinate breaks in order; the image is the last surface.
+    path, missing: see `load_lens`. name: of the lens. distance: of the object, below 0 for a
+    virtual one behind the first vertex. medium: keys of the object's medium. parts: surfaces and
+    coordinate breaks in order; the image is the last surface.
     glasses: those that the file itself defines, as in a prescription.
     notes: what is left out or read differently from the file.
     """
@@ -210,8 +211,8 @@ class Record:
                 surfaces[-1]["semi_diameter"] = semi_diameter
         if not surfaces:
             raise self.error(0, "no surface lies between object and image")
-        if self.distance <= 0:
-            raise self.error(rows[0].line, f"the object lies {-self.distance:g} mm behind this")
+        if abs(self.distance) < CLOSEST:
+            raise self.error(rows[0].line, "the object touches this surface")
         top: dict[str, Any] = {"surfaces": surfaces}
         top |= {"elements": elements} if elements else {}
         top |= {"object": self.medium} if self.medium else {}
@@ -241,8 +242,8 @@ def listed(words: Iterable[str], most: int) -> str:
 
 
 def distance_of(value: float) -> float:
-    """A distance of a file, mm; inf from 1e10 mm on."""
-    return math.inf if value >= _FAR else value
+    """A distance of a file, mm; inf from 1e10 mm on, in front of the lens or behind it."""
+    return math.inf if abs(value) >= _FAR else value
 
 
 def rotation_of(tilt: tuple[float, float, float]) -> np.ndarray:

@@ -232,8 +232,8 @@ def test_surfaces_that_touch_and_fields_of_90_degrees(tmp_path):
     with pytest.warns(UserWarning, match="line 4: fields of 90 degrees and more cannot be traced"):
         assert np.degrees(read(tmp_path, YFLN="0 90").fields[1, 1]) == 90
     assert "line 4: a field angle of 90" in refused(tmp_path, YFLN="0 90", object="200")
-    message = refused(tmp_path, FRONT, BACK.replace("DISZ 48", "DISZ -1"))
-    assert message.startswith(", line 33: sensor: 3 mm lies before the vertex of surface 1")
+    with pytest.warns(UserWarning, match="sensor: 3 mm lies before the vertex of surface 1"):
+        read(tmp_path, FRONT, BACK.replace("DISZ 48", "DISZ -1"))
 
 
 def test_apertures(tmp_path):
@@ -399,6 +399,22 @@ def test_more_than_twelve_fields(tmp_path):
     path.write_text(own)
     with pytest.raises(LensError, match="XFLN has 12 of 14 fields"):
         load_system(path)
+
+
+def test_a_virtual_object_and_a_virtual_image(tmp_path):
+    """1 / s' = 1 / s + 1 / f of a thin lens: light that converges to 100 mm behind it; and a
+    sensor in front of a negative lens, which is said."""
+    lens = "TYPE STANDARD|STOP|CURV {}|DISZ 1e-3|GLAS ___BLANK 1 0 1.5 0|DIAM 5"
+    back = "TYPE STANDARD|CURV 0|DISZ {}|DIAM 5"
+    system = read(tmp_path, lens.format(0.02), back.format(50), object="-100")
+    assert system.distance == -100
+    found = first_order(system.lens, system.distance, jnp.array([0.55]))
+    np.testing.assert_allclose(found.image_distance, 50, rtol=1e-4)
+    with pytest.warns(UserWarning, match="virtual image"):
+        system = read(tmp_path, lens.format(-0.02), back.format(-100), object="-1e12")
+    found = first_order(system.lens, system.distance, jnp.array([0.55]))
+    np.testing.assert_allclose(found.image_distance, -100, rtol=1e-4)
+    assert "the object touches" in refused(tmp_path, object="0")
 
 
 def test_a_file_without_a_stop(tmp_path):
