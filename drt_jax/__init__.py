@@ -106,6 +106,7 @@ from .lens.glass import refractive_index as refractive_index
 from .lens.glasses import find_glass as find_glass, nearest_glasses as nearest_glasses
 from .lens.lens import (
     Lens as Lens,
+    movable as movable,
     sag as sag,
     with_glass as with_glass,
     with_model_glass as with_model_glass,

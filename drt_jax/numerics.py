@@ -54,6 +54,12 @@ def concrete(tree: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def still(tree: Any) -> Any:
+    """`tree` without derivatives: what `jit`, `vmap` or a derivative fills in is a constant."""
+    held = lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.core.Tracer) else a  # noqa: E731
+    return jax.tree.map(held, tree)
+
+
 def known_values(tree: Any) -> Any:
     """`tree` with its numbers, also while it is being differentiated; None for what `jit` or `vmap`
     is to fill in.
@@ -61,8 +67,7 @@ def known_values(tree: Any) -> Any:
     What follows from a scene, such as how many rays it needs, is not differentiated itself but
     must be decided in an eager `jax.grad`, too: there `stop_gradient` leaves the values.
     """
-    still = lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.core.Tracer) else a  # noqa: E731
-    values = jax.tree.map(still, tree)
+    values = still(tree)
     return values if concrete(values) else None
 
 

@@ -7,14 +7,15 @@ import functools
 import jax
 import numpy as np
 
+from drt_jax.lens.lens import HELD
 from drt_jax.rays.find import find_many
 from drt_jax.rays.solve import reattach
 from drt_jax.rays.trace import aims
 
 
 def bendable(lens):
-    """The lens, every row of which may be curved: derivatives by all shapes."""
-    return dataclasses.replace(lens, curved=tuple(range(lens.count + 1)))
+    """The lens, every row of which may be curved, with nothing held: derivatives by all numbers."""
+    return dataclasses.replace(lens, curved=tuple(range(lens.count + 1)), free=tuple(HELD))
 
 
 @jax.jit

@@ -171,7 +171,9 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
     above = NORMAL_LINE[0] + NORMAL_LINE[1] * vd + (0 if partial is None else partial)
     known = jnp.stack([nd - 1, mean, above * mean], axis=-1)
     powers = jnp.stack([wavelengths**p for p in _CONRADY])
-    return known @ jnp.asarray(formula, known.dtype) @ powers
+    # A medium with a formula of its own stays as it is.
+    own = jnp.where(model[:, :1] > 1, known, 0)
+    return own @ jnp.asarray(formula, known.dtype) @ powers
 
 
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:

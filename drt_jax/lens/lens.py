@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 from jax import Array
 from jax.dtypes import canonicalize_dtype
 
-from ..numerics import Numbers, concrete, real_array
+from ..numerics import Numbers, concrete, real_array, still
 from .aperture import Apertures
 from .elements import Elements, rotation_matrix
 from .forms import Shape
@@ -64,13 +65,28 @@ class Labels:
         return hash(self.structure)
 
 
-@jax.tree_util.register_dataclass
+# What a derivative by a whole lens leaves alone, see `Lens`: an array at the stop, or arrays of a
+# part.
+HELD = {
+    "semi_diameter": (),
+    "dispersion": ("strength", "resonance", "schott", "ranges"),
+    "phase": ("order",),
+}
+
+
+@jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True, repr=False)
 class Lens:
     """A lens of S surfaces. Every array over surfaces ends with a row for the sensor.
 
     All arrays are differentiable leaves of one floating dtype; `jax.grad` with respect to a
     lens returns a `Lens`. z runs along the axis from the first vertex. None costs nothing.
+
+    A derivative by a whole lens is 0 where a designer would not move a number: the constants of
+    air and of glasses with a formula (nd and vd of model glasses do move), the size of the stop,
+    orders of diffraction, and shapes of planes (`curved`). What is asked for by name has its
+    derivative: what `dataclasses.replace(lens, semi_diameter=...)` puts in within the function that
+    is differentiated, and what `free` names.
 
     curvature: (S + 1,), 1/mm.
     conic: (S + 1,), 0 for a sphere, -1 for a paraboloid.
@@ -97,6 +113,9 @@ class Lens:
     curved: rows that are not active but may be curved, S for the sensor; the other such rows are
         planes, whose derivatives by curvature, conic and coefficients are 0. `load_lens` lists
         those that a prescription curves.
+    free: of "semi_diameter", "dispersion" and "phase" those with all derivatives.
+
+    held: what JAX handed in without derivatives; what is replaced is another object. Not for use.
     """
 
     curvature: Array
@@ -116,6 +135,38 @@ class Lens:
     forms: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
     mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True}, default=())
     curved: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
+    free: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
+    held: tuple = dataclasses.field(default=(), kw_only=True)
+
+    def tree_flatten(self) -> tuple[list, tuple]:
+        """For JAX: the leaves; and the rest: which numbers are held, and what is static."""
+
+        def is_held(name: str) -> bool:
+            array = getattr(self, name)
+            return name not in self.free and (any(array is h for h in self.held) or concrete(array))
+
+        leaves, static = _fields()
+        rest = (frozenset(filter(is_held, HELD)), *(getattr(self, name) for name in static))
+        return [getattr(self, name) for name in leaves], rest
+
+    def tree_flatten_with_keys(self) -> tuple[list, tuple]:
+        """For JAX: the same, each leaf with its name."""
+        leaves, rest = self.tree_flatten()
+        names = map(jax.tree_util.GetAttrKey, _fields()[0])
+        return [*zip(names, leaves, strict=True)], rest
+
+    @classmethod
+    def tree_unflatten(cls, rest: tuple, children: Sequence) -> "Lens":
+        """For JAX: the lens of these leaves. The derivatives of held numbers end here, where the
+        lens is handed to a function."""
+        leaves, static = _fields()
+        given = dict(zip((*leaves, *static), (*children, *rest[1:]), strict=True))
+        for name in rest[0]:
+            whole = given[name]
+            if not concrete(whole):
+                known = {leaf: still(getattr(whole, leaf)) for leaf in HELD[name]}
+                given[name] = dataclasses.replace(whole, **known) if known else _open(whole, given)
+        return cls(**given, held=tuple(given[name] for name in rest[0]))
 
     def __repr__(self) -> str:
         """A short description, also of a gradient and inside a trace."""
@@ -237,10 +288,24 @@ class Lens:
                     outside = f"wavelength {value:g} um is outside the range of {name}"
                     raise ValueError(f"{outside}, {low:g} to {high:g} um")
 
+    @functools.cached_property
+    def _wrong(self) -> str:
+        """What is wrong with the numbers, as far as they are known; empty for nothing."""
+        for path, leaf in jax.tree_util.tree_leaves_with_path(self):
+            if concrete(leaf) and np.any(np.isnan(np.asarray(leaf))):
+                return f"lens{jax.tree_util.keystr(path)}: expected numbers, got NaN"
+        schott, strength = self.dispersion.schott, self.dispersion.strength
+        if concrete((schott, strength)):
+            vacuum = np.eye(1, schott.shape[1])
+            odd = np.any(np.asarray(schott) != vacuum, axis=1) | np.any(np.asarray(strength), axis=1)
+            for i in np.flatnonzero(odd & (np.array(self.glasses) == "air")):
+                return f"lens.dispersion: medium {i} is called air, but its constants are not those"
+        return ""
+
     def check(self) -> None:
         """ValueError, naming the array, for a shape other than those above, for more than one
-        floating dtype, and, as far as numbers are known, for a stop without a size. Also in a
-        trace; takes some microseconds."""
+        floating dtype, and, as far as numbers are known, for NaN, for a medium that is called air
+        and is none, and for a stop without a size. Also in a trace; takes some microseconds."""
         rows, terms = self.count + 1, np.shape(self.coefficients)[1:2] or (0,)
         shapes: dict[str, tuple] = dict.fromkeys(("curvature", "conic", "semi_diameter"), (rows,))
         shapes |= {"coefficients": (rows, *terms), "thickness": (rows - 2,), "sensor": ()}
@@ -264,6 +329,10 @@ class Lens:
                 raise ValueError(f"lens.{name}: expected {rows} rows, got {len(values)}")
         if not {*self.curved} <= {*range(rows)}:
             raise ValueError(f"lens.curved: expected rows 0 to {rows - 1}, got {self.curved}")
+        if not {*self.free} <= {*HELD}:
+            raise ValueError(f"lens.free: expected some of {', '.join(HELD)}, got {self.free}")
+        if self._wrong:
+            raise ValueError(self._wrong)
         if not 0 <= self.stop < self.count:
             raise ValueError(f"lens.stop: expected 0 to {self.count - 1}, got {self.stop}")
         if concrete(self.semi_diameter):
@@ -273,6 +342,33 @@ class Lens:
                     f"lens.semi_diameter: that of the stop, surface {self.stop}, must be above 0 "
                     f"mm and finite, got {semi:g}"
                 )
+
+
+@functools.cache
+def _fields() -> tuple[list[str], list[str]]:
+    """Names of the leaves of a lens, and of what is static."""
+    known = [field for field in dataclasses.fields(Lens) if field.name != "held"]
+    static = [field.name for field in known if field.metadata.get("static")]
+    return [field.name for field in known if field.name not in static], static
+
+
+def _open(semi: Array, given: dict[str, Any]) -> Array:
+    """Semi-diameters with derivatives, but for that of the stop."""
+    at_stop = np.broadcast_to(np.arange(len(given["labels"].glasses)) == given["stop"], semi.shape)
+    return jnp.where(at_stop, still(semi), semi)
+
+
+def movable(lens: Lens) -> Lens:
+    """A lens of truth values: False for arrays that no rule of an optimiser may touch, such as a
+    decay of weights: apertures, and what a derivative by the lens leaves alone (see `Lens`).
+
+    `optax.adamw(1e-3, mask=drt_jax.movable)` and `optax.lion(1e-3, mask=drt_jax.movable)` train a
+    lens: air stays air, and infinite apertures infinite.
+    """
+    held = {leaf for name, leaves in HELD.items() if name not in lens.free for leaf in leaves}
+    held |= {"semi_diameter", "apertures"} - {*lens.free}
+    moves = lambda path, _: not held & {key.name for key in path}  # noqa: E731
+    return jax.tree_util.tree_map_with_path(moves, lens)
 
 
 def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:
