@@ -71,6 +71,16 @@ def known_values(tree: Any) -> Any:
     return values if concrete(values) else None
 
 
+def brief(one: Any) -> str:
+    """A dataclass in one line, its arrays by dtype and shape: for `__repr__`."""
+
+    def shown(value: Any) -> str:
+        return f"{value.dtype}{[*value.shape]}" if getattr(value, "shape", ()) else repr(value)
+
+    parts = (f"{f.name}={shown(getattr(one, f.name))}" for f in dataclasses.fields(one))
+    return f"{type(one).__name__}({', '.join(parts)})"
+
+
 def leaves(*names: str) -> Callable[[type[T]], type[T]]:
     """A decorator: a frozen dataclass becomes a pytree of these fields, the others static. What
     JAX rebuilds from its leaves is not checked again by `__post_init__`."""

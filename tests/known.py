@@ -13,9 +13,14 @@ from drt_jax.rays.solve import reattach
 from drt_jax.rays.trace import aims
 
 
+def freed(lens):
+    """The lens with nothing held: derivatives by the stop and by glasses, too."""
+    return dataclasses.replace(lens, free=tuple(HELD))
+
+
 def bendable(lens):
-    """The lens, every row of which may be curved, with nothing held: derivatives by all numbers."""
-    return dataclasses.replace(lens, curved=tuple(range(lens.count + 1)), free=tuple(HELD))
+    """The lens with derivatives by all numbers: every row may be curved, and nothing is held."""
+    return dataclasses.replace(freed(lens), curved=tuple(range(lens.count + 1)))
 
 
 @jax.jit

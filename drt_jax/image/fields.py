@@ -17,7 +17,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import points_arrays, scene_of, vergence_of
-from ..numerics import Numbers, real_array
+from ..numerics import Numbers, brief, real_array
 from ..pupil.rules import Symmetry
 from ..rays.solve import solve_aimed
 from ..rays.status import Status
@@ -51,6 +51,7 @@ class GridMethod:
     size: int = dataclasses.field(metadata={"static": True})
     symmetry: Symmetry = dataclasses.field(metadata={"static": True})
     together: bool = dataclasses.field(default=False, metadata={"static": True})
+    __repr__ = brief
 
 
 @jax.tree_util.register_dataclass

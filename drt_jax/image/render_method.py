@@ -8,6 +8,7 @@ import numpy as np
 
 from ..lens.lens import Lens
 from ..lens.paraxial import effective_focal_length
+from ..lens.scene import NEAREST
 from ..numerics import Numbers, known_values
 from .beam_psf import Kind, PsfModel
 from .fields import image_points
@@ -81,8 +82,11 @@ def layer_distances(distance: Numbers, shape: tuple[int, int], layers: int) -> n
             f"distance: expected one number or a depth map of {shape[0]} x {shape[1]} pixels, as "
             f"the picture, got {' x '.join(map(str, far.shape))}"
         )
-    if not np.all(far > 0):
-        raise ValueError("distance: must be above 0 mm everywhere, inf for infinity")
+    if not np.all(far >= NEAREST):
+        raise ValueError(
+            "distance: must be above 0 mm everywhere, inf for infinity, and nowhere below "
+            f"{NEAREST:g} mm; got {np.min(far):g}"
+        )
     ends = 1 / np.min(far), 1 / np.max(far)
     if ends[0] == ends[1]:
         return np.ravel(far)[:1]

@@ -18,7 +18,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..numerics import Numbers, safe_divide, safe_sqrt
+from ..numerics import Numbers, brief, safe_divide, safe_sqrt
 from .blur import SIDES
 from .fields import GridMethod, KernelGrid, kernel_grid
 from .grid_method import warn_of_loss
@@ -53,6 +53,7 @@ class RenderMethod:
     places: Array
     shape: tuple[int, int] = dataclasses.field(metadata={"static": True})
     tile: tuple[int, int] = dataclasses.field(metadata={"static": True})
+    __repr__ = brief
 
 
 @jax.tree_util.register_dataclass

@@ -6,6 +6,7 @@ the sensor layer has true context on all sides. Nothing is downloaded.
 
 import contextlib
 import dataclasses
+import functools
 import io
 import os
 import pathlib
@@ -19,7 +20,7 @@ import numpy as np
 from skimage import data
 
 from ..inputs import InputError, one_line, shown
-from .images import SUFFIXES, find_images, look, read
+from .images import SUFFIXES, find_images, in_bands, look, read
 
 # Colour and texture photographs in the scikit-image wheel.
 _BUNDLED = (
@@ -67,7 +68,7 @@ class DataConfig:
 class Patches(NamedTuple):
     """Image patches.
 
-    train, test: uint8 (N, P, P, 3), in memory or memory-mapped.
+    train, test: uint8 (N, P, P, bands), in memory or memory-mapped.
     skipped: a line with the reason for each file, folder or kind of image that was skipped.
     """
 
@@ -77,7 +78,11 @@ class Patches(NamedTuple):
 
 
 def load_patches(
-    config: DataConfig, side: int, seed: int, progress: Callable[[list], Iterator] = iter
+    config: DataConfig,
+    side: int,
+    seed: int,
+    progress: Callable[[list], Iterator] = iter,
+    bands: int = 3,
 ) -> Patches:
     """Random square patches, split by image into train and test.
 
@@ -85,6 +90,8 @@ def load_patches(
     side: side of a patch, pixels.
     seed: the same `config`, `side` and `seed` give the same patches.
     progress: wraps the two loops over the images, of headers and of contents (tqdm).
+    bands: of each patch: 3 for colours, 1 for the luminance; images of other numbers of bands are
+        arrays uint8 (H, W, bands) that `numpy.save` wrote, in a folder of `.npy` files.
 
     Images that cannot be used are skipped and listed in the result, see `images.read`. Images are
     decoded one at a time. DataError for a folder that does not exist or has fewer than two usable
@@ -92,12 +99,13 @@ def load_patches(
     """
     sources, skipped = _sources(config.root)
     fitting = [i for i in progress([*range(len(sources))]) if _fits(sources[i], side, skipped)]
-    _check_room(config, len(fitting), side)
+    size = bands * side**2  # bytes of a crop
+    _check_room(config, len(fitting), side, size)
     usable = 0
     with contextlib.ExitStack() as open_files, _room(config.memory_map):
         pool, kept = (_file(config.memory_map, open_files) for _ in range(2))
         for i in progress(fitting):
-            pixels = _tried(_pixels, sources[i], skipped)
+            pixels = _tried(functools.partial(_pixels, bands=bands), sources[i], skipped)
             if pixels is not None:
                 usable += 1
                 for crop in _crops(pixels, config.crops_per_image, side, [seed, 1, i]):
@@ -111,8 +119,9 @@ def load_patches(
         order = np.random.default_rng([seed, 0]).permutation(usable)
         count = min(max(1, round(config.test_fraction * usable)), usable - 1)
         is_test = np.isin(np.arange(usable), order[:count]).repeat(config.crops_per_image)
-        _part(pool, kept, is_test, 3 * side**2)
-        return Patches(_array(pool, side), _array(kept, side), tuple(skipped))
+        _part(pool, kept, is_test, size)
+        shape = -1, side, side, bands
+        return Patches(_array(pool, shape), _array(kept, shape), tuple(skipped))
 
 
 def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
@@ -133,13 +142,15 @@ def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
     return paths, left_out
 
 
-def _pixels(source: _Source) -> np.ndarray:
-    """Pixels, uint8 (H, W, 3), of a file or a bundled photograph."""
+def _pixels(source: _Source, bands: int = 3) -> np.ndarray:
+    """Pixels, uint8 (H, W, bands), of a file or a bundled photograph."""
     if isinstance(source, pathlib.Path):
-        return read(source)
+        return read(source, bands)
     pixels = getattr(data, source)()
     pixels = pixels[0] if isinstance(pixels, tuple) else pixels  # a stereo pair
-    return np.broadcast_to(pixels[..., None], (*pixels.shape, 3)) if pixels.ndim == 2 else pixels
+    if pixels.ndim == 2:
+        pixels = np.broadcast_to(pixels[..., None], (*pixels.shape, 3))
+    return in_bands(pixels, bands)
 
 
 def _size(source: _Source) -> tuple[int, int]:
@@ -179,9 +190,10 @@ def _crops(pixels: np.ndarray, count: int, side: int, seed: list[int]) -> Iterat
     return (pixels[top : top + side, left : left + side] for top, left in zip(tops, lefts))
 
 
-def _check_room(config: DataConfig, count: int, side: int) -> None:
-    """DataError if the patches of `count` images take more room than there is."""
-    needed, folder = 3 * side**2 * config.crops_per_image * count, config.memory_map
+def _check_room(config: DataConfig, count: int, side: int, size: int) -> None:
+    """DataError if the patches of `count` images take more room than there is. size: of a patch,
+    bytes."""
+    needed, folder = size * config.crops_per_image * count, config.memory_map
     what = f"{count} images x {config.crops_per_image} crops of {side} x {side} pixels"
     if not folder and needed > _MOST_MEMORY:
         raise DataError(
@@ -234,18 +246,18 @@ def _part(pool: IO[bytes], kept: IO[bytes], is_test: np.ndarray, size: int) -> N
     pool.truncate(end)
 
 
-def _array(file: IO[bytes], side: int) -> np.ndarray:
-    """The crops in a file, (N, side, side, 3)."""
+def _array(file: IO[bytes], shape: tuple[int, ...]) -> np.ndarray:
+    """The crops in a file, uint8. shape: of the result, -1 for their number."""
     if isinstance(file, io.BytesIO):
-        return np.frombuffer(file.getbuffer(), np.uint8).reshape(-1, side, side, 3)
+        return np.frombuffer(file.getbuffer(), np.uint8).reshape(shape)
     file.flush()
-    return np.memmap(file, np.uint8, "r").reshape(-1, side, side, 3)
+    return np.memmap(file, np.uint8, "r").reshape(shape)
 
 
 def batches(patches: np.ndarray, size: int, seed: int, start: int = 0) -> Iterator[np.ndarray]:
-    """Endless batches (size, P, P, 3): a new permutation each epoch, without its incomplete batch.
+    """Endless batches (size, P, P, C): a new permutation each epoch, without its incomplete batch.
 
-    patches: uint8 (N, P, P, 3).
+    patches: uint8 (N, P, P, C).
     size: patches in a batch; DataError if there are fewer.
     seed: batch k depends only on it and k, so that a resumed run gets the same batches.
     start: number of the first batch.

@@ -33,19 +33,22 @@ class FieldImager:
     points: kernels and light of object points, such as a function of `psfs`.
     restore: (weights, images) -> images; None for a camera without a network.
     convolve: (scenes, kernels) -> images as `convolve_each`, or that shared by devices.
+    dtype: of scenes and images; kernels, made in the dtype of the lens, are cast to it. A network
+        of one's own has the same: under `jax_enable_x64` libraries make their weights in float64.
     """
 
     points: Points
     restore: Callable[[Any, Array], Array] | None = None
     convolve: Callable[[Array, Array], Array] = convolve_each
+    dtype: Any = jnp.float32
 
     def sensor(
         self, optics: Any, scenes: Array, seen: "ObjectPoints", noise: Numbers, key: Array
     ) -> Array:
-        """Sensor images float32 (B, H, W, C), with even brightness: where the lens loses light, the
-        gain raises the noise.
+        """Sensor images (B, H, W, C), in the dtype of the scenes, with even brightness: where
+        the lens loses light, the gain raises the noise.
 
-        scenes: float32 (B, H + K - 1, W + K - 1, C), values from 0 to 1; patch b shows point
+        scenes: floating (B, H + K - 1, W + K - 1, C), values from 0 to 1; patch b shows point
             b P // B.
         seen: the P points; B is a multiple of P.
         noise: standard deviation of the noise where the light is 1.
@@ -73,12 +76,12 @@ class FieldImager:
         noise: Numbers,
         key: Array,
     ) -> tuple[Array, Array, Array]:
-        """True, sensor and restored images, float32 (B, H, W, C).
+        """True, sensor and restored images (B, H, W, C), of the dtype of the imager.
 
         parameters: "optics", and "network" for a network.
         scenes: uint8 (B, H + K - 1, W + K - 1, C).
         """
-        real = scenes.astype(jnp.float32) / 255
+        real = scenes.astype(self.dtype) / 255
         image = self.sensor(parameters["optics"], real, seen, noise, key)
         return truth_of(real, image), image, self._restored(parameters, image)
 
@@ -219,7 +222,7 @@ def make_damped_step(
 
     def step(state: tuple[Any, Any, _Newton], scenes: Array, noise: Array, index: Array):
         parameters, moments, means = state
-        (seen, noise_key), real = _drawn(draw, seed, index), scenes.astype(jnp.float32) / 255
+        (seen, noise_key), real = _drawn(draw, seed, index), scenes.astype(imager.dtype) / 255
         vector, optics_of = ravel_pytree(parameters["optics"])
 
         def sensor(vector):

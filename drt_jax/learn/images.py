@@ -1,7 +1,8 @@
-"""Photographs: found in a folder, read upright with 8 bits per channel.
+"""Photographs: found in a folder, read upright with 8 bits per channel. Arrays of NumPy hold images
+of any number of bands.
 
-Pillow reads and converts them. Images that it would misread are refused with the reason, from the
-header where that suffices.
+Pillow reads and converts photographs. Images that it would misread are refused with the reason,
+from the header where that suffices.
 """
 
 import collections
@@ -12,10 +13,12 @@ import stat
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+# Those that others are best converted to, and all that are read.
+_COMMON = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+SUFFIXES = (*_COMMON, ".jpe", ".jfif", ".webp", ".npy")
 # Images of other kinds, which are counted and reported.
 _UNREAD = {
-    *(".gif", ".webp", ".avif", ".heic", ".heif", ".jfif", ".jpe", ".jp2", ".j2k", ".jxl", ".svg"),
+    *(".gif", ".avif", ".heic", ".heif", ".jp2", ".j2k", ".jxl", ".svg"),
     *(".pbm", ".pgm", ".ppm", ".pnm", ".pfm", ".tga", ".ico", ".psd", ".exr", ".hdr", ".eps"),
     *(".raw", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"),
 }
@@ -30,27 +33,62 @@ MOST_PIXELS = 178_956_970
 
 def look(path: pathlib.Path) -> tuple[int, int]:
     """Width and height of an image from its header, pixels; raises as `read` does."""
+    if path.suffix.lower() == ".npy":
+        height, width = _array(path).shape[:2]
+        return width, height
     with _open(path) as image:
         return image.size
 
 
-def read(path: pathlib.Path) -> np.ndarray:
-    """The first image of a file, upright, uint8 (H, W, 3).
+def read(path: pathlib.Path, bands: int = 3) -> np.ndarray:
+    """The first image of a file, upright, uint8 (H, W, bands).
+
+    bands: 3 for the colours of a photograph, 1 for its luminance; or those of an array of NumPy
+        (`.npy`), uint8 (H, W, bands).
 
     An exception of any kind says why a file cannot be used. Only regular files are opened, not
     pipes; an image above `MOST_PIXELS` pixels is not decoded.
     """
+    if path.suffix.lower() == ".npy":
+        return in_bands(np.array(_array(path)), bands)
     with _open(path) as image:
         upright = ImageOps.exif_transpose(image)
         if upright.mode.startswith("I;16"):
             upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-        return np.asarray(upright.convert("RGB"))
+        return in_bands(np.asarray(upright.convert("RGB")), bands)
+
+
+def in_bands(pixels: np.ndarray, bands: int) -> np.ndarray:
+    """Pixels (H, W, bands) of pixels (H, W, C), uint8; of three colours also the luminance.
+    ValueError for another number of bands."""
+    if bands == 1 and pixels.shape[2] == 3:
+        return np.asarray(Image.fromarray(pixels).convert("L"))[..., None]
+    if pixels.shape[2] != bands:
+        raise ValueError(
+            f"{pixels.shape[2]} bands, {bands} are asked for: give arrays (H, W, {bands}), uint8, "
+            "written by numpy.save"
+        )
+    return pixels
+
+
+def _array(path: pathlib.Path) -> np.ndarray:
+    """An array of NumPy, (H, W, C), not yet read from its file."""
+    _refuse_pipes(path)
+    pixels = np.load(path, mmap_mode="r", allow_pickle=False)
+    if pixels.ndim != 3 or pixels.dtype != np.uint8 or not 0 < pixels.size <= 4 * MOST_PIXELS:
+        expected = f"expected (H, W, bands), uint8, at most {4 * MOST_PIXELS} numbers"
+        raise ValueError(f"{expected}, got {pixels.shape}, {pixels.dtype}")
+    return pixels
+
+
+def _refuse_pipes(path: pathlib.Path) -> None:
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise ValueError("not a regular file")
 
 
 def _open(path: pathlib.Path) -> Image.Image:
     """Opens an image and reads its header."""
-    if not stat.S_ISREG(os.stat(path).st_mode):
-        raise ValueError("not a regular file")
+    _refuse_pipes(path)
     try:
         image = Image.open(path, formats=_FORMATS)
     except UnidentifiedImageError as error:
@@ -99,7 +137,7 @@ def find_images(folder: str) -> tuple[list[pathlib.Path], list[str]]:
                 found.append(pathlib.Path(entry.path))
             elif suffix in _UNREAD:
                 counts[suffix] += 1
-    kinds = ", ".join(SUFFIXES)
+    kinds = ", ".join(_COMMON)
     for suffix, count in counts.items():
         left_out.append(f"{folder}: {count} x {suffix}, which is not read; convert to {kinds}")
     return sorted(found), sorted(left_out)

@@ -1,13 +1,14 @@
 """RED-Net, the restoration network of the paper, as a pair (init, apply).
 
-Five convolutions and five transposed convolutions: 3x3, 64 channels, stride 1, biases, RGB in and
-out, 298,947 parameters. At stride 1 a transposed convolution is a convolution with the mirrored
-kernel, so all ten are convolutions here. Source: Mao, Shen and Yang, NIPS 2016 (ref. 32 of the
-paper).
+Five convolutions and five transposed convolutions: 3x3, 64 channels, stride 1, biases, three bands
+(RGB) in and out, 298,947 parameters. At stride 1 a transposed convolution is a convolution with the
+mirrored kernel, so all ten are convolutions here. Source: Mao, Shen and Yang, NIPS 2016 (ref. 32 of
+the paper).
 """
 
 import itertools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,12 @@ Parameters = list[dict[str, Array]]
 
 
 def red_net(
-    layers: int = 5, channels: int = 64, skip_every: int = 2, input_skip: bool = True
+    layers: int = 5,
+    channels: int = 64,
+    skip_every: int = 2,
+    input_skip: bool = True,
+    bands: int = 3,
+    dtype: Any = jnp.float32,
 ) -> tuple[Callable[[Array], Parameters], Callable[[Parameters, Array], Array]]:
     """The network as (init, apply).
 
@@ -31,28 +37,36 @@ def red_net(
         last layer then starts at a tenth of its usual scale: the network begins near the identity,
         and the first Adam steps do not kill the ReLUs. (At zero they did: nothing was learned at a
         rate of 1e-3.)
+    bands: of the images, such as 3 colours.
+    dtype: of parameters and images, float32 also where JAX's default is float64.
 
-    init(key) -> parameters, float32: a list of {"kernel" (3, 3, in, out), "bias" (out,)}.
-    apply(parameters, images (B, H, W, 3) float32) -> restored images of the same shape.
-    ValueError for numbers out of range.
+    init(key) -> parameters: a list of {"kernel" (3, 3, in, out), "bias" (out,)}.
+    apply(parameters, images (B, H, W, bands)) -> restored images of the same shape and dtype.
+    ValueError for numbers out of range, and for images of other bands or another dtype.
     """
-    if layers < 1 or channels < 1 or skip_every < 0:
-        raise ValueError("layers and channels must be positive, skip_every not negative")
-    widths = [3] + [channels] * (2 * layers - 1) + [3]
+    if layers < 1 or channels < 1 or bands < 1 or skip_every < 0:
+        raise ValueError("layers, channels and bands must be positive, skip_every not negative")
+    widths = [bands] + [channels] * (2 * layers - 1) + [bands]
 
     def init(key: Array) -> Parameters:
         parameters = []
         for i, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
             shape = (3, 3, fan_in, fan_out)
-            kernel = jax.random.normal(jax.random.fold_in(key, i), shape, jnp.float32)
+            kernel = jax.random.normal(jax.random.fold_in(key, i), shape, dtype)
             scale = (2 / (9 * fan_in)) ** 0.5  # He et al. 2015, for ReLU
             if input_skip and i == 2 * layers - 1:
                 scale = 0.1 * scale
-            bias = jnp.zeros(fan_out, jnp.float32)
-            parameters.append({"kernel": kernel * jnp.float32(scale), "bias": bias})
+            bias = jnp.zeros(fan_out, dtype)
+            parameters.append({"kernel": kernel * jnp.asarray(scale, dtype), "bias": bias})
         return parameters
 
     def apply(parameters: Parameters, images: Array) -> Array:
+        kernel = parameters[0]["kernel"]
+        if images.shape[-1:] != kernel.shape[2:3] or images.dtype != kernel.dtype:
+            raise ValueError(
+                f"images: expected (B, H, W, {kernel.shape[2]}), {kernel.dtype}, got "
+                f"{images.shape}, {images.dtype}: see bands and dtype of red_net"
+            )
         features = images
         skips: dict[int, Array] = {}
         for i, layer in enumerate(parameters):

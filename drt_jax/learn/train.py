@@ -45,7 +45,11 @@ class Camera:
 
 
 def make_imager(
-    blur: Blur, restore: Restore | None, camera: Camera, convolve: Convolve = convolve
+    blur: Blur,
+    restore: Restore | None,
+    camera: Camera,
+    convolve: Convolve = convolve,
+    dtype: Any = jnp.float32,
 ) -> Imager:
     """The chain moments -> PSF -> sensor layer -> network as one function.
 
@@ -54,19 +58,20 @@ def make_imager(
     camera: constants of the sensor layer.
     convolve: `convolve`, or `convolve_taps` for values and forward mode, which `make_step` uses
         where a single number is trained.
+    dtype: of scenes and images, and of the network; kernels are cast to it.
 
     The function maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
-    distance in mm, noise, key) to the true, the sensor and the restored image, float32
-    (B, H, W, C), and the standard deviation (C,) of the blur in mm. The kernel is centred on the
-    mean centroid of the wavelengths that arrive, so that images are registered. Each channel is
-    multiplied by the throughput of its wavelength.
+    distance in mm, noise, key) to the true, the sensor and the restored image
+    (B, H, W, C), of this dtype, and the standard deviation (C,) of the blur in mm. The kernel is
+    centred on the mean centroid of the wavelengths that arrive, so that images are registered. Each
+    channel is multiplied by the throughput of its wavelength.
     """
     margin = camera.kernel // 2
 
     def imager(
         parameters: dict[str, Any], scenes: Array, distance: Array, noise: Numbers, key: Array
     ) -> tuple[Array, Array, Array, Array]:
-        scenes = scenes.astype(jnp.float32) / 255
+        scenes = scenes.astype(dtype) / 255
         spot = blur(parameters["optics"], distance)
         arrives = spot.throughput > 0
         total = jnp.sum(jnp.where(arrives[:, None], spot.mean, 0), axis=0, keepdims=True)
@@ -74,7 +79,7 @@ def make_imager(
         pixel = camera.pixel_um * 1e-3
         psf = separable_psf if spot.separable else gaussian_psf
         kernel = psf(offset, spot.covariance, pixel, camera.kernel, camera.form)
-        throughput = jnp.expand_dims(spot.throughput.astype(jnp.float32), (0, 1, 2))
+        throughput = jnp.expand_dims(spot.throughput.astype(dtype), (0, 1, 2))
         image = sensor_layer(scenes * throughput, kernel, noise, key, convolve)
         restored = image if restore is None else restore(parameters["network"], image)
         end = scenes.shape[1] - margin, scenes.shape[2] - margin

@@ -297,7 +297,9 @@ class Lens:
         schott, strength = self.dispersion.schott, self.dispersion.strength
         if concrete((schott, strength)):
             vacuum = np.eye(1, schott.shape[1])
-            odd = np.any(np.asarray(schott) != vacuum, axis=1) | np.any(np.asarray(strength), axis=1)
+            odd = np.any(np.asarray(schott) != vacuum, axis=1) | np.any(
+                np.asarray(strength), axis=1
+            )
             for i in np.flatnonzero(odd & (np.array(self.glasses) == "air")):
                 return f"lens.dispersion: medium {i} is called air, but its constants are not those"
         return ""
@@ -331,8 +333,6 @@ class Lens:
             raise ValueError(f"lens.curved: expected rows 0 to {rows - 1}, got {self.curved}")
         if not {*self.free} <= {*HELD}:
             raise ValueError(f"lens.free: expected some of {', '.join(HELD)}, got {self.free}")
-        if self._wrong:
-            raise ValueError(self._wrong)
         if not 0 <= self.stop < self.count:
             raise ValueError(f"lens.stop: expected 0 to {self.count - 1}, got {self.stop}")
         if concrete(self.semi_diameter):
@@ -342,6 +342,8 @@ class Lens:
                     f"lens.semi_diameter: that of the stop, surface {self.stop}, must be above 0 "
                     f"mm and finite, got {semi:g}"
                 )
+        if self._wrong:
+            raise ValueError(self._wrong)
 
 
 @functools.cache
@@ -354,8 +356,8 @@ def _fields() -> tuple[list[str], list[str]]:
 
 def _open(semi: Array, given: dict[str, Any]) -> Array:
     """Semi-diameters with derivatives, but for that of the stop."""
-    at_stop = np.broadcast_to(np.arange(len(given["labels"].glasses)) == given["stop"], semi.shape)
-    return jnp.where(at_stop, still(semi), semi)
+    rows = np.arange(semi.size).reshape(semi.shape) % len(given["labels"].glasses)
+    return jnp.where(rows == given["stop"], still(semi), semi)
 
 
 def movable(lens: Lens) -> Lens:

@@ -14,7 +14,7 @@ from .lens import Lens
 _RIGHT = np.pi / 2
 # Smallest distance of an object, in front or behind, mm: the square of 1 / distance is still finite
 # in float32.
-_NEAREST = 1e-6
+NEAREST = 1e-6
 
 
 @jax.tree_util.register_dataclass
@@ -56,7 +56,7 @@ def ahead(angle: Array) -> Array:
 
 def apart(distance: Array) -> Array:
     """True where an object at a distance (...), mm, does not lie at the first vertex, bool."""
-    return jnp.abs(distance) >= _NEAREST
+    return jnp.abs(distance) >= NEAREST
 
 
 def vergence_of(distance: Array) -> Array:
@@ -130,9 +130,9 @@ def distance_array(distance: Numbers, dtype: Any) -> Array:
     if far.ndim:
         raise ValueError(f"distance: expected one number, got shape {far.shape}")
     for value in _known(distance):
-        if not abs(value) >= _NEAREST:
+        if not abs(far.dtype.type(value)) >= far.dtype.type(NEAREST):  # 1e-6 in float32, too
             raise ValueError(
-                f"distance: must be {_NEAREST:g} mm or more, inf for an object at infinity, below "
+                f"distance: must be {NEAREST:g} mm or more, inf for an object at infinity, below "
                 f"0 for light that converges to a point behind the first vertex; got {value:g}"
             )
     return far

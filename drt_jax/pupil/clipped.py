@@ -20,7 +20,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import Numbers, safe_divide
+from ..numerics import Numbers, brief, safe_divide
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, dot, system_of
 from ..rays.trace import Bundle
@@ -138,6 +138,7 @@ class ClippedGroup(Fitted):
     sizes: tuple[int, ...] = dataclasses.field(metadata={"static": True})
     symmetry: Symmetry = dataclasses.field(metadata={"static": True})
     crossing: bool = dataclasses.field(metadata={"static": True})
+    __repr__ = brief
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """Points of all orders, and their weights, 0 for orders that are not chosen."""

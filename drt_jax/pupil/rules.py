@@ -19,7 +19,7 @@ from ..lens.clearance import clearance
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
-from ..numerics import Numbers, concrete, real_array
+from ..numerics import Numbers, brief, concrete, real_array
 from ..rays.status import Status
 from ..rays.system import Vector
 from ..rays.trace import Bundle
@@ -180,6 +180,7 @@ class Pattern(PupilRule):
     positions: Numbers
     weights: Numbers
     symmetry: Symmetry = dataclasses.field(metadata={"static": True}, default="none")
+    __repr__ = brief
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """The points and weights. ValueError for wrong shapes."""

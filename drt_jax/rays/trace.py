@@ -155,7 +155,7 @@ def trace_rays(
 
     ValueError as in `scene_of`. Inside `jit` or `vmap`, where values are not known, a wavelength
     outside the range of a glass gives the status NO_INDEX; a field of 90 degrees or more, or a
-    distance that is not above 0, gives MISSED.
+    distance within 1e-6 mm of 0, gives MISSED.
     """
     scene, points = scene_of(lens, field, distance, wavelengths), stop_points(lens, pupil)
     count, size = len(points), _padded(len(points))

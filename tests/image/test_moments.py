@@ -23,12 +23,12 @@ from drt_jax import (
 )
 
 from ..conftest import RGB, assert_close
-from ..known import known, search
+from ..known import freed, known, search
 
 FAR = 25000.0
 # All fast tests are about one lens: its programs, for one radius, half a pupil and all of it, are
 # those of every call that converges.
-LENS = load_lens("double_gauss")
+LENS = freed(load_lens("double_gauss"))
 # Double Gauss, object at 25 m, mean of R, G, B, in um, found before this package was written.
 SIGMA = {
     130: 257.8,

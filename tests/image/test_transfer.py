@@ -17,9 +17,9 @@ from drt_jax.lens.forms import fringe_terms
 from drt_jax.lens.scene import scene_of
 from drt_jax.rays.trace import trace_bundle
 
-from ..known import check_slopes
+from ..known import check_slopes, freed
 
-COOKE = load_lens("cooke_triplet")
+COOKE = freed(load_lens("cooke_triplet"))
 WAVES = (0.6, 0.53, 0.48)
 RULE = Gauss(8, "bilateral")
 # A paraboloid of f/50: a perfect image, its pupil even in direction cosines to 1e-4.

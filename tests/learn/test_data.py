@@ -47,6 +47,45 @@ def test_memory_mapped_patches_are_the_same(folder):
     np.testing.assert_array_equal(mapped.train, load_patches(config, 40, seed=0).train)
 
 
+def test_patches_of_any_number_of_bands(folder):
+    """Of photographs the luminance, by the weights of ITU-R 601; eight bands from arrays."""
+    config = DataConfig(root=str(folder), crops_per_image=3)
+    grey = load_patches(config, 40, seed=0, bands=1)
+    colours = load_patches(config, 40, seed=0).train.astype(float)
+    assert grey.train.shape == (*colours.shape[:3], 1)
+    assert np.max(np.abs(colours @ [0.299, 0.587, 0.114] - grey.train[..., 0])) < 1
+    many = folder / "many"
+    many.mkdir()
+    generator = np.random.default_rng(0)
+    arrays = [generator.integers(0, 255, (41 + i, 50, 8), dtype=np.uint8) for i in range(3)]
+    for i, array in enumerate(arrays):
+        np.save(many / f"{i}.npy", array)
+    np.save(many / "float.npy", np.ones((50, 50, 8)))
+    np.save(many / "object.npy", np.array([{}]), allow_pickle=True)
+    for memory_map in ("", str(folder)):
+        config = DataConfig(root=str(many), crops_per_image=2, memory_map=memory_map)
+        patches = load_patches(config, 40, seed=0, bands=8)
+        assert patches.train.shape == (4, 40, 40, 8) and patches.test.shape == (2, 40, 40, 8)
+        windows = [np.lib.stride_tricks.sliding_window_view(a, (40, 40), (0, 1)) for a in arrays]
+        crops = {bytes(np.moveaxis(v, 0, -1)) for w in windows for row in w for v in row}
+        assert all(bytes(crop) in crops for crop in (*patches.train, *patches.test))
+        assert any(
+            "float.npy: unreadable (expected (H, W, bands), uint8" in s for s in patches.skipped
+        )
+        assert any("object.npy" in line for line in patches.skipped)
+    with pytest.raises(DataError, match=r"8 bands, 3 are asked for: give arrays \(H, W, 3\)"):
+        load_patches(config, 40, seed=0)
+    with pytest.raises(DataError, match="3 bands, 8 are asked for"):
+        load_patches(DataConfig(), 40, seed=0, bands=8)
+
+
+def test_webp_is_found(tmp_path):
+    for i in range(2):
+        Image.new("RGB", (50, 50), (i, 2, 3)).save(tmp_path / f"{i}.webp", lossless=True)
+    patches = load_patches(DataConfig(root=str(tmp_path), crops_per_image=1), 40, seed=0)
+    assert not patches.skipped and {*patches.train[0, 0, 0, 1:]} == {2, 3}
+
+
 def test_split_by_image_and_by_seed(folder):
     config = DataConfig(root=str(folder), crops_per_image=4)
     first, again, other = (load_patches(config, 40, seed=s) for s in (0, 0, 3))
@@ -168,8 +207,8 @@ def test_clear_errors(folder, name):
 
 def test_errors_of_folders_and_batches(tmp_path, folder):
     (tmp_path / "empty").mkdir()
-    (tmp_path / "empty" / "a.webp").touch()
-    with pytest.raises(DataError, match="holds no image.* 1 x .webp, which is not read"):
+    (tmp_path / "empty" / "a.avif").touch()
+    with pytest.raises(DataError, match="holds no image.* 1 x .avif, which is not read"):
         load_patches(DataConfig(root=str(tmp_path / "empty")), 40, 0)
     shutil.copy(folder / "images" / "striped" / "0.png", tmp_path / "empty")
     with pytest.raises(DataError, match="1 usable images; train and test need one each"):

@@ -77,6 +77,22 @@ def test_learns_to_denoise():
     assert after < 0.6 * before
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("bands", [1, 8])
+def test_bands_and_dtype_are_arguments(bands, dtype):
+    init, apply = red_net(1, 4, bands=bands, dtype=dtype)
+    parameters = init(jax.random.key(0))
+    assert {leaf.dtype for leaf in jax.tree.leaves(parameters)} == {jnp.dtype(dtype)}
+    images = jnp.ones((1, 4, 4, bands), dtype)
+    restored = jax.eval_shape(apply, parameters, images)
+    assert restored.shape == images.shape and restored.dtype == dtype
+    with pytest.raises(ValueError, match=rf"images: expected \(B, H, W, {bands}\), {images.dtype}"):
+        apply(parameters, jnp.ones((1, 4, 4, 3), dtype))
+    other = jnp.float64 if dtype == jnp.float32 else jnp.float32
+    with pytest.raises(ValueError, match="see bands and dtype of red_net"):
+        apply(parameters, images.astype(other))
+
+
 def test_bad_sizes():
     with pytest.raises(ValueError, match="must be positive"):
         red_net(layers=0)

@@ -34,8 +34,9 @@ def power(lens):
     bends = jnp.sum(jnp.diff(lens.index(GREEN)[:, 0]) * lens.curvature[:-1])
     if lens.phase is not None:
         bends = bends + jnp.sum(lens.phase.order[:, None] * lens.phase.coefficients)
-    return bends * (lens.sensor - lens.thickness[0]) / lens.semi_diameter[lens.stop] + (
-        lens.semi_diameter[0]
+    return (
+        bends * (lens.sensor - lens.thickness[0]) / lens.semi_diameter[lens.stop]
+        + (lens.semi_diameter[0])
     )
 
 

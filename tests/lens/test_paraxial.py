@@ -13,6 +13,7 @@ import drt_jax
 from drt_jax import Status, load_lens, trace_rays
 
 from ..conftest import RGB
+from ..known import freed
 
 GREEN = jnp.array([0.55])
 COLOURS = jnp.array(RGB)
@@ -257,7 +258,7 @@ def test_image_space_in_water():
 @pytest.mark.slow
 def test_gradients_batches_and_one_program_for_all():
     """Gradients against central differences of the fourth order, to 1e-6, all in one vmap."""
-    lens = load_lens(IMMERSED)
+    lens = freed(load_lens(IMMERSED))
 
     def terms(lens):
         first = drt_jax.first_order(lens, 200.0, COLOURS)

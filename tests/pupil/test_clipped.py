@@ -11,6 +11,8 @@ import drt_jax
 from drt_jax import Clipped, Gauss, Soft, focus_moments, load_lens, psf_moments, trace_rays
 from drt_jax.pupil import hexapolar
 
+from ..known import freed
+
 GREEN = (0.53,)
 FAR = 25000.0
 
@@ -19,7 +21,7 @@ def clipped(front, rear):
     """The Double Gauss, its front and rear apertures made smaller."""
     lens = load_lens("double_gauss")
     semi = lens.semi_diameter.at[0].set(front).at[10].set(rear)
-    return dataclasses.replace(lens, semi_diameter=semi)
+    return freed(dataclasses.replace(lens, semi_diameter=semi))
 
 
 # Field (radians along y, or x and y) and clear apertures; what is left of the pupil is round, has
@@ -193,7 +195,8 @@ def test_gradients_in_float32_are_those_in_float64():
         return psf_moments(lens, 0.1, jnp.inf, GREEN, rule=rule).covariance[0, 1, 1]
 
     optimised = {"xla_backend_optimization_level": 3}
-    gradient, lens = jax.jit(jax.grad(variance), compiler_options=optimised), load_lens("singlet")
+    gradient = jax.jit(jax.grad(variance), compiler_options=optimised)
+    lens = freed(load_lens("singlet"))
     for semi in (3.0, 4.9, 5.1, 7.0):
         double = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[1].set(semi))
         single = jax.tree.map(lambda a: a.astype(jnp.float32), double)
