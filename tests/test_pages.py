@@ -1,5 +1,6 @@
 """The code of each page of `docs/` runs, in a fresh process as a notebook of one page."""
 
+import importlib.util
 import os
 import pathlib
 import re
@@ -9,30 +10,50 @@ import sys
 import pytest
 
 DOCS = pathlib.Path(__file__).resolve().parent.parent / "docs"
-CODE = {
-    page.name: re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
-    for page in sorted(DOCS.glob("*.md"))
-}
+# What the package and its tests do not install: blocks that begin with it are left out without it.
+EXTRA = ("flax",)
+
+
+def blocks(page):
+    """The blocks of code of a page that can run here."""
+    found = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    absent = tuple(f"from {name} " for name in EXTRA if not importlib.util.find_spec(name))
+    return [block for block in found if not block.startswith(absent)]
+
+
+CODE = {page.name: blocks(page) for page in sorted(DOCS.glob("*.md"))}
+X64 = 'jax.config.update("jax_enable_x64", True)'
 
 
 # Pages that trace thousands of lenses: faster machine code pays.
 MANY = ("tolerances.md",)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page, blocks in CODE.items() if blocks])
-def test_code_runs(tmp_path, page):
+def run(folder, page, code):
     given = os.environ["XLA_FLAGS"]
     given = given.replace("level=0", "level=1") if page in MANY else given
     flags = {"XLA_FLAGS": given, "JAX_PLATFORMS": "cpu"}
     ran = subprocess.run(
-        [sys.executable, "-W", "error", "-c", "\n".join(CODE[page])],
-        cwd=tmp_path,
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=folder,
         env=os.environ | flags,
         capture_output=True,
         text=True,
     )
     assert ran.returncode == 0, ran.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page, blocks in CODE.items() if blocks])
+def test_code_runs(tmp_path, page):
+    run(tmp_path, page, "\n".join(CODE[page]))
+
+
+@pytest.mark.slow
+def test_your_own_loop_runs_in_float32(tmp_path):
+    code = "\n".join(CODE["your_own_loop.md"])
+    assert code.count(X64) == 1
+    run(tmp_path, "your_own_loop.md", code.replace(X64, ""))
 
 
 def test_pages_have_code():

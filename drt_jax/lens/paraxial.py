@@ -6,8 +6,8 @@ without rotational symmetry the (y, z) section counts. Source of the formulas: W
 of Optical Systems (1986), ch. 3, 6, 8, 10.
 
 ValueError as in `scene_of`. Inside a trace, where values are not known, results are inf for a
-wavelength outside the range of a glass, for a distance within 1e-6 mm of 0 and for a field of 90 degrees
-and more.
+wavelength outside the range of a glass, for a distance within 1e-6 mm of 0 and for a field of 90
+degrees and more.
 """
 
 import dataclasses

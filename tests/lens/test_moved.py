@@ -125,8 +125,9 @@ def test_check_refuses_nan_and_air_that_is_none():
             dataclasses.replace(LENS, **changes).check()
 
     for name in ("curvature", "semi_diameter", "thickness", "sensor"):
-        array = getattr(LENS, name)
-        refused(f"lens.{name}: expected numbers, got NaN", **{name: array * np.nan})
+        array = np.array(getattr(LENS, name))
+        array[(0,) * array.ndim] = np.nan
+        refused(f"lens.{name}: expected numbers, got NaN", **{name: jnp.asarray(array)})
     constants = LENS.dispersion
     for i, k in ((0, 0), (6, 3)):
         changed = dataclasses.replace(constants, schott=constants.schott.at[i, k].add(-1e-3))
