@@ -59,9 +59,9 @@ class _Rows:
         tilt = np.arctan2(-axis[:, 1], axis[:, 2]), np.arcsin(np.clip(axis[:, 0], -1, 1)), flat
         self.rows.append((mirror, flat + c, flat + k, flat + across, point, np.stack(tilt, -1)))
 
-    def scenes(self, rng, fits, stop, radius, distance, media=None, form=None):
-        """Scenes of the rows at the indices `fits`, with fields of up to a degree. media: as in
-        `batch_of`; form: that of mirrors with curvatures across."""
+    def scenes(self, rng, fits, stop, radius, distance, widest=1.0, media=None, form=None):
+        """Scenes of the rows at the indices `fits`. widest: largest field of each, degrees; media:
+        as in `batch_of`; form: that of mirrors with curvatures across."""
         mirrors, *arrays = zip(*self.rows)
         c, k, across, point, tilt = (np.stack(a, 1)[fits] for a in arrays)
         z, static = point[..., 2] - point[:, :1, 2], {"mirrors": mirrors[:-1]}
@@ -73,6 +73,7 @@ class _Rows:
             parts["coefficients"] = across[:, :-1, None]
             static["forms"] = tuple(form if mirror else "asphere" for mirror in mirrors)
         field = fields(rng, len(fits), 0, 1) * (rng.random((len(fits), 1)) < 0.7)
+        field = field * np.broadcast_to(widest, len(radius))[fits, None]
         lens = batch_of(parts, radius[fits], stop, media, **static)
         return Scenes(lens, field, distance[fits], pupil_points(rng, len(fits)))
 
@@ -104,13 +105,14 @@ class Walk(NamedTuple):
 
     def __call__(self, rng, count, variant):
         mirrors, between = variant
-        n, rows = 100 * count, _Rows()
+        n, rows = 200 * count, _Rows()
         reach = rng.uniform(20, 80, n)
         radius = h = reach * self.width * rng.uniform(0.05, 1, n)
         distance = reach * rng.uniform(0.2, 2, n)
         distance = np.where(rng.random(n) < (0.5 if self.parallel else 0.2), np.inf, distance)
-        point, d, size, sense = np.zeros((n, 3)), np.tile([0.0, 0.0, 1.0], (n, 1)), 1.0, 1
-        near, fits = 1 / (distance + reach), np.full(n, True)
+        point, d, sense = np.zeros((n, 3)), np.tile([0.0, 0.0, 1.0], (n, 1)), 1
+        size, near = h * (1 + reach / distance), 1 / (distance + reach)
+        fits, widest = np.full(n, True), np.ones(n)
         rows.add(point, d)
         for i in range(mirrors):
             point, e = point + reach[:, None] * d, self._turned(rng, d)
@@ -119,6 +121,10 @@ class Walk(NamedTuple):
                 image = np.where(near == 0, abs(image), 0)
             c, k, across, axis, vertex, cosine = self.mirror(d, e, near, image)
             fits &= (cosine > self.least) & (np.linalg.norm(vertex, axis=-1) < 30 * reach)
+            # No ray of the beam, and no field, may come from behind a grazing mirror.
+            angle = np.linalg.norm(d - e, axis=-1) / 2
+            fits &= size * np.maximum(abs(near), abs(image)) < angle / 2
+            widest = np.minimum(widest, np.degrees(angle) / 4)
             rows.add(point + vertex, sense * axis, sense * c, k, sense * across, True)
             d, sense, reach = e, -sense, reach * rng.uniform(0.7, 1.5, n)
             if between and not i:
@@ -126,15 +132,15 @@ class Walk(NamedTuple):
                 radius = h * abs(1 - part * image)
                 rows.add(point + part[:, None] * d, sense * d)
             if i + 1 < mirrors:
-                size = size * abs(1 - reach * image)
-                fits &= (size > 0.1) & (size < 2) & (radius > 0.1 * h)
-                near = image / np.where(fits, reach * image - 1, 1)
+                growth = abs(1 - reach * image)
+                fits &= (growth > 0.1) & (growth < 2) & (radius > 0.1 * h)
+                size, near = size * growth, image / np.where(fits, reach * image - 1, 1)
         focus = (image > 0) & (rng.random(n) < 0.7)
         reach = np.where(focus, 1 / np.where(focus, image, 1), reach)
         lean = np.tan(np.radians(rng.uniform(0, 30, (n, 1))))
         rows.add(point + reach[:, None] * d, sense * _unit(d + lean * _beside(rng, d)))
         chosen, stop = np.flatnonzero(fits)[:count], 2 if between else 0
-        return rows.scenes(rng, chosen, stop, radius, distance, form=self.form)
+        return rows.scenes(rng, chosen, stop, radius, distance, widest, form=self.form)
 
 
 def relay(rng, count, name):
@@ -160,4 +166,4 @@ def relay(rng, count, name):
         point = np.stack([aside * np.cos(turn), aside * np.sin(turn), centre + place], -1)
         axis = _unit([0, 0, 1] + 3e-3 * rng.normal(size=point.shape))
         rows.add(point + shift, axis, -1 / place if kind else 0.0, mirror=kind < 0)
-    return rows.scenes(rng, np.arange(count), 2, radius, gap, media)
+    return rows.scenes(rng, np.arange(count), 2, radius, gap, media=media)

@@ -139,15 +139,18 @@ def _shoot(lens, field, distance, point):
 def _retrace(lens, field, distance, points):
     """Difference of the points (RAYS, S + 1, 3) of each ray from a sequential trace through the
     first of them, relative to their size and to the growth of a shift of the start; and whether
-    that trace fails although its neighbours arrive (at the edge of the beam either may fail)."""
+    that trace fails, and its four neighbours all arrive or all fail (at the edge of the beam, where
+    some do, either may be right)."""
 
     def one(points):
         size = 1 + jnp.max(jnp.abs(points))
-        shift = 1e-7 * size * jnp.eye(3, k=-1)  # not at all, in x, in y
+        shift = 1e-7 * size * jnp.eye(3, k=-1)[jnp.array([0, 1, 2, 1, 2])]  # not, in x, in y
+        shift = shift * jnp.array([[0], [1], [1], [-1], [-1]])
         hits, ok = jax.vmap(lambda s: _shoot(lens, field, distance, points[0] + s))(shift)
         growth = jnp.max(jnp.abs(hits[1:] - hits[:1])) / (1e-7 * size)
         off = jnp.max(jnp.abs(hits[0] - points))
-        return off / (size * (1 + jnp.nan_to_num(growth))), ~ok[0] & ok[1] & ok[2]
+        denied = ~ok[0] & (jnp.all(ok[1:]) | ~jnp.any(ok[1:]))
+        return off / (size * (1 + jnp.nan_to_num(growth))), denied
 
     return jax.vmap(one)(points)
 
