@@ -131,6 +131,7 @@ from .lens.phase import Phase as Phase
 from .lens.scene import Scene as Scene, field_of_height as field_of_height, scene_of as scene_of
 from .lens.seidel import ThirdOrder as ThirdOrder, third_order as third_order
 from .pupil.clipped import Clipped as Clipped
+from .pupil.mask import Mask as Mask, Masked as Masked
 from .pupil.rules import (
     Gauss as Gauss,
     Pattern as Pattern,

@@ -19,6 +19,7 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import safe_divide
 from ..pupil.clipped import Clipped
+from ..pupil.mask import Mask
 from ..pupil.patterns import disc, half_disc, meridian
 from ..pupil.rules import Pattern, PupilRule, Symmetry, fits
 from ..rays.solve import Solver, solve
@@ -33,7 +34,9 @@ _SIDES = 16
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=("points", "weights", "hits", "direction", "path", "index", "motion", "known"),
+    data_fields=(
+        *("points", "weights", "hits", "direction", "path", "index", "motion", "known", "mask"),
+    ),
     meta_fields=("degree", "azimuths", "clipped"),
 )
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +56,7 @@ class Beam:
     degree: of the polynomials. azimuths: the largest m of their terms cos(m a), one less than the
         azimuths of rays on half a disc. clipped: whether more than the rim of the stop bounds the
         light.
+    mask: in the stop; only kernels know it: `weights` are of the light without it.
     """
 
     points: Array
@@ -66,6 +70,7 @@ class Beam:
     degree: int
     azimuths: int
     clipped: bool
+    mask: Mask | None = None
 
     @property
     def throughput(self) -> Array:
@@ -159,10 +164,12 @@ class Beam:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class BeamRule:
-    """Which rays make a beam, and the degree of its polynomials, see `beam_rule`."""
+    """Which rays make a beam, and the degree of its polynomials, see `beam_rule`; the mask in its
+    stop, if there is one."""
 
     rule: PupilRule
     degree: int = dataclasses.field(metadata={"static": True})
+    mask: Mask | None = None
 
 
 def beam_rule(degree: int, symmetry: Symmetry, clipped: PupilRule | None = None) -> BeamRule:
@@ -186,7 +193,8 @@ def trace_beam(lens: Lens, scene: Scene, rule: BeamRule, solver: Solver = solve)
     weights = jnp.where(fits(symmetry, scene.field), weights, 0)
     weights = weights * rule.rule.transmission(lens, bundle)
     clipped = isinstance(rule.rule, Clipped)
-    return beam_of(lens, scene, points, weights, bundle, symmetry, rule.degree, clipped)
+    beam = beam_of(lens, scene, points, weights, bundle, symmetry, rule.degree, clipped)
+    return dataclasses.replace(beam, mask=rule.mask)
 
 
 def beam_of(

@@ -9,12 +9,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..lens.lens import Lens
+from ..numerics import safe_divide
+from ..pupil.mask import Mask
 from .beam import Beam, BeamRule, centroid_and_variances
 from .kernel import gaussian_shares
-from .ray_psf import ray_kernel
+from .ray_psf import ray_kernel, ray_spots
 from .wave_psf import wave_kernel
 
 Kind = Literal["gaussian", "rays", "waves"]
+_FINE = 8  # cells for each pixel of a mask
 
 
 @jax.tree_util.register_dataclass
@@ -56,6 +59,26 @@ class PsfModel:
     cells: int
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
 
+    def masked(self, mask: Mask, cells: int = 0) -> "PsfModel":
+        """The model with a mask in the stop, of which it is as differentiable as of the lens; for
+        use in `jax.jit` too. It needs no more rays. Kernels are centred as without it.
+
+        cells: along a side of the grid; 0 for as many as the model has, and 8 for each pixel of the
+            mask. docs/images.md says how precise that is.
+
+        ValueError for a mask of a wrong shape, for the model "gaussian", which knows the moments of
+        the whole stop alone, and for a path and the model "rays".
+        """
+        mask.check()
+        if self.kind == "gaussian" or (self.kind == "rays" and mask.path is not None):
+            raise ValueError(
+                f"a mask{' with a path' if mask.path is not None else ''} in the model "
+                f'"{self.kind}": make one of "waves"'
+            )
+        cells = cells or max(self.cells, _FINE * max(jnp.shape(mask.amplitude)[-2:]))
+        rule = dataclasses.replace(self.rule, mask=mask)
+        return dataclasses.replace(self, rule=rule, cells=cells)
+
 
 def psf_of_beam(
     lens: Lens,
@@ -71,7 +94,10 @@ def psf_of_beam(
     mean, (xx, xy, yy) = centroid_and_variances(beam.hits[:, -1], beam.weights)
     if centre is None:
         centre = jnp.mean(mean, axis=-1)
-    total = beam.throughput[:, None, None]
+    light = beam.throughput
+    if beam.mask is not None:
+        light = jnp.sum(ray_spots(lens, beam, cells)[2], axis=-1)
+    total = light[:, None, None]
     if kind == "gaussian":
         covariance = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
         kernel = gaussian_shares((mean - centre[:, None]).T, covariance, pixel, size)
@@ -82,5 +108,6 @@ def psf_of_beam(
         else:
             kernel = wave_kernel(lens, beam, wavelengths, centre, pixel, size, cells)
         kernel = jnp.where(total > 0, kernel / jnp.where(total > 0, total, 1), 0)
-    outside = jnp.where(beam.throughput > 0, 1 - jnp.sum(kernel, axis=(1, 2)), 0)
-    return Psf(kernel, outside, centre, beam.throughput, beam.solid_angle())
+    outside = jnp.where(light > 0, 1 - jnp.sum(kernel, axis=(1, 2)), 0)
+    solid_angle = beam.solid_angle() * safe_divide(light, beam.throughput)
+    return Psf(kernel, outside, centre, light, solid_angle)

@@ -40,7 +40,7 @@ def ray_kernel(lens: Lens, beam: Beam, centre: Array, pixel: Array, size: int, c
 
 def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
     """The light as Q = cells^2 spots: where they are (2, W, Q) and half how wide along x and y
-    (2, W, Q), mm, and their light (W, Q)."""
+    (2, W, Q), mm, and their light (W, Q), what the beam's mask lets pass of it."""
     functions, waves = beam.over_stop(), beam.path.shape[0]
     # Cells of the square that holds the light; its middle and half its side, in units of the stop.
     low, high = beam.extent()
@@ -57,7 +57,11 @@ def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
     cell = (step * (2 / cells))[:, None, :, None, None]
     reach = safe_sqrt(sum((s * c) ** 2 for s, c in zip(slopes, cell)))
     hits, width = values[:2].reshape(2, waves, -1), _CELLS * reach.reshape(2, waves, -1)
-    return _corrected(hits, weights, width, beam), width, weights
+    hits = _corrected(hits, weights, width, beam)
+    if beam.mask is not None:
+        sides = jnp.broadcast_to(axes[1][..., None, None] / 2, stop.shape)
+        weights = weights * beam.mask.light(stop, sides).reshape(waves, -1)
+    return hits, width, weights
 
 
 def _corrected(hits: Array, weights: Array, width: Array, beam: Beam) -> Array:

@@ -104,7 +104,21 @@ def amplitudes(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tuple[
     middle, step = _grid(beam, cells)
     light, inside, phase = pupil_function(lens, beam, wavelengths, cells)(middle, step)
     size = safe_sqrt(light / jnp.pi) * inside
-    return jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase)), step
+    waves = jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase))
+    return _masked(waves, beam, wavelengths, middle, step), step
+
+
+def _masked(waves: Array, beam: Beam, wavelengths: Array, middle: Array, step: Array) -> Array:
+    """Waves (W, N, N) on a grid of directions behind the beam's mask: each cell gets the mean of
+    the pixels that it covers."""
+    if beam.mask is None:
+        return waves
+    functions, cells = beam.over_directions(), waves.shape[-1]
+    start, unit = (middle - functions.centre) / functions.scale, step / functions.scale
+    side = np.arange(cells) - (cells - 1) / 2
+    values, *slopes = functions.on_grid(start, unit, side, slice(1, 3))
+    half = sum(abs(s) * u[None, :, None, None] for s, u in zip(slopes, unit)) / 2
+    return waves * beam.mask.waves(wavelengths, values[1:3], half)
 
 
 def autocorrelation(amplitude: Array) -> Array:
