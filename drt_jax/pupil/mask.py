@@ -8,7 +8,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import safe_divide
+from ..numerics import brief, safe_divide
 from ..rays.system import Vector
 from ..rays.trace import Bundle
 from .rules import PupilRule
@@ -29,6 +29,7 @@ class Mask:
 
     amplitude: Array
     path: Array | None = None
+    __repr__ = brief
 
     def check(self) -> None:
         """ValueError for other shapes."""
