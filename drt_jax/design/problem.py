@@ -115,7 +115,7 @@ class Problem:
     @classmethod
     def from_variables(
         cls,
-        variables: Variables,
+        variables: Variables | Sequence[Variables],
         operands: Sequence[Operand | OperandName | OperandFunction],
         fields: Numbers = 0.0,
         wavelengths: Numbers = 0.5875618,
@@ -126,6 +126,7 @@ class Problem:
     ) -> "Problem":
         """Makes a problem.
 
+        variables: variables of a lens, or several of one lens, see `Variables.joined`.
         operands: operands, at least one with a weight above 0; a name or function stands for an
             operand of weight 1.
         fields: one, (F,) along y, or (F, 2), radians.
@@ -139,6 +140,7 @@ class Problem:
         and for a limit that the lens violates and no variable changes. (For limits that need rays,
         `optimise` raises it.)
         """
+        variables = Variables.joined(variables)
         lens = variables.lens
         asked = tuple(o if isinstance(o, Operand) else Operand(o) for o in operands)
         dtype = lens.curvature.dtype

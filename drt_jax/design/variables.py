@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -289,6 +289,40 @@ class Variables:
         fixed_solves, start = fix_solves(variables.lens_of(variables.start), solves)
         return dataclasses.replace(variables, lens=start, solves=fixed_solves)
 
+    @classmethod
+    def joined(cls, sets: "Variables | Sequence[Variables]") -> "Variables":
+        """The variables of several sets of one lens as one. ValueError for none, for what is no
+        set, for sets of different lenses, and for a number that varies or follows twice."""
+        if isinstance(sets, Variables):
+            return sets
+        found = list(sets) if isinstance(sets, Sequence) else [sets]
+        if not found or not all(isinstance(own, Variables) for own in found):
+            raise ValueError("variables: expected Variables.from_lens(lens, [...]), or several")
+        kinds, lenses = {place.kind for own in found for place in own.places}, []
+        for each in found:
+            lens = _with_arrays(each.lens, kinds)
+            for own in found:  # ties and solves have changed the lens of each set
+                lens = dataclasses.replace(own, lens=lens).lens_of(own.start)
+            lenses.append(lens)
+        for lens in lenses[1:]:
+            if not _same(lenses[0], lens):
+                raise ValueError("variables: of different lenses; make them from one lens")
+        taken = [*(p for own in found for p in own.places), *(p for s in found for _, p in s.ties)]
+        _refuse_twice("variables", taken, "stands twice")
+        ends = np.cumsum([0, *(len(own.places) for own in found)]).tolist()
+
+        def both(name: str) -> Any:
+            return jnp.concatenate([getattr(own, name) for own in found])
+
+        return dataclasses.replace(
+            found[0],
+            lens=lenses[0],
+            **{name: both(name) for name in ("low", "high", "scale", "lines")},
+            solves=tuple(solve for own in found for solve in own.solves),
+            places=tuple(place for own in found for place in own.places),
+            ties=tuple((k + end, p) for end, own in zip(ends, found) for k, p in own.ties),
+        )
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the variables, such as "curvature 3"."""
@@ -334,6 +368,12 @@ def _with_numbers(lens: Lens, changes: Sequence[tuple[Place, Array]]) -> Lens:
             numbers = jnp.stack([number for _, number in own])
             lens = kind.write(lens, kind.read(lens).at[rows, terms].set(numbers))
     return lens
+
+
+def _same(one: Lens, two: Lens) -> bool:
+    """Whether two known lenses have the same numbers."""
+    alike = str(jax.tree.structure(one)) == str(jax.tree.structure(two))
+    return alike and all(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(two)))
 
 
 def _refuse_twice(what: str, places: Iterable[Place], said: str) -> None:

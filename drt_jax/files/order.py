@@ -2,10 +2,14 @@
 
 import warnings
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.order import crossings, heights, neighbours
+from ..lens.paraxial import marginal_ray, paraxial_system
 from .entry import LensError
 
 # Prescriptions round semi-diameters: neighbours may cross beyond this fraction of the smaller
@@ -15,12 +19,24 @@ _RIM = 0.9
 CLOSEST = 1e-6
 
 
-def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
-    """LensError if light would go backwards, or if neighbours overlap within both their apertures.
-    If they overlap only near the rim, a warning: light goes backwards there and is lost. A warning,
-    too, for a sensor in front of the last surface, where the image is virtual.
+@jax.jit
+def _paraxial_beam(lens: Lens, wave: Array) -> Array:
+    return jnp.abs(marginal_ray(paraxial_system(lens, wave), jnp.zeros_like(wave)).height[:, 0])
+
+
+def _beam(lens: Lens, wave: float) -> np.ndarray:
+    """Radius of the paraxial beam on each surface, from an object at infinity, mm."""
+    return np.asarray(_paraxial_beam(lens, jnp.asarray(wave, lens.curvature.dtype)))
+
+
+def check_order(lens: Lens, gaps: list[float], moved: list[bool], wave: float) -> None:
+    """LensError if light would go backwards, or if neighbours overlap within both their apertures
+    and within the beam of the axis. If they overlap only outside of it, or near the rim, a warning:
+    light goes backwards there and is lost. A warning, too, for a sensor in front of the last
+    surface, where the image is virtual.
 
     gaps, moved: see `lens.order.neighbours`, which returns the neighbours.
+    wave: wavelength of the beam, um.
     """
     pairs = neighbours(lens, gaps, moved)
     for i, j, gap in pairs:
@@ -63,6 +79,6 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool]) -> None:
             f"cross at {place:.3g} mm from the axis, within their semi-diameters of "
             f"{semi[i]:g} and {semi[j]:g} mm; raise the thickness or lower a semi-diameter"
         )
-        if place < _RIM * rim:
+        if place < min(_RIM * rim, max(_beam(lens, wave)[[i, j]])):
             raise LensError(message, f"surfaces[{i}].thickness")
         warnings.warn(f"{message}; light that comes there is lost", stacklevel=4)

@@ -47,7 +47,7 @@ def _coefficients(surface: Entry) -> list[float]:
     for key in ("radius_x", "curvature_x", "conic_x", "norm_radius"):
         if key in surface and key.replace("radius_x", "curvature_x") not in first:
             raise surface.error(key, f"a surface of the form {form} has none")
-    given = Entry(surface.get("coefficients", {}), surface.name("coefficients"), powers)
+    given = Entry(_numbered(surface), surface.name("coefficients"), powers)
     columns = {len(first) + powers.index(power): given.number(power, most=WIDE) for power in given}
     if "curvature_x" in first:
         columns[0] = surface.curvature("_x")
@@ -58,6 +58,17 @@ def _coefficients(surface: Entry) -> list[float]:
         if columns[0] <= 0:
             raise surface.error("norm_radius", "must be positive")
     return [columns.get(k, 0.0) for k in range(max(columns, default=-1) + 1)]
+
+
+def _numbered(surface: Entry) -> object:
+    """The entry `coefficients`; a power may be given as text, as in JSON."""
+    given = surface.get("coefficients", {})
+    if not isinstance(given, dict):
+        return given
+    keys = [int(key) if isinstance(key, str) and key.isdecimal() else key for key in given]
+    if len({*keys}) < len(keys):
+        raise surface.error("coefficients", "one of them is given twice, as a number and as text")
+    return dict(zip(keys, given.values(), strict=True))
 
 
 def _phase(surfaces: list[Entry]) -> Phase | None:
@@ -160,7 +171,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     if focused:
         lens = _focused(lens, line)
         gaps[-1] = float(lens.sensor) - sum(gaps[:-1])
-    check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)])
+    check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)], line)
     if "focal_length" in top:
         _check_focal_length(lens, top.number("focal_length"), line)
     return _with_pupil(top, lens, line)

@@ -286,7 +286,8 @@ class Lens:
             for value in values:
                 if not low <= value <= high:
                     outside = f"wavelength {value:g} um is outside the range of {name}"
-                    raise ValueError(f"{outside}, {low:g} to {high:g} um")
+                    nm = f"; wavelengths are in um: {value / 1000:g}" if value > 100 else ""
+                    raise ValueError(f"{outside}, {low:g} to {high:g} um{nm}")
 
     @functools.cached_property
     def _wrong(self) -> str:

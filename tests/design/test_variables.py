@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drt_jax import load_lens
-from drt_jax.design import Solve, Tie, Variables, Vary
+from drt_jax.design import Problem, Solve, Tie, Variables, Vary
 from drt_jax.design.kinds import KINDS
 from drt_jax.lens.surface import surface_sag
 
@@ -348,3 +348,29 @@ def test_float32_stays(lens):
     variables = Variables.from_lens(small, [*ALL], solves=[Solve("focal_length", surface=6)])
     made = variables.lens_of(variables.start)
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((made, variables.start)))
+
+
+def test_several_sets_of_one_lens_are_one_problem():
+    """In any sequence; what varies in two of them, or belongs to another lens, is refused."""
+    lens = load_lens("cooke_triplet")
+    tie = Tie((0, 2), how="opposite")
+    sets = (
+        Variables.from_lens(lens, [Vary("curvature", (0,))], ties=[tie]),
+        Variables.from_lens(lens, [Vary("thickness", (1,), low=1.0), Vary("tilt", (1,))]),
+    )
+    both = Variables.joined(sets)
+    assert both.names == sets[0].names + sets[1].names
+    vector = both.start * 1.01
+    one, two = both.lens_of(vector), sets[0].lens_of(vector[:1])
+    np.testing.assert_array_equal(one.curvature, two.curvature)
+    np.testing.assert_array_equal(one.thickness[1], lens.thickness[1] * 1.01)
+    problem = Problem.from_variables([*sets], ["focal_length"])
+    assert problem.variables.names == both.names
+    with pytest.raises(ValueError, match="curvature 0 stands twice"):
+        Variables.joined([sets[0], sets[0]])
+    with pytest.raises(ValueError, match="variables: of different lenses"):
+        other = Variables.from_lens(load_lens("singlet"), ["curvature"])
+        Problem.from_variables([sets[0], other], ["focal_length"])
+    for wrong in ([], [Vary("curvature")], None):
+        with pytest.raises(ValueError, match=r"expected Variables.from_lens\(lens"):
+            Problem.from_variables(wrong, ["focal_length"])

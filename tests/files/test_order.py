@@ -68,6 +68,7 @@ def test_index_1_is_air():
 
 DUMMY = {"radius": 5.0, "semi_diameter": 4.0}
 WIDE = {**FRONT, "semi_diameter": 10.0}
+OPEN = {**STOP, "semi_diameter": 9.5}
 BACKWARDS = {
     "past the stop": (
         (FRONT, 5.0, {**STOP, "index": 1.5}, -6.0, BACK, 20.0),
@@ -86,7 +87,7 @@ BACKWARDS = {
         r"surfaces\[0\].thickness up to surface 2, in sum: must be negative, as a mirror",
     ),
     "crossing, with the stop between": (
-        (WIDE, 2.0, {**STOP, "index": 1.5}, 2.0, {**BACK, "semi_diameter": 10.0}, 20.0),
+        (WIDE, 2.0, {**OPEN, "index": 1.5}, 2.0, {**BACK, "semi_diameter": 10.0}, 20.0),
         r"surfaces\[0\].thickness: 4 mm makes surfaces 0 and 2 cross at .* mm from the axis",
     ),
     "sensor, behind the stop": (
@@ -121,7 +122,7 @@ def test_zeros_that_are_written_are_variables_and_turn_off_no_check(key, zeros):
     with pytest.raises(LensError, match="must be positive"):
         load_lens(in_order(STOP | still, 0.0, FRONT | still, -1.0, BACK, 20.0))
     with pytest.raises(LensError, match="cross at"):
-        load_lens(in_order(STOP, 0.0, WIDE, 1.0, BACK | {"semi_diameter": 10} | still, 20.0))
+        load_lens(in_order(OPEN, 0.0, WIDE, 1.0, BACK | {"semi_diameter": 10} | still, 20.0))
     with pytest.warns(UserWarning, match="sensor: 0 mm lies before"):
         load_lens({**in_order(STOP, 0.0, FRONT, 1.0, BACK, -1.0), f"sensor_{key}": zeros})
 
@@ -141,6 +142,16 @@ def test_only_neighbours_of_a_moved_surface_are_not_checked(key, value):
     ):
         with pytest.raises(LensError, match="must be positive"):
             load_lens(lens)
+
+
+def test_surfaces_that_cross_outside_of_the_light():
+    """Apertures of 10 mm, where the faces meet at 8.75 mm: a warning while the beam of the axis is
+    narrower, as in files whose apertures a program chose."""
+    rows = (WIDE, 4.0, {**BACK, "semi_diameter": 10.0}, 20.0)
+    with pytest.warns(UserWarning, match="cross at 8.75 mm.*light that comes there is lost"):
+        load_lens(in_order(STOP, 0.0, *rows))
+    with pytest.raises(LensError, match="cross at 8"):
+        load_lens(in_order({**STOP, "semi_diameter": 9.5}, 0.0, *rows))
 
 
 @pytest.mark.slow

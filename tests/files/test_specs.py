@@ -276,3 +276,16 @@ def test_a_sensor_in_focus(tmp_path):
     assert abs(float(rays.points[0, 0, -1, 1])) < 1e-9
     save_lens(lens, tmp_path / "again.yaml")
     assert load_lens(tmp_path / "again.yaml").sensor == lens.sensor
+
+
+def test_powers_of_json_are_numbers():
+    """A key of JSON is text: "4" is the coefficient 4, here of a Zernike polynomial."""
+    rows = {"form": "zernike", "radius": 50, "norm_radius": 9, "thickness": 9, "index": 1.5}
+    stop = {"radius": -50, "thickness": 90, "stop": True, "semi_diameter": 5}
+    for keys in ({"4": 0.01, "11": 0.02}, {4: 0.01, "11": 0.02}):
+        lens = load_lens({"surfaces": [rows | {"coefficients": keys}, stop]})
+        assert lens.coefficients[0, 4] == 0.01 and lens.coefficients[0, 11] == 0.02
+    with pytest.raises(LensError, match=r"surfaces\[0\].coefficients: .* given twice"):
+        load_lens({"surfaces": [rows | {"coefficients": {4: 0.01, "4": 0.02}}, stop]})
+    with pytest.raises(LensError, match="unknown key 0;"):
+        load_lens({"surfaces": [rows | {"coefficients": {"0": 0.01}}, stop]})

@@ -48,6 +48,8 @@ def test_wavelength_outside_a_glass_names_its_range():
         ValueError, match=re.escape("0.9 um is outside the range of SK16, 0.4 to 0.7")
     ):
         load_lens("cooke_triplet").index(jnp.array([0.55, 0.9]))
+    with pytest.raises(ValueError, match=re.escape("wavelengths are in um: 0.55")):
+        load_lens("cooke_triplet").index(550.0)
 
 
 def test_one_compilation_serves_lenses_of_one_shape():
