@@ -39,13 +39,19 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
     path: of the file, which is overwritten; it ends in `.yaml`, `.yml`, `.zmx` or `.seq`.
 
     LensError for another ending, if the file cannot hold the lens, such as a prescription a curved
-    sensor, if `load_lens` would refuse it, or if the file cannot be written.
+    sensor, if `Lens.check` or `load_lens` refuse it, or if the file cannot be written.
     """
     kind = known_ending(path)
     system = lens if isinstance(lens, System) else system_for(lens)
     if kind in (".yaml", ".yml") and isinstance(lens, System):
         warnings.warn(f"{path}: fields, wavelengths and vignetting are not written", stacklevel=2)
-    text = {".zmx": zmx_text, ".seq": seq_text}.get(kind, _yaml_text)(system)
+    try:
+        text = {".zmx": zmx_text, ".seq": seq_text}.get(kind, _yaml_text)(system)
+        system.lens.check()
+    except LensError:
+        raise
+    except ValueError as error:
+        raise LensError(f"{path}: not written: {error}") from error
     low, high = system.lens.dispersion.range
     waves = dict.fromkeys([*FRAUNHOFER[:3], *system.wavelengths.tolist()])
     known = [wave for wave in waves if low <= wave <= high]

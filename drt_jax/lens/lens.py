@@ -72,6 +72,7 @@ HELD = {
     "dispersion": ("strength", "resonance", "schott", "ranges"),
     "phase": ("order",),
 }
+_REMEDY = "; go back to the lens before, and if an optimiser decays weights, give it `movable`"
 
 
 @jax.tree_util.register_pytree_with_keys_class
@@ -294,7 +295,7 @@ class Lens:
         """What is wrong with the numbers, as far as they are known; empty for nothing."""
         for path, leaf in jax.tree_util.tree_leaves_with_path(self):
             if concrete(leaf) and np.any(np.isnan(np.asarray(leaf))):
-                return f"lens{jax.tree_util.keystr(path)}: expected numbers, got NaN"
+                return f"lens{jax.tree_util.keystr(path)}: expected numbers, got NaN{_REMEDY}"
         schott, strength = self.dispersion.schott, self.dispersion.strength
         if concrete((schott, strength)):
             vacuum = np.eye(1, schott.shape[1])
@@ -302,7 +303,7 @@ class Lens:
                 np.asarray(strength), axis=1
             )
             for i in np.flatnonzero(odd & (np.array(self.glasses) == "air")):
-                return f"lens.dispersion: medium {i} is called air, but its constants are not those"
+                return f"lens.dispersion: medium {i} is called air and has another index{_REMEDY}"
         return ""
 
     def check(self) -> None:

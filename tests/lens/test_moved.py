@@ -119,10 +119,15 @@ def test_optimisers_leave_air_and_glass_alone(rule, tmp_path):
     np.testing.assert_array_equal(again.curvature, lens.curvature)
 
 
-def test_check_refuses_nan_and_air_that_is_none():
+def test_check_refuses_nan_and_air_that_is_none(tmp_path):
     def refused(match, **changes):
+        lens = dataclasses.replace(LENS, **changes)
         with pytest.raises(ValueError, match=match):
-            dataclasses.replace(LENS, **changes).check()
+            lens.check()
+        for ending in ("yaml", "zmx", "seq"):
+            with pytest.raises(drt_jax.LensError):
+                drt_jax.save_lens(lens, tmp_path / f"lens.{ending}")
+        assert not any(tmp_path.iterdir())
 
     for name in ("curvature", "semi_diameter", "thickness", "sensor"):
         array = np.array(getattr(LENS, name))
