@@ -124,9 +124,8 @@ def test_check_refuses_nan_and_air_that_is_none(tmp_path):
         lens = dataclasses.replace(LENS, **changes)
         with pytest.raises(ValueError, match=match):
             lens.check()
-        for ending in ("yaml", "zmx", "seq"):
-            with pytest.raises(drt_jax.LensError):
-                drt_jax.save_lens(lens, tmp_path / f"lens.{ending}")
+        with pytest.raises(drt_jax.LensError):
+            drt_jax.save_lens(lens, tmp_path / "lens.yaml")
         assert not any(tmp_path.iterdir())
 
     for name in ("curvature", "semi_diameter", "thickness", "sensor"):
