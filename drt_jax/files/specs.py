@@ -24,7 +24,7 @@ _MOST = 5000  # surfaces
 _FOCUS = "focus"  # value of `sensor`
 _TOP_KEYS = (
     *("name", "source", "focal_length", "glasses", "object", "surfaces", "elements"),
-    *("sensor", "sensor_tilt", "sensor_decentre", "pupil"),
+    *("sensor", "sensor_tilt", "sensor_decentre", "afocal", "pupil"),
 )
 _SURFACE_KEYS = (
     *("form", "radius", "curvature", "conic", "radius_x", "curvature_x", "conic_x"),
@@ -114,7 +114,7 @@ def _focused(lens: Lens, wavelength: float) -> Lens:
     """The lens with its sensor at the paraxial focus for an object at infinity."""
     place = image_distance(lens, math.inf, wavelength)[0]
     if not math.isfinite(float(place)):
-        raise LensError("sensor: focus: there is none, light leaves parallel; give mm", "sensor")
+        raise LensError("sensor: focus: there is none, light leaves parallel; give mm and afocal: true", "sensor")
     return dataclasses.replace(lens, sensor=place)
 
 
@@ -162,6 +162,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
         labels=Labels(top.text("name", name[:100]), tuple(medium.name for medium in media)),
         forms=(*map(_form, surfaces), "asphere"),
         mirrors=tuple(surface.flag("mirror") for surface in surfaces),
+        afocal=top.flag("afocal"),
     )
     bent = (surface.curvature() or any(row) for surface, row in zip(surfaces, coefficients))
     curved = tuple(i for i, does in enumerate(bent) if does and i not in lens.active)

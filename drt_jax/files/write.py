@@ -81,6 +81,7 @@ def _yaml_text(system: System) -> str:
     if lens.elements is not None:
         top["elements"] = [_element(lens.elements, g) for g in range(len(lens.elements.spans))]
     top["sensor"] = float(lens.sensor)
+    top |= {"afocal": True} if lens.afocal else {}
     top |= {f"sensor_{key}": value for key, value in _place(lens, lens.count).items()}
     return yaml.safe_dump(top, sort_keys=False, default_flow_style=None, width=1000)
 

@@ -17,7 +17,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import safe_divide
+from ..numerics import safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.mask import Mask
 from ..pupil.patterns import disc, half_disc, meridian
@@ -26,8 +26,11 @@ from ..rays.solve import Solver, solve
 from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import Bundle, trace_bundle
+from .wavefront import reference_curvature
 from .zernike import Polynomials, fitted
 
+# The largest spot, in parts of the distance to the exit pupil, for which that counts.
+_NEAR = 0.3
 # Directions along which the light of a clipped beam has ends.
 _SIDES = 16
 
@@ -35,7 +38,8 @@ _SIDES = 16
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=(
-        *("points", "weights", "hits", "direction", "path", "index", "motion", "known", "mask"),
+        *("points", "weights", "hits", "direction", "path", "index", "motion", "curvature"),
+        *("known", "mask"),
     ),
     meta_fields=("degree", "azimuths", "clipped"),
 )
@@ -52,6 +56,7 @@ class Beam:
         of the sensor to the ray: the phase of its plane wave there.
     index: (W,), refractive index before the sensor.
     motion: (3,), how the sensor's vertex moves in mm a mm of `Lens.sensor`, along its axes.
+    curvature: (W,), 1 / distance along the light from the exit pupil to the sensor, 1/mm.
     known: (W, Q), whether the ray exists.
     degree: of the polynomials. azimuths: the largest m of their terms cos(m a), one less than the
         azimuths of rays on half a disc. clipped: whether more than the rim of the stop bounds the
@@ -66,6 +71,7 @@ class Beam:
     path: Array
     index: Array
     motion: Array
+    curvature: Array
     known: Array
     degree: int
     azimuths: int
@@ -86,7 +92,35 @@ class Beam:
         for k in range(2):
             hits = hits.at[k, -1].add(ahead * self.direction[k] - move[k])
         path = self.path + self.index[:, None] * dot(tuple(self.direction), tuple(move))
-        return dataclasses.replace(self, hits=hits, path=path)
+        farther = means(ahead[None], self._light())[0] * self.curvature
+        curvature = safe_divide(self.curvature, 1 + farther)
+        return dataclasses.replace(self, hits=hits, path=path, curvature=curvature)
+
+    def on_sphere(self) -> tuple[Array, Array]:
+        """Where rays cross a sphere through the exit pupil about the middle of the spot: direction
+        cosines (2, W, Q) from there to the middle, and the path (W, Q) of a plane wave of this
+        direction, as `path` has that of the ray's own, mm.
+
+        Huygens' waves from the sphere interfere on the sensor as plane waves of these directions
+        do, but for a phase of (blur x aperture)^2 / (2 radius). Rays as plane waves, a sphere of
+        infinite radius, would be the limit of many Fresnel zones. Formulas as in `wavefront`. Where
+        the spot is no longer small beside the radius, that limit is taken.
+        """
+        light = self._light()
+        middle = means(self.hits[:, -1], light)[..., None]
+        e, line = self.hits[:, -1] - middle, self.direction[:2]
+        e = jnp.where(self.known[None], e, 0)
+        axis = means(self.direction, light)
+        kappa = self.curvature * jnp.abs(jnp.sum(axis * self.motion[:, None], axis=0))
+        square = jnp.sum(e**2, axis=0)
+        near = kappa**2 * jnp.max(square, axis=-1) < _NEAR**2
+        kappa = jnp.where(near, kappa, 0)[:, None]
+        along = jnp.sum(e * line, axis=0)
+        x = along**2 - square
+        before = along + kappa * x / (1 + safe_sqrt(1 + kappa**2 * x))
+        cosines = (1 + kappa * before)[None] * line - kappa[None] * e
+        offset = jnp.sum(self.hits[:, -1] * line - middle * cosines, axis=0) - before
+        return cosines, self.path + self.index[:, None] * jnp.where(self.known, offset, 0)
 
     def over_stop(self) -> Polynomials:
         """Hits on the sensor (2) and, of a clipped pupil, on all surfaces (2 S + 2), mm, as
@@ -95,9 +129,9 @@ class Beam:
 
     def over_directions(self) -> Polynomials:
         """Path (1), mm, stop point (2) and, of a clipped pupil, hits on all surfaces (2 S + 2), mm,
-        as functions of the first two direction cosines at the sensor."""
-        values = self._with_edges([self.path[None], self.points])
-        return self._fitted(self.direction[:2], values)
+        as functions of the direction cosines of `on_sphere`."""
+        cosines, path = self.on_sphere()
+        return self._fitted(cosines, self._with_edges([path[None], self.points]))
 
     def solid_angle(self) -> Array:
         """Area of the cone of light on the sensor, (W,), in direction cosines: irradiance is this
@@ -119,8 +153,9 @@ class Beam:
         return _extent(self.points, self.known, self._margin())
 
     def directions_extent(self) -> tuple[Array, Array]:
-        """The rectangle of direction cosines that the light lies in: two corners, (2, W)."""
-        return _extent(self.direction[:2], self.known, self._margin())
+        """The rectangle of direction cosines, see `on_sphere`, that the light lies in: two corners,
+        (2, W)."""
+        return _extent(self.on_sphere()[0], self.known, self._margin())
 
     def near(self, places: Array, middle: Array, step: Array, cells: int) -> Array:
         """Whether cells of a grid (W, N, N) [y, x] reach to where light may come, next to the rays.
@@ -154,11 +189,13 @@ class Beam:
         edges = [self.hits.reshape(-1, *self.path.shape)] if self.clipped else []
         return jnp.concatenate([*values, *edges])
 
-    def _fitted(self, points: Array, values: Array) -> Polynomials:
-        # Where light is taken away, rays stand for it as well as where it is.
+    def _light(self) -> Array:
+        """Weights (W, Q) above 0: where light is taken away, rays stand for it as well."""
         weights = jnp.where(self.known, jnp.abs(self.weights), 0)
-        weights = jnp.where(self.throughput[:, None] > 0, weights, 1)
-        return fitted(points, values, weights, self.degree, self.azimuths)
+        return jnp.where(self.throughput[:, None] > 0, weights, 1)
+
+    def _fitted(self, points: Array, values: Array) -> Polynomials:
+        return fitted(points, values, self._light(), self.degree, self.azimuths)
 
 
 @jax.tree_util.register_dataclass
@@ -238,6 +275,7 @@ def beam_of(
         path=repeated(path),
         index=index,
         motion=jnp.array([0, 0, 1], index.dtype) if motion is None else motion,
+        curvature=reference_curvature(lens, scene.wavelengths),
         known=repeated(known),
         degree=degree,
         azimuths=degree if azimuths is None else azimuths,

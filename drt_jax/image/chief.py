@@ -28,6 +28,7 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of
 from ..lens.surface import surface_sag
 from ..numerics import Numbers, known_values, real_array, safe_divide, safe_sqrt
+from ..rays.afocal import FOCAL
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
@@ -151,16 +152,20 @@ def distortion(
             raise ValueError(f"focal_length: expected () or ({waves},), got {length.shape}")
         scale = jnp.broadcast_to(length, (waves,))[:, None, None] * jnp.eye(2, dtype=dtype)[None]
     fitted = isinstance(focal_length, str)
-    return _distortion(found, angles, scale, mapping, fitted)
+    return _distortion(found, angles, scale, mapping, fitted, lens.afocal)
 
 
-@functools.partial(jax.jit, static_argnames=("mapping", "fitted"))
+@functools.partial(jax.jit, static_argnames=("mapping", "fitted", "afocal"))
 def _distortion(
-    found: _ChiefRays, angles: Array, scale: Array, mapping: Mapping, fitted: bool
+    found: _ChiefRays, angles: Array, scale: Array, mapping: Mapping, fitted: bool, afocal: bool
 ) -> Distortion:
     """Of chief rays, scale (W, 2, 2) mm."""
     whole = found.whole[1:] & found.whole[:1]
     place = jnp.tan(angles)
+    if afocal and mapping == "tangent":
+        size = safe_sqrt(jnp.sum(found.hit**2, axis=-1, keepdims=True)) / FOCAL
+        longer = jnp.where(size > 0, safe_divide(jnp.tan(size), size), 1)
+        found = found._replace(hit=found.hit * longer)
     if mapping == "angle":
         size = safe_sqrt(jnp.sum(place**2, axis=-1, keepdims=True))
         place = place * jnp.where(size > 0, safe_divide(jnp.arctan(size), size), 1)
@@ -225,6 +230,8 @@ def _chief_ray(lens: Lens, axis: Scene, field: Array) -> _ChiefRays:
     tangential, sagittal = _foci(Scene(field, axis.distance, axis.wavelengths), columns)
     sine = safe_sqrt(across[0] ** 2 + across[1] ** 2)
     angle = jnp.arctan2(sine, jnp.where(whole, jnp.abs(along), 1))
+    if lens.afocal:
+        angle = safe_sqrt(hit[0] ** 2 + hit[1] ** 2) / FOCAL
     lost = lambda a: jnp.where(whole, a, jnp.inf)  # noqa: E731
     return _ChiefRays(
         jnp.stack(hit, axis=-1), lost(angle), lost(tangential), lost(sagittal), by_field, whole

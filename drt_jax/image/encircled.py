@@ -7,7 +7,6 @@ the sensor, as in the kernel of rays, and so passes the circle gradually, measur
 the radius; so the part is smooth in all numbers, 0 at R = 0 and 1 beyond the last ray.
 """
 
-import dataclasses
 import functools
 
 import jax
@@ -17,16 +16,16 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene
-from ..numerics import Numbers, known_values, safe_divide, safe_sqrt
+from ..numerics import Numbers, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
-from .beam import Beam, beam_rule, trace_beam
+from .beam import Beam
 from .ray_psf import below, ray_spots
+from .refined import TOLERANCE, beams_of, to_tolerance
 from .transfer import Model, arrays_of, centre_of, through_focus
 from .wave_psf import amplitudes, autocorrelation, period
 
 _UM = 1e3  # per mm
-_DEGREE, _CELLS = 14, 128
+_DEGREE = 14
 # Polynomials 9.4.4 and 9.4.6 of Abramowitz and Stegun, in (z / 3)^2 and in 3 / z: right to 1e-7.
 _NEAR = (0.5, -0.56249985, 0.21093573, -0.03954289, 0.00443319, -0.00031761, 0.00001109)
 _SIZE = (0.79788456, 0.00000156, 0.01659667, 0.00017105, -0.00249511, 0.00113653, -0.00020033)
@@ -45,47 +44,39 @@ def encircled_energy(
     rule: PupilRule | None = None,
     degree: int = _DEGREE,
     cells: int | None = None,
+    tolerance: float = TOLERANCE,
 ) -> Array:
     """The part (F, N) of the light on the sensor within circles about the centroid of all
     wavelengths; (F, Z, N) with Z values of `focus`. 0 where no light arrives.
 
-    radii: (N,) mm. cells: of the grid of the pupil along a side; None: 128 or, of waves and outside
-    of a trace, as many as keep what the grid repeats out of the largest circle. Other arguments,
-    and errors, as of `transfer`.
+    radii: (N,) mm. cells: of the grid of the pupil along a side; None: as many as keep the error
+    of the part below `tolerance`, and what a grid of waves repeats out of the largest circle;
+    inside `jit` and `vmap` 128. A spot too large for the grid, 64 Airy radii for 128 cells, is
+    counted by rays. Other arguments, and errors, as of `transfer`.
     """
     scene = fields, distance, wavelengths
     given = arrays_of(lens, scene, model, focus, wavelength_weights, rule, "radii", radii)
-    if cells is None:
-        cells = _CELLS
-        known_now = known_values((lens, *given))
-        if model == "waves" and known_now is not None:
-            cells = max(_CELLS, 64 * int(np.ceil(_cells(*known_now, degree) / 64)))
-    return _encircled(lens, *given, model, degree, cells)
+    angles, axis, values, spectrum, steps, rule = given
+    beams = beams_of(lens, angles, axis, rule, degree)
+    of = functools.partial(_encircled, model=model)
+    known = lens, beams, axis.wavelengths, values, spectrum, steps
+    return to_tolerance(of, known, cells, tolerance, _cells if model == "waves" else lambda *_: 0)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames=("model", "degree", "cells"))
+@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells"))
 def _encircled(
     lens: Lens,
-    fields: Array,
-    axis: Scene,
+    beams: Beam,
+    wavelengths: Array,
     radii: Array,
     spectrum: Array,
     focus: Array,
-    rule: PupilRule,
     model: Model,
-    degree: int,
     cells: int,
 ) -> Array:
-    made = beam_rule(degree, rule.symmetry, rule)
-
-    def one(field: Array) -> Array:
-        beam = trace_beam(lens, dataclasses.replace(axis, field=field), made)
-        of = functools.partial(encircled, lens, wavelengths=axis.wavelengths, radii=radii)
-        return through_focus(
-            beam, focus, lambda moved: of(moved, spectrum=spectrum, model=model, cells=cells)
-        )
-
-    return jax.vmap(one)(fields)
+    given = wavelengths, radii, spectrum, model, cells
+    of = lambda beam: encircled(lens, beam, *given)  # noqa: E731
+    return jax.vmap(lambda beam: through_focus(beam, focus, of))(beams)
 
 
 def encircled(
@@ -99,8 +90,12 @@ def encircled(
 ) -> Array:
     """The parts (N,) of one beam, see `encircled_energy`."""
     share, centre = centre_of(beam, spectrum)
-    of = _of_rays if model == "rays" else _of_waves
-    return jnp.einsum("w,wn->n", share, of(lens, beam, wavelengths, radii, centre, cells))
+    parts = _of_rays(lens, beam, wavelengths, radii, centre, cells)
+    if model == "waves":
+        wide = cells_needed(beam, wavelengths, radii) > cells
+        waves = _of_waves(lens, beam, wavelengths, radii, centre, cells)
+        parts = jnp.where(wide[:, None], parts, waves)
+    return jnp.einsum("w,wn->n", share, parts)
 
 
 def _of_rays(
@@ -170,25 +165,17 @@ def _bessel(z: Array) -> Array:
     )
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames="degree")
+@functools.partial(jit, wanted=LARGE)
 def _cells(
-    lens: Lens,
-    fields: Array,
-    axis: Scene,
-    radii: Array,
-    spectrum: Array,
-    focus: Array,
-    rule: PupilRule,
-    degree: int,
+    lens: Lens, beams: Beam, wavelengths: Array, radii: Array, spectrum: Array, focus: Array
 ) -> Array:
-    """So many cells, (), that the spot and the circles fit into what the grid repeats."""
-    made = beam_rule(degree, rule.symmetry, rule)
+    """So many cells, (), that the spots and the circles fit into what the grid repeats."""
+    of = lambda beam: jnp.max(cells_needed(beam, wavelengths, radii))  # noqa: E731
+    return jnp.max(jax.vmap(lambda beam: through_focus(beam, focus, of))(beams))
 
-    def one(field: Array, step: Array) -> Array:
-        beam = trace_beam(lens, dataclasses.replace(axis, field=field), made).refocused(step)
-        places = jnp.where(beam.known & (beam.throughput > 0)[:, None], beam.hits[:, -1], jnp.nan)
-        reach = jnp.nanmax(places, (1, 2)) - jnp.nanmin(places, (1, 2))
-        needed = jnp.nan_to_num(jnp.max(reach)) + jnp.max(radii)
-        return needed / jnp.min(period(beam, axis.wavelengths, 1))
 
-    return jnp.max(jax.vmap(lambda f: jax.vmap(lambda s: one(f, s))(jnp.atleast_1d(focus)))(fields))
+def cells_needed(beam: Beam, wavelengths: Array, radii: Array) -> Array:
+    """So many cells (W,) that the spot and circles fit into what the grid repeats."""
+    places = jnp.where(beam.known & (beam.throughput > 0)[:, None], beam.hits[:, -1], jnp.nan)
+    reach = jnp.nan_to_num(jnp.nanmax(places, -1) - jnp.nanmin(places, -1))
+    return jnp.max((reach + jnp.max(radii)) / period(beam, wavelengths, 1), axis=0)

@@ -192,11 +192,12 @@ def _misfit(
     beam: Beam, scene: Scene, wavelength: int, pixel: Array, pictures: bool, degree: int
 ) -> float:
     """The error of the fit at one wavelength, see `_degree`."""
-    row = jax.tree.map(np.asarray, (beam.weights, beam.known, beam.path, beam.hits[:, -1]))
+    cosines, waves = beam.on_sphere()
+    row = jax.tree.map(np.asarray, (beam.weights, beam.known, waves, beam.hits[:, -1]))
     weight, known, path, hits = (a[..., wavelength, :] for a in row)
     weight = np.sqrt(np.where(known, np.abs(weight), 0) / np.sum(np.abs(weight)))
     spread = np.sqrt(np.sum((weight * (hits - _mean(hits, weight))) ** 2))
-    points, directions = (np.asarray(a[:2, wavelength]) for a in (beam.points, beam.direction))
+    points, directions = (np.asarray(a[:, wavelength]) for a in (beam.points, cosines))
     error = _residual(points, hits, weight, degree) / max(float(spread), float(pixel))
     if not pictures:
         return error

@@ -51,7 +51,7 @@ def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
     grid = jnp.asarray(np.stack(np.meshgrid(side, side))[:, None], half.dtype)
     stop = middle[..., None, None] + half[..., None, None] * grid
     axes = middle, half * (2 / cells)
-    light = cover(lens, beam, stop, values[2:], beam.points, axes).reshape(waves, -1)
+    light = cover(lens, beam, stop, values[2:], beam.points, axes)[0].reshape(waves, -1)
     weights = normalised(light) * beam.throughput[:, None]
     # How far the cell of a ray reaches on the sensor, along x and y.
     cell = (step * (2 / cells))[:, None, :, None, None]

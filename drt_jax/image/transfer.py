@@ -23,16 +23,17 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
 from ..numerics import Numbers, real_array, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
-from .beam import Beam, beam_rule, trace_beam
+from .beam import Beam
 from .cover import cover
+from .refined import TOLERANCE, beams_of, to_tolerance
 from .spot import normalised
 from .spots import light_rule
-from .wave_psf import pupil_function
+from .wave_psf import pupil_function, shared_part
 
 Model = Literal["waves", "rays"]
 _UM = 1e3  # per mm
-# Cells of the grid of directions, along a side; degree of the polynomials.
-_CELLS, _DEGREE = 64, 14
+# Degree of the polynomials.
+_DEGREE = 14
 
 
 class Transfer(NamedTuple):
@@ -68,7 +69,8 @@ def transfer(
     wavelength_weights: Numbers | None = None,
     rule: PupilRule | None = None,
     degree: int = _DEGREE,
-    cells: int = _CELLS,
+    cells: int | None = None,
+    tolerance: float = TOLERANCE,
 ) -> Transfer:
     """Optical transfer functions over frequency, field and focus, see `Transfer`.
 
@@ -79,15 +81,23 @@ def transfer(
         then (F, Z, 2, N), and no more rays are traced.
     wavelength_weights: (W,), of any sum; None: equal. Light that is lost counts less.
     rule: of the pupil, whose kind is kept (`Gauss` or `Clipped`); None: found, outside of a trace.
-    degree: of the polynomials of the pupil. cells: of the grid, along a side.
+    degree: of the polynomials of the pupil. cells: of the grid, along a side; None: as many as keep
+        the error of the contrast below `tolerance`; inside `jit` and `vmap`, where they cannot
+        follow from it, 128. Too few lower the contrast of a large blur, and never raise it.
 
-    Differentiable in every mode. ValueError as of `scene_of`, and without a rule inside a trace.
+    Differentiable in every mode. ValueError as of `scene_of`, without a rule inside a trace, and
+    for a tolerance that is not between 0 and 1; warns if the tolerance is not met.
     """
     scene = fields, distance, wavelengths
     given = arrays_of(
         lens, scene, model, focus, wavelength_weights, rule, "frequencies", frequencies
     )
-    return _transfer(lens, *given, model, degree, cells)
+    angles, axis, values, spectrum, steps, rule = given
+    beams = beams_of(lens, angles, axis, rule, degree)
+    of = functools.partial(_transfer, model=model)
+    known = lens, beams, axis.wavelengths, values, spectrum, steps
+    otf, limit = to_tolerance(of, known, cells, tolerance, lambda *_: 0)
+    return Transfer(values, otf, limit)
 
 
 def arrays_of(
@@ -123,32 +133,27 @@ def strehl(
     wavelengths: Numbers,
     rule: PupilRule | None = None,
     degree: int = _DEGREE,
-    cells: int = 2 * _CELLS,
+    cells: int | None = None,
+    tolerance: float = TOLERANCE,
 ) -> Array:
     """Strehl ratio (F, W): the irradiance of the image of a point over that without aberrations in
     the same pupil, `|integral of P|^2 / (integral of |P|)^2` over direction cosines.
 
     At the place where the wavefront has no tilt, in the mean square over the pupil: the peak of an
-    image of a quarter of a wave or better. 0 where no light arrives. Arguments as of `transfer`.
+    image of a quarter of a wave or better. 0 where no light arrives. Arguments as of `transfer`;
+    `tolerance` is that of the ratio.
     """
     axis = scene_of(lens, 0.0, distance, wavelengths)
     angles = fields_array(fields, lens.curvature.dtype)
     if rule is None:
         rule = light_rule(lens, fields, distance, wavelengths)
-    return _strehl(lens, angles, axis, rule, degree, cells)
+    given = lens, beams_of(lens, angles, axis, rule, degree), axis.wavelengths
+    return to_tolerance(_strehl, given, cells, tolerance, lambda *_: 0)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames=("degree", "cells"))
-def _strehl(
-    lens: Lens, fields: Array, axis: Scene, rule: PupilRule, degree: int, cells: int
-) -> Array:
-    made = beam_rule(degree, rule.symmetry, rule)
-
-    def one(field: Array) -> Array:
-        beam = trace_beam(lens, Scene(field, axis.distance, axis.wavelengths), made)
-        return strehl_of(lens, beam, axis.wavelengths, cells)
-
-    return jax.vmap(one)(fields)
+@functools.partial(jit, wanted=LARGE, static_argnames="cells")
+def _strehl(lens: Lens, beams: Beam, wavelengths: Array, cells: int) -> Array:
+    return jax.vmap(lambda beam: strehl_of(lens, beam, wavelengths, cells))(beams)
 
 
 def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
@@ -156,44 +161,38 @@ def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
     lit = beam.throughput > 0
     low, high = beam.directions_extent()
     pupil = pupil_function(lens, beam, wavelengths, cells)
-    density, inside, phase = pupil((low + high) / 2, (high - low) / cells)
-    size = safe_sqrt(density) * inside
+    density, inside, phase, turn, off = pupil((low + high) / 2, (high - low) / cells)
+    size, phase = safe_sqrt(density) * inside, phase + jnp.sum(turn * off, axis=0)
     share = normalised(size, (1, 2))
     # The tilt goes along x, then y, which have no mean and a product of their own.
     side = np.arange(cells) - (cells - 1) / 2
-    for line in np.meshgrid(side, side):
-        place = jnp.asarray(line, phase.dtype)[None]
+    places = off + jnp.asarray(np.stack(np.meshgrid(side, side)), phase.dtype)[:, None]
+    slopes: list[Array] = []
+    for place in places:
         place = place - jnp.sum(share * place, axis=(1, 2), keepdims=True)
         phase = phase - jnp.sum(share * phase, axis=(1, 2), keepdims=True)
         square = jnp.sum(share * place**2, axis=(1, 2), keepdims=True)
         product = jnp.sum(share * place * phase, axis=(1, 2), keepdims=True)
-        phase = phase - safe_divide(product, square) * place
-    parts = (jnp.sum(share * f(phase), axis=(1, 2)) for f in (jnp.cos, jnp.sin))
-    return jnp.where(lit, sum(p**2 for p in parts), 0)
+        slopes.append(safe_divide(product, square))
+        phase = phase - slopes[-1] * place
+    total = jnp.sum(_mean_wave(share, phase, turn - jnp.stack(slopes), inside), axis=(1, 2))
+    return jnp.where(lit, total.real**2 + total.imag**2, 0)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames=("model", "degree", "cells"))
+@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells"))
 def _transfer(
     lens: Lens,
-    fields: Array,
-    axis: Scene,
+    beams: Beam,
+    wavelengths: Array,
     frequencies: Array,
     spectrum: Array,
     focus: Array,
-    rule: PupilRule,
     model: Model,
-    degree: int,
     cells: int,
-) -> Transfer:
-    made = beam_rule(degree, rule.symmetry, rule)
-
-    def one(field: Array) -> tuple[Array, Array]:
-        beam = trace_beam(lens, Scene(field, axis.distance, axis.wavelengths), made)
-        given = axis.wavelengths, frequencies, spectrum, model, cells
-        return through_focus(beam, focus, lambda moved: transfer_of(lens, moved, *given))
-
-    otf, limit = jax.vmap(one)(fields)
-    return Transfer(frequencies, otf, limit)
+) -> tuple[Array, Array]:
+    given = wavelengths, frequencies, spectrum, model, cells
+    of = lambda beam: transfer_of(lens, beam, *given)  # noqa: E731
+    return jax.vmap(lambda beam: through_focus(beam, focus, of))(beams)
 
 
 def through_focus(beam: Beam, focus: Array, of: Callable[[Beam], Any]) -> Any:
@@ -232,6 +231,16 @@ def _turned(size: Array, phase: Array) -> Array:
     return jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase))
 
 
+def _mean_wave(size: Array, phase: Array, turn: Array, inside: Array) -> Array:
+    """size exp(i phase) as the mean over cells (..., N, N), of which light fills the parts
+    `inside`. phase: at the middle of the light. turn: (2, ..., N, N), its change over a cell along
+    x and y. Where cells are too coarse for the wave the mean is small, and no light is made of it.
+    """
+    x, y = jnp.sinc(turn * inside[None] / (2 * jnp.pi))
+    bend = jnp.gradient(turn[0], axis=-1) + jnp.gradient(turn[1], axis=-2)
+    return _turned(size * x * y, phase + inside**2 * bend / 24)
+
+
 def _of_rays(
     lens: Lens, beam: Beam, wavelengths: Array, frequencies: Array, centre: Array, cells: int
 ) -> tuple[Array, Array]:
@@ -240,16 +249,23 @@ def _of_rays(
     low, high = beam.extent()
     functions, middle, half = beam.over_stop(), (low + high) / 2, (high - low) / 2
     start, step = (middle - functions.centre) / functions.scale, half / functions.scale
-    values = functions.on_grid(start, step, side, slice(0))[0]
+    values, *slopes = functions.on_grid(start, step, side, slice(2))
     places = jnp.asarray(np.stack(np.meshgrid(side, side)), values.dtype)[:, None]
     stop = middle[..., None, None] + half[..., None, None] * places
     axes = middle, half * (2 / cells)
-    weight = cover(lens, beam, stop, values[2:], beam.points, axes)
-    weight = normalised(weight, (1, 2))
-    hits = values[1::-1] - centre[::-1, None, None, None]  # y first
+    inside, off = cover(lens, beam, stop, values[2:], beam.points, axes)
+    weight = normalised(inside, (1, 2))
+    # How much hits change over a cell, [along, component].
+    unit = (step * (2 / cells))[:, None, :, None, None]
+    change = jnp.stack(slopes) * unit
+    hits = values[:2] + jnp.sum(change * off[:, None], axis=0)
+    inside, weight = (jnp.broadcast_to(a, hits.shape) for a in (inside, weight))
+    hits = (hits - centre[:, None, None, None])[::-1]  # y first
+    change = change[:, ::-1]
 
     def at(frequency: Array) -> Array:
-        waves = _turned(jnp.broadcast_to(weight, hits.shape), -2 * jnp.pi * frequency * hits)
+        turn = -2 * jnp.pi * frequency
+        waves = _mean_wave(weight, turn * hits, turn * change, inside)
         return jnp.sum(waves, axis=(2, 3))
 
     otf = jnp.moveaxis(jax.lax.map(at, frequencies), (0, 1, 2), (2, 1, 0))
@@ -268,9 +284,14 @@ def _of_waves(
         step = jnp.maximum(high - low - jnp.abs(shear), 0) / cells
         middle = (low + high) / 2
         first, second = pupil(middle + shear / 2, step), pupil(middle - shear / 2, step)
-        light = safe_sqrt(first[0] * second[0]) * jnp.minimum(first[1], second[1])
+        inside = shared_part(first, second)
+        light = safe_sqrt(first.light * second.light) * inside
         light = light * (step[0] * step[1])[:, None, None]
-        turned = _turned(light, first[2] - second[2])
+        # Where they differ, one of them is cut less: to the middle of the light of the other.
+        off = jnp.where(first.inside < second.inside, first.middle, second.middle)
+        turn = first.turn - second.turn
+        phase = first.phase - second.phase + jnp.sum(turn * off, axis=0)
+        turned = _mean_wave(light, phase, turn, inside)
         return jnp.sum(turned, axis=(1, 2)), jnp.sum(light, axis=(1, 2))
 
     def at(frequency: Array) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ Express 15, 15935 (2007) for the product.
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..numerics import safe_sqrt
+from ..numerics import safe_divide, safe_sqrt
 from .beam import Beam
 from .cover import cover
 
@@ -75,34 +76,57 @@ def _grid(beam: Beam, cells: int) -> tuple[Array, Array]:
     return (low + high) / 2, (high - low) / cells
 
 
+class PupilCells(NamedTuple):
+    """Cells of a grid of directions, (W, N, N).
+
+    light: pi times the light a unit of directions. inside: the part of a cell that it fills.
+    phase: at the middle of the cell, radians. turn: (2, W, N, N), its change over a cell along x
+        and y. middle: (2, W, N, N), of the light, see `cover`.
+    """
+
+    light: Array
+    inside: Array
+    phase: Array
+    turn: Array
+    middle: Array
+
+
 def pupil_function(
     lens: Lens, beam: Beam, wavelengths: Array, cells: int
-) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
-    """A function of the middle and the step of a grid of directions, (2, W) each: pi times the
-    light a unit of directions, the part of cells that it fills, and phases, (W, N, N)."""
+) -> Callable[[Array, Array], PupilCells]:
+    """The cells as a function of the middle and the step of their grid, (2, W) each."""
     functions, side = beam.over_directions(), np.arange(cells) - (cells - 1) / 2
     turns = (2 * jnp.pi * _UM / wavelengths)[:, None, None]
 
-    def pupil(middle: Array, step: Array) -> tuple[Array, Array, Array]:
+    def pupil(middle: Array, step: Array) -> PupilCells:
         start = (middle - functions.centre) / functions.scale
-        found = functions.on_grid(start, step / functions.scale, side, slice(1, 3))
-        values, by_x, by_y = found
-        (ax, ay), (bx, by) = (
-            [d[k] / functions.scale[i][:, None, None] for k in (0, 1)]
-            for i, d in enumerate((by_x, by_y))
-        )
+        values, *slopes = functions.on_grid(start, step / functions.scale, side, slice(3))
+        # [direction, value], by the directions themselves.
+        change = jnp.stack(slopes) / functions.scale[:, None, :, None, None]
+        (_, ax, ay), (_, bx, by) = change
+        turn = turns[None] * change[:, 0] * step[..., None, None]
         axes = middle, step
-        inside = cover(lens, beam, values[1:3], values[3:], beam.direction[:2], axes)
-        return jnp.abs(ax * by - ay * bx), inside, turns * values[0]
+        inside, off = cover(lens, beam, values[1:3], values[3:], beam.on_sphere()[0], axes)
+        return PupilCells(jnp.abs(ax * by - ay * bx), inside, turns * values[0], turn, off)
 
     return pupil
+
+
+def shared_part(first: PupilCells, second: PupilCells) -> Array:
+    """The part of cells that the light of both fills, (W, N, N): the lesser part where their edges
+    are parallel, the product where they cross at right angles, and in between by the cosine."""
+    one, other = first.inside, second.inside
+    sizes = (safe_sqrt(jnp.sum(p.middle**2, axis=0)) for p in (first, second))
+    cosine = safe_divide(jnp.sum(first.middle * second.middle, axis=0), jnp.multiply(*sizes))
+    along = jnp.where(cosine > 0, jnp.minimum(one, other), jnp.maximum(one + other - 1, 0))
+    return one * other + jnp.abs(cosine) * (along - one * other)
 
 
 def amplitudes(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tuple[Array, Array]:
     """Amplitudes (W, cells, cells) [y, x] on a regular grid of direction cosines, whose squares are
     the light a unit of their area, and the step of the grid, (2, W)."""
     middle, step = _grid(beam, cells)
-    light, inside, phase = pupil_function(lens, beam, wavelengths, cells)(middle, step)
+    light, inside, phase, *_ = pupil_function(lens, beam, wavelengths, cells)(middle, step)
     size = safe_sqrt(light / jnp.pi) * inside
     waves = jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase))
     return _masked(waves, beam, wavelengths, middle, step), step

@@ -23,6 +23,7 @@ from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray, paraxial_system
 from ..lens.scene import Scene, scene_of
 from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
+from ..rays.afocal import FOCAL
 from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import Bundle, stop_points, trace_bundle
@@ -48,10 +49,13 @@ class Wavefront(NamedTuple):
 def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
     """1 / distance from the paraxial exit pupil to the sensor along the light, (W,), 1/mm: positive
     for a pupil in front of the sensor, 0 for a telecentric lens. Tilts and decentres are neglected.
-    wavelengths: (W,), um."""
+    Of an afocal lens behind the ideal lens of `rays.afocal`. wavelengths: (W,), um."""
     height, slope = chief_ray(paraxial_system(lens, wavelengths), front=False)
     at_sensor = height + slope * (lens.sensor - lens.vertices[-2])
-    return safe_divide(slope * jnp.asarray(lens.senses[-1], slope.dtype), at_sensor)
+    slope = slope * jnp.asarray(lens.senses[-1], slope.dtype)
+    if lens.afocal:
+        return safe_divide(-at_sensor, slope) / FOCAL**2
+    return safe_divide(slope, at_sensor)
 
 
 def wavefront(

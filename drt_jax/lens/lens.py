@@ -114,6 +114,8 @@ class Lens:
     curved: rows that are not active but may be curved, S for the sensor; the other such rows are
         planes, whose derivatives by curvature, conic and coefficients are 0. `load_lens` lists
         those that a prescription curves.
+    afocal: light leaves the lens collimated, and what meets the sensor counts by its angle: where
+        hits on the sensor are in mm, they are in mrad, see docs/analysis.md.
     free: of "semi_diameter", "dispersion" and "phase" those with all derivatives.
 
     held: what JAX handed in without derivatives; what is replaced is another object. Not for use.
@@ -136,6 +138,7 @@ class Lens:
     forms: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
     mirrors: tuple[bool, ...] = dataclasses.field(metadata={"static": True}, default=())
     curved: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
+    afocal: bool = dataclasses.field(metadata={"static": True}, default=False)
     free: tuple[str, ...] = dataclasses.field(metadata={"static": True}, default=())
     held: tuple = dataclasses.field(default=(), kw_only=True)
 
@@ -234,9 +237,9 @@ class Lens:
     @property
     def sensor_motion(self) -> Array | None:
         """Derivative of the sensor's vertex by `sensor`, (3,) along the sensor's axes; None for
-        (0, 0, 1), where the sensor is not tilted."""
+        (0, 0, 1), where the sensor is not tilted or its place does not count."""
         rotation = self.places[2]
-        if rotation is None:
+        if rotation is None or self.afocal:
             return None
 
         def vertex(sensor: Array) -> Array:

@@ -4,6 +4,7 @@ Three steps: `aims` makes the system and the stop points, a `Solver` finds the r
 adds the other surfaces and the status.
 """
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from ..lens.scene import Scene, scene_of
 from ..lens.surface import by_form, surface_sag
 from ..numerics import Numbers, concrete, known_values, real_array
 from . import fermat
+from .afocal import at_infinity
 from .find import Found
 from .meet import cross
 from .solve import Solver, solve
@@ -33,6 +35,7 @@ class Bundle(NamedTuple):
     status: (W, Q), int32, see `Status`.
     arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along its axes.
     path: (W, Q), optical path from the object, mm, see `fermat.optical_path`.
+    Of an afocal lens the hits on the sensor, arrival and path are those of `rays.afocal`.
     steps: (), int32, Newton steps.
     """
 
@@ -124,7 +127,10 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
     status = jnp.where(clipped, jnp.int32(Status.CLIPPED), status)
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = rotate(rotation, found.arrival, back=True)
-    return Bundle(hits, status, arrival, fermat.optical_path(found.hits, system), found.steps)
+    path = fermat.optical_path(found.hits, system)
+    if lens.afocal:
+        hits, arrival, path = at_infinity(hits, arrival, path, exists, system.index[-1])
+    return Bundle(hits, status, arrival, path, found.steps)
 
 
 def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:
@@ -196,7 +202,7 @@ def stop_points(lens: Lens, pupil: Numbers) -> Array:
 def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     system, target = aims(lens, scene, (pupil[:, 0], pupil[:, 1]))
     found = solve(system, target)
-    bundle = bundle_of(lens, scene, system, target, found)
+    bundle = bundle_of(dataclasses.replace(lens, afocal=False), scene, system, target, found)
     exists = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     rows = placed(lens, range(lens.count + 1))
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)

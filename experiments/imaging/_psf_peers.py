@@ -42,7 +42,7 @@ def pupil(
     middle, step = (low + high) / 2, float(np.max(high - low)) / count
     grid = jnp.asarray(middle[:, None]), jnp.full((2, 1), step)
     function = pupil_function(lens, beam, scene.wavelengths, count)
-    density, inside, phase = (np.asarray(a)[0] for a in function(*grid))
+    density, inside, phase = (np.asarray(a)[0] for a in function(*grid)[:3])
     centre = np.asarray(centroid_and_variances(beam.hits[:, -1], beam.weights)[0])[:, 0]
     side = (np.arange(count) - (count - 1) / 2) * step
     x, y = np.meshgrid(side, side)

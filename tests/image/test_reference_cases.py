@@ -69,7 +69,11 @@ def test_the_huygens_psf_that_opticstudio_prints(shared):
     diagonal = np.array(printed["diagonal_from_centre_pixels_0_to_11"])
     pixel = spacing / 3
     found = drt_jax.psf(*scene, pixel, size, model)
-    light = np.asarray(found.kernel[0]) * wave**2 / (pixel**2 * float(found.solid_angle[0]))
+    # By the peak without aberrations, of the cone from the exit pupil.
+    pupil = drt_jax.exit_pupil(lens, 0.543)
+    away = float(lens.sensor - lens.vertices[-2] - pupil.position[0])
+    sine = np.sin(np.arctan(float(pupil.semi_diameter[0]) / away))
+    light = np.asarray(found.kernel[0]) * wave**2 / (pixel**2 * np.pi * sine**2)
     # A pixel holds the mean over its square: that of a point is less by its bend / 24.
     around = sum(np.roll(light, s, a) for s in (-1, 1) for a in (0, 1)) - 4 * light
     light = light - around / 24
