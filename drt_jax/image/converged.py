@@ -34,7 +34,7 @@ from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
 from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
-from .moments import FocusMoments, check_sensor, weigh
+from .moments import FocusMoments, check_focus, weigh
 from .orders import Group, rules_by_order
 from .spot import Moments
 from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
@@ -88,10 +88,10 @@ def focus_moments(
     """Moments of the rays as functions of the sensor position; the sensor is flat.
 
     Arguments as in `psf_moments`, but the tolerance holds at every sensor position, and
-    `converged_focus_rule` makes the rule. ValueError also for an element that rotates surfaces
-    about the sensor.
+    `converged_focus_rule` makes the rule. ValueError also for an afocal lens, and for an element
+    that rotates surfaces about the sensor.
     """
-    check_sensor(lens)
+    check_focus(lens)
     return _moments(lens, field, distance, wavelengths, tolerance, rule, best_focus)
 
 
@@ -127,7 +127,7 @@ def converged_focus_rule(
 ) -> PupilRule:
     """`converged_rule` for every sensor position: the tolerance also holds where the spot is
     smallest. ValueError as in `focus_moments`."""
-    check_sensor(lens)
+    check_focus(lens)
     seen = field, distance, wavelengths
     return _converge(scenes_of, lens, seen, tolerance, best_focus).rule
 

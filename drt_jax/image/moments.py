@@ -82,6 +82,16 @@ def check_sensor(lens: Lens) -> None:
             )
 
 
+def check_focus(lens: Lens) -> None:
+    """ValueError as in `check_sensor`, and for an afocal lens, which no sensor position focuses."""
+    check_sensor(lens)
+    if lens.afocal:
+        raise ValueError(
+            "afocal: no place of the sensor focuses this lens: vary a thickness, or take `focus` of "
+            "transfer and encircled_energy, in 1e-3 dioptre"
+        )
+
+
 def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusMoments:
     """Moments of traced rays. weights: (1 or W, Q), of the rule."""
     weight = weights * rule.transmission(lens, bundle)

@@ -35,6 +35,8 @@ from ..pupil.rules import Gauss, PupilRule, symmetry_of
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
+from .spot import normalised
+from .wavefront import reference_curvature
 
 Point = Literal["object", "sensor"]
 # Nodes along a radius of the rules that are made here.
@@ -44,6 +46,8 @@ _ORDER = 12
 _RIM, _AZIMUTHS = 48, 24
 # Rings of rays that tell whether light fills the stop.
 _RINGS = 6
+# An image farther than so many times the distance of the exit pupil lies at infinity.
+_FAR = 1e3
 # The first zero of the Airy pattern, in mm by um over NA.
 _AIRY = 0.60983494563325225e-3
 
@@ -141,8 +145,20 @@ def relative_illumination(
 
     0 where no light arrives. OpticStudio's analysis divides by the brightest field of its scan,
     `r / r.max()`, its operand RELI by the axis. Other arguments and errors as of `spot_diagram`.
+    ValueError also where the light of an object point on the axis arrives collimated, without a
+    cone; inside a trace the ratio is then 0. An afocal lens has a cone, the area of its beams.
     """
-    area = _light(lens, fields, distance, wavelengths, rule, point).solid_angle
+    light = _light(lens, fields, distance, wavelengths, rule, point)
+    area = light.solid_angle
+    if point == "object":
+        level = _collimated(lens, light, lens.checked_wavelengths(wavelengths))
+        known = known_values(level)
+        if known is not None and bool(jnp.any(known)):
+            raise ValueError(
+                "point: light of one object point arrives collimated, without a cone: take "
+                "point='sensor', or afocal: true for a lens whose image lies at infinity"
+            )
+        area = jnp.where(level[None], 0, area)
     return safe_divide(area[1:], jnp.broadcast_to(area[:1], area[1:].shape))
 
 
@@ -216,6 +232,16 @@ class _Light:
     chief_whole: Array
     throughput: Array
     solid_angle: Array
+
+
+def _collimated(lens: Lens, light: _Light, wavelengths: Array) -> Array:
+    """Whether the image of the axis is farther than `_FAR` times the exit pupil, (W,): there light
+    has no cone, but the width of the pupil."""
+    hit, weight = light.hit[0], light.weight[0]
+    share = normalised(weight)[..., None]
+    square = jnp.sum(share * (hit - jnp.sum(share * hit, axis=1, keepdims=True)) ** 2, axis=(1, 2))
+    kappa = reference_curvature(lens, jnp.clip(wavelengths, *lens.dispersion.range))
+    return light.solid_angle[0] < np.pi * square * (kappa / _FAR) ** 2
 
 
 def _light(

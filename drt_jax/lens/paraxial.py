@@ -24,6 +24,10 @@ from .scene import ahead, apart, distance_array, field_array, vergence_of
 from .surface import vertex_curvature
 
 
+# Last digits of the sum that makes a slope which may be wrong.
+_ROUNDING = 16
+
+
 class Pupil(NamedTuple):
     """An image of the stop; inf for a telecentric lens.
 
@@ -158,11 +162,19 @@ def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
 
 
 def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | float) -> ParaxialRay:
-    """Traces the ray of a height (mm) and slope, () or (W,), in front of the first vertex."""
+    """Traces the ray of a height (mm) and slope, () or (W,), in front of the first vertex. A last
+    slope that is no more than rounding, as behind an afocal lens, is 0."""
     one = jnp.ones_like(system.index[0])
     start = one * height, one * slope
     heights, behind = trace_yu(system.power, system.gaps, system.index, *start)
-    return ParaxialRay(heights, jnp.concatenate([start[1][None], behind[:-1]]), behind)
+    before = jnp.concatenate([start[1][None], behind[:-1]])
+    # What the last n u is the sum of: n u in front, and height times power of each surface.
+    reach = jnp.abs(jnp.concatenate([start[0][None], heights[:-1]]))
+    reach = reach.at[1:].add(jnp.abs(system.gaps[:, None] * before[1:]))
+    terms = jnp.abs(system.index[0] * start[1]) + jnp.sum(reach * jnp.abs(system.power), axis=0)
+    least = _ROUNDING * jnp.finfo(terms.dtype).eps * terms
+    last = jnp.where(jnp.abs(system.index[-1] * behind[-1]) >= least, behind[-1], 0)
+    return ParaxialRay(heights, before, behind.at[-1].set(last))
 
 
 def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
