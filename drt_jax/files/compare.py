@@ -18,7 +18,7 @@ def difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) -
 
     waves: wavelengths where indices are compared, um. indices: how far they may differ.
     """
-    for name in ("count", "stop", "mirrors", "forms"):
+    for name in ("count", "stop", "mirrors", "forms", "afocal"):
         a, b = getattr(one, name), getattr(two, name)
         if a != b:
             return f"{name} {a}, read back {b}"

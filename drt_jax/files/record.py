@@ -61,7 +61,7 @@ class Record:
     path, missing: see `load_lens`. name: of the lens. distance: of the object, below 0 for a
     virtual one behind the first vertex. medium: keys of the object's medium. parts: surfaces and
     coordinate breaks in order; the image is the last surface.
-    glasses: those that the file itself defines, as in a prescription.
+    glasses: those that the file itself defines, as in a prescription. afocal: as in `Lens`.
     notes: what is left out or read differently from the file.
     """
 
@@ -72,6 +72,7 @@ class Record:
     parts: list[Row | Breaking] = dataclasses.field(default_factory=list)
     medium: dict[str, Any] = dataclasses.field(default_factory=dict)
     glasses: dict[str, Any] = dataclasses.field(default_factory=dict)
+    afocal: bool = False
     notes: list[str] = dataclasses.field(default_factory=list)
 
     def error(self, line: int, message: str) -> LensError:
@@ -213,7 +214,7 @@ class Record:
             raise self.error(0, "no surface lies between object and image")
         if abs(self.distance) < CLOSEST:
             raise self.error(rows[0].line, "the object touches this surface")
-        top: dict[str, Any] = {"surfaces": surfaces}
+        top: dict[str, Any] = {"surfaces": surfaces, "afocal": self.afocal}
         top |= {"elements": elements} if elements else {}
         top |= {"object": self.medium} if self.medium else {}
         top |= {"glasses": self.glasses} if self.glasses else {}

@@ -114,7 +114,10 @@ def _focused(lens: Lens, wavelength: float) -> Lens:
     """The lens with its sensor at the paraxial focus for an object at infinity."""
     place = image_distance(lens, math.inf, wavelength)[0]
     if not math.isfinite(float(place)):
-        raise LensError("sensor: focus: there is none, light leaves parallel; give mm and afocal: true", "sensor")
+        raise LensError(
+            "sensor: focus: there is none, light leaves parallel; give mm and afocal: true",
+            "sensor",
+        )
     return dataclasses.replace(lens, sensor=place)
 
 

@@ -74,7 +74,7 @@ def _use(system: System) -> list[str]:
     turned = system.vignetting * [1, 1, 1, 1, 180 / math.pi]
     fields = np.hstack([system.heights, system.field_weights[:, None], turned]).tolist()
     short = [[0.0, 0.0, 1.0, *[0.0] * 5]] * (BESIDE - len(fields))
-    lines = [f"FTYP {kind} 0 {len(fields)} {len(waves)} 0 0 0"]
+    lines = [f"FTYP {kind} 0 {len(fields)} {len(waves)} 0 0 {int(system.lens.afocal)}"]
     for key, column in zip(COLUMNS, zip(*fields[:BESIDE], *short, strict=True), strict=True):
         lines.append(f"{key} {' '.join(map(repr, column))}")
     lines += [f"FEFD {' '.join(map(repr, row))}" for row in fields[BESIDE:]]

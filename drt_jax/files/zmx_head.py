@@ -126,6 +126,7 @@ def _fields(head: Head, words: Words) -> None:
         if not (1 <= fields <= _MOST and 1 <= waves <= _MOST):
             raise record.error(line, f"{fields} fields and {waves} wavelengths")
         head.counts = fields, waves
+    record.afocal = record.count(line, words.rest, 6, 0) == 1
 
 
 def _column(head: Head, words: Words) -> None:

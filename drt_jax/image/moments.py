@@ -87,8 +87,8 @@ def check_focus(lens: Lens) -> None:
     check_sensor(lens)
     if lens.afocal:
         raise ValueError(
-            "afocal: no place of the sensor focuses this lens: vary a thickness, or take `focus` of "
-            "transfer and encircled_energy, in 1e-3 dioptre"
+            "afocal: no place of the sensor focuses this lens: vary a thickness, or take `focus` "
+            "of transfer and encircled_energy, in 1e-3 dioptre"
         )
 
 

@@ -237,8 +237,8 @@ def _mean_wave(size: Array, phase: Array, turn: Array, inside: Array) -> Array:
     x and y. Where cells are too coarse for the wave the mean is small, and no light is made of it.
     """
     x, y = jnp.sinc(turn * inside[None] / (2 * jnp.pi))
-    bend = jnp.gradient(turn[0], axis=-1) + jnp.gradient(turn[1], axis=-2)
-    return _turned(size * x * y, phase + inside**2 * bend / 24)
+    bends = (jnp.asarray(jnp.gradient(turn[k], axis=a)) for k, a in enumerate((-1, -2)))
+    return _turned(size * x * y, phase + inside**2 * sum(bends) / 24)
 
 
 def _of_rays(

@@ -23,7 +23,6 @@ from .lens import Lens
 from .scene import ahead, apart, distance_array, field_array, vergence_of
 from .surface import vertex_curvature
 
-
 # Last digits of the sum that makes a slope which may be wrong.
 _ROUNDING = 16
 

@@ -11,7 +11,6 @@ import drt_jax
 from drt_jax import Clipped, Gauss, Pattern, Soft, design, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import Operand, Problem, Variables, Vary, trace_fields
-from drt_jax.image import transfer
 
 from ..image.test_encircled import ZEROS
 from ..image.test_transfer import CIRCLE, COOKE, LIMIT, MIRROR, PARTS, WAVE
