@@ -25,7 +25,8 @@ from .transfer import Model, arrays_of, centre_of, through_focus
 from .wave_psf import amplitudes, autocorrelation, period
 
 _UM = 1e3  # per mm
-_DEGREE = 14
+# Degree of the polynomials; cells to begin with, as energy has no better use of cells at edges.
+_DEGREE, _LEAST = 14, 96
 # Polynomials 9.4.4 and 9.4.6 of Abramowitz and Stegun, in (z / 3)^2 and in 3 / z: right to 1e-7.
 _NEAR = (0.5, -0.56249985, 0.21093573, -0.03954289, 0.00443319, -0.00031761, 0.00001109)
 _SIZE = (0.79788456, 0.00000156, 0.01659667, 0.00017105, -0.00249511, 0.00113653, -0.00020033)
@@ -60,7 +61,8 @@ def encircled_energy(
     beams = beams_of(lens, angles, axis, rule, degree)
     of = functools.partial(_encircled, model=model)
     known = lens, beams, axis.wavelengths, values, spectrum, steps
-    return to_tolerance(of, known, cells, tolerance, _cells if model == "waves" else lambda *_: 0)
+    fewest = lambda *known: max(_LEAST, _cells(*known) if model == "waves" else 0)  # noqa: E731
+    return to_tolerance(of, known, cells, tolerance, fewest)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells"))

@@ -87,10 +87,12 @@ def aspheric(coefficient, radius):
 def test_strehl_with_spherical_aberration():
     """W r^4 waves in the paraxial focus, and with -W r^2 of defocus: by Fresnel's integrals
     (Mahajan, Optical Imaging and Aberrations II (2011)); small ones by exp(-(2 pi sigma)^2)."""
-    radius = 8.0
+    # Ten times larger: many Fresnel zones as seen from the mirror, where the wave is bent.
+    radius, larger = 6.0, 10.0
     square = 1 / (1 + (100 / radius - radius / 400) ** 2)
     for waves in (0.1, 0.5, 1.0, 2.0):
-        lens = aspheric(waves * WAVE * 1e-3 / (2 * radius**4), radius)
+        lens = aspheric(waves * WAVE * 1e-3 / (2 * radius**4) / larger, radius)
+        lens = drt_jax.scaled(lens, larger)
         focus = waves * WAVE * 1e-3 / (1 - np.sqrt(1 - square))
         for step, width, sigma in ((0.0, 2, 2 / np.sqrt(45)), (-focus, 1, 1 / np.sqrt(180))):
             moved = dataclasses.replace(lens, sensor=lens.sensor + step)
