@@ -31,7 +31,7 @@ _CURVE, _LIGHT, _FAN, _FIELDS = 31, 10, 33, 3
 # Highest frequency of transfer functions, cycles/mm, unless the diffraction limit is lower.
 _LINES = 200.0
 # Order of the spot rule, degree of polynomials, cells for MTF, least and most cells for energy.
-_ORDER, _DEGREE, _CELLS, _LEAST, _MOST = 8, 10, 48, 128, 384
+_ORDER, _DEGREE, _CELLS, _LEAST, _MOST = 8, 10, 64, 128, 384
 # Analyses by the names of their axes.
 _TITLES = {
     "layout": "Layout",
