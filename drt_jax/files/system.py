@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -198,14 +198,7 @@ def _without_rim(lens: Lens) -> Lens:
     keep = [k for k in range(len(own.surfaces)) if k not in rims[:1]]
     if not keep:
         return dataclasses.replace(lens, apertures=None)
-    chosen: dict[str, Any] = {
-        name: tuple(getattr(own, name)[k] for k in keep) for name in ("surfaces", "kinds", "blocks")
-    }
-    centre = None if own.centre is None else own.centre[np.array(keep)]
-    return dataclasses.replace(
-        lens,
-        apertures=dataclasses.replace(own, half=own.half[np.array(keep)], centre=centre, **chosen),
-    )
+    return dataclasses.replace(lens, apertures=own.only(keep))
 
 
 def _angles(

@@ -506,6 +506,14 @@ def test_user_apertures_are_polygons(tmp_path):
         save_lens(lens, tmp_path / "lens.seq")
 
 
+def test_a_polygon_behind_a_stop_whose_rim_is_its_aperture(tmp_path):
+    """The rim is left out, the polygon stays."""
+    front = FRONT.replace("DIAM 6 0", "DIAM 5 0|FLAP 0 5 0")
+    clips = read(tmp_path, front, f"{BACK}|USAP 0 0 0|{SLIT}").lens.apertures
+    assert clips.kinds == ("polygon",) and clips.surfaces == (1,)
+    np.testing.assert_allclose(clips.outline(0), [[-0.5, -9], [0.5, -9], [0, 9]])
+
+
 def test_user_apertures_that_are_not_known_are_refused(tmp_path):
     for lines, why in (
         ("USAP 0 0 0", "SURF 1: a user aperture with no UDAD lines"),
