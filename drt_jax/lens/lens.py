@@ -87,7 +87,9 @@ class Lens:
     air and of glasses with a formula (nd and vd of model glasses do move), the size of the stop,
     orders of diffraction, and shapes of planes (`curved`). What is asked for by name has its
     derivative: what `dataclasses.replace(lens, semi_diameter=...)` puts in within the function that
-    is differentiated, and what `free` names.
+    is differentiated, and what `free` names. What a program (`jit`) puts in counts as asked for
+    there. Where `scan` or `cond` put such numbers in, `free` must name them: it keeps the type of
+    the pytree.
 
     curvature: (S + 1,), 1/mm.
     conic: (S + 1,), 0 for a sphere, -1 for a paraboloid.
