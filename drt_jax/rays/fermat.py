@@ -237,7 +237,7 @@ def stationary(path: Path, system: System, target: Vector) -> Array:
     ok = ok & jnp.where(turns, arrives * leaves < 0, arrives * leaves > 0)
     if system.rows.rotation is None:
         ok = ok & (arrives * system.senses[:, None, None] > 0)
-        ok = ok.at[-1].set(ok[-1] & (path.length[-1] * system.sensor_way >= 0))
+    ok = ok.at[-1].set(ok[-1] & (path.length[-1] * system.sensor_way >= 0))
     return jnp.all(ok, axis=0) & met(label(path, system), target, path.hits, system)
 
 

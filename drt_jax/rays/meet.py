@@ -69,13 +69,9 @@ def reach(
         length, on_sheet = jnp.where(turned, other, length), jnp.where(turned, also, on_sheet)
     if _plain(form, shape):
         return length, met & on_sheet
-    # Newton's method starts at the conic, or at the vertex plane, where that is nearer.
+    # Newton's method starts at the conic; for a ray that misses it, at the vertex plane.
     plane = -safe_divide(p[-1], d[-1])
-    if form == "asphere":
-        start = jnp.where(met, length, plane)
-    else:
-        gaps = (abs(_gap(form, p, d, shape, s)[0]) for s in (length, plane))
-        start = jnp.where(met & on_sheet & jnp.less(*gaps), length, plane)
+    start = jnp.where(met & on_sheet, length, plane)
     size = jnp.sqrt(dot(d, d))
     settled = max(_SETTLED, 16 * float(jnp.finfo(length.dtype).eps))
 

@@ -264,7 +264,7 @@ def _follow(
     """
     kinds, phases = _forms(system)
     each = [partial(meet, kind) for kind in kinds]
-    tilted = system.rows.rotation is not None
+    tilted, way = system.rows.rotation is not None, system.sensor_way
     point, direction, far = _begin(system, launch)
 
     def ahead(row, length):
@@ -272,13 +272,12 @@ def _follow(
         the launch, or from the row before. The sensor may lie in front of the last surface, where
         light only seems to come from."""
         beyond = jnp.where(row.first, system.vergence * length + far, length)
-        beyond = jnp.where(row.last, tilted | (beyond * system.sensor_way > 0), beyond > 0)
-        return beyond | (not forward)
+        return (jnp.where(row.last, way * beyond, beyond) > 0) | (not forward)
 
     def least(row):
         """The smallest length of the crossing of a tilted surface."""
         start = jnp.where(system.vergence > 0, -safe_divide(far, system.vergence), -jnp.inf)
-        anywhere = row.last | ~row.active
+        anywhere = (row.last & (way < 0)) | ~row.active
         return jnp.where(row.first, start, jnp.where(anywhere, -jnp.inf, 0))
 
     def step(state, row):
@@ -334,9 +333,7 @@ def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
     state, met = _follow(system, launch, smooth=True, forward=False)
     lengths = split_stop(system, (met.length,))[0][0][1:]
     if len(lengths):
-        last = lengths[-1:]
-        last = last * system.sensor_way if system.rows.rotation is None else abs(last)
-        lengths = jnp.concatenate([lengths[:-1], last])
+        lengths = jnp.concatenate([lengths[:-1], lengths[-1:] * system.sensor_way])
     return met.hit, lengths, state.status
 
 

@@ -195,24 +195,32 @@ class System:
 
     @property
     def sensor_way(self) -> Array:
-        """1, or -1 for a sensor in front of the last surface, which shows a virtual image; ()."""
-        rows = self.rows.vertex
-        if len(self.forms) == 1:
-            return jnp.ones_like(rows[0])
-        return jnp.where((rows[-1] - rows[-2]) * self.senses[-1] < 0, -1, 1).astype(rows.dtype)
+        """1, or -1 for a sensor in front of the last surface, which shows a virtual image; (). It
+        is told by the axis of the last surface; behind a mirror in a lens with tilts, whose axis
+        says nothing of the beam, the sensor lies ahead."""
+        rows, rotation = self.rows, self.rows.rotation
+        if len(self.forms) == 1 or (rotation is not None and self.mirrors[-1]):
+            return jnp.ones_like(rows.vertex[0])
+        step = rows.vertex[-1] - rows.vertex[-2]
+        if rotation is not None:
+            last, sensor = (jnp.stack([a[k] for a in rows.origin(2)]) for k in (-2, -1))
+            step = jnp.dot(sensor - last, rotation[-2, :, 2])
+        return jnp.where(step * self.senses[-1] < 0, -1, 1).astype(step.dtype)
 
     @property
     def sides(self) -> Array:
         """(R,), 1 for rows that light is expected to cross towards +z of their own axes, -1 towards
-        -z: by the number of mirrors in front; the first row by the side on which the object lies,
-        seen from its vertex, as its axis may be tilted by more than 90 degrees."""
+        -z: by the number of mirrors in front. The first row has the opposite side if its axis
+        points to the object, by 30 degrees or more from its vertex plane: an off-axis mirror
+        prescribed the other way round."""
         sides = jnp.asarray(self.senses)
         rotation = self.rows.rotation
         if rotation is None:
             return sides
         vertex = jnp.stack([a[0] for a in self.rows.origin(self.dim)])
-        along = jnp.dot(self.vergence * vertex - self.source, rotation[0, :, 2])
-        return sides.at[0].set(jnp.where(along < 0, -1, 1).astype(sides.dtype))
+        light = self.vergence * vertex - self.source
+        turned = jnp.dot(light, rotation[0, :, 2]) < -0.5 * jnp.sqrt(jnp.dot(light, light))
+        return sides.at[0].set(jnp.where(turned, -1, 1).astype(sides.dtype))
 
     @property
     def senses(self) -> np.ndarray:

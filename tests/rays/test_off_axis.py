@@ -56,7 +56,7 @@ def mirror(vertex, opening, radius, conic, sensor, leaving, semi, flipped):
 
 def from_focus(turn, q, semi, flipped=False):
     """The lens, and of its rays the right hits on the mirror (Q, 3), directions behind it and paths
-    to the sensor, 40 mm behind the mirror."""
+    to the sensor, 250 mm behind the mirror."""
     leaving, hit = turned(turn), SOURCE + FAR * Z
     d = np.concatenate([semi * PUPIL, np.full((len(PUPIL), 1), 50.0)], axis=1)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -79,7 +79,7 @@ def from_focus(turn, q, semi, flipped=False):
         points = SOURCE + ((total**2 - apart**2) / (2 * (total - d @ line)))[:, None] * d
         behind = np.sign(q) * (other - points)
         behind /= np.linalg.norm(behind, axis=1, keepdims=True)
-    sensor = hit + 40.0 * leaving
+    sensor = hit + 250.0 * leaving
     lens = mirror(vertex, opening, radius, conic, sensor, leaving, semi, flipped)
     rest = ((sensor - points) @ leaving) / (behind @ leaving)
     path = np.linalg.norm(points - SOURCE, axis=1) + rest - 50.0
