@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..image.rounding import tell_of_paths
 from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
-from ..lens.scene import distance_array, fields_array, vergence_of
+from ..lens.scene import Scene, distance_array, fields_array, vergence_of
 from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
@@ -138,7 +139,8 @@ class Problem:
 
         ValueError, which names the argument, if an argument does not fit the lens or the problem,
         and for a limit that the lens violates and no variable changes. (For limits that need rays,
-        `optimise` raises it.)
+        `optimise` raises it.) Of operands of waves and wavefronts, warns of float32 as `wavefront`
+        does.
         """
         variables = Variables.joined(variables)
         lens = variables.lens
@@ -154,6 +156,9 @@ class Problem:
         if isinstance(rule, Clipped):  # rays of weight 0 would serve nothing
             rule = dataclasses.replace(rule, order=int(rule.order), size=0)
         _check_operands(asked, lens, len(angles), len(waves), np.asarray(far), rule)
+        if any(kind_of(operand.kind).of_paths for operand in asked):
+            for distance in far:
+                tell_of_paths(lens, Scene(angles[0], distance, waves), angles)
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)
         equal = np.ones(len(waves)) if wavelength_weights is None else wavelength_weights
         share = _weights("wavelength_weights", equal, len(waves)) / len(waves)

@@ -131,7 +131,14 @@ class Beam:
         """Path (1), mm, stop point (2) and, of a clipped pupil, hits on all surfaces (2 S + 2), mm,
         as functions of the direction cosines of `on_sphere`."""
         cosines, path = self.on_sphere()
-        return self._fitted(cosines, self._with_edges([path[None], self.points]))
+        # Less the tilt towards the middle of the light, thousands of waves, of which float32 would
+        # round too much. It is put back exactly: terms 1 to 3 of Noll are 1, 2 x and 2 y.
+        along = jax.lax.stop_gradient(self.index[None] * means(self.hits[:, -1], self._light()))
+        path = path + dot(tuple(along[..., None]), tuple(cosines))
+        found = self._fitted(cosines, self._with_edges([path[None], self.points]))
+        tilt = jnp.stack([dot(along, found.centre), *(along * found.scale / 2)], axis=-1)
+        coefficients = found.coefficients.at[:, 0, :3].add(-tilt)
+        return dataclasses.replace(found, coefficients=coefficients)
 
     def solid_angle(self) -> Array:
         """Area of the cone of light on the sensor, (W,), in direction cosines: irradiance is this
@@ -195,7 +202,12 @@ class Beam:
         return jnp.where(self.throughput[:, None] > 0, weights, 1)
 
     def _fitted(self, points: Array, values: Array) -> Polynomials:
-        return fitted(points, values, self._light(), self.degree, self.azimuths)
+        # A constant of its own, so that float32 rounds the rest of the values alone.
+        mean = jax.lax.stop_gradient(means(values, self._light()))
+        rest = values - mean[..., None]
+        found = fitted(points, rest, self._light(), self.degree, self.azimuths)
+        coefficients = found.coefficients.at[..., 0].add(mean.T)
+        return dataclasses.replace(found, coefficients=coefficients)
 
 
 @jax.tree_util.register_dataclass
@@ -320,7 +332,9 @@ def _images(symmetry: Symmetry, degree: int) -> tuple[np.ndarray, tuple[int, ...
 def _spread(turns: np.ndarray, mirrors: tuple[int, ...], vector: Sequence[Array]) -> Array:
     """Vectors of rays, D arrays (..., Q), turned and mirrored: (2, ..., images Q)."""
     if len(vector) == 1:
-        parts = [(np.cos(a) * vector[0], np.sin(a) * vector[0]) for a in turns]
+        # Python numbers: NumPy's would make float32 double.
+        sides = zip(np.cos(turns).tolist(), np.sin(turns).tolist())
+        parts = [(x * vector[0], y * vector[0]) for x, y in sides]
     else:
         parts = [(sign * vector[0], vector[1]) for sign in mirrors]
     return jnp.stack([jnp.concatenate(side, axis=-1) for side in zip(*parts)])

@@ -23,6 +23,7 @@ from ..numerics import Numbers
 from ..pupil.patterns import disc
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
+from .rounding import tell_of_paths
 from .wavefront import path_differences
 from .zernike import zernike
 
@@ -41,7 +42,7 @@ def zernike_standard(
     count: how many, 1 to 91.
 
     inf where the chief ray fails, or so many rays that the terms are not told apart. Differentiable
-    in every mode.
+    in every mode. Warns of float32 as `wavefront` does.
     """
     return _coefficients(lens, fields, distance, wavelengths, _checked(count, _MOST))
 
@@ -79,7 +80,9 @@ def _coefficients(
     """Of some terms in Noll's order, counted from 0."""
     rows = tuple(range(rows)) if isinstance(rows, int) else rows
     axis = scene_of(lens, 0.0, distance, wavelengths)
-    return _fitted(lens, fields_array(fields, lens.curvature.dtype), axis, rows)
+    angles = fields_array(fields, lens.curvature.dtype)
+    tell_of_paths(lens, axis, angles, 4)
+    return _fitted(lens, angles, axis, rows)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="rows")

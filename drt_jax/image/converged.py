@@ -36,13 +36,12 @@ from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
 from .orders import Group, rules_by_order
+from .rounding import hit_rounding, rough as is_rough, tell
 from .spot import Moments
 from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
 
 # Smallest spot, mm: below 1 nm rounding would never converge.
 _SMALLEST = 1e-6
-# The precision of float64 is below this, that of float32 above.
-_DOUBLE = 1e-12
 # Order of the rule that finds where light ends.
 _DIAGNOSIS = 8
 
@@ -116,6 +115,12 @@ def converged_rule(
     """
     seen = field, distance, wavelengths
     return _converge(scenes_of, lens, seen, tolerance, at_sensor).rule
+
+
+def silent_rule(lens: Lens, seen: tuple[Numbers, Numbers, Numbers], tolerance: float) -> PupilRule:
+    """`converged_rule`, for callers who speak of rounding themselves. seen: field, distance and
+    wavelengths."""
+    return _converge(scenes_of, lens, seen, tolerance, at_sensor, False).rule
 
 
 def converged_focus_rule(
@@ -225,9 +230,10 @@ def _converge(
     seen: tuple[Numbers, Numbers, Numbers],
     tolerance: float,
     places: Callable,
+    says: bool = True,
 ) -> _Trial:
     """The rule that meets the tolerance, as tried, for the scenes that `make` makes of fields,
-    distances and wavelengths `seen`."""
+    distances and wavelengths `seen`. says: whether it warns of rounding."""
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
     known = known_values((lens, seen))
@@ -241,11 +247,16 @@ def _converge(
     with jax.core.eval_context():
         lens, seen = known
         scenes = make(lens, *seen)
-        return _try_orders(lens, scenes, symmetry_of(lens, seen[0]), tolerance, places)
+        return _try_orders(lens, scenes, symmetry_of(lens, seen[0]), tolerance, places, says)
 
 
 def _try_orders(
-    lens: Lens, scenes: Sequence[Scene], symmetry: Symmetry, tolerance: float, places: Callable
+    lens: Lens,
+    scenes: Sequence[Scene],
+    symmetry: Symmetry,
+    tolerance: float,
+    places: Callable,
+    says: bool,
 ) -> _Trial:
     """The first of three orders that agree: of Gauss rules or, if a ray fails or is clipped, of
     rules fitted to the rest of the light."""
@@ -270,7 +281,9 @@ def _try_orders(
                 change = max(changes, default=np.inf)
                 rough = max(_rounding(lens, found) for found in trial.moments)
                 if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
-                    _warn_of_rounding(lens, rough, tolerance)
+                    if says and is_rough(lens) and rough > tolerance:
+                        wrong = f"{rough:.0e} of its size"
+                        tell(lens, "the spot", wrong, f"{tolerance:.0e}", 4)
                     # If rounding hides their difference, take the last.
                     return trials[-1 if 2 * rough > tolerance else 0]
         else:
@@ -311,20 +324,9 @@ def _eps(lens: Lens) -> float:
 
 
 def _rounding(lens: Lens, found: FocusMoments) -> float:
-    """Relative rounding error of the smallest spot: hits are rounded relative to the length of the
-    lens. Measured in float32 over 54 scenes of bundled lenses: an eighth of this in the median, at
-    most 0.93 of it; more for Hubble, 6 m long with a spot of 10 nm."""
+    """Relative rounding error of the smallest spot."""
     size = np.sqrt(np.min(np.sum(np.asarray(found.spread)[0, :, :2], axis=-1)))
-    return 2 * _eps(lens) * abs(float(lens.sensor)) / max(size, _SMALLEST)
-
-
-def _warn_of_rounding(lens: Lens, rough: float, tolerance: float) -> None:
-    if rough > tolerance and _eps(lens) > _DOUBLE:
-        warnings.warn(
-            f"in {lens.curvature.dtype} the spot may be wrong by {rough:.0e} of its size, not by "
-            f'{tolerance:.0e}: jax.config.update("jax_enable_x64", True) before the lens is loaded',
-            stacklevel=5,
-        )
+    return hit_rounding(lens) / max(float(size), _SMALLEST)
 
 
 def _change(before: _Trial, now: _Trial, places: Callable) -> float:

@@ -18,6 +18,7 @@ from ..lens.scene import Scene, fields_array, scene_of
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
+from .rounding import tell_of_paths
 from .wavefront import path_differences
 
 
@@ -67,12 +68,14 @@ def ray_fans(
         middle one, W // 2. Paths count from the chief ray of each wavelength.
 
     As OpticStudio plots ey against Py and ex against Px, with rays aimed at the real stop; without
-    aiming, of `with_paraxial_pupil(lens)`. Differentiable like `trace_rays`. ValueError as of
-    `scene_of`.
+    aiming, of `with_paraxial_pupil(lens)`. Differentiable like `trace_rays`. Warns of float32 as
+    `wavefront` does. ValueError as of `scene_of`.
     """
     if not isinstance(count, int | np.integer) or count < 2:
         raise ValueError(f"count: expected at least 2, a whole number, got {count!r}")
     heights = jnp.linspace(-1, 1, int(count), dtype=lens.curvature.dtype)
+    axis = scene_of(lens, 0.0, distance, wavelengths)
+    tell_of_paths(lens, axis, fields_array(fields, lens.curvature.dtype))
     hit, _, opd, good = _of_fields(lens, fields, distance, wavelengths, heights)
     middle = hit.shape[1] // 2 if reference is None else reference
     if not -hit.shape[1] <= middle < hit.shape[1]:

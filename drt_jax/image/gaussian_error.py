@@ -9,7 +9,7 @@ from ..lens.scene import fields_array
 from ..numerics import Numbers, known_values
 from .beam_psf import PsfModel
 from .psf import psf
-from .psf_model import converged_psf, difference
+from .psf_model import chosen_psf, difference
 
 _LINES = 64  # Frequencies on either side, at least.
 
@@ -53,7 +53,7 @@ def gaussian_error(
     pairs = fields_array(fields, lens.curvature.dtype)
     far = np.atleast_1d(np.asarray(distances, float))
     around = wavelengths, pixel, size
-    fine = converged_psf(lens, pairs, far, *around, "waves", tolerance)
+    fine = chosen_psf(lens, (pairs, far, wavelengths), pixel, size, "waves", tolerance)[0]
     models = PsfModel("gaussian", fine.rule, 0), fine
     found = np.zeros((3, len(pairs), len(far)))
     for i, field in enumerate(pairs):

@@ -18,7 +18,7 @@ from ..rays.solve import solve_aimed
 from .beam_psf import Kind, PsfModel
 from .fields import GridMethod, KernelGrid, unique_nodes
 from .moments import moments
-from .psf_model import converged_psf
+from .psf_model import chosen_psf
 from .spot import Moments
 
 # Kernel sides to try, pixels.
@@ -85,8 +85,9 @@ def grid_method(
             need = _reach(found, arrives, pixel)
             size = next((n for n in _SIZES if n >= need), _SIZES[-1])
         if isinstance(model, str):
-            scene = lens, *_some(tangents, far, arrives), wavelengths
-            model = converged_psf(*scene, pixel, size, model, tolerance, norm)
+            seen = *_some(tangents, far, arrives), wavelengths
+            # `warn_of_loss` speaks of light beside the kernels, of all nodes.
+            model = chosen_psf(lens, seen, pixel, size, model, tolerance, norm)[0]
         array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
         nearest = jnp.asarray(_nearest(tangents, arrives), jnp.int32)
         return GridMethod(

@@ -11,17 +11,18 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene, points_arrays, scene_of
-from ..numerics import Numbers, real_array
+from ..numerics import Numbers, known_values, real_array
 from ..pupil.rules import require_fit
 from .beam import BeamRule, trace_beam
 from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
 from .kernel import check_pixels
-from .psf_model import TOLERANCE, converged_psf
+from .psf_model import LOST, TOLERANCE, converged_psf, tell_of_loss, traced
 
 
 def psf(
@@ -97,9 +98,10 @@ def psfs(
     fields: (B, 2), radians. distances: (B,), mm, or one. wavelengths, pixel, size: as in `psf`.
     model: one model from `converged_psf` for all points.
 
-    For use in `jax.jit`. The gradient traces each point again and keeps the rays of one point at a
-    time. ValueError for other shapes, and as in `psf` for fields that the model is not made for. A
-    point without light has the throughput 0.
+    For use in `jax.jit`; outside of it, warns where more than 1 % of the light of a point falls
+    beside its kernel, with a size for which less does. The gradient traces each point again and
+    keeps the rays of one point at a time. ValueError for other shapes, and as in `psf` for fields
+    that the model is not made for. A point without light has the throughput 0.
     """
     dtype = lens.curvature.dtype
     angles, far = points_arrays(fields, distances, dtype)
@@ -110,4 +112,15 @@ def psfs(
     def one(point: tuple[Array, Array]) -> Psf:
         return _psf(lens, scene_of(lens, *point, wavelengths), model.rule, *given)
 
-    return jax.lax.map(jax.checkpoint(one), (angles, far))
+    found = jax.lax.map(jax.checkpoint(one), (angles, far))
+    known = known_values((lens, angles, far, wavelengths, pixel, found.outside))
+    if known is not None:
+        lens, angles, far, wavelengths, pixel, outside = known
+        lost = np.max(np.asarray(outside), axis=-1)
+        k = int(np.argmax(lost))
+        if lost[k] > LOST:
+            with jax.core.eval_context():
+                scene = scene_of(lens, angles[k], far[k], wavelengths)
+                beam = traced(lens, scene, model.rule)
+            tell_of_loss(float(lost[k]), scene, beam, pixel, size, model.kind, 3)
+    return found

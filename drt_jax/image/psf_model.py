@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import warnings
-from typing import Literal, cast, get_args
+from collections.abc import Callable
+from typing import Any, Literal, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +20,27 @@ from ..pupil.clipped import Clipped
 from ..pupil.rules import symmetry_of
 from .beam import Beam, BeamRule, beam_rule, trace_beam
 from .beam_psf import Kind, PsfModel, psf_of_beam
-from .converged import converged_rule, scenes_of
+from .converged import scenes_of, silent_rule
 from .kernel import check_pixels
+from .rounding import hit_rounding, path_rounding, rough, tell
 from .wave_psf import period
 from .zernike import zernike
 
+# What a tolerance bounds.
+Of = Literal["kernel", "gradient"]
 # Default tolerance: the sum of the absolute errors of a kernel's pixels.
 TOLERANCE = 1e-2
 # Polynomial degrees to try, first of a coarse, then of a fine trace; cells of a grid to try.
 _DEGREES = (4, 6, 8, 10, 12, 14, 16), (20, 24)
 _CELLS = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768)
+# The error falls with the square of the number of cells, and a step is 4/3 or more: the kernels of
+# more cells are off by at most their change over this.
+_STEP = 0.75
+# How much larger the relative error of a kernel's derivatives may be than its own; and the
+# derivative, a part of the light a pixel of the marginal ray, below which it is not relative.
+_STEEPER, _FLAT = 5, 0.1
+# Light beside a kernel that is told of.
+LOST = 0.01
 _UM = 1e3  # per mm
 
 
@@ -42,6 +54,7 @@ def converged_psf(
     model: Kind | Literal["auto"] = "auto",
     tolerance: float = TOLERANCE,
     norm: int = 1,
+    of: Of = "kernel",
 ) -> PsfModel:
     """A PSF model whose kernels are within `tolerance`, the sum of the absolute errors of the
     pixels; with `norm` 2 the root of the sum of their squares: the error of a white-noise picture.
@@ -49,42 +62,83 @@ def converged_psf(
     field: angle along y, or (x, y), in radians, or many pairs (F, 2). distance: mm, one or (Z,).
     Other arguments as in `psf`; all are known numbers. The model is valid for every field at every
     distance. "auto" takes the cheapest model within the tolerance of "waves", and `errors` gives
-    the differences of the others. Warns if no degree or no grid that is tried meets the tolerance.
-    ValueError inside a trace.
+    the differences of the others.
+    of: "kernel": the tolerance bounds the kernel alone; the error of its derivatives was up to five
+        times as large. "gradient": also the error of its derivative by the place of the sensor,
+        which stands for those by all numbers of the lens, relative to the sum of its absolute
+        values, or to a tenth of the light for each pixel by which the marginal ray moves, where
+        that is more.
+
+    Warns if no degree or no grid that is tried meets the tolerance; if rounding does not, as in
+    float32 of waves from a large lens, where the search ends at what rounding allows; and if more
+    than 1 % of the light falls beside the kernel, with a size for which less does. ValueError
+    inside a trace.
     """
+    seen = field, distance, wavelengths
+    found, view = chosen_psf(lens, seen, pixel, size, model, tolerance, norm, of)
+    view.tell_of_loss(found)
+    return found
+
+
+def chosen_psf(
+    lens: Lens,
+    seen: tuple[Numbers, Numbers, Numbers],
+    pixel: Numbers,
+    size: int,
+    model: Kind | Literal["auto"],
+    tolerance: float,
+    norm: int = 1,
+    of: Of = "kernel",
+) -> tuple[PsfModel, "_View"]:
+    """`converged_psf` of field, distance and wavelengths `seen`, silent on light beside the
+    kernel, and what tells of it."""
     _check_asked(model, tolerance, norm)
-    known = known_values((lens, field, distance, wavelengths, pixel))
+    require_one_of("of", of, get_args(Of))
+    known = known_values((lens, seen, pixel))
     if known is None:
         raise ValueError(
             "inside jax.jit or jax.vmap the cost of a kernel cannot follow from a tolerance: make "
             "the model outside and pass it on, model=drt_jax.converged_psf(...)"
         )
     with jax.core.eval_context():
-        lens, field, distance, wavelengths, pixel = known
-        dtype = lens.curvature.dtype
-        side, size = check_pixels(pixel, size, dtype)
-        scenes = scenes_of(lens, field, distance, wavelengths)
-        base = converged_rule(lens, field, distance, wavelengths, min(tolerance, 1e-3))
+        lens, seen, pixel = known
+        side, size = check_pixels(pixel, size, lens.curvature.dtype)
+        scenes = scenes_of(lens, *seen)
+        base = silent_rule(lens, seen, min(tolerance, 1e-3))
         clipped = base if isinstance(base, Clipped) else None
-        symmetry = symmetry_of(lens, field)
+        symmetry = symmetry_of(lens, seen[0])
+        rounded = _rounded(lens, scenes, side, model)
+        fit = tolerance / _STEEPER if of == "gradient" else tolerance
         for degrees in _DEGREES:
             whole = beam_rule(degrees[-1], symmetry, clipped)
-            beams = [_traced(lens, scene, whole) for scene in scenes]
-            degree, error = _degree(beams, scenes, side, model != "gaussian", degrees, tolerance)
-            if error <= tolerance:
+            beams = [traced(lens, scene, whole) for scene in scenes]
+            degree, error = _degree(beams, scenes, side, rounded, degrees, fit)
+            if error <= fit:
                 break
         else:
             warnings.warn(
                 f"polynomials of degree {degree} give back the rays to {error:.1e} only, not to "
-                f"{tolerance:.1e}",
-                stacklevel=2,
+                f"{fit:.1e}",
+                stacklevel=3,
             )
+        worst = max(rounded.values())
+        if worst > tolerance and rough(lens):
+            tell(lens, "kernels", f"{worst:.0e}", f"{tolerance:.0e}", 3)
         rule = beam_rule(degree, symmetry, clipped)
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
-        view = _View(lens, tuple(scenes), tuple(beams), side, size, norm)
+        view = _View(lens, tuple(scenes), tuple(beams), side, size, norm, worst, of)
         if model != "auto":
-            return PsfModel(model, rule, view.cells(model, tolerance))
-        return _cheapest(view, rule, tolerance)
+            return PsfModel(model, rule, view.cells(model, tolerance)), view
+        return _cheapest(view, rule, tolerance), view
+
+
+def _rounded(lens: Lens, scenes: list[Scene], pixel: Array, model: str) -> dict[str, float]:
+    """What rounding adds to the error of kernels: of hits, and of phases if waves are asked for."""
+    hits = hit_rounding(lens) / float(pixel)
+    if model not in ("waves", "auto"):
+        return {"hits": hits}
+    paths = path_rounding(lens, scenes) if rough(lens) else 0.0
+    return {"hits": hits, "phase": 4 * np.pi * paths}
 
 
 def _check_asked(model: str, tolerance: float, norm: int) -> None:
@@ -96,7 +150,8 @@ def _check_asked(model: str, tolerance: float, norm: int) -> None:
 
 
 @functools.partial(jit, wanted=LARGE)
-def _traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
+def traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
+    """`trace_beam`, compiled."""
     return trace_beam(lens, scene, rule)
 
 
@@ -104,9 +159,26 @@ def _traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
 _kernels = jit(psf_of_beam, ONCE, static_argnames=("size", "kind", "cells"))
 
 
+@functools.partial(jit, wanted=ONCE, static_argnames=("size", "kind", "cells"))
+def _slopes(
+    lens: Lens, wavelengths: Array, beam: Beam, pixel: Array, centre: None, **static: Any
+) -> Array:
+    """Derivatives of kernels by the place of the sensor, for each pixel that the marginal ray
+    moves, (W, size, size)."""
+
+    def at(step: Array) -> Array:
+        moved = beam.refocused(step)
+        return psf_of_beam(lens, wavelengths, moved, pixel, centre, **static).kernel
+
+    low, high = beam.directions_extent()
+    one = pixel / jnp.max((high - low) / 2)
+    return jax.jvp(at, (jnp.zeros_like(one),), (one,))[1]
+
+
 @dataclasses.dataclass(frozen=True)
 class _View:
-    """The beams of scenes, and the pixels of the kernels. All numbers are known."""
+    """The beams of scenes, and the pixels of the kernels. All numbers are known. rounded: what
+    rounding adds to the error of a kernel."""
 
     lens: Lens
     scenes: tuple[Scene, ...]
@@ -114,23 +186,33 @@ class _View:
     pixel: Array
     size: int
     norm: int
+    rounded: float
+    of: Of
+
+    def made(self, program: Callable, kind: Kind, cells: int) -> list[Any]:
+        """What `_kernels` or `_slopes` makes of each scene."""
+        named = {"size": self.size, "kind": kind, "cells": cells}
+        return [
+            program(self.lens, scene.wavelengths, beam, self.pixel, None, **named)
+            for scene, beam in zip(self.scenes, self.beams)
+        ]
 
     def kernels(self, kind: Kind, cells: int) -> np.ndarray:
-        """Kernels of all scenes and wavelengths, (scenes W, size, size)."""
-        made = (
-            _kernels(
-                self.lens,
-                scene.wavelengths,
-                beam,
-                self.pixel,
-                None,
-                size=self.size,
-                kind=kind,
-                cells=cells,
-            )
-            for scene, beam in zip(self.scenes, self.beams)
-        )
-        return np.concatenate([np.asarray(one.kernel) for one in made])
+        """Kernels of all scenes and wavelengths, (scenes W, size, size); of gradients, also their
+        derivatives over their size."""
+        found = np.concatenate([np.asarray(a.kernel) for a in self.made(_kernels, kind, cells)])
+        if self.of == "kernel":
+            return found
+        slopes = np.concatenate([np.asarray(a) for a in self.made(_slopes, kind, cells)])
+        total = np.sum(np.abs(slopes), axis=(1, 2), keepdims=True)
+        return np.concatenate([found, slopes / np.maximum(total, _FLAT)])
+
+    def tell_of_loss(self, model: PsfModel) -> None:
+        """Warns of light beside the kernels of a model."""
+        made = self.made(_kernels, model.kind, model.cells)
+        lost = [float(jnp.max(one.outside)) for one in made]
+        k = int(np.argmax(lost))
+        tell_of_loss(lost[k], self.scenes[k], self.beams[k], self.pixel, self.size, model.kind, 4)
 
     def cells(self, kind: Kind, tolerance: float) -> int:
         """The smallest number of cells for which the kernels are within the tolerance."""
@@ -142,13 +224,12 @@ class _View:
         for cells in tried:
             now = self.kernels(kind, cells)
             change = np.inf if before is None else difference(now, before, self.norm)
-            # The error falls with the square of the number of cells; a step is 4/3 or more.
-            if change <= 0.75 * tolerance:
+            if change <= _STEP * max(tolerance, self.rounded):
                 return cells
             before = now
         warnings.warn(
-            f"{kind} of {cells} x {cells} cells have converged to {change:.1e} only, not to "
-            f"{tolerance:.1e}: the spot may be too large; take a larger tolerance",
+            f"{kind} of {cells} x {cells} cells have converged to {change / _STEP:.1e} only, not "
+            f"to {tolerance:.1e}: the spot may be too large; take a larger tolerance",
             stacklevel=4,
         )
         return cells
@@ -170,40 +251,81 @@ def difference(a: np.ndarray, b: np.ndarray, norm: int = 1) -> float:
     return float(np.max(total ** (1 / norm)))
 
 
+def tell_of_loss(
+    lost: float, scene: Scene, beam: Beam, pixel: Numbers, size: int, kind: Kind, level: int
+) -> None:
+    """Warns if more than `LOST` of the light falls beside a kernel, with a size for which less
+    does. scene, beam: where most is lost."""
+    if lost <= LOST:
+        return
+    hits, weights = np.asarray(beam.hits[:, -1], float), np.asarray(beam.weights, float)
+    share = weights / np.maximum(np.sum(weights, axis=-1, keepdims=True), np.finfo(float).tiny)
+    centre = np.mean(np.sum(share * hits, axis=-1), axis=-1)
+    away = np.max(np.abs(hits - centre[:, None, None]), axis=0)
+    # Some of the light that is lost stays with rays that end farther out, a part is diffracted
+    # farther from all others: from a round pupil 2 / (pi v) at v = 2 pi NA r / wavelength, and
+    # wavelength / (2 NA) is a `period`.
+    parts = np.linspace(0.05, 0.95, 19) * LOST if kind == "waves" else np.zeros(1)
+    spread = 2 / np.pi**2 * np.max(np.asarray(period(beam, scene.wavelengths, 1)), axis=0)
+    reach = np.zeros((len(away), len(parts)))
+    for k, (far, light) in enumerate(zip(away, share)):
+        order = np.argsort(far)
+        last = np.searchsorted(np.cumsum(light[order]), 1 - LOST + parts)
+        reach[k] = far[order][np.minimum(last, len(far) - 1)]
+        reach[k] += spread[k] / parts if kind == "waves" else 0
+    needed = np.min(np.max(reach, axis=0)) / float(np.asarray(pixel))
+    more = max(2 * int(np.ceil(needed)) + 1, size + 2)
+    warnings.warn(
+        f"size: {100 * lost:.2g} % of the light falls beside a kernel of {size} x {size} pixels; "
+        f"{more} x {more} hold 99 %",
+        stacklevel=level,
+    )
+
+
 def _degree(
     beams: list[Beam],
     scenes: list[Scene],
     pixel: Array,
-    pictures: bool,
+    rounded: dict[str, float],
     degrees: tuple[int, ...],
     tolerance: float,
 ) -> tuple[int, float]:
-    """The lowest degree whose polynomials fit the rays, and the error of the fit, relative to the
-    spot or, for the phase, in radians. There are more rays than terms."""
+    """The lowest degree whose polynomials fit the rays, and the error of the fit beyond rounding,
+    relative to the spot or, for the phase, in radians. There are more rays than terms."""
     pairs = [(b, s, w) for b, s in zip(beams, scenes) for w in range(s.wavelengths.size)]
     for degree in degrees:
-        error = max(_misfit(b, s, w, pixel, pictures, degree) for b, s, w in pairs)
+        error = max(_misfit(b, s, w, pixel, rounded, degree) for b, s, w in pairs)
         if error <= tolerance:
             break
     return degree, error
 
 
 def _misfit(
-    beam: Beam, scene: Scene, wavelength: int, pixel: Array, pictures: bool, degree: int
+    beam: Beam,
+    scene: Scene,
+    wavelength: int,
+    pixel: Array,
+    rounded: dict[str, float],
+    degree: int,
 ) -> float:
     """The error of the fit at one wavelength, see `_degree`."""
     cosines, waves = beam.on_sphere()
-    row = jax.tree.map(np.asarray, (beam.weights, beam.known, waves, beam.hits[:, -1]))
-    weight, known, path, hits = (a[..., wavelength, :] for a in row)
+    rows = jax.tree.map(np.asarray, (beam.weights, beam.known, waves, beam.hits[:, -1]))
+    weight, known, path, hits = (a[..., wavelength, :] for a in rows)
     weight = np.sqrt(np.where(known, np.abs(weight), 0) / np.sum(np.abs(weight)))
-    spread = np.sqrt(np.sum((weight * (hits - _mean(hits, weight))) ** 2))
+    middle = _mean(hits, weight)
+    spread = np.sqrt(np.sum((weight * (hits - middle)) ** 2))
     points, directions = (np.asarray(a[:, wavelength]) for a in (beam.points, cosines))
-    error = _residual(points, hits, weight, degree) / max(float(spread), float(pixel))
-    if not pictures:
+    error = _residual(points, hits - middle, weight, degree) / max(float(spread), float(pixel))
+    error -= 2 * rounded["hits"]
+    if "phase" not in rounded:
         return error
-    # The error of the wave field is the phase error; it counts twice.
+    # The error of the wave field is the phase error; it counts twice. Without the tilt towards the
+    # middle of the light, as in `Beam.over_directions`.
+    path = path + float(beam.index[wavelength]) * np.sum(middle * directions, axis=0)
     phase = path[None] * (4 * np.pi * _UM / float(scene.wavelengths[wavelength]))
-    return max(error, _residual(directions, phase, weight, degree))
+    phase = phase - _mean(phase, weight)
+    return max(error, _residual(directions, phase, weight, degree) - 2 * rounded["phase"])
 
 
 def _mean(hits: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -216,7 +338,7 @@ def _residual(points: np.ndarray, values: np.ndarray, weight: np.ndarray, degree
     centre = _mean(points, weight)
     scale = 2 * np.sqrt(np.sum(weight**2 * (points - centre) ** 2, axis=-1, keepdims=True))
     basis = np.asarray(zernike(jnp.asarray((points - centre) / scale), degree))
-    matrix, right = (basis * weight).T, (values * weight).T
+    matrix, right = (np.float64(a * weight).T for a in (basis, values))
     found = np.linalg.lstsq(matrix, right, rcond=None)[0]
     return float(np.sqrt(np.sum((matrix @ found - right) ** 2)))
 

@@ -26,6 +26,7 @@ from ..pupil.rules import PupilRule
 from .beam import Beam
 from .cover import cover
 from .refined import TOLERANCE, beams_of, to_tolerance
+from .rounding import tell_of_paths
 from .spot import normalised
 from .spots import light_rule
 from .wave_psf import pupil_function, shared_part
@@ -85,8 +86,9 @@ def transfer(
         the error of the contrast below `tolerance`; inside `jit` and `vmap`, where they cannot
         follow from it, 128. Too few lower the contrast of a large blur, and never raise it.
 
-    Differentiable in every mode. ValueError as of `scene_of`, without a rule inside a trace, and
-    for a tolerance that is not between 0 and 1; warns if the tolerance is not met.
+    Differentiable in every mode. Of waves, warns of float32 as `wavefront` does. ValueError as of
+    `scene_of`, without a rule inside a trace, and for a tolerance that is not between 0 and 1;
+    warns if the tolerance is not met.
     """
     scene = fields, distance, wavelengths
     given = arrays_of(
@@ -116,6 +118,8 @@ def arrays_of(
     require_one_of("model", model, get_args(Model))
     dtype = lens.curvature.dtype
     axis, angles = scene_of(lens, 0.0, *scene[1:]), fields_array(scene[0], dtype)
+    if model == "waves":
+        tell_of_paths(lens, axis, angles, 4)
     values, steps = real_array(name, places, dtype), real_array("focus", focus, dtype)
     if values.ndim != 1:
         raise ValueError(f"{name}: expected (N,), got shape {values.shape}")
@@ -145,6 +149,7 @@ def strehl(
     """
     axis = scene_of(lens, 0.0, distance, wavelengths)
     angles = fields_array(fields, lens.curvature.dtype)
+    tell_of_paths(lens, axis, angles)
     if rule is None:
         rule = light_rule(lens, fields, distance, wavelengths)
     given = lens, beams_of(lens, angles, axis, rule, degree), axis.wavelengths

@@ -27,6 +27,7 @@ from ..rays.afocal import FOCAL
 from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import Bundle, stop_points, trace_bundle
+from .rounding import tell_of_paths
 
 _MM = 1e-3  # per um
 
@@ -73,9 +74,10 @@ def wavefront(
         `reference_curvature`; needed for a lens folded by tilted mirrors, which the paraxial trace
         cannot follow.
 
-    Differentiable like `trace_rays`; the reference sphere moves with the lens. ValueError as in
-    `trace_rays`, and for a known curvature that is not finite; inside a trace rays that pass are
-    then UNCONVERGED and have no opd.
+    Differentiable like `trace_rays`; the reference sphere moves with the lens. In float32 warns,
+    outside of a trace, where rounding makes path differences wrong by more than 1e-3 waves, as in a
+    telescope of metres. ValueError as in `trace_rays`, and for a known curvature that is not
+    finite; inside a trace rays that pass are then UNCONVERGED and have no opd.
     """
     scene = scene_of(lens, field, distance, wavelengths)
     points = stop_points(lens, pupil)
@@ -88,6 +90,7 @@ def wavefront(
             )
         if concrete(curvature) and not np.all(np.isfinite(np.asarray(curvature, float))):
             raise ValueError("curvature: must be finite; 0 for a telecentric exit pupil")
+    tell_of_paths(lens, scene)
     return _wavefront(lens, scene, points, kappa)
 
 

@@ -188,30 +188,53 @@ def _inverse(length: Array) -> Array:
     return safe_divide(jnp.ones_like(length), length)
 
 
-def optical_path(hits: Vector, system: System) -> Array:
+def _chain(hits: Vector, system: System) -> tuple[Array, Vector, Vector]:
+    """Heights (R, W, Q), first points, D + 1 arrays (W, Q), mm, and segments (R, W, Q): of the
+    first, vergence times the vector from the object."""
+    heights = by_form(surface_sag, hits, system.rows.wide, system.forms)
+    first, step = _segments(hits, heights, system)
+    near = (system.vergence * q - p for q, p in zip(first, system.source, strict=True))
+    chain = (jnp.concatenate([n[None], s]) for n, s in zip(near, step, strict=True))
+    return heights, first, tuple(chain)
+
+
+def optical_path(hits: Vector, system: System, middle: Vector | None = None) -> Array:
     """Optical path (W, Q), mm, from the object to the sensor (paper Eq. 2).
 
     It starts at the sphere about the object through the first vertex (a plane for an object at
-    infinity), so that it is finite for any distance. hits: D arrays (R, W, Q), mm.
+    infinity), so that it is finite for any distance.
+
+    hits: D arrays (R, W, Q), mm.
+    middle: D arrays (R, W, 1), mm, of a path that is subtracted, segment by segment, before lengths
+        are summed: float32 then rounds by what paths differ in, not by how long they are. None for
+        none.
     """
-    heights = by_form(surface_sag, hits, system.rows.wide, system.forms)
-    q, step = _segments(hits, heights, system)
-    p = tuple(system.source)
-    near = tuple(system.vergence * a - b for a, b in zip(q, p, strict=True))
-    # |q - p/v| - |p/v| without cancellation and without a division by v
-    far = _length(near) + _length(p)
-    first = (system.vergence * dot(q, q) - 2 * dot(q, p)) / far
-    lengths = jnp.concatenate([first[None], _length(step)])
+    heights, first, chain = _chain(hits, system)
+    if middle is None:  # nothing but the vector from the object to the first vertex
+        other = tuple(jnp.zeros_like(a).at[0].set(-p) for a, p in zip(chain, system.source))
+        moved = tuple(c.at[0].set(q) for c, q in zip(chain, first, strict=True))
+    else:
+        beside, _, other = _chain(middle, system)
+        own = (a - b for a, b in zip((*hits, heights), (*middle, beside), strict=True))
+        point = rotate(system.rows.rotation, tuple(own))
+        moved = tuple(jnp.concatenate([p[:1], p[1:] - p[:-1]]) for p in point)
+    # |a| - |b| = (a - b).(a + b) / (|a| + |b|), without cancellation; a - b of the first segment is
+    # divided by the vergence, which may be 0.
+    both = tuple(a + b for a, b in zip(chain, other, strict=True))
+    lengths = safe_divide(dot(moved, both), _length(chain) + _length(other))
     if len(system.forms) > 1:
         shape = Shape(*(a[..., -2, :, :] for a in system.rows.wide))
         slope = sag_derivatives(tuple(h[-2] for h in hits), shape, system.forms[-2])[1]
-        to = near if len(step[0]) == 1 else tuple(s[-2] for s in step)
-        way = _way(to, tuple(s[-1] for s in step), slope, system)
+        to, off = (tuple(c[k] for c in chain) for k in (-2, -1))
+        way = _way(to, off, slope, system)
         lengths = jnp.concatenate([lengths[:-1], way[None] * lengths[-1:]])
     path = jnp.sum(system.index * lengths, axis=0)
     if system.diffraction is None:
         return path
-    return path + jnp.sum(added(hits, system.diffraction)[1][0], axis=0)
+    waves = added(hits, system.diffraction)[1][0]
+    if middle is not None:
+        waves = waves - added(middle, system.diffraction)[1][0]
+    return path + jnp.sum(waves, axis=0)
 
 
 def stationary(path: Path, system: System, target: Vector) -> Array:

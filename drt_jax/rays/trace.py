@@ -34,7 +34,8 @@ class Bundle(NamedTuple):
     hits: D arrays (S + 1, W, Q), mm along the axes of each surface and the sensor.
     status: (W, Q), int32, see `Status`.
     arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along its axes.
-    path: (W, Q), optical path from the object, mm, see `fermat.optical_path`.
+    path: (W, Q), optical path from the object, mm, less that of a path in the middle of the rays
+        of its wavelength, which has no derivative by its hits, see `fermat.optical_path`.
     Of an afocal lens the hits on the sensor, arrival and path are those of `rays.afocal`.
     steps: (), int32, Newton steps.
     """
@@ -127,10 +128,19 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
     status = jnp.where(clipped, jnp.int32(Status.CLIPPED), status)
     rotation = None if system.rows.rotation is None else system.rows.rotation[-1]
     arrival = rotate(rotation, found.arrival, back=True)
-    path = fermat.optical_path(found.hits, system)
+    path = path_of(found, system)
     if lens.afocal:
         hits, arrival, path = at_infinity(hits, arrival, path, exists, system.index[-1])
     return Bundle(hits, status, arrival, path, found.steps)
+
+
+def path_of(found: Found, system: System) -> Array:
+    """`Bundle.path` of the rays that a `Solver` found."""
+    good = found.status == Status.OK
+    count = jnp.maximum(jnp.sum(good, axis=-1, keepdims=True), 1)
+    hits = (jnp.sum(jnp.where(good, h, 0), axis=-1, keepdims=True) for h in found.hits)
+    middle = tuple(jax.lax.stop_gradient(h / count[None].astype(h.dtype)) for h in hits)
+    return fermat.optical_path(found.hits, system, middle)
 
 
 def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:
@@ -215,5 +225,5 @@ def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
         return jnp.where(exists, jnp.stack(tuple(vector)), 0).transpose(2, 3, 1, 0)
 
     directions = stacked(d[behind] for d in direction)
-    path = jnp.where(exists, bundle.path, 0)
+    path = jnp.where(exists, fermat.optical_path(found.hits, system), 0)
     return Rays(stacked(points), directions, path, bundle.status, bundle.steps)

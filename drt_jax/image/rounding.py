@@ -1,0 +1,104 @@
+"""What float32, JAX's default, cannot hold: measured, and told where numbers are known.
+
+Analyses of waves need path differences to a thousandth of a wave. Paths are taken relative to one
+in the middle of the beam before lengths are summed (`rays.fermat.optical_path`), so that float32
+keeps them in a camera, though not in a telescope of metres. How far they are off is measured by the
+arithmetic itself: paths are stationary, so that hits which differ in their last digits have the
+same path but for its rounding. Inside of a trace no number is known and nothing can be told; the
+values stay finite.
+"""
+
+import dataclasses
+import functools
+import warnings
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..compilation import LARGE, jit
+from ..lens.lens import Lens
+from ..lens.scene import Scene
+from ..numerics import known_values
+from ..rays.solve import solve_aimed
+from ..rays.status import Status
+from ..rays.trace import aims, path_of
+
+# The precision of float64 is below this, that of float32 above.
+_DOUBLE = 1e-12
+# RMS error of path differences, waves, up to which analyses are silent: 6e-3 of a Strehl ratio.
+_WAVES = 1e-3
+# Rays of the measurement: as many on the rim of the stop as at half of its radius.
+_RAYS = 16
+# Last digits by which hits differ.
+_DIGITS = 8
+_MM = 1e-3  # per um
+
+
+def rough(lens: Lens) -> bool:
+    """Whether the numbers of a lens are coarser than float64."""
+    return float(jnp.finfo(lens.curvature.dtype).eps) > _DOUBLE
+
+
+def tell(lens: Lens, what: str, wrong: str, allowed: str, level: int) -> None:
+    """Warns that the dtype of a lens makes something wrong by more than is allowed. level: of the
+    caller of the public function, counted as `warnings.warn` counts from its own caller."""
+    warnings.warn(
+        f"in {lens.curvature.dtype} {what} may be wrong by {wrong}, not by {allowed}: "
+        'jax.config.update("jax_enable_x64", True) before the lens is loaded',
+        stacklevel=level + 1,
+    )
+
+
+def hit_rounding(lens: Lens) -> float:
+    """Error of hits by rounding, mm, which is relative to the length of the lens. Measured in
+    float32 over 54 scenes of bundled lenses: an eighth of this in the median, at most 0.93 of it;
+    more for Hubble, 6 m long with a spot of 10 nm."""
+    return 2 * float(jnp.finfo(lens.curvature.dtype).eps) * abs(float(lens.sensor))
+
+
+def tell_of_paths(lens: Lens, axis: Scene, fields: Array | None = None, level: int = 3) -> None:
+    """Warns if rounding makes path differences wrong by more than `_WAVES`, where it is known.
+    axis: the scene, or that of the axis for `fields` (F, 2), radians."""
+    known = known_values((lens, axis, fields)) if rough(lens) else None
+    if known is None:
+        return
+    lens, axis, fields = known
+    with jax.core.eval_context():
+        angles = [axis.field] if fields is None else [*fields]
+        scenes = [dataclasses.replace(axis, field=angle) for angle in angles]
+        error = path_rounding(lens, scenes)
+    if error > _WAVES:
+        wrong = f"{error:.0e} waves RMS"
+        tell(lens, "path differences", wrong, f"{_WAVES:g}", level)
+
+
+def path_rounding(lens: Lens, scenes: Sequence[Scene]) -> float:
+    """RMS error of path differences by rounding, waves: the largest of all scenes and wavelengths.
+    Known numbers."""
+    noise = [np.asarray(_noise(lens, s)) / (_MM * np.asarray(s.wavelengths)) for s in scenes]
+    return float(np.max(noise))
+
+
+@functools.partial(jit, wanted=LARGE)
+def _noise(lens: Lens, scene: Scene) -> Array:
+    """RMS difference (W,), mm, of the paths of hits that differ in their last digits."""
+    angle = 2 * np.pi * np.arange(_RAYS) * (3 / _RAYS)
+    radius = np.where(np.arange(_RAYS) % 2, 0.98, 0.5)
+    points = tuple(jnp.asarray(radius * f(angle), lens.curvature.dtype) for f in (np.cos, np.sin))
+    system, target = aims(lens, scene, points)
+    found = solve_aimed(system, target)
+    good = found.status == Status.OK
+    # The sensor, where the path is not stationary, keeps its hits.
+    shape = found.hits[0].shape
+    turn = np.random.default_rng(0).integers(-_DIGITS, _DIGITS + 1, (2, *shape))
+    turn[:, -1] = 0
+    eps = float(jnp.finfo(lens.curvature.dtype).eps)
+    hits = tuple(h * (1 + jnp.asarray(eps * t, h.dtype)) for h, t in zip(found.hits, turn))
+    change = path_of(found._replace(hits=hits), system) - path_of(found, system)
+    count = jnp.maximum(jnp.sum(good, axis=-1, keepdims=True), 1).astype(change.dtype)
+    change = jnp.where(good, change, 0)
+    change = jnp.where(good, change - jnp.sum(change, axis=-1, keepdims=True) / count, 0)
+    return jnp.sqrt(jnp.sum(change**2, axis=-1) / (2 * count[:, 0]))

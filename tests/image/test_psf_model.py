@@ -1,0 +1,47 @@
+"""The choice of a PSF model: what it says where light, degrees or grids do not suffice."""
+
+import re
+import warnings
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import j0, j1
+
+from drt_jax.image import psf_model
+from drt_jax.image.beam import Beam
+from drt_jax.pupil.patterns import disc
+
+PIXEL, WAVE = 0.01, 0.5
+
+
+def beam_of(radius, aperture=0.1):
+    """Light all over a disc of a radius in mm on the sensor, and in a round cone."""
+    points, weights = disc(12, 25)
+    points = np.asarray(points).T[:, None]
+    directions = np.concatenate([aperture * points, np.ones_like(points[:1])])
+    one = np.ones((1, weights.size))
+    given = points, weights[None], radius * points[:, None], directions, 0 * one, np.ones(1)
+    return Beam(*map(jnp.asarray, (*given, np.array([0.0, 0, 1]), one > 0)), 12, 12, False)
+
+
+def size_told(radius, kind):
+    scene = SimpleNamespace(wavelengths=jnp.array([WAVE]))
+    with pytest.warns(UserWarning, match="20 % of the light falls beside a kernel") as said:
+        psf_model.tell_of_loss(0.2, scene, beam_of(radius), PIXEL, 5, kind, 2)
+    assert said[0].filename == __file__
+    return int(re.search(r"; (\d+) x \1 hold 99 %", str(said[0].message))[1])
+
+
+def test_the_size_that_would_do():
+    """Of rays all over a disc; of Airy's pattern, whose encircled energy is 1 - J0^2 - J1^2."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        psf_model.tell_of_loss(0.01, None, None, PIXEL, 5, "rays", 2)
+    assert 19 <= size_told(0.1, "rays") <= 21 and size_told(1e-6, "rays") == 7
+    half = size_told(0.0, "waves") * PIXEL / 2
+    v = 2 * np.pi * 0.1 * half / (WAVE * 1e-3)
+    assert 0.988 < 1 - j0(v) ** 2 - j1(v) ** 2 < 0.993  # in the circle; the square holds more
+    both = size_told(0.1, "waves")
+    assert size_told(0.1, "rays") < both <= 20 + 2 * half / PIXEL
