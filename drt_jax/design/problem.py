@@ -32,6 +32,7 @@ from .values import OPERANDS, kind_of
 from .variables import Variables
 from .waves import degree_of
 
+_OF_PATHS = "path_difference", "rms_wavefront"
 # Least miss that a failed ray counts for, in semi-diameters of the stop.
 _FAILED = 4.0
 # No variable changes a limit if its violation differs by at most `_STILL` (relative) at vectors
@@ -156,7 +157,8 @@ class Problem:
         if isinstance(rule, Clipped):  # rays of weight 0 would serve nothing
             rule = dataclasses.replace(rule, order=int(rule.order), size=0)
         _check_operands(asked, lens, len(angles), len(waves), np.asarray(far), rule)
-        if any(kind_of(operand.kind).of_paths for operand in asked):
+        # What follows from path differences, which float32 may round too much.
+        if any(kind_of(o.kind).of_waves or o.kind in _OF_PATHS for o in asked):
             for distance in far:
                 tell_of_paths(lens, Scene(angles[0], distance, waves), angles)
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)

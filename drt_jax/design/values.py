@@ -135,11 +135,6 @@ class OperandKind(NamedTuple):
         return self.function in (mtf, strehl, encircled_energy)
 
     @property
-    def of_paths(self) -> bool:
-        """True if values follow from path differences, which float32 may round too much."""
-        return self.of_waves or self.function in (_path_difference, _rms_wavefront)
-
-    @property
     def of_all_views(self) -> bool:
         """True if values of all fields are computed before some are selected."""
         return self.function is relative_illumination

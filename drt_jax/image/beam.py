@@ -204,8 +204,8 @@ class Beam:
     def _fitted(self, points: Array, values: Array) -> Polynomials:
         # A constant of its own, so that float32 rounds the rest of the values alone.
         mean = jax.lax.stop_gradient(means(values, self._light()))
-        rest = values - mean[..., None]
-        found = fitted(points, rest, self._light(), self.degree, self.azimuths)
+        given = points, values - mean[..., None], self._light()
+        found = fitted(*given, self.degree, self.azimuths)
         coefficients = found.coefficients.at[..., 0].add(mean.T)
         return dataclasses.replace(found, coefficients=coefficients)
 

@@ -36,7 +36,7 @@ from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
 from .orders import Group, rules_by_order
-from .rounding import hit_rounding, rough as is_rough, tell
+from .rounding import hit_rounding, tell
 from .spot import Moments
 from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
 
@@ -114,13 +114,7 @@ def converged_rule(
     inside a trace, or if no ray arrives.
     """
     seen = field, distance, wavelengths
-    return _converge(scenes_of, lens, seen, tolerance, at_sensor).rule
-
-
-def silent_rule(lens: Lens, seen: tuple[Numbers, Numbers, Numbers], tolerance: float) -> PupilRule:
-    """`converged_rule`, for callers who speak of rounding themselves. seen: field, distance and
-    wavelengths."""
-    return _converge(scenes_of, lens, seen, tolerance, at_sensor, False).rule
+    return converge(scenes_of, lens, seen, tolerance, at_sensor).rule
 
 
 def converged_focus_rule(
@@ -134,7 +128,7 @@ def converged_focus_rule(
     smallest. ValueError as in `focus_moments`."""
     check_focus(lens)
     seen = field, distance, wavelengths
-    return _converge(scenes_of, lens, seen, tolerance, best_focus).rule
+    return converge(scenes_of, lens, seen, tolerance, best_focus).rule
 
 
 def at_sensor(spread: np.ndarray) -> list[np.ndarray]:
@@ -163,7 +157,7 @@ def _moments(
     if rule is None:
         tolerance = _TOLERANCE if tolerance is None else tolerance
         seen = field, distance, wavelengths
-        trial = _converge(lambda *one: [scene_of(*one)], lens, seen, tolerance, places)
+        trial = converge(lambda *one: [scene_of(*one)], lens, seen, tolerance, places)
         if concrete((lens, seen)):
             return jax.tree.map(jnp.asarray, trial.moments[0])
         # The rays are known: only weigh and differentiate them.
@@ -224,7 +218,7 @@ def _each(values: Array, rank: int) -> list[Array]:
     return [*values] if values.ndim == rank and values.size else [values]
 
 
-def _converge(
+def converge(
     make: Callable[..., list[Scene]],
     lens: Lens,
     seen: tuple[Numbers, Numbers, Numbers],
@@ -251,13 +245,9 @@ def _converge(
 
 
 def _try_orders(
-    lens: Lens,
-    scenes: Sequence[Scene],
-    symmetry: Symmetry,
-    tolerance: float,
-    places: Callable,
-    says: bool,
-) -> _Trial:
+    lens: Lens, scenes: Sequence[Scene], symmetry: Symmetry, tolerance: float, places: Callable,
+    says: bool
+) -> _Trial:  # fmt: skip
     """The first of three orders that agree: of Gauss rules or, if a ray fails or is clipped, of
     rules fitted to the rest of the light."""
     # A rule on the whole stop may miss an obscuration.
@@ -281,9 +271,8 @@ def _try_orders(
                 change = max(changes, default=np.inf)
                 rough = max(_rounding(lens, found) for found in trial.moments)
                 if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
-                    if says and is_rough(lens) and rough > tolerance:
-                        wrong = f"{rough:.0e} of its size"
-                        tell(lens, "the spot", wrong, f"{tolerance:.0e}", 4)
+                    if says:
+                        tell(lens, "the spot", rough, tolerance, " of its size", 4)
                     # If rounding hides their difference, take the last.
                     return trials[-1 if 2 * rough > tolerance else 0]
         else:

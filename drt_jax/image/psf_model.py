@@ -3,8 +3,7 @@
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable
-from typing import Any, Literal, cast, get_args
+from typing import Literal, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +18,8 @@ from ..numerics import Numbers, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import symmetry_of
 from .beam import Beam, BeamRule, beam_rule, trace_beam
-from .beam_psf import Kind, PsfModel, psf_of_beam
-from .converged import scenes_of, silent_rule
+from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
+from .converged import at_sensor, converge, scenes_of
 from .kernel import check_pixels
 from .rounding import hit_rounding, path_rounding, rough, tell
 from .wave_psf import period
@@ -36,9 +35,6 @@ _CELLS = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768)
 # The error falls with the square of the number of cells, and a step is 4/3 or more: the kernels of
 # more cells are off by at most their change over this.
 _STEP = 0.75
-# How much larger the relative error of a kernel's derivatives may be than its own; and the
-# derivative, a part of the light a pixel of the marginal ray, below which it is not relative.
-_STEEPER, _FLAT = 5, 0.1
 # Light beside a kernel that is told of.
 LOST = 0.01
 _UM = 1e3  # per mm
@@ -63,11 +59,8 @@ def converged_psf(
     Other arguments as in `psf`; all are known numbers. The model is valid for every field at every
     distance. "auto" takes the cheapest model within the tolerance of "waves", and `errors` gives
     the differences of the others.
-    of: "kernel": the tolerance bounds the kernel alone; the error of its derivatives was up to five
-        times as large. "gradient": also the error of its derivative by the place of the sensor,
-        which stands for those by all numbers of the lens, relative to the sum of its absolute
-        values, or to a tenth of the light for each pixel by which the marginal ray moves, where
-        that is more.
+    of: "kernel": the tolerance bounds the kernel alone; the relative error of its derivatives was
+        up to five times as large. "gradient": a fifth of it is kept, so that it holds for both.
 
     Warns if no degree or no grid that is tried meets the tolerance; if rounding does not, as in
     float32 of waves from a large lens, where the search ends at what rounding allows; and if more
@@ -75,25 +68,20 @@ def converged_psf(
     inside a trace.
     """
     seen = field, distance, wavelengths
-    found, view = chosen_psf(lens, seen, pixel, size, model, tolerance, norm, of)
+    require_one_of("of", of, get_args(Of))
+    exact = tolerance / 5 if of == "gradient" else tolerance
+    found, view = chosen_psf(lens, seen, pixel, size, model, exact, norm)
     view.tell_of_loss(found)
     return found
 
 
 def chosen_psf(
-    lens: Lens,
-    seen: tuple[Numbers, Numbers, Numbers],
-    pixel: Numbers,
-    size: int,
-    model: Kind | Literal["auto"],
-    tolerance: float,
-    norm: int = 1,
-    of: Of = "kernel",
-) -> tuple[PsfModel, "_View"]:
+    lens: Lens, seen: tuple[Numbers, Numbers, Numbers], pixel: Numbers, size: int,
+    model: Kind | Literal["auto"], tolerance: float, norm: int = 1
+) -> tuple[PsfModel, "_View"]:  # fmt: skip
     """`converged_psf` of field, distance and wavelengths `seen`, silent on light beside the
     kernel, and what tells of it."""
     _check_asked(model, tolerance, norm)
-    require_one_of("of", of, get_args(Of))
     known = known_values((lens, seen, pixel))
     if known is None:
         raise ValueError(
@@ -104,29 +92,27 @@ def chosen_psf(
         lens, seen, pixel = known
         side, size = check_pixels(pixel, size, lens.curvature.dtype)
         scenes = scenes_of(lens, *seen)
-        base = silent_rule(lens, seen, min(tolerance, 1e-3))
+        base = converge(scenes_of, lens, seen, min(tolerance, 1e-3), at_sensor, False).rule
         clipped = base if isinstance(base, Clipped) else None
         symmetry = symmetry_of(lens, seen[0])
         rounded = _rounded(lens, scenes, side, model)
-        fit = tolerance / _STEEPER if of == "gradient" else tolerance
         for degrees in _DEGREES:
             whole = beam_rule(degrees[-1], symmetry, clipped)
             beams = [traced(lens, scene, whole) for scene in scenes]
-            degree, error = _degree(beams, scenes, side, rounded, degrees, fit)
-            if error <= fit:
+            degree, error = _degree(beams, scenes, side, rounded, degrees, tolerance)
+            if error <= tolerance:
                 break
         else:
             warnings.warn(
                 f"polynomials of degree {degree} give back the rays to {error:.1e} only, not to "
-                f"{fit:.1e}",
+                f"{tolerance:.1e}",
                 stacklevel=3,
             )
         worst = max(rounded.values())
-        if worst > tolerance and rough(lens):
-            tell(lens, "kernels", f"{worst:.0e}", f"{tolerance:.0e}", 3)
+        tell(lens, "kernels", worst, tolerance, "", 3)
         rule = beam_rule(degree, symmetry, clipped)
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
-        view = _View(lens, tuple(scenes), tuple(beams), side, size, norm, worst, of)
+        view = _View(lens, tuple(scenes), tuple(beams), side, size, norm, worst)
         if model != "auto":
             return PsfModel(model, rule, view.cells(model, tolerance)), view
         return _cheapest(view, rule, tolerance), view
@@ -159,22 +145,6 @@ def traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
 _kernels = jit(psf_of_beam, ONCE, static_argnames=("size", "kind", "cells"))
 
 
-@functools.partial(jit, wanted=ONCE, static_argnames=("size", "kind", "cells"))
-def _slopes(
-    lens: Lens, wavelengths: Array, beam: Beam, pixel: Array, centre: None, **static: Any
-) -> Array:
-    """Derivatives of kernels by the place of the sensor, for each pixel that the marginal ray
-    moves, (W, size, size)."""
-
-    def at(step: Array) -> Array:
-        moved = beam.refocused(step)
-        return psf_of_beam(lens, wavelengths, moved, pixel, centre, **static).kernel
-
-    low, high = beam.directions_extent()
-    one = pixel / jnp.max((high - low) / 2)
-    return jax.jvp(at, (jnp.zeros_like(one),), (one,))[1]
-
-
 @dataclasses.dataclass(frozen=True)
 class _View:
     """The beams of scenes, and the pixels of the kernels. All numbers are known. rounded: what
@@ -187,30 +157,22 @@ class _View:
     size: int
     norm: int
     rounded: float
-    of: Of
 
-    def made(self, program: Callable, kind: Kind, cells: int) -> list[Any]:
-        """What `_kernels` or `_slopes` makes of each scene."""
+    def made(self, kind: Kind, cells: int) -> list[Psf]:
+        """What a model makes of each scene."""
         named = {"size": self.size, "kind": kind, "cells": cells}
         return [
-            program(self.lens, scene.wavelengths, beam, self.pixel, None, **named)
+            _kernels(self.lens, scene.wavelengths, beam, self.pixel, None, **named)
             for scene, beam in zip(self.scenes, self.beams)
         ]
 
     def kernels(self, kind: Kind, cells: int) -> np.ndarray:
-        """Kernels of all scenes and wavelengths, (scenes W, size, size); of gradients, also their
-        derivatives over their size."""
-        found = np.concatenate([np.asarray(a.kernel) for a in self.made(_kernels, kind, cells)])
-        if self.of == "kernel":
-            return found
-        slopes = np.concatenate([np.asarray(a) for a in self.made(_slopes, kind, cells)])
-        total = np.sum(np.abs(slopes), axis=(1, 2), keepdims=True)
-        return np.concatenate([found, slopes / np.maximum(total, _FLAT)])
+        """Kernels of all scenes and wavelengths, (scenes W, size, size)."""
+        return np.concatenate([np.asarray(one.kernel) for one in self.made(kind, cells)])
 
     def tell_of_loss(self, model: PsfModel) -> None:
         """Warns of light beside the kernels of a model."""
-        made = self.made(_kernels, model.kind, model.cells)
-        lost = [float(jnp.max(one.outside)) for one in made]
+        lost = [float(jnp.max(one.outside)) for one in self.made(model.kind, model.cells)]
         k = int(np.argmax(lost))
         tell_of_loss(lost[k], self.scenes[k], self.beams[k], self.pixel, self.size, model.kind, 4)
 
@@ -265,14 +227,13 @@ def tell_of_loss(
     # Some of the light that is lost stays with rays that end farther out, a part is diffracted
     # farther from all others: from a round pupil 2 / (pi v) at v = 2 pi NA r / wavelength, and
     # wavelength / (2 NA) is a `period`.
-    parts = np.linspace(0.05, 0.95, 19) * LOST if kind == "waves" else np.zeros(1)
-    spread = 2 / np.pi**2 * np.max(np.asarray(period(beam, scene.wavelengths, 1)), axis=0)
+    parts, waves = np.linspace(0.05, 0.95, 19) * LOST, kind == "waves"
+    spread = 2 / np.pi**2 * waves * np.max(np.asarray(period(beam, scene.wavelengths, 1)), axis=0)
     reach = np.zeros((len(away), len(parts)))
     for k, (far, light) in enumerate(zip(away, share)):
         order = np.argsort(far)
         last = np.searchsorted(np.cumsum(light[order]), 1 - LOST + parts)
-        reach[k] = far[order][np.minimum(last, len(far) - 1)]
-        reach[k] += spread[k] / parts if kind == "waves" else 0
+        reach[k] = far[order][np.minimum(last, len(far) - 1)] + spread[k] / parts
     needed = np.min(np.max(reach, axis=0)) / float(np.asarray(pixel))
     more = max(2 * int(np.ceil(needed)) + 1, size + 2)
     warnings.warn(
@@ -283,13 +244,9 @@ def tell_of_loss(
 
 
 def _degree(
-    beams: list[Beam],
-    scenes: list[Scene],
-    pixel: Array,
-    rounded: dict[str, float],
-    degrees: tuple[int, ...],
-    tolerance: float,
-) -> tuple[int, float]:
+    beams: list[Beam], scenes: list[Scene], pixel: Array, rounded: dict[str, float],
+    degrees: tuple[int, ...], tolerance: float
+) -> tuple[int, float]:  # fmt: skip
     """The lowest degree whose polynomials fit the rays, and the error of the fit beyond rounding,
     relative to the spot or, for the phase, in radians. There are more rays than terms."""
     pairs = [(b, s, w) for b, s in zip(beams, scenes) for w in range(s.wavelengths.size)]
@@ -301,12 +258,7 @@ def _degree(
 
 
 def _misfit(
-    beam: Beam,
-    scene: Scene,
-    wavelength: int,
-    pixel: Array,
-    rounded: dict[str, float],
-    degree: int,
+    beam: Beam, scene: Scene, wavelength: int, pixel: Array, rounded: dict[str, float], degree: int
 ) -> float:
     """The error of the fit at one wavelength, see `_degree`."""
     cosines, waves = beam.on_sphere()
@@ -322,9 +274,8 @@ def _misfit(
         return error
     # The error of the wave field is the phase error; it counts twice. Without the tilt towards the
     # middle of the light, as in `Beam.over_directions`.
-    path = path + float(beam.index[wavelength]) * np.sum(middle * directions, axis=0)
+    path = path + float(beam.index[wavelength]) * np.sum(np.float64(middle) * directions, axis=0)
     phase = path[None] * (4 * np.pi * _UM / float(scene.wavelengths[wavelength]))
-    phase = phase - _mean(phase, weight)
     return max(error, _residual(directions, phase, weight, degree) - 2 * rounded["phase"])
 
 

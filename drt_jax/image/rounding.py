@@ -30,11 +30,9 @@ from ..rays.trace import aims, path_of
 _DOUBLE = 1e-12
 # RMS error of path differences, waves, up to which analyses are silent: 6e-3 of a Strehl ratio.
 _WAVES = 1e-3
-# Rays of the measurement: as many on the rim of the stop as at half of its radius.
-_RAYS = 16
-# Last digits by which hits differ.
-_DIGITS = 8
-_MM = 1e-3  # per um
+# Rays of the measurement, as many on the rim of the stop as at half of its radius, and last digits
+# by which their hits differ.
+_RAYS, _DIGITS = 16, 8
 
 
 def rough(lens: Lens) -> bool:
@@ -42,14 +40,15 @@ def rough(lens: Lens) -> bool:
     return float(jnp.finfo(lens.curvature.dtype).eps) > _DOUBLE
 
 
-def tell(lens: Lens, what: str, wrong: str, allowed: str, level: int) -> None:
-    """Warns that the dtype of a lens makes something wrong by more than is allowed. level: of the
-    caller of the public function, counted as `warnings.warn` counts from its own caller."""
-    warnings.warn(
-        f"in {lens.curvature.dtype} {what} may be wrong by {wrong}, not by {allowed}: "
-        'jax.config.update("jax_enable_x64", True) before the lens is loaded',
-        stacklevel=level + 1,
-    )
+def tell(lens: Lens, what: str, wrong: float, allowed: float, unit: str, level: int) -> None:
+    """Warns if the dtype of a lens, coarser than float64, makes something wrong by more than is
+    allowed. level: as of `warnings.warn`, where 1 is the caller of this function."""
+    if rough(lens) and wrong > allowed:
+        warnings.warn(
+            f"in {lens.curvature.dtype} {what} may be wrong by {wrong:.0e}{unit}, not by "
+            f'{allowed:.0e}: jax.config.update("jax_enable_x64", True) before the lens is loaded',
+            stacklevel=level + 1,
+        )
 
 
 def hit_rounding(lens: Lens) -> float:
@@ -67,19 +66,16 @@ def tell_of_paths(lens: Lens, axis: Scene, fields: Array | None = None, level: i
         return
     lens, axis, fields = known
     with jax.core.eval_context():
-        angles = [axis.field] if fields is None else [*fields]
-        scenes = [dataclasses.replace(axis, field=angle) for angle in angles]
-        error = path_rounding(lens, scenes)
-    if error > _WAVES:
-        wrong = f"{error:.0e} waves RMS"
-        tell(lens, "path differences", wrong, f"{_WAVES:g}", level)
+        angles = [axis.field] if fields is None else fields
+        error = path_rounding(lens, [dataclasses.replace(axis, field=angle) for angle in angles])
+    tell(lens, "path differences", error, _WAVES, " waves RMS", level)
 
 
 def path_rounding(lens: Lens, scenes: Sequence[Scene]) -> float:
     """RMS error of path differences by rounding, waves: the largest of all scenes and wavelengths.
     Known numbers."""
-    noise = [np.asarray(_noise(lens, s)) / (_MM * np.asarray(s.wavelengths)) for s in scenes]
-    return float(np.max(noise))
+    # From mm to waves in um.
+    return max(float(jnp.max(1e3 * _noise(lens, s) / s.wavelengths)) for s in scenes)
 
 
 @functools.partial(jit, wanted=LARGE)
@@ -92,13 +88,11 @@ def _noise(lens: Lens, scene: Scene) -> Array:
     found = solve_aimed(system, target)
     good = found.status == Status.OK
     # The sensor, where the path is not stationary, keeps its hits.
-    shape = found.hits[0].shape
-    turn = np.random.default_rng(0).integers(-_DIGITS, _DIGITS + 1, (2, *shape))
+    shape = (2, *found.hits[0].shape)
+    turn = np.random.default_rng(0).integers(-_DIGITS, _DIGITS + 1, shape)
     turn[:, -1] = 0
     eps = float(jnp.finfo(lens.curvature.dtype).eps)
     hits = tuple(h * (1 + jnp.asarray(eps * t, h.dtype)) for h, t in zip(found.hits, turn))
     change = path_of(found._replace(hits=hits), system) - path_of(found, system)
-    count = jnp.maximum(jnp.sum(good, axis=-1, keepdims=True), 1).astype(change.dtype)
-    change = jnp.where(good, change, 0)
-    change = jnp.where(good, change - jnp.sum(change, axis=-1, keepdims=True) / count, 0)
-    return jnp.sqrt(jnp.sum(change**2, axis=-1) / (2 * count[:, 0]))
+    noise = jnp.std(change, axis=-1, where=good) / np.sqrt(2).item()
+    return jnp.where(jnp.any(good, axis=-1), noise, 0)

@@ -35,7 +35,7 @@ from ..pupil.rules import Gauss, PupilRule, symmetry_of
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
-from .rounding import hit_rounding, rough, tell
+from .rounding import hit_rounding, tell
 from .spot import normalised
 from .wavefront import reference_curvature
 
@@ -118,17 +118,11 @@ def spot_diagram(
     colour = known[middle]
     index = lens.index(colour)[-1, 0]
     found = _spots(light, spectrum / jnp.sum(spectrum), colour / index, middle)
-    _tell_of_rounding(lens, found.rms)
-    return found
-
-
-def _tell_of_rounding(lens: Lens, rms: Array) -> None:
-    """Warns if rounding is more than a part of a spot (F,), mm, where it is known."""
-    known = known_values((lens, rms)) if rough(lens) else None
+    known = known_values((lens, found.rms))
     if known is not None:
         wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
-        if wrong > _ROUGH:
-            tell(lens, "spots", f"{wrong:.0e} of their size", f"{_ROUGH:g}", 3)
+        tell(known[0], "spots", wrong, _ROUGH, " of their size", 2)
+    return found
 
 
 def vignetting(

@@ -215,8 +215,8 @@ def optical_path(hits: Vector, system: System, middle: Vector | None = None) -> 
         moved = tuple(c.at[0].set(q) for c, q in zip(chain, first, strict=True))
     else:
         beside, _, other = _chain(middle, system)
-        own = (a - b for a, b in zip((*hits, heights), (*middle, beside), strict=True))
-        point = rotate(system.rows.rotation, tuple(own))
+        own = tuple(a - b for a, b in zip((*hits, heights), (*middle, beside), strict=True))
+        point = rotate(system.rows.rotation, own)
         moved = tuple(jnp.concatenate([p[:1], p[1:] - p[:-1]]) for p in point)
     # |a| - |b| = (a - b).(a + b) / (|a| + |b|), without cancellation; a - b of the first segment is
     # divided by the vergence, which may be 0.

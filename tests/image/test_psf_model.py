@@ -23,7 +23,8 @@ def beam_of(radius, aperture=0.1):
     directions = np.concatenate([aperture * points, np.ones_like(points[:1])])
     one = np.ones((1, weights.size))
     given = points, weights[None], radius * points[:, None], directions, 0 * one, np.ones(1)
-    return Beam(*map(jnp.asarray, (*given, np.array([0.0, 0, 1]), one > 0)), 12, 12, False)
+    rest = np.array([0.0, 0, 1]), np.zeros(1), one > 0
+    return Beam(*map(jnp.asarray, (*given, *rest)), 12, 12, False)
 
 
 def size_told(radius, kind):
