@@ -20,6 +20,8 @@ def difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) -
     """
     for name in ("count", "stop", "mirrors", "forms", "afocal"):
         a, b = getattr(one, name), getattr(two, name)
+        if name == "forms":  # an even asphere may be written as an odd one
+            a, b = ([form.removeprefix("odd_") for form in own] for own in (a, b))
         if a != b:
             return f"{name} {a}, read back {b}"
     close = max(_CLOSE, 256 * float(np.finfo(np.asarray(one.curvature).dtype).eps))
@@ -44,7 +46,7 @@ def _numbers(one: Lens, two: Lens, waves: list[float], indices: float) -> Iterat
     for name in ("curvature", "conic", *(("thickness", "sensor") if spaced else ())):
         parts = [np.asarray(getattr(own, name), float) for own in both]
         yield name, *parts, size if name in ("thickness", "sensor") else 0.0
-    yield "coefficients", *_padded(*(np.asarray(own.coefficients, float) for own in both)), 0.0
+    yield "coefficients", *_padded(*map(_coefficients, both)), 0.0
     yield "stop's semi_diameter", *(_at(own.semi_diameter, own.stop) for own in both), 0.0
     yield "apertures", *map(_apertures, both), size
     yield "index", *(np.asarray(own.index(waves), float) for own in both), max(_CLOSE, indices)
@@ -64,6 +66,16 @@ def _padded(one: np.ndarray, two: np.ndarray) -> list[np.ndarray]:
     """Rows of coefficients filled up to one length by zeros."""
     width = max(one.shape[1], two.shape[1])
     return [np.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in (one, two)]
+
+
+def _coefficients(lens: Lens) -> np.ndarray:
+    """Rows of coefficients; those of even aspheres as those of odd ones."""
+    given = np.asarray(lens.coefficients, float)
+    rows = np.pad(given, ((0, 0), (0, given.shape[1])))
+    for i, form in enumerate(lens.forms):
+        if form == "asphere":
+            rows[i, ::2], rows[i, 1::2] = 0, given[i]
+    return rows
 
 
 def _places(lens: Lens) -> list[np.ndarray]:

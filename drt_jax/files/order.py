@@ -17,6 +17,7 @@ from .entry import LensError
 _RIM = 0.9
 # Between vertices closer than this (mm), rounding errors hide the direction of a ray.
 CLOSEST = 1e-6
+TOUCHING = CLOSEST - 1e-9  # sums of thicknesses are rounded
 
 
 @jax.jit
@@ -42,7 +43,7 @@ def check_order(lens: Lens, gaps: list[float], moved: list[bool], wave: float) -
     for i, j, gap in pairs:
         forwards = lens.senses[i + 1] > 0
         turned = "" if forwards else ", as a mirror has turned the light"
-        if gap >= CLOSEST:
+        if gap >= TOUCHING:
             continue
         if j == lens.count:
             where = f"{float(lens.sensor):g} mm"

@@ -12,7 +12,7 @@ import numpy as np
 from ..inputs import InputError, Lines, one_line, shown
 from ..lens.lens import Lens
 from .entry import LensError
-from .order import CLOSEST
+from .order import CLOSEST, TOUCHING
 from .specs import build_lens
 
 Missing = Literal["error", "warn"]
@@ -158,7 +158,7 @@ class Record:
             own = {key: part.entry[key] for key in _MEDIUM if key in part.entry}
             turns, image = part.entry.get("mirror", False), part is self.parts[-1]
             bends = turns or "phase" in part.entry or own != medium
-            if last and before and (bends or image) and abs(gap) < CLOSEST:
+            if last and before and (bends or image) and abs(gap) < TOUCHING:
                 before.thickness += sense * CLOSEST - gap
                 found.append(before.name)
             if bends:

@@ -199,6 +199,8 @@ def _form(lens: Lens, i: int) -> list[str]:
     name, conic = lens.forms[i], float(lens.conic[i])
     row = np.asarray(lens.coefficients[i], float).tolist()
     even = {power: letter for letter, power in LETTERS.items()}
+    if name == "asphere" and any([*row[:1], *row[10:]]):  # ASP has r^4 to r^20
+        name, row = "odd_asphere", [own for value in row for own in (0.0, value)]
     if name == "asphere":
         terms = _powers(lens, i, row, even)
         kind = ["ASP"] if terms else (["CON"] if conic else [])

@@ -138,13 +138,18 @@ def _extra(*values: float) -> list[str]:
 
 
 def _phase(lens: Lens, i: int, row: list[float]) -> list[str]:
-    """A grating on a conic, or a radial phase (radians, norm radius 1 mm) on an even asphere."""
+    """A grating on a conic or a toroid; or a radial phase (radians, norm radius 1 mm) on an even
+    asphere."""
     assert lens.phase is not None
     at = lens.phase.surfaces.index(i)
     order, form = float(lens.phase.order[at]), lens.phase.forms[at]
     own = np.asarray(lens.phase.coefficients[at], float).tolist()
     if form == "linear" and lens.forms[i] == "asphere" and not any(row):
         return ["TYPE DGRATING", f"PARM 1 {own[0] / 1e3!r}", f"PARM 2 {order!r}"]
+    if form == "linear" and lens.forms[i] == "toroid" and not any(row[1:]):
+        radius = 1 / row[0] if row[0] else 0.0
+        numbers = enumerate((radius, own[0] / 1e3, order), 1)
+        return ["TYPE TOROGRAT", *(f"PARM {k} {value!r}" for k, value in numbers)]
     if form != "asphere" or lens.forms[i] != "asphere" or any(row[8:]):
         raise LensError(f"surfaces[{i}].phase: not written to .zmx on this surface: save as .yaml")
     powers = [f"PARM {k + 1} {value!r}" for k, value in enumerate(row[:8])]

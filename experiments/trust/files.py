@@ -1,10 +1,13 @@
-"""Lens files of another program against its own listings: right, near, refused, or silently wrong.
+"""Lens files of other programs: right, near, refused, or silently wrong; and written again.
 
-drt_jax and, where installed, Optiland and ray-optics read each NAME.zmx of a folder in the same
-run; NAME.txt beside it is OpticStudio's listing. Right: focal length, f-number, entrance pupil and
-all indices of glasses agree with the listing to its last digit; near: to a thousandth; wrong: not,
-and without a message. Writes results.json: `rows` hold `file`, `reader`, `outcome`, `off` (the
-largest relative error of a number) and `why` (the message, or the number of that error).
+drt_jax and, where installed, Optiland and ray-optics read each `.zmx` and `.seq` file of some
+folders in the same run; NAME.txt beside it is OpticStudio's listing, or INDEX.md a table of focal
+lengths (column 4, mm, at the primary wavelength) that others confirm. Right: focal length,
+f-number, entrance pupil and all indices of glasses agree with the listing to its last digit, or the
+focal length to 1e-6; near: to a thousandth; wrong: not, and without a message. What drt_jax reads
+it writes in all formats, reads back and compares. Writes results.json: `rows` hold `file`,
+`reader`, `outcome`, `off` (the largest relative error of a number), `why` (the message, or the
+number of that error), and of drt_jax `trips`: by format "" or why there is none.
 """
 
 import contextlib
@@ -13,6 +16,7 @@ import io
 import pathlib
 import re
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +31,7 @@ from .runs.folder import Run
 
 OUTCOMES = ("right", "near", "refused", "wrong", "unlisted", "absent")
 COLUMNS = OUTCOMES
+FORMATS = (".zmx", ".seq", ".yaml")
 _NEAR = 1e-3
 _INDEX = 2e-9  # silica's constants have one digit more in some programs
 Read = tuple[list[float], list[float], float | None]
@@ -40,9 +45,9 @@ _NUMBERS = (
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings of the experiment; see configs/files.yaml. folder: of files and listings."""
+    """Settings of the experiment; see configs/files.yaml. folders: of files and listings."""
 
-    folder: str
+    folders: tuple[str, ...]
 
 
 def _ours(path: str) -> Read:
@@ -56,9 +61,9 @@ def _ours(path: str) -> Read:
 
 
 def _optiland(path: str) -> Read:
-    from optiland.fileio import load_zemax_file
+    from optiland.fileio import load_codev_file, load_zemax_file
 
-    optic = load_zemax_file(path)
+    optic = (load_codev_file if path.endswith(".seq") else load_zemax_file)(path)
     own = optic.paraxial
     values = (own.f2(), own.FNO(), own.EPD(), own.EPL())
     first = [float(np.ravel(value)[0]) for value in values]
@@ -140,6 +145,33 @@ def differences(
     return found
 
 
+def indexed(path: pathlib.Path) -> float | None:
+    """The focal length (mm) of a file in the table of INDEX.md beside it; None if it is not."""
+    index = path.with_name("INDEX.md")
+    lines = index.read_text().splitlines() if index.is_file() else []
+    cells = [[cell.strip() for cell in line.split("|")] for line in lines]
+    return next((float(row[4]) for row in cells if row[1:2] == [path.name]), None)
+
+
+def trips(path: pathlib.Path) -> dict[str, str]:
+    """By format, why a file is not written again and read back as the same; "" where it is."""
+    found: dict[str, str] = {}
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        system, numbers = drt_jax.load_system(path), _ours(str(path))
+        for kind in FORMATS:
+            out = pathlib.Path(folder) / f"again{kind}"
+            try:
+                drt_jax.save_lens(system, out)
+            except drt_jax.LensError as error:
+                found[kind] = f"refused: {str(error).removeprefix(str(out)).lstrip(', :')}"
+                continue
+            found[kind] = ""
+            if kind != ".yaml" and not np.allclose(_ours(str(out))[0], numbers[0], 1e-9, 1e-9):
+                found[kind] = "wrong"
+    return found
+
+
 def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
     """Row of one file read by one program, whose output is dropped."""
     row = {"file": path.name, "reader": reader, "off": None}
@@ -160,10 +192,16 @@ def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
         return row | {"outcome": "refused", "why": why}
     if np.any(np.isnan(numbers[0])):
         return row | {"outcome": "refused", "why": "the numbers are none: NaN"}
-    listing = path.with_suffix(".txt")
-    if not listing.is_file():
+    if reader == "drt_jax":
+        row["trips"] = trips(path)
+    listing, known = path.with_suffix(".txt"), indexed(path)
+    if listing.is_file():
+        found = differences(listing.read_text("latin-1"), *numbers)
+    elif known:
+        own, off = abs(numbers[0][0]), abs(abs(numbers[0][0]) / known - 1)
+        found = [(off, off <= 1e-6, f"focal length {own:.8g}, others {known:.8g}")]
+    else:
         return row | {"outcome": "unlisted", "why": "no listing"}
-    found = differences(listing.read_text("latin-1"), *numbers)
     off, _, why = max(found, key=lambda one: np.nan_to_num(one[0], nan=np.inf))
     row["off"] = float(off) if np.isfinite(off) else None
     if all(right for _, right, _ in found):
@@ -173,8 +211,9 @@ def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Reads each file by each program."""
-    paths = sorted(pathlib.Path(config.folder).glob("*.zmx"))
-    _common.require(len(paths) > 0, f"folder: no .zmx file in {config.folder}")
+    each = [pathlib.Path(folder).glob("*") for folder in config.folders]
+    paths = [p for own in each for p in sorted(own) if p.suffix.lower() in (".zmx", ".seq")]
+    _common.require(len(paths) > 0, f"folders: no file in {', '.join(config.folders)}")
 
     def one(path: pathlib.Path) -> list[dict[str, Any]]:
         return [outcome(path, reader) for reader in READERS]
@@ -207,7 +246,14 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         why = [group[0]["why"]] if group[0]["why"] else errors[:1]
         rows.append([name, *map(_cell, group), "".join(why)])
     totals = [[reader, *counts(results["rows"], reader)] for reader in READERS]
+    again = [row["trips"] | {"file": row["file"]} for row in results["rows"] if "trips" in row]
+    told = []
+    for kind in FORMATS:
+        own = [(row["file"], row[kind]) for row in again]
+        lost = [f"{name}: {why}" for name, why in own if why]
+        told.append([kind, sum(not why for _, why in own), len(lost), "; ".join(lost)])
     return {
+        "files, round trips": _common.table(("format", "the same", "not written", "why"), told),
         "files": _common.table(("file", *READERS, "why"), rows),
         "files, counts": _common.table(("reader", *OUTCOMES), totals),
     }

@@ -21,7 +21,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 STARTS = {
     "stability": ["families=[offaxis]", "scenes=12"],
     "faults": ["parts=[files]", "files=30", "traced=1"],
-    "files": ["folder={toy}"],
+    "files": ["folders=[{toy}]"],
     "benchmark": ["tasks=[axial]", "growth=false", "repeats=1", "lens=singlet"],
     "devices": ["counts=[1]", "patch=8", "repeats=2", "network={layers: 1, channels: 4}"],
     "lenses": [

@@ -1,6 +1,5 @@
 """`.seq` files: each command by its meaning, CODE V's own listings, and what is no file."""
 
-import dataclasses
 import re
 import time
 import warnings
@@ -495,20 +494,26 @@ def test_written_forms_glasses_apertures_and_places(tmp_path):
     save_lens(lens, tmp_path / "own.seq")
     for one, two in zip(lens.places, read_back(tmp_path).places, strict=True):
         np.testing.assert_allclose(one, two, rtol=0, atol=1e-13)
-    lens = read(tmp_path, f"{FRONT}; SPS ODD; SCO AR2 .01", BACK).lens
-    with pytest.raises(LensError, match=r"hold no r\^2 here: save as .yaml"):
-        save_lens(
-            dataclasses.replace(
-                lens, forms=("asphere",) * 3, coefficients=lens.coefficients[:, 1:]
-            ),
-            tmp_path / "x.seq",
-        )
     more = {"own": {"schott": [2.59, -0.0154, 0.0102, 0.00158, -1.9e-4, 1e-5, 1e-5, 0, 0]}}
     rows = [{"radius": 50, "thickness": 3, "glass": "own", "semi_diameter": 5, "stop": True}]
     rows.append({"radius": -50})
     lens = load_lens({"glasses": more, "surfaces": rows, "sensor": 50.0})
     with pytest.raises(LensError, match=r"glass own: .* to L\^-8: save as .yaml"):
         save_lens(lens, tmp_path / "more.seq")
+
+
+def test_powers_that_asp_has_not(tmp_path):
+    """An even asphere with r^2 or r^22 is an SPS ODD: the same sag."""
+    rows = [{"radius": 50, "thickness": 3, "index": 1.5, "semi_diameter": 5, "stop": True}]
+    own = {"radius": -50, "conic": -1, "coefficients": {2: 1e-3, 4: 1e-6, 22: 1e-20}}
+    lens = load_lens({"surfaces": [*rows, own], "sensor": 50.0})
+    save_lens(lens, tmp_path / "own.seq")
+    again = read_back(tmp_path)
+    assert again.forms[1] == "odd_asphere"
+    np.testing.assert_allclose(sag(again, 1, 3.0, 4.0), sag(lens, 1, 3.0, 4.0), rtol=1e-14)
+    own = own | {"coefficients": {2: 1e-3, 40: 1e-40}}
+    with pytest.raises(LensError, match="hold no form odd_asphere of 40 here: save as .yaml"):
+        save_lens(load_lens({"surfaces": [*rows, own], "sensor": 50.0}), tmp_path / "more.seq")
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-8", "utf-8-sig", "latin-1"])

@@ -267,6 +267,22 @@ def test_rings_and_other_apertures(kind, tmp_path):
             save_lens(lens, tmp_path / "two.zmx")
 
 
+def test_a_sensor_that_nearly_touches_and_a_toroidal_grating(tmp_path):
+    """A gap of 1e-6 mm, which rounding of a sum makes narrower; TOROGRAT, by its radius."""
+    rows = [FRONT | {"index": 1.5}, BACK | {"thickness": 104.42}]
+    glass = {"curvature": 0.0, "thickness": 1e-6}
+    grating = {"form": "toroid", "radius": 90.0, "radius_x": -70.0, "thickness": 0.1 + 0.2}
+    grating |= {"phase": {"form": "linear", "order": -2, "coefficients": {"y": 300.0}}}
+    plate = {"curvature": 0.0, "thickness": 3.3, "index": 1.6}
+    lens = load_lens({"surfaces": [*rows, grating, plate, glass]})
+    for kind in (".zmx", ".yaml"):
+        save_lens(lens, tmp_path / f"own{kind}")
+        again = load_lens(tmp_path / f"own{kind}")
+        np.testing.assert_allclose(again.coefficients, lens.coefficients, rtol=1e-15)
+        np.testing.assert_allclose(again.phase.coefficients, [[300.0]], rtol=1e-15)
+        assert again.phase.order == -2 and again.forms == lens.forms
+
+
 USES = {
     "angle": ("inf", [[0, 0], [1, 5]]),
     "object height": ("200", [[0, 0], [1, 5]]),
