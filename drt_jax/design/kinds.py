@@ -57,7 +57,7 @@ def diffractive(lens: Lens) -> list[int]:
     return [] if lens.phase is None else list(lens.phase.surfaces)
 
 
-def _read_phase(lens: Lens) -> Array:
+def _phases(lens: Lens) -> Array:
     """Coefficients of the phases, zeros on other surfaces."""
     phase: Any = lens.phase
     if phase is None:
@@ -66,7 +66,11 @@ def _read_phase(lens: Lens) -> Array:
     return none.at[np.array(phase.surfaces)].set(phase.coefficients)
 
 
-def _write_phase(lens: Lens, array: Array) -> Lens:
+def _phase_terms(lens: Lens) -> int:
+    return _phases(lens).shape[1]
+
+
+def _with_phases(lens: Lens, array: Array) -> Lens:
     phase: Any = lens.phase
     own = dataclasses.replace(phase, coefficients=array[np.array(phase.surfaces)])
     return dataclasses.replace(lens, phase=own)
@@ -194,14 +198,7 @@ KINDS: dict[str, Kind] = {
         _finite, _finite, _one, *_leaf("semi_diameter"), (1, 0.05), (1e-6, np.inf)
     ),
     # 10 h waves at h: a tenth of what a plate of f/4 has in green light.
-    "phase": Kind(
-        diffractive,
-        diffractive,
-        lambda lens: _read_phase(lens).shape[1],
-        _read_phase,
-        _write_phase,
-        (1, 10.0),
-    ),
+    "phase": Kind(diffractive, diffractive, _phase_terms, _phases, _with_phases, (1, 10)),
 }
 # Kinds with the coefficients of a form.
 SERIES = ("coefficients", "phase")

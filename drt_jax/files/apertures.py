@@ -127,11 +127,8 @@ def apertures_of(surfaces: list[Entry]) -> Apertures | None:
     )
     times = len(apertures.terms()[0])
     if times > _TERMS:
-        raise surfaces[0].error(
-            "",
-            f"the apertures of the lens need {times} sets of rays, {_TERMS} at most: give "
-            "polygons fewer inward corners, or join obscurations",
-        )
+        what = f"the apertures of the lens need {times} sets of rays, {_TERMS} at most"
+        raise surfaces[0].error("", f"{what}: join some, or give polygons fewer inward corners")
     return apertures
 
 

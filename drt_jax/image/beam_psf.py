@@ -71,10 +71,8 @@ class PsfModel:
         """
         mask.check()
         if self.kind == "gaussian" or (self.kind == "rays" and mask.path is not None):
-            raise ValueError(
-                f"a mask{' with a path' if mask.path is not None else ''} in the model "
-                f'"{self.kind}": make one of "waves"'
-            )
+            what = "a mask" if mask.path is None else "a mask with a path"
+            raise ValueError(f'{what} in the model "{self.kind}": make one of "waves"')
         cells = cells or max(self.cells, _FINE * max(jnp.shape(mask.amplitude)[-2:]))
         rule = dataclasses.replace(self.rule, mask=mask)
         return dataclasses.replace(self, rule=rule, cells=cells)

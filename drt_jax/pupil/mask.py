@@ -1,6 +1,7 @@
 """Plates of pixels in the stop: coded apertures, apodisers, phase plates."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -60,22 +61,18 @@ class Mask:
         that are no larger than a pixel; the pixel itself for sides of 0; 0 beside the plate."""
         padded = jnp.pad(pixels, [(0, 0)] * (pixels.ndim - 2) + [(1, 1)] * 2)
         padded = jnp.broadcast_to(padded, (at.shape[1], *padded.shape[-2:]))
-        places, shares = [], []
+        ends = []  # of the box along x and y: two pixels and the parts of it that lie in them
         for point, reach, count in zip(at, half, pixels.shape[:-3:-1]):
             low, wide = (point - reach + 1) * (count / 2), reach * count
             first = jnp.floor(low)
             second = jnp.clip(safe_divide(low + wide - first - 1, wide), 0, 1)
             place = jnp.clip(first, -1, count).astype(jnp.int32) + 1
-            places.append((place, jnp.minimum(place + 1, count + 1)))
-            shares.append((1 - second, second))
+            ends.append([(place, 1 - second), (jnp.minimum(place + 1, count + 1), second)])
         take = jax.vmap(lambda table, y, x: table[y, x])
-        (across, down), (a, b) = places, shares
-        parts = [
-            (a[i] * b[j]).astype(padded.dtype) * take(padded, down[j], across[i])
-            for i in (0, 1)
-            for j in (0, 1)
-        ]
-        return jnp.sum(jnp.stack(parts), axis=0)
+        found = jnp.zeros(at.shape[1:], padded.dtype)
+        for (x, part), (y, other) in itertools.product(*ends):
+            found += (part * other).astype(padded.dtype) * take(padded, y, x)
+        return found
 
 
 @jax.tree_util.register_dataclass
