@@ -8,7 +8,7 @@ import itertools
 
 import numpy as np
 
-# Most corners of a polygon, and of a convex piece.
+# Most corners of a polygon of a file, and of a convex piece.
 CORNERS, _SIDES = 64, 24
 # What counts as no area, relative to the square of the size.
 _TINY = 1e-12
@@ -26,15 +26,13 @@ def _least(corners: np.ndarray) -> float:
 
 def tidied(corners: np.ndarray) -> np.ndarray:
     """The corners (N, 2) of a polygon without repeated ones and those on a straight line.
-    ValueError for fewer than three, and for more than 64."""
+    ValueError for fewer than three."""
     for k in reversed(range(len(corners))):
         three = np.take(corners, (k - 1, k, k + 1), axis=0, mode="wrap")
         if len(corners) > 2 and abs(_turn(*three)) <= _least(corners):
             corners = np.delete(corners, k, axis=0)
     if len(corners) < 3:
         raise ValueError("needs three corners that do not lie on one line")
-    if len(corners) > CORNERS:
-        raise ValueError(f"{len(corners)} corners are more than {CORNERS}")
     return corners
 
 

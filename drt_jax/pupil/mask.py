@@ -37,10 +37,8 @@ class Mask:
         shape = jnp.shape(self.amplitude)
         other = shape if self.path is None else jnp.shape(self.path)
         if len(shape) not in (2, 3) or other != shape:
-            raise ValueError(
-                "mask: expected an amplitude (N, M) or (W, N, M), and a path of the same shape or "
-                f"None, got {shape} and {other}"
-            )
+            what = "expected an amplitude (N, M) or (W, N, M) and a path of that shape or None"
+            raise ValueError(f"mask: {what}, got {shape} and {other}")
 
     def light(self, at: Array, half: Array) -> Array:
         """Mean part of the light that passes boxes, see `means`, (W, ...)."""
@@ -99,10 +97,9 @@ class Masked(PupilRule):
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """Points and weights of the rule."""
         self.mask.check()
-        if self.symmetry != "none":
-            raise ValueError('Masked: give a rule of the symmetry "none": a mask has no other')
-        if self.mask.path is not None:
-            raise ValueError('Masked: a path acts on waves alone: psf with a model "waves"')
+        if self.symmetry != "none" or self.mask.path is not None:
+            what = 'give a rule of the symmetry "none" and no path: a path acts on waves alone'
+            raise ValueError(f"Masked: {what}, in psf")
         return self.rule.points(lens, scene)
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
