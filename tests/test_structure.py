@@ -40,7 +40,7 @@ ALLOWED = {
 ALLOWED_ALL = {"show.layout", "show.analyses", "show.sheet", "show.glasses"}
 # Lines of code: no blank, comment, docstring or import is counted. 18,609 before what outside
 # trials found was mended (off-axis mirrors, afocal systems, polygons, float32).
-HOUSE = 19_900
+HOUSE = 20_200
 # Outside packages that belong to some modules or floors alone.
 ONLY = {
     "optimistix": {"rays.aim", "rays.find", "image.field"},
