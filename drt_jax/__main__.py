@@ -3,6 +3,7 @@ writes a lens file in the format of another program; `glass N-BK7`: what a glass
 
 import argparse
 import contextlib
+import dataclasses
 import math
 import pathlib
 import sys
@@ -11,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from typing import get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .compilation import ONCE, jit, keep_programs
@@ -18,14 +20,16 @@ from .files.system import System
 from .files.write import save_lens
 from .files.yaml import lens_names, load_lens, load_system
 from .image.converged import psf_moments
+from .image.diagnose import crossed
 from .lens.lens import Lens
 from .lens.order import may_cross
 from .lens.paraxial import FirstOrder, first_order
 from .lens.scene import Scene, scene_of
 from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
+from .rays.status import Status
 from .show import glasses
-from .show.layout import Beam, beam_of
+from .show.layout import ENDS, Beam, beam_of
 from .show.page import Part, page
 from .show.sheet import panels, sheet
 
@@ -50,6 +54,7 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     show.add_argument("--field", type=float, nargs="+", help=f"degrees; {own} 0 7 10")
     show.add_argument("--distance", type=float, help=f"to the object, mm; {own} inf")
     show.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {ends} C, d and F")
+    show.add_argument("--missing", choices=("error", "warn"), default="error", help=_MISSING)
     show.add_argument("--html", action="store_true", help="a page of tables and figures instead")
     ends = "of the sheet or page; default: LENS.png or LENS.html here"
     show.add_argument("--out", type=pathlib.Path, help=ends)
@@ -92,6 +97,9 @@ def surface_rows(lens: Lens) -> Iterator[tuple[str, ...]]:
     for i, ((curvature, conic, semi), gap) in enumerate(zip(numbers, gaps)):
         radius = f"{1 / curvature:.6g}" if curvature else "plane"
         medium = "mirror" if lens.mirrors[i] else lens.glasses[i + 1]
+        if medium.startswith("model "):
+            nd, vd = map(float, medium.split()[1:3])
+            medium = f"nd {nd:.4f} vd {vd:.4g}"
         name = f"{i}, stop" if i == lens.stop else str(i)
         shape = "" if not np.any(lens.coefficients[i]) else lens.forms[i]
         yield name, radius, f"{conic:.5g}", shape, f"{gap:.6g}", medium, f"{semi:.5g}"
@@ -133,7 +141,14 @@ def field_rows(
         change = np.max(np.abs(squares[1] / squares[0] - 1)) / 2
         if change > _TOLERANCE:
             yield f"  ! these spots are known to {change:.1g} of their size only"
-        if field == 0 and f"{light:.2f}" != "100.00":
+        for wavelength, part in zip(wavelengths, 100 * np.asarray(found.throughput)):
+            if f"{part:.2f}" != f"{light:.2f}":
+                yield f"  ! at {wavelength:.4g} um {part:.2f} % of the light arrives"
+        if ENDS[Status.CROSSED] in beam.ends:
+            wide = np.where(np.isinf(lens.semi_diameter), 1.3 * beam.wide, lens.semi_diameter)
+            where = crossed(dataclasses.replace(lens, semi_diameter=jnp.asarray(wide)))
+            yield f"  ! rays that would have to step back do not arrive{where}"
+        if field == 0 and f"{light:.2f}" != "100.00" and not (beam.obscured and not beam.ends):
             share = f"{100 - light:.2g} % of the light that fills the stop"
             yield f"  ! on the axis {share} does not arrive; surfaces that clip: {cut}"
 
@@ -230,20 +245,27 @@ def _warnings_on_stdout() -> Iterator[None]:
 
 def _view(options: argparse.Namespace) -> tuple[Lens, list[float], float, list[float]]:
     """The lens, fields in degrees, the distance in mm and wavelengths in um. Options override the
-    values of a .zmx or .seq file. The middle wavelength is the primary one."""
-    fields, distance, waves = [0.0, 7.0, 10.0], math.inf, list(_LINES)
+    values of a .zmx or .seq file. The middle wavelength is the primary one. `options.note` becomes
+    what the file has on wavelengths and is not shown, or ""."""
+    fields, distance, waves, note = [0.0, 7.0, 10.0], math.inf, list(_LINES), ""
     if pathlib.Path(options.lens).suffix.lower() in (".zmx", ".seq"):
-        system = load_system(options.lens)
+        system = load_system(options.lens, options.missing)
         lens, distance, primary = system.lens, system.distance, system.wavelengths[system.primary]
         ends = [w for w in (system.wavelengths.max(), system.wavelengths.min()) if w != primary]
         waves = [*map(float, (*ends[:1], primary, *ends[1:]))]
         angles = system.fields
-        if angles is not None and np.any(angles[:, 1]) and not np.any(angles[:, 0]):
+        others = sorted({*map(float, system.wavelengths)} - {*waves})
+        weights = {*map(float, system.wavelength_weights)}
+        if options.wavelengths is None and (others or len(weights) > 1):
+            shown, left = (", ".join(f"{w:.4g}" for w in some) for some in (waves, others))
+            note = f"  ! wavelengths shown, of equal weight: {shown} um; left out: {left or 'none'}"
+        if angles is not None and not np.any(angles[:, 0]):
             fields = np.unique(np.round(np.degrees(angles[:, 1]), 12)).tolist()
         elif options.field is None:
             warnings.warn("the file has no fields along y alone: --field 0 7 10", stacklevel=2)
     else:
-        lens = load_lens(options.lens)
+        lens = load_lens(options.lens, options.missing)
+    options.note = note
     distance = distance if options.distance is None else options.distance
     return lens, options.field or fields, distance, options.wavelengths or waves
 
@@ -261,8 +283,10 @@ def run_show(options: argparse.Namespace) -> None:
         first = [*first_rows(lens, found, middle)]
         _say([f"{lens.name}: {about}", *(f"  {name:<19}  {value}" for name, value in first)])
         _wait("tracing; another kind of lens is compiled first, for half a minute or less")
-        axial, *beams = (beam_of(lens, angle, distance, middle) for angle in (0.0, *angles))
-        notes = _say([*focus_lines(found, middle, axial), ""])
+        axial = beam_of(lens, 0.0, distance, middle)
+        others = [wave for wave in waves if wave != middle]
+        beams = [beam_of(lens, angle, distance, middle, *others) for angle in angles]
+        notes = _say([*focus_lines(found, middle, axial), *filter(None, [options.note]), ""])
         table = _say(field_rows(lens, fields, distance, waves, beams))
         notes += _say(aperture_lines(lens, beams))
         kind = ".html" if options.html else ".png"
@@ -278,7 +302,9 @@ def run_show(options: argparse.Namespace) -> None:
             told += [("Surfaces", [*surface_rows(lens)]), *panels(*given).items()]
             out.write_text(page(f"{lens.name}: {about}", told), encoding="utf-8")
         else:
-            sheet(*given).savefig(out)
+            figure = sheet(*given)
+            figure.supxlabel(options.note.strip(" !"), fontsize=7, x=0.01, ha="left")
+            figure.savefig(out)
     _say([f"drawn in {out}"])
 
 

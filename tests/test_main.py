@@ -144,6 +144,13 @@ def test_a_lens_file_is_shown_as_it_is_used(tmp_path):
     assert lens.count == 3 and view == [[-2, 0, 3], 500, [0.7, 0.5876, 0.4861]]
     given = ["--field", "1", "--distance", "9e3", "--wavelengths", "0.5"]
     assert _view(_options(["show", str(path), *given]))[1:] == ([1], 9e3, [0.5])
+    options = _options(["show", str(path)])
+    _view(options)
+    assert options.note == (
+        "  ! wavelengths shown, of equal weight: 0.7, 0.5876, 0.4861 um; left out: 0.6563"
+    )
+    path.write_text(re.sub("YFLN.*", "YFLN 0 0 0", path.read_text()))  # the axis alone
+    assert _view(_options(["show", str(path)]))[1] == [0]
     _, *view = _view(_options(["show", "singlet"]))
     assert view == [[0, 7, 10], np.inf, [0.6562725, 0.5875618, 0.4861327]]
 

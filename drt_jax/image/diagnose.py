@@ -25,6 +25,7 @@ _HOW = {
     Status.CLIPPED: "is clipped at {}",
     Status.UNCONVERGED: "finds no way through the stop",
     Status.NO_INDEX: "has no index",
+    Status.CROSSED: "steps back to {}, which crosses its neighbour",
 }
 # Most reasons in a message.
 _PARTS = 3

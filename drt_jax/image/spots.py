@@ -70,6 +70,10 @@ class Spots:
     airy_radius: (F,) mm, 0.61 wavelength / NA for the reference wavelength, where pi NA^2 is its
         solid angle; of a round pupil the first zero of the diffraction pattern.
     throughput, solid_angle: (F, W), as of `vignetting` and `solid_angle`.
+    left_out: (F, W), the share of 175 rays, evenly over the stop and on its rim, that fail for
+        another reason than an aperture (see `Status`), and so are in no number above: they miss,
+        are totally reflected, or would have to step back where surfaces cross. Programs that let
+        rays step back count those, and give larger spots.
 
     Lengths are inf where no light arrives, those from the chief ray also where it fails.
     """
@@ -85,6 +89,7 @@ class Spots:
     airy_radius: Array
     throughput: Array
     solid_angle: Array
+    left_out: Array
 
 
 def spot_diagram(
@@ -222,6 +227,15 @@ def _fills(lens: Lens, fields: Array, axis: Scene) -> Array:
     return jnp.all(jax.vmap(one)(fields))
 
 
+def _beside() -> np.ndarray:
+    """Rays without light, (B, 2): the chief ray, the rim of the stop, and evenly all over it."""
+    return np.concatenate([np.zeros((1, 2)), _rim(), _even()])
+
+
+def _even() -> np.ndarray:
+    return hexapolar(_RINGS)[0]
+
+
 def _rim() -> np.ndarray:
     angle = 2 * np.pi * (np.arange(_RIM) + 0.25) / _RIM
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -232,7 +246,7 @@ def _rim() -> np.ndarray:
 class _Light:
     """Of the axis and F fields: hit (F + 1, W, Q, 2) mm, weight (F + 1, W, Q), arrives likewise,
     rays of the rule first, then their mirror images, then the chief ray and those on the rim;
-    chief_whole, throughput, solid_angle (F + 1, W)."""
+    chief_whole, throughput, solid_angle, left_out (F + 1, W)."""
 
     hit: Array
     weight: Array
@@ -241,6 +255,7 @@ class _Light:
     chief_whole: Array
     throughput: Array
     solid_angle: Array
+    left_out: Array
 
 
 def _collimated(lens: Lens, light: _Light, wavelengths: Array) -> Array:
@@ -296,7 +311,10 @@ def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: boo
     weight = weights * passes[:, :count]
     throughput, cone = jnp.sum(weight, axis=-1), jnp.sum(weight * area, axis=-1)
     arrives = status == Status.OK
-    parts = [jnp.stack(hit, axis=-1), arrives]
+    failed = (status != Status.OK) & (status != Status.CLIPPED)
+    left_out = jnp.mean(failed[:, 1 - len(_beside()) :].astype(weight.dtype), axis=-1)
+    traced = slice(0, -len(_even()))
+    parts = [jnp.stack(hit, axis=-1)[:, traced], arrives[:, traced]]
     weight = jnp.pad(weight, ((0, 0), (0, 1 + _RIM)))
     if rule.symmetry == "bilateral":  # and the mirror images of the rays of the rule
         images = parts[0][:, :count] * jnp.array([[[-1, 1]]], weight.dtype), arrives[:, :count]
@@ -306,12 +324,12 @@ def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: boo
     chief = status[:, count]
     whole = (chief == Status.OK) | (chief == Status.CLIPPED)
     chief_hit = jnp.stack([h[:, count] for h in hit], axis=-1)
-    return _Light(hits, weight, arrives, chief_hit, whole, throughput, cone)
+    return _Light(hits, weight, arrives, chief_hit, whole, throughput, cone, left_out)
 
 
 def _whole_rule(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
-    """Points of a rule, then the centre and the rim of the stop, 2 arrays (W, Q + 1 + _RIM), and
-    weights (W, Q). One radius stands for azimuths that it is turned by."""
+    """Points of a rule, then those of `_beside`, 2 arrays (W, Q + B), and weights (W, Q). One
+    radius stands for azimuths that it is turned by."""
     points, weights = rule.points(lens, scene)
     waves = scene.wavelengths.shape[0]
     wide = lambda a: jnp.broadcast_to(a, (waves, a.shape[-1]))  # noqa: E731
@@ -321,8 +339,7 @@ def _whole_rule(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Arra
         turned = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)]), weights.dtype)
         points = tuple(jnp.outer(wide(points[0]), t).reshape(waves, -1) for t in turned)
         weights = jnp.repeat(weights, _AZIMUTHS, axis=-1) / _AZIMUTHS
-    extra = np.concatenate([np.zeros((1, 2)), _rim()]).T
-    rows = zip(points, extra, strict=True)
+    rows = zip(points, _beside().T, strict=True)
     joined = ((wide(p), wide(jnp.asarray(e, weights.dtype)[None])) for p, e in rows)
     return tuple(jnp.concatenate(pair, axis=-1) for pair in joined), weights
 
@@ -379,4 +396,5 @@ def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Sp
         airy,
         light.throughput,
         light.solid_angle,
+        light.left_out,
     )

@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from ..numerics import Numbers, safe_divide
+from ..numerics import Numbers, known_values, safe_divide
 from .forms import FORMS
 from .lens import Lens
 from .paraxial import (
@@ -99,8 +100,9 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
 
     Conics and the r^2 and r^4 terms of aspheres count; odd powers of r have no place in this theory
     and are neglected. Transverse aberrations are 0 for an image at infinity, colour is 0 for one
-    wavelength. ValueError for a surface that diffracts or has no rotational symmetry, and as in
-    `paraxial`.
+    wavelength. ValueError for a surface that diffracts, has no rotational symmetry or is tilted or
+    decentred, and as in `paraxial`; inside a trace, where tilts are not known, a tilted lens has
+    infinite aberrations.
 
     field: (), edge of the field, radians.
     distance: from the object to the first vertex, inf allowed, mm.
@@ -111,12 +113,19 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
         raise ValueError(f"third order: no theory for surfaces of the form {', '.join(others)}")
     if lens.phase is not None:
         raise ValueError("third order: no theory for diffractive surfaces")
+    moves = lens.decentre, lens.tilt, lens.elements and (lens.elements.shift, lens.elements.tilt)
+    if any(np.any(move) for move in jax.tree.leaves(known_values(moves))):
+        raise ValueError(
+            "third order: no theory for tilted or decentred surfaces; set lens.tilt, lens.decentre "
+            "and lens.elements to None for the lens without them"
+        )
     system = paraxial_system(lens, wavelengths)
     far = distance_array(distance, lens.curvature.dtype)
     angle = field_array(field, lens.curvature.dtype)
     if angle.ndim:
         raise ValueError(f"field: expected one angle, got shape {angle.shape}")
     vergence, forwards = vergence_of(far), ahead(angle)
+    bent = jnp.any(jnp.array([jnp.any(move != 0) for move in jax.tree.leaves(moves)], bool))
     n, c = system.index, system.curvature[:, None]
     marginal = marginal_ray(system, vergence)
     height, slope = chief_ray(system, front=True)
@@ -141,4 +150,4 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
         lateral_colour=2 * half * colour * (chief.height * c + chief.before),
         petzval_curvature=-n[-1:] * petzval_parts(system),
     )
-    return system.masked(found, forwards & apart(far))
+    return system.masked(found, forwards & apart(far) & ~bent)

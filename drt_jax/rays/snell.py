@@ -36,7 +36,7 @@ class Trace(NamedTuple):
 
     hits: D arrays (R, ...), transverse coordinates on the rows, mm. If the stop is not a row, its
         crossing is inserted at `system.before`, see `split_stop`. Undefined behind a failure.
-    status: (...), int32, OK, MISSED or TIR.
+    status: (...), int32, OK, MISSED, TIR or CROSSED.
     rounding_angle: (...), largest change of direction of a segment by rounding of the hits,
         radians in units of the rounding error.
     """
@@ -258,7 +258,7 @@ def _follow(
     launch: D arrays (...), mm on the launch plane.
     to_stop: True to trace to the stop alone.
     smooth: as in `meetings`.
-    forward: True if a ray that steps back to a row fails.
+    forward: True if a ray that steps back to a row is CROSSED.
 
     Returns the rays behind the last row and the `Meeting` with all rows; None if `to_stop`.
     """
@@ -272,7 +272,8 @@ def _follow(
         the launch, or from the row before. The sensor may lie in front of the last surface, where
         light only seems to come from."""
         beyond = jnp.where(row.first, system.vergence * length + far, length)
-        return (jnp.where(row.last, way * beyond, beyond) > 0) | (not forward)
+        beyond = jnp.where(row.last, way * beyond, beyond) > 0
+        return beyond | ((not forward) & ~row.first)
 
     def least(row):
         """The smallest length of the crossing of a tilted surface."""
@@ -296,9 +297,11 @@ def _follow(
         direction = rotate(row.surface.rotation, direction)
         behind = state._replace(point=point, direction=direction, hit=hit)
         meeting = Meeting(p, d, hit, crosses, length, front, through, state.status)
-        met = crosses & (~row.active | ((front > 0) & ahead(row, length)))
+        met, beyond = crosses & (~row.active | (front > 0)), ~row.active | ahead(row, length)
         passes = (meeting.through > 0) | ~row.bends
-        here = jnp.where(met, jnp.where(passes, Status.OK, Status.TIR), Status.MISSED)
+        here = jnp.where(passes, Status.OK, Status.TIR)
+        back = jnp.where(row.first | row.last, Status.MISSED, Status.CROSSED)
+        here = jnp.where(met, jnp.where(beyond, here, back), Status.MISSED)
         status = jnp.where(going, here.astype(jnp.int32), state.status)
         wide = jnp.maximum(dot(meeting.hit, meeting.hit), dot(state.hit, state.hit))
         wide = jax.lax.stop_gradient(jnp.sqrt(wide))  # has no derivative on the axis
@@ -344,7 +347,8 @@ def meetings(system: System, launch: Vector, smooth: bool = False) -> Meeting:
 
 
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:
-    """Crossings of the stop, D arrays, mm along its axes, and the status there (...). launch: as in
+    """Crossings of the stop, D arrays, mm along its axes, and the status there (...), of rays that
+    may step back: whether they do is asked last, and does not end a search. launch: as in
     `shoot`."""
-    state, _ = _follow(system, launch, to_stop=True)
+    state, _ = _follow(system, launch, to_stop=True, forward=False)
     return state.hit, state.status

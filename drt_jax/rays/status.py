@@ -12,3 +12,4 @@ class Status(enum.IntEnum):
     CLIPPED = 3  # outside a clear aperture, or inside an obscuration
     UNCONVERGED = 4  # the search found no stationary path through the stop point
     NO_INDEX = 5  # the wavelength lies outside the range of a glass
+    CROSSED = 6  # neighbouring surfaces cross: the ray would have to step back to the second

@@ -6,6 +6,7 @@ fields (F,) are angles in radians. Values that are not finite are left out.
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -38,6 +39,18 @@ def colours(wavelengths: ArrayLike) -> list[str]:
     return [to_hex(c) for c in ramp(place)]
 
 
+def _coloured(wavelengths: ArrayLike) -> list[dict[str, Any]]:
+    """Colour and label of the curve of each wavelength."""
+    waves = np.ravel(np.asarray(wavelengths, float))
+    return [{"color": c, "label": f"{w:.4g} um"} for c, w in zip(colours(waves), waves)]
+
+
+def legend(axes: Axes) -> None:
+    """The wavelengths of the curves of an analysis, if there are several."""
+    if len({*axes.get_legend_handles_labels()[1]}) > 1:
+        axes.legend(fontsize=5, frameon=False, handlelength=1, markerscale=4)
+
+
 def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: float = 0) -> Axes:
     """The spot of one of the fields about its centroid, in um, with the Airy circle.
 
@@ -47,9 +60,9 @@ def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: fl
     centroid = np.asarray(found.centroid)[field]
     points = 1e3 * (np.asarray(found.points)[field] - centroid)
     airy = 1e3 * float(found.airy_radius[field])
-    for rays, colour in zip(points, colours(wavelengths)):
+    for rays, style in zip(points, _coloured(wavelengths)):
         good = np.all(np.isfinite(rays), axis=-1)
-        axes.plot(*rays[good].T, ".", markersize=1.5, color=colour)
+        axes.plot(*rays[good].T, ".", markersize=1.5, **style)
     if np.isfinite(airy):
         axes.add_patch(Circle((0, 0), airy, fill=False, color="black", linewidth=0.8))
         shown, farthest = (1e3 * float(a[field]) for a in (spot_radius(found), found.radius))
@@ -70,8 +83,8 @@ def fan(
     """Transverse ray errors of one field, um, along the y axis of the stop or, with `sagittal`,
     along the x axis."""
     errors, component = (found.sagittal, 0) if sagittal else (found.tangential, 1)
-    for curve, colour in zip(np.asarray(errors)[field, ..., component], colours(wavelengths)):
-        axes.plot(found.pupil, 1e3 * _finite(curve), color=colour)
+    for curve, style in zip(np.asarray(errors)[field, ..., component], _coloured(wavelengths)):
+        axes.plot(found.pupil, 1e3 * _finite(curve), **style)
     _cross(axes)
     axes.set(xlim=(-1, 1))
     return axes
@@ -81,10 +94,11 @@ def field_curvature(
     axes: Axes, found: FieldCurvature, fields: ArrayLike, wavelengths: ArrayLike
 ) -> Axes:
     """Foci over the field, mm from the sensor: solid lines are tangential, dashed sagittal."""
-    for k, colour in enumerate(colours(wavelengths)):
-        for foci, style in zip(found, ("-", "--")):
+    for k, style in enumerate(_coloured(wavelengths)):
+        for foci, line in zip(found, ("-", "--")):
             curve = np.asarray(foci)[:, k]
-            axes.plot(_finite(curve), _degrees(fields), style, color=colour)
+            axes.plot(_finite(curve), _degrees(fields), line, **style)
+            style = {"color": style["color"]}  # one entry of a legend
     _over_field(axes, fields, "focus (mm), S dashed")
     return axes
 
@@ -92,8 +106,8 @@ def field_curvature(
 def distortion(axes: Axes, found: Distortion, fields: ArrayLike, wavelengths: ArrayLike) -> Axes:
     """Distortion over the field in per cent."""
     curves = 100 * np.asarray(found.relative).T
-    for curve, colour in zip(curves, colours(wavelengths)):
-        axes.plot(_finite(curve), _degrees(fields), color=colour)
+    for curve, style in zip(curves, _coloured(wavelengths)):
+        axes.plot(_finite(curve), _degrees(fields), **style)
     _over_field(axes, fields, "distortion (%)")
     return axes
 
@@ -106,8 +120,8 @@ def lateral_colour(
     curves = 1e3 * np.asarray(found)[..., 1].T
     if 0 < airy < np.inf:
         axes.axvspan(-airy, airy, color="0.92")
-    for curve, colour in zip(curves, colours(wavelengths)):
-        axes.plot(_finite(curve), _degrees(fields), color=colour)
+    for curve, style in zip(curves, _coloured(wavelengths)):
+        axes.plot(_finite(curve), _degrees(fields), **style)
     _over_field(axes, fields, "lateral colour (um)")
     return axes
 

@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-# Colours of the fields, in the order of the fields.
-FIELD_COLOURS = ("tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange")
+# Colours of the fields, in the order of the fields; none of them is one of the wavelengths, blue to
+# green to red (`analyses.colours`), so that a colour means one thing on a page.
+FIELD_COLOURS = ("tab:orange", "tab:purple", "deeppink", "gold", "tab:cyan")
 
 
 class _Figure(Figure):

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 
 from ..compilation import ONCE, jit
 from ..lens.aperture import depths
-from ..lens.clearance import clipping_surface
+from ..lens.clearance import clearance, clipping_surface
 from ..lens.lens import Lens, sag
 from ..lens.scene import Scene, scene_of
 from ..pupil.patterns import hexapolar
@@ -28,11 +28,12 @@ _RAYS = 600  # rays per trace, so that all traces share one compiled program
 _RINGS, _RIM = 10, 240  # rings of rays that fill the stop, and number of rays on its rim
 _SCANS = 3  # scans of the meridian for the edges of a beam; each refines the last one
 # Words for rays that do not reach the sensor, other than those clipped by an aperture.
-_ENDS = {
+ENDS = {
     Status.MISSED: "some miss",
     Status.TIR: "total reflection",
     Status.UNCONVERGED: "no path",
     Status.NO_INDEX: "no index",
+    Status.CROSSED: "surfaces cross",
 }
 
 
@@ -168,6 +169,7 @@ class Beam(NamedTuple):
 
     clipping: surfaces whose apertures clip rays that no earlier surface clips.
     ends: other failures of rays, in words.
+    obscured: True if obscurations alone clip.
     wide: (S + 1,), largest distance of arriving rays from each vertex, mm; 0 if none arrives.
     spot: RMS radius on the sensor, mm; nan if no light arrives. best, shift: the smallest RMS
         radius at any sensor position, and how far that position is behind the sensor, mm.
@@ -175,30 +177,53 @@ class Beam(NamedTuple):
 
     clipping: list[int]
     ends: list[str]
+    obscured: bool
     wide: np.ndarray
     spot: float
     best: float
     shift: float
 
 
-def beam_of(lens: Lens, field: float, distance: float, wavelength: float) -> Beam:
-    """The beam of a field in radians, for a distance in mm and a wavelength in um."""
+def beam_of(lens: Lens, field: float, distance: float, wavelength: float, *others: float) -> Beam:
+    """The beam of a field in radians, for a distance in mm and a wavelength in um. others: of what
+    clips and fails, wavelengths that count, too."""
+    if others:
+        own, *more = (beam_of(lens, field, distance, wave) for wave in (wavelength, *others))
+        for each in more:
+            own = own._replace(
+                clipping=sorted({*own.clipping, *each.clipping}),
+                ends=[words for words in ENDS.values() if words in (*own.ends, *each.ends)],
+                obscured=own.obscured and each.obscured,
+                wide=np.maximum(own.wide, each.wide),
+            )
+        return own
     rim = np.linspace(0, 2 * np.pi, _RIM)
     pupil = np.concatenate([hexapolar(_RINGS)[0], np.stack([np.sin(rim), np.cos(rim)], axis=-1)])
     scene = scene_of(lens, field, distance, wavelength)
     _, hits, directions, status, clips = _traced(lens, scene, pupil)
     clipping = np.unique(clips[status == Status.CLIPPED]).tolist()
-    ends = [words for end, words in _ENDS.items() if np.any(status == end)]
+    ends = [words for end, words in ENDS.items() if np.any(status == end)]
+    obscured = _obscured(lens, hits[status == Status.CLIPPED])
     wide = np.max(np.linalg.norm(hits[status == Status.OK], axis=-1), axis=0, initial=0.0)
     inside = (status == Status.OK) & (np.arange(len(pupil)) < len(pupil) - _RIM)
     if not np.any(inside):
-        return Beam(clipping, ends, wide, math.nan, math.nan, math.nan)
+        return Beam(clipping, ends, obscured, wide, math.nan, math.nan, math.nan)
     hits, slopes = hits[inside, -1], directions[inside]
     hits, slopes = (a - a.mean(axis=0) for a in (hits, slopes[:, :2] / slopes[:, 2:]))
     size, growth = np.mean(np.sum(hits**2, axis=1)), np.mean(np.sum(slopes**2, axis=1))
     shift = -np.mean(np.sum(hits * slopes, axis=1)) / growth if growth > 0 else 0.0
     best = math.sqrt(max(size - growth * shift**2, 0.0))
-    return Beam(clipping, ends, wide, math.sqrt(size), best, float(shift))
+    return Beam(clipping, ends, obscured, wide, math.sqrt(size), best, float(shift))
+
+
+def _obscured(lens: Lens, hits: np.ndarray) -> bool:
+    """Whether obscurations alone clip rays with hits (Q, S + 1, 2), mm."""
+    blocks = () if lens.apertures is None else lens.apertures.blocks
+    if not any(blocks) or not len(hits):
+        return False
+    edges = clearance(lens, (jnp.asarray(hits[..., 0].T), jnp.asarray(hits[..., 1].T)))
+    clear = np.append(np.full(lens.count + 1, True), ~np.array(blocks))
+    return not np.any(np.asarray(edges)[clear] < 0)
 
 
 def _pieces(lens: Lens) -> list[tuple[int, int]]:

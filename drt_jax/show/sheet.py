@@ -56,8 +56,9 @@ def sheet(
     say: Callable[[str], None] = lambda what: None,
 ) -> Figure:
     """One figure: layout; spots with the Airy circle, ray fans, transfer functions and encircled
-    energy of three of the fields; field curvature, distortion, lateral colour and illumination up
-    to the largest field.
+    energy of three of the fields (the layout names those that are left out); field curvature,
+    distortion, lateral colour and illumination up to the largest field. All wavelengths count the
+    same. Blue to red are wavelengths; other colours are fields.
 
     fields: angles along y, radians. distance: mm, inf allowed. wavelengths: um, the middle one is
     the reference. rule: pupil rule of the spots, for all fields; None: as in `spot_diagram`. say:
@@ -130,14 +131,18 @@ def _analysed(
 
     def draw_on(axes: dict[str, Any]) -> None:
         lens_drawing(axes["layout"], draw(lens, fields, distance, wavelengths[middle]))
-        _per_field(axes, spots, fans, some, waves)
+        others = ", ".join(f"{np.degrees(a):.4g}°" for a in angles if a not in some)
+        if others:
+            words = f"without spots, fans, MTF and energy: {others}"
+            axes["layout"].set_title(words, fontsize=8, loc="left")
+        hues = [FIELD_COLOURS[[*fields].index(field) % len(FIELD_COLOURS)] for field in some]
+        _per_field(axes, spots, fans, some, waves, hues)
         analyses.field_curvature(axes["foci"], foci, line, waves)
         analyses.distortion(axes["bent"], bent, line, waves)
         analyses.lateral_colour(axes["colour"], colour, line, waves, 1e3 * spots.airy_radius[0])
         later, cone = slice(1 + len(some), None), spots.solid_angle[:, middle]
         light = cone[later] / cone[0], spots.throughput[later, middle]
         analyses.illumination(axes["light"], *light, wide[later])
-        hues = [FIELD_COLOURS[[*fields].index(field) % len(FIELD_COLOURS)] for field in some]
         given = [f"{np.degrees(field):.3g}°" for field in some], hues  # as in the layout
         analyses.mtf(axes["mtf"], lines, contrast, best, *given)
         analyses.encircled_energy(
@@ -145,6 +150,10 @@ def _analysed(
         )
         axes["energy"].set_title(f"encircled energy ({model})", fontsize=8)
         axes["foci"].set_ylabel("field (degrees)")
+        for name in ("spots", "tangential", "sagittal"):
+            analyses.legend(axes[name][-1])
+        for name in ("foci", "bent", "colour"):
+            analyses.legend(axes[name])
 
     return len(some), draw_on
 
@@ -214,11 +223,12 @@ def _per_field(
     fans: RayFans,
     fields: list[float],
     waves: np.ndarray,
+    hues: list[str],
 ) -> None:
     for k, field in enumerate(fields):
         spot, tangential, sagittal = (axes[n][k] for n in ("spots", "tangential", "sagittal"))
         analyses.spots(spot, spots, 1 + k, waves)
-        spot.set_title(f"{np.degrees(field):.4g}°", fontsize=8)
+        spot.set_title(f"{np.degrees(field):.4g}°", fontsize=8, color=hues[k])
         analyses.fan(tangential, fans, k, waves)
         analyses.fan(sagittal, fans, k, waves, sagittal=True)
         sagittal.set_xlabel("stop")

@@ -124,3 +124,24 @@ def test_third_order_needs_an_axis():
     }
     with pytest.raises(ValueError, match="of the form toroid"):
         drt_jax.third_order(load_lens({"surfaces": [entry]}), 0.1, np.inf, GREEN)
+
+
+@pytest.mark.slow
+def test_third_order_is_that_of_a_centred_lens():
+    """A known tilt is refused, and infinite inside a trace; arrays of zeros are no tilt."""
+    lens = load_lens("singlet")
+    for name, still in (("tilt", np.zeros((4, 3))), ("decentre", np.zeros((4, 2)))):
+        moved = still.copy()
+        moved[1, 0] = 1e-3
+
+        def spherical(moves, name=name):
+            given = dataclasses.replace(lens, **{name: jnp.asarray(moves)})
+            return drt_jax.third_order(given, 0.1, np.inf, GREEN).spherical
+
+        with pytest.raises(ValueError, match="no theory for tilted or decentred surfaces"):
+            spherical(moved)
+        traced = jax.jit(spherical)
+        np.testing.assert_array_equal(traced(moved), np.inf)
+        usual = drt_jax.third_order(lens, 0.1, np.inf, GREEN).spherical
+        np.testing.assert_allclose(traced(still), usual, rtol=1e-13)
+        np.testing.assert_allclose(spherical(still), usual, rtol=1e-13)

@@ -8,7 +8,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from drt_jax import Status, load_lens, trace_rays
+from drt_jax import Gauss, Status, load_lens, spot_diagram, trace_rays
+from drt_jax.pupil import hexapolar
 from drt_jax.rays import aim, fermat, find, linear
 
 from ..conftest import assert_close
@@ -176,3 +177,32 @@ def test_several_rays_that_are_sought():
     points = [[0, 0], [0, 1], [0, -1], [1, 0], [-0.113, 0.078], [0.866, 0.282], [0.648, -0.427]]
     rays = trace_rays(load_lens({"surfaces": rows}), 0.23138, 1e3, [0.55], points)
     assert np.all(rays.status == Status.OK)
+
+
+@pytest.mark.slow
+def test_where_neighbouring_surfaces_cross_a_ray_is_told_so():
+    """A thin plano-convex lens: the sphere, R = 20, lies behind the plane 2 mm away from
+    y^2 = 20^2 - 18^2 on. Snell's law carries a ray back to the plane and through a stop behind."""
+    surfaces = [
+        {"radius": 20.0, "index": 1.5, "thickness": 6.0},
+        {"radius": "inf", "thickness": 4.0},
+        {"radius": "inf", "thickness": 30.0, "stop": True, "semi_diameter": 10.0},
+    ]
+    lens = load_lens({"surfaces": surfaces})
+    lens = dataclasses.replace(lens, thickness=lens.thickness.at[0].set(2.0))
+    start = np.array([0.0, 5.0, 8.6, 8.8, 9.5])
+    sag = 20 - np.sqrt(400 - start**2)
+    lean = np.arcsin(start / 20)
+    inside = np.arcsin(np.sin(lean) / 1.5) - lean
+    plane = start + (2 - sag) * np.tan(inside)
+    stop = plane + 4 * np.tan(np.arcsin(1.5 * np.sin(inside)))
+    pupil = np.stack([0 * stop, stop / 10], axis=-1)
+    rays = trace_rays(lens, 0.0, np.inf, 0.55, pupil)
+    crossed = start**2 > 20**2 - 18**2
+    np.testing.assert_array_equal(rays.status[0], np.where(crossed, Status.CROSSED, Status.OK))
+    np.testing.assert_allclose(rays.points[0, ~crossed, 0, 1], start[~crossed], atol=1e-12)
+    found = spot_diagram(lens, [0.0], np.inf, 0.55, Gauss(4, "rotational"))
+    rings = np.concatenate([hexapolar(6)[0], [[0, 1]] * 48])
+    edge = np.interp(np.sqrt(76), start, stop) / 10
+    share = np.mean(np.linalg.norm(rings, axis=1) > edge)
+    assert abs(found.left_out[0, 0] - share) < 0.02 and share > 0.05

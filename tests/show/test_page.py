@@ -53,6 +53,11 @@ def test_the_prescription_is_that_of_the_lens():
     assert rows[0][:3] == ("0", "22.0136", "0") and rows[3][0] == "3, stop"
     assert [row[5] for row in rows] == ["SK16", "air", "F2", "air", "SK16", "air"]
     assert next(row for row in [*surface_rows(load_lens("hubble"))][1:] if row[5] == "mirror")
+    model = {"radius": 50.0, "nd": 1.62040204782857, "vd": 60.3242871706773, "thickness": 90.0}
+    header, row = surface_rows(
+        load_lens({"surfaces": [model | {"semi_diameter": 3, "stop": True}]})
+    )
+    assert row[5] == "nd 1.6204 vd 60.32"
 
 
 @pytest.mark.slow

@@ -5,10 +5,12 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 import drt_jax
 from drt_jax import show
 from drt_jax.show import analyses
+from drt_jax.show.figures import FIELD_COLOURS
 
 WAVES = (0.6, 0.53, 0.48)
 LENS = drt_jax.load_lens("cooke_triplet")
@@ -19,6 +21,18 @@ def test_colours_run_from_blue_to_red():
     assert analyses.colours((0.48, 0.6)) == ["#1f77b4", "#d62728"]
     assert analyses.colours(WAVES)[1] not in ("#1f77b4", "#d62728")
     assert len(analyses.colours([0.55])) == 1 and len(analyses.colours([0.5, 0.5])) == 2
+
+
+def test_a_colour_is_a_field_or_a_wavelength():
+    """Colours of fields are no mixture of those of wavelengths, blue to green to red."""
+    ramp = np.array([to_rgb(c) for c in analyses.colours(np.linspace(0.4, 0.7, 101))])
+    for hue in FIELD_COLOURS:
+        assert np.min(np.linalg.norm(ramp - to_rgb(hue), axis=1)) > 0.15
+    _, axes = show.new()
+    nothing = np.full((2, 3, 2), np.inf)
+    show.lateral_colour(axes, nothing, SCENE[0][:2], WAVES)
+    analyses.legend(axes)
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [f"{w} um" for w in WAVES]
 
 
 @pytest.mark.slow
