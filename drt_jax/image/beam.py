@@ -92,8 +92,8 @@ class Beam:
         for k in range(2):
             hits = hits.at[k, -1].add(ahead * self.direction[k] - move[k])
         path = self.path + self.index[:, None] * dot(tuple(self.direction), tuple(move))
-        farther = means(ahead[None], self._light())[0] * self.curvature
-        curvature = safe_divide(self.curvature, 1 + farther)
+        farther = step * jnp.sign(self._along_motion())
+        curvature = safe_divide(self.curvature, 1 + farther * self.curvature)
         return dataclasses.replace(self, hits=hits, path=path, curvature=curvature)
 
     def on_sphere(self) -> tuple[Array, Array]:
@@ -110,8 +110,7 @@ class Beam:
         middle = means(self.hits[:, -1], light)[..., None]
         e, line = self.hits[:, -1] - middle, self.direction[:2]
         e = jnp.where(self.known[None], e, 0)
-        axis = means(self.direction, light)
-        kappa = self.curvature * jnp.abs(jnp.sum(axis * self.motion[:, None], axis=0))
+        kappa = self.curvature * jnp.abs(self._along_motion())
         square = jnp.sum(e**2, axis=0)
         near = kappa**2 * jnp.max(square, axis=-1) < _NEAR**2
         kappa = jnp.where(near, kappa, 0)[:, None]
@@ -195,6 +194,10 @@ class Beam:
         """The values, and hits on all surfaces of a beam that their edges clip, (D, W, Q)."""
         edges = [self.hits.reshape(-1, *self.path.shape)] if self.clipped else []
         return jnp.concatenate([*values, *edges])
+
+    def _along_motion(self) -> Array:
+        """Cosine (W,) between the middle of the light and the way that the sensor moves."""
+        return jnp.sum(means(self.direction, self._light()) * self.motion[:, None], axis=0)
 
     def _light(self) -> Array:
         """Weights (W, Q) above 0: where light is taken away, rays stand for it as well."""

@@ -1,8 +1,8 @@
 """As many cells of the pupil as a tolerance asks for, found by trials.
 
 The rays are traced once; each trial evaluates their polynomials on a finer grid. Its error falls
-with the square of the number of cells or faster, so that the change from one trial to the next, a
-step of 4/3 or more, bounds it.
+with the square of the number of cells or faster, so that the change from one trial to the next
+tells it.
 """
 
 import functools
@@ -25,6 +25,8 @@ from .beam import Beam, beam_rule, trace_beam
 # Cells along a side to try, and where values are not known.
 _TRIALS = (64, 96, 128, 192, 256, 384, 512)
 CELLS = 128
+# The least change to the next trial, a step of 4/3 or more, for an error of 1 that is left.
+_STEP = 0.75
 # Default tolerance of contrast, Strehl ratio and encircled energy, absolute.
 TOLERANCE = 1e-3
 
@@ -56,7 +58,7 @@ def to_tolerance(
             now = of(*known, cells=cells)
             if before is not None:
                 pairs = zip(jax.tree.leaves(now), jax.tree.leaves(before), strict=True)
-                change = max(float(jnp.max(jnp.abs(a - b))) for a, b in pairs)
+                change = max(float(jnp.max(jnp.abs(a - b))) for a, b in pairs) / _STEP
             if change <= tolerance:
                 break
             before = now

@@ -65,6 +65,16 @@ def test_the_transfer_function_of_a_perfect_circle():
 
 
 @pytest.mark.slow
+def test_a_grid_too_coarse_for_the_blur_shows_no_contrast():
+    """Out of focus by 85 waves, where a cell holds a whole turn of the wave at a quarter of the
+    limit: samples of it would all be equal, a contrast of 0.68."""
+    edges = np.arange(81.0, 89.0, 0.5)
+    focus = edges * WAVE * 1e-3 / (1 - np.sqrt(1 - APERTURE**2))
+    found = np.array([perfect(float(step)).mtf[0] for step in focus])
+    assert np.max(found[..., 2]) < 0.01
+
+
+@pytest.mark.slow
 def test_the_transfer_function_of_an_annulus():
     """P10: O'Neill's, of an obscuration of 0.612 of the radius; the table by a grid, to 1.5e-4."""
     stop, mirror = MIRROR["surfaces"]
@@ -73,7 +83,7 @@ def test_the_transfer_function_of_an_annulus():
     scene = lens, 0.0, np.inf, WAVE, PARTS[1:6] * LIMIT
     found = drt_jax.transfer(*scene, rule=rule, degree=6, cells=128)
     for way in range(2):
-        np.testing.assert_allclose(found.mtf[0, way], ANNULUS, rtol=0, atol=1e-3)
+        np.testing.assert_allclose(found.mtf[0, way], ANNULUS, rtol=0, atol=2e-4)
 
 
 def aspheric(coefficient, radius):
