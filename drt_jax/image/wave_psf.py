@@ -1,12 +1,12 @@
 """The kernel of wave optics: plane waves of all directions of a beam, added up on the pixels.
 
-The field at a place x of the sensor is U(x) = sum over directions d of c exp(i k n d.x), with
-k = 2 pi / wavelength, and |c|^2 the light times the cell's area of direction cosines. On a regular
-grid of direction cosines |U|^2 is a sum over the differences of two directions, the optical
-transfer function: the autocorrelation of c, which two Fourier transforms give. A pixel's integral
-of each of its waves is a sinc, so that the kernel is a product of three matrices, and exact for
-the grid. Source: Goodman, Introduction to Fourier Optics (2005), ch. 6; Soummer et al., Opt.
-Express 15, 15935 (2007) for the product.
+The field at a place x of the sensor is U(x) = sum over directions d of c exp(i k n d.x), with k = 2
+pi / wavelength, directions from the sphere of the exit pupil (`Beam.on_sphere`), and |c|^2 the
+light times the cell's area of direction cosines. On a regular grid of direction cosines |U|^2 is a
+sum over the differences of two directions, the optical transfer function: the autocorrelation of c,
+which two Fourier transforms give. A pixel's integral of each of its waves is a sinc, so that the
+kernel is a product of three matrices, and exact for the grid. Source: Goodman, Introduction to
+Fourier Optics (2005), ch. 6; Soummer et al., Opt. Express 15, 15935 (2007) for the product.
 """
 
 import functools

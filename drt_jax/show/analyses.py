@@ -5,6 +5,7 @@ fields (F,) are angles in radians. Values that are not finite are left out.
 """
 
 import itertools
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +21,8 @@ from ..image.gaussian_error import GaussianError
 from ..image.spots import Spots
 from .figures import FIELD_COLOURS
 
+# Units of lengths on the sensor, and those of an afocal lens.
+_UNITS = {"um": "urad", "cycles/mm": "cycles/mrad", r"focus \(mm": "focus (1e-3 dioptre"}
 # Rays farther than this many RMS radii from the centroid are stray and do not widen a plot.
 _STRAY = 5.0
 
@@ -196,6 +199,20 @@ def gaussian_error(
     axes.set(xlabel="field (degrees)", ylabel="distance (m)")
     axes.set_title("light in wrong pixels (%)", fontsize=9)
     return axes
+
+
+def in_angles(axes: Axes) -> None:
+    """The units of an afocal lens in place of those of lengths, in labels and title."""
+    for get, put in (
+        (axes.get_xlabel, axes.set_xlabel),
+        (axes.get_ylabel, axes.set_ylabel),
+        (axes.get_title, axes.set_title),
+    ):
+        text = get()
+        for length, angle in _UNITS.items():
+            text = re.sub(rf"\b{length}\b", angle, text)
+        if text != get():
+            put(text)
 
 
 def _finite(curve: np.ndarray) -> np.ndarray:

@@ -154,6 +154,8 @@ def _analysed(
             analyses.legend(axes[name][-1])
         for name in ("foci", "bent", "colour"):
             analyses.legend(axes[name])
+        for each in jax.tree.leaves(axes) if lens.afocal else ():
+            analyses.in_angles(each)
 
     return len(some), draw_on
 

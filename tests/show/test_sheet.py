@@ -35,6 +35,17 @@ def test_a_colour_is_a_field_or_a_wavelength():
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [f"{w} um" for w in WAVES]
 
 
+def test_labels_of_an_afocal_lens_name_angles():
+    _, axes = show.new()
+    axes.set(xlabel="RMS 3, Airy 4 um", ylabel="illumination", title="lateral colour (um)")
+    analyses.in_angles(axes)
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("RMS 3, Airy 4 urad", "illumination")
+    axes.set(xlabel="focus (mm), S dashed", ylabel="cycles/mm")
+    analyses.in_angles(axes)
+    assert axes.get_xlabel() == "focus (1e-3 dioptre), S dashed"
+    assert axes.get_ylabel() == "cycles/mrad" and axes.get_title() == "lateral colour (urad)"
+
+
 @pytest.mark.slow
 def test_curves_hold_the_numbers():
     bent = drt_jax.distortion(LENS, *SCENE)
