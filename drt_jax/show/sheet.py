@@ -124,8 +124,7 @@ def _analysed(
     limit = 2e3 * np.sqrt(spots.solid_angle[0, middle] / np.pi) / waves[middle]
     lines = np.linspace(0, min(limit, _LINES) if limit > 0 else _LINES, _CURVE)
     radii, model, cells = _circles(spots, len(some))
-    axis = scene_of(lens, 0.0, distance, waves)
-    picked = lens, fields_array(some, axis.wavelengths.dtype), axis
+    picked = lens, fields_array(some, lens.curvature.dtype), scene_of(lens, 0.0, distance, waves)
     contrast, best, energy = _waves(*picked, jnp.asarray(lines), radii, rule, model, cells)
     say("drawing")
 
