@@ -1,73 +1,58 @@
-"""What float32, JAX's default, costs: every analysis of every bundled lens against float64.
+"""Print what float32, JAX's default, costs: every analysis of every bundled lens against float64.
 
-The same rays in both precisions, on the axis and at the full field, an object at infinity. The Airy
-radius is 0.61 wavelength / numerical aperture on the axis. Writes results.json: a row of each lens
-holds `lens`, `field_deg`, `told`, what float32 says of its path differences (empty: nothing), and
-the error of each analysis, the largest of both fields.
+    python tools/float32.py [LENS ...]
+
+Half a minute a lens on one core. The same rays in both
+precisions, at 0.55 um, on the axis and at the full field, an object at infinity; the larger error
+of the two. The Airy radius is 0.61 wavelength / numerical aperture on the axis.
 
 spot: RMS radius, um. focus: where along the axis the spot is smallest, in depths of focus,
-wavelength / numerical aperture^2. path: RMS path difference of all rays, waves. strehl; mtf: at a
-fifth of the cut-off; energy: encircled, within two Airy radii. rays, waves: sum of the absolute
-errors of a kernel of 15 x 15 pixels, each as wide as the Airy radius. distortion; angle: of the
-chief ray, radians; light: relative illumination.
+wavelength / numerical aperture^2. path: path differences, waves RMS. strehl; mtf: at a fifth of the
+cut-off; energy: encircled, within two Airy radii. rays, waves: sums of the absolute errors of
+kernels of 15 x 15 pixels, each as wide as the Airy radius. distortion; angle: of the chief ray,
+radians; light: relative illumination. told: whether float32 warns of its path differences.
 """
 
-import dataclasses
 import functools
 import pathlib
 import sys
 import warnings
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-import drt_jax
-from drt_jax import Lens, design, show
-from drt_jax.compilation import ONCE, jit
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent))
+jax.config.update("jax_enable_x64", True)
 
-from . import _command, _common
-from .lenses import LensFields
-from .runs.folder import Run
+import drt_jax  # noqa: E402
+from drt_jax import design  # noqa: E402
+from drt_jax.compilation import ONCE, jit  # noqa: E402
 
+FIELDS = {
+    "camera_50mm": 23.5, "cooke_triplet": 20, "dagor_240mm": 26.6, "double_gauss": 14,
+    "double_gauss_addon": 14, "fisheye_8mm": 85, "heliar_100mm": 26.6, "hubble": 0.1,
+    "hypergon_100mm": 67, "microscope_objective": 2, "petzval_100mm": 8, "phone": 32.2,
+    "phone_tele": 20, "ritchey_chretien": 0.2, "singlet": 7, "telephoto_300mm": 4,
+}  # fmt: skip
+KINDS = {"spot": "rms_spot", "path": "path_difference", "strehl": "strehl", "mtf": "mtf"}
+KINDS |= {"energy": "encircled_energy", "distortion": "distortion"}
+KINDS |= {"angle": "chief_ray_angle", "light": "relative_illumination"}
 COLUMNS = ("spot", "focus", "path", "strehl", "mtf", "energy", "rays", "waves")
 COLUMNS += ("distortion", "angle", "light")
-_KINDS = {"spot": "rms_spot", "path": "path_difference", "strehl": "strehl", "mtf": "mtf"}
-_KINDS |= {"energy": "encircled_energy", "angle": "chief_ray_angle"}
-_KINDS |= {"distortion": "distortion", "light": "relative_illumination"}
-_UM = 1e3  # per mm
-
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """Settings of the experiment; see configs/float32.yaml.
-
-    order: of the Gauss rule of the pupil.
-    """
-
-    lenses: tuple[LensFields, ...]
-    order: int = 8
-    wavelength_um: float = 0.55
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        _common.require(len(self.lenses) > 0, "lenses: needs at least one item")
-        _common.require_within("", self, order=(2, 16), wavelength_um=(1e-4, 1e6))
+WAVELENGTH = 0.55e-3  # mm
 
 
 @functools.partial(jit, wanted=ONCE)
-def values(problem: design.Problem, lens: Lens) -> dict[str, Array]:
+def values(problem, lens):
     """Every analysis, from rays of one trace."""
     rays = design.trace_fields(problem, lens)
     aperture = design.OPERANDS["numerical_aperture"].function(lens, rays)[0, 0]
-    wavelength = rays.wavelengths[0] / _UM
-    airy = 0.61 * wavelength / aperture
-    at = {"mtf": (0.4 * aperture / wavelength,), "energy": (2 * airy,)}
+    airy = 0.61 * WAVELENGTH / aperture
+    at = {"mtf": (0.4 * aperture / WAVELENGTH,), "energy": (2 * airy,)}
     found = {
         name: design.OPERANDS[kind].function(lens, rays, *at.get(name, ()))
-        for name, kind in _KINDS.items()
+        for name, kind in KINDS.items()
     }
     light = jnp.where(rays.arrives, rays.weights, 0)[None]
     slope = jnp.where(rays.arrives, jnp.stack(rays.bundle.arrival[:-1]), 0)
@@ -75,66 +60,39 @@ def values(problem: design.Problem, lens: Lens) -> dict[str, Array]:
     hits, slope = (a - jnp.sum(light * a, -1, keepdims=True) for a in (rays.sensor_hits, slope))
     focus = -jnp.sum(light * hits * slope, (0, -1)) / jnp.sum(light * slope**2, (0, -1))
     kernels = {kind: design.psf(lens, rays, airy, 15, kind) for kind in ("rays", "waves")}
-    return found | {"focus": focus * aperture**2 / wavelength} | kernels
+    return found | {"focus": focus * aperture**2 / WAVELENGTH} | kernels
 
 
-def measure(config: Config, scene: LensFields) -> dict[str, Any]:
-    """The row of a lens."""
-    double = drt_jax.load_lens(scene.lens)
-    fields, um = np.radians([0.0, scene.field_deg]), (config.wavelength_um,)
-    found = []
+def row(name):
+    """The cells of a lens."""
+    double, found = drt_jax.load_lens(name), []
+    fields, um = np.radians([0.0, FIELDS[name]]), (1e3 * WAVELENGTH,)
     for dtype in (jnp.float64, jnp.float32):
         lens = jax.tree.map(lambda a, dtype=dtype: a.astype(dtype), double)
         variables = design.Variables.from_lens(lens, ["sensor"])
-        given = variables, ["path_difference"], fields, um, np.inf, config.order
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            problem = design.Problem.from_variables(*given)
+            problem = design.Problem.from_variables(
+                variables, ["path_difference"], fields, um, np.inf, 8
+            )
         found.append(jax.tree.map(lambda a: np.asarray(a, float), values(problem, lens)))
-    double_, single_ = found
-    errors = {name: np.abs(single_[name] - double_[name]) for name in COLUMNS}
-    row = {name: float(np.max(error)) for name, error in errors.items()}
-    row["spot"] *= _UM
-    for name in ("rays", "waves"):
-        row[name] = float(np.max(np.sum(errors[name], axis=(-2, -1))))
-    row["path"] = float(np.max(np.sqrt(np.sum(errors["path"] ** 2, axis=-1))))
-    told = str(said[0].message).split(",")[0] if said else ""
-    return {"lens": scene.lens, "field_deg": scene.field_deg, "told": told} | row
+    errors = {column: np.abs(found[1][column] - found[0][column]) for column in COLUMNS}
+    errors["spot"] *= 1e3
+    errors["path"] = np.sqrt(np.sum(errors["path"] ** 2, axis=-1))
+    for kind in ("rays", "waves"):
+        errors[kind] = np.sum(errors[kind], axis=(-2, -1))
+    cells = [f"{np.max(errors[column]):.0e}" for column in COLUMNS]
+    return [name, str(FIELDS[name]), *cells, "yes" if said else ""]
 
 
-def run(config: Config, run: Run) -> dict[str, Any]:
-    """Measures all lenses."""
-
-    def one(scene: LensFields) -> dict[str, Any]:
-        row = measure(config, scene)
-        run.log(scene.lens, 0, {c: np.array([row[c]]) for c in COLUMNS})
+def main(names):
+    """Print the table."""
+    header = ["lens", "field, degrees", *COLUMNS, "told"]
+    print("| " + " | ".join(header) + " |\n" + "|--" * len(header) + "|")
+    for name in names or FIELDS:
+        print("| " + " | ".join(row(name)) + " |", flush=True)
         jax.clear_caches()
-        return row
-
-    jobs = {s.lens: lambda s=s: one(s) for s in config.lenses}
-    return {"rows": _common.measured(run, "lens", jobs), "seconds": run.seconds}
-
-
-def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Errors by lens and analysis."""
-    header = "lens", "field, degrees", *COLUMNS, "told"
-    rows = [
-        (r["lens"], r["field_deg"], *(f"{r[c]:.0e}" for c in COLUMNS), "yes" if r["told"] else "")
-        for r in results["rows"]
-    ]
-    return {"float32": _common.table(header, rows)}
-
-
-def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws the errors of path differences and of what follows from them."""
-    figure, axes = show.new(1, 1, 8, 4)
-    names = [row["lens"] for row in results["rows"]]
-    for column in ("path", "strehl", "mtf", "waves", "rays"):
-        axes.semilogy(names, [row[column] for row in results["rows"]], "o", label=column)
-    axes.tick_params(axis="x", rotation=60)
-    axes.legend()
-    figure.savefig(figures / "float32.png")
 
 
 if __name__ == "__main__":
-    _command.main(sys.modules[__name__])
+    main(sys.argv[1:])

@@ -207,8 +207,7 @@ class Beam:
     def _fitted(self, points: Array, values: Array) -> Polynomials:
         # A constant of its own, so that float32 rounds the rest of the values alone.
         mean = jax.lax.stop_gradient(means(values, self._light()))
-        given = points, values - mean[..., None], self._light()
-        found = fitted(*given, self.degree, self.azimuths)
+        found = fitted(points, values - mean[..., None], self._light(), self.degree, self.azimuths)
         coefficients = found.coefficients.at[..., 0].add(mean.T)
         return dataclasses.replace(found, coefficients=coefficients)
 

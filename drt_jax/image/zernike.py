@@ -140,11 +140,17 @@ def fitted(points: Array, values: Array, weights: Array, degree: int, azimuths: 
     terms, basis = len(basis), basis[some]
     weighted = basis * weights[None]
     normal = jnp.einsum("pwq,rwq->wpr", weighted, basis)
-    right = jnp.einsum("pwq,dwq->wpd", weighted, values)
     least = _RIDGE * float(jnp.finfo(values.dtype).eps)
     diagonal = jnp.max(jnp.diagonal(normal, 0, 1, 2), axis=-1)[:, None, None]
     normal = normal + least * diagonal * jnp.eye(len(basis), dtype=values.dtype)[None]
-    found = jnp.swapaxes(jax.vmap(_solved)(normal, right), 1, 2)
+
+    def solution(rest: Array) -> Array:
+        right = jnp.einsum("pwq,dwq->wpd", weighted, rest)
+        return jnp.swapaxes(jax.vmap(_solved)(normal, right), 1, 2)
+
+    found = solution(values)
+    if least > 1e-12:  # float32: once more for what the first solution leaves
+        found = found + solution(values - jnp.einsum("wdp,pwq->dwq", found, basis))
     every = jnp.zeros((*found.shape[:2], terms), found.dtype).at[..., some].set(found)
     return Polynomials(centre, scale, every, degree)
 
