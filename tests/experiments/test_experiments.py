@@ -85,7 +85,7 @@ def unbroken(tmp_path_factory):
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_config_loads_strictly(path):
     kind = CONFIGS[path].Config
-    others = {"seed": "99", "repeats": "99", "seeds": "99", "folder": "elsewhere"}
+    others = {"seed": "99", "repeats": "99", "seeds": "99", "folders": "[elsewhere]"}
     others |= {"starts": "{seed: 99}"}
     name = next(name for name in others if name in kind.__dataclass_fields__)
     other = "starts.seed=99" if name == "starts" else f"{name}={others[name]}"

@@ -110,6 +110,7 @@ BAD = {
         lambda e: (
             surface(0, semi_diameter=20.0)(e),
             surface(1, semi_diameter=20.0, radius=-50)(e),
+            surface(2, semi_diameter=20.0)(e),  # the stop: light comes there
         ),
         r"surfaces\[0\].thickness: 4 mm makes surfaces 0 and 1 cross at .* mm from the axis",
     ),
