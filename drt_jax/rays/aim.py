@@ -251,11 +251,13 @@ def nearest_found(launch: Vector, ok: Array, target: Vector) -> Vector:
 
 
 def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
-    """Radius of the beam at the stop, and its largest likely radius on the first surface, mm."""
+    """Radius of the beam at the stop, and its largest likely radius on the first surface, mm; both
+    above 0, also for the chief ray alone through a stop at the first surface."""
     beam = jnp.sqrt(jnp.max(dot(target, target)))
     lean = jnp.sqrt(dot(system.source[:-1], system.source[:-1]))
     depth = jnp.abs(system.at_stop[0].axial - system.rows.axial[0])
     width = 2 * beam + lean * (depth + beam) + 0.02 * depth
+    width = jnp.where(width > 0, width, 1)
     return jnp.where(beam > 0, beam, 0.1 * width), width
 
 

@@ -308,3 +308,17 @@ def test_bundles_of_nearly_as_many_rays_share_a_program():
     _, inside = jax.jit(lambda f: jax.jvp(lambda f: arrive(f, 19), (f,), (1.0,)))(0.1)
     assert few.shape == (3, 19)
     assert_close(slopes, inside, 1e-12)
+
+
+def test_the_chief_ray_alone_through_a_stop_at_the_first_mirror():
+    """Nothing but the field tells the size of the beam: a Mersenne telescope, its chief ray."""
+    rows = [
+        {"radius": -200, "conic": -1, "mirror": True, "stop": True, "thickness": -75.0},
+        {"radius": -50, "conic": -1, "mirror": True},
+    ]
+    rows[0]["semi_diameter"] = 20.0
+    lens = load_lens({"surfaces": rows, "sensor": 10.0})
+    alone = trace_rays(lens, 0.002, np.inf, [0.5], [[0, 0]])
+    both = trace_rays(lens, 0.002, np.inf, [0.5], [[0, 0], [0, 0.5]])
+    assert alone.status[0, 0] == both.status[0, 0] == Status.OK
+    np.testing.assert_allclose(alone.points[0, 0], both.points[0, 0], atol=1e-13)
