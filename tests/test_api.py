@@ -303,8 +303,8 @@ def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
     for rule in (None, Gauss(4, "rotational")):
         with pytest.raises(ValueError, match=why):
             psf_moments(crossed, 0.0, np.inf, GREEN, rule=rule)
-    with pytest.raises(ValueError, match="surface 2 and the sensor cross on the axis: -3 mm"):
-        psf_moments(changed(sensor=3.0), 0.0, np.inf, GREEN)
+    # A sensor in front of the last surface shows a virtual image.
+    assert psf_moments(changed(sensor=3.0), 0.0, np.inf, GREEN).throughput[0] > 0.999
     wide = changed(thickness=[2.0, 1.0], semi_diameter=[5.0, 12.5, 12.5, np.inf])
     assert "surface 1 and surface 2 cross from 10.2 mm off the axis on" in diagnose.crossed(wide)
     assert diagnose.crossed(LENS) == ""
@@ -332,7 +332,7 @@ def test_random_lenses_give_finite_moments_or_an_error():
             try:
                 found = psf_moments(dataclasses.replace(LENS, **moved), 0.0, 1e3, GREEN)
             except ValueError as error:
-                assert "surface" in str(error)
+                assert "surface" in str(error) or "no way through the stop" in str(error)
                 results.append(False)
                 continue
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))

@@ -13,7 +13,16 @@ from jax import Array
 
 from ..inputs import require_one_of
 from ..lens.lens import Lens
-from .kinds import KINDS, SERIES, VariableKind, lift_of, step_of, whole_numbers, word_terms
+from .kinds import (
+    KINDS,
+    SERIES,
+    VariableKind,
+    back_distance,
+    lift_of,
+    step_of,
+    whole_numbers,
+    word_terms,
+)
 from .solves import Solve, fix_solves
 
 _How = Literal["equal", "opposite", "cemented"]
@@ -75,7 +84,8 @@ class Vary:
         tilt, decentre: active surfaces; semi_diameter: finite ones; phase: those with one).
     terms: numbers of coefficients, or components of a tilt or decentre, from 0; () for all except
         the coefficient of r^2 of a surface, which the curvature replaces, and a norm radius.
-    low, high: bounds in the units of the lens.
+    low, high: bounds in the units of the lens. A sensor without bounds stays on its side of the
+        last vertex, so that a real image does not become a virtual one.
     scale: typical change in the units of the lens; 0 to choose it by the kind, the semi-diameter of
         the stop and `sag`.
     sag, semi_diameter: for coefficients, mm, instead of low and high: each coefficient changes the
@@ -132,7 +142,11 @@ class Vary:
     def bounds(self, lens: Lens, place: Place) -> tuple[float, float, float]:
         """Low, high and scale of one variable, in the units of the lens."""
         if not self.sag:
-            return self.low, self.high, self.scale or step_of(lens, *place)
+            low, high = self.low, self.high
+            if self.kind == "sensor" and (low, high) == (-np.inf, np.inf):
+                behind = float(back_distance(lens))
+                low, high = (low if behind < 0 else 0.0), (high if behind > 0 else 0.0)
+            return low, high, self.scale or step_of(lens, *place)
         most = self.sag / lift_of(lens, self.kind, place.row, place.term, self.semi_diameter)
         return -most, most, self.scale or _STEP_OF_SAG * most
 
