@@ -111,8 +111,8 @@ class Apertures:
 
     def edges(self) -> tuple[Array, Array, np.ndarray]:
         """Edges ``|q| = 1`` of convex apertures, q = matrix (hit - centre): matrices (E, 2, 2),
-        centres (E, 2), mm, and surfaces (E,). A side of a polygon is one side of a strip that is twice as
-        wide as the polygon."""
+        centres (E, 2), mm, and surfaces (E,). A side of a polygon is one side of a strip that is
+        twice as wide as the polygon."""
         found, eye = [], jnp.eye(2, dtype=self.half.dtype)
         for k, kind in enumerate(self.kinds):
             middle = jnp.zeros((1, 2), eye.dtype) if self.centre is None else self.centre[k : k + 1]
