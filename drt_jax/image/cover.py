@@ -27,22 +27,28 @@ def cover(
     places: (2, W, Q), of the beam's rays in the plane of the grid, its points or directions.
     axes: the middle and the step of the grid, (2, W) each.
     """
-    rim = _edge(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
-    if not beam.clipped:
-        return _filled(rim)
-    x, y = hits.reshape(2, -1, *stop.shape[1:])
+    least = _edge(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
+    if beam.clipped:
+        least = _clipped(lens, least, hits.reshape(2, -1, *stop.shape[1:]))
+    inside, middle = _filled(least)
+    return jnp.where(beam.near(places, *axes, stop.shape[-1]), inside, 0), middle
+
+
+def _clipped(lens: Lens, rim: "_Edge", hits: Array) -> "_Edge":
+    """Of each cell the edge that leaves the least of it, of the rim of the stop and the edges of
+    all surfaces, on which rays hit (2, S + 1, W, N, N)."""
+    x, y = hits
     edges = clearance(lens, (x, y))
 
     def nearest(found: _Edge, depth: Array) -> tuple[_Edge, None]:
-        """Of each cell the edge that leaves the least of it; most edges cut no light."""
+        """The one or the other; most edges cut no light."""
         new = _edge(jnp.where(jnp.isfinite(depth), depth, 1))
         deep, least = jax.lax.stop_gradient((_cells_deep(new), _cells_deep(found)))
         cuts = (deep < jnp.minimum(least, 0.5)) & (least > -0.5)
         pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(cuts, a, b), new, old)  # noqa: E731
         return jax.lax.cond(jnp.any(cuts), pick, lambda _, old: old, new, found), None
 
-    inside, middle = _filled(jax.lax.scan(nearest, rim, edges)[0])
-    return jnp.where(beam.near(places, *axes, stop.shape[-1]), inside, 0), middle
+    return jax.lax.scan(nearest, rim, edges)[0]
 
 
 class _Edge(NamedTuple):
