@@ -158,9 +158,10 @@ class Problem:
             rule = dataclasses.replace(rule, order=int(rule.order), size=0)
         _check_operands(asked, lens, len(angles), len(waves), np.asarray(far), rule)
         # What follows from path differences, which float32 may round too much.
-        if any(kind_of(o.kind).of_waves or o.kind in _OF_PATHS for o in asked):
+        of_beams = any(kind_of(o.kind).of_waves for o in asked)
+        if of_beams or any(o.kind in _OF_PATHS for o in asked):
             for distance in far:
-                tell_of_paths(lens, Scene(angles[0], distance, waves), angles)
+                tell_of_paths(lens, Scene(angles[0], distance, waves), angles, of_beams=of_beams)
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)
         equal = np.ones(len(waves)) if wavelength_weights is None else wavelength_weights
         share = _weights("wavelength_weights", equal, len(waves)) / len(waves)

@@ -123,7 +123,7 @@ def _rounded(lens: Lens, scenes: list[Scene], pixel: Array, model: str) -> dict[
     hits = hit_rounding(lens) / float(pixel)
     if model not in ("waves", "auto"):
         return {"hits": hits}
-    paths = path_rounding(lens, scenes) if rough(lens) else 0.0
+    paths = path_rounding(lens, scenes, True) if rough(lens) else 0.0
     return {"hits": hits, "phase": 4 * np.pi * paths}
 
 

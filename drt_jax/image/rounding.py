@@ -58,41 +58,53 @@ def hit_rounding(lens: Lens) -> float:
     return 2 * float(jnp.finfo(lens.curvature.dtype).eps) * abs(float(lens.sensor))
 
 
-def tell_of_paths(lens: Lens, axis: Scene, fields: Array | None = None, level: int = 3) -> None:
+def tell_of_paths(
+    lens: Lens, axis: Scene, fields: Array | None = None, level: int = 3, of_beams: bool = False
+) -> None:
     """Warns if rounding makes path differences wrong by more than `_WAVES`, where it is known.
-    axis: the scene, or that of the axis for `fields` (F, 2), radians."""
+    axis: the scene, or that of the axis for `fields` (F, 2), radians. of_beams: see
+    `path_rounding`."""
     known = known_values((lens, axis, fields)) if rough(lens) else None
     if known is None:
         return
     lens, axis, fields = known
     with jax.core.eval_context():
         angles = [axis.field] if fields is None else fields
-        error = path_rounding(lens, [dataclasses.replace(axis, field=angle) for angle in angles])
+        scenes = [dataclasses.replace(axis, field=angle) for angle in angles]
+        error = path_rounding(lens, scenes, of_beams)
     tell(lens, "path differences", error, _WAVES, " waves RMS", level)
 
 
-def path_rounding(lens: Lens, scenes: Sequence[Scene]) -> float:
+def path_rounding(lens: Lens, scenes: Sequence[Scene], of_beams: bool = False) -> float:
     """RMS error of path differences by rounding, waves: the largest of all scenes and wavelengths.
-    Known numbers."""
+    Known numbers. of_beams: also by that of hits on the sensor, with which `image.beam` refers
+    paths to the middle of the spot; it grows with the height of the image and the slant."""
     # From mm to waves in um.
-    return max(float(jnp.max(1e3 * _noise(lens, s) / s.wavelengths)) for s in scenes)
+    parts = [1e3 * np.asarray(_noise(lens, s)) / np.asarray(s.wavelengths) for s in scenes]
+    return max(float(np.max(np.hypot(p[0], p[1]) if of_beams else p[0])) for p in parts)
 
 
 @functools.partial(jit, wanted=LARGE)
 def _noise(lens: Lens, scene: Scene) -> Array:
-    """RMS difference (W,), mm, of the paths of hits that differ in their last digits."""
+    """Of the paths, mm, of hits that differ in their last digits, the RMS difference by (2, W): all
+    but the sensor's; the sensor's alone, as far as rounding changes those."""
     angle = 2 * np.pi * np.arange(_RAYS) * (3 / _RAYS)
     radius = np.where(np.arange(_RAYS) % 2, 0.98, 0.5)
     points = tuple(jnp.asarray(radius * f(angle), lens.curvature.dtype) for f in (np.cos, np.sin))
     system, target = aims(lens, scene, points)
     found = solve_aimed(system, target)
     good = found.status == Status.OK
-    # The sensor, where the path is not stationary, keeps its hits.
-    shape = (2, *found.hits[0].shape)
-    turn = np.random.default_rng(0).integers(-_DIGITS, _DIGITS + 1, shape)
-    turn[:, -1] = 0
+    turn = np.random.default_rng(0).integers(-_DIGITS, _DIGITS + 1, (2, *found.hits[0].shape))
+    last = np.arange(turn.shape[1])[:, None, None] == turn.shape[1] - 1
     eps = float(jnp.finfo(lens.curvature.dtype).eps)
-    hits = tuple(h * (1 + jnp.asarray(eps * t, h.dtype)) for h, t in zip(found.hits, turn))
-    change = path_of(found._replace(hits=hits), system) - path_of(found, system)
-    noise = jnp.std(change, axis=-1, where=good) / np.sqrt(2).item()
-    return jnp.where(jnp.any(good, axis=-1), noise, 0)
+
+    def noise(turn: np.ndarray) -> Array:
+        hits = tuple(h * (1 + jnp.asarray(eps * t, h.dtype)) for h, t in zip(found.hits, turn))
+        change = path_of(found._replace(hits=hits), system) - path_of(found, system)
+        spread = jnp.std(change, axis=-1, where=good)
+        return jnp.where(jnp.any(good, axis=-1), spread, 0)
+
+    # The path is stationary but for hits on the sensor. Rounding changes those by 0.22 digits RMS.
+    digits = np.sqrt(_DIGITS * (_DIGITS + 1) / 3).item()
+    parts = noise(np.where(last, 0, turn)) / np.sqrt(2).item(), noise(np.where(last, turn, 0))
+    return jnp.stack([parts[0], parts[1] * (0.22 / digits)])

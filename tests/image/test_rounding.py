@@ -70,6 +70,17 @@ def test_strehl_of_a_phone_at_a_slant():
 
 
 @pytest.mark.slow
+def test_rounding_of_a_high_image_is_told():
+    """At 67 degrees hits 235 mm high are rounded by 0.29 of 2^-16 mm RMS, and paths by nearly as
+    much: 0.0074 waves. Strehl ratios were 0.02 off without a word."""
+    lens = single("hypergon_100mm")
+    scene = scene_of(lens, np.radians(67.0), np.inf, GREEN)
+    told = [rounding.path_rounding(lens, [scene], of_beams) for of_beams in (False, True)]
+    by_hand = 0.29 * 2.0**-16 * np.sin(np.radians(67)) / 0.55e-3
+    assert told[0] < 1e-3 and 0.5 * by_hand < told[1] < 2 * by_hand
+
+
+@pytest.mark.slow
 def test_float32_stays():
     """Where a process has float64, too, dtypes follow the lens, and nothing is promoted. Traced,
     not compiled; one radius stands for azimuths."""
