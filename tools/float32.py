@@ -75,7 +75,9 @@ def row(name):
         variables = design.Variables.from_lens(lens, ["sensor"])
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            problem = design.Problem.from_variables(variables, ["strehl"], fields, um, np.inf, rule)
+            problem = design.Problem.from_variables(
+                variables, [design.Operand("strehl", target=1.0)], fields, um, np.inf, rule
+            )
         found.append(jax.tree.map(lambda a: np.asarray(a, float), values(problem, lens)))
     errors = {column: np.abs(found[1][column] - found[0][column]) for column in COLUMNS}
     errors["spot"] *= 1e3
