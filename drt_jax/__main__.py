@@ -122,8 +122,9 @@ def field_rows(
 ) -> Iterator[tuple[str, ...] | str]:
     """A table of spots over fields in degrees, and warnings as lines between its rows."""
     spots = [f"spot at {wavelength:.3f}" for wavelength in wavelengths]
-    yield "field", "image height", *spots, "light", "surfaces that clip"
-    yield "deg", "mm", *("RMS um" for _ in spots), "%", ""
+    place, unit, size = ("angle", "mrad", "urad") if lens.afocal else ("height", "mm", "um")
+    yield "field", f"image {place}", *spots, "light", "surfaces that clip"
+    yield "deg", unit, *(f"RMS {size}" for _ in spots), "%", ""
     angles, middle = [math.radians(field) for field in fields], len(wavelengths) // 2
     symmetry, whole = _widest(lens, angles), _whole(beams)
     for field, angle, beam in zip(fields, angles, beams):

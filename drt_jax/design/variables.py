@@ -145,7 +145,7 @@ class Vary:
             low, high = self.low, self.high
             if self.kind == "sensor" and (low, high) == (-np.inf, np.inf):
                 behind = float(back_distance(lens))
-                low, high = (low if behind < 0 else 0.0), (high if behind > 0 else 0.0)
+                low, high = (0.0 if behind > 0 else low), (0.0 if behind < 0 else high)
             return low, high, self.scale or step_of(lens, *place)
         most = self.sag / lift_of(lens, self.kind, place.row, place.term, self.semi_diameter)
         return -most, most, self.scale or _STEP_OF_SAG * most

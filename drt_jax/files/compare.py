@@ -25,7 +25,7 @@ def difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) -
         if a != b:
             return f"{name} {a}, read back {b}"
     close = max(_CLOSE, 256 * float(np.finfo(np.asarray(one.curvature).dtype).eps))
-    for name, a, b, least in _numbers(one, two, waves, indices):
+    for name, a, b, least in _numbers(one, two, waves, indices, close):
         if a.shape != b.shape:
             return f"{name}: {len(a)} of them, read back {len(b)}"
         with np.errstate(invalid="ignore"):  # inf - inf
@@ -37,10 +37,12 @@ def difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) -
     return ""
 
 
-def _numbers(one: Lens, two: Lens, waves: list[float], indices: float) -> Iterator[Any]:
-    """Arrays of both lenses with their name and the absolute tolerance."""
+def _numbers(
+    one: Lens, two: Lens, waves: list[float], indices: float, close: float
+) -> Iterator[Any]:
+    """Arrays of both lenses with their name and the absolute tolerance. close: of a length of 1."""
     both = one, two
-    size = _CLOSE * max(1.0, abs(float(one.sensor)))
+    size = close * max(1.0, abs(float(one.sensor)))
     # Elements that move along the axis become thicknesses in files of other programs.
     spaced = one.elements is None and two.elements is None
     for name in ("curvature", "conic", *(("thickness", "sensor") if spaced else ())):
@@ -52,7 +54,7 @@ def _numbers(one: Lens, two: Lens, waves: list[float], indices: float) -> Iterat
     yield "index", *(np.asarray(own.index(waves), float) for own in both), max(_CLOSE, indices)
     rows = ["decentre", "vertex", "rotation"]
     for name, *parts in zip(rows, *map(_places, both), strict=True):
-        yield name, *parts, size if name != "rotation" else 1e-8
+        yield name, *parts, size if name != "rotation" else max(1e-8, close)
     phases = [own.phase for own in both]
     if any(phase is not None for phase in phases):
         yield "phase", *_padded(*map(_phase, phases)), 0.0

@@ -39,6 +39,8 @@ def seq_text(system: System) -> str:
     """The text of a file. LensError, with the remedy, for features that are not written; a warning
     tells how far a model glass differs that becomes a private one."""
     lens, worst = system.lens, 0.0
+    if lens.afocal:
+        raise LensError(".seq files hold no afocal image space here: save as .yaml or .zmx")
     media, own = media_of_lens(lens)
     for i, keys in enumerate(media):
         made, off = _made(keys, system.wavelengths)

@@ -170,7 +170,7 @@ def _centre(reader: _Reader, words: Words) -> None:
 
 
 def _refused(reader: _Reader, words: Words) -> None:
-    if any(word.strip("+-.0") for word in words.rest):
+    if words.key != "SPID" or any(word.strip("+-.0") for word in words.rest):
         reader.record.lacks(words.line, f"{words.key}, {_REFUSED[words.key]}")
 
 

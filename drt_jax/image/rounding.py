@@ -45,7 +45,7 @@ def tell(lens: Lens, what: str, wrong: float, allowed: float, unit: str, level: 
     allowed. level: as of `warnings.warn`, where 1 is the caller of this function."""
     if rough(lens) and wrong > allowed:
         warnings.warn(
-            f"in {lens.curvature.dtype} {what} may be wrong by {wrong:.0e}{unit}, not by "
+            f"in {lens.curvature.dtype} {what} may be wrong by {wrong:.0e}{unit}, more than "
             f'{allowed:.0e}: jax.config.update("jax_enable_x64", True) before the lens is loaded',
             stacklevel=level + 1,
         )

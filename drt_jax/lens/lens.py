@@ -367,17 +367,24 @@ def _open(semi: Array, given: dict[str, Any]) -> Array:
     return jnp.where(rows == given["stop"], still(semi), semi)
 
 
-def movable(lens: Lens) -> Lens:
-    """A lens of truth values: False for arrays that no rule of an optimiser may touch, such as a
-    decay of weights: apertures, and what a derivative by the lens leaves alone (see `Lens`).
+def movable(tree: Any) -> Any:
+    """A lens, or each lens in a tree of parameters, of truth values: False for arrays that no rule
+    of an optimiser may touch, such as a decay of weights: apertures, and what a derivative by the
+    lens leaves alone (see `Lens`). True for what is no lens.
 
     `optax.adamw(1e-3, mask=drt_jax.movable)` and `optax.lion(1e-3, mask=drt_jax.movable)` train a
     lens: air stays air, and infinite apertures infinite.
     """
-    held = {leaf for name, leaves in HELD.items() if name not in lens.free for leaf in leaves}
-    held |= {"semi_diameter", "apertures"} - {*lens.free}
-    moves = lambda path, _: not held & {key.name for key in path}  # noqa: E731
-    return jax.tree_util.tree_map_with_path(moves, lens)
+
+    def one(lens: Any) -> Any:
+        if not isinstance(lens, Lens):
+            return True
+        held = {leaf for name, leaves in HELD.items() if name not in lens.free for leaf in leaves}
+        held |= {"semi_diameter", "apertures"} - {*lens.free}
+        moves = lambda path, _: not held & {getattr(key, "name", None) for key in path}  # noqa: E731
+        return jax.tree_util.tree_map_with_path(moves, lens)
+
+    return jax.tree.map(one, tree, is_leaf=lambda part: isinstance(part, Lens))
 
 
 def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..numerics import Numbers, safe_divide
+from ..numerics import Numbers, safe_divide, still
 from .lens import Lens
 from .scene import ahead, apart, distance_array, field_array, vergence_of
 from .surface import vertex_curvature
@@ -172,8 +172,9 @@ def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | floa
     reach = reach.at[1:].add(jnp.abs(system.gaps[:, None] * before[1:]))
     terms = jnp.abs(system.index[0] * start[1]) + jnp.sum(reach * jnp.abs(system.power), axis=0)
     least = _ROUNDING * jnp.finfo(terms.dtype).eps * terms
-    last = jnp.where(jnp.abs(system.index[-1] * behind[-1]) >= least, behind[-1], 0)
-    return ParaxialRay(heights, before, behind.at[-1].set(last))
+    # Its value goes, its derivative stays: a solve may start from an afocal lens.
+    rest = jnp.where(jnp.abs(system.index[-1] * behind[-1]) >= least, 0, still(behind[-1]))
+    return ParaxialRay(heights, before, behind.at[-1].add(-rest))
 
 
 def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:

@@ -42,14 +42,15 @@ class Mask:
 
     def light(self, at: Array, half: Array) -> Array:
         """Mean part of the light that passes boxes, see `means`, (W, ...)."""
-        return self.means(self.amplitude**2, at, half)
+        return self.means(jnp.asarray(self.amplitude, at.dtype) ** 2, at, half)
 
     def waves(self, wavelengths: Array, at: Array, half: Array) -> Array:
         """Mean factor of waves in boxes, see `means`, complex (W, ...). wavelengths: (W,), um."""
-        path = jnp.zeros_like(self.amplitude) if self.path is None else self.path
+        given = self.amplitude, 0 * self.amplitude if self.path is None else self.path
+        amplitude, path = (jnp.asarray(a, wavelengths.dtype) for a in given)
         shape = jnp.broadcast_shapes(path.shape, (len(wavelengths), 1, 1))
         phase = 2 * jnp.pi * _UM / wavelengths[:, None, None] * jnp.broadcast_to(path, shape)
-        size = jnp.broadcast_to(self.amplitude, shape)
+        size = jnp.broadcast_to(amplitude, shape)
         return self.means(jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase)), at, half)
 
     @staticmethod

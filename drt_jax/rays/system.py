@@ -196,10 +196,10 @@ class System:
     @property
     def sensor_way(self) -> Array:
         """1, or -1 for a sensor in front of the last surface, which shows a virtual image; (). It
-        is told by the axis of the last surface; behind a mirror in a lens with tilts, whose axis
-        says nothing of the beam, the sensor lies ahead."""
+        is told by the axis of the last surface; in a lens with tilts and a mirror, where that
+        axis says nothing of the beam, the sensor lies ahead."""
         rows, rotation = self.rows, self.rows.rotation
-        if len(self.forms) == 1 or (rotation is not None and self.mirrors[-1]):
+        if len(self.forms) == 1 or (rotation is not None and any(self.mirrors)):
             return jnp.ones_like(rows.vertex[0])
         step = rows.vertex[-1] - rows.vertex[-2]
         if rotation is not None:

@@ -139,3 +139,11 @@ def test_check_refuses_nan_and_air_that_is_none(tmp_path):
     strange = dataclasses.replace(constants, strength=constants.strength.at[2].set(np.nan))
     refused("lens.dispersion.strength: expected numbers", dispersion=strange)
     refused("lens.free: expected some of semi_diameter, dispersion, phase", free=("glass",))
+
+
+def test_a_mask_of_a_tree_of_parameters():
+    """As of a training step: a lens beside other parameters."""
+    lens = drt_jax.load_lens("cooke_triplet")
+    mask = drt_jax.movable({"optics": lens, "network": [jnp.ones(3)]})
+    assert mask["network"] == [True] and mask["optics"].curvature is True
+    assert mask["optics"].semi_diameter is False

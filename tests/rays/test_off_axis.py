@@ -132,3 +132,19 @@ def test_derivatives_of_hits_by_the_tilt_of_the_mirror(name):
     wanted = (hits(1e-5) - hits(-1e-5)) / 2e-5
     for mode in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(mode(hits)(jnp.zeros(())), wanted, rtol=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [90.0, -90.0])
+def test_a_lens_behind_a_fold_mirror_may_have_its_axis_either_way(turn):
+    """A plano-convex lens 10 mm behind a mirror at 45 degrees: rays reach the sensor."""
+    rows = [
+        {"radius": "inf", "stop": True, "semi_diameter": 2.0, "thickness": 20.0},
+        {"radius": "inf", "mirror": True, "tilt": [45.0, 0, 0], "thickness": 0.0},
+        {"radius": "inf", "index": 1.5, "decentre": [0, 10.0], "tilt": [turn, 0, 0]},
+        {"radius": 50 * turn / 90, "decentre": [0, 14.0], "tilt": [turn, 0, 0]},
+    ]
+    rows[2]["thickness"] = 0.0
+    place = {"sensor": 20.0, "sensor_decentre": [0, 114.0], "sensor_tilt": [turn, 0, 0]}
+    rays = trace_rays(load_lens({"surfaces": rows, **place}), 0.0, np.inf, (0.55,), PUPIL)
+    np.testing.assert_array_equal(rays.status, Status.OK)
+    np.testing.assert_allclose(rays.points[0, :, -1, 1:], [[114.0, 20.0]] * 5, atol=0.01)
