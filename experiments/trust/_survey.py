@@ -145,7 +145,7 @@ def _retrace(lens, field, distance, points):
     def one(points):
         size = 1 + jnp.max(jnp.abs(points))
         shift = 1e-7 * size * jnp.eye(3, k=-1)[jnp.array([0, 1, 2, 1, 2])]  # not, in x, in y
-        shift = shift * jnp.array([[0], [1], [1], [-1], [-1]])
+        shift = shift * jnp.array([[0.0], [1], [1], [-1], [-1]], shift.dtype)
         hits, ok = jax.vmap(lambda s: _shoot(lens, field, distance, points[0] + s))(shift)
         growth = jnp.max(jnp.abs(hits[1:] - hits[:1])) / (1e-7 * size)
         off = jnp.max(jnp.abs(hits[0] - points))

@@ -90,6 +90,7 @@ def test_derivatives_of_virtual_images(virtual):
         np.testing.assert_allclose(found, jnp.stack(wanted), rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_negative_lens_focuses_where_paraxial_optics_says():
     rows = [
         {"radius": "inf", "thickness": 2.0, "index": 1.5, "stop": True, "semi_diameter": 0.01},
