@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -121,16 +122,18 @@ class Studio:
         distances = sorted(set(self.depths))
         size = config.camera.kernel
         grid = self.waves, self.pixel, size
-        try:
-            model = drt_jax.converged_psf(
-                lens, fields, distances, *grid, "rays", config.camera.tolerance
-            )
-        except ValueError as error:
-            _common.require(False, f"field_deg: {error}")
         worst = 0.0
-        for distance in distances:
-            found = drt_jax.psfs(lens, fields, distance, *grid, model)
-            worst = max(worst, float(np.max(found.outside)))
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "size: ")  # light beside kernels is judged below
+            try:
+                model = drt_jax.converged_psf(
+                    lens, fields, distances, *grid, "rays", config.camera.tolerance
+                )
+            except ValueError as error:
+                _common.require(False, f"field_deg: {error}")
+            for distance in distances:
+                found = drt_jax.psfs(lens, fields, distance, *grid, model)
+                worst = max(worst, float(np.max(found.outside)))
         beside = f"{100 * worst:.0f} % of the light of the spoilt lens falls beside a kernel"
         remedy = "give a larger one, larger pixels, or spoil the lens less"
         _common.require(worst <= _BESIDE, f"camera.kernel: {beside} of {size} pixels: {remedy}")
