@@ -85,6 +85,7 @@ def test_values_are_those_of_analyses(triplet):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:size.* hold 99 %")
 def test_kernels_are_those_of_psf():
     """An operand of one's own: the light beside the pixel in the middle, and its derivative."""
     variables = Variables.from_lens(COOKE, ["sensor"])

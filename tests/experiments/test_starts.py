@@ -30,14 +30,15 @@ STARTS = {
     ],
     "images": [
         *(
-            "views=[{lens: singlet, field_deg: 0, pixel_um: 8}]",
+            "views=[{lens: singlet, field_deg: 0, pixel_um: 100}]",
             "size=9",
             "rays=[16]",
             "waves=[48]",
         ),
         "photographs=[{lens: singlet, pixel_um: 100}]",
         *("limit=64", "rounds=2", "peers=[64]", "frequencies=5", "photo_pixels=48", "repeats=1"),
-        *("gallery.lens=singlet", "gallery.fields_deg=[0]", "gallery.distances_m=[.inf]"),
+        *("gallery.lens=singlet", "gallery.pixel_um=100", "gallery.fields_deg=[0]"),
+        "gallery.distances_m=[.inf]",
     ],
     "joint": [
         *(

@@ -11,7 +11,7 @@ import numpy as np
 from drt_jax import Status, load_lens, trace_rays
 
 from .. import oracle
-from ..known import bendable
+from ..known import bendable, freed
 
 WAVELENGTHS = (0.55,)
 ROWS = (*oracle.LENS, *oracle.MOVES, *oracle.MEDIA)
@@ -26,11 +26,15 @@ def hexapolar(rings):
     return np.concatenate(points)
 
 
-@functools.partial(jax.jit, static_argnames="chosen")
 def rays_and_derivatives(lens, field, distance, pupil, chosen):
     """Rays of one colour through `pupil`, and the derivatives by (lens, field) of the outputs of
-    those numbered `chosen`: a lens and a field with a leading axis (chosen, x, y and path)."""
+    those numbered `chosen`: a lens and a field with a leading axis (chosen, x, y and path). By all
+    numbers of the lens: nothing is held."""
+    return _both(freed(lens), field, distance, pupil, chosen)
 
+
+@functools.partial(jax.jit, static_argnames="chosen")
+def _both(lens, field, distance, pupil, chosen):
     def outputs(lens, field):
         rays = trace_rays(bendable(lens), field, distance, WAVELENGTHS, pupil)
         picked = jnp.array(chosen)
