@@ -39,7 +39,9 @@ def tidied(corners: np.ndarray) -> np.ndarray:
 def convex_pieces(corners: np.ndarray) -> tuple[tuple[int, ...], ...]:
     """Convex pieces of a polygon (N, 2), each the numbers of its corners counterclockwise, 24 at
     most: ears are cut off, then pieces joined that stay convex (Hertel and Mehlhorn, 1983).
-    ValueError if sides cross or touch."""
+    ValueError if sides cross or touch, or if `tidied` would leave corners out."""
+    if len(tidied(corners)) < len(corners):
+        raise ValueError("has a corner twice, or one on a straight side: leave it out")
     if _crosses(corners):
         raise ValueError("its sides cross or touch")
     ring = list(range(len(corners)))

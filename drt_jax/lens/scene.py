@@ -23,8 +23,9 @@ class Scene:
     """An object point and its wavelengths, arrays of one floating dtype.
 
     field: (2,), angles along x and y, radians: light goes along (tan x, tan y, 1).
-    distance: (), from the object plane to the first vertex, inf allowed, mm. Below 0 for a virtual
-        object: light that converges towards a point behind the first vertex.
+    distance: (), from the object plane to the first vertex, mm; inf, or -inf, for an object at
+        infinity. Below 0 for a virtual object: light that converges to a point behind the first
+        vertex.
     wavelengths: (W,), um.
     """
 
@@ -69,8 +70,7 @@ def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers
     """A scene in the dtype of the lens.
 
     field: one angle (along y) or two (x, y), radians: light goes along (tan x, tan y, 1).
-    distance: from the object plane to the first vertex, inf allowed, mm; below 0 for a virtual
-        object, see `Scene`.
+    distance: from the object plane to the first vertex, mm, see `Scene`.
     wavelengths: (W,) or one, um.
 
     ValueError for other shapes, for what is no real number, for a lens whose arrays do not fit

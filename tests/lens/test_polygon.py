@@ -71,6 +71,14 @@ def test_what_is_no_polygon_is_refused():
     ):
         with pytest.raises(LensError, match=why):
             lens_of(aperture={"polygon": corners})
+    square = [[0, 0], [2, 0], [2, 2], [0, 2]]
+    for more in ([0, 2], [0, 1]):
+        own = jnp.asarray([[*square, more]], float)
+        with pytest.raises(ValueError, match="a corner twice, or one on a straight side"):
+            Apertures(
+                jnp.ones((1, 2)), jnp.zeros((1, 2)), own,
+                surfaces=(0,), kinds=("polygon",), blocks=(False,),
+            )  # fmt: skip
     with pytest.raises(LensError, match="216 sets of rays, 64 at most"):
         lens_of(obscuration=[{"polygon": SHAPES["star"], "centre": [i, 0]} for i in range(3)])
     with pytest.raises(LensError, match="reaches beyond the surface"):
