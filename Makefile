@@ -34,7 +34,7 @@ test-slow: install
 	$(BIN)/python -m pytest -m slow
 
 test-all: install
-	$(BIN)/python -m pytest -m ""
+	$(BIN)/python -m pytest -m "" --durations=60
 
 # A part of the tests with other releases of Python and JAX, where there are such Pythons.
 test-versions: install
