@@ -15,6 +15,7 @@ from ..rays.trace import Bundle
 from .rules import PupilRule
 
 _UM = 1e3  # per mm
+_ROUND = 64  # last digits by which a ray on the rim may miss it
 
 
 @jax.tree_util.register_dataclass
@@ -63,6 +64,9 @@ class Mask:
         ends = []  # of the box along x and y: two pixels and the parts of it that lie in them
         for point, reach, count in zip(at, half, pixels.shape[:-3:-1]):
             low, wide = (point - reach + 1) * (count / 2), reach * count
+            # A ray on the rim crosses the pixel inside, also if rounding puts it beside the plate.
+            near = jnp.abs(jnp.abs(point) - 1) <= _ROUND * float(jnp.finfo(point.dtype).eps)
+            low = jnp.where(near & (reach == 0), jnp.clip(low, 0, count - 1), low)
             first = jnp.floor(low)
             second = jnp.clip(safe_divide(low + wide - first - 1, wide), 0, 1)
             place = jnp.clip(first, -1, count).astype(jnp.int32) + 1

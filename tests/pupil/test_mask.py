@@ -38,6 +38,10 @@ def test_means_over_boxes():
         np.testing.assert_allclose(found[k], means[1] @ table @ means[0], atol=3e-3)
     point = Mask.means(jnp.asarray(table), jnp.array([[[0.3]], [[-0.6]]]), jnp.zeros((2, 1, 1)))
     assert point[0, 0] == table[0, 2]
+    for eps in (0.0, 2e-16, -2e-16):  # a ray on the rim, by rounding beside it
+        rim = jnp.array([[[1, -1, 0.1, 0.1]], [[0.1, 0.1, 1, -1]]]) * (1 + eps)
+        found = Mask.means(jnp.asarray(table), rim, jnp.zeros((2, 1, 4)))[0]
+        np.testing.assert_array_equal(found, [table[2, 3], table[2, 0], table[3, 2], table[0, 2]])
 
 
 def test_what_a_mask_cannot_be_is_refused():
