@@ -89,9 +89,8 @@ class Record:
         """Notes of lines with solves, and of words that are not known. what: kind of the words."""
         if solves:
             some = listed(map(str, solves), 5)
-            self.notes.append(
-                f"solves and pickups are read as the values beside them, lines {some}"
-            )
+            place = f"line{'s' * (len(solves) > 1)} {some}"
+            self.notes.append(f"{place}: solves and pickups are read as the values beside them")
         if unknown:
             some = listed([f"{key} (line {line})" for key, line in unknown.items()], 8)
             self.notes.append(f"{what} that are not known: {some}")

@@ -379,7 +379,7 @@ def test_listed_double_gauss(tmp_path):
     """CODE V 10.8 on a file of its own: indices, first order, rays, to the last printed digit."""
     path = tmp_path / "gauss.seq"
     path.write_text(GAUSS)
-    with pytest.warns(UserWarning, match=r"values beside them, lines 16$"):
+    with pytest.warns(UserWarning, match=r"line 16: solves and pickups are read as the values"):
         system = load_system(path)
     glasses = np.asarray(system.lens.index(system.wavelengths))[[1, 3, 4, 8]]
     listed = [[1.618769, 1.622292, 1.630455], [1.604134, 1.607379, 1.614860]]
@@ -407,7 +407,7 @@ def test_later_changes_solves_and_zooms(tmp_path):
     rows = found.parts
     assert [row.thickness for row in rows] == [6, 48, 0]
     assert [row.entry["curvature"] for row in rows] == [1 / 40, -0.03, 0]
-    assert rows[0].entry["glass"] == "F2" and "lines 11" in found.notes[0]
+    assert rows[0].entry["glass"] == "F2" and "line 11: solves" in found.notes[0]
     zoom = ["ZOO 3", "ZOO THI S1 7 8 9", "ZOO THC S1 0 0 0", "ZOO YAN F2 3 4 5", "EPD Z2 40"]
     found, use = record(tmp_path, FRONT, BACK, *zoom)
     assert found.parts[0].thickness == 7 and use.heights[1] == (0, 3) and use.aperture == 10

@@ -534,7 +534,8 @@ def test_what_is_read_otherwise_is_said(tmp_path):
         read(tmp_path, FRONT, own, tail=("MNUM 3 2",))
     message = str(said[0].message)
     assert all(
-        word in message for word in ("3 configurations number 2", "lines 33", "ABCD (line 34)")
+        word in message
+        for word in ("3 configurations number 2", "line 33: solves and pickups", "ABCD (line 34)")
     )
     many = "".join(f"|ABC{k} 7" for k in range(11))
     with pytest.warns(UserWarning, match=r"ABC7 \(line 40\) and 3 more"):
