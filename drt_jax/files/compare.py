@@ -1,12 +1,13 @@
 """Compare a lens with what is read back from the text that stands for it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from ..lens.lens import Lens
 from .apertures import shapes_of
+from .system import System
 
 _KINDS = ("circle", "ellipse", "rectangle", "polygon")
 _CLOSE = 1e-9  # relative, and in mm; rounding of float32 is larger
@@ -25,11 +26,35 @@ def difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) -
         if a != b:
             return f"{name} {a}, read back {b}"
     close = max(_CLOSE, 256 * float(np.finfo(np.asarray(one.curvature).dtype).eps))
-    for name, a, b, least in _numbers(one, two, waves, indices, close):
+    return _first(_numbers(one, two, waves, indices, close), close)
+
+
+def use_difference(system: System, used: Mapping[str, Any]) -> str:
+    """The same of the use of a lens. used: fields of `System` that were read back."""
+    for name in ("field_kind", "primary"):
+        a, b = getattr(system, name), used.get(name, getattr(system, name))
+        if a != b:
+            return f"{name} {a}, read back {b}"
+    pairs = ((name, getattr(system, name), b) for name, b in used.items() if name != "field_kind")
+    return _first(((name, _used(name, a), _used(name, b), _CLOSE) for name, a, b in pairs), _CLOSE)
+
+
+def _used(name: str, values: Any) -> np.ndarray:
+    """A field of `System` as an array; a pupil that is not vignetted is not turned."""
+    found = np.array(values, float)
+    if name == "vignetting":
+        found[:, 4] *= np.any(found[:, :4], axis=1)
+    return found
+
+
+def _first(pairs: Iterator[Any], close: float) -> str:
+    """The first difference of pairs of arrays, see `_numbers`."""
+    for name, a, b, least in pairs:
         if a.shape != b.shape:
             return f"{name}: {len(a)} of them, read back {len(b)}"
         with np.errstate(invalid="ignore"):  # inf - inf
-            off = (a != b) & ~(np.abs(a - b) <= np.maximum(least, close * np.abs(a)))
+            room = np.maximum(least, close * np.minimum(np.abs(a), np.abs(b)))
+            off = (a != b) & ~(np.abs(a - b) <= room)
         if np.any(off):
             at = tuple(np.argwhere(off)[0])
             place = f"[{', '.join(map(str, at))}]" if at else ""

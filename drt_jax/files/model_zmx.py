@@ -14,6 +14,7 @@ from .record import Record, Row
 _POWERS = np.array([0.0, -1.0, -3.5])
 _LINES = (0.5875618, 0.4861327, 0.6562725, 0.4358343)
 _NORMAL = 0.6438, -0.001682
+_ROUNDING = 1e-12  # a P_gF that is as near to the normal line lies on it
 _M1 = np.array([-7.12849, 4.95284, -0.202244])
 _M2 = np.array([8.84931, -6.91677, 0.454415])
 
@@ -25,7 +26,8 @@ def to_ours(nd: float, vd: float, above: float) -> tuple[float, float, float]:
     terms[0] += nd
     d, f, c, g = (np.array(_LINES)[:, None] ** _POWERS) @ terms
     abbe = (d - 1) / (f - c)
-    return float(d), float(abbe), float((g - f) / (f - c) - _NORMAL[0] - _NORMAL[1] * abbe)
+    partial = float((g - f) / (f - c) - _NORMAL[0] - _NORMAL[1] * abbe)
+    return float(d), float(abbe), partial if abs(partial) > _ROUNDING else 0.0
 
 
 def to_theirs(nd: float, vd: float, above: float) -> tuple[float, float, float]:

@@ -13,7 +13,7 @@ from ..lens.elements import Elements
 from ..lens.forms import FORMS
 from ..lens.glass import FRAUNHOFER
 from ..lens.lens import Lens
-from .compare import difference
+from .compare import difference, use_difference
 from .entry import LensError
 from .exact import degrees_of
 from .media_out import media_of_lens
@@ -32,9 +32,10 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
     hold in degrees, and model glasses and radii in `.zmx`: to the last digit but one).
 
     The text is read back before it becomes a file: if curvatures, thicknesses, places, indices at
-    the wavelengths, the stop or apertures differ beyond rounding, nothing is written. The file
-    contains the constants of glasses that differ from the catalogue's. A second medium of the same
-    name with other constants is called name*.
+    the wavelengths, the stop, apertures or, of a `System`, distance, fields, vignetting and
+    wavelengths differ beyond rounding, nothing is written. The file contains the constants of
+    glasses that differ from the catalogue's. A second medium of the same name with other constants
+    is called name*.
 
     lens: a lens; or a `System`, whose fields, wavelengths, vignetting and distance of the object
         stand in `.zmx` and `.seq` files, with the size of the stop; a lens alone is written with an
@@ -61,12 +62,12 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            again = lens_in(text, path)
+            again, used = lens_in(text, path)
     except LensError as error:
         raise LensError(f"{error}; not written, as it could not be read back") from error
     # A private glass of .seq stands for a model glass by six terms.
     room = _PRIVATE if kind == ".seq" and system.lens.dispersion.model is not None else 0.0
-    if found := difference(system.lens, again, known, room):
+    if found := difference(system.lens, again, known, room) or use_difference(system, used):
         raise LensError(f"{path}: not written: what is read back differs: {found}")
     try:
         pathlib.Path(path).write_text(text, encoding="utf-8")

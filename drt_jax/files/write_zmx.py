@@ -194,8 +194,11 @@ def _apertures(lens: Lens, i: int) -> list[str]:
     inner = others[0].size[0] if others else 0.0
     ring = Shape(True, "circle", [inner] * 2, centre)
     if others and not (kind == "circle" and not blocks and others == [ring]):
+        own = " and ".join(f"{'a blocking' if s.blocks else 'a clear'} {s.kind}" for s in shapes)
         raise LensError(
-            f"surfaces[{i}]: a .zmx surface has one aperture, or a circle in one: save as .yaml"
+            f"surfaces[{i}]: has {own}; a .zmx surface has one aperture, or a blocking circle in a "
+            "clear one of its centre: put the others on plane surfaces of their own beside it, or "
+            "save as .yaml"
         )
     if kind == "polygon":
         corners = [*zip(size[::2], size[1::2], strict=True)]

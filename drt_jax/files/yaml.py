@@ -20,6 +20,8 @@ from .zmx import read_zmx
 _BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
 _READERS = {".zmx": read_zmx, ".seq": read_seq}
 _ENDINGS = (".yaml", ".yml", *_READERS)
+_FIELDS = ("heights", "field_kind", "field_weights", "vignetting")
+_USED = (*_FIELDS, "wavelengths", "wavelength_weights", "primary")
 
 
 def lens_names() -> list[str]:
@@ -70,12 +72,15 @@ def known_ending(path: str | pathlib.Path) -> str:
     return kind
 
 
-def lens_in(text: str, path: str | pathlib.Path) -> Lens:
-    """The lens of the text of a file. LensError as of `load_lens`. path: its name."""
+def lens_in(text: str, path: str | pathlib.Path) -> tuple[Lens, dict[str, Any]]:
+    """The lens of the text of a file, and of its use the fields of `System` that need no ray; none
+    of a prescription. LensError as of `load_lens`. path: its name."""
     kind = known_ending(path)
-    if kind in _READERS:
-        return lens_of(*_READERS[kind](str(path), "error", text.splitlines()))
-    return _lens_of_yaml(text, pathlib.Path(path))
+    if kind not in _READERS:
+        return _lens_of_yaml(text, pathlib.Path(path)), {}
+    record, use = _READERS[kind](str(path), "error", text.splitlines())
+    used = {key: value for key, value in vars(use).items() if key in _USED}
+    return lens_of(record, use), used | {"distance": record.distance}
 
 
 def _lens_of_yaml(text: str, path: pathlib.Path) -> Lens:
