@@ -38,6 +38,7 @@ _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
 _MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
 _DEFOCUS = 3.0  # times the smallest spot; a larger spot is out of focus
+_NONE = 1e-9  # mm, mrad: a smaller spot is rounding, of no known size
 
 
 def _options(argv: list[str] | None) -> argparse.Namespace:
@@ -86,7 +87,12 @@ def first_rows(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[tup
         place = f"at {image_of.position + 0.0:.5g} mm from the {end} vertex"
         yield f"{name} pupil", f"{2 * image_of.semi_diameter:.5g} mm wide, {place}"
     yield "sensor", f"{float(lens.sensor):.6g} mm from the first vertex"
-    yield "paraxial focus", f"{found.image_distance:.6g} mm from the first vertex"
+    if lens.afocal:
+        far = float(found.image_distance) - float(lens.vertices[-2])
+        vergence = f"{1e3 / far if far else math.inf:.4g} dioptres behind the last vertex"
+        yield "vergence", f"{vergence}, 0 for collimated light"
+    else:
+        yield "paraxial focus", f"{found.image_distance:.6g} mm from the first vertex"
 
 
 def surface_rows(lens: Lens) -> Iterator[tuple[str, ...]]:
@@ -136,10 +142,10 @@ def field_rows(
             continue
         cut = "; ".join(filter(None, (", ".join(map(str, beam.clipping)), *beam.ends))) or "none"
         squares = [np.trace(np.asarray(m.covariance), axis1=1, axis2=2) for m in (found, rough)]
-        sizes = [f"{1e3 * math.sqrt(square):.4g}" for square in squares[0]]
+        sizes = [f"{1e3 * s:.4g}" if s > _NONE else "<1e-6" for s in np.sqrt(squares[0])]
         height = round(float(found.mean[middle, 1]), 9) + 0.0  # no -0
         yield f"{field:.4g}", f"{height:.5g}", *sizes, f"{light:.2f}", cut
-        change = np.max(np.abs(squares[1] / squares[0] - 1)) / 2
+        change = np.max(np.abs(squares[1] - squares[0]) / np.maximum(squares[0], _NONE**2)) / 2
         if change > _TOLERANCE:
             yield f"  ! these spots are known to {change:.1g} of their size only"
         for wavelength, part in zip(wavelengths, 100 * np.asarray(found.throughput)):
@@ -287,7 +293,8 @@ def run_show(options: argparse.Namespace) -> None:
         axial = beam_of(lens, 0.0, distance, middle)
         others = [wave for wave in waves if wave != middle]
         beams = [beam_of(lens, angle, distance, middle, *others) for angle in angles]
-        notes = _say([*focus_lines(found, middle, axial), *filter(None, [options.note]), ""])
+        focus = [] if lens.afocal else focus_lines(found, middle, axial)
+        notes = _say([*focus, *filter(None, [options.note]), ""])
         table = _say(field_rows(lens, fields, distance, waves, beams))
         notes += _say(aperture_lines(lens, beams))
         kind = ".html" if options.html else ".png"

@@ -86,6 +86,37 @@ def test_what_looks_odd(tmp_path, capsys, undrawn):
     assert "! out of focus on the axis" in said and "mm further" in said and "! no ray" in said
 
 
+AFOCAL = """
+surfaces:
+  - {curvature: 0.01, index: 1.5, thickness: 3, semi_diameter: 5, stop: true}
+  - {curvature: -0.01}
+sensor: 110
+afocal: true
+"""
+PARABOLA = """
+surfaces: [{curvature: -0.005, conic: -1, mirror: true, semi_diameter: 10, stop: true}]
+sensor: -100
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["afocal", "perfect"])
+def test_no_focus_and_no_spot(kind, tmp_path, capsys, undrawn):
+    """An afocal lens has no focus, but a vergence: 1000 / 99.4975 mm here. A spot of rounding has
+    no size."""
+    (tmp_path / "mine.yaml").write_text(AFOCAL if kind == "afocal" else PARABOLA)
+    words = ["show", str(tmp_path / "mine.yaml"), "--field", "0", "--wavelengths", "0.55"]
+    main([*words, "--out", str(tmp_path / "lens.png")])
+    said = capsys.readouterr().out
+    assert "!" not in said
+    if kind == "afocal":
+        (row,) = [line.split() for line in said.splitlines() if "vergence" in line]
+        assert float(row[1]) == 10.05 and "paraxial focus" not in said
+    else:
+        (row,) = [line.split() for line in said.splitlines() if line.split()[:1] == ["0"]]
+        assert row[2] == "<1e-6" and "paraxial focus" in said
+
+
 @pytest.mark.slow
 def test_words_for_apertures_and_focal_length(tmp_path, capsys, undrawn):
     """A diameter for a semi-diameter; an aperture that cuts; a wrong sign."""

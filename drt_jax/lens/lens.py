@@ -88,8 +88,9 @@ class Lens:
     orders of diffraction, and shapes of planes (`curved`). What is asked for by name has its
     derivative: what `dataclasses.replace(lens, semi_diameter=...)` puts in within the function that
     is differentiated, and what `free` names. What a program (`jit`) puts in counts as asked for
-    there. Where `scan` or `cond` put such numbers in, `free` must name them: it keeps the type of
-    the pytree.
+    there. It makes the lens a pytree of another type: where it meets the lens before, as in
+    `jax.tree.map(f, before, after)` in a program and in the carry of `scan` or the branches of
+    `cond`, give both the name in `free`, which keeps the type.
 
     curvature: (S + 1,), 1/mm.
     conic: (S + 1,), 0 for a sphere, -1 for a paraboloid.

@@ -66,6 +66,21 @@ def test_one_compilation_serves_lenses_of_one_shape():
     assert len(traced) == 1
 
 
+def test_a_lens_meets_the_one_before_in_a_program():
+    """What a program puts in makes another type of pytree, but for what `free` names."""
+
+    @jax.jit
+    def change(lens):
+        after = dataclasses.replace(lens, semi_diameter=2 * lens.semi_diameter)
+        return jax.tree.map(jnp.subtract, after, lens)
+
+    lens = load_lens("singlet")
+    found = change(dataclasses.replace(lens, free=("semi_diameter",)))
+    np.testing.assert_allclose(found.semi_diameter[:-1], lens.semi_diameter[:-1])
+    with pytest.raises(ValueError, match="different pytree metadata"):
+        change(lens)
+
+
 @pytest.mark.parametrize("semi", [0.0, np.inf, np.nan])
 def test_a_stop_without_a_size_gets_one_line(semi):
     lens = load_lens("cooke_triplet")
