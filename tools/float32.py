@@ -10,7 +10,10 @@ spot: RMS radius, um. focus: where along the axis the spot is smallest, in depth
 wavelength / numerical aperture^2. path: path differences, waves RMS. strehl; mtf: at a fifth of the
 cut-off; energy: encircled, within two Airy radii. rays, waves: sums of the absolute errors of
 kernels of 15 x 15 pixels, each as wide as the Airy radius. distortion; angle: of the chief ray,
-radians; light: relative illumination. told: whether float32 warns of waves.
+radians; light: relative illumination.
+
+Bold: above its bound (`BOUNDS`), which for path differences, foci and kernels is that above which
+calls warn by default. told: of what float32 warns, path differences or foci.
 """
 
 import functools
@@ -28,6 +31,8 @@ jax.config.update("jax_enable_x64", True)
 import drt_jax  # noqa: E402
 from drt_jax import design  # noqa: E402
 from drt_jax.compilation import ONCE, jit  # noqa: E402
+from drt_jax.image.psf_model import TOLERANCE  # noqa: E402
+from drt_jax.image.rounding import tell_of_focus  # noqa: E402
 
 FIELDS = {
     "camera_50mm": 23.5, "cooke_triplet": 20, "dagor_240mm": 26.6, "double_gauss": 14,
@@ -40,6 +45,8 @@ KINDS |= {"energy": "encircled_energy", "distortion": "distortion"}
 KINDS |= {"angle": "chief_ray_angle", "light": "relative_illumination"}
 COLUMNS = ("spot", "focus", "path", "strehl", "mtf", "energy", "rays", "waves")
 COLUMNS += ("distortion", "angle", "light")
+BOUNDS = {"focus": 0.02, "path": 1e-3, "rays": TOLERANCE, "waves": TOLERANCE}
+BOUNDS |= dict.fromkeys(("strehl", "mtf", "energy", "distortion", "light"), 5e-3)
 WAVELENGTH = 0.55e-3  # mm
 
 
@@ -63,6 +70,12 @@ def values(problem, lens):
     return found | {"focus": focus * aperture**2 / WAVELENGTH} | kernels
 
 
+def cell(column, error):
+    """A number of the table, bold above its bound."""
+    text = f"{error:.0e}"
+    return f"**{text}**" if float(text) > BOUNDS.get(column, np.inf) else text
+
+
 def row(name):
     """The cells of a lens."""
     double, found = drt_jax.load_lens(name), []
@@ -75,6 +88,7 @@ def row(name):
         variables = design.Variables.from_lens(lens, ["sensor"])
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
+            tell_of_focus(lens, np.inf, um)
             problem = design.Problem.from_variables(
                 variables, [design.Operand("strehl", target=1.0)], fields, um, np.inf, rule
             )
@@ -84,8 +98,9 @@ def row(name):
     errors["path"] = np.sqrt(np.sum(errors["path"] ** 2, axis=-1))
     for kind in ("rays", "waves"):
         errors[kind] = np.sum(errors[kind], axis=(-2, -1))
-    cells = [f"{np.max(errors[column]):.0e}" for column in COLUMNS]
-    return [name, str(FIELDS[name]), *cells, "yes" if said else ""]
+    cells = [cell(column, np.max(errors[column])) for column in COLUMNS]
+    told = [what for what in ("path", "focus") if what in " ".join(map(str, said))]
+    return [name, str(FIELDS[name]), *cells, ", ".join(told)]
 
 
 def main(names):

@@ -33,6 +33,7 @@ from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
 from .field import CHIEF
+from .rounding import tell_of_focus
 
 Mapping = Literal["tangent", "angle"]
 # As many fields at a time are a program.
@@ -87,8 +88,11 @@ def field_curvature(
     fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
 
     Positive where the focus has the larger z, as OpticStudio plots it. In a lens without a plane of
-    symmetry these are the two focal lines, named by the direction that they are nearer to.
+    symmetry these are the two focal lines, named by the direction that they are nearer to. Warns,
+    outside of a trace, where float32 moves a focus by more than 2 % of the depth of focus, the
+    wavelength over NA^2.
     """
+    tell_of_focus(lens, distance, wavelengths)
     found = _chief_rays(lens, fields, distance, wavelengths)
     return FieldCurvature(found.tangential[1:], found.sagittal[1:])
 

@@ -18,7 +18,7 @@ from ..lens.scene import Scene, fields_array, scene_of
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
-from .rounding import tell_of_paths
+from .rounding import tell_of_focus, tell_of_paths
 from .wavefront import path_differences
 
 
@@ -97,11 +97,13 @@ def axial_colour(
     distance: mm, inf allowed. wavelengths: (W,) um. heights: (N,) on the y axis of the stop, in
     units of its semi-diameter, none 0.
 
-    The paraxial foci leave out tilts and decentres. ValueError as of `scene_of`.
+    The paraxial foci leave out tilts and decentres. Warns of float32 as `field_curvature` does.
+    ValueError as of `scene_of`.
     """
     points = real_array("heights", heights, lens.curvature.dtype)
     if points.ndim != 1:
         raise ValueError(f"heights: expected (N,), got shape {points.shape}")
+    tell_of_focus(lens, distance, wavelengths)
     hit, slope, _, good = _of_fields(lens, 0.0, distance, wavelengths, points)
     height, bend = (a[0, :, 1 : len(points) + 1, 1] - a[0, :, :1, 1] for a in (hit, slope))
     arrives = good[0, :, 1 : len(points) + 1] & good[0, :, :1] & (bend != 0)

@@ -95,7 +95,10 @@ def chosen_psf(
         base = converge(scenes_of, lens, seen, min(tolerance, 1e-3), at_sensor, False).rule
         clipped = base if isinstance(base, Clipped) else None
         symmetry = symmetry_of(lens, seen[0])
-        rounded = _rounded(lens, scenes, side, model)
+        rounded = {"hits": hit_rounding(lens)}
+        if model in ("waves", "auto"):
+            paths = path_rounding(lens, scenes, True) if rough(lens) else 0.0
+            rounded["phase"] = 4 * np.pi * paths
         for degrees in _DEGREES:
             whole = beam_rule(degrees[-1], symmetry, clipped)
             beams = [traced(lens, scene, whole) for scene in scenes]
@@ -108,23 +111,15 @@ def chosen_psf(
                 f"{tolerance:.1e}",
                 stacklevel=3,
             )
-        worst = max(rounded.values())
-        tell(lens, "kernels", worst, tolerance, "", 3)
         rule = beam_rule(degree, symmetry, clipped)
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
-        view = _View(lens, tuple(scenes), tuple(beams), side, size, norm, worst)
+        view = _View(lens, tuple(scenes), tuple(beams), side, size, norm)
+        worst = max(rounded.get("phase", 0.0), view.hit_error(model))
+        tell(lens, "kernels", worst, tolerance, "", 3)
+        view = dataclasses.replace(view, rounded=worst)
         if model != "auto":
             return PsfModel(model, rule, view.cells(model, tolerance)), view
         return _cheapest(view, rule, tolerance), view
-
-
-def _rounded(lens: Lens, scenes: list[Scene], pixel: Array, model: str) -> dict[str, float]:
-    """What rounding adds to the error of kernels: of hits, and of phases if waves are asked for."""
-    hits = hit_rounding(lens) / float(pixel)
-    if model not in ("waves", "auto"):
-        return {"hits": hits}
-    paths = path_rounding(lens, scenes, True) if rough(lens) else 0.0
-    return {"hits": hits, "phase": 4 * np.pi * paths}
 
 
 def _check_asked(model: str, tolerance: float, norm: int) -> None:
@@ -143,6 +138,7 @@ def traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
 
 # Each number of cells needs its own compiled program, which runs once per scene.
 _kernels = jit(psf_of_beam, ONCE, static_argnames=("size", "kind", "cells"))
+_refocused = jax.jit(Beam.refocused)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +152,7 @@ class _View:
     pixel: Array
     size: int
     norm: int
-    rounded: float
+    rounded: float = 0.0
 
     def made(self, kind: Kind, cells: int) -> list[Psf]:
         """What a model makes of each scene."""
@@ -169,6 +165,20 @@ class _View:
     def kernels(self, kind: Kind, cells: int) -> np.ndarray:
         """Kernels of all scenes and wavelengths, (scenes W, size, size)."""
         return np.concatenate([np.asarray(one.kernel) for one in self.made(kind, cells)])
+
+    def hit_error(self, model: Kind | Literal["auto"]) -> float:
+        """What rounding of hits adds to the error of kernels; those of waves follow from paths. It
+        is measured by a defocus that moves rays at the rim of the pupil as far. Sums of errors in
+        float32 at Airy's radius: 0.02 for 0.006 of a microscope objective, 3e-4 for 4e-5 where
+        the spot is large."""
+        if model == "waves" or not rough(self.lens):
+            return 0.0
+        given: tuple[Kind, int] = ("gaussian", 0) if model == "gaussian" else ("rays", _CELLS[0])
+        cones = [float(np.max(one.solid_angle)) for one in self.made(*given)]
+        steps = [hit_rounding(self.lens) * np.sqrt(np.pi / a) if a > 0 else 0.0 for a in cones]
+        beams = [_refocused(b, b.index.dtype.type(step)) for b, step in zip(self.beams, steps)]
+        moved = dataclasses.replace(self, beams=tuple(beams))
+        return difference(moved.kernels(*given), self.kernels(*given), self.norm)
 
     def tell_of_loss(self, model: PsfModel) -> None:
         """Warns of light beside the kernels of a model."""
@@ -248,7 +258,8 @@ def _degree(
     degrees: tuple[int, ...], tolerance: float
 ) -> tuple[int, float]:  # fmt: skip
     """The lowest degree whose polynomials fit the rays, and the error of the fit beyond rounding,
-    relative to the spot or, for the phase, in radians. There are more rays than terms."""
+    relative to the spot or, for the phase, in radians. There are more rays than terms. rounded: of
+    hits, mm, and of phases, radians."""
     pairs = [(b, s, w) for b, s in zip(beams, scenes) for w in range(s.wavelengths.size)]
     for degree in degrees:
         error = max(_misfit(b, s, w, pixel, rounded, degree) for b, s, w in pairs)
@@ -268,8 +279,8 @@ def _misfit(
     middle = _mean(hits, weight)
     spread = np.sqrt(np.sum((weight * (hits - middle)) ** 2))
     points, directions = (np.asarray(a[:, wavelength]) for a in (beam.points, cosines))
-    error = _residual(points, hits - middle, weight, degree) / max(float(spread), float(pixel))
-    error -= 2 * rounded["hits"]
+    error = _residual(points, hits - middle, weight, degree) - 2 * rounded["hits"]
+    error /= max(float(spread), float(pixel))
     if "phase" not in rounded:
         return error
     # The error of the wave field is the phase error; it counts twice. Without the tilt towards the

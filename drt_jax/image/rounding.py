@@ -20,8 +20,9 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
+from ..lens.paraxial import numerical_aperture
 from ..lens.scene import Scene
-from ..numerics import known_values
+from ..numerics import Numbers, known_values
 from ..rays.solve import solve_aimed
 from ..rays.status import Status
 from ..rays.trace import aims, path_of
@@ -30,6 +31,8 @@ from ..rays.trace import aims, path_of
 _DOUBLE = 1e-12
 # RMS error of path differences, waves, up to which analyses are silent: 6e-3 of a Strehl ratio.
 _WAVES = 1e-3
+# Error of a focus, in parts of the depth of focus, that is borne in silence.
+_FOCUS = 0.02
 # Rays of the measurement, as many on the rim of the stop as at half of its radius, and last digits
 # by which their hits differ.
 _RAYS, _DIGITS = 16, 8
@@ -56,6 +59,22 @@ def hit_rounding(lens: Lens) -> float:
     float32 over 54 scenes of bundled lenses: an eighth of this in the median, at most 0.93 of it;
     more for Hubble, 6 m long with a spot of 10 nm."""
     return 2 * float(jnp.finfo(lens.curvature.dtype).eps) * abs(float(lens.sensor))
+
+
+def tell_of_focus(lens: Lens, distance: Numbers, wavelengths: Numbers, level: int = 3) -> None:
+    """Warns if rounding moves a focus by more than `_FOCUS` of the depth of focus, wavelength over
+    NA^2, where it is known: by the error of hits over NA. Foci of spots of the bundled lenses were
+    off by a fifth of this in the median, at most by 0.97 of it."""
+    known = known_values((lens, distance, wavelengths)) if rough(lens) else None
+    if known is None:
+        return
+    with jax.core.eval_context():
+        lens, distance, wavelengths = known
+        # From mm to waves in um.
+        waves = lens.checked_wavelengths(wavelengths)
+        per_um = numerical_aperture(lens, distance, waves) / waves
+        moved = 1e3 * hit_rounding(lens) * float(jnp.max(per_um))
+    tell(lens, "the focus", moved, _FOCUS, " of its depth", level)
 
 
 def tell_of_paths(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
+from drt_jax import design
 from drt_jax.image import rounding
 from drt_jax.image.beam import beam_rule
 from drt_jax.image.cover import cover
@@ -93,3 +94,42 @@ def test_float32_stays():
 
     found = jax.tree.leaves(jax.eval_shape(both, lens))
     assert {a.dtype for a in found} == {np.dtype("float32")}
+
+
+@pytest.mark.slow
+def test_a_focus_that_rounding_moves_is_told():
+    """Of a telescope, by 0.09 of the depth of focus; not of a camera."""
+    remedy = r'in float32 the focus may be wrong by 9e-02 of its depth.*"jax_enable_x64", True'
+    with pytest.warns(UserWarning, match=remedy) as said:
+        drt_jax.field_curvature(single("ritchey_chretien"), jnp.zeros(1), np.inf, GREEN)
+    with pytest.warns(UserWarning, match=remedy) as more:
+        drt_jax.axial_colour(single("ritchey_chretien"), np.inf, GREEN)
+    with pytest.warns(UserWarning, match=remedy) as solved:
+        solve = design.Solve("paraxial_focus", wavelengths=GREEN)
+        design.Variables.from_lens(
+            single("ritchey_chretien"), ["sensor", "curvature"], solves=[solve]
+        )
+    assert {one[0].filename for one in (said, more, solved)} == {__file__}
+    drt_jax.field_curvature(single("cooke_triplet"), jnp.zeros(1), np.inf, GREEN)
+
+
+@pytest.mark.slow
+def test_kernels_of_rays_that_rounding_spoils_are_told():
+    """At Airy's radius those of a microscope objective are off by 6e-3, those of a lens with a
+    large spot by 5e-5, though hits of both are rounded by more than 1e-2 of a pixel."""
+    for name, pixel, loud in (
+        ("microscope_objective", 5e-4, True),
+        ("double_gauss", 2.2e-3, False),
+    ):
+        kernels = []
+        for lens in (drt_jax.load_lens(name), single(name)):
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                model = drt_jax.converged_psf(lens, 0.0, np.inf, GREEN, pixel, 15, "rays")
+            kernels.append(
+                np.asarray(drt_jax.psf(lens, 0.0, np.inf, GREEN, pixel, 15, model).kernel)
+            )
+        assert any("in float32 kernels may be wrong" in str(one.message) for one in said) == loud
+        assert rounding.hit_rounding(single(name)) > 0.01 * pixel
+        error = np.sum(np.abs(kernels[1].astype(float) - kernels[0]))
+        assert (error > 1e-3) == loud
