@@ -107,3 +107,19 @@ def test_a_negative_lens_focuses_where_paraxial_optics_says():
 def test_no_object_at_the_first_vertex(virtual):
     with pytest.raises(ValueError, match=r"distance: must be 1e-06 mm or more.*got 1e-07"):
         trace_rays(virtual, 0.0, 1e-7, [0.55], on_y(0.0))
+
+
+@pytest.mark.slow
+def test_minus_infinity_is_infinity():
+    """Light of an object at infinity is parallel, wherever it is said to lie."""
+
+    @jax.jit
+    def found(lens, distance):
+        rays = drt_jax.trace_rays(lens, 0.05, distance, [0.55], [[0.0, 0.0], [0.3, 0.7]])
+        first = drt_jax.first_order(lens, distance, [0.55])
+        return rays.points, rays.path, rays.status, first
+
+    lens = load_lens("singlet")
+    one, two = (jax.tree.leaves(found(lens, far)) for far in (np.inf, -np.inf))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)
