@@ -12,8 +12,8 @@ cut-off; energy: encircled, within two Airy radii. rays, waves: sums of the abso
 kernels of 15 x 15 pixels, each as wide as the Airy radius. distortion; angle: of the chief ray,
 radians; light: relative illumination.
 
-Bold: above its bound (`BOUNDS`), which for path differences, foci and kernels is that above which
-calls warn by default. told: of what float32 warns, path differences or foci.
+Bold: above its bound (`BOUNDS`), which for path differences and foci is that above which calls
+warn. told: of what float32 warns, path differences or foci.
 """
 
 import functools
@@ -31,7 +31,6 @@ jax.config.update("jax_enable_x64", True)
 import drt_jax  # noqa: E402
 from drt_jax import design  # noqa: E402
 from drt_jax.compilation import ONCE, jit  # noqa: E402
-from drt_jax.image.psf_model import TOLERANCE  # noqa: E402
 from drt_jax.image.rounding import tell_of_focus  # noqa: E402
 
 FIELDS = {
@@ -45,8 +44,8 @@ KINDS |= {"energy": "encircled_energy", "distortion": "distortion"}
 KINDS |= {"angle": "chief_ray_angle", "light": "relative_illumination"}
 COLUMNS = ("spot", "focus", "path", "strehl", "mtf", "energy", "rays", "waves")
 COLUMNS += ("distortion", "angle", "light")
-BOUNDS = {"focus": 0.02, "path": 1e-3, "rays": TOLERANCE, "waves": TOLERANCE}
-BOUNDS |= dict.fromkeys(("strehl", "mtf", "energy", "distortion", "light"), 5e-3)
+BOUNDS = {"focus": 0.02, "path": 1e-3}
+BOUNDS |= dict.fromkeys(("strehl", "mtf", "energy", "rays", "waves", "distortion", "light"), 4e-3)
 WAVELENGTH = 0.55e-3  # mm
 
 
