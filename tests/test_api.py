@@ -208,6 +208,7 @@ def test_no_light_comes_from_where_the_lens_cannot_see(name):
 EXTREME = [(a, b) for a in (0.0, 1e-300, 1.57) for b in (1e-300, 1e-9, 1e300)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field, distance", EXTREME)
 def test_extreme_scenes_have_finite_rays_and_derivatives(field, distance):
     scene = [jnp.asarray(value, float) for value in (field, distance, GREEN)]
@@ -310,6 +311,7 @@ def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
     assert diagnose.crossed(LENS) == ""
 
 
+@pytest.mark.slow
 def test_a_wrong_field_in_an_eager_gradient_is_named():
     """Its values are known there, too."""
     slope = jax.grad(lambda field: psf_moments(LENS, field, np.inf, GREEN, rule=RULE).mean[0, 1])

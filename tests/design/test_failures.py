@@ -53,6 +53,7 @@ def test_the_stronger_a_surface_the_more_is_lacking(name, surface):
         before = found.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, surface", [("cooke_triplet", 5), ("phone", 5)])
 def test_derivatives_are_those_of_differences(name, surface):
     """By all curvatures and thicknesses; forward and reverse mode, the axis ray too."""

@@ -133,6 +133,7 @@ def test_chief_rays(triplet):
         )
 
 
+@pytest.mark.slow
 def test_numerical_apertures(triplet):
     """n sin of the angle between the chief ray and those through the rim, by the direction cosines;
     on the axis near the paraxial one."""

@@ -206,6 +206,7 @@ def test_index_and_abbe_number_are_off_by_what_is_said():
         assert_close(number, vd * (1 + 0.01 * jnp.eye(3)[k]), 1e-6)
 
 
+@pytest.mark.slow
 def test_errors_have_derivatives_and_keep_the_dtype():
     lens = jax.tree.map(lambda a: a.astype(jnp.float32), lens_of())
     kinds = [Tolerance(kind, 1e-2) for kind in KINDS]

@@ -74,6 +74,7 @@ def test_conditions_hold_whatever_varies(solve):
         np.testing.assert_allclose(variables.vector(lens), vector, rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_focal_length_in_air_is_kept_in_front_of_water():
     rows = [{"radius": 30, "glass": "N-BK7", "thickness": 6.0, "semi_diameter": 8.0, "stop": True}]
     lens = load_lens({"surfaces": [*rows, {"radius": -40, "glass": "water", "thickness": 70.0}]})
@@ -140,6 +141,7 @@ def test_best_focus_is_best():
     assert spots[0] > spots[1] < spots[2] and abs(spots[0] / spots[2] - 1) < 1e-9
 
 
+@pytest.mark.slow
 def test_solved_numbers_have_derivatives():
     """In forward and reverse mode, against central differences; the condition itself has none."""
     solves = [Solve("focal_length", surface=5), Solve("f_number"), Solve("best_focus")]
@@ -238,6 +240,7 @@ def test_bad_words_and_numbers(make, said):
     assert said in str(told.value)
 
 
+@pytest.mark.slow
 def test_a_lens_without_focus(tmp_path):
     path = tmp_path / "plate.yaml"
     path.write_text(

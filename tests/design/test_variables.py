@@ -343,6 +343,7 @@ def test_a_lens_without_any():
     assert Vary("curvature", [1]).surfaces == (1,) and hash(Vary("curvature", [1]))
 
 
+@pytest.mark.slow
 def test_float32_stays(lens):
     small = jax.tree.map(lambda a: a.astype(jnp.float32), lens)
     variables = Variables.from_lens(small, [*ALL], solves=[Solve("focal_length", surface=6)])

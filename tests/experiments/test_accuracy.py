@@ -41,6 +41,7 @@ def assert_kept(lens, field, distance, size, tolerances):
         assert error <= tolerance, f"{error:.1e} at a tolerance of {tolerance:g}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [25e3, math.inf])
 @pytest.mark.parametrize(
     "degrees", [0.0, *(pytest.param(x, marks=pytest.mark.slow) for x in (5.0, 10.0, 14.0))]

@@ -231,6 +231,7 @@ def test_a_table_can_be_read_as_text():
     ]
 
 
+@pytest.mark.slow
 def test_interrupt_in_the_last_steps_of_a_job_stops_before_the_next(
     unbroken, tmp_path, monkeypatch
 ):

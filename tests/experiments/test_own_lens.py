@@ -149,6 +149,7 @@ def test_edof_with_a_field_beside_the_planes_of_the_lens(tmp_path, capsys):
         assert arrays["blur_um"][1].mean() < arrays["blur_um"][0].mean()
 
 
+@pytest.mark.slow
 def test_the_sensor_alone_traces_no_ray_off_the_axis_either():
     some = lens("sensor")
     blur = some.blur(SCENE, FAR, FAR)
@@ -173,6 +174,7 @@ def joint():
     return jax.jit(jax.value_and_grad(loss)), some.start(60.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["curvature 0", "curvature 3"])
 def test_gradient_of_the_joint_loss_by_a_curvature(name):
     """Against central differences whose step is swept: images are float32, so that it is neither

@@ -55,7 +55,7 @@ STARTS = {
     ],
 }
 # Programs of many kinds.
-LONG = ("benchmark", "images", "joint", "lenses", "stability")
+LONG = ("benchmark", "faults", "files", "images", "joint", "lenses", "stability")
 # Those that tests of their own start, in `test_NAME`.
 ELSEWHERE = ("accuracy", "design", "render", "tolerance")
 

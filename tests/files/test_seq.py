@@ -226,6 +226,7 @@ def assert_close(found, wanted):
         assert found == (wanted if isinstance(wanted, str) else pytest.approx(wanted, rel=1e-14))
 
 
+@pytest.mark.slow
 def test_a_zone_plate_focuses_as_its_optical_path_says(tmp_path):
     """OPD C1 r^2 at HWL is that of a thin lens of f = -1 / (2 C1); f goes as 1 / wavelength."""
     own = "S 0 9; STO; DIF DOE; HOR 1; HWL 550; HCT R; HCO C1 -.005"
@@ -325,6 +326,7 @@ def own_hits(system, field, points):
     return np.real([np.stack(np.broadcast_arrays(*hit), -1)[0] for hit in rays.own])
 
 
+@pytest.mark.slow
 def test_listed_rays_through_tilted_mirrors(tmp_path):
     """The hand of ADE, DAR, the defocus of a tilted image, the signs of fields: to 1e-5 mm, as
     radii are printed to 1e-5."""
@@ -375,6 +377,7 @@ SI 0.0 -0.4002686453541377
 GO"""
 
 
+@pytest.mark.slow
 def test_listed_double_gauss(tmp_path):
     """CODE V 10.8 on a file of its own: indices, first order, rays, to the last printed digit."""
     path = tmp_path / "gauss.seq"

@@ -268,6 +268,7 @@ def test_every_form_from_a_file(tmp_path):
         np.testing.assert_array_equal(lens.senses, [1, 1, 1, 1, -1])
 
 
+@pytest.mark.slow
 def test_a_sensor_in_focus(tmp_path):
     """Where an axial ray close to the axis crosses it; written as a number."""
     lens = load_lens(write(tmp_path, lambda e: e.update(sensor="focus")))

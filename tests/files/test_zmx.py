@@ -327,6 +327,7 @@ def test_a_mirror_keeps_the_medium_and_a_tilted_one_folds(tmp_path):
     np.testing.assert_allclose(lens.places[1][-1], [0, 20], atol=1e-14)  # -y' is +y here
 
 
+@pytest.mark.slow
 def test_apertures_of_systems_by_their_definition(tmp_path):
     def first(**own):
         system = read(tmp_path, ENPD=None, **own)

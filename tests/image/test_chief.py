@@ -145,6 +145,7 @@ def test_small_fields_by_petzval():
         )
 
 
+@pytest.mark.slow
 def test_on_the_axis_both_foci_are_the_paraxial_focus():
     found = drt_jax.field_curvature(COOKE, 0.0, 900.0, WAVES)
     wanted = drt_jax.image_distance(COOKE, 900.0, WAVES) - COOKE.sensor
@@ -175,6 +176,7 @@ def slopes(lens, fields):
     return jax.value_and_grad(total, has_aux=True)(lens)
 
 
+@pytest.mark.slow
 def test_derivatives_by_lens_numbers():
     """Reverse mode against central differences."""
     fields = jnp.array([[0.05, 0.2], [0.0, 0.1], [-0.1, 0.0]])

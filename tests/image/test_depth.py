@@ -15,6 +15,7 @@ LENS = load_lens("double_gauss_addon")
 NEAR, FAR = 1e4, 5e4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", [0.0, pytest.param(0.05, marks=pytest.mark.slow)])
 def test_depth_interpolation_is_the_traced_moment(field):
     depths = depth_moments(LENS, field, 5e3, 5e4, RGB, 1e-11)
@@ -48,6 +49,7 @@ def test_gradient_of_the_depth_interpolation_is_the_traced_one():
     assert_close(ours(*scene), wanted(*scene), 1e-10, 1e-18)
 
 
+@pytest.mark.slow
 def test_cheapest_model_agrees_with_retracing():
     values, cheap = moments_model(LENS, ("sensor",), 0.0, (NEAR, FAR), RGB, 1e-10)
     everything, retrace = moments_model(LENS, ("sensor", "curvature"), 0.0, (NEAR, FAR), RGB, 1e-10)

@@ -73,6 +73,7 @@ def test_foci_of_rays_by_colour():
     np.testing.assert_allclose(found.real[:, 1:], -y / slope, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_and_failed_rays():
     """Rays beyond the edge of a surface are infinite, and have no derivative; others have that of
     their differences."""

@@ -47,6 +47,7 @@ def at(sensor, lens=LENS):
     return dataclasses.replace(lens, sensor=jnp.asarray(sensor, float))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", SIGMA)
 def test_blur_of_the_double_gauss(sensor):
     found = psf_moments(at(sensor), 0.0, FAR, RGB)
@@ -303,6 +304,7 @@ def test_an_eager_gradient_is_that_of_a_program_and_of_differences():
         np.testing.assert_allclose(getattr(inside, leaf)[k], difference, rtol=3e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_no_failing_lens_looks_good():
     """Eagerly an error; inside a trace passed = 0, the covariance inf, no derivatives."""
     rule = converged_rule(at(133.0), 0.0, FAR, RGB, 1e-9)

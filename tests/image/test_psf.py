@@ -224,6 +224,7 @@ def slopes(lens, field, defocus):
     return jax.value_and_grad(merit, (0, 1), has_aux=True)(lens, defocus)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_kernel(double_gauss):
     lens, field, *_ = double_gauss
     field = jnp.array([0.0, field])

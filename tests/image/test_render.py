@@ -51,6 +51,7 @@ def test_a_row_of_tiles_is_blurred_by_each_pixels_own_kernel():
         np.testing.assert_allclose(found[:, y, x], wanted, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_few_kernels_give_back_those_that_they_span():
     """Two kernels span all; a third place, the same as the first, adds nothing and no NaN."""
     random = np.random.default_rng(2)
@@ -254,6 +255,7 @@ def test_noise_has_the_variance_of_its_electrons():
     assert np.isfinite(slope(jnp.zeros(3))).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

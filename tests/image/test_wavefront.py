@@ -136,6 +136,7 @@ def test_a_tilted_sensor_through_the_focus_changes_nothing():
     np.testing.assert_allclose(wave.opd, 0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_in_both_modes_and_on_axis(monkeypatch):
     """Reverse and forward mode agree to rounding, and with central differences to 1e-6; all
     finite, also on axis, where rays and errors vanish."""

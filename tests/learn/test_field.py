@@ -113,6 +113,7 @@ def loss_of(imager, weights):
     return loss
 
 
+@pytest.mark.slow
 def test_the_loss_has_the_derivative_of_finite_differences_by_every_kind_of_number(camera):
     # Through network, sensor, kernels and rays; the sensor layer rounds to float32.
     variables, imager, weights = camera

@@ -65,6 +65,7 @@ def test_light_takes_the_same_path_backwards():
         np.testing.assert_allclose(own, path[-2::-1], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_twice_flipped_is_the_lens():
     again = drt_jax.flipped(drt_jax.flipped(LENS))
     assert jax.tree.structure(again) == jax.tree.structure(LENS)
@@ -78,6 +79,7 @@ def test_twice_flipped_is_the_lens():
     )
 
 
+@pytest.mark.slow
 def test_rays_of_a_larger_lens_keep_their_angles():
     """All hits are as much larger; so is the focal length, and its derivative by the factor."""
     points, factor = np.array([[0.3, 0.8], [-0.7, 0.2]]), 2.5

@@ -98,6 +98,7 @@ def test_the_pupil_follows_the_lens():
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_file_may_ask_for_it(tmp_path):
     """`save_lens` writes the planes, so that what it writes is the same lens."""
     lens = load_lens({"surfaces": MOVED, "pupil": "paraxial"})

@@ -113,6 +113,7 @@ def test_telecentric_pupils_are_infinite_and_have_no_nan():
     assert np.all(exit_(behind, GREEN).position > 1e6)
 
 
+@pytest.mark.slow
 def test_pupils_are_where_fermat_chief_rays_cross_the_axis():
     """A chief ray at 1e-4 rad: third order leaves 1e-8 of the distance."""
     lens = load_lens("cooke_triplet")

@@ -105,6 +105,7 @@ def test_agrees_with_many_rays_that_drop_out():
     np.testing.assert_allclose(mean[0], hits.mean(axis=0), atol=2e-3 * np.sqrt(spread.max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["on axis", pytest.param("front and rear", marks=pytest.mark.slow)]
 )

@@ -117,6 +117,7 @@ def random_like(tree):
     )
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_small_bundles(lens, points, found):
     """Reverse and forward."""
     at = lens, scene(lens)

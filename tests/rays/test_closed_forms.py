@@ -37,6 +37,7 @@ STIGMATIC = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [1, 0, -0.1])
 @pytest.mark.parametrize("name", STIGMATIC)
 def test_c18_stigmatic_surfaces(name, gap):
@@ -91,6 +92,7 @@ def test_c19_plane_parallel_plate():
     np.testing.assert_allclose(shift, 3.8762756430420553, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "front, back, thickness, wanted", [(5, -5, 10, 7.5), (50, -50, 10, 51.72413793103448)]
 )

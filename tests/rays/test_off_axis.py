@@ -134,6 +134,7 @@ def test_derivatives_of_hits_by_the_tilt_of_the_mirror(name):
         np.testing.assert_allclose(mode(hits)(jnp.zeros(())), wanted, rtol=1e-7, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [90.0, -90.0])
 def test_a_lens_behind_a_fold_mirror_may_have_its_axis_either_way(turn):
     """A plano-convex lens 10 mm behind a mirror at 45 degrees: rays reach the sensor."""

@@ -133,6 +133,7 @@ def hybrid(form, base, stop):
     return load_lens({"surfaces": rows})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "base", "stop"),
     [

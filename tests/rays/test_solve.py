@@ -57,6 +57,7 @@ def direction(lens, group):
     return jax.tree_util.tree_map_with_path(fill, lens)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow) if n == "tilted" else n for n in PROBLEMS]
 )
@@ -153,6 +154,7 @@ def test_against_the_unrolled_iteration():
     assert_close(pushed(*given, moving), tangents, 1e-9)
 
 
+@pytest.mark.slow
 def test_solve_and_solve_reverse_are_one(monkeypatch):
     """Gradients by the system and the stop points, and those of `attach`: to 1e-12. Both are handed
     the rays that the search has found."""
@@ -197,6 +199,7 @@ def second_order(change, way, lens, scene, points, found, weights):
     return first, slope, forward, jax.grad(along)(change), twice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tilted", pytest.param("meridional", marks=pytest.mark.slow)])
 def test_products_with_the_hessian(name):
     """Three ways, and against differences of the gradient of rays found anew, two steps freed of

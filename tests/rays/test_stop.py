@@ -68,6 +68,7 @@ def test_every_ray_of_the_phone_lenses():
         assert_same_rays(ours(lens, field)[0], Truth(*each), 1e-11, f"{name}, {field[1]} rad")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", phones.LENSES)
 def test_derivatives_of_the_phone_lenses(name):
     """Sensor points and paths of rays at 30 degrees by every parameter, the stop's place, size,

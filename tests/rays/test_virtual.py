@@ -37,6 +37,7 @@ HEIGHTS = np.array([-4.0, 0.0, 1.0, 5.0])
 DISTANCE = R * (1 + 1 / N) - GAP
 
 
+@pytest.mark.slow
 def test_an_aplanatic_virtual_image(virtual):
     """All rays seem to come from one point, run forwards and have one path."""
     rays = trace_rays(virtual, 0.0, DISTANCE, [0.55], on_y(*HEIGHTS))
@@ -51,6 +52,7 @@ def test_an_aplanatic_virtual_image(virtual):
     np.testing.assert_allclose(behind.path[0] - rays.path[0], further, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_an_aplanatic_virtual_object():
     """Light in air that converges to a point 25 mm behind a glass sphere meets in it."""
     rows = [{"radius": R, "index": N, "thickness": R * (1 + 1 / N)}]

@@ -78,6 +78,7 @@ def test_a_lens_is_drawn_to_its_clear_apertures_and_a_mirror_with_its_hole():
     np.testing.assert_allclose(np.nanmax(abs(along)), 18)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [np.inf, 40.0])
 def test_a_stop_that_pokes_through_a_surface_is_drawn_and_is_no_corner_of_a_ray(distance):
     drawn = show.draw(load_lens(PHONE), 0.1, distance)
