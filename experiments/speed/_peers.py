@@ -189,7 +189,8 @@ def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Calla
 
 def network_step(batch: int, patch: int, rate: float) -> Callable:
     """step(): one Adam step of the same RED-Net in PyTorch, channels last, on the mean absolute
-    error of random images."""
+    error of random images, on a GPU where JAX uses one."""
+    import jax
     import torch
     from torch import nn
 
@@ -212,10 +213,11 @@ def network_step(batch: int, patch: int, rate: float) -> Callable:
             return images + features
 
     torch.manual_seed(0)
-    net = RedNet().to(memory_format=torch.channels_last)
+    device = "cuda" if jax.default_backend() == "gpu" else "cpu"
+    net = RedNet().to(device, memory_format=torch.channels_last)
     adam = torch.optim.Adam(net.parameters(), rate)
     images, truth = (
-        torch.rand(batch, 3, patch, patch).contiguous(memory_format=torch.channels_last)
+        torch.rand(batch, 3, patch, patch).to(device, memory_format=torch.channels_last)
         for _ in range(2)
     )
 
@@ -224,6 +226,6 @@ def network_step(batch: int, patch: int, rate: float) -> Callable:
         loss = torch.mean(torch.abs(net(images) - truth))
         loss.backward()
         adam.step()
-        return float(loss)
+        return loss.item()
 
     return step

@@ -148,11 +148,12 @@ def bundle_task(config: Config) -> list[Row]:
     peers = peer("batoid", batoid, ", launched at our first hits")
     task = f"{config.bundle} skew rays"
     rows = rows_of(task, ours, error, peers, config.repeats)
-    devices = os.cpu_count() or 1
-    shared = _work.in_a_new_process(_work.SPREAD.format(config=config, devices=devices), {})
-    same = {key: rows[0][key] for key in ("peer", "peer_s", "peer_error", "note", "ours_error")}
-    same["ratio"] = same["peer_s"] and same["peer_s"] / shared
-    rows.append(_work.row(f"{task}, {devices} CPU devices", shared, **same))
+    if jax.default_backend() == "cpu":
+        devices = os.cpu_count() or 1
+        shared = _work.in_a_new_process(_work.SPREAD.format(config=config, devices=devices), {})
+        same = {key: rows[0][key] for key in ("peer", "peer_s", "peer_error", "note", "ours_error")}
+        same["ratio"] = same["peer_s"] and same["peer_s"] / shared
+        rows.append(_work.row(f"{task}, {devices} CPU devices", shared, **same))
 
     def square(lens):
         return jnp.mean(_work.hits(lens, field, distance, waves, points)[0] ** 2)
