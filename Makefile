@@ -29,9 +29,9 @@ test test-slow test-all test-versions site: export JAX_COMPILATION_CACHE_DIR ?= 
 test: install
 	$(BIN)/python -m pytest
 
-# The larger scenes.
+# The larger scenes; PART=0, 1 or 2 is a third of them.
 test-slow: install
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow --durations=60 $(if $(PART),--part=$(PART))
 
 test-all: install
 	$(BIN)/python -m pytest -m "" --durations=60

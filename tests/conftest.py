@@ -2,6 +2,7 @@
 nothing may change precision or shape silently."""
 
 import gc
+import itertools
 import os
 import pathlib
 import resource
@@ -51,19 +52,36 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 # takes a seventh of the time of the tests.
 gc.set_threshold(100_000, 20, 20)
 
+# All slow tests take longer than CI may: it runs another third of them for another commit.
+PARTS = 3
 LONGEST = ("test_readme.py", "test_experiments.py", "test_derivatives.py")
 RGB = (0.6, 0.53, 0.48)
 LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
 
 
 def pytest_addoption(parser):
-    """Adds --write-tables: the tests that make a table of `results` write it there."""
+    """Adds --write-tables: the tests that make a table of `results` write it there; and --part."""
     parser.addoption("--write-tables", action="store_true", help="rewrite the tables in results/")
+    parser.addoption("--part", type=int, choices=range(PARTS), help="a third of the slow tests")
 
 
-def pytest_collection_modifyitems(items):
-    """Files with long tests first: none is left for one worker alone at the end."""
+def pytest_collection_modifyitems(config, items):
+    """Files with long tests first: none is left for one worker alone at the end. With `--part`,
+    every third slow function of a file; the cases of one share programs."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+    part = config.getoption("--part")
+    if part is None:
+        return
+    slow = (item for item in items if item.get_closest_marker("slow"))
+    functions = dict.fromkeys((item.path, item.originalname) for item in slow)
+    wanted = set(itertools.islice(functions, part, None, PARTS))
+    left = [
+        item
+        for item in items
+        if item.get_closest_marker("slow") and (item.path, item.originalname) not in wanted
+    ]
+    config.hook.pytest_deselected(items=left)
+    items[:] = [item for item in items if item not in set(left)]
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from jax import Array
 from ..image.spot import deviations, normalised
 from ..inputs import require_one_of
 from ..lens.lens import Lens
-from ..numerics import concrete, safe_divide, safe_sqrt
+from ..numerics import concrete, matmul, safe_divide, safe_sqrt
 from ..rays.status import Status
 from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
 from .problem import Problem
@@ -76,11 +76,11 @@ def compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple
     moves = jnp.zeros(0, x.dtype)
     if len(levers):
         square = jnp.sum(growth**2, axis=(0, 2))
-        matrix = (levers * square[None]) @ levers.T
+        matrix = matmul(levers * square[None], levers.T)
         lit = matrix[0, 0] > 0
         matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
-        moves = jnp.linalg.solve(matrix, -levers @ jnp.sum(offsets * growth, axis=(0, 2)))
-        offsets = offsets + growth * (moves @ levers)[None, :, None]
+        moves = jnp.linalg.solve(matrix, -matmul(levers, jnp.sum(offsets * growth, axis=(0, 2))))
+        offsets = offsets + growth * matmul(moves, levers)[None, :, None]
     light = rays.weights[..., EXTRAS:] > 0
     failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
     valid = ~failed & jnp.all(rays.throughput > 0, axis=1)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..numerics import run_if, safe_divide
+from ..numerics import matmul, run_if, safe_divide
 
 _DAMPING, _MOST_DAMPING = 1e-3, 1e16
 _PARTS = (1.0, 0.5, 0.25, 0.1, 0.03)
@@ -224,17 +224,17 @@ def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
     scale = jnp.where(search.scale > 0, search.scale, 1)
     move, fixed = jnp.zeros_like(y), jnp.zeros(y.shape, bool)
     for k in range(_SETS):
-        model = search.residuals + search.jacobian @ move
+        model = search.residuals + matmul(search.jacobian, move)
         counts = (~sided | (model > 0)).astype(y.dtype)
-        gradient = search.jacobian.T @ (counts * search.residuals)
-        square = search.jacobian.T @ (counts[:, None] * search.jacobian)
+        gradient = matmul(search.jacobian.T, counts * search.residuals)
+        square = matmul(search.jacobian.T, counts[:, None] * search.jacobian)
         if not k:
             fixed = ((y <= low) & (gradient > 0)) | ((y >= high) & (gradient < 0))
         # In units of the column norms; fixed numbers keep their move.
         free = (~fixed).astype(y.dtype)
         matrix = square / scale[:, None] / scale[None] * free[:, None] * free[None]
         matrix = matrix + jnp.diag(search.damping * free + (1 - free))
-        right = -(gradient + square @ (move * (1 - free))) / scale * free
+        right = -(gradient + matmul(square, move * (1 - free))) / scale * free
         step = jax.scipy.linalg.solve(matrix, right, assume_a="pos") / scale
         move = jnp.where(fixed, move, step)
         fixed = fixed | (y + move < low) | (y + move > high)
@@ -242,7 +242,7 @@ def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
     move = jnp.where(jnp.isfinite(move), move, 0)
     # If the active set cycles, a part of the step is better than the whole.
     parts = jnp.asarray(_PARTS, y.dtype)
-    model = search.residuals[:, None] + (search.jacobian @ move)[:, None] * parts[None]
+    model = search.residuals[:, None] + matmul(search.jacobian, move)[:, None] * parts[None]
     totals = jnp.sum(_counting(model, sided[:, None]) ** 2, axis=0)
     best = jnp.argmin(totals)
     return parts[best] * move, jnp.sum(_counting(search.residuals, sided) ** 2) - totals[best]

@@ -9,7 +9,7 @@ from jax import Array
 
 from ..compilation import ONCE, jit
 from ..inputs import require_one_of
-from ..numerics import concrete
+from ..numerics import concrete, matmul
 from .compensate import Compensator, check, compensated
 from .perturbed import PerturbedLens
 from .problem import Problem, quick
@@ -50,8 +50,8 @@ class Predicted(NamedTuple):
         """q (K,) for deviations (K, P); below 0 where the model fails. ValueError as `matrix`."""
         return (
             self.nominal
-            + perturbation @ self.gradient
-            + jnp.sum(perturbation * (perturbation @ self.matrix(order)), axis=-1) / 2
+            + matmul(perturbation, self.gradient)
+            + jnp.sum(perturbation * matmul(perturbation, self.matrix(order)), axis=-1) / 2
         )
 
     def moments(self, variances: Array, order: Order) -> tuple[Array, Array]:
@@ -59,9 +59,9 @@ class Predicted(NamedTuple):
         (P,). The mean is exact for the quadratic model; the standard deviation holds for normal
         deviations (root sum of squares). ValueError as in `matrix`."""
         matrix = self.matrix(order)
-        mean = self.nominal + jnp.diag(matrix) @ variances / 2
-        pairs = variances @ matrix**2 @ variances / 2
-        return mean, jnp.sqrt(self.gradient**2 @ variances + pairs)
+        mean = self.nominal + matmul(jnp.diag(matrix), variances) / 2
+        pairs = matmul(matmul(variances, matrix**2), variances) / 2
+        return mean, jnp.sqrt(matmul(self.gradient**2, variances) + pairs)
 
 
 def predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
@@ -90,7 +90,7 @@ def _predict_all(problem: Problem, perturbed: PerturbedLens, compensator: Compen
     (offsets, moves), push, squares = jax.linearize(rays, zero, has_aux=True)
     derivatives, slopes = jax.lax.map(push, units)
     hessian = jax.lax.map(lambda unit: jax.jvp(jax.grad(measure), (zero,), (unit,))[1], units)
-    gradient, gauss = 2 * derivatives @ offsets, 2 * derivatives @ derivatives.T
+    gradient, gauss = 2 * matmul(derivatives, offsets), 2 * matmul(derivatives, derivatives.T)
     return Predicted(jnp.mean(squares), gradient, gauss, hessian, moves, slopes)
 
 

@@ -76,7 +76,7 @@ from ..image.wavefront import path_differences
 from ..lens.glasses import glass_map_distance
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import matmul, safe_divide, safe_sqrt
 from .field_rays import (
     EXTRAS,
     FieldRays,
@@ -194,7 +194,7 @@ def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _throughput(lens: Lens, rays: FieldRays) -> Array:
-    return rays.throughput @ rays.wavelength_weights
+    return matmul(rays.throughput, rays.wavelength_weights)
 
 
 def _first_order(get: Callable[[FirstOrder], Array]) -> Function:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..numerics import matmul
 from .problem import Problem, quick
 
 # Largest violation that counts as met, in the units of `Evaluation.constraints`.
@@ -47,10 +48,10 @@ def within_limits(problem: Problem, before: Array, after: Array) -> Array:
     def onto(vector: Array, beyond: Array) -> Array:
         slopes = jax.jacfwd(lambda v: problem.evaluate(v).constraints)(vector)
         slopes = jnp.where((beyond > 0)[:, None], slopes, 0)
-        square = slopes @ slopes.T
+        square = matmul(slopes, slopes.T)
         tiny = jnp.finfo(vector.dtype).eps * (1 + jnp.trace(square))
         square = square + tiny * jnp.eye(len(beyond), dtype=vector.dtype)
-        step = slopes.T @ jnp.linalg.solve(square, jnp.maximum(beyond, 0))
+        step = matmul(slopes.T, jnp.linalg.solve(square, jnp.maximum(beyond, 0)))
         return jnp.clip(vector - jnp.where(jnp.isfinite(step), step, 0), low, high)
 
     def turn(state: _Turn) -> _Turn:

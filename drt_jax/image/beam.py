@@ -17,7 +17,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import einsum, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.mask import Mask
 from ..pupil.patterns import disc, half_disc, meridian
@@ -344,7 +344,7 @@ def _spread(turns: np.ndarray, mirrors: tuple[int, ...], vector: Sequence[Array]
 
 def means(values: Array, weights: Array) -> Array:
     """Means (D, W) of values (D, W, Q) with weights (W, Q)."""
-    total = jnp.einsum("wq,dwq->dw", weights, values)
+    total = einsum("wq,dwq->dw", weights, values)
     return safe_divide(total, jnp.broadcast_to(jnp.sum(weights, -1), total.shape))
 
 

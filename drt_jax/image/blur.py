@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..numerics import einsum
+
 # Sides of the squares that are transformed: fast ones.
 SIDES = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 
@@ -34,8 +36,7 @@ def blur_row(
         kernel, share = given
         blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides), sides)
         inside = blurred[..., size - 1 : ends[0], size - 1 : ends[1]]
-        exact = jax.lax.Precision.HIGHEST
-        each = jnp.einsum("cym,xm->cyx", share, across, precision=exact)
+        each = einsum("cym,xm->cyx", share, across)
         return total + each * jnp.moveaxis(inside, 0, 2).reshape(total.shape), None
 
     start = jnp.zeros((channels, height, count * width), light.dtype)

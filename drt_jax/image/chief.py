@@ -27,7 +27,7 @@ from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of
 from ..lens.surface import surface_sag
-from ..numerics import Numbers, known_values, real_array, safe_divide, safe_sqrt
+from ..numerics import Numbers, einsum, known_values, real_array, safe_divide, safe_sqrt
 from ..rays.afocal import FOCAL
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
@@ -173,7 +173,7 @@ def _distortion(
     if mapping == "angle":
         size = safe_sqrt(jnp.sum(place**2, axis=-1, keepdims=True))
         place = place * jnp.where(size > 0, safe_divide(jnp.arctan(size), size), 1)
-    ideal = jnp.einsum("wij,fj->fwi", scale, place)
+    ideal = einsum("wij,fj->fwi", scale, place)
     moved = jnp.where(whole[..., None], found.hit[1:] - found.hit[:1], 0)
     along, square = jnp.sum(moved * ideal, axis=-1), jnp.sum(ideal**2, axis=-1)
     square = jnp.where(whole, square, 0)

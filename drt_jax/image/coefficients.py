@@ -19,7 +19,7 @@ from ..compilation import LARGE, jit
 from ..lens.forms import fringe_terms, noll_terms
 from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of
-from ..numerics import Numbers
+from ..numerics import Numbers, einsum
 from ..pupil.patterns import disc
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
@@ -100,8 +100,8 @@ def _fitted(lens: Lens, fields: Array, axis: Scene, rows: tuple[int, ...]) -> Ar
         whole = (status[:, 0] == Status.OK) | (status[:, 0] == Status.CLIPPED)
         enough = whole & (jnp.sum(light > 0, axis=-1) > 2 * len(rows))
         light = jnp.where(enough[:, None], light, jnp.asarray(weights, dtype)[None])
-        normal = jnp.einsum("wq,pq,rq->wpr", light, basis, basis)
-        right = jnp.einsum("wq,pq,wq->wp", light, basis, opd[:, 1:])
+        normal = einsum("wq,pq,rq->wpr", light, basis, basis)
+        right = einsum("wq,pq,wq->wp", light, basis, opd[:, 1:])
         found = jnp.linalg.solve(normal, right[..., None])[..., 0]
         return jnp.where(enough[:, None], found, jnp.inf)
 

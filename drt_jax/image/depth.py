@@ -14,7 +14,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import distance_array, scene_of, vergence_of
-from ..numerics import Numbers, concrete
+from ..numerics import Numbers, concrete, tensordot
 from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
 from .moments import FocusMoments, moments
@@ -51,7 +51,7 @@ class DepthMoments:
         x = (2 * vergence_of(far) - high - low) / (high - low)
         count = self.series.mean.shape[0]
         basis = chebyshev(x, count - 1)[0]
-        return jax.tree.map(lambda c: jnp.tensordot(basis, c, axes=1), self.series)
+        return jax.tree.map(lambda c: tensordot(basis, c, axes=1), self.series)
 
 
 def depth_moments(
@@ -81,7 +81,7 @@ def depth_moments(
         transform[0] /= 2
         traced = [focus_moments(lens, field, 1 / node, wavelengths, tolerance) for node in nodes]
         series = jax.tree.map(
-            lambda *values: jnp.tensordot(
+            lambda *values: tensordot(
                 jnp.asarray(transform, values[0].dtype), jnp.stack(values), axes=1
             ),
             *traced,

@@ -16,7 +16,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..numerics import Numbers, safe_divide, safe_sqrt
+from ..numerics import Numbers, einsum, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
 from .ray_psf import below, ray_spots
@@ -97,7 +97,7 @@ def encircled(
         wide = cells_needed(beam, wavelengths, radii) > cells
         waves = _of_waves(lens, beam, wavelengths, radii, centre, cells)
         parts = jnp.where(wide[:, None], parts, waves)
-    return jnp.einsum("w,wn->n", share, parts)
+    return einsum("w,wn->n", share, parts)
 
 
 def _of_rays(

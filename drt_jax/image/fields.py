@@ -17,7 +17,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import points_arrays, scene_of, vergence_of
-from ..numerics import Numbers, brief, real_array
+from ..numerics import Numbers, brief, einsum, real_array
 from ..pupil.rules import Symmetry
 from ..rays.solve import solve_aimed
 from ..rays.status import Status
@@ -221,4 +221,4 @@ def _kernel_at(grid: KernelGrid, tangent: Array, vergence: Array) -> Array:
     sizes = [weights.shape[0] for _, weights in parts]
     starts = [first for first, _ in parts] + [jnp.zeros((), jnp.int32)] * 3
     near = jax.lax.dynamic_slice(table, starts, (*sizes, *table.shape[3:]))
-    return jnp.einsum("dyxwij,d,y,x->wij", near, *(weights for _, weights in parts))
+    return einsum("dyxwij,d,y,x->wij", near, *(weights for _, weights in parts))

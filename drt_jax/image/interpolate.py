@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..numerics import tensordot
+
 
 def lagrange(place: Array, count: int, order: int) -> tuple[Array, Array]:
     """First node (...), int32, and weights (..., order) of the polynomial through the `order` nodes
@@ -34,7 +36,7 @@ def at_point(table: Array, place: Array, order: int) -> Array:
     for where in (place[1], place[0]):
         first, weights = lagrange(where, table.shape[0], order)
         rows = jax.lax.dynamic_slice_in_dim(table, first, weights.shape[0], axis=0)
-        table = jnp.tensordot(weights, rows, axes=1)
+        table = tensordot(weights, rows, axes=1)
     return table
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import einsum, safe_divide, safe_sqrt
 from .beam import Beam, centroid_and_variances, means
 from .cover import cover
 from .spot import normalised
@@ -35,7 +35,7 @@ def ray_kernel(lens: Lens, beam: Beam, centre: Array, pixel: Array, size: int, c
     edges = jnp.arange(size + 1, dtype=pixel.dtype) - size / 2
     place, blur = (hits - centre[:, None, None]) / pixel, width / pixel + _BLUR
     across, down = (_shares(edges, h, w) for h, w in zip(place, blur))
-    return jnp.einsum("wqy,wqx->wyx", weights[..., None] * down, across)
+    return einsum("wqy,wqx->wyx", weights[..., None] * down, across)
 
 
 def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:

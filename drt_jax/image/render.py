@@ -23,7 +23,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import vergence_of
-from ..numerics import Numbers, concrete, safe_divide, safe_sqrt
+from ..numerics import Numbers, concrete, einsum, safe_divide, safe_sqrt
 from .blur import blur_row
 from .interpolate import basis, cubic
 from .render_method import WAVELENGTHS, layer_distances, render_method
@@ -53,10 +53,8 @@ def _strip(maps: Maps, method: RenderMethod, picture: Array, row: Array, lit: bo
         places.append(basis(place, count, SMOOTH))
         local.append(basis(place[margin : length + margin], count, LOCAL))
 
-    product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
-
     def between(values: Array, where: list[Array]) -> Array:
-        return product("ym,cmn,xn->cyx", where[0], values, where[1])
+        return einsum("ym,cmn,xn->cyx", where[0], values, where[1])
 
     x, y = (between(maps.sources[..., k], places) for k in (0, 1))
     warped = cubic(picture, y, x)
@@ -64,7 +62,7 @@ def _strip(maps: Maps, method: RenderMethod, picture: Array, row: Array, lit: bo
         kernels, shares, across = _corners(maps.kernels, method, row)
     else:
         kernels, across = maps.kernels[None], local[1]
-        shares = product("ym,crmn->cryn", local[0], maps.shares)
+        shares = einsum("ym,crmn->cryn", local[0], maps.shares)
     blurred = blur_row(warped, kernels, shares, across, method.tile)
     if lit:
         blurred = blurred * between(maps.light, local)

@@ -6,13 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..numerics import Numbers
+from ..numerics import EXACT, Numbers, einsum
 from .kernel import SeparableKernel
 
 Convolve = Callable[[Array, SeparableKernel | Array], Array]
-
-# Otherwise GPUs round the factors of a float32 product to 10 bits.
-_EXACT = jax.lax.Precision.HIGHEST
 
 
 def _banded(kernel: Array, outputs: int) -> Array:
@@ -45,8 +42,8 @@ def _by_bands(scenes: Array, kernel: SeparableKernel) -> Array:
     taps = kernel.row.shape[-1]
     down = _banded(kernel.column, scenes.shape[1] - taps + 1)
     across = _banded(kernel.row, scenes.shape[2] - taps + 1)
-    half = jnp.einsum("cyh,bhwc->cbyw", down, scenes, precision=_EXACT)
-    return jnp.einsum("cxw,cbyw->byxc", across, half, precision=_EXACT)
+    half = einsum("cyh,bhwc->cbyw", down, scenes)
+    return einsum("cxw,cbyw->byxc", across, half)
 
 
 def _check(scenes: Array, kernel: SeparableKernel | Array) -> None:
@@ -88,7 +85,7 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
         padding="VALID",
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
         feature_group_count=scenes.shape[-1],
-        precision=_EXACT,
+        precision=EXACT,
     )
 
 

@@ -18,7 +18,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..numerics import Numbers, brief, safe_divide, safe_sqrt
+from ..numerics import Numbers, brief, einsum, matmul, safe_divide, safe_sqrt
 from .blur import SIDES
 from .fields import GridMethod, KernelGrid, kernel_grid
 from .grid_method import warn_of_loss
@@ -122,21 +122,22 @@ def _parts(seen: Array, places: Array) -> tuple[Array, Array]:
     basis = jnp.zeros((len(places), rows.shape[1]), rows.dtype)
     for k in range(len(places)):
         row = rows[places[k]]
-        rest = row - (basis @ row) @ basis
-        rest = rest - (basis @ rest) @ basis
+        rest = row - matmul(matmul(basis, row), basis)
+        rest = rest - matmul(matmul(basis, rest), basis)
         length, whole = (safe_sqrt(jnp.sum(a * a)) for a in (rest, row))
         there = length > _ALIKE * jnp.finfo(rows.dtype).eps * whole
         basis = basis.at[k].set(jnp.where(there, safe_divide(rest, length[None]), 0))
-    shares = rows @ basis.T
+    shares = matmul(rows, basis.T)
     # Shares change a little, so that the sum and the first moments, in pixels, stay: they decide
     # where a point lands, and how moments vary over the picture what light it brings.
     side = np.arange(size) - size // 2
     x, y = (np.ravel(a) for a in np.meshgrid(side, side))
     moments = jnp.asarray(np.stack([np.full_like(x, size), x, y], -1), rows.dtype)
-    own = basis @ moments
-    missing = rows @ moments - shares @ own
-    shares = shares + missing @ jnp.linalg.solve(jnp.eye(3, dtype=own.dtype) + own.T @ own, own.T)
-    sums = jnp.sum(rows, axis=1), shares @ jnp.sum(basis, axis=1)
+    own = matmul(basis, moments)
+    missing = matmul(rows, moments) - matmul(shares, own)
+    square = jnp.eye(3, dtype=own.dtype) + matmul(own.T, own)
+    shares = shares + matmul(missing, jnp.linalg.solve(square, own.T))
+    sums = jnp.sum(rows, axis=1), matmul(shares, jnp.sum(basis, axis=1))
     shares = shares * safe_divide(*sums)[:, None]
     return basis.reshape(-1, size, size), shares.T.reshape(-1, down, across)
 
@@ -270,7 +271,7 @@ def _source(method: RenderMethod, table: Array, wanted: Array) -> tuple[Array, A
         return safe_divide(jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]), size[None, None])
 
     def step(u: Array, _: None) -> tuple[Array, None]:
-        return jnp.clip(u - inverse(u) @ (image(u) - wanted), -half - 1, half + 1), None
+        return jnp.clip(u - matmul(inverse(u), image(u) - wanted), -half - 1, half + 1), None
 
     u, _ = jax.lax.scan(step, jnp.clip(wanted, -half, half), length=_NEWTON)
     return u, inverse(u)
@@ -294,7 +295,7 @@ def _seen(
     shift = jnp.asarray(np.stack(np.meshgrid(k, k), -1), u.dtype) * (method.grid.pixel / unit)
     half = jnp.asarray(method.grid.half[::-1], u.dtype)
     end = 2 * half
-    moved = (u + half).reshape(1, 1, 2) - jnp.einsum("ab,yxb->yxa", slope, shift)
+    moved = (u + half).reshape(1, 1, 2) - einsum("ab,yxb->yxa", slope, shift)
     # Half a step beyond the nodes, where light from outside of the picture comes from.
     places = jnp.clip(moved, -0.5, end.reshape(1, 1, 2) + 0.5)
     down, across = table.shape[:2]

@@ -21,7 +21,7 @@ from ..compilation import LARGE, jit
 from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
-from ..numerics import Numbers, real_array, safe_divide, safe_sqrt
+from ..numerics import Numbers, einsum, real_array, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
 from .cover import cover
@@ -210,7 +210,7 @@ def centre_of(beam: Beam, spectrum: Array) -> tuple[Array, Array]:
     """The part (W,) of the light on the sensor in each wavelength and the centroid (2,) of all, mm.
     spectrum: (W,), weights of the light that fills the stop."""
     share = normalised(spectrum * beam.throughput)
-    centre = jnp.einsum("w,wq,dwq->d", share, normalised(beam.weights), beam.hits[:, -1])
+    centre = einsum("w,wq,dwq->d", share, normalised(beam.weights), beam.hits[:, -1])
     return share, centre
 
 
@@ -227,7 +227,7 @@ def transfer_of(
     share, centre = centre_of(beam, spectrum)
     of = _of_rays if model == "rays" else _of_waves
     found = of(lens, beam, wavelengths, frequencies, centre, cells)
-    otf, limit = (jnp.einsum("w,wkn->kn", share.astype(a.dtype), a) for a in found)
+    otf, limit = (einsum("w,wkn->kn", share.astype(a.dtype), a) for a in found)
     return otf, limit
 
 
@@ -283,12 +283,14 @@ def _of_waves(
     """(W, 2, N) each."""
     pupil = pupil_function(lens, beam, wavelengths, cells)
     low, high = beam.directions_extent()
+    middle = (low + high) / 2
 
     def sheared(shear: Array) -> tuple[Array, Array]:
         """The integrals (W,) for a difference of two directions (2, W)."""
         step = jnp.maximum(high - low - jnp.abs(shear), 0) / cells
-        middle = (low + high) / 2
-        first, second = pupil(middle + shear / 2, step), pupil(middle - shear / 2, step)
+        ends = jnp.stack([middle + shear / 2, middle - shear / 2])
+        both = jax.vmap(lambda end: pupil(end, step))(ends)
+        first, second = (jax.tree.map(lambda a, k=k: a[k], both) for k in (0, 1))
         inside = shared_part(first, second)
         light = safe_sqrt(first.light * second.light) * inside
         light = light * (step[0] * step[1])[:, None, None]
@@ -299,18 +301,14 @@ def _of_waves(
         turned = _mean_wave(light, phase, turn, inside)
         return jnp.sum(turned, axis=(1, 2)), jnp.sum(light, axis=(1, 2))
 
-    def at(frequency: Array) -> tuple[Array, Array]:
-        shear = frequency * wavelengths / (_UM * beam.index)
-        turned, light = [], []
-        for k in (1, 0):
-            both = [shear if d == k else jnp.zeros_like(shear) for d in range(2)]
-            first, second = sheared(jnp.stack(both))
-            back = 2 * jnp.pi * frequency * centre[k]
-            turned.append(first * _turned(jnp.ones_like(back), back))
-            light.append(second)
-        return jnp.stack(turned), jnp.stack(light)
-
-    otf, light = jax.lax.map(at, frequencies)
-    size = jnp.broadcast_to(sheared(jnp.zeros_like(low))[1], light.shape)
-    otf, light = safe_divide(otf, size.astype(otf.dtype)), safe_divide(light, size)
-    return jnp.moveaxis(otf, (0, 1, 2), (2, 1, 0)), jnp.moveaxis(light, (0, 1, 2), (2, 1, 0))
+    # One loop, so that the pupil is compiled once: no shear, whose light is all light, then those
+    # of all frequencies along y, then those along x.
+    shear = frequencies[:, None] * (wavelengths / (_UM * beam.index))[None]
+    along = [jnp.stack([jnp.zeros_like(shear), shear], 1), jnp.stack([shear, 0 * shear], 1)]
+    otf, light = jax.lax.map(sheared, jnp.concatenate([jnp.zeros_like(low)[None], *along]))
+    back = 2 * jnp.pi * centre[::-1, None] * frequencies[None]
+    turned = otf[1:].reshape(*back.shape, -1) * _turned(jnp.ones_like(back), back)[..., None]
+    whole = jnp.broadcast_to(light[0], turned.shape)
+    otf = safe_divide(turned, whole.astype(turned.dtype))
+    light = safe_divide(light[1:].reshape(whole.shape), whole)
+    return jnp.moveaxis(otf, -1, 0), jnp.moveaxis(light, -1, 0)

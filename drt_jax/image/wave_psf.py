@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import einsum, safe_divide, safe_sqrt
 from .beam import Beam
 from .cover import cover
 
@@ -59,7 +59,7 @@ def wave_kernel(
     across, down = waves
     # The lags that `transfer` leaves out have the conjugate values.
     across = across * jnp.asarray(np.where(lags[:cells] > 0, 2, 1), across.dtype)[None, None]
-    kernel = jnp.einsum("wyv,wvu,wxu->wyx", down, transfer, across).real
+    kernel = einsum("wyv,wvu,wxu->wyx", down, transfer, across).real
     cell = step[0] * step[1] * beam.index * _UM / wavelengths
     return kernel * (cell * pixel)[:, None, None] ** 2
 

@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.forms import noll_terms
+from ..numerics import einsum, matmul
 
 # Normal equations are solved to this many last digits of their largest element.
 _RIDGE = 16
@@ -77,7 +78,7 @@ class Polynomials:
     def at(self, points: Array) -> Array:
         """The functions (D, W, Q) at points (2, W or 1, Q)."""
         basis = zernike((points - self.centre[..., None]) / self.scale[..., None], self.degree)
-        return jnp.einsum("wdp,pwq->dwq", self.coefficients, basis)
+        return einsum("wdp,pwq->dwq", self.coefficients, basis)
 
     def on_grid(
         self, start: Array, step: Array, side: np.ndarray, slopes: slice
@@ -86,12 +87,12 @@ class Polynomials:
         in y, where u is start + step side for both components: start, step (2, W), side (N,)."""
         dtype = self.coefficients.dtype
         square = jnp.asarray(_tochebyshev(self.degree), dtype)
-        terms = jnp.einsum("wdp,pij->wdij", self.coefficients, square)
+        terms = einsum("wdp,pij->wdij", self.coefficients, square)
         u = start[..., None] + step[..., None] * jnp.asarray(side, dtype)[None, None]
         (x, dx), (y, dy) = (chebyshev(part / _EDGE, self.degree) for part in u)
 
         def product(terms: Array, a: Array, b: Array) -> Array:
-            return jnp.moveaxis(jnp.einsum("wdij,iwx,jwy->wdyx", terms, a, b), 0, 1)
+            return jnp.moveaxis(einsum("wdij,iwx,jwy->wdyx", terms, a, b), 0, 1)
 
         some = terms[:, slopes] / _EDGE
         return product(terms, x, y), product(some, dx, y), product(some, x, dy)
@@ -139,18 +140,18 @@ def fitted(points: Array, values: Array, weights: Array, degree: int, azimuths: 
     some = np.array([k for k, (_, m) in enumerate(noll_terms(degree)) if abs(m) <= azimuths])
     terms, basis = len(basis), basis[some]
     weighted = basis * weights[None]
-    normal = jnp.einsum("pwq,rwq->wpr", weighted, basis)
+    normal = einsum("pwq,rwq->wpr", weighted, basis)
     least = _RIDGE * float(jnp.finfo(values.dtype).eps)
     diagonal = jnp.max(jnp.diagonal(normal, 0, 1, 2), axis=-1)[:, None, None]
     normal = normal + least * diagonal * jnp.eye(len(basis), dtype=values.dtype)[None]
 
     def solution(rest: Array) -> Array:
-        right = jnp.einsum("pwq,dwq->wpd", weighted, rest)
+        right = einsum("pwq,dwq->wpd", weighted, rest)
         return jnp.swapaxes(jax.vmap(_solved)(normal, right), 1, 2)
 
     found = solution(values)
     if least > 1e-12:  # float32: once more for what the first solution leaves
-        found = found + solution(values - jnp.einsum("wdp,pwq->dwq", found, basis))
+        found = found + solution(values - einsum("wdp,pwq->dwq", found, basis))
     every = jnp.zeros((*found.shape[:2], terms), found.dtype).at[..., some].set(found)
     return Polynomials(centre, scale, every, degree)
 
@@ -159,7 +160,7 @@ def _solved(matrix: Array, right: Array) -> Array:
     """The solution (P, D) of matrix (P, P) x = right, for a positive definite matrix."""
     known = jax.lax.stop_gradient(matrix)
     return jax.lax.custom_linear_solve(
-        lambda x: matrix @ x, right, lambda _, b: _by_cholesky(known, b), symmetric=True
+        lambda x: matmul(matrix, x), right, lambda _, b: _by_cholesky(known, b), symmetric=True
     )
 
 

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..numerics import matmul
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -39,10 +41,10 @@ class Elements:
             own = slice(first, last + 1)
             turned = rotation_matrix(self.tilt[g])
             pivot = jnp.zeros_like(point[:1]).at[:, 2].set(axis[self.about[g]] + self.pivot[g])
-            moved = pivot + self.shift[g][None] + (point[own] - pivot) @ turned.T
+            moved = pivot + self.shift[g][None] + matmul(point[own] - pivot, turned.T)
             point, rotation = (
                 point.at[own].set(moved),
-                rotation.at[own].set(turned[None] @ rotation[own]),
+                rotation.at[own].set(matmul(turned[None], rotation[own])),
             )
         return point, rotation
 
@@ -55,4 +57,4 @@ def rotation_matrix(tilt: Array) -> Array:
     about_x = jnp.array([[one, zero, zero], [zero, cx, -sx], [zero, sx, cx]])
     about_y = jnp.array([[cy, zero, sy], [zero, one, zero], [-sy, zero, cy]])
     about_z = jnp.array([[cz, -sz, zero], [sz, cz, zero], [zero, zero, one]])
-    return about_x @ about_y @ about_z
+    return matmul(matmul(about_x, about_y), about_z)

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..numerics import tensordot
+
 # Smallest argument of the square root: there the normal of a sphere leans 0.57 degrees (cos = 0.01)
 # short of 90 degrees. Beyond, the root continues smoothly and stays positive, so that an iteration
 # that strays outside stays finite and can come back; a ray that ends there misses the surface.
@@ -210,7 +212,7 @@ def zernike(w: Point, shape: Shape) -> tuple[Array, Array]:
     z, argument = _conic(square(w), shape.curvature, shape.conic)
     if len(shape.coefficients) > 1:
         pairs, table = _noll(len(shape.coefficients) - 1)
-        terms = jnp.tensordot(jnp.asarray(table, z.dtype), shape.coefficients[1:], 1)
+        terms = tensordot(jnp.asarray(table, z.dtype), shape.coefficients[1:], 1)
         inverse = _inverse(shape.coefficients[0])
         z = z + _polynomial([a * inverse for a in w], dict(zip(pairs, terms, strict=True)))
     return z, argument
@@ -250,7 +252,7 @@ def qbfs(w: Point, shape: Shape) -> tuple[Array, Array]:
     x = r2 * inverse * inverse
     basis = _forbes(len(shape.coefficients) - 1)
     last, total = jnp.zeros_like(x), jnp.zeros_like(x)
-    for b in jnp.tensordot(jnp.asarray(basis, z.dtype), shape.coefficients[1:], 1)[::-1]:
+    for b in tensordot(jnp.asarray(basis, z.dtype), shape.coefficients[1:], 1)[::-1]:
         last, total = total, b + (2 - 4 * x) * total - last
     steep = root(argument + shape.curvature**2 * r2) / root(argument)
     return z + x * (1 - x) * steep * 2 * (total + last), argument

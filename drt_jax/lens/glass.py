@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..numerics import concrete, safe_divide, safe_sqrt
+from ..numerics import concrete, matmul, safe_divide, safe_sqrt
 
 # Model glasses: the lines d, F, C, g (um) and the powers of the wavelength L in Conrady's formula.
 FRAUNHOFER, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
@@ -173,7 +173,7 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
     powers = jnp.stack([wavelengths**p for p in _CONRADY])
     # A medium with a formula of its own stays as it is.
     own = jnp.where(model[:, :1] > 1, known, 0)
-    return own @ jnp.asarray(formula, known.dtype) @ powers
+    return matmul(matmul(own, jnp.asarray(formula, known.dtype)), powers)
 
 
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
@@ -191,7 +191,7 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     within = jnp.clip(wavelengths, _SHORTEST)
     count = dispersion.schott.shape[1]
     powers = jnp.stack([(wavelengths if p > -9 else within) ** p for p in POWERS[:count]])
-    index = safe_sqrt(sellmeier + dispersion.schott @ powers)
+    index = safe_sqrt(sellmeier + matmul(dispersion.schott, powers))
     if dispersion.model is None:
         return index
     return index + _model_index(dispersion.model, dispersion.partial, wavelengths)

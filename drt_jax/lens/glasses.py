@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..numerics import matmul
 from .glass import FRAUNHOFER, POWERS, Glass
 
 _TABLE = pathlib.Path(__file__).parent / "catalogue" / "glasses.txt.gz"
@@ -240,4 +241,4 @@ def glass_map_distance(model: Array) -> Array:
     inside, in units of nd with 100 of vd as 1. model: (G, 2), nd and vd."""
     edges = jnp.asarray(_glass_map(), model.dtype)
     scaled = model * jnp.array([[1, _PER_VD]], model.dtype)
-    return jnp.max(scaled @ edges[:, :2].T + edges[None, :, 2], axis=1)
+    return jnp.max(matmul(scaled, edges[:, :2].T) + edges[None, :, 2], axis=1)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from jax.dtypes import canonicalize_dtype
 
-from ..numerics import Numbers, concrete, real_array, still
+from ..numerics import Numbers, concrete, matmul, real_array, still
 from .aperture import Apertures
 from .elements import Elements, rotation_matrix
 from .forms import Shape
@@ -250,7 +250,8 @@ class Lens:
             across = jnp.zeros((len(z), 2), z.dtype) if across is None else across
             return jnp.append(across[-1], z[-1])
 
-        return jax.jvp(vertex, (self.sensor,), (jnp.ones_like(self.sensor),))[1] @ rotation[-1]
+        step = jax.jvp(vertex, (self.sensor,), (jnp.ones_like(self.sensor),))[1]
+        return matmul(step, rotation[-1])
 
     @property
     def shape(self) -> Shape:

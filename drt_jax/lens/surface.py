@@ -3,6 +3,7 @@
 `forms` describes points, shapes and forms.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -44,37 +45,51 @@ def domain(w: Point, shape: Shape, form: str = "asphere") -> Array:
     return FORMS[form].function(w, shape)[1] > RIM
 
 
+@functools.partial(jax.jit, static_argnames="form")
+def sag_slope(w: Point, shape: Shape, form: str = "asphere") -> tuple[Array, tuple[Array, ...]]:
+    """Sag (mm) and its gradient (D arrays) by the transverse coordinates, all shaped as `w[0]`. w:
+    D arrays, mm.
+
+    By automatic differentiation; for an asphere, the form of nearly all surfaces, written out with
+    one root and one division. JAX keeps what it traced: a program calls this for every search.
+    """
+    w = tuple(w)
+    if form == "asphere":
+        z, first, _ = _profile(w, shape)
+        return z, tuple(2 * a * first for a in w)
+    z, pull_back = jax.vjp(lambda w: surface_sag(w, shape, form), w)
+    return z, pull_back(jnp.ones_like(z))[0]
+
+
+@functools.partial(jax.jit, static_argnames="form")
 def sag_derivatives(
     w: Point, shape: Shape, form: str = "asphere"
 ) -> tuple[Array, tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
     """Sag (mm), its gradient (D arrays) and its Hessian (1/mm, D rows of D) by the transverse
-    coordinates, all shaped as `w[0]`. w: D arrays, mm.
-
-    By automatic differentiation; for an asphere, the form of nearly all surfaces, written out with
-    one root and one division.
-    """
+    coordinates, all shaped as `w[0]`. w: D arrays, mm."""
     w = tuple(w)
     if form == "asphere":
-        return _asphere_derivatives(w, shape)
-
-    def slopes(w):
-        z, pull_back = jax.vjp(lambda w: surface_sag(w, shape, form), w)
-        return pull_back(jnp.ones_like(z))[0], z
-
+        z, first, second = _profile(w, shape)
+        bend = tuple(
+            tuple(4 * a * b * second + (2 * first if i == j else 0) for j, b in enumerate(w))
+            for i, a in enumerate(w)
+        )
+        return z, tuple(2 * a * first for a in w), bend
     rows = []
     for d in range(len(w)):
         unit = tuple(jnp.full_like(a, float(k == d)) for k, a in enumerate(w))
-        slope, row, z = jax.jvp(slopes, (w,), (unit,), has_aux=True)
+        (z, slope), (_, row) = jax.jvp(lambda w: sag_slope(w, shape, form), (w,), (unit,))
         rows.append(row)
     return z, slope, tuple(rows)
 
 
-def _asphere_derivatives(w: tuple[Array, ...], shape: Shape) -> Any:
+def _profile(w: tuple[Array, ...], shape: Shape) -> tuple[Array, Array, Array]:
+    """Sag of an asphere and its first and second derivatives by r^2. Beyond the rim, it continues
+    with the slope at the rim."""
     c, bent = shape.curvature, (1 + shape.conic) * shape.curvature**2
     r2 = square(w)
     argument = 1 - bent * r2
     inverse = 1 / jnp.sqrt(jnp.maximum(argument, RIM))
-    # z and its derivatives by r^2; beyond the rim, z continues with the slope at the rim.
     z, first = c * r2 / (1 + root(argument)), c / 2 * inverse
     second = jnp.where(argument > RIM, c * bent / 4 * inverse**3, 0)
     if shape.coefficients.shape[0]:
@@ -82,11 +97,7 @@ def _asphere_derivatives(w: tuple[Array, ...], shape: Shape) -> Any:
         once = [(j + 1) * a for j, a in enumerate(shape.coefficients)]
         first = first + horner(r2, once)
         second = second + horner(r2, [(j + 1) * a for j, a in enumerate(once[1:])])
-    bend = tuple(
-        tuple(4 * a * b * second + (2 * first if i == j else 0) for j, b in enumerate(w))
-        for i, a in enumerate(w)
-    )
-    return z, tuple(2 * a * first for a in w), bend
+    return z, first, second
 
 
 def vertex_curvature(shape: Shape, forms: tuple[str, ...], dim: int) -> tuple[Array, ...]:

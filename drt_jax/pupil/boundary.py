@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..lens.lens import Lens
-from ..numerics import safe_divide, safe_sqrt
+from ..numerics import einsum, safe_divide, safe_sqrt
 from ..rays.snell import shoot, shoot_anyway, split_stop
 from ..rays.status import Status
 from ..rays.system import System, dot
@@ -132,7 +132,7 @@ def trace(
         q.append(jnp.stack([ways / (_LONGEST * span) - 1, 0 * ways]))
     if lens.apertures is not None:
         matrix, centre, own = lens.apertures.edges()
-        q.append(jnp.einsum("eij,jewb->iewb", matrix, hit[:, own] - centre.T[..., None, None]))
+        q.append(einsum("eij,jewb->iewb", matrix, hit[:, own] - centre.T[..., None, None]))
     return (hit[:, lens.stop] / lens.semi_diameter[lens.stop], jnp.concatenate(q, axis=1)), good
 
 

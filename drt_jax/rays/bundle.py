@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..numerics import einsum, tensordot
 from .aim import aim, beam_size, paraxial_launch
 from .status import Status
 from .system import System, Vector, dot
@@ -95,14 +96,14 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
     # the inverse triangle grow, so that no digit is lost.
     basis, triangle = np.linalg.qr(np.prod(points.T[:, None] ** pairs, axis=-1))
     launch = jnp.stack(aimed.launch)
-    parts = jnp.tensordot(jnp.asarray(basis.T, launch.dtype), launch, axes=(1, 2))
-    terms = jnp.tensordot(jnp.asarray(np.linalg.inv(triangle), launch.dtype), parts, axes=1)
+    parts = tensordot(jnp.asarray(basis.T, launch.dtype), launch, axes=(1, 2))
+    terms = tensordot(jnp.asarray(np.linalg.inv(triangle), launch.dtype), parts, axes=1)
     empty = jnp.zeros((_DEGREE + 1, _DEGREE + 1, *terms.shape[1:]), launch.dtype)
     coefficients = empty.at[pairs[:, 0], pairs[:, 1]].set(terms)
 
     def at(target):
         x, y = (_powers(a / radius) for a in target)
-        rows = jnp.einsum("ijdw,jwq->idwq", coefficients, y)
+        rows = einsum("ijdw,jwq->idwq", coefficients, y)
         fitted = sum((rows[i] * x[i][None] for i in range(1, _DEGREE + 1)), rows[0])
         start = paraxial_launch(system, target, sizes[1])
         return tuple(jnp.where(all_ok, f, s) for f, s in zip(fitted, start, strict=True))

@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.forms import Shape
-from ..lens.surface import by_form, domain, sag_derivatives, surface_sag
+from ..lens.surface import by_form, domain, sag_derivatives, sag_slope, surface_sag
 from ..numerics import safe_divide, safe_sqrt
 from .meet import cross
 from .system import Diffraction, System, Vector, dot, rotate
@@ -59,6 +59,7 @@ def _segments(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vec
     return tuple(o[0] + p[0] for o, p in zip(origin, own, strict=True)), step
 
 
+@jax.jit
 def geometry(hits: Vector, system: System) -> Path:
     """Directions, lengths and sag derivatives of the paths through `hits`, D arrays (R, W, Q).
 
@@ -224,7 +225,7 @@ def optical_path(hits: Vector, system: System, middle: Vector | None = None) -> 
     lengths = safe_divide(dot(moved, both), _length(chain) + _length(other))
     if len(system.forms) > 1:
         shape = Shape(*(a[..., -2, :, :] for a in system.rows.wide))
-        slope = sag_derivatives(tuple(h[-2] for h in hits), shape, system.forms[-2])[1]
+        slope = sag_slope(tuple(h[-2] for h in hits), shape, system.forms[-2])[1]
         to, off = (tuple(c[k] for c in chain) for k in (-2, -1))
         way = _way(to, off, slope, system)
         lengths = jnp.concatenate([lengths[:-1], way[None] * lengths[-1:]])

@@ -126,6 +126,7 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
     return solution.value, all_solved | solution.state.solved, solution.stats["num_steps"]
 
 
+@jax.jit
 def find(
     system: System, target: Vector, launch: Vector | None = None, searched: Array | None = None
 ) -> Found:
@@ -151,6 +152,7 @@ def find(
     return Found(hits, fermat.arrival(hits, system), status, steps)
 
 
+@jax.jit
 def find_aimed(system: System, target: Vector) -> Found:
     """Finds rays by aiming alone, see `aim_outwards`; every ray that does not meet its stop point
     to rounding is UNCONVERGED. The program is a third of that of `find`; where rays fail it takes a
@@ -271,6 +273,7 @@ def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Arr
     return trace.hits, jnp.where(status == Status.OK, traced, status)
 
 
+@jax.jit
 def find_many(system: System, target: Vector) -> Found:
     """Finds rays as `find` does. A large bundle is split into tiles; polynomials launch its rays,
     and only tiles in which a ray misses are searched. A stop point that is not finite is MISSED

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.forms import RIM, Shape
-from ..lens.surface import domain, sag_derivatives
+from ..lens.surface import domain, sag_slope
 from ..numerics import safe_divide, safe_sqrt
 from .system import Placed, Vector, dot
 
@@ -113,7 +113,7 @@ def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple[
     if _plain(form, shape):
         quadric = tuple(shape.curvature * a for a in (*across, (1 + shape.conic) * z))
         return dot(quadric, (*across, z)) / 2 - z, dot(quadric, d) - d[-1]
-    height, slope, _ = sag_derivatives(across, shape, form)
+    height, slope = sag_slope(across, shape, form)
     return height - z, dot(slope, d[:-1]) - d[-1]
 
 
@@ -146,7 +146,7 @@ def meet(
         c = shape.curvature
         normal = *(-c * a for a in own[:-1]), 1 - (1 + shape.conic) * c * own[-1]
     else:
-        _, slope, _ = sag_derivatives(own[:-1], shape, form)
+        _, slope = sag_slope(own[:-1], shape, form)
         normal = *(-a for a in slope), jnp.ones_like(own[-1])
     return own, normal, met, length
 

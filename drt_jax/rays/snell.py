@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.forms import Shape
-from ..lens.surface import sag_derivatives
+from ..lens.surface import sag_slope
 from ..numerics import safe_divide, safe_sqrt
 from .meet import meet, near_side
 from .status import Status
@@ -123,7 +123,7 @@ def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
     if row is None:
         return ()
     none = lambda hit, _: tuple(jnp.zeros_like(a) for a in hit)  # noqa: E731
-    each = [lambda hit, phase, kind=kind: sag_derivatives(hit, phase, kind)[1] for kind in kinds]
+    each = [lambda hit, phase, kind=kind: sag_slope(hit, phase, kind)[1] for kind in kinds]
     slope = jax.lax.switch(row.kind, [none, *each], hit, row.phase)
     return tuple(row.wave * s for s in slope)
 
@@ -246,6 +246,7 @@ def _along_the_axis(going: Array, side: Array, p: Vector, d: Vector) -> tuple[Ve
     return p, tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
 
 
+@partial(jax.jit, static_argnames=("to_stop", "smooth", "forward"))
 def _follow(
     system: System,
     launch: Vector,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from ..lens.surface import by_form, sag_derivatives
+from ..lens.surface import by_form, sag_slope
 from . import fermat, linear
 from .bundle import derivative_tile, in_tiles
 from .fermat import Path
@@ -74,7 +74,7 @@ def _right_side(path: Path, system: System, moving: list[Array | None]) -> linea
         new = dict(zip(some, changed, strict=True))
         own = jax.tree.unflatten(structure, [new.get(k, a) for k, a in enumerate(leaves)])
         rows = own.rows
-        height, slope, _ = by_form(sag_derivatives, path.hits, rows.on(path.length), own.forms)
+        height, slope = by_form(sag_slope, path.hits, rows.on(path.length), own.forms)
         before, after = (rotate(rows.rotation, a, back=True) for a in directions)
         residual = fermat.residual(path._replace(before=before, after=after, slope=slope), own)
         point = rotate(rows.rotation, (*path.hits, height))

@@ -17,7 +17,7 @@ from ..lens.forms import Shape
 from ..lens.lens import Lens
 from ..lens.phase import Phase
 from ..lens.scene import Scene
-from ..numerics import safe_divide
+from ..numerics import matmul, safe_divide
 
 Vector = tuple[Array, ...]
 _MM = 1e-3  # mm per um
@@ -204,7 +204,7 @@ class System:
         step = rows.vertex[-1] - rows.vertex[-2]
         if rotation is not None:
             last, sensor = (jnp.stack([a[k] for a in rows.origin(2)]) for k in (-2, -1))
-            step = jnp.dot(sensor - last, rotation[-2, :, 2])
+            step = matmul(sensor - last, rotation[-2, :, 2])
         return jnp.where(step * self.senses[-1] < 0, -1, 1).astype(step.dtype)
 
     @property
@@ -219,7 +219,7 @@ class System:
             return sides
         vertex = jnp.stack([a[0] for a in self.rows.origin(self.dim)])
         light = self.vergence * vertex - self.source
-        turned = jnp.dot(light, rotation[0, :, 2]) < -0.5 * jnp.sqrt(jnp.dot(light, light))
+        turned = matmul(light, rotation[0, :, 2]) < -0.5 * jnp.sqrt(matmul(light, light))
         return sides.at[0].set(jnp.where(turned, -1, 1).astype(sides.dtype))
 
     @property

@@ -18,6 +18,7 @@ from ..lens.aperture import depths
 from ..lens.clearance import clearance, clipping_surface
 from ..lens.lens import Lens, sag
 from ..lens.scene import Scene, scene_of
+from ..numerics import einsum
 from ..pupil.patterns import hexapolar
 from ..rays.status import Status
 from ..rays.trace import trace_rays
@@ -127,7 +128,7 @@ def _rays(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
     across = jnp.zeros((len(vertex), 2), vertex.dtype) if across is None else across
     own = points - jnp.concatenate([across, vertex[:, None]], axis=1)[None]
     if turned is not None:
-        own = jnp.einsum("qsi,sij->qsj", own, turned)
+        own = einsum("qsi,sij->qsj", own, turned)
         directions = directions @ turned[-1]
     hits = own[..., :2]
     clips = clipping_surface(lens, (hits[..., 0].T, hits[..., 1].T))

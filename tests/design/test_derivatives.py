@@ -56,7 +56,8 @@ def crooked(tmp_path_factory):
     fields = [[0.02, 0.05], [0.01, 0.25], [0.03, 0.45]]
     problem = Problem.from_variables(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "none"))
     moves = np.random.default_rng(0).normal(size=len(variables.places))
-    return problem, variables.start + moves
+    # As optimisers search: a third of the program, and the derivatives do not know.
+    return quick(problem), variables.start + moves
 
 
 @pytest.mark.slow

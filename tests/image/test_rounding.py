@@ -125,3 +125,27 @@ def test_kernels_of_rays_that_rounding_spoils_are_told(name, pixel, loud):
         warnings.simplefilter("always")
         drt_jax.converged_psf(single(name), 0.0, np.inf, GREEN, pixel, 15, "rays")
     assert any("in float32 kernels may be wrong" in str(one.message) for one in said) == loud
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("answer", ["rays", "kernel", "contrast", "energy"])
+def test_no_product_is_rounded_by_a_gpu(answer):
+    """GPUs round the factors of float32 products of matrices to 10 bits unless a program asks for
+    more: the refractive index would be 5e-4 off."""
+    waves, rule = jnp.array([0.5, 0.6]), drt_jax.Gauss(4, "bilateral")
+    pupil, field = jnp.asarray(drt_jax.pupil.sobol_disc(5000)[0]), jnp.array([0.1])
+    model = drt_jax.PsfModel("waves", beam_rule(6, "bilateral"), 32)
+    of = {
+        "rays": lambda lens: drt_jax.trace_rays(lens, 0.1, np.inf, waves, pupil).path,
+        "kernel": lambda lens: drt_jax.psf(lens, 0.1, np.inf, waves, 4e-3, 9, model).kernel,
+        "contrast": lambda lens: (
+            drt_jax.transfer(lens, field, np.inf, waves, jnp.array([30.0]), rule=rule, cells=32).mtf
+        ),
+        "energy": lambda lens: drt_jax.encircled_energy(
+            lens, field, np.inf, waves, jnp.array([0.01]), rule=rule, cells=32
+        ),
+    }[answer]
+    gradient = jax.jit(jax.grad(lambda lens: jnp.sum(of(lens))))
+    text = gradient.lower(drt_jax.load_lens("cooke_triplet")).as_text()
+    products = [line for line in text.splitlines() if "dot_general" in line]
+    assert products and all("[HIGHEST, HIGHEST]" in line for line in products)

@@ -78,6 +78,7 @@ def test_points_cover_the_field_and_the_depths():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:size.* hold 99 %")
 def test_the_kernels_of_many_points_are_those_of_each(camera):
     variables, imager, _ = camera
     kernels, light = imager.points({"lens": variables.start}, SEEN)
