@@ -195,7 +195,8 @@ def test_failed_rays_have_a_status_and_change_no_other(monkeypatch):
     gradient, wave = opd(steep, searched(steep, scene, heights))
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
     status = np.asarray(wave.status[0])
-    assert status[0] == Status.MISSED and status[4] == Status.OK
+    # At 24 mm the sphere is 5.9 mm deep, and the glass 4 mm thick.
+    assert status[0] == Status.CROSSED and status[4] == Status.OK
     assert np.any(status == Status.CLIPPED)
     assert np.all(np.asarray(wave.opd)[0, status != Status.OK] == 0)
     weights = np.where(status == Status.OK, 1.0, 7.0)
