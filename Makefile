@@ -29,7 +29,7 @@ test test-slow test-all test-versions site: export JAX_COMPILATION_CACHE_DIR ?= 
 test: install
 	$(BIN)/python -m pytest
 
-# The larger scenes; PART=0, 1 or 2 is a third of them.
+# The larger scenes; PART=0, 1, 2 or 3 is a quarter of them.
 test-slow: install
 	$(BIN)/python -m pytest -m slow --durations=60 $(if $(PART),--part=$(PART))
 

@@ -52,8 +52,8 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 # takes a seventh of the time of the tests.
 gc.set_threshold(100_000, 20, 20)
 
-# All slow tests take longer than CI may: it runs another third of them for another commit.
-PARTS = 3
+# All slow tests take longer than CI may: it runs another quarter of them for another commit.
+PARTS = 4
 LONGEST = ("test_readme.py", "test_experiments.py", "test_derivatives.py")
 RGB = (0.6, 0.53, 0.48)
 LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
@@ -62,12 +62,12 @@ LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
 def pytest_addoption(parser):
     """Adds --write-tables: the tests that make a table of `results` write it there; and --part."""
     parser.addoption("--write-tables", action="store_true", help="rewrite the tables in results/")
-    parser.addoption("--part", type=int, choices=range(PARTS), help="a third of the slow tests")
+    parser.addoption("--part", type=int, choices=range(PARTS), help="a quarter of the slow tests")
 
 
 def pytest_collection_modifyitems(config, items):
     """Files with long tests first: none is left for one worker alone at the end. With `--part`,
-    every third slow function of a file; the cases of one share programs."""
+    every fourth slow function; the cases of one share programs."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
     part = config.getoption("--part")
     if part is None:
