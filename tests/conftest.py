@@ -72,16 +72,11 @@ def pytest_collection_modifyitems(config, items):
     part = config.getoption("--part")
     if part is None:
         return
-    slow = (item for item in items if item.get_closest_marker("slow"))
-    functions = dict.fromkeys((item.path, item.originalname) for item in slow)
-    wanted = set(itertools.islice(functions, part, None, PARTS))
-    left = [
-        item
-        for item in items
-        if item.get_closest_marker("slow") and (item.path, item.originalname) not in wanted
-    ]
+    slow = {i: (i.path, i.originalname) for i in items if i.get_closest_marker("slow")}
+    wanted = set(itertools.islice(dict.fromkeys(slow.values()), part, None, PARTS))
+    left = [item for item, function in slow.items() if function not in wanted]
     config.hook.pytest_deselected(items=left)
-    items[:] = [item for item in items if item not in set(left)]
+    items[:] = [item for item in items if slow.get(item) is None or slow[item] in wanted]
 
 
 @pytest.fixture

@@ -288,9 +288,7 @@ def _of_waves(
     def sheared(shear: Array) -> tuple[Array, Array]:
         """The integrals (W,) for a difference of two directions (2, W)."""
         step = jnp.maximum(high - low - jnp.abs(shear), 0) / cells
-        ends = jnp.stack([middle + shear / 2, middle - shear / 2])
-        both = jax.vmap(lambda end: pupil(end, step))(ends)
-        first, second = (jax.tree.map(lambda a, k=k: a[k], both) for k in (0, 1))
+        first, second = pupil(middle + shear / 2, step), pupil(middle - shear / 2, step)
         inside = shared_part(first, second)
         light = safe_sqrt(first.light * second.light) * inside
         light = light * (step[0] * step[1])[:, None, None]
@@ -301,11 +299,12 @@ def _of_waves(
         turned = _mean_wave(light, phase, turn, inside)
         return jnp.sum(turned, axis=(1, 2)), jnp.sum(light, axis=(1, 2))
 
-    # One loop, so that the pupil is compiled once: no shear, whose light is all light, then those
+    # One loop, so that `sheared` is compiled once: no shear, whose light is all light, then those
     # of all frequencies along y, then those along x.
     shear = frequencies[:, None] * (wavelengths / (_UM * beam.index))[None]
-    along = [jnp.stack([jnp.zeros_like(shear), shear], 1), jnp.stack([shear, 0 * shear], 1)]
-    otf, light = jax.lax.map(sheared, jnp.concatenate([jnp.zeros_like(low)[None], *along]))
+    none = jnp.zeros_like(shear)
+    shears = jnp.zeros_like(low)[None], jnp.stack([none, shear], 1), jnp.stack([shear, none], 1)
+    otf, light = jax.lax.map(sheared, jnp.concatenate(shears))
     back = 2 * jnp.pi * centre[::-1, None] * frequencies[None]
     turned = otf[1:].reshape(*back.shape, -1) * _turned(jnp.ones_like(back), back)[..., None]
     whole = jnp.broadcast_to(light[0], turned.shape)

@@ -126,7 +126,6 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
     return solution.value, all_solved | solution.state.solved, solution.stats["num_steps"]
 
 
-@jax.jit
 def find(
     system: System, target: Vector, launch: Vector | None = None, searched: Array | None = None
 ) -> Found:

@@ -30,7 +30,7 @@ _STOP_MISS = 1e-9  # mm
 
 def _over_scenes(function: Callable) -> Callable:
     """Maps a function of one scene over any number of scenes, in batches; NumPy arrays."""
-    program = jit(jax.vmap(function), QUICK)
+    program = jit(lambda *scenes: jax.lax.map(lambda scene: function(*scene), scenes), QUICK)
 
     def run(*arguments):
         count, parts = len(jax.tree.leaves(arguments)[0]), []
