@@ -364,7 +364,10 @@ def _fields() -> tuple[list[str], list[str]]:
 
 
 def _open(semi: Array, given: dict[str, Any]) -> Array:
-    """Semi-diameters with derivatives, but for that of the stop."""
+    """Semi-diameters with derivatives, but for that of the stop. `jax.jacrev` of a function of
+    several outputs puts a tuple in the place of an array: that is returned as it is."""
+    if not isinstance(semi, Array):
+        return semi
     rows = np.arange(semi.size).reshape(semi.shape) % len(given["labels"].glasses)
     return jnp.where(rows == given["stop"], still(semi), semi)
 

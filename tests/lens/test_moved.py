@@ -52,6 +52,15 @@ def held(gradient):
     return [*jax.tree.leaves(constants), *rest, *order]
 
 
+def test_a_jacobian_of_several_outputs_is_that_of_each():
+    """Also in `jit`, where each array of the lens becomes a tuple of derivatives."""
+    first, second = jax.jit(jax.jacrev(lambda lens: (power(lens), {"twice": 2 * power(lens)})))(LENS)
+    one = slopes(LENS)
+    for name in ("curvature", "semi_diameter", "sensor"):
+        assert np.array_equal(getattr(first, name), getattr(one, name))
+        assert np.array_equal(getattr(second["twice"], name), 2 * getattr(one, name))
+
+
 @pytest.mark.parametrize("prescription", ["cooke_triplet", MIXED], ids=["glasses", "mixed"])
 def test_a_gradient_by_a_lens_holds_what_a_designer_holds(prescription):
     lens = drt_jax.load_lens(prescription)
