@@ -31,8 +31,8 @@ from ..rays.system import System, dot
 from ..rays.trace import on_all_surfaces
 
 _ZOOMS, _STEPS = 10, 8  # refinements of the grid and Newton steps in `middle`
-# Unit of the length between two surfaces in the edge of `crossing`, in units of the length of the
-# lens: a longer path counts as clipped.
+# With `crossing`, a path between two surfaces passes from 0 to twice this length, in units of the
+# length of the lens.
 _LONGEST = 100.0
 
 # A function from launches (2, W, B) to ((stop points, q), good), see `Rays`.
