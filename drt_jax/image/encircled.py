@@ -19,7 +19,7 @@ from ..lens.lens import Lens
 from ..numerics import Numbers, einsum, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
-from .ray_psf import below, ray_spots
+from .ray_psf import ray_spots, spot_below
 from .refined import TOLERANCE, beams_of, to_tolerance
 from .transfer import Model, arrays_of, centre_of, through_focus
 from .wave_psf import amplitudes, autocorrelation, period
@@ -114,7 +114,7 @@ def _of_rays(
 
     def part(inside: Array) -> Array:
         return jnp.where(
-            reach > 0, below(safe_divide(inside, reach)), (inside >= 0).astype(inside.dtype)
+            reach > 0, spot_below(safe_divide(inside, reach)), (inside >= 0).astype(inside.dtype)
         )
 
     def at(radius: Array) -> Array:
