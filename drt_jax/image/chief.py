@@ -33,7 +33,7 @@ from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
 from .field import CHIEF
-from .rounding import tell_of_focus
+from .rounding import warn_of_focus
 
 Mapping = Literal["tangent", "angle"]
 # As many fields at a time are a program.
@@ -92,7 +92,7 @@ def field_curvature(
     outside of a trace, where float32 moves a focus by more than 2 % of the depth of focus, the
     wavelength over NA^2.
     """
-    tell_of_focus(lens, distance, wavelengths)
+    warn_of_focus(lens, distance, wavelengths)
     found = _chief_rays(lens, fields, distance, wavelengths)
     return FieldCurvature(found.tangential[1:], found.sagittal[1:])
 

@@ -23,7 +23,7 @@ from ..numerics import Numbers, einsum
 from ..pupil.patterns import disc
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
-from .rounding import tell_of_paths
+from .rounding import warn_of_paths
 from .wavefront import path_differences
 from .zernike import zernike
 
@@ -81,7 +81,7 @@ def _coefficients(
     rows = tuple(range(rows)) if isinstance(rows, int) else rows
     axis = scene_of(lens, 0.0, distance, wavelengths)
     angles = fields_array(fields, lens.curvature.dtype)
-    tell_of_paths(lens, axis, angles, 4)
+    warn_of_paths(lens, axis, angles, 4)
     return _fitted(lens, angles, axis, rows)
 
 

@@ -36,7 +36,7 @@ from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
 from .orders import Group, rules_by_order
-from .rounding import hit_rounding, tell
+from .rounding import hit_rounding, warn_of_rounding
 from .spot import Moments
 from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
 
@@ -269,12 +269,12 @@ def _try_orders(
                 trials = [*trials, trial][-3:]
                 changes = (_change(trials[0], later, places) for later in trials[1:])
                 change = max(changes, default=np.inf)
-                rough = max(_rounding(lens, found) for found in trial.moments)
-                if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
+                rounded = max(_rounding(lens, found) for found in trial.moments)
+                if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rounded):
                     if says:
-                        tell(lens, "the spot", rough, tolerance, " of its size", 4)
+                        warn_of_rounding(lens, "the spot", rounded, tolerance, " of its size", 4)
                     # If rounding hides their difference, take the last.
-                    return trials[-1 if 2 * rough > tolerance else 0]
+                    return trials[-1 if 2 * rounded > tolerance else 0]
         else:
             break
     warnings.warn(

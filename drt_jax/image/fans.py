@@ -18,7 +18,7 @@ from ..lens.scene import Scene, fields_array, scene_of
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
-from .rounding import tell_of_focus, tell_of_paths
+from .rounding import warn_of_focus, warn_of_paths
 from .wavefront import path_differences
 
 
@@ -75,7 +75,7 @@ def ray_fans(
         raise ValueError(f"count: expected at least 2, a whole number, got {count!r}")
     heights = jnp.linspace(-1, 1, int(count), dtype=lens.curvature.dtype)
     axis = scene_of(lens, 0.0, distance, wavelengths)
-    tell_of_paths(lens, axis, fields_array(fields, lens.curvature.dtype))
+    warn_of_paths(lens, axis, fields_array(fields, lens.curvature.dtype))
     hit, _, opd, good = _of_fields(lens, fields, distance, wavelengths, heights)
     middle = hit.shape[1] // 2 if reference is None else reference
     if not -hit.shape[1] <= middle < hit.shape[1]:
@@ -103,7 +103,7 @@ def axial_colour(
     points = real_array("heights", heights, lens.curvature.dtype)
     if points.ndim != 1:
         raise ValueError(f"heights: expected (N,), got shape {points.shape}")
-    tell_of_focus(lens, distance, wavelengths)
+    warn_of_focus(lens, distance, wavelengths)
     hit, slope, _, good = _of_fields(lens, 0.0, distance, wavelengths, points)
     height, bend = (a[0, :, 1 : len(points) + 1, 1] - a[0, :, :1, 1] for a in (hit, slope))
     arrives = good[0, :, 1 : len(points) + 1] & good[0, :, :1] & (bend != 0)

@@ -26,7 +26,7 @@ from ..pupil.rules import PupilRule
 from .beam import Beam
 from .cover import cover
 from .refined import TOLERANCE, beams_of, to_tolerance
-from .rounding import tell_of_paths
+from .rounding import warn_of_paths
 from .spot import normalised
 from .spots import light_rule
 from .wave_psf import pupil_function, shared_part
@@ -119,7 +119,7 @@ def arrays_of(
     dtype = lens.curvature.dtype
     axis, angles = scene_of(lens, 0.0, *scene[1:]), fields_array(scene[0], dtype)
     if model == "waves":
-        tell_of_paths(lens, axis, angles, 4, True)
+        warn_of_paths(lens, axis, angles, 4, True)
     values, steps = real_array(name, places, dtype), real_array("focus", focus, dtype)
     if values.ndim != 1:
         raise ValueError(f"{name}: expected (N,), got shape {values.shape}")
@@ -149,7 +149,7 @@ def strehl(
     """
     axis = scene_of(lens, 0.0, distance, wavelengths)
     angles = fields_array(fields, lens.curvature.dtype)
-    tell_of_paths(lens, axis, angles, of_beams=True)
+    warn_of_paths(lens, axis, angles, of_beams=True)
     if rule is None:
         rule = light_rule(lens, fields, distance, wavelengths)
     given = lens, beams_of(lens, angles, axis, rule, degree), axis.wavelengths

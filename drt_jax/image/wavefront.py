@@ -27,7 +27,7 @@ from ..rays.afocal import FOCAL
 from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import Bundle, stop_points, trace_bundle
-from .rounding import tell_of_paths
+from .rounding import warn_of_paths
 
 _MM = 1e-3  # per um
 
@@ -90,7 +90,7 @@ def wavefront(
             )
         if concrete(curvature) and not np.all(np.isfinite(np.asarray(curvature, float))):
             raise ValueError("curvature: must be finite; 0 for a telecentric exit pupil")
-    tell_of_paths(lens, scene)
+    warn_of_paths(lens, scene)
     return _wavefront(lens, scene, points, kappa)
 
 
