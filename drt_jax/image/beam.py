@@ -119,7 +119,7 @@ class Beam:
         kappa t) d - kappa e, and the path is `path` + n (d.(C + e) - c.C - t). Where the spot is
         not small compared with the radius, kappa = 0: the ray's own direction.
         """
-        light = self._fit_weights()
+        light = self._light()
         middle = means(self.hits[:, -1], light)[..., None]
         e, line = self.hits[:, -1] - middle, self.direction[:2]
         e = jnp.where(self.known[None], e, 0)
@@ -149,9 +149,7 @@ class Beam:
         """
         cosines, path = self.on_sphere()
         # The tilt n C.c, see above.
-        along = jax.lax.stop_gradient(
-            self.index[None] * means(self.hits[:, -1], self._fit_weights())
-        )
+        along = jax.lax.stop_gradient(self.index[None] * means(self.hits[:, -1], self._light()))
         path = path + dot(tuple(along[..., None]), tuple(cosines))
         found = self._fitted(cosines, self._with_edges([path[None], self.points]))
         tilt = jnp.stack([dot(along, found.centre), *(along * found.scale / 2)], axis=-1)
@@ -223,9 +221,9 @@ class Beam:
     def _along_motion(self) -> Array:
         """Cosine (W,) between the mean direction of the light and the direction in which the
         sensor moves."""
-        return jnp.sum(means(self.direction, self._fit_weights()) * self.motion[:, None], axis=0)
+        return jnp.sum(means(self.direction, self._light()) * self.motion[:, None], axis=0)
 
-    def _fit_weights(self) -> Array:
+    def _light(self) -> Array:
         """Weights (W, Q) >= 0 of fits and centroids: the absolute values of `weights`, which are
         negative for rays inside of obscurations; 1 for a wavelength without light."""
         weights = jnp.where(self.known, jnp.abs(self.weights), 0)
@@ -235,10 +233,8 @@ class Beam:
         """Polynomials of the beam's degree fitted to values (D, W, Q) at points (2, W, Q)."""
         # Fit the deviations from the mean, so that float32 rounds only these, and add the mean to
         # the constant term.
-        mean = jax.lax.stop_gradient(means(values, self._fit_weights()))
-        found = fitted(
-            points, values - mean[..., None], self._fit_weights(), self.degree, self.azimuths
-        )
+        mean = jax.lax.stop_gradient(means(values, self._light()))
+        found = fitted(points, values - mean[..., None], self._light(), self.degree, self.azimuths)
         coefficients = found.coefficients.at[..., 0].add(mean.T)
         return dataclasses.replace(found, coefficients=coefficients)
 

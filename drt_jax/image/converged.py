@@ -36,7 +36,7 @@ from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
 from .orders import Group, rules_by_order
-from .rounding import hit_rounding, warn_of_rounding
+from .rounding import hit_rounding, warn_dtype
 from .spot import Moments
 from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
 
@@ -272,7 +272,7 @@ def _try_orders(
                 rounded = max(_rounding(lens, found) for found in trial.moments)
                 if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rounded):
                     if says:
-                        warn_of_rounding(lens, "the spot", rounded, tolerance, " of its size", 4)
+                        warn_dtype(lens, "the spot", rounded, tolerance, " of its size", 4)
                     # If rounding hides their difference, take the last.
                     return trials[-1 if 2 * rounded > tolerance else 0]
         else:

@@ -22,7 +22,7 @@ from ..pupil.rules import require_fit
 from .beam import BeamRule, trace_beam
 from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
 from .kernel import check_pixels
-from .psf_model import LOST, TOLERANCE, converged_psf, traced, warn_of_outside
+from .psf_model import LOST, TOLERANCE, converged_psf, traced, warn_of_loss
 
 
 def psf(
@@ -131,5 +131,5 @@ def psfs(
             with jax.core.eval_context():
                 scene = scene_of(lens, angles[k], far[k], wavelengths)
                 beam = traced(lens, scene, model.rule)
-            warn_of_outside(float(lost[k]), scene, beam, pixel, size, model.kind, 3)
+            warn_of_loss(float(lost[k]), scene, beam, pixel, size, model.kind, 3)
     return found

@@ -22,7 +22,7 @@ from .beam import Beam, BeamRule, beam_rule, trace_beam
 from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
 from .converged import at_sensor, converge, scenes_of
 from .kernel import check_pixels
-from .rounding import below_double, hit_rounding, path_rounding, warn_of_rounding
+from .rounding import below_double, hit_rounding, path_rounding, warn_dtype
 from .wave_psf import period
 from .zernike import zernike
 
@@ -80,7 +80,7 @@ def converged_psf(
     require_one_of("of", of, get_args(Of))
     bound = tolerance / 5 if of == "gradient" else tolerance
     found, view = chosen_psf(lens, requested, pixel, size, model, bound, norm)
-    view.warn_of_outside(found)
+    view.warn_of_loss(found)
     return found
 
 
@@ -128,7 +128,7 @@ def chosen_psf(
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
         view = _View(lens, tuple(scenes), tuple(beams), side, size, norm)
         worst = max(rounded.get("phase", 0.0), view.hit_error(model))
-        warn_of_rounding(lens, "kernels", worst, tolerance, "", 3)
+        warn_dtype(lens, "kernels", worst, tolerance, "", 3)
         view = dataclasses.replace(view, rounded=worst)
         if model != "auto":
             return PsfModel(model, rule, view.cells(model, tolerance)), view
@@ -194,22 +194,18 @@ class _View:
         large."""
         if model == "waves" or not below_double(self.lens):
             return 0.0
-        kind_and_cells: tuple[Kind, int] = (
-            ("gaussian", 0) if model == "gaussian" else ("rays", _CELLS[0])
-        )
-        cones = [float(np.max(one.solid_angle)) for one in self.psfs(*kind_and_cells)]
+        trial: tuple[Kind, int] = ("gaussian", 0) if model == "gaussian" else ("rays", _CELLS[0])
+        cones = [float(np.max(one.solid_angle)) for one in self.psfs(*trial)]
         steps = [hit_rounding(self.lens) * np.sqrt(np.pi / a) if a > 0 else 0.0 for a in cones]
         beams = [_refocused(b, b.index.dtype.type(step)) for b, step in zip(self.beams, steps)]
         moved = dataclasses.replace(self, beams=tuple(beams))
-        return difference(moved.kernels(*kind_and_cells), self.kernels(*kind_and_cells), self.norm)
+        return difference(moved.kernels(*trial), self.kernels(*trial), self.norm)
 
-    def warn_of_outside(self, model: PsfModel) -> None:
+    def warn_of_loss(self, model: PsfModel) -> None:
         """Warns of light outside of the kernels of a model, for the scene with most of it."""
         lost = [float(jnp.max(one.outside)) for one in self.psfs(model.kind, model.cells)]
         k = int(np.argmax(lost))
-        warn_of_outside(
-            lost[k], self.scenes[k], self.beams[k], self.pixel, self.size, model.kind, 4
-        )
+        warn_of_loss(lost[k], self.scenes[k], self.beams[k], self.pixel, self.size, model.kind, 4)
 
     def cells(self, kind: Kind, tolerance: float) -> int:
         """The smallest number of cells for which the kernels are within the tolerance."""
@@ -248,7 +244,7 @@ def difference(a: np.ndarray, b: np.ndarray, norm: int = 1) -> float:
     return float(np.max(total ** (1 / norm)))
 
 
-def warn_of_outside(
+def warn_of_loss(
     lost: float, scene: Scene, beam: Beam, pixel: Numbers, size: int, kind: Kind, level: int
 ) -> None:
     """Warns if more than `LOST` of the light falls outside of a kernel, and names a size for which

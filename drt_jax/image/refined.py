@@ -48,32 +48,28 @@ def beams_of(lens: Lens, fields: Array, axis: Scene, rule: PupilRule, degree: in
 
 
 def to_tolerance(
-    evaluate: Callable[..., Any],
-    arguments: tuple,
-    cells: int | None,
-    tolerance: float,
-    fewest: Callable,
+    run: Callable[..., Any], args: tuple, cells: int | None, tolerance: float, fewest: Callable
 ) -> Any:
-    """`evaluate(*arguments, cells=cells)` with the fewest cells for which the error of each number
+    """`run(*args, cells=cells)` with the fewest cells for which the error of each number
     is below a tolerance.
 
-    evaluate: function that returns arrays.
-    arguments: its positional arguments.
+    run: function that returns arrays.
+    args: its positional args.
     cells: a number of cells; None to find it, or `CELLS` inside of `jit` and `vmap`.
     tolerance: absolute.
-    fewest: function of the same arguments, the number of cells to begin with.
+    fewest: function of the same args, the number of cells to begin with.
 
     ValueError for a tolerance that is not between 0 and 1. Warns if no trial meets it.
     """
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
-    known = known_values(arguments)
+    known = known_values(args)
     if cells is not None or known is None:
-        return evaluate(*arguments, cells=CELLS if cells is None else cells)
+        return run(*args, cells=CELLS if cells is None else cells)
     with jax.core.eval_context():
         before, change, first = None, np.inf, fewest(*known)
         for cells in [n for n in _TRIALS if n >= first or n in _TRIALS[-2:]]:
-            now = evaluate(*known, cells=cells)
+            now = run(*known, cells=cells)
             if before is not None:
                 pairs = zip(jax.tree.leaves(now), jax.tree.leaves(before), strict=True)
                 change = max(float(jnp.max(jnp.abs(a - b))) for a, b in pairs) / _STEP
@@ -86,4 +82,4 @@ def to_tolerance(
                 f"{tolerance:.0e}: the blur is too large for them; try model='rays'",
                 stacklevel=4,
             )
-    return now if concrete(arguments) else evaluate(*arguments, cells=cells)
+    return now if concrete(args) else run(*args, cells=cells)

@@ -43,9 +43,7 @@ def below_double(lens: Lens) -> bool:
     return float(jnp.finfo(lens.curvature.dtype).eps) > _DOUBLE
 
 
-def warn_of_rounding(
-    lens: Lens, what: str, wrong: float, allowed: float, unit: str, level: int
-) -> None:
+def warn_dtype(lens: Lens, what: str, wrong: float, allowed: float, unit: str, level: int) -> None:
     """Warns if the dtype of a lens is less precise than float64 and an error exceeds what is
     allowed.
 
@@ -86,7 +84,7 @@ def warn_of_focus(lens: Lens, distance: Numbers, wavelengths: Numbers, level: in
         waves = lens.checked_wavelengths(wavelengths)
         per_um = numerical_aperture(lens, distance, waves) / waves
         moved = 1e3 * hit_rounding(lens) * float(jnp.max(per_um))
-    warn_of_rounding(lens, "the focus", moved, _FOCUS, " of its depth", level)
+    warn_dtype(lens, "the focus", moved, _FOCUS, " of its depth", level)
 
 
 def warn_of_paths(
@@ -108,7 +106,7 @@ def warn_of_paths(
         angles = [axis.field] if fields is None else fields
         scenes = [dataclasses.replace(axis, field=angle) for angle in angles]
         error = path_rounding(lens, scenes, of_beams)
-    warn_of_rounding(lens, "path differences", error, _WAVES, " waves RMS", level)
+    warn_dtype(lens, "path differences", error, _WAVES, " waves RMS", level)
 
 
 def path_rounding(lens: Lens, scenes: Sequence[Scene], of_beams: bool = False) -> float:

@@ -35,7 +35,7 @@ from ..pupil.rules import Gauss, PupilRule, symmetry_of
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
-from .rounding import hit_rounding, warn_of_rounding
+from .rounding import hit_rounding, warn_dtype
 from .spot import normalised
 from .wavefront import reference_curvature
 
@@ -126,7 +126,7 @@ def spot_diagram(
     known = known_values((lens, found.rms))
     if known is not None:
         wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
-        warn_of_rounding(known[0], "spots", wrong, _ROUGH, " of their size", 2)
+        warn_dtype(known[0], "spots", wrong, _ROUGH, " of their size", 2)
     return found
 
 

@@ -36,7 +36,7 @@ __all__ = ["Clipped", "ClippedGroup"]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _differentiable(
+def _attach(
     radial: RadialRule, crossing: bool, lens: Lens, scene: Scene, plan: Plan
 ) -> tuple[Array, Array]:
     """Stop points and launches (2, W, K) of the rays of a plan, with derivatives by the lens and
@@ -44,10 +44,8 @@ def _differentiable(
     return plan.edge.rays.point, plan.edge.rays.launch
 
 
-@_differentiable.defjvp
-def _differentiable_jvp(
-    radial: RadialRule, crossing: bool, primals: Any, tangents: Any
-) -> tuple[Any, Any]:
+@_attach.defjvp
+def _attach_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
     """Implicit derivatives of the boundary rays.
 
     A ray on the boundary is a root F(launch; lens, scene) = 0: it stays on its edge (|q| = 1) and
@@ -60,7 +58,7 @@ def _differentiable_jvp(
     _, pair, settled = plan.edge
     # Call the function itself, so that point and launch have derivatives here too: for higher
     # orders.
-    point, launch = _differentiable(radial, crossing, lens, scene, plan)
+    point, launch = _attach(radial, crossing, lens, scene, plan)
 
     def trace(lens, scene, launch):
         return boundary.trace(lens, system_of(lens, scene), crossing, launch)
@@ -242,7 +240,7 @@ def _inside(
     used = jnp.asarray(_spokes(lens, symmetry, orders), jnp.int32)
     plan = find_boundary(*jax.lax.stop_gradient((lens, scene)), radial, used, crossing)
     plan = jax.lax.stop_gradient(plan)
-    point, _ = _differentiable(radial, crossing, lens, scene, plan)
+    point, _ = _attach(radial, crossing, lens, scene, plan)
     corner, end = point[..., : -radial.count], point[..., -radial.count :]
     toward, share = plan.spokes(radial, corner)
     length = _along(end - plan.frame.centre, toward)

@@ -105,22 +105,20 @@ def _rescue(setting: _Setting, state: _State, _: Array) -> tuple[_State, _Task]:
     """Stage 2: for a wavelength of which no ray arrives, the ray of a fan that crosses the stop
     nearest to its centre."""
     system, rays = setting.system, state.latest.rays
-    failed = ~jnp.any(rays.good, axis=-1)
+    lost = ~jnp.any(rays.good, axis=-1)
     zero = jnp.zeros_like(rays.point[0])
     rim = zero, zero + setting.lens.semi_diameter[setting.lens.stop]
 
     def with_fan(launch):
-        fan = trace_fan(
-            system, no_fan(system, len(failed)), tuple(launch), beam_size(system, rim)[1]
-        )
+        fan = trace_fan(system, no_fan(system, len(lost)), tuple(launch), beam_size(system, rim)[1])
         best = nearest_start(fan, tuple(jnp.zeros_like(launch[:, :, :1])))
-        return jnp.where(failed[None, :, None], jnp.stack(best), launch)
+        return jnp.where(lost[None, :, None], jnp.stack(best), launch)
 
-    rays = rays._replace(launch=run_if(jnp.any(failed), with_fan, rays.launch))
+    rays = rays._replace(launch=run_if(jnp.any(lost), with_fan, rays.launch))
     return state, (
         rays,
         target_of(rays, rays.point),
-        jnp.any(failed).astype(jnp.int32),
+        jnp.any(lost).astype(jnp.int32),
         _near(rays, True),
     )
 
