@@ -50,14 +50,14 @@ def beams_of(lens: Lens, fields: Array, axis: Scene, rule: PupilRule, degree: in
 def to_tolerance(
     run: Callable[..., Any], args: tuple, cells: int | None, tolerance: float, fewest: Callable
 ) -> Any:
-    """`run(*args, cells=cells)` with the fewest cells for which the error of each number
-    is below a tolerance.
+    """`run(*args, cells=cells)` with the fewest cells for which the error of each number is below a
+    tolerance.
 
     run: function that returns arrays.
-    args: its positional args.
+    args: its positional arguments.
     cells: a number of cells; None to find it, or `CELLS` inside of `jit` and `vmap`.
     tolerance: absolute.
-    fewest: function of the same args, the number of cells to begin with.
+    fewest: function of the same arguments; returns the number of cells to begin with.
 
     ValueError for a tolerance that is not between 0 and 1. Warns if no trial meets it.
     """
