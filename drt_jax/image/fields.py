@@ -159,8 +159,8 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
     nodes, index, swapped = unique_nodes(method.half, method.symmetry)
     tangents = jnp.asarray(nodes, method.step.dtype) * method.step
 
-    def one(given: tuple[Array, Array]) -> tuple[Array, ...]:
-        return _kernel_of(lens, method, given[1], given[0], wavelengths)
+    def one(pair: tuple[Array, Array]) -> tuple[Array, ...]:
+        return _kernel_of(lens, method, pair[1], pair[0], wavelengths)
 
     # One object point at a time: the rays of all kernels together would not fit into the cache.
     pairs = (len(method.distances), len(nodes))
@@ -183,11 +183,11 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
     has_light = method.nearest == jnp.arange(len(nodes), dtype=jnp.int32)[None]
     points = jnp.where(has_light[:, :, None, None] & finite, points, guess)
 
-    def on_grid(values: Array) -> Array:
+    def full(values: Array) -> Array:
         return values[:, index]
 
     swap = jnp.asarray(swapped)
-    points, kernels = on_grid(points), on_grid(kernels)
+    points, kernels = full(points), full(kernels)
     points = jnp.where(swap[None, ..., None, None], points[..., ::-1], points)
     kernels = jnp.where(swap[None, ..., None, None, None], jnp.swapaxes(kernels, -1, -2), kernels)
     y, x = (np.arange(-n, n + 1) < 0 for n in method.half)
@@ -200,9 +200,7 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
         points = points * jnp.where(below[..., None], jnp.array([1.0, -1], points.dtype), 1)
         kernels = jnp.where(below[..., None, None], kernels[..., ::-1, :], kernels)
     vergences = jax.vmap(vergence_of)(method.distances)
-    return KernelGrid(
-        method.step, vergences, points, on_grid(solid_angle), on_grid(outside), kernels
-    )
+    return KernelGrid(method.step, vergences, points, full(solid_angle), full(outside), kernels)
 
 
 def _kernel_of(
@@ -210,9 +208,10 @@ def _kernel_of(
 ) -> tuple[Array, ...]:
     """Centre (W, 2), mm, solid angle (W,), outside (W,), and kernel (W, K, K) of one object
     point."""
-    # A centroid is the centre: off centre, a spot smaller than a pixel would be rounded.
+    # Each kernel is centred on the centroid of its light: rounding would spoil a spot smaller than
+    # a pixel that is far off centre.
 
-    def some(waves: Array) -> tuple[Array, ...]:
+    def traced(waves: Array) -> tuple[Array, ...]:
         field = jnp.arctan(tangent)
         found = psf(lens, field, distance, waves, method.pixel, method.size, method.model)
         arrives = found.throughput > 0
@@ -220,8 +219,8 @@ def _kernel_of(
         return centre, found.solid_angle, found.outside, found.kernel
 
     if method.together:
-        return some(wavelengths)
-    return jax.tree.map(lambda a: a[:, 0], jax.vmap(some)(wavelengths[:, None]))
+        return traced(wavelengths)
+    return jax.tree.map(lambda a: a[:, 0], jax.vmap(traced)(wavelengths[:, None]))
 
 
 def kernels_at(grid: KernelGrid, fields: Numbers, distances: Numbers) -> Array:

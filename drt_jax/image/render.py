@@ -221,8 +221,8 @@ def composed(
     """
     vergences = np.asarray(jax.vmap(vergence_of)(method.grid.distances)).tolist()
     at = vergence_of(depth)
-    apart = jnp.stack([jnp.abs(at - v) for v in vergences])
-    label = jnp.argmin(apart, axis=0)
+    away = jnp.stack([jnp.abs(at - v) for v in vergences])
+    label = jnp.argmin(away, axis=0)
     dtype = picture.dtype
     total: Any = 0.0
     cover: Any = 0.0
@@ -231,10 +231,10 @@ def composed(
         own = (label == layer)[..., None].astype(dtype)
         known = (label >= layer)[..., None].astype(dtype)
         share = spread(own, known)
-        here = spread(picture * own, own) * share
-        part = _whole(maps, method, here, progress, layer)
-        there = jnp.broadcast_to(share, picture.shape)
-        covered = _whole(maps, method, there, progress, layer, lit=False)
+        filled = spread(picture * own, own) * share
+        part = _whole(maps, method, filled, progress, layer)
+        mask = jnp.broadcast_to(share, picture.shape)
+        covered = _whole(maps, method, mask, progress, layer, lit=False)
         total = total + open_ * part
         cover = cover + open_ * covered
         open_ = open_ * (1 - covered)

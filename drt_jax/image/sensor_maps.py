@@ -115,8 +115,8 @@ def _maps(grid: KernelGrid, method: RenderMethod) -> Maps:
 
     def one(index: Array) -> tuple[Array, Array, Array, Array | None]:
         part = index // colours, index % colours
-        seen = _kernels_at(grid, method, *part, where)
-        kernels, shares = _parts(seen, method.places) if few else (seen, None)
+        g = _kernels_at(grid, method, *part, where)
+        kernels, shares = _parts(g, method.places) if few else (g, None)
         return *_sources(grid, method, *part), kernels, shares
 
     # One distance and colour after the other, because the kernels of all positions take much
@@ -125,10 +125,10 @@ def _maps(grid: KernelGrid, method: RenderMethod) -> Maps:
     return Maps(*jax.tree.map(lambda a: a.reshape(far, colours, *a.shape[1:]), found))
 
 
-def _parts(seen: Array, places: Array) -> tuple[Array, Array]:
+def _parts(g: Array, places: Array) -> tuple[Array, Array]:
     """Basis and coefficients of kernels that vary over the sensor.
 
-    seen: (My, Mx, K, K), kernels G at all positions.
+    g: (My, Mx, K, K), kernels G at all positions.
     places: (R,), int32, positions whose kernels span the basis.
 
     Returns an orthonormal basis (R, K, K), by Gram-Schmidt with a second pass, and the shares (R,
@@ -136,8 +136,8 @@ def _parts(seen: Array, places: Array) -> tuple[Array, Array]:
     exact and its centroid nearly: with the moments m = (K x sum, x, y) of the basis, s += (m_G - s
     m) (1 + m^T m)^-1 m^T, then s is scaled to the exact sum.
     """
-    down, across, size = seen.shape[:3]
-    rows = seen.reshape(down * across, size * size)
+    down, across, size = g.shape[:3]
+    rows = g.reshape(down * across, size * size)
     basis = jnp.zeros((len(places), rows.shape[1]), rows.dtype)
     for k in range(len(places)):
         row = rows[places[k]]
@@ -180,22 +180,18 @@ def chosen(
     blend = left = 0.0
     for distance in range(len(grid.vergences)):
         for colour in range(grid.solid_angle.shape[-1]):
-            seen = np.asarray(_kernels_of(grid, method, distance, colour), float)
-            blend = max(blend, _blend_error(seen, controls(method)))
-            left = max(left, _greedy(seen.reshape(-1, method.grid.size**2), places, tolerance))
+            g = np.asarray(_kernels_of(grid, method, distance, colour), float)
+            blend = max(blend, _blend_error(g, controls(method)))
+            left = max(left, _greedy(g.reshape(-1, method.grid.size**2), places, tolerance))
     size = method.grid.size
     wide = next((n for n in SIDES if n >= max(2 * size, _FFT_SIDE)), 3 * size)
     # Each option: cost as transformed values for each pixel, error, side of a tile, positions.
-    options = [
-        (len(places) * (wide / (wide - size + 1)) ** 2, left, wide - size + 1, places or [0])
-    ]
+    ways = [(len(places) * (wide / (wide - size + 1)) ** 2, left, wide - size + 1, places or [0])]
     for side in SIDES:
         if (tile := side - size + 1) >= side / 2:
-            options.append((4 * (side / tile) ** 2, blend * tile**2, tile, []))
-    accurate = [option for option in options if option[1] <= tolerance]
-    _, error, tile, picked = (
-        min(accurate) if accurate else min(options, key=lambda option: option[1])
-    )
+            ways.append((4 * (side / tile) ** 2, blend * tile**2, tile, []))
+    good = [way for way in ways if way[1] <= tolerance]
+    _, error, tile, picked = min(good) if good else min(ways, key=lambda way: way[1])
     if error > tolerance:
         warnings.warn(
             f"the blur varies so much that kernels are interpolated to {error:.1e} only, not to "
@@ -207,17 +203,17 @@ def chosen(
     return dataclasses.replace(method, places=jnp.asarray(picked, jnp.int32), tile=(down, across))
 
 
-def _blend_error(seen: np.ndarray, places: tuple[np.ndarray, np.ndarray]) -> float:
+def _blend_error(g: np.ndarray, places: tuple[np.ndarray, np.ndarray]) -> float:
     """Error of G in the middle of a tile, if it is blended from the corners, divided by the square
     of the side of the tile, 1/pixels^2. For nodes at the distance h it is |(G_-1 + G_1) / 2 - G_0|
     / (2 h)^2, along y plus along x.
 
-    seen: (My, Mx, K, K), G at equidistant positions.
+    g: (My, Mx, K, K), G at equidistant positions.
     places: these positions along y and x, pixels.
     """
     total = 0.0
     for axis, nodes in enumerate(places):
-        parts = np.moveaxis(seen, axis, 0)
+        parts = np.moveaxis(g, axis, 0)
         bent = (parts[:-2] + parts[2:]) / 2 - parts[1:-1]
         total += np.max(np.linalg.norm(bent, axis=(-2, -1))) / (nodes[2] - nodes[0]) ** 2
     return float(total)
@@ -298,9 +294,9 @@ def _kernels_at(
         a[distance][:, :, colour] for a in (grid.solid_angle, grid.outside, grid.kernels)
     )
     table = _table(grid, method, distance, colour)
-    seen = functools.partial(_sensor_kernel, method, grid.step, table, light, outside, kernels)
+    g = functools.partial(_sensor_kernel, method, grid.step, table, light, outside, kernels)
     wanted = _points(method, where, grid.step.dtype)
-    return jax.lax.map(jax.checkpoint(jax.vmap(seen)), wanted)  # row by row, to save memory
+    return jax.lax.map(jax.checkpoint(jax.vmap(g)), wanted)  # row by row, to save memory
 
 
 def _source(method: RenderMethod, table: Array, wanted: Array) -> tuple[Array, Array]:
