@@ -115,9 +115,9 @@ class Beam:
         good approximation.
 
         With the formulas of `wavefront`: for a ray of direction d with the hit C + e, which crosses
-        the sphere at the distance 1 / kappa + t in front of it, the direction to C is c = (1 +
-        kappa t) d - kappa e, and the path is `path` + n (d.(C + e) - c.C - t). Where the spot is
-        not small compared with the radius, kappa = 0: the ray's own direction.
+        the sphere at the distance 1 / kappa + t in front of it, the direction to C is
+        c = (1 + kappa t) d - kappa e, and the path is `path` + n (d.(C + e) - c.C - t). Where the
+        spot is not small compared with the radius, kappa = 0: the ray's own direction.
         """
         light = self._light()
         middle = means(self.hits[:, -1], light)[..., None]

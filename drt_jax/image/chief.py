@@ -99,8 +99,8 @@ def field_curvature(
 
     Positive where the focus has the larger z, as OpticStudio plots it. In a lens without a plane of
     symmetry the two focal lines are named by the direction that they are nearer to. Warns, outside
-    of a trace, where float32 moves a focus by more than 2 % of the depth of focus, wavelength /
-    NA^2.
+    of a trace, where float32 moves a focus by more than 2 % of the depth of focus,
+    wavelength / NA^2.
     """
     warn_of_focus(lens, distance, wavelengths)
     found = _chief_rays(lens, fields, distance, wavelengths)

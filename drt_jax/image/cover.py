@@ -91,21 +91,21 @@ def _relative_depth(edge: _Edge) -> Array:
 
 
 def _clipped_square(edge: _Edge) -> tuple[Array, Array]:
-    """Area and centroid of the part of a unit square that lies inside of an edge, (W, N, N) and (2,
-    W, N, N).
+    """Area and centroid of the part of a unit square that lies inside of an edge, (W, N, N) and
+    (2, W, N, N).
 
     In the cell the depth is t + a u + b v, with a >= b >= 0 the changes along the steeper axis u
     and the other axis v, and u, v from -1/2 to 1/2. For |t| <= (a - b) / 2 the edge crosses two
-    opposite sides: the area is 1/2 + t / a, the first moments are 1/8 - ((t / a)^2 + (b / a)^2 /
-    12) / 2 along u and (b / a) / 12 along v. Otherwise the edge cuts off a triangle with the legs l
-    / a and l / b, l = (a + b) / 2 - |t|, and the area l^2 / (2 a b). The moment of the light about
-    the middle of the cell is area x (1/2 - leg / 3) along each axis, whether the triangle is the
-    light or what is cut off.
+    opposite sides: the area is 1/2 + t / a, the first moments are
+    1/8 - ((t / a)^2 + (b / a)^2 / 12) / 2 along u and (b / a) / 12 along v. Otherwise the edge cuts
+    off a triangle with the legs l / a and l / b, l = (a + b) / 2 - |t|, and the area l^2 / (2 a b).
+    The moment of the light about the middle of the cell is area x (1/2 - leg / 3) along each axis,
+    whether the triangle is the light or what is cut off.
     """
     down, across = jnp.abs(edge.down), jnp.abs(edge.across)
     a, b = jnp.maximum(down, across), jnp.minimum(down, across)
     # Area: linear in t while the edge crosses opposite sides, a parabola where it cuts off a
-    #     corner.
+    # corner.
     whole, flat = (a + b) / 2, (a - b) / 2
     t = jnp.clip(edge.depth, -whole, whole)
     at_corner, left = jnp.abs(t) > flat, whole - jnp.abs(t)

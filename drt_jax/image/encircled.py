@@ -117,11 +117,11 @@ def _of_rays(
 ) -> Array:
     """Fractions (W, N) of geometric spots.
 
-    A spot at the distance r with the half width w along the radius extends from r^2 - reach to r^2
-    + reach in the square of the radius, reach = 2 r w + w^2. With B the integral of the biweight
-    profile, the fraction within R is B((R^2 - r^2) / reach). Where the profile extends below 0, it
-    is reflected there, so that each ray keeps the weight 1: the fraction is B((R^2 - r^2) / reach)
-    + B((R^2 + r^2) / reach) - 1.
+    A spot at the distance r with the half width w along the radius extends from r^2 - reach to
+    r^2 + reach in the square of the radius, reach = 2 r w + w^2. With B the integral of the
+    biweight profile, the fraction within R is B((R^2 - r^2) / reach). Where the profile extends
+    below 0, it is reflected there, so that each ray keeps the weight 1: the fraction is
+    B((R^2 - r^2) / reach) + B((R^2 + r^2) / reach) - 1.
     """
     hits, width, weights = ray_spots(lens, beam, cells)
     x, y = hits - centre[:, None, None]

@@ -213,11 +213,15 @@ def composed(
 
     A pixel belongs to the layer that is nearest to it in 1 / distance. Behind nearer layers, where
     nobody knows what is hidden, each layer is extrapolated by `spread`. A layer is blurred with its
-    own kernels, and its mask (1 where it is) with the same kernels. What is seen of a layer is
-    multiplied by the product of 1 - mask of all nearer layers, and the sum is divided by the sum of
-    the masks, weighted in the same way. So a uniform scene stays uniform at any depth. The product
-    of masks treats the layers as if light met them independently of where it crosses the pupil. A
-    slope shows steps where the blur of neighbouring layers differs.
+    own kernels, and so is its mask, which is 1 where the layer is. The result is
+
+        sum_k open_k blurred_k / sum_k open_k mask_k,
+        open_k = product over nearer layers j of (1 - mask_j),
+
+    with the masks blurred and, in the denominator, without the relative light. So a uniform scene
+    stays uniform at any depth, except for the relative light. The product of masks treats the
+    layers as if light met them independently of where it crosses the pupil. A slope shows steps
+    where the blur of neighbouring layers differs.
     """
     vergences = np.asarray(jax.vmap(vergence_of)(method.grid.distances)).tolist()
     at = vergence_of(depth)

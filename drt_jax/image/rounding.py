@@ -68,9 +68,10 @@ def hit_rounding(lens: Lens) -> float:
 
 
 def warn_of_focus(lens: Lens, distance: Numbers, wavelengths: Numbers, level: int = 3) -> None:
-    """Warns if rounding moves a focus by more than `_FOCUS` of the depth of focus, wavelength /
-    NA^2, if the numbers are known. The estimate is the rounding of hits over NA. The foci of spots
-    of the bundled lenses were off by a fifth of this in the median, and by at most 0.97 of it.
+    """Warns if rounding moves a focus by more than `_FOCUS` of the depth of focus,
+    wavelength / NA^2, if the numbers are known. The estimate is the rounding of hits over NA. The
+    foci of spots of the bundled lenses were off by a fifth of this in the median, and by at most
+    0.97 of it.
 
     distance, wavelengths: as in `scene_of`.
     level: as of `warnings.warn`.

@@ -131,10 +131,10 @@ def _parts(g: Array, places: Array) -> tuple[Array, Array]:
     g: (My, Mx, K, K), kernels G at all positions.
     places: (R,), int32, positions whose kernels span the basis.
 
-    Returns an orthonormal basis (R, K, K), by Gram-Schmidt with a second pass, and the shares (R,
-    My, Mx), the projections of G. The shares s are then corrected so that the sum of each kernel is
-    exact and its centroid nearly: with the moments m = (K x sum, x, y) of the basis, s += (m_G - s
-    m) (1 + m^T m)^-1 m^T, then s is scaled to the exact sum.
+    Returns an orthonormal basis (R, K, K), by Gram-Schmidt with a second pass, and the shares
+    (R, My, Mx), the projections of G. The shares s are then corrected so that the sum of each
+    kernel is exact and its centroid nearly: with the moments m = (K x sum, x, y) of the basis,
+    s += (m_G - s m) (1 + m^T m)^-1 m^T, then s is scaled to the exact sum.
     """
     down, across, size = g.shape[:3]
     rows = g.reshape(down * across, size * size)
@@ -205,8 +205,8 @@ def chosen(
 
 def _blend_error(g: np.ndarray, places: tuple[np.ndarray, np.ndarray]) -> float:
     """Error of G in the middle of a tile, if it is blended from the corners, divided by the square
-    of the side of the tile, 1/pixels^2. For nodes at the distance h it is |(G_-1 + G_1) / 2 - G_0|
-    / (2 h)^2, along y plus along x.
+    of the side of the tile, 1/pixels^2. For nodes at the distance h it is
+    |(G_-1 + G_1) / 2 - G_0| / (2 h)^2, along y plus along x.
 
     g: (My, Mx, K, K), G at equidistant positions.
     places: these positions along y and x, pixels.
@@ -306,8 +306,8 @@ def _source(method: RenderMethod, table: Array, wanted: Array) -> tuple[Array, A
     table: (Ny, Nx, 2), image points, see `_table`.
     wanted: (2,), sensor point in the same units.
 
-    Returns the source u (2,), in nodes from the axis, and its Jacobian du / d(sensor point), (2,
-    2).
+    Returns the source u (2,), in nodes from the axis, and its Jacobian du / d(sensor point),
+    (2, 2).
     """
     half = jnp.asarray(method.grid.half[::-1], table.dtype)
 

@@ -85,8 +85,8 @@ def transfer(
     wavelengths: (W,), um.
     frequencies: (N,), cycles/mm.
     model: "waves" (diffraction) or "rays" (geometric).
-    focus: (), mm by which the sensor is moved back; or (Z,), through focus: arrays are then (F, Z,
-        2, N), and no more rays are traced.
+    focus: (), mm by which the sensor is moved back; or (Z,), through focus: arrays are then
+        (F, Z, 2, N), and no more rays are traced.
     wavelength_weights: (W,), normalised to the sum 1; None: equal. Each is multiplied by the
         throughput, so vignetted wavelengths count less.
     rule: pupil rule, whose kind is kept (`Gauss` or `Clipped`); None: found, outside of a trace.
@@ -157,7 +157,7 @@ def strehl(
     tolerance: float = TOLERANCE,
 ) -> Array:
     """Strehl ratio: the irradiance at the centre of the image of a point, relative to that without
-    aberrations in the same pupil: |integral of P|^2 / (integral of |P|)^2 over direction cosines.
+    aberrations in the same pupil: `|integral of P|^2 / (integral of |P|)^2` over direction cosines.
 
     lens, fields, distance, wavelengths, rule, degree, cells: as in `transfer`.
     tolerance: absolute error of the ratio.

@@ -1,9 +1,9 @@
 """PSF kernel of wave optics: plane waves of all directions of a beam, superposed on the pixels.
 
-The field at a point x of the sensor is U(x) = sum over directions d of c(d) exp(i k n d.x), with k
-= 2 pi / wavelength, the directions from the sphere of the exit pupil (`Beam.on_sphere`), and |c|^2
-the light times the area of the cell of direction cosines. On a regular grid of directions with the
-step s,
+The field at a point x of the sensor is U(x) = sum over directions d of c(d) exp(i k n d.x), with
+k = 2 pi / wavelength, the directions from the sphere of the exit pupil (`Beam.on_sphere`), and
+|c|^2 the light times the area of the cell of direction cosines. On a regular grid of directions
+with the step s,
 
     |U(x)|^2 = sum over lags l of T(l) exp(i k n s l.x),
 
@@ -133,12 +133,13 @@ def pupil_function(
 
 
 def shared_part(first: PupilCells, second: PupilCells) -> Array:
-    """Fraction (W, N, N) of each cell that the light of two pupils fills.
+    """Fraction (W, N, N) of each cell that the light of two pupils fills, if they fill the
+    fractions a and b.
 
-    Where their edges are parallel (c = 1) it is the smaller fraction, where they face each other (c
-    = -1) max(a + b - 1, 0), where they cross at right angles (c = 0) the product a b. In between,
-    it is interpolated linearly in c, the cosine of the angle between the directions of the two
-    centroids.
+    With c, the cosine of the angle between the directions of the two centroids: where their edges
+    are parallel (c = 1) it is min(a, b), where they face each other (c = -1) it is max(a + b - 1,
+    0), and where they cross at right angles (c = 0) it is a b. In between, it is interpolated
+    linearly in |c|.
     """
     one, other = first.inside, second.inside
     sizes = (safe_sqrt(jnp.sum(p.middle**2, axis=0)) for p in (first, second))

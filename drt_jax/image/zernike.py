@@ -73,8 +73,8 @@ def _jacobi(t: Array, degree: int) -> Array:
 )
 @dataclasses.dataclass(frozen=True)
 class Polynomials:
-    """D functions of a point p in a plane, for each of W wavelengths, as Zernike polynomials of u =
-    (p - centre) / scale.
+    """D functions of a point p in a plane, for each of W wavelengths, as Zernike polynomials of
+    u = (p - centre) / scale.
 
     centre, scale: (2, W).
     coefficients: (W, D, P), in Noll's order.
@@ -133,8 +133,8 @@ _EDGE = 1.25
 
 @functools.cache
 def _in_chebyshev(degree: int) -> np.ndarray:
-    """Coefficients (P, degree + 1, degree + 1) of each Zernike term as a sum of products T_i(x /
-    _EDGE) T_j(y / _EDGE)."""
+    """Coefficients (P, degree + 1, degree + 1) of each Zernike term as a sum of products
+    T_i(x / _EDGE) T_j(y / _EDGE)."""
     nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
     rows = np.polynomial.chebyshev.chebvander(nodes, degree).T * 2 / (degree + 1)
     rows[0] /= 2

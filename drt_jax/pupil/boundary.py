@@ -182,8 +182,8 @@ def extrapolated(rays: Rays, change: Array) -> Rays:
 
 
 def corner_step(rays: Rays, pair: Array) -> Array:
-    """Newton step (2, W, B) of the stop points to the corner of two edges, where |q_a|^2 = |q_b|^2
-    = 1.
+    """Newton step (2, W, B) of the stop points to the corner of two edges, where
+    |q_a|^2 = |q_b|^2 = 1.
 
     rays: rays with their linear models.
     pair: (2, W, B), edges a and b.
@@ -198,8 +198,8 @@ def edge_distance(rays: Rays, target: Target) -> Array:
 
     Returns s (E, W, B), in units of `target.toward`; inf for an edge that does not depend on the
     stop point. With q = base + s rate, |q|^2 = 1 is square s^2 + 2 linear s + constant = 0. Its
-    larger root is (root - linear) / square = -constant / (linear + root), root = sqrt(linear^2 -
-    square constant).
+    larger root is (root - linear) / square = -constant / (linear + root),
+    root = sqrt(linear^2 - square constant).
     """
     base = rays.q + displace(rays.d_q, target.centre - rays.point)
     rate = displace(rays.d_q, target.toward)
@@ -273,8 +273,9 @@ def barrier(rays: Rays, point: Array) -> tuple[Array, Array]:
     rays: rays with their linear models.
     point: (2, W, B), where the derivatives are taken.
 
-    Returns the first derivatives (2, W, B) and the second derivatives (2, 2, W, B). With slope_i =
-    2 q.q_i / (1 - |q|^2) the second ones are the sum of 2 q_i.q_j / (1 - |q|^2) + slope_i slope_j.
+    Returns the first derivatives (2, W, B) and the second derivatives (2, 2, W, B). With
+    slope_i = 2 q.q_i / (1 - |q|^2) the second ones are the sum of 2 q_i.q_j / (1 - |q|^2) + slope_i
+    slope_j.
     """
     q, rates = rays.q + displace(rays.d_q, point - rays.point), rays.d_q
     room = jnp.maximum(1 - dot(q, q), jnp.finfo(q.dtype).eps)
@@ -288,8 +289,8 @@ def stretch(rays: Rays) -> Array:
     around rays; the unit matrix for a circle.
 
     The shape is the square root of the inverse of the barrier's second derivatives H, scaled. For a
-    2 x 2 matrix A = 2 H^-1 / trace(H^-1) it is sqrt(A) = (A + d I) / sqrt(trace(A) + 2 d), d =
-    sqrt(det A).
+    2 x 2 matrix A = 2 H^-1 / trace(H^-1) it is sqrt(A) = (A + d I) / sqrt(trace(A) + 2 d),
+    d = sqrt(det A).
     """
     (xx, xy), (_, yy) = barrier(rays, rays.point)[1]
     # A of the docstring, with the trace 2.

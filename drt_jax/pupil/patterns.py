@@ -103,7 +103,7 @@ def square_grid(side: int) -> tuple[np.ndarray, np.ndarray]:
 def hexapolar(rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Hexapolar pattern: the centre and n rings of 6, 12, 18, ... points, with equal weights.
 
-    rings: n.
+    rings: n, number of rings.
 
     Returns points (Q, 2), Q = 1 + 3 n (n + 1), and weights (Q,). Each ray represents the same area
     of the disc: the radius of a ring divides its annulus into two equal areas. (Lens design

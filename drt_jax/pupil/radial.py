@@ -20,9 +20,9 @@ from .rules import Symmetry
 
 # CORNERS: largest number of corners of a boundary without polygons.
 # _PARTS: number of parts into which each interval between two even spokes is divided to find
-#     corners.
+# corners.
 # _EXTRA: the number of nodes in a panel between two corners is proportional to its width in units
-#     of pi, plus this.
+# of pi, plus this.
 CORNERS, _PARTS, _EXTRA = 8, 32, 0.15
 
 
@@ -45,8 +45,8 @@ def changes(distance: Array, closed: bool, most: int) -> tuple[Array, Array]:
     Returns positions (W, C), in intervals between spokes, and both edges (2, W, C), int32, which
     are equal where there is no corner. The distances are interpolated on a grid of `_PARTS` points
     in each interval. Where the nearest edge changes from a to b, the difference d_b - d_a falls
-    from `start` >= 0 to `end` <= 0, and linear interpolation puts its zero at start / (start -
-    end).
+    from `start` >= 0 to `end` <= 0, and linear interpolation puts its zero at
+    start / (start - end).
     """
     last = distance.shape[-1] - 1
     index = np.arange(last)[:, None] + np.arange(-2, 4)

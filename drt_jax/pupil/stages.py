@@ -210,8 +210,8 @@ class Plan(NamedTuple):
     used: Array
 
     def spokes(self, radial: RadialRule, corner: Array) -> tuple[Array, Array]:
-        """Directions (2, W, B) of the spokes between corners (2, W, C), and their weights (W,
-        B)."""
+        """Directions (2, W, B) of the spokes between corners (2, W, C), and their weights
+        (W, B)."""
         exists = self.edge.settled[:, : corner.shape[-1]]
         angle, share = radial.nodes(self.frame, self.used, corner, exists)
         return self.frame.toward(angle), share
