@@ -12,7 +12,7 @@ of `scene_of`. Chief rays through the paraxial entrance pupil, which other progr
 aim at the stop, are those of `with_paraxial_pupil(lens)`.
 
 Sources: Welford, Aberrations of Optical Systems (1986), ch. 4.5 and 6; conventions of the field
-    curvature and distortion plots of OpticStudio where they are named.
+curvature and distortion plots of OpticStudio where they are named.
 """
 
 import functools
@@ -270,9 +270,9 @@ def _foci(scene: Scene, columns: list[tuple]) -> tuple[Array, Array]:
     columns: derivatives of hit and slope by the two components of the stop point.
 
     det(h_p + s m_p) = 0 has the roots s = eigenvalues of M = -m_p^-1 h_p, a matrix that maps the
-    plane of the stop onto itself: mean +- sqrt(half^2 + b c), with M = [[mean + half, b], [c, mean
-    - half]]. The tangential one is on that side of the mean where e.M e is, e the direction of the
-    field.
+    plane of the stop onto itself: mean +- sqrt(half^2 + b c), with
+    M = [[mean + half, b], [c, mean - half]]. The tangential one is on that side of the mean where
+    e.M e is, e the direction of the field.
     """
     rows = tuple(zip(*(d_slope for _, d_slope in columns)))
     first, second = (divide(rows, tuple(-a for a in d_hit)) for d_hit, _ in columns)

@@ -5,7 +5,7 @@ the unclipped light as the weight. Pupil coordinates are those of the stop in un
 semi-diameter; angles are measured from the x axis.
 
 Sources: Noll, J. Opt. Soc. Am. 66, 207 (1976), which OpticStudio calls Standard; for the order of
-    the fringe terms, Wyant and Creath, Basic Wavefront Aberration Theory (1992).
+the fringe terms, Wyant and Creath, Basic Wavefront Aberration Theory (1992).
 """
 
 import functools

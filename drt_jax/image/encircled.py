@@ -1,13 +1,13 @@
 """Encircled energy: the fraction of the light within a circle about its centroid.
 
 Waves: the pattern is the Fourier integral of the transfer function T(f), and the integral of a wave
-    exp(2 pi i f.x) over a circle of radius R is R J1(2 pi R |f|) / |f|. So the energy is the
-    integral of T(f) R J1(2 pi R |f|) / |f| over all frequencies. On the grid of the autocorrelation
-    of the pupil function this is exact, except for periodic copies of the pattern.
+exp(2 pi i f.x) over a circle of radius R is R J1(2 pi R |f|) / |f|. So the energy is the integral
+of T(f) R J1(2 pi R |f|) / |f| over all frequencies. On the grid of the autocorrelation of the pupil
+function this is exact, except for periodic copies of the pattern.
 
 Rays: each ray is a spot with the width of its cell of the stop on the sensor, as in the kernel of
-    rays. So it passes the circle gradually, as a function of the square of the radius. This makes
-    the fraction a smooth function of all numbers, 0 at R = 0 and 1 beyond the last ray.
+rays. So it passes the circle gradually, as a function of the square of the radius. This makes the
+fraction a smooth function of all numbers, 0 at R = 0 and 1 beyond the last ray.
 """
 
 import functools

@@ -11,7 +11,7 @@ with the field as their first axis. Without a rule, one rule for all fields is f
 `jax.jit` and `jax.vmap` a rule is required. Differentiable in every mode where the rule is.
 
 Sources: Rimmer, Relative illumination calculations, Proc. SPIE 655, 99 (1986), which OpticStudio
-    follows; Slater, Remote Sensing (1980), for the cone at a point of the sensor.
+follows; Slater, Remote Sensing (1980), for the cone at a point of the sensor.
 """
 
 import dataclasses
