@@ -31,7 +31,7 @@ jax.config.update("jax_enable_x64", True)
 import drt_jax  # noqa: E402
 from drt_jax import design  # noqa: E402
 from drt_jax.compilation import ONCE, jit  # noqa: E402
-from drt_jax.image.rounding import tell_of_focus  # noqa: E402
+from drt_jax.image.rounding import warn_of_focus  # noqa: E402
 
 FIELDS = {
     "camera_50mm": 23.5, "cooke_triplet": 20, "dagor_240mm": 26.6, "double_gauss": 14,
@@ -87,7 +87,7 @@ def row(name):
         variables = design.Variables.from_lens(lens, ["sensor"])
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            tell_of_focus(lens, np.inf, um)
+            warn_of_focus(lens, np.inf, um)
             problem = design.Problem.from_variables(
                 variables, [design.Operand("strehl", target=1.0)], fields, um, np.inf, rule
             )

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..image.rounding import tell_of_paths
+from ..image.rounding import warn_of_paths
 from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
@@ -161,7 +161,7 @@ class Problem:
         of_beams = any(kind_of(o.kind).of_waves for o in asked)
         if of_beams or any(o.kind in _OF_PATHS for o in asked):
             for distance in far:
-                tell_of_paths(lens, Scene(angles[0], distance, waves), angles, of_beams=of_beams)
+                warn_of_paths(lens, Scene(angles[0], distance, waves), angles, of_beams=of_beams)
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)
         equal = np.ones(len(waves)) if wavelength_weights is None else wavelength_weights
         share = _weights("wavelength_weights", equal, len(waves)) / len(waves)

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from ..image.moments import moments
-from ..image.rounding import tell_of_focus
+from ..image.rounding import warn_of_focus
 from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil, marginal_ray, paraxial_system, trace_ray
@@ -136,7 +136,7 @@ class Solve:
                     f"solves: {self.kind}: there is none: the light behind the lens is parallel, "
                     "or none arrives; leave it out, or begin with another lens"
                 )
-            tell_of_focus(lens, self.distance, self.wavelengths, 5)
+            warn_of_focus(lens, self.distance, self.wavelengths, 5)
             return self
         condition, solve = _CONDITIONS[self.kind], self
         if self.value == 0:

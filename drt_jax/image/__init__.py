@@ -1,1 +1,1 @@
-"""What the rays make of a point: moments, wavefront, kernels, the sensor."""
+"""Analyses of traced rays: moments, wavefront, PSF kernels, MTF, the sensor and its picture."""

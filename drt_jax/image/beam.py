@@ -1,9 +1,9 @@
-"""All rays of an object point as polynomials of the pupil, fitted to a few traced ones.
+"""All rays of an object point as polynomials over the pupil, fitted to a few traced rays.
 
-Where rays meet the surfaces and the sensor, their directions and their optical paths are smooth
-functions of the point of the stop, and of the direction at the sensor. Some dozens of rays give the
-polynomials; spots, kernels and transfer functions of any density follow from these without another
-ray.
+The hits on the surfaces and on the sensor, the directions and the optical paths of rays are smooth
+functions of the stop point, and also of the direction at the sensor. A few dozen rays determine the
+polynomials. Spots, kernels and transfer functions at any density follow from them without tracing
+more rays.
 """
 
 import dataclasses
@@ -29,10 +29,11 @@ from ..rays.trace import Bundle, trace_bundle
 from .wavefront import reference_curvature
 from .zernike import Polynomials, fitted
 
-# The largest spot, in parts of the distance to the exit pupil, for which that counts.
-_NEAR = 0.3
-# Directions along which the light of a clipped beam has ends.
-_SIDES = 16
+# Largest spot radius, in units of the distance to the exit pupil, for which `on_sphere` uses the
+# sphere of the exit pupil.
+_MAX_SPOT = 0.3
+# Number of directions in which `near` bounds the light of a clipped beam.
+_BOUNDS = 16
 
 
 @functools.partial(
@@ -45,23 +46,26 @@ _SIDES = 16
 )
 @dataclasses.dataclass(frozen=True)
 class Beam:
-    """Rays of W wavelengths that stand for all light of an object point; Q of them all over the
-    part of the pupil that the light fills.
+    """Rays of W wavelengths that represent all light of an object point; Q rays over the part of
+    the pupil that the light fills.
 
-    points: (2, W, Q), where they cross the stop, in units of its semi-diameter.
-    weights: (W, Q), the light that they stand for, adding up to the throughput.
-    hits: (2, S + 1, W, Q) mm, on all surfaces and the sensor.
+    points: (2, W, Q), crossings of the stop in units of its semi-diameter.
+    weights: (W, Q), the light that each ray represents; their sum is the throughput.
+    hits: (2, S + 1, W, Q), mm, on all surfaces and the sensor.
     direction: (3, W, Q), unit vectors at the sensor, along its axes.
-    path: (W, Q) mm, optical path from the object to the foot of the perpendicular from the middle
-        of the sensor to the ray: the phase of its plane wave there.
-    index: (W,), refractive index before the sensor.
-    motion: (3,), how the sensor's vertex moves in mm a mm of `Lens.sensor`, along its axes.
-    curvature: (W,), 1 / distance along the light from the exit pupil to the sensor, 1/mm.
-    known: (W, Q), whether the ray exists.
-    degree: of the polynomials. azimuths: the largest m of their terms cos(m a), one less than the
-        azimuths of rays on half a disc. clipped: whether more than the rim of the stop bounds the
-        light.
-    mask: in the stop; only kernels know it: `weights` are of the light without it.
+    path: (W, Q), mm, optical path of the plane wave of each ray to the origin of the sensor: the
+        path from the object to the foot of the perpendicular from the origin to the ray.
+    index: (W,), refractive index in front of the sensor.
+    motion: (3,), displacement of the sensor's vertex per mm of `Lens.sensor`, along the axes of the
+        sensor.
+    curvature: (W,), 1/mm, 1 / distance along the light from the exit pupil to the sensor.
+    known: (W, Q), bool, True for rays that exist.
+    degree: degree of the polynomials.
+    azimuths: largest azimuthal order m of their terms cos(m a); one less than the number of
+        azimuths of rays on half a disc.
+    clipped: True if more than the rim of the stop bounds the light.
+    mask: mask in the stop, or None. Only kernels take it into account; `weights` are those without
+        it.
     """
 
     points: Array
@@ -80,12 +84,13 @@ class Beam:
 
     @property
     def throughput(self) -> Array:
-        """The part of the light through the stop that reaches the sensor, (W,)."""
+        """Fraction (W,) of the light through the stop that reaches the sensor."""
         return jnp.sum(self.weights, axis=-1)
 
     def refocused(self, step: Array) -> "Beam":
-        """The same light with the sensor `step` mm, (), farther along its way: no ray is traced."""
-        # The middle of the sensor moves by `move`; rays go on to the plane where it then lies.
+        """The beam with the sensor moved by `step` mm, (), along the light. No ray is traced:
+        the straight rays are extended to the new plane, and paths refer to its new origin."""
+        # The origin of the sensor moves by `move`; rays are extended to the new plane.
         move = step * self.motion[:, None, None]
         ahead = safe_divide(jnp.broadcast_to(move[2], self.path.shape), self.direction[2])
         hits = self.hits
@@ -97,14 +102,22 @@ class Beam:
         return dataclasses.replace(self, hits=hits, path=path, curvature=curvature)
 
     def on_sphere(self) -> tuple[Array, Array]:
-        """Where rays cross a sphere through the exit pupil about the middle of the spot: direction
-        cosines (2, W, Q) from there to the middle, and the path (W, Q) of a plane wave of this
-        direction, as `path` has that of the ray's own, mm.
+        """Rays as plane waves whose directions point from the exit pupil to the spot.
 
-        Huygens' waves from the sphere interfere on the sensor as plane waves of these directions
-        do, but for a phase of (blur x aperture)^2 / (2 radius). Rays as plane waves, a sphere of
-        infinite radius, would be the limit of many Fresnel zones. Formulas as in `wavefront`. Where
-        the spot is no longer small beside the radius, that limit is taken.
+        Returns cosines (2, W, Q), the direction cosines from the point where each ray crosses a
+        sphere through the exit pupil, centred on the centroid of the spot, to that centroid; and
+        the path (W, Q), mm, of the plane wave of this direction to the origin of the sensor, in
+        place of `path`, which is that of the ray's own direction.
+
+        On the sensor, Huygens' waves from the sphere interfere like plane waves of these
+        directions, except for a phase of (blur x aperture)^2 / (2 radius). With the ray's own
+        direction (a sphere of infinite radius) a plane wave would need many Fresnel zones to be a
+        good approximation.
+
+        With the formulas of `wavefront`: for a ray of direction d with the hit C + e, which crosses
+        the sphere at the distance 1 / kappa + t in front of it, the direction to C is
+        c = (1 + kappa t) d - kappa e, and the path is `path` + n (d.(C + e) - c.C - t). Where the
+        spot is not small compared with the radius, kappa = 0: the ray's own direction.
         """
         light = self._light()
         middle = means(self.hits[:, -1], light)[..., None]
@@ -112,7 +125,7 @@ class Beam:
         e = jnp.where(self.known[None], e, 0)
         kappa = self.curvature * jnp.abs(self._along_motion())
         square = jnp.sum(e**2, axis=0)
-        near = kappa**2 * jnp.max(square, axis=-1) < _NEAR**2
+        near = kappa**2 * jnp.max(square, axis=-1) < _MAX_SPOT**2
         kappa = jnp.where(near, kappa, 0)[:, None]
         along = jnp.sum(e * line, axis=0)
         x = along**2 - square
@@ -122,16 +135,20 @@ class Beam:
         return cosines, self.path + self.index[:, None] * jnp.where(self.known, offset, 0)
 
     def over_stop(self) -> Polynomials:
-        """Hits on the sensor (2) and, of a clipped pupil, on all surfaces (2 S + 2), mm, as
-        functions of the stop point."""
+        """Polynomials in the stop point: hits on the sensor (2) and, for a clipped pupil, hits
+        on all surfaces (2 S + 2), mm."""
         return self._fitted(self.points, self._with_edges([self.hits[:, -1]]))
 
     def over_directions(self) -> Polynomials:
-        """Path (1), mm, stop point (2) and, of a clipped pupil, hits on all surfaces (2 S + 2), mm,
-        as functions of the direction cosines of `on_sphere`."""
+        """Polynomials in the direction cosines of `on_sphere`: path (1), mm; stop point (2); and,
+        for a clipped pupil, hits on all surfaces (2 S + 2), mm.
+
+        The tilt n C.c towards the centroid C of the spot is thousands of waves, of which float32
+        would lose too many digits. It is taken off before the fit and its exact coefficients are
+        added afterwards: the first three terms of Noll are 1, 2 x and 2 y.
+        """
         cosines, path = self.on_sphere()
-        # Less the tilt towards the middle of the light, thousands of waves, of which float32 would
-        # round too much. It is put back exactly: terms 1 to 3 of Noll are 1, 2 x and 2 y.
+        # The tilt n C.c, see above.
         along = jax.lax.stop_gradient(self.index[None] * means(self.hits[:, -1], self._light()))
         path = path + dot(tuple(along[..., None]), tuple(cosines))
         found = self._fitted(cosines, self._with_edges([path[None], self.points]))
@@ -140,8 +157,9 @@ class Beam:
         return dataclasses.replace(found, coefficients=coefficients)
 
     def solid_angle(self) -> Array:
-        """Area of the cone of light on the sensor, (W,), in direction cosines: irradiance is this
-        times the radiance that fills the stop."""
+        """Area (W,) of the cone of light on the sensor, in direction cosines: pi times the
+        weighted mean of |d(direction) / d(stop point)|. Irradiance is this area times the
+        radiance that fills the stop."""
         directions = self._fitted(self.points, self.direction[:2])
         one, zero = jnp.ones_like(self.points[0]), jnp.zeros_like(self.points[0])
 
@@ -152,28 +170,33 @@ class Beam:
         return jnp.pi * jnp.sum(self.weights * jnp.abs(a * d - b * c), axis=-1)
 
     def extent(self) -> tuple[Array, Array]:
-        """The square of the stop that the light lies in: two corners, (2, W)."""
+        """Square of the stop that contains the light: its lower and upper corner, (2, W) each,
+        in units of the semi-diameter."""
         if not self.clipped:
             one = jnp.ones((2, self.path.shape[0]), self.path.dtype)
             return -one, one
         return _extent(self.points, self.known, self._margin())
 
     def directions_extent(self) -> tuple[Array, Array]:
-        """The rectangle of direction cosines, see `on_sphere`, that the light lies in: two corners,
-        (2, W)."""
+        """Rectangle of direction cosines of `on_sphere` that contains the light: its lower and
+        upper corner, (2, W) each."""
         return _extent(self.on_sphere()[0], self.known, self._margin())
 
     def near(self, places: Array, middle: Array, step: Array, cells: int) -> Array:
-        """Whether cells of a grid (W, N, N) [y, x] reach to where light may come, next to the rays.
-        Far from all rays polynomials run away, and some come back to where apertures seem to pass
-        them.
+        """Mask (W, N, N) [y, x] of the cells of a grid that may contain light, because they are
+        near traced rays. Far from all rays the polynomials extrapolate, and apertures can seem to
+        let such points pass.
 
-        places: (2, W, Q) of the rays. middle, step: (2, W), of the grid.
+        places: (2, W, Q), positions of the rays in the plane of the grid.
+        middle, step: (2, W), centre and step of the grid.
+        cells: N.
+
+        The light is bounded by the convex polygon of its extents in `_BOUNDS` directions.
         """
         side = jnp.asarray(np.arange(cells) - (cells - 1) / 2, step.dtype)
         axes = middle[..., None] + step[..., None] * side[None, None]
         found = jnp.ones((axes.shape[1], cells, cells), bool)
-        for angle in np.pi / _SIDES * np.arange(_SIDES):
+        for angle in np.pi / _BOUNDS * np.arange(_BOUNDS):
             x, y = np.cos(angle).item(), np.sin(angle).item()
             low, high = _extent(x * places[0] + y * places[1], self.known, self._margin())
             along = x * axes[0][:, None, :] + y * axes[1][:, :, None]
@@ -183,29 +206,33 @@ class Beam:
         return found
 
     def _margin(self) -> float:
-        """By what part the light may reach farther than the outermost rays: they lie inside of the
-        rim, and between two of their azimuths."""
+        """Factor by which the light may extend farther than the outermost rays, because Gauss
+        nodes lie inside of the rim, and because the rim bulges between two azimuths."""
         order = self.degree // 2 + 1
         outermost = np.polynomial.legendre.leggauss(order + self.clipped)[0][-1]
         radius = (1 + outermost) / 2 if self.clipped else np.sqrt((1 + outermost) / 2)
         return float(1.005 / (radius * np.cos(np.pi / (2 * self.azimuths + 2))))
 
     def _with_edges(self, values: list[Array]) -> Array:
-        """The values, and hits on all surfaces of a beam that their edges clip, (D, W, Q)."""
+        """`values` and, for a clipped beam, the hits on all surfaces, stacked to (D, W, Q)."""
         edges = [self.hits.reshape(-1, *self.path.shape)] if self.clipped else []
         return jnp.concatenate([*values, *edges])
 
     def _along_motion(self) -> Array:
-        """Cosine (W,) between the middle of the light and the way that the sensor moves."""
+        """Cosine (W,) between the mean direction of the light and the direction in which the
+        sensor moves."""
         return jnp.sum(means(self.direction, self._light()) * self.motion[:, None], axis=0)
 
     def _light(self) -> Array:
-        """Weights (W, Q) above 0: where light is taken away, rays stand for it as well."""
+        """Weights (W, Q) >= 0 of fits and centroids: the absolute values of `weights`, which are
+        negative for rays inside of obscurations; 1 for a wavelength without light."""
         weights = jnp.where(self.known, jnp.abs(self.weights), 0)
         return jnp.where(self.throughput[:, None] > 0, weights, 1)
 
     def _fitted(self, points: Array, values: Array) -> Polynomials:
-        # A constant of its own, so that float32 rounds the rest of the values alone.
+        """Polynomials of the beam's degree fitted to values (D, W, Q) at points (2, W, Q)."""
+        # Fit the deviations from the mean, so that float32 rounds only these, and add the mean to
+        # the constant term.
         mean = jax.lax.stop_gradient(means(values, self._light()))
         found = fitted(points, values - mean[..., None], self._light(), self.degree, self.azimuths)
         coefficients = found.coefficients.at[..., 0].add(mean.T)
@@ -215,8 +242,12 @@ class Beam:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class BeamRule:
-    """Which rays make a beam, and the degree of its polynomials, see `beam_rule`; the mask in its
-    stop, if there is one."""
+    """How a beam is traced, see `beam_rule`.
+
+    rule: pupil rule of the rays.
+    degree: static, degree of the polynomials.
+    mask: mask in the stop, or None.
+    """
 
     rule: PupilRule
     degree: int = dataclasses.field(metadata={"static": True})
@@ -224,8 +255,14 @@ class BeamRule:
 
 
 def beam_rule(degree: int, symmetry: Symmetry, clipped: PupilRule | None = None) -> BeamRule:
-    """The fewest rays that give polynomials of a degree: a rule that integrates products of two of
-    them. clipped: the rule of a clipped pupil, if it is, whose kind is kept."""
+    """The fewest rays that determine polynomials of a degree: a rule that integrates products of
+    two of them exactly.
+
+    degree: degree of the polynomials.
+    symmetry: of the pupil, see `symmetry_of`.
+    clipped: a rule of the kind `Clipped` if the pupil is clipped; the beam then has a rule of this
+        kind. Another rule or None: the whole stop.
+    """
     order = degree // 2 + 1
     if isinstance(clipped, Clipped):
         rule = dataclasses.replace(clipped, order=order + 1, size=order + 1)
@@ -237,7 +274,12 @@ def beam_rule(degree: int, symmetry: Symmetry, clipped: PupilRule | None = None)
 
 
 def trace_beam(lens: Lens, scene: Scene, rule: BeamRule, solver: Solver = solve) -> Beam:
-    """The beam of an object point. Differentiable in the modes of the solver."""
+    """Traces the beam of an object point.
+
+    lens, scene: the lens, and the object point with its wavelengths.
+    rule: rays and degree, see `beam_rule`.
+    solver: of the rays; the beam is differentiable in the modes of the solver.
+    """
     points, weights = rule.rule.points(lens, scene)
     bundle = trace_bundle(lens, scene, points, solver)
     symmetry: Symmetry = rule.rule.symmetry
@@ -259,15 +301,24 @@ def beam_of(
     clipped: bool,
     azimuths: int | None = None,
 ) -> Beam:
-    """The beam of traced rays; `points` and `symmetry` are those of their rule, `weights` (W, Q)
-    theirs times what they transmit. azimuths: None for `degree`."""
+    """The beam of traced rays.
+
+    lens, scene: what was traced.
+    points, symmetry: points on the stop and symmetry of the pupil rule.
+    weights: (W, Q), weights of the rule times the transmission of the rays.
+    bundle: the traced rays.
+    degree, clipped: as in `Beam`.
+    azimuths: as in `Beam`; None for `degree`.
+
+    Rays of a part of the pupil are repeated, rotated or mirrored, so that they cover all of it.
+    """
     known = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     index = lens.index(scene.wavelengths)[-1]
     hits = [jnp.where(known, h, 0) for h in bundle.hits]
     arrival = [jnp.where(known, a, 0) for a in bundle.arrival]
     sensor = tuple(h[-1] for h in hits)
     path = bundle.path - index[:, None] * dot(tuple(arrival[:-1]), sensor)
-    # A constant is no phase.
+    # A constant in the path does not matter; the mean is removed so that float32 keeps the rest.
     path = jnp.where(known, path, 0)
     total = jnp.sum(known, axis=-1, keepdims=True).astype(path.dtype)
     mean = safe_divide(jnp.sum(path, axis=-1, keepdims=True), total)
@@ -276,9 +327,11 @@ def beam_of(
     images, motion = len(turns) * len(mirrors), lens.sensor_motion
 
     def spread(vector: Sequence[Array]) -> Array:
+        """A vector (D components) of all rays and their images."""
         return _spread(turns, mirrors, vector)
 
     def repeated(values: Array) -> Array:
+        """A scalar of all rays and their images."""
         return jnp.tile(jnp.broadcast_to(values, known.shape), (1, images))
 
     beam = Beam(
@@ -295,28 +348,30 @@ def beam_of(
         azimuths=degree if azimuths is None else azimuths,
         clipped=clipped,
     )
-    return _filled(beam)
+    return _with_placeholders(beam)
 
 
-def _filled(beam: Beam) -> Beam:
-    """The beam; for a wavelength of which no light arrives, rays without light that fill a pupil,
-    so that all that follows from them is finite."""
+def _with_placeholders(beam: Beam) -> Beam:
+    """The beam with placeholder rays for each wavelength of which no light arrives: rays of
+    weight 0 on a spiral over the unit disc, so that fits and all that follows from them stay
+    finite."""
     count = beam.path.shape[-1]
     place = np.arange(count) + 0.5
     spiral = np.sqrt(place / count) * np.exp(2.4j * place)
     disc = jnp.asarray(np.stack([spiral.real, spiral.imag])[:, None], beam.path.dtype)
-    lit = beam.throughput[:, None] > 0
+    arrives = beam.throughput[:, None] > 0
     return dataclasses.replace(
         beam,
-        points=jnp.where(lit, beam.points, disc),
-        weights=jnp.where(lit, beam.weights, 0),
-        direction=jnp.where(lit, beam.direction, jnp.concatenate([disc, disc[:1]])),
-        known=beam.known | ~lit,
+        points=jnp.where(arrives, beam.points, disc),
+        weights=jnp.where(arrives, beam.weights, 0),
+        direction=jnp.where(arrives, beam.direction, jnp.concatenate([disc, disc[:1]])),
+        known=beam.known | ~arrives,
     )
 
 
 def _extent(places: Array, known: Array, margin: float) -> tuple[Array, Array]:
-    """Ends (..., W) of what holds all light whose rays are at places (..., W, Q)."""
+    """Smallest and largest coordinate (..., W) of the light whose rays are at `places` (..., W,
+    Q), with the factor `margin` about their middle."""
     low = jnp.min(jnp.where(known, places, jnp.inf), axis=-1)
     high = jnp.max(jnp.where(known, places, -jnp.inf), axis=-1)
     middle, half = (low + high) / 2, margin * (high - low) / 2
@@ -324,7 +379,8 @@ def _extent(places: Array, known: Array, margin: float) -> tuple[Array, Array]:
 
 
 def _images(symmetry: Symmetry, degree: int) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Azimuths by which, and signs of x with which, rays of a part of the pupil fill all of it."""
+    """Azimuths of the rotations, and signs of x of the reflections, that extend rays of a part
+    of the pupil to all of it."""
     if symmetry == "rotational":
         azimuths = 2 * degree + 1
         return 2 * np.pi * np.arange(azimuths) / azimuths, (1,)
@@ -332,9 +388,9 @@ def _images(symmetry: Symmetry, degree: int) -> tuple[np.ndarray, tuple[int, ...
 
 
 def _spread(turns: np.ndarray, mirrors: tuple[int, ...], vector: Sequence[Array]) -> Array:
-    """Vectors of rays, D arrays (..., Q), turned and mirrored: (2, ..., images Q)."""
+    """Vectors of rays, D arrays (..., Q), rotated and mirrored: (2, ..., images x Q)."""
     if len(vector) == 1:
-        # Python numbers: NumPy's would make float32 double.
+        # Python floats, because NumPy's would promote float32 to float64.
         sides = zip(np.cos(turns).tolist(), np.sin(turns).tolist())
         parts = [(x * vector[0], y * vector[0]) for x, y in sides]
     else:
@@ -343,13 +399,14 @@ def _spread(turns: np.ndarray, mirrors: tuple[int, ...], vector: Sequence[Array]
 
 
 def means(values: Array, weights: Array) -> Array:
-    """Means (D, W) of values (D, W, Q) with weights (W, Q)."""
+    """Weighted means (D, W) of values (D, W, Q) with weights (W, Q)."""
     total = einsum("wq,dwq->dw", weights, values)
     return safe_divide(total, jnp.broadcast_to(jnp.sum(weights, -1), total.shape))
 
 
 def centroid_and_variances(hits: Array, weights: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Centroid (2, W) of hits (2, W, Q) and their variances xx, xy, yy, (W,) each."""
+    """Centroid (2, W) of hits (2, W, Q), and their variances xx, xy and yy, (W,) each; weights
+    (W, Q)."""
     mean = means(hits, weights)
     x, y = hits - mean[..., None]
     xx, xy, yy = means(jnp.stack([x * x, x * y, y * y]), weights)

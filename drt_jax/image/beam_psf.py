@@ -17,7 +17,7 @@ from .ray_psf import ray_kernel, ray_spots
 from .wave_psf import wave_kernel
 
 Kind = Literal["gaussian", "rays", "waves"]
-_FINE = 8  # cells for each pixel of a mask
+_FINE = 8  # cells along each side of a pixel of a mask
 
 
 @jax.tree_util.register_dataclass
@@ -26,8 +26,8 @@ class Psf:
     """Light of an object point on the pixels, for W wavelengths.
 
     kernel: (W, size, size), [wavelength, y, x], with the sum 1 - outside.
-    outside: (W,), fraction of the light on the sensor that falls outside the kernel.
-    centre: (2,) mm, the centre of the kernel on the sensor.
+    outside: (W,), fraction of the light on the sensor that falls outside of the kernel.
+    centre: (2,), mm, centre of the kernel on the sensor.
     throughput: (W,), fraction of the light through the stop that reaches the sensor.
     solid_angle: (W,), area of the cone of light on the sensor in direction cosines. Irradiance is
         radiance times this area. Its ratio to the area on the axis is the relative illumination.
@@ -49,9 +49,11 @@ class Psf:
 class PsfModel:
     """A PSF model with its rays and its grid, see `converged_psf`.
 
-    kind: "gaussian", "rays" or "waves". rule: of the rays. cells: number of cells along a side of
-    the pupil grid; 0 for "gaussian". errors: with "auto", for each kind the difference of its
-    kernel from that of "waves" at the worst wavelength, which is compared with the tolerance.
+    kind: "gaussian", "rays" or "waves".
+    rule: rays and polynomials of the beam.
+    cells: number of cells along a side of the pupil grid; 0 for "gaussian".
+    errors: with "auto", the difference between the kernel of each kind and that of "waves" at the
+        worst wavelength, which is compared with the tolerance.
     """
 
     kind: Kind
@@ -60,14 +62,15 @@ class PsfModel:
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def masked(self, mask: Mask, cells: int = 0) -> "PsfModel":
-        """The model with a mask in the stop, of which it is as differentiable as of the lens; for
-        use in `jax.jit` too. It needs no more rays. Kernels are centred as without it.
+        """The model with a mask in the stop. Also for use in `jax.jit`; differentiable in the mask.
 
-        cells: along a side of the grid; 0 for as many as the model has, and 8 for each pixel of the
-            mask. docs/images.md says how precise that is.
+        mask: the mask.
+        cells: number of cells along a side of the grid; 0 for the larger of the model's own number
+            and 8 for each pixel of the mask. docs/images.md gives the accuracy.
 
-        ValueError for a mask of a wrong shape, for the model "gaussian", which knows the moments of
-        the whole stop alone, and for a path and the model "rays".
+        No more rays are traced than without the mask, and kernels are centred as without it.
+        ValueError for a mask of a wrong shape, for the model "gaussian", which only has the moments
+        of the whole stop, and for a mask with a path in the model "rays".
         """
         mask.check()
         if self.kind == "gaussian" or (self.kind == "rays" and mask.path is not None):
@@ -88,7 +91,14 @@ def psf_of_beam(
     kind: Kind,
     cells: int,
 ) -> Psf:
-    """`psf` of a beam. wavelengths: (W,), um. pixel: (), mm. centre: (2,) mm or None."""
+    """The `Psf` of a beam.
+
+    lens, beam: the lens and its beam.
+    wavelengths: (W,), um.
+    pixel: (), mm.
+    centre: (2,), mm, or None for the mean of the centroids.
+    size, kind, cells: as in `PsfModel` and `psf`.
+    """
     mean, (xx, xy, yy) = centroid_and_variances(beam.hits[:, -1], beam.weights)
     if centre is None:
         centre = jnp.mean(mean, axis=-1)

@@ -1,7 +1,8 @@
-"""Blur that varies over the picture: a few kernels, whose shares vary from pixel to pixel.
+"""Blur that varies over the picture: a sum of a few kernels with weights that vary from pixel to
+pixel.
 
-The kernel of a pixel is a sum of R kernels, the same for all pixels of a tile, times shares of its
-own. Each kernel takes one transform back of a tile's light.
+The kernel of a pixel is sum_r shares_r kernel_r. The R kernels are the same for all pixels of a
+tile; the shares are the pixel's own. So a tile costs one FFT, and one inverse FFT for each kernel.
 """
 
 import jax
@@ -10,20 +11,24 @@ from jax import Array
 
 from ..numerics import einsum
 
-# Sides of the squares that are transformed: fast ones.
+# Sides of the squares that are transformed: sizes with fast FFTs.
 SIDES = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 
 
 def blur_row(
     light: Array, kernels: Array, shares: Array, across: Array, tile: tuple[int, int]
 ) -> Array:
-    """A row of n tiles of height and width `tile`, blurred: (C, height, n width).
+    """Blurs a row of n tiles.
 
-    light: (C, height + K - 1, n width + K - 1), with what lies around.
-    kernels: (n, C, R, K, K) of each tile, or (1, ...) of all; a pixel collects kernel[k] of the
-        light k pixels before it, as in a convolution.
-    shares: (C, R, height, M) or (1, ...), what of each kernel a row of pixels takes at M places
-        along it; across: (n width, M), the matrix that interpolates between them.
+    light: (C, height + K - 1, n width + K - 1), the tiles with a margin of context.
+    kernels: (n, C, R, K, K) for each tile, or (1, ...) for all tiles; a pixel collects kernel[k] of
+        the light k pixels before it, as in a convolution.
+    shares: (C, R, height, M) or (1, ...), weight of each kernel in each row of pixels, at M nodes
+        along the row.
+    across: (n width, M), matrix that interpolates the shares from the nodes to pixels.
+    tile: height and width of a tile, pixels.
+
+    Returns (C, height, n width).
     """
     size, channels = kernels.shape[-1], len(light)
     (height, width), count = tile, len(across) // tile[1]
@@ -32,8 +37,9 @@ def blur_row(
     tiles = jnp.stack([light[:, :, j * width : j * width + ends[1]] for j in range(count)])
     spectra = jnp.fft.rfft2(tiles, sides)  # (n, C, ...)
 
-    def added(total: Array, given: tuple[Array, Array]) -> tuple[Array, None]:
-        kernel, share = given
+    def added(total: Array, pair: tuple[Array, Array]) -> tuple[Array, None]:
+        """Adds the light blurred with one kernel, times its shares."""
+        kernel, share = pair
         blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides), sides)
         inside = blurred[..., size - 1 : ends[0], size - 1 : ends[1]]
         each = einsum("cym,xm->cyx", share, across)

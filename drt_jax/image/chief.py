@@ -1,14 +1,14 @@
 """Chief rays over the field: distortion, field curvature, lateral colour, chief ray angle.
 
-A chief ray goes through the centre of the stop. How the hit h on the sensor and the slope m there
-follow from the stop point p comes from the derivatives of the traced ray: neighbouring rays meet
-it where h_p + s m_p is singular, a distance s behind the sensor. These are the foci of
-Coddington's equations, in any lens, tilted or not.
+A chief ray passes through the centre of the stop. JVPs of the traced ray give the derivatives h_p
+and m_p, by the stop point p, of its hit h on the sensor and its slope m there. A distance s behind
+the sensor, neighbouring rays are at h + h_p dp + s (m + m_p dp), so they meet the chief ray where
+h_p + s m_p is singular. These are the foci of Coddington's equations, for any lens, tilted or not.
 
 All functions take `fields`, F angles along y (F,) or pairs (F, 2) in radians, and return an array
-with the field as its first axis; jit, vmap and derivatives in every mode as of `trace_rays`. A
-field whose chief ray fails has inf; one that an aperture clips counts like others. ValueError as
-of `scene_of`. Chief rays of the paraxial entrance pupil, as other programs have them unless they
+with the field as its first axis. jit, vmap and derivatives in every mode work as for `trace_rays`.
+A field whose chief ray fails has inf; one that an aperture clips counts like others. ValueError as
+of `scene_of`. Chief rays through the paraxial entrance pupil, which other programs use unless they
 aim at the stop, are those of `with_paraxial_pupil(lens)`.
 
 Sources: Welford, Aberrations of Optical Systems (1986), ch. 4.5 and 6; conventions of the field
@@ -33,19 +33,20 @@ from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
 from .field import CHIEF
-from .rounding import tell_of_focus
+from .rounding import warn_of_focus
 
 Mapping = Literal["tangent", "angle"]
-# As many fields at a time are a program.
+# The number of fields is padded to a multiple of this, so that programs are shared.
 _FIELDS = 16
 
 
 class FieldCurvature(NamedTuple):
-    """Foci of thin pencils about the chief rays, (F, W) in mm along the z axis of the sensor, from
+    """Foci of narrow pencils about the chief rays, (F, W), mm along the z axis of the sensor, from
     where the chief ray meets it; inf for none.
 
     tangential: of rays that cross the stop beside its centre in the direction of the field (y, for
-        the axis). sagittal: across it.
+        the axis).
+    sagittal: of rays that cross it at right angles to that.
     """
 
     tangential: Array
@@ -53,12 +54,14 @@ class FieldCurvature(NamedTuple):
 
 
 class Distortion(NamedTuple):
-    """Chief rays on the sensor against an ideal image.
+    """Chief rays on the sensor compared with an ideal image.
 
-    relative: (F, W), how much farther from the image of the axis they are than the ideal point,
-        towards which it counts, in parts of its distance; 0 on the axis.
-    real, ideal: (F, W, 2) mm, x and y on the sensor.
-    focal_length: (W,) mm, the y of the ideal image by the tangent of the field, or by the angle.
+    relative: (F, W), displacement from the ideal point, relative to the distance of that point from
+        the image of the axis. Only the component along that distance counts; positive outwards; 0
+        on the axis.
+    real, ideal: (F, W, 2), mm, x and y on the sensor.
+    focal_length: (W,), mm, scale of the ideal image: y by the tangent of the field, or by the
+        angle.
     """
 
     relative: Array
@@ -68,8 +71,12 @@ class Distortion(NamedTuple):
 
 
 class _ChiefRays(NamedTuple):
-    """Of the axis and F fields: hit (F + 1, W, 2) mm; angle, tangential, sagittal (F + 1, W);
-    by_field (F + 1, W, 2, 2) mm per radian, [x y of the hit, x y of the field]; whole (F + 1, W).
+    """The chief rays of F + 1 fields: row 0 is the axis.
+
+    hit: (F + 1, W, 2), mm.
+    angle, tangential, sagittal: (F + 1, W), as `chief_ray_angle` and `FieldCurvature` have them.
+    by_field: (F + 1, W, 2, 2), mm per radian, derivatives of the hit (x, y) by the field (x, y).
+    whole: (F + 1, W), bool, False where the ray fails.
     """
 
     hit: Array
@@ -85,21 +92,28 @@ def field_curvature(
 ) -> FieldCurvature:
     """Tangential and sagittal foci relative to the sensor, see `FieldCurvature`.
 
-    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
+    lens: the lens.
+    fields: (F,) along y or (F, 2), radians.
+    distance: mm, inf allowed.
+    wavelengths: (W,), um.
 
     Positive where the focus has the larger z, as OpticStudio plots it. In a lens without a plane of
-    symmetry these are the two focal lines, named by the direction that they are nearer to. Warns,
-    outside of a trace, where float32 moves a focus by more than 2 % of the depth of focus, the
-    wavelength over NA^2.
+    symmetry the two focal lines are named by the direction that they are nearer to. Warns, outside
+    of a trace, where float32 moves a focus by more than 2 % of the depth of focus,
+    wavelength / NA^2.
     """
-    tell_of_focus(lens, distance, wavelengths)
+    warn_of_focus(lens, distance, wavelengths)
     found = _chief_rays(lens, fields, distance, wavelengths)
     return FieldCurvature(found.tangential[1:], found.sagittal[1:])
 
 
 def chief_ray_angle(lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Angle (F, W) in radians between the chief ray and the normal of the sensor's vertex, from 0.
-    Arguments as of `field_curvature`."""
+    """Angle between the chief ray and the normal of the sensor's vertex.
+
+    lens, fields, distance, wavelengths: as in `field_curvature`.
+
+    Returns (F, W), radians, 0 or more.
+    """
     return _chief_rays(lens, fields, distance, wavelengths).angle[1:]
 
 
@@ -110,10 +124,12 @@ def lateral_colour(
     wavelengths: Numbers,
     reference: int | None = None,
 ) -> Array:
-    """Where the chief rays meet the sensor, (F, W, 2) in mm along its x and y, less where that of
-    the reference wavelength does.
+    """Hits of the chief rays on the sensor, less those of a reference wavelength.
 
-    reference: its index, by default the middle one, W // 2. Else as `field_curvature`.
+    lens, fields, distance, wavelengths: as in `field_curvature`.
+    reference: index of the reference wavelength; None: the middle one, W // 2.
+
+    Returns (F, W, 2), mm along x and y of the sensor. ValueError for an index out of range.
     """
     found = _chief_rays(lens, fields, distance, wavelengths)
     middle = found.whole.shape[1] // 2 if reference is None else reference
@@ -132,15 +148,17 @@ def distortion(
     mapping: Mapping = "tangent",
     focal_length: Numbers | Literal["fitted"] | None = None,
 ) -> Distortion:
-    """Chief rays against the ideal image f tan(field) or f field, see `Distortion`.
+    """Chief rays compared with the ideal image f tan(field) or f field, see `Distortion`.
 
-    mapping: "tangent" or "angle" (f-theta; of a field (x, y) the angle to the axis).
-    focal_length: () or (W,) mm; None: the limit of real chief rays near the axis, on the sensor
+    lens, fields, distance, wavelengths: as in `field_curvature`.
+    mapping: "tangent"; or "angle" (f-theta), for a field (x, y) the angle to the axis.
+    focal_length: f, () or (W,), mm; None: the limit of real chief rays near the axis, on the sensor
         where it is, which is OpticStudio's reference; "fitted": calibrated, the least squares over
-        these fields. A finite distance has the same formulae: tan(field) is height over distance.
-        A lens without an axis has a matrix in place of f, the derivative at the field 0.
+        these fields. A finite distance has the same formulae, with tan(field) = height / distance.
+        For a lens without an axis a matrix takes the place of f, the derivative of the hit at the
+        field 0.
 
-    Else as `field_curvature`.
+    ValueError for another mapping or focal length.
     """
     require_one_of("mapping", mapping, get_args(Mapping))
     if isinstance(focal_length, str) and focal_length != "fitted":
@@ -163,10 +181,10 @@ def distortion(
 def _distortion(
     found: _ChiefRays, angles: Array, scale: Array, mapping: Mapping, fitted: bool, afocal: bool
 ) -> Distortion:
-    """Of chief rays, scale (W, 2, 2) mm."""
+    """`distortion` from chief rays, angles (F, 2) and scale (W, 2, 2), mm."""
     whole = found.whole[1:] & found.whole[:1]
     place = jnp.tan(angles)
-    if afocal and mapping == "tangent":
+    if afocal and mapping == "tangent":  # hits are angles, in mrad: compare their tangents
         size = safe_sqrt(jnp.sum(found.hit**2, axis=-1, keepdims=True)) / FOCAL
         longer = jnp.where(size > 0, safe_divide(jnp.tan(size), size), 1)
         found = found._replace(hit=found.hit * longer)
@@ -194,7 +212,7 @@ def _chief_rays(lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Num
     angles = fields_array(fields, lens.curvature.dtype)
     scene = scene_of(lens, 0.0, distance, wavelengths)
     count = len(angles)
-    # Nearly as many fields share a program.
+    # Padding lets similar numbers of fields share a program.
     spare = -(count + 1) % _FIELDS if known_values((lens, angles, scene)) is not None else 0
     angles = jnp.pad(angles, ((1, spare), (0, 0)))
     found = _traced(lens, angles, scene)
@@ -203,6 +221,7 @@ def _chief_rays(lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Num
 
 @functools.partial(jit, wanted=LARGE)
 def _traced(lens: Lens, fields: Array, scene: Scene) -> _ChiefRays:
+    """The chief rays of fields (F + 1, 2)."""
     one = functools.partial(_chief_ray, lens, scene)
     return jax.vmap(one)(fields)
 
@@ -211,6 +230,8 @@ def _chief_ray(lens: Lens, axis: Scene, field: Array) -> _ChiefRays:
     """The chief rays of one field."""
 
     def arriving(point: Vector, field: Array) -> tuple[tuple[Vector, Array, Vector], tuple]:
+        """Hit, sag and slope at the sensor, which are differentiated; and whether the ray
+        exists, with its direction cosines."""
         scene = Scene(field, axis.distance, axis.wavelengths)
         bundle = trace_bundle(lens, scene, point)
         whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
@@ -221,16 +242,17 @@ def _chief_ray(lens: Lens, axis: Scene, field: Array) -> _ChiefRays:
         return (hit, surface_sag(hit, row, lens.forms[-1]), slope), (whole[:, 0], across, along)
 
     points = tuple(jnp.asarray(CHIEF, lens.curvature.dtype))
-    (hit, _, slope), push, rest = jax.linearize(arriving, points, field, has_aux=True)
+    (hit, _, slope), jvp, rest = jax.linearize(arriving, points, field, has_aux=True)
     whole, across, along = rest
-    none, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
-    # Derivatives by the stop point, of hits on the plane through that of the chief ray.
+    still, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
+    # Derivatives by the stop point of the hits on the plane through the chief ray's hit: less the
+    # slope times the change of the sag.
     columns = []
     for k in range(2):
-        beside = tuple(jnp.full_like(p, float(k == j)) for j, p in enumerate(points))
-        moved, height, bent = push(beside, jnp.zeros_like(field))
-        columns.append(([a - m * height for a, m in zip(moved, slope)], bent))
-    by_field = jnp.stack([jnp.stack(push(none, unit)[0], axis=-1) for unit in units], axis=-1)
+        shift = tuple(jnp.full_like(p, float(k == j)) for j, p in enumerate(points))
+        d_hit, d_sag, d_slope = jvp(shift, jnp.zeros_like(field))
+        columns.append(([a - m * d_sag for a, m in zip(d_hit, slope)], d_slope))
+    by_field = jnp.stack([jnp.stack(jvp(still, unit)[0], axis=-1) for unit in units], axis=-1)
     tangential, sagittal = _foci(Scene(field, axis.distance, axis.wavelengths), columns)
     sine = safe_sqrt(across[0] ** 2 + across[1] ** 2)
     angle = jnp.arctan2(sine, jnp.where(whole, jnp.abs(along), 1))
@@ -243,14 +265,21 @@ def _chief_ray(lens: Lens, axis: Scene, field: Array) -> _ChiefRays:
 
 
 def _foci(scene: Scene, columns: list[tuple]) -> tuple[Array, Array]:
-    """Tangential and sagittal foci (W,), mm: s with det(h_p + s m_p) = 0, the eigenvalues of
-    -m_p^-1 h_p, which maps the plane of the stop onto itself."""
-    rows = tuple(zip(*(bent for _, bent in columns)))
-    first, second = (divide(rows, tuple(-a for a in moved)) for moved, _ in columns)
+    """Tangential and sagittal foci (W,), mm.
+
+    columns: derivatives of hit and slope by the two components of the stop point.
+
+    det(h_p + s m_p) = 0 has the roots s = eigenvalues of M = -m_p^-1 h_p, a matrix that maps the
+    plane of the stop onto itself: mean +- sqrt(half^2 + b c), with
+    M = [[mean + half, b], [c, mean - half]]. The tangential one is on that side of the mean where
+    e.M e is, e the direction of the field.
+    """
+    rows = tuple(zip(*(d_slope for _, d_slope in columns)))
+    first, second = (divide(rows, tuple(-a for a in d_hit)) for d_hit, _ in columns)
     (a, c), (b, d) = first, second
     mean, half, product = (a + d) / 2, (a - d) / 2, b * c
     root = safe_sqrt(half**2 + product)
-    # Which of them is tangential: [x y] turned so that y is the direction of the field.
+    # `turned` is mean - e.M e, e = (x, y) the direction of the field.
     tangent = jax.lax.stop_gradient(scene.tangent)
     size = safe_sqrt(jnp.sum(tangent**2))
     x, y = safe_divide(tangent, jnp.broadcast_to(size, (2,)))

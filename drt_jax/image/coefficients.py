@@ -1,8 +1,8 @@
 """Wavefronts as Zernike coefficients: Noll's standard ones, and the fringe ones.
 
-The path difference of `wavefront` over the stop, W = sum of c_j Z_j, in least squares with the
-light that is not clipped as the weight. Pupil coordinates are those of the stop in units of its
-semi-diameter, angles from the x axis.
+The path difference of `wavefront` over the stop is W = sum of c_j Z_j, fitted in least squares with
+the unclipped light as the weight. Pupil coordinates are those of the stop in units of its
+semi-diameter; angles are measured from the x axis.
 
 Sources: Noll, J. Opt. Soc. Am. 66, 207 (1976), which OpticStudio calls Standard; for the order of
 the fringe terms, Wyant and Creath, Basic Wavefront Aberration Theory (1992).
@@ -23,11 +23,12 @@ from ..numerics import Numbers, einsum
 from ..pupil.patterns import disc
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
-from .rounding import tell_of_paths
+from .rounding import warn_of_paths
 from .wavefront import path_differences
 from .zernike import zernike
 
-# Nodes along a radius, and azimuths: no term up to the degree 24 is taken for another.
+# Nodes along a radius, and azimuths on half the disc: no aliasing between terms up to the degree
+# 24.
 _ORDER, _AZIMUTHS = 13, 26
 _MOST = 91
 
@@ -35,14 +36,17 @@ _MOST = 91
 def zernike_standard(
     lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, count: int = 37
 ) -> Array:
-    """Coefficients (F, W, count) in waves of Noll's Zernike polynomials, orthonormal over the disc:
-    the squares of all but the first add up to the mean square wavefront error.
+    """Coefficients of Noll's Zernike polynomials, which are orthonormal over the disc: the squares
+    of all but the first add up to the mean square wavefront error.
 
-    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
-    count: how many, 1 to 91.
+    lens: the lens.
+    fields: (F,) along y or (F, 2), radians.
+    distance: mm, inf allowed.
+    wavelengths: (W,), um.
+    count: number of coefficients, 1 to 91.
 
-    inf where the chief ray fails, or so many rays that the terms are not told apart. Differentiable
-    in every mode. Warns of float32 as `wavefront` does.
+    Returns (F, W, count), waves; inf where the chief ray fails, or where so many rays fail that the
+    fit is not determined. Differentiable in every mode. Warns of float32 as `wavefront` does.
     """
     return _coefficients(lens, fields, distance, wavelengths, _checked(count, _MOST))
 
@@ -50,14 +54,19 @@ def zernike_standard(
 def zernike_fringe(
     lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, count: int = 37
 ) -> Array:
-    """Coefficients (F, W, count) in waves of fringe Zernike polynomials, 1 at the edge of the disc.
-    count: 1 to 37. Else as `zernike_standard`."""
+    """Coefficients of the fringe Zernike polynomials, which are 1 at the edge of the disc.
+
+    lens, fields, distance, wavelengths: as in `zernike_standard`.
+    count: number of coefficients, 1 to 37.
+
+    Returns (F, W, count), waves; else as `zernike_standard`.
+    """
     count = _checked(count, 37)
     terms = fringe_terms()[:count]
     most = max(n for n, _ in terms)
     noll = noll_terms(most)
     scale = np.array([np.sqrt(n + 1 if m == 0 else 2 * (n + 1)) for n, m in terms])
-    # The fit is of these terms alone, as the standard one is of its own.
+    # Only these terms are fitted, as the standard coefficients are a fit of their own terms.
     rows = np.array([noll.index(term) for term in terms])
     return (
         _coefficients(lens, fields, distance, wavelengths, tuple(rows.tolist())) * scale[None, None]
@@ -65,6 +74,7 @@ def zernike_fringe(
 
 
 def _checked(count: int, most: int) -> int:
+    """`count` as an int. ValueError if it is not a whole number from 1 to `most`."""
     if not isinstance(count, int | np.integer) or not 1 <= count <= most:
         raise ValueError(f"count: expected a whole number from 1 to {most}, got {count!r}")
     return int(count)
@@ -77,16 +87,19 @@ def _coefficients(
     wavelengths: Numbers,
     rows: int | tuple[int, ...],
 ) -> Array:
-    """Of some terms in Noll's order, counted from 0."""
+    """Coefficients (F, W, P) of terms given by their indices in Noll's order, counted from 0; a
+    number stands for the first ones."""
     rows = tuple(range(rows)) if isinstance(rows, int) else rows
     axis = scene_of(lens, 0.0, distance, wavelengths)
     angles = fields_array(fields, lens.curvature.dtype)
-    tell_of_paths(lens, axis, angles, 4)
+    warn_of_paths(lens, axis, angles, 4)
     return _fitted(lens, angles, axis, rows)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="rows")
 def _fitted(lens: Lens, fields: Array, axis: Scene, rows: tuple[int, ...]) -> Array:
+    """The least-squares fit: the normal equations of the terms, solved for each field and
+    wavelength."""
     points, weights = disc(_ORDER, _AZIMUTHS)
     degree = next(n for n in range(40) if (n + 1) * (n + 2) // 2 > max(rows))
     dtype = lens.curvature.dtype

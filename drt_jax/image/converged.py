@@ -1,7 +1,7 @@
 """Moments to a tolerance: the pupil rule that a scene needs, found by trials.
 
-A trace cannot choose a number of rays from values: inside `jax.jit` and `jax.vmap`, `psf_moments`
-and `focus_moments` take a rule that was made outside.
+The number of rays cannot depend on the values of tracers. So inside `jax.jit` and `jax.vmap`,
+`psf_moments` and `focus_moments` take a rule that was made outside.
 """
 
 import itertools
@@ -36,13 +36,14 @@ from ..rays.trace import aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
 from .orders import Group, rules_by_order
-from .rounding import hit_rounding, tell
+from .rounding import hit_rounding, warn_dtype
 from .spot import Moments
 from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
 
-# Smallest spot, mm: below 1 nm rounding would never converge.
+# Smallest spot size that errors are taken relative to, mm: below 1 nm rounding would prevent
+# convergence.
 _SMALLEST = 1e-6
-# Order of the rule that finds where light ends.
+# Order of the rule that finds out why no light arrives.
 _DIAGNOSIS = 8
 
 # Default relative error of the RMS spot size.
@@ -59,18 +60,20 @@ def psf_moments(
 ) -> Moments:
     """Centroid, covariance and throughput of the rays on the sensor. Paper section 4.3.
 
+    lens: the lens.
     field: angle along y, or (x, y), radians.
-    distance: from the object plane to the first vertex, inf allowed, mm.
+    distance: from the object plane to the first vertex, mm; inf allowed.
     wavelengths: (W,), um.
-    tolerance: relative error of the RMS spot size, 1e-6 by default, which chooses the rule. In
-        float32 the error of a camera's spot is about 1e-3 of its size or of 4 um; warns if that is
-        above the tolerance.
-    rule: pupil rule instead of a tolerance; needed inside `jax.jit` and `jax.vmap`: make it outside
+    tolerance: relative error of the RMS spot size, 1e-6 by default, from which the rule is chosen.
+        In float32 the error of a camera's spot is about 1e-3 of its size or of 4 um; warns if that
+        is above the tolerance.
+    rule: pupil rule instead of a tolerance. Needed inside `jax.jit` and `jax.vmap`; make it outside
         with `converged_rule`.
 
-    Rays fill the stop uniformly. Differentiable in every mode, in the lens, field, distance and
-    wavelengths. ValueError as in `scene_of`, and if no ray of a wavelength arrives, with where its
-    light ends; inside a trace its `throughput` is then 0 and its covariance inf.
+    Returns `Moments`. Rays fill the stop uniformly. Differentiable in every mode, in the lens,
+    field, distance and wavelengths. ValueError as in `scene_of`, and if no ray of a wavelength
+    arrives, with the surfaces that stop its light. Inside a trace its `throughput` is then 0 and
+    its covariance inf.
     """
     found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
     return found.at(lens.sensor)
@@ -86,8 +89,11 @@ def focus_moments(
 ) -> FocusMoments:
     """Moments of the rays as functions of the sensor position; the sensor is flat.
 
-    Arguments as in `psf_moments`, but the tolerance holds at every sensor position, and
-    `converged_focus_rule` makes the rule. ValueError also for an afocal lens, and for an element
+    lens, field, distance, wavelengths: as in `psf_moments`.
+    tolerance: as there, but it holds at every sensor position.
+    rule: as there; `converged_focus_rule` makes it.
+
+    Returns `FocusMoments`. ValueError as in `psf_moments`, for an afocal lens, and for an element
     that rotates surfaces about the sensor.
     """
     check_focus(lens)
@@ -101,20 +107,21 @@ def converged_rule(
     wavelengths: Numbers,
     tolerance: float = _TOLERANCE,
 ) -> PupilRule:
-    """The rule that keeps the relative error of the RMS spot size on the sensor within a tolerance,
-    for every field at every distance.
+    """The pupil rule that keeps the relative error of the RMS spot size on the sensor within a
+    tolerance, for every field at every distance.
 
+    lens: the lens.
     field: angle along y, or (x, y), or many pairs (F, 2), radians.
     distance: one or (Z,), mm.
     wavelengths, tolerance: as in `psf_moments`.
 
-    A Gauss rule on the stop; if rays are clipped or fail, a rule fitted to the rest. It is the
-    first order whose covariance, relative to its trace, differs from those of the next two orders
-    by at most the tolerance: two alone may agree by accident. Warns if no order does. ValueError
-    inside a trace, or if no ray arrives.
+    Returns a Gauss rule on the stop or, if rays are clipped or fail, a rule fitted to the rest of
+    the pupil. It is the first order whose covariance, relative to its trace, differs from those of
+    the next two orders by at most the tolerance; two orders alone may agree by accident. Warns if
+    no order does. ValueError inside a trace, or if no ray arrives.
     """
-    seen = field, distance, wavelengths
-    return converge(scenes_of, lens, seen, tolerance, at_sensor).rule
+    sought = field, distance, wavelengths
+    return converge(scenes_of, lens, sought, tolerance, at_sensor).rule
 
 
 def converged_focus_rule(
@@ -125,20 +132,30 @@ def converged_focus_rule(
     tolerance: float = _TOLERANCE,
 ) -> PupilRule:
     """`converged_rule` for every sensor position: the tolerance also holds where the spot is
-    smallest. ValueError as in `focus_moments`."""
+    smallest.
+
+    lens, field, distance, wavelengths, tolerance: as in `converged_rule`.
+
+    ValueError as in `focus_moments`.
+    """
     check_focus(lens)
-    seen = field, distance, wavelengths
-    return converge(scenes_of, lens, seen, tolerance, best_focus).rule
+    sought = field, distance, wavelengths
+    return converge(scenes_of, lens, sought, tolerance, best_focus).rule
 
 
 def at_sensor(spread: np.ndarray) -> list[np.ndarray]:
-    """Where the tolerance must hold: at the sensor, (W,) 0 mm from the reference."""
+    """Sensor positions where the tolerance must hold: at the sensor, (W,) zeros, mm from the
+    reference."""
     return [np.zeros(spread.shape[1])]
 
 
 def best_focus(spread: np.ndarray) -> list[np.ndarray]:
-    """Where the tolerance must hold: at the sensor, and where the spot of each wavelength is
-    smallest, (W,) mm behind the reference."""
+    """Sensor positions where the tolerance must hold, (W,) mm from the reference: at the sensor,
+    and where the spot of each wavelength is smallest. The variance c + b d + a d^2 has its minimum
+    at d = -b / (2 a).
+
+    spread: (3, W, C), as in `FocusMoments`.
+    """
     _, linear, square = np.sum(spread[..., :2], axis=-1)
     return [*at_sensor(spread), -linear / np.where(square > 0, 2 * square, 1)]
 
@@ -152,15 +169,16 @@ def _moments(
     rule: PupilRule | None,
     places: Callable,
 ) -> FocusMoments:
+    """`psf_moments` and `focus_moments`; `places` is `at_sensor` or `best_focus`."""
     if not (tolerance is None or rule is None):
         raise ValueError("tolerance and rule: give one of them; a rule has its own precision")
     if rule is None:
         tolerance = _TOLERANCE if tolerance is None else tolerance
-        seen = field, distance, wavelengths
-        trial = converge(lambda *one: [scene_of(*one)], lens, seen, tolerance, places)
-        if concrete((lens, seen)):
+        sought = field, distance, wavelengths
+        trial = converge(lambda *one: [scene_of(*one)], lens, sought, tolerance, places)
+        if concrete((lens, sought)):
             return jax.tree.map(jnp.asarray, trial.moments[0])
-        # The rays are known: only weigh and differentiate them.
+        # The rays are already found: only weigh them, with derivatives.
         scene = scene_of(lens, field, distance, wavelengths)
         return _weigh_known(lens, scene, trial.used, trial.found[0])
     scene = scene_of(lens, field, distance, wavelengths)
@@ -168,13 +186,13 @@ def _moments(
     found = _weigh(lens, scene, rule)
     throughput = known_values(found.throughput)
     if throughput is not None and not np.all(np.asarray(throughput) > 0):
-        _say_why(lens, scene, rule.symmetry, throughput)
+        _no_light(lens, scene, rule.symmetry, throughput)
     return found
 
 
 @partial(jit, wanted=LARGE)
 def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> FocusMoments:
-    """Moments of a rule."""
+    """Moments of a rule: traces its rays and weighs them."""
     points, weights = rule.points(lens, scene)
     weights = jnp.where(fits(rule.symmetry, scene.field), weights, 0)
     return weigh(lens, rule, weights, trace_bundle(lens, scene, points))
@@ -182,7 +200,7 @@ def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> FocusMoments:
 
 @jax.jit
 def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> FocusMoments:
-    """Moments of known rays with derivatives, without a search."""
+    """Moments, with derivatives, of rays that were found before; no search."""
     points, weights = rule.points(lens, scene)
     system, target = aims(lens, scene, points)
     bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
@@ -193,7 +211,8 @@ class _Trial(NamedTuple):
     """A rule tried on scenes.
 
     rule: the rule.
-    used: the rule as it was evaluated, with points of other orders and padding.
+    used: the rule as it was evaluated, with points of other orders and padding, which have weight
+        0.
     moments: its moments of each scene, NumPy arrays.
     found: its rays of each scene.
     """
@@ -205,7 +224,7 @@ class _Trial(NamedTuple):
 
 
 def scenes_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> list[Scene]:
-    """A scene of each field at each distance."""
+    """A list with one `Scene` for each field at each distance; arguments as in `converged_rule`."""
     lens.check()
     dtype = lens.curvature.dtype
     fields = _each(field_array(field, dtype), 2)
@@ -214,43 +233,52 @@ def scenes_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Number
 
 
 def _each(values: Array, rank: int) -> list[Array]:
-    """Rows of an array of a rank; for another rank the array itself."""
+    """The rows of an array of a given rank; for another rank a list of the array itself."""
     return [*values] if values.ndim == rank and values.size else [values]
 
 
 def converge(
     make: Callable[..., list[Scene]],
     lens: Lens,
-    seen: tuple[Numbers, Numbers, Numbers],
+    sought: tuple[Numbers, Numbers, Numbers],
     tolerance: float,
     places: Callable,
-    says: bool = True,
+    warns: bool = True,
 ) -> _Trial:
-    """The rule that meets the tolerance, as tried, for the scenes that `make` makes of fields,
-    distances and wavelengths `seen`. says: whether it warns of rounding."""
+    """Finds the rule that meets a tolerance.
+
+    make: makes a list of scenes from the lens and `sought`.
+    lens: the lens.
+    sought: fields, distances and wavelengths.
+    tolerance: relative error of the RMS spot size.
+    places: `at_sensor` or `best_focus`.
+    warns: whether it warns of rounding.
+
+    Returns the trial of that rule. ValueError inside a trace.
+    """
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
-    known = known_values((lens, seen))
+    known = known_values((lens, sought))
     if known is None:
         raise ValueError(
             "inside jax.jit or jax.vmap the number of rays cannot follow from a tolerance: make "
             "the rule outside and pass it on, rule=drt_jax.converged_rule(lens, field, distance, "
             "wavelengths, tolerance)"
         )
-    # Outside of any trace, even if this is called inside one: all that follows is known.
+    # `eval_context` leaves any trace that this is called in, so all that follows is known.
     with jax.core.eval_context():
-        lens, seen = known
-        scenes = make(lens, *seen)
-        return _try_orders(lens, scenes, symmetry_of(lens, seen[0]), tolerance, places, says)
+        lens, sought = known
+        scenes = make(lens, *sought)
+        return _try_orders(lens, scenes, symmetry_of(lens, sought[0]), tolerance, places, warns)
 
 
 def _try_orders(
     lens: Lens, scenes: Sequence[Scene], symmetry: Symmetry, tolerance: float, places: Callable,
-    says: bool
+    warns: bool
 ) -> _Trial:  # fmt: skip
-    """The first of three orders that agree: of Gauss rules or, if a ray fails or is clipped, of
-    rules fitted to the rest of the light."""
-    # A rule on the whole stop may miss an obscuration.
+    """The trial of the first of three successive orders that agree. Gauss rules on the stop are
+    tried first; if a ray fails or is clipped, rules fitted to the open part of the pupil."""
+    # The rays of a rule on the whole stop may all pass by a small obscuration.
     blocked = lens.apertures is not None and any(lens.apertures.blocks)
     solver: Solver = solve_aimed
     for clipped in (False, True)[blocked:]:
@@ -259,7 +287,7 @@ def _try_orders(
             trace = partial(_trace, lens, scenes, group.traced)
             rays, failing, cut = trace(solver)
             if failing and solver is solve_aimed and (clipped or not cut):
-                solver = solve  # some rays must be searched for
+                solver = solve  # aiming failed for some rays: search for them
                 rays, failing, cut = trace(solver)
             if failing and solver is solve:
                 check_order(lens)
@@ -269,12 +297,12 @@ def _try_orders(
                 trials = [*trials, trial][-3:]
                 changes = (_change(trials[0], later, places) for later in trials[1:])
                 change = max(changes, default=np.inf)
-                rough = max(_rounding(lens, found) for found in trial.moments)
-                if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rough):
-                    if says:
-                        tell(lens, "the spot", rough, tolerance, " of its size", 4)
-                    # If rounding hides their difference, take the last.
-                    return trials[-1 if 2 * rough > tolerance else 0]
+                rounded = max(_rounding(lens, found) for found in trial.moments)
+                if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rounded):
+                    if warns:
+                        warn_dtype(lens, "the spot", rounded, tolerance, " of its size", 4)
+                    # If rounding hides the differences, take the last of the three.
+                    return trials[-1 if 2 * rounded > tolerance else 0]
         else:
             break
     warnings.warn(
@@ -288,7 +316,7 @@ def _try_orders(
 def _trace(
     lens: Lens, scenes: Sequence[Scene], used: PupilRule, solver: Solver
 ) -> tuple[list[Traced], bool, bool]:
-    """The rays of a rule for all scenes, whether a ray fails, and whether one is clipped."""
+    """Rays of a rule for all scenes; whether a ray fails; and whether one is clipped."""
     rays = [trace_rule(lens, scene, used, solver) for scene in scenes]
     return rays, any(one.failing for one in rays), any(one.cut for one in rays)
 
@@ -296,19 +324,21 @@ def _trace(
 def _weighed(
     lens: Lens, scenes: Sequence[Scene], group: Group, rays: Sequence[Traced]
 ) -> Iterator[_Trial]:
-    """Rules of a group with their moments. ValueError if no light of a wavelength arrives."""
+    """Trials of the rules of a group, from its traced rays. ValueError if no light of a
+    wavelength arrives."""
     found = tuple(one.found for one in rays)
     for start in range(0, len(group.rules), AT_ONCE):
-        some = group.rules[start : start + AT_ONCE]
-        each = [weigh_rules(lens, [used for _, used in some], one) for one in rays]
-        for (rule, used), *moments in zip(some, *each, strict=True):
+        batch = group.rules[start : start + AT_ONCE]
+        each = [weigh_rules(lens, [used for _, used in batch], one) for one in rays]
+        for (rule, used), *moments in zip(batch, *each, strict=True):
             for scene, one in zip(scenes, moments, strict=True):
                 if not np.all(one.throughput > 0):
-                    _say_why(lens, scene, rule.symmetry, one.throughput)
+                    _no_light(lens, scene, rule.symmetry, one.throughput)
             yield _Trial(rule, used, tuple(moments), found)
 
 
 def _eps(lens: Lens) -> float:
+    """Machine epsilon of the lens's dtype."""
     return float(jnp.finfo(lens.curvature.dtype).eps)
 
 
@@ -319,7 +349,8 @@ def _rounding(lens: Lens, found: FocusMoments) -> float:
 
 
 def _change(before: _Trial, now: _Trial, places: Callable) -> float:
-    """Largest change of a covariance relative to its trace, at `places`, see `at_sensor`."""
+    """Largest change of a covariance from one trial to another, relative to its trace, at the
+    sensor positions `places`."""
     worst = 0.0
     for pair in zip(now.moments, before.moments, strict=True):
         spreads = [np.asarray(found.spread, float) for found in pair]
@@ -331,13 +362,16 @@ def _change(before: _Trial, now: _Trial, places: Callable) -> float:
     return worst
 
 
-def _say_why(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) -> None:
-    """Raises ValueError that says where the light of a wavelength without throughput ends.
-    throughput: (W,)."""
+def _no_light(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) -> None:
+    """Raises the ValueError that names the surfaces where the light of a wavelength without
+    throughput ends.
+
+    throughput: (W,).
+    """
     wavelength = int(np.argmin(np.asarray(throughput) > 0))
     lens, scene = known_values((lens, scene))
     with jax.core.eval_context():
-        # Checks the values of an eager gradient, which were not known before.
+        # In an eager gradient the values were not known before, so check them now.
         scene_of(lens, scene.field, scene.distance, scene.wavelengths)
         rule = Pattern(*gauss_points(_DIAGNOSIS, symmetry), symmetry)
         found = trace_rule(lens, scene, rule, solve).found

@@ -1,7 +1,9 @@
-"""The part of each cell of a grid of rays that light fills, and the middle of that part.
+"""Antialiasing of pupil edges: the fraction of each cell of a grid that light fills, and the
+centroid of that part.
 
-An edge is straight in a cell. With the middle a sum over cells is right to the third order of their
-side also where edges cut them: the value of a cell is that at the middle of its light.
+An edge is taken as a straight line within a cell. The value of a cell is the integrand at the
+centroid of its light, times the filled area. With this, a sum over cells has an error of the third
+order in the side of a cell, also where edges cut cells.
 """
 
 from typing import NamedTuple
@@ -19,41 +21,55 @@ from .beam import Beam
 def cover(
     lens: Lens, beam: Beam, stop: Array, hits: Array, places: Array, axes: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """The part of each cell of a grid of rays that light fills, (W, N, N), and how far the middle
-    of the light lies from the middle of the cell, (2, W, N, N) along x and y, in sides of a cell.
+    """Filled fraction and centroid of the light in each cell of a grid of rays.
 
-    stop: (2, W, N, N), where the rays of the grid cross the stop, in its semi-diameters.
-    hits: (2 S + 2, W, N, N), where they meet all surfaces, mm, of a clipped beam.
-    places: (2, W, Q), of the beam's rays in the plane of the grid, its points or directions.
-    axes: the middle and the step of the grid, (2, W) each.
+    lens: the lens with its apertures.
+    beam: traced rays; cells far from them count as dark.
+    stop: (2, W, N, N), crossings of the stop by the rays at the middles of the cells, in units of
+        its semi-diameter.
+    hits: (2 S + 2, W, N, N), mm, their hits on all surfaces; used for a clipped beam only.
+    places: (2, W, Q), positions of the beam's rays in the plane of the grid: stop points or
+        direction cosines.
+    axes: centre and step of the grid, (2, W) each.
+
+    Returns the fraction (W, N, N), and the centroid of the light relative to the middle of the
+    cell, (2, W, N, N), x and y in units of the sides of a cell.
     """
     least = _edge(1 - safe_sqrt(stop[0] ** 2 + stop[1] ** 2))
     if beam.clipped:
-        least = _clipped(lens, least, hits.reshape(2, -1, *stop.shape[1:]))
-    inside, middle = _filled(least)
+        least = _nearest_edge(lens, least, hits.reshape(2, -1, *stop.shape[1:]))
+    inside, middle = _clipped_square(least)
     return jnp.where(beam.near(places, *axes, stop.shape[-1]), inside, 0), middle
 
 
-def _clipped(lens: Lens, rim: "_Edge", hits: Array) -> "_Edge":
-    """Of each cell the edge that leaves the least of it, of the rim of the stop and the edges of
-    all surfaces, on which rays hit (2, S + 1, W, N, N)."""
+def _nearest_edge(lens: Lens, rim: "_Edge", hits: Array) -> "_Edge":
+    """For each cell, the edge that blocks most of it.
+
+    rim: the edge of the stop.
+    hits: (2, S + 1, W, N, N), mm, on all surfaces, whose edges are compared with the rim.
+    """
     x, y = hits
     edges = clearance(lens, (x, y))
 
-    def nearest(found: _Edge, depth: Array) -> tuple[_Edge, None]:
-        """The one or the other; most edges cut no light."""
+    def closer(found: _Edge, depth: Array) -> tuple[_Edge, None]:
+        """One step of the scan over edges: replaces the edge where the new one, with the
+        clearance `depth`, blocks more of a cell. `lax.cond` skips edges that cut no cell, which
+        are most of them."""
         new = _edge(jnp.where(jnp.isfinite(depth), depth, 1))
-        deep, least = jax.lax.stop_gradient((_cells_deep(new), _cells_deep(found)))
-        cuts = (deep < jnp.minimum(least, 0.5)) & (least > -0.5)
+        new_depth, least = jax.lax.stop_gradient((_relative_depth(new), _relative_depth(found)))
+        cuts = (new_depth < jnp.minimum(least, 0.5)) & (least > -0.5)
         pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(cuts, a, b), new, old)  # noqa: E731
         return jax.lax.cond(jnp.any(cuts), pick, lambda _, old: old, new, found), None
 
-    return jax.lax.scan(nearest, rim, edges)[0]
+    return jax.lax.scan(closer, rim, edges)[0]
 
 
 class _Edge(NamedTuple):
-    """How deep the middles of cells (W, N, N) lie inside of an edge, in any unit, and how much that
-    changes over a cell, down and across."""
+    """An edge as a linear function in each cell (W, N, N).
+
+    depth: signed distance of the middle of the cell inside of the edge, in any unit.
+    down, across: change of the depth over one cell along y and along x.
+    """
 
     depth: Array
     down: Array
@@ -61,21 +77,35 @@ class _Edge(NamedTuple):
 
 
 def _edge(depth: Array) -> _Edge:
+    """The linear functions of an edge from its depth (W, N, N) on the grid, by finite
+    differences."""
     down, across = jnp.gradient(depth, axis=(-2, -1))
     return _Edge(depth, down, across)
 
 
-def _cells_deep(edge: _Edge) -> Array:
-    """The depth over the sum of the changes: 0.5 for a cell that lies just inside, -0.5 outside."""
+def _relative_depth(edge: _Edge) -> Array:
+    """Depth / (|down| + |across|): 0.5 for a cell that just lies inside of the edge, -0.5 for
+    one that just lies outside."""
     change = jnp.abs(edge.down) + jnp.abs(edge.across)
     return jnp.where(change > 0, safe_divide(edge.depth, change), jnp.sign(edge.depth) * jnp.inf)
 
 
-def _filled(edge: _Edge) -> tuple[Array, Array]:
-    """The part of each cell, (W, N, N), inside of an edge, and its middle (2, W, N, N)."""
+def _clipped_square(edge: _Edge) -> tuple[Array, Array]:
+    """Area and centroid of the part of a unit square that lies inside of an edge, (W, N, N) and
+    (2, W, N, N).
+
+    In the cell the depth is t + a u + b v, with a >= b >= 0 the changes along the steeper axis u
+    and the other axis v, and u, v from -1/2 to 1/2. For |t| <= (a - b) / 2 the edge crosses two
+    opposite sides: the area is 1/2 + t / a, the first moments are
+    1/8 - ((t / a)^2 + (b / a)^2 / 12) / 2 along u and (b / a) / 12 along v. Otherwise the edge cuts
+    off a triangle with the legs l / a and l / b, l = (a + b) / 2 - |t|, and the area l^2 / (2 a b).
+    The moment of the light about the middle of the cell is area x (1/2 - leg / 3) along each axis,
+    whether the triangle is the light or what is cut off.
+    """
     down, across = jnp.abs(edge.down), jnp.abs(edge.across)
     a, b = jnp.maximum(down, across), jnp.minimum(down, across)
-    # A unit square cut across by a line: its area is linear in between, a parabola at corners.
+    # Area: linear in t while the edge crosses opposite sides, a parabola where it cuts off a
+    # corner.
     whole, flat = (a + b) / 2, (a - b) / 2
     t = jnp.clip(edge.depth, -whole, whole)
     at_corner, left = jnp.abs(t) > flat, whole - jnp.abs(t)
@@ -83,7 +113,7 @@ def _filled(edge: _Edge) -> tuple[Array, Array]:
     corner = legs[0] * legs[1] / 2
     linear = 0.5 + safe_divide(t, a)
     part = jnp.where(at_corner, jnp.where(t > 0, 1 - corner, corner), linear)
-    # Its first moments along the steeper and the other axis are those of what is cut off.
+    # First moments along the steeper and the other axis, see above.
     slant = safe_divide(b, a)
     steep = 1 / 8 - (safe_divide(t, a) ** 2 + slant**2 / 12) / 2
     pairs = zip(legs, (steep, slant / 12))

@@ -1,6 +1,7 @@
-"""Moments over a range of object distances, and the cheapest model for trained parameters.
+"""Moments over a range of object distances, and the cheapest model of the moments for trained
+parameters.
 
-`FocusMoments` are interpolated in 1/distance, in which they are smooth to infinity.
+`FocusMoments` are interpolated in 1/distance, of which they are smooth functions up to infinity.
 """
 
 import dataclasses
@@ -22,14 +23,15 @@ from .spot import Moments
 from .zernike import chebyshev
 
 _MAX_NODES = 64
-# Relative amount by which a distance may exceed its range: 1 / (1 / far) is not always far.
+# Relative amount by which a distance may exceed its range, because 1 / (1 / far) is not exactly
+# far.
 _ROUNDED = 1e-5
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class DepthMoments:
-    """`FocusMoments` as polynomials in 1/distance.
+    """`FocusMoments` as Chebyshev series in 1/distance.
 
     near, far: (), range of the distance, mm.
     series: `FocusMoments` whose leaves have a first axis of Chebyshev coefficients in 1/distance.
@@ -40,8 +42,10 @@ class DepthMoments:
     series: FocusMoments
 
     def at(self, distance: Numbers) -> FocusMoments:
-        """Moments of an object at a distance between near and far, (), mm. ValueError for a known
-        distance outside."""
+        """`FocusMoments` of an object at a distance between near and far.
+
+        distance: (), mm. ValueError for a known distance outside.
+        """
         far = distance_array(distance, self.far.dtype)
         if concrete((distance, self.near, self.far)):
             place, near, end = np.array([distance, self.near, self.far], float).tolist()
@@ -62,11 +66,15 @@ def depth_moments(
     wavelengths: Numbers,
     tolerance: float = 1e-9,
 ) -> DepthMoments:
-    """Moments for every sensor position and every distance between `near` and `far`, mm.
+    """Moments for every sensor position and every distance between `near` and `far`.
 
-    The number of Chebyshev nodes in 1/distance doubles until the last coefficients of the moments
-    are below `tolerance` relative to the largest; each node has its own converged rule. Other
-    arguments as in `focus_moments`. ValueError inside a trace.
+    lens, field, wavelengths: as in `focus_moments`.
+    near, far: range of the distance, mm.
+    tolerance: bound of the last coefficients of the moments, relative to the largest.
+
+    Returns `DepthMoments`. The number of Chebyshev nodes in 1/distance doubles until the tolerance
+    is met, from 4 to at most 64, where it warns; each node has its own converged rule. ValueError
+    inside a trace, and unless 0 < near < far.
     """
     if not concrete((near, far)):
         raise ValueError("inside jax.jit or jax.vmap the nodes cannot follow: give near and far")
@@ -112,13 +120,17 @@ def moments_model(
     wavelengths: Numbers,
     tolerance: float = 1e-6,
 ) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], Moments]]:
-    """The cheapest exact model of the moments for trained parameters: their initial values, and a
-    function (values, distance) -> `Moments`. If only the sensor is trained, the function is a
-    polynomial in the sensor position and 1/distance; otherwise it traces the rays.
+    """The cheapest exact model of the moments for trained parameters. If only the sensor is
+    trained, the model is a polynomial in the sensor position and 1/distance; otherwise it traces
+    the rays.
 
+    lens: the lens.
     trained: names of fields of `Lens`.
-    distances: nearest and farthest, mm; equal for one distance.
     field, wavelengths, tolerance: as in `focus_moments`.
+    distances: nearest and farthest, mm; equal for one distance.
+
+    Returns a dict with the initial values of the trained parameters, and a function (values,
+    distance) -> `Moments`.
     """
     near, far = distances
     for distance in distances:
@@ -132,12 +144,14 @@ def moments_model(
             at = depth_moments(lens, field, near, far, wavelengths, tolerance).at
 
         def from_plane(values, distance):
+            """Moments from the polynomials, without a trace."""
             return at(distance).at(values.get("sensor", lens.sensor))
 
         return values, from_plane
     rule = converged_focus_rule(lens, field, np.unique([near, far]), wavelengths, tolerance)
 
     def retrace(values, distance):
+        """Moments of rays that are traced with a fixed rule."""
         changed = dataclasses.replace(lens, **values)
         scene = scene_of(changed, field, distance, wavelengths)
         return moments(changed, scene, rule, solve_reverse).at(changed.sensor)

@@ -1,4 +1,4 @@
-"""Why no light arrives: the surface that stops it, and surfaces that cross."""
+"""Why no light arrives: the surfaces that stop it, and surfaces that cross."""
 
 import functools
 
@@ -27,14 +27,15 @@ _HOW = {
     Status.NO_INDEX: "has no index",
     Status.CROSSED: "steps back to {}, which crosses its neighbour",
 }
-# Most reasons in a message.
+# Largest number of reasons in a message.
 _PARTS = 3
 
 
 def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, wavelength: int) -> str:
-    """What stops the light of a wavelength, as text: "87% misses surface 3, ...". Outside of
-    traces.
+    """The surfaces that stop the light of a wavelength, as text: "87% misses surface 3, ...". For
+    use outside of traces.
 
+    lens, scene: what was traced.
     rule: pupil rule.
     found: rays of the rule.
     wavelength: index of the wavelength.
@@ -54,7 +55,8 @@ def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, wavelength:
 
 
 def crossed(lens: Lens) -> str:
-    """The surfaces of a known lens that cross, as text after a semicolon; "" if none do."""
+    """The surfaces of a known lens that cross, as text after a semicolon; an empty text if none
+    do."""
     pairs = neighbours_now(lens)
     places = zip(pairs, crossings(lens, pairs), strict=True)
     parts = [describe_crossing(lens, pair, place) for pair, place in places if place is not None]
@@ -62,7 +64,8 @@ def crossed(lens: Lens) -> str:
 
 
 def check_order(lens: Lens) -> None:
-    """ValueError if the vertices of two neighbours of a known lens are in the wrong order."""
+    """ValueError if the vertices of two neighbouring surfaces of a known lens are in the wrong
+    order."""
     for pair in neighbours_now(lens):
         if pair.gap <= 0 and pair.second < lens.count:
             raise ValueError(f"{describe_crossing(lens, pair, 0.0)}; light cannot go backwards")
@@ -70,9 +73,9 @@ def check_order(lens: Lens) -> None:
 
 @functools.partial(jit, wanted=ONCE)
 def _last_surface(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Array, Array]:
-    """Status (W, Q) of rays and the surface where each ends, (W, Q), int32; S for the sensor, -1
-    for none. It is the first surface that clips the ray; for other rays, where the paraxial launch
-    towards the stop point fails."""
+    """Status (W, Q) of rays, and the index (W, Q), int32, of the surface where each ends; S for
+    the sensor, -1 for none. For a clipped ray it is the first surface that clips it; for other
+    rays the surface where the paraxial launch towards the stop point fails."""
     points, _ = rule.points(lens, scene)
     system, target = aims(lens, scene, points)
     bundle = bundle_of(lens, scene, system, target, found)

@@ -1,10 +1,13 @@
-"""Encircled energy: the part of the light within a circle about its centroid.
+"""Encircled energy: the fraction of the light within a circle about its centroid.
 
-Waves: the integral of the pattern over a circle of radius R is that of the transfer function times
-R J1(2 pi R f) / f over all frequencies f; on the grid of the autocorrelation of the pupil function
-it is exact but for light that the grid repeats. Rays: each has the width of its cell of the stop on
-the sensor, as in the kernel of rays, and so passes the circle gradually, measured in the square of
-the radius; so the part is smooth in all numbers, 0 at R = 0 and 1 beyond the last ray.
+Waves: the pattern is the Fourier integral of the transfer function T(f), and the integral of a wave
+exp(2 pi i f.x) over a circle of radius R is R J1(2 pi R |f|) / |f|. So the energy is the integral
+of T(f) R J1(2 pi R |f|) / |f| over all frequencies. On the grid of the autocorrelation of the pupil
+function this is exact, except for periodic copies of the pattern.
+
+Rays: each ray is a spot with the width of its cell of the stop on the sensor, as in the kernel of
+rays. So it passes the circle gradually, as a function of the square of the radius. This makes the
+fraction a smooth function of all numbers, 0 at R = 0 and 1 beyond the last ray.
 """
 
 import functools
@@ -19,15 +22,16 @@ from ..lens.lens import Lens
 from ..numerics import Numbers, einsum, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
-from .ray_psf import below, ray_spots
+from .ray_psf import ray_spots, spot_below
 from .refined import TOLERANCE, beams_of, to_tolerance
 from .transfer import Model, arrays_of, centre_of, through_focus
 from .wave_psf import amplitudes, autocorrelation, period
 
 _UM = 1e3  # per mm
-# Degree of the polynomials; cells to begin with, as energy has no better use of cells at edges.
+# Degree of the polynomials; and the smallest number of cells to begin with, because the treatment
+# of edge cells does not help the energy.
 _DEGREE, _LEAST = 14, 96
-# Polynomials 9.4.4 and 9.4.6 of Abramowitz and Stegun, in (z / 3)^2 and in 3 / z: right to 1e-7.
+# Polynomials 9.4.4 and 9.4.6 of Abramowitz and Stegun, in (z / 3)^2 and in 3 / z: accurate to 1e-7.
 _NEAR = (0.5, -0.56249985, 0.21093573, -0.03954289, 0.00443319, -0.00031761, 0.00001109)
 _SIZE = (0.79788456, 0.00000156, 0.01659667, 0.00017105, -0.00249511, 0.00113653, -0.00020033)
 _PHASE = (-2.35619449, 0.12499612, 0.0000565, -0.00637879, 0.00074348, 0.00079824, -0.00029166)
@@ -47,22 +51,28 @@ def encircled_energy(
     cells: int | None = None,
     tolerance: float = TOLERANCE,
 ) -> Array:
-    """The part (F, N) of the light on the sensor within circles about the centroid of all
-    wavelengths; (F, Z, N) with Z values of `focus`. 0 where no light arrives.
+    """Fraction of the light on the sensor within circles about the centroid of all wavelengths.
 
-    radii: (N,) mm. cells: of the grid of the pupil along a side; None: as many as keep the error
-    of the part below `tolerance`, and what a grid of waves repeats out of the largest circle;
-    inside `jit` and `vmap` 128. A spot too large for the grid, 64 Airy radii for 128 cells, is
-    counted by rays. Other arguments, and errors, as of `transfer`.
+    lens, fields, distance, wavelengths, model, focus, wavelength_weights, rule, degree: as in
+        `transfer`.
+    radii: (N,), mm.
+    cells: number of cells along a side of the pupil grid. None: as many as keep the error of the
+        fraction below `tolerance` and periodic copies of waves out of the largest circle; inside
+        `jit` and `vmap` 128.
+    tolerance: absolute error of the fraction.
+
+    Returns (F, N), or (F, Z, N) with Z values of `focus`; 0 where no light arrives. A spot too
+    large for the grid of waves, 64 Airy radii for 128 cells, is computed by rays. Errors as of
+    `transfer`.
     """
     scene = fields, distance, wavelengths
-    given = arrays_of(lens, scene, model, focus, wavelength_weights, rule, "radii", radii)
-    angles, axis, values, spectrum, steps, rule = given
+    arrays = arrays_of(lens, scene, model, focus, wavelength_weights, rule, "radii", radii)
+    angles, axis, values, spectrum, steps, rule = arrays
     beams = beams_of(lens, angles, axis, rule, degree)
-    of = functools.partial(_encircled, model=model)
+    run = functools.partial(_encircled, model=model)
     known = lens, beams, axis.wavelengths, values, spectrum, steps
     fewest = lambda *known: max(_LEAST, _cells(*known) if model == "waves" else 0)  # noqa: E731
-    return to_tolerance(of, known, cells, tolerance, fewest)
+    return to_tolerance(run, known, cells, tolerance, fewest)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells"))
@@ -76,9 +86,10 @@ def _encircled(
     model: Model,
     cells: int,
 ) -> Array:
-    given = wavelengths, radii, spectrum, model, cells
-    of = lambda beam: encircled(lens, beam, *given)  # noqa: E731
-    return jax.vmap(lambda beam: through_focus(beam, focus, of))(beams)
+    """`encircled_energy` of beams with F as first axis, for a number of cells."""
+    settings = wavelengths, radii, spectrum, model, cells
+    one = lambda beam: encircled(lens, beam, *settings)  # noqa: E731
+    return jax.vmap(lambda beam: through_focus(beam, focus, one))(beams)
 
 
 def encircled(
@@ -90,7 +101,8 @@ def encircled(
     model: Model,
     cells: int,
 ) -> Array:
-    """The parts (N,) of one beam, see `encircled_energy`."""
+    """Fractions (N,) of one beam; arguments as in `encircled_energy`. spectrum: (W,), weights of
+    the wavelengths."""
     share, centre = centre_of(beam, spectrum)
     parts = _of_rays(lens, beam, wavelengths, radii, centre, cells)
     if model == "waves":
@@ -103,24 +115,31 @@ def encircled(
 def _of_rays(
     lens: Lens, beam: Beam, wavelengths: Array, radii: Array, centre: Array, cells: int
 ) -> Array:
-    """(W, N)."""
+    """Fractions (W, N) of geometric spots.
+
+    A spot at the distance r with the half width w along the radius extends from r^2 - reach to
+    r^2 + reach in the square of the radius, reach = 2 r w + w^2. With B the integral of the
+    biweight profile, the fraction within R is B((R^2 - r^2) / reach). Where the profile extends
+    below 0, it is reflected there, so that each ray keeps the weight 1: the fraction is
+    B((R^2 - r^2) / reach) + B((R^2 + r^2) / reach) - 1.
+    """
     hits, width, weights = ray_spots(lens, beam, cells)
     x, y = hits - centre[:, None, None]
     square = x * x + y * y
-    along = safe_divide((width[0] * x) ** 2 + (width[1] * y) ** 2, square)
-    along = jnp.where(square > 0, along, width[0] * width[1])
-    # How far the square of the radius goes from the middle of a ray to its edge.
-    reach = 2 * safe_sqrt(square * along) + along
+    across = safe_divide((width[0] * x) ** 2 + (width[1] * y) ** 2, square)
+    across = jnp.where(square > 0, across, width[0] * width[1])
+    # Half width of the spot in the square of the radius; `across` is w^2.
+    reach = 2 * safe_sqrt(square * across) + across
 
-    def part(inside: Array) -> Array:
+    def below_edge(inside: Array) -> Array:
         return jnp.where(
-            reach > 0, below(safe_divide(inside, reach)), (inside >= 0).astype(inside.dtype)
+            reach > 0, spot_below(safe_divide(inside, reach)), (inside >= 0).astype(inside.dtype)
         )
 
     def at(radius: Array) -> Array:
-        # What a ray would have below a square of 0 is turned back.
-        found = part(radius**2 - square) + part(radius**2 + square) - 1
-        return jnp.sum(found * weights, axis=-1)
+        # The reflection of the part below 0, see above.
+        fraction = below_edge(radius**2 - square) + below_edge(radius**2 + square) - 1
+        return jnp.sum(fraction * weights, axis=-1)
 
     return safe_divide(jax.lax.map(at, radii).T, beam.throughput[:, None])
 
@@ -128,9 +147,11 @@ def _of_rays(
 def _of_waves(
     lens: Lens, beam: Beam, wavelengths: Array, radii: Array, centre: Array, cells: int
 ) -> Array:
-    """(W, N)."""
+    """Fractions (W, N) of diffraction patterns: the sum over the frequencies of the grid, see
+    the module docstring."""
     amplitude, step = amplitudes(lens, beam, wavelengths, cells)
-    # One half of all frequencies; the other has the conjugate values.
+    # Half of all frequencies; those of negative fx have conjugate values and count by a factor of
+    # 2.
     transfer = autocorrelation(amplitude)
     unit = step * (beam.index * _UM / wavelengths)[None]
     lags = np.fft.fftfreq(2 * cells, 1 / (2 * cells))
@@ -139,7 +160,8 @@ def _of_waves(
     turn = 2 * jnp.pi * (fx * centre[0] + fy * centre[1])
     real = transfer.real * jnp.cos(turn) - transfer.imag * jnp.sin(turn)
     real = real * jnp.asarray(np.where(lags[:cells] > 0, 2, 1), unit.dtype)[None, None]
-    # By the light itself: squares of amplitudes lack a part of it in the cells at edges.
+    # Normalise by the throughput, and not by T(0): in edge cells the squares of the mean amplitudes
+    # miss part of the light.
     area = unit[0] * unit[1] * step[0] * step[1]
     real = real * safe_divide(area, beam.throughput)[:, None, None]
     frequency = safe_sqrt(fx**2 + fy**2)
@@ -155,6 +177,7 @@ def _bessel(z: Array) -> Array:
     """J1(z) / z for z >= 0."""
 
     def sum_of(terms: tuple[float, ...], t: Array) -> Array:
+        """A polynomial in t by Horner's scheme."""
         total = jnp.full_like(t, terms[-1])
         for term in terms[-2::-1]:
             total = total * t + term
@@ -171,13 +194,14 @@ def _bessel(z: Array) -> Array:
 def _cells(
     lens: Lens, beams: Beam, wavelengths: Array, radii: Array, spectrum: Array, focus: Array
 ) -> Array:
-    """So many cells, (), that the spots and the circles fit into what the grid repeats."""
-    of = lambda beam: jnp.max(cells_needed(beam, wavelengths, radii))  # noqa: E731
-    return jnp.max(jax.vmap(lambda beam: through_focus(beam, focus, of))(beams))
+    """Number of cells, (), for which all spots and circles fit into one period of the pattern."""
+    most = lambda beam: jnp.max(cells_needed(beam, wavelengths, radii))  # noqa: E731
+    return jnp.max(jax.vmap(lambda beam: through_focus(beam, focus, most))(beams))
 
 
 def cells_needed(beam: Beam, wavelengths: Array, radii: Array) -> Array:
-    """So many cells (W,) that the spot and circles fit into what the grid repeats."""
+    """Number of cells (W,) for which the spot and the largest circle fit into one period of the
+    pattern."""
     places = jnp.where(beam.known & (beam.throughput > 0)[:, None], beam.hits[:, -1], jnp.nan)
     reach = jnp.nan_to_num(jnp.nanmax(places, -1) - jnp.nanmin(places, -1))
     return jnp.max((reach + jnp.max(radii)) / period(beam, wavelengths, 1), axis=0)

@@ -1,6 +1,8 @@
-"""Fans of rays: transverse and path errors along two diameters of the stop, and colour on the axis.
+"""Ray fans: transverse ray errors and path differences along two diameters of the stop, and axial
+colour.
 
-Where an exit pupil would have to be found first, the stop is the label: a fan runs over its points.
+Rays are labelled by their stop point, so no exit pupil has to be found: a fan runs over points of
+the stop.
 """
 
 import functools
@@ -18,20 +20,20 @@ from ..lens.scene import Scene, fields_array, scene_of
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.status import Status
 from ..rays.trace import trace_bundle
-from .rounding import tell_of_focus, tell_of_paths
+from .rounding import warn_of_focus, warn_of_paths
 from .wavefront import path_differences
 
 
 class RayFans(NamedTuple):
-    """Rays through N points of two diameters of the stop, of F fields and W wavelengths.
+    """Rays through N points on each of two diameters of the stop, for F fields and W wavelengths.
 
     pupil: (N,), from -1 to 1, in units of the stop's semi-diameter.
-    tangential, sagittal: (F, W, N, 2) mm, x and y on the sensor of the rays through points on the
-        y axis of the stop and on its x axis, less those of the reference chief ray.
-    tangential_path, sagittal_path: (F, W, N) waves, path of the chief ray of the same wavelength
+    tangential, sagittal: (F, W, N, 2), mm, x and y on the sensor of the rays through points on the
+        y axis and on the x axis of the stop, less those of the reference chief ray.
+    tangential_path, sagittal_path: (F, W, N), waves, path of the chief ray of the same wavelength
         less that of the ray, to the reference sphere of `wavefront`.
 
-    All but the first are inf for a ray that fails or is clipped, and where a chief ray fails.
+    All but `pupil` are inf for a ray that fails or is clipped, and where a chief ray fails.
     """
 
     pupil: Array
@@ -44,8 +46,9 @@ class RayFans(NamedTuple):
 class AxialColour(NamedTuple):
     """Foci on the axis, mm along z from the sensor; inf for none.
 
-    paraxial: (W,). real: (W, N), where rays through N heights on the stop cross the chief ray of
-        the field 0: spherical aberration by colour.
+    paraxial: (W,), paraxial foci.
+    real: (W, N), where rays through N heights on the stop cross the chief ray of the field 0:
+        spherical aberration for each wavelength.
     """
 
     paraxial: Array
@@ -62,20 +65,23 @@ def ray_fans(
 ) -> RayFans:
     """Transverse ray errors and path differences along the y and the x axis of the stop.
 
-    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
-    count: N, evenly spaced points from rim to rim; odd to hold the centre.
-    reference: index of the wavelength whose chief ray transverse errors count from; None: the
-        middle one, W // 2. Paths count from the chief ray of each wavelength.
+    lens: the lens.
+    fields: (F,) along y or (F, 2), radians.
+    distance: mm, inf allowed.
+    wavelengths: (W,), um.
+    count: N, number of evenly spaced points from rim to rim; odd to contain the centre.
+    reference: index of the wavelength whose chief ray transverse errors are measured from; None:
+        the middle one, W // 2. Paths are measured from the chief ray of each wavelength.
 
-    As OpticStudio plots ey against Py and ex against Px, with rays aimed at the real stop; without
-    aiming, of `with_paraxial_pupil(lens)`. Differentiable like `trace_rays`. Warns of float32 as
-    `wavefront` does. ValueError as of `scene_of`.
+    Returns `RayFans`, as OpticStudio plots ey against Py and ex against Px with rays aimed at the
+    real stop; for its plots without aiming, pass `with_paraxial_pupil(lens)`. Differentiable like
+    `trace_rays`. Warns of float32 as `wavefront` does. ValueError as of `scene_of`.
     """
     if not isinstance(count, int | np.integer) or count < 2:
         raise ValueError(f"count: expected at least 2, a whole number, got {count!r}")
     heights = jnp.linspace(-1, 1, int(count), dtype=lens.curvature.dtype)
     axis = scene_of(lens, 0.0, distance, wavelengths)
-    tell_of_paths(lens, axis, fields_array(fields, lens.curvature.dtype))
+    warn_of_paths(lens, axis, fields_array(fields, lens.curvature.dtype))
     hit, _, opd, good = _of_fields(lens, fields, distance, wavelengths, heights)
     middle = hit.shape[1] // 2 if reference is None else reference
     if not -hit.shape[1] <= middle < hit.shape[1]:
@@ -94,16 +100,18 @@ def axial_colour(
 ) -> AxialColour:
     """Where light of each wavelength is in focus on the axis, see `AxialColour`.
 
-    distance: mm, inf allowed. wavelengths: (W,) um. heights: (N,) on the y axis of the stop, in
-    units of its semi-diameter, none 0.
+    lens: the lens.
+    distance: mm, inf allowed.
+    wavelengths: (W,), um.
+    heights: (N,), on the y axis of the stop, in units of its semi-diameter; none may be 0.
 
-    The paraxial foci leave out tilts and decentres. Warns of float32 as `field_curvature` does.
+    The paraxial foci ignore tilts and decentres. Warns of float32 as `field_curvature` does.
     ValueError as of `scene_of`.
     """
     points = real_array("heights", heights, lens.curvature.dtype)
     if points.ndim != 1:
         raise ValueError(f"heights: expected (N,), got shape {points.shape}")
-    tell_of_focus(lens, distance, wavelengths)
+    warn_of_focus(lens, distance, wavelengths)
     hit, slope, _, good = _of_fields(lens, 0.0, distance, wavelengths, points)
     height, bend = (a[0, :, 1 : len(points) + 1, 1] - a[0, :, :1, 1] for a in (hit, slope))
     arrives = good[0, :, 1 : len(points) + 1] & good[0, :, :1] & (bend != 0)
@@ -114,8 +122,12 @@ def axial_colour(
 def _of_fields(
     lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, heights: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Hits and slopes (F, W, 1 + 2 N, 2), path differences and whether rays arrive, of the chief
-    ray and those through heights (N,) on the y axis and on the x axis of the stop."""
+    """The chief ray, and the rays through heights (N,) on the y axis and then on the x axis of the
+    stop.
+
+    Returns hits (F, W, 1 + 2 N, 2), mm, slopes of the same shape, path differences (F, W, 1 + 2 N),
+    waves, and whether each ray arrives, bool.
+    """
     angles = fields_array(fields, lens.curvature.dtype)
     return _traced(lens, angles, scene_of(lens, 0.0, distance, wavelengths), heights)
 
@@ -124,6 +136,7 @@ def _of_fields(
 def _traced(
     lens: Lens, fields: Array, axis: Scene, heights: Array
 ) -> tuple[Array, Array, Array, Array]:
+    """`_of_fields` of arrays."""
     none, first = jnp.zeros_like(heights), jnp.zeros_like(heights[:1])
     points = jnp.concatenate([first, none, heights]), jnp.concatenate([first, heights, none])
 
@@ -131,7 +144,7 @@ def _traced(
         bundle = trace_bundle(lens, Scene(field, axis.distance, axis.wavelengths), points)
         opd, status, _ = path_differences(lens, axis.wavelengths, bundle)
         whole = (status == Status.OK) | (status == Status.CLIPPED)
-        # A chief ray may be clipped: others are measured from it all the same.
+        # A clipped chief ray still serves as the reference of the others.
         good = (status == Status.OK) | (whole & (np.arange(status.shape[-1]) == 0)[None])
         *across, along = (jnp.where(whole, a, 0) for a in bundle.arrival)
         hit = jnp.stack([jnp.where(whole, h[-1], 0) for h in bundle.hits], axis=-1)

@@ -1,4 +1,4 @@
-"""From a field angle to its image point, and back, by the real chief ray."""
+"""From a field angle to its image point and back, by the real chief ray."""
 
 import jax
 import jax.numpy as jnp
@@ -13,33 +13,42 @@ from ..numerics import Numbers, real_array, safe_divide
 from ..rays.trace import trace_bundle
 
 _STEPS = 20
-# Stop points: that of the chief ray, and one beside it, because the steps of the search follow from
-# the width of the beam. Without it the chief ray is not found if the stop is at the first vertex.
+# Stop points: the centre for the chief ray, and one beside it, because the search scales its steps
+# with the width of the beam. Without it the chief ray is not found if the stop is at the first
+# vertex.
 CHIEF = np.array([[0.0, 0.0], [0.0, 0.1]])
 
 
 def image_point(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Points of the chief rays on the sensor, (W, 2), x and y along its axes, mm; 0 where the ray
-    fails. The chief ray passes the centre of the stop. Arguments as in `trace_rays`. Differentiable
-    in every mode. The centroid of a spot is another point, see `psf_moments`."""
+    """Points where the chief rays meet the sensor. The chief ray passes through the centre of the
+    stop.
+
+    lens, field, distance, wavelengths: as in `trace_rays`.
+
+    Returns (W, 2), x and y along the axes of the sensor, mm; 0 where the ray fails. Differentiable
+    in every mode. The centroid of a spot is another point, see `psf_moments`.
+    """
     return _image_point(lens, scene_of(lens, field, distance, wavelengths))
 
 
 @jax.jit
 def _image_point(lens: Lens, scene: Scene) -> Array:
+    """`image_point` of a scene."""
     points = jnp.asarray(CHIEF, lens.curvature.dtype)
     hits = trace_bundle(lens, scene, tuple(points)).hits
     return jnp.stack([h[-1, :, 0] for h in hits], axis=-1)
 
 
 def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Numbers) -> Array:
-    """The field (2,), along x and y, whose chief ray meets the sensor at a point, radians; inf if
-    none was found. Newton's method from the paraxial field; derivatives by the implicit function
-    theorem.
+    """The field whose chief ray meets the sensor at a given point.
 
+    lens: the lens.
     point: (2,), along the axes of the sensor, mm.
     distance: as in `trace_rays`.
     wavelength: one, um.
+
+    Returns (2,), angles along x and y, radians; inf if none was found. Newton's method from the
+    paraxial field; derivatives by the implicit function theorem.
     """
     scene = scene_of(lens, 0.0, distance, wavelength)
     target = real_array("point", point, lens.curvature.dtype)
@@ -52,6 +61,7 @@ def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Nu
 
 @jax.jit
 def _field_of_image(lens: Lens, scene: Scene, target: Array) -> Array:
+    """`field_of_image` of checked arguments."""
     dtype = target.dtype
     unit = image_height(lens, jnp.asarray(jnp.pi / 4, dtype), scene.distance, scene.wavelengths)[0]
     start = jnp.arctan(safe_divide(target, jnp.broadcast_to(unit, (2,))))

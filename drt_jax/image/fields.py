@@ -1,8 +1,8 @@
-"""Kernels over the whole field and over depth, computed once on a small grid of object points.
+"""PSF kernels over the whole field and over depth, computed once on a small grid of object points.
 
 The nodes are equidistant in the tangents of the field angles along x and y, and in 1 / distance.
-For a rotationally symmetric lens an eighth of the nodes is traced. Mirroring and swapping x and y,
-which are exact on pixels, give the others.
+For a rotationally symmetric lens only an eighth of the nodes is traced. Mirroring, and swapping x
+and y, give the others; both are exact on pixels.
 """
 
 import dataclasses
@@ -35,11 +35,15 @@ _ORDER = 4
 class GridMethod:
     """Settings of the kernels over the field, made by `grid_method` for `kernel_grid`.
 
-    step: (), spacing of the nodes, tangent. distances: (D,) mm, equidistant in 1 / distance.
-    pixel: (), side, mm. model: PSF model of the kernels, see `converged_psf`.
-    nearest: (D, U), index of the traced node with light that is nearest to each traced node.
-    half: number of nodes on each side of the axis, along y and x. size: side of a kernel, pixels.
-    symmetry: that of the lens. together: see `grid_method`.
+    step: (), spacing of the nodes, tangent of the field angle.
+    distances: (D,), mm, equidistant in 1 / distance.
+    pixel: (), side of a pixel, mm.
+    model: PSF model of the kernels, see `converged_psf`.
+    nearest: (D, U), int32, for each traced node the index of the nearest traced node with light.
+    half: number of nodes on each side of the axis, along y and x.
+    size: number of pixels along a side of a kernel.
+    symmetry: of the lens.
+    together: see `grid_method`.
     """
 
     step: Array
@@ -60,11 +64,11 @@ class KernelGrid:
     """PSF kernels of a lens at D distances, Ny x Nx fields and W wavelengths.
 
     step: (), spacing of the nodes, tangent of the field angle; the middle node is the axis.
-    vergences: (D,) 1/mm, of the objects.
-    points: (D, Ny, Nx, W, 2) mm, centres of the kernels on the sensor: the centroids of the light.
+    vergences: (D,), 1/mm, of the objects.
+    points: (D, Ny, Nx, W, 2), mm, centres of the kernels on the sensor: the centroids of the light.
     solid_angle: (D, Ny, Nx, W), solid angle of the light on the sensor, as an area in direction
         cosines: irradiance = radiance x solid_angle.
-    outside: (D, Ny, Nx, W), fraction of the light that falls outside a kernel.
+    outside: (D, Ny, Nx, W), fraction of the light that falls outside of a kernel.
     kernels: (D, Ny, Nx, W, K, K) [y, x], with the sum 1 - outside; 0 where no light arrives.
     """
 
@@ -82,23 +86,31 @@ class KernelGrid:
 
 
 def unique_nodes(half: tuple[int, int], symmetry: Symmetry) -> tuple[np.ndarray, ...]:
-    """Traced nodes (U, 2), x and y in steps. For each node of the grid (Ny, Nx): the index of its
-    traced node, and whether x and y are swapped there."""
+    """Nodes that must be traced, and how they give all nodes of the grid.
+
+    half: number of nodes on each side of the axis, along y and x.
+    symmetry: of the lens.
+
+    Returns the traced nodes (U, 2), x and y in steps; and for each node of the grid (Ny, Nx) the
+    index of its traced node, and whether x and y are swapped there.
+    """
     y, x = np.meshgrid(*(np.arange(-n, n + 1) for n in half), indexing="ij")
-    exchanged = np.zeros(x.shape, bool)
+    swapped = np.zeros(x.shape, bool)
     if symmetry != "none":
         x = np.abs(x)
     if symmetry == "rotational":
         y = np.abs(y)
-        exchanged = x > y
+        swapped = x > y
         x, y = np.minimum(x, y), np.maximum(x, y)
     places = np.stack([x, y], axis=-1).reshape(-1, 2)
     nodes, index = np.unique(places, axis=0, return_inverse=True)
-    return nodes, index.reshape(x.shape), exchanged
+    return nodes, index.reshape(x.shape), swapped
 
 
 @functools.partial(jit, wanted=LARGE)
 def _chief(lens: Lens, tangents: Array, distances: Array, wavelengths: Array) -> Array:
+    """`image_points` of arrays."""
+
     def one(distance: Array, tangent: Array) -> Array:
         scene = scene_of(lens, jnp.arctan(tangent), distance, wavelengths)
         centre = jnp.zeros(1, lens.curvature.dtype)
@@ -111,8 +123,16 @@ def _chief(lens: Lens, tangents: Array, distances: Array, wavelengths: Array) ->
 
 
 def image_points(lens: Lens, tangents: Any, distances: Any, wavelengths: Any) -> np.ndarray:
-    """Points on the sensor (D, U, W, 2) mm of the chief rays of fields (U, 2), tangents, at
-    distances (D,) mm; inf where a chief ray fails. Known numbers."""
+    """Points where chief rays meet the sensor.
+
+    lens: the lens.
+    tangents: (U, 2), tangents of the field angles.
+    distances: (D,), mm.
+    wavelengths: (W,), um.
+
+    Returns (D, U, W, 2), mm, as a NumPy array; inf where a chief ray fails. The numbers must be
+    known.
+    """
     dtype = lens.curvature.dtype
     waves = jnp.atleast_1d(real_array("wavelengths", wavelengths, dtype))
     return np.asarray(
@@ -121,21 +141,28 @@ def image_points(lens: Lens, tangents: Any, distances: Any, wavelengths: Any) ->
 
 
 def kernel_grid(lens: Lens, method: GridMethod, wavelengths: Numbers) -> KernelGrid:
-    """The kernels of a lens over field and depth. Works inside `jax.jit` and is differentiable in
-    the lens. wavelengths: (W,), um."""
+    """The PSF kernels of a lens over field and depth.
+
+    lens: the lens.
+    method: settings from `grid_method`.
+    wavelengths: (W,), um.
+
+    Returns a `KernelGrid`. Works inside `jax.jit`; differentiable in the lens.
+    """
     waves = jnp.atleast_1d(lens.checked_wavelengths(wavelengths))
     return _kernel_grid(lens, method, waves)
 
 
 @functools.partial(jit, wanted=LARGE)
 def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGrid:
-    nodes, index, exchanged = unique_nodes(method.half, method.symmetry)
+    """`kernel_grid` of arrays: traces the unique nodes, then mirrors and swaps them."""
+    nodes, index, swapped = unique_nodes(method.half, method.symmetry)
     tangents = jnp.asarray(nodes, method.step.dtype) * method.step
 
-    def one(given: tuple[Array, Array]) -> tuple[Array, ...]:
-        return _record(lens, method, given[1], given[0], wavelengths)
+    def one(pair: tuple[Array, Array]) -> tuple[Array, ...]:
+        return _kernel_of(lens, method, pair[1], pair[0], wavelengths)
 
-    # One point at a time: the rays of all kernels together would not fit into the cache.
+    # One object point at a time: the rays of all kernels together would not fit into the cache.
     pairs = (len(method.distances), len(nodes))
     every = (
         jnp.repeat(method.distances, pairs[1]),
@@ -144,7 +171,8 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
     found = jax.lax.map(jax.checkpoint(one), every)
     found = tuple(a.reshape(*pairs, *a.shape[1:]) for a in found)
     points, solid_angle, outside, kernels = found
-    # A node without light gets the ratio of point to tangent of the nearest node with light.
+    # A node without light gets an extrapolated image point: its tangent times the ratio of image
+    # point to tangent of the nearest node with light.
     finite = jnp.isfinite(points)
     points = jnp.where(finite, points, 0)
     near = jnp.take_along_axis(points, method.nearest[:, :, None, None], axis=1)
@@ -152,36 +180,38 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
     along = jnp.sum(near * tangents[method.nearest][:, :, None], axis=-1)
     ratio = along / jnp.where(squared > 0, squared, 1)[..., None]
     guess = ratio[..., None] * tangents[None, :, None]
-    is_there = method.nearest == jnp.arange(len(nodes), dtype=jnp.int32)[None]
-    points = jnp.where(is_there[:, :, None, None] & finite, points, guess)
+    has_light = method.nearest == jnp.arange(len(nodes), dtype=jnp.int32)[None]
+    points = jnp.where(has_light[:, :, None, None] & finite, points, guess)
 
-    def placed(values: Array) -> Array:
+    def full(values: Array) -> Array:
         return values[:, index]
 
-    swap = jnp.asarray(exchanged)
-    points, kernels = placed(points), placed(kernels)
+    swap = jnp.asarray(swapped)
+    points, kernels = full(points), full(kernels)
     points = jnp.where(swap[None, ..., None, None], points[..., ::-1], points)
     kernels = jnp.where(swap[None, ..., None, None, None], jnp.swapaxes(kernels, -1, -2), kernels)
     y, x = (np.arange(-n, n + 1) < 0 for n in method.half)
     if method.symmetry != "none":
-        left = jnp.asarray(np.broadcast_to(x[None], exchanged.shape))[None, ..., None]
+        left = jnp.asarray(np.broadcast_to(x[None], swapped.shape))[None, ..., None]
         points = points * jnp.where(left[..., None], jnp.array([-1.0, 1], points.dtype), 1)
         kernels = jnp.where(left[..., None, None], kernels[..., ::-1], kernels)
     if method.symmetry == "rotational":
-        below = jnp.asarray(np.broadcast_to(y[:, None], exchanged.shape))[None, ..., None]
+        below = jnp.asarray(np.broadcast_to(y[:, None], swapped.shape))[None, ..., None]
         points = points * jnp.where(below[..., None], jnp.array([1.0, -1], points.dtype), 1)
         kernels = jnp.where(below[..., None, None], kernels[..., ::-1, :], kernels)
     vergences = jax.vmap(vergence_of)(method.distances)
-    return KernelGrid(method.step, vergences, points, placed(solid_angle), placed(outside), kernels)
+    return KernelGrid(method.step, vergences, points, full(solid_angle), full(outside), kernels)
 
 
-def _record(
+def _kernel_of(
     lens: Lens, method: GridMethod, tangent: Array, distance: Array, wavelengths: Array
 ) -> tuple[Array, ...]:
-    """Centre (W, 2), solid angle and outside (W,), and kernel (W, K, K) of an object point."""
-    # A centroid is the centre: off centre, a spot smaller than a pixel would be rounded.
+    """Centre (W, 2), mm, solid angle (W,), outside (W,), and kernel (W, K, K) of one object
+    point."""
+    # Each kernel is centred on the centroid of its light: rounding would spoil a spot smaller than
+    # a pixel that is far off centre.
 
-    def some(waves: Array) -> tuple[Array, ...]:
+    def traced(waves: Array) -> tuple[Array, ...]:
         field = jnp.arctan(tangent)
         found = psf(lens, field, distance, waves, method.pixel, method.size, method.model)
         arrives = found.throughput > 0
@@ -189,19 +219,21 @@ def _record(
         return centre, found.solid_angle, found.outside, found.kernel
 
     if method.together:
-        return some(wavelengths)
-    return jax.tree.map(lambda a: a[:, 0], jax.vmap(some)(wavelengths[:, None]))
+        return traced(wavelengths)
+    return jax.tree.map(lambda a: a[:, 0], jax.vmap(traced)(wavelengths[:, None]))
 
 
 def kernels_at(grid: KernelGrid, fields: Numbers, distances: Numbers) -> Array:
-    """Interpolate the kernels (B, W, K, K) of B object points.
+    """Kernels of B object points, interpolated from a grid.
 
-    fields: (B, 2) angles along x and y, radians; outside the grid the kernels of its edge apply.
-    distances: (B,) mm, or one; inf allowed.
+    grid: from `kernel_grid`.
+    fields: (B, 2), angles along x and y, radians; outside of the grid the kernels of its edge
+        apply.
+    distances: (B,), mm, or one; inf allowed.
 
-    Interpolation uses polynomials through the four nearest nodes along x, y and 1 / distance, or
-    all nodes if there are fewer. Differentiable in the grid, the fields and the distances.
-    ValueError for other shapes.
+    Returns (B, W, K, K). Interpolation uses polynomials through the four nearest nodes along x, y
+    and 1 / distance, or through all nodes if there are fewer. Differentiable in the grid, the
+    fields and the distances. ValueError for other shapes.
     """
     dtype = grid.kernels.dtype
     angles, far = points_arrays(fields, distances, dtype)
@@ -209,6 +241,7 @@ def kernels_at(grid: KernelGrid, fields: Numbers, distances: Numbers) -> Array:
 
 
 def _kernel_at(grid: KernelGrid, tangent: Array, vergence: Array) -> Array:
+    """Kernel (W, K, K) at one field, given by its tangents (2,), and one vergence, 1/mm."""
     count, vergences = grid.kernels.shape[0], grid.vergences
     spacing = (vergences[-1] - vergences[0]) / max(count - 1, 1)
     depth = (vergence - vergences[0]) / jnp.where(spacing != 0, spacing, 1)

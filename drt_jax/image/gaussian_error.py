@@ -1,4 +1,4 @@
-"""Is the Gaussian good enough here? Its kernels against those with diffraction."""
+"""Accuracy of the Gaussian model: its kernels compared with those of diffraction."""
 
 from typing import NamedTuple
 
@@ -11,17 +11,17 @@ from .beam_psf import PsfModel
 from .psf import psf
 from .psf_model import chosen_psf, difference
 
-_LINES = 64  # Frequencies on either side, at least.
+_LINES = 64  # at least so many frequencies up to Nyquist
 
 
 class GaussianError(NamedTuple):
-    """How far Gaussian kernels are from those of waves, for F fields at D distances, the worst of
-    the wavelengths.
+    """Differences of Gaussian kernels from those of waves for F fields at D distances, each for the
+    worst wavelength.
 
-    misplaced: (F, D), the sum of the absolute differences of all pixels: 0 to 2.
-    contrast: (F, D), the largest difference of the MTF of both kernels up to the pixels' Nyquist
+    misplaced: (F, D), sum of the absolute differences of all pixels: 0 to 2.
+    contrast: (F, D), largest difference of the MTF of both kernels up to the pixels' Nyquist
         frequency.
-    outside: (F, D), the part of the light that falls beside the kernel of waves.
+    outside: (F, D), fraction of the light that falls outside of the kernel of waves.
     """
 
     misplaced: np.ndarray
@@ -38,13 +38,17 @@ def gaussian_error(
     size: int = 21,
     tolerance: float = 1e-2,
 ) -> GaussianError:
-    """How far the Gaussian of the moments is from the kernel with diffraction, on `size` x `size`
-    pixels of a side of `pixel` mm.
+    """Differences between the Gaussian kernels of the moments and the kernels with diffraction.
 
-    fields: (F,) angles along y, or pairs (F, 2), radians. distances: (D,) mm, inf allowed.
-    wavelengths: (W,) um. tolerance: of the kernels of waves, as of `psf`.
+    lens: the lens.
+    fields: (F,) angles along y, or pairs (F, 2), radians.
+    distances: (D,), mm, inf allowed.
+    wavelengths: (W,), um.
+    pixel: side of a pixel, mm.
+    size: number of pixels along a side of a kernel.
+    tolerance: of the kernels of waves, as in `psf`.
 
-    Known numbers: ValueError inside a trace, and as of `psf`.
+    All numbers must be known. ValueError inside a trace, and as of `psf`.
     """
     known = known_values((lens, fields, distances, wavelengths, pixel))
     if known is None:
@@ -52,20 +56,20 @@ def gaussian_error(
     lens, fields, distances, wavelengths, pixel = known
     pairs = fields_array(fields, lens.curvature.dtype)
     far = np.atleast_1d(np.asarray(distances, float))
-    around = wavelengths, pixel, size
+    settings = wavelengths, pixel, size
     fine = chosen_psf(lens, (pairs, far, wavelengths), pixel, size, "waves", tolerance)[0]
     models = PsfModel("gaussian", fine.rule, 0), fine
     found = np.zeros((3, len(pairs), len(far)))
     for i, field in enumerate(pairs):
         for k, distance in enumerate(far):
-            blur, light = (psf(lens, field, distance, *around, model) for model in models)
+            blur, light = (psf(lens, field, distance, *settings, model) for model in models)
             a, b = np.asarray(blur.kernel), np.asarray(light.kernel)
             found[:, i, k] = difference(a, b), _contrast(a, b), np.max(np.asarray(light.outside))
     return GaussianError(*found)
 
 
 def _contrast(a: np.ndarray, b: np.ndarray) -> float:
-    """The largest difference of the MTF of kernels (W, size, size)."""
+    """Largest difference of the MTFs of two sets of kernels (W, size, size)."""
     count = max(2 * _LINES, 2 * a.shape[-1])
     spectra = [np.abs(np.fft.rfft2(k, (count, count))) for k in (a, b)]
     first, second = (s / np.maximum(s[:, :1, :1], 1e-300) for s in spectra)

@@ -21,16 +21,16 @@ from .moments import moments
 from .psf_model import chosen_psf
 from .spot import Moments
 
-# Kernel sides to try, pixels.
+# Numbers of pixels along a side of a kernel to choose from.
 _SIZES = (9, 13, 17, 21, 25, 33, 41, 49, 65, 97, 129)
 # Half the side of a kernel, in standard deviations of the blur.
 _REACH = 4.5
-# Warn if a larger fraction of the light falls outside a kernel.
-_LOST = 1e-2
+# Fraction of the light outside of a kernel above which a warning is given.
+_MAX_OUTSIDE = 1e-2
 # Default tolerance: the sum of the absolute errors of a kernel's pixels.
 _TOLERANCE = 5e-3
-# Order of the rule that tests from which fields light arrives.
-_LOOK = 8
+# Order of the rule that tests for which fields light arrives.
+_TEST_ORDER = 8
 
 
 def grid_method(
@@ -46,18 +46,23 @@ def grid_method(
     together: bool = False,
     norm: int = 1,
 ) -> GridMethod:
-    """Choose the settings of `kernel_grid`. All arguments are known numbers.
+    """Chooses the settings of `kernel_grid`. All arguments are known numbers.
 
+    lens: the lens.
     fields: the largest angles (2,) along x and y, radians.
-    distances: (D,) mm, inf allowed; 1 / distance is equidistant, rising or falling.
-    wavelengths: (W,) um. pixel: side of a pixel, mm.
-    size: side of a kernel, pixels, odd; the default reaches 4.5 standard deviations to each side.
+    distances: (D,), mm, inf allowed; equidistant in 1 / distance, rising or falling.
+    wavelengths: (W,), um.
+    pixel: side of a pixel, mm.
+    size: number of pixels along a side of a kernel, odd; by default it extends to 4.5 standard
+        deviations of the blur on each side.
     nodes: number of nodes from the axis to the largest angle, 2 or more.
     model, tolerance, norm: as in `converged_psf`; a name is converged to one model for all fields.
     together: True centres the kernels of all wavelengths on the mean of their centroids, so that
-        they contain the lateral colour (for patches); False centres each on its own centroid.
+        they contain the lateral colour (for patches); False centres each kernel on its own
+        centroid.
 
-    ValueError inside a trace, for invalid numbers, and if no light arrives from any field.
+    Returns a `GridMethod`. ValueError inside a trace, for invalid numbers, and if no light arrives
+    from any field.
     """
     known = known_values((lens, fields, distances, wavelengths, pixel))
     if known is None:
@@ -77,7 +82,7 @@ def grid_method(
         half = down, across
         symmetry = symmetry_of(lens, 0.0)
         tangents = unique_nodes(half, symmetry)[0] * step
-        found = _look(lens, tangents, far, wavelengths)
+        found = _spots_at(lens, tangents, far, wavelengths)
         arrives = np.all(np.asarray(found.throughput) > 0, axis=-1)
         if not np.any(arrives):
             raise ValueError("fields: no light of any of them reaches the sensor")
@@ -85,9 +90,10 @@ def grid_method(
             need = _reach(found, arrives, pixel)
             size = next((n for n in _SIZES if n >= need), _SIZES[-1])
         if isinstance(model, str):
-            seen = *_some(tangents, far, arrives), wavelengths
-            # `warn_of_loss` speaks of light beside the kernels, of all nodes.
-            model = chosen_psf(lens, seen, pixel, size, model, tolerance, norm)[0]
+            where = *_extremes(tangents, far, arrives), wavelengths
+            # No warning here of light outside of the kernels: `warn_of_loss` gives it for all
+            # nodes.
+            model = chosen_psf(lens, where, pixel, size, model, tolerance, norm)[0]
         array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
         nearest = jnp.asarray(_nearest(tangents, arrives), jnp.int32)
         return GridMethod(
@@ -104,7 +110,8 @@ def check_pixel(pixel: Numbers) -> None:
 
 
 def _widest(fields: Any) -> np.ndarray:
-    """Tangents (2,) of the largest field angles along x and y. Known numbers."""
+    """Tangents (2,) of the largest field angles along x and y. ValueError unless they are two
+    finite angles, one above 0."""
     wide = np.tan(np.abs(np.asarray(fields, float)))
     if wide.shape != (2,) or not np.all(np.isfinite(wide)) or not np.max(wide) > 0:
         raise ValueError(f"fields: expected two angles, one above 0, got {fields!r}")
@@ -112,6 +119,7 @@ def _widest(fields: Any) -> np.ndarray:
 
 
 def _check_counts(size: Any, nodes: Any) -> None:
+    """ValueError for an even kernel size or fewer than 2 nodes."""
     whole = isinstance(size, int | np.integer) and size > 0 and size % 2
     if size is not None and not whole:
         raise ValueError(f"size: expected an odd number of pixels, got {size!r}")
@@ -120,18 +128,24 @@ def _check_counts(size: Any, nodes: Any) -> None:
 
 
 def _reach(found: Moments, arrives: np.ndarray, pixel: Any) -> int:
-    """The kernel side, pixels, that is wide enough for the spots (D, U, W) with light (D, U)."""
+    """Number of pixels along the side of a kernel that is wide enough for all spots (D, U, W)
+    with light (D, U)."""
     sigma = np.sqrt(np.diagonal(np.asarray(found.covariance), 0, -2, -1))[arrives]
     return int(np.ceil(_REACH * np.max(sigma) / float(np.asarray(pixel)))) * 2 + 1
 
 
 def warn_of_loss(lens: Lens, method: GridMethod, grid: KernelGrid, wavelengths: Any) -> None:
-    """Warn if kernels are too small for the blur. The warning gives the lost fraction of the light
-    and the size that is needed. Known numbers."""
+    """Warns if kernels are too small for the blur, with the fraction of the light outside and the
+    size that is needed. The numbers are known.
+
+    lens, method: the lens and the settings of the kernels.
+    grid: the kernels.
+    wavelengths: (W,), um.
+    """
     lost = np.max(np.asarray(grid.outside), initial=0.0)
-    if lost > _LOST:
+    if lost > _MAX_OUTSIDE:
         tangents = unique_nodes(method.half, method.symmetry)[0] * float(method.step)
-        found = _look(lens, tangents, np.asarray(method.distances), wavelengths)
+        found = _spots_at(lens, tangents, np.asarray(method.distances), wavelengths)
         need = _reach(found, np.all(np.asarray(found.throughput) > 0, axis=-1), method.pixel)
         remedy = f"give {need}" if need > method.size else "give more, or larger pixels"
         warnings.warn(
@@ -142,15 +156,18 @@ def warn_of_loss(lens: Lens, method: GridMethod, grid: KernelGrid, wavelengths: 
 
 
 def _nearest(tangents: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    """For each node (U, 2) and distance, the index of the nearest node with light, `lit` (D, U)."""
-    apart = np.sum((tangents[:, None] - tangents[None]) ** 2, axis=-1)
-    return np.argmin(np.where(lit[:, None], apart[None], np.inf), axis=-1)
+    """Index (D, U) of the node with light that is nearest to each node (U, 2). lit: (D, U),
+    bool, nodes with light."""
+    squared = np.sum((tangents[:, None] - tangents[None]) ** 2, axis=-1)
+    return np.argmin(np.where(lit[:, None], squared[None], np.inf), axis=-1)
 
 
 @functools.partial(jit, wanted=LARGE)
 def _spots(
     lens: Lens, tangents: Array, distances: Array, wavelengths: Array, rule: PupilRule
 ) -> Moments:
+    """`_spots_at` of arrays."""
+
     def one(distance: Array, tangent: Array) -> Moments:
         scene = scene_of(lens, jnp.arctan(tangent), distance, wavelengths)
         return moments(lens, scene, rule, solve_aimed).at(lens.sensor)
@@ -158,21 +175,23 @@ def _spots(
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(distances, tangents)
 
 
-def _look(lens: Lens, tangents: np.ndarray, far: np.ndarray, wavelengths: Any) -> Moments:
-    """Spots of all fields (U, 2), tangents, at all distances; they show where light arrives."""
+def _spots_at(lens: Lens, tangents: np.ndarray, far: np.ndarray, wavelengths: Any) -> Moments:
+    """`Moments` (D, U, ...) of fields with the tangents (U, 2) at all distances, which show
+    where light arrives."""
     dtype = lens.curvature.dtype
     waves = jnp.atleast_1d(real_array("wavelengths", wavelengths, dtype))
-    rule = Gauss(_LOOK, "none")
+    rule = Gauss(_TEST_ORDER, "none")
     return _spots(lens, jnp.asarray(tangents, dtype), jnp.asarray(far, dtype), waves, rule)
 
 
-def _some(tangents: np.ndarray, far: np.ndarray, arrives: np.ndarray) -> tuple[Any, Any]:
-    """Fields (F, 2), radians, and distances for the choice of a PSF model: the farthest field with
-    light, a middle one and the axis; the first and the last distance."""
-    every = np.all(arrives, axis=0)
-    lit = tangents[every if np.any(every) else np.any(arrives, axis=0)]
+def _extremes(tangents: np.ndarray, far: np.ndarray, arrives: np.ndarray) -> tuple[Any, Any]:
+    """Fields (F, 2), radians, and distances for the choice of a PSF model: the farthest field
+    with light, a middle one and the axis; the first and the last distance."""
+    always = np.all(arrives, axis=0)
+    lit = tangents[always if np.any(always) else np.any(arrives, axis=0)]
     order = lit[np.argsort(np.sum(lit**2, axis=1))]
-    some = order[[-1, len(order) // 2, 0]]
-    # A small shift off the symmetry planes, where the rule would use half a pupil only.
-    angles = np.arctan(some + 1e-6 * max(np.max(np.abs(some)), 1e-3))
+    chosen = order[[-1, len(order) // 2, 0]]
+    # Shift the fields slightly off the planes of symmetry, where the rule would trace half a pupil
+    # only.
+    angles = np.arctan(chosen + 1e-6 * max(np.max(np.abs(chosen)), 1e-3))
     return angles, np.unique([far[0], far[-1]])

@@ -1,4 +1,4 @@
-"""Interpolation on equidistant nodes by local polynomials, and of pictures by cubic convolution."""
+"""Interpolation by local polynomials on equidistant nodes, and of pictures by cubic convolution."""
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +8,16 @@ from ..numerics import tensordot
 
 
 def lagrange(place: Array, count: int, order: int) -> tuple[Array, Array]:
-    """First node (...), int32, and weights (..., order) of the polynomial through the `order` nodes
-    nearest to `place` (...), in units of nodes 0 to count - 1. Continuous; exact for polynomials
-    of degree order - 1; beyond the ends the outermost polynomial goes on."""
+    """Weights of local Lagrange interpolation on equidistant nodes.
+
+    place: (...), position in units of nodes 0 to count - 1.
+    count: number of nodes.
+    order: number of nodes that a value is interpolated from, the nearest ones.
+
+    Returns the index (...), int32, of the first of these nodes and the weights (..., order). The
+    interpolation is continuous, and exact for polynomials of degree order - 1. Outside of the nodes
+    the outermost polynomial extrapolates.
+    """
     order = min(order, count)
     known = jax.lax.stop_gradient(place)
     first = jnp.clip(jnp.floor(known) - (order - 1) // 2, 0, count - order)
@@ -24,7 +31,8 @@ def lagrange(place: Array, count: int, order: int) -> tuple[Array, Array]:
 
 
 def basis(place: Array, count: int, order: int) -> Array:
-    """The matrix (N, count) that interpolates values at nodes 0 to count - 1 at `place` (N,)."""
+    """Matrix (N, count) that interpolates values at nodes 0 to count - 1 to places (N,); `order`
+    as in `lagrange`."""
     first, weights = lagrange(place, count, order)
     columns = first[:, None] + jnp.arange(weights.shape[1], dtype=first.dtype)[None]
     chosen = columns[:, :, None] == jnp.arange(count, dtype=first.dtype)[None, None]
@@ -32,7 +40,14 @@ def basis(place: Array, count: int, order: int) -> Array:
 
 
 def at_point(table: Array, place: Array, order: int) -> Array:
-    """`table` (Ny, Nx, ...) interpolated at one `place` (2,), x and y in units of nodes."""
+    """A table interpolated at one point.
+
+    table: (Ny, Nx, ...).
+    place: (2,), x and y in units of nodes.
+    order: as in `lagrange`.
+
+    Returns an array (...).
+    """
     for where in (place[1], place[0]):
         first, weights = lagrange(where, table.shape[0], order)
         rows = jax.lax.dynamic_slice_in_dim(table, first, weights.shape[0], axis=0)
@@ -41,9 +56,13 @@ def at_point(table: Array, place: Array, order: int) -> Array:
 
 
 def cubic(picture: Array, y: Array, x: Array) -> Array:
-    """A picture (H, W, C) at the places y, x (C, ...) of each colour, in pixels, by cubic
-    convolution (Keys, IEEE Trans. ASSP 29, 1153, 1981), of third order; beyond its edge it goes on
-    as it ends."""
+    """A picture interpolated by cubic convolution, which is of third order.
+
+    picture: (H, W, C).
+    y, x: (C, ...), places for each colour, in pixels. Outside of the picture its edge pixels apply.
+
+    Returns an array (C, ...). Source: Keys, IEEE Trans. ASSP 29, 1153 (1981).
+    """
     height, width, colours = picture.shape
     (row, down), (column, across) = (_keys(a, n) for a, n in ((y, height), (x, width)))
     colour = jnp.arange(colours, dtype=row.dtype).reshape(-1, *[1] * (y.ndim - 1))
@@ -59,7 +78,7 @@ def cubic(picture: Array, y: Array, x: Array) -> Array:
 
 
 def _keys(place: Array, count: int) -> tuple[Array, list[Array]]:
-    """The pixel before `place` and the weights of the four around it."""
+    """Index of the pixel before `place`, and the weights of the four pixels around it."""
     inside = jnp.clip(place, 0, count - 1)
     first = jnp.floor(jax.lax.stop_gradient(inside))
     s = inside - first

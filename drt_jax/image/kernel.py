@@ -1,4 +1,5 @@
-"""Kernels on the pixel grid from centroid and covariance (paper Eq. 5). From here on: pixels."""
+"""Gaussian kernels on the pixel grid from centroid and covariance (paper Eq. 5). From this
+module on, lengths can be in pixels."""
 
 import warnings
 from typing import Any, Literal, NamedTuple, get_args
@@ -15,20 +16,24 @@ from .spot import normalised
 
 Form = Literal["integrated", "sampled"]
 
-# A Gaussian narrower than this (pixels) counts as a point.
+# A Gaussian with a sigma below this (pixels) is treated as a point.
 _POINT = 1e-4
 _ANGLES, _ANGLE_WEIGHTS = np.polynomial.legendre.leggauss(24)
 _MAX_CORRELATION = 1 - 1e-6
-# A pixel larger than this (mm) is more likely given in um.
+# A pixel larger than this (mm) was more likely given in um.
 _LARGE_PIXEL = 1.0
-# Limits whose squares are finite in float32: of centroids (pixels; of pixels, mm), of variances
-# (pixels^2) and of the distance from the centre of a Gaussian (sigma). Beyond them a kernel is dark
-# or even.
+# Limits whose squares are finite in float32. Beyond them a kernel is 0 or constant.
+# _FAR: centroids, pixels; and the side of a pixel, mm, as well as its inverse.
+# _WIDE: variances, pixels^2.
+# _DARK: distance from the centre of a Gaussian, sigma.
 _FAR, _WIDE, _DARK = 1e9, 1e15, 60.0
 
 
 class SeparableKernel(NamedTuple):
-    """A kernel that is an outer product, kernel[c, y, x] = column[c, y] row[c, x]: (C, K) each."""
+    """A kernel that is an outer product: kernel[c, y, x] = column[c, y] row[c, x].
+
+    column, row: (C, K) each.
+    """
 
     column: Array
     row: Array
@@ -45,20 +50,20 @@ def gaussian_psf(
     size: int = 21,
     form: Form = "integrated",
 ) -> Array:
-    """Gaussian kernels [channel, y, x] of C channels, (C, size, size), in the dtype of `mean`.
+    """Gaussian kernels of C channels.
 
     mean: (C, 2), x and y from the centre of the grid, mm.
     covariance: (C, 2, 2), mm^2.
-    pixel: (), side of a pixel, mm; warns above 1 mm, which may be meant in um.
-    size: pixels along a side of the grid.
+    pixel: (), side of a pixel, mm. Warns above 1 mm, which may be meant in um.
+    size: number of pixels along a side of the grid.
     form: "integrated" over the area of each pixel, and normalised to the sum 1; or "sampled" as in
         Eq. 5, the density at the pixel centres, which is not normalised: the sum is below 1 for a
         wide blur and may be anything for a narrow one.
 
-    Values and derivatives stay finite as the blur shrinks to a point or grows beyond the grid.
-    ValueError for other shapes, for known values that are not finite, and for a pixel not above 0.
-    Inside a trace, a channel with such values (an infinite covariance if no ray arrives) is black,
-    with derivatives 0.
+    Returns an array [channel, y, x], (C, size, size), in the dtype of `mean`. Values and
+    derivatives stay finite as the blur shrinks to a point or grows beyond the grid. ValueError for
+    other shapes, for known values that are not finite, and for a pixel not above 0. Inside a trace,
+    a channel with such values (an infinite covariance if no ray arrives) is 0, with derivatives 0.
     """
     kernel = _gaussian(*_checked(mean, covariance, pixel, size, form), size, form)
     assert not isinstance(kernel, SeparableKernel)
@@ -73,7 +78,12 @@ def separable_psf(
     form: Form = "integrated",
 ) -> SeparableKernel:
     """`gaussian_psf` for diagonal covariances, as a row and a column for each channel, see
-    `Moments.separable`. Arguments as there. ValueError also for a known xy other than 0."""
+    `Moments.separable`.
+
+    mean, covariance, pixel, size, form: as in `gaussian_psf`.
+
+    ValueError as there, and for a known xy other than 0.
+    """
     centroid, matrix, side = _checked(mean, covariance, pixel, size, form)
     if concrete(covariance) and np.any(np.asarray(matrix)[:, [0, 1], [1, 0]]):
         raise ValueError("covariance: xy must be 0 for a separable kernel; use gaussian_psf")
@@ -83,8 +93,8 @@ def separable_psf(
 
 
 def gaussian_shares(mean: Array, covariance: Array, pixel: Array, size: int) -> Array:
-    """`gaussian_psf` of checked arrays, not normalised: the sum is the fraction of the light that
-    falls on the grid."""
+    """`gaussian_psf` without checks and without normalisation: the sum of a kernel is the
+    fraction of its light that falls on the grid."""
     kernel = _gaussian(mean, covariance, pixel, size, "integrated", whole=False)
     assert not isinstance(kernel, SeparableKernel)
     return kernel
@@ -93,7 +103,7 @@ def gaussian_shares(mean: Array, covariance: Array, pixel: Array, size: int) -> 
 def _gaussian(
     mean: Array, covariance: Array, side: Array, size: int, form: Form, whole: bool = True
 ) -> SeparableKernel | Array:
-    """The kernel.
+    """The kernel of checked arguments.
 
     covariance: (C, 2, 2); or variances (C, 2) for a separable kernel.
     whole: True to normalise an integrated kernel to the sum 1.
@@ -124,8 +134,8 @@ def _gaussian(
 def _checked(
     mean: Numbers, covariance: Numbers, pixel: Numbers, size: int, form: Form
 ) -> tuple[Array, Array, Array]:
-    """Checks the arguments of `gaussian_psf`, and returns centroids, covariances and pixel as
-    arrays of one dtype."""
+    """Checks the arguments of `gaussian_psf`; returns centroids, covariances and pixel as arrays
+    of one dtype."""
     require_one_of("form", form, get_args(Form))
     floating = jnp.issubdtype(getattr(mean, "dtype", int), jnp.floating)
     dtype = jnp.result_type(mean) if floating else jnp.result_type(float)
@@ -144,8 +154,11 @@ def _checked(
 
 
 def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> tuple[Array, int]:
-    """Checks the side of a pixel, (), mm, and the pixels along a side of a grid. Warns of a large
-    pixel."""
+    """Checks the side of a pixel, (), mm, and the number of pixels along a side of a grid.
+
+    Returns both. Warns of a pixel above 1 mm; `stacklevel` as of `warnings.warn`. ValueError for
+    invalid values, as far as they are known.
+    """
     if not isinstance(size, int | np.integer) or size < 1:
         raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
     side = real_array("pixel", pixel, dtype)
@@ -164,29 +177,38 @@ def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> 
 
 
 def _standardise(offset: Array, variance: Array) -> tuple[Array, Array]:
-    """offset / sigma, and True where the Gaussian is wider than a point."""
+    """offset / sigma, and a mask that is True where the Gaussian is not treated as a point."""
     sigma = safe_sqrt(variance)[..., None]
     wide = sigma > _POINT
     return offset / jnp.where(wide, sigma, 1), wide
 
 
 def _cumulative(offset: Array, variance: Array) -> Array:
-    """Fraction of a Gaussian below an offset from its centre; a step for a point. offset: (C, N),
-    pixels."""
+    """Fraction of a Gaussian below an offset from its centre; a step function for a point.
+
+    offset: (C, N), pixels.
+    variance: (C,), pixels^2.
+    """
     z, wide = _standardise(offset, variance)
     step = jnp.heaviside(offset, 0.5)
     return jnp.where(wide, (1 + erf(z * 0.5**0.5)) / 2, step)
 
 
 def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
+    """Integrals of a Gaussian over pixels with the edges (C, 2, size + 1), pixels from the
+    centroid.
+
+    For a correlation r the bivariate normal distribution is the product of its marginals plus the
+    integral over a, from 0 to arcsin r, of exp(-(x^2 - 2 x y sin a + y^2) / (2 cos^2 a)) / (2 pi),
+    here by 24 Gauss nodes. Differences over the corners of a pixel give its integral. Source:
+    Plackett (1954); Drezner and Wesolowsky (1990).
+    """
     diagonal = covariance if covariance.ndim == 2 else jnp.diagonal(covariance, 0, 1, 2)
     below = [_cumulative(edges[:, i], diagonal[:, i]) for i in range(2)]
     row, column = (jnp.diff(part, axis=-1) for part in below)
     if covariance.ndim == 2:
         return SeparableKernel(column, row)
-    # The bivariate normal distribution is the product of its marginals plus an integral over the
-    # correlation (Plackett 1954; Drezner and Wesolowsky 1990); differences over the corners of each
-    # pixel follow.
+    # The part that the correlation adds, see above.
     (x, wide_x), (y, wide_y) = (_standardise(edges[:, i], diagonal[:, i]) for i in range(2))
     both = (wide_x & wide_y)[:, 0]
     scale = jnp.where(both, diagonal[:, 0] * diagonal[:, 1], 1)
@@ -204,7 +226,7 @@ def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
 
 
 def _sampled(offset: Array, covariance: Array) -> SeparableKernel | Array:
-    """Densities at the pixel centres; 0 for a point."""
+    """Densities of a Gaussian at the pixel centres; 0 for a point."""
     if covariance.ndim == 2:
         z, wide = _standardise(offset, covariance)
         sigma = jnp.where(wide, safe_sqrt(covariance)[..., None], 1)

@@ -1,7 +1,8 @@
 """Centroid and covariance of the rays on the sensor, as functions of the sensor position.
 
 The paper traces 256 random rays for each sensor position. Here the rays of a pupil rule are traced
-once, because the moments are exact polynomials in the sensor position.
+once. Rays in front of the sensor are straight, so a hit is linear in the sensor position, and
+centroid and covariance are exact polynomials of degree 1 and 2 in it.
 """
 
 import dataclasses
@@ -29,7 +30,7 @@ class FocusMoments:
     reference: (), mm.
     mean: (W, 2), mm.
     slope: (W, 2).
-    spread: (3, W, C) in mm^2, mm and 1, of xx, yy and xy, C = 3; without xy, C = 2, if symmetry
+    spread: (3, W, C) in mm^2, mm and 1; C = 3 for xx, yy and xy, or C = 2 without xy where symmetry
         makes it 0.
     throughput: (W,), fraction of the light through the stop that reaches the sensor.
     """
@@ -41,13 +42,13 @@ class FocusMoments:
     throughput: Array
 
     def at(self, sensor: Numbers) -> Moments:
-        """The spot at a sensor position, (), mm."""
+        """The `Moments` at a sensor position, (), mm."""
         return _at(self, jnp.asarray(sensor, self.reference.dtype))
 
 
 @jax.jit
 def _at(moments: FocusMoments, sensor: Array) -> Moments:
-    # One program rather than one for each operation.
+    # A jitted function, so that this is one program and not one for each operation.
     d = sensor - moments.reference
     spread = moments.spread[0] + d * (moments.spread[1] + d * moments.spread[2])
     arrives = (moments.throughput > 0)[:, None]
@@ -59,10 +60,15 @@ def _at(moments: FocusMoments, sensor: Array) -> Moments:
 
 
 def moments(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver = solve) -> FocusMoments:
-    """Moments of the rays of a rule, with the reference at `lens.sensor`. Paper section 4.3.
+    """Moments of the rays of a rule as functions of the sensor position. Paper section 4.3.
 
-    Weights are normalised over the light that arrives. Differentiable, except in the status of
-    rays, in the modes of the `solver`. ValueError as in `check_sensor`.
+    lens, scene: the lens, and the object point with its wavelengths.
+    rule: pupil rule.
+    solver: of the rays.
+
+    Returns `FocusMoments` with the reference at `lens.sensor`. Weights are normalised over the
+    light that arrives. Differentiable in the modes of the solver; the status of rays is a constant.
+    ValueError as in `check_sensor`.
     """
     check_sensor(lens)
     points, weights = rule.points(lens, scene)
@@ -70,8 +76,8 @@ def moments(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver = solve) -
 
 
 def check_sensor(lens: Lens) -> None:
-    """ValueError for an element that rotates surfaces about the sensor: it moves with the sensor,
-    so that the moments are not polynomials in its position."""
+    """ValueError for an element that rotates surfaces about the sensor: it moves with the
+    sensor, so the moments are not polynomials in the sensor position."""
     if lens.elements is None:
         return
     for g, ((first, _), about) in enumerate(zip(lens.elements.spans, lens.elements.about)):
@@ -93,7 +99,13 @@ def check_focus(lens: Lens) -> None:
 
 
 def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusMoments:
-    """Moments of traced rays. weights: (1 or W, Q), of the rule."""
+    """Moments of traced rays.
+
+    lens: the lens.
+    rule: pupil rule of the rays, which gives their transmission.
+    weights: (1 or W, Q), weights of the rule.
+    bundle: the traced rays.
+    """
     weight = weights * rule.transmission(lens, bundle)
     throughput = jnp.sum(weight, axis=-1)
     weight = normalised(weight)
@@ -112,5 +124,5 @@ def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusM
 
 
 def _plane(mean: Vector) -> Array:
-    """Means, D arrays (W, 1), as (W, 2)."""
+    """Means, D arrays (W, 1), as an array (W, 2); x is 0 for D = 1."""
     return jnp.concatenate([jnp.zeros_like(mean[0])] * (2 - len(mean)) + [*mean], axis=-1)

@@ -1,4 +1,4 @@
-"""Pupil rules by rising order, as they are tried until a tolerance is met."""
+"""Pupil rules in rising order, in which they are tried until a tolerance is met."""
 
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -12,8 +12,9 @@ from ..pupil.clipped import Clipped, ClippedGroup
 from ..pupil.rules import Gauss, Pattern, Symmetry, gauss_points
 
 _MAX_ORDER = 40
-# Orders for a clipped pupil: three at a time, as three must agree and one search finds the points
-# of all; and their sizes, so that groups share a program.
+# Orders for a clipped pupil and their sizes (`Clipped.size`). Three orders form a group, because
+# three must agree and one search finds the points of all three. Groups of equal sizes share a
+# compiled program.
 _CLIPPED = (
     ((4, 5, 6), (10, 11, 12)),
     ((7, 8, 9), (10, 11, 12)),
@@ -22,16 +23,17 @@ _CLIPPED = (
     ((24, 28, 32), (36, 39, 42)),
     ((36, 39, 42), (36, 39, 42)),
 )
-# Numbers of rays that patterns are padded to, so that they share a few compiled programs.
+# Numbers of rays that patterns are padded to, so that only a few programs are compiled.
 _SIZES = {"rotational": (_MAX_ORDER + 2,), "bilateral": (208, 416, 1768, 3696)}
 _SIZES["none"] = _SIZES["bilateral"]
 
 
 class Group(NamedTuple):
-    """Rules that are traced at once.
+    """Rules that are traced together.
 
-    traced: has the points of all of them.
-    rules: each rule, and a rule with the points of `traced` in which only its own have weight.
+    traced: a rule that has the points of all of them.
+    rules: pairs of each rule and a rule with the points of `traced` in which only its own points
+        have weight.
     """
 
     traced: Pattern | ClippedGroup
@@ -39,10 +41,11 @@ class Group(NamedTuple):
 
 
 def rules_by_order(lens: Lens, symmetry: Symmetry, clipped: bool) -> Iterator[Group]:
-    """Rules by rising order, in groups.
+    """Rules in rising order, in groups.
 
+    lens: the lens.
     symmetry: of the rules, see `symmetry_of`.
-    clipped: whether the rules are fitted to the light that apertures leave.
+    clipped: whether the rules are fitted to the open part of a clipped pupil.
     """
     if not clipped:
         order = 2
@@ -62,9 +65,9 @@ def rules_by_order(lens: Lens, symmetry: Symmetry, clipped: bool) -> Iterator[Gr
 
 @cache
 def _gauss_group(first: int, symmetry: Symmetry) -> Group:
-    """The Gauss rule of an order, and those of the next orders as long as all their points are at
-    most half of the smallest size. The pattern is padded with weightless rays along the rim of
-    the stop, where clear apertures clip first."""
+    """The Gauss rule of an order, and those of the next orders as long as all their points
+    together are at most half of the smallest size. The pattern is padded with rays of weight 0
+    along the rim of the stop, where clear apertures clip first."""
     sizes, rules = _SIZES[symmetry], [gauss_points(first, symmetry)]
     total, order = rules[0][1].size, first + 1
     while total + (following := gauss_points(order, symmetry))[1].size <= sizes[0] / 2:

@@ -1,9 +1,9 @@
-"""The point spread function on the pixels, by one of three models.
+"""The point spread function (PSF) on the pixels, by one of three models.
 
-"gaussian" uses the moments of the rays, as in the paper; "rays" uses the light of all rays; "waves"
-adds diffraction. "auto" takes the first of these whose kernel is within the tolerance of "waves".
-`converged_psf` chooses the number of rays and cells from the tolerance, outside of `jax.jit`. The
-model that it returns is a value, which `psf` takes anywhere.
+"gaussian" uses the moments of the rays, as in the paper; "rays" the light of all rays; "waves" adds
+diffraction. "auto" takes the first of these whose kernel is within the tolerance of "waves".
+`converged_psf` chooses the number of rays and cells from a tolerance, outside of `jax.jit`. The
+model that it returns is a value that `psf` accepts anywhere.
 """
 
 import functools
@@ -22,7 +22,7 @@ from ..pupil.rules import require_fit
 from .beam import BeamRule, trace_beam
 from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
 from .kernel import check_pixels
-from .psf_model import LOST, TOLERANCE, converged_psf, tell_of_loss, traced
+from .psf_model import LOST, TOLERANCE, converged_psf, traced, warn_of_loss
 
 
 def psf(
@@ -37,19 +37,23 @@ def psf(
     centre: Numbers | None = None,
     defocus: Numbers = 0.0,
 ) -> Psf:
-    """The point spread function on `size` x `size` pixels, see `Psf`.
+    """The point spread function of an object point on `size` x `size` pixels, see `Psf`.
 
-    field, distance, wavelengths (W,): as in `psf_moments`. pixel: the side of a pixel, mm.
-    model: a name, or a model from `converged_psf` (needed inside `jax.jit` and `jax.vmap`).
-    tolerance: only with a name: the sum of the absolute errors of a kernel's pixels, 1e-2 by
-        default.
-    centre: (2,) mm, of the kernel on the sensor; by default the mean of the wavelengths' centroids.
-    defocus: (), mm by which the sensor is moved back; this needs no new ray trace.
+    lens: the lens.
+    field, distance, wavelengths: as in `psf_moments`; wavelengths (W,).
+    pixel: side of a pixel, mm.
+    size: number of pixels along a side of the kernel.
+    model: a name, or a model from `converged_psf`, which is needed inside `jax.jit` and `jax.vmap`.
+    tolerance: only with a name: bound of the sum of the absolute errors of a kernel's pixels, 1e-2
+        by default.
+    centre: (2,), mm, centre of the kernel on the sensor; by default the mean of the centroids of
+        the wavelengths.
+    defocus: (), mm by which the sensor is moved back. This needs no new ray trace.
 
-    Light fills the stop uniformly. Differentiable in all numbers, in every mode. ValueError as in
-    `scene_of`, for a pixel that is not above 0, if no ray arrives, and for a field that a model is
-    not made for: one of fields along y alone has half a pupil. Where it is not known, inside
-    `jax.jit`, such a field is dark.
+    The stop is filled uniformly with light. Differentiable in all numbers, in every mode.
+    ValueError as in `scene_of`, for a pixel that is not above 0, if no ray arrives, and for a field
+    whose symmetry the model does not have: a model for fields along y traces half a pupil. Inside
+    `jax.jit`, where the field is not known, the kernel of such a field is 0.
     """
     scene = scene_of(lens, field, distance, wavelengths)
     pixel_, size = check_pixels(pixel, size, lens.curvature.dtype)
@@ -80,6 +84,7 @@ def _psf(
     kind: Kind,
     cells: int,
 ) -> Psf:
+    """`psf` of checked arguments."""
     beam = trace_beam(lens, scene, rule).refocused(defocus)
     return psf_of_beam(lens, scene.wavelengths, beam, pixel, centre, size, kind, cells)
 
@@ -93,24 +98,28 @@ def psfs(
     size: int,
     model: PsfModel,
 ) -> Psf:
-    """`psf` of B object points, one after the other. Each leaf of the result has B as first axis.
+    """`psf` of B object points, one after the other.
 
-    fields: (B, 2), radians. distances: (B,), mm, or one. wavelengths, pixel, size: as in `psf`.
+    lens: the lens.
+    fields: (B, 2), radians.
+    distances: (B,), mm, or one.
+    wavelengths, pixel, size: as in `psf`.
     model: one model from `converged_psf` for all points.
 
-    For use in `jax.jit`; outside of it, warns where more than 1 % of the light of a point falls
-    beside its kernel, with a size for which less does. The gradient traces each point again and
-    keeps the rays of one point at a time. ValueError for other shapes, and as in `psf` for fields
-    that the model is not made for. A point without light has the throughput 0.
+    Returns a `Psf` whose leaves have B as first axis; a point without light has the throughput 0.
+    For use in `jax.jit`; outside of it, warns if more than 1 % of the light of a point falls
+    outside of its kernel, with a size for which less does. The gradient traces each point again, so
+    only the rays of one point are in memory. ValueError for other shapes, and as in `psf` for
+    fields whose symmetry the model does not have.
     """
     dtype = lens.curvature.dtype
     angles, far = points_arrays(fields, distances, dtype)
     require_fit(model.rule.rule.symmetry, angles)
     side, size = check_pixels(pixel, size, dtype)
-    given = side, None, jnp.zeros((), dtype), size, model.kind, model.cells
+    settings = side, None, jnp.zeros((), dtype), size, model.kind, model.cells
 
     def one(point: tuple[Array, Array]) -> Psf:
-        return _psf(lens, scene_of(lens, *point, wavelengths), model.rule, *given)
+        return _psf(lens, scene_of(lens, *point, wavelengths), model.rule, *settings)
 
     found = jax.lax.map(jax.checkpoint(one), (angles, far))
     known = known_values((lens, angles, far, wavelengths, pixel, found.outside))
@@ -122,5 +131,5 @@ def psfs(
             with jax.core.eval_context():
                 scene = scene_of(lens, angles[k], far[k], wavelengths)
                 beam = traced(lens, scene, model.rule)
-            tell_of_loss(float(lost[k]), scene, beam, pixel, size, model.kind, 3)
+            warn_of_loss(float(lost[k]), scene, beam, pixel, size, model.kind, 3)
     return found

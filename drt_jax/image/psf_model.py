@@ -1,4 +1,5 @@
-"""The choice of a PSF model from a tolerance: its polynomials and the cells of its grid."""
+"""The choice of a PSF model from a tolerance: the degree of its polynomials and the cells of its
+grid."""
 
 import dataclasses
 import functools
@@ -21,7 +22,7 @@ from .beam import Beam, BeamRule, beam_rule, trace_beam
 from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
 from .converged import at_sensor, converge, scenes_of
 from .kernel import check_pixels
-from .rounding import hit_rounding, path_rounding, rough, tell
+from .rounding import below_double, hit_rounding, path_rounding, warn_dtype
 from .wave_psf import period
 from .zernike import zernike
 
@@ -32,10 +33,11 @@ TOLERANCE = 1e-2
 # Polynomial degrees to try, first of a coarse, then of a fine trace; cells of a grid to try.
 _DEGREES = (4, 6, 8, 10, 12, 14, 16), (20, 24)
 _CELLS = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768)
-# The error falls with the square of the number of cells, and a step is 4/3 or more: the kernels of
-# more cells are off by at most their change over this.
+# The error falls with the square of the number of cells n, and n rises by a factor of 4/3 or more
+# from one trial to the next. So the error of the finer kernels is at most their change divided by
+# (4/3)^2 - 1 > 0.75.
 _STEP = 0.75
-# Light beside a kernel that is told of.
+# Fraction of the light outside of a kernel above which a warning is given.
 LOST = 0.01
 _UM = 1e3  # per mm
 
@@ -52,52 +54,63 @@ def converged_psf(
     norm: int = 1,
     of: Of = "kernel",
 ) -> PsfModel:
-    """A PSF model whose kernels are within `tolerance`, the sum of the absolute errors of the
-    pixels; with `norm` 2 the root of the sum of their squares: the error of a white-noise picture.
+    """A PSF model whose kernels are accurate to a tolerance.
 
-    field: angle along y, or (x, y), in radians, or many pairs (F, 2). distance: mm, one or (Z,).
-    Other arguments as in `psf`; all are known numbers. The model is valid for every field at every
-    distance. "auto" takes the cheapest model within the tolerance of "waves", and `errors` gives
-    the differences of the others.
+    lens: the lens.
+    field: angle along y, or (x, y), or many pairs (F, 2), radians.
+    distance: one or (Z,), mm. The model is valid for every field at every distance.
+    wavelengths: (W,), um.
+    pixel: side of a pixel, mm.
+    size: number of pixels along a side of the kernels.
+    model: "gaussian", "rays", "waves", or "auto": the cheapest of these within the tolerance of
+        "waves"; `PsfModel.errors` then gives the differences of the other models.
+    tolerance: bound of the sum of the absolute errors of a kernel's pixels.
+    norm: 1; or 2, to bound the root of the sum of the squared errors, which is the error of a
+        white-noise picture.
     of: "kernel": the tolerance bounds the kernel alone; the relative error of its derivatives was
-        up to five times as large. "gradient": a fifth of it is kept, so that it holds for both.
+        up to five times as large. "gradient": a fifth of the tolerance is used, so that it holds
+        for both.
 
-    Warns if no degree or no grid that is tried meets the tolerance; if rounding does not, as in
-    float32 of waves from a large lens, where the search ends at what rounding allows; and if more
-    than 1 % of the light falls beside the kernel, with a size for which less does. ValueError
-    inside a trace.
+    All numbers must be known; ValueError inside a trace. Warns if no degree or no grid that is
+    tried meets the tolerance; if rounding does not allow it, as in float32 for waves from a large
+    lens, where the search ends at the accuracy that rounding allows; and if more than 1 % of the
+    light falls outside of the kernel, with a size for which less does.
     """
-    seen = field, distance, wavelengths
+    requested = field, distance, wavelengths
     require_one_of("of", of, get_args(Of))
-    exact = tolerance / 5 if of == "gradient" else tolerance
-    found, view = chosen_psf(lens, seen, pixel, size, model, exact, norm)
-    view.tell_of_loss(found)
+    bound = tolerance / 5 if of == "gradient" else tolerance
+    found, view = chosen_psf(lens, requested, pixel, size, model, bound, norm)
+    view.warn_of_loss(found)
     return found
 
 
 def chosen_psf(
-    lens: Lens, seen: tuple[Numbers, Numbers, Numbers], pixel: Numbers, size: int,
+    lens: Lens, requested: tuple[Numbers, Numbers, Numbers], pixel: Numbers, size: int,
     model: Kind | Literal["auto"], tolerance: float, norm: int = 1
 ) -> tuple[PsfModel, "_View"]:  # fmt: skip
-    """`converged_psf` of field, distance and wavelengths `seen`, silent on light beside the
-    kernel, and what tells of it."""
+    """`converged_psf` without its warning of light outside of the kernels.
+
+    requested: field, distance and wavelengths.
+
+    Returns the model, and the `_View` that can give this warning.
+    """
     _check_asked(model, tolerance, norm)
-    known = known_values((lens, seen, pixel))
+    known = known_values((lens, requested, pixel))
     if known is None:
         raise ValueError(
             "inside jax.jit or jax.vmap the cost of a kernel cannot follow from a tolerance: make "
             "the model outside and pass it on, model=drt_jax.converged_psf(...)"
         )
     with jax.core.eval_context():
-        lens, seen, pixel = known
+        lens, requested, pixel = known
         side, size = check_pixels(pixel, size, lens.curvature.dtype)
-        scenes = scenes_of(lens, *seen)
-        base = converge(scenes_of, lens, seen, min(tolerance, 1e-3), at_sensor, False).rule
+        scenes = scenes_of(lens, *requested)
+        base = converge(scenes_of, lens, requested, min(tolerance, 1e-3), at_sensor, False).rule
         clipped = base if isinstance(base, Clipped) else None
-        symmetry = symmetry_of(lens, seen[0])
+        symmetry = symmetry_of(lens, requested[0])
         rounded = {"hits": hit_rounding(lens)}
         if model in ("waves", "auto"):
-            paths = path_rounding(lens, scenes, True) if rough(lens) else 0.0
+            paths = path_rounding(lens, scenes, True) if below_double(lens) else 0.0
             rounded["phase"] = 4 * np.pi * paths
         for degrees in _DEGREES:
             whole = beam_rule(degrees[-1], symmetry, clipped)
@@ -115,7 +128,7 @@ def chosen_psf(
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
         view = _View(lens, tuple(scenes), tuple(beams), side, size, norm)
         worst = max(rounded.get("phase", 0.0), view.hit_error(model))
-        tell(lens, "kernels", worst, tolerance, "", 3)
+        warn_dtype(lens, "kernels", worst, tolerance, "", 3)
         view = dataclasses.replace(view, rounded=worst)
         if model != "auto":
             return PsfModel(model, rule, view.cells(model, tolerance)), view
@@ -123,6 +136,7 @@ def chosen_psf(
 
 
 def _check_asked(model: str, tolerance: float, norm: int) -> None:
+    """ValueError for an unknown model, a tolerance that is not between 0 and 1, or another norm."""
     require_one_of("model", model, (*get_args(Kind), "auto"))
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
@@ -136,15 +150,21 @@ def traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
     return trace_beam(lens, scene, rule)
 
 
-# Each number of cells needs its own compiled program, which runs once per scene.
+# Each number of cells needs its own compiled program, which runs once for each scene.
 _kernels = jit(psf_of_beam, ONCE, static_argnames=("size", "kind", "cells"))
 _refocused = jax.jit(Beam.refocused)
 
 
 @dataclasses.dataclass(frozen=True)
 class _View:
-    """The beams of scenes, and the pixels of the kernels. All numbers are known. rounded: what
-    rounding adds to the error of a kernel."""
+    """The beams of scenes, and the pixels of the kernels. All numbers are known.
+
+    lens, scenes, beams: the lens, its scenes and their beams.
+    pixel: (), mm.
+    size: number of pixels along a side of the kernels.
+    norm: as in `converged_psf`.
+    rounded: error of a kernel from rounding.
+    """
 
     lens: Lens
     scenes: tuple[Scene, ...]
@@ -154,8 +174,8 @@ class _View:
     norm: int
     rounded: float = 0.0
 
-    def made(self, kind: Kind, cells: int) -> list[Psf]:
-        """What a model makes of each scene."""
+    def psfs(self, kind: Kind, cells: int) -> list[Psf]:
+        """The `Psf` of each scene by a model."""
         named = {"size": self.size, "kind": kind, "cells": cells}
         return [
             _kernels(self.lens, scene.wavelengths, beam, self.pixel, None, **named)
@@ -163,28 +183,29 @@ class _View:
         ]
 
     def kernels(self, kind: Kind, cells: int) -> np.ndarray:
-        """Kernels of all scenes and wavelengths, (scenes W, size, size)."""
-        return np.concatenate([np.asarray(one.kernel) for one in self.made(kind, cells)])
+        """Kernels of all scenes and wavelengths, (scenes x W, size, size)."""
+        return np.concatenate([np.asarray(one.kernel) for one in self.psfs(kind, cells)])
 
     def hit_error(self, model: Kind | Literal["auto"]) -> float:
-        """What rounding of hits adds to the error of kernels; those of waves follow from paths. It
-        is measured by a defocus that moves rays at the rim of the pupil as far. Sums of errors in
-        float32 at Airy's radius: 0.02 for 0.006 of a microscope objective, 3e-4 for 4e-5 where
-        the spot is large."""
-        if model == "waves" or not rough(self.lens):
+        """Estimated error of the kernels from rounding of hits; that of waves follows from the
+        paths instead. It is measured by a defocus that moves the rays at the rim of the pupil by
+        the rounding of hits: rounding / NA. In float32 at pixels of the Airy radius it gave 0.02
+        for an error of 0.006 of a microscope objective, and 3e-4 for 4e-5 where the spot is
+        large."""
+        if model == "waves" or not below_double(self.lens):
             return 0.0
-        given: tuple[Kind, int] = ("gaussian", 0) if model == "gaussian" else ("rays", _CELLS[0])
-        cones = [float(np.max(one.solid_angle)) for one in self.made(*given)]
+        trial: tuple[Kind, int] = ("gaussian", 0) if model == "gaussian" else ("rays", _CELLS[0])
+        cones = [float(np.max(one.solid_angle)) for one in self.psfs(*trial)]
         steps = [hit_rounding(self.lens) * np.sqrt(np.pi / a) if a > 0 else 0.0 for a in cones]
         beams = [_refocused(b, b.index.dtype.type(step)) for b, step in zip(self.beams, steps)]
         moved = dataclasses.replace(self, beams=tuple(beams))
-        return difference(moved.kernels(*given), self.kernels(*given), self.norm)
+        return difference(moved.kernels(*trial), self.kernels(*trial), self.norm)
 
-    def tell_of_loss(self, model: PsfModel) -> None:
-        """Warns of light beside the kernels of a model."""
-        lost = [float(jnp.max(one.outside)) for one in self.made(model.kind, model.cells)]
+    def warn_of_loss(self, model: PsfModel) -> None:
+        """Warns of light outside of the kernels of a model, for the scene with most of it."""
+        lost = [float(jnp.max(one.outside)) for one in self.psfs(model.kind, model.cells)]
         k = int(np.argmax(lost))
-        tell_of_loss(lost[k], self.scenes[k], self.beams[k], self.pixel, self.size, model.kind, 4)
+        warn_of_loss(lost[k], self.scenes[k], self.beams[k], self.pixel, self.size, model.kind, 4)
 
     def cells(self, kind: Kind, tolerance: float) -> int:
         """The smallest number of cells for which the kernels are within the tolerance."""
@@ -207,7 +228,7 @@ class _View:
         return cells
 
     def _fewest(self, scene: Scene, beam: Beam) -> int:
-        """The fewest cells for which no periodic copy of spot or window overlaps the window."""
+        """The fewest cells for which no periodic copy of the spot overlaps the kernel."""
         hits = np.asarray(beam.hits[:, -1])
         middle = np.mean(hits[:, np.asarray(beam.known)], axis=-1)
         reach = np.max(np.where(np.asarray(beam.known), np.abs(hits - middle[:, None, None]), 0))
@@ -217,26 +238,35 @@ class _View:
 
 
 def difference(a: np.ndarray, b: np.ndarray, norm: int = 1) -> float:
-    """The largest difference of kernels (..., size, size): the sum of the absolute differences of
-    their pixels or, with `norm` 2, the root of the sum of the squares."""
+    """Largest difference of kernels (..., size, size): of the sums of the absolute differences
+    of their pixels or, with `norm` 2, of the roots of the sums of the squares."""
     total = np.sum(np.abs(a - b) ** norm, axis=(-2, -1))
     return float(np.max(total ** (1 / norm)))
 
 
-def tell_of_loss(
+def warn_of_loss(
     lost: float, scene: Scene, beam: Beam, pixel: Numbers, size: int, kind: Kind, level: int
 ) -> None:
-    """Warns if more than `LOST` of the light falls beside a kernel, with a size for which less
-    does. scene, beam: where most is lost."""
+    """Warns if more than `LOST` of the light falls outside of a kernel, and names a size for which
+    less does.
+
+    lost: fraction of the light outside.
+    scene, beam: those for which it is largest.
+    pixel, size, kind: of the kernel.
+    level: as of `warnings.warn`.
+
+    For each share p of `LOST` that diffraction may lose, the radius that is needed is the sum of
+    two: within the first, rays have all but LOST - p of the light; beyond the second, a round pupil
+    diffracts p. That is 2 / (pi v) = p at v = 2 pi NA r / wavelength, so r = 2 / (pi^2 p)
+    wavelength / (2 NA), and wavelength / (2 NA) is a `period`.
+    """
     if lost <= LOST:
         return
     hits, weights = np.asarray(beam.hits[:, -1], float), np.asarray(beam.weights, float)
     share = weights / np.maximum(np.sum(weights, axis=-1, keepdims=True), np.finfo(float).tiny)
     centre = np.mean(np.sum(share * hits, axis=-1), axis=-1)
     away = np.max(np.abs(hits - centre[:, None, None]), axis=0)
-    # Some of the light that is lost stays with rays that end farther out, a part is diffracted
-    # farther from all others: from a round pupil 2 / (pi v) at v = 2 pi NA r / wavelength, and
-    # wavelength / (2 NA) is a `period`.
+    # Shares of the loss for diffraction, and the radius that they need, times the share.
     parts, waves = np.linspace(0.05, 0.95, 19) * LOST, kind == "waves"
     spread = 2 / np.pi**2 * waves * np.max(np.asarray(period(beam, scene.wavelengths, 1)), axis=0)
     reach = np.zeros((len(away), len(parts)))
@@ -257,9 +287,11 @@ def _degree(
     beams: list[Beam], scenes: list[Scene], pixel: Array, rounded: dict[str, float],
     degrees: tuple[int, ...], tolerance: float
 ) -> tuple[int, float]:  # fmt: skip
-    """The lowest degree whose polynomials fit the rays, and the error of the fit beyond rounding,
-    relative to the spot or, for the phase, in radians. There are more rays than terms. rounded: of
-    hits, mm, and of phases, radians."""
+    """The lowest degree whose polynomials fit the rays, and the error of the fit beyond rounding:
+    relative to the spot or, for the phase, in radians. There are more rays than terms.
+
+    rounded: rounding of hits, mm, and of phases, radians.
+    """
     pairs = [(b, s, w) for b, s in zip(beams, scenes) for w in range(s.wavelengths.size)]
     for degree in degrees:
         error = max(_misfit(b, s, w, pixel, rounded, degree) for b, s, w in pairs)
@@ -271,7 +303,7 @@ def _degree(
 def _misfit(
     beam: Beam, scene: Scene, wavelength: int, pixel: Array, rounded: dict[str, float], degree: int
 ) -> float:
-    """The error of the fit at one wavelength, see `_degree`."""
+    """Error of the fit of one beam at one wavelength, see `_degree`."""
     cosines, waves = beam.on_sphere()
     rows = jax.tree.map(np.asarray, (beam.weights, beam.known, waves, beam.hits[:, -1]))
     weight, known, path, hits = (a[..., wavelength, :] for a in rows)
@@ -283,20 +315,27 @@ def _misfit(
     error /= max(float(spread), float(pixel))
     if "phase" not in rounded:
         return error
-    # The error of the wave field is the phase error; it counts twice. Without the tilt towards the
-    # middle of the light, as in `Beam.over_directions`.
+    # The error of the wave field is the phase error, and that of the intensity twice as large: 4 pi
+    # in place of 2 pi. The tilt towards the centroid is removed, as in `Beam.over_directions`.
     path = path + float(beam.index[wavelength]) * np.sum(np.float64(middle) * directions, axis=0)
     phase = path[None] * (4 * np.pi * _UM / float(scene.wavelengths[wavelength]))
     return max(error, _residual(directions, phase, weight, degree) - 2 * rounded["phase"])
 
 
 def _mean(hits: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Weighted mean (D, 1) of hits (D, Q); `weight` (Q,) is the square root of the normalised
+    light."""
     return cast(np.ndarray, np.sum(weight**2 * hits, axis=-1, keepdims=True))
 
 
 def _residual(points: np.ndarray, values: np.ndarray, weight: np.ndarray, degree: int) -> float:
-    """RMS residual of a fit of polynomials of a degree to values (D, Q) at points (2, Q); `weight`
-    (Q,) is the square root of the light."""
+    """RMS residual of a fit of polynomials of a degree.
+
+    points: (2, Q).
+    values: (D, Q).
+    weight: (Q,), square root of the normalised light.
+    degree: of the polynomials.
+    """
     centre = _mean(points, weight)
     scale = 2 * np.sqrt(np.sum(weight**2 * (points - centre) ** 2, axis=-1, keepdims=True))
     basis = np.asarray(zernike(jnp.asarray((points - centre) / scale), degree))
@@ -306,7 +345,7 @@ def _residual(points: np.ndarray, values: np.ndarray, weight: np.ndarray, degree
 
 
 def _cheapest(view: _View, rule: BeamRule, tolerance: float) -> PsfModel:
-    """The first model, from cheap to exact, that is within the tolerance of "waves"."""
+    """The first of "gaussian", "rays" and "waves" that is within the tolerance of "waves"."""
     ladder: list[tuple[Kind, int]] = [
         (kind, view.cells(kind, tolerance)) for kind in get_args(Kind)
     ]

@@ -1,11 +1,11 @@
-"""The kernel of geometric optics: the light of many rays, collected by pixels.
+"""PSF kernel of geometric optics: the light of many rays, collected by pixels.
 
-Hits come from the polynomials of a beam on a grid of the stop, so that many rays cost little.
-Each ray stands for a cell of the grid; on the sensor it is a spot about as wide as the cell becomes
-there (the biweight kernel of density estimation), so that the kernel is smooth in all parameters,
-also where rays cross, and no light is lost or made. What the width of the spots adds to the
-variance is taken away by drawing the hits together: centroid and covariance are those of the
-moments.
+The polynomials of a beam give the hits for a fine grid of stop points, so many rays cost little.
+Each ray represents a cell of the grid. On the sensor it is a spot about as wide as the image of
+that cell: the biweight kernel 15 / 16 (1 - t^2)^2 of density estimation. So the PSF is a smooth
+function of all parameters, also where rays cross (at caustics), and the light is conserved. The
+width of the spots would add to the variance; the hits are contracted to compensate, so that
+centroid and covariance are those of the moments.
 """
 
 import jax.numpy as jnp
@@ -18,18 +18,22 @@ from .beam import Beam, centroid_and_variances, means
 from .cover import cover
 from .spot import normalised
 
-# Half the width of a spot: in pixels at least, and in cells of the grid.
+# Half the width of a spot: _BLUR pixels plus _CELLS times the size of the image of a cell.
 _BLUR, _CELLS = 0.05, 0.8
-# Variance of a spot of half width 1.
+# Variance of a biweight spot of half width 1.
 _VARIANCE = 1 / 7
 
 
 def ray_kernel(lens: Lens, beam: Beam, centre: Array, pixel: Array, size: int, cells: int) -> Array:
-    """What pixels collect of the light, (W, size, size) [y, x], adding to the part of the
-    throughput that falls on the grid of pixels.
+    """Geometric PSF kernel of a beam on the pixels.
 
-    centre: (2,) mm, of the pixels on the sensor. pixel: () mm. cells: of the grid on the stop,
-    along a side.
+    lens, beam: the lens and its beam.
+    centre: (2,), mm, centre of the kernel on the sensor.
+    pixel: (), side of a pixel, mm.
+    size: number of pixels along a side of the kernel.
+    cells: number of cells along a side of the grid on the stop.
+
+    Returns (W, size, size) [y, x]. The sum is the part of the throughput that falls on the kernel.
     """
     hits, width, weights = ray_spots(lens, beam, cells)
     edges = jnp.arange(size + 1, dtype=pixel.dtype) - size / 2
@@ -39,10 +43,16 @@ def ray_kernel(lens: Lens, beam: Beam, centre: Array, pixel: Array, size: int, c
 
 
 def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
-    """The light as Q = cells^2 spots: where they are (2, W, Q) and half how wide along x and y
-    (2, W, Q), mm, and their light (W, Q), what the beam's mask lets pass of it."""
+    """The light of a beam as Q = cells^2 spots, one for each cell of a grid on the stop.
+
+    lens, beam: the lens and its beam.
+    cells: number of cells along a side of the grid.
+
+    Returns centres (2, W, Q) and half widths along x and y (2, W, Q), mm, and the light (W, Q) of
+    each spot, which is multiplied by the transmission of the beam's mask.
+    """
     functions, waves = beam.over_stop(), beam.path.shape[0]
-    # Cells of the square that holds the light; its middle and half its side, in units of the stop.
+    # Centre and half side of the square that contains the light, in semi-diameters of the stop.
     low, high = beam.extent()
     middle, half = (low + high) / 2, (high - low) / 2
     side = (np.arange(cells) - (cells - 1) / 2) * (2 / cells)
@@ -53,7 +63,7 @@ def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
     axes = middle, half * (2 / cells)
     light = cover(lens, beam, stop, values[2:], beam.points, axes)[0].reshape(waves, -1)
     weights = normalised(light) * beam.throughput[:, None]
-    # How far the cell of a ray reaches on the sensor, along x and y.
+    # Size of the image of a cell on the sensor, along x and y: sqrt((dx/du du)^2 + (dx/dv dv)^2).
     cell = (step * (2 / cells))[:, None, :, None, None]
     reach = safe_sqrt(sum((s * c) ** 2 for s, c in zip(slopes, cell)))
     hits, width = values[:2].reshape(2, waves, -1), _CELLS * reach.reshape(2, waves, -1)
@@ -65,13 +75,21 @@ def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
 
 
 def _corrected(hits: Array, weights: Array, width: Array, beam: Beam) -> Array:
-    """Hits (2, W, Q) of spots of a width (2, W, Q), moved so that their light has the centroid and
-    the covariance of the beam's rays."""
-    centroid, wanted = centroid_and_variances(beam.hits[:, -1], beam.weights)
+    """Centres of spots, moved so that their light has the centroid and the covariance of the beam's
+    rays.
+
+    hits, width: (2, W, Q), mm, centres and half widths.
+    weights: (W, Q).
+
+    A spot of half width w adds the variance w^2 / 7. With the Cholesky factors L of the covariance
+    of the centres, and M of the covariance of the beam's rays less the mean of w^2 / 7, the map h
+    -> centroid + M L^-1 (h - mean) gives the centres the covariance M M^T.
+    """
+    centroid, target = centroid_and_variances(beam.hits[:, -1], beam.weights)
     mean, found = centroid_and_variances(hits, weights)
     spots = _VARIANCE * means(width**2, weights)
-    p, q, r = _root(found)
-    a, b, c = _root((wanted[0] - spots[0], wanted[1], wanted[2] - spots[1]))
+    p, q, r = _cholesky(found)
+    a, b, c = _cholesky((target[0] - spots[0], target[1], target[2] - spots[1]))
     x, y = hits - mean[..., None]
     xx, yy = safe_divide(a, p), safe_divide(c, r)
     yx = safe_divide(b - yy * q, p)
@@ -79,8 +97,9 @@ def _corrected(hits: Array, weights: Array, width: Array, beam: Beam) -> Array:
     return centroid[..., None] + moved
 
 
-def _root(covariance: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    """Elements 11, 21 and 22 of Cholesky's factor."""
+def _cholesky(covariance: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """Elements 11, 21 and 22 of the Cholesky factor of a covariance with the elements xx, xy and
+    yy."""
     xx, xy, yy = covariance
     a = safe_sqrt(xx)
     b = safe_divide(xy, a)
@@ -88,14 +107,18 @@ def _root(covariance: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
 
 
 def _shares(edges: Array, place: Array, width: Array) -> Array:
-    """The part (W, Q, size) of spots at `place` (W, Q) of half `width` (W, Q) between neighbouring
-    edges (size + 1,)."""
-    found = below((edges[None, None] - place[..., None]) / width[..., None])
+    """Fractions (W, Q, size) of spots along one axis that fall between neighbouring pixel edges.
+
+    edges: (size + 1,), pixels.
+    place, width: (W, Q), centres and half widths of the spots, pixels.
+    """
+    found = spot_below((edges[None, None] - place[..., None]) / width[..., None])
     return found[..., 1:] - found[..., :-1]
 
 
-def below(t: Array) -> Array:
-    """The part of a spot of half width 1 below t: the integral of 15 / 16 (1 - t^2)^2."""
+def spot_below(t: Array) -> Array:
+    """Fraction of a spot of half width 1 below t: the integral of 15 / 16 (1 - t^2)^2 from -1 to
+    t."""
     t = jnp.clip(t, -1, 1)
     square = t * t
     return 0.5 + t * (15 / 16 + square * (-5 / 8 + square * (3 / 16)))

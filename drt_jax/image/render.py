@@ -1,14 +1,15 @@
 """The photograph that a lens takes of an ideal picture.
 
-Radiance stays the same along a ray. So a point of the sensor collects the mean radiance over its
-cone of light, times the cone's solid angle in direction cosines:
+Radiance is constant along a ray. So a point p of the sensor collects the mean radiance over its
+cone of light, times the solid angle of the cone in direction cosines:
 
-    irradiance(p) = solid_angle(p) sum_k G(k; p) radiance(source of p - k),
+    irradiance(p) = solid_angle(p) sum_k G(k; p) radiance(source of p - k).
 
-where the source of a point is the field whose centroid lies there, each colour its own, and G the
-kernel as seen from the sensor: that of the source of p - k, weighted with its light, at k. G adds
-up to 1, less what falls beside the kernel, so that an even scene stays even but for the solid
-angle. G is a sum of a few kernels with shares that vary over the picture, see `blur`.
+The source of a point is the field whose centroid lies there, for each colour separately. G is the
+kernel as seen from the sensor: its element k is the element k of the kernel of the source of p - k,
+weighted with the light of that source. G has the sum 1, less the light outside of the kernel, so
+that a uniform scene stays uniform except for the solid angle. G is a sum of a few kernels with
+coefficients that vary over the picture, see `blur`.
 """
 
 import functools
@@ -40,8 +41,16 @@ from .sensor_maps import (
 
 @functools.partial(jit, wanted=LARGE, static_argnames="lit")
 def _strip(maps: Maps, method: RenderMethod, picture: Array, row: Array, lit: bool) -> Array:
-    """A row of tiles of one distance, (height, n width, C): what the kernels make of a picture
-    (H, W, C) in the dtype of `maps`; if `lit`, times the light."""
+    """A row of tiles of one distance.
+
+    maps: maps of one distance.
+    method: from `render_method`.
+    picture: (H, W, C), in the dtype of `maps`.
+    row: index of the row of tiles.
+    lit: True to multiply with the relative light.
+
+    Returns (height, n width, C), channels last.
+    """
     (tile, wide), margin, dtype = method.tile, method.grid.size // 2, picture.dtype
     starts = (row * tile).astype(dtype), jnp.zeros((), dtype)
     lengths = tile, tiles_of(method)[1] * wide
@@ -54,6 +63,7 @@ def _strip(maps: Maps, method: RenderMethod, picture: Array, row: Array, lit: bo
         local.append(basis(place[margin : length + margin], count, LOCAL))
 
     def between(values: Array, where: list[Array]) -> Array:
+        """Values at the positions of the maps, interpolated to pixels."""
         return einsum("ym,cmn,xn->cyx", where[0], values, where[1])
 
     x, y = (between(maps.sources[..., k], places) for k in (0, 1))
@@ -70,8 +80,13 @@ def _strip(maps: Maps, method: RenderMethod, picture: Array, row: Array, lit: bo
 
 
 def _corners(kernels: Array, method: RenderMethod, row: Array) -> tuple[Array, Array, Array]:
-    """What `blur_row` takes of a row of n tiles: kernels (n, C, 4, K, K) of the corners, from all
-    (C, Cy, Cx, K, K), their shares (1, 4, height, 2) and the matrix (n width, 2)."""
+    """Arguments of `blur_row` for a row of n tiles whose kernels are blended from the corners.
+
+    kernels: (C, Cy, Cx, K, K), at the corners of all tiles.
+
+    Returns the kernels (n, C, 4, K, K) of the corners of each tile, their shares (1, 4, height, 2),
+    which are linear ramps, and the matrix (n width, 2) that interpolates along the row.
+    """
     count, dtype = tiles_of(method)[1], kernels.dtype
     near = jax.lax.dynamic_slice_in_dim(kernels, row, 2, axis=1)
     four = [near[:, d, a : a + count] for d in (0, 1) for a in (0, 1)]
@@ -92,24 +107,28 @@ def render(
     method: RenderMethod | None = None,
     progress: Callable[[Iterable], Iterable] = iter,
 ) -> Array:
-    """What a lens makes of an ideal picture on its sensor: distortion, lateral colour, blur that
-    varies over the field, vignetting and relative illumination: (H, W, C) in the dtype of `image`.
+    """The picture that a lens forms of an ideal picture on its sensor, with distortion, lateral
+    colour, blur that varies over the field, vignetting and relative illumination.
 
-    image: (H, W, C), radiance, linear, of C wavelengths, in floating numbers; (H, W) stands for all
-        colours. What a pinhole of the lens's effective focal length f sees: f tan(field), centred
-        on the axis, at the sensor's pixels; rows along y, columns along x of the sensor (where
-        pictures stand upside down, as this one does for a scene the right way up).
-        Outside of the picture it goes on as at its edge.
-    distance: mm, inf allowed, or a depth map (H, W) of the picture: layers, see `composed`.
-    pixel: side of a pixel, mm. wavelengths: (C,) um.
-    method: of `render_method` for this distance and pixel, made outside; needed inside `jax.jit`
+    lens: the lens.
+    image: (H, W, C), linear radiance of C wavelengths, floating-point numbers; (H, W) is used for
+        all colours. It is what a pinhole camera with the lens's effective focal length f sees: f
+        tan(field), centred on the axis, at the sensor's pixels, with rows along y and columns along
+        x of the sensor. (On a sensor pictures stand upside down, as this one does for an upright
+        scene.) Outside of the picture its edge pixels continue.
+    distance: mm, inf allowed; or a depth map (H, W) of the picture, which is rendered in layers,
+        see `composed`.
+    pixel: side of a pixel, mm.
+    wavelengths: (C,), um.
+    method: from `render_method` for this distance and pixel, made outside; needed inside `jax.jit`
         and `jax.vmap`. By default it is made here, with its own defaults.
-    progress: wraps the loop over rows of tiles (tqdm), where all numbers are known.
+    progress: wraps the loop over rows of tiles (such as tqdm), where all numbers are known.
 
-    The result is the irradiance over that of the axis: 1 where a picture of 1 meets the axis. Light
-    beside the kernels is lost. Each colour is resampled by cubic convolution, to third order in
-    the distortion. Differentiable in the lens and the image, in every mode. ValueError for other
-    shapes and dtypes, pictures that are not finite, and as of `render_method`.
+    Returns (H, W, C) in the dtype of `image`: the irradiance relative to that on the axis, 1 where
+    a picture of 1 meets the axis. Light outside of the kernels is lost. Each colour is resampled by
+    cubic convolution, which is of third order in the distortion. Differentiable in the lens and the
+    image, in every mode. ValueError for other shapes and dtypes, for pictures that are not finite,
+    and as of `render_method`.
     """
     count = len(lens.checked_wavelengths(wavelengths).reshape(-1))
     picture = _picture(image, count)
@@ -128,7 +147,7 @@ def render(
 
 
 def _check_method(method: RenderMethod, distance: Numbers, pixel: Numbers) -> None:
-    """ValueError for known numbers that are not those of the method."""
+    """ValueError if known numbers are not those that the method was made for."""
     if concrete(distance):
         layer_distances(distance, method.shape, 2)
     for name, given, own in (
@@ -143,7 +162,7 @@ def _check_method(method: RenderMethod, distance: Numbers, pixel: Numbers) -> No
 
 
 def _picture(image: Array, channels: int) -> Array:
-    """(H, W, C), checked."""
+    """The picture as a checked array (H, W, C)."""
     shape, dtype = np.shape(image), jnp.result_type(image)
     if not jnp.issubdtype(dtype, jnp.floating):
         raise ValueError(f"image: linear floating numbers are expected, not {dtype}")
@@ -164,7 +183,7 @@ def _whole(
     layer: int = 0,
     lit: bool = True,
 ) -> Any:
-    """All rows of tiles of a picture (H, W, C), see `_strip`."""
+    """All rows of tiles of a picture (H, W, C), see `_strip`. layer: index of the distance."""
     (height, width), tile, rows = method.shape, method.tile[0], tiles_of(method)[0]
     picture = jnp.asarray(picture)
     colours = picture.shape[-1]
@@ -184,19 +203,30 @@ def _whole(
 def composed(
     maps: Maps, method: RenderMethod, picture: Array, depth: Array, progress: Callable = iter
 ) -> Any:
-    """The picture of a depth map in layers, the nearest first.
+    """The picture of a scene with a depth map, in layers, the nearest first.
 
-    A pixel belongs to the layer nearest to it in 1 / distance. Behind nearer layers each goes on
-    as `spread` has it, since nobody knows what is hidden there. It is blurred with its own
-    kernels, and so is its cover, 1 where it is; what the covers of nearer layers let through is
-    seen. So an even scene stays even at any depth. The covers multiply, as if light met the layers
-    independently of where it crosses the pupil; a slope shows its steps where the blur of
-    neighbouring layers differs.
+    maps: maps of all layers.
+    method: from `render_method`.
+    picture: (H, W, C).
+    depth: (H, W), mm.
+    progress: as in `render`.
+
+    A pixel belongs to the layer that is nearest to it in 1 / distance. Behind nearer layers, where
+    nobody knows what is hidden, each layer is extrapolated by `spread`. A layer is blurred with its
+    own kernels, and so is its mask, which is 1 where the layer is. The result is
+
+        sum_k open_k blurred_k / sum_k open_k mask_k,
+        open_k = product over nearer layers j of (1 - mask_j),
+
+    with the masks blurred and, in the denominator, without the relative light. So a uniform scene
+    stays uniform at any depth, except for the relative light. The product of masks treats the
+    layers as if light met them independently of where it crosses the pupil. A slope shows steps
+    where the blur of neighbouring layers differs.
     """
     vergences = np.asarray(jax.vmap(vergence_of)(method.grid.distances)).tolist()
     at = vergence_of(depth)
-    apart = jnp.stack([jnp.abs(at - v) for v in vergences])
-    label = jnp.argmin(apart, axis=0)
+    away = jnp.stack([jnp.abs(at - v) for v in vergences])
+    label = jnp.argmin(away, axis=0)
     dtype = picture.dtype
     total: Any = 0.0
     cover: Any = 0.0
@@ -205,10 +235,10 @@ def composed(
         own = (label == layer)[..., None].astype(dtype)
         known = (label >= layer)[..., None].astype(dtype)
         share = spread(own, known)
-        here = spread(picture * own, own) * share
-        part = _whole(maps, method, here, progress, layer)
-        there = jnp.broadcast_to(share, picture.shape)
-        covered = _whole(maps, method, there, progress, layer, lit=False)
+        filled = spread(picture * own, own) * share
+        part = _whole(maps, method, filled, progress, layer)
+        mask = jnp.broadcast_to(share, picture.shape)
+        covered = _whole(maps, method, mask, progress, layer, lit=False)
         total = total + open_ * part
         cover = cover + open_ * covered
         open_ = open_ * (1 - covered)
@@ -216,20 +246,28 @@ def composed(
 
 
 def spread(values: Array, known: Array) -> Array:
-    """`values` (H, W, C), 0 where unknown, gone on to where `known` (H, W, 1) is 0: there the mean
-    of what is known in the 3 x 3 pixels around; where none is, of pixels 2, 4, 8, ... as large."""
+    """Inpainting: fills unknown pixels with a local mean of known ones.
+
+    values: (H, W, C), 0 where unknown.
+    known: (H, W, 1), weight of each pixel, 0 where unknown.
+
+    The mean is that of the known pixels among the 3 x 3 around; where there is none, of pixels that
+    are 2, 4, 8, ... times as large.
+    """
     height, width = known.shape[:2]
     zero = jnp.zeros((), values.dtype)
 
-    def around(a: Array) -> Array:
+    def neighbours(a: Array) -> Array:
+        """Sum over the 3 x 3 pixels around each pixel."""
         return jax.lax.reduce_window(a, zero, jax.lax.add, (3, 3, 1), (1, 1, 1), "SAME")
 
     def halved(a: Array) -> Array:
+        """Mean over blocks of 2 x 2 pixels."""
         a = jnp.pad(a, ((0, height % 2), (0, width % 2), (0, 0)))
         return a.reshape(-(-height // 2), 2, -(-width // 2), 2, -1).mean(axis=(1, 3))
 
-    share = around(known)
-    near = safe_divide(around(values), share)
+    share = neighbours(known)
+    near = safe_divide(neighbours(values), share)
     if max(height, width) > 3:
         far = spread(halved(values), halved(known))
         across = jnp.repeat(jnp.repeat(far, 2, axis=0), 2, axis=1)[:height, :width]
@@ -240,11 +278,13 @@ def spread(values: Array, known: Array) -> Array:
 def sensor_noise(image: Array, key: Array, full_well: Numbers, read_noise: Numbers) -> Array:
     """An image with the noise of a sensor, in the units of the image, not clipped.
 
-    image: (...), 1 for a pixel that is full. key: a PRNG key.
-    full_well: electrons of a full pixel. read_noise: standard deviation, electrons.
+    image: (...), 1 for a full pixel.
+    key: a PRNG key.
+    full_well: number of electrons of a full pixel.
+    read_noise: standard deviation, electrons.
 
-    Shot noise as a Gaussian whose variance is the number of electrons, right to a few per cent from
-    some 20 electrons on; differentiable in the image.
+    Shot noise is a Gaussian whose variance is the number of electrons, which is accurate to a few
+    per cent from some 20 electrons on. Differentiable in the image.
     """
     dtype = image.dtype
     full, read = (jnp.asarray(a, dtype) for a in (full_well, read_noise))

@@ -1,4 +1,4 @@
-"""How a photograph is rendered: fields, kernels and tiles for a tolerance."""
+"""How a photograph is rendered: the choice of fields, kernels and tiles for a tolerance."""
 
 from typing import Any, Literal
 
@@ -16,9 +16,10 @@ from .grid_method import check_pixel, grid_method
 from .sensor_maps import RenderMethod, chosen
 
 WAVELENGTHS = (0.6, 0.53, 0.48)
-# How much farther than the field of a pinhole that of a pixel is looked for, as a part of it.
+# Fields that are tried in `_angles`, in units of the field of a pinhole camera at the edge of the
+# picture.
 _TRIED = np.linspace(0, 2, 81)
-# The largest tangent of a field, that of 85 degrees.
+# Largest tangent of a field, that of 85 degrees.
 _WIDEST = 11.4
 
 
@@ -34,19 +35,26 @@ def render_method(
     model: Kind | Literal["auto"] | PsfModel = "rays",
     tolerance: float = 1e-3,
 ) -> RenderMethod:
-    """Choose how `render` works; all numbers are known.
+    """Chooses how `render` works. All arguments are known numbers.
 
-    shape: of the picture, H and W.
-    distance: mm, one or a depth map (H, W), of which `layers` follow, equidistant in 1 / distance.
-    pixel: mm. wavelengths: (C,) um.
-    size: side of a kernel in pixels, odd; by default wide enough for 4.5 standard deviations.
-    nodes: fields on one side of the axis, along the longer side of the picture, see `grid_method`.
-    model: of the kernels, as of `psf`. tolerance: of the kernels, and of what lies between those of
-        a grid: the root of the sum of the squared errors of pixels, by which a picture of white
-        noise of variance 1 is off.
+    lens: the lens.
+    shape: height and width of the picture, pixels.
+    distance: mm; one, or a depth map (H, W), which is divided into `layers` distances, equidistant
+        in 1 / distance.
+    pixel: side of a pixel, mm.
+    wavelengths: (C,), um.
+    size: number of pixels along a side of a kernel, odd; by default wide enough for 4.5 standard
+        deviations of the blur.
+    nodes: number of fields on one side of the axis, along the longer side of the picture, see
+        `grid_method`.
+    layers: number of distances for a depth map.
+    model: of the kernels, as in `psf`.
+    tolerance: of the kernels, and of their interpolation between the nodes of the grid: the root of
+        the sum of the squared errors of a kernel's pixels. This is the RMS error of a picture of
+        white noise of variance 1.
 
-    Warns of light beside kernels that are too small. ValueError inside a trace, for numbers that
-    make no sense, and where no light arrives.
+    Returns a `RenderMethod`. Warns of light outside of kernels that are too small. ValueError
+    inside a trace, for invalid numbers, and where no light arrives.
     """
     known = known_values((lens, distance, pixel, wavelengths))
     if known is None:
@@ -75,7 +83,7 @@ def render_method(
 
 
 def layer_distances(distance: Numbers, shape: tuple[int, int], layers: int) -> np.ndarray:
-    """Distances (D,) mm of the layers of a known distance or depth map, the nearest first."""
+    """Distances (D,), mm, of the layers of a known distance or depth map, the nearest first."""
     far = np.asarray(distance, float)
     if far.ndim and far.shape != tuple(shape):
         raise ValueError(
@@ -102,20 +110,20 @@ def _angles(
     focal: float,
     wavelengths: Any,
 ) -> np.ndarray:
-    """Fields (2,), radians along x and y, whose image points lie at the edges of the picture, or as
-    far outside as the lens has any."""
+    """Largest fields (2,), radians along x and y, whose image points lie at the edges of the
+    picture, or as far outside as chief rays exist and image heights rise with the field."""
     half = np.array([shape[1], shape[0]]) / 2 * pixel
     corners = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * half
     tangents = corners[:, None] * _TRIED[None, :, None] / abs(focal)
     points = image_points(lens, tangents.reshape(-1, 2), far[[0, -1]], wavelengths)
     points = points.reshape(2, *tangents.shape[:2], -1, 2)
-    there = np.isfinite(points)
+    exists = np.isfinite(points)
     units = corners / np.sum(corners**2, axis=1, keepdims=True)
-    radii = np.sum(np.where(there, points, 0) * units[None, :, None, None], axis=-1)
-    radii = np.where(np.all(there, axis=-1), np.abs(radii), np.nan)
+    radii = np.sum(np.where(exists, points, 0) * units[None, :, None, None], axis=-1)
+    radii = np.where(np.all(exists, axis=-1), np.abs(radii), np.nan)
     farthest = 1.0
     for ray in np.moveaxis(radii, 2, -1).reshape(-1, len(_TRIED)):
-        rising = np.concatenate([[True], np.diff(ray) > 0])  # False for a NaN, too
+        rising = np.concatenate([[True], np.diff(ray) > 0])  # also False for a NaN
         end = len(ray) if np.all(rising) else int(np.argmin(rising))
         reached = np.flatnonzero(ray[:end] >= 1)
         farthest = max(farthest, _TRIED[reached[0] if len(reached) else end - 1])

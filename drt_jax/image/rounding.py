@@ -1,11 +1,11 @@
-"""What float32, JAX's default, cannot hold: measured, and told where numbers are known.
+"""Rounding errors of float32, JAX's default: estimates, and warnings where numbers are known.
 
-Analyses of waves need path differences to a thousandth of a wave. Paths are taken relative to one
-in the middle of the beam before lengths are summed (`rays.fermat.optical_path`), so that float32
-keeps them in a camera, though not in a telescope of metres. How far they are off is measured by the
-arithmetic itself: paths are stationary, so that hits which differ in their last digits have the
-same path but for its rounding. Inside of a trace no number is known and nothing can be told; the
-values stay finite.
+Analyses of waves need path differences to a thousandth of a wave. Paths are computed relative to
+one in the middle of the beam before lengths are summed (`rays.fermat.optical_path`), so float32 is
+accurate enough for a camera, though not for a telescope of metres. The error is measured with the
+arithmetic itself: paths are stationary, so hits that differ in their last digits have equal paths
+except for rounding. Inside of a trace no number is known, so no warning can be given; the values
+stay finite.
 """
 
 import dataclasses
@@ -27,26 +27,32 @@ from ..rays.solve import solve_aimed
 from ..rays.status import Status
 from ..rays.trace import aims, path_of
 
-# The precision of float64 is below this, that of float32 above.
+# The machine epsilon of float64 is below this, that of float32 above.
 _DOUBLE = 1e-12
-# RMS error of path differences, waves, up to which analyses are silent: 6e-3 of a Strehl ratio.
+# RMS error of path differences, waves, up to which no warning is given: 6e-3 of a Strehl ratio.
 _WAVES = 1e-3
-# Error of a focus, in parts of the depth of focus, that is borne in silence.
+# Error of a focus, in units of the depth of focus, up to which no warning is given.
 _FOCUS = 0.02
-# Rays of the measurement, as many on the rim of the stop as at half of its radius, and last digits
-# by which their hits differ.
+# Number of rays of the measurement, half of them near the rim of the stop (0.98) and half at half
+# of its radius; and the largest number of machine epsilons by which their hits are changed.
 _RAYS, _DIGITS = 16, 8
 
 
-def rough(lens: Lens) -> bool:
-    """Whether the numbers of a lens are coarser than float64."""
+def below_double(lens: Lens) -> bool:
+    """Whether the dtype of a lens is less precise than float64."""
     return float(jnp.finfo(lens.curvature.dtype).eps) > _DOUBLE
 
 
-def tell(lens: Lens, what: str, wrong: float, allowed: float, unit: str, level: int) -> None:
-    """Warns if the dtype of a lens, coarser than float64, makes something wrong by more than is
-    allowed. level: as of `warnings.warn`, where 1 is the caller of this function."""
-    if rough(lens) and wrong > allowed:
+def warn_dtype(lens: Lens, what: str, wrong: float, allowed: float, unit: str, level: int) -> None:
+    """Warns if the dtype of a lens is less precise than float64 and an error exceeds what is
+    allowed.
+
+    what: name of the quantity, for the message.
+    wrong, allowed: estimated error and bound.
+    unit: text behind the number in the message.
+    level: as of `warnings.warn`, where 1 is the caller of this function.
+    """
+    if below_double(lens) and wrong > allowed:
         warnings.warn(
             f"in {lens.curvature.dtype} {what} may be wrong by {wrong:.0e}{unit}, more than "
             f'{allowed:.0e}: jax.config.update("jax_enable_x64", True) before the lens is loaded',
@@ -55,17 +61,22 @@ def tell(lens: Lens, what: str, wrong: float, allowed: float, unit: str, level: 
 
 
 def hit_rounding(lens: Lens) -> float:
-    """Error of hits by rounding, mm, which is relative to the length of the lens. Measured in
-    float32 over 54 scenes of bundled lenses: an eighth of this in the median, at most 0.93 of it;
-    more for Hubble, 6 m long with a spot of 10 nm."""
+    """Estimated error of hits from rounding, mm: 2 eps times the length of the lens. Measured in
+    float32 over 54 scenes of bundled lenses, the error was an eighth of this in the median and
+    at most 0.93 of it; more for Hubble, which is 6 m long with a spot of 10 nm."""
     return 2 * float(jnp.finfo(lens.curvature.dtype).eps) * abs(float(lens.sensor))
 
 
-def tell_of_focus(lens: Lens, distance: Numbers, wavelengths: Numbers, level: int = 3) -> None:
-    """Warns if rounding moves a focus by more than `_FOCUS` of the depth of focus, wavelength over
-    NA^2, where it is known: by the error of hits over NA. Foci of spots of the bundled lenses were
-    off by a fifth of this in the median, at most by 0.97 of it."""
-    known = known_values((lens, distance, wavelengths)) if rough(lens) else None
+def warn_of_focus(lens: Lens, distance: Numbers, wavelengths: Numbers, level: int = 3) -> None:
+    """Warns if rounding moves a focus by more than `_FOCUS` of the depth of focus,
+    wavelength / NA^2, if the numbers are known. The estimate is the rounding of hits over NA. The
+    foci of spots of the bundled lenses were off by a fifth of this in the median, and by at most
+    0.97 of it.
+
+    distance, wavelengths: as in `scene_of`.
+    level: as of `warnings.warn`.
+    """
+    known = known_values((lens, distance, wavelengths)) if below_double(lens) else None
     if known is None:
         return
     with jax.core.eval_context():
@@ -74,16 +85,21 @@ def tell_of_focus(lens: Lens, distance: Numbers, wavelengths: Numbers, level: in
         waves = lens.checked_wavelengths(wavelengths)
         per_um = numerical_aperture(lens, distance, waves) / waves
         moved = 1e3 * hit_rounding(lens) * float(jnp.max(per_um))
-    tell(lens, "the focus", moved, _FOCUS, " of its depth", level)
+    warn_dtype(lens, "the focus", moved, _FOCUS, " of its depth", level)
 
 
-def tell_of_paths(
+def warn_of_paths(
     lens: Lens, axis: Scene, fields: Array | None = None, level: int = 3, of_beams: bool = False
 ) -> None:
-    """Warns if rounding makes path differences wrong by more than `_WAVES`, where it is known.
-    axis: the scene, or that of the axis for `fields` (F, 2), radians. of_beams: see
-    `path_rounding`."""
-    known = known_values((lens, axis, fields)) if rough(lens) else None
+    """Warns if rounding makes path differences wrong by more than `_WAVES`, if the numbers are
+    known.
+
+    axis: the scene, or that of the axis for `fields`.
+    fields: (F, 2), radians, or None.
+    level: as of `warnings.warn`.
+    of_beams: as in `path_rounding`.
+    """
+    known = known_values((lens, axis, fields)) if below_double(lens) else None
     if known is None:
         return
     lens, axis, fields = known
@@ -91,13 +107,17 @@ def tell_of_paths(
         angles = [axis.field] if fields is None else fields
         scenes = [dataclasses.replace(axis, field=angle) for angle in angles]
         error = path_rounding(lens, scenes, of_beams)
-    tell(lens, "path differences", error, _WAVES, " waves RMS", level)
+    warn_dtype(lens, "path differences", error, _WAVES, " waves RMS", level)
 
 
 def path_rounding(lens: Lens, scenes: Sequence[Scene], of_beams: bool = False) -> float:
-    """RMS error of path differences by rounding, waves: the largest of all scenes and wavelengths.
-    Known numbers. of_beams: also by that of hits on the sensor, with which `image.beam` refers
-    paths to the middle of the spot; it grows with the height of the image and the slant."""
+    """RMS error of path differences from rounding, waves: the largest of all scenes and
+    wavelengths. The numbers are known.
+
+    of_beams: True to add the error from rounding of the hits on the sensor, with which `image.beam`
+        refers paths to the centroid of the spot. It grows with the image height and the angle of
+        incidence.
+    """
     # From mm to waves in um.
     parts = [1e3 * np.asarray(_noise(lens, s)) / np.asarray(s.wavelengths) for s in scenes]
     return max(float(np.max(np.hypot(p[0], p[1]) if of_beams else p[0])) for p in parts)
@@ -105,8 +125,9 @@ def path_rounding(lens: Lens, scenes: Sequence[Scene], of_beams: bool = False) -
 
 @functools.partial(jit, wanted=LARGE)
 def _noise(lens: Lens, scene: Scene) -> Array:
-    """Of the paths, mm, of hits that differ in their last digits, the RMS difference by (2, W): all
-    but the sensor's; the sensor's alone, as far as rounding changes those."""
+    """RMS differences, mm, (2, W), of the paths of two sets of hits that differ in their last
+    digits: first for changes of all hits but those on the sensor, then for changes on the sensor
+    alone, of the size of its rounding."""
     angle = 2 * np.pi * np.arange(_RAYS) * (3 / _RAYS)
     radius = np.where(np.arange(_RAYS) % 2, 0.98, 0.5)
     points = tuple(jnp.asarray(radius * f(angle), lens.curvature.dtype) for f in (np.cos, np.sin))
@@ -118,12 +139,15 @@ def _noise(lens: Lens, scene: Scene) -> Array:
     eps = float(jnp.finfo(lens.curvature.dtype).eps)
 
     def noise(turn: np.ndarray) -> Array:
+        """RMS over the rays (W,) of the change of the path when hits change by `turn` epsilons."""
         hits = tuple(h * (1 + jnp.asarray(eps * t, h.dtype)) for h, t in zip(found.hits, turn))
         change = path_of(found._replace(hits=hits), system) - path_of(found, system)
         spread = jnp.std(change, axis=-1, where=good)
         return jnp.where(jnp.any(good, axis=-1), spread, 0)
 
-    # The path is stationary but for hits on the sensor. Rounding changes those by 0.22 digits RMS.
+    # The path is stationary in all hits but those on the sensor. The first part is the difference
+    # of two roundings, hence sqrt(2). The RMS of a uniform integer from -n to n is sqrt(n (n + 1) /
+    # 3); rounding changes hits on the sensor by 0.22 epsilons RMS.
     digits = np.sqrt(_DIGITS * (_DIGITS + 1) / 3).item()
     parts = noise(np.where(last, 0, turn)) / np.sqrt(2).item(), noise(np.where(last, turn, 0))
     return jnp.stack([parts[0], parts[1] * (0.22 / digits)])

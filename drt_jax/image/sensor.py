@@ -1,4 +1,4 @@
-"""The sensor layer: image = kernel * scene + noise (paper Eq. 6)."""
+"""The sensor layer: image = kernel * scene + noise (paper Eq. 6), with * a convolution."""
 
 from collections.abc import Callable
 
@@ -13,8 +13,12 @@ Convolve = Callable[[Array, SeparableKernel | Array], Array]
 
 
 def _banded(kernel: Array, outputs: int) -> Array:
-    """Matrix (C, N, N + K - 1) with the flipped kernel in row i from column i on. kernel: (C, K).
-    outputs: N."""
+    """Banded matrix (C, N, N + K - 1) of a convolution: row i has the flipped kernel from column i
+    on.
+
+    kernel: (C, K).
+    outputs: N.
+    """
     channels, taps = kernel.shape
     width = outputs + taps - 1
     row = jnp.pad(kernel[:, ::-1], ((0, 0), (0, outputs)))  # width + 1: each row shifts by one
@@ -23,8 +27,8 @@ def _banded(kernel: Array, outputs: int) -> Array:
 
 
 def _by_taps(scenes: Array, kernel: SeparableKernel) -> Array:
-    """Image by image, so that the planes stay in the cache and XLA does not compute the taps
-    again."""
+    """Separable convolution as a sum over taps, image by image, so that the planes stay in the
+    cache and XLA does not compute the taps again."""
 
     def filtered(taps, planes, axis):
         count = planes.shape[axis] - taps.shape[1] + 1
@@ -38,7 +42,8 @@ def _by_taps(scenes: Array, kernel: SeparableKernel) -> Array:
 
 
 def _by_bands(scenes: Array, kernel: SeparableKernel) -> Array:
-    """Two products with banded matrices, each one product for all images, forwards and back."""
+    """Separable convolution as two products with banded matrices, each one product for all
+    images, in forward and reverse mode."""
     taps = kernel.row.shape[-1]
     down = _banded(kernel.column, scenes.shape[1] - taps + 1)
     across = _banded(kernel.row, scenes.shape[2] - taps + 1)
@@ -47,7 +52,7 @@ def _by_bands(scenes: Array, kernel: SeparableKernel) -> Array:
 
 
 def _check(scenes: Array, kernel: SeparableKernel | Array) -> None:
-    """ValueError unless the kernel fits into the scenes and these are floating numbers."""
+    """ValueError unless the scenes are floating-point numbers and the kernel fits into them."""
     shape, dtype = jnp.shape(scenes), jnp.result_type(scenes)
     if not jnp.issubdtype(dtype, jnp.floating):
         remedy = "scenes.astype(jnp.float32) / 255" if dtype == jnp.uint8 else "floating numbers"
@@ -67,13 +72,14 @@ def _check(scenes: Array, kernel: SeparableKernel | Array) -> None:
 
 
 def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
-    """'Valid' convolution of each channel with its own kernel, (B, H, W, C).
+    """'Valid' convolution of each channel with its own kernel.
 
     scenes: (B, H + K - 1, W + K - 1, C), with true context on all sides.
-    kernel: (C, K, K) [channel, y, x], or separable, which is applied as two products with banded
-        matrices.
+    kernel: (C, K, K) [channel, y, x]; or a `SeparableKernel`, which is applied as two products with
+        banded matrices.
 
-    ValueError for scenes that are not floating numbers, and for shapes that do not fit.
+    Returns (B, H, W, C). ValueError for scenes that are not floating-point numbers, and for shapes
+    that do not fit.
     """
     _check(scenes, kernel)
     if isinstance(kernel, SeparableKernel):
@@ -90,14 +96,13 @@ def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:
 
 
 def convolve_each(scenes: Array, kernels: Array) -> Array:
-    """'Valid' convolution of each channel of each image with its own kernel, by Fourier transform,
-    (B, H, W, C).
+    """'Valid' convolution of each channel of each image with its own kernel, by FFT.
 
     scenes: (B, H + K - 1, W + K - 1, C), with true context on all sides.
     kernels: (B, C, K, K) [image, channel, y, x], from `kernels_at`; cast to the dtype of the
         scenes.
 
-    ValueError for shapes that do not fit.
+    Returns (B, H, W, C). ValueError for shapes that do not fit.
     """
     _check(scenes, jnp.zeros((scenes.shape[-1], *kernels.shape[-2:]), scenes.dtype))
     if kernels.shape[:2] != (scenes.shape[0], scenes.shape[3]):
@@ -110,8 +115,11 @@ def convolve_each(scenes: Array, kernels: Array) -> Array:
 
 
 def convolve_taps(scenes: Array, kernel: SeparableKernel | Array) -> Array:
-    """`convolve`, tap by tap on a CPU with a separable kernel: faster for values and forward mode,
-    ten times slower in reverse mode. Arguments as there."""
+    """`convolve`, but tap by tap for a separable kernel on a CPU: faster for values and in forward
+    mode, ten times slower in reverse mode.
+
+    scenes, kernel: as in `convolve`.
+    """
     _check(scenes, kernel)
     if not isinstance(kernel, SeparableKernel):
         return convolve(scenes, kernel)
@@ -125,7 +133,7 @@ def sensor_layer(
     key: Array,
     convolve: Convolve = convolve,
 ) -> Array:
-    """Sensor images (B, H, W, C): the convolved scenes plus white Gaussian noise.
+    """Sensor images: the convolved scenes plus white Gaussian noise.
 
     scenes: (B, H + K - 1, W + K - 1, C), values from 0 to 1.
     kernel: as in `convolve`; cast to the dtype of the scenes.
@@ -133,7 +141,7 @@ def sensor_layer(
     key: a PRNG key.
     convolve: `convolve` or `convolve_taps`.
 
-    ValueError as in `convolve`.
+    Returns (B, H, W, C). ValueError as in `convolve`.
     """
     _check(scenes, kernel)
     images = convolve(scenes, jax.tree.map(lambda array: array.astype(scenes.dtype), kernel))

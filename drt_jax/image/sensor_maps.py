@@ -1,9 +1,10 @@
-"""What a sensor sees through a lens: the source of each of its points, its light, its kernel.
+"""Maps of the sensor: for each point its source in the ideal picture, its light, and its kernel.
 
-Of few places of the sensor, from a grid of fields; `render` interpolates between them. Kernels
-vary in one of two ways. Those of all places are nearly sums of those of a few places; or a tile
-blends those of its four corners. Few pixels or a small blur ask for the first, large pictures for
-the second; `chosen` takes what costs less for a tolerance.
+They are sampled at a few sensor positions, interpolated from the kernel grid; `render` interpolates
+between them. The kernels vary over the picture in one of two ways. Either all kernels are
+combinations of the kernels at a few positions (a basis), or the kernels within a tile are blended
+from those at its four corners. A picture of few pixels or with a small blur favours the basis, a
+large picture the corners; `chosen` takes what costs less for a tolerance.
 """
 
 import dataclasses
@@ -24,28 +25,29 @@ from .fields import GridMethod, KernelGrid, kernel_grid
 from .grid_method import warn_of_loss
 from .interpolate import at_point, lagrange
 
-# Nodes that a place, and a kernel or its light, are interpolated from along each axis.
+# Numbers of nodes along each axis from which positions, and kernels or light, are interpolated; and
+# the steps of Newton's method.
 SMOOTH, LOCAL = 6, 4
 _NEWTON = 6
-# The side of the squares that are transformed with kernels of places, unless these are large.
-_SIDE = 256
-# The most kernels that a picture is blurred with.
-_MOST = 40
-# Kernels that differ by fewer roundings are the same.
-_ALIKE = 8
+# Side of the FFTs with a basis of kernels, unless the kernels are large.
+_FFT_SIDE = 256
+# Largest number of kernels in a basis.
+_MAX_KERNELS = 40
+# A kernel counts as linearly dependent if its residual is below this many machine epsilons.
+_ROUNDINGS = 8
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RenderMethod:
-    """How a picture is rendered: what `render_method` chose, to be passed on.
+    """How a picture is rendered, as chosen by `render_method`.
 
     grid: fields, distances and rays of the kernels.
-    focal: () mm, of the pinhole that sees the ideal picture.
-    places: (R,), of those in `controls`, row by row, whose kernels stand for all; none: those at
-        the corners of tiles do.
-    shape: of the picture, height and width.
-    tile: of its tiles, height and width.
+    focal: (), mm, focal length of the pinhole camera that sees the ideal picture.
+    places: (R,), int32, indices of those positions of `controls`, row by row, whose kernels form
+        the basis; empty: the kernels are blended from those at the corners of tiles.
+    shape: height and width of the picture, pixels.
+    tile: height and width of its tiles, pixels.
     """
 
     grid: GridMethod
@@ -59,13 +61,15 @@ class RenderMethod:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Maps:
-    """What the sensor sees from D distances in C colours.
+    """Maps of the sensor for D distances and C colours.
 
-    sources: (D, C, My, Mx, 2), pixels x and y of the ideal picture, at equidistant places of the
-        sensor. light: (D, C, My, Mx), solid angle there relative to the axis.
-    kernels: (D, C, R, K, K), orthonormal. shares: (D, C, R, My, Mx): G at a place is the sum of
-        the kernels times their shares there. Or (D, C, Cy, Cx, K, K), G at the corners of tiles,
-        and None.
+    sources: (D, C, My, Mx, 2), x and y in pixels of the ideal picture, at equidistant positions of
+        the sensor.
+    light: (D, C, My, Mx), solid angle there relative to that on the axis.
+    kernels: (D, C, R, K, K), an orthonormal basis; or, without `shares`, (D, C, Cy, Cx, K, K), G at
+        the corners of tiles.
+    shares: (D, C, R, My, Mx), coefficients: G at a position is the sum of the kernels times their
+        shares there; or None.
     """
 
     sources: Array
@@ -75,13 +79,18 @@ class Maps:
 
 
 def sensor_maps(lens: Lens, method: RenderMethod, wavelengths: Numbers) -> Maps:
-    """What the sensor sees; the part of `render` that depends on the lens."""
+    """Maps of the sensor: the part of `render` that depends on the lens.
+
+    lens: the lens.
+    method: from `render_method`.
+    wavelengths: (C,), um.
+    """
     grid = kernel_grid(lens, method.grid, wavelengths)
     return _maps(grid, method)
 
 
 def controls(method: RenderMethod) -> tuple[np.ndarray, np.ndarray]:
-    """Places (My,), (Mx,) of the maps, pixels of the sensor."""
+    """Positions (My,), (Mx,) of the maps on the sensor, pixels."""
     margin = method.grid.size // 2 + 1
     found = []
     for count, half in zip(method.shape, method.grid.half, strict=True):
@@ -91,13 +100,14 @@ def controls(method: RenderMethod) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tiles_of(method: RenderMethod) -> tuple[int, int]:
-    """The number of tiles down and across the picture; the last of each may reach beyond it."""
+    """Number of tiles down and across the picture; the last ones may extend beyond it."""
     (height, width), (down, across) = method.shape, method.tile
     return -(-height // down), -(-width // across)
 
 
 @functools.partial(jit, wanted=LARGE)
 def _maps(grid: KernelGrid, method: RenderMethod) -> Maps:
+    """`sensor_maps` from a grid of kernels."""
     colours, far = grid.solid_angle.shape[-1], len(grid.vergences)
     few = len(method.places) > 0
     y, x = (np.arange(n + 1) * t for n, t in zip(tiles_of(method), method.tile, strict=True))
@@ -105,31 +115,40 @@ def _maps(grid: KernelGrid, method: RenderMethod) -> Maps:
 
     def one(index: Array) -> tuple[Array, Array, Array, Array | None]:
         part = index // colours, index % colours
-        seen = _seen_at(grid, method, *part, where)
-        kernels, shares = _parts(seen, method.places) if few else (seen, None)
-        return *_lit(grid, method, *part), kernels, shares
+        g = _kernels_at(grid, method, *part, where)
+        kernels, shares = _parts(g, method.places) if few else (g, None)
+        return *_sources(grid, method, *part), kernels, shares
 
-    # One after the other: the kernels of all places at once take room.
+    # One distance and colour after the other, because the kernels of all positions take much
+    # memory.
     found = jax.lax.map(jax.checkpoint(one), jnp.arange(far * colours, dtype=jnp.int32))
     return Maps(*jax.tree.map(lambda a: a.reshape(far, colours, *a.shape[1:]), found))
 
 
-def _parts(seen: Array, places: Array) -> tuple[Array, Array]:
-    """Kernels (R, K, K) and shares (R, My, Mx) of G (My, Mx, K, K): an orthonormal basis of the
-    kernels of `places`, and G projected on it so that its sum stays and its centroid nearly."""
-    down, across, size = seen.shape[:3]
-    rows = seen.reshape(down * across, size * size)
+def _parts(g: Array, places: Array) -> tuple[Array, Array]:
+    """Basis and coefficients of kernels that vary over the sensor.
+
+    g: (My, Mx, K, K), kernels G at all positions.
+    places: (R,), int32, positions whose kernels span the basis.
+
+    Returns an orthonormal basis (R, K, K), by Gram-Schmidt with a second pass, and the shares
+    (R, My, Mx), the projections of G. The shares s are then corrected so that the sum of each
+    kernel is exact and its centroid nearly: with the moments m = (K x sum, x, y) of the basis,
+    s += (m_G - s m) (1 + m^T m)^-1 m^T, then s is scaled to the exact sum.
+    """
+    down, across, size = g.shape[:3]
+    rows = g.reshape(down * across, size * size)
     basis = jnp.zeros((len(places), rows.shape[1]), rows.dtype)
     for k in range(len(places)):
         row = rows[places[k]]
         rest = row - matmul(matmul(basis, row), basis)
         rest = rest - matmul(matmul(basis, rest), basis)
         length, whole = (safe_sqrt(jnp.sum(a * a)) for a in (rest, row))
-        there = length > _ALIKE * jnp.finfo(rows.dtype).eps * whole
-        basis = basis.at[k].set(jnp.where(there, safe_divide(rest, length[None]), 0))
+        independent = length > _ROUNDINGS * jnp.finfo(rows.dtype).eps * whole
+        basis = basis.at[k].set(jnp.where(independent, safe_divide(rest, length[None]), 0))
     shares = matmul(rows, basis.T)
-    # Shares change a little, so that the sum and the first moments, in pixels, stay: they decide
-    # where a point lands, and how moments vary over the picture what light it brings.
+    # Correct the sum and the first moments, in pixels: they decide where a point is imaged, and the
+    # change of the moments over the picture decides how much light it brings.
     side = np.arange(size) - size // 2
     x, y = (np.ravel(a) for a in np.meshgrid(side, side))
     moments = jnp.asarray(np.stack([np.full_like(x, size), x, y], -1), rows.dtype)
@@ -145,57 +164,77 @@ def _parts(seen: Array, places: Array) -> tuple[Array, Array]:
 def chosen(
     lens: Lens, method: RenderMethod, wavelengths: Numbers, tolerance: float
 ) -> RenderMethod:
-    """The method with the places, or the tiles, that cost least for a `tolerance` of G: the root of
-    the sum of the squared errors of its pixels, which is what a picture of white noise of variance
-    1 is off. Known numbers. Warns of light beside the kernels, and of an error that is larger."""
+    """The method with those positions, or those tiles, that cost least for a tolerance. The numbers
+    are known.
+
+    lens, method: the lens and a method without tiles.
+    wavelengths: (C,), um.
+    tolerance: of G: the root of the sum of the squared errors of its pixels, which is the RMS error
+        of a picture of white noise of variance 1.
+
+    Warns if kernels truncate light, and if the error exceeds the tolerance.
+    """
     grid = kernel_grid(lens, method.grid, wavelengths)
     warn_of_loss(lens, method.grid, grid, wavelengths)
     places: list[int] = []
-    bent = left = 0.0
+    blend = left = 0.0
     for distance in range(len(grid.vergences)):
         for colour in range(grid.solid_angle.shape[-1]):
-            seen = np.asarray(_seen_of(grid, method, distance, colour), float)
-            bent = max(bent, _bent(seen, controls(method)))
-            left = max(left, _choose(seen.reshape(-1, method.grid.size**2), places, tolerance))
+            g = np.asarray(_kernels_of(grid, method, distance, colour), float)
+            blend = max(blend, _blend_error(g, controls(method)))
+            left = max(left, _greedy(g.reshape(-1, method.grid.size**2), places, tolerance))
     size = method.grid.size
-    wide = next((n for n in SIDES if n >= max(2 * size, _SIDE)), 3 * size)
-    # Transforms for each pixel, error, side of a tile, places.
+    wide = next((n for n in SIDES if n >= max(2 * size, _FFT_SIDE)), 3 * size)
+    # Each option: cost as transformed values for each pixel, error, side of a tile, positions.
     ways = [(len(places) * (wide / (wide - size + 1)) ** 2, left, wide - size + 1, places or [0])]
     for side in SIDES:
         if (tile := side - size + 1) >= side / 2:
-            ways.append((4 * (side / tile) ** 2, bent * tile**2, tile, []))
+            ways.append((4 * (side / tile) ** 2, blend * tile**2, tile, []))
     good = [way for way in ways if way[1] <= tolerance]
-    _, error, tile, taken = min(good) if good else min(ways, key=lambda way: way[1])
+    _, error, tile, picked = min(good) if good else min(ways, key=lambda way: way[1])
     if error > tolerance:
         warnings.warn(
             f"the blur varies so much that kernels are interpolated to {error:.1e} only, not to "
             f"{tolerance:.1e}: take a larger tolerance",
             stacklevel=3,
         )
-    # Equal tiles, the last of which end where the picture does.
+    # Equal tiles, so that the last ones end about where the picture does.
     down, across = (-(-n // -(-n // tile)) for n in method.shape)
-    return dataclasses.replace(method, places=jnp.asarray(taken, jnp.int32), tile=(down, across))
+    return dataclasses.replace(method, places=jnp.asarray(picked, jnp.int32), tile=(down, across))
 
 
-def _bent(seen: np.ndarray, places: tuple[np.ndarray, np.ndarray]) -> float:
-    """The error of G in the middle of a tile, blended of that in its corners, over the square of
-    the side, 1/pixels^2; seen: (My, Mx, K, K) at equidistant places."""
+def _blend_error(g: np.ndarray, places: tuple[np.ndarray, np.ndarray]) -> float:
+    """Error of G in the middle of a tile, if it is blended from the corners, divided by the square
+    of the side of the tile, 1/pixels^2. For nodes at the distance h it is
+    |(G_-1 + G_1) / 2 - G_0| / (2 h)^2, along y plus along x.
+
+    g: (My, Mx, K, K), G at equidistant positions.
+    places: these positions along y and x, pixels.
+    """
     total = 0.0
     for axis, nodes in enumerate(places):
-        parts = np.moveaxis(seen, axis, 0)
+        parts = np.moveaxis(g, axis, 0)
         bent = (parts[:-2] + parts[2:]) / 2 - parts[1:-1]
         total += np.max(np.linalg.norm(bent, axis=(-2, -1))) / (nodes[2] - nodes[0]) ** 2
     return float(total)
 
 
-def _choose(rows: np.ndarray, places: list[int], tolerance: float) -> float:
-    """Adds to `places` those that the kernels of all, (M, K^2), need; the error that is left."""
+def _greedy(rows: np.ndarray, places: list[int], tolerance: float) -> float:
+    """Greedy basis: extends `places` until the kernels there span all kernels to a tolerance, by
+    pivoted Gram-Schmidt. Each step adds the kernel with the largest residual.
+
+    rows: (M, K^2), kernels at all positions.
+    places: indices, extended in place; they may hold those that other colours or distances need.
+    tolerance: bound of the norm of a residual.
+
+    Returns the largest residual; above the tolerance if `_MAX_KERNELS` do not suffice.
+    """
     basis = 0
     while True:
-        # Those that others needed first, then the place that is worst off.
+        # First remove the kernels that are already in `places`, then add the largest residual.
         errors = np.linalg.norm(rows, axis=1)
         if basis == len(places):
-            if np.max(errors) <= tolerance or len(places) == _MOST:
+            if np.max(errors) <= tolerance or len(places) == _MAX_KERNELS:
                 return float(np.max(errors))
             places.append(int(np.argmax(errors)))
         row = rows[places[basis]]
@@ -206,33 +245,36 @@ def _choose(rows: np.ndarray, places: list[int], tolerance: float) -> float:
 
 
 @functools.partial(jit, wanted=LARGE)
-def _seen_of(grid: KernelGrid, method: RenderMethod, distance: Array, colour: Array) -> Array:
-    return _seen_at(grid, method, distance, colour, controls(method))
+def _kernels_of(grid: KernelGrid, method: RenderMethod, distance: Array, colour: Array) -> Array:
+    """G (My, Mx, K, K) of one distance and colour at the positions of the maps."""
+    return _kernels_at(grid, method, distance, colour, controls(method))
 
 
 def _table(grid: KernelGrid, method: RenderMethod, distance: Array, colour: Array) -> Array:
-    """The image points of one distance and colour, so that each is about its node's own place."""
+    """Image points (Ny, Nx, 2) of one distance and colour, in units of step x focal length, so
+    that each is near the indices of its own node."""
     return grid.points[distance][:, :, colour] / (grid.step * method.focal)
 
 
-def _wanted(method: RenderMethod, where: tuple[np.ndarray, np.ndarray], dtype: Any) -> Array:
-    """Places (My, Mx, 2) mm on the sensor, of pixels along y and x."""
+def _points(method: RenderMethod, where: tuple[np.ndarray, np.ndarray], dtype: Any) -> Array:
+    """Points (My, Mx, 2), mm on the sensor, of positions in pixels along y and x."""
     middle = (np.array(method.shape) - 1) / 2
     places = np.stack(np.meshgrid(where[1] - middle[1], where[0] - middle[0]), -1)
     return jnp.asarray(places, dtype) * method.grid.pixel
 
 
-def _lit(
+def _sources(
     grid: KernelGrid, method: RenderMethod, distance: Array, colour: Array
 ) -> tuple[Array, Array]:
-    """Sources (My, Mx, 2) and light (My, Mx) of one distance and colour."""
+    """Sources (My, Mx, 2), pixels of the ideal picture, and relative light (My, Mx) of one
+    distance and colour."""
     unit, dtype = grid.step * method.focal, grid.step.dtype
     table = _table(grid, method, distance, colour)
     light = grid.solid_angle[distance][:, :, colour]
     half = jnp.asarray(method.grid.half[::-1], dtype)
     axis = light[method.grid.half[0], method.grid.half[1]]
     middle = (np.array(method.shape) - 1) / 2
-    wanted = _wanted(method, controls(method), dtype)
+    wanted = _points(method, controls(method), dtype)
     nodes = jax.vmap(jax.vmap(lambda p: _source(method, table, p / unit)[0]))(wanted)
     sources = nodes * (unit / method.grid.pixel)
     sources = sources + jnp.asarray(middle[::-1], dtype).reshape(1, 1, 2)
@@ -240,26 +282,33 @@ def _lit(
     return sources, jnp.maximum(level, 0) / jnp.where(axis > 0, axis, 1)
 
 
-def _seen_at(
+def _kernels_at(
     grid: KernelGrid,
     method: RenderMethod,
     distance: Array,
     colour: Array,
     where: tuple[np.ndarray, np.ndarray],
 ) -> Array:
-    """G (My, Mx, K, K) of one distance and colour."""
+    """G (My, Mx, K, K) of one distance and colour at given positions."""
     light, outside, kernels = (
         a[distance][:, :, colour] for a in (grid.solid_angle, grid.outside, grid.kernels)
     )
     table = _table(grid, method, distance, colour)
-    seen = functools.partial(_seen, method, grid.step, table, light, outside, kernels)
-    wanted = _wanted(method, where, grid.step.dtype)
-    return jax.lax.map(jax.checkpoint(jax.vmap(seen)), wanted)  # all at once take room
+    g = functools.partial(_sensor_kernel, method, grid.step, table, light, outside, kernels)
+    wanted = _points(method, where, grid.step.dtype)
+    return jax.lax.map(jax.checkpoint(jax.vmap(g)), wanted)  # row by row, to save memory
 
 
 def _source(method: RenderMethod, table: Array, wanted: Array) -> tuple[Array, Array]:
-    """The place (2,), in nodes from the axis, whose image point is `wanted` (2,), and how it
-    moves with that (2, 2): Newton's method on the interpolated points, table (Ny, Nx, 2)."""
+    """Source of a sensor point, by Newton's method on the interpolated image points.
+
+    method: sizes of the grid.
+    table: (Ny, Nx, 2), image points, see `_table`.
+    wanted: (2,), sensor point in the same units.
+
+    Returns the source u (2,), in nodes from the axis, and its Jacobian du / d(sensor point),
+    (2, 2).
+    """
     half = jnp.asarray(method.grid.half[::-1], table.dtype)
 
     def image(u: Array) -> Array:
@@ -277,7 +326,7 @@ def _source(method: RenderMethod, table: Array, wanted: Array) -> tuple[Array, A
     return u, inverse(u)
 
 
-def _seen(
+def _sensor_kernel(
     method: RenderMethod,
     step: Array,
     table: Array,
@@ -286,8 +335,12 @@ def _seen(
     kernels: Array,
     corner: Array,
 ) -> Array:
-    """G (K, K) of a sensor point (2,), mm: at k the kernel of the source of the point k before it,
-    times the light there."""
+    """Kernel G (K, K) as seen from a sensor point (2,), mm. Element k is the light that reaches the
+    point p from the source of p - k: the kernel of that source at k, times its solid angle.
+
+    The source of p - k is linearised, u - (du / dp) k, and the kernel is interpolated there. G is
+    normalised to the sum 1 - outside.
+    """
     size = method.grid.size
     unit = step * method.focal
     u, slope = _source(method, table, corner / unit)
@@ -296,7 +349,7 @@ def _seen(
     half = jnp.asarray(method.grid.half[::-1], u.dtype)
     end = 2 * half
     moved = (u + half).reshape(1, 1, 2) - einsum("ab,yxb->yxa", slope, shift)
-    # Half a step beyond the nodes, where light from outside of the picture comes from.
+    # Up to half a step beyond the nodes, where light from outside of the picture comes from.
     places = jnp.clip(moved, -0.5, end.reshape(1, 1, 2) + 0.5)
     down, across = table.shape[:2]
     (row, wy), (column, wx) = (

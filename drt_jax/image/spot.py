@@ -1,6 +1,6 @@
-"""A spot: the centroid of rays and their deviations from it.
+"""A spot: the centroid of rays on the sensor, and the deviations of the rays from it.
 
-Rays of a part of the pupil stand for their mirror images too.
+Rays on a part of the pupil also represent their mirror images.
 """
 
 import dataclasses
@@ -13,16 +13,16 @@ from ..numerics import safe_divide
 from ..pupil.rules import Symmetry
 from ..rays.system import Vector
 
-# True for components whose mean is 0 by symmetry.
+# For each component: True if its mean is 0 by symmetry.
 _MIRRORED = {"rotational": (True,), "bilateral": (True, False), "none": (False, False)}
-# Pairs of components whose product does not have the mean 0 by symmetry.
+# Pairs of components whose products do not have the mean 0 by symmetry.
 _PAIRS = {"rotational": ((0, 0),), "bilateral": ((0, 0), (1, 1))}
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Moments:
-    """The spot of W wavelengths.
+    """Centroid, covariance and throughput of the spots of W wavelengths.
 
     mean: (W, 2), centroid on the sensor, mm.
     covariance: (W, 2, 2), mm^2; inf on the diagonal if no light of the wavelength arrives.
@@ -37,7 +37,7 @@ class Moments:
 
 
 def normalised(weight: Array, axes: tuple[int, ...] = (-1,)) -> Array:
-    """Weights divided by their sum over axes; 0 where that is 0."""
+    """Weights divided by their sum over `axes`; 0 where the sum is 0."""
     total = jnp.sum(weight, axis=axes, keepdims=True)
     return safe_divide(weight, jnp.broadcast_to(total, weight.shape))
 
@@ -45,12 +45,14 @@ def normalised(weight: Array, axes: tuple[int, ...] = (-1,)) -> Array:
 def deviations(
     values: Vector, weight: Array, symmetry: Symmetry, axes: tuple[int, ...] = (-1,)
 ) -> tuple[Vector, Vector]:
-    """Hits or slopes less their means, D arrays (..., Q), and the means, with length 1 along axes.
+    """Deviations of hits or slopes from their means, and the means.
 
-    values: D arrays (..., Q), D = 1 on the meridian.
-    weight: (..., Q), normalised over axes.
-    symmetry: of the pupil rule of the rays.
+    values: D arrays (..., Q), D = 1 for rays on one radius (the meridian).
+    weight: (..., Q), normalised over `axes`.
+    symmetry: symmetry of the pupil rule of the rays.
     axes: axes of the means.
+
+    Returns D arrays (..., Q) of deviations, and D arrays of means with length 1 along `axes`.
     """
 
     def mean(value: Array, mirrored: bool) -> Array:
@@ -62,8 +64,13 @@ def deviations(
 
 
 def mean_products(a: Vector, b: Vector, weight: Array, symmetry: Symmetry) -> Array:
-    """Means of the products of deviations `a` and `b` over the whole pupil, (..., C): xx, yy and,
-    without symmetry, xy. With b = a the covariance. Arguments as in `deviations`."""
+    """Means of products of deviations over the whole pupil; with b = a, the covariance.
+
+    a, b: deviations, D arrays (..., Q), as `deviations` returns them.
+    weight, symmetry: as in `deviations`.
+
+    Returns (..., C): xx, yy and, without symmetry, xy.
+    """
     pairs = _PAIRS.get(symmetry, ((0, 0), (1, 1), (0, 1)))
     found = [jnp.sum(weight * (a[i] * b[j] + b[i] * a[j]), axis=-1) / 2 for i, j in pairs]
     if symmetry == "rotational":  # over the full circle <xx> = <yy> = <rho^2> / 2

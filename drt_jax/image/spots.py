@@ -1,13 +1,14 @@
 """Spots over the field, and how much light arrives there: throughput and relative illumination.
 
-One trace of a rule of the pupil gives all: where its rays meet the sensor, the light that they
-carry, and the area of their directions. A uniform, Lambertian scene gives a point of the sensor an
-irradiance in proportion to the area of the cone of light that comes to it in direction cosines:
-that of the stop, by the determinant |dl / dp| of directions l by stop points p.
+One trace of a pupil rule gives all of these: the hits of its rays on the sensor, the light that
+they represent, and the area of their directions. In a uniform, Lambertian scene the irradiance at a
+point of the sensor is proportional to the area, in direction cosines, of the cone of light that
+reaches it. That is the integral over the stop of the determinant |dl / dp| of directions l by stop
+points p.
 
 All functions take `fields`, F angles along y (F,) or pairs (F, 2) in radians, and return arrays
-with the field as their first axis. A rule, one for all fields, is found where none is given;
-inside `jax.jit` and `jax.vmap` it must be. Differentiable in every mode where the rule is.
+with the field as their first axis. Without a rule, one rule for all fields is found; inside
+`jax.jit` and `jax.vmap` a rule is required. Differentiable in every mode where the rule is.
 
 Sources: Rimmer, Relative illumination calculations, Proc. SPIE 655, 99 (1986), which OpticStudio
 follows; Slater, Remote Sensing (1980), for the cone at a point of the sensor.
@@ -35,23 +36,24 @@ from ..pupil.rules import Gauss, PupilRule, symmetry_of
 from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
-from .rounding import hit_rounding, tell
+from .rounding import hit_rounding, warn_dtype
 from .spot import normalised
 from .wavefront import reference_curvature
 
 Point = Literal["object", "sensor"]
-# Nodes along a radius of the rules that are made here.
+# Nodes along a radius of rules that are made here.
 _ORDER = 12
-# Rays on the rim of the stop, which carry no light of a rule, and how many azimuths stand for a
-# rule of one radius.
+# Number of rays on the rim of the stop, which have no weight; and of azimuths to which rays on one
+# radius are rotated.
 _RIM, _AZIMUTHS = 48, 24
-# Rings of rays that tell whether light fills the stop.
+# Hexapolar rings of the rays that test whether light fills the stop.
 _RINGS = 6
-# An image farther than so many times the distance of the exit pupil lies at infinity.
+# An image farther away than this many times the distance of the exit pupil counts as at infinity.
 _FAR = 1e3
-# Error of a spot by rounding, relative to its size, that is borne in silence.
+# Error of a spot from rounding, relative to its size, up to which no warning is given.
 _ROUGH = 0.02
-# The first zero of the Airy pattern, in mm by um over NA.
+# Radius of the first zero of the Airy pattern: this times wavelength / NA; wavelength in um, radius
+# in mm.
 _AIRY = 0.60983494563325225e-3
 
 
@@ -60,22 +62,23 @@ _AIRY = 0.60983494563325225e-3
 class Spots:
     """Spots of F fields in W wavelengths, of Q rays each.
 
-    points: (F, W, Q, 2) mm, x and y on the sensor; inf for rays that do not arrive.
-    weights: (F, W, Q), the light that each ray stands for, adding up to the throughput times the
-        wavelength's part; rays on the rim of the stop have none.
-    centroid: (F, 2) mm, of all wavelengths. chief: (F, 2) mm, the chief ray of the reference
-        wavelength.
-    rms, rms_chief: (F,) mm, root mean square distance of the light from either.
-    radius, radius_chief: (F,) mm, largest distance of a ray from either ("geometric").
-    airy_radius: (F,) mm, 0.61 wavelength / NA for the reference wavelength, where pi NA^2 is its
-        solid angle; of a round pupil the first zero of the diffraction pattern.
+    points: (F, W, Q, 2), mm, x and y on the sensor; inf for rays that do not arrive.
+    weights: (F, W, Q), the light that each ray represents; their sum is the throughput times the
+        weight of the wavelength. Rays on the rim of the stop have weight 0.
+    centroid: (F, 2), mm, of all wavelengths.
+    chief: (F, 2), mm, the chief ray of the reference wavelength.
+    rms, rms_chief: (F,), mm, root mean square distance of the light from the centroid and from the
+        chief ray.
+    radius, radius_chief: (F,), mm, largest distance of a ray from either ("geometric").
+    airy_radius: (F,), mm, 0.61 wavelength / NA for the reference wavelength, where pi NA^2 is its
+        solid angle; for a round pupil the first zero of the diffraction pattern.
     throughput, solid_angle: (F, W), as of `vignetting` and `solid_angle`.
-    left_out: (F, W), the share of 175 rays, evenly over the stop and on its rim, that fail for
-        another reason than an aperture (see `Status`), and so are in no number above: they miss,
-        are totally reflected, or would have to step back where surfaces cross. Programs that let
-        rays step back count those, and give larger spots.
+    left_out: (F, W), fraction of 175 rays, evenly over the stop and on its rim, that fail for
+        another reason than an aperture (see `Status`), and so do not count in any number above:
+        they miss a surface, are totally reflected, or would have to step back where surfaces cross.
+        Programs that let rays step back count those, and report larger spots.
 
-    Lengths are inf where no light arrives, those from the chief ray also where it fails.
+    Lengths are inf where no light arrives; those from the chief ray also where it fails.
     """
 
     points: Array
@@ -101,13 +104,16 @@ def spot_diagram(
     wavelength_weights: Numbers | None = None,
     reference: int | None = None,
 ) -> Spots:
-    """Where the light of each field meets the sensor, see `Spots`.
+    """Spots of all fields on the sensor, see `Spots`.
 
-    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
-    rule: of the pupil; for a picture a `Pattern` such as that of `pupil.hexapolar`. None: Gauss
-        nodes, fitted to what apertures leave.
-    wavelength_weights: (W,), of any sum; None: equal. reference: index of a wavelength; None: the
-        middle one, W // 2.
+    lens: the lens.
+    fields: (F,) along y or (F, 2), radians.
+    distance: mm, inf allowed.
+    wavelengths: (W,), um.
+    rule: pupil rule; for a picture of the spot a `Pattern` such as that of `pupil.hexapolar`. None:
+        Gauss nodes, fitted to the open part of the pupil.
+    wavelength_weights: (W,), normalised to the sum 1; None: equal.
+    reference: index of the reference wavelength; None: the middle one, W // 2.
 
     Warns, outside of a trace, where float32 rounds more than 2 % of a spot. ValueError as of
     `scene_of`; without a rule also inside a trace.
@@ -126,7 +132,7 @@ def spot_diagram(
     known = known_values((lens, found.rms))
     if known is not None:
         wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
-        tell(known[0], "spots", wrong, _ROUGH, " of their size", 2)
+        warn_dtype(known[0], "spots", wrong, _ROUGH, " of their size", 2)
     return found
 
 
@@ -137,8 +143,12 @@ def vignetting(
     wavelengths: Numbers,
     rule: PupilRule | None = None,
 ) -> Array:
-    """The part (F, W) of the light through the stop that reaches the sensor, from 0 to 1: the
-    unvignetted fraction. Arguments and errors as of `spot_diagram`."""
+    """Unvignetted fraction: the fraction of the light through the stop that reaches the sensor.
+
+    lens, fields, distance, wavelengths, rule: as in `spot_diagram`.
+
+    Returns (F, W), from 0 to 1. Errors as of `spot_diagram`.
+    """
     return _light(lens, fields, distance, wavelengths, rule, "object").throughput[1:]
 
 
@@ -150,15 +160,16 @@ def relative_illumination(
     rule: PupilRule | None = None,
     point: Point = "object",
 ) -> Array:
-    """Irradiance (F, W) on the sensor relative to that of the field 0, of a uniform, Lambertian
-    scene: the ratio of the areas of the cones of light in direction cosines.
+    """Irradiance on the sensor relative to that of the field 0, for a uniform, Lambertian scene:
+    the ratio of the areas of the cones of light in direction cosines.
 
-    point: "object": the cone of light from one object point, as OpticStudio and CODE V have it;
-        "sensor": the cone at one point of the sensor, what a pixel collects. Both agree as far as
-        rays from one meet in the other.
+    lens, fields, distance, wavelengths, rule: as in `spot_diagram`.
+    point: "object": the cone of light from one object point, as OpticStudio and CODE V compute it;
+        "sensor": the cone at one point of the sensor, which is what a pixel collects. Both agree as
+        far as the rays from an object point meet in one point.
 
-    0 where no light arrives. OpticStudio's analysis divides by the brightest field of its scan,
-    `r / r.max()`, its operand RELI by the axis. Other arguments and errors as of `spot_diagram`.
+    Returns (F, W); 0 where no light arrives. OpticStudio's analysis divides by the brightest field
+    of its scan, `r / r.max()`; its operand RELI divides by the axis. Errors as of `spot_diagram`.
     ValueError also where the light of an object point on the axis arrives collimated, without a
     cone; inside a trace the ratio is then 0. An afocal lens has a cone, the area of its beams.
     """
@@ -184,17 +195,27 @@ def solid_angle(
     rule: PupilRule | None = None,
     point: Point = "object",
 ) -> Array:
-    """Area (F, W) of the cone of light in direction cosines on the sensor: irradiance over
-    radiance; for a cone round the normal pi sin^2 of its half angle, 0 where no light arrives.
-    Arguments and errors as of `relative_illumination`."""
+    """Area of the cone of light in direction cosines on the sensor: irradiance over radiance.
+
+    lens, fields, distance, wavelengths, rule, point: as in `relative_illumination`.
+
+    Returns (F, W); for a round cone about the normal it is pi sin^2 of its half angle; 0 where no
+    light arrives. Errors as of `spot_diagram`.
+    """
     return _light(lens, fields, distance, wavelengths, rule, point).solid_angle[1:]
 
 
 def light_rule(
     lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, order: int = _ORDER
 ) -> Gauss | Clipped:
-    """A rule of an order for the light of all fields and the axis: on the stop if that is filled,
-    else one fitted to what apertures leave. All is known; ValueError inside a trace."""
+    """A pupil rule for the light of all fields and the axis: a Gauss rule on the stop if light
+    fills it for all of them, else one that is fitted to the open part of the pupil.
+
+    lens, fields, distance, wavelengths: as in `spot_diagram`; known numbers.
+    order: of the rule.
+
+    ValueError inside a trace.
+    """
     known = known_values((lens, fields, distance, wavelengths))
     if known is None:
         raise ValueError(
@@ -216,7 +237,7 @@ def light_rule(
 
 @functools.partial(jit, wanted=LARGE)
 def _fills(lens: Lens, fields: Array, axis: Scene) -> Array:
-    """Whether all rays over the stop and on its rim arrive."""
+    """Whether all rays over the stop and on its rim arrive, for all fields."""
     points = np.concatenate([hexapolar(_RINGS)[0], _rim()])
     aimed = tuple(jnp.asarray(p, lens.curvature.dtype) for p in points.T)
 
@@ -227,16 +248,19 @@ def _fills(lens: Lens, fields: Array, axis: Scene) -> Array:
     return jnp.all(jax.vmap(one)(fields))
 
 
-def _beside() -> np.ndarray:
-    """Rays without light, (B, 2): the chief ray, the rim of the stop, and evenly all over it."""
+def _extra_points() -> np.ndarray:
+    """Stop points of rays without weight, (B, 2): the chief ray, the rim, and evenly over the
+    whole stop."""
     return np.concatenate([np.zeros((1, 2)), _rim(), _even()])
 
 
 def _even() -> np.ndarray:
+    """Stop points evenly over the whole stop."""
     return hexapolar(_RINGS)[0]
 
 
 def _rim() -> np.ndarray:
+    """Stop points on the rim."""
     angle = 2 * np.pi * (np.arange(_RIM) + 0.25) / _RIM
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
@@ -244,9 +268,16 @@ def _rim() -> np.ndarray:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class _Light:
-    """Of the axis and F fields: hit (F + 1, W, Q, 2) mm, weight (F + 1, W, Q), arrives likewise,
-    rays of the rule first, then their mirror images, then the chief ray and those on the rim;
-    chief_whole, throughput, solid_angle, left_out (F + 1, W)."""
+    """Rays and light of F + 1 fields: row 0 is the axis.
+
+    hit: (F + 1, W, Q, 2), mm. Along Q: mirror images of the rays of the rule (if it is bilateral),
+        the rays of the rule, the chief ray, and those on the rim.
+    weight: (F + 1, W, Q); 0 for chief ray and rim.
+    arrives: (F + 1, W, Q), bool.
+    chief: (F + 1, W, 2), mm, hit of the chief ray.
+    chief_whole: (F + 1, W), bool, False where the chief ray fails.
+    throughput, solid_angle, left_out: (F + 1, W), as in `Spots`.
+    """
 
     hit: Array
     weight: Array
@@ -259,8 +290,10 @@ class _Light:
 
 
 def _collimated(lens: Lens, light: _Light, wavelengths: Array) -> Array:
-    """Whether the image of the axis is farther than `_FAR` times the exit pupil, (W,): there light
-    has no cone, but the width of the pupil."""
+    """Whether the image of the axis is farther away than `_FAR` times the exit pupil, (W,).
+    There the light has no cone, and the hits show the width of the beam: the solid angle is
+    below pi var (kappa / _FAR)^2, var the variance of the hits, 1 / kappa the distance of the
+    exit pupil."""
     hit, weight = light.hit[0], light.weight[0]
     share = normalised(weight)[..., None]
     square = jnp.sum(share * (hit - jnp.sum(share * hit, axis=1, keepdims=True)) ** 2, axis=(1, 2))
@@ -288,17 +321,20 @@ def _light(
 
 @functools.partial(jit, wanted=LARGE, static_argnames="fixed")
 def _traced(lens: Lens, fields: Array, axis: Scene, rule: PupilRule, fixed: bool) -> _Light:
-    """`fixed`: the point on the sensor is, not the object point."""
+    """The light of fields (F + 1, 2). fixed: True for the cone at a point of the sensor, False
+    for that of an object point."""
     return jax.vmap(lambda field: _of_field(lens, field, axis, rule, fixed))(fields)
 
 
 def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: bool) -> _Light:
-    """Arrays without the axis of fields."""
+    """The light of one field: `_Light` without the axis of fields."""
     scene = Scene(field, axis.distance, axis.wavelengths)
     points, weights = _whole_rule(lens, scene, rule)
     count = weights.shape[-1]
 
     def arriving(points: Vector, field: Array) -> tuple[tuple[Vector, Vector], tuple]:
+        """Hits and transverse direction cosines at the sensor, which are differentiated; status
+        and transmission."""
         scene = Scene(field, axis.distance, axis.wavelengths)
         bundle = trace_bundle(lens, scene, points)
         whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
@@ -306,17 +342,17 @@ def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: boo
         line = tuple(jnp.where(whole, a, 0) for a in bundle.arrival[:-1])
         return (hit, line), (bundle.status, rule.transmission(lens, bundle))
 
-    (hit, _), push, (status, passes) = jax.linearize(arriving, points, field, has_aux=True)
-    area = np.pi * jnp.abs(direction_determinant(push, points, field, fixed))[:, :count]
+    (hit, _), jvp, (status, passes) = jax.linearize(arriving, points, field, has_aux=True)
+    area = np.pi * jnp.abs(direction_determinant(jvp, points, field, fixed))[:, :count]
     weight = weights * passes[:, :count]
     throughput, cone = jnp.sum(weight, axis=-1), jnp.sum(weight * area, axis=-1)
     arrives = status == Status.OK
     failed = (status != Status.OK) & (status != Status.CLIPPED)
-    left_out = jnp.mean(failed[:, 1 - len(_beside()) :].astype(weight.dtype), axis=-1)
+    left_out = jnp.mean(failed[:, 1 - len(_extra_points()) :].astype(weight.dtype), axis=-1)
     traced = slice(0, -len(_even()))
     parts = [jnp.stack(hit, axis=-1)[:, traced], arrives[:, traced]]
     weight = jnp.pad(weight, ((0, 0), (0, 1 + _RIM)))
-    if rule.symmetry == "bilateral":  # and the mirror images of the rays of the rule
+    if rule.symmetry == "bilateral":  # add the mirror images of the rays of the rule
         images = parts[0][:, :count] * jnp.array([[[-1, 1]]], weight.dtype), arrives[:, :count]
         parts = [jnp.concatenate(pair, axis=1) for pair in zip(images, parts)]
         weight = jnp.concatenate([weight[:, :count], weight], axis=1) / 2
@@ -328,8 +364,8 @@ def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: boo
 
 
 def _whole_rule(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
-    """Points of a rule, then those of `_beside`, 2 arrays (W, Q + B), and weights (W, Q). One
-    radius stands for azimuths that it is turned by."""
+    """Points of a rule, followed by those of `_extra_points`, 2 arrays (W, Q + B), and weights
+    (W, Q). Points on one radius are repeated at rotated azimuths."""
     points, weights = rule.points(lens, scene)
     waves = scene.wavelengths.shape[0]
     wide = lambda a: jnp.broadcast_to(a, (waves, a.shape[-1]))  # noqa: E731
@@ -339,22 +375,28 @@ def _whole_rule(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Arra
         turned = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)]), weights.dtype)
         points = tuple(jnp.outer(wide(points[0]), t).reshape(waves, -1) for t in turned)
         weights = jnp.repeat(weights, _AZIMUTHS, axis=-1) / _AZIMUTHS
-    rows = zip(points, _beside().T, strict=True)
+    rows = zip(points, _extra_points().T, strict=True)
     joined = ((wide(p), wide(jnp.asarray(e, weights.dtype)[None])) for p, e in rows)
     return tuple(jnp.concatenate(pair, axis=-1) for pair in joined), weights
 
 
-def direction_determinant(push: Callable, points: Vector, field: Array, fixed: bool) -> Array:
-    """Determinants dl / dp (W, Q), of the object point or, `fixed`, of the point on the sensor:
-    where that stays the field moves by -h_f^-1 h_p, so that it is l_p - l_f h_f^-1 h_p.
-    push: derivatives of hits and directions by points and field."""
+def direction_determinant(jvp: Callable, points: Vector, field: Array, fixed: bool) -> Array:
+    """Determinants dl / dp (W, Q) of the directions by the stop points.
+
+    jvp: derivatives (h, l) of hits and directions, as a function of tangents of points and field.
+    points: stop points, 2 arrays (W, Q).
+    field: (2,).
+    fixed: False for a fixed object point: the determinant of l_p. True for a fixed point of the
+        sensor: there the field changes with p by df = -h_f^-1 h_p dp, so it is the determinant of
+        l_p - l_f h_f^-1 h_p.
+    """
     zero, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
     sides = [tuple(jnp.full_like(p, float(j == k)) for j, p in enumerate(points)) for k in range(2)]
     columns = []
     for side in sides:
-        hit, line = push(side, jnp.zeros_like(field))
+        hit, line = jvp(side, jnp.zeros_like(field))
         if fixed:
-            (hit_x, line_x), (hit_y, line_y) = (push(zero, unit) for unit in units)
+            (hit_x, line_x), (hit_y, line_y) = (jvp(zero, unit) for unit in units)
             back = divide(tuple(zip(hit_x, hit_y)), hit)
             line = [a - back[0] * b - back[1] * c for a, b, c in zip(line, line_x, line_y)]
         columns.append(line)
@@ -363,7 +405,8 @@ def direction_determinant(push: Callable, points: Vector, field: Array, fixed: b
 
 @functools.partial(jax.jit, static_argnames="middle")
 def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
-    """The fields' spots; wavelength: the reference one in the medium of the sensor, um."""
+    """`Spots` of the fields. wavelength: the reference wavelength in the medium of the sensor,
+    um."""
     light = jax.tree.map(lambda a: a[1:], light)
     weight = light.weight * spectrum[None, :, None]
     hit = light.hit
@@ -375,6 +418,7 @@ def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Sp
     whole = good & light.chief_whole[:, middle]
 
     def spread(centre: Array, good: Array) -> tuple[Array, Array]:
+        """RMS and largest distance from `centre`; inf where not `good`."""
         square = jnp.sum((hit - centre[:, None, None]) ** 2, axis=-1)
         mean = safe_sqrt(jnp.sum(share * square, axis=(1, 2)))
         largest = safe_sqrt(jnp.max(jnp.where(light.arrives, square, 0), axis=(1, 2)))

@@ -1,11 +1,15 @@
-"""Optical transfer functions: the pupil function of a beam, in direction cosines, against itself.
+"""Optical transfer functions: the autocorrelation of the pupil function of a beam, in direction
+cosines.
 
-Light of a wavelength makes a grating of f cycles/mm on the sensor where two of its directions
-differ by f wavelength / n. Its contrast is the integral of P(d + s / 2) conj(P(d - s / 2)) over
-directions d, s the difference, over that of |P|^2, P the amplitude in direction cosines on the
-sensor: Hopkins' formula with the real pupil (Goodman, Introduction to Fourier Optics, ch. 6). The
-grid of d covers what both pupils share, however little that is, so that the function is right up to
-where it ends. In the limit of short wavelengths it is the mean of exp(-2 pi i f.x) over rays.
+A grating of f cycles/mm on the sensor is formed by pairs of directions that differ by s = f
+wavelength / n. Its contrast is Hopkins' formula with the real pupil (Goodman, Introduction to
+Fourier Optics, ch. 6):
+
+    OTF(f) = integral of P(d + s / 2) conj(P(d - s / 2)) over directions d / integral of |P|^2,
+
+where P is the amplitude in direction cosines on the sensor. The grid of d covers the overlap of
+both pupils, however small it is, so the function is accurate up to its cut-off. In the limit of
+short wavelengths it is the mean of exp(-2 pi i f.x) over rays.
 """
 
 import functools
@@ -26,7 +30,7 @@ from ..pupil.rules import PupilRule
 from .beam import Beam
 from .cover import cover
 from .refined import TOLERANCE, beams_of, to_tolerance
-from .rounding import tell_of_paths
+from .rounding import warn_of_paths
 from .spot import normalised
 from .spots import light_rule
 from .wave_psf import pupil_function, shared_part
@@ -38,13 +42,13 @@ _DEGREE = 14
 
 
 class Transfer(NamedTuple):
-    """Transfer functions of F fields at N frequencies, of all wavelengths together.
+    """Transfer functions of F fields at N frequencies, for all wavelengths together.
 
-    frequencies: (N,) cycles/mm on the sensor.
-    otf: (F, 2, N) or, through focus, (F, Z, 2, N), complex, 1 at 0: of a grating across the y axis
-        of the sensor (tangential, for a field along y), and across its x axis (sagittal), about the
-        centroid of the light.
-    limit: the same of waves without aberrations in the same pupil.
+    frequencies: (N,), cycles/mm on the sensor.
+    otf: complex, (F, 2, N) or, through focus, (F, Z, 2, N); 1 at frequency 0. Index 0 of the axis
+        of 2 is a grating across the y axis of the sensor (tangential, for a field along y), index 1
+        one across its x axis (sagittal). The phase refers to the centroid of the light.
+    limit: the same for waves without aberrations in the same pupil.
 
     All are 0 where no light arrives.
     """
@@ -55,7 +59,7 @@ class Transfer(NamedTuple):
 
     @property
     def mtf(self) -> Array:
-        """The modulus of the otf."""
+        """Modulus of the otf."""
         return jnp.abs(self.otf)
 
 
@@ -75,30 +79,36 @@ def transfer(
 ) -> Transfer:
     """Optical transfer functions over frequency, field and focus, see `Transfer`.
 
-    fields: (F,) along y or (F, 2), radians. distance: mm, inf allowed. wavelengths: (W,) um.
-    frequencies: (N,) cycles/mm.
+    lens: the lens.
+    fields: (F,) along y or (F, 2), radians.
+    distance: mm, inf allowed.
+    wavelengths: (W,), um.
+    frequencies: (N,), cycles/mm.
     model: "waves" (diffraction) or "rays" (geometric).
-    focus: () mm by which the sensor stands behind its place; or (Z,), through focus: arrays are
-        then (F, Z, 2, N), and no more rays are traced.
-    wavelength_weights: (W,), of any sum; None: equal. Light that is lost counts less.
-    rule: of the pupil, whose kind is kept (`Gauss` or `Clipped`); None: found, outside of a trace.
-    degree: of the polynomials of the pupil. cells: of the grid, along a side; None: as many as keep
-        the error of the contrast below `tolerance`; inside `jit` and `vmap`, where they cannot
-        follow from it, 128. Too few lower the contrast of a large blur, and never raise it.
+    focus: (), mm by which the sensor is moved back; or (Z,), through focus: arrays are then
+        (F, Z, 2, N), and no more rays are traced.
+    wavelength_weights: (W,), normalised to the sum 1; None: equal. Each is multiplied by the
+        throughput, so vignetted wavelengths count less.
+    rule: pupil rule, whose kind is kept (`Gauss` or `Clipped`); None: found, outside of a trace.
+    degree: of the polynomials of the pupil.
+    cells: number of cells along a side of the pupil grid. None: as many as keep the error of the
+        contrast below `tolerance`; inside `jit` and `vmap`, where they cannot depend on it, 128.
+        Too few cells lower the contrast of a large blur, and never raise it.
+    tolerance: absolute error of the contrast.
 
-    Differentiable in every mode. Of waves, warns of float32 as `wavefront` does. ValueError as of
-    `scene_of`, without a rule inside a trace, and for a tolerance that is not between 0 and 1;
-    warns if the tolerance is not met.
+    Differentiable in every mode. For waves, warns of float32 as `wavefront` does. ValueError as of
+    `scene_of`, without a rule inside a trace, and for a tolerance that is not between 0 and 1.
+    Warns if the tolerance is not met.
     """
     scene = fields, distance, wavelengths
-    given = arrays_of(
+    arrays = arrays_of(
         lens, scene, model, focus, wavelength_weights, rule, "frequencies", frequencies
     )
-    angles, axis, values, spectrum, steps, rule = given
+    angles, axis, values, spectrum, steps, rule = arrays
     beams = beams_of(lens, angles, axis, rule, degree)
-    of = functools.partial(_transfer, model=model)
+    run = functools.partial(_transfer, model=model)
     known = lens, beams, axis.wavelengths, values, spectrum, steps
-    otf, limit = to_tolerance(of, known, cells, tolerance, lambda *_: 0)
+    otf, limit = to_tolerance(run, known, cells, tolerance, lambda *_: 0)
     return Transfer(values, otf, limit)
 
 
@@ -112,14 +122,20 @@ def arrays_of(
     name: str,
     places: Numbers,
 ) -> tuple[Array, Scene, Array, Array, Array, PupilRule]:
-    """Arguments of `transfer` and of `encircled_energy`, checked, as arrays: fields (F, 2), scene
-    of the axis, places (N,), spectrum (W,), focus () or (Z,), and the rule. scene: fields, distance
-    and wavelengths. name: of the places, for messages."""
+    """Checks the arguments of `transfer` and of `encircled_energy`, and returns them as arrays.
+
+    scene: fields, distance and wavelengths.
+    model, focus, wavelength_weights, rule: as in `transfer`.
+    name, places: frequencies or radii (N,), and their name for messages.
+
+    Returns fields (F, 2), the scene of the axis, places (N,), spectrum (W,), focus () or (Z,), and
+    the rule.
+    """
     require_one_of("model", model, get_args(Model))
     dtype = lens.curvature.dtype
     axis, angles = scene_of(lens, 0.0, *scene[1:]), fields_array(scene[0], dtype)
     if model == "waves":
-        tell_of_paths(lens, axis, angles, 4, True)
+        warn_of_paths(lens, axis, angles, 4, True)
     values, steps = real_array(name, places, dtype), real_array("focus", focus, dtype)
     if values.ndim != 1:
         raise ValueError(f"{name}: expected (N,), got shape {values.shape}")
@@ -140,36 +156,40 @@ def strehl(
     cells: int | None = None,
     tolerance: float = TOLERANCE,
 ) -> Array:
-    """Strehl ratio (F, W): the irradiance of the image of a point over that without aberrations in
-    the same pupil, `|integral of P|^2 / (integral of |P|)^2` over direction cosines.
+    """Strehl ratio: the irradiance at the centre of the image of a point, relative to that without
+    aberrations in the same pupil: `|integral of P|^2 / (integral of |P|)^2` over direction cosines.
 
-    At the place where the wavefront has no tilt, in the mean square over the pupil: the peak of an
-    image of a quarter of a wave or better. 0 where no light arrives. Arguments as of `transfer`;
-    `tolerance` is that of the ratio.
+    lens, fields, distance, wavelengths, rule, degree, cells: as in `transfer`.
+    tolerance: absolute error of the ratio.
+
+    Returns (F, W); 0 where no light arrives. The centre is the point where the wavefront has no
+    tilt in the least-squares sense over the pupil: the peak, if the wavefront error is a quarter of
+    a wave or less.
     """
     axis = scene_of(lens, 0.0, distance, wavelengths)
     angles = fields_array(fields, lens.curvature.dtype)
-    tell_of_paths(lens, axis, angles, of_beams=True)
+    warn_of_paths(lens, axis, angles, of_beams=True)
     if rule is None:
         rule = light_rule(lens, fields, distance, wavelengths)
-    given = lens, beams_of(lens, angles, axis, rule, degree), axis.wavelengths
-    return to_tolerance(_strehl, given, cells, tolerance, lambda *_: 0)
+    arrays = lens, beams_of(lens, angles, axis, rule, degree), axis.wavelengths
+    return to_tolerance(_strehl, arrays, cells, tolerance, lambda *_: 0)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="cells")
 def _strehl(lens: Lens, beams: Beam, wavelengths: Array, cells: int) -> Array:
+    """`strehl` of beams with F as first axis, for a number of cells."""
     return jax.vmap(lambda beam: strehl_of(lens, beam, wavelengths, cells))(beams)
 
 
 def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
-    """The ratio (W,) of one beam, see `strehl`."""
+    """Strehl ratio (W,) of one beam, see `strehl`."""
     lit = beam.throughput > 0
     low, high = beam.directions_extent()
     pupil = pupil_function(lens, beam, wavelengths, cells)
     density, inside, phase, turn, off = pupil((low + high) / 2, (high - low) / cells)
     size, phase = safe_sqrt(density) * inside, phase + jnp.sum(turn * off, axis=0)
     share = normalised(size, (1, 2))
-    # The tilt goes along x, then y, which have no mean and a product of their own.
+    # Remove the mean and the tilt by least squares, first along x, then along y of what is left.
     side = np.arange(cells) - (cells - 1) / 2
     places = off + jnp.asarray(np.stack(np.meshgrid(side, side)), phase.dtype)[:, None]
     slopes: list[Array] = []
@@ -195,20 +215,25 @@ def _transfer(
     model: Model,
     cells: int,
 ) -> tuple[Array, Array]:
-    given = wavelengths, frequencies, spectrum, model, cells
-    of = lambda beam: transfer_of(lens, beam, *given)  # noqa: E731
-    return jax.vmap(lambda beam: through_focus(beam, focus, of))(beams)
+    """`transfer` of beams with F as first axis, for a number of cells: otf and limit."""
+    settings = wavelengths, frequencies, spectrum, model, cells
+    one = lambda beam: transfer_of(lens, beam, *settings)  # noqa: E731
+    return jax.vmap(lambda beam: through_focus(beam, focus, one))(beams)
 
 
 def through_focus(beam: Beam, focus: Array, of: Callable[[Beam], Any]) -> Any:
-    """`of` the beam with the sensor `focus` mm farther, (), or of all (Z,) in a first axis."""
+    """A function `of` the beam with the sensor moved back by `focus` mm, (); or for each of
+    (Z,), as a first axis."""
     moved = lambda step: of(beam.refocused(step))  # noqa: E731
     return jax.vmap(moved)(focus) if focus.ndim else moved(focus)
 
 
 def centre_of(beam: Beam, spectrum: Array) -> tuple[Array, Array]:
-    """The part (W,) of the light on the sensor in each wavelength and the centroid (2,) of all, mm.
-    spectrum: (W,), weights of the light that fills the stop."""
+    """Fraction (W,) of the light on the sensor in each wavelength, and the centroid (2,), mm, of
+    all.
+
+    spectrum: (W,), weights of the wavelengths in the light that fills the stop.
+    """
     share = normalised(spectrum * beam.throughput)
     centre = einsum("w,wq,dwq->d", share, normalised(beam.weights), beam.hits[:, -1])
     return share, centre
@@ -231,25 +256,33 @@ def transfer_of(
     return otf, limit
 
 
-def _turned(size: Array, phase: Array) -> Array:
+def _phasor(size: Array, phase: Array) -> Array:
     """size exp(i phase)."""
     return jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase))
 
 
 def _mean_wave(size: Array, phase: Array, turn: Array, inside: Array) -> Array:
-    """size exp(i phase) as the mean over cells (..., N, N), of which light fills the parts
-    `inside`. phase: at the middle of the light. turn: (2, ..., N, N), its change over a cell along
-    x and y. Where cells are too coarse for the wave the mean is small, and no light is made of it.
+    """Means of a wave, size exp(i phase), over cells (..., N, N).
+
+    size: amplitude.
+    phase: at the centroid of the light of the cell, radians.
+    turn: (2, ..., N, N), change of the phase over a cell along x and y.
+    inside: fraction of the cell that light fills.
+
+    A phase that is linear over the width w (in cells) gives the factor sinc(turn w / (2 pi)) along
+    each axis, a second derivative b the mean phase b w^2 / 24. Where cells are too coarse for the
+    wave, the mean is small, so that no false contrast appears.
     """
     x, y = jnp.sinc(turn * inside[None] / (2 * jnp.pi))
     bends = (jnp.asarray(jnp.gradient(turn[k], axis=a)) for k, a in enumerate((-1, -2)))
-    return _turned(size * x * y, phase + inside**2 * sum(bends) / 24)
+    return _phasor(size * x * y, phase + inside**2 * sum(bends) / 24)
 
 
 def _of_rays(
     lens: Lens, beam: Beam, wavelengths: Array, frequencies: Array, centre: Array, cells: int
 ) -> tuple[Array, Array]:
-    """(W, 2, N) each: of the hits of all cells of the stop; the limit is 1."""
+    """Geometric transfer function (W, 2, N): the mean of exp(-2 pi i f.x) over the hits x of all
+    cells of the stop; and its limit, which is 1."""
     side = (np.arange(cells) - (cells - 1) / 2) * (2 / cells)
     low, high = beam.extent()
     functions, middle, half = beam.over_stop(), (low + high) / 2, (high - low) / 2
@@ -260,7 +293,7 @@ def _of_rays(
     axes = middle, half * (2 / cells)
     inside, off = cover(lens, beam, stop, values[2:], beam.points, axes)
     weight = normalised(inside, (1, 2))
-    # How much hits change over a cell, [along, component].
+    # Change of the hits over a cell, [along, component].
     unit = (step * (2 / cells))[:, None, :, None, None]
     change = jnp.stack(slopes) * unit
     hits = values[:2] + jnp.sum(change * off[:, None], axis=0)
@@ -280,33 +313,35 @@ def _of_rays(
 def _of_waves(
     lens: Lens, beam: Beam, wavelengths: Array, frequencies: Array, centre: Array, cells: int
 ) -> tuple[Array, Array]:
-    """(W, 2, N) each."""
+    """Diffraction transfer function and its limit, (W, 2, N) each, see the module docstring."""
     pupil = pupil_function(lens, beam, wavelengths, cells)
     low, high = beam.directions_extent()
     middle = (low + high) / 2
 
     def sheared(shear: Array) -> tuple[Array, Array]:
-        """The integrals (W,) for a difference of two directions (2, W)."""
+        """The integrals (W,) of P conj(P) and of |P| |P| over the overlap of two pupils that are
+        shifted by `shear` (2, W)."""
         step = jnp.maximum(high - low - jnp.abs(shear), 0) / cells
         first, second = pupil(middle + shear / 2, step), pupil(middle - shear / 2, step)
         inside = shared_part(first, second)
         light = safe_sqrt(first.light * second.light) * inside
         light = light * (step[0] * step[1])[:, None, None]
-        # Where they differ, one of them is cut less: to the middle of the light of the other.
+        # Phases are taken at the centroid of the light of that pupil whose edge cuts more of the
+        # cell.
         off = jnp.where(first.inside < second.inside, first.middle, second.middle)
         turn = first.turn - second.turn
         phase = first.phase - second.phase + jnp.sum(turn * off, axis=0)
         turned = _mean_wave(light, phase, turn, inside)
         return jnp.sum(turned, axis=(1, 2)), jnp.sum(light, axis=(1, 2))
 
-    # One loop, so that `sheared` is compiled once: no shear, whose light is all light, then those
-    # of all frequencies along y, then those along x.
+    # One loop, so that `sheared` is compiled once: first no shear, which gives all the light; then
+    # the shears of all frequencies along y; then those along x.
     shear = frequencies[:, None] * (wavelengths / (_UM * beam.index))[None]
     none = jnp.zeros_like(shear)
     shears = jnp.zeros_like(low)[None], jnp.stack([none, shear], 1), jnp.stack([shear, none], 1)
     otf, light = jax.lax.map(sheared, jnp.concatenate(shears))
     back = 2 * jnp.pi * centre[::-1, None] * frequencies[None]
-    turned = otf[1:].reshape(*back.shape, -1) * _turned(jnp.ones_like(back), back)[..., None]
+    turned = otf[1:].reshape(*back.shape, -1) * _phasor(jnp.ones_like(back), back)[..., None]
     whole = jnp.broadcast_to(light[0], turned.shape)
     otf = safe_divide(turned, whole.astype(turned.dtype))
     light = safe_divide(light[1:].reshape(whole.shape), whole)

@@ -1,12 +1,16 @@
-"""The kernel of wave optics: plane waves of all directions of a beam, added up on the pixels.
+"""PSF kernel of wave optics: plane waves of all directions of a beam, superposed on the pixels.
 
-The field at a place x of the sensor is U(x) = sum over directions d of c exp(i k n d.x), with k = 2
-pi / wavelength, directions from the sphere of the exit pupil (`Beam.on_sphere`), and |c|^2 the
-light times the cell's area of direction cosines. On a regular grid of direction cosines |U|^2 is a
-sum over the differences of two directions, the optical transfer function: the autocorrelation of c,
-which two Fourier transforms give. A pixel's integral of each of its waves is a sinc, so that the
-kernel is a product of three matrices, and exact for the grid. Source: Goodman, Introduction to
-Fourier Optics (2005), ch. 6; Soummer et al., Opt. Express 15, 15935 (2007) for the product.
+The field at a point x of the sensor is U(x) = sum over directions d of c(d) exp(i k n d.x), with
+k = 2 pi / wavelength, the directions from the sphere of the exit pupil (`Beam.on_sphere`), and
+|c|^2 the light times the area of the cell of direction cosines. On a regular grid of directions
+with the step s,
+
+    |U(x)|^2 = sum over lags l of T(l) exp(i k n s l.x),
+
+where T, the autocorrelation of c, is the optical transfer function; two Fourier transforms give it.
+The integral of each of these waves over a pixel is a sinc. So the kernel is a product of three
+matrices, exact for the grid. Sources: Goodman, Introduction to Fourier Optics (2005), ch. 6;
+Soummer et al., Opt. Express 15, 15935 (2007) for the product.
 """
 
 import functools
@@ -35,18 +39,25 @@ def wave_kernel(
     size: int,
     cells: int,
 ) -> Array:
-    """What pixels collect of the light, (W, size, size) [y, x], adding to the part of the
-    throughput that falls on the grid.
+    """Diffraction PSF kernel of a beam on the pixels.
 
-    wavelengths: (W,) um. centre: (2,) mm of the grid on the sensor. pixel: () mm. cells: of the
-    grid of directions, along a side; the kernel repeats every `period`. Cells at an edge hold the
-    mean of their amplitude. So a kernel lacks a fraction (pi x / period)^2 / 3 of the light that
-    edges diffract to the distance x: with 128 cells 1.5e-3 of Airy's light within half a period.
+    lens, beam: the lens and its beam.
+    wavelengths: (W,), um.
+    centre: (2,), mm, centre of the kernel on the sensor.
+    pixel: (), side of a pixel, mm.
+    size: number of pixels along a side of the kernel.
+    cells: number of cells along a side of the grid of directions. The pattern on the sensor repeats
+        after one `period`.
+
+    Returns (W, size, size) [y, x]. The sum is the part of the throughput that falls on the kernel.
+    A cell at an edge has the mean of its amplitude. Because of this, the kernel lacks a fraction
+    (pi x / period)^2 / 3 of the light that edges diffract to the distance x: with 128 cells 1.5e-3
+    of the light of an Airy pattern within half a period.
     """
     amplitude, step = amplitudes(lens, beam, wavelengths, cells)
     transfer = autocorrelation(amplitude)
     lags = np.fft.fftfreq(2 * cells, 1 / (2 * cells))
-    # Waves of the differences of two directions, cycles a mm: (2, W, 2 N).
+    # Frequencies of the lags, cycles/mm, (2, W, 2 N).
     unit = step * (beam.index * _UM / wavelengths)[None]
     frequency = unit[..., None] * jnp.asarray(lags, unit.dtype)[None, None]
     place = (jnp.arange(size, dtype=pixel.dtype) - (size - 1) / 2) * pixel
@@ -57,7 +68,8 @@ def wave_kernel(
         wave = jax.lax.complex(jnp.cos(phase), jnp.sin(phase))
         waves.append(wave * jnp.sinc(f * pixel).astype(wave.dtype))
     across, down = waves
-    # The lags that `transfer` leaves out have the conjugate values.
+    # The lags of negative u, which `transfer` leaves out, have conjugate values: count the others
+    # twice.
     across = across * jnp.asarray(np.where(lags[:cells] > 0, 2, 1), across.dtype)[None, None]
     kernel = einsum("wyv,wvu,wxu->wyx", down, transfer, across).real
     cell = step[0] * step[1] * beam.index * _UM / wavelengths
@@ -65,7 +77,8 @@ def wave_kernel(
 
 
 def period(beam: Beam, wavelengths: Array, cells: int) -> Array:
-    """After how many mm along x and y, (2, W), the kernel of so many cells repeats."""
+    """Distance along x and y, (2, W), mm, after which the pattern of a grid of `cells` x `cells`
+    directions repeats: wavelength / (n step)."""
     step = _grid(beam, cells)[1]
     return (wavelengths / (_UM * beam.index))[None] / step
 
@@ -77,11 +90,13 @@ def _grid(beam: Beam, cells: int) -> tuple[Array, Array]:
 
 
 class PupilCells(NamedTuple):
-    """Cells of a grid of directions, (W, N, N).
+    """The pupil function on a grid of directions, (W, N, N) cells.
 
-    light: pi times the light a unit of directions. inside: the part of a cell that it fills.
-    phase: at the middle of the cell, radians. turn: (2, W, N, N), its change over a cell along x
-        and y. middle: (2, W, N, N), of the light, see `cover`.
+    light: pi times the light per unit area of direction cosines.
+    inside: fraction of the cell that light fills.
+    phase: at the middle of the cell, radians.
+    turn: (2, W, N, N), change of the phase over a cell along x and y, radians.
+    middle: (2, W, N, N), centroid of the light in the cell, see `cover`.
     """
 
     light: Array
@@ -94,14 +109,19 @@ class PupilCells(NamedTuple):
 def pupil_function(
     lens: Lens, beam: Beam, wavelengths: Array, cells: int
 ) -> Callable[[Array, Array], PupilCells]:
-    """The cells as a function of the middle and the step of their grid, (2, W) each."""
+    """The pupil function of a beam, as a function of the centre and the step of a grid of
+    directions, (2, W) each.
+
+    The light per unit area of direction cosines is that of the stop times the Jacobian |d(stop
+    point) / d(direction)|.
+    """
     functions, side = beam.over_directions(), np.arange(cells) - (cells - 1) / 2
     turns = (2 * jnp.pi * _UM / wavelengths)[:, None, None]
 
     def pupil(middle: Array, step: Array) -> PupilCells:
         start = (middle - functions.centre) / functions.scale
         values, *slopes = functions.on_grid(start, step / functions.scale, side, slice(3))
-        # [direction, value], by the directions themselves.
+        # Derivatives by the direction cosines, [direction, value].
         change = jnp.stack(slopes) / functions.scale[:, None, :, None, None]
         (_, ax, ay), (_, bx, by) = change
         turn = turns[None] * change[:, 0] * step[..., None, None]
@@ -113,8 +133,14 @@ def pupil_function(
 
 
 def shared_part(first: PupilCells, second: PupilCells) -> Array:
-    """The part of cells that the light of both fills, (W, N, N): the lesser part where their edges
-    are parallel, the product where they cross at right angles, and in between by the cosine."""
+    """Fraction (W, N, N) of each cell that the light of two pupils fills, if they fill the
+    fractions a and b.
+
+    With c, the cosine of the angle between the directions of the two centroids: where their edges
+    are parallel (c = 1) it is min(a, b), where they face each other (c = -1) it is max(a + b - 1,
+    0), and where they cross at right angles (c = 0) it is a b. In between, it is interpolated
+    linearly in |c|.
+    """
     one, other = first.inside, second.inside
     sizes = (safe_sqrt(jnp.sum(p.middle**2, axis=0)) for p in (first, second))
     cosine = safe_divide(jnp.sum(first.middle * second.middle, axis=0), jnp.multiply(*sizes))
@@ -123,8 +149,11 @@ def shared_part(first: PupilCells, second: PupilCells) -> Array:
 
 
 def amplitudes(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tuple[Array, Array]:
-    """Amplitudes (W, cells, cells) [y, x] on a regular grid of direction cosines, whose squares are
-    the light a unit of their area, and the step of the grid, (2, W)."""
+    """Complex amplitudes c on a regular grid of direction cosines.
+
+    Returns (W, cells, cells) [y, x], whose squared moduli are the light per unit area of direction
+    cosines, and the step of the grid, (2, W).
+    """
     middle, step = _grid(beam, cells)
     light, inside, phase, *_ = pupil_function(lens, beam, wavelengths, cells)(middle, step)
     size = safe_sqrt(light / jnp.pi) * inside
@@ -133,8 +162,8 @@ def amplitudes(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> tuple[
 
 
 def _masked(waves: Array, beam: Beam, wavelengths: Array, middle: Array, step: Array) -> Array:
-    """Waves (W, N, N) on a grid of directions behind the beam's mask: each cell gets the mean of
-    the pixels that it covers."""
+    """Waves (W, N, N) on a grid of directions, times the beam's mask: each cell takes the mean
+    of the mask over the stop area that it maps to."""
     if beam.mask is None:
         return waves
     functions, cells = beam.over_directions(), waves.shape[-1]
@@ -146,9 +175,14 @@ def _masked(waves: Array, beam: Beam, wavelengths: Array, middle: Array, step: A
 
 
 def autocorrelation(amplitude: Array) -> Array:
-    """Sums over the cells of products with those some cells away, at a lag (v, u) of
-    c[y + v, x + u] conj(c[y, x]): (W, 2 N, N), v in the order of `numpy.fft.fftfreq`, u from 0 to
-    N - 1. At (-v, -u) the sum is the conjugate."""
+    """Autocorrelation T(v, u) = sum over y, x of c[y + v, x + u] conj(c[y, x]), without wrapping.
+
+    amplitude: (W, N, N), c.
+
+    Returns (W, 2 N, N), with v in the order of `numpy.fft.fftfreq` and u from 0 to N - 1. T(-v, -u)
+    is the conjugate of T(v, u). By the Wiener-Khinchin theorem T is the inverse transform of
+    |FFT(c)|^2 with c padded to 2 N.
+    """
     cells = amplitude.shape[-1]
     pad = functools.partial(jnp.pad, pad_width=((0, 0), (0, cells), (0, cells)))
     spectrum = jnp.fft.fft2(pad(amplitude))

@@ -1,4 +1,4 @@
-"""Optical path difference of the rays against a sphere about the image point.
+"""Optical path difference of the rays against a reference sphere about the image point.
 
 For each wavelength, the chief ray (through the centre of the stop) meets the sensor at C, the
 centre of the reference sphere. Its radius R is measured along the chief ray, against the light,
@@ -27,7 +27,7 @@ from ..rays.afocal import FOCAL
 from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import Bundle, stop_points, trace_bundle
-from .rounding import tell_of_paths
+from .rounding import warn_of_paths
 
 _MM = 1e-3  # per um
 
@@ -35,11 +35,11 @@ _MM = 1e-3  # per um
 class Wavefront(NamedTuple):
     """Optical path differences of rays.
 
-    opd: (W, Q), path of the chief ray less path of the ray, both to the reference sphere, waves:
+    opd: (W, Q), waves, path of the chief ray less path of the ray, both to the reference sphere:
         positive where the wavefront is ahead of the sphere; 0 for a ray that fails or is clipped.
     status: (W, Q), int32, see `Status`. If the chief ray of a wavelength fails, no ray has an opd,
-        and OK and CLIPPED become the status of the chief ray.
-    image: (W, 2), point of the chief ray on the sensor, along its axes, mm; 0 if the ray fails.
+        and OK and CLIPPED are replaced by the status of the chief ray.
+    image: (W, 2), mm, point of the chief ray on the sensor, along its axes; 0 if the ray fails.
     """
 
     opd: Array
@@ -48,9 +48,15 @@ class Wavefront(NamedTuple):
 
 
 def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
-    """1 / distance from the paraxial exit pupil to the sensor along the light, (W,), 1/mm: positive
-    for a pupil in front of the sensor, 0 for a telecentric lens. Tilts and decentres are neglected.
-    Of an afocal lens behind the ideal lens of `rays.afocal`. wavelengths: (W,), um."""
+    """Curvature of the reference sphere: 1 / distance from the paraxial exit pupil to the sensor
+    along the light, 1/mm.
+
+    wavelengths: (W,), um.
+
+    Returns (W,): positive for a pupil in front of the sensor, 0 for a telecentric lens. Tilts and
+        decentres are neglected. For an afocal lens it is that behind the ideal lens of
+        `rays.afocal`.
+    """
     height, slope = chief_ray(paraxial_system(lens, wavelengths), front=False)
     at_sensor = height + slope * (lens.sensor - lens.vertices[-2])
     slope = slope * jnp.asarray(lens.senses[-1], slope.dtype)
@@ -69,15 +75,18 @@ def wavefront(
 ) -> Wavefront:
     """Optical path difference of the rays that cross the stop at given points.
 
-    field, distance, wavelengths (W,), pupil (Q, 2): as in `trace_rays`.
+    lens: the lens.
+    field, distance, wavelengths: as in `trace_rays`; wavelengths (W,).
+    pupil: (Q, 2), points on the stop, as in `trace_rays`.
     curvature: () or (W,), kappa of the reference sphere along the axis, 1/mm, instead of
-        `reference_curvature`; needed for a lens folded by tilted mirrors, which the paraxial trace
+        `reference_curvature`. Needed for a lens folded by tilted mirrors, which the paraxial trace
         cannot follow.
 
-    Differentiable like `trace_rays`; the reference sphere moves with the lens. In float32 warns,
-    outside of a trace, where rounding makes path differences wrong by more than 1e-3 waves, as in a
-    telescope of metres. ValueError as in `trace_rays`, and for a known curvature that is not
-    finite; inside a trace rays that pass are then UNCONVERGED and have no opd.
+    Returns a `Wavefront`. Differentiable like `trace_rays`; the reference sphere moves with the
+    lens. In float32 warns, outside of a trace, where rounding makes path differences wrong by more
+    than 1e-3 waves, as in a telescope of metres. ValueError as in `trace_rays`, and for a known
+    curvature that is not finite; inside a trace rays that pass are then UNCONVERGED and have no
+    opd.
     """
     scene = scene_of(lens, field, distance, wavelengths)
     points = stop_points(lens, pupil)
@@ -90,12 +99,13 @@ def wavefront(
             )
         if concrete(curvature) and not np.all(np.isfinite(np.asarray(curvature, float))):
             raise ValueError("curvature: must be finite; 0 for a telecentric exit pupil")
-    tell_of_paths(lens, scene)
+    warn_of_paths(lens, scene)
     return _wavefront(lens, scene, points, kappa)
 
 
 @functools.partial(jit, wanted=LARGE)
 def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) -> Wavefront:
+    """`wavefront` of checked arguments."""
     points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil])  # the chief ray first
     bundle = trace_bundle(lens, scene, (points[:, 0], points[:, 1]))
     opd, status, image = path_differences(lens, scene.wavelengths, bundle, curvature)
@@ -105,8 +115,15 @@ def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) 
 def path_differences(
     lens: Lens, wavelengths: Array, bundle: Bundle, curvature: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Path differences (W, Q), waves, status (W, Q) and image points (W, D), mm, of traced rays,
-    the chief ray first. curvature: as in `wavefront`."""
+    """Path differences of traced rays, the chief ray first.
+
+    lens: the lens.
+    wavelengths: (W,), um.
+    bundle: the traced rays.
+    curvature: as in `wavefront`.
+
+    Returns path differences (W, Q), waves, status (W, Q) and image points (W, D), mm.
+    """
     waves = jnp.clip(wavelengths, *lens.dispersion.range)
     whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
     chief_ok = whole[:, :1]
@@ -139,10 +156,11 @@ def path_differences(
 
 
 def rms_wavefront(wave: Wavefront, weights: Numbers) -> Array:
-    """Root mean square (W,) of the opd about its mean, waves; 0 if no ray has one. The tilt about
-    the chief ray is not removed.
+    """Root mean square (W,) of the opd about its mean, waves; 0 if no ray has an opd. The tilt
+    about the chief ray is not removed.
 
-    weights: (Q,), of the points, as from `pupil.disc`; rays that fail or are clipped count 0.
+    wave: result of `wavefront`.
+    weights: (Q,), of the points, as from `pupil.disc`. Rays that fail or are clipped have weight 0.
         ValueError for another shape.
     """
     weight = real_array("weights", weights, wave.opd.dtype)

@@ -1,12 +1,14 @@
 """Quadrature fitted to the open part of a clipped pupil.
 
-A rule on the whole stop whose clipped rays drop out one by one converges like a sum of pixels.
-`Clipped` finds the boundary. In polar coordinates about a point inside, the distance to the
-boundary is smooth between the corners where the nearest edge changes. Gauss rules between corners
-and along the radii converge as on an open stop. In a narrow slit the coordinates are stretched
-until the slit is about as wide as long.
+A rule on the whole stop whose clipped rays drop out one by one converges only like a count of
+pixels, because the integrand jumps at the boundary. `Clipped` finds the boundary. In polar
+coordinates about a point inside, the distance to the boundary is a smooth function of the azimuth
+between the corners where the nearest edge changes. So Gauss rules between the corners and along the
+radii converge as fast as on an open stop. In a narrow slit the coordinates are stretched until the
+slit is about as wide as long.
 
-Vectors are arrays with 2 components on the first axis and B rays per wavelength on the last.
+Vectors are arrays with their 2 components on the first axis and the B rays of a wavelength on the
+last.
 """
 
 import dataclasses
@@ -34,7 +36,7 @@ __all__ = ["Clipped", "ClippedGroup"]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _follow(
+def _attach(
     radial: RadialRule, crossing: bool, lens: Lens, scene: Scene, plan: Plan
 ) -> tuple[Array, Array]:
     """Stop points and launches (2, W, K) of the rays of a plan, with derivatives by the lens and
@@ -42,12 +44,21 @@ def _follow(
     return plan.edge.rays.point, plan.edge.rays.launch
 
 
-@_follow.defjvp
-def _follow_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
+@_attach.defjvp
+def _attach_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """Implicit derivatives of the boundary rays.
+
+    A ray on the boundary is a root F(launch; lens, scene) = 0: it stays on its edge (|q| = 1) and
+    on its spoke, or on both edges of a corner. At a root, one Newton step launch - F_launch^-1 F
+    has the value 0 and, at a fixed launch, the derivative -F_launch^-1 dF by lens and scene, which
+    is the implicit one. So one step is differentiated; the derivative of the slopes is multiplied
+    by F = 0 and is left out.
+    """
     lens, scene, plan = primals
-    _, pair, follows = plan.edge
-    # Call the function itself, so that the points have derivatives for higher orders.
-    point, launch = _follow(radial, crossing, lens, scene, plan)
+    _, pair, settled = plan.edge
+    # Call the function itself, so that point and launch have derivatives here too: for higher
+    # orders.
+    point, launch = _attach(radial, crossing, lens, scene, plan)
 
     def trace(lens, scene, launch):
         return boundary.trace(lens, system_of(lens, scene), crossing, launch)
@@ -55,39 +66,40 @@ def _follow_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any)
     rays = boundary.launched(functools.partial(trace, lens, scene), launch)
     corners, ends = (slice(None, -radial.count), slice(-radial.count, None))
 
-    def step(lens, scene):  # one Newton step, by the linear models of these rays
+    def step(lens, scene):  # one Newton step with the slopes of `rays`
         (crossed, q), _ = trace(lens, scene, launch)
-        # What does not exist does not move: its slopes may be infinite, and in reverse mode 0 times
-        # inf is no number.
-        crossed = jnp.where(follows, crossed, jax.lax.stop_gradient(rays.point))
-        q = jnp.where(follows, q, jax.lax.stop_gradient(rays.q))
-        moved = rays._replace(point=crossed, q=q)
-        # A corner stays on both edges.
-        corner = (crossed + boundary.corner_step(moved, pair))[..., corners]
-        corner = jnp.where(follows[:, corners], corner, point[..., corners])
-        # A spoke rotates with the corners, and ends on its edge.
+        # Zero tangents for rays that did not settle: their slopes may be inf, and in reverse mode 0
+        # times inf is NaN.
+        crossed = jnp.where(settled, crossed, jax.lax.stop_gradient(rays.point))
+        q = jnp.where(settled, q, jax.lax.stop_gradient(rays.q))
+        updated = rays._replace(point=crossed, q=q)
+        # A corner stays on both of its edges.
+        corner = (crossed + boundary.corner_step(updated, pair))[..., corners]
+        corner = jnp.where(settled[:, corners], corner, point[..., corners])
+        # A spoke turns with the corners, between which it is a Gauss node, and its end stays on its
+        # edge.
         toward, _ = plan.spokes(radial, corner)
-        moved = jax.tree.map(lambda a: a[..., ends], moved)
-        distance = boundary.edge_distance(moved, target_of(moved, plan.frame.centre, toward))
+        updated = jax.tree.map(lambda a: a[..., ends], updated)
+        distance = boundary.edge_distance(updated, target_of(updated, plan.frame.centre, toward))
         length = boundary.picked(distance, pair[:1, :, ends])[0]
         known = jax.lax.stop_gradient(_along(point[..., ends] - plan.frame.centre, toward))
-        length = jnp.where(follows[:, ends], length, known)
+        length = jnp.where(settled[:, ends], length, known)
         new = jnp.concatenate([corner, plan.frame.centre + length[None] * toward], axis=-1)
-        return new, jnp.where(follows, displace(rays.d_launch, new - crossed), 0)
+        return new, jnp.where(settled, displace(rays.d_launch, new - crossed), 0)
 
     return (point, launch), jax.jvp(step, (lens, scene), tangents[:2])[1]
 
 
 def _along(line: Array, toward: Array) -> Array:
-    """Length (W, B) of a line in units of `toward`."""
+    """Length (W, B) of the projection of `line` on `toward`, in units of `toward`."""
     return safe_divide(dot(toward, line), dot(toward, toward))
 
 
 class Fitted(PupilRule):
-    """A rule whose weights contain the clipping."""
+    """Base class of rules whose weights contain the clipping."""
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """1 for all rays (W, Q) that exist."""
+        """1 (W, Q) for every ray that exists, clipped or not; 0 for rays that fail."""
         whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
         return whole.astype(bundle.path.dtype)
 
@@ -95,15 +107,17 @@ class Fitted(PupilRule):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Clipped(Fitted):
-    """Gauss rules between the corners of the boundary and along the radii to it. Each obscuration
-    doubles the number of rays: the light inside of it is subtracted.
+    """Gauss rule fitted to the open part of the pupil: Gauss nodes in azimuth between the corners
+    of the boundary, and along the radii to it.
 
-    order: nodes along a radius.
+    order: number of nodes along a radius.
     symmetry: see `symmetry_of`.
-    size: order up to which rays of weight 0 fill up, so that orders share a compiled program; 0 for
-        `order`.
-    crossing: True if the boundary also contains points where neighbouring surfaces cross; False
+    size: order whose number of rays is used; rays of weight 0 pad a lower order, so that several
+        orders share a compiled program. 0 for `order`.
+    crossing: True if points where neighbouring surfaces cross also belong to the boundary; False
         takes half the time.
+
+    Each obscuration doubles the number of rays, because the light inside of it is subtracted.
     """
 
     order: int
@@ -117,7 +131,7 @@ class Clipped(Fitted):
             object.__setattr__(self, "size", self.order)
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points and weights, differentiable by the lens."""
+        """Points and weights, both differentiable in the lens."""
         orders = jnp.asarray([self.order], jnp.int32)
         return _open(lens, scene, orders, (self.size,), self.symmetry, self.crossing)[0]
 
@@ -128,7 +142,7 @@ class ClippedGroup(Fitted):
     """Rules `Clipped` of several orders, whose points one search finds.
 
     orders: (G,), int32.
-    chosen: (), int32, number of the order whose points have weight; -1 for all of them.
+    chosen: (), int32, index of the order whose points have weight; -1 for all of them.
     sizes: `Clipped.size` of each order.
     symmetry, crossing: as in `Clipped`.
     """
@@ -141,7 +155,7 @@ class ClippedGroup(Fitted):
     __repr__ = brief
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points of all orders, and their weights, 0 for orders that are not chosen."""
+        """Points of all orders and their weights, which are 0 for orders that are not chosen."""
         orders = jnp.asarray(self.orders, jnp.int32)
         parts = _open(lens, scene, orders, self.sizes, self.symmetry, self.crossing)
         (*points, weights) = (
@@ -150,7 +164,7 @@ class ClippedGroup(Fitted):
         return tuple(points), jnp.where(self.own(lens)[None], weights, 0)
 
     def own(self, lens: Lens) -> Any:
-        """Rays of the chosen order, (Q,), bool; NumPy if `chosen` is known."""
+        """Mask (Q,), bool, of the rays of the chosen order; a NumPy array if `chosen` is known."""
         sets = 1 if lens.apertures is None else len(lens.apertures.terms()[0])
         counts = [sets * n * _most(lens, self.symmetry, n) for n in self.sizes]
         order, chosen = np.repeat(np.arange(len(counts), dtype=np.int32), counts), self.chosen
@@ -158,8 +172,8 @@ class ClippedGroup(Fitted):
 
 
 def _spokes(lens: Lens, symmetry: Symmetry, order: Any) -> Any:
-    """Number of spokes of an order. Edges make corners; narrow panels between them need spokes
-    too."""
+    """Number of spokes of an order. Each edge can add corners, and the narrow panels between
+    corners need spokes too."""
     part = {"rotational": 0, "bilateral": 1, "none": 2}[symmetry]
     return part * (2 * order + 6 + 2 * boundary.aperture_edges(lens))
 
@@ -177,22 +191,28 @@ def _open(
     symmetry: Symmetry,
     crossing: bool,
 ) -> list[tuple[Vector, Array]]:
-    """Points and weights of each of G orders: those of the `terms` of the apertures."""
-    given, extra = (scene, orders, sizes, symmetry, crossing), lens.apertures
+    """Points and weights of each of G orders, for the open area of the pupil.
+
+    orders: (G,), int32; other arguments as in `ClippedGroup`.
+
+    The open area is a sum, with signs, of areas inside of convex apertures: the `terms` of the
+    apertures, which subtract obscurations and add the convex pieces of polygons.
+    """
+    settings, extra = (scene, orders, sizes, symmetry, crossing), lens.apertures
     if extra is None or not (extra.most or any(extra.blocks)):
-        return _inside(lens, *given)
+        return _inside(lens, *settings)
     sign, *terms = extra.terms()
 
     def part(shapes, corners):
-        return _inside(dataclasses.replace(lens, apertures=extra.part(shapes, corners)), *given)
+        return _inside(dataclasses.replace(lens, apertures=extra.part(shapes, corners)), *settings)
 
     def total(points, weight):  # from (W, T, Q)
         weight = weight * jnp.asarray(sign, weight.dtype)[None, :, None]
         points, weight = jax.tree.map(lambda a: a.reshape(len(a), -1), (points, weight))
         # A total within rounding counts as no light.
         least = float(jnp.finfo(weight.dtype).eps) ** 0.5
-        lit = jnp.sum(weight, axis=-1, keepdims=True) > least
-        return points, jnp.where(lit, weight, 0)
+        positive = jnp.sum(weight, axis=-1, keepdims=True) > least
+        return points, jnp.where(positive, weight, 0)
 
     return [total(*one) for one in jax.vmap(part, out_axes=1)(*map(jnp.asarray, terms))]
 
@@ -205,7 +225,14 @@ def _inside(
     symmetry: Symmetry,
     crossing: bool,
 ) -> list[tuple[Vector, Array]]:
-    """Points and weights of the light inside of all apertures and obscurations, as in `_open`."""
+    """Points and weights of each of G orders, for the area that is inside of all apertures and also
+    inside of all obscurations; arguments as in `_open`.
+
+    With p = centre + r L(a) M e(a), e(a) = (cos a, sin a), L the length of the spoke and M the
+    stretching, the mean over the disc is the integral of det(M) L^2 r dr da / pi: weight = share
+    L^2 det(M) 2 r w_r for a spoke with the weight `share` in azimuth and a radial node r with the
+    weight w_r.
+    """
     most = tuple(_most(lens, symmetry, size) for size in sizes)
     extra = lens.apertures
     sides = 0 if extra is None else extra.most * extra.kinds.count("polygon")
@@ -213,16 +240,16 @@ def _inside(
     used = jnp.asarray(_spokes(lens, symmetry, orders), jnp.int32)
     plan = find_boundary(*jax.lax.stop_gradient((lens, scene)), radial, used, crossing)
     plan = jax.lax.stop_gradient(plan)
-    point, _ = _follow(radial, crossing, lens, scene, plan)
+    point, _ = _attach(radial, crossing, lens, scene, plan)
     corner, end = point[..., : -radial.count], point[..., -radial.count :]
     toward, share = plan.spokes(radial, corner)
     length = _along(end - plan.frame.centre, toward)
     area = jnp.where(plan.passes, share * length**2 * determinant(plan.frame.shape), 0)
     axial, centre, found = symmetry == "rotational", plan.frame.centre[..., None], []
-    stops = np.cumsum(most)  # the spokes behind the last stop only fill up the search
+    stops = np.cumsum(most)  # the spokes behind the last stop are padding
     for k, (start, stop) in enumerate(zip(stops - most, stops)):
         node, weight = jnp.asarray(gauss(sizes[k]), length.dtype)[:, orders[k]]
-        # For "rotational" r^2 is the variable, as without clipping.
+        # For "rotational" the variable is r^2, as in the rule without clipping.
         node, weight = (jnp.sqrt(node), weight) if axial else (node, 2 * node * weight)
         node, weight = node[None, None], weight[None, None]
         radius = length[:, start:stop, None] * node

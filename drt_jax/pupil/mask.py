@@ -1,4 +1,4 @@
-"""Plates of pixels in the stop: coded apertures, apodisers, phase plates."""
+"""Masks in the plane of the stop, made of pixels: coded apertures, apodisers, phase plates."""
 
 import dataclasses
 import itertools
@@ -15,18 +15,21 @@ from ..rays.trace import Bundle
 from .rules import PupilRule
 
 _UM = 1e3  # per mm
-_ROUND = 64  # last digits by which a ray on the rim may miss it
+_ROUND = 64  # machine epsilons by which a ray aimed at the rim may miss it
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Mask:
-    """A plate of N x M pixels [y, x] that fills the square around the circle of the stop, from the
-    lowest y and x on; each pixel is even.
+    """A mask in the stop: N x M pixels [y, x] on the square that circumscribes the stop.
 
-    amplitude: (N, M) or (W, N, M), one for each wavelength; its square is the light that passes.
-    path: of the same shape, optical path that a pixel adds, mm; None for none. It acts on waves:
-        rays go on as they did.
+    Row 0 has the lowest y and column 0 the lowest x. Transmission and path are constant over a
+    pixel.
+
+    amplitude: (N, M), or (W, N, M) with one table for each wavelength; amplitude transmission. The
+        transmitted fraction of the light is its square.
+    path: same shape as `amplitude`, optical path that a pixel adds, mm; None for none. It changes
+        the phase of waves only; the directions of rays do not change.
     """
 
     amplitude: Array
@@ -34,7 +37,8 @@ class Mask:
     __repr__ = brief
 
     def check(self) -> None:
-        """ValueError for other shapes."""
+        """ValueError if the shapes of `amplitude` and `path` are not those of the class
+        docstring."""
         shape = jnp.shape(self.amplitude)
         other = shape if self.path is None else jnp.shape(self.path)
         if len(shape) not in (2, 3) or other != shape:
@@ -42,11 +46,15 @@ class Mask:
             raise ValueError(f"mask: {what}, got {shape} and {other}")
 
     def light(self, at: Array, half: Array) -> Array:
-        """Mean part of the light that passes boxes, see `means`, (W, ...)."""
+        """Mean of amplitude^2 over boxes, (W, ...); arguments as in `means`."""
         return self.means(jnp.asarray(self.amplitude, at.dtype) ** 2, at, half)
 
     def waves(self, wavelengths: Array, at: Array, half: Array) -> Array:
-        """Mean factor of waves in boxes, see `means`, complex (W, ...). wavelengths: (W,), um."""
+        """Mean of amplitude exp(2 pi i path / wavelength) over boxes, complex (W, ...).
+
+        wavelengths: (W,), um.
+        at, half: boxes, as in `means`.
+        """
         given = self.amplitude, 0 * self.amplitude if self.path is None else self.path
         amplitude, path = (jnp.asarray(a, wavelengths.dtype) for a in given)
         shape = jnp.broadcast_shapes(path.shape, (len(wavelengths), 1, 1))
@@ -56,15 +64,25 @@ class Mask:
 
     @staticmethod
     def means(pixels: Array, at: Array, half: Array) -> Array:
-        """Means (W, ...) of pixels (N, M) or (W, N, M) in boxes about points `at` (2, W, ...) with
-        half sides `half` (2, W, ...), in semi-diameters of the stop: exact for boxes along x and y
-        that are no larger than a pixel; the pixel itself for sides of 0; 0 beside the plate."""
+        """Means of a table of pixels over boxes, (W, ...).
+
+        pixels: (N, M) or (W, N, M).
+        at: (2, W, ...), x and y of the centres of the boxes, in units of the semi-diameter of the
+            stop.
+        half: (2, W, ...), half the sides of the boxes, same unit.
+
+        A box with sides along x and y that is no larger than a pixel overlaps at most two pixels
+        along each axis, so the mean is exact: a sum of four pixels with the product of the
+        overlapped fractions as weights. A box of size 0 takes the pixel at its centre. Outside of
+        the mask the table is 0.
+        """
         padded = jnp.pad(pixels, [(0, 0)] * (pixels.ndim - 2) + [(1, 1)] * 2)
         padded = jnp.broadcast_to(padded, (at.shape[1], *padded.shape[-2:]))
-        ends = []  # of the box along x and y: two pixels and the parts of it that lie in them
+        ends = []  # along x and y: the two pixels that a box overlaps, and the fractions
         for point, reach, count in zip(at, half, pixels.shape[:-3:-1]):
             low, wide = (point - reach + 1) * (count / 2), reach * count
-            # A ray on the rim crosses the pixel inside, also if rounding puts it beside the plate.
+            # A ray aimed at the rim takes the outermost pixel, even if rounding puts it just
+            # outside of the mask.
             near = jnp.abs(jnp.abs(point) - 1) <= _ROUND * float(jnp.finfo(point.dtype).eps)
             low = jnp.where(near & (reach == 0), jnp.clip(low, 0, count - 1), low)
             first = jnp.floor(low)
@@ -81,14 +99,16 @@ class Mask:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Masked(PupilRule):
-    """A rule whose rays carry the light that a mask lets pass.
+    """A pupil rule whose rays are weighted with the transmission of a mask.
 
-    Each ray has the light of the pixel that it crosses. With the Q rays of a rule, sums over pixels
-    come out to about the part of the rays whose neighbour crosses another pixel: take many, such as
-    a `Pattern` of `pupil.square_grid`. `PsfModel.masked` needs no more rays than without a mask.
+    rule: pupil rule of the symmetry "none".
+    mask: mask without a path, because a path does not change rays.
 
-    rule: of the symmetry "none". mask: without a path, which turns no rays. ValueError for others,
-    where rays are traced.
+    Each ray takes the transmission of the pixel that it crosses. With Q rays, a sum over the pixels
+    has a relative error of about the fraction of rays whose neighbour crosses another pixel: take
+    many rays, for instance a `Pattern` of `pupil.square_grid`. `PsfModel.masked` needs no more rays
+    than a model without a mask. ValueError, when rays are traced, for another symmetry and for a
+    mask with a path.
     """
 
     rule: PupilRule
@@ -96,11 +116,11 @@ class Masked(PupilRule):
 
     @property
     def symmetry(self):  # type: ignore[override]
-        """Symmetry of the rule."""
+        """Symmetry of `rule`."""
         return self.rule.symmetry
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points and weights of the rule."""
+        """Points and weights of `rule`. ValueError as described for the class."""
         self.mask.check()
         if self.symmetry != "none" or self.mask.path is not None:
             what = 'give a rule of the symmetry "none" and no path: a path acts on waves alone'
@@ -108,6 +128,6 @@ class Masked(PupilRule):
         return self.rule.points(lens, scene)
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """Transmission of the rule times that of the mask, (W, Q)."""
+        """Transmission (W, Q) of `rule` times that of the mask."""
         at = jnp.stack([hit[lens.stop] for hit in bundle.hits]) / lens.semi_diameter[lens.stop]
         return self.rule.transmission(lens, bundle) * self.mask.light(at, jnp.zeros_like(at))

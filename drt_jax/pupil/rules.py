@@ -1,8 +1,8 @@
 """Quadrature rules on the pupil: points on the stop with weights.
 
 A rule is a value: a frozen pytree whose kind, order and symmetry are static. It chooses points on
-the stop, their weights, and the transmission of each ray. The weights of the light that fills the
-stop add up to 1; with transmission they add up to the throughput.
+the stop, their weights, and the transmission of each ray. The weights sum to 1 for a stop that is
+filled with light; weights times transmission sum to the throughput.
 """
 
 import abc
@@ -28,19 +28,21 @@ from . import patterns
 # Part of the pupil that is traced: one radius, the half x > 0, or the whole disc.
 Symmetry = Literal["rotational", "bilateral", "none"]
 MAX_ORDER = 42
-# Components of a field that a symmetry wants to be 0, from the first on.
+# Number of leading components (x, then y) of a field that must be 0 for a symmetry to hold.
 _ACROSS = {"rotational": 2, "bilateral": 1, "none": 0}
-# Largest angle off a plane of symmetry that counts as in it, radians.
-_OFF = 1e-3
+# Largest angle from a plane of symmetry for which a field counts as in it, radians.
+_MAX_ANGLE = 1e-3
 
 
 def symmetry_of(lens: Lens, field: Numbers) -> Symmetry:
-    """Symmetry of the pupil for a field: "rotational" on the axis of a rotationally symmetric lens,
-    "bilateral" for a field along y if x -> -x does not change the lens, else "none".
+    """Symmetry of the pupil for given fields.
 
-    field: angle along y, (x, y), or several (F, 2), radians.
+    lens: the lens.
+    field: angle along y, one (x, y), or several (F, 2), radians.
 
-    ValueError inside `jit` or `vmap`, if values that are not known there decide.
+    Returns "rotational" for fields on the axis of a rotationally symmetric lens, "bilateral" for
+    fields along y if the lens is symmetric under x -> -x, else "none". ValueError inside `jit` or
+    `vmap`, if the result depends on values that are tracers.
     """
     group, extra = lens.elements, lens.apertures
     shift, turned = (None, None) if group is None else (group.shift, group.tilt)
@@ -65,16 +67,23 @@ def symmetry_of(lens: Lens, field: Numbers) -> Symmetry:
 
 
 def fits(symmetry: Symmetry, field: Numbers) -> Array:
-    """Whether the part of the pupil that a rule of a symmetry traces stands for the whole at
-    fields (..., 2), radians: bool (...). Smaller angles than `_OFF` pass, so that differences at a
-    plane of symmetry can be taken."""
-    return ~jnp.any(jnp.abs(jnp.asarray(field)[..., : _ACROSS[symmetry]]) > _OFF, axis=-1)
+    """Whether the symmetry of a rule holds for fields, so that the rays on a part of the pupil
+    represent the whole pupil.
+
+    symmetry: symmetry of the rule.
+    field: (..., 2), radians.
+
+    Returns bool (...). Angles up to `_MAX_ANGLE` from the plane of symmetry are accepted, so that
+    finite differences can be taken there.
+    """
+    return ~jnp.any(jnp.abs(jnp.asarray(field)[..., : _ACROSS[symmetry]]) > _MAX_ANGLE, axis=-1)
 
 
 def require_fit(symmetry: Symmetry, field: Numbers) -> None:
-    """ValueError for known fields (..., 2) that a rule of a symmetry does not fit."""
-    # NumPy, because inside of a trace even what JAX computes of known numbers is not known.
-    if concrete(field) and np.any(np.abs(np.asarray(field)[..., : _ACROSS[symmetry]]) > _OFF):
+    """ValueError if the symmetry of a rule does not hold for fields (..., 2), as far as these
+    are known (no tracers)."""
+    # NumPy, because inside of a trace the result of a JAX operation on known numbers is a tracer.
+    if concrete(field) and np.any(np.abs(np.asarray(field)[..., : _ACROSS[symmetry]]) > _MAX_ANGLE):
         where = {"rotational": "the axis", "bilateral": "fields along y"}[symmetry]
         raise ValueError(
             f"the rule is made for {where}, where a part of the pupil stands for all of it; the "
@@ -83,7 +92,8 @@ def require_fit(symmetry: Symmetry, field: Numbers) -> None:
 
 
 class PupilRule(abc.ABC):
-    """A rule: `points` on the stop with weights, and the `transmission` of each ray.
+    """Base class of the rules: `points` on the stop with weights, and the `transmission` of each
+    ray.
 
     symmetry: part of the pupil that is traced, see `symmetry_of`.
     """
@@ -92,19 +102,26 @@ class PupilRule(abc.ABC):
 
     @abc.abstractmethod
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points on the unit disc of the stop, D arrays (Q,) or (W, Q), and weights, (1, Q) or
-        (W, Q). D = 1 for "rotational", else 2."""
+        """Points on the stop in units of its semi-diameter, and their weights.
+
+        Returns D arrays (Q,) or (W, Q), D = 1 for "rotational" and 2 otherwise, and weights (1, Q)
+        or (W, Q).
+        """
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """Transmitted fraction of each ray (W, Q); 0 for rays that fail or are clipped."""
+        """Transmitted fraction (W, Q) of each ray; 0 for rays that fail or are clipped."""
         return (bundle.status == Status.OK).astype(bundle.path.dtype)
 
 
 def gauss_points(order: int, symmetry: Symmetry) -> tuple[np.ndarray, np.ndarray]:
-    """Points (Q, D) and weights (Q,) of a Gauss rule on the part of the pupil that is traced.
+    """Points and weights of a Gauss rule on the part of the pupil that is traced.
 
-    An aberration of degree p in the pupil reaches azimuthal order p. With order + 1 azimuths on the
-    half disc, azimuths and radii integrate its square to the same degree.
+    order: number of nodes in r^2.
+    symmetry: see `symmetry_of`.
+
+    Returns points (Q, D) and weights (Q,). An aberration of degree p in the pupil has azimuthal
+    orders up to p. With order + 1 azimuths on the half disc, the azimuths and the radii integrate
+    the square of an aberration exactly to the same degree.
     """
     if symmetry == "rotational":
         return patterns.meridian(order)
@@ -114,10 +131,10 @@ def gauss_points(order: int, symmetry: Symmetry) -> tuple[np.ndarray, np.ndarray
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Gauss(PupilRule):
-    """Gauss rule on the stop. Rays that fail or are clipped drop out one by one.
+    """Gauss rule on the stop. Rays that fail or are clipped are left out one by one.
 
-    order: nodes n in r^2, 1 to 42; n rays for "rotational", n (n + 1) for "bilateral", twice as
-        many for "none".
+    order: number of nodes n in r^2, 1 to 42; n rays for "rotational", n (n + 1) for "bilateral",
+        twice as many for "none".
     symmetry: see `symmetry_of`.
     """
 
@@ -128,7 +145,7 @@ class Gauss(PupilRule):
         check_rule(self.order, self.symmetry)
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points and weights of the order: constants."""
+        """Points and weights of the order, which are constants."""
         points, weights = gauss_points(self.order, self.symmetry)
         dtype = lens.curvature.dtype
         return tuple(jnp.asarray(p, dtype) for p in points.T), jnp.asarray(weights, dtype)[None]
@@ -137,10 +154,11 @@ class Gauss(PupilRule):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Soft(PupilRule):
-    """Gauss rule with smooth aperture edges: the transmission of each is a logistic step.
+    """Gauss rule with soft aperture edges: the transmission of each edge is a logistic function of
+    the clearance.
 
     order, symmetry: as in `Gauss`.
-    width: (), width of the steps, mm.
+    width: (), width of the logistic function, mm: transmission = 1 / (1 + exp(-clearance / width)).
     """
 
     order: int = dataclasses.field(metadata={"static": True})
@@ -153,15 +171,15 @@ class Soft(PupilRule):
             raise ValueError(f"width: expected a number above 0 mm, got {self.width!r}")
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """Points and weights of the order: constants."""
+        """Points and weights of the order, which are constants."""
         return Gauss(self.order, self.symmetry).points(lens, scene)
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
-        """Product (W, Q) of the steps of all apertures and obscurations except the stop's circle;
-        0 for rays that fail."""
+        """Product (W, Q) of the transmissions of all apertures and obscurations except the rim
+        of the stop; 0 for rays that fail."""
         whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
         inside = clearance(lens, bundle.hits)
-        bounded = jnp.isfinite(inside)  # inf / width has no derivative by the width
+        bounded = jnp.isfinite(inside)  # its derivative by the width would be NaN
         inside = jnp.where(bounded, inside, 0) / jnp.asarray(self.width, inside.dtype)
         steps = jax.nn.sigmoid(jnp.where(bounded, inside, jnp.inf))
         return jnp.where(whole, jnp.prod(steps, axis=0), 0)
@@ -170,10 +188,11 @@ class Soft(PupilRule):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Pattern(PupilRule):
-    """Rule of any points on the stop, such as those of `pupil.hexapolar`; clipped rays drop out.
+    """Rule with given points on the stop, such as those of `pupil.hexapolar`. Clipped rays are left
+    out.
 
     positions: (Q, 2), x and y in units of the semi-diameter of the stop; (Q, 1) for "rotational".
-    weights: (Q,), with the sum 1 for a stop filled with light.
+    weights: (Q,), which sum to 1 for a stop that is filled with light.
     symmetry: see `symmetry_of`.
     """
 
@@ -183,7 +202,7 @@ class Pattern(PupilRule):
     __repr__ = brief
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-        """The points and weights. ValueError for wrong shapes."""
+        """The given points and weights in the dtype of the lens. ValueError for wrong shapes."""
         dtype = lens.curvature.dtype
         positions = real_array("positions", self.positions, dtype)
         weights = real_array("weights", self.weights, dtype)
@@ -197,7 +216,7 @@ class Pattern(PupilRule):
 
 
 def check_rule(order: int, symmetry: Symmetry) -> None:
-    """Raises ValueError for an order or a symmetry that no rule has."""
+    """ValueError for an order outside of 1 to 42 and for an unknown symmetry."""
     whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
     if not whole or not 1 <= order <= MAX_ORDER:
         raise ValueError(f"order: expected a whole number from 1 to {MAX_ORDER}, got {order!r}")
@@ -207,12 +226,15 @@ def check_rule(order: int, symmetry: Symmetry) -> None:
 def pupil_points(
     lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers, rule: PupilRule
 ) -> tuple[Array, Array]:
-    """Points where the rays of a rule cross the stop, (W, Q, 2) in units of its semi-diameter, and
-    their weights (W, Q). Both are differentiable by the lens. Points of a "rotational" rule lie on
-    the y axis and stand for all azimuths.
+    """Points where the rays of a rule cross the stop, and their weights.
 
+    lens: the lens.
     field, distance, wavelengths: as in `trace_rays`.
-    rule: the rule.
+    rule: the pupil rule.
+
+    Returns points (W, Q, 2), in units of the semi-diameter of the stop, and weights (W, Q). Both
+    are differentiable in the lens. The points of a "rotational" rule lie on the y axis and
+    represent all azimuths.
     """
     scene = scene_of(lens, field, distance, wavelengths)
     points, weights = rule.points(lens, scene)
