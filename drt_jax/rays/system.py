@@ -261,14 +261,12 @@ def placed(lens: Lens, rows: Any) -> Placed:
     """
     rows = np.asarray(rows)
     vertex, offset, rotation = lens.places
-    has_derivative = np.isin(rows, [*lens.active, *lens.curved])
+    bends = np.isin(rows, [*lens.active, *lens.curved])
 
     def shape(array: Array) -> Array:
         own = array[rows]
-        mask = has_derivative.reshape(
-            has_derivative.shape + (1,) * (own.ndim - has_derivative.ndim)
-        )
-        return own if has_derivative.all() else jnp.where(mask, own, jax.lax.stop_gradient(own))
+        mask = bends.reshape(bends.shape + (1,) * (own.ndim - bends.ndim))
+        return own if bends.all() else jnp.where(mask, own, jax.lax.stop_gradient(own))
 
     return Placed(
         vertex[rows],
