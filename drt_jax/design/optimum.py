@@ -129,7 +129,7 @@ def _refuse_fixed(problem: Problem, search: Search) -> None:
     excess = np.asarray(search.evaluation.constraints)
     slopes = np.asarray(search.jacobian)[-len(excess) or len(search.jacobian) :]
     if np.any((excess > 0) & (np.max(np.abs(slopes), axis=1, initial=0) * _FAR < excess)):
-        nearby = take_step(problem, init_problem(problem, problem.elsewhere(search.vector)))
+        nearby = take_step(problem, init_problem(problem, problem.nearby_vector(search.vector)))
         problem.refuse_fixed(excess, nearby.evaluation.constraints)
 
 
