@@ -24,9 +24,9 @@ from .variables import Variables
 
 # Number of searches in a tile. The searches of one tile run in one program on one core.
 _TILE = 16
-# Two minima count as the same if the score of the worse exceeds the merit of the better by less than
-# `_SAME_MERIT` (relative), and their vectors differ by less than `_SAME_PLACE` (root mean square, in
-# units of the scales).
+# Two minima count as the same if the score of the worse exceeds the merit of the better by less
+# than `_SAME_MERIT` (relative), and their vectors differ by less than `_SAME_PLACE` (root mean
+# square, in units of the scales).
 _SAME_MERIT, _SAME_PLACE = 1e-3, 1.0
 
 
