@@ -20,7 +20,7 @@ from jax import Array
 
 from ..numerics import Numbers, safe_divide, still
 from .lens import Lens
-from .scene import ahead, apart, distance_array, field_array, vergence_of
+from .scene import ahead, away_from_vertex, distance_array, field_array, vergence_of
 from .surface import vertex_curvature
 
 # Last digits of the sum that makes a slope which may be wrong.
@@ -255,7 +255,7 @@ def first_order(lens: Lens, distance: Numbers, wavelengths: Numbers) -> FirstOrd
         petzval_radius=_quotient(-one, index[-1] * jnp.sum(petzval_parts(system), axis=0)),
         effective_focal_length=_quotient(-one, index[-1] * u),
     )
-    return system.masked(found, apart(far))
+    return system.masked(found, away_from_vertex(far))
 
 
 def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
@@ -331,4 +331,4 @@ def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Num
     tangent = jnp.tan(jnp.where(forwards, angle, 0))
     fields = tuple(range(tangent.ndim - 1))
     front, bend = (jnp.expand_dims(a, fields) for a in (system.index[0], system.index[-1] * slope))
-    return system.masked(_quotient(-tangent * front, bend), forwards & apart(far))
+    return system.masked(_quotient(-tangent * front, bend), forwards & away_from_vertex(far))

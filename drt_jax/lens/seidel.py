@@ -22,7 +22,7 @@ from .paraxial import (
     petzval_parts,
     trace_ray,
 )
-from .scene import ahead, apart, distance_array, field_array, vergence_of
+from .scene import ahead, away_from_vertex, distance_array, field_array, vergence_of
 from .surface import by_form, surface_sag
 
 
@@ -150,4 +150,4 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
         lateral_colour=2 * half * colour * (chief.height * c + chief.before),
         petzval_curvature=-n[-1:] * petzval_parts(system),
     )
-    return system.masked(found, forwards & apart(far) & ~bent)
+    return system.masked(found, forwards & away_from_vertex(far) & ~bent)
