@@ -24,8 +24,8 @@ from .lens import Lens
 from .scene import ahead, away_from_vertex, distance_array, field_array, vergence_of
 from .surface import vertex_curvature
 
-# Rounding error of the last slope, in units of eps times the sum of the absolute values of the terms
-# of which it consists.
+# Largest rounding error of the last slope, in units of eps times the sum of the absolute values of
+# its terms.
 _ROUNDING = 16
 
 
