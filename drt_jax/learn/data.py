@@ -119,7 +119,7 @@ def load_patches(
         order = np.random.default_rng([seed, 0]).permutation(usable)
         count = min(max(1, round(config.test_fraction * usable)), usable - 1)
         is_test = np.isin(np.arange(usable), order[:count]).repeat(config.crops_per_image)
-        _move_test_crops(pool, test_file, is_test, size)
+        _part(pool, test_file, is_test, size)
         shape = -1, side, side, bands
         return Patches(_array(pool, shape), _array(test_file, shape), tuple(skipped))
 
@@ -238,7 +238,7 @@ def _file(folder: str, open_files: contextlib.ExitStack) -> IO[bytes]:
     return open_files.enter_context(tempfile.TemporaryFile(dir=os.path.expanduser(folder)))
 
 
-def _move_test_crops(pool: IO[bytes], test_file: IO[bytes], is_test: np.ndarray, size: int) -> None:
+def _part(pool: IO[bytes], test_file: IO[bytes], is_test: np.ndarray, size: int) -> None:
     """Moves the test crops from `pool` to `kept`, and closes the gaps.
 
     It copies crop by crop, because both files together may be larger than the memory.
