@@ -219,11 +219,11 @@ def _write(lines: Iterable[tuple[str, ...] | str]) -> list[tuple[str, ...] | str
     """Writes each line, or row of a table, to stdout as soon as it is known, and returns them
     all.
     """
-    said = []
+    written = []
     for line in lines:
-        said.append(line)
+        written.append(line)
         _print_line(line if isinstance(line, str) else _row(*line))
-    return said
+    return written
 
 
 def _print_line(line: str) -> None:
@@ -315,16 +315,16 @@ def run_show(options: argparse.Namespace) -> None:
         out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}{kind}")
         symmetry, cut = _widest(lens, angles), not _unclipped(beams)
         rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
-        given = lens, angles, distance, waves, rule, _show_task
+        view = lens, angles, distance, waves, rule, _show_task
         if options.html:
             rows = [row for row in table if not isinstance(row, str)]
             lines = [line for line in (*notes, *table) if isinstance(line, str) and line]
-            told: list[tuple[str, Part]] = [("First-order data", first), ("Spots", rows)]
-            told += [("Warnings", "\n".join(lines))] if lines else []
-            told += [("Surfaces", [*surface_rows(lens)]), *panels(*given).items()]
-            out.write_text(page(f"{lens.name}: {about}", told), encoding="utf-8")
+            parts: list[tuple[str, Part]] = [("First-order data", first), ("Spots", rows)]
+            parts += [("Warnings", "\n".join(lines))] if lines else []
+            parts += [("Surfaces", [*surface_rows(lens)]), *panels(*view).items()]
+            out.write_text(page(f"{lens.name}: {about}", parts), encoding="utf-8")
         else:
-            figure = sheet(*given)
+            figure = sheet(*view)
             figure.supxlabel(options.note.strip(" !"), fontsize=7, x=0.01, ha="left")
             figure.savefig(out)
     _write([f"drawn in {out}"])

@@ -72,11 +72,10 @@ def _known(name: str, value: Any) -> bool:
 
 
 def jit_outside(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
-    """`jax.jit(function, **keywords)` with the options that the backend knows, which is asked at
-    the first call.
+    """`jax.jit(function, **keywords)` with the options that the backend knows.
 
-    Only for calls outside of other programs and of derivatives, because JAX accepts no options
-    inside of them.
+    The backend is asked at the first call. Only for calls outside of other programs and of
+    derivatives, because JAX accepts no options inside of them.
     """
 
     @functools.cache

@@ -99,8 +99,9 @@ def read_yaml(path: str | os.PathLike) -> tuple[Any, Lines]:
 
 
 def parse(text: str) -> tuple[Any, Lines]:
-    """The content of YAML text: dict, list, str, int, float, bool, None; and the line numbers of
-    its keys.
+    """The content of YAML text, and the line numbers of its keys.
+
+    The content consists of dict, list, str, int, float, bool and None.
 
     InputError, with the line number, for text that is not YAML or is refused, see above.
     """

@@ -83,8 +83,8 @@ def still(tree: Any) -> Any:
 
 
 def known_values(tree: Any) -> Any:
-    """`tree` with its numbers, also while it is being differentiated; None if `jit` or `vmap` hides
-    them.
+    """`tree` with its numbers, also while it is being differentiated; None for tracers of `jit` or
+    `vmap`.
 
     What follows from a scene, such as how many rays it needs, is not differentiated, but it must be
     decided in an eager `jax.grad`, too: there `stop_gradient` returns the values.
@@ -104,10 +104,9 @@ def brief(one: Any) -> str:
 
 
 def leaves(*names: str) -> Callable[[type[T]], type[T]]:
-    """A decorator that makes a frozen dataclass a pytree of the named fields; other fields are
-    static.
+    """A decorator that makes a frozen dataclass a pytree of the named fields.
 
-    What JAX rebuilds from leaves is not checked again by `__post_init__`.
+    Other fields are static. What JAX rebuilds from leaves is not checked again by `__post_init__`.
     """
 
     def register(cls: type[T]) -> type[T]:

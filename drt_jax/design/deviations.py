@@ -147,10 +147,9 @@ def x_curvatures(lens: Lens, at: np.ndarray) -> Array:
 
 
 def deviations_of(lens: Lens, tolerances: Sequence[Tolerance]) -> dict[Deviation, float]:
-    """The deviations that tolerances allow, with the largest size of each in the units of
-    `Tolerance`.
+    """The deviations that tolerances allow, with the largest size of each.
 
-    The components x and y of one part follow each other.
+    Sizes are in the units of `Tolerance`. The components x and y of one part follow each other.
 
     ValueError for no tolerance, for a part that does not exist (the message lists those that do),
     and for a part that is named twice.

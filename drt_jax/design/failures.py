@@ -52,11 +52,11 @@ def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
 
 
 def shortfall(system: System, launch: Vector, target: Vector) -> Array:
-    """Penalty (W, Q) of a failed ray: the fraction of rows that it does not reach, plus log(1 + the
-    distance by which it misses the first of them).
+    """Penalty (W, Q) of a failed ray.
 
-    For a ray that reaches the sensor, the second term is log(1 + distance from its stop point), in
-    units of the largest distance of a stop point from the axis.
+    It is the fraction of rows that the ray does not reach, plus log(1 + the distance by which it
+    misses the first of them). For a ray that reaches the sensor, the second term is log(1 +
+    distance from its stop point), in units of the largest distance of a stop point from the axis.
 
     launch: D arrays (W, Q), launch points as in `snell.shoot`, mm.
     target: D arrays (W, Q), stop points, mm.

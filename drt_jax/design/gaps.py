@@ -16,10 +16,9 @@ ZONES = np.array([0.5, 0.7, 0.85, 1.0])
 
 
 def between(lens: Lens, glass: bool) -> list[tuple[int, int]]:
-    """Pairs of neighbours among the active surfaces and the sensor, with glass or with air between
-    them.
+    """Pairs of neighbouring active surfaces with glass, or with air, between them.
 
-    The medium in front of the lens counts as air.
+    The sensor counts as a surface, and the medium in front of the lens as air.
 
     glass: True for pairs with glass between them, False for pairs with air.
     """

@@ -118,8 +118,7 @@ def grow(
     max_steps: int = 40,
     callback: Callable[[Search], None] = lambda search: None,
 ) -> Growth:
-    """Designs a lens for a part of its fields and aperture, and extends it step by step to the
-    whole.
+    """Designs a lens for a part of its fields and aperture, and extends the part to the whole.
 
     If the whole meets the target, `Growth.done` is 1; start `optimise` from its `vector`.
 

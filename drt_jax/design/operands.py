@@ -78,8 +78,8 @@ class Operand:
         low = -math.inf if self.low is None else self.low
         high = math.inf if self.high is None else self.high
         if (self.at is None) == bool(known.at):
-            said = _NEEDED if known.at else "is of mtf and encircled_energy; leave it out"
-            raise ValueError(f"{what}: at: {said}")
+            reason = _NEEDED if known.at else "is of mtf and encircled_energy; leave it out"
+            raise ValueError(f"{what}: at: {reason}")
         if not concrete((low, high, self.weight, self.target, self.at)):
             return
         if self.at is not None and not 0 < self.at < math.inf:

@@ -253,8 +253,8 @@ class Problem:
         return limits_of(self.operands, lens, counts, sizes, np.asarray(constraints))
 
     def nearby_vector(self, vector: Array) -> Array:
-        """A nearby vector (N,) within the bounds, of which every component that its bounds let move
-        differs.
+        """A nearby vector (N,) within the bounds, in which every component that can move is
+        different.
 
         vector: (N,).
         """
@@ -272,10 +272,10 @@ class Problem:
         constraints, nearby: (L,), constraints at both vectors.
         """
         one, two = np.asarray(constraints), np.asarray(nearby)
-        for limit, there in zip(self.limits(one), self.limits(two)):
+        for limit, other in zip(self.limits(one), self.limits(two)):
             if limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names:
                 continue
-            still = abs(there.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
+            still = abs(other.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
             if limit.excess > 0 and still:
                 raise ValueError(
                     f"operands: {limit}, and no variable moves it; leave this limit out, widen it, "
@@ -289,9 +289,9 @@ class Problem:
 
     def _refuse_fixed(self) -> None:
         """Calls `refuse_fixed` for limits that need no rays."""
-        some = tuple(o for o in self.operands if o.limits and not kind_of(o.kind).traced)
-        if some and concrete(self):
-            part = dataclasses.replace(self, operands=some)
+        without_rays = tuple(o for o in self.operands if o.limits and not kind_of(o.kind).traced)
+        if without_rays and concrete(self):
+            part = dataclasses.replace(self, operands=without_rays)
             start = self.variables.start
             part.refuse_fixed(part._exceeded(start), part._exceeded(self.nearby_vector(start)))
 

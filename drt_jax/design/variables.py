@@ -133,14 +133,14 @@ class Vary:
 
     def _check_sag(self) -> None:
         """Raises ValueError for `sag` and `semi_diameter` that do not fit together or the kind."""
-        given = self.sag, self.semi_diameter
-        if given == (0, 0):
+        pair = self.sag, self.semi_diameter
+        if pair == (0, 0):
             return
         what = "variables: sag and semi_diameter"
         if self.kind not in SERIES:
             raise ValueError(f"{what}: are of coefficients, not of {self.kind}; give low and high")
-        if not all(0 < number < np.inf for number in given):
-            raise ValueError(f"{what}: give both, above 0 mm, got {given[0]:g} and {given[1]:g}")
+        if not all(0 < number < np.inf for number in pair):
+            raise ValueError(f"{what}: give both, above 0 mm, got {pair[0]:g} and {pair[1]:g}")
         if (self.low, self.high) != (-np.inf, np.inf):
             raise ValueError(f"{what}: stand instead of low and high; leave these out")
 
@@ -406,11 +406,11 @@ def _same(one: Lens, two: Lens) -> bool:
     return alike and all(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(two)))
 
 
-def _refuse_twice(what: str, places: Iterable[Place], said: str) -> None:
+def _refuse_twice(what: str, places: Iterable[Place], reason: str) -> None:
     """Raises ValueError for a place that occurs twice."""
     for place, group in itertools.groupby(sorted(places)):
         if len(list(group)) > 1:
-            raise ValueError(f"{what}: {place} {said}; leave one out")
+            raise ValueError(f"{what}: {place} {reason}; leave one out")
 
 
 def _with_arrays(lens: Lens, kinds: set[str]) -> Lens:

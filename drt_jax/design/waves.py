@@ -112,5 +112,5 @@ def psf(
             f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
         )
     side, size = check_pixels(pixel, size, rays.wavelengths.dtype)
-    waves, given = rays.wavelengths, (side, None, size, model, cells)
-    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, waves, beam, *given).kernel)
+    waves, options = rays.wavelengths, (side, None, size, model, cells)
+    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, waves, beam, *options).kernel)

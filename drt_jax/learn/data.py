@@ -268,8 +268,9 @@ def _array(file: IO[bytes], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def batches(patches: np.ndarray, size: int, seed: int, start: int = 0) -> Iterator[np.ndarray]:
-    """Endless batches (size, P, P, C): a new permutation in each epoch, without its incomplete
-    batch.
+    """Endless batches (size, P, P, C) in random order.
+
+    Each epoch is a new permutation of the patches, without its incomplete batch.
 
     patches: uint8 (N, P, P, C).
     size: number of patches in a batch; DataError if there are fewer.

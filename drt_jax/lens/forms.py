@@ -95,11 +95,11 @@ def odd_asphere(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 
 def biconic(w: Point, shape: Shape) -> tuple[Array, Array]:
-    """A conic of different parameters along x and y: c and k hold for y, a_0 and a_1 are c and k
-    for x.
+    """A conic of different parameters along x and y.
 
-    z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2)) + a_2 r^2 + a_3
-    r^4 + ... Source: the biconic of Zemax and of batoid.
+    c and k hold for y, a_0 and a_1 are c and k for x. z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 +
+    kx) cx^2 x^2 - (1 + ky) cy^2 y^2)) + a_2 r^2 + a_3 r^4 + ... Source: the biconic of Zemax and of
+    batoid.
     """
     x2, y2 = w[0] * w[0], w[1] * w[1]
     cy, ky, (cx, kx) = shape.curvature, shape.conic, shape.coefficients[:2]

@@ -40,8 +40,7 @@ class _Entry(NamedTuple):
 
 
 class Neighbour(NamedTuple):
-    """A glass of the table, with its nd and vd, and its distance in the glass map from a given
-    point.
+    """A glass of the table, with its nd and vd and its distance from a point of the glass map.
 
     The distance is in units of nd, where 100 of vd count as 1.
     """
@@ -252,10 +251,10 @@ def _glass_map() -> np.ndarray:
 
 
 def glass_map_distance(model: Array) -> Array:
-    """Distance (G,) of glasses from the convex hull of the plain glasses except water, negative
-    inside.
+    """Distance (G,) of glasses from the convex hull of the plain glasses except water.
 
-    It is in units of nd, where 100 of vd count as 1: the largest signed distance from an edge.
+    It is negative inside, in units of nd, where 100 of vd count as 1: the largest signed distance
+    from an edge.
 
     model: (G, 2), nd and vd.
     """

@@ -44,11 +44,11 @@ class Labels:
 
     @functools.cached_property
     def structure(self) -> tuple[int, ...]:
-        """The structure on which equality depends: whether the first medium is air, then a number
-        for each medium.
+        """The structure on which equality depends.
 
-        The number is 0 for the medium in front of the lens, -1 for air, and otherwise the number of
-        the glass, which increases by one at each boundary.
+        It says whether the first medium is air, and has a number for each medium: 0 for the medium
+        in front of the lens, -1 for air, and otherwise the number of the glass, which increases by
+        one at each boundary.
         """
         found, last = [0], 0
         for before, name in itertools.pairwise(self.glasses):
@@ -183,13 +183,13 @@ class Lens:
         function.
         """
         leaves, static = _fields()
-        given = dict(zip((*leaves, *static), (*children, *rest[1:]), strict=True))
+        parts = dict(zip((*leaves, *static), (*children, *rest[1:]), strict=True))
         for name in rest[0]:
-            whole = given[name]
+            whole = parts[name]
             if not concrete(whole):
                 known = {leaf: still(getattr(whole, leaf)) for leaf in HELD[name]}
-                given[name] = dataclasses.replace(whole, **known) if known else _open(whole, given)
-        return cls(**given, held=tuple(given[name] for name in rest[0]))
+                parts[name] = dataclasses.replace(whole, **known) if known else _open(whole, parts)
+        return cls(**parts, held=tuple(parts[name] for name in rest[0]))
 
     def __repr__(self) -> str:
         """A short description; it also works for a gradient and inside a trace."""
@@ -399,10 +399,10 @@ def _fields() -> tuple[list[str], list[str]]:
     return [field.name for field in known if field.name not in static], static
 
 
-def _open(semi: Array, given: dict[str, Any]) -> Array:
+def _open(semi: Array, parts: dict[str, Any]) -> Array:
     """Semi-diameters of which all but that of the stop have derivatives."""
-    rows = np.arange(semi.size).reshape(semi.shape) % len(given["labels"].glasses)
-    return jnp.where(rows == given["stop"], still(semi), semi)
+    rows = np.arange(semi.size).reshape(semi.shape) % len(parts["labels"].glasses)
+    return jnp.where(rows == parts["stop"], still(semi), semi)
 
 
 def movable(tree: Any) -> Any:

@@ -55,10 +55,10 @@ def neighbours(lens: Lens, gaps: list[float], moved: list[bool]) -> list[Pair]:
 
 
 def heights(lens: Lens, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (P, Y) from the axis up to the smaller semi-diameter of each of P pairs, and the sags
-    (P, 2, Y) of both surfaces there, mm.
+    """Sags of the surfaces of P pairs at the same heights from the axis.
 
-    Pairs without apertures have only heights of 0.
+    Returns the heights (P, Y), up to the smaller semi-diameter of the pair, and the sags (P, 2, Y)
+    of both surfaces there, mm. Pairs without apertures have only heights of 0.
     """
     rows = np.array([pair[:2] for pair in pairs], int).reshape(-1, 2)
     semi = np.asarray(lens.semi_diameter)
@@ -77,8 +77,7 @@ def heights(lens: Lens, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def crossings(lens: Lens, pairs: Sequence[Pair]) -> list[float | None]:
-    """For each pair, the smallest height at which the neighbours cross inside of both apertures,
-    mm.
+    """The smallest height at which each pair of neighbours crosses inside of both apertures, mm.
 
     It is 0 if their vertices are in the wrong order, and None if they do not cross. The sensor
     crosses nothing: where it lies in front of the last surface, the image is virtual.
@@ -94,11 +93,10 @@ def crossings(lens: Lens, pairs: Sequence[Pair]) -> list[float | None]:
 
 
 def may_cross(lens: Lens) -> bool:
-    """True if neighbouring surfaces of a lens with known numbers cross inside of their apertures,
-    or if that cannot be excluded.
+    """True if neighbouring surfaces of a lens with known numbers cross, or may cross.
 
-    It cannot be excluded without apertures, and for surfaces that are decentred or tilted against
-    each other.
+    Only crossings inside of the apertures count. A crossing cannot be excluded without apertures,
+    and for surfaces that are decentred or tilted against each other.
     """
     pairs, semi = neighbours_now(lens), np.asarray(lens.semi_diameter)
     if len(pairs) < max(len(lens.active), 1):

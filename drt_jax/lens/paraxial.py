@@ -165,8 +165,7 @@ def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
 
 
 def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | float) -> ParaxialRay:
-    """Traces the paraxial ray of a height (mm) and a slope, () or (W,), in front of the first
-    vertex.
+    """Traces the paraxial ray of a height (mm) and slope, () or (W,), in front of the first vertex.
 
     A slope behind the lens that is only rounding error, as for an afocal lens, is set to 0.
     """
@@ -176,9 +175,9 @@ def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | floa
     before = jnp.concatenate([start[1][None], behind[:-1]])
     # The last n u is a sum of n u in front of the lens and height times power of each surface. Add
     # up the absolute values of these terms.
-    reach = jnp.abs(jnp.concatenate([start[0][None], heights[:-1]]))
-    reach = reach.at[1:].add(jnp.abs(system.gaps[:, None] * before[1:]))
-    terms = jnp.abs(system.index[0] * start[1]) + jnp.sum(reach * jnp.abs(system.power), axis=0)
+    sizes = jnp.abs(jnp.concatenate([start[0][None], heights[:-1]]))
+    sizes = sizes.at[1:].add(jnp.abs(system.gaps[:, None] * before[1:]))
+    terms = jnp.abs(system.index[0] * start[1]) + jnp.sum(sizes * jnp.abs(system.power), axis=0)
     least = _ROUNDING * jnp.finfo(terms.dtype).eps * terms
     # Remove the value but keep the derivative, because a solve may start from an afocal lens.
     error = jnp.where(jnp.abs(system.index[-1] * behind[-1]) >= least, 0, still(behind[-1]))
@@ -294,10 +293,10 @@ def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
 
 
 def effective_focal_length(lens: Lens, wavelengths: Numbers) -> Array:
-    """Effective focal length in air (W,), 1 / power, mm, for any medium of the image; inf for an
-    afocal lens.
+    """Effective focal length in air (W,), 1 / power, mm; inf for an afocal lens.
 
-    It is the EFL of design programs, positive for lenses and mirrors that converge light.
+    It is the EFL of design programs for any medium of the image, positive for lenses and mirrors
+    that converge light.
 
     lens: the lens.
     wavelengths: (W,), um.
@@ -355,10 +354,10 @@ def f_number(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
 
 
 def lateral_magnification(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Image height / object height (W,): negative for an inverted image, 0 for an object at
-    infinity.
+    """Lateral magnification (W,), image height / object height.
 
-    Arguments as in `image_distance`.
+    It is negative for an inverted image, and 0 for an object at infinity. Arguments as in
+    `image_distance`.
     """
     return first_order(lens, distance, wavelengths).magnification
 

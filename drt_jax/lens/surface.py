@@ -49,8 +49,7 @@ def domain(w: Point, shape: Shape, form: str = "asphere") -> Array:
 
 @functools.partial(jax.jit, static_argnames="form")
 def sag_slope(w: Point, shape: Shape, form: str = "asphere") -> tuple[Array, tuple[Array, ...]]:
-    """Sag (mm) and its gradient (D arrays) by the transverse coordinates, all in the shape of
-    `w[0]`.
+    """Sag (mm) and its gradient (D arrays) by the transverse coordinates, in the shape of `w[0]`.
 
     The gradient is computed by automatic differentiation. For an asphere, the form of nearly all
     surfaces, it is written out with one root and one division. The function is jitted because a
@@ -70,10 +69,11 @@ def sag_slope(w: Point, shape: Shape, form: str = "asphere") -> tuple[Array, tup
 def sag_derivatives(
     w: Point, shape: Shape, form: str = "asphere"
 ) -> tuple[Array, tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
-    """Sag (mm), its gradient (D arrays) and its Hessian (1/mm, D rows of D arrays), all in the
-    shape of `w[0]`.
+    """Sag, its gradient and its Hessian by the transverse coordinates, in the shape of `w[0]`.
 
     w: D arrays, mm.
+
+    Returns the sag, mm; the gradient, D arrays; and the Hessian, 1/mm, D rows of D arrays.
     """
     w = tuple(w)
     if form == "asphere":

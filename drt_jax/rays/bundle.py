@@ -30,8 +30,7 @@ _DEGREE = 18
 
 
 def tile_of(rays: int, waves: int) -> int:
-    """Number of rays for each wavelength that are found at once: all `rays` of a bundle, or one
-    tile.
+    """Number of rays for each wavelength that are found at once: a whole bundle, or one tile of it.
 
     rays: number of rays for each wavelength.
     waves: number of wavelengths.

@@ -65,8 +65,8 @@ def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
     Pass `fan` and `tried` through the loop carry: XLA hoists loop-invariant work out of a loop and
     would trace the fan even when no ray is missing.
     """
-    reach = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
-    launch = tuple(reach * a for a in fan.launch)
+    extent = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
+    launch = tuple(extent * a for a in fan.launch)
     shape = fan.stop[0].shape
     flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
     trace = shoot(system, flat)

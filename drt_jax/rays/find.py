@@ -215,8 +215,8 @@ def _search(
     starts = min(STARTS, rays)
     rounds, ray = -(-STARTS // starts), np.arange(rays, dtype=np.int32)
 
-    def from_fan(given):
-        fan, target, launch = given
+    def from_fan(inputs):
+        fan, target, launch = inputs
         fan = trace_fan(system, fan, launch, sizes[1])
         return fan, target, nearest_start(fan, target)
 
@@ -224,15 +224,15 @@ def _search(
         whole, missing = state.round < 2, state.left > 0
         lanes = Lanes(missing, starts)
 
-        def from_several(given):
-            fan, target, _ = given
+        def from_several(inputs):
+            fan, target, _ = inputs
             points, left = lanes.of_rays((target, state.left))
             ranks = (rounds - left)[..., None] * starts + ray[None, None, :starts]
             begin = starts_of(fan, points, ranks)
             return fan, *lanes.spread((tuple(a[..., None] for a in points), begin))
 
-        given = run_if(state.round == 1, from_fan, (state.fan, target, launch))
-        fan, own, begin = run_if(state.round > 1, from_several, given)
+        inputs = run_if(state.round == 1, from_fan, (state.fan, target, launch))
+        fan, own, begin = run_if(state.round > 1, from_several, inputs)
         reach = jnp.where(state.round == 0, sizes[1], sizes[1] / 8)
         upright = whole & (system.rows.rotation is None)
         new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
@@ -313,6 +313,9 @@ def find_many(system: System, target: Vector) -> Found:
 
 
 def _find_many(system: System, target: Vector, known: Array) -> Found:
+    """`find_many` for finite stop points. known: (W, Q), bool, rays whose stop points were
+    finite.
+    """
     waves, rays = target[0].shape
     size = tile_of(rays, waves)
     if len(target) == 1 or size == rays:

@@ -156,11 +156,11 @@ def solve(path: Path, system: System, ok: Array, rhs: RightSide) -> tuple[Vector
     first = jax.vmap(lambda hit: _first(path, system, hit))(tuple(map(jnp.stack, units)))
     free = _Change(*first, jax.tree.map(lambda a: jnp.stack([a] * dim), unknown))
 
-    def step(changes, given):
-        row, *given_here = given
+    def step(changes, inputs):
+        row, *rhs_here = inputs
         alone = lambda change: _step(row, active_stop, ok, change, none, still)  # noqa: E731
         free = jax.vmap(alone)(changes[0])
-        forced = _step(row, active_stop, ok, changes[1], *given_here)
+        forced = _step(row, active_stop, ok, changes[1], *rhs_here)
         return (free[0], forced[0]), (free[1], forced[1])
 
     start = free, _Change(still, rhs.direction, unknown)

@@ -48,8 +48,7 @@ class Trace(NamedTuple):
 
 
 def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
-    """Splits traced hits into the hits on the R rows, D arrays (R, ...), and on the stop, D arrays
-    (...).
+    """Splits traced hits into those on the R rows, D arrays (R, ...), and the stop, D arrays (...).
 
     system: the traced system.
     hits: D arrays, mm, as in `Trace`.
@@ -145,8 +144,9 @@ def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
 
 
 class Row(NamedTuple):
-    """One step of the trace: an active surface, the stop or the sensor. Several rows have a first
-    axis.
+    """One step of the trace: an active surface, the stop or the sensor.
+
+    Several rows have a first axis.
 
     first, last: True for the first row, and for the sensor.
     active: False for a stop that is only a label: the ray is extended to it in either direction.

@@ -47,15 +47,15 @@ class Lanes:
 
         return jax.tree.map(wide, tree)
 
-    def best(self, worth: Array) -> tuple[Array, Array]:
+    def best(self, quality: Array) -> tuple[Array, Array]:
         """The best lane of each ray.
 
-        worth: (W, Q), value of the trial in each lane; 0 for a failed trial.
+        quality: (W, Q), quality of the trial in each lane; 0 for a failed trial.
 
-        Returns the first lane with the highest value among the lanes of each ray, (W, Q), int32;
-        and a mask (W, Q) of the rays that have lanes and in one of them a value above 0.
+        Returns the first lane with the highest quality among the lanes of each ray, (W, Q), int32;
+        and a mask (W, Q) of the rays that have lanes and in one of them a quality above 0.
         """
-        own = worth[:, : self.few * self.each].reshape(len(worth), self.few, self.each)
+        own = quality[:, : self.few * self.each].reshape(len(quality), self.few, self.each)
         slot = jnp.clip(self._rank, 0, self.few - 1)
         lane = jnp.take_along_axis(jnp.argmax(own, axis=-1).astype(jnp.int32), slot, axis=-1)
         found = jnp.take_along_axis(jnp.any(own > 0, axis=-1), slot, axis=-1)

@@ -172,8 +172,7 @@ def trace_rays(
     wavelengths: Numbers,
     pupil: Numbers,
 ) -> Rays:
-    """Traces the rays that cross the stop at given points, aimed at the real stop for every
-    wavelength.
+    """Traces the rays that cross the real stop at given points, aimed for every wavelength.
 
     The result is differentiable in every mode and to any order.
 
@@ -200,11 +199,10 @@ def trace_rays(
 
 
 def _padded(count: int) -> int:
-    """Number of rays after padding: at least 16, then a multiple of an eighth of the next power of
-    2.
+    """Number of rays after padding.
 
-    Above 1024 rays there is no padding, because arithmetic then takes more time than compilation
-    saves.
+    It is at least 16, then a multiple of an eighth of the next power of 2. Above 1024 rays there is
+    no padding, because arithmetic then takes more time than compilation saves.
     """
     if count > 1024:
         return count
