@@ -206,7 +206,7 @@ def aim_outwards(system: System, target: Vector) -> Aimed:
     Round 0 starts at the paraxial launch. In each later round the rays that failed start again from
     the launch point of the nearest ray of any wavelength that was found; if none was found, from
     the nearest ray of a coarse fan. Rounds end when one finds no more rays, when no ray is missing,
-    or after 8 of them. All rounds are one loop, so that aiming is compiled once.
+    or after 8 later rounds. All rounds are one loop, so that aiming is compiled once.
 
     target: D arrays (W, Q), stop points, mm.
     """
