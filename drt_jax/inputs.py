@@ -63,7 +63,9 @@ class Lines(dict[str, int]):
     """The line number of each key of a file, with keys such as "surfaces[0].radius"."""
 
     def of(self, key: str) -> str:
-        """ ", line 7" of a key or of what it is in; nothing where none is known."""
+        """The text ", line 7" for a key, or for the mapping or list that contains it; "" if not
+        known.
+        """
         while key and key not in self:
             key = key[: max(key.rfind("."), key.rfind("["), 0)]
         return f", line {self[key]}" if key else ""

@@ -17,8 +17,8 @@ from jax import Array
 from jax.typing import ArrayLike
 
 T = TypeVar("T")
-# Matrix products in full precision. By default GPUs round float32 factors to 10 bits, which changes
-# a refractive index by 5e-4.
+# Matrix products in full precision. By default GPUs round float32 factors to 10 bits, an error of
+# 5e-4 of a refractive index.
 EXACT = jax.lax.Precision.HIGHEST
 einsum = functools.partial(jnp.einsum, precision=EXACT)
 matmul = functools.partial(jnp.matmul, precision=EXACT)

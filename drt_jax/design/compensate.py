@@ -24,7 +24,7 @@ from .problem import Problem
 # What is adjusted in every lens: the distance of the sensor, or also its tilts about x and y.
 Compensator = Literal["none", "focus", "focus and tilt"]
 _STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
-_SYMMETRIES = ("rotational", "bilateral", "none")  # in the order of the traced part of the pupil
+_SYMMETRIES = ("rotational", "bilateral", "none")  # by the traced part of the pupil, smallest first
 
 
 class AsBuilt(NamedTuple):

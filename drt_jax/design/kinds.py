@@ -187,7 +187,7 @@ def _terms(lens: Lens) -> int:
     return lens.coefficients.shape[1]
 
 
-# As the keys of `KINDS`, which a test compares.
+# The keys of `KINDS`; a test compares them.
 VariableKind = Literal[
     "curvature", "conic", "coefficients", "thickness", "sensor", "index", "abbe", "tilt",
     "decentre", "semi_diameter", "phase"

@@ -319,7 +319,7 @@ _RAYS = ("fields", "wavelengths", "distances")
 _VIEWS = ("distances", "fields")
 _OF_RAYS = (*_VIEWS, "wavelengths", "rays")
 _COLOURS = ("wavelengths",)
-_WAVES_PER_MM = 200.0  # green light at f/5
+_WAVES_PER_MM = 200.0  # path difference for each mm of miss, for green light at f/5
 _SCALES = ("wavelengths", "distances")
 OPERANDS: dict[str, OperandKind] = {
     "spot": OperandKind(_spot, _RAYS, squared="rms_spot", order=_OF_RAYS),

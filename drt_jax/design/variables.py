@@ -278,7 +278,7 @@ class Variables:
                     f"ties: {leader}, which {follower} follows, itself follows from a tie or a "
                     "solve; begin with another surface"
                 )
-        # The name of a kind leaves out tied and solved numbers; naming one of them is an error.
+        # If all numbers of a kind vary, tied and solved ones are left out. Naming one is an error.
         for place, v in found:
             if place in taken and v.surfaces:
                 raise ValueError(
@@ -294,7 +294,7 @@ class Variables:
                 f"solves: {len(solves)} of them, but {len(found)} variables; leave some out"
             )
         index = {place: k for k, (place, _) in enumerate(found)}
-        # Followers of a number that does not change are set once.
+        # Followers of a number that does not vary are set once, here.
         fixed = [(f, a * _number(lens, p) + b) for p, f, (a, b) in following if p not in index]
         lens = _with_numbers(_with_arrays(lens, {place.kind for place, _ in found}), fixed)
         dtype = lens.curvature.dtype

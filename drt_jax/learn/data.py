@@ -69,7 +69,7 @@ class Patches(NamedTuple):
     """Image patches.
 
     train, test: uint8 (N, P, P, bands), in memory or memory-mapped.
-    skipped: a line with the reason for each file, folder or kind of image that was skipped.
+    skipped: for each file, folder or kind of image that was skipped, a line with the reason.
     """
 
     train: np.ndarray

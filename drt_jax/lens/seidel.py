@@ -92,7 +92,7 @@ def _seidel(
     bend = y * (marginal.behind / n[1:] - marginal.before / n[:-1])
     invariant = n[0] * (chief.before[0] * y[0] - marginal.before[0] * chief_y[0])
     aspheric = 8 * figure[:, None] * (n[1:] - n[:-1])
-    # Welford's S5, written without the quotient B / A, which may be 0 / 0.
+    # Welford's S5, written without the quotient B / A, in which A may be 0.
     change, step = 1 / n[1:] - 1 / n[:-1], 1 / n[1:] ** 2 - 1 / n[:-1] ** 2
     s5 = chief_y * chief_a * c * change * (2 * y * chief_a - chief_y * a) - chief_a**3 * y * step
     return (

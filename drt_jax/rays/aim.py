@@ -112,8 +112,11 @@ class AimNewton(optx.AbstractRootFinder):
 
 
 def _derivatives(function: Callable, y: Vector) -> tuple[Vector, Vector, Any]:
-    """Value (D numbers) of a function of D numbers, its derivatives by each (D arrays (D,)) and its
-    auxiliary output, all from one trace."""
+    """Value and derivatives of a function of D numbers, from one trace by JVPs.
+
+    Returns the value, D numbers; its derivatives by each argument, D arrays (D,); and the auxiliary
+    output of the function.
+    """
     units = tuple(jnp.asarray(u, y[0].dtype) for u in np.eye(len(y)))
 
     def along(unit):

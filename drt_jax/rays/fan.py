@@ -13,8 +13,7 @@ from .system import System, Vector, dot
 
 # The fan has `_TILES` tiles per side, each with `_FAN` rays per side. The first guesses for a stop
 # point are taken from its `STARTS` nearest tiles: from each tile the ray that crosses the stop
-# nearest to the stop point. Guesses from different tiles are well separated, so that at least one
-# of them is likely to lie in the basin of Newton's method.
+# nearest to the stop point.
 _TILES, _FAN, STARTS = 15, 5, 24
 
 
@@ -58,12 +57,12 @@ def no_fan(system: System, waves: int, rays: int = _FAN) -> Fan:
 def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
     """Traces a fan.
 
-    fan: the fan of `no_fan`.
-    tried: D arrays (W, Q), launches already tried, mm; the fan reaches beyond them.
-    width: (), radius of the beam on the first surface, mm; the fan reaches twice as far.
+    Pass `fan` and `tried` through the carry of the loop in which this is called: XLA moves work
+    that does not depend on the loop out of it, and would trace the fan even when no ray is missing.
 
-    Pass `fan` and `tried` through the loop carry: XLA hoists loop-invariant work out of a loop and
-    would trace the fan even when no ray is missing.
+    fan: the fan of `no_fan`.
+    tried: D arrays (W, Q), launch points already tried, mm; the fan reaches 1.6 times as far.
+    width: (), radius of the beam on the first surface, mm; the fan reaches at least twice as far.
     """
     extent = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
     launch = tuple(extent * a for a in fan.launch)

@@ -105,8 +105,10 @@ class BlockNewton(optx.AbstractRootFinder):
 
 
 def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tuple:
-    """Makes the hits of the `active` rays (W, Q) stationary. Returns the hits, the mask of solved
-    rays and the number of steps."""
+    """Makes the hits of the `active` rays (W, Q) stationary, by at most 16 Newton steps.
+
+    Returns the hits, the mask of solved rays and the number of steps.
+    """
 
     def equations(hits, args):
         system, target, _ = args

@@ -27,7 +27,8 @@ from .meet import meet, near_side
 from .status import Status
 from .system import Placed, System, Vector, dot, rotate
 
-# Least cosine of a traced ray with the normal of a surface: 0.006 degrees from grazing.
+# Smallest cosine of the angle between a traced ray and the normal of a surface: 0.006 degrees from
+# grazing incidence.
 _FLATTEST = 1e-4
 
 
@@ -338,7 +339,7 @@ def _follow(
         here = jnp.where(met, jnp.where(beyond, here, back), Status.MISSED)
         status = jnp.where(going, here.astype(jnp.int32), state.status)
         wide = jnp.maximum(dot(meeting.hit, meeting.hit), dot(state.hit, state.hit))
-        wide = jax.lax.stop_gradient(jnp.sqrt(wide))  # has no derivative on the axis
+        wide = jax.lax.stop_gradient(jnp.sqrt(wide))  # the root has no derivative on the axis
         angle = safe_divide(wide, jnp.where(row.first, 0, abs(meeting.length)))
         angle = jnp.maximum(jnp.where(status == Status.OK, angle, 0), state.rounding_angle)
         behind = behind._replace(status=status, rounding_angle=angle)

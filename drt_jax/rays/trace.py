@@ -147,7 +147,9 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
 
 
 def path_of(found: Found, system: System) -> Array:
-    """`Bundle.path` of the rays that a `Solver` found."""
+    """`Bundle.path` of the rays that a `Solver` found: the optical path less that of the mean
+    hits.
+    """
     good = found.status == Status.OK
     count = jnp.maximum(jnp.sum(good, axis=-1, keepdims=True), 1)
     hits = (jnp.sum(jnp.where(good, h, 0), axis=-1, keepdims=True) for h in found.hits)
@@ -202,7 +204,7 @@ def _padded(count: int) -> int:
     """Number of rays after padding.
 
     It is at least 16, then a multiple of an eighth of the next power of 2. Above 1024 rays there is
-    no padding, because arithmetic then takes more time than compilation saves.
+    no padding, because arithmetic then takes most of the time.
     """
     if count > 1024:
         return count
