@@ -61,7 +61,8 @@ def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
     that does not depend on the loop out of it, and would trace the fan even when no ray is missing.
 
     fan: the fan of `no_fan`.
-    tried: D arrays (W, Q), launch points already tried, mm; the fan reaches 1.6 times as far.
+    tried: D arrays (W, Q), launch points already tried, mm; the fan reaches at least 1.6 times as
+        far.
     width: (), radius of the beam on the first surface, mm; the fan reaches at least twice as far.
     """
     extent = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
