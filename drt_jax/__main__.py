@@ -37,11 +37,12 @@ _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 # Orders of the two rules for the spots; a larger relative difference of spot size is reported.
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
 _MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
-_DEFOCUS = 3.0  # times the smallest spot; a larger spot is out of focus
-_NONE = 1e-9  # mm, mrad: a smaller spot is rounding, of no known size
+_DEFOCUS = 3.0  # a spot larger than this many times the smallest spot is out of focus
+_NO_SIZE = 1e-9  # mm, mrad: a smaller spot is only rounding error
 
 
 def _options(argv: list[str] | None) -> argparse.Namespace:
+    """The parsed command line."""
     parser = argparse.ArgumentParser(prog="python -m drt_jax", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="show, convert or glass")
     about = (
@@ -69,7 +70,7 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
     glass = commands.add_parser("glass", help=about, description=about)
     glasses.arguments(glass)
-    glass.set_defaults(run=lambda options: _say(glasses.told(options)))
+    glass.set_defaults(run=lambda options: _write(glasses.told(options)))
     return parser.parse_args(argv)
 
 
@@ -96,7 +97,7 @@ def first_rows(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[tup
 
 
 def surface_rows(lens: Lens) -> Iterator[tuple[str, ...]]:
-    """The prescription of a lens, a row for each surface."""
+    """The prescription of a lens, with a row for each surface."""
     yield "surface", "radius mm", "conic", "form", "thickness mm", "medium", "semi-diameter mm"
     gaps = [*np.asarray(lens.thickness), float(lens.sensor - lens.vertices[-2])]
     numbers = zip(*map(np.asarray, (lens.curvature, lens.conic, lens.semi_diameter)))
@@ -126,26 +127,26 @@ def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[s
 def field_rows(
     lens: Lens, fields: list[float], distance: float, wavelengths: list[float], beams: list[Beam]
 ) -> Iterator[tuple[str, ...] | str]:
-    """A table of spots over fields in degrees, and warnings as lines between its rows."""
+    """A table of spots for fields in degrees, with warnings as lines between its rows."""
     spots = [f"spot at {wavelength:.3f}" for wavelength in wavelengths]
     place, unit, size = ("angle", "mrad", "urad") if lens.afocal else ("height", "mm", "um")
     yield "field", f"image {place}", *spots, "light", "surfaces that clip"
     yield "deg", unit, *(f"RMS {size}" for _ in spots), "%", ""
     angles, middle = [math.radians(field) for field in fields], len(wavelengths) // 2
-    symmetry, whole = _widest(lens, angles), _whole(beams)
+    symmetry, whole = _widest(lens, angles), _unclipped(beams)
     for field, angle, beam in zip(fields, angles, beams):
         scene = scene_of(lens, angle, distance, np.array(wavelengths))
         rough, found = (_moments(lens, scene, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
         light = 100 * float(found.throughput[middle])
         if not light > 0:
-            yield f"{field:.4g}", f"! {_why(lens, scene, Gauss(8, symmetry))}"
+            yield f"{field:.4g}", f"! {_why_dark(lens, scene, Gauss(8, symmetry))}"
             continue
         cut = "; ".join(filter(None, (", ".join(map(str, beam.clipping)), *beam.ends))) or "none"
         squares = [np.trace(np.asarray(m.covariance), axis1=1, axis2=2) for m in (found, rough)]
-        sizes = [f"{1e3 * s:.4g}" if s > _NONE else "<1e-6" for s in np.sqrt(squares[0])]
+        sizes = [f"{1e3 * s:.4g}" if s > _NO_SIZE else "<1e-6" for s in np.sqrt(squares[0])]
         height = round(float(found.mean[middle, 1]), 9) + 0.0  # no -0
         yield f"{field:.4g}", f"{height:.5g}", *sizes, f"{light:.2f}", cut
-        change = np.max(np.abs(squares[1] - squares[0]) / np.maximum(squares[0], _NONE**2)) / 2
+        change = np.max(np.abs(squares[1] - squares[0]) / np.maximum(squares[0], _NO_SIZE**2)) / 2
         if change > _TOLERANCE:
             yield f"  ! these spots are known to {change:.1g} of their size only"
         for wavelength, part in zip(wavelengths, 100 * np.asarray(found.throughput)):
@@ -165,7 +166,8 @@ def _widest(lens: Lens, angles: list[float]) -> Symmetry:
     return max((symmetry_of(lens, a) for a in angles), key=get_args(Symmetry).index)
 
 
-def _whole(beams: list[Beam]) -> bool:
+def _unclipped(beams: list[Beam]) -> bool:
+    """Whether no surface clips any beam."""
     return not any(beam.clipping or beam.ends for beam in beams)
 
 
@@ -175,7 +177,7 @@ _moments = jit(
 _first_order = jit(first_order, ONCE)
 
 
-def _why(lens: Lens, scene: Scene, rule: PupilRule) -> str:
+def _why_dark(lens: Lens, scene: Scene, rule: PupilRule) -> str:
     """The reason why no light of a scene arrives."""
     try:
         psf_moments(lens, scene.field, scene.distance, scene.wavelengths, rule=rule)
@@ -185,7 +187,10 @@ def _why(lens: Lens, scene: Scene, rule: PupilRule) -> str:
 
 
 def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
-    """A pupil rule. whole: the beam fills the stop. All orders share one compiled program."""
+    """A pupil rule. All orders share one compiled program.
+
+    whole: True if the beam fills the stop.
+    """
     if not whole:
         return Clipped(order, symmetry, _ORDERS[-1], may_cross(lens))
     points, weights = gauss_points(order, symmetry)
@@ -194,7 +199,7 @@ def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
 
 
 def aperture_lines(lens: Lens, beams: list[Beam]) -> Iterator[str]:
-    """Warnings about clear apertures that are so wide that they clip nothing."""
+    """Warnings of clear apertures that are so wide that they clip nothing."""
     needed = np.max([beam.wide for beam in beams], axis=0)
     for i, semi in enumerate(np.asarray(lens.semi_diameter)[:-1]):
         if math.isfinite(semi) and semi > 1.8 * needed[i] > 0:
@@ -205,55 +210,64 @@ def aperture_lines(lens: Lens, beams: list[Beam]) -> Iterator[str]:
 
 
 def _row(first: str, *cells: str) -> str:
+    """A row of a table as text."""
     *numbers, last = cells
     return f"{first:>6}" + "".join(f"{cell:>15}" for cell in numbers) + f"   {last}".rstrip()
 
 
-def _say(lines: Iterable[tuple[str, ...] | str]) -> list[tuple[str, ...] | str]:
-    """Write each line, or row of a table, to stdout as soon as it is known; return them."""
-    said = []
+def _write(lines: Iterable[tuple[str, ...] | str]) -> list[tuple[str, ...] | str]:
+    """Writes each line, or row of a table, to stdout as soon as it is known, and returns them
+    all.
+    """
+    written = []
     for line in lines:
-        said.append(line)
-        _tell(line if isinstance(line, str) else _row(*line))
-    return said
+        written.append(line)
+        _print_line(line if isinstance(line, str) else _row(*line))
+    return written
 
 
-def _tell(line: str) -> None:
-    _wait("")
+def _print_line(line: str) -> None:
+    """Writes one line to stdout, in place of the current task."""
+    _show_task("")
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
 
-def _wait(what: str) -> None:
-    """Show the current task on the last line of a terminal; elsewhere write nothing."""
+def _show_task(what: str) -> None:
+    """Shows the current task on the last line of a terminal; writes nothing if stderr is not a
+    terminal.
+    """
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\033[K{what}")
         sys.stderr.flush()
 
 
 def run_convert(options: argparse.Namespace) -> None:
-    """Write a lens in another format, and print which data the new file leaves out."""
+    """Writes a lens in another format, and prints which data the new file leaves out."""
     kind = pathlib.Path(options.lens).suffix.lower()
     load = load_system if kind in (".zmx", ".seq") else load_lens
     with _warnings_on_stdout():
         found = load(options.lens, options.missing)
         save_lens(found, options.out)
     lens = found.lens if isinstance(found, System) else found
-    _say([f"{lens.name or 'the lens'}, {lens.count} surfaces, is written to {options.out}"])
+    _write([f"{lens.name or 'the lens'}, {lens.count} surfaces, is written to {options.out}"])
 
 
 @contextlib.contextmanager
 def _warnings_on_stdout() -> Iterator[None]:
+    """Prints every warning as a line."""
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        warnings.showwarning = lambda message, *_, **__: _tell(f"  ! {message}")
+        warnings.showwarning = lambda message, *_, **__: _print_line(f"  ! {message}")
         yield
 
 
 def _view(options: argparse.Namespace) -> tuple[Lens, list[float], float, list[float]]:
-    """The lens, fields in degrees, the distance in mm and wavelengths in um. Options override the
-    values of a .zmx or .seq file. The middle wavelength is the primary one. `options.note` becomes
-    what the file has on wavelengths and is not shown, or ""."""
+    """The lens, fields in degrees, the distance in mm and wavelengths in um.
+
+    Options override the values of a .zmx or .seq file. The middle wavelength is the primary one.
+    `options.note` is set to a line on the wavelengths of the file that are not shown, or to "".
+    """
     fields, distance, waves, note = [0.0, 7.0, 10.0], math.inf, list(_LINES), ""
     if pathlib.Path(options.lens).suffix.lower() in (".zmx", ".seq"):
         system = load_system(options.lens, options.missing)
@@ -278,7 +292,7 @@ def _view(options: argparse.Namespace) -> tuple[Lens, list[float], float, list[f
 
 
 def run_show(options: argparse.Namespace) -> None:
-    """Print the data of a lens as they are computed, and draw its sheet."""
+    """Prints the data of a lens as they are computed, and draws its sheet."""
     if not all(abs(field) < 90 for field in options.field or ()):
         raise ValueError("--field: must be within 90 degrees")
     with _warnings_on_stdout():
@@ -288,44 +302,46 @@ def run_show(options: argparse.Namespace) -> None:
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
         about = f"{lens.count} surfaces, the stop is number {lens.stop}"
         first = [*first_rows(lens, found, middle)]
-        _say([f"{lens.name}: {about}", *(f"  {name:<19}  {value}" for name, value in first)])
-        _wait("tracing; another kind of lens is compiled first, for half a minute or less")
+        _write([f"{lens.name}: {about}", *(f"  {name:<19}  {value}" for name, value in first)])
+        _show_task("tracing; another kind of lens is compiled first, for half a minute or less")
         axial = beam_of(lens, 0.0, distance, middle)
         others = [wave for wave in waves if wave != middle]
         beams = [beam_of(lens, angle, distance, middle, *others) for angle in angles]
         focus = [] if lens.afocal else focus_lines(found, middle, axial)
-        notes = _say([*focus, *filter(None, [options.note]), ""])
-        table = _say(field_rows(lens, fields, distance, waves, beams))
-        notes += _say(aperture_lines(lens, beams))
+        notes = _write([*focus, *filter(None, [options.note]), ""])
+        table = _write(field_rows(lens, fields, distance, waves, beams))
+        notes += _write(aperture_lines(lens, beams))
         kind = ".html" if options.html else ".png"
         out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}{kind}")
-        symmetry, cut = _widest(lens, angles), not _whole(beams)
+        symmetry, cut = _widest(lens, angles), not _unclipped(beams)
         rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
-        given = lens, angles, distance, waves, rule, _wait
+        view = lens, angles, distance, waves, rule, _show_task
         if options.html:
             rows = [row for row in table if not isinstance(row, str)]
             lines = [line for line in (*notes, *table) if isinstance(line, str) and line]
-            told: list[tuple[str, Part]] = [("First-order data", first), ("Spots", rows)]
-            told += [("Warnings", "\n".join(lines))] if lines else []
-            told += [("Surfaces", [*surface_rows(lens)]), *panels(*given).items()]
-            out.write_text(page(f"{lens.name}: {about}", told), encoding="utf-8")
+            parts: list[tuple[str, Part]] = [("First-order data", first), ("Spots", rows)]
+            parts += [("Warnings", "\n".join(lines))] if lines else []
+            parts += [("Surfaces", [*surface_rows(lens)]), *panels(*view).items()]
+            out.write_text(page(f"{lens.name}: {about}", parts), encoding="utf-8")
         else:
-            figure = sheet(*given)
+            figure = sheet(*view)
             figure.supxlabel(options.note.strip(" !"), fontsize=7, x=0.01, ha="left")
             figure.savefig(out)
-    _say([f"drawn in {out}"])
+    _write([f"drawn in {out}"])
 
 
 def set_up() -> None:
-    """Change settings that a library must not change: float64, and compiled programs are kept
-    where there is a place for them."""
+    """Changes settings that a library must not change.
+
+    It enables float64, and keeps compiled programs if there is a folder for them.
+    """
     jax.config.update("jax_enable_x64", True)
     with contextlib.suppress(OSError):
         keep_programs()
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command line. An error prints one line; exit status 2, 1 (file) or 130 (Ctrl-C)."""
+    """Runs the command line. An error prints one line; exit status 2, 1 (file) or 130 (Ctrl-C)."""
     try:
         set_up()
         options = _options(argv)

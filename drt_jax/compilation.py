@@ -1,7 +1,7 @@
-"""Options of XLA for programs that are slow to compile, and a folder that keeps what is compiled.
+"""Options of XLA for programs that are slow to compile, and a folder that keeps compiled programs.
 
-XLA refuses an option that its release does not know, and drops old ones, so each is tried once on a
-trivial program when it is needed.
+XLA refuses an option that its release does not know, and drops old ones. Each option is therefore
+tried once on a trivial program when it is needed.
 """
 
 import functools
@@ -15,20 +15,25 @@ import jax.numpy as jnp
 
 from .numerics import concrete
 
-# XLA's newer fusions of CPUs take twice as long to compile what is large and runs no faster.
+# XLA's newer fusion emitters for CPUs take twice as long to compile large programs, which run no
+# faster.
 LARGE = {"xla_cpu_use_fusion_emitters": False}
-# For what is large to compile and runs once.
+# For large programs that run once.
 ONCE = {**LARGE, "xla_backend_optimization_level": 0}
-# A choice of passes with which a RED-Net step takes a tenth less time (docs/performance.md).
+# A preset of compiler passes with which a RED-Net step takes a tenth less time
+# (docs/performance.md).
 NETWORK = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_FAST_COMPILE"}
 
 
 def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path:
-    """Keep compiled programs on disk, so that the next process need not compile them, and return
-    their folder. Changes JAX's settings; call it before the first program is compiled.
+    """Keeps compiled programs on disk, so that the next process need not compile them.
 
-    folder: None: that which JAX_COMPILATION_CACHE_DIR or an earlier call names, else `drt_jax` in
-        the user's cache. OSError if it cannot be made.
+    Changes JAX's settings; call it before the first program is compiled.
+
+    folder: folder for the programs. None for that which JAX_COMPILATION_CACHE_DIR or an earlier
+        call names, else `drt_jax` in the user's cache.
+
+    Returns the folder. OSError if it cannot be made.
     """
     chosen = folder or jax.config.values["jax_compilation_cache_dir"]
     if not chosen:
@@ -44,8 +49,13 @@ def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path:
 
 
 def known_options(wanted: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the options, as `jax.jit(compiler_options=...)` takes them, that the default backend
-    knows; none unless it is a CPU, on which alone they were measured. Starts the backend."""
+    """The options that the default backend knows, for `jax.jit(compiler_options=...)`.
+
+    There are none unless the backend is a CPU, because the options were measured only there. Starts
+    the backend.
+
+    wanted: options and their values.
+    """
     if jax.default_backend() != "cpu":
         return {}
     return {name: value for name, value in wanted.items() if _known(name, value)}
@@ -53,6 +63,7 @@ def known_options(wanted: Mapping[str, Any]) -> dict[str, Any]:
 
 @functools.cache
 def _known(name: str, value: Any) -> bool:
+    """Whether the backend knows an option."""
     try:
         jax.jit(lambda x: x + 1, compiler_options={name: value}).lower(0.0).compile()
     except RuntimeError:  # INVALID_ARGUMENT: no such option, or no such value
@@ -61,8 +72,11 @@ def _known(name: str, value: Any) -> bool:
 
 
 def jit_outside(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
-    """`jax.jit(function, **keywords)` with the options that the backend knows, asked at the first
-    call. For calls outside of other programs and of derivatives, inside of which JAX takes none."""
+    """`jax.jit(function, **keywords)` with the options that the backend knows.
+
+    The backend is asked at the first call. Only for calls outside of other programs and of
+    derivatives, because JAX accepts no options inside of them.
+    """
 
     @functools.cache
     def program() -> Callable:
@@ -77,8 +91,10 @@ def jit_outside(function: Callable, wanted: Mapping[str, Any], **keywords: Any) 
 
 
 def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
-    """`jit_outside` for calls inside of other programs and of derivatives, too, where it is
-    `jax.jit(function, **keywords)`."""
+    """As `jit_outside`, but it may also be called inside of other programs and of derivatives.
+
+    There it is `jax.jit(function, **keywords)`.
+    """
     outside, inside = jit_outside(function, wanted, **keywords), jax.jit(function, **keywords)
 
     @functools.wraps(function)

@@ -1,7 +1,7 @@
-"""Work shared by several devices, of one process or of many, by JAX's own sharding: data are split
-along their first axis, everything else is copied to every device.
+"""Work shared by several devices, of one process or of many, by JAX's own sharding.
 
-Source of the terms: JAX's pages on `jax.sharding` and `jax.shard_map`.
+Data are split along their first axis, and everything else is copied to every device. Source of the
+terms: JAX's pages on `jax.sharding` and `jax.shard_map`.
 """
 
 import concurrent.futures
@@ -16,17 +16,23 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 
 def in_turn(run: Callable, tasks: Sequence, threads: int | None = None) -> Iterator:
-    """`run(task)` of each task, in order: the first alone, so that one thread compiles it, then by
-    threads, by default one for each CPU core."""
+    """`run(task)` for each task, in order.
+
+    The first task runs alone, so that one thread compiles the program; then threads run the others.
+
+    run: function of a task.
+    tasks: the tasks.
+    threads: number of threads; None for one for each CPU core.
+    """
     yield from map(run, tasks[:1])
     with concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         yield from pool.map(run, tasks[1:])
 
 
 def device_mesh(count: int) -> Mesh:
-    """`count` devices of the default backend in a row, as many of each process.
+    """A mesh of `count` devices of the default backend in a row, with equally many of each process.
 
-    ValueError if there are not so many, or if the processes cannot have equally many.
+    ValueError if there are not so many devices, or if the processes cannot have equally many.
     """
     processes, here = jax.process_count(), jax.local_device_count()
     each, rest = divmod(count, processes)
@@ -49,14 +55,16 @@ def device_mesh(count: int) -> Mesh:
 
 
 def shared(function: Callable, mesh: Mesh | None, whole: int = 0) -> Callable:
-    """A function whose work the devices of a mesh share: each calls it with its own part of the
-    rows, without a word to the others. The function must treat each row alone. It works in `jit`
-    and under differentiation as the function does.
+    """A function whose work the devices of a mesh share.
 
-    function: of pytrees; results have an axis of rows first.
-    mesh: of `device_mesh`, or any with one axis; None for the function itself.
-    whole: number of leading arguments that every device gets whole. The first axis of all others
-        is a multiple of the number of devices.
+    Each device calls it with its own part of the rows, without communication with the others. The
+    function must treat each row independently. It works in `jit` and under differentiation as the
+    function does.
+
+    function: of pytrees; its results have an axis of rows first.
+    mesh: as `device_mesh` returns it, or any mesh with one axis; None for the function itself.
+    whole: number of leading arguments that every device gets whole. The first axis of all others is
+        a multiple of the number of devices.
     """
     if mesh is None:
         return function
@@ -72,30 +80,35 @@ def shared(function: Callable, mesh: Mesh | None, whole: int = 0) -> Callable:
 
 
 def split(mesh: Mesh | None, tree: Any) -> Any:
-    """Arrays with their first axis split among the devices of a mesh; without one, as they are.
-    Every process gives the same."""
+    """Arrays with their first axis split among the devices of a mesh; unchanged without a mesh.
+
+    Every process passes the same arrays.
+    """
     return tree if mesh is None else _placed(mesh, tree, PartitionSpec(*mesh.axis_names))
 
 
 def copied(mesh: Mesh | None, tree: Any) -> Any:
-    """Arrays copied to every device of a mesh; without one, as they are. Every process gives the
-    same."""
+    """Arrays copied to every device of a mesh; unchanged without a mesh.
+
+    Every process passes the same arrays.
+    """
     return tree if mesh is None else _placed(mesh, tree, PartitionSpec())
 
 
 def _placed(mesh: Mesh, tree: Any, spec: PartitionSpec) -> Any:
+    """Arrays placed on the devices of a mesh."""
     sharding = NamedSharding(mesh, spec)
 
     def placed(leaf: Any) -> jax.Array:
         array = np.asarray(leaf)
-        # Not device_put, which compares the arrays of all processes first.
+        # device_put would first compare the arrays of all processes.
         return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
 
     return jax.tree.map(placed, tree)
 
 
 def gathered(tree: Any) -> Any:
-    """NumPy arrays of arrays on any devices, the rows of all processes included."""
+    """NumPy arrays of arrays on any devices, with the rows of all processes."""
 
     def whole(leaf: Any) -> np.ndarray:
         local = getattr(leaf, "is_fully_addressable", True) or leaf.is_fully_replicated

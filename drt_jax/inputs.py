@@ -1,8 +1,8 @@
-"""What comes from outside: text bounded and read strictly, values shown in few words.
+"""Input from outside: text is limited in size and parsed strictly, and values are shown shortened.
 
-Of YAML, prescriptions and settings need mappings, lists, text, numbers, true, false and null. What
-else it has is refused with its line: aliases (a few of them make gigabytes), tags, second
-documents, keys given twice, of which other readers take the last.
+Prescriptions and settings need mappings, lists, text, numbers, true, false and null of YAML.
+Everything else is refused with its line number: aliases (a few of them can expand to gigabytes),
+tags, second documents, and duplicate keys (other readers take the last one).
 """
 
 import os
@@ -13,10 +13,11 @@ from typing import Any
 
 import yaml
 
-# The parser of libyaml, where PyYAML was built with it, takes a tenth of the time.
+# The parser of libyaml takes a tenth of the time, where PyYAML was built with it.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _CONSTRUCTOR = yaml.constructor.SafeConstructor()
-# Bytes of a file, values in it, how deep they nest, characters of a number, of a message.
+# Largest number of bytes of a file, of values in it, of nested levels, of characters of a number,
+# and of characters of a message.
 LARGEST = 2**20
 _VALUES, _DEEPEST, _DIGITS, _LONGEST = 100_000, 20, 40, 300
 _SHORT = reprlib.Repr()
@@ -25,9 +26,10 @@ _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxlevel = 3
 
 
 class InputError(ValueError):
-    """Something from outside that cannot be used, said in one line of at most 300 characters.
+    """Input from outside that cannot be used, with a message of one line of at most 300 characters.
 
-    message: names the place and the remedy. key: of a file, such as "surfaces[0].radius".
+    message: names the place and the remedy.
+    key: key in a file, such as "surfaces[0].radius".
     """
 
     def __init__(self, message: str, key: str = ""):
@@ -36,7 +38,7 @@ class InputError(ValueError):
 
 
 def one_line(text: str) -> str:
-    """Text as one printable line; of a long one, the beginning and the end."""
+    """Text as one printable line. Long text is reduced to its beginning and its end."""
     text = text if len(text) < 4 * _LONGEST else text[:_LONGEST] + text[-_LONGEST:]
     text = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     head = _LONGEST - 100
@@ -44,31 +46,33 @@ def one_line(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """A value in a message: its `repr`, cut where it is long."""
+    """A value in a message: its `repr`, shortened where it is long."""
     try:
         return _SHORT.repr(value)
-    except ValueError:  # Python writes no integer of over 4300 digits
+    except ValueError:  # Python does not print an integer of more than 4300 digits
         return f"a {type(value).__name__} of too many digits"
 
 
 def require_one_of(what: str, value: object, known: Iterable[str]) -> None:
-    """ValueError, with the known words, for a value that is none of them."""
+    """Raises ValueError, which lists the known words, for a value that is none of them."""
     if value not in (words := [*known]):
         raise ValueError(f"{what}: expected one of {', '.join(words)}, got {shown(value)}")
 
 
 class Lines(dict[str, int]):
-    """The line of each key of a file, keys such as "surfaces[0].radius"."""
+    """The line number of each key of a file, with keys such as "surfaces[0].radius"."""
 
     def of(self, key: str) -> str:
-        """ ", line 7" of a key or of what it is in; nothing where none is known."""
+        """The text ", line 7" for a key, or for the mapping or list that contains it; "" if not
+        known.
+        """
         while key and key not in self:
             key = key[: max(key.rfind("."), key.rfind("["), 0)]
         return f", line {self[key]}" if key else ""
 
 
 def read_bytes(path: str | os.PathLike, largest: int = LARGEST, what: str = "YAML file") -> bytes:
-    """Content of a file of at most so many bytes. InputError for what cannot be read."""
+    """Content of a file of at most `largest` bytes. InputError if it cannot be read."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             raise InputError(f"is not a file; give the path of a {what}")
@@ -76,7 +80,7 @@ def read_bytes(path: str | os.PathLike, largest: int = LARGEST, what: str = "YAM
             content = file.read(largest + 1)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}") from error
-    except ValueError as error:  # a path with a NUL; an InputError as it is
+    except ValueError as error:  # a path with a NUL; an InputError passes unchanged
         raise error if isinstance(error, InputError) else InputError(str(error)) from error
     if len(content) > largest:
         raise InputError(f"is larger than {largest // 2**20} MB; is it the right file?")
@@ -84,7 +88,7 @@ def read_bytes(path: str | os.PathLike, largest: int = LARGEST, what: str = "YAM
 
 
 def read_text(path: str | os.PathLike, largest: int = LARGEST) -> str:
-    """UTF-8 text of a file of at most so many bytes. InputError for what cannot be read."""
+    """UTF-8 text of a file of at most `largest` bytes. InputError if it cannot be read."""
     try:
         return read_bytes(path, largest).decode()
     except UnicodeDecodeError as error:
@@ -92,14 +96,16 @@ def read_text(path: str | os.PathLike, largest: int = LARGEST) -> str:
 
 
 def read_yaml(path: str | os.PathLike) -> tuple[Any, Lines]:
-    """What a YAML file holds, and the lines of its keys; see `parse`."""
+    """The content of a YAML file, and the line numbers of its keys; see `parse`."""
     return parse(read_text(path))
 
 
 def parse(text: str) -> tuple[Any, Lines]:
-    """What YAML text holds: dict, list, str, int, float, bool, None; and the lines of its keys.
+    """The content of YAML text, and the line numbers of its keys.
 
-    InputError, with the line, for what is not YAML or is refused, see above.
+    The content consists of dict, list, str, int, float, bool and None.
+
+    InputError, with the line number, for text that is not YAML or is refused, see above.
     """
     try:
         _check(yaml.parse(text, Loader=_Loader))
@@ -113,8 +119,10 @@ def parse(text: str) -> tuple[Any, Lines]:
 
 
 def _check(events: Iterable[Any]) -> None:
-    """InputError, with the line, for YAML that is refused. Before nodes are made of it, which
-    takes recursion."""
+    """Raises InputError, with the line number, for YAML that is refused.
+
+    It checks parser events, before nodes are composed, because composing is recursive.
+    """
     documents = values = depth = 0
     for event in events:
         documents += isinstance(event, yaml.DocumentStartEvent)
@@ -135,7 +143,7 @@ def _check(events: Iterable[Any]) -> None:
 
 
 def _value(node: Any, name: str, lines: Lines) -> Any:
-    """The value of a node of YAML that is called `name`; adds the lines of all keys in it."""
+    """The value of a YAML node with the key `name`; adds the line numbers of all keys in it."""
     if name:
         lines.setdefault(name, node.start_mark.line + 1)
     if isinstance(node, yaml.ScalarNode):
@@ -157,7 +165,9 @@ def _value(node: Any, name: str, lines: Lines) -> Any:
 
 
 def _scalar(node: Any) -> Any:
-    """A word, quoted or not, as YAML 1.1 reads it, but no date and no number of sixties."""
+    """A scalar, quoted or not, as YAML 1.1 reads it, but without dates and without sexagesimal
+    numbers.
+    """
     text, kind = node.value, node.tag.rpartition(":")[2]
     if kind not in ("null", "bool", "int", "float") or (kind != "null" and ":" in text):
         return text

@@ -1,8 +1,8 @@
 """Functions that stay finite, with finite derivatives, where the plain ones do not.
 
-Each is written with a double `where`: the dangerous operation only ever sees a harmless
-argument, so neither its value nor its derivative can turn into NaN. Nothing is added to a
-denominator, so ordinary values are not biased.
+Each is written with a double `where`: the dangerous operation only sees a harmless argument, so
+that neither its value nor its derivative can become NaN. Nothing is added to a denominator, so that
+ordinary values are not biased.
 """
 
 import dataclasses
@@ -17,7 +17,8 @@ from jax import Array
 from jax.typing import ArrayLike
 
 T = TypeVar("T")
-# Products of matrices. Otherwise GPUs round the factors of float32 to 10 bits: 5e-4 of an index.
+# Matrix products in full precision. By default GPUs round float32 factors to 10 bits, an error of
+# 5e-4 of a refractive index.
 EXACT = jax.lax.Precision.HIGHEST
 einsum = functools.partial(jnp.einsum, precision=EXACT)
 matmul = functools.partial(jnp.matmul, precision=EXACT)
@@ -27,12 +28,18 @@ if TYPE_CHECKING:
 else:
 
     class Numbers:
-        """What public functions take for numbers: an array, or numbers in lists and tuples, which
-        JAX's own alias leaves out. A class, so that `help` prints its name and not the union."""
+        """Numbers as arguments of public functions: an array, or numbers in lists and tuples.
+
+        JAX's own alias does not include lists and tuples. This is a class, so that `help` prints
+        its name and not the union.
+        """
 
 
 def safe_sqrt(x: Array) -> Array:
-    """Square root of `x`; 0, with derivative 0, where `x` <= 0. Any shape, floating dtype."""
+    """Square root of `x`; 0, with derivative 0, where `x` <= 0.
+
+    x: any shape, floating dtype.
+    """
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
@@ -40,44 +47,54 @@ def safe_sqrt(x: Array) -> Array:
 def safe_divide(numerator: Array, denominator: Array) -> Array:
     """`numerator / denominator`; 0, with derivative 0, where the denominator is 0.
 
-    The arguments broadcast and share one floating dtype.
+    numerator, denominator: arrays that broadcast, of one floating dtype.
     """
     good = denominator != 0
     return jnp.where(good, numerator / jnp.where(good, denominator, 1), 0)
 
 
 def run_if(condition: Array, function: Callable, value: Any) -> Any:
-    """`function(value)`, of the same structure, if the condition holds, else the value. A loop:
-    under `vmap` too it costs nothing where the condition holds nowhere. Not for reverse mode."""
+    """`function(value)` if the condition holds, else the value.
+
+    It is a loop of at most one round, so that under `vmap` too it costs nothing if the condition
+    holds nowhere. Not for reverse mode.
+
+    condition: (), bool.
+    function: returns a pytree of the structure of its argument.
+    value: a pytree.
+    """
     once = lambda state: (function(state[0]), jnp.array(False))  # noqa: E731
     return jax.lax.while_loop(lambda state: state[1], once, (value, condition))[0]
 
 
 def concrete(tree: Any) -> bool:
-    """Whether all numbers of `tree` are known: none is for `jit` or `vmap` to fill in, and none is
-    being differentiated."""
+    """Whether no leaf of `tree` is a tracer of `jit`, `vmap` or a derivative: all numbers are
+    known.
+    """
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def still(tree: Any) -> Any:
-    """`tree` without derivatives: what `jit`, `vmap` or a derivative fills in is a constant."""
+    """`tree` with `stop_gradient` on every tracer, so that it counts as a constant in
+    derivatives.
+    """
     held = lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.core.Tracer) else a  # noqa: E731
     return jax.tree.map(held, tree)
 
 
 def known_values(tree: Any) -> Any:
-    """`tree` with its numbers, also while it is being differentiated; None for what `jit` or `vmap`
-    is to fill in.
+    """`tree` with its numbers, also while it is being differentiated; None for tracers of `jit` or
+    `vmap`.
 
-    What follows from a scene, such as how many rays it needs, is not differentiated itself but
-    must be decided in an eager `jax.grad`, too: there `stop_gradient` leaves the values.
+    What follows from a scene, such as how many rays it needs, is not differentiated, but it must be
+    decided in an eager `jax.grad`, too: there `stop_gradient` returns the values.
     """
     values = still(tree)
     return values if concrete(values) else None
 
 
 def brief(one: Any) -> str:
-    """A dataclass in one line, its arrays by dtype and shape: for `__repr__`."""
+    """A dataclass in one line for `__repr__`, with its arrays by dtype and shape."""
 
     def shown(value: Any) -> str:
         return f"{value.dtype}{[*value.shape]}" if getattr(value, "shape", ()) else repr(value)
@@ -87,8 +104,10 @@ def brief(one: Any) -> str:
 
 
 def leaves(*names: str) -> Callable[[type[T]], type[T]]:
-    """A decorator: a frozen dataclass becomes a pytree of these fields, the others static. What
-    JAX rebuilds from its leaves is not checked again by `__post_init__`."""
+    """A decorator that makes a frozen dataclass a pytree of the named fields.
+
+    Other fields are static. What JAX rebuilds from leaves is not checked again by `__post_init__`.
+    """
 
     def register(cls: type[T]) -> type[T]:
         static = [f.name for f in dataclasses.fields(cast(Any, cls)) if f.name not in names]
@@ -109,14 +128,15 @@ def leaves(*names: str) -> Callable[[type[T]], type[T]]:
 
 @functools.cache
 def _real(kind: Any) -> bool:
+    """Whether a dtype or type is floating or integer."""
     return jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)
 
 
 def real_array(what: str, value: Numbers, dtype: Any) -> Array:
-    """`value`, a number, a list of them or an array, as an array of a floating dtype.
+    """`value`, a number, a list of numbers or an array, as an array of a floating dtype.
 
-    ValueError, which begins with `what`, for text, truth values, complex numbers, none at all, and
-    lists that are no array.
+    ValueError, which begins with `what`, for text, truth values, complex numbers, an empty list,
+    and lists that do not form an array.
     """
     leaves = jax.tree.leaves(value)
     kinds: list[Any] = [getattr(leaf, "dtype", None) or type(leaf) for leaf in leaves]

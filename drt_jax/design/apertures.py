@@ -1,4 +1,4 @@
-"""Clear apertures that follow the light of a design instead of clipping it."""
+"""Clear apertures that follow the beam of a design instead of clipping it."""
 
 import dataclasses
 
@@ -9,16 +9,21 @@ from .problem import Problem
 
 
 def open_apertures(lens: Lens) -> Lens:
-    """The lens with infinite semi-diameters, except that of the stop."""
+    """The lens with infinite semi-diameters, except for the stop, which keeps its own.
+
+    lens: the lens. Its `apertures` are not changed.
+    """
     free = jnp.full_like(lens.semi_diameter, jnp.inf)
     own = lens.semi_diameter[lens.stop]
     return dataclasses.replace(lens, semi_diameter=free.at[lens.stop].set(own))
 
 
 def fit_apertures(problem: Problem, lens: Lens, margin: float = 0.01) -> Lens:
-    """The lens with semi-diameters that just pass the light of all fields of a problem; the stop
-    keeps its own.
+    """The lens with semi-diameters that just pass the rays of all fields of a problem.
 
+    The stop keeps its own semi-diameter.
+
+    problem: the problem whose rays must pass.
     lens: a lens with open apertures, see `open_apertures`.
     margin: relative increase of the semi-diameters.
     """

@@ -1,8 +1,10 @@
 """A lens as built: its spots after the sensor has been adjusted.
 
-The measure q of a lens is the mean over its fields of the squared RMS radius of the polychromatic
-spot, after optimal compensation. Squared radii are quadratic in the position of the sensor, so that
-a small linear system gives the compensation of every lens.
+The figure of merit q of a lens is the mean over its fields of the squared RMS radius of the
+polychromatic spot, after optimal compensation. The distance o of a ray from the centroid changes
+linearly with the shift t of the sensor at the spot, o + g t, where g is the slope of the ray less
+the mean slope. So q is quadratic in the compensation, and the normal equations of a small linear
+least-squares problem give the optimal compensation.
 """
 
 from typing import Literal, NamedTuple, get_args
@@ -19,17 +21,17 @@ from ..rays.status import Status
 from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
 from .problem import Problem
 
-# Adjustment of every lens: the distance of the sensor, or also its tilts about x and y.
+# What is adjusted in every lens: the distance of the sensor, or also its tilts about x and y.
 Compensator = Literal["none", "focus", "focus and tilt"]
 _STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
-_SYMMETRIES = ("rotational", "bilateral", "none")  # from the least of the pupil to all of it
+_SYMMETRIES = ("rotational", "bilateral", "none")  # by the traced part of the pupil, smallest first
 
 
 class AsBuilt(NamedTuple):
     """A lens as built, after compensation.
 
     squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
-    moves: (C,), compensation: shift of the sensor, mm, then its tilts about x and -y, radians.
+    moves: (C,), compensation: the shift of the sensor, mm, then its tilts about x and -y, radians.
     """
 
     squares: Array
@@ -37,13 +39,16 @@ class AsBuilt(NamedTuple):
 
     @property
     def spot(self) -> Array:
-        """The root of q, (), mm."""
+        """The square root of q, (), mm."""
         return jnp.sqrt(jnp.mean(self.squares, axis=-1))
 
 
 def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
-    """Distances from the centroid, mm, and how they grow with the sensor's distance, (D, V, W Q)
-    each, times the root of the light; and centroids (2, V), mm."""
+    """Distances of rays from the centroid of their view, and the derivatives of these distances.
+
+    Returns distances, mm, and their derivatives by the shift of the sensor, (D, V, W Q) each, times
+    the root of the weight of the ray; and the centroids (2, V), mm.
+    """
     waves = rays.wavelength_weights[None, :, None]
     light = (rays.weights * waves)[..., EXTRAS:]
     passes = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
@@ -65,11 +70,19 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
 
 
 def compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
-    """A lens after compensation, and its residuals (D, V, W Q): distances from the centroids, whose
-    squares add up to those of the RMS radii, mm. `check` comes first."""
+    """A lens after compensation, and its residuals. Call `check` before.
+
+    With the distances o and their derivatives g of all rays, and the shift of the sensor t_v =
+    sum_k m_k l_kv at the spot of view v (levers l: 1, y and x of the centroid), the compensation m
+    solves (sum g^2 l l^T) m = -sum o g l.
+
+    Returns the result, and the residuals (D, V, W Q): distances from the centroids, mm, whose
+    squares add up to the squared RMS radii.
+    """
     rays = trace_views(lens, problem.views(), problem.solver)
     offsets, growth, (x, y) = _spots(rays)
-    # The sensor moves by d + a y + b x along its normal where a spot is; d in parts of `sensor`.
+    # At a spot (x, y) the sensor moves by d n + a y + b x along its normal, where d is the change
+    # of `Lens.sensor`, n the normal component of the motion of the sensor, and a, b are the tilts.
     motion = lens.sensor_motion
     normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
     levers = jnp.stack([normal, y, x])[: _STEPS[compensator]]
@@ -89,18 +102,24 @@ def compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple
 
 
 def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
-    """Evaluates a lens at the fields of a problem after compensation. Works in `jit`, `vmap` and
-    under differentiation.
+    """Evaluates a lens at the fields of a problem after compensation.
 
-    ValueError for an unknown compensator, for one that the fields do not determine, and for a rule
-    with more symmetry than the lens.
+    Works in `jit`, `vmap` and under differentiation.
+
+    problem: gives the fields, wavelengths and pupil rule.
+    lens: the lens as built.
+    compensator: "none", "focus" (the distance of the sensor) or "focus and tilt" (also its tilts
+        about x and y).
+
+    ValueError for an unknown compensator, for one that the fields do not determine, and for a pupil
+    rule with more symmetry than the lens.
     """
     check(problem, lens, compensator)
     return compensated(problem, lens, compensator)[0]
 
 
 def check(problem: Problem, lens: Lens, compensator: str) -> None:
-    """ValueError as in `as_built`."""
+    """Raises the ValueErrors of `as_built`."""
     require_one_of("compensator", compensator, get_args(Compensator))
     has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
     if _SYMMETRIES.index(has) < _SYMMETRIES.index(needs):

@@ -1,4 +1,4 @@
-"""Tolerances and deviations of a lens as built: their kinds, sizes and parts."""
+"""Tolerances and deviations of a lens as built: their kinds, sizes and the parts that have them."""
 
 import dataclasses
 import itertools
@@ -20,7 +20,7 @@ WITH_X = ("biconic", "toroid")
 class Kind(NamedTuple):
     """A kind of deviation.
 
-    whole: the part that deviates, "surface" or "element".
+    whole: what deviates, a "surface" or an "element".
     axes: number of components, 2 for x and y.
     unit: unit of the deviation.
     most: upper bound of the size, in that unit.
@@ -54,16 +54,16 @@ KINDS = {
 class Tolerance:
     """Largest deviation of parts of one kind, in both directions.
 
-    kind: one of these. A fringe is half a wave of 546 nm.
+    kind: one of the following. A fringe is half a wave of 546 nm.
         Of surfaces: "radius", of the vertex, per cent; "fringes", a change of curvature, measured
-        along the normal at the rim of the light; "irregularity", a cylinder, in fringes between
-        both directions, half of them along y and minus half along x; "wedge", a tilt about x and y,
-        arc minutes.
+        along the normal at the rim of the beam; "irregularity", a cylinder, in fringes between both
+        directions (half of them along y, and minus half of them along x); "wedge", a tilt about x
+        and y, arc minutes.
         Behind surfaces: "thickness", mm; "index", of the d line; "abbe", per cent.
         Of elements: "shift" along x and y, mm; "tilt" about x and y through the first vertex, arc
         minutes.
     size: largest deviation, in these units.
-    which: numbers of surfaces or elements, from 0; () for all.
+    which: numbers of surfaces or elements, from 0; () for all that have this kind of deviation.
     """
 
     kind: ToleranceKind
@@ -99,12 +99,15 @@ class Deviation(NamedTuple):
 
 
 def _solid(lens: Lens, medium: int) -> bool:
+    """Whether a medium is neither air nor the medium in front of the lens."""
     return lens.glasses[medium] not in ("air", lens.glasses[0])
 
 
 def elements_of(lens: Lens) -> tuple[tuple[int, int], ...]:
-    """First and last surface of each element: active surfaces with glass between neighbours.
-    Cemented elements count as one; so does a mirror in air."""
+    """First and last surface of each element: neighbouring active surfaces with glass between them.
+
+    Cemented elements count as one. A mirror in air is an element of one surface.
+    """
     spans: list[tuple[int, int]] = []
     for i in lens.active:
         if spans and _solid(lens, i):
@@ -115,8 +118,11 @@ def elements_of(lens: Lens) -> tuple[tuple[int, int], ...]:
 
 
 def pieces_of(lens: Lens) -> dict[int, tuple[int, ...]]:
-    """Media of each piece of glass, by the surface in front of it. A piece has several media if a
-    mirror sends light back into it or if a surface inside it is not active."""
+    """The media of each piece of glass, by the surface in front of it.
+
+    A piece has several media if a mirror sends light back into it, or if a surface inside of it is
+    not active.
+    """
     pieces: dict[int, tuple[int, ...]] = {}
     for i in range(lens.count):
         inside = lens.mirrors[i] or i not in lens.active
@@ -131,7 +137,9 @@ def pieces_of(lens: Lens) -> dict[int, tuple[int, ...]]:
 
 
 def x_curvatures(lens: Lens, at: np.ndarray) -> Array:
-    """Curvatures along x of surfaces `at`, 1/mm; 0 for a form without one of its own."""
+    """Curvatures along x of the surfaces `at`, 1/mm; 0 for a form without a separate curvature
+    along x.
+    """
     has = np.array([lens.forms[i] in WITH_X for i in at])
     if not has.any():
         return jnp.zeros(len(at), lens.curvature.dtype)
@@ -139,26 +147,27 @@ def x_curvatures(lens: Lens, at: np.ndarray) -> Array:
 
 
 def deviations_of(lens: Lens, tolerances: Sequence[Tolerance]) -> dict[Deviation, float]:
-    """Deviations that tolerances allow, and the largest size of each in the units of `Tolerance`.
-    The components x and y of one part follow each other.
+    """The deviations that tolerances allow, with the largest size of each.
 
-    ValueError for no tolerance, for a part that does not exist (it lists those that do), and for a
-    part that is named twice.
+    Sizes are in the units of `Tolerance`. The components x and y of one part follow each other.
+
+    ValueError for no tolerance, for a part that does not exist (the message lists those that do),
+    and for a part that is named twice.
     """
     sizes: dict[Deviation, float] = {}
     for tolerance in tolerances:
         kind = tolerance.kind
-        there = _there(lens, kind)
-        if not there:
-            raise ValueError(f"tolerances: {kind}: {_NONE.get(kind, 'the lens has none')}")
+        possible = _possible_places(lens, kind)
+        if not possible:
+            raise ValueError(f"tolerances: {kind}: {_WHY_NONE.get(kind, 'the lens has none')}")
         for place in tolerance.which:
-            if place not in there:
+            if place not in possible:
                 raise ValueError(
                     f"tolerances: {kind}: no {KINDS[kind].whole} {place} can deviate; "
-                    f"there are {', '.join(map(str, there))}"
+                    f"there are {', '.join(map(str, possible))}"
                 )
         axes = range(KINDS[kind].axes)
-        for place, axis in itertools.product(tolerance.which or there, axes):
+        for place, axis in itertools.product(tolerance.which or possible, axes):
             deviation = Deviation(kind, place, axis)
             if deviation in sizes:
                 raise ValueError(f"tolerances: {deviation} is named twice; remove one")
@@ -168,7 +177,7 @@ def deviations_of(lens: Lens, tolerances: Sequence[Tolerance]) -> dict[Deviation
     return sizes
 
 
-_NONE = {
+_WHY_NONE = {
     "radius": "no surface is curved; for planes use fringes",
     "irregularity": "no surface is a sphere, conic, even asphere, biconic or toroid",
     "thickness": "the lens has one surface, without a thickness behind it",
@@ -177,8 +186,8 @@ _NONE = {
 }
 
 
-def _there(lens: Lens, kind: str) -> list[int]:
-    """Numbers of the surfaces or elements that have deviations of a kind."""
+def _possible_places(lens: Lens, kind: str) -> list[int]:
+    """Numbers of the surfaces or elements that can have deviations of a kind."""
     active = list(lens.active)
     if KINDS[kind].whole == "element":
         return list(range(len(elements_of(lens))))

@@ -1,4 +1,4 @@
-"""Residuals of failed rays: finite, with derivatives that point to where the ray passes."""
+"""Residuals of failed rays. They are finite and decrease towards lenses that pass the ray."""
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,11 @@ from .field_rays import FieldRays
 
 
 def failures(lens: Lens, rays: FieldRays) -> Array:
-    """Failure residual (V, W, Q): 0 if the ray arrives, otherwise sqrt(weight) x (1 + shortfall).
+    """Failure residuals (V, W, Q): 0 if the ray arrives, otherwise sqrt(weight) (1 + shortfall).
+
     A chief ray has the weight of all light of its wavelength. If all light of a wavelength is
-    clipped, its residuals are inf."""
+    clipped, its residuals are inf.
+    """
     light = rays.weights * rays.wavelength_weights[None, :, None]
     chief = np.arange(light.shape[-1]) == 0
     light = jnp.where(chief[None, None], rays.wavelength_weights[None, :, None], light)
@@ -32,7 +34,7 @@ def failures(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
-    """Shortfall (V, W, Q) of the paraxial launch of each failed ray; 0 for one that arrives."""
+    """Shortfall (V, W, Q) of the paraxial launch of each failed ray; 0 for a ray that arrives."""
     failed = ~rays.arrives
 
     def of_view(field: Array, distance: Array, points: Vector) -> Array:
@@ -50,11 +52,13 @@ def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
 
 
 def shortfall(system: System, launch: Vector, target: Vector) -> Array:
-    """Shortfall (W, Q) of a failed ray: the fraction of rows it does not reach, plus log(1 +
-    distance by which it misses the first of them). For a ray that reaches the sensor it is log(1 +
+    """Penalty (W, Q) of a failed ray.
+
+    It is the fraction of rows that the ray does not reach, plus log(1 + the distance by which it
+    misses the first of them). For a ray that reaches the sensor, the second term is log(1 +
     distance from its stop point), in units of the largest distance of a stop point from the axis.
 
-    launch: D arrays (W, Q), as in `snell.shoot`, mm.
+    launch: D arrays (W, Q), launch points as in `snell.shoot`, mm.
     target: D arrays (W, Q), stop points, mm.
     """
     met, rows = meetings(system, launch, smooth=True), rows_met(system)
@@ -62,19 +66,24 @@ def shortfall(system: System, launch: Vector, target: Vector) -> Array:
     first = failed & ~jnp.concatenate([jnp.zeros_like(failed[:1]), failed[:-1]])
     _, crossing = split_stop(system, met.hit)
     miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
-    off = safe_divide(safe_sqrt(dot(miss, miss)), jnp.sqrt(jnp.max(dot(target, target))))
+    stop_miss = safe_divide(safe_sqrt(dot(miss, miss)), jnp.sqrt(jnp.max(dot(target, target))))
     missed = jnp.sum(jnp.where(first, _missed(met, rows), 0), axis=0)
     part = jnp.mean(failed.astype(missed.dtype), axis=0)
-    return part + jnp.log1p(jnp.where(failed[-1], missed, off))
+    return part + jnp.log1p(jnp.where(failed[-1], missed, stop_miss))
 
 
 def _missed(met: Meeting, rows: Row) -> Array:
     """Measure (R, W, Q) of how far rays miss each row, meet it from behind, or exceed the limit of
-    total reflection there."""
+    total internal reflection there.
+
+    For a ray that misses a conic, it is minus the discriminant of the quadratic equation of the
+    intersection, b^2 - a e < 0, see `meet.reach`.
+    """
     first, active, bends = (a[:, None, None] for a in (rows.first, rows.active, rows.bends))
     back = jnp.where(first, 0, jnp.maximum(-met.length, 0)) + jnp.maximum(-met.front, 0)
     back = jnp.where(active, back, 0) + jnp.where(bends, jnp.maximum(-met.through, 0), 0)
-    # Miss of a conic. It continues the measure of total reflection at grazing incidence.
+    # The measure of missing a conic. The second term makes it continuous, at grazing incidence,
+    # with the measure of total internal reflection.
     square, linear, constant = quadratic(met.point, met.direction, rows.surface.wide)
     conic = jnp.maximum(square * constant - linear**2, 0)
     conic = conic + jnp.where(bends, jnp.maximum(rows.ratio**2 - 1, 0), 0)

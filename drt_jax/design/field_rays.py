@@ -23,15 +23,19 @@ from ..rays.status import Status
 from ..rays.system import Vector, dot, system_of
 from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 
-# The first rays of every view, without weight: the chief ray, and those through the top, bottom and
-# side of the stop.
+# The first rays of every view: the chief ray, and the rays through the top, bottom and side of the
+# rim of the stop. They have no weight.
 _EXTRA = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
 EXTRAS = _EXTRA.shape[1]
 
 
 def symmetry_by_structure(lens: Lens, axial: bool = False) -> Symmetry:
-    """Symmetry of the pupil for fields along y, from the structure of a lens alone: its numbers may
-    be unknown, as in `jit`. axial: True for the axial field alone."""
+    """Symmetry of the pupil for fields along y, from the structure of a lens alone.
+
+    The numbers of the lens may be unknown, as in `jit`.
+
+    axial: True for the axial field alone.
+    """
     moves = (lens.decentre, lens.tilt, lens.elements, lens.apertures)
     forms = (*lens.forms, *(() if lens.phase is None else lens.phase.forms))
     kinds = {FORMS[form].symmetry for form in forms}
@@ -43,9 +47,11 @@ def symmetry_by_structure(lens: Lens, axial: bool = False) -> Symmetry:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class FieldRays:
-    """Rays of V views: all fields at the first distance, then all fields at the next. Each view has
-    W wavelengths of Q rays. The first ray is the chief ray, the next three pass the rim of the
-    stop; these four have no weight. The fields from `bundle` on are None before rays are traced.
+    """The rays of V views: all fields at the first distance, then all fields at the next distance.
+
+    Each view has W wavelengths of Q rays. The first ray is the chief ray, and the next three pass
+    through the rim of the stop; these four have no weight. The fields from `bundle` on are None
+    before rays are traced.
 
     field: (V, 2), radians.
     distance: (V,), mm.
@@ -83,7 +89,7 @@ class FieldRays:
 
     @property
     def arrives(self) -> Array:
-        """Mask (V, W, Q) of rays that meet the sensor, clipped or not."""
+        """Mask (V, W, Q) of the rays that meet the sensor, clipped or not."""
         return (self.bundle.status == Status.OK) | (self.bundle.status == Status.CLIPPED)
 
     @property
@@ -92,7 +98,9 @@ class FieldRays:
         return jnp.stack([h[:, -1] for h in self.bundle.hits])
 
     def views(self, fields: Sequence[int], distances: Sequence[int]) -> np.ndarray:
-        """Numbers of the views of given fields and distances, all counted from 0; () for all."""
+        """Numbers of the views of given fields and distances, which are counted from 0; () for
+        all.
+        """
         distances = distances or range(self.distances)
         return np.array(
             [d * self.fields + f for d in distances for f in fields or range(self.fields)]
@@ -101,13 +109,17 @@ class FieldRays:
     def select(
         self, fields: Sequence[int], distances: Sequence[int], wavelengths: Sequence[int]
     ) -> "FieldRays":
-        """The rays of given fields, distances and wavelengths, counted from 0; () for all."""
+        """The rays of given fields, distances and wavelengths.
+
+        fields, distances, wavelengths: numbers, counted from 0; () for all. The weights of the
+            selected wavelengths are normalised to the sum 1.
+        """
         if not (fields or distances or wavelengths):
             return self
         views = self.views(fields, distances)
         waves = np.array(wavelengths or range(len(self.wavelengths)))
 
-        def some(tree: Any) -> Any:
+        def selected(tree: Any) -> Any:
             """Selects from arrays (V, W) and (V, ..., W, Q)."""
             return jax.tree.map(lambda a: a[views][..., *[waves, slice(None)][: a.ndim - 1]], tree)
 
@@ -123,18 +135,18 @@ class FieldRays:
         )
         if self.bundle is None:
             return found
-        bundle = some(self.bundle._replace(steps=self.throughput))
+        bundle = selected(self.bundle._replace(steps=self.throughput))
         return dataclasses.replace(
             found,
             bundle=bundle._replace(steps=self.bundle.steps[views]),
-            points=some(self.points),
-            stop_weights=some(self.stop_weights),
-            weights=some(self.weights),
-            throughput=some(self.throughput),
+            points=selected(self.points),
+            stop_weights=selected(self.stop_weights),
+            weights=selected(self.weights),
+            throughput=selected(self.throughput),
         )
 
     def unvignetted(self) -> "FieldRays":
-        """The rays with the weights they have if only the stop clips."""
+        """The rays with the weights that they have if only the stop clips."""
         clipped = self.bundle.status == Status.CLIPPED
         status = jnp.where(clipped, Status.OK, self.bundle.status)
         bundle = self.bundle._replace(status=status)
@@ -144,7 +156,8 @@ class FieldRays:
 def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
     """Traces the rays of all views together.
 
-    views: views without rays. ValueError for the rule `Clipped`, if the lens has obscurations.
+    lens: the lens.
+    views: views without rays. ValueError for the rule `Clipped` if the lens has obscurations.
     solver: a ray solver.
     """
     extra, rule = lens.apertures, views.rule
@@ -176,8 +189,11 @@ def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
 
 
 def _points(rule: PupilRule, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
-    """Stop points, D arrays (W, Q) in units of the semi-diameter of the stop, and weights (W, Q), 0
-    for the four extra rays, which come first."""
+    """Stop points and weights of a rule, with the four extra rays in front.
+
+    Returns the points, D arrays (W, Q) in units of the semi-diameter of the stop, and the weights
+    (W, Q), 0 for the extra rays.
+    """
     points, weights = rule.points(lens, scene)
     waves = scene.wavelengths.shape[0]
     extra = jnp.asarray(_EXTRA[2 - len(points) :], weights.dtype)
@@ -189,8 +205,10 @@ def _points(rule: PupilRule, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
 
 
 def beam_radius(lens: Lens, rays: FieldRays) -> Array:
-    """Radius of the beam footprint on each surface (S,), mm: the semi-diameter or, if that is inf,
-    the largest distance of a ray from the axis."""
+    """Radius of the beam footprint on each surface (S,), mm.
+
+    It is the semi-diameter or, if that is inf, the largest distance of a ray from the axis.
+    """
     squares = sum((h**2 for h in rays.bundle.hits), jnp.zeros(()))
     radius = safe_sqrt(jnp.max(jnp.where(rays.arrives[:, None], squares, 0), axis=(0, 2, 3)))
     semi = lens.semi_diameter
@@ -199,7 +217,8 @@ def beam_radius(lens: Lens, rays: FieldRays) -> Array:
 
 def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
     """Cosines (V, L, W, Q) of the angles of incidence on the L active surfaces; 1 for failed
-    rays."""
+    rays.
+    """
     rows = np.array([*lens.active, lens.count])
 
     def one(field: Array, distance: Array, hits: Vector, arrives: Array) -> Array:
@@ -214,9 +233,11 @@ def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
 
 
 def relative_illumination(lens: Lens, rays: FieldRays) -> Array:
-    """Relative illumination (V,) at the middle wavelength, relative to the first field at the same
-    distance, for a uniform Lambertian object: the sum over rays that are not clipped of weight
-    times projected solid angle at the sensor (Slater), see `_solid_angles`."""
+    """Relative illumination (V,) at the middle wavelength, for a uniform Lambertian object.
+
+    It is the sum over rays that are not clipped of weight times projected solid angle at the sensor
+    (Slater), see `_solid_angles`, divided by that of the first field at the same distance.
+    """
     middle = len(rays.wavelengths) // 2
     one = slice(middle, middle + 1)
     scene = rays.field, rays.distance, rays.bundle, rays.points
@@ -231,9 +252,12 @@ def _solid_angles(
     lens: Lens, wavelength: Array, one: slice, field: Array, distance: Array, bundle: Bundle,
     points: Vector
 ) -> Array:  # fmt: skip
-    """Determinant dl/dp (1, Q): area of direction cosines l at a fixed point of the sensor per area
-    of the stop. Hit h and direction l are functions of the stop point p and the field f; h is fixed
-    for df = -(dh/df)^-1 (dh/dp) dp, so that dl/dp = l_p - l_f h_f^-1 h_p."""
+    """Determinant of dl/dp, (1, Q): area of direction cosines l at a fixed point of the sensor, for
+    each area of the stop.
+
+    The hit h and the direction l are functions of the stop point p and of the field f. The hit
+    stays fixed for df = -(dh/df)^-1 (dh/dp) dp, so that dl/dp = l_p - l_f h_f^-1 h_p.
+    """
     rows = np.array([*lens.active, lens.count])
     scene = Scene(field, distance, wavelength)
     hits = jax.lax.stop_gradient(tuple(h[rows, one] for h in bundle.hits))
@@ -250,5 +274,5 @@ def _solid_angles(
     points = tuple(p[one] for p in points)
     if len(points) == 1:  # on the axis, as the first field
         return jnp.ones_like(points[0])
-    _, push = jax.linearize(arriving, points, field)
-    return direction_determinant(push, points, field, fixed=True)
+    _, derivative = jax.linearize(arriving, points, field)
+    return direction_determinant(derivative, points, field, fixed=True)

@@ -10,25 +10,31 @@ from jax import Array
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
 
-# Zones of edge thicknesses, in units of the larger (glass) or smaller (air) of two beam radii.
+# Heights at which edge thicknesses are measured, in units of the larger (glass) or the smaller
+# (air) beam radius of the two surfaces.
 ZONES = np.array([0.5, 0.7, 0.85, 1.0])
 
 
 def between(lens: Lens, glass: bool) -> list[tuple[int, int]]:
-    """Pairs of neighbours among the active surfaces and the sensor, with glass between them, or
-    with air. The medium in front of the lens counts as air."""
+    """Pairs of neighbouring active surfaces with glass, or with air, between them.
+
+    The sensor counts as a surface, and the medium in front of the lens as air.
+
+    glass: True for pairs with glass between them, False for pairs with air.
+    """
     air = lens.glasses[0], "air"
     pairs = itertools.pairwise([*lens.active, lens.count])
     return [(i, j) for i, j in pairs if (lens.glasses[i + 1] not in air) == glass]
 
 
 def gaps(lens: Lens, beam_radius: Array, glass: bool) -> tuple[Array, Array]:
-    """Thicknesses of the G gaps of `between`, mm along the light: on the axis (G,), and at zones
-    towards the rim (G, Z).
+    """Thicknesses of the G gaps of `between`, mm along the light.
 
-    beam_radius: (S,), mm. Zones reach the larger radius of the two surfaces in glass, the smaller
-        in air; in front of the sensor that of the last surface.
+    beam_radius: (S,), mm. In glass, zones reach the larger radius of the two surfaces, in air the
+        smaller one; in front of the sensor, the radius of the last surface.
     glass: True for gaps of glass, False for air.
+
+    Returns the thicknesses on the axis (G,), and at the zones towards the rim (G, Z).
     """
     dtype = lens.curvature.dtype
     pairs = between(lens, glass)

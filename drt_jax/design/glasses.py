@@ -1,4 +1,4 @@
-"""Real glasses in place of model glasses, one by one, the least costly first."""
+"""Replaces model glasses by real glasses, one place after the other, the least costly one first."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
@@ -15,19 +15,21 @@ from .kinds import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
 from .problem import Problem, quick
 
-# Media are one medium where nd and vd differ by less.
+# Two media count as the same medium if their nd and vd differ by less than this.
 _SAME = (1e-5, 1e-2)
-# Least gain of an exchange, relative, and how many are tried before the search ends.
+# Smallest relative gain for which a real glass is exchanged, and the number of exchanges that are
+# tried before the search ends.
 _GAIN, _EXCHANGES = 1e-3, 3
 
 
 class Snap(NamedTuple):
     """A glass that was exchanged.
 
-    surfaces: behind which it begins; several if their nd or vd are tied.
-    glass, replaced: its name, and that of the medium before it.
-    model: nd and vd of that medium.
-    before, after: `Optimum.score` of the lens before, and after least squares of what still varies.
+    surfaces: surfaces behind which the glass begins; several if their nd or vd are tied.
+    glass, replaced: name of the new glass, and of the medium before.
+    model: nd and vd of the medium before.
+    before, after: `Optimum.score` of the lens before the exchange, and after least squares of the
+        remaining variables.
     """
 
     surfaces: tuple[int, ...]
@@ -41,13 +43,14 @@ class Snap(NamedTuple):
 class Snapped(NamedTuple):
     """Result of `snap_glasses`.
 
-    lens: of real glasses, each with its own dispersion formula.
-    optimum: its last optimisation; its lens is `lens`.
-    snaps: in their order; exchanges of a real glass for another come last.
-    alternatives: by the first surface behind which a glass begins: glasses tried there, all others
-        as in `lens`, and `Optimum.score` after the steps of a trial, the best first; inf if light
-        fails. Trials meet limits only nearly: compare with the trial of the glass in `lens`.
-    problem: in it real glasses vary no more; go on from `optimum.vector`.
+    lens: the lens with real glasses, each with its own dispersion formula.
+    optimum: the last optimisation; its lens is `lens`.
+    snaps: the exchanges in their order. Exchanges of a real glass for another real glass come last.
+    alternatives: by the first surface behind which a glass begins: the glasses that were tried
+        there, all others being as in `lens`, and `Optimum.score` after the steps of the trial, the
+        best first; inf if rays fail. Trials meet limits only nearly, so compare a score with that
+        of the trial of the glass in `lens`.
+    problem: the problem in which real glasses are not varied; continue from `optimum.vector`.
     """
 
     lens: Lens
@@ -58,7 +61,9 @@ class Snapped(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """A glass in one place: its problem, the best vector found in some steps, and its score."""
+    """A glass in one place: its problem, the best vector found in some steps, and the score of
+    it.
+    """
 
     place: tuple[int, ...]
     near: Neighbour
@@ -68,8 +73,11 @@ class _Trial(NamedTuple):
 
 
 def _places(problem: Problem) -> list[tuple[int, ...]]:
-    """The surfaces at which model glasses begin, those together whose nd or vd are tied.
-    ValueError for glasses that are tied but not equal, and where there is none."""
+    """The places of model glasses: tuples of the surfaces behind which they begin.
+
+    Surfaces whose nd or vd are tied form one place. ValueError for glasses that are tied by a scale
+    or shift, and if the lens has no model glass.
+    """
     variables = problem.variables
     first = {row: row for row in model_glasses(variables.lens)}
     for (k, follower), line in zip(variables.ties, variables.lines.tolist(), strict=True):
@@ -87,8 +95,11 @@ def _places(problem: Problem) -> list[tuple[int, ...]]:
 def _with_glass(
     problem: Problem, vector: np.ndarray, place: tuple[int, ...], glass: Glass
 ) -> tuple[Problem, np.ndarray]:
-    """The problem and its vector (N,) with a glass in a place. Its nd and vd are fixed at those
-    that mark a real glass. Only numbers differ, so that one program serves all glasses."""
+    """The problem, and its vector (N,), with a real glass in a place.
+
+    The variables nd and vd of this glass are fixed at the values that mark a real glass. Only
+    numbers differ, so that one compiled program serves all glasses.
+    """
     variables = problem.variables
     scale, dtype = np.asarray(variables.scale), variables.low.dtype
     low, high, vector = (np.array(a) for a in (variables.low, variables.high, vector))
@@ -102,7 +113,7 @@ def _with_glass(
 
 @dataclasses.dataclass(frozen=True)
 class _Search:
-    """Which glasses are tried, see `snap_glasses`."""
+    """The glasses that are tried, see `snap_glasses`."""
 
     makers: Collection[str] | None
     accept: Callable[[Glass], bool]
@@ -110,8 +121,11 @@ class _Search:
     steps: int
 
     def neighbours(self, problem: Problem, lens: Lens, place: tuple[int, ...]) -> list[Neighbour]:
-        """Glasses next to the medium in a place of a lens, known at all wavelengths, no two of the
-        same constants, and none that this medium touches."""
+        """The nearest accepted glasses to the medium in a place of a lens.
+
+        The index of each is known at all wavelengths, no two have the same constants, and none is
+        the same as a medium that touches this one.
+        """
         waves, points = np.asarray(problem.wavelengths), np.asarray(nd_and_vd(lens.dispersion))
         rows, (nd, vd) = glass_rows(lens, place), points[place[0] + 1].tolist()
         touched = points[~rows & (np.roll(rows, 1) | np.roll(rows, -1))]
@@ -150,7 +164,7 @@ class _Search:
 
 
 def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]:
-    """The glass of a trial in place of that of an optimum, with least squares of the rest."""
+    """Puts the glass of a trial into an optimum, and optimises the remaining variables."""
     after = optimise(trial.problem, jnp.asarray(trial.vector), max_steps)
     row = trial.place[0] + 1
     nd, vd = np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()
@@ -172,21 +186,22 @@ def snap_glasses(
     """Replaces the model glasses of an optimum by real ones.
 
     Each round tries real glasses in all places that still have a model glass, keeps the one that
-    costs least, and optimises what still varies. At the end real glasses are exchanged for
-    neighbours as long as the lens gets better.
+    increases the score least, and optimises the remaining variables. At the end real glasses are
+    exchanged for neighbouring glasses as long as the score falls by at least 0.1 %.
 
-    found: result of `optimise` for `problem`; the operand `glass_map` keeps its glasses near real
-        ones.
-    makers: of the glasses, see `glass_makers`; None: all.
-    accept: whether to use a glass of theirs.
-    count: glasses tried in each place, the nearest in nd and vd.
-    steps: of least squares with each.
-    max_steps: as in `optimise`, after each snap.
-    callback: called after each snap.
+    problem: the problem of the optimum.
+    found: result of `optimise` for `problem`. The operand `glass_map` keeps its model glasses near
+        real ones.
+    makers: makers of the glasses, see `glass_makers`; None for all.
+    accept: function of a glass, whether it may be used.
+    count: number of glasses tried in each place, the nearest in nd and vd.
+    steps: number of steps of least squares with each of them.
+    max_steps: as in `optimise`, after each exchange.
+    callback: called with each exchange.
 
     Compiles nothing that `optimise` has not compiled for the problem, unless a glass has more
-    constants than those before. ValueError where the lens has no model glass, for an unknown maker,
-    and where no glass fits.
+    constants than those before. ValueError if the lens has no model glass, for an unknown maker,
+    and if no glass fits.
     """
     places, search, snaps = _places(problem), _Search(makers, accept, count, steps), list[Snap]()
     left = [*places]
@@ -200,7 +215,7 @@ def snap_glasses(
     better = True
     while better:
         ranked, better = search.ranked(problem, found, places), False
-        # Better than trials of the glasses that are there.
+        # Keep the trials that are better than those of the present glasses.
         names = found.lens.glasses
         now = [t.score for t in ranked if t.near.glass.name == names[t.place[0] + 1]]
         most = (1 - _GAIN) * min(now, default=np.inf)
@@ -213,6 +228,7 @@ def snap_glasses(
                 callback(snap)
                 break
     alternatives = {p[0]: [(t.near, t.score) for t in ranked if t.place == p] for p in places}
-    # nd and vd of media without a model are exact in the lens of the variables.
+    # In the lens of the variables, nd and vd of media without a model are exact; in `found.lens`
+    # they have passed through the vector.
     lens = dataclasses.replace(found.lens, dispersion=problem.variables.lens.dispersion)
     return Snapped(lens, found._replace(lens=lens), snaps, alternatives, problem)

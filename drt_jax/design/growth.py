@@ -13,7 +13,7 @@ from .least_squares import Search
 from .optimum import Optimum, optimise
 from .problem import Problem
 
-# Least step to the next part, and the factor of the step after a success.
+# Smallest step to the next part, and the factor by which the step grows after a success.
 SHORTEST, _FASTER = 0.002, 1.2
 
 
@@ -22,8 +22,8 @@ class Growth(NamedTuple):
 
     done: largest part that meets the target; 1 for the whole, 0 for none yet.
     part: part to try next.
-    step: step to the part after that.
-    vector: (N,), best vector of the variables for `done`.
+    step: step from the part after that to the next.
+    vector: (N,), best vector of the variables for the part `done`.
     failed: last search that missed the target; None if none did.
     steps, jacobians, seconds, first: totals over all searches, see `Optimum`.
     """
@@ -40,16 +40,18 @@ class Growth(NamedTuple):
 
     @property
     def ended(self) -> bool:
-        """True once the whole is reached, or once the step is too small."""
+        """True once the whole is reached, or once the step is below 0.002."""
         return self.done >= 1 or self.step < SHORTEST
 
 
 def part_of(problem: Problem, part: Array | float) -> Problem:
-    """The problem for a part of its fields and aperture. Only numbers differ: one program serves
-    all parts.
+    """The problem for a part of its fields and aperture.
 
-    part: factor of the fields, and of the entrance pupil or f-number of a solve, if there is one,
-        else of the stop.
+    Only numbers differ, so that one compiled program serves all parts.
+
+    problem: the whole problem.
+    part: factor of the fields; and of the aperture: of the entrance pupil or f-number of a solve,
+        if there is one, else of the stop.
     """
     variables, solves = problem.variables, []
     lens = variables.lens
@@ -67,7 +69,11 @@ def part_of(problem: Problem, part: Array | float) -> Problem:
 
 
 def start_growth(problem: Problem, first: float = 0.3, step: float = 0.1) -> Growth:
-    """The state before the first search. first: part to begin with. step: step to the next."""
+    """The state before the first search.
+
+    first: part to begin with.
+    step: step to the next part.
+    """
     return Growth(0.0, first, step, np.asarray(problem.variables.start))
 
 
@@ -78,8 +84,11 @@ def grow_once(
     max_steps: int = 40,
     callback: Callable[[Search], None] = lambda search: None,
 ) -> Growth:
-    """Optimises the next part. It is accepted if its score is at most the target; otherwise the
-    step is halved. Arguments as in `grow`."""
+    """Optimises the next part.
+
+    The part is accepted if its score is at most the target; the next step is then 1.2 times as
+    long. Otherwise the step is halved. Arguments as in `grow`.
+    """
     part, done, step = growth.part, growth.done, growth.step
     vector = jnp.asarray(growth.vector)
     found = optimise(part_of(problem, part), vector, max_steps, callback, target_merit)
@@ -109,14 +118,18 @@ def grow(
     max_steps: int = 40,
     callback: Callable[[Search], None] = lambda search: None,
 ) -> Growth:
-    """Designs a lens for a part of its fields and aperture, and extends it step by step. If the
-    whole meets the target, `Growth.done` is 1; start `optimise` from its `vector`.
+    """Designs a lens for a part of its fields and aperture, and extends the part to the whole.
 
+    If the whole meets the target, `Growth.done` is 1; start `optimise` from its `vector`.
+
+    problem: the whole problem.
     target_merit: score, as `Optimum.score`, at which a part is accepted; about 16 times the merit
-        wanted of the whole. A lens that is perfect for a part is a bad start for more.
+        that is wanted of the whole. A lens that is perfect for a part is a bad start for a larger
+        part.
     first: part to begin with.
-    step: first step; it grows by 1.2 after a success and halves after a failure, down to 0.002.
-    max_steps: most steps for each part.
+    step: first step. It grows by a factor of 1.2 after a success and halves after a failure, down
+        to 0.002.
+    max_steps: largest number of steps for each part.
     callback: called with the search after each step.
     """
     growth = start_growth(problem, first, step)

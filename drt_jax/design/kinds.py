@@ -1,4 +1,4 @@
-"""The kinds of variables of a lens, each an array over rows and terms."""
+"""The kinds of variables of a lens. Each kind reads and writes an array over rows and terms."""
 
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -20,12 +20,13 @@ class Kind(NamedTuple):
 
     rows: function of a lens, the rows that vary if none are named.
     allowed: function of a lens, the rows that may be named.
-    terms: function of a lens, the number of values per row.
+    terms: function of a lens, the number of values of each row.
     read: function of a lens, its array (rows, terms).
     write: function of a lens and an array (rows, terms), the lens with that array.
-    step: (power, factor), typical change factor x h^power for a semi-diameter h of the stop, mm; of
-        coefficients, the change of the sag at h, mm, and of a phase that of the phase, waves.
-    limits: least and largest meaningful value.
+    step: (power, factor). The typical change is factor h^power for a semi-diameter h of the stop,
+        mm. For coefficients it is the change of the sag at h, mm, and for a phase that of the
+        phase, waves.
+    limits: smallest and largest meaningful value.
     """
 
     rows: Callable[[Lens], list[int]]
@@ -38,8 +39,10 @@ class Kind(NamedTuple):
 
 
 def whole_numbers(what: str, given: Any) -> tuple[int, ...]:
-    """Numbers of surfaces and the like as a tuple. ValueError, which begins with `what`, unless
-    `given` is an iterable of whole numbers."""
+    """Numbers of surfaces and the like as a tuple of int.
+
+    ValueError, which begins with `what`, unless `given` is an iterable of whole numbers.
+    """
     numbers = given if isinstance(given, Iterable) and not isinstance(given, str) else [None]
     found = tuple(numbers)
     if all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in found):
@@ -58,7 +61,7 @@ def diffractive(lens: Lens) -> list[int]:
 
 
 def _phases(lens: Lens) -> Array:
-    """Coefficients of the phases, zeros on other surfaces."""
+    """Coefficients of the phases (S, K); zeros on surfaces without a phase."""
     phase: Any = lens.phase
     if phase is None:
         return jnp.zeros((0, 0))
@@ -67,20 +70,24 @@ def _phases(lens: Lens) -> Array:
 
 
 def _phase_terms(lens: Lens) -> int:
+    """Number of coefficients of a phase."""
     return _phases(lens).shape[1]
 
 
 def _with_phases(lens: Lens, array: Array) -> Lens:
+    """The lens with other coefficients (S, K) of its phases."""
     phase: Any = lens.phase
     own = dataclasses.replace(phase, coefficients=array[np.array(phase.surfaces)])
     return dataclasses.replace(lens, phase=own)
 
 
 def _all(lens: Lens) -> list[int]:
+    """All surfaces."""
     return list(range(lens.count))
 
 
 def _active(lens: Lens) -> list[int]:
+    """The active surfaces."""
     return list(lens.active)
 
 
@@ -94,8 +101,10 @@ def model_glasses(lens: Lens) -> list[int]:
 
 
 def _begins(lens: Lens) -> np.ndarray:
-    """Surface (S,) at which the medium behind each surface begins; a mirror, or a stop inside a
-    glass, continues the medium in front."""
+    """The surface (S,) at which the medium behind each surface begins.
+
+    A mirror, or a stop inside of a glass, continues the medium in front of it.
+    """
     found: list[int] = []
     for i in range(lens.count):
         same = i > 0 and lens.glasses[i] == lens.glasses[i + 1]
@@ -104,7 +113,7 @@ def _begins(lens: Lens) -> np.ndarray:
 
 
 def _finite(lens: Lens) -> list[int]:
-    """Surfaces with a clear aperture."""
+    """Surfaces with a finite semi-diameter."""
     return np.flatnonzero(np.isfinite(np.asarray(lens.semi_diameter)[:-1])).tolist()
 
 
@@ -114,7 +123,9 @@ def _placed(lens: Lens) -> list[int]:
 
 
 def _leaf(name: str) -> tuple[Callable, Callable]:
-    """Reader and writer of an array over surfaces; the reader returns zeros for None."""
+    """Reader and writer of an array over surfaces. The reader returns zeros if the array is
+    None.
+    """
 
     def read(lens: Lens) -> Array:
         array = getattr(lens, name)
@@ -130,15 +141,16 @@ def _leaf(name: str) -> tuple[Callable, Callable]:
     return read, write
 
 
-_WIDTH = {"tilt": 3, "decentre": 2}
+_WIDTH = {"tilt": 3, "decentre": 2}  # components in each row
 
 
 def _write_sensor(lens: Lens, array: Array) -> Lens:
+    """Writes the distance of the sensor from the last vertex."""
     return dataclasses.replace(lens, sensor=jnp.sum(lens.thickness) + array[0, 0])
 
 
 def _write_thickness(lens: Lens, array: Array) -> Lens:
-    """Writes thicknesses; the sensor keeps its distance from the last vertex."""
+    """Writes thicknesses. The sensor keeps its distance from the last vertex."""
     changed = dataclasses.replace(lens, thickness=array[:, 0])
     return _write_sensor(changed, back_distance(lens)[None, None])
 
@@ -161,18 +173,21 @@ def _glass(column: int) -> tuple[Callable, Callable]:
 
 
 def _one(lens: Lens) -> int:
+    """One term in each row."""
     return 1
 
 
 def _gaps(lens: Lens) -> list[int]:
+    """Surfaces with a surface behind them."""
     return list(range(lens.count - 1))
 
 
 def _terms(lens: Lens) -> int:
+    """Number of coefficients of a surface."""
     return lens.coefficients.shape[1]
 
 
-# As the keys of `KINDS`, which a test compares.
+# The keys of `KINDS`; a test compares them.
 VariableKind = Literal[
     "curvature", "conic", "coefficients", "thickness", "sensor", "index", "abbe", "tilt",
     "decentre", "semi_diameter", "phase"
@@ -197,20 +212,20 @@ KINDS: dict[str, Kind] = {
     "semi_diameter": Kind(
         _finite, _finite, _one, *_leaf("semi_diameter"), (1, 0.05), (1e-6, np.inf)
     ),
-    # 10 h waves at h: a tenth of what a plate of f/4 has in green light.
+    # 10 h waves at the height h, mm: a tenth of the phase of a plate of f/4 in green light.
     "phase": Kind(diffractive, diffractive, _phase_terms, _phases, _with_phases, (1, 10)),
 }
-# Kinds with the coefficients of a form.
+# Kinds that are coefficients of a form.
 SERIES = ("coefficients", "phase")
 
 
 def beam(lens: Lens) -> float:
-    """Semi-diameter of the stop, mm, a measure of the beam."""
+    """Semi-diameter of the stop, mm, as a measure of the size of the beam."""
     return float(np.asarray(lens.semi_diameter)[lens.stop])
 
 
 def step_of(lens: Lens, kind: str, row: int, term: int) -> float:
-    """Typical change of a variable, in its unit."""
+    """Typical change of a variable, in the units of the lens."""
     power, factor = KINDS[kind].step
     step = factor * beam(lens) ** power
     return step / lift_of(lens, kind, row, term, beam(lens)) if kind in SERIES else step
@@ -228,8 +243,13 @@ def _series(lens: Lens, kind: str, row: int) -> tuple[str, Shape]:
 
 
 def lift_of(lens: Lens, kind: str, row: int, term: int, away: float) -> float:
-    """Largest change of the sag, mm, or of the phase, waves, per unit of a coefficient at `away` mm
-    from the axis. kind: one of `SERIES`."""
+    """Largest change of the sag, mm, or of the phase, waves, for each unit of a coefficient.
+
+    It is the largest absolute derivative of the sag at 8 azimuths.
+
+    kind: one of `SERIES`.
+    away: distance from the axis, mm.
+    """
     name, shape = _series(lens, kind, row)
     angle, dtype = np.pi * np.arange(8) / 8, lens.curvature.dtype
     points = tuple(jnp.asarray(away * f(angle), dtype) for f in (np.cos, np.sin))
@@ -243,8 +263,11 @@ def lift_of(lens: Lens, kind: str, row: int, term: int, away: float) -> float:
 
 
 def word_terms(lens: Lens, kind: str, row: int) -> list[int]:
-    """Terms of a row that vary if none are named: all, except the coefficient of r^2 of a surface,
-    which the curvature replaces, or, if there is one, the norm radius."""
+    """Terms of a row that vary if none are named.
+
+    These are all terms, except for the coefficient of r^2 of a surface, which the curvature
+    replaces, or the norm radius if the form has one.
+    """
     count = KINDS[kind].terms(lens)
     if kind not in SERIES:
         return list(range(count))

@@ -1,12 +1,19 @@
 """Least squares by Levenberg and Marquardt's method within bounds, on exact Jacobians.
 
-Damping in units of column norms: More, The Levenberg-Marquardt algorithm (1978). Its size follows
-from the gain of each trial: Nielsen, Damping parameter in Marquardt's method (1999). A number at a
-bound is fixed there while the merit falls only beyond the bound.
+With the residuals r, the Jacobian J and the diagonal matrix D of the column norms of J, a step d
+solves
 
-Constraints c <= 0 enter as one-sided residuals max(0, c + shift). Each time the merit has settled,
-the remaining violation is added to the shift: the method of multipliers (Rockafellar 1973), which
-meets constraints exactly without large penalty weights.
+    (D^-1 J^T J D^-1 + damping I) D d = -D^-1 J^T r
+
+(damping in units of the column norms: More, The Levenberg-Marquardt algorithm, 1978). Let rho be
+the decrease of the sum of squares divided by the decrease that the linear model promises. After an
+accepted trial the damping is multiplied by max(1/3, 1 - (2 rho - 1)^3); after the first, second,
+third, ... rejected trial in a row by 2, 4, 8, ... (Nielsen, Damping parameter in Marquardt's
+method, 1999). A variable at a bound is fixed there while the merit falls only beyond the bound.
+
+A constraint c <= 0 enters as the one-sided residual max(0, c + shift). Each time the merit has
+settled, the shift is set to max(0, c + shift). This is the method of multipliers (Rockafellar
+1973), which meets constraints exactly without large penalty weights.
 """
 
 from collections.abc import Callable
@@ -18,23 +25,24 @@ from jax import Array
 
 from ..numerics import matmul, run_if, safe_divide
 
-_DAMPING, _MOST_DAMPING = 1e-3, 1e16
-_PARTS = (1.0, 0.5, 0.25, 0.1, 0.03)
+_DAMPING, _MOST_DAMPING = 1e-3, 1e16  # at the start, and where a search ends
+_PARTS = (1.0, 0.5, 0.25, 0.1, 0.03)  # fractions of a step of which the model chooses the best
 _SETS = 5  # updates of the active set (bounds and constraints) in one step
-# A merit has settled when the model promises a relative gain below `_COARSE`, or `_FINE` once
-# constraints are met. A search aims `_WITHIN` inside of its constraints, in their own units, so
-# that they are met although it only converges to them.
+# The merit has settled when the model promises a relative gain below `_COARSE`, or below `_FINE`
+# once constraints are met. A search only converges to its constraints, so it aims `_WITHIN` inside
+# of them, in their own units, in order to meet them.
 _COARSE, _FINE, _WITHIN = 1e-5, 1e-13, 1e-9
-_ROUNDS = 30
+_ROUNDS = 30  # largest number of shifts
 
 
 class Evaluation(NamedTuple):
-    """Evaluation of a function at a vector, such as that of a problem.
+    """Evaluation of a function, such as that of a problem, at a vector.
 
     residuals: (M,); the merit is the sum of their squares.
-    constraints: (L,), violations of the limits times their weights; met where 0 or less.
-    overlap: (), total overlap of surfaces within the beam, mm, a measure of an unphysical lens; inf
-        where a number is not finite.
+    constraints: (L,), violations of the limits times their weights; a limit is met where it is 0 or
+        less.
+    overlap: (), total overlap of surfaces within the beam, mm, as a measure of an unphysical lens;
+        inf where a number is not finite.
     failed: (), int32, number of failed rays.
     """
 
@@ -50,20 +58,20 @@ Function = Callable[[Array], Evaluation]
 class Search(NamedTuple):
     """State of a search for an optimum.
 
-    vector: (N,), best so far.
-    evaluation: evaluation of the vector.
+    vector: (N,), best vector so far.
+    evaluation: evaluation of that vector.
     residuals: (M + L,), residuals, then the shifted constraints.
     jacobian: (M + L, N), their derivatives.
     total: (), sum of the squares of residuals and of violated constraints.
     scale: (N,), column norms of the Jacobian.
     damping: (), damping of the next step.
     growth: (), factor of the damping after a rejected trial.
-    gain: (), gain that the model promised for the last trial, relative to the total.
+    gain: (), gain that the linear model promised for the last trial, relative to the total.
     jacobians, steps: (), int32, numbers of Jacobians and of trials.
     stale: (), bool, True if the vector must be evaluated first: at the start, and after a shift.
     shift: (L,), shifts of the constraints.
     stiffness: (), factor of the constraints.
-    rounds: (), int32, number of shifts.
+    rounds: (), int32, number of times that constraints were shifted.
     fine: (), bool, True if constraints are met and the search only refines.
     done: (), bool, True if the search has ended.
     """
@@ -98,7 +106,9 @@ class Search(NamedTuple):
 
     @property
     def score(self) -> Array:
-        """Merit plus the squares of the violations, (); inf for an unphysical lens."""
+        """Merit plus the squares of the violations of constraints, (); inf for an unphysical
+        lens.
+        """
         exceeded = jnp.maximum(self.evaluation.constraints, 0)
         score = self.merit + jnp.sum(exceeded**2, axis=-1)
         physical = jnp.isfinite(score) & jnp.isfinite(self.evaluation.overlap)
@@ -106,7 +116,11 @@ class Search(NamedTuple):
 
 
 def init(function: Function, vector: Array) -> Search:
-    """The state of a search before the first step from a vector (N,); evaluates nothing."""
+    """The state of a search before the first step. Evaluates nothing.
+
+    function: from a vector (N,) to its evaluation.
+    vector: (N,), start.
+    """
     values = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(function, vector))
     count, dtype = values.residuals.size + values.constraints.size, vector.dtype
     one, zero, no = jnp.ones((), dtype), jnp.zeros((), jnp.int32), jnp.bool_(False)
@@ -135,10 +149,11 @@ def step(function: Function, search: Search, low: Array, high: Array) -> Search:
     """One trial of a search; none if the search is done.
 
     A trial is accepted if the total falls and the overlap does not grow; then its Jacobian is
-    computed. The search is done when the model promises a relative gain below 1e-13 or the damping
-    is at its limit, and constraints are met or were shifted 30 times.
+    computed. The search is done when constraints are met, or were shifted 30 times, and the model
+    promises a relative gain below 1e-13 or the damping is above 1e16.
 
     function: from a vector (N,) to its evaluation.
+    search: the state before the trial.
     low, high: (N,), bounds of the vector.
     """
     new = _shifted(_tried(function, search, low, high))
@@ -146,7 +161,7 @@ def step(function: Function, search: Search, low: Array, high: Array) -> Search:
 
 
 def _tried(function: Function, search: Search, low: Array, high: Array) -> Search:
-    """One trial, and its Jacobian if it is accepted."""
+    """The state after one trial, with a new Jacobian if the trial is accepted."""
 
     def residuals_of(vector: Array) -> tuple[Array, Evaluation]:
         values = function(vector)
@@ -156,14 +171,14 @@ def _tried(function: Function, search: Search, low: Array, high: Array) -> Searc
     sided = _sided(search)
     move, promised = _proposal(search, low, high)
     vector = jnp.where(search.stale, search.vector, jnp.clip(search.vector + move, low, high))
-    residuals, push, values = jax.linearize(residuals_of, vector, has_aux=True)
+    residuals, derivative, values = jax.linearize(residuals_of, vector, has_aux=True)
     total = jnp.sum(_counting(residuals, sided) ** 2)
     finite = jnp.isfinite(total) & jnp.isfinite(values.overlap)
     better = finite & (total < search.total) & (values.overlap <= search.evaluation.overlap)
     taken = search.stale | better
     ratio = safe_divide(search.total - total, promised)
     units = jnp.eye(vector.size, dtype=vector.dtype)
-    jacobian = run_if(taken, lambda _: jax.vmap(push, out_axes=1)(units), search.jacobian)
+    jacobian = run_if(taken, lambda _: jax.vmap(derivative, out_axes=1)(units), search.jacobian)
     jacobian = jnp.where(jnp.isfinite(jacobian), jacobian, 0)
     shrink = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
     damping = jnp.where(better, search.damping * shrink, search.damping * search.growth)
@@ -188,7 +203,9 @@ def _tried(function: Function, search: Search, low: Array, high: Array) -> Searc
 
 
 def _shifted(search: Search) -> Search:
-    """The method of multipliers: shifts violated constraints once the merit has settled."""
+    """Shifts violated constraints once the merit has settled (method of multipliers), and decides
+    whether the search is done.
+    """
     constraints = search.evaluation.constraints
     small = ((search.gain >= 0) & (search.gain <= _FINE)) | (search.total <= 0)
     ended = small | (search.damping > _MOST_DAMPING)
@@ -206,20 +223,24 @@ def _shifted(search: Search) -> Search:
 
 
 def _counting(residuals: Array, sided: Array) -> Array:
-    """The residuals, with 0 for one-sided residuals below 0."""
+    """The residuals that count: one-sided residuals below 0 are set to 0."""
     return jnp.where(sided, jnp.maximum(residuals, 0), residuals)
 
 
 def _sided(search: Search) -> Array:
-    """Mask (M + L,) of the residuals that belong to constraints."""
+    """Mask (M + L,) of the one-sided residuals, which belong to constraints."""
     count = search.residuals.shape[-1]
     return jnp.arange(count) >= count - search.shift.shape[-1]
 
 
 def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
-    """The damped step within the bounds (N,), and the decrease of the total that the model
-    promises. The end of the step determines the active set: the constraints that count and the
-    numbers that are fixed at a bound."""
+    """The damped step within the bounds (N,), and the decrease of the total that the linear model
+    promises.
+
+    Which constraints count, and which variables are fixed at a bound, is decided by the model at
+    the end of the step. Since this depends on the step, the step is computed five times, each time
+    with the active set of the step before.
+    """
     y, sided = search.vector, _sided(search)
     scale = jnp.where(search.scale > 0, search.scale, 1)
     move, fixed = jnp.zeros_like(y), jnp.zeros(y.shape, bool)
@@ -230,7 +251,7 @@ def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
         square = matmul(search.jacobian.T, counts[:, None] * search.jacobian)
         if not k:
             fixed = ((y <= low) & (gradient > 0)) | ((y >= high) & (gradient < 0))
-        # In units of the column norms; fixed numbers keep their move.
+        # The equations in units of the column norms. Fixed variables keep their move.
         free = (~fixed).astype(y.dtype)
         matrix = square / scale[:, None] / scale[None] * free[:, None] * free[None]
         matrix = matrix + jnp.diag(search.damping * free + (1 - free))
@@ -240,7 +261,7 @@ def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
         fixed = fixed | (y + move < low) | (y + move > high)
         move = jnp.clip(y + move, low, high) - y
     move = jnp.where(jnp.isfinite(move), move, 0)
-    # If the active set cycles, a part of the step is better than the whole.
+    # If the active set did not converge, a part of the step may be better than the whole step.
     parts = jnp.asarray(_PARTS, y.dtype)
     model = search.residuals[:, None] + matmul(search.jacobian, move)[:, None] * parts[None]
     totals = jnp.sum(_counting(model, sided[:, None]) ** 2, axis=0)
@@ -249,7 +270,7 @@ def _proposal(search: Search, low: Array, high: Array) -> tuple[Array, Array]:
 
 
 def promised_gain(search: Search, low: Array, high: Array) -> Array:
-    """Relative gain (), as the model promises it for a step with little damping."""
+    """Relative gain (), as the linear model promises it for a step with a damping of 1e-3."""
     search = search._replace(damping=jnp.full_like(search.damping, _DAMPING))
     gain = _proposal(search, low, high)[1]
     return safe_divide(jnp.abs(gain), search.total)

@@ -15,10 +15,10 @@ _Side = Literal["low", "high"]
 
 
 class Limit(NamedTuple):
-    """One limit of one value; its text is one complete line.
+    """One limit of one value. Its text is one complete line.
 
     kind: kind of the operand.
-    where: name of the value, such as "surface 7, zone 1"; empty if the operand has one value.
+    where: name of the value, such as "surface 7, zone 1"; empty if the operand has only one value.
     side: "low" or "high".
     bound: the limit, in the unit of the values.
     excess: violation in that unit; negative if the limit is met.
@@ -50,8 +50,10 @@ def limits_of(
 ) -> list[Limit]:
     """The limits of operands by name.
 
-    counts: numbers of "fields", "wavelengths", "distances" and of components, "xy".
-    sizes: number of constraints of each operand.
+    operands: operands of a problem.
+    lens: the lens, which names the surfaces.
+    counts: numbers of "fields", "wavelengths", "distances", and of components "xy".
+    sizes: number of constraints of each operand with a user's function; other numbers are not used.
     constraints: (L,), see `Operand.constraints`.
     """
     found: list[Limit] = []
@@ -65,7 +67,9 @@ def limits_of(
 
 
 def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> list[str]:
-    """Names of the `size` values of an operand, in their order."""
+    """Names of the values of an operand, in their order. size: number of values of a user's
+    function.
+    """
     known = kind_of(operand.kind)
     parts: list[Iterable[str]] = []
     for axis in known.axes:
@@ -78,8 +82,8 @@ def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> l
         elif axis == "xy":
             parts.append(["x", "y"] if counts["xy"] == 2 else [""])
         elif axis == "surfaces":
-            named, there = operand.surfaces, known.rows or known.places
-            surfaces = there(lens) if there else []
+            named, surfaces_of = operand.surfaces, known.rows or known.places
+            surfaces = surfaces_of(lens) if surfaces_of else []
             parts.append([f"surface {k}" for k in surfaces if not named or k in named])
         else:
             name = "wavelengths" if axis in ("middle", "later") else axis

@@ -16,11 +16,11 @@ from .field_rays import FieldRays
 from .kinds import whole_numbers
 from .values import OPERANDS, kind_of
 
-# What an operand may name.
+# Arguments of an operand that select values by their numbers.
 _NUMBERS = ("fields", "wavelengths", "distances", "surfaces")
 _NEEDED = "missing; give the frequency of an mtf in cycles/mm, the radius of encircled_energy in mm"
 
-# As the keys of `OPERANDS`, which a test compares.
+# The keys of `OPERANDS`; a test compares them.
 OperandName = Literal[
     "spot", "spot_of_colours", "spot_chief", "rms_spot", "centroid", "path_difference",
     "rms_wavefront", "focal_length", "effective_focal_length", "back_focal_distance",
@@ -35,16 +35,19 @@ OperandFunction = Callable[[Lens, FieldRays], Array]
 @leaves("target", "low", "high", "weight", "at")
 @dataclasses.dataclass(frozen=True)
 class Operand:
-    """One operand of a merit function: a target, or limits that are met exactly. A pytree: target,
-    limits, weight and `at` are leaves; in a problem, a limit that is not given is None.
+    """One operand of a merit function: a target, or limits that are met exactly.
 
-    kind: one of `OPERANDS`, see values.py for their meaning and units; or a function of a lens and
-        its `FieldRays` that returns an array.
+    An operand is a pytree: target, limits, weight and `at` are leaves. In a problem, a limit that
+    is not given is None.
+
+    kind: one of `OPERANDS` (values.py describes their meaning and units), or a function of a lens
+        and its `FieldRays` that returns an array.
     target: target of the values, in their unit.
     low, high: limits instead of a target, in the unit of the values.
-    weight: factor of the difference to the target, or of the violation; 0 turns the operand off.
-    fields, wavelengths, distances, surfaces: numbers of those of the problem or lens, from 0; ()
-        for all.
+    weight: factor of the difference from the target, or of the violation of a limit; 0 turns the
+        operand off.
+    fields, wavelengths, distances, surfaces: numbers of those of the problem or lens, counted from
+        0; () for all.
     vignetting: for spots, wavefronts and functions. False counts clipped rays as if they passed, so
         that clipping light does not lower the merit.
     at: of an mtf, the frequency on the sensor, cycles/mm; of encircled_energy, the radius, mm.
@@ -75,8 +78,8 @@ class Operand:
         low = -math.inf if self.low is None else self.low
         high = math.inf if self.high is None else self.high
         if (self.at is None) == bool(known.at):
-            said = _NEEDED if known.at else "is of mtf and encircled_energy; leave it out"
-            raise ValueError(f"{what}: at: {said}")
+            reason = _NEEDED if known.at else "is of mtf and encircled_energy; leave it out"
+            raise ValueError(f"{what}: at: {reason}")
         if not concrete((low, high, self.weight, self.target, self.at)):
             return
         if self.at is not None and not 0 < self.at < math.inf:
@@ -108,7 +111,7 @@ class Operand:
 
     @property
     def sides(self) -> list[Literal["low", "high"]]:
-        """The limits that are given."""
+        """The limits that are given, "low" before "high"."""
         return [side for side in ("low", "high") if _is_limit(getattr(self, side))]
 
     @property
@@ -117,41 +120,49 @@ class Operand:
         return bool(self.sides)
 
     def check(self, lens: Lens, counts: dict[str, int]) -> None:
-        """Raises ValueError for a number that the lens or problem does not have. counts: numbers of
-        "fields", "wavelengths" and "distances" of the problem."""
+        """Raises ValueError for a number that the lens or the problem does not have.
+
+        counts: numbers of "fields", "wavelengths" and "distances" of the problem.
+        """
         what = f"operands: {self.name}"
         places = kind_of(self.kind).places
-        there = {name: list(range(count)) for name, count in counts.items()}
-        there["surfaces"] = [] if places is None else places(lens)
+        numbers = {name: list(range(count)) for name, count in counts.items()}
+        numbers["surfaces"] = [] if places is None else places(lens)
         for name in _NUMBERS:
             for k in getattr(self, name):
-                if k not in there[name]:
-                    some = ", ".join(map(str, there[name])) or "none"
+                if k not in numbers[name]:
+                    some = ", ".join(map(str, numbers[name])) or "none"
                     raise ValueError(f"{what}: {name}: no number {k}; there are {some}")
-        if places is not None and not there["surfaces"]:
+        if places is not None and not numbers["surfaces"]:
             raise ValueError(f"{what}: the lens has no surface with one; leave it out")
-        if self.kind == "lateral_colour" and len(self.wavelengths or there["wavelengths"]) < 2:
+        if self.kind == "lateral_colour" and len(self.wavelengths or numbers["wavelengths"]) < 2:
             raise ValueError(f"{what}: wavelengths: needs two or more; leave it out")
 
     def placed(self, lens: Lens) -> "Operand":
-        """The operand for a problem: numbers become arrays in the dtype of the lens, and surfaces
-        that depend on numbers of the lens are named."""
+        """The operand for a problem.
+
+        Its numbers become arrays in the dtype of the lens. Surfaces are filled in where they depend
+        on numbers of the lens.
+        """
         surfaces, places = self.surfaces, kind_of(self.kind).places
         if self.kind == "glass_map" and not surfaces and places:
             surfaces = tuple(places(lens))
         placed = dataclasses.replace(self, surfaces=surfaces)
         for name in ("target", "low", "high", "weight", "at"):
             number = getattr(self, name)
-            there = name not in ("low", "high", "at") or _is_limit(number)
-            array = jnp.asarray(number, lens.curvature.dtype) if there else None
+            given = name not in ("low", "high", "at") or _is_limit(number)
+            array = jnp.asarray(number, lens.curvature.dtype) if given else None
             object.__setattr__(placed, name, array)
         return placed
 
     def values(self, lens: Lens, rays: FieldRays) -> Array:
-        """The values (K,) of a lens, which are compared with the target or limits."""
+        """The values (K,) of a lens, which are compared with the target or the limits."""
         return jnp.ravel(self._values(lens, rays))
 
     def _values(self, lens: Lens, rays: FieldRays) -> Array:
+        """The values in the shape of the kind, with the selected fields, distances, wavelengths and
+        surfaces.
+        """
         kind = kind_of(self.kind)
         if not self.vignetting:
             rays = rays.unvignetted()
@@ -160,16 +171,19 @@ class Operand:
         waves = self.wavelengths
         if "middle" in kind.axes and not waves:
             waves = (len(rays.wavelengths) // 2,)
-        given = () if self.at is None else (self.at,)
-        values = kind.function(lens, rays.select(self.fields, self.distances, waves), *given)
+        arguments = () if self.at is None else (self.at,)
+        values = kind.function(lens, rays.select(self.fields, self.distances, waves), *arguments)
         places = kind.rows or kind.places
         if not self.surfaces or places is None:
             return values
         return values[np.array([k for k, i in enumerate(places(lens)) if i in self.surfaces])]
 
     def residuals(self, lens: Lens, rays: FieldRays, field_weights: Array | None = None) -> Array:
-        """Residuals (K,), (0,) for limits. field_weights: (F,), factors of the squares of each
-        field; None for 1. They do not apply to a user's function."""
+        """Residuals (K,): weight times (value - target); (0,) for limits.
+
+        field_weights: (F,), factors of the squares of the residuals of each field; None for 1. They
+            do not apply to a user's function.
+        """
         if self.limits:
             return jnp.zeros(0, lens.curvature.dtype)
         values, axes = self._values(lens, rays), kind_of(self.kind).axes
@@ -183,7 +197,9 @@ class Operand:
         return jnp.ravel(found)
 
     def constraints(self, lens: Lens, rays: FieldRays) -> Array:
-        """Violations of the limits times the weight, negative where met; (0,) for a target."""
+        """Violations of the limits times the weight, negative where a limit is met; (0,) for a
+        target.
+        """
         if not self.limits:
             return jnp.zeros(0, lens.curvature.dtype)
         values = self.values(lens, rays)

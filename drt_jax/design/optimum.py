@@ -16,13 +16,15 @@ from .least_squares import Search, init, promised_gain, step
 from .limits import Limit
 from .problem import Problem, quick
 
-# Violations below `_NEAR` that remain when the steps are used up are removed in at most `_MENDING`
-# more steps, in which constraints count `_STIFF` times.
+# Violations of at most `_NEAR` that remain at the end are removed in at most `_MENDING` more steps,
+# in which constraints are multiplied by `_STIFF`.
 _NEAR, _MENDING, _STIFF = 1e-3, 20, 1e4
-# A search has converged if the relative gain promised for a step with little damping is at most:
+# A search has converged if the relative gain that the linear model promises for a step with little
+# damping is at most `_LEFT`.
 _LEFT = 1e-6
 _promised_gain = jax.jit(promised_gain)
-# Largest change of a variable, in units of its scale.
+# A limit does not depend on the variables if none of them meets it by a change of `_FAR` times its
+# scale.
 _FAR = 1e6
 
 
@@ -35,16 +37,16 @@ class Optimum(NamedTuple):
     lens: the best lens.
     vector: (N,), its vector.
     merit: sum of the squares of the residuals.
-    score: merit plus the squares of the violations.
+    score: merit plus the squares of the violations of limits.
     max_violation: largest violation of a limit times its weight; 0 if all are met.
     limits: all limits by name, the largest violation first, each in its own unit.
-    ended: why the search ended. "converged": all limits are met and there is next to no gain left.
-        "target": the target merit is reached. "steps": the steps are used up. "limits": the limits
-        contradict each other. "stuck": no trial is better, for instance because surfaces touch,
-        which a limit such as air_edge prevents.
+    ended: why the search ended. "converged": all limits are met, and the linear model predicts a
+        relative decrease of at most 1e-6. "target": the target merit is reached. "steps": the steps
+        are used up. "limits": the limits contradict each other. "stuck": no trial is better, for
+        instance because surfaces touch, which a limit such as air_edge prevents.
     history: (T, 3), merit, largest violation and number of Jacobians after each trial.
     seconds: time of all trials except the first.
-    first: time of the first trial, with compilation if needed, s.
+    first: time of the first trial, with compilation if it is needed, s.
     """
 
     lens: Lens
@@ -60,12 +62,14 @@ class Optimum(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """True at an optimum that meets all limits."""
+        """True if the search converged to an optimum that meets all limits."""
         return self.ended == "converged"
 
     @property
     def worst_limit(self) -> Limit | None:
-        """The limit with the largest violation or, if all are met, the nearest; None without."""
+        """The limit with the largest violation; if all are met, the one nearest to its bound; None
+        without limits.
+        """
         return self.limits[0] if self.limits else None
 
     @property
@@ -88,9 +92,13 @@ def step_problem(problem: Problem, search: Search) -> Search:
 take_step = jit(step_problem, LARGE)
 
 
-def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem, Search]:
-    """The problem and search to continue with: `tried`, whose rays are only aimed; or, if the full
-    ray search of `problem` finds more rays at the best vector, that problem, evaluated again."""
+def _with_full_search(problem: Problem, tried: Problem, search: Search) -> tuple[Problem, Search]:
+    """The problem and the search to continue with.
+
+    `tried` is the problem whose rays are only aimed. If the full ray search of `problem` finds more
+    rays at the best vector, the search continues with `problem`, and the vector is evaluated again;
+    otherwise with `tried`.
+    """
     failed = int(search.evaluation.failed)
     if tried.solver is problem.solver or not failed or int(problem.failed(search.vector)) == failed:
         return tried, search
@@ -99,7 +107,10 @@ def _searched(problem: Problem, tried: Problem, search: Search) -> tuple[Problem
 
 
 def _mended(problem: Problem, search: Search) -> Search:
-    """A search near another that meets all limits; the other if there is none."""
+    """Continues a search with stiff constraints until all limits are met.
+
+    Returns that search, or the original one if the limits are not met within 20 steps.
+    """
     stiff = search._replace(
         stale=jnp.bool_(True),
         shift=jnp.zeros_like(search.shift),
@@ -114,16 +125,16 @@ def _mended(problem: Problem, search: Search) -> Search:
 
 
 def _refuse_fixed(problem: Problem, search: Search) -> None:
-    """Raises ValueError for a limit that the start violates and no variable changes."""
+    """Raises ValueError for a limit that the start violates and that no variable changes."""
     excess = np.asarray(search.evaluation.constraints)
     slopes = np.asarray(search.jacobian)[-len(excess) or len(search.jacobian) :]
     if np.any((excess > 0) & (np.max(np.abs(slopes), axis=1, initial=0) * _FAR < excess)):
-        beside = take_step(problem, init_problem(problem, problem.elsewhere(search.vector)))
-        problem.refuse_fixed(excess, beside.evaluation.constraints)
+        nearby = take_step(problem, init_problem(problem, problem.nearby_vector(search.vector)))
+        problem.refuse_fixed(excess, nearby.evaluation.constraints)
 
 
-def _refuse_unjudged(search: Search) -> None:
-    """Raises ValueError for a search without a lens that can be evaluated."""
+def _check_start(search: Search) -> None:
+    """Raises ValueError if no lens of the search could be evaluated."""
     if not bool(jnp.isfinite(search.evaluation.overlap)):
         raise ValueError(
             "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
@@ -132,6 +143,7 @@ def _refuse_unjudged(search: Search) -> None:
 
 
 def _why(problem: Problem, search: Search, target_merit: float) -> Ended:
+    """Why a search ended, see `Optimum.ended`."""
     if target_merit and float(search.score) <= target_merit:
         return "target"
     if not bool(search.done):
@@ -149,17 +161,20 @@ def optimise(
     callback: Callable[[Search], None] = lambda search: None,
     target_merit: float = 0.0,
 ) -> Optimum:
-    """Searches for the optimum near a vector. Read `Optimum.converged` and `Optimum.ended`. A few
-    more steps remove small violations that remain when the steps are used up.
+    """Searches for the optimum near a vector by Levenberg and Marquardt's method.
 
+    Read `Optimum.converged` and `Optimum.ended`. Small violations of limits that remain at the end
+    are removed by a few more steps.
+
+    problem: the design problem.
     vector: (N,), start of the variables; None for that of the problem.
     max_steps: largest number of trials.
     callback: called with the search after each trial.
     target_merit: the search ends once its score is at most this; 0 to search for the optimum.
 
     One compiled program serves all problems that differ only in numbers or names. ValueError if the
-    start cannot be evaluated (no ray of a field passes, or a number is not finite), and for a limit
-    that the start violates and no variable changes.
+    start cannot be evaluated (no ray of a field passes, or a number is not finite), for a limit
+    that the start violates and that no variable changes, and inside of `jax.jit`.
     """
     if not concrete((problem, vector)):
         raise ValueError(
@@ -175,16 +190,16 @@ def optimise(
     _refuse_fixed(tried, search)
     history = [[search.merit, search.max_violation, search.jacobians]]
     callback(search)
-    tried, search = _searched(problem, tried, search)
+    tried, search = _with_full_search(problem, tried, search)
     for _ in range(max_steps - 1):
         search = take_step(tried, search)
         history.append([search.merit, search.max_violation, search.jacobians])
         callback(search)
         if search.jacobians > history[-2][2]:  # a better lens
-            tried, search = _searched(problem, tried, search)
+            tried, search = _with_full_search(problem, tried, search)
         if bool(search.done) or float(search.score) <= target_merit:
             break
-    _refuse_unjudged(search)
+    _check_start(search)
     why = _why(tried, search, target_merit)
     if why != "target" and 0 < float(search.max_violation) <= _NEAR:
         search = _mended(tried, search)

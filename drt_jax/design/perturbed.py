@@ -36,12 +36,12 @@ _MINUTE = math.pi / 180 / 60
 class PerturbedLens:
     """A lens with P deviations.
 
-    lens: the nominal lens, with all arrays that deviations need.
+    lens: the nominal lens, with all arrays that the deviations need.
     beam_radius: (S,), radius of the beam footprint on each surface, mm.
     sizes: (P,), largest deviations, in the units of `Tolerance`.
 
     Static:
-    deviations: P of them; the components x and y of one part follow each other.
+    deviations: the P deviations; the components x and y of one part follow each other.
     spans: first and last surface of each element.
     groups: index of each element in `lens.elements`.
     """
@@ -59,9 +59,12 @@ class PerturbedLens:
     ) -> "PerturbedLens":
         """The lens with the deviations that tolerances allow.
 
+        lens: the nominal lens.
         beam_radius: (S,), mm, for instance that of `Problem.beam_radius`.
+        tolerances: the tolerances.
 
-        ValueError for a part that does not exist (it lists those that do) or is named twice.
+        ValueError for a part that does not exist (the message lists those that do) or is named
+        twice.
         """
         if np.shape(beam_radius) != (lens.count,):
             raise ValueError(
@@ -80,34 +83,41 @@ class PerturbedLens:
 
     @property
     def parts(self) -> list[list[int]]:
-        """Indices of the deviations of each part: one, or the components x and y."""
+        """Indices of the deviations of each part: one index, or those of the components x and y."""
         parts: dict[tuple, list[int]] = {}
         for k, error in enumerate(self.deviations):
             parts.setdefault(error[:2], []).append(k)
         return list(parts.values())
 
     def lens_of(self, perturbation: Array) -> Lens:
-        """The lens with a perturbation (P,): deviations in units of their largest. Works in `jit`,
-        `vmap` and under differentiation."""
+        """The lens with a perturbation.
+
+        Works in `jit`, `vmap` and under differentiation.
+
+        perturbation: (P,), deviations in units of their largest.
+        """
         lens = self.lens
         found: dict[str, list[tuple[Deviation, Array]]] = {}
         for k, error in enumerate(self.deviations):
             found.setdefault(error.kind, []).append((error, perturbation[k] * self.sizes[k]))
-        for kind, some in found.items():
-            places = np.array([error.place for error, _ in some])
-            axes = np.array([error.axis for error, _ in some])
-            lens = self._off(lens, kind, places, axes, jnp.stack([by for _, by in some]))
+        for kind, own in found.items():
+            places = np.array([error.place for error, _ in own])
+            axes = np.array([error.axis for error, _ in own])
+            lens = self._deviated(lens, kind, places, axes, jnp.stack([by for _, by in own]))
         return lens
 
-    def _off(self, lens: Lens, kind: str, at: np.ndarray, axis: np.ndarray, by: Array) -> Lens:
+    def _deviated(self, lens: Lens, kind: str, at: np.ndarray, axis: np.ndarray, by: Array) -> Lens:
+        """The lens with deviations `by` of one kind, at the places `at` and along the axes
+        `axis`.
+        """
         replace, own = dataclasses.replace, self.lens
         if kind == "radius":
             part = 1 / (1 + by / 100) - 1
-            return _bent(lens, at, own.curvature[at] * part, x_curvatures(own, at) * part)
+            return _curved(lens, at, own.curvature[at] * part, x_curvatures(own, at) * part)
         if kind in ("fringes", "irregularity"):
             bend = by * _FRINGE / _rise(own, at, self.beam_radius)
             both = (bend, bend) if kind == "fringes" else (bend / 2, -bend / 2)
-            return _bent(lens, at, *both)
+            return _curved(lens, at, *both)
         if kind == "thickness":
             gap = lens.thickness.at[at].add(by)
             return replace(lens, thickness=gap, sensor=lens.sensor + jnp.sum(by))
@@ -132,8 +142,11 @@ class PerturbedLens:
 def _with_elements(
     lens: Lens, spans: tuple[tuple[int, int], ...], kinds: set[str]
 ) -> tuple[Lens, tuple[int, ...]]:
-    """The same lens with a group for each element, and the indices of these groups; unchanged if no
-    deviation moves an element. Groups that the lens has stay, inside or around them."""
+    """The same lens with a group for each element, and the indices of these groups.
+
+    The lens is unchanged if no deviation moves an element. Groups that the lens already has are
+    kept, inside of the new ones or around them.
+    """
     if not any(KINDS[kind].whole == "element" for kind in kinds):
         return lens, ()
     zero = jnp.zeros((len(spans), 3), lens.curvature.dtype)
@@ -169,8 +182,10 @@ def _with_cylinders(lens: Lens) -> Lens:
     return dataclasses.replace(lens, coefficients=wide, forms=forms)
 
 
-def _bent(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
-    """The lens with curvatures of surfaces `at` changed, and those along x by `across`."""
+def _curved(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
+    """The lens with the curvatures of surfaces `at` changed by `by`, and those along x by
+    `across`.
+    """
     own = np.array([lens.forms[i] in WITH_X for i in at])
     coefficients = lens.coefficients
     if own.any():
@@ -180,8 +195,11 @@ def _bent(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
 
 
 def _rise(lens: Lens, at: np.ndarray, beam_radius: Array) -> Array:
-    """Displacement of surfaces `at` along the normal at the rim of the beam, mm per 1/mm of
-    curvature along y."""
+    """Displacement of surfaces `at` along the normal at the rim of the beam, mm for each 1/mm of
+    curvature along y.
+
+    It is d(sag)/d(curvature) / sqrt(1 + slope^2).
+    """
     shape = jax.tree.map(lambda a: a[..., at], lens.shape)
     forms, zero = tuple(lens.forms[i] for i in at), jnp.zeros(len(at), lens.curvature.dtype)
 
@@ -196,10 +214,10 @@ def _rise(lens: Lens, at: np.ndarray, beam_radius: Array) -> Array:
 
 
 def _medium(lens: Lens, nominal: Dispersion, kind: str, at: np.ndarray, by: Array) -> Dispersion:
-    """Dispersion with a change of nd of media `at`, or of vd by per cent at constant nd.
+    """Dispersion with a change of nd of the media `at`, or of vd by per cent at constant nd.
 
-    For a glass with a formula, n^2 changes by a constant, or by a term in 1/L^2, that gives this
-    change at the d line, or between the F and C lines.
+    For a glass with a dispersion formula, n^2 changes by a constant that gives the change at the d
+    line, or by a term in 1/L^2 (L the wavelength) that gives the change of n_F - n_C.
     """
     constants, model = lens.dispersion, lens.dispersion.model
     own = jnp.zeros(len(at), bool)

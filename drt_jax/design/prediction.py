@@ -16,17 +16,19 @@ from .problem import Problem, quick
 
 # Order of a prediction: gradient of q, Gauss-Newton part of its Hessian, or whole Hessian.
 Order = Literal["first", "rays", "second"]
-_ASCENTS = 16  # eigenvectors from which ascents start, in both directions
+_ASCENTS = 16  # number of eigenvectors from which ascents start, in both directions
 
 
 class Predicted(NamedTuple):
-    """Model of q, the mean squared RMS radius, mm^2, as a function of deviations in units of their
-    largest.
+    """A quadratic model of q, the mean squared RMS radius of the spots, mm^2.
+
+    q(p) = nominal + gradient.p + p^T H p / 2, where p are deviations in units of their largest.
 
     nominal: (), q without deviations.
-    gradient: (P,), first derivatives.
-    gauss: (P, P), Gauss-Newton part of the Hessian, 2 J^T J.
-    hessian: (P, P), second derivatives.
+    gradient: (P,), first derivatives of q.
+    gauss: (P, P), Gauss-Newton part of the Hessian, 2 J^T J, with J the derivatives of the
+        residuals.
+    hessian: (P, P), second derivatives of q.
     moves: (C,), compensation without deviations, see `AsBuilt`.
     move_slopes: (P, C), derivatives of the compensation.
     """
@@ -40,14 +42,20 @@ class Predicted(NamedTuple):
 
     def matrix(self, order: Order) -> Array:
         """Matrix (P, P) of an order: 0 for "first", `gauss` for "rays", `hessian` for "second".
-        ValueError for another order."""
+
+        ValueError for another order.
+        """
         require_one_of("order", order, get_args(Order))
         if order == "first":
             return 0 * self.hessian
         return self.gauss if order == "rays" else self.hessian
 
     def at(self, perturbation: Array | np.ndarray, order: Order) -> Array:
-        """q (K,) for deviations (K, P); below 0 where the model fails. ValueError as `matrix`."""
+        """q (K,) for deviations (K, P); below 0 where the model fails.
+
+        perturbation: (K, P), in units of the largest deviations.
+        order: as in `matrix`. ValueError for another order.
+        """
         return (
             self.nominal
             + matmul(perturbation, self.gradient)
@@ -55,9 +63,14 @@ class Predicted(NamedTuple):
         )
 
     def moments(self, variances: Array, order: Order) -> tuple[Array, Array]:
-        """Mean and standard deviation of q, () each, for independent deviations with variances
-        (P,). The mean is exact for the quadratic model; the standard deviation holds for normal
-        deviations (root sum of squares). ValueError as in `matrix`."""
+        """Mean and standard deviation of q, () each, for independent deviations.
+
+        The mean is exact for the quadratic model. The standard deviation is exact for the quadratic
+        model if deviations are normal; without the matrix it is the root sum of squares.
+
+        variances: (P,), variances of the deviations.
+        order: as in `matrix`. ValueError for another order.
+        """
         matrix = self.matrix(order)
         mean = self.nominal + matmul(jnp.diag(matrix), variances) / 2
         pairs = matmul(matmul(variances, matrix**2), variances) / 2
@@ -65,16 +78,26 @@ class Predicted(NamedTuple):
 
 
 def predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
-    """Predicts q from exact first and second derivatives. ValueError as in `as_built`."""
+    """Predicts q from exact first and second derivatives by deviations.
+
+    problem: gives the fields, wavelengths and pupil rule.
+    perturbed: the lens and its deviations.
+    compensator: as in `as_built`.
+
+    ValueError as in `as_built`.
+    """
     check(problem, perturbed.lens, compensator)
     if not concrete((problem, perturbed)):
         return _predict(problem, perturbed, compensator)
     found = _predict(quick(problem), perturbed, compensator)
-    # What aiming does not find, the full search may.
+    # The full search may find rays that aiming does not find.
     return found if bool(jnp.isfinite(found.nominal)) else _predict(problem, perturbed, compensator)
 
 
 def _predict_all(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
+    """The body of `predict`: J from one linearised trace, the Hessian by forward over reverse
+    mode.
+    """
     zero = jnp.zeros_like(perturbed.sizes)
     units = jnp.eye(len(zero), dtype=zero.dtype)
 
@@ -87,8 +110,8 @@ def _predict_all(problem: Problem, perturbed: PerturbedLens, compensator: Compen
             compensated(problem, perturbed.lens_of(perturbation), compensator)[0].squares
         )
 
-    (offsets, moves), push, squares = jax.linearize(rays, zero, has_aux=True)
-    derivatives, slopes = jax.lax.map(push, units)
+    (offsets, moves), derivative, squares = jax.linearize(rays, zero, has_aux=True)
+    derivatives, slopes = jax.lax.map(derivative, units)
     hessian = jax.lax.map(lambda unit: jax.jvp(jax.grad(measure), (zero,), (unit,))[1], units)
     gradient, gauss = 2 * matmul(derivatives, offsets), 2 * matmul(derivatives, derivatives.T)
     return Predicted(jnp.mean(squares), gradient, gauss, hessian, moves, slopes)
@@ -101,21 +124,28 @@ _predict = jit(_predict_all, ONCE, static_argnums=2)
 def worst_case(
     perturbed: PerturbedLens, predicted: Predicted, order: Order = "second"
 ) -> np.ndarray:
-    """Largest deviations (P,) with the largest predicted q that several ascents find, which may not
-    be the global maximum. They start at the gradient and at the largest eigenvectors. ValueError
-    for an unknown order."""
+    """Largest deviations (P,) with a large predicted q, the worst that several ascents find.
+
+    Each ascent repeats p <- the largest deviations along the gradient of q at p, until p does not
+    change. Ascents start at the gradient without deviations and at 16 eigenvectors of the matrix,
+    in both directions. The result may not be the global maximum.
+
+    perturbed: the lens and its deviations.
+    predicted: the model of q.
+    order: as in `Predicted.matrix`. ValueError for another order.
+    """
     slope, matrix = np.asarray(predicted.gradient), np.asarray(predicted.matrix(order))
     values, vectors = np.linalg.eigh(matrix)
-    # Where all deviations are largest, a multiple of the unit matrix only adds a constant to q. It
-    # makes q convex, so that the largest step along its gradient never descends.
+    # If all deviations are largest, adding a multiple of the unit matrix only adds a constant to q.
+    # It makes q convex, so that no step to the largest deviations along the gradient decreases q.
     matrix = matrix + max(0.0, -values[0]) * np.eye(len(matrix))
     largest = vectors[:, ::-1][:, :_ASCENTS].T
     found: list[np.ndarray] = []
     for start in (slope, *largest, *-largest):
-        perturbation = _to_the_ends(perturbed, start)
+        perturbation = _largest_along(perturbed, start)
         for _ in range(100):
             perturbation, before = (
-                _to_the_ends(perturbed, slope + matrix @ perturbation),
+                _largest_along(perturbed, slope + matrix @ perturbation),
                 perturbation,
             )
             if np.array_equal(perturbation, before):
@@ -125,8 +155,10 @@ def worst_case(
     return found[int(np.argmax(sizes))]
 
 
-def _to_the_ends(perturbed: PerturbedLens, vector: np.ndarray) -> np.ndarray:
-    """The largest deviations (P,) along a vector (P,): each part has the length 1."""
+def _largest_along(perturbed: PerturbedLens, vector: np.ndarray) -> np.ndarray:
+    """The largest deviations (P,) along a vector (P,): the components of each part have the length
+    1.
+    """
     perturbation = np.zeros(len(vector))
     for part in perturbed.parts:
         size = np.linalg.norm(vector[part])

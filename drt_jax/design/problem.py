@@ -33,12 +33,12 @@ from .variables import Variables
 from .waves import degree_of
 
 _OF_PATHS = "path_difference", "rms_wavefront"
-# Least miss that a failed ray counts for, in semi-diameters of the stop.
+# Smallest penalty of a failed ray: it counts as a miss by this many semi-diameters of the stop.
 _FAILED = 4.0
 # No variable changes a limit if its violation differs by at most `_STILL` (relative) at vectors
-# that differ by up to `_BESIDE`.
-_BESIDE, _STILL = 0.3, 1e-9
-# Least width of the beam at the stop, relative to that on any surface.
+# whose components differ by up to `_NEARBY`.
+_NEARBY, _STILL = 0.3, 1e-9
+# Smallest height of the marginal ray at the stop, relative to its largest height on any surface.
 _SLIMMEST = 0.1
 
 
@@ -50,8 +50,11 @@ def _check_operands(
     distances: np.ndarray,
     rule: PupilRule,
 ) -> None:
-    """Raises ValueError for operands that do not fit the lens, the scene or the rule. fields,
-    wavelengths: their numbers. distances: (Z,), mm."""
+    """Raises ValueError for operands that do not fit the lens, the scene or the rule.
+
+    fields, wavelengths: numbers of fields and of wavelengths.
+    distances: (Z,), mm.
+    """
     if not operands:
         raise ValueError("operands: none; a merit needs at least one, such as spot")
     counts = {"fields": fields, "wavelengths": wavelengths, "distances": len(distances)}
@@ -75,7 +78,9 @@ def _check_operands(
 
 
 def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
-    """Weights (count,) with the mean 1. ValueError for a wrong shape or value."""
+    """Weights (count,) with the mean 1. ValueError, which begins with `what`, for a wrong shape or
+    value.
+    """
     found = np.asarray(given, float)
     valid = found.shape == (count,) and np.all(np.isfinite(found) & (found >= 0))
     if not valid or not np.any(found):
@@ -86,7 +91,7 @@ def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A design problem. All numbers are leaves, so that another number compiles nothing.
+    """A design problem. All numbers are leaves, so that a change of a number compiles nothing.
 
     variables: the variables of the lens.
     fields: (F, 2), radians.
@@ -100,8 +105,8 @@ class Problem:
 
     Static:
     solver: ray solver. The default, a full search, finds every ray that exists. `optimise`,
-        `many_starts` and `monte_carlo` first use `solve_aimed`, a smaller program, and the full
-        search only where that misses a ray.
+        `many_starts` and `monte_carlo` first use `solve_aimed`, which is a smaller program, and the
+        full search only where that misses a ray.
     """
 
     variables: Variables
@@ -128,10 +133,11 @@ class Problem:
     ) -> "Problem":
         """Makes a problem.
 
-        variables: variables of a lens, or several of one lens, see `Variables.joined`.
-        operands: operands, at least one with a weight above 0; a name or function stands for an
+        variables: variables of a lens, or several sets of variables of one lens, see
+            `Variables.joined`.
+        operands: operands, at least one with a weight above 0; a name or a function stands for an
             operand of weight 1.
-        fields: one, (F,) along y, or (F, 2), radians.
+        fields: one angle, (F,) along y, or (F, 2), radians.
         wavelengths: one or (W,), um.
         distances: one or (Z,), mm.
         rule: pupil rule, or the order of a Gauss rule.
@@ -139,9 +145,9 @@ class Problem:
         field_weights: (F,), of any sum; None for equal weights. Limits do not depend on them.
 
         ValueError, which names the argument, if an argument does not fit the lens or the problem,
-        and for a limit that the lens violates and no variable changes. (For limits that need rays,
-        `optimise` raises it.) Of operands of waves and wavefronts, warns of float32 as `wavefront`
-        does.
+        and for a limit that the lens violates and that no variable changes. (For limits that need
+        rays, `optimise` raises it.) With operands of waves and wavefronts, warns of float32 as
+        `wavefront` does.
         """
         variables = Variables.joined(variables)
         lens = variables.lens
@@ -154,10 +160,10 @@ class Problem:
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
             rule = Gauss(rule, symmetry if across else "none")
-        if isinstance(rule, Clipped):  # rays of weight 0 would serve nothing
+        if isinstance(rule, Clipped):  # trace no rays of weight 0
             rule = dataclasses.replace(rule, order=int(rule.order), size=0)
         _check_operands(asked, lens, len(angles), len(waves), np.asarray(far), rule)
-        # What follows from path differences, which float32 may round too much.
+        # Warn if float32 rounds the path differences of these operands too much.
         of_beams = any(kind_of(o.kind).of_waves for o in asked)
         if of_beams or any(o.kind in _OF_PATHS for o in asked):
             for distance in far:
@@ -165,12 +171,12 @@ class Problem:
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)
         equal = np.ones(len(waves)) if wavelength_weights is None else wavelength_weights
         share = _weights("wavelength_weights", equal, len(waves)) / len(waves)
-        made = cls(variables, angles, far, waves, jnp.asarray(share, dtype), rule, on)
+        problem = cls(variables, angles, far, waves, jnp.asarray(share, dtype), rule, on)
         if field_weights is not None:
             own = jnp.asarray(_weights("field_weights", field_weights, len(angles)), dtype)
-            made = dataclasses.replace(made, field_weights=own)
-        made._refuse_fixed()
-        return made
+            problem = dataclasses.replace(problem, field_weights=own)
+        problem._refuse_fixed()
+        return problem
 
     def with_order(self, order: int) -> "Problem":
         """The problem with a Gauss rule of another order."""
@@ -194,8 +200,12 @@ class Problem:
         return any(kind_of(operand.kind).traced for operand in self.operands)
 
     def evaluate(self, vector: Array) -> Evaluation:
-        """Residuals, constraints, overlap and failed rays at a vector (N,) of the variables. Works
-        in `jit`, `vmap` and under differentiation."""
+        """Residuals, constraints, overlap and number of failed rays at a vector of the variables.
+
+        Works in `jit`, `vmap` and under differentiation.
+
+        vector: (N,).
+        """
         lens = self.variables.lens_of(vector)
         rays = _rays(self, lens)
         parts = [operand.residuals(lens, rays, self.field_weights) for operand in self.operands]
@@ -206,7 +216,7 @@ class Problem:
         radius = beam_radius(lens, rays) if self.traces else jnp.zeros(lens.count, vector.dtype)
         both = [gaps(lens, radius, glass) for glass in (True, False)]
         overlap = sum(jnp.sum(jnp.maximum(-part, 0)) for pair in both for part in pair)
-        # With the stop at a focus of the beam all rays coincide, and any lens seems perfect.
+        # Reject a stop at a focus of the beam: all rays coincide there, and any lens seems perfect.
         system = paraxial_system(lens, self.wavelengths)
         marginal = marginal_ray(system, vergence_of(self.distances[0])).height
         slim = _SLIMMEST * jnp.max(jnp.abs(marginal)) - jnp.abs(system.aperture)
@@ -217,17 +227,23 @@ class Problem:
         return Evaluation(residuals, constraints, jax.lax.stop_gradient(overlap), failed)
 
     def _failures(self, lens: Lens, rays: FieldRays) -> Array:
-        """Residuals of failed rays, see `failures`, in the unit of the operand that weighs most."""
+        """Residuals of failed rays, see `failures`, in the unit of the operand with the largest
+        weight.
+        """
         size = _FAILED * jax.lax.stop_gradient(lens.semi_diameter[lens.stop])
         weights = [o.weight * kind_of(o.kind).per_mm for o in self.operands if not o.limits]
         weight = jnp.max(jnp.stack(weights)) if weights else 1.0
         return jnp.ravel(weight * size * failures(lens, rays))
 
     def _constraints(self, lens: Lens, rays: FieldRays) -> Array:
+        """The constraints (L,) of all operands."""
         return jnp.concatenate([operand.constraints(lens, rays) for operand in self.operands])
 
     def limits(self, constraints: Numbers) -> list[Limit]:
-        """The limits by name, in the order of `Evaluation.constraints` (L,)."""
+        """The limits by name, in the order of `Evaluation.constraints`.
+
+        constraints: (L,), constraints of an evaluation.
+        """
         counts = {"fields": len(self.fields), "distances": len(self.distances)}
         counts |= {"wavelengths": len(self.wavelengths)}
         counts |= {"xy": 2 if self.rule.symmetry == "none" else 1}
@@ -236,24 +252,30 @@ class Problem:
             sizes = [a.size for a in jax.eval_shape(_constraints_of_each, self, lens)]
         return limits_of(self.operands, lens, counts, sizes, np.asarray(constraints))
 
-    def elsewhere(self, vector: Array) -> Array:
-        """A vector (N,) near another, within the bounds, with every number changed."""
+    def nearby_vector(self, vector: Array) -> Array:
+        """A nearby vector (N,) within the bounds, in which every component that can move is
+        different.
+
+        vector: (N,).
+        """
         low, high = self.variables.low, self.variables.high
-        move = _BESIDE * jnp.cos(1 + 2 * jnp.arange(vector.size, dtype=vector.dtype))
+        move = _NEARBY * jnp.cos(1 + 2 * jnp.arange(vector.size, dtype=vector.dtype))
         move = jnp.where((vector + move < low) | (vector + move > high), -move, move)
         return jnp.clip(vector + move, low, high)
 
-    def refuse_fixed(self, constraints: Numbers, beside: Numbers) -> None:
-        """Raises ValueError for a limit that is violated by as much at a nearby vector. Limits on
-        rays are left out: a failed ray does not change until it passes.
+    def refuse_fixed(self, constraints: Numbers, nearby: Numbers) -> None:
+        """Raises ValueError for a limit whose violation is the same at a nearby vector.
 
-        constraints, beside: (L,), constraints at both vectors.
+        Limits on rays are left out, because the violation by a failed ray does not change until the
+        ray passes.
+
+        constraints, nearby: (L,), constraints at both vectors.
         """
-        one, two = np.asarray(constraints), np.asarray(beside)
-        for limit, there in zip(self.limits(one), self.limits(two)):
+        one, two = np.asarray(constraints), np.asarray(nearby)
+        for limit, other in zip(self.limits(one), self.limits(two)):
             if limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names:
                 continue
-            still = abs(there.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
+            still = abs(other.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
             if limit.excess > 0 and still:
                 raise ValueError(
                     f"operands: {limit}, and no variable moves it; leave this limit out, widen it, "
@@ -262,16 +284,16 @@ class Problem:
 
     @jax.jit
     def _exceeded(self, vector: Array) -> Array:
-        """Constraints of operands that need no rays, at a vector (N,)."""
+        """Constraints (L,) of operands that need no rays, at a vector (N,)."""
         return self._constraints(self.variables.lens_of(vector), self.views())
 
     def _refuse_fixed(self) -> None:
         """Calls `refuse_fixed` for limits that need no rays."""
-        some = tuple(o for o in self.operands if o.limits and not kind_of(o.kind).traced)
-        if some and concrete(self):
-            part = dataclasses.replace(self, operands=some)
+        without_rays = tuple(o for o in self.operands if o.limits and not kind_of(o.kind).traced)
+        if without_rays and concrete(self):
+            part = dataclasses.replace(self, operands=without_rays)
             start = self.variables.start
-            part.refuse_fixed(part._exceeded(start), part._exceeded(self.elsewhere(start)))
+            part.refuse_fixed(part._exceeded(start), part._exceeded(self.nearby_vector(start)))
 
     @jax.jit
     def beam_radius(self, lens: Lens) -> Array:
@@ -285,14 +307,19 @@ class Problem:
 
     @jax.jit
     def merit(self, vector: Array) -> Array:
-        """Sum () of the squares of the residuals; limits are not in it."""
+        """Sum of the squares of the residuals, (); limits do not contribute."""
         return jnp.sum(self.evaluate(vector).residuals ** 2)
 
 
 @jax.jit
 def trace_fields(problem: Problem, lens: Lens) -> FieldRays:
-    """The rays of a lens from all fields and distances of a problem. Differentiable, in `jit` and
-    `vmap` too."""
+    """Traces the rays of a lens from all fields and distances of a problem.
+
+    Differentiable, also in `jit` and `vmap`.
+
+    problem: gives the fields, distances, wavelengths and pupil rule.
+    lens: the lens.
+    """
     return trace_views(lens, problem.views(), problem.solver)
 
 
@@ -303,10 +330,13 @@ def _rays(problem: Problem, lens: Lens) -> FieldRays:
 
 
 def _constraints_of_each(problem: Problem, lens: Lens) -> list[Array]:
+    """The constraints of each operand."""
     rays = _rays(problem, lens)
     return [operand.constraints(lens, rays) for operand in problem.operands]
 
 
 def quick(problem: Problem) -> Problem:
-    """The problem with `solve_aimed`, a smaller program without the full ray search."""
+    """The problem with `solve_aimed` as its solver, a smaller program without the full ray
+    search.
+    """
     return dataclasses.replace(problem, solver=solve_aimed)

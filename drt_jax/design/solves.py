@@ -1,4 +1,6 @@
-"""Solves: numbers of a lens that follow from the others, so that a condition holds exactly."""
+"""Solves: numbers of a lens that are computed from the others, so that a condition holds
+exactly.
+"""
 
 import copy
 import dataclasses
@@ -24,7 +26,7 @@ from ..rays.solve import solve_aimed
 from .field_rays import symmetry_by_structure
 from .kinds import KINDS, back_distance, step_of
 
-# In the order of application: no solve changes what an earlier one fixes, see `fix_solves`.
+# In the order of application. No solve changes the condition of an earlier one, see `fix_solves`.
 _Name = Literal[
     "focal_length",
     "effective_focal_length",
@@ -34,12 +36,14 @@ _Name = Literal[
     "paraxial_focus",
     "best_focus",
 ]
-# Compiled where numbers are known, part of the caller's program in a trace.
+# Functions are compiled when called outside of `jit`; inside they become a part of its program.
 _program = functools.partial(jax.jit, inline=True)
-# Newton steps: every condition is linear in its number; the second step removes rounding errors.
+# Number of Newton steps. Every condition is linear in the solved number, so that one step solves
+# it; the second step removes rounding errors.
 _STEPS = 2
 _ORDER = 6  # of the rule of the best focus
-# Relative tolerance of a solve; also the least relative sensitivity to the solved number.
+# Relative tolerance of a solve, and smallest relative change of a condition by a typical change of
+# the solved number.
 _TOLERANCE = 1e-9
 _NO_SURFACE = 5000  # larger than any number of a surface; settings have no negative numbers
 
@@ -47,19 +51,20 @@ _NO_SURFACE = 5000  # larger than any number of a surface; settings have no nega
 @leaves("value", "fields", "distance", "wavelengths")
 @dataclasses.dataclass(frozen=True)
 class Solve:
-    """A condition, and the number of the lens that is solved for it. A pytree: kind and surface are
-    static; in a problem, numbers are arrays.
+    """A condition, and the number of the lens that is solved for it.
 
-    kind: one of these.
+    A solve is a pytree: kind and surface are static. In a problem, numbers are arrays.
+
+    kind: one of the following.
         Solved by the curvature of `surface`: "focal_length" in image space, mm;
         "effective_focal_length" in air, mm; "image_angle", the paraxial slope of the marginal ray
         behind the lens, negative for converging light.
         Solved by the distance of the sensor from the last vertex: "paraxial_focus"; "best_focus",
-        of least mean square spots of `fields`, each wavelength about its own centroid.
+        of the smallest mean square spots of `fields`, each wavelength about its own centroid.
         Solved by the semi-diameter of the stop: "entrance_pupil", its diameter, mm; "f_number", the
         working f-number.
-    value: value of the condition; 0 for that of the lens at the start. For a focus, distance from
-        the focus to the sensor, mm.
+    value: value of the condition; 0 for the value of the lens at the start. For a focus, the
+        distance from the focus to the sensor, mm.
     surface: number of the surface whose curvature is solved, from 0.
     fields: fields of the best focus along y, radians.
     distance: distance of the object, mm, for a focus, image_angle and f_number.
@@ -90,7 +95,7 @@ class Solve:
 
     @property
     def focuses(self) -> bool:
-        """True if the sensor is solved."""
+        """True if the distance of the sensor is solved."""
         return self.kind in ("paraxial_focus", "best_focus")
 
     @property
@@ -99,8 +104,10 @@ class Solve:
         return self.kind in ("entrance_pupil", "f_number")
 
     def place(self, lens: Lens) -> tuple[str, int, int]:
-        """Kind, row and term of the solved number. ValueError if there is none, or if the condition
-        does not depend on it."""
+        """Kind, row and term of the solved number.
+
+        ValueError if the lens has no such number, or if the condition does not depend on it.
+        """
         if self.focuses:
             return "sensor", 0, 0
         if self.aperture:
@@ -118,8 +125,10 @@ class Solve:
         return "curvature", self.surface, 0
 
     def placed(self, lens: Lens) -> "Solve":
-        """The solve for a problem: numbers as arrays in the dtype of the lens; None for the axial
-        field, which needs fewer rays."""
+        """The solve for a problem: its numbers are arrays in the dtype of the lens.
+
+        The axial field becomes None, because it needs fewer rays.
+        """
         own = copy.copy(self)
         if concrete(self.fields):
             fields = tuple(field or None for field in self.fields)
@@ -127,8 +136,10 @@ class Solve:
         return jax.tree.map(lambda number: jnp.asarray(number, lens.curvature.dtype), own)
 
     def fixed(self, lens: Lens) -> "Solve":
-        """The solve with its value filled in. ValueError if the lens has no such value, or if the
-        solved number does not change it."""
+        """The solve with its value filled in.
+
+        ValueError if the lens has no such value, or if the solved number does not change it.
+        """
         kind, row, term = self.place(lens)
         if self.focuses:
             if not float(_focus(lens, self.placed(lens))[1]) > 0:
@@ -140,10 +151,10 @@ class Solve:
             return self
         condition, solve = _CONDITIONS[self.kind], self
         if self.value == 0:
-            now = condition.value(float(_measure(lens, self)))
-            if now == 0 or not math.isfinite(now):
+            current = condition.value(float(_measure(lens, self)))
+            if current == 0 or not math.isfinite(current):
                 raise ValueError(f"solves: {self.kind}: the lens has none to keep; give its value")
-            solve = dataclasses.replace(self, value=now)
+            solve = dataclasses.replace(self, value=current)
         target = condition.value(float(solve.value))
         ratio = float(_measure(solve.apply(lens), solve)) / target
         change = float(solve.rate(lens, solve)) * step_of(lens, kind, row, term)
@@ -170,8 +181,11 @@ class Solve:
 
 
 def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], Lens]:
-    """The solves with their values, as arrays, in the order of application; and the lens that meets
-    them. ValueError as in `Solve.fixed`, and if one solve changes the condition of another."""
+    """The solves with their values filled in, and the lens that meets them.
+
+    Returns the solves in the order of application, with numbers as arrays; and the lens. ValueError
+    as in `Solve.fixed`, and if one solve changes the condition of an earlier one.
+    """
     found: list[Solve] = []
     for solve in sorted(solves, key=lambda solve: get_args(_Name).index(solve.kind)):
         for other in found:
@@ -187,12 +201,13 @@ def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], 
 
 @_program
 def _measure(lens: Lens, solve: Solve) -> Array:
+    """The measure () of a condition, see `_Condition`."""
     return _CONDITIONS[solve.kind].measure(lens, solve)
 
 
 @_program
 def _met(lens: Lens, solve: Solve) -> Array:
-    """The solved number (), by Newton's method."""
+    """The solved number (), by Newton's method on measure - value = 0."""
     number, with_number = _number(lens, solve)
     condition = _CONDITIONS[solve.kind]
 
@@ -220,7 +235,7 @@ class _Condition(NamedTuple):
     """A condition.
 
     measure: function of the lens and the solve, linear in the solved number.
-    value: conversion between `Solve.value` and the measure, its own inverse.
+    value: conversion between `Solve.value` and the measure; it is its own inverse.
     """
 
     measure: Callable[[Lens, Solve], Array]
@@ -228,18 +243,19 @@ class _Condition(NamedTuple):
 
 
 def _wavelengths(lens: Lens, solve: Solve) -> Array:
+    """The wavelengths of a solve, (W,), um, in the dtype of the lens."""
     return jnp.stack([jnp.asarray(wave, lens.curvature.dtype) for wave in solve.wavelengths])
 
 
 def _power(lens: Lens, solve: Solve) -> Array:
-    """1 / focal length, in image space or in air."""
+    """1 / focal length, in image space or in air, 1/mm; mean over wavelengths."""
     system = paraxial_system(lens, _wavelengths(lens, solve))
     slope = trace_ray(system, 1.0, 0.0).behind[-1]
     return -jnp.mean(slope if solve.kind == "focal_length" else system.index[-1] * slope)
 
 
 def _slope(lens: Lens, solve: Solve) -> Array:
-    """Paraxial slope of the marginal ray behind the lens."""
+    """Paraxial slope of the marginal ray behind the lens; mean over wavelengths."""
     vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
     return jnp.mean(
         marginal_ray(paraxial_system(lens, _wavelengths(lens, solve)), vergence).behind[-1]
@@ -247,33 +263,41 @@ def _slope(lens: Lens, solve: Solve) -> Array:
 
 
 def _pupil(lens: Lens, solve: Solve) -> Array:
-    """Diameter of the entrance pupil."""
+    """Diameter of the entrance pupil, mm; mean over wavelengths."""
     return 2 * jnp.mean(entrance_pupil(lens, _wavelengths(lens, solve)).semi_diameter)
 
 
 def _inverse(value: Any) -> Any:
+    """1 / value."""
     if isinstance(value, float):
         return 1 / value if value else math.inf
     return safe_divide(jnp.ones_like(value), value)
 
 
-def _itself(value: Any) -> Any:
+def _identity(value: Any) -> Any:
+    """The value itself."""
     return value
 
 
 _CONDITIONS = {
     "focal_length": _Condition(_power, _inverse),
     "effective_focal_length": _Condition(_power, _inverse),
-    "image_angle": _Condition(_slope, _itself),
-    "entrance_pupil": _Condition(_pupil, _itself),
+    "image_angle": _Condition(_slope, _identity),
+    "entrance_pupil": _Condition(_pupil, _identity),
     "f_number": _Condition(lambda lens, solve: 2 * jnp.abs(_slope(lens, solve)), _inverse),
 }
 
 
 @_program
 def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
-    """Distance () from the last vertex to `solve.value` mm behind the focus, mm, and a measure of
-    the convergence, 0 where there is no focus."""
+    """The focus, for the mean over wavelengths.
+
+    The mean square spot is a quadratic function of the shift t of the sensor, a + b t + c t^2, with
+    its minimum at t = -b / (2 c).
+
+    Returns the distance () from the last vertex to `solve.value` mm behind the focus, mm; and a
+    measure of the convergence, 0 where there is no focus: the slope of the paraxial ray, or c.
+    """
     waves = _wavelengths(lens, solve)
     if solve.kind == "paraxial_focus":
         vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))

@@ -1,4 +1,4 @@
-"""Many starts: parallel searches with successive halving, and a ranking of their minima."""
+"""Many starts: parallel searches with successive halving, and a ranking of the minima they find."""
 
 import dataclasses
 import math
@@ -22,25 +22,38 @@ from .optimum import init_problem, step_problem
 from .problem import Problem, quick, trace_fields
 from .variables import Variables
 
-# Searches of one tile share a program and a core.
+# Number of searches in a tile. The searches of one tile run in one program on one core.
 _TILE = 16
-# Two minima are the same if their merits differ by less than `_SAME_MERIT` (relative), and their
-# vectors by less than `_SAME_PLACE` (root mean square, in units of the scales).
+# Two minima count as the same if the score of the worse exceeds the merit of the better by less
+# than `_SAME_MERIT` (relative), and their vectors differ by less than `_SAME_PLACE` (root mean
+# square, in units of the scales).
 _SAME_MERIT, _SAME_PLACE = 1e-3, 1.0
 
 
 def normal_starts(variables: Variables, count: int, spread: float, seed: int = 0) -> np.ndarray:
-    """Starts (count, N) about the lens within the bounds: its own vector, then vectors with normal
-    deviates. spread: their standard deviation, in units of the scales of the variables."""
+    """Starts around the lens, within the bounds: its own vector, then normally distributed vectors.
+
+    variables: variables of the lens.
+    count: number of starts.
+    spread: standard deviation, in units of the scales of the variables.
+    seed: seed of NumPy's generator.
+
+    Returns (count, N).
+    """
     moves = np.random.default_rng(seed).normal(size=(count, len(variables.places)))
     moves[0] = 0
     return np.clip(np.asarray(variables.start) + spread * moves, variables.low, variables.high)
 
 
 def sobol_starts(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
-    """Starts (count, N), evenly distributed within the bounds (scrambled Sobol sequence).
+    """Starts that are evenly distributed within the bounds (scrambled Sobol sequence).
 
-    ValueError, which names it, for a variable without bounds.
+    variables: variables, all with bounds. ValueError, which names it, for a variable without
+        bounds.
+    count: number of starts.
+    seed: seed of the scrambling.
+
+    Returns (count, N).
     """
     low, high = np.asarray(variables.low), np.asarray(variables.high)
     for name, bounds in zip(variables.names, zip(low, high)):
@@ -54,10 +67,15 @@ def sobol_starts(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
 def as_built_starts(
     variables: Variables, count: int, per_cent: float = 1.0, off_mm: float = 0.1, seed: int = 0
 ) -> np.ndarray:
-    """Starts (count, N) from the lens as it might be built, with normal deviates.
+    """Starts at lenses as they might be built, with normally distributed errors.
 
+    variables: variables of the lens.
+    count: number of starts.
     per_cent: standard deviation of all curvatures, per cent.
     off_mm: standard deviation of all thicknesses, mm.
+    seed: seed of NumPy's generator.
+
+    Returns (count, N).
     """
     rng, lens, vectors = np.random.default_rng(seed), variables.lens, []
     for _ in range(count):
@@ -87,11 +105,11 @@ class Minimum(NamedTuple):
 class Starts(NamedTuple):
     """Result of many starts.
 
-    minima: the distinct minima, best first.
+    minima: the distinct minima, the best first.
     merits: (K,), score of every start at the end of its search; inf if no ray ever passed.
     steps, jacobians, rays: totals over all searches.
     seconds: total time.
-    compile_s: time of the compilation, part of `seconds`.
+    compile_s: time of the compilation, which is a part of `seconds`.
     best: best score after each tile.
     """
 
@@ -110,12 +128,14 @@ _begin = jax.jit(jax.vmap(init_problem, (None, 0)))
 
 @partial(jit, wanted=LARGE, static_argnames="mesh")
 def _advance(problem: Problem, steps: Array, searches: Search, mesh: Mesh | None) -> Search:
-    """Takes `steps` steps of a tile of searches; a device whose searches are all done takes
-    fewer."""
+    """Takes `steps` steps of a tile of searches. A device whose searches are all done takes
+    fewer.
+    """
     return shared(_advanced_here, mesh, 2)(problem, steps, searches)
 
 
 def _advanced_here(problem: Problem, steps: Array, searches: Search) -> Search:
+    """The part of `_advance` that runs on one device."""
     both = jax.vmap(step_problem, (None, 0))
 
     def more(state: tuple[Array, Search]) -> Array:
@@ -134,16 +154,23 @@ def many_starts(
     threads: int | None = None,
     mesh: Mesh | None = None,
 ) -> Starts:
-    """Searches from many starts with successive halving (Jamieson and Talwalkar 2016). A search
-    that fails is ranked last. The result does not depend on threads, tiles or devices.
+    """Searches from many starts with successive halving (Jamieson and Talwalkar 2016).
 
+    Each stage takes some steps of every remaining search; the better part of them continues to the
+    next stage. A search that fails is ranked last. Where aiming misses rays at the end, the search
+    continues with the full ray search. The result does not depend on threads, tiles or devices.
+
+    problem: the design problem.
     starts: (K, N).
-    steps: steps of every search in each stage.
-    survivors: fraction that continues to the next stage, at least a tile of 16.
-    callback: called with the tiles done, all tiles, and the best score so far.
+    steps: number of steps of every search in each stage.
+    survivors: fraction of the searches that continues to the next stage, at least a tile of 16.
+    callback: called with the number of tiles done, the number of all tiles, and the best score so
+        far.
     threads: number of threads; None for one per core.
-    mesh: devices that share the searches, of `devices.device_mesh`; each tile then is one for every
-        device, and `threads` is not used. None for the default device.
+    mesh: devices that share the searches, of `devices.device_mesh`. A tile then has 16 searches for
+        every device, and `threads` is not used. None for the default device.
+
+    ValueError for starts of another shape.
     """
     begun = time.perf_counter()
     vectors = np.asarray(starts, float)
@@ -159,9 +186,9 @@ def many_starts(
     total = sum(-(-size // _tile(mesh)) for size in sizes)
     for _ in _advanced(tried, state, alive[:1], 0, threads, mesh):
         compiled = time.perf_counter() - begun
-    for size, more in zip(sizes, steps):
+    for size, stage_steps in zip(sizes, steps):
         alive = alive[np.argsort(_score(state, alive), kind="stable")[:size]]
-        for _ in _advanced(tried, state, alive, more, threads, mesh):
+        for _ in _advanced(tried, state, alive, stage_steps, threads, mesh):
             best.append(float(np.min(_score(state, alive))))
             callback(len(best), total, best[-1])
     for _ in _advanced(problem, state, _missed(problem, state, alive), steps[-1], threads, mesh):
@@ -181,8 +208,10 @@ def many_starts(
 
 
 def _missed(problem: Problem, state: Search, alive: np.ndarray) -> np.ndarray:
-    """The searches in which the full ray search finds rays that aiming did not; they are marked to
-    go on."""
+    """The searches in which the full ray search finds rays that aiming does not find.
+
+    They are marked so that they continue.
+    """
     failed = np.asarray(state.evaluation.failed)[alive]
     rows = [
         row
@@ -194,6 +223,7 @@ def _missed(problem: Problem, state: Search, alive: np.ndarray) -> np.ndarray:
 
 
 def _tile(mesh: Mesh | None) -> int:
+    """Number of searches of a tile."""
     return _TILE * (mesh.size if mesh else 1)
 
 
@@ -222,15 +252,17 @@ def _advanced(
 
 
 def _score(state: Search, rows: np.ndarray) -> np.ndarray:
+    """Scores of some searches."""
     return np.asarray(_rows(state, rows).score)
 
 
 def _rows(tree: Search, rows: np.ndarray) -> Search:
+    """Some rows of the arrays of a state."""
     return jax.tree.map(lambda a: a[rows], tree)
 
 
 def rays_of(problem: Problem) -> int:
-    """Number of rays that one evaluation traces."""
+    """Number of rays that one evaluation of a problem traces."""
     if not problem.traces:
         return 0
     rays = jax.eval_shape(lambda p: trace_fields(p, p.variables.lens).weights, problem)
@@ -238,7 +270,11 @@ def rays_of(problem: Problem) -> int:
 
 
 def distinct(searches: Search, numbers: np.ndarray) -> list[Minimum]:
-    """The distinct minima of searches (K,), best first. numbers: (K,), numbers of their starts."""
+    """The distinct minima of searches (K,), the best first.
+
+    searches: states of the searches.
+    numbers: (K,), numbers of their starts.
+    """
     scores, vectors = np.asarray(searches.score), np.asarray(searches.vector)
     violations = np.asarray(searches.max_violation)
     found: list[Minimum] = []

@@ -2,41 +2,41 @@
 
 Lengths are in mm, angles in radians. A kind has one value for each combination of the names in
 brackets, and an operand may select some of them: fields, wavelengths, distances, surfaces.
-"Middle": the middle wavelength, unless wavelengths are named.
+"Wavelength: middle" means the middle wavelength, unless wavelengths are named.
 
-residuals that are squared, without a target or limits
-    spot: distance of each ray from the centroid of all wavelengths, times the root of its weight;
-        the squares of a field add up to the mean square radius of its spot, mm^2. Clipped rays have
-        no weight, so that clipping the worst rays lowers the merit. vignetting=False, here and up
-        to centroid, counts clipped rays as if they passed
+residuals for a merit function, whose squares are summed; they take no target and no limits
+    spot: distance of each ray from the centroid of all wavelengths, times the root of its weight.
+        The squares of a field add up to the mean square radius of its spot, mm^2. Clipped rays have
+        no weight, so that clipping the worst rays lowers the merit. With vignetting=False, for this
+        and the following kinds up to centroid, clipped rays count as if they passed
     spot_of_colours: the same from the centroid of the ray's own wavelength
     spot_chief: the same from the chief ray of the middle wavelength
     path_difference: optical path of each ray less the mean of its wavelength, waves, times the root
-        of its weight; the squares add up to the mean square wavefront error
+        of its weight. The squares add up to the mean square wavefront error
 
 spots and wavefronts [distance, field]
     rms_spot: root of the sum of the squares of spot, mm
     rms_wavefront: root of the sum of the squares of path_difference, waves
     centroid: y of the centroid of all wavelengths on the sensor, mm
-    throughput: fraction of the light through the stop that is not clipped; it has derivatives with
-        the rules Soft and Clipped, while Gauss drops rays one by one
+    throughput: unvignetted fraction of the light through the stop. It has derivatives with the
+        rules Soft and Clipped; with Gauss it changes in steps, ray by ray
     relative_illumination: from projected solid angles, relative to the first field; at the middle
         wavelength
 
-waves; target=1 for the best, see waves.py
+diffraction; the best value is 1, so use target=1; see waves.py
     mtf [distance, field, tangential or sagittal]: modulus of the transfer function of all
         wavelengths at the frequency `at` on the sensor, cycles/mm
     strehl [distance, field, wavelength]: irradiance of the image of a point over that without
         aberrations
-    encircled_energy [distance, field]: the part of the light of all wavelengths within a circle of
-        the radius `at`, mm, about the centroid; spot and circle must be narrower than
-        64 wavelengths / numerical aperture, some 140 um at f/2
+    encircled_energy [distance, field]: fraction of the light of all wavelengths within a circle of
+        the radius `at`, mm, about the centroid. Spot and circle must be narrower than
+        64 wavelengths / numerical aperture, about 140 um at f/2
 
 chief rays, through the centre of the stop
     distortion [distance, field, wavelength: middle]: (real - paraxial image height) / paraxial
         image height; 0 on the axis
-    lateral_colour [distance, field, wavelength but the first]: y on the sensor less that of the
-        first wavelength, mm; and x, if the pupil rule covers the whole disc
+    lateral_colour [distance, field, all wavelengths except the first]: y on the sensor less that of
+        the first wavelength, mm; and the same in x, if the pupil rule covers the whole disc
     chief_ray_angle [distance, field, wavelength]: angle with the normal at the sensor's vertex, at
         least 0
 
@@ -44,8 +44,8 @@ chief rays, through the centre of the stop
         between the chief ray and rays through the rim of the stop, root mean square, at the sensor
 
 first order
-    focal_length, effective_focal_length, back_focal_distance [wavelength: middle]: mm; the first in
-        image space, n' / power, the second in air, 1 / power
+    focal_length, effective_focal_length, back_focal_distance [wavelength: middle]: mm. The focal
+        length is that in image space, n' / power, the effective one that in air, 1 / power
     entrance_pupil [wavelength: middle]: diameter, mm
     f_number [distance, wavelength: middle]: working f-number
     magnification [distance, wavelength: middle]: image height / object height
@@ -53,15 +53,17 @@ first order
     length: first vertex to last vertex, mm
     back_distance: last vertex to sensor, mm
 
-thicknesses between active surfaces, and in front of the sensor, by the surface in front
+thicknesses between active surfaces, and in front of the sensor; the surface is that in front
     glass_centre, air_centre [surface]: thickness along the light on the axis, mm
-    glass_edge, air_edge [surface, zone]: thickness at 0.5, 0.7, 0.85 and 1 of a beam radius along
-        y, mm: of the larger of both radii in glass, of the smaller in air; see `beam_radius`
+    glass_edge, air_edge [surface, zone]: thickness at 0.5, 0.7, 0.85 and 1 times a beam radius
+        along y, mm: the larger radius of the two surfaces in glass, the smaller one in air; see
+        `beam_radius`
     incidence_angle [surface]: largest angle of incidence of all rays
 
-model glasses, by the surface where they begin
-    glass_map [surface]: distance of (nd, vd) outside of the convex hull of the catalogue, negative
-        inside, 0 of real ones, in units of nd, 100 of vd as one. high=0 keeps them inside
+model glasses; the surface is that where the glass begins
+    glass_map [surface]: distance of (nd, vd) outside of the convex hull of the catalogue, in units
+        of nd, where 100 of vd count as one; negative inside, 0 for real glasses. high=0 keeps model
+        glasses inside
 """
 
 from collections.abc import Callable
@@ -97,10 +99,12 @@ class OperandKind(NamedTuple):
 
     function: values, of any shape, from a lens and the rays that `Operand` selects.
     names: names by which an operand may select values.
-    places: function of a lens, the surfaces that have a value; None if values are not of surfaces.
+    places: function of a lens, the surfaces that have a value; None if values do not belong to
+        surfaces.
     traced: True if the function needs rays.
-    squared: for residuals that are squared, the kind of the root of their sum; else empty.
-    per_mm: penalty per millimetre of miss for a failed ray, in the unit of the operand.
+    squared: for residuals whose squares are summed, the kind that is the root of the sum; else
+        empty.
+    per_mm: penalty for each millimetre of miss of a failed ray, in the unit of the operand.
     order: axes of the values, see `axes`; () for the usual ones.
     rows: function of a lens, the surfaces that the function returns; None for `places`.
     at: the name of `Operand.at`, if the function takes it; else empty.
@@ -118,9 +122,12 @@ class OperandKind(NamedTuple):
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Axes of the values in their order: "xy", "distances" and "fields" (together one axis),
-        "wavelengths", "middle" (wavelengths; the middle one if none is named), "later" (all but the
-        first), "surfaces", "zones", "sections" (tangential, sagittal), "rays"."""
+        """Axes of the values in their order.
+
+        They are "xy", "distances" and "fields" (together one axis), "wavelengths", "middle"
+        (wavelengths; the middle one if none is named), "later" (all wavelengths except the first),
+        "surfaces", "zones", "sections" (tangential, sagittal) and "rays".
+        """
         ours = [name for name in ("distances", "fields", "surfaces") if name in self.names]
         return self.order or (*ours, *["middle"] * ("wavelengths" in self.names))
 
@@ -131,18 +138,22 @@ class OperandKind(NamedTuple):
 
     @property
     def of_waves(self) -> bool:
-        """True for shares of light, at best 1, that need polynomials of the pupil."""
+        """True for kinds of diffraction, which have the best value 1 and need polynomials of the
+        pupil.
+        """
         return self.function in (mtf, strehl, encircled_energy)
 
     @property
     def of_all_views(self) -> bool:
-        """True if values of all fields are computed before some are selected."""
+        """True if the values of all fields must be computed before some are selected."""
         return self.function is relative_illumination
 
 
 def _hits(rays: FieldRays) -> tuple[Array, Array]:
-    """Hits on the sensor (D, V, W, Q), mm, 0 for rays without weight; and weights (V, W, Q) with
-    the sum 1 over all wavelengths of a view."""
+    """Hits on the sensor (D, V, W, Q), mm, and weights (V, W, Q).
+
+    Hits are 0 for rays without weight. Weights have the sum 1 over all wavelengths of a view.
+    """
     light = jnp.where(rays.arrives, rays.weights, 0)[..., EXTRAS:]
     # Normalise the light that arrives for each wavelength, as in `psf_moments`.
     light = normalised(light) * rays.wavelength_weights[None, :, None]
@@ -151,21 +162,25 @@ def _hits(rays: FieldRays) -> tuple[Array, Array]:
 
 def _spread(rays: FieldRays, axes: tuple[int, ...]) -> Array:
     """Distances of rays from the centroid over `axes`, times the root of their weight, (D, V, W,
-    Q), mm."""
+    Q), mm.
+    """
     hits, light = _hits(rays)
     parts, _ = deviations(tuple(hits), normalised(light, axes), rays.symmetry, axes)
     return jnp.stack(parts) * safe_sqrt(light)[None]
 
 
 def _spot(lens: Lens, rays: FieldRays) -> Array:
+    """Residuals of "spot", (D, V, W, Q), mm."""
     return _spread(rays, (-2, -1))
 
 
 def _spot_of_colours(lens: Lens, rays: FieldRays) -> Array:
+    """Residuals of "spot_of_colours", (D, V, W, Q), mm."""
     return _spread(rays, (-1,))
 
 
 def _spot_chief(lens: Lens, rays: FieldRays) -> Array:
+    """Residuals of "spot_chief", (D, V, W, Q), mm."""
     hits, light = _hits(rays)
     chief = rays.sensor_hits[..., 0]
     middle = chief[..., chief.shape[-1] // 2, None, None]
@@ -173,15 +188,18 @@ def _spot_chief(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _rms_spot(lens: Lens, rays: FieldRays) -> Array:
+    """RMS radii of the spots (V,), mm."""
     return safe_sqrt(jnp.sum(_spot(lens, rays) ** 2, axis=(0, 2, 3)))
 
 
 def _centroid(lens: Lens, rays: FieldRays) -> Array:
+    """y of the centroids (V,), mm."""
     hits, light = _hits(rays)
     return safe_divide(jnp.sum(light * hits[-1], (-2, -1)), jnp.sum(light, (-2, -1)))
 
 
 def _path_difference(lens: Lens, rays: FieldRays) -> Array:
+    """Residuals of "path_difference", (V, W, Q), waves."""
     of_view = lambda bundle: path_differences(lens, rays.wavelengths, bundle, None)[0]  # noqa: E731
     waves = jax.vmap(of_view)(rays.bundle)[..., EXTRAS:]
     _, light = _hits(rays)
@@ -190,15 +208,19 @@ def _path_difference(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:
+    """RMS wavefront errors (V,), waves."""
     return safe_sqrt(jnp.sum(_path_difference(lens, rays) ** 2, axis=(1, 2)))
 
 
 def _throughput(lens: Lens, rays: FieldRays) -> Array:
+    """Unvignetted fraction of the light (V,)."""
     return matmul(rays.throughput, rays.wavelength_weights)
 
 
 def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
-    """Function of a first-order value that depends on distance and wavelength, (Z, W)."""
+    """A function that returns a first-order value that depends on distance and wavelength, (Z,
+    W).
+    """
 
     def values(lens: Lens, rays: FieldRays) -> Array:
         far, waves = rays.distance[:: rays.fields], rays.wavelengths
@@ -208,15 +230,21 @@ def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
 
 
 def _lens_alone(get: Callable[[FirstOrder], Array]) -> Function:
-    """Function of a first-order value that depends on wavelength alone, (W,)."""
+    """A function that returns a first-order value that depends on wavelength alone, (W,)."""
     return lambda lens, rays: get(first_order(lens, jnp.inf, rays.wavelengths))
 
 
 def _back_distance(lens: Lens, rays: FieldRays) -> Array:
+    """Distance from the last vertex to the sensor along the light, (), mm."""
     return float(lens.senses[-1]) * back_distance(lens)
 
 
 def _distortion(lens: Lens, rays: FieldRays) -> Array:
+    """(Real - paraxial image height) / paraxial image height, (V, W).
+
+    The real height is projected on the direction of the paraxial one: (h.p - p.p) / p.p.
+    """
+
     def ideal_of(field: Array, distance: Array) -> Array:
         return image_height(lens, field, distance, rays.wavelengths)
 
@@ -227,18 +255,25 @@ def _distortion(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _lateral_colour(lens: Lens, rays: FieldRays) -> Array:
+    """Chief rays on the sensor less that of the first wavelength, (D, V, W - 1), mm."""
     points = rays.sensor_hits[..., 0]
     points = points if rays.symmetry == "none" else points[-1:]
     return points[..., 1:] - points[..., :1]
 
 
 def _chief_ray_angle(lens: Lens, rays: FieldRays) -> Array:
+    """Angles of chief rays with the normal of the sensor, (V, W), radians."""
     *across, along = (jnp.where(rays.arrives, a, 0)[..., 0] for a in rays.bundle.arrival)
     sine = safe_sqrt(sum((a**2 for a in across), jnp.zeros_like(along)))
     return jnp.arctan2(sine, jnp.where(sine + along**2 > 0, jnp.abs(along), 1))
 
 
 def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
+    """Index times RMS sine of the angles between the chief ray and rays through the rim, (V, W).
+
+    For unit vectors with the distance d, the sine of their angle satisfies sin^2 = d^2 (1 - d^2 /
+    4).
+    """
     arrival = rays.bundle.arrival
     lines = jnp.stack([jnp.where(rays.arrives, a, 0)[..., :EXTRAS] for a in arrival])
     square = jnp.sum((lines[..., 1:] - lines[..., :1]) ** 2, axis=0)
@@ -250,6 +285,8 @@ def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _gap(glass: bool, edge: bool) -> OperandKind:
+    """The kind of thicknesses in glass or air, on the axis or towards the rim."""
+
     def values(lens: Lens, rays: FieldRays) -> Array:
         radius = beam_radius(lens, rays) if edge else jnp.zeros_like(lens.semi_diameter[:-1])
         return gaps(lens, radius, glass)[int(edge)]
@@ -262,13 +299,17 @@ def _gap(glass: bool, edge: bool) -> OperandKind:
 
 
 def _incidence(lens: Lens, rays: FieldRays) -> Array:
+    """Largest angle of incidence on each active surface (L,), radians."""
     least = jnp.min(incidence_cosines(lens, rays), axis=(0, 2, 3))
     return jnp.arctan2(safe_sqrt((1 - least) * (1 + least)), least)
 
 
 def _glass_map(lens: Lens, rays: FieldRays) -> Array:
-    """Values of all surfaces, 0 of real glasses, whose nd in the model is 1 to rounding;
-    `Operand.placed` selects those where a model glass begins."""
+    """Values of "glass_map" for all surfaces (S,); 0 for real glasses, whose nd in the model is 1
+    to rounding.
+
+    `Operand.placed` selects the surfaces where a model glass begins.
+    """
     model = lens.dispersion.model
     assert model is not None, "Operand.check refuses it"
     return jnp.where(model[1:, 0] > 1.001, glass_map_distance(model[1:]), 0)
@@ -278,7 +319,7 @@ _RAYS = ("fields", "wavelengths", "distances")
 _VIEWS = ("distances", "fields")
 _OF_RAYS = (*_VIEWS, "wavelengths", "rays")
 _COLOURS = ("wavelengths",)
-_WAVES_PER_MM = 200.0  # green light at f/5
+_WAVES_PER_MM = 200.0  # path difference for each mm of miss, for green light at f/5
 _SCALES = ("wavelengths", "distances")
 OPERANDS: dict[str, OperandKind] = {
     "spot": OperandKind(_spot, _RAYS, squared="rms_spot", order=_OF_RAYS),
@@ -332,5 +373,5 @@ OPERANDS: dict[str, OperandKind] = {
 
 
 def kind_of(kind: str | Function) -> OperandKind:
-    """The kind of an operand, by its name or function; a user's function may select rays."""
+    """The kind of an operand, by its name or function. A user's function may select rays."""
     return OPERANDS[kind] if isinstance(kind, str) else OperandKind(kind, _RAYS, order=("value",))

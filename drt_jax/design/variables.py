@@ -26,11 +26,11 @@ from .kinds import (
 from .solves import Solve, fix_solves
 
 _How = Literal["equal", "opposite", "cemented"]
-# Typical change of a coefficient, relative to its bound.
+# Typical change of a coefficient with a bound `sag`, relative to the bound.
 _STEP_OF_SAG = 0.03
-# What cemented neighbours share.
+# The kinds that cemented neighbours share.
 _SHAPE = ("curvature", "conic", "coefficients")
-_NONE = {
+_WHY_NONE = {
     "coefficients": "the lens has none; write them into its prescription, zeros too",
     "phase": "the lens has none; write one into its prescription, zeros too",
     "thickness": "the lens has one surface; its distance to the sensor is the kind sensor",
@@ -40,7 +40,7 @@ _NONE = {
 
 
 class Place(NamedTuple):
-    """One number of a lens."""
+    """One number of a lens: its kind, its row (mostly a surface) and its term within the row."""
 
     kind: str
     row: int
@@ -54,16 +54,19 @@ class Place(NamedTuple):
 def _places(
     what: str, lens: Lens, kind: str, surfaces: tuple[int, ...], terms: tuple[int, ...] = ()
 ) -> list[Place]:
-    """Places of a kind. ValueError, which begins with `what`, for a surface or term that does not
-    exist; it lists those that do."""
+    """Places of a kind.
+
+    ValueError, which begins with `what`, for a surface or term that does not exist; the message
+    lists those that do.
+    """
     known = KINDS[kind]
     allowed, count = known.allowed(lens), known.terms(lens)
     if not allowed or not count:
-        raise ValueError(f"{what}: {kind}: {_NONE.get(kind, 'the lens has none')}")
-    for name, given, there in (("surface", surfaces, allowed), ("term", terms, range(count))):
-        for number in given:
-            if number not in there:
-                some = ", ".join(map(str, there))
+        raise ValueError(f"{what}: {kind}: {_WHY_NONE.get(kind, 'the lens has none')}")
+    for name, named, possible in (("surface", surfaces, allowed), ("term", terms, range(count))):
+        for number in named:
+            if number not in possible:
+                some = ", ".join(map(str, possible))
                 raise ValueError(f"{what}: {kind}: no {name} {number}; there are {some}")
     return [
         Place(kind, row, term)
@@ -79,18 +82,19 @@ class Vary:
     kind: "curvature", "conic", "coefficients", "thickness" (behind a surface; the sensor keeps its
         distance from the last vertex), "sensor" (its distance from the last vertex), "index" and
         "abbe" of the model glass that begins behind a surface, "tilt", "decentre", "semi_diameter",
-        "phase" (coefficients of diffractive surfaces, waves / mm^power, see `Phase`).
+        or "phase" (coefficients of diffractive surfaces, waves / mm^power, see `Phase`).
     surfaces: numbers of surfaces from 0; () for all that have one (curvature, conic, coefficients,
         tilt, decentre: active surfaces; semi_diameter: finite ones; phase: those with one).
     terms: numbers of coefficients, or components of a tilt or decentre, from 0; () for all except
         the coefficient of r^2 of a surface, which the curvature replaces, and a norm radius.
     low, high: bounds in the units of the lens. A sensor without bounds stays on its side of the
         last vertex, so that a real image does not become a virtual one.
-    scale: typical change in the units of the lens; 0 to choose it by the kind, the semi-diameter of
-        the stop and `sag`.
+    scale: typical change in the units of the lens; 0 to choose it from the kind, the semi-diameter
+        of the stop and `sag`.
     sag, semi_diameter: for coefficients, mm, instead of low and high: each coefficient changes the
-        sag by at most `sag` at `semi_diameter` from the axis, the largest beam of the design. This
-        leaves low powers free and keeps high ones small. For a phase `sag` is in waves.
+        sag by at most `sag` at the distance `semi_diameter` from the axis, the largest beam of the
+        design. This leaves low powers free and keeps high ones small. For a phase, `sag` is in
+        waves.
     """
 
     kind: VariableKind
@@ -128,19 +132,20 @@ class Vary:
             )
 
     def _check_sag(self) -> None:
-        given = self.sag, self.semi_diameter
-        if given == (0, 0):
+        """Raises ValueError for `sag` and `semi_diameter` that do not fit together or the kind."""
+        pair = self.sag, self.semi_diameter
+        if pair == (0, 0):
             return
         what = "variables: sag and semi_diameter"
         if self.kind not in SERIES:
             raise ValueError(f"{what}: are of coefficients, not of {self.kind}; give low and high")
-        if not all(0 < number < np.inf for number in given):
-            raise ValueError(f"{what}: give both, above 0 mm, got {given[0]:g} and {given[1]:g}")
+        if not all(0 < number < np.inf for number in pair):
+            raise ValueError(f"{what}: give both, above 0 mm, got {pair[0]:g} and {pair[1]:g}")
         if (self.low, self.high) != (-np.inf, np.inf):
             raise ValueError(f"{what}: stand instead of low and high; leave these out")
 
     def bounds(self, lens: Lens, place: Place) -> tuple[float, float, float]:
-        """Low, high and scale of one variable, in the units of the lens."""
+        """Low bound, high bound and scale of one variable, in the units of the lens."""
         if not self.sag:
             low, high = self.low, self.high
             if self.kind == "sensor" and (low, high) == (-np.inf, np.inf):
@@ -157,7 +162,7 @@ class Vary:
 
 @dataclasses.dataclass(frozen=True)
 class Tie:
-    """A tie: followers = scale x leader + shift.
+    """A tie of numbers of several surfaces: followers = scale x leader + shift.
 
     surfaces: numbers of two or more surfaces; the first is the leader.
     how: "equal", "opposite" (with the other sign), or "cemented" (two neighbours of one shape).
@@ -191,7 +196,7 @@ class Tie:
 
     @property
     def line(self) -> tuple[float, float]:
-        """Factor and shift of the followers."""
+        """Factor and shift of the followers; the factor is negative for "opposite"."""
         return (-self.scale if self.how == "opposite" else self.scale), self.shift
 
     def pairs(self, lens: Lens) -> list[tuple[Place, Place]]:
@@ -221,10 +226,10 @@ class Tie:
 class Variables:
     """N numbers of a lens as a vector, each in units of its scale.
 
-    lens: the lens at the start; all other numbers stay as in it.
+    lens: the lens at the start; all other numbers stay as they are in it.
     low, high: (N,), bounds of the vector.
     scale: (N,), in the units of the lens.
-    solves: applied in this order.
+    solves: the solves, in the order in which they are applied.
     lines: (T, 2), factor and shift of each tie.
 
     Static:
@@ -251,7 +256,8 @@ class Variables:
     ) -> "Variables":
         """Makes the variables of a lens.
 
-        vary: variables; the name of a kind stands for all of that kind.
+        lens: the lens at the start.
+        vary: variables; the name of a kind stands for all variables of that kind.
         ties: numbers that follow a variable, or a number that does not change.
         solves: conditions that hold exactly.
 
@@ -272,7 +278,7 @@ class Variables:
                     f"ties: {leader}, which {follower} follows, itself follows from a tie or a "
                     "solve; begin with another surface"
                 )
-        # The name of a kind leaves out tied and solved numbers; naming one of them is an error.
+        # If all numbers of a kind vary, tied and solved ones are left out. Naming one is an error.
         for place, v in found:
             if place in taken and v.surfaces:
                 raise ValueError(
@@ -288,7 +294,7 @@ class Variables:
                 f"solves: {len(solves)} of them, but {len(found)} variables; leave some out"
             )
         index = {place: k for k, (place, _) in enumerate(found)}
-        # Followers of a number that does not change are set once.
+        # Followers of a number that does not vary are set once, here.
         fixed = [(f, a * _number(lens, p) + b) for p, f, (a, b) in following if p not in index]
         lens = _with_numbers(_with_arrays(lens, {place.kind for place, _ in found}), fixed)
         dtype = lens.curvature.dtype
@@ -305,8 +311,11 @@ class Variables:
 
     @classmethod
     def joined(cls, sets: "Variables | Sequence[Variables]") -> "Variables":
-        """The variables of several sets of one lens as one. ValueError for none, for what is no
-        set, for sets of different lenses, and for a number that varies or follows twice."""
+        """Joins several sets of variables of one lens.
+
+        ValueError for no set, for something that is not a set, for sets of different lenses, and
+        for a number that varies or follows twice.
+        """
         if isinstance(sets, Variables):
             return sets
         found = list(sets) if isinstance(sets, Sequence) else [sets]
@@ -356,8 +365,12 @@ class Variables:
         return vector * self.scale
 
     def lens_of(self, vector: Array) -> Lens:
-        """The lens of a vector (N,), with ties and solves applied, bounds not. Works in `jit`,
-        `vmap` and under differentiation."""
+        """The lens of a vector, with ties and solves applied. Bounds are not applied.
+
+        Works in `jit`, `vmap` and under differentiation.
+
+        vector: (N,), in units of the scales.
+        """
         numbers = self.numbers(vector)
         changes = [(place, numbers[k]) for k, place in enumerate(self.places)]
         pairs = zip(self.ties, self.lines, strict=True)
@@ -369,12 +382,15 @@ class Variables:
 
 
 def _number(lens: Lens, place: Place) -> Array:
+    """The number () of a lens at a place."""
     return KINDS[place.kind].read(lens)[place.row, place.term]
 
 
 def _with_numbers(lens: Lens, changes: Sequence[tuple[Place, Array]]) -> Lens:
-    """The lens with changed numbers; thicknesses come before the sensor, whose distance counts from
-    the last vertex."""
+    """The lens with changed numbers.
+
+    Thicknesses are written before the sensor, whose distance counts from the last vertex.
+    """
     for name, kind in KINDS.items():
         own = [(place, number) for place, number in changes if place.kind == name]
         if own:
@@ -385,15 +401,16 @@ def _with_numbers(lens: Lens, changes: Sequence[tuple[Place, Array]]) -> Lens:
 
 
 def _same(one: Lens, two: Lens) -> bool:
-    """Whether two known lenses have the same numbers."""
+    """Whether two lenses with known numbers are equal."""
     alike = str(jax.tree.structure(one)) == str(jax.tree.structure(two))
     return alike and all(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(two)))
 
 
-def _refuse_twice(what: str, places: Iterable[Place], said: str) -> None:
+def _refuse_twice(what: str, places: Iterable[Place], reason: str) -> None:
+    """Raises ValueError for a place that occurs twice."""
     for place, group in itertools.groupby(sorted(places)):
         if len(list(group)) > 1:
-            raise ValueError(f"{what}: {place} {said}; leave one out")
+            raise ValueError(f"{what}: {place} {reason}; leave one out")
 
 
 def _with_arrays(lens: Lens, kinds: set[str]) -> Lens:

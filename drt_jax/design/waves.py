@@ -1,8 +1,8 @@
-"""Operands of waves: transfer functions, Strehl ratios, encircled energy and kernels of rays that a
-problem has traced, by the polynomials of `image.beam`. No ray is added.
+"""Operands of diffraction: transfer functions, Strehl ratios, encircled energy and kernels.
 
-With the rule `Gauss` all light that fills the stop counts, clipped or not. With `Soft` and
-`Clipped` only light counts that passes the apertures.
+They are computed from the rays that a problem has traced, by the polynomials of `image.beam`, and
+trace no other rays. With the rule `Gauss`, all light that fills the stop counts, clipped or not.
+With `Soft` and `Clipped`, only the light that passes the apertures counts.
 """
 
 from collections.abc import Callable
@@ -26,44 +26,48 @@ from ..rays.system import Vector
 from ..rays.trace import Bundle
 from .field_rays import EXTRAS, FieldRays
 
-# Cells of the pupil along a side: of transfer functions and Strehl ratios, of encircled energy.
+# Cells of the pupil along a side: for transfer functions and Strehl ratios, for encircled energy.
 _CELLS, _ENERGY = 64, 128
 
 
 def degree_of(rule: PupilRule) -> int:
-    """The degree of the polynomials of the pupil that the rays of a rule give, see `beam_rule`; 0
-    for a rule of too low an order or of another kind. Problems have no padded rules."""
+    """Degree of the polynomials of the pupil that the rays of a rule determine, see `beam_rule`.
+
+    It is 0 for a rule of too low an order or of another kind. The rules of problems are not padded.
+    """
     if isinstance(rule, Gauss | Soft):
         return 2 * (rule.order - 1)
     return 2 * max(rule.size - 2, 0) if isinstance(rule, Clipped) else 0
 
 
 def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Array]) -> Array:
-    """A function of the beam of each view, (V, ...)."""
+    """Evaluates a function of the beam of each view, (V, ...)."""
     full, degree = isinstance(rays.rule, Gauss), degree_of(rays.rule)
     light = rays.stop_weights if full else rays.weights * rays.throughput[..., None]
     light = jnp.where(rays.arrives, light, 0)
-    # The azimuths of `gauss_points` give no more terms.
+    # The azimuths of `gauss_points` determine no more azimuthal terms.
     azimuths = rays.rule.order if isinstance(rays.rule, Gauss | Soft) else degree
 
     def one(field: Array, distance: Array, points: Vector, light: Array, bundle: Bundle) -> Array:
-        given = rays.symmetry, degree, not full, azimuths
+        options = rays.symmetry, degree, not full, azimuths
         scene = Scene(field, distance, rays.wavelengths)
-        return function(beam_of(lens, scene, points, light, bundle, *given))
+        return function(beam_of(lens, scene, points, light, bundle, *options))
 
-    # `steps` alone has no axis of rays, and no use here.
+    # `steps` is the only field without an axis of rays; it is not used here and is replaced.
     of_rays = rays.points, light, rays.bundle._replace(steps=light)
     of_rays = jax.tree.map(lambda a: a[..., EXTRAS:], of_rays)
     return jax.vmap(one)(rays.field, rays.distance, *of_rays)
 
 
 def mtf(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
-    """Modulus (V, 2) of the transfer function of all wavelengths at a frequency, cycles/mm:
-    tangential and sagittal."""
+    """Modulus (V, 2) of the transfer function of all wavelengths, tangential and sagittal.
+
+    at: frequency on the sensor, cycles/mm.
+    """
     frequency = jnp.reshape(jnp.asarray(at, rays.wavelengths.dtype), 1)
-    given = rays.wavelengths, frequency, rays.wavelength_weights
-    of = lambda beam: transfer_of(lens, beam, *given, "waves", _CELLS)[0]  # noqa: E731
-    otf = _of_beams(lens, rays, of)[..., 0]
+    arguments = rays.wavelengths, frequency, rays.wavelength_weights
+    transfer = lambda beam: transfer_of(lens, beam, *arguments, "waves", _CELLS)[0]  # noqa: E731
+    otf = _of_beams(lens, rays, transfer)[..., 0]
     return safe_sqrt(otf.real**2 + otf.imag**2)
 
 
@@ -73,12 +77,14 @@ def strehl(lens: Lens, rays: FieldRays) -> Array:
 
 
 def encircled_energy(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
-    """The part (V,) of the light within a circle of a radius in mm about the centroid of all
-    wavelengths."""
+    """Fraction (V,) of the light within a circle about the centroid of all wavelengths.
+
+    at: radius of the circle, mm.
+    """
     radius = jnp.reshape(jnp.asarray(at, rays.wavelengths.dtype), 1)
-    given = rays.wavelengths, radius, rays.wavelength_weights
-    of = lambda beam: encircled(lens, beam, *given, "waves", _ENERGY)  # noqa: E731
-    return _of_beams(lens, rays, of)[:, 0]
+    arguments = rays.wavelengths, radius, rays.wavelength_weights
+    energy = lambda beam: encircled(lens, beam, *arguments, "waves", _ENERGY)  # noqa: E731
+    return _of_beams(lens, rays, energy)[:, 0]
 
 
 def psf(
@@ -89,15 +95,22 @@ def psf(
     model: Kind = "waves",
     cells: int = _ENERGY,
 ) -> Array:
-    """Kernels (V, W, size, size) of all views, see `drt_jax.psf`: for operands of your own.
+    """Kernels of all views, for operands of your own; see `drt_jax.psf`.
 
-    pixel: mm. cells: of the grid of the pupil along a side; more for spots of many pixels, see
-    `converged_psf`. ValueError for a rule whose rays give no polynomials.
+    lens: the lens.
+    rays: its rays, as `trace_fields` returns them or as an operand gets them.
+    pixel: pixel pitch, mm.
+    size: side of the kernels, pixels.
+    model: kind of the kernels, see `drt_jax.psf`.
+    cells: number of cells of the pupil grid along a side; more for spots of many pixels, see
+        `converged_psf`.
+
+    Returns (V, W, size, size). ValueError for a rule whose rays do not determine polynomials.
     """
     if degree_of(rays.rule) < 2:
         raise ValueError(
             f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
         )
     side, size = check_pixels(pixel, size, rays.wavelengths.dtype)
-    waves, given = rays.wavelengths, (side, None, size, model, cells)
-    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, waves, beam, *given).kernel)
+    waves, options = rays.wavelengths, (side, None, size, model, cells)
+    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, waves, beam, *options).kernel)

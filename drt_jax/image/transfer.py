@@ -189,17 +189,15 @@ def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
     density, inside, phase, turn, off = pupil((low + high) / 2, (high - low) / cells)
     size, phase = safe_sqrt(density) * inside, phase + jnp.sum(turn * off, axis=0)
     share = normalised(size, (1, 2))
-    # Remove the mean and the tilt by least squares, first along x, then along y of what is left.
+    mean = lambda a: jnp.sum(share * a, axis=(1, 2), keepdims=True)  # noqa: E731
+    # Remove the mean and the tilt by least squares: the normal equations of a x + b y.
     side = np.arange(cells) - (cells - 1) / 2
     places = off + jnp.asarray(np.stack(np.meshgrid(side, side)), phase.dtype)[:, None]
-    slopes: list[Array] = []
-    for place in places:
-        place = place - jnp.sum(share * place, axis=(1, 2), keepdims=True)
-        phase = phase - jnp.sum(share * phase, axis=(1, 2), keepdims=True)
-        square = jnp.sum(share * place**2, axis=(1, 2), keepdims=True)
-        product = jnp.sum(share * place * phase, axis=(1, 2), keepdims=True)
-        slopes.append(safe_divide(product, square))
-        phase = phase - slopes[-1] * place
+    x, y, phase = (a - mean(a) for a in (*places, phase))
+    xx, xy, yy, xp, yp = map(mean, (x * x, x * y, y * y, x * phase, y * phase))
+    det = xx * yy - xy**2
+    slopes = safe_divide(yy * xp - xy * yp, det), safe_divide(xx * yp - xy * xp, det)
+    phase = phase - slopes[0] * x - slopes[1] * y
     total = jnp.sum(_mean_wave(share, phase, turn - jnp.stack(slopes), inside), axis=(1, 2))
     return jnp.where(lit, total.real**2 + total.imag**2, 0)
 

@@ -1,4 +1,6 @@
-"""Adam (Kingma and Ba 2015) as a pair (init, update), with a rate for each group of parameters."""
+"""Adam (Kingma and Ba 2015) as a pair (init, update), with a learning rate for each group of
+parameters.
+"""
 
 import math
 from collections.abc import Callable, Mapping
@@ -12,8 +14,8 @@ from jax import Array
 class AdamState(NamedTuple):
     """State of the optimiser.
 
-    steps: (), int32, updates so far.
-    first, second: moments of the gradient, shaped as the parameters.
+    steps: (), int32, number of updates so far.
+    first, second: first and second moments of the gradient, in the shape of the parameters.
     """
 
     steps: Array
@@ -24,11 +26,11 @@ class AdamState(NamedTuple):
 def adam(
     rates: float | Mapping[str, Any], b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8
 ) -> tuple[Callable[[Any], AdamState], Callable[[Any, AdamState], tuple[Any, AdamState]]]:
-    """The optimiser as (init, update).
+    """The optimiser Adam as a pair of functions (init, update).
 
-    rates: one learning rate, or one for each top-level key of the parameters, such as
-        {"optics": 1e-2, "network": 1e-3}; a rate may be such a mapping itself. `update` raises
-        KeyError for a key without a rate.
+    rates: one learning rate, or one for each top-level key of the parameters, such as {"optics":
+        1e-2, "network": 1e-3}; a rate may be such a mapping itself. `update` raises KeyError for a
+        key without a rate.
     b1, b2: decay rates of the first and second moment.
     eps: added to the root of the second moment.
 
@@ -50,7 +52,7 @@ def adam(
                 return {name: scaled(rate[name], first[name], second[name]) for name in first}
 
             def leaf(m: Array, v: Array) -> Array:
-                # 1 - b^steps, without the cancellation that costs float32 five digits.
+                # 1 - b^steps, without cancellation, by which float32 would lose five digits.
                 bias = [-jnp.expm1(steps.astype(m.dtype) * math.log(b)) for b in (b1, b2)]
                 return -rate * (m / bias[0]) / (jnp.sqrt(v / bias[1]) + eps)
 
@@ -62,11 +64,14 @@ def adam(
 
 
 def apply_updates(parameters: Any, updates: Any) -> Any:
-    """Parameters + updates, leaf by leaf, each in its own dtype."""
+    """Parameters plus updates, leaf by leaf, each in the dtype of the parameter."""
     return jax.tree.map(lambda p, u: p + u.astype(p.dtype), parameters, updates)
 
 
 def copied(parameters: Any) -> Any:
-    """A copy, because the first step overwrites the buffers; with an explicit dtype, because
-    weakly typed parameters would compile the step again."""
+    """A copy of parameters.
+
+    It is needed because the first step donates (overwrites) the buffers. The dtypes are explicit,
+    because weakly typed parameters would cause the step to be compiled again.
+    """
     return jax.tree.map(lambda p: jnp.array(p, jnp.asarray(p).dtype), parameters)

@@ -1,4 +1,4 @@
-"""3x3 convolution for the network: on a CPU by Winograd's minimal filtering, image by image."""
+"""3x3 convolution for the network; on a CPU by Winograd's minimal filtering, image by image."""
 
 import math
 
@@ -27,8 +27,8 @@ _KERNEL = (
     (0, 0, 1),
 )
 _OUTPUT = tuple((*(p**k for p in (0.0, _S, -_S, _T, -_T)), float(k == 3)) for k in range(4))
-# With fewer channels the transforms cost more than they save; for images of fewer pixels ten
-# seconds of compilation do not pay.
+# With fewer channels than `_CHANNELS` the transforms cost more than they save. For images of fewer
+# pixels than `_PIXELS` the gain is not worth ten seconds of compilation.
 _CHANNELS, _PIXELS = 32, 1024
 
 
@@ -38,7 +38,7 @@ def convolve_3x3(images: Array, kernel: Array) -> Array:
     images: (B, H, W, in).
     kernel: (3, 3, in, out), of the same floating dtype.
 
-    In float32 the error is about 1e-6 of the largest value, as of any convolution.
+    In float32 the error is about 1e-6 of the largest value, as for any convolution.
     """
     (height, width), (into, out) = images.shape[1:3], kernel.shape[2:]
     if height * width < _PIXELS:
@@ -49,13 +49,18 @@ def convolve_3x3(images: Array, kernel: Array) -> Array:
 
 
 def _direct(images: Array, kernel: Array) -> Array:
+    """XLA's own convolution."""
     return lax.conv_general_dilated(
         images, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
 
 
 def _gathered(images: Array, kernel: Array) -> Array:
-    """For small images: as fast as XLA's convolution, which is 25 times slower inside a loop."""
+    """For small images: one matrix product of the nine shifted images, side by side, with the
+    kernel.
+
+    It is as fast as XLA's convolution, which is 25 times slower inside of a loop.
+    """
     height, width = images.shape[1:3]
 
     def one(image: Array) -> Array:
@@ -67,21 +72,26 @@ def _gathered(images: Array, kernel: Array) -> Array:
 
 
 def _winograd(images: Array, kernel: Array) -> Array:
+    """Winograd's filtering F(4x4, 3x3), image by image."""
     # (3, 3, in, out) -> 36 matrices (in, out).
     kernels = [k for row in _combined(_KERNEL, list(kernel)) for k in _combined(_KERNEL, list(row))]
     # Image by image, so that the transforms stay in the cache. The gradient computes them again,
-    # which costs less than to keep them.
+    # which costs less than storing them.
     return lax.map(jax.checkpoint(lambda image: _filtered(image, kernels)), images)
 
 
 def _combined(matrix: tuple, parts: list[Array]) -> list[Array]:
-    """Product of a matrix and a vector of arrays, written out: XLA makes one loop of each sum."""
+    """Product of a matrix and a vector of arrays, written out, so that XLA makes one loop of each
+    sum.
+    """
     return [sum(c * p for c, p in zip(row, parts) if c) for row in matrix]
 
 
 def _filtered(image: Array, kernels: list[Array]) -> Array:
-    """(H, W, in) -> (H, W, out), by 36 products, not one over a batch: XLA runs them in
-    parallel."""
+    """(H, W, in) -> (H, W, out) by 36 separate matrix products.
+
+    One product over a batch of 36 would not run in parallel in XLA.
+    """
     height, width = image.shape[0] // 4, image.shape[1] // 4
     padded = jnp.pad(image, ((1, 3), (1, 3), (0, 0)))
     rows = _combined(_INPUT, _taps(padded, 0))
@@ -95,8 +105,11 @@ def _filtered(image: Array, kernels: list[Array]) -> Array:
 
 
 def _taps(padded: Array, axis: int) -> list[Array]:
-    """The six inputs of every tile along an axis: entries 4 t, ..., 4 t + 5. By a split, whose
-    gradient is a concatenation; strided slices would give six scattered sums."""
+    """The six inputs of every tile along an axis: entries 4 t, ..., 4 t + 5.
+
+    They are made by a split, whose gradient is a concatenation. The gradient of strided slices
+    would be six scattered sums.
+    """
     count, shape = padded.shape[axis] // 4 - 1, padded.shape
     blocks = padded.reshape(*shape[:axis], count + 1, 4, *shape[axis + 1 :])
     phases = [part.squeeze(axis + 1) for part in lax.split(blocks, (1,) * 4, axis + 1)]

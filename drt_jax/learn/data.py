@@ -1,4 +1,4 @@
-"""Image patches for training and testing: from the scikit-image wheel or from a folder.
+"""Image patches for training and testing, from the scikit-image wheel or from a folder.
 
 Patches are uint8. They are larger than the image to be restored by the support of the blur, so that
 the sensor layer has true context on all sides. Nothing is downloaded.
@@ -28,14 +28,14 @@ _BUNDLED = (
     *("immunohistochemistry", "retina", "rocket", "stereo_motorcycle"),
 )
 _MOST_CROPS = 100_000
-# Most bytes of patches in memory: many times those of the paper's set.
+# Largest number of bytes of patches in memory: many times those of the paper's set.
 _MOST_MEMORY = 8 * 10**9
 _T = TypeVar("_T")
 _Source = str | pathlib.Path
 
 
 class DataError(InputError):
-    """Images cannot be used; the message names the folder or file and the remedy."""
+    """Images cannot be used. The message names the folder or file and the remedy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class DataConfig:
     """Where patches come from.
 
     root: "bundled", or a folder with subfolders (for DTD its `images` folder).
-    crops_per_image: random crops of each image.
+    crops_per_image: number of random crops of each image.
     test_fraction: fraction of the images, not of the crops, for testing.
     memory_map: folder on a disk for patches that do not fit in memory; empty to hold up to 8 GB in
         memory.
@@ -69,7 +69,7 @@ class Patches(NamedTuple):
     """Image patches.
 
     train, test: uint8 (N, P, P, bands), in memory or memory-mapped.
-    skipped: a line with the reason for each file, folder or kind of image that was skipped.
+    skipped: for each file, folder or kind of image that was skipped, a line with the reason.
     """
 
     train: np.ndarray
@@ -89,13 +89,13 @@ def load_patches(
     config: source of the images.
     side: side of a patch, pixels.
     seed: the same `config`, `side` and `seed` give the same patches.
-    progress: wraps the two loops over the images, of headers and of contents (tqdm).
-    bands: of each patch: 3 for colours, 1 for the luminance; images of other numbers of bands are
+    progress: wraps the two loops over the images, that over headers and that over contents (tqdm).
+    bands: of each patch: 3 for colours, 1 for the luminance. Images of other numbers of bands are
         arrays uint8 (H, W, bands) that `numpy.save` wrote, in a folder of `.npy` files.
 
     Images that cannot be used are skipped and listed in the result, see `images.read`. Images are
     decoded one at a time. DataError for a folder that does not exist or has fewer than two usable
-    images, and for patches that take more room than there is.
+    images, and for patches that need more memory or disk space than there is.
     """
     sources, skipped = _sources(config.root)
     fitting = [i for i in progress([*range(len(sources))]) if _fits(sources[i], side, skipped)]
@@ -103,9 +103,9 @@ def load_patches(
     _check_room(config, len(fitting), side, size)
     usable = 0
     with contextlib.ExitStack() as open_files, _room(config.memory_map):
-        pool, kept = (_file(config.memory_map, open_files) for _ in range(2))
+        pool, test_file = (_file(config.memory_map, open_files) for _ in range(2))
         for i in progress(fitting):
-            pixels = _tried(functools.partial(_pixels, bands=bands), sources[i], skipped)
+            pixels = _read_or_skip(functools.partial(_pixels, bands=bands), sources[i], skipped)
             if pixels is not None:
                 usable += 1
                 for crop in _crops(pixels, config.crops_per_image, side, [seed, 1, i]):
@@ -119,9 +119,9 @@ def load_patches(
         order = np.random.default_rng([seed, 0]).permutation(usable)
         count = min(max(1, round(config.test_fraction * usable)), usable - 1)
         is_test = np.isin(np.arange(usable), order[:count]).repeat(config.crops_per_image)
-        _part(pool, kept, is_test, size)
+        _part(pool, test_file, is_test, size)
         shape = -1, side, side, bands
-        return Patches(_array(pool, shape), _array(kept, shape), tuple(skipped))
+        return Patches(_array(pool, shape), _array(test_file, shape), tuple(skipped))
 
 
 def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
@@ -143,7 +143,7 @@ def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
 
 
 def _pixels(source: _Source, bands: int = 3) -> np.ndarray:
-    """Pixels, uint8 (H, W, bands), of a file or a bundled photograph."""
+    """Pixels, uint8 (H, W, bands), of a file or of a bundled photograph."""
     if isinstance(source, pathlib.Path):
         return read(source, bands)
     pixels = getattr(data, source)()
@@ -154,7 +154,7 @@ def _pixels(source: _Source, bands: int = 3) -> np.ndarray:
 
 
 def _size(source: _Source) -> tuple[int, int]:
-    """Width and height, pixels."""
+    """Width and height of an image, pixels."""
     if isinstance(source, pathlib.Path):
         return look(source)
     height, width = _pixels(source).shape[:2]
@@ -162,16 +162,19 @@ def _size(source: _Source) -> tuple[int, int]:
 
 
 def _fits(source: _Source, side: int, skipped: list[str]) -> bool:
-    """True if the header of an image says that it is large enough; otherwise adds the reason to
-    `skipped`."""
-    size = _tried(_size, source, skipped)
+    """True if an image is large enough according to its header; otherwise adds the reason to
+    `skipped`.
+    """
+    size = _read_or_skip(_size, source, skipped)
     if size and min(size) < side:
         skipped.append(one_line(f"{source}: {size[0]} x {size[1]} pixels, smaller than {side}"))
     return bool(size and min(size) >= side)
 
 
-def _tried(reader: Callable[..., _T], source: _Source, skipped: list[str]) -> _T | None:
-    """What a reader returns; if it raises, None, and adds the reason to `skipped`."""
+def _read_or_skip(reader: Callable[..., _T], source: _Source, skipped: list[str]) -> _T | None:
+    """The result of a reader. If the reader raises, adds the reason to `skipped` and returns
+    None.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -183,6 +186,7 @@ def _tried(reader: Callable[..., _T], source: _Source, skipped: list[str]) -> _T
 
 
 def _crops(pixels: np.ndarray, count: int, side: int, seed: list[int]) -> Iterator[np.ndarray]:
+    """Random crops of an image."""
     height, width = pixels.shape[:2]
     generator = np.random.default_rng(seed)
     tops = generator.integers(0, height - side + 1, count)
@@ -191,8 +195,11 @@ def _crops(pixels: np.ndarray, count: int, side: int, seed: list[int]) -> Iterat
 
 
 def _check_room(config: DataConfig, count: int, side: int, size: int) -> None:
-    """DataError if the patches of `count` images take more room than there is. size: of a patch,
-    bytes."""
+    """Raises DataError if the patches of `count` images need more memory or disk space than there
+    is.
+
+    size: of a patch, bytes.
+    """
     needed, folder = size * config.crops_per_image * count, config.memory_map
     what = f"{count} images x {config.crops_per_image} crops of {side} x {side} pixels"
     if not folder and needed > _MOST_MEMORY:
@@ -213,7 +220,7 @@ def _check_room(config: DataConfig, count: int, side: int, size: int) -> None:
 
 @contextlib.contextmanager
 def _room(folder: str) -> Iterator[None]:
-    """Raises DataError for errors of the memory or the disk."""
+    """Raises DataError for errors of the memory or of the disk."""
     try:
         yield
     except MemoryError as error:
@@ -223,21 +230,27 @@ def _room(folder: str) -> Iterator[None]:
 
 
 def _file(folder: str, open_files: contextlib.ExitStack) -> IO[bytes]:
-    """A file in memory; or one without a name in a folder, which vanishes with the process."""
+    """A file in memory; or a file without a name in a folder, which is deleted when the process
+    ends.
+    """
     if not folder:
         return io.BytesIO()
     return open_files.enter_context(tempfile.TemporaryFile(dir=os.path.expanduser(folder)))
 
 
-def _part(pool: IO[bytes], kept: IO[bytes], is_test: np.ndarray, size: int) -> None:
-    """Moves the test crops from `pool` to `kept`, and closes the gaps. Crop by crop, because both
-    together may be larger than the memory. size: bytes of a crop."""
+def _part(pool: IO[bytes], test_file: IO[bytes], is_test: np.ndarray, size: int) -> None:
+    """Moves the test crops from `pool` to `kept`, and closes the gaps.
+
+    It copies crop by crop, because both files together may be larger than the memory.
+
+    size: bytes of a crop.
+    """
     end = 0
     for k, moves in enumerate(is_test):
         pool.seek(k * size)
         crop = pool.read(size)
         if moves:
-            kept.write(crop)
+            test_file.write(crop)
             continue
         if end < k * size:
             pool.seek(end)
@@ -247,7 +260,7 @@ def _part(pool: IO[bytes], kept: IO[bytes], is_test: np.ndarray, size: int) -> N
 
 
 def _array(file: IO[bytes], shape: tuple[int, ...]) -> np.ndarray:
-    """The crops in a file, uint8. shape: of the result, -1 for their number."""
+    """The crops in a file, uint8. shape: shape of the result, with -1 for the number of crops."""
     if isinstance(file, io.BytesIO):
         return np.frombuffer(file.getbuffer(), np.uint8).reshape(shape)
     file.flush()
@@ -255,11 +268,13 @@ def _array(file: IO[bytes], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def batches(patches: np.ndarray, size: int, seed: int, start: int = 0) -> Iterator[np.ndarray]:
-    """Endless batches (size, P, P, C): a new permutation each epoch, without its incomplete batch.
+    """Endless batches (size, P, P, C) in random order.
+
+    Each epoch is a new permutation of the patches, without its incomplete batch.
 
     patches: uint8 (N, P, P, C).
-    size: patches in a batch; DataError if there are fewer.
-    seed: batch k depends only on it and k, so that a resumed run gets the same batches.
+    size: number of patches in a batch; DataError if there are fewer.
+    seed: batch k depends only on the seed and k, so that a resumed run gets the same batches.
     start: number of the first batch.
     """
     per_epoch = len(patches) // size

@@ -1,5 +1,8 @@
-"""Lens and network trained together over the field and over depth: kernels of object points that
-change in each step, sensor layer, network, and two optimisers of the lens."""
+"""Lens and network trained together over the field and over depth.
+
+The kernels of object points, which are drawn anew in each step, go through the sensor layer and the
+network. There are two optimisers of the lens.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,14 +18,15 @@ from ..image.sensor import convolve_each
 from ..numerics import Numbers
 from .adam import adam, apply_updates, copied
 
-# From optics and what is seen to kernels (P, C, K, K) and the light (P, C) on the sensor, relative
-# to a constant of the camera.
+# A function from the optics and object points to kernels (P, C, K, K), and to the light (P, C) on
+# the sensor relative to a constant of the camera.
 Points = Callable[[Any, "ObjectPoints"], tuple[Array, Array]]
-# From optics before and after an update to optics that can be built.
+# A function from the optics before and after an update to optics that can be built.
 Hold = Callable[[Any, Any], Any]
-# Least light that the gain of the sensor makes up for; below it the image stays dark.
+# Smallest amount of light for which the gain of the sensor compensates; below it the image is dark.
 _DARKEST = 0.02
-# Least mean residual in the curvature of the mean absolute error, for values from 0 to 1.
+# Lower bound of the mean residual in the curvature of the mean absolute error, for values from 0
+# to 1.
 _SMALLEST = 1e-3
 
 
@@ -30,11 +34,12 @@ _SMALLEST = 1e-3
 class FieldImager:
     """The chain kernels -> sensor layer -> network, for patches anywhere in the field.
 
-    points: kernels and light of object points, such as a function of `psfs`.
+    points: function that returns kernels and light of object points, for instance by `psfs`.
     restore: (weights, images) -> images; None for a camera without a network.
-    convolve: (scenes, kernels) -> images as `convolve_each`, or that shared by devices.
-    dtype: of scenes and images; kernels, made in the dtype of the lens, are cast to it. A network
-        of one's own has the same: under `jax_enable_x64` libraries make their weights in float64.
+    convolve: (scenes, kernels) -> images as `convolve_each`, or that function shared by devices.
+    dtype: of scenes and images. Kernels are made in the dtype of the lens and cast to it. A network
+        of your own must have the same dtype: under `jax_enable_x64` libraries make their weights in
+        float64.
     """
 
     points: Points
@@ -45,12 +50,14 @@ class FieldImager:
     def sensor(
         self, optics: Any, scenes: Array, seen: "ObjectPoints", noise: Numbers, key: Array
     ) -> Array:
-        """Sensor images (B, H, W, C), in the dtype of the scenes, with even brightness: where
-        the lens loses light, the gain raises the noise.
+        """Sensor images (B, H, W, C), in the dtype of the scenes, with even brightness.
 
-        scenes: floating (B, H + K - 1, W + K - 1, C), values from 0 to 1; patch b shows point
-            b P // B.
-        seen: the P points; B is a multiple of P.
+        Where the lens transmits less light, the gain of the sensor amplifies the noise.
+
+        optics: parameters of the lens.
+        scenes: floating (B, H + K - 1, W + K - 1, C), values from 0 to 1; patch b shows point b P
+            // B.
+        seen: the P object points; B is a multiple of P.
         noise: standard deviation of the noise where the light is 1.
         key: a PRNG key.
         """
@@ -76,16 +83,18 @@ class FieldImager:
         noise: Numbers,
         key: Array,
     ) -> tuple[Array, Array, Array]:
-        """True, sensor and restored images (B, H, W, C), of the dtype of the imager.
+        """True, sensor and restored images (B, H, W, C), in the dtype of the imager.
 
         parameters: "optics", and "network" for a network.
         scenes: uint8 (B, H + K - 1, W + K - 1, C).
+        seen, noise, key: as in `sensor`.
         """
         real = scenes.astype(self.dtype) / 255
         image = self.sensor(parameters["optics"], real, seen, noise, key)
         return truth_of(real, image), image, self._restored(parameters, image)
 
     def _restored(self, parameters: dict[str, Any], image: Array) -> Array:
+        """The images that the network restores."""
         restore = self.restore
         return image if restore is None else restore(parameters.get("network"), image)
 
@@ -95,8 +104,8 @@ class ObjectPoints(NamedTuple):
 
     fields: (P, 2), radians.
     distances: (P,), mm.
-    deviations: of the parts of the lens as built, for `FieldImager.points`; None for the lens as
-        designed.
+    deviations: of the parts of the lens as built, for `FieldImager.points`; None for the nominal
+        lens.
     """
 
     fields: Array
@@ -112,13 +121,15 @@ def truth_of(scenes: Array, image: Array) -> Array:
 
 
 def draw_points(key: Array, count: int, field: float, depths: tuple[float, float]) -> ObjectPoints:
-    """Object points over a circular field: one in each of `count` rings of equal area, at any
-    azimuth, and evenly in 1 / distance, in another order.
+    """Random object points over a circular field and a range of depths.
+
+    The field has one point in each of `count` rings of equal area, at a random azimuth. The range
+    of 1 / distance has one point in each of `count` equal intervals, in a random order.
 
     key: a PRNG key.
     count: number of points P.
     field: largest angle, radians.
-    depths: nearest and farthest distance, mm; inf allowed.
+    depths: nearest and farthest distance, mm; may be inf.
     """
     ring, turn, depth, order = jax.random.split(key, 4)
     kind = jnp.result_type(float)
@@ -133,8 +144,8 @@ def draw_points(key: Array, count: int, field: float, depths: tuple[float, float
     return ObjectPoints(jnp.arctan(tangents), distances)
 
 
-def _kept(before: Any, after: Any) -> Any:
-    """A `Hold` that allows everything."""
+def _allow_all(before: Any, after: Any) -> Any:
+    """A `Hold` that allows every update."""
     return after
 
 
@@ -143,18 +154,19 @@ def make_field_step(
     rates: dict[str, Any],
     draw: Callable[[Array], ObjectPoints],
     seed: int,
-    hold: Hold = _kept,
+    hold: Hold = _allow_all,
 ) -> tuple[Callable, Callable]:
     """Adam on the mean absolute error, for lens and network, as (init, step) for `fit`.
 
     imager: the camera.
     rates: learning rates of "optics" and "network", see `adam`.
-    draw: points of a step from a PRNG key, such as a function of `draw_points`.
-    seed: points and noise depend only on it and the index of the step.
+    draw: function that returns the object points of a step from a PRNG key, for instance by
+        `draw_points`.
+    seed: points and noise depend only on it and on the index of the step.
     hold: keeps the optics within what can be built, see `design.within_limits`.
 
-    init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the
-    state donated. metrics: loss, (). Parameters without "network" train the optics alone.
+    init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, with
+    the state donated. metrics: loss, (). Parameters without "network" train the optics alone.
     """
     init_adam, update = adam(rates)
 
@@ -180,13 +192,13 @@ def make_field_step(
 
 
 class _Newton(NamedTuple):
-    """Running means for the optics: gradient (N,) and curvature (N, N), of the same weights."""
+    """Running means for the optics: gradient (N,) and curvature (N, N), with the same weights."""
 
     gradient: Array
     curvature: Array
 
     def step(self, damping: float) -> Array:
-        """The full step (N,), with the curvature's diagonal raised by a part of it."""
+        """The full step (N,): -(C + damping diag(C))^-1 gradient, with the curvature C."""
         diagonal = jnp.diag(self.curvature)
         least = jnp.finfo(diagonal.dtype).eps * jnp.max(diagonal)
         raised = self.curvature + jnp.diag(damping * diagonal + jnp.where(least > 0, least, 1))
@@ -198,19 +210,19 @@ def make_damped_step(
     rates: dict[str, Any],
     draw: Callable[[Array], ObjectPoints],
     seed: int,
-    hold: Hold = _kept,
+    hold: Hold = _allow_all,
     damping: float = 0.1,
     memory: float = 0.9,
 ) -> tuple[Callable, Callable]:
     """As `make_field_step`, but the optics take damped least-squares steps.
 
-    rates: of "optics", the part of a full step; of "network", as before.
+    rates: of "optics", the fraction of a full step; of "network", the learning rate as before.
     damping: added to the curvature, relative to its diagonal.
-    memory: decay of the running means of gradient and curvature.
+    memory: decay rate of the running means of gradient and curvature.
 
     The gradient is exact. The curvature is that of Gauss and Newton for the pixels in front of the
-    network: J^T J over the mean absolute residual, J forward through rays and kernels. The optics
-    are a dict of vectors.
+    network, J^T J / (number of pixels times mean absolute residual), with J computed in forward
+    mode through rays and kernels. The optics are a dict of vectors.
     """
     init_adam, update = adam({"network": rates["network"]})
 
@@ -228,18 +240,18 @@ def make_damped_step(
         def sensor(vector):
             return imager.sensor(optics_of(vector), real, seen, noise, noise_key)
 
-        image, push = jax.linearize(sensor, vector)
-        slopes = jax.vmap(push)(jnp.eye(vector.size, dtype=vector.dtype))
+        image, derivative = jax.linearize(sensor, vector)
+        slopes = jax.vmap(derivative)(jnp.eye(vector.size, dtype=vector.dtype))
         truth = truth_of(real, image)
 
         def loss(weights, image):
             return jnp.mean(jnp.abs(imager._restored(weights, image) - truth))
 
         weights = _weights(parameters)
-        error, (gradients, toward) = jax.value_and_grad(loss, (0, 1))(weights, image)
+        error, (gradients, image_gradient) = jax.value_and_grad(loss, (0, 1))(weights, image)
         flat = slopes.reshape(vector.size, -1)
         size = jnp.maximum(error, _SMALLEST) * flat.shape[1]
-        now = _Newton(flat @ toward.ravel(), flat @ flat.T / size)
+        now = _Newton(flat @ image_gradient.ravel(), flat @ flat.T / size)
         means = jax.tree.map(lambda m, n: memory * m + (1 - memory) * n.astype(m.dtype), means, now)
         moved = vector + rates["optics"] * means.step(damping)
         updates, moments = update(gradients, moments)
@@ -253,10 +265,11 @@ def make_damped_step(
 def _drawn(
     draw: Callable[[Array], ObjectPoints], seed: int, index: Array
 ) -> tuple[ObjectPoints, Array]:
-    """The points of a step, and the key of its noise."""
+    """The object points of a step, and the key of its noise."""
     noise_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
     return draw(key), noise_key
 
 
 def _weights(parameters: dict[str, Any]) -> dict[str, Any]:
+    """The parameters without the optics."""
     return {name: value for name, value in parameters.items() if name != "optics"}

@@ -1,8 +1,8 @@
-"""Photographs: found in a folder, read upright with 8 bits per channel. Arrays of NumPy hold images
-of any number of bands.
+"""Photographs: found in a folder, and read upright with 8 bits per channel. NumPy arrays hold
+    images of any number of bands.
 
-Pillow reads and converts photographs. Images that it would misread are refused with the reason,
-from the header where that suffices.
+Pillow reads and converts photographs. Images that it would read wrongly are refused with the
+reason, from the header where that is sufficient.
 """
 
 import collections
@@ -13,10 +13,10 @@ import stat
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-# Those that others are best converted to, and all that are read.
+# Formats to which other images are best converted, and all formats that are read.
 _COMMON = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 SUFFIXES = (*_COMMON, ".jpe", ".jfif", ".webp", ".npy")
-# Images of other kinds, which are counted and reported.
+# Formats that are not read; such images are counted and reported.
 _UNREAD = {
     *(".gif", ".avif", ".heic", ".heif", ".jp2", ".j2k", ".jxl", ".svg"),
     *(".pbm", ".pgm", ".ppm", ".pnm", ".pfm", ".tga", ".ico", ".psd", ".exr", ".hdr", ".eps"),
@@ -25,14 +25,14 @@ _UNREAD = {
 # Formats that a file may have, whatever its name: images saved from web pages are often WebP. For
 # others Pillow may start a program (EPS).
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "GIF", "WEBP")
-# Modes that Pillow converts to RGB rightly; 16 bits are shifted here.
+# Modes that Pillow converts to RGB correctly; `read` shifts 16 bits to 8.
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
-# Pillow's own limit; at its 4 bytes per pixel this is 0.7 GB.
+# Pillow's own limit on the number of pixels. At its 4 bytes per pixel this is 0.7 GB.
 MOST_PIXELS = 178_956_970
 
 
 def look(path: pathlib.Path) -> tuple[int, int]:
-    """Width and height of an image from its header, pixels; raises as `read` does."""
+    """Width and height of an image from its header, pixels. Raises as `read` does."""
     if path.suffix.lower() == ".npy":
         height, width = _array(path).shape[:2]
         return width, height
@@ -43,11 +43,11 @@ def look(path: pathlib.Path) -> tuple[int, int]:
 def read(path: pathlib.Path, bands: int = 3) -> np.ndarray:
     """The first image of a file, upright, uint8 (H, W, bands).
 
-    bands: 3 for the colours of a photograph, 1 for its luminance; or those of an array of NumPy
-        (`.npy`), uint8 (H, W, bands).
+    bands: 3 for the colours of a photograph, 1 for its luminance; or the number of bands of a NumPy
+        array (`.npy`), uint8 (H, W, bands).
 
     An exception of any kind says why a file cannot be used. Only regular files are opened, not
-    pipes; an image above `MOST_PIXELS` pixels is not decoded.
+    pipes. An image above `MOST_PIXELS` pixels is not decoded.
     """
     if path.suffix.lower() == ".npy":
         return in_bands(np.array(_array(path)), bands)
@@ -59,8 +59,11 @@ def read(path: pathlib.Path, bands: int = 3) -> np.ndarray:
 
 
 def in_bands(pixels: np.ndarray, bands: int) -> np.ndarray:
-    """Pixels (H, W, bands) of pixels (H, W, C), uint8; of three colours also the luminance.
-    ValueError for another number of bands."""
+    """Pixels (H, W, bands), uint8, of pixels (H, W, C); the luminance of three colours if bands is
+    1.
+
+    ValueError for another number of bands.
+    """
     if bands == 1 and pixels.shape[2] == 3:
         return np.asarray(Image.fromarray(pixels).convert("L"))[..., None]
     if pixels.shape[2] != bands:
@@ -72,7 +75,7 @@ def in_bands(pixels: np.ndarray, bands: int) -> np.ndarray:
 
 
 def _array(path: pathlib.Path) -> np.ndarray:
-    """An array of NumPy, (H, W, C), not yet read from its file."""
+    """A NumPy array, (H, W, C), memory-mapped."""
     _refuse_pipes(path)
     pixels = np.load(path, mmap_mode="r", allow_pickle=False)
     if pixels.ndim != 3 or pixels.dtype != np.uint8 or not 0 < pixels.size <= 4 * MOST_PIXELS:
@@ -82,6 +85,7 @@ def _array(path: pathlib.Path) -> np.ndarray:
 
 
 def _refuse_pipes(path: pathlib.Path) -> None:
+    """Raises ValueError for anything that is not a regular file."""
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError("not a regular file")
 
@@ -96,15 +100,15 @@ def _open(path: pathlib.Path) -> Image.Image:
     except Image.DecompressionBombError as error:
         raise ValueError(f"more than {MOST_PIXELS} pixels") from error
     width, height = image.size
-    problem = f"more than {MOST_PIXELS} pixels" if width * height > MOST_PIXELS else _odd(image)
+    problem = f"more than {MOST_PIXELS} pixels" if width * height > MOST_PIXELS else _flaw(image)
     if problem:
         image.close()
         raise ValueError(problem)
     return image
 
 
-def _odd(image: Image.Image) -> str:
-    """Why the values of an image would be misread; "" if they are not."""
+def _flaw(image: Image.Image) -> str:
+    """Why the values of an image would be read wrongly; "" if they are read correctly."""
     tags = getattr(image, "tag_v2", {})  # of a TIFF
     bits, is_deep = tags.get(258, (16,))[0], image.mode.startswith("I;16")
     is_plain = is_deep or image.mode in _MODES
@@ -115,9 +119,12 @@ def _odd(image: Image.Image) -> str:
 
 
 def find_images(folder: str) -> tuple[list[pathlib.Path], list[str]]:
-    """Files with one of `SUFFIXES` in a folder and its subfolders, sorted by path, and a line for
-    each thing skipped: folders that are links (they may lead back) or cannot be read, and images of
-    other kinds, counted."""
+    """Images in a folder and its subfolders.
+
+    Returns the files with one of `SUFFIXES`, sorted by path; and a line for each thing that is
+    skipped: folders that are links (they may lead back) or that cannot be read, and images of other
+    formats, counted.
+    """
     found, left_out, counts = [], [], collections.Counter[str]()
     folders = [folder]
     while folders:

@@ -1,9 +1,9 @@
 """RED-Net, the restoration network of the paper, as a pair (init, apply).
 
-Five convolutions and five transposed convolutions: 3x3, 64 channels, stride 1, biases, three bands
-(RGB) in and out, 298,947 parameters. At stride 1 a transposed convolution is a convolution with the
-mirrored kernel, so all ten are convolutions here. Source: Mao, Shen and Yang, NIPS 2016 (ref. 32 of
-the paper).
+It has five convolutions and five transposed convolutions: 3x3, 64 channels, stride 1, biases, three
+bands (RGB) in and out, 298,947 parameters. At stride 1 a transposed convolution is a convolution
+with the mirrored kernel, so all ten are convolutions here. Source: Mao, Shen and Yang, NIPS 2016
+(ref. 32 of the paper).
 """
 
 import itertools
@@ -27,22 +27,22 @@ def red_net(
     bands: int = 3,
     dtype: Any = jnp.float32,
 ) -> tuple[Callable[[Array], Parameters], Callable[[Parameters, Array], Array]]:
-    """The network as (init, apply).
+    """The network as a pair of functions (init, apply).
 
-    layers: number of convolutions before the middle, and of transposed ones behind it.
-    channels: channels between layers.
-    skip_every: n adds the output of every n-th convolution, counted from the middle, to that of
-        its mirror image before the ReLU; 0 for no such skips, 2 in the original.
+    layers: number of convolutions before the middle, and of transposed convolutions behind it.
+    channels: number of channels between layers.
+    skip_every: n adds the output of every n-th convolution, counted from the middle, to that of its
+        mirror image before the ReLU; 0 for no such skips; 2 in the original.
     input_skip: True adds the input to the output, so that the network learns the correction. The
         last layer then starts at a tenth of its usual scale: the network begins near the identity,
-        and the first Adam steps do not kill the ReLUs. (At zero they did: nothing was learned at a
-        rate of 1e-3.)
-    bands: of the images, such as 3 colours.
-    dtype: of parameters and images, float32 also where JAX's default is float64.
+        and the first Adam steps do not make the ReLUs inactive. (With a last layer of zeros they
+        did, and nothing was learned at a rate of 1e-3.)
+    bands: number of bands of the images, such as 3 colours.
+    dtype: of parameters and images; float32 by default, even where JAX's default is float64.
 
-    init(key) -> parameters: a list of {"kernel" (3, 3, in, out), "bias" (out,)}.
-    apply(parameters, images (B, H, W, bands)) -> restored images of the same shape and dtype.
-    ValueError for numbers out of range, and for images of other bands or another dtype.
+    init(key) -> parameters: a list of {"kernel" (3, 3, in, out), "bias" (out,)}. apply(parameters,
+    images (B, H, W, bands)) -> restored images of the same shape and dtype. ValueError for numbers
+    out of range, and for images of other bands or of another dtype.
     """
     if layers < 1 or channels < 1 or bands < 1 or skip_every < 0:
         raise ValueError("layers, channels and bands must be positive, skip_every not negative")

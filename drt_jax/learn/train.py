@@ -53,18 +53,18 @@ def make_imager(
 ) -> Imager:
     """The chain moments -> PSF -> sensor layer -> network as one function.
 
-    blur: a function of `moments_model`.
+    blur: a function that `moments_model` returns.
     restore: (parameters, images) -> images; None for a camera without a network.
     camera: constants of the sensor layer.
-    convolve: `convolve`, or `convolve_taps` for values and forward mode, which `make_step` uses
+    convolve: `convolve`; or `convolve_taps` for values and forward mode, which `make_step` uses
         where a single number is trained.
     dtype: of scenes and images, and of the network; kernels are cast to it.
 
     The function maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
-    distance in mm, noise, key) to the true, the sensor and the restored image
-    (B, H, W, C), of this dtype, and the standard deviation (C,) of the blur in mm. The kernel is
-    centred on the mean centroid of the wavelengths that arrive, so that images are registered. Each
-    channel is multiplied by the throughput of its wavelength.
+    distance in mm, noise, key) to the true, the sensor and the restored image (B, H, W, C), of this
+    dtype, and to the standard deviation (C,) of the blur in mm. The kernel is centred on the mean
+    centroid of the wavelengths that arrive, so that images are registered. Each channel is
+    multiplied by the throughput of its wavelength.
     """
     margin = camera.kernel // 2
 
@@ -90,16 +90,18 @@ def make_imager(
 
 
 def blur_width(covariance: Array) -> Array:
-    """Standard deviation (C,) of a blur, the root of the mean of its variances along x and y, mm.
-    covariance: (C, 2, 2), mm^2."""
+    """Standard deviation (C,) of a blur, mm: the root of the mean of its variances along x and y.
+
+    covariance: (C, 2, 2), mm^2.
+    """
     return safe_sqrt(jnp.mean(jnp.diagonal(covariance, 0, 1, 2), axis=1))
 
 
 def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:
-    """((value, extras), gradient) of a loss (parameters) -> (value, extras).
+    """((value, extras), gradient) of a loss function parameters -> (value, extras).
 
-    In forward mode where a single number is trained, such as the sensor position: it takes two
-    thirds of the time, see paper section 3.
+    Where a single number is trained, such as the sensor position, the gradient is computed in
+    forward mode, which takes two thirds of the time, see paper section 3.
     """
     if count_parameters(parameters) > 1:
         return jax.value_and_grad(loss, has_aux=True)(parameters)
@@ -118,15 +120,15 @@ def make_step(
 ) -> tuple[Callable, Callable]:
     """Adam on the mean absolute error as (init, step).
 
-    imager: a function of `make_imager`.
+    imager: a function that `make_imager` returns.
     rates: learning rates of "optics" and "network", see `adam`, in the unit of each parameter.
-    depths: limits of the object distance, uniform in each step, mm.
-    seed: noise and distance depend only on it and the step index.
+    depths: limits of the object distance, which is uniform in each step, mm.
+    seed: noise and distance depend only on it and on the index of the step.
     vectorised: True for N jobs at once, along the first axis of all parameters.
 
-    init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, the
-    state donated. metrics: loss, sigma_um (mean over the wavelengths), depth_mm, and the parameters
-    of the optics by name, "sensor" as sensor_mm, each () or (N,).
+    init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, with
+    the state donated. metrics: loss, sigma_um (mean over the wavelengths), depth_mm, and the
+    parameters of the optics by name, "sensor" as sensor_mm, each () or (N,).
     """
     init_adam, update = adam(rates)
     near, far = depths
@@ -170,14 +172,14 @@ def fit(
 ) -> Any:
     """Runs steps and returns the final state.
 
-    step, state: from `make_step`.
+    step, state: as `make_step` and its `init` return them.
     scenes: batches uint8 (B, P, P, C), one for each step.
     noise: standard deviation, for values from 0 to 1.
     steps: indices of the steps.
-    every: steps between reports; between them nothing waits for the device.
+    every: number of steps between reports; between them nothing waits for the device.
     report: report(start, metrics, state), called every `every` steps and at the end, with the
         metrics since step `start` stacked on the first axis.
-    stopped: called after each step; True ends early, with a report.
+    stopped: called after each step; True ends the loop early, with a report.
     """
     strength = np.float32(noise)
     pending: list[dict[str, Array]] = []
@@ -203,17 +205,18 @@ def evaluate(
     seed: int,
     batch: int = 32,
 ) -> dict[str, float]:
-    """Image quality over patches, by scikit-image, for values from 0 to 1, not clipped: mae and
-    rmse over all values, psnr (dB) and ssim as means over the patches, of the restored images; with
-    the prefix `sensor_`, of the images in front of the network.
+    """Image quality over patches, by scikit-image, for values from 0 to 1, not clipped.
 
-    imager: a function of `make_imager`.
+    Returns mae and rmse over all values, psnr (dB) and ssim as means over the patches, of the
+    restored images; and the same with the prefix `sensor_` of the images in front of the network.
+
+    imager: a function that `make_imager` returns.
     parameters: of optics and network.
     patches: uint8 (N, P, P, C).
     distance: of the object, mm.
-    noise: standard deviation.
+    noise: standard deviation of the noise.
     seed: seed of the noise.
-    batch: patches imaged at a time.
+    batch: number of patches that are imaged at a time.
     """
     rows: list[dict[str, float]] = []
     for start in range(0, len(patches), batch):
@@ -230,6 +233,7 @@ def evaluate(
 
 
 def _quality(truth: np.ndarray, image: np.ndarray, prefix: str) -> dict[str, float]:
+    """Quality of one image: mae, mse, psnr (dB) and ssim, with a prefix."""
     similarity = metrics.structural_similarity(truth, image, data_range=1, channel_axis=-1)
     return {
         prefix + "mae": float(np.mean(np.abs(truth - image))),

@@ -1,5 +1,6 @@
-"""Apertures other than circles about a vertex: ellipses, rectangles, polygons, decentres,
-obscurations."""
+"""Apertures other than circles about a vertex: ellipses, rectangles, polygons, decentred apertures
+and obscurations.
+"""
 
 import dataclasses
 import itertools
@@ -19,20 +20,21 @@ from .polygon import convex_pieces
 class Apertures:
     """A apertures, each along the axes of its surface.
 
-    half: (A, 2), half widths along x and y, mm; of a circle the first is the radius, the second is
-        not used; of a polygon the units of its corners along x and y.
+    half: (A, 2), half widths along x and y, mm. Of a circle the first is the radius, and the second
+        is not used. Of a polygon they are the units of its corners along x and y.
     centre: (A, 2), from the vertex, mm; None if all are centred on their vertices.
-    corners: (A, N, 2), of polygons, from the centre in units of `half`, in their order around; rows
-        behind the last corner are not used. None without polygons.
+    corners: (A, N, 2), corners of polygons from their centres, in units of `half`, in their order
+        around the polygon; rows behind the last corner are not used. None without polygons.
 
     Static, A of each:
     surfaces: indices of the surfaces.
     kinds: "circle", "ellipse", "rectangle" or "polygon".
-    blocks: True for an obscuration, which stops the light inside; False stops the light outside.
-    pieces: the convex pieces of a polygon, each the numbers of its corners counterclockwise, see
-        `convex_pieces`; () for others. () in place of all is replaced by the pieces of polygons of
-        which all N corners are used. ValueError if these are not known, as inside `jax.jit`, or if
-        sides cross.
+    blocks: True for an obscuration, which stops the light inside; False for an aperture that stops
+        the light outside.
+    pieces: the convex pieces of each polygon, each piece the numbers of its corners
+        counterclockwise, see `convex_pieces`; () for other kinds. If () is given in place of all,
+        the pieces are computed from the corners, for polygons that use all N corners. ValueError if
+        the corners are not known, as inside `jax.jit`, or if sides cross.
     """
 
     half: Array
@@ -57,8 +59,11 @@ class Apertures:
 
     @property
     def sizes(self) -> Array:
-        """Half widths (A, 2) along x and y, mm; of a circle both are the radius, of a polygon the
-        largest distances of its corners from its centre."""
+        """Half widths (A, 2) along x and y, mm.
+
+        Of a circle both are the radius; of a polygon they are the largest distances of its corners
+        from its centre.
+        """
         rows = []
         for k, kind in enumerate(self.kinds):
             if kind == "polygon":
@@ -68,7 +73,7 @@ class Apertures:
         return jnp.stack(rows)
 
     def only(self, keep: list[int]) -> "Apertures":
-        """Some of the apertures, by their numbers."""
+        """A selection of the apertures. keep: their numbers."""
         names, rows = ("surfaces", "kinds", "blocks", "pieces"), np.array(keep)
         static: dict[str, Any] = {n: tuple(getattr(self, n)[k] for k in keep) for n in names}
         centre, corners = (a if a is None else a[rows] for a in (self.centre, self.corners))
@@ -81,16 +86,19 @@ class Apertures:
 
     @property
     def most(self) -> int:
-        """Most corners of a convex piece; 0 without polygons."""
+        """Largest number of corners of a convex piece; 0 without polygons."""
         return max(map(len, itertools.chain(*self.pieces)), default=0)
 
     def terms(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The open area as a sum of T areas that convex shapes have in common: signs (T,), which
-        apertures shape each (T, A), bool, and the corners of the pieces of polygons (T, A, N).
+        """The open area as a signed sum of T areas, each the intersection of convex shapes.
 
         Light passes inside of all clear apertures and outside of all obscurations. By inclusion and
-        exclusion, this is a sum over sets of obscurations of the light inside of all of a set, with
-        negative signs for an odd number; and a polygon is the sum of its pieces.
+        exclusion, the product of (1 - B) over the obscurations B is the sum over all sets of
+        obscurations of the area inside of all of the set, with a negative sign for an odd number of
+        them. A polygon is the sum of its convex pieces.
+
+        Returns signs (T,); which apertures shape each area (T, A), bool; and the corners of the
+        pieces of polygons (T, A, N).
         """
         none, options = (0,) * self.most, []  # a polygon with one corner has no edge
         for blocks, pieces in zip(self.blocks, self.pieces, strict=True):
@@ -103,16 +111,19 @@ class Apertures:
         return np.prod(signs, axis=1), shapes, corners
 
     def part(self, shapes: Array, corners: Array) -> "Apertures":
-        """The apertures of one of the `terms`, whose polygons are convex."""
+        """The apertures of one of the `terms`; its polygons are convex."""
         half, own = jnp.where(shapes[:, None], self.half, jnp.inf), self.corners
         if own is not None:
             own = jnp.take_along_axis(own, corners[..., None], axis=1)
         return dataclasses.replace(self, half=half, corners=own)
 
     def edges(self) -> tuple[Array, Array, np.ndarray]:
-        """Edges ``|q| = 1`` of convex apertures, q = matrix (hit - centre): matrices (E, 2, 2),
-        centres (E, 2), mm, and surfaces (E,). A side of a polygon is one side of a strip that is
-        twice as wide as the polygon."""
+        """Edges q.q = 1 of convex apertures, with q = matrix (hit - centre).
+
+        A side of a polygon is one side of a strip that is twice as wide as the polygon.
+
+        Returns matrices (E, 2, 2), centres (E, 2), mm, and surfaces (E,).
+        """
         found, eye = [], jnp.eye(2, dtype=self.half.dtype)
         for k, kind in enumerate(self.kinds):
             middle = jnp.zeros((1, 2), eye.dtype) if self.centre is None else self.centre[k : k + 1]
@@ -130,8 +141,10 @@ class Apertures:
 
 
 def _strips(corners: Array) -> tuple[Array, Array]:
-    """Matrices (N, 2, 2) and centres (N, 2) of the edges of a convex polygon (N, 2); a side without
-    a length is no edge."""
+    """Matrices (N, 2, 2) and centres (N, 2) of the edges of a convex polygon (N, 2).
+
+    A side of length 0 is no edge.
+    """
     along = jnp.roll(corners, -1, axis=0) - corners
     outwards = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
     length = safe_sqrt(jnp.sum(along**2, axis=1, keepdims=True))
@@ -144,7 +157,13 @@ def _strips(corners: Array) -> tuple[Array, Array]:
 
 def depths(apertures: Apertures, hits: tuple[Array, ...]) -> Array:
     """Distance of hits from the edge of each aperture, (A, ...), mm, to first order; negative
-    outside. hits: D arrays (S + 1, ...), on all surfaces, mm; D = 1 on the meridian."""
+    outside.
+
+    For a rectangle it is the distance from the nearest side; for a polygon the distance from the
+    nearest side segment. For an ellipse with q = (x / a, y / b) it is (1 - |q|) / |grad |q||.
+
+    hits: D arrays (S + 1, ...), on all surfaces, mm; D = 1 on the meridian.
+    """
     found = []
     for k, (surface, kind) in enumerate(zip(apertures.surfaces, apertures.kinds, strict=True)):
         point = [hit[surface] for hit in hits]
@@ -167,15 +186,15 @@ def depths(apertures: Apertures, hits: tuple[Array, ...]) -> Array:
 
 
 def _polygon_depth(corners: Array, y: Array, x: Array | None = None) -> Array:
-    """Distance (...) of points inside of the nearest side of a polygon (N, 2), negative outside."""
+    """Distance (...) of points from the nearest side of a polygon (N, 2), negative outside."""
     point = jnp.stack([0 * y if x is None else x, y])
     end = jnp.roll(corners, -1, axis=0)
     a, b = (c.T.reshape(2, -1, *[1] * y.ndim) for c in (corners, end))
-    along, off = b - a, point[:, None] - a
-    share = jnp.clip(jnp.sum(off * along, axis=0) / jnp.sum(along**2, axis=0), 0, 1)
-    far = safe_sqrt(jnp.min(jnp.sum((off - share[None] * along) ** 2, axis=0), axis=0))
+    along, offset = b - a, point[:, None] - a
+    fraction = jnp.clip(jnp.sum(offset * along, axis=0) / jnp.sum(along**2, axis=0), 0, 1)
+    far = safe_sqrt(jnp.min(jnp.sum((offset - fraction[None] * along) ** 2, axis=0), axis=0))
     # The point lies inside if an odd number of sides cross its height to its right.
     passes = (a[1] > y[None]) != (b[1] > y[None])
-    right = (along[0] * off[1] > along[1] * off[0]) == (along[1] > 0)
+    right = (along[0] * offset[1] > along[1] * offset[0]) == (along[1] > 0)
     inside = jnp.sum(passes & right, axis=0) % 2 == 1
     return jnp.where(inside, far, -far)

@@ -1,4 +1,4 @@
-"""Clearance: the distance of rays from the edges that clip them."""
+"""Clearance: the signed distance of rays from the edges that clip them."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +10,11 @@ from .lens import Lens
 
 
 def clearance(lens: Lens, hits: tuple[Array, ...]) -> Array:
-    """Distance of hits from each of E edges, (E, ...), mm; below 0 the edge stops the ray.
+    """Distance of hits from each of E edges, (E, ...), mm; negative if the edge stops the ray.
 
-    The first S + 1 edges are the circles of `semi_diameter`; the clearance is inf where there is
-    none, and at the stop, because rays are aimed inside its rim. Then follow `lens.apertures`.
+    The first S + 1 edges are the circles of `semi_diameter`, with the clearance semi_diameter - r.
+    It is inf where there is no circle, and at the stop, because rays are aimed inside of its rim.
+    Then follow the edges of `lens.apertures`, with the sign reversed for obscurations.
 
     hits: D arrays (S + 1, ...), on all surfaces, mm; D = 1 on the meridian.
     """
@@ -28,8 +29,12 @@ def clearance(lens: Lens, hits: tuple[Array, ...]) -> Array:
 
 
 def clipping_surface(lens: Lens, hits: tuple[Array, ...]) -> Array:
-    """The first surface that clips each ray, (...), int32; for a ray that passes, the surface with
-    the nearest edge. hits: as in `clearance`."""
+    """The first surface that clips each ray, (...), int32.
+
+    For a ray that passes, it is the surface with the nearest edge.
+
+    hits: as in `clearance`.
+    """
     extra, none = lens.apertures, lens.count + 1
     edges = clearance(lens, hits)
     stops = (edges < 0) | (edges == jnp.min(edges, axis=0, keepdims=True))

@@ -1,4 +1,4 @@
-"""The same lens at another size, and the other way round."""
+"""The same lens at another size, or reversed."""
 
 import dataclasses
 import re
@@ -13,7 +13,8 @@ from .forms import FORMS
 from .lens import Labels, Lens
 from .phase import Phase
 
-# How the named coefficients of forms change with size (a power of it) and with the sign of a sag.
+# How the named coefficients of forms change: the power of the size with which they scale, and their
+# sign if the sag changes sign.
 _NAMED = {"curvature_x": (-1, -1), "conic_x": (0, 1), "norm_radius": (1, 1)}
 
 
@@ -25,8 +26,10 @@ def _degree(power: int | str) -> int:
 
 
 def _terms(form: str, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The powers of the size by which `count` coefficients of a form change, and their signs if the
-    sag changes sign."""
+    """How `count` coefficients of a form change.
+
+    Returns the powers of the size with which they scale, and their signs if the sag changes sign.
+    """
     record = FORMS[form]
     by_radius = "norm_radius" in record.named  # coefficients are heights, mm
     terms = [_NAMED[name] for name in record.named]
@@ -37,17 +40,19 @@ def _terms(form: str, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _resized(coefficients: Array, forms: tuple[str, ...], factor: Array) -> Array:
-    """Coefficients (N, K) of forms, or of phases, of which all lengths are `factor` times as
-    long."""
+    """Coefficients (N, K) of forms or phases, after all lengths were multiplied by `factor`."""
     powers = np.array([_terms(form, coefficients.shape[1])[0] for form in forms])
     return coefficients * factor ** jnp.asarray(powers, factor.dtype)
 
 
 def scaled(lens: Lens, factor: Numbers) -> Lens:
-    """The lens with all lengths times a factor: rays keep their angles, and all errors in mm grow
-    by the factor. Gratings and other phases keep the angles, too.
+    """The lens with all lengths multiplied by a factor.
 
-    factor: (), above 0; differentiable. ValueError for another, where it is known.
+    Rays keep their angles, and all aberrations in mm scale with the factor. Gratings and other
+    phases keep the angles, too.
+
+    lens: the lens.
+    factor: (), above 0; differentiable. ValueError for another factor, where it is known.
     """
     size = real_array("factor", factor, lens.curvature.dtype)
     if size.shape or (concrete(size) and not size > 0):
@@ -77,8 +82,10 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
 
 
 def flipped(lens: Lens) -> Lens:
-    """The lens the other way round: light takes each path backwards. The sensor is not turned, and
-    stays as far behind the last vertex as it was. ValueError for a lens with mirrors or elements.
+    """The lens reversed: light takes each path backwards.
+
+    The sensor is not reversed, and keeps its distance from the last vertex. ValueError for a lens
+    with mirrors or elements.
     """
     if any(lens.mirrors) or lens.elements is not None:
         raise ValueError("lens: with mirrors or elements it cannot be flipped")
@@ -86,10 +93,10 @@ def flipped(lens: Lens) -> Lens:
     order = np.array([*range(count)[::-1], count])
     other = {i: count - 1 - i for i in range(count)} | {count: count}
     signs = np.array([_terms(form, lens.coefficients.shape[1])[1] for form in lens.forms])
-    signs[-1], turn = 1, np.array([*[-1] * count, 1])  # the sensor keeps its shape and place
+    signs[-1], turn = 1, np.array([*[-1] * count, 1])  # the sensor is not reversed
     dtype = lens.curvature.dtype
     tilt = lens.tilt
-    if tilt is not None:  # about x and y the other way
+    if tilt is not None:  # tilts about x and y change their sign
         tilt = (tilt * jnp.asarray(np.stack([turn, turn, turn**2], axis=1), dtype))[order]
     phase, apertures = lens.phase, lens.apertures
     if phase is not None:

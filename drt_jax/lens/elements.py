@@ -12,11 +12,11 @@ from ..numerics import matmul
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Elements:
-    """G rigid groups of neighbouring surfaces. A group that ends with the sensor is a coordinate
-    break: it moves all that follows.
+    """G rigid groups of neighbouring surfaces.
 
-    A group is tilted about its pivot, then shifted. A group inside another stands behind it in this
-    order and moves with it.
+    A group that ends with the sensor is a coordinate break: it moves all that follows. A group is
+    tilted about its pivot, then shifted. A group inside of another one comes after it in this
+    order, and moves with it.
 
     shift: (G, 3), along x, y and z, mm.
     tilt: (G, 3), about x, then the rotated y, then the rotated z, right-handed, radians.
@@ -34,24 +34,32 @@ class Elements:
     about: tuple[int, ...] = dataclasses.field(metadata={"static": True})
 
     def carry(self, axis: Array, point: Array, rotation: Array) -> tuple[Array, Array]:
-        """Moves vertices (S + 1, 3), mm, and rotations (S + 1, 3, 3) of the surfaces with their
-        groups. axis: (S + 1,), z of the vertices on the undisturbed axis, mm."""
+        """Moves surfaces with their groups, the inner groups first.
+
+        axis: (S + 1,), z of the vertices on the undisturbed axis, mm.
+        point: (S + 1, 3), vertices, mm.
+        rotation: (S + 1, 3, 3), rotations of the surfaces.
+
+        Returns the moved vertices and rotations.
+        """
         for g in reversed(range(len(self.spans))):
             first, last = self.spans[g]
             own = slice(first, last + 1)
-            turned = rotation_matrix(self.tilt[g])
+            turn = rotation_matrix(self.tilt[g])
             pivot = jnp.zeros_like(point[:1]).at[:, 2].set(axis[self.about[g]] + self.pivot[g])
-            moved = pivot + self.shift[g][None] + matmul(point[own] - pivot, turned.T)
+            moved = pivot + self.shift[g][None] + matmul(point[own] - pivot, turn.T)
             point, rotation = (
                 point.at[own].set(moved),
-                rotation.at[own].set(matmul(turned[None], rotation[own])),
+                rotation.at[own].set(matmul(turn[None], rotation[own])),
             )
         return point, rotation
 
 
 def rotation_matrix(tilt: Array) -> Array:
-    """Rotation (3, 3) from the axes of a tilted surface to those of the lens. tilt: (3,), about x,
-    then the rotated y, then the rotated z, radians."""
+    """Rotation (3, 3) from the axes of a tilted surface to those of the lens.
+
+    tilt: (3,), about x, then the rotated y, then the rotated z, radians.
+    """
     (cx, cy, cz), (sx, sy, sz) = jnp.cos(tilt), jnp.sin(tilt)
     one, zero = jnp.ones_like(cx), jnp.zeros_like(cx)
     about_x = jnp.array([[one, zero, zero], [zero, cx, -sx], [zero, sx, cx]])

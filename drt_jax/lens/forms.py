@@ -1,10 +1,10 @@
-"""The forms of surfaces: one function and one record in `FORMS` each.
+"""The forms of surfaces: each is one function and one record in `FORMS`.
 
 A point w on a surface has one transverse coordinate, y in the meridional plane, or two, x and y
-(paper Eq. 1): a tuple of arrays, or an array with the component axis first. A form is a function
-(w, shape) -> (sag, argument), elementwise in all other axes; the surface exists where `argument` is
-above 0. Slopes, vertex curvatures and derivatives follow by automatic differentiation, see
-`surface`.
+(paper Eq. 1). It is a tuple of arrays, or an array with the component axis first. A form is a
+function (w, shape) -> (sag, argument), which works elementwise on all other axes; the surface
+exists where `argument` is above 0. Slopes, vertex curvatures and derivatives follow by automatic
+differentiation, see `surface`.
 """
 
 import functools
@@ -19,9 +19,10 @@ from jax import Array
 
 from ..numerics import tensordot
 
-# Smallest argument of the square root: there the normal of a sphere leans 0.57 degrees (cos = 0.01)
-# short of 90 degrees. Beyond, the root continues smoothly and stays positive, so that an iteration
-# that strays outside stays finite and can come back; a ray that ends there misses the surface.
+# Smallest argument of the square root. There the normal of a sphere makes an angle with the axis
+# that is 0.57 degrees below 90 degrees (cos = 0.01). Beyond, the root continues smoothly and stays
+# positive, so that an iteration that goes outside stays finite and can return. A ray that ends
+# there misses the surface.
 RIM = 1e-4
 # Below this r^2 (mm^2) r counts as 0, because r has no derivative there.
 _AXIS = 1e-16
@@ -44,18 +45,19 @@ class Shape(NamedTuple):
 
 
 def square(w: Point) -> Array:
-    """r^2 of points, shaped as `w[0]`, mm^2."""
+    """r^2 of points, mm^2, in the shape of `w[0]`."""
     return sum((a * a for a in w[1:]), w[0] * w[0])
 
 
 def root(argument: Array) -> Array:
-    """Square root down to `RIM`, continued smoothly and positively below. Any shape."""
+    """Square root for arguments above `RIM`, continued smoothly and positively below. Any shape."""
     inside = argument > RIM
     beyond = RIM**0.5 / (1 + (1 - jnp.where(inside, RIM, argument) / RIM) / 2)
     return jnp.where(inside, jnp.sqrt(jnp.where(inside, argument, 1)), beyond)
 
 
 def _conic(r2: Array, c: Array, k: Array) -> tuple[Array, Array]:
+    """Sag of a conic, and the argument of its square root."""
     argument = 1 - (1 + k) * c**2 * r2
     return c * r2 / (1 + root(argument)), argument
 
@@ -86,17 +88,18 @@ def odd_asphere(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Conic and every power of r: ... + a_0 r + a_1 r^2 + a_2 r^3 + ..."""
     r2 = square(w)
     z, argument = _conic(r2, shape.curvature, shape.conic)
-    off = r2 > _AXIS
-    r = jnp.where(off, jnp.sqrt(jnp.where(off, r2, 1)), 0)
+    off_axis = r2 > _AXIS
+    r = jnp.where(off_axis, jnp.sqrt(jnp.where(off_axis, r2, 1)), 0)
     odd, even = horner(r2, shape.coefficients[::2]), horner(r2, shape.coefficients[1::2])
     return z + r * odd + r2 * even, argument
 
 
 def biconic(w: Point, shape: Shape) -> tuple[Array, Array]:
-    """Another conic in each direction: c and k hold for y, a_0 and a_1 are c and k for x.
+    """A conic of different parameters along x and y.
 
-    z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2)), and then
-    a_2 r^2 + a_3 r^4 + ... Source: the biconic of Zemax and of batoid.
+    c and k hold for y, a_0 and a_1 are c and k for x. z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 +
+    kx) cx^2 x^2 - (1 + ky) cy^2 y^2)) + a_2 r^2 + a_3 r^4 + ... Source: the biconic of Zemax and of
+    batoid.
     """
     x2, y2 = w[0] * w[0], w[1] * w[1]
     cy, ky, (cx, kx) = shape.curvature, shape.conic, shape.coefficients[:2]
@@ -107,18 +110,18 @@ def biconic(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 
 def toroid(w: Point, shape: Shape) -> tuple[Array, Array]:
-    """A curve g(y) rotated about an axis along y at the distance 1 / a_0 from the vertex.
+    """A curve g(y) rotated about an axis along y, at the distance 1 / a_0 from the vertex.
 
-    g is the conic of c and k plus a_1 y^2 + a_2 y^4 + ...; a_0 is the curvature in x.
-    z = Rx - sign(Rx) sqrt((Rx - g)^2 - x^2) with Rx = 1 / a_0, written so that a_0 may be 0.
+    g is the conic of c and k plus a_1 y^2 + a_2 y^4 + ...; a_0 is the curvature along x. z = Rx -
+    sign(Rx) sqrt((Rx - g)^2 - x^2) with Rx = 1 / a_0, written in a form in which a_0 may be 0.
     """
     x2, y2 = w[0] * w[0], w[1] * w[1]
     g, argument = _conic(y2, shape.curvature, shape.conic)
     g = g + y2 * horner(y2, shape.coefficients[1:])
     cx = shape.coefficients[0]
-    turned = (1 - cx * g) ** 2 - cx**2 * x2
-    z = (2 * g - cx * g * g + cx * x2) / (1 + root(turned))
-    return z, jnp.minimum(argument, turned)
+    argument_x = (1 - cx * g) ** 2 - cx**2 * x2
+    z = (2 * g - cx * g * g + cx * x2) / (1 + root(argument_x))
+    return z, jnp.minimum(argument, argument_x)
 
 
 def powers_xy(count: int) -> list[tuple[int, int]]:
@@ -128,7 +131,7 @@ def powers_xy(count: int) -> list[tuple[int, int]]:
 
 
 def _polynomial(w: Point, terms: dict[tuple[int, int], Array]) -> Array:
-    """sum_ij a_ij x^i y^j. terms: a_ij by (i, j)."""
+    """sum_ij a_ij x^i y^j by Horner's scheme. terms: a_ij by (i, j)."""
     degree = max((i + j for i, j in terms), default=0)
     zero = jnp.zeros_like(w[0])
     # A polynomial in y for each power of x.
@@ -144,14 +147,14 @@ def polynomial_xy(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 
 def linear(w: Point, shape: Shape) -> tuple[Array, Array]:
-    """Conic and a slope: ... + a_0 y. As a phase, a grating with lines along x."""
+    """Conic and a linear term: ... + a_0 y. As a phase, it is a grating with lines along x."""
     z, argument = _conic(square(w), shape.curvature, shape.conic)
     return z + w[-1] * sum(shape.coefficients[:1], jnp.zeros_like(z)), argument
 
 
 @functools.cache
 def noll_terms(degree: int) -> tuple[tuple[int, int], ...]:
-    """(n, m) of the terms up to a degree in Noll's order, m below 0 for the sines."""
+    """(n, m) of the Zernike terms up to a degree in Noll's order; m is negative for sines."""
     terms: list[tuple[int, int]] = []
     for n in range(degree + 1):
         for m in range(n % 2, n + 1, 2):
@@ -162,7 +165,7 @@ def noll_terms(degree: int) -> tuple[tuple[int, int], ...]:
 
 
 def fringe_terms() -> list[tuple[int, int]]:
-    """(n, m) of the 37 fringe terms, m below 0 for the sines."""
+    """(n, m) of the 37 fringe terms; m is negative for sines."""
     found: list[tuple[int, int]] = []
     for half in range(6):
         for m in range(half, -1, -1):
@@ -172,8 +175,12 @@ def fringe_terms() -> list[tuple[int, int]]:
 
 
 def noll_of_fringe(fringe: int) -> tuple[int, float]:
-    """Noll's number of a fringe term, which is 1 at the rim where Noll's is the second number
-    returned. fringe: its number, 1 to 37."""
+    """Noll's number of a fringe term, and the ratio of the fringe term to Noll's.
+
+    A fringe term is 1 at the rim where Noll's term has the value of this ratio.
+
+    fringe: number of the fringe term, 1 to 37.
+    """
     n, m = fringe_terms()[fringe - 1]
     return noll_terms(n).index((n, m)) + 1, math.sqrt((n + 1) * (2 if m else 1))
 
@@ -206,8 +213,9 @@ def _noll(count: int) -> tuple[list[tuple[int, int]], np.ndarray]:
 def zernike(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Conic and Zernike polynomials: ... + sum_j a_j Z_j(x / R, y / R) with R = a_0 in mm.
 
-    Z_j in Noll's order and norm, theta from the x axis. Summed as a polynomial in x and y, which
-    keeps 11 of 16 digits of a_j with 91 terms, the most that files may give.
+    Z_j has Noll's order and norm, with theta measured from the x axis. The sum is evaluated as a
+    polynomial in x and y, which keeps 11 of 16 digits of a_j with 91 terms, the largest number in
+    files.
     """
     z, argument = _conic(square(w), shape.curvature, shape.conic)
     if len(shape.coefficients) > 1:
@@ -220,7 +228,7 @@ def zernike(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 @functools.cache
 def _forbes(count: int) -> np.ndarray:
-    """Coefficients (count, count) of the auxiliary P_j in Q_m, column m, see `qbfs`."""
+    """Coefficients (count, count) of the auxiliary polynomials P_j in Q_m, column m, see `qbfs`."""
     f, g, h = [2.0, math.sqrt(19) / 2], [-0.5], []
     basis = np.eye(count)
     for m in range(count):
@@ -238,11 +246,11 @@ def _forbes(count: int) -> np.ndarray:
 def qbfs(w: Point, shape: Shape) -> tuple[Array, Array]:
     """Conic and Forbes' polynomials Q_m along its normal, whose slopes are orthonormal on a sphere.
 
-    z = ... + x (1 - x) s sum_m a_(m + 1) Q_m(x), with x = (r / a_0)^2, a_0 in mm, and
-    s = sqrt(1 - k c^2 r^2) / sqrt(1 - (1 + k) c^2 r^2), 1 / cosine of the conic's slope. Summed by
-    Clenshaw's recurrence in P_0 = 2, P_1 = 6 - 8 x, P_(m + 1) = (2 - 4 x) P_m - P_(m - 1), which
-    has no large terms. Source: Forbes, Opt. Express 15, 5218 (2007) and 18, 19700 (2010), as in
-    Zemax.
+    z = ... + x (1 - x) s sum_m a_(m + 1) Q_m(x), with x = (r / a_0)^2, a_0 in mm, and s = sqrt(1 -
+    k c^2 r^2) / sqrt(1 - (1 + k) c^2 r^2), which is 1 / cosine of the slope of the conic. The sum
+    is evaluated by Clenshaw's recurrence in P_0 = 2, P_1 = 6 - 8 x, P_(m + 1) = (2 - 4 x) P_m -
+    P_(m - 1), which has no large terms. Source: Forbes, Opt. Express 15, 5218 (2007) and 18, 19700
+    (2010), as in Zemax.
     """
     r2 = square(w)
     z, argument = _conic(r2, shape.curvature, shape.conic)
@@ -269,8 +277,8 @@ class Form(NamedTuple):
     function: (w, shape) -> (sag in mm, argument), see the top of this file.
     symmetry: "rotational" about the z axis, "bilateral" for x -> -x, or "none".
     powers: names of the coefficients in files, in order.
-    named: keys of their own for the first coefficients in files.
-    round: True if the conic is one of r, so that the surface ends at a rim.
+    named: separate keys in files for the first coefficients.
+    round: True if the conic is a function of r, so that the surface ends at a circular rim.
     """
 
     function: Callable[[Point, Shape], tuple[Array, Array]]

@@ -10,15 +10,17 @@ from jax import Array
 
 from ..numerics import concrete, matmul, safe_divide, safe_sqrt
 
-# Model glasses: the lines d, F, C, g (um) and the powers of the wavelength L in Conrady's formula.
+# Of model glasses: the lines d, F, C, g (um), and the powers of the wavelength L in Conrady's
+# formula.
 FRAUNHOFER, _CONRADY = (0.5875618, 0.4861327, 0.6562725, 0.4358343), (0, -1, -3.5)
-# P_gF on Schott's normal line (constant, slope by vd); range of model glasses, from line i to t.
+# P_gF on Schott's normal line (constant, and slope by vd); range of model glasses, um, from the
+# line i to the line t.
 NORMAL_LINE, VISIBLE = (0.6438, -0.001682), (0.365, 1.014)
 _NO_MODEL, _FARTHEST = (1.0, 50.0), 0.2
-# Range (um) of a medium without one: 0.1 nm to 1 m.
+# Range (um) of a medium for which none is given: 0.1 nm to 1 m.
 ANY = 1e-4, 1e6
-# Powers of L in `Glass.schott`. The two before the last are too large for float32 below the
-# shortest wavelength.
+# Powers of L in `Glass.schott`. L^-10 and L^-12 are too large for float32 at wavelengths below
+# `_SHORTEST`, um.
 POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12, 6), 0.01
 
 
@@ -26,17 +28,18 @@ POWERS, _SHORTEST = (0, 2, -2, -4, -6, -8, 4, -10, -12, 6), 0.01
 class Glass:
     """Dispersion constants of one medium.
 
-    n^2 is the sum of Sellmeier's and Schott's formulas. A Sellmeier glass has a0 = 1, a medium of
-    constant index n has a0 = n^2.
+    n^2 is the sum of Sellmeier's and Schott's formulas, sum_t B_t L^2 / (L^2 - C_t) + sum_k a_k
+    L^p_k with the wavelength L in um. A Sellmeier glass has a0 = 1; a medium of constant index n
+    has a0 = n^2.
 
     name: as in a prescription.
     sellmeier: (B1 .. BT, C1 .. CT), any number of terms T; C in um^2.
     schott: (a0 .. a5), coefficients of L^0, L^2, L^-2, L^-4, L^-6, L^-8, and up to four more, of
         L^4, L^-10, L^-12, L^6.
-    range: shortest and longest wavelength for which they hold, um.
+    range: shortest and longest wavelength for which the constants hold, um.
     model: nd and vd of a model glass, see `model_glass`.
     partial: P_gF of a model glass less that of the normal line.
-    maker, source: in the table of glasses; "" for none.
+    maker, source: as in the table of glasses; "" for none.
     """
 
     name: str
@@ -54,8 +57,8 @@ class Glass:
 class Dispersion:
     """Dispersion constants of M media as arrays, so that an index can be differentiated.
 
-    T, at least 3, is the largest number of Sellmeier terms, K the largest number of Schott's
-    coefficients; shorter rows end with zeros.
+    T, at least 3, is the largest number of Sellmeier terms, and K the largest number of Schott's
+    coefficients; shorter rows are filled with zeros.
 
     strength: (M, T), Sellmeier's B.
     resonance: (M, T), Sellmeier's C, um^2.
@@ -74,8 +77,11 @@ class Dispersion:
 
     @property
     def range(self) -> tuple[Any, Any]:
-        """Shortest and longest wavelength at which the index of all media is known, um; the first
-        number is the larger one if there is none. Floats, or arrays () in a trace."""
+        """Shortest and longest wavelength at which the index of all media is known, um.
+
+        If there is no such wavelength, the first number is larger than the second. Both are floats,
+        or arrays () in a trace.
+        """
         if concrete(self.ranges):
             low, high = np.asarray(self.ranges, float).T
             return float(low.max()), float(high.min())
@@ -83,8 +89,10 @@ class Dispersion:
         return jnp.max(low), jnp.min(high)
 
     def knows(self, wavelengths: Array) -> Array:
-        """True where the index of all media is known, bool; also in a trace. wavelengths: any
-        shape, um."""
+        """True where the index of all media is known, bool; also in a trace.
+
+        wavelengths: any shape, um.
+        """
         low, high = (jnp.asarray(end, wavelengths.dtype) for end in self.range)
         return (wavelengths >= low) & (wavelengths <= high)
 
@@ -113,11 +121,14 @@ class Dispersion:
 def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
     """A glass of given nd and Abbe number vd = (nd - 1) / (nF - nC).
 
-    Conrady's n = A + B / L + C / L^3.5 through nd, nF - nC and ng - nF = P_gF (nF - nC), with
-    P_gF = 0.6438 - 0.001682 vd + partial. ValueError unless 1 < nd <= 4, 10 <= vd <= 120 and
-    |partial| <= 0.2.
+    Its index follows Conrady's formula n = A + B / L + C / L^3.5 through nd, nF - nC and ng - nF =
+    P_gF (nF - nC), with P_gF = 0.6438 - 0.001682 vd + partial.
 
+    nd: index at the d line.
+    vd: Abbe number.
     partial: P_gF less that of Schott's normal line.
+
+    ValueError unless 1 < nd <= 4, 10 <= vd <= 120 and -0.2 <= partial <= 0.2.
     """
     if not (1 < nd <= 4 and 10 <= vd <= 120):
         raise ValueError(f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
@@ -128,15 +139,18 @@ def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
 
 
 def nd_and_vd(dispersion: Dispersion) -> Array:
-    """nd and Abbe number vd (M, 2) of all media; vd is 0 without dispersion."""
+    """nd and Abbe number vd (M, 2) of all media; vd is 0 for a medium without dispersion."""
     lines = jnp.asarray(FRAUNHOFER[:3], dispersion.schott.dtype)
     nd, f, c = refractive_index(dispersion, lines).T
     return jnp.stack([nd, safe_divide(nd - 1, f - c)], axis=-1)
 
 
 def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> Dispersion:
-    """Replaces the media `rows`, bool (M,), by those of `other`, which has M media or one for all.
-    The result has as many terms as the dispersion with more."""
+    """Replaces the media `rows`, bool (M,), by those of `other`.
+
+    other: M media, or one medium for all. The result has as many terms as the dispersion with more
+        of them.
+    """
 
     def mixed(name: str, none: Any) -> Any:
         both = getattr(dispersion, name), getattr(other, name)
@@ -155,7 +169,9 @@ def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> D
 
 
 def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
-    """Replaces media by model glasses of the same nd and vd. rows: (M,), bool, which."""
+    """Replaces media by model glasses of the same nd and vd. rows: (M,), bool, the media to
+    replace.
+    """
     found = nd_and_vd(dispersion)
     none = jnp.zeros((1, 1), found.dtype)
     models = Dispersion(none, none, none + 1, jnp.asarray([VISIBLE], found.dtype), found)
@@ -163,7 +179,10 @@ def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
 
 
 def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Array:
-    """n - 1 of model glasses, (M, W). Arguments: see `Dispersion`."""
+    """n - 1 of model glasses, (M, W); 0 for other media. Arguments as in `Dispersion`.
+
+    Inverts the 3 x 3 system for A - 1, B and C of Conrady's formula.
+    """
     d, f, c, g = np.power.outer(FRAUNHOFER, np.asarray(_CONRADY, float))
     formula = np.linalg.inv(np.stack([d, f - c, g - f])).T
     nd, vd = model[:, 0], model[:, 1]
@@ -171,7 +190,7 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
     above = NORMAL_LINE[0] + NORMAL_LINE[1] * vd + (0 if partial is None else partial)
     known = jnp.stack([nd - 1, mean, above * mean], axis=-1)
     powers = jnp.stack([wavelengths**p for p in _CONRADY])
-    # A medium with a formula of its own stays as it is.
+    # A medium with a dispersion formula has no model.
     own = jnp.where(model[:, :1] > 1, known, 0)
     return matmul(matmul(own, jnp.asarray(formula, known.dtype)), powers)
 
@@ -179,7 +198,8 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     """Index of each medium at each wavelength, (M, W), relative to air, whose index is 1.
 
-    Finite for any wavelength; 0 where the formula has no real root, far outside its range.
+    It is finite for any wavelength, and 0 where the formula has no real root, far outside of its
+    range.
 
     dispersion: of M media.
     wavelengths: (W,), um.

@@ -18,8 +18,8 @@ from ..numerics import matmul
 from .glass import FRAUNHOFER, POWERS, Glass
 
 _TABLE = pathlib.Path(__file__).parent / "catalogue" / "glasses.txt.gz"
-# Distances in the glass map are in units of nd; 100 of vd count as 1 of nd: Zemax's default weights
-# (1 and 1e-4 of squares) where it replaces model glasses.
+# Distances in the glass map are in units of nd, where 100 of vd count as 1 of nd. These are Zemax's
+# default weights (1 and 1e-4 of squares) for the replacement of model glasses.
 _PER_VD = 0.01
 
 
@@ -27,6 +27,7 @@ class _Entry(NamedTuple):
     """A line of the table.
 
     plain: True if the name without a maker means this glass.
+    maker, source: of the glass.
     celsius: temperature of its constants, as text.
     constants: range, Sellmeier and Schott coefficients, as text.
     """
@@ -39,8 +40,10 @@ class _Entry(NamedTuple):
 
 
 class Neighbour(NamedTuple):
-    """A glass of the table, its nd and vd, and its distance in the glass map, in units of nd with
-    100 of vd as 1."""
+    """A glass of the table, with its nd and vd and its distance from a point of the glass map.
+
+    The distance is in units of nd, where 100 of vd count as 1.
+    """
 
     glass: Glass
     nd: float
@@ -50,7 +53,7 @@ class Neighbour(NamedTuple):
 
 @functools.cache
 def _table() -> dict[str, list[_Entry]]:
-    """All lines by name, the plain one first."""
+    """All lines by name; the plain one comes first."""
     table: dict[str, list[_Entry]] = {"air": [_Entry(True, "", "", "", "0.0001 1000000\t\t")]}
     head = ["", "", ""]
     for line in gzip.decompress(_TABLE.read_bytes()).decode().split("\n"):
@@ -66,13 +69,13 @@ def _table() -> dict[str, list[_Entry]]:
 
 @functools.cache
 def glass_makers() -> tuple[str, ...]:
-    """Makers of the table, and Zemax's catalogues MISC and INFRARED."""
+    """Makers in the table, including Zemax's catalogues MISC and INFRARED."""
     found = {entry.maker for entries in _table().values() for entry in entries}
     return tuple(sorted(found - {""}))
 
 
 def _glass(name: str, entry: _Entry) -> Glass:
-    """The glass of a line, under the shortest name that finds it."""
+    """The glass of a line, under the shortest name by which it is found."""
     low_high, sellmeier, schott = (
         tuple(map(float, part.split())) for part in entry.constants.split("\t")
     )
@@ -94,26 +97,28 @@ def _differ(entries: list[_Entry]) -> bool:
 
 
 def _all() -> list[tuple[str, _Entry]]:
-    """All glasses except air."""
+    """All glasses except air, with their names."""
     return [(n, e) for n, entries in _table().items() for e in entries if n != "air"]
 
 
 @functools.cache
 def glass_names() -> tuple[str, ...]:
-    """Names of all glasses, NAME_MAKER where a name is ambiguous; plain ones first."""
+    """Names of all glasses, NAME_MAKER where a name is ambiguous; plain names first."""
     ordered = sorted(_all(), key=lambda own: not own[1].plain)
     return ("air", *dict.fromkeys(_glass(name, entry).name for name, entry in ordered))
 
 
 def find_glass(name: str, maker: str | None = None) -> Glass:
-    """Finds a glass by name. ValueError for an unknown name, with near names, and for a name of
-    several makers with different glasses, with the makers.
+    """Finds a glass by name.
 
-    Names are exact: SK16 and N-SK16 are two glasses. Without a maker, names of Schott's catalogue
-    of 2017 mean Schott's glass, SK2 and SK16 Hikari's. Source: `Glass.source`.
+    Names are exact: SK16 and N-SK16 are two glasses. Without a maker, names in Schott's catalogue
+    of 2017 mean Schott's glass; SK2 and SK16 mean Hikari's. For its source see `Glass.source`.
 
     name: as the maker writes it; "SK16_SCHOTT" is SK16 of SCHOTT.
     maker: one of `glass_makers()`; None for any.
+
+    ValueError for an unknown name (the message lists similar names), and for a name of several
+    makers with different glasses (it lists the makers).
     """
     table = _table()
     plain, _, after = name.rpartition("_")
@@ -141,17 +146,17 @@ def find_glass(name: str, maker: str | None = None) -> Glass:
 
 
 def plain_names() -> list[str]:
-    """Names of the table without makers."""
+    """Names in the table, without makers."""
     return [*_table()]
 
 
 def spellings(name: str) -> list[str]:
-    """Names of the table that differ from a name only in capitals."""
+    """Names in the table that differ from a name only in upper and lower case."""
     return [own for own in _table() if own.lower() == name.lower()]
 
 
 def near_names(name: str, count: int = 6) -> list[str]:
-    """Names of glasses that look like `name`, at most `count`."""
+    """At most `count` names of glasses that look like `name`."""
     folded, name = dict.fromkeys(own.lower() for own in _table()), name.lower()
     near = difflib.get_close_matches(name, folded, n=count, cutoff=0.5)
     near += [known for known in folded if name in known and known not in near]
@@ -161,7 +166,10 @@ def near_names(name: str, count: int = 6) -> list[str]:
 
 
 def indices(glass: Glass, wavelengths: np.ndarray) -> np.ndarray:
-    """Index (W,) of a glass of the table in float64, without JAX. wavelengths: (W,), um."""
+    """Index (W,) of a glass of the table in float64, without JAX.
+
+    wavelengths: (W,), um.
+    """
     square = np.square(wavelengths)
     b, c = np.reshape(glass.sellmeier, (2, -1, 1))
     powers = square[:, None] ** (np.array(POWERS[: len(glass.schott)]) / 2)
@@ -187,8 +195,10 @@ def flaw(glass: Glass) -> str:
 
 
 def map_point(glass: Glass) -> tuple[float, float] | None:
-    """nd and vd of a glass of the table; None if its range does not contain the lines F, d and C,
-    or it has no dispersion."""
+    """nd and vd of a glass of the table.
+
+    None if its range does not contain the lines F, d and C, or if it has no dispersion.
+    """
     if glass.range[0] > FRAUNHOFER[1] or glass.range[1] < FRAUNHOFER[2]:
         return None
     d, f, c = indices(glass, np.array(FRAUNHOFER[:3])).tolist()
@@ -197,7 +207,7 @@ def map_point(glass: Glass) -> tuple[float, float] | None:
 
 @functools.cache
 def _mapped() -> tuple[list[_Entry], list[Glass], np.ndarray]:
-    """Entries, glasses, and nd and vd (G, 2) of all solids that have these."""
+    """Entries, glasses, and nd and vd (G, 2) of all solids that have nd and vd."""
     solids = [(entry, _glass(name, entry)) for name, entry in _all() if name.lower() != "water"]
     found = [(*own, point) for own in solids if (point := map_point(own[1]))]
     entries, glasses, points = zip(*found, strict=True)
@@ -207,11 +217,13 @@ def _mapped() -> tuple[list[_Entry], list[Glass], np.ndarray]:
 def nearest_glasses(
     nd: float, vd: float, makers: Collection[str] | None = None, count: int | None = 10
 ) -> list[Neighbour]:
-    """Glasses nearest to nd and vd in the glass map, the nearest first: the distance is that of nd
-    and vd / 100. ValueError for unknown makers.
+    """The glasses nearest to nd and vd in the glass map, the nearest first.
 
-    makers: some of `glass_makers()`; None for all.
-    count: most glasses; None for all.
+    The distance is that of the points (nd, vd / 100).
+
+    nd, vd: index at the d line, and Abbe number.
+    makers: some of `glass_makers()`; None for all. ValueError for unknown makers.
+    count: largest number of glasses; None for all.
     """
     only = None if makers is None else {maker.upper() for maker in makers}
     for maker in sorted((only or set()) - {*glass_makers()}):
@@ -228,8 +240,10 @@ def nearest_glasses(
 
 @functools.cache
 def _glass_map() -> np.ndarray:
-    """Convex hull of the plain glasses except water in nd and vd / 100, (E, 3): outward normal of
-    each edge, and signed distance of the origin from it."""
+    """Convex hull of the plain glasses except water in nd and vd / 100.
+
+    Returns (E, 3): the outward normal of each edge, and the signed distance of the origin from it.
+    """
     from scipy.spatial import ConvexHull  # takes half a second to import
 
     entries, _, points = _mapped()
@@ -237,8 +251,13 @@ def _glass_map() -> np.ndarray:
 
 
 def glass_map_distance(model: Array) -> Array:
-    """Distance (G,) of glasses from the convex hull of the plain glasses except water, negative
-    inside, in units of nd with 100 of vd as 1. model: (G, 2), nd and vd."""
+    """Distance (G,) of glasses from the convex hull of the plain glasses except water.
+
+    It is negative inside, in units of nd, where 100 of vd count as 1: the largest signed distance
+    from an edge.
+
+    model: (G, 2), nd and vd.
+    """
     edges = jnp.asarray(_glass_map(), model.dtype)
     scaled = model * jnp.array([[1, _PER_VD]], model.dtype)
     return jnp.max(matmul(scaled, edges[:, :2].T) + edges[None, :, 2], axis=1)

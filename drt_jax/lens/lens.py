@@ -30,8 +30,10 @@ from .surface import surface_sag
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Labels:
-    """Names of a lens and its media. Labels are equal if the same surfaces separate different media
-    and the same media are air: another name compiles nothing.
+    """Names of a lens and of its media.
+
+    Labels are equal if the same surfaces separate different media and if the same media are air.
+    They are static in `jit`, so that a program is not compiled again for other names.
 
     name: name of the lens.
     glasses: names of the S + 1 media.
@@ -42,8 +44,12 @@ class Labels:
 
     @functools.cached_property
     def structure(self) -> tuple[int, ...]:
-        """A number for each medium: 0 for the medium in front of the lens, -1 for air, otherwise
-        the number of the glass, one more at each boundary."""
+        """The structure on which equality depends.
+
+        It says whether the first medium is air, and has a number for each medium: 0 for the medium
+        in front of the lens, -1 for air, and otherwise the number of the glass, which increases by
+        one at each boundary.
+        """
         found, last = [0], 0
         for before, name in itertools.pairwise(self.glasses):
             solid = name not in ("air", self.glasses[0])
@@ -53,7 +59,7 @@ class Labels:
 
     @functools.cached_property
     def unnamed(self) -> "Labels":
-        """Labels of the same structure that name nothing."""
+        """Labels of the same structure with generic names."""
         air, *media = self.structure
         names = {0: "air" if air else "medium", -1: "air"}
         return Labels("", tuple(names.get(k, f"glass {k}") for k in media))
@@ -65,8 +71,7 @@ class Labels:
         return hash(self.structure)
 
 
-# What a derivative by a whole lens leaves alone, see `Lens`: an array at the stop, or arrays of a
-# part.
+# What has no derivative by a whole lens, see `Lens`: an array at the stop, or arrays of a part.
 HELD = {
     "semi_diameter": (),
     "dispersion": ("strength", "resonance", "schott", "ranges"),
@@ -80,48 +85,54 @@ _REMEDY = "; go back to the lens before, and if an optimiser decays weights, giv
 class Lens:
     """A lens of S surfaces. Every array over surfaces ends with a row for the sensor.
 
-    All arrays are differentiable leaves of one floating dtype; `jax.grad` with respect to a
-    lens returns a `Lens`. z runs along the axis from the first vertex. None costs nothing.
+    All arrays are differentiable leaves of one floating dtype; `jax.grad` with respect to a lens
+    returns a `Lens`. z runs along the axis from the first vertex. A part that is None costs
+    nothing.
 
-    A derivative by a whole lens is 0 where a designer would not move a number: the constants of
-    air and of glasses with a formula (nd and vd of model glasses do move), the size of the stop,
-    orders of diffraction, and shapes of planes (`curved`). What is asked for by name has its
-    derivative: what `dataclasses.replace(lens, semi_diameter=...)` puts in within the function that
-    is differentiated, and what `free` names. What a program (`jit`) puts in counts as asked for
-    there. It makes the lens a pytree of another type: where it meets the lens before, as in
-    `jax.tree.map(f, before, after)` in a program and in the carry of `scan` or the branches of
-    `cond`, give both the name in `free`, which keeps the type.
+    The derivative by a whole lens is 0 for numbers that a designer does not vary: the dispersion
+    constants of air and of glasses with a formula (nd and vd of model glasses do have derivatives),
+    the semi-diameter of the stop, orders of diffraction, and the shapes of planes (see `curved`).
+    Such a number has its derivative if it is requested by name: if the differentiated function
+    inserts it with `dataclasses.replace(lens, semi_diameter=...)`, or if `free` names it. An array
+    that is inserted inside of a program (`jit`) counts as requested there. The insertion changes
+    the pytree structure of the lens. Where the new lens meets the old one, as in `jax.tree.map(f,
+    before, after)` in a program, in the carry of `scan` or in the branches of `cond`, give both
+    lenses the name in `free`, so that they have the same structure.
 
     curvature: (S + 1,), 1/mm.
     conic: (S + 1,), 0 for a sphere, -1 for a paraboloid.
-    coefficients: (S + 1, K), of the surface's form, see `forms`; of an asphere those of r^2, r^4,
-        ... in mm^-1, mm^-3, ...
+    coefficients: (S + 1, K), of the form of the surface, see `forms`; of an asphere those of r^2,
+        r^4, ... in mm^-1, mm^-3, ...
     thickness: (S - 1,), between neighbouring vertices, mm; negative behind an odd number of
-        mirrors, and beside a dummy stop that lies out of order along z.
-    semi_diameter: (S + 1,), clear aperture, mm, inf for none; at the stop its own aperture.
+        mirrors, and next to a dummy stop that lies out of order along z.
+    semi_diameter: (S + 1,), clear aperture, mm, inf for none; at the stop, the semi-diameter of the
+        stop.
     sensor: (), z of the sensor, mm.
-    dispersion: of the S + 1 media, the first in front of the lens. A medium that continues behind a
-        surface keeps the constants of its first row.
-    decentre: (S + 1, 2), x and y, mm, of each surface from its place on the axis; None for all 0.
+    dispersion: of the S + 1 media, the first one in front of the lens. A medium that continues
+        behind a surface keeps the constants of its first row.
+    decentre: (S + 1, 2), x and y, mm, of each surface from its place on the axis; None if all are
+        0.
     tilt: (S + 1, 3), about x, then the rotated y, then the rotated z, right-handed, radians; None
-        for all 0.
-    phase: of diffractive surfaces; None without any.
+        if all are 0.
+    phase: phases of diffractive surfaces; None without any.
     elements: groups of surfaces that move together; None without any.
-    apertures: other than the circles of `semi_diameter`, and obscurations; None without any.
+    apertures: apertures other than the circles of `semi_diameter`, and obscurations; None without
+        any.
 
     Static:
     stop: index of the stop surface.
     labels: names of the lens and of the S + 1 media.
-    forms: a name in `forms.FORMS` for each of the S + 1 rows; empty for all aspheres.
-    mirrors: True for each of the S surfaces that reflects; empty for none.
-    curved: rows that are not active but may be curved, S for the sensor; the other such rows are
-        planes, whose derivatives by curvature, conic and coefficients are 0. `load_lens` lists
-        those that a prescription curves.
-    afocal: light leaves the lens collimated, and what meets the sensor counts by its angle: where
-        hits on the sensor are in mm, they are in mrad, see docs/analysis.md.
-    free: of "semi_diameter", "dispersion" and "phase" those with all derivatives.
+    forms: a name in `forms.FORMS` for each of the S + 1 rows; empty if all are aspheres.
+    mirrors: for each of the S surfaces, True if it reflects; empty for none.
+    curved: rows that are not active but may be curved, S for the sensor. The other inactive rows
+        are planes, whose derivatives by curvature, conic and coefficients are 0. `load_lens` lists
+        the rows that a prescription curves.
+    afocal: True if light leaves the lens collimated. Hits on the sensor are then angles: where they
+        are in mm for other lenses, they are in mrad, see docs/analysis.md.
+    free: those of "semi_diameter", "dispersion" and "phase" of which all numbers have derivatives.
 
-    held: what JAX handed in without derivatives; what is replaced is another object. Not for use.
+    held: the arrays that JAX inserted without derivatives; an array that is replaced is another
+        object. Not for use.
     """
 
     curvature: Array
@@ -146,7 +157,9 @@ class Lens:
     held: tuple = dataclasses.field(default=(), kw_only=True)
 
     def tree_flatten(self) -> tuple[list, tuple]:
-        """For JAX: the leaves; and the rest: which numbers are held, and what is static."""
+        """For JAX: the leaves; and as auxiliary data the names of parts without derivatives, and
+        the static fields.
+        """
 
         def is_held(name: str) -> bool:
             array = getattr(self, name)
@@ -157,26 +170,29 @@ class Lens:
         return [getattr(self, name) for name in leaves], rest
 
     def tree_flatten_with_keys(self) -> tuple[list, tuple]:
-        """For JAX: the same, each leaf with its name."""
+        """For JAX: as `tree_flatten`, each leaf with its name."""
         leaves, rest = self.tree_flatten()
         names = map(jax.tree_util.GetAttrKey, _fields()[0])
         return [*zip(names, leaves, strict=True)], rest
 
     @classmethod
     def tree_unflatten(cls, rest: tuple, children: Sequence) -> "Lens":
-        """For JAX: the lens of these leaves. The derivatives of held numbers end here, where the
-        lens is handed to a function."""
+        """For JAX: the lens of these leaves.
+
+        Derivatives of held numbers are stopped here, where a transformation hands the lens to a
+        function.
+        """
         leaves, static = _fields()
-        given = dict(zip((*leaves, *static), (*children, *rest[1:]), strict=True))
+        parts = dict(zip((*leaves, *static), (*children, *rest[1:]), strict=True))
         for name in rest[0]:
-            whole = given[name]
+            whole = parts[name]
             if not concrete(whole):
                 known = {leaf: still(getattr(whole, leaf)) for leaf in HELD[name]}
-                given[name] = dataclasses.replace(whole, **known) if known else _open(whole, given)
-        return cls(**given, held=tuple(given[name] for name in rest[0]))
+                parts[name] = dataclasses.replace(whole, **known) if known else _open(whole, parts)
+        return cls(**parts, held=tuple(parts[name] for name in rest[0]))
 
     def __repr__(self) -> str:
-        """A short description, also of a gradient and inside a trace."""
+        """A short description; it also works for a gradient and inside a trace."""
         what = f"{self.count} surfaces, the stop is number {self.stop}"
         sensor = self.sensor
         if concrete(sensor) and getattr(sensor, "shape", None) == ():
@@ -187,17 +203,17 @@ class Lens:
     def __post_init__(self) -> None:
         object.__setattr__(self, "forms", self.forms or ("asphere",) * (self.count + 1))
         object.__setattr__(self, "mirrors", self.mirrors or (False,) * self.count)
-        if not concrete(self.curvature):  # one program serves lenses of all names
+        if not concrete(self.curvature):  # a program does not depend on names
             object.__setattr__(self, "labels", self.labels.unnamed)
 
     @property
     def name(self) -> str:
-        """Name of the lens; empty in a trace and in what a program returns."""
+        """Name of the lens; empty in a trace and in the result of a program."""
         return self.labels.name
 
     @property
     def glasses(self) -> tuple[str, ...]:
-        """Names of the S + 1 media; "glass 1", ... in a trace and in what a program returns."""
+        """Names of the S + 1 media; "glass 1", ... in a trace and in the result of a program."""
         return self.labels.glasses
 
     @property
@@ -214,16 +230,19 @@ class Lens:
 
     @property
     def vertices(self) -> Array:
-        """z of the S vertices and the sensor on the undisturbed axis, (S + 1,), mm; the first is
-        0."""
+        """z of the S vertices and of the sensor on the undisturbed axis, (S + 1,), mm; the first is
+        0.
+        """
         first = jnp.zeros_like(self.sensor)[None]
         return jnp.concatenate([first, jnp.cumsum(self.thickness), self.sensor[None]])
 
     @property
     def places(self) -> tuple[Array, Array | None, Array | None]:
-        """Positions of the S vertices and the sensor along the axes of the lens, z (S + 1,) and
-        x, y (S + 1, 2), mm, and rotations (S + 1, 3, 3) from the axes of each surface to those of
-        the lens. None for x, y of 0 and for no rotation."""
+        """Positions and rotations of the S vertices and of the sensor along the axes of the lens.
+
+        Returns z (S + 1,), mm; x and y (S + 1, 2), mm, or None if they are 0; and rotations (S + 1,
+        3, 3) from the axes of each surface to those of the lens, or None for no rotation.
+        """
         across, rotation = self.decentre, None
         if self.tilt is not None:
             rotation = jax.vmap(rotation_matrix)(self.tilt)
@@ -239,8 +258,11 @@ class Lens:
 
     @property
     def sensor_motion(self) -> Array | None:
-        """Derivative of the sensor's vertex by `sensor`, (3,) along the sensor's axes; None for
-        (0, 0, 1), where the sensor is not tilted or its place does not count."""
+        """Derivative of the vertex of the sensor by `sensor`, (3,), along the axes of the sensor.
+
+        None stands for (0, 0, 1): where the sensor is not tilted, or where its place does not count
+        (afocal lenses).
+        """
         rotation = self.places[2]
         if rotation is None or self.afocal:
             return None
@@ -260,18 +282,25 @@ class Lens:
 
     @property
     def senses(self) -> np.ndarray:
-        """Direction of light in front of each surface and the sensor, (S + 1,): 1 along the
-        surface's z axis, -1 against it after an odd number of mirrors."""
+        """Direction of the light in front of each surface and of the sensor, (S + 1,).
+
+        It is 1 along the z axis of the surface, and -1 against it, after an odd number of mirrors.
+        """
         return np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
 
     def index(self, wavelengths: Numbers) -> Array:
-        """Refractive index (S + 1, W) of every medium. wavelengths: (W,), um. ValueError as in
-        `checked_wavelengths`."""
+        """Refractive index (S + 1, W) of every medium.
+
+        wavelengths: one or (W,), um. ValueError as in `checked_wavelengths`.
+        """
         return refractive_index(self.dispersion, self.checked_wavelengths(wavelengths))
 
     def checked_wavelengths(self, wavelengths: Numbers) -> Array:
-        """Wavelengths as an array (W,), um. wavelengths: one or a list, um. ValueError for none,
-        for another shape, and as in `check_wavelengths`."""
+        """Wavelengths as an array (W,), um.
+
+        wavelengths: one or a list, um. ValueError for none, for another shape, and as in
+            `check_wavelengths`.
+        """
         found = jnp.atleast_1d(real_array("wavelengths", wavelengths, self.curvature.dtype))
         if found.ndim != 1 or not found.size:
             raise ValueError(f"wavelengths: expected one or a list, got shape {found.shape}")
@@ -279,8 +308,12 @@ class Lens:
         return found
 
     def check_wavelengths(self, wavelengths: Numbers) -> None:
-        """ValueError for a wavelength outside the range of a medium. Inside a trace values are not
-        known and nothing is checked: see `Dispersion.knows`. wavelengths: one or (W,), um."""
+        """Raises ValueError for a wavelength outside the range of a medium.
+
+        Inside a trace values are not known and nothing is checked: see `Dispersion.knows`.
+
+        wavelengths: one or (W,), um.
+        """
         ranges = self.dispersion.ranges
         if not concrete((wavelengths, ranges)):
             return
@@ -299,7 +332,7 @@ class Lens:
 
     @functools.cached_property
     def _wrong(self) -> str:
-        """What is wrong with the numbers, as far as they are known; empty for nothing."""
+        """What is wrong with the numbers, as far as they are known; empty if nothing is."""
         for path, leaf in jax.tree_util.tree_leaves_with_path(self):
             if concrete(leaf) and np.any(np.isnan(np.asarray(leaf))):
                 return f"lens{jax.tree_util.keystr(path)}: expected numbers, got NaN{_REMEDY}"
@@ -314,9 +347,12 @@ class Lens:
         return ""
 
     def check(self) -> None:
-        """ValueError, naming the array, for a shape other than those above, for more than one
-        floating dtype, and, as far as numbers are known, for NaN, for a medium that is called air
-        and is none, and for a stop without a size. Also in a trace; takes some microseconds."""
+        """Raises ValueError, naming the array, for a lens whose arrays do not fit together.
+
+        It checks the shapes given above and that there is only one floating dtype; and, as far as
+        numbers are known, that there is no NaN, that media called air have the index of air, and
+        that the stop has a finite size above 0. Works also in a trace, and takes some microseconds.
+        """
         rows, terms = self.count + 1, np.shape(self.coefficients)[1:2] or (0,)
         shapes: dict[str, tuple] = dict.fromkeys(("curvature", "conic", "semi_diameter"), (rows,))
         shapes |= {"coefficients": (rows, *terms), "thickness": (rows - 2,), "sensor": ()}
@@ -357,28 +393,30 @@ class Lens:
 
 @functools.cache
 def _fields() -> tuple[list[str], list[str]]:
-    """Names of the leaves of a lens, and of what is static."""
+    """Names of the leaves of a lens, and of its static fields."""
     known = [field for field in dataclasses.fields(Lens) if field.name != "held"]
     static = [field.name for field in known if field.metadata.get("static")]
     return [field.name for field in known if field.name not in static], static
 
 
-def _open(semi: Array, given: dict[str, Any]) -> Array:
-    """Semi-diameters with derivatives, but for that of the stop. `jax.jacrev` of a function of
-    several outputs puts a tuple in the place of an array: that is returned as it is."""
+def _open(semi: Array, parts: dict[str, Any]) -> Array:
+    """Semi-diameters of which all but that of the stop have derivatives. `jax.jacrev` of a function
+    of several outputs puts a tuple in the place of an array: that is returned as it is."""
     if not isinstance(semi, Array):
         return semi
-    rows = np.arange(semi.size).reshape(semi.shape) % len(given["labels"].glasses)
-    return jnp.where(rows == given["stop"], still(semi), semi)
+    rows = np.arange(semi.size).reshape(semi.shape) % len(parts["labels"].glasses)
+    return jnp.where(rows == parts["stop"], still(semi), semi)
 
 
 def movable(tree: Any) -> Any:
-    """A lens, or each lens in a tree of parameters, of truth values: False for arrays that no rule
-    of an optimiser may touch, such as a decay of weights: apertures, and what a derivative by the
-    lens leaves alone (see `Lens`). True for what is no lens.
+    """A mask for optimisers: a lens, or each lens in a tree of parameters, of truth values.
+
+    False marks arrays that no rule of an optimiser, such as weight decay, may change: apertures,
+    and the numbers without a derivative by the whole lens (see `Lens`). Anything that is not a lens
+    is True.
 
     `optax.adamw(1e-3, mask=drt_jax.movable)` and `optax.lion(1e-3, mask=drt_jax.movable)` train a
-    lens: air stays air, and infinite apertures infinite.
+    lens: air remains air, and infinite apertures remain infinite.
     """
 
     def one(lens: Any) -> Any:
@@ -393,8 +431,9 @@ def movable(tree: Any) -> Any:
 
 
 def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:
-    """Height of a surface above its vertex plane, mm, along its own axes.
+    """Sag of a surface: its height above its vertex plane, mm, along its own axes.
 
+    lens: the lens.
     surface: 0 to S - 1, or S for the sensor.
     x, y: mm, of shapes that broadcast.
     """
@@ -404,14 +443,17 @@ def sag(lens: Lens, surface: int, x: Numbers, y: Numbers) -> Array:
 
 
 def glass_rows(lens: Lens, surfaces: Sequence[int]) -> np.ndarray:
-    """The media, bool (S + 1,), of the glasses that begin behind some surfaces; empty for all.
-    ValueError, which lists those that exist, for a surface behind which no glass begins."""
+    """The media, bool (S + 1,), of the glasses that begin behind some surfaces.
+
+    surfaces: numbers of surfaces; empty for all glasses. ValueError, which lists those that exist,
+        for a surface behind which no glass begins.
+    """
     media = lens.glasses
-    there = [i for i in range(lens.count) if media[i + 1] not in ("air", media[i])]
+    possible = [i for i in range(lens.count) if media[i + 1] not in ("air", media[i])]
     rows = np.zeros(len(media), bool)
-    for i in surfaces or there:
-        if i not in there:
-            some = ", ".join(map(str, there)) or "none"
+    for i in surfaces or possible:
+        if i not in possible:
+            some = ", ".join(map(str, possible)) or "none"
             raise ValueError(f"surfaces: no glass begins behind surface {i}; there are {some}")
         end = next((k for k in range(i + 1, len(media)) if media[k] != media[i + 1]), len(media))
         rows[i + 1 : end] = True
@@ -419,14 +461,17 @@ def glass_rows(lens: Lens, surfaces: Sequence[int]) -> np.ndarray:
 
 
 def _renamed(lens: Lens, dispersion: Dispersion, glasses: Sequence[str]) -> Lens:
+    """The lens with another dispersion and other names of media."""
     labels = Labels(lens.name, tuple(glasses))
     return dataclasses.replace(lens, dispersion=dispersion, labels=labels)
 
 
 def with_glass(lens: Lens, glass: Glass, surfaces: Sequence[int] = ()) -> Lens:
-    """Puts another glass, such as one of `find_glass`, in place of glasses, with its own constants.
+    """Replaces glasses by another glass, such as one of `find_glass`, with its own constants.
 
-    surfaces: surfaces, from 0, behind which the glasses begin; empty for all.
+    lens: the lens.
+    glass: the new glass.
+    surfaces: surfaces, from 0, behind which the replaced glasses begin; empty for all.
 
     ValueError as in `with_model_glass`, and for a glass of the name of a medium that it touches.
     """
@@ -441,11 +486,14 @@ def with_glass(lens: Lens, glass: Glass, surfaces: Sequence[int] = ()) -> Lens:
 def with_model_glass(lens: Lens, surfaces: Sequence[int] = ()) -> Lens:
     """Replaces glasses by model glasses, whose nd and vd are leaves that can be varied.
 
-    nd and nF - nC stay; the rest of the dispersion changes by the error of a model glass, see
-    docs/limits.md. ValueError for a surface behind which no glass begins and, as far as numbers are
-    known, for a glass without dispersion.
+    nd and nF - nC are kept. The rest of the dispersion changes by the error of a model glass, see
+    docs/limits.md.
 
-    surfaces: surfaces, from 0, behind which the glasses begin; empty for all.
+    lens: the lens.
+    surfaces: surfaces, from 0, behind which the replaced glasses begin; empty for all.
+
+    ValueError for a surface behind which no glass begins and, as far as numbers are known, for a
+    glass without dispersion.
     """
     media, rows = lens.glasses, glass_rows(lens, surfaces)
     if concrete(lens.dispersion):

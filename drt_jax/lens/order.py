@@ -1,4 +1,4 @@
-"""Neighbouring surfaces that cross, so that light would have to go backwards."""
+"""Neighbouring surfaces that cross, so that light would have to travel backwards between them."""
 
 import itertools
 from collections.abc import Sequence
@@ -11,11 +11,12 @@ from .forms import Shape
 from .lens import Lens
 from .surface import surface_sag
 
-# Overlap at the rims that counts as touching, mm: apertures of prescriptions are rounded.
+# Overlap at the rims up to which surfaces only touch, mm: apertures of prescriptions are rounded.
 _TOUCH = 1e-4
 # Number of heights where sags are compared.
 _HEIGHTS = 257
-# Surfaces of a form in a call, filled up by repeats, so that all lenses share a program.
+# Number of surfaces of a form in one call. The rest is filled with repeated surfaces, so that all
+# lenses share a compiled program.
 _TOGETHER = 32
 _sag = jax.jit(surface_sag, static_argnums=2)
 
@@ -23,8 +24,8 @@ _sag = jax.jit(surface_sag, static_argnums=2)
 class Pair(NamedTuple):
     """Two neighbouring active surfaces, or the last one and the sensor.
 
-    first, second: their indices; the sensor's is S.
-    gap: between their vertices along the light, mm.
+    first, second: their indices; that of the sensor is S.
+    gap: distance between their vertices along the light, mm.
     """
 
     first: int
@@ -35,12 +36,12 @@ class Pair(NamedTuple):
 def neighbours(lens: Lens, gaps: list[float], moved: list[bool]) -> list[Pair]:
     """The pairs of a lens that must keep their order.
 
-    A dummy stop may lie anywhere: the straight ray between its neighbours is prolonged to it. Pairs
-    that are decentred or tilted against each other are left out: their order on the axis may differ
-    from that along the light.
+    A dummy stop may lie anywhere, because the straight ray between its neighbours is extended to
+    it. Pairs that are decentred or tilted against each other are left out, because their order on
+    the axis may differ from that along the light.
 
-    gaps: from each surface to the next, and from the last to the sensor, mm.
-    moved: True for each surface, and the sensor, that is decentred or tilted by itself.
+    gaps: from each surface to the next, and from the last one to the sensor, mm.
+    moved: for each surface and the sensor, True if it is decentred or tilted by itself.
     """
     groups = () if lens.elements is None else lens.elements.spans
     separated = lambda i, j: any((a <= i <= b) != (a <= j <= b) for a, b in groups)  # noqa: E731
@@ -54,8 +55,11 @@ def neighbours(lens: Lens, gaps: list[float], moved: list[bool]) -> list[Pair]:
 
 
 def heights(lens: Lens, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (P, Y) from the axis up to the smaller semi-diameter of each of P pairs, and the sags
-    (P, 2, Y) of both surfaces there, mm. Pairs without apertures have heights 0 alone."""
+    """Sags of the surfaces of P pairs at the same heights from the axis.
+
+    Returns the heights (P, Y), up to the smaller semi-diameter of the pair, and the sags (P, 2, Y)
+    of both surfaces there, mm. Pairs without apertures have only heights of 0.
+    """
     rows = np.array([pair[:2] for pair in pairs], int).reshape(-1, 2)
     semi = np.asarray(lens.semi_diameter)
     sags = np.zeros((*rows.shape, _HEIGHTS), semi.dtype)
@@ -73,9 +77,11 @@ def heights(lens: Lens, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def crossings(lens: Lens, pairs: Sequence[Pair]) -> list[float | None]:
-    """For each pair the smallest height at which the neighbours cross inside both apertures, mm; 0
-    if their vertices are in the wrong order, None if they do not cross. A sensor crosses nothing:
-    where it lies in front of the last surface, the image is virtual."""
+    """The smallest height at which each pair of neighbours crosses inside of both apertures, mm.
+
+    It is 0 if their vertices are in the wrong order, and None if they do not cross. The sensor
+    crosses nothing: where it lies in front of the last surface, the image is virtual.
+    """
     semi, senses, found = np.asarray(lens.semi_diameter), lens.senses, []
     for pair, y, (front, back) in zip(pairs, *heights(lens, pairs), strict=True):
         with np.errstate(invalid="ignore"):  # sags may be inf, or no number
@@ -87,8 +93,11 @@ def crossings(lens: Lens, pairs: Sequence[Pair]) -> list[float | None]:
 
 
 def may_cross(lens: Lens) -> bool:
-    """True if neighbours of a known lens cross inside their apertures or may do so: without
-    apertures, or decentred or tilted against each other."""
+    """True if neighbouring surfaces of a lens with known numbers cross, or may cross.
+
+    Only crossings inside of the apertures count. A crossing cannot be excluded without apertures,
+    and for surfaces that are decentred or tilted against each other.
+    """
     pairs, semi = neighbours_now(lens), np.asarray(lens.semi_diameter)
     if len(pairs) < max(len(lens.active), 1):
         return True
@@ -97,7 +106,9 @@ def may_cross(lens: Lens) -> bool:
 
 
 def neighbours_now(lens: Lens) -> list[Pair]:
-    """`neighbours` from the arrays of a known lens, such as after an optimiser's step."""
+    """`neighbours` from the arrays of a lens with known numbers, for instance after a step of an
+    optimiser.
+    """
     gaps = np.asarray(lens.thickness, float).tolist()
     moves = [np.asarray(a) for a in (lens.decentre, lens.tilt) if a is not None]
     moved = [any(bool(np.any(a[k] != 0)) for a in moves) for k in range(lens.count + 1)]
@@ -105,7 +116,10 @@ def neighbours_now(lens: Lens) -> list[Pair]:
 
 
 def describe_crossing(lens: Lens, pair: Pair, place: float) -> str:
-    """A sentence that two neighbours cross. place: height where they do, see `crossings`, mm."""
+    """A sentence that says that two neighbours cross.
+
+    place: height where they cross, mm, see `crossings`.
+    """
     second = "the sensor" if pair.second == lens.count else f"surface {pair.second}"
     where = f"from {place:.3g} mm off the axis on" if place else "on the axis"
     return f"surface {pair.first} and {second} cross {where}: {pair.gap:.4g} mm between them"

@@ -1,13 +1,14 @@
 """Gaussian optics: the y-u trace, focal length, pupils, image.
 
-A paraxial ray has a height y (mm) and a slope u = dy/dz at each surface. Behind an odd number of
-mirrors, index and distances are negative. Tilts and decentres are neglected; of a surface or phase
-without rotational symmetry the (y, z) section counts. Source of the formulas: Welford, Aberrations
-of Optical Systems (1986), ch. 3, 6, 8, 10.
+A paraxial ray has a height y (mm) and a slope u = dy/dz at each surface. From surface to surface y'
+= y + d u, and at a surface of power P the slope follows from n' u' = n u - y P. Behind an odd
+number of mirrors, index and distances are negative. Tilts and decentres are neglected. For a
+surface or phase without rotational symmetry, the (y, z) section counts. Source of the formulas:
+Welford, Aberrations of Optical Systems (1986), ch. 3, 6, 8, 10.
 
 ValueError as in `scene_of`. Inside a trace, where values are not known, results are inf for a
 wavelength outside the range of a glass, for a distance within 1e-6 mm of 0 and for a field of 90
-degrees and more.
+degrees or more.
 """
 
 import dataclasses
@@ -20,18 +21,19 @@ from jax import Array
 
 from ..numerics import Numbers, safe_divide, still
 from .lens import Lens
-from .scene import ahead, apart, distance_array, field_array, vergence_of
+from .scene import ahead, away_from_vertex, distance_array, field_array, vergence_of
 from .surface import vertex_curvature
 
-# Last digits of the sum that makes a slope which may be wrong.
+# Largest rounding error of the last slope, in units of eps times the sum of the absolute values of
+# its terms.
 _ROUNDING = 16
 
 
 class Pupil(NamedTuple):
     """An image of the stop; inf for a telecentric lens.
 
-    position: (W,), along z, of the entrance pupil from the first vertex, of the exit pupil from the
-        last, mm.
+    position: (W,), mm, along z: of the entrance pupil from the first vertex, of the exit pupil from
+        the last vertex.
     semi_diameter: (W,), mm.
     """
 
@@ -40,7 +42,7 @@ class Pupil(NamedTuple):
 
 
 class FirstOrder(NamedTuple):
-    """First-order data, as the functions of the same names describe them.
+    """First-order data. The functions of the same names describe them.
 
     focal_length, back_focal_distance, front_focal_distance, image_distance: (W,), mm.
     f_number, numerical_aperture: (W,).
@@ -48,7 +50,7 @@ class FirstOrder(NamedTuple):
     entrance_pupil: the stop as seen from the object.
     exit_pupil: the stop as seen from the image.
     petzval_radius: (W,), radius of the image of a flat object without astigmatism, mm; inf for a
-        flat one.
+        flat image.
     effective_focal_length: (W,), mm.
     """
 
@@ -79,7 +81,7 @@ def trace_yu(
     gaps: (S - 1,), of any sign, mm.
     index: (S + 1, ...), of the media, negative behind an odd number of mirrors.
     height: (...), at the first vertex, mm.
-    slope: (...), in front of it.
+    slope: (...), in front of the first surface.
     """
     shape = jnp.broadcast_shapes(height.shape, slope.shape, power.shape[1:], index.shape[1:])
 
@@ -96,7 +98,7 @@ def trace_yu(
     gaps = jnp.concatenate([jnp.zeros_like(gaps, shape=1), gaps])
     power, index = wide(power), wide(index)
     ray = jnp.broadcast_to(height, shape), jnp.broadcast_to(slope, shape)
-    # A loop over the surfaces, not unrolled: the arrays are tiny, compilation is what costs.
+    # The loop over the surfaces is not unrolled: arrays are tiny, and compilation takes most time.
     return jax.lax.scan(step, ray, (gaps, power, index[:-1], index[1:]))[1]
 
 
@@ -136,7 +138,9 @@ class ParaxialSystem:
 
 
 class ParaxialRay(NamedTuple):
-    """A paraxial ray: height on each surface, mm, slope before and behind it, each (S, W)."""
+    """A paraxial ray: height on each surface, mm, and slopes in front of it and behind it, each (S,
+    W).
+    """
 
     height: Array
     before: Array
@@ -161,26 +165,29 @@ def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
 
 
 def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | float) -> ParaxialRay:
-    """Traces the ray of a height (mm) and slope, () or (W,), in front of the first vertex. A last
-    slope that is no more than rounding, as behind an afocal lens, is 0."""
+    """Traces the paraxial ray of a height (mm) and slope, () or (W,), in front of the first vertex.
+
+    A slope behind the lens that is only rounding error, as for an afocal lens, is set to 0.
+    """
     one = jnp.ones_like(system.index[0])
     start = one * height, one * slope
     heights, behind = trace_yu(system.power, system.gaps, system.index, *start)
     before = jnp.concatenate([start[1][None], behind[:-1]])
-    # What the last n u is the sum of: n u in front, and height times power of each surface.
-    reach = jnp.abs(jnp.concatenate([start[0][None], heights[:-1]]))
-    reach = reach.at[1:].add(jnp.abs(system.gaps[:, None] * before[1:]))
-    terms = jnp.abs(system.index[0] * start[1]) + jnp.sum(reach * jnp.abs(system.power), axis=0)
+    # The last n u is a sum of n u in front of the lens and height times power of each surface. Add
+    # up the absolute values of these terms.
+    sizes = jnp.abs(jnp.concatenate([start[0][None], heights[:-1]]))
+    sizes = sizes.at[1:].add(jnp.abs(system.gaps[:, None] * before[1:]))
+    terms = jnp.abs(system.index[0] * start[1]) + jnp.sum(sizes * jnp.abs(system.power), axis=0)
     least = _ROUNDING * jnp.finfo(terms.dtype).eps * terms
-    # Its value goes, its derivative stays: a solve may start from an afocal lens.
-    rest = jnp.where(jnp.abs(system.index[-1] * behind[-1]) >= least, 0, still(behind[-1]))
-    return ParaxialRay(heights, before, behind.at[-1].add(-rest))
+    # Remove the value but keep the derivative, because a solve may start from an afocal lens.
+    error = jnp.where(jnp.abs(system.index[-1] * behind[-1]) >= least, 0, still(behind[-1]))
+    return ParaxialRay(heights, before, behind.at[-1].add(-error))
 
 
 def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
     """Height (W,), mm, and slope (W,) of the ray through the centre of the stop with n u = 1 there.
 
-    front: True for the ray in front of the first vertex, False for behind the last.
+    front: True for the ray in front of the first vertex, False for the ray behind the last vertex.
     """
     power, gaps, index, stop = system.power, system.gaps, system.index, system.stop
     if front:  # backwards: the same lens seen from behind
@@ -198,25 +205,36 @@ def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
 
 
 def _pupil(system: ParaxialSystem, front: bool) -> Pupil:
+    """The entrance pupil (`front`) or the exit pupil."""
     height, slope = chief_ray(system, front)
-    # n u times the size of the pupil is the Lagrange invariant.
+    # n u times the semi-diameter of the pupil is the Lagrange invariant: that of the stop.
     bend = jnp.abs(system.index[0 if front else -1] * slope)
     return system.masked(Pupil(_quotient(-height, slope), _quotient(system.aperture, bend)))
 
 
 def entrance_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
-    """The stop as seen from the object. wavelengths: (W,), um."""
+    """The entrance pupil: the stop as seen from the object.
+
+    lens: the lens.
+    wavelengths: (W,), um.
+    """
     return _pupil(paraxial_system(lens, wavelengths), front=True)
 
 
 def exit_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
-    """The stop as seen from the image. wavelengths: (W,), um."""
+    """The exit pupil: the stop as seen from the image.
+
+    lens: the lens.
+    wavelengths: (W,), um.
+    """
     return _pupil(paraxial_system(lens, wavelengths), front=False)
 
 
 def marginal_ray(system: ParaxialSystem, vergence: Array) -> ParaxialRay:
-    """The ray from the axial object point through the rim of the stop. vergence: (), 1 / distance,
-    1/mm."""
+    """The ray from the axial object point through the rim of the stop.
+
+    vergence: (), 1 / distance, 1/mm.
+    """
     ray = trace_ray(system, 1.0, vergence)
     factor = safe_divide(system.aperture, ray.height[system.stop])
     return ParaxialRay(*(part * factor[None] for part in ray))
@@ -231,7 +249,8 @@ def petzval_parts(system: ParaxialSystem) -> Array:
 def first_order(lens: Lens, distance: Numbers, wavelengths: Numbers) -> FirstOrder:
     """First-order data. Focal length, focal distances and pupils do not depend on the distance.
 
-    distance: from the object to the first vertex, inf allowed, mm.
+    lens: the lens.
+    distance: from the object to the first vertex, mm; may be inf.
     wavelengths: (W,), um.
     """
     system = paraxial_system(lens, wavelengths)
@@ -255,43 +274,63 @@ def first_order(lens: Lens, distance: Numbers, wavelengths: Numbers) -> FirstOrd
         petzval_radius=_quotient(-one, index[-1] * jnp.sum(petzval_parts(system), axis=0)),
         effective_focal_length=_quotient(-one, index[-1] * u),
     )
-    return system.masked(found, apart(far))
+    return system.masked(found, away_from_vertex(far))
 
 
 def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
-    """Focal length in image space (W,), n' / power, mm; inf for an afocal lens. Distance along z
-    from the rear principal plane to the focus: longer in water than `effective_focal_length`, by
-    the index, and negative for a concave mirror. wavelengths: (W,), um."""
+    """Focal length in image space (W,), n' / power, mm; inf for an afocal lens.
+
+    It is the distance along z from the rear principal plane to the focus. It is longer than
+    `effective_focal_length` by the factor of the index if the image lies in water, and negative for
+    a concave mirror.
+
+    lens: the lens.
+    wavelengths: (W,), um.
+    """
     system = paraxial_system(lens, wavelengths)
     slope = trace_ray(system, 1.0, 0.0).behind[-1]
     return system.masked(_quotient(-jnp.ones_like(slope), slope))
 
 
 def effective_focal_length(lens: Lens, wavelengths: Numbers) -> Array:
-    """Effective focal length in air (W,), 1 / power, mm, whatever the medium of the image: the EFL
-    of design programs, positive for lenses and mirrors that converge; inf for an afocal lens.
-    wavelengths: (W,), um."""
+    """Effective focal length in air (W,), 1 / power, mm; inf for an afocal lens.
+
+    It is the EFL of design programs for any medium of the image, positive for lenses and mirrors
+    that converge light.
+
+    lens: the lens.
+    wavelengths: (W,), um.
+    """
     return first_order(lens, jnp.inf, wavelengths).effective_focal_length
 
 
 def back_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
     """Distance from the last vertex to the rear focus (W,), mm; inf for an afocal lens.
-    wavelengths: (W,), um."""
+
+    lens: the lens.
+    wavelengths: (W,), um.
+    """
     system = paraxial_system(lens, wavelengths)
     ray = trace_ray(system, 1.0, 0.0)
     return system.masked(_quotient(-ray.height[-1], ray.behind[-1]))
 
 
 def front_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
-    """Distance from the first vertex to the front focus (W,), mm, negative in front of the lens;
-    inf for an afocal lens. wavelengths: (W,), um."""
+    """Distance from the first vertex to the front focus (W,), mm; inf for an afocal lens.
+
+    It is negative for a focus in front of the lens.
+
+    lens: the lens.
+    wavelengths: (W,), um.
+    """
     return first_order(lens, jnp.inf, wavelengths).front_focal_distance
 
 
 def image_distance(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
     """Distance from the first vertex to the paraxial image (W,), mm; inf for an image at infinity.
 
-    distance: from the object to the first vertex, inf allowed, mm.
+    lens: the lens.
+    distance: from the object to the first vertex, mm; may be inf.
     wavelengths: (W,), um.
     """
     return first_order(lens, distance, wavelengths).image_distance
@@ -299,27 +338,35 @@ def image_distance(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array
 
 def numerical_aperture(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
     """Paraxial n u of the marginal ray at the image (W,), positive; 0 for an image at infinity.
-    Arguments as in `image_distance`."""
+
+    Arguments as in `image_distance`.
+    """
     return first_order(lens, distance, wavelengths).numerical_aperture
 
 
 def f_number(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity. For an object
-    at infinity the focal length over the diameter of the entrance pupil, else the working f-number.
-    Arguments as in `image_distance`."""
+    """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity.
+
+    For an object at infinity it is the focal length over the diameter of the entrance pupil; else
+    it is the working f-number. Arguments as in `image_distance`.
+    """
     return first_order(lens, distance, wavelengths).f_number
 
 
 def lateral_magnification(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Image height / object height (W,), negative for an inverted image, 0 for an object at
-    infinity. Arguments as in `image_distance`."""
+    """Lateral magnification (W,), image height / object height.
+
+    It is negative for an inverted image, and 0 for an object at infinity. Arguments as in
+    `image_distance`.
+    """
     return first_order(lens, distance, wavelengths).magnification
 
 
 def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
     """Paraxial image height (..., W), mm; inf for an image at infinity.
 
-    field: (...), radians; light of a positive angle travels upwards, from an object below the axis,
+    lens: the lens.
+    field: (...), radians. Light of a positive angle travels upwards, from an object below the axis,
         see `field_of_height`.
     distance, wavelengths: as in `image_distance`.
     """
@@ -331,4 +378,4 @@ def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Num
     tangent = jnp.tan(jnp.where(forwards, angle, 0))
     fields = tuple(range(tangent.ndim - 1))
     front, bend = (jnp.expand_dims(a, fields) for a in (system.index[0], system.index[-1] * slope))
-    return system.masked(_quotient(-tangent * front, bend), forwards & apart(far))
+    return system.masked(_quotient(-tangent * front, bend), forwards & away_from_vertex(far))

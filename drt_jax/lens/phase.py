@@ -12,19 +12,19 @@ from .forms import Shape
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Phase:
-    """Phases on N surfaces, which may refract, reflect or neither.
+    """Phases on N surfaces, which may refract, reflect or do neither.
 
     Each adds order * wavelength * phi(w) to the optical path of a ray through the point w. The
-    phase phi, in waves, has the formula of a sag without curvature and conic, see `forms`.
-    "linear": a grating of a_0 lines per mm; its first order turns light towards +y. "asphere": a
+    phase phi, in waves, has the formula of a sag without curvature and conic, see `forms`. "linear"
+    is a grating of a_0 lines per mm, whose first order turns light towards +y. "asphere" is a
     radial phase; a_0 = -1 / (2 f L) is a zone plate of focal length f at the wavelength L, both in
-    mm. Or "polynomial_xy".
+    mm. The third possible form is "polynomial_xy".
 
     coefficients: (N, K), waves / mm^power.
     order: (N,), order of diffraction, a whole number.
 
     Static:
-    surfaces: indices of the N surfaces, rising.
+    surfaces: indices of the N surfaces, in increasing order.
     forms: names of the N forms.
     """
 

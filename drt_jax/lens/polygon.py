@@ -1,32 +1,38 @@
-"""Polygons: what may be one, and its convex pieces.
+"""Polygons: which corners are valid, and decomposition into convex pieces.
 
-A quadrature that is fitted to a boundary needs pieces that are convex. They are chosen once, from
-known corners, as numbers of corners; the corners may then vary.
+A quadrature that is fitted to a boundary needs convex pieces. They are chosen once, from known
+corners, as numbers of corners; the corners may then vary.
 """
 
 import itertools
 
 import numpy as np
 
-# Most corners of a polygon of a file, and of a convex piece.
+# Largest number of corners of a polygon in a file, and of a convex piece.
 CORNERS, _SIDES = 64, 24
-# What counts as no area, relative to the square of the size.
+# Area up to which a triangle counts as empty, relative to the square of the size of the polygon.
 _TINY = 1e-12
 
 
 def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Twice the area of triangles of points (..., 2); above 0 if they turn counterclockwise."""
+    """Twice the signed area of triangles of points (..., 2); positive if the corners are
+    counterclockwise.
+    """
     (p, q), (r, s) = np.moveaxis(b - a, -1, 0), np.moveaxis(c - a, -1, 0)
     return np.asarray(p * s - q * r)
 
 
 def _least(corners: np.ndarray) -> float:
+    """Twice the area, mm^2, up to which a triangle counts as empty."""
     return float(_TINY * np.max(np.ptp(corners, axis=0)) ** 2)
 
 
 def tidied(corners: np.ndarray) -> np.ndarray:
-    """The corners (N, 2) of a polygon without repeated ones and those on a straight line.
-    ValueError for fewer than three."""
+    """The corners (N, 2) of a polygon without repeated corners and without corners on a straight
+    line.
+
+    ValueError if fewer than three remain.
+    """
     for k in reversed(range(len(corners))):
         three = np.take(corners, (k - 1, k, k + 1), axis=0, mode="wrap")
         if len(corners) > 2 and abs(_turn(*three)) <= _least(corners):
@@ -37,9 +43,13 @@ def tidied(corners: np.ndarray) -> np.ndarray:
 
 
 def convex_pieces(corners: np.ndarray) -> tuple[tuple[int, ...], ...]:
-    """Convex pieces of a polygon (N, 2), each the numbers of its corners counterclockwise, 24 at
-    most: ears are cut off, then pieces joined that stay convex (Hertel and Mehlhorn, 1983).
-    ValueError if sides cross or touch, or if `tidied` would leave corners out."""
+    """Convex pieces of a polygon (N, 2), each the numbers of its corners counterclockwise, at most
+    24.
+
+    Ears are cut off, which gives triangles; then pieces are joined as long as the result is convex
+    (Hertel and Mehlhorn, 1983). ValueError if sides cross or touch, or if `tidied` would leave
+    corners out.
+    """
     if len(tidied(corners)) < len(corners):
         raise ValueError("has a corner twice, or one on a straight side: leave it out")
     if _crosses(corners):
@@ -57,7 +67,7 @@ def convex_pieces(corners: np.ndarray) -> tuple[tuple[int, ...], ...]:
 
 
 def _crosses(corners: np.ndarray) -> bool:
-    """Whether two sides that are no neighbours have a point in common."""
+    """Whether two sides that are not neighbours have a point in common."""
     ends = [*zip(corners, np.roll(corners, -1, axis=0))]
     for i, j in itertools.combinations(range(len(ends)), 2):
         if j - i in (1, len(ends) - 1):
@@ -72,7 +82,9 @@ def _crosses(corners: np.ndarray) -> bool:
 
 
 def _is_ear(corners: np.ndarray, ring: list[int]) -> bool:
-    """Whether the first three corners of a ring are a triangle that holds no other."""
+    """Whether the first three corners of a ring form a counterclockwise triangle that contains no
+    other corner.
+    """
     a, b, c = corners[ring[:3]]
     least, others = _least(corners), corners[ring[3:]]
     within = [_turn(p, q, others) >= -least for p, q in ((a, b), (b, c), (c, a))]
@@ -80,7 +92,7 @@ def _is_ear(corners: np.ndarray, ring: list[int]) -> bool:
 
 
 def _joined(corners: np.ndarray, pieces: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
-    """Pieces of which no two can be joined to a convex one."""
+    """Joins pieces until no two of them can be joined to a convex piece of at most 24 corners."""
     for p, q in itertools.permutations(pieces, 2):
         for k in np.flatnonzero(np.isin(p, q)):
             at = q.index(p[k])

@@ -12,17 +12,17 @@ from ..numerics import Numbers, concrete, real_array
 from .lens import Lens
 
 _RIGHT = np.pi / 2
-# Smallest distance of an object, in front or behind, mm: the square of 1 / distance is still finite
-# in float32.
+# Smallest distance of an object in front of the first vertex or behind it, mm: the square of
+# 1 / distance is still finite in float32.
 NEAREST = 1e-6
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """An object point and its wavelengths, arrays of one floating dtype.
+    """An object point and its wavelengths, as arrays of one floating dtype.
 
-    field: (2,), angles along x and y, radians: light goes along (tan x, tan y, 1).
+    field: (2,), angles along x and y, radians: light travels along (tan x, tan y, 1).
     distance: (), from the object plane to the first vertex, mm; inf, or -inf, for an object at
         infinity. Below 0 for a virtual object: light that converges to a point behind the first
         vertex.
@@ -35,13 +35,16 @@ class Scene:
 
     @property
     def possible(self) -> Array:
-        """True if light comes from the object, (), bool: angles below 90 degrees and a distance
-        other than 0. In a trace, light from elsewhere is MISSED."""
-        return jnp.all(ahead(self.field)) & apart(self.distance)
+        """True if light from the object can enter the lens, (), bool.
+
+        This needs angles below 90 degrees and a distance other than 0. In a trace, the rays of
+        other scenes are MISSED.
+        """
+        return jnp.all(ahead(self.field)) & away_from_vertex(self.distance)
 
     @property
     def tangent(self) -> Array:
-        """Tangents (2,) of the field; 0 for an angle of 90 degrees and more."""
+        """Tangents (2,) of the field angles; 0 for an angle of 90 degrees or more."""
         return jnp.tan(jnp.where(ahead(self.field), self.field, 0))
 
     @property
@@ -51,31 +54,32 @@ class Scene:
 
 
 def ahead(angle: Array) -> Array:
-    """True where light at an angle to the axis (...), radians, goes forwards, bool."""
+    """True where light at an angle to the axis (...), radians, travels forwards, bool."""
     return jnp.abs(angle) < _RIGHT
 
 
-def apart(distance: Array) -> Array:
+def away_from_vertex(distance: Array) -> Array:
     """True where an object at a distance (...), mm, does not lie at the first vertex, bool."""
     return jnp.abs(distance) >= NEAREST
 
 
 def vergence_of(distance: Array) -> Array:
     """1 / distance (...), 1/mm; 0 for a distance of 0."""
-    good = apart(distance)
+    good = away_from_vertex(distance)
     return jnp.where(good, 1 / jnp.where(good, distance, 1), 0)
 
 
 def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Scene:
     """A scene in the dtype of the lens.
 
-    field: one angle (along y) or two (x, y), radians: light goes along (tan x, tan y, 1).
+    lens: the lens.
+    field: one angle (along y) or two (x, y), radians: light travels along (tan x, tan y, 1).
     distance: from the object plane to the first vertex, mm, see `Scene`.
     wavelengths: (W,) or one, um.
 
-    ValueError for other shapes, for what is no real number, for a lens whose arrays do not fit
-    together, and, as far as values are known, for an angle of 90 degrees and more, a distance
-    within 1e-6 mm of 0 or a wavelength outside the range of a glass. See `Scene.possible`.
+    ValueError for other shapes, for anything that is not a real number, for a lens whose arrays do
+    not fit together, and, as far as values are known, for an angle of 90 degrees or more, a
+    distance within 1e-6 mm of 0 or a wavelength outside the range of a glass. See `Scene.possible`.
     """
     lens.check()
     dtype = lens.curvature.dtype
@@ -88,8 +92,10 @@ def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers
 
 
 def field_array(field: Numbers, dtype: Any) -> Array:
-    """Angles as an array (...), radians. ValueError for what is no angle, and for a known one of 90
-    degrees and more."""
+    """Angles as an array (...), radians.
+
+    ValueError for anything that is not an angle, and for a known angle of 90 degrees or more.
+    """
     angles = real_array("field", field, dtype)
     for angle in _known(field):
         if not abs(angle) < _RIGHT:
@@ -101,8 +107,11 @@ def field_array(field: Numbers, dtype: Any) -> Array:
 
 
 def fields_array(fields: Numbers, dtype: Any) -> Array:
-    """Angles of F fields as an array (F, 2), radians. fields: one angle, (F,) along y, or (F, 2).
-    ValueError for other shapes, and as in `field_array`."""
+    """Angles of F fields as an array (F, 2), radians.
+
+    fields: one angle, (F,) along y, or (F, 2). ValueError for other shapes, and as in
+        `field_array`.
+    """
     angles = jnp.atleast_1d(field_array(fields, dtype))
     if angles.ndim == 1:
         angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
@@ -112,8 +121,10 @@ def fields_array(fields: Numbers, dtype: Any) -> Array:
 
 
 def spectrum_of(weights: Numbers | None, scene: Scene, dtype: Any) -> Array:
-    """Weights of the wavelengths of a scene as an array (W,), of any sum. weights: (W,), or None
-    for equal ones. ValueError for another shape."""
+    """Weights of the wavelengths of a scene as an array (W,), of any sum.
+
+    weights: (W,), or None for equal weights. ValueError for another shape.
+    """
     count = scene.wavelengths.shape[0]
     if weights is None:
         return jnp.ones(count, dtype)
@@ -124,8 +135,11 @@ def spectrum_of(weights: Numbers | None, scene: Scene, dtype: Any) -> Array:
 
 
 def distance_array(distance: Numbers, dtype: Any) -> Array:
-    """A distance as an array (), mm. ValueError for other shapes, for what is no number, and for a
-    known one within 1e-6 mm of 0."""
+    """A distance as an array (), mm.
+
+    ValueError for other shapes, for anything that is not a number, and for a known distance within
+    1e-6 mm of 0.
+    """
     far = real_array("distance", distance, dtype)
     if far.ndim:
         raise ValueError(f"distance: expected one number, got shape {far.shape}")
@@ -144,26 +158,29 @@ def _known(values: Numbers) -> list[float]:
 
 
 def field_of_height(height: Numbers, distance: Numbers) -> Array:
-    """Field angle (...) of an object point, radians: negative above the axis, from where light
-    travels downwards.
+    """Field angle (...) of an object point, radians.
+
+    The angle is negative for a point above the axis, from which light travels downwards.
 
     height: (...), of the object point above the axis, mm.
     distance: (), from the object plane to the first vertex, finite, mm.
 
-    ValueError for a known distance of 0 or not finite; inside a trace the angle then is 90
-    degrees, from where no light comes.
+    ValueError for a known distance that is 0 or not finite. Inside a trace the angle is then 90
+    degrees, from which no light enters the lens.
     """
     heights = real_array("height", height, float)
     far = distance_array(distance, float)
     if np.inf in np.abs(_known(distance)):
         raise ValueError("distance: at infinity an object has a field, but no height")
-    good = apart(far) & (jnp.abs(far) < jnp.inf)
+    good = away_from_vertex(far) & (jnp.abs(far) < jnp.inf)
     return jnp.where(good, -jnp.arctan(heights / jnp.where(good, far, 1)), _RIGHT)
 
 
 def points_arrays(fields: Numbers, distances: Numbers, dtype: jnp.dtype) -> tuple[Array, Array]:
-    """Fields (B, 2), radians, and distances (B,), mm, of B object points; one distance serves all.
-    ValueError for other shapes."""
+    """Fields (B, 2), radians, and distances (B,), mm, of B object points.
+
+    One distance serves all points. ValueError for other shapes.
+    """
     angles = real_array("fields", fields, dtype)
     far = real_array("distances", distances, dtype)
     if angles.ndim != 2 or angles.shape[1] != 2 or far.shape not in ((), angles.shape[:1]):

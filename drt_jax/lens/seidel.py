@@ -22,19 +22,19 @@ from .paraxial import (
     petzval_parts,
     trace_ray,
 )
-from .scene import ahead, apart, distance_array, field_array, vergence_of
+from .scene import ahead, away_from_vertex, distance_array, field_array, vergence_of
 from .surface import by_form, surface_sag
 
 
 class ThirdOrder(NamedTuple):
-    """Third-order aberrations at the paraxial image, the contribution of each surface.
+    """Third-order aberrations at the paraxial image: the contribution of each surface.
 
-    Transverse, of the ray from the edge of the field through the rim of the stop. The signs are
-    those of CODE V's SA, TCO, TAS, SAS, PTB, DST, AX, LAT, PTZ.
+    They are transverse aberrations of the ray from the edge of the field through the rim of the
+    stop. The signs are those of CODE V's SA, TCO, TAS, SAS, PTB, DST, AX, LAT, PTZ.
 
     spherical: (S, W), mm.
     tangential_coma: (S, W), mm.
-    tangential_astigmatism, sagittal_astigmatism: (S, W), blur of the tangential and the sagittal
+    tangential_astigmatism, sagittal_astigmatism: (S, W), blur of the tangential and of the sagittal
         image in the paraxial image plane, mm.
     petzval_blur: (S, W), mm.
     distortion: (S, W), mm.
@@ -59,8 +59,9 @@ class ThirdOrder(NamedTuple):
 
 
 def _fourth_order(lens: Lens, vertex: Array) -> Array:
-    """Coefficient (S,) of r^4 in the sag less that of the sphere of curvature `vertex` (S,),
-    mm^-3."""
+    """Coefficient (S,) of r^4 in the sag, less that of the sphere of curvature `vertex` (S,),
+    mm^-3.
+    """
 
     def height(y):
         return by_form(surface_sag, (y,), lens.shape, lens.forms)
@@ -76,14 +77,22 @@ def _fourth_order(lens: Lens, vertex: Array) -> Array:
 def _seidel(
     system: ParaxialSystem, figure: Array, marginal: ParaxialRay, chief: ParaxialRay
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Seidel's five terms (S, W), mm. figure: (S,), see `_fourth_order`."""
+    """Seidel's five terms (S, W), mm.
+
+    With the refraction invariants A = n (y c + u) of the marginal ray and B of the chief ray, the
+    Lagrange invariant H and the change D(u/n) at the surface, they are S1 = -A^2 y D(u/n), S2 = -A
+    B y D(u/n), S3 = -B^2 y D(u/n), S4 = -H^2 c D(1/n), and S5, plus the terms of the aspheric part
+    of the sag.
+
+    figure: (S,), see `_fourth_order`.
+    """
     n, c = system.index, system.curvature[:, None]
     y, chief_y = marginal.height, chief.height
     a, chief_a = n[:-1] * (y * c + marginal.before), n[:-1] * (chief_y * c + chief.before)
     bend = y * (marginal.behind / n[1:] - marginal.before / n[:-1])
     invariant = n[0] * (chief.before[0] * y[0] - marginal.before[0] * chief_y[0])
     aspheric = 8 * figure[:, None] * (n[1:] - n[:-1])
-    # Welford's formula without its quotient of chief and marginal incidence.
+    # Welford's S5, written without the quotient B / A, in which A may be 0.
     change, step = 1 / n[1:] - 1 / n[:-1], 1 / n[1:] ** 2 - 1 / n[:-1] ** 2
     s5 = chief_y * chief_a * c * change * (2 * y * chief_a - chief_y * a) - chief_a**3 * y * step
     return (
@@ -96,17 +105,20 @@ def _seidel(
 
 
 def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> ThirdOrder:
-    """Third-order aberrations of each surface; `.total` sums them up.
+    """Third-order aberrations of each surface; `.total` adds them up.
 
-    Conics and the r^2 and r^4 terms of aspheres count; odd powers of r have no place in this theory
-    and are neglected. Transverse aberrations are 0 for an image at infinity, colour is 0 for one
-    wavelength. ValueError for a surface that diffracts, has no rotational symmetry or is tilted or
-    decentred, and as in `paraxial`; inside a trace, where tilts are not known, a tilted lens has
-    infinite aberrations.
+    Conics and the r^2 and r^4 terms of aspheres count. Odd powers of r have no place in this theory
+    and are neglected. Transverse aberrations are 0 for an image at infinity, and colour is 0 for
+    one wavelength.
 
+    lens: the lens.
     field: (), edge of the field, radians.
-    distance: from the object to the first vertex, inf allowed, mm.
+    distance: from the object to the first vertex, mm; may be inf.
     wavelengths: (W,), um.
+
+    ValueError for a surface that diffracts, has no rotational symmetry or is tilted or decentred,
+    and as in `paraxial`. Inside a trace, where tilts are not known, a tilted lens has infinite
+    aberrations.
     """
     others = sorted({form for form in lens.forms if FORMS[form].symmetry != "rotational"})
     if others:
@@ -150,4 +162,4 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
         lateral_colour=2 * half * colour * (chief.height * c + chief.before),
         petzval_curvature=-n[-1:] * petzval_parts(system),
     )
-    return system.masked(found, forwards & apart(far) & ~bent)
+    return system.masked(found, forwards & away_from_vertex(far) & ~bent)

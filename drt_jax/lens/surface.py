@@ -16,8 +16,10 @@ from .forms import FORMS, RIM, Point, Shape, horner, root, square
 
 
 def by_form(function: Callable, w: Point, shape: Shape, forms: tuple[str, ...]) -> Any:
-    """Calls `function(w, shape, form)` once for each form that occurs, with its surfaces, and puts
-    the results, trees of arrays (S, ...), in order of the surfaces.
+    """Calls `function(w, shape, form)` once for each form that occurs, with all surfaces of that
+    form.
+
+    Returns the results, trees of arrays (S, ...), in the order of the surfaces.
 
     w: D arrays (S, ...).
     shape: arrays (S, ...) of the rank of `w`, and coefficients (K, S, ...).
@@ -36,22 +38,24 @@ def by_form(function: Callable, w: Point, shape: Shape, forms: tuple[str, ...]) 
 
 
 def surface_sag(w: Point, shape: Shape, form: str = "asphere") -> Array:
-    """Height above the vertex plane, mm, shaped as `w[0]`. w: D arrays, mm."""
+    """Sag: height above the vertex plane, mm, in the shape of `w[0]`. w: D arrays, mm."""
     return FORMS[form].function(w, shape)[0]
 
 
 def domain(w: Point, shape: Shape, form: str = "asphere") -> Array:
-    """True where the surface exists, bool, shaped as `w[0]`. w: D arrays, mm."""
+    """True where the surface exists, bool, in the shape of `w[0]`. w: D arrays, mm."""
     return FORMS[form].function(w, shape)[1] > RIM
 
 
 @functools.partial(jax.jit, static_argnames="form")
 def sag_slope(w: Point, shape: Shape, form: str = "asphere") -> tuple[Array, tuple[Array, ...]]:
-    """Sag (mm) and its gradient (D arrays) by the transverse coordinates, all shaped as `w[0]`. w:
-    D arrays, mm.
+    """Sag (mm) and its gradient (D arrays) by the transverse coordinates, in the shape of `w[0]`.
 
-    By automatic differentiation; for an asphere, the form of nearly all surfaces, written out with
-    one root and one division. JAX keeps what it traced: a program calls this for every search.
+    The gradient is computed by automatic differentiation. For an asphere, the form of nearly all
+    surfaces, it is written out with one root and one division. The function is jitted because a
+    program calls it for every search, and JAX then traces it only once.
+
+    w: D arrays, mm.
     """
     w = tuple(w)
     if form == "asphere":
@@ -65,8 +69,12 @@ def sag_slope(w: Point, shape: Shape, form: str = "asphere") -> tuple[Array, tup
 def sag_derivatives(
     w: Point, shape: Shape, form: str = "asphere"
 ) -> tuple[Array, tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
-    """Sag (mm), its gradient (D arrays) and its Hessian (1/mm, D rows of D) by the transverse
-    coordinates, all shaped as `w[0]`. w: D arrays, mm."""
+    """Sag, its gradient and its Hessian by the transverse coordinates, in the shape of `w[0]`.
+
+    w: D arrays, mm.
+
+    Returns the sag, mm; the gradient, D arrays; and the Hessian, 1/mm, D rows of D arrays.
+    """
     w = tuple(w)
     if form == "asphere":
         z, first, second = _profile(w, shape)
@@ -84,8 +92,10 @@ def sag_derivatives(
 
 
 def _profile(w: tuple[Array, ...], shape: Shape) -> tuple[Array, Array, Array]:
-    """Sag of an asphere and its first and second derivatives by r^2. Beyond the rim, it continues
-    with the slope at the rim."""
+    """Sag of an asphere and its first and second derivatives by r^2.
+
+    Beyond the rim, it continues with the slope at the rim.
+    """
     c, bent = shape.curvature, (1 + shape.conic) * shape.curvature**2
     r2 = square(w)
     argument = 1 - bent * r2
@@ -101,8 +111,10 @@ def _profile(w: tuple[Array, ...], shape: Shape) -> tuple[Array, Array, Array]:
 
 
 def vertex_curvature(shape: Shape, forms: tuple[str, ...], dim: int) -> tuple[Array, ...]:
-    """Vertex curvature along each of `dim` components: `dim` arrays (S,), 1/mm. shape: arrays (S,)
-    and (K, S)."""
+    """Vertex curvature along each of `dim` components: `dim` arrays (S,), 1/mm.
+
+    shape: arrays (S,) and (K, S).
+    """
     if set(forms) <= {"asphere"}:
         bend = shape.curvature + (2 * shape.coefficients[0] if len(shape.coefficients) else 0)
         return (bend,) * dim

@@ -24,21 +24,23 @@ from .status import Status
 from .system import System, Vector, determinant, divide, dot
 
 # A ray is aimed if it misses its stop point by less than `_NEAR` times the beam radius. Newton's
-# method converges quadratically: one more step reaches the point to rounding, without polish.
+# method converges quadratically, so that one more step reaches the point to rounding, and the ray
+# need not be polished.
 _NEAR = 1e-7
-# Most steps of one search; it ends after `_PATIENCE` steps in a row that came no nearer.
+# Largest number of steps of one search. It ends after `_PATIENCE` steps in a row that did not
+# reduce the miss.
 _STEPS, _PATIENCE = 48, 12
-# Most rounds in which a bundle is aimed again from the rays that were found. The bundled lenses at
-# twice their apertures and fields take 3.
+# Largest number of rounds in which a bundle is aimed again from the rays that were found. The
+# bundled lenses at twice their apertures and fields need 3.
 _ROUNDS = 8
 
 
 class _State(NamedTuple):
     """State of the aiming of one ray.
 
-    move: D numbers, step from the best launch so far to the next trial, mm.
-    far: (), miss of the best launch at the stop, mm; inf before a ray arrives.
-    bad: (), int32, trials in a row that came no nearer.
+    move: D numbers, step from the best launch point so far to the next trial, mm.
+    far: (), miss at the stop of the best launch point, mm; inf before any trial ray arrives.
+    bad: (), int32, number of trials in a row that did not reduce the miss.
     folded: (), bool, whether the best ray crosses the stop beyond a fold of the beam.
     """
 
@@ -49,20 +51,23 @@ class _State(NamedTuple):
 
 
 class AimNewton(optx.AbstractRootFinder):
-    """Damped Newton's method for one launch point. A step after which the ray fails or misses by
-    more is followed by one half as long; a good step by one at most twice as long.
+    """Damped Newton's method for one launch point.
 
-    The function returns the miss (D numbers, mm) and the status of the ray as auxiliary output. The
-    search ends when the miss is at most `atol`, and takes the remaining step; or it ends with
-    RESULTS.nonlinear_divergence.
+    The function returns the miss m (D numbers, mm) and the status of the ray as auxiliary output. A
+    trial that reduces |m| is accepted; the next step is the Newton step -(dm/dy)^-1 m, shortened to
+    twice the length of the step before. After a trial whose ray fails or misses by more, the step
+    from the best launch point is halved. The search ends successfully when the miss is at most
+    `atol`, and takes the remaining Newton step. It ends with RESULTS.nonlinear_divergence after 12
+    trials in a row without success, or at once if the first ray does not arrive.
 
     rtol: not used.
     atol: accepted miss, mm.
     norm: norm of D numbers.
-    Option "reach": longest first step, mm.
-    Option "upright": True if trials beyond a fold of the beam, where its image on the stop is
-        mirrored, count as failed. Where two rays pass one stop point, neighbouring stop points then
-        take rays of the same branch.
+
+    Option "reach": length of the longest first step, mm.
+    Option "upright": True if trials beyond a fold of the beam, where det(dm/dy) < 0 (the image of
+        the beam on the stop is mirrored), count as failed. Where two rays pass one stop point,
+        neighbouring stop points then get rays of the same branch.
     """
 
     rtol: float
@@ -107,8 +112,11 @@ class AimNewton(optx.AbstractRootFinder):
 
 
 def _derivatives(function: Callable, y: Vector) -> tuple[Vector, Vector, Any]:
-    """Value (D numbers) of a function of D numbers, its derivatives by each (D arrays (D,)) and its
-    auxiliary output, all from one trace."""
+    """Value and derivatives of a function of D numbers, from one trace by JVPs.
+
+    Returns the value, D numbers; its derivatives by each argument, D arrays (D,); and the auxiliary
+    output of the function.
+    """
     units = tuple(jnp.asarray(u, y[0].dtype) for u in np.eye(len(y)))
 
     def along(unit):
@@ -143,8 +151,8 @@ def aim(
     """Aims rays at stop points.
 
     target: D arrays (W, Q), stop points, mm.
-    launch: D arrays (W, Q), first guesses, mm.
-    sizes: () and (), radius of the beam at the stop, and the longest first step, mm.
+    launch: D arrays (W, Q), first guesses of the launch points, mm.
+    sizes: () and (), radius of the beam at the stop, and length of the longest first step, mm.
     upright: as in `AimNewton`.
     """
     eps = float(jnp.finfo(launch[0].dtype).eps)
@@ -187,7 +195,7 @@ class _Growth(NamedTuple):
 
     aimed: the bundle so far.
     more: (), bool, whether another round may find more rays.
-    rounds: (), int32, rounds so far.
+    rounds: (), int32, number of rounds so far.
     """
 
     aimed: Aimed
@@ -196,9 +204,15 @@ class _Growth(NamedTuple):
 
 
 def aim_outwards(system: System, target: Vector) -> Aimed:
-    """Aims rays at stop points from the paraxial launch. Rays that fail start again from the
-    nearest ray of any wavelength that was found, as long as a round finds more; if no ray was
-    found, from the nearest ray of a coarse fan. target: D arrays (W, Q), mm."""
+    """Aims rays at stop points in rounds, outwards from the rays that were found.
+
+    Round 0 starts at the paraxial launch. In each later round the rays that failed start again from
+    the launch point of the nearest ray of any wavelength that was found; if none was found, from
+    the nearest ray of a coarse fan. Rounds end when one finds no more rays, when no ray is missing,
+    or after 8 later rounds. All rounds are one loop, so that aiming is compiled once.
+
+    target: D arrays (W, Q), stop points, mm.
+    """
     beam, reach = beam_size(system, target)
     upright = system.rows.rotation is None
     waves = target[0].shape[0]
@@ -236,12 +250,13 @@ def aim_outwards(system: System, target: Vector) -> Aimed:
 
 
 def nearest_found(launch: Vector, ok: Array, target: Vector) -> Vector:
-    """For each stop point, the launch of the nearest ray of any wavelength that was found, D arrays
-    (W, Q), mm; undefined if none was.
+    """For each stop point, the launch point of the nearest ray of any wavelength that was found.
 
-    launch: D arrays (W, Q), mm.
+    launch: D arrays (W, Q), launch points, mm.
     ok: (W, Q), bool, rays that were found.
     target: D arrays (W, Q), stop points of the rays, mm.
+
+    Returns D arrays (W, Q), mm; undefined if no ray was found.
     """
     every = [a.reshape(-1) for a in target]
     gaps = (a[..., None] - b[None, None] for a, b in zip(target, every, strict=True))
@@ -251,8 +266,12 @@ def nearest_found(launch: Vector, ok: Array, target: Vector) -> Vector:
 
 
 def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
-    """Radius of the beam at the stop, and its largest likely radius on the first surface, mm; both
-    above 0, also for the chief ray alone through a stop at the first surface."""
+    """Radius of the beam at the stop, and an upper estimate of its radius on the first surface, mm.
+
+    The estimate is 2 beam + tan(field) (depth + beam) + 0.02 depth, where depth is the axial
+    distance between the first surface and the stop. Both are above 0, also for the chief ray alone
+    through a stop at the first surface.
+    """
     beam = jnp.sqrt(jnp.max(dot(target, target)))
     lean = jnp.sqrt(dot(system.source[:-1], system.source[:-1]))
     depth = jnp.abs(system.at_stop[0].axial - system.rows.axial[0])
@@ -262,9 +281,13 @@ def beam_size(system: System, target: Vector) -> tuple[Array, Array]:
 
 
 def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
-    """Launches of the rays through the paraxial entrance pupil, D arrays (W, Q), mm; tilts are
-    neglected. No launch is farther than 4 `width` from the axis: the pupil of a telecentric
-    lens lies at infinity.
+    """Launch points of the rays through the paraxial entrance pupil, D arrays (W, Q), mm.
+
+    Two paraxial rays are traced to the stop: an axial one with heights a_0 on the first surface and
+    a_s at the stop, and an oblique one with heights t_0 and t_s for a field of tangent 1. The ray
+    of the field of tangent u that crosses the stop at p has the height (p - u t_s) / a_s a_0 + u
+    t_0 on the first surface. Tilts are neglected. No launch point is farther than 4 `width` from
+    the axis, because the pupil of a telecentric lens lies at infinity.
 
     target: D arrays (W, Q), stop points, mm.
     width: (), radius of the beam on the first surface, mm.

@@ -1,8 +1,8 @@
 """Large bundles: rays launched by polynomials, in tiles that fit the cache of a core.
 
-The launch of a ray is a smooth function of its stop point. Polynomials are fitted to a few hundred
-aimed rays and launch all others, which meet their stop points to rounding; only where they do not,
-they are searched for.
+The launch point of a ray is a smooth function of its stop point. Polynomials of the stop point are
+fitted to the launch points of a few hundred aimed rays. They launch all other rays of the bundle,
+which then meet their stop points to rounding. Rays that do not are searched for.
 """
 
 from collections.abc import Callable
@@ -18,10 +18,11 @@ from .aim import aim, beam_size, paraxial_launch
 from .status import Status
 from .system import System, Vector, dot
 
-# Bundles of more than `_MANY` rays are launched by polynomials and solved in tiles of `_TILE` rays,
-# all wavelengths together: the arrays of one surface then fit the cache of a core. Derivatives hold
-# 0.9 kB per ray and row, 21 MB for `_DERIVATIVES`. The allocator returns blocks above 32 MB to the
-# operating system after each call, which takes longer than the computation.
+# Bundles of more than `_MANY` rays for each wavelength are launched by polynomials and solved in
+# tiles of `_TILE` rays (all wavelengths together), whose arrays on one surface fit the cache of a
+# core. Derivatives need 0.9 kB for each ray and row, 21 MB for `_DERIVATIVES` rays times rows. The
+# allocator returns blocks above 32 MB to the operating system after each call, which takes longer
+# than the computation.
 _MANY, _TILE, _DERIVATIVES = 1024, 2048, 24_000
 # In a Double Gauss at 10 degrees, rays miss their stop points by 1e-13 mm with degree 18, by
 # 1e-10 mm with degree 14.
@@ -29,13 +30,21 @@ _DEGREE = 18
 
 
 def tile_of(rays: int, waves: int) -> int:
-    """Rays per wavelength that are found at once: all `rays` of a bundle, or those of a tile."""
+    """Number of rays for each wavelength that are found at once: a whole bundle, or one tile of it.
+
+    rays: number of rays for each wavelength.
+    waves: number of wavelengths.
+    """
     size = max(_TILE // waves, 64)
     return rays if rays <= max(_MANY, size) else size
 
 
 def derivative_tile(waves: int, rows: int) -> int:
-    """Rays per wavelength whose derivatives are taken at once, for `rows` rows."""
+    """Number of rays for each wavelength whose derivatives are computed at once.
+
+    waves: number of wavelengths.
+    rows: number of rows of the system.
+    """
     return max(min(_TILE, _DERIVATIVES // rows) // waves, 64)
 
 
@@ -76,11 +85,16 @@ def _nodes() -> np.ndarray:
 
 
 def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vector]:
-    """Fits polynomials of the stop point to the launch of aimed rays, over the disc that holds
-    `target`, 2 arrays (W, Q), mm.
+    """Fits polynomials of degree 18 in the stop point to the launch points of aimed rays.
 
-    Returns a function from stop points to launches, 2 arrays (W, N) each, mm, for any N. It returns
-    the paraxial launch if a ray of the fit fails.
+    With the monomials x^i y^j at the nodes as the columns of a matrix V = B T (QR factorisation),
+    the coefficients are T^-1 B^T launch.
+
+    target: 2 arrays (W, Q), stop points, mm. The fit covers the disc about the axis that contains
+        them.
+
+    Returns a function from stop points to launch points, 2 arrays (W, N) each, mm, for any N. It
+    returns the paraxial launch if a ray of the fit fails.
     """
     points = _nodes()
     radius = jnp.sqrt(jnp.max(dot(target, target)))
@@ -92,12 +106,12 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
     all_ok = jnp.all(aimed.status == Status.OK)
 
     pairs = np.array([(i, d - i) for d in range(_DEGREE + 1) for i in range(d + 1)])
-    # Fit in an orthogonal basis of rising degree: its coefficients fall as fast as the entries of
-    # the inverse triangle grow, so that no digit is lost.
+    # Fit in an orthogonal basis ordered by degree. Its coefficients decrease as fast as the entries
+    # of the inverse triangle increase, so that no digit is lost.
     basis, triangle = np.linalg.qr(np.prod(points.T[:, None] ** pairs, axis=-1))
     launch = jnp.stack(aimed.launch)
-    parts = tensordot(jnp.asarray(basis.T, launch.dtype), launch, axes=(1, 2))
-    terms = tensordot(jnp.asarray(np.linalg.inv(triangle), launch.dtype), parts, axes=1)
+    projections = tensordot(jnp.asarray(basis.T, launch.dtype), launch, axes=(1, 2))
+    terms = tensordot(jnp.asarray(np.linalg.inv(triangle), launch.dtype), projections, axes=1)
     empty = jnp.zeros((_DEGREE + 1, _DEGREE + 1, *terms.shape[1:]), launch.dtype)
     coefficients = empty.at[pairs[:, 0], pairs[:, 1]].set(terms)
 

@@ -1,7 +1,7 @@
 """The Fermat equations of a bundle of rays: optical path, its gradient, and the label of a ray.
 
-The object point and the crossing of the stop label a ray. The unknowns are its hits on the L
-active surfaces (refracting, reflecting or diffracting) and on the sensor. The equations are
+A ray is labelled by its object point and its crossing of the stop. The unknowns are its hits w_i on
+the L active surfaces (refracting, reflecting or diffracting) and on the sensor. The equations are
 dOP/dw_i = 0 on the active surfaces (paper Eqs. 2 and 3) and the label: the straight line through
 the hits in front of and behind the stop, extended both ways, crosses the stop at the given point.
 If the stop is an active surface, the label is its hit.
@@ -51,8 +51,11 @@ class Path(NamedTuple):
 
 
 def _segments(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vector]:
-    """First points, D + 1 arrays (W, Q), and the steps between neighbouring points, (L, W, Q), mm.
-    A step is a sum of small differences, so that no digit is lost far from the origin."""
+    """First points, D + 1 arrays (W, Q), and vectors between neighbouring points, (L, W, Q), mm.
+
+    The vertices and the points relative to their vertices are subtracted separately, so that no
+    digit is lost far from the origin.
+    """
     own = rotate(system.rows.rotation, (*hits, heights))
     origin = [a[..., None, None] for a in system.rows.origin(len(hits))]
     step = tuple((o[1:] - o[:-1]) + (p[1:] - p[:-1]) for o, p in zip(origin, own, strict=True))
@@ -61,11 +64,13 @@ def _segments(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vec
 
 @jax.jit
 def geometry(hits: Vector, system: System) -> Path:
-    """Directions, lengths and sag derivatives of the paths through `hits`, D arrays (R, W, Q).
+    """Directions, lengths and derivatives of the sag of the paths through given hits.
 
-    The first segment starts at P_0 = source / vergence. Scaled by the vergence it is
+    The first segment starts at the object point source / vergence. Multiplied by the vergence it is
     q = vergence P_1 - source, which has the same direction and stays finite and smooth for an
     object at infinity.
+
+    hits: D arrays (R, W, Q), mm.
     """
     rotation = system.rows.rotation
     z, slope, bend = by_form(sag_derivatives, hits, system.rows.wide, system.forms)
@@ -91,11 +96,13 @@ def geometry(hits: Vector, system: System) -> Path:
 
 
 def _way(before: Vector, after: Vector, slope: Vector, system: System) -> Array:
-    """1 where the sensor lies ahead of the last surface, -1 where light only seems to come from it.
-    Light leaves a mirror to the side from which it came, and another surface to the other side.
+    """1 where the sensor lies ahead of the last surface; -1 where it lies in front of it and the
+    light only seems to come from there.
 
-    before, after: D + 1 arrays, steps to the last surface and from there to the sensor.
-    slope: D arrays, of the last surface.
+    Light leaves a mirror to the side from which it came, and any other surface to the other side.
+
+    before, after: D + 1 arrays, vectors to the last surface, and from there to the sensor.
+    slope: D arrays, slopes of the last surface.
     """
     rotation = None if system.rows.rotation is None else system.rows.rotation[-2]
     sides = (_forward(rotate(rotation, a, back=True), slope) for a in (before, after))
@@ -104,44 +111,55 @@ def _way(before: Vector, after: Vector, slope: Vector, system: System) -> Array:
 
 
 def added(hits: Vector, by: Diffraction) -> tuple[np.ndarray, tuple]:
-    """Indices (N,) of the diffractive rows, and the optical path that their phase adds, (N, W, Q),
-    mm, with its first derivatives by the hits, D arrays, and second, D rows of D arrays."""
+    """Optical path that the diffractive rows add, with its derivatives by the hits.
+
+    Returns the indices (N,) of these rows; and the path (N, W, Q), mm, its first derivatives, D
+    arrays, and its second derivatives, D rows of D arrays.
+    """
     rows, wide = np.array(by.rows), Shape(*(a[..., None, None] for a in by.phase))
     waves = by_form(sag_derivatives, tuple(h[rows] for h in hits), wide, by.forms)
     return rows, jax.tree.map(lambda a: by.wave * a, waves)
 
 
 def residual(path: Path, system: System) -> Vector:
-    """F = dOP/dw, D arrays (R, W, Q), dimensionless (paper Eq. 3); 0 on the sensor for any path."""
+    """Residual of the Fermat equations, F = dOP/dw, D arrays (R, W, Q), dimensionless (paper Eq.
+    3).
+
+    With unit vectors b in front of a surface, a behind it (transverse part t, component z) and the
+    slope s of its sag, F = n (b_t + s b_z) - n' (a_t + s a_z), plus the gradient of the optical
+    path that a phase adds. On the sensor F is 0 for any path.
+    """
     index, behind = (jnp.broadcast_to(n, path.length.shape) for n in (system.index, system.behind))
     *across, along = (index * b - behind * a for b, a in zip(path.before, path.after, strict=True))
-    force = tuple(c + s * along for c, s in zip(across, path.slope, strict=True))
+    gradient = tuple(c + s * along for c, s in zip(across, path.slope, strict=True))
     if system.diffraction is None:
-        return force
+        return gradient
     rows, (_, kick, _) = added(path.hits, system.diffraction)
-    return tuple(f.at[rows].add(k) for f, k in zip(force, kick, strict=True))
+    return tuple(f.at[rows].add(k) for f, k in zip(gradient, kick, strict=True))
 
 
 def up_to(hits: Vector, system: System, row: int) -> tuple[Vector, System]:
-    """Hits and system of one row and the two rows in front of it, as far as there are. These
-    determine the ray in front of that row."""
-    some = slice(max(row - 2, 0), row + 1)
-    rows = jax.tree.map(lambda a: a[some], system.rows)
+    """Hits and system of one row and of at most two rows in front of it, which determine the ray in
+    front of that row.
+    """
+    near = slice(max(row - 2, 0), row + 1)
+    rows = jax.tree.map(lambda a: a[near], system.rows)
     part = dataclasses.replace(
         system,
         rows=rows,
-        index=system.index[some],
+        index=system.index[near],
         diffraction=None,
-        forms=system.forms[some],
-        mirrors=system.mirrors[some.start : row],
+        forms=system.forms[near],
+        mirrors=system.mirrors[near.start : row],
         before=min(system.before, 1),
     )
-    return tuple(h[some] for h in hits), part
+    return tuple(h[near] for h in hits), part
 
 
 def ray_at(path: Path, system: System, row: int) -> tuple[Vector, Vector]:
     """Points on one row (mm) and unit vectors in front of it, D + 1 arrays (W, Q) each, along the
-    axes of the lens."""
+    axes of the lens.
+    """
     rotation = None if system.rows.rotation is None else system.rows.rotation[row]
     origin = (a[row] for a in system.rows.origin(system.dim))
     own = rotate(rotation, (*(h[row] for h in path.hits), path.height[row]))
@@ -157,16 +175,18 @@ def label(path: Path, system: System) -> Vector:
 
 
 def arrival(hits: Vector, system: System) -> Vector:
-    """Directions of rays at the sensor: unit vectors, D + 1 arrays (W, Q), along the lens axes."""
+    """Directions of rays at the sensor: unit vectors, D + 1 arrays (W, Q), along the axes of the
+    lens.
+    """
     hits, part = up_to(hits, system, len(system.forms) - 1)
     return ray_at(geometry(hits, part), part, -1)[1]
 
 
 def met(crossing: Vector, target: Vector, hits: Vector, system: System) -> Array:
-    """Mask (W, Q) of rays that pass their stop points to rounding.
+    """Mask (W, Q) of the rays that cross their stop points within 64 rounding errors.
 
     crossing, target: D arrays (W, Q), crossings of the stop and stop points, mm.
-    hits: D arrays (R, W, Q), mm; rounding is relative to the largest.
+    hits: D arrays (R, W, Q), mm. The rounding error is relative to the largest of them.
     """
     eps = float(jnp.finfo(hits[0].dtype).eps)
     miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
@@ -175,23 +195,29 @@ def met(crossing: Vector, target: Vector, hits: Vector, system: System) -> Array
 
 
 def _width(hits: Vector, system: System) -> Array:
-    """Magnitude of the coordinates of hits, (R, W, Q), mm; their rounding scales with it."""
+    """Magnitude of the coordinates of hits, (R, W, Q), mm. Their rounding errors are proportional
+    to it.
+    """
     width = jnp.sqrt(dot(hits, hits))
     offset = system.rows.offset
     return width if offset is None else width + jnp.max(jnp.abs(offset), axis=1)[:, None, None]
 
 
 def _length(vector: Vector) -> Array:
+    """Length of a vector; 0, with derivative 0, for the zero vector."""
     return safe_sqrt(dot(vector, vector))
 
 
 def _inverse(length: Array) -> Array:
+    """1 / length; 0 where the length is 0."""
     return safe_divide(jnp.ones_like(length), length)
 
 
 def _chain(hits: Vector, system: System) -> tuple[Array, Vector, Vector]:
-    """Heights (R, W, Q), first points, D + 1 arrays (W, Q), mm, and segments (R, W, Q): of the
-    first, vergence times the vector from the object."""
+    """Heights (R, W, Q), mm; first points, D + 1 arrays (W, Q), mm; and segments (R, W, Q), mm.
+
+    The first segment is the vector from the object multiplied by the vergence.
+    """
     heights = by_form(surface_sag, hits, system.rows.wide, system.forms)
     first, step = _segments(hits, heights, system)
     near = (system.vergence * q - p for q, p in zip(first, system.source, strict=True))
@@ -203,24 +229,24 @@ def optical_path(hits: Vector, system: System, middle: Vector | None = None) -> 
     """Optical path (W, Q), mm, from the object to the sensor (paper Eq. 2).
 
     It starts at the sphere about the object through the first vertex (a plane for an object at
-    infinity), so that it is finite for any distance.
+    infinity), so that it is finite for any distance. Differences of lengths are computed as |a| -
+    |b| = (a - b).(a + b) / (|a| + |b|), without cancellation.
 
     hits: D arrays (R, W, Q), mm.
-    middle: D arrays (R, W, 1), mm, of a path that is subtracted, segment by segment, before lengths
-        are summed: float32 then rounds by what paths differ in, not by how long they are. None for
-        none.
+    middle: D arrays (R, W, 1), mm, of a reference path that is subtracted segment by segment before
+        the lengths are summed. In float32 the rounding error is then proportional to the
+        differences between paths and not to their length. None for no reference path.
     """
     heights, first, chain = _chain(hits, system)
-    if middle is None:  # nothing but the vector from the object to the first vertex
+    if middle is None:  # subtract only the vector from the object to the first vertex
         other = tuple(jnp.zeros_like(a).at[0].set(-p) for a, p in zip(chain, system.source))
         moved = tuple(c.at[0].set(q) for c, q in zip(chain, first, strict=True))
     else:
-        beside, _, other = _chain(middle, system)
-        own = tuple(a - b for a, b in zip((*hits, heights), (*middle, beside), strict=True))
+        middle_heights, _, other = _chain(middle, system)
+        own = tuple(a - b for a, b in zip((*hits, heights), (*middle, middle_heights), strict=True))
         point = rotate(system.rows.rotation, own)
         moved = tuple(jnp.concatenate([p[:1], p[1:] - p[:-1]]) for p in point)
-    # |a| - |b| = (a - b).(a + b) / (|a| + |b|), without cancellation; a - b of the first segment is
-    # divided by the vergence, which may be 0.
+    # `moved` is a - b. In the first segment a - b is divided by the vergence, which may be 0.
     both = tuple(a + b for a, b in zip(chain, other, strict=True))
     lengths = safe_divide(dot(moved, both), _length(chain) + _length(other))
     if len(system.forms) > 1:
@@ -239,12 +265,14 @@ def optical_path(hits: Vector, system: System, middle: Vector | None = None) -> 
 
 
 def stationary(path: Path, system: System, target: Vector) -> Array:
-    """Mask (W, Q) of the paths that are rays: F = 0, forward, inside the domain of each sag, and
-    through the stop points. target: D arrays (W, Q), stop points, mm.
+    """Mask (W, Q) of the trial paths that are rays.
 
-    F counts as 0 if it is within 64 times the change by rounding of the hits, about 1e-14 radians
-    for a camera in float64. A path is not accepted if rounding turns it by more than 1e-6 radians
-    (2e-2 in float32).
+    A path is a ray if F = 0 on every surface, all segments run forwards, every hit lies inside of
+    the domain of its sag, and it passes through its stop point. F counts as 0 if its size is at
+    most 64 times the change by rounding of the hits, about 1e-14 radians for a camera in float64. A
+    path is not accepted if rounding turns it by more than 1e-6 radians (2e-2 in float32).
+
+    target: D arrays (W, Q), stop points, mm.
     """
     eps = float(jnp.finfo(path.length.dtype).eps)
     size = _width(path.hits, system)

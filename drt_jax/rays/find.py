@@ -1,7 +1,8 @@
 """Ray finding: for each stop point, a root of the Fermat equations and the label.
 
-Rays are aimed and traced. A ray that misses its stop point by more than rounding is polished on
-the Fermat equations; a missing ray is searched for with a fan. For derivatives see `solve`.
+Rays are aimed and traced. A ray that misses its stop point by more than rounding is polished on the
+Fermat equations. A ray that aiming does not find is searched for with a fan. For derivatives see
+`solve`.
 """
 
 from collections.abc import Callable
@@ -23,7 +24,7 @@ from .sparse import Lanes
 from .status import Status
 from .system import System, Vector, dot
 
-_MAX_STEPS = 16
+_MAX_STEPS = 16  # Newton steps of the polish
 
 
 class Found(NamedTuple):
@@ -45,9 +46,9 @@ class Found(NamedTuple):
 class _State(NamedTuple):
     """State of the polish.
 
-    solved: (W, Q), bool.
-    still: (), int32, steps in a row that moved no ray.
-    step: (), int32, steps so far.
+    solved: (W, Q), bool, rays that are stationary to rounding.
+    still: (), int32, number of steps in a row that moved no ray.
+    step: (), int32, number of steps so far.
     """
 
     solved: Array
@@ -59,7 +60,7 @@ class BlockNewton(optx.AbstractRootFinder):
     """Newton's method for a bundle of Fermat paths, with the propagation of `linear` as its solve.
 
     The arguments of the equations are (system, target, mask (W, Q) of the rays that may move). All
-    rays step together; a ray whose correction is not finite keeps its hits. The search ends when
+    rays step together. A ray whose correction is not finite keeps its hits. The search ends when
     all rays are stationary to rounding (see `fermat.stationary`). It ends with
     RESULTS.nonlinear_divergence when two steps in a row move no ray by more than `atol` + `rtol`
     times its hits; the state then holds the mask of the solved rays.
@@ -79,9 +80,9 @@ class BlockNewton(optx.AbstractRootFinder):
     def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
         """One Newton step of every ray that is not stationary yet."""
         system, target, _ = args
-        (push, path), aux = fn(y, args)
+        (rhs, path), aux = fn(y, args)
         solved = state.solved | fermat.stationary(path, system, target)
-        change, _ = linear.solve(path, system, ~solved, push)
+        change, _ = linear.solve(path, system, ~solved, rhs)
         finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
         moves = finite & ~solved
         change = tuple(jnp.where(moves, c, 0) for c in change)
@@ -104,8 +105,10 @@ class BlockNewton(optx.AbstractRootFinder):
 
 
 def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tuple:
-    """Makes the hits of the `active` rays (W, Q) stationary. Returns the hits, the mask of solved
-    rays and the number of steps."""
+    """Makes the hits of the `active` rays (W, Q) stationary, by at most 16 Newton steps.
+
+    Returns the hits, the mask of solved rays and the number of steps.
+    """
 
     def equations(hits, args):
         system, target, _ = args
@@ -129,11 +132,13 @@ def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tupl
 def find(
     system: System, target: Vector, launch: Vector | None = None, searched: Array | None = None
 ) -> Found:
-    """Finds the rays through stop points; not differentiable. Rays that aiming does not find are
-    searched for with a fan; rays that miss their stop points by more than rounding are polished.
+    """Finds the rays through stop points; not differentiable.
+
+    Rays that aiming does not find are searched for with a fan. Rays that miss their stop points by
+    more than rounding are polished.
 
     target: D arrays (W, Q), stop points, mm.
-    launch: D arrays (W, Q), first guesses, mm; None for the paraxial launch.
+    launch: D arrays (W, Q), first guesses of the launch points, mm; None for the paraxial launch.
     searched: (W, Q), bool, rays that are searched for with a fan; None for all.
     """
     sizes = beam_size(system, target)
@@ -153,9 +158,13 @@ def find(
 
 @jax.jit
 def find_aimed(system: System, target: Vector) -> Found:
-    """Finds rays by aiming alone, see `aim_outwards`; every ray that does not meet its stop point
-    to rounding is UNCONVERGED. The program is a third of that of `find`; where rays fail it takes a
-    tenth of the time. target: D arrays (W, Q), mm."""
+    """Finds rays by aiming alone, see `aim_outwards`.
+
+    Every ray that does not meet its stop point to rounding is UNCONVERGED. The compiled program is
+    a third of that of `find`; where rays fail it takes a tenth of the time.
+
+    target: D arrays (W, Q), stop points, mm.
+    """
     aimed = aim_outwards(system, target)
     hits, status = _verdict(system, aimed.launch, aimed.status)
     hits, crossing = split_stop(system, hits)
@@ -170,7 +179,8 @@ class _Search(NamedTuple):
 
     hits: D arrays, mm, see `snell.Trace`.
     status: (W, Q), int32.
-    left: (W, Q), int32, rounds left for each missing ray.
+    left: (W, Q), int32, number of rounds left for each missing ray; 0 for a ray that is found or
+        given up.
     fan: the fan, traced in round 1.
     round, steps: (), int32, rounds and Newton steps so far.
     """
@@ -186,20 +196,29 @@ class _Search(NamedTuple):
 def _search(
     system: System, target: Vector, launch: Vector, sizes: tuple, searched: Array
 ) -> _Search:
-    """Searches for rays in rounds. Round 0 aims all rays from their first guesses. Round 1 aims the
-    `searched` rays that failed from the nearest ray of a fan. Each later round aims the first few
-    missing rays from several rays of the fan each; `rounds` rounds use all `STARTS` starts.
+    """Searches for rays in rounds.
 
-    All rounds share one loop with as many lanes as rays: the aiming is compiled once, and the fan
-    costs nothing while no ray is missing, also under `vmap`. Arguments as in `find`; sizes as in
-    `aim`.
+    - Round 0 aims all rays from their first guesses.
+    - Round 1 traces a fan and aims the `searched` rays that failed, each from the nearest ray of
+      the fan.
+    - Each later round packs missing rays into the lanes of the bundle (`Lanes`), N lanes for each
+      ray in the order of the rays, and aims each of them from N rays of the fan, the nearest to its
+      stop point first. The best trial is kept; a ray in front of a fold of the beam is better than
+      one beyond it. A ray is given up after R rounds in which it had lanes; N R lanes hold all
+      `STARTS` first guesses.
+
+    All rounds share one loop with as many lanes as rays, so that aiming is compiled once. The fan
+    costs nothing while no ray is missing, also under `vmap`.
+
+    target, launch, searched: as in `find`.
+    sizes: as in `aim`.
     """
     waves, rays = target[0].shape
     starts = min(STARTS, rays)
     rounds, ray = -(-STARTS // starts), np.arange(rays, dtype=np.int32)
 
-    def from_fan(given):
-        fan, target, launch = given
+    def from_fan(inputs):
+        fan, target, launch = inputs
         fan = trace_fan(system, fan, launch, sizes[1])
         return fan, target, nearest_start(fan, target)
 
@@ -207,23 +226,23 @@ def _search(
         whole, missing = state.round < 2, state.left > 0
         lanes = Lanes(missing, starts)
 
-        def from_several(given):
-            fan, target, _ = given
+        def from_several(inputs):
+            fan, target, _ = inputs
             points, left = lanes.of_rays((target, state.left))
             ranks = (rounds - left)[..., None] * starts + ray[None, None, :starts]
             begin = starts_of(fan, points, ranks)
             return fan, *lanes.spread((tuple(a[..., None] for a in points), begin))
 
-        given = run_if(state.round == 1, from_fan, (state.fan, target, launch))
-        fan, own, begin = run_if(state.round > 1, from_several, given)
+        inputs = run_if(state.round == 1, from_fan, (state.fan, target, launch))
+        fan, own, begin = run_if(state.round > 1, from_several, inputs)
         reach = jnp.where(state.round == 0, sizes[1], sizes[1] / 8)
         upright = whole & (system.rows.rotation is None)
         new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
 
-        worth = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
-        lane, found = lanes.best(worth)
+        quality = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
+        lane, found = lanes.best(quality)
         lane = jnp.where(whole, ray[None], lane)
-        found = jnp.where(whole, (state.round == 0) | (missing & (worth > 0)), found)
+        found = jnp.where(whole, (state.round == 0) | (missing & (quality > 0)), found)
         status = jnp.take_along_axis(new.status, lane, axis=-1)
         status = jnp.where(found, status, state.status)
         taken = (jnp.take_along_axis(h, lane[None], axis=-1) for h in new.hits)
@@ -252,18 +271,24 @@ class _Traced(NamedTuple):
 def _aimed(
     system: System, target: Vector, launch: Vector, sizes: tuple, upright: Array | bool
 ) -> tuple[_Traced, Array]:
-    """Aims and traces rays, arguments as in `aim`; and the mask (W, Q) of those beyond a fold."""
+    """Aims and traces rays, arguments as in `aim`. Also returns the mask (W, Q) of the rays beyond
+    a fold.
+    """
     aimed = aim(system, target, launch, sizes, upright)
     hits, status = _verdict(system, aimed.launch, aimed.status)
     return _Traced(hits, status, aimed.steps), aimed.folded
 
 
 def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Array]:
-    """Traces rays: hits and status (W, Q). A ray whose direction changes by more than 1e-6 radians
-    (float32: 2e-2) when its hits are rounded is UNCONVERGED.
+    """Traces aimed rays and decides their status.
 
-    launch: D arrays (W, Q), mm.
-    status: (W, Q), status of the aiming, kept where it is not OK.
+    A ray whose direction changes by more than 1e-6 radians (2e-2 in float32) when its hits are
+    rounded is UNCONVERGED.
+
+    launch: D arrays (W, Q), launch points, mm.
+    status: (W, Q), status of the aiming, which is kept where it is not OK.
+
+    Returns the hits, D arrays, mm, and the status (W, Q).
     """
     trace = shoot(system, launch)
     eps = float(jnp.finfo(launch[0].dtype).eps)
@@ -274,9 +299,13 @@ def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Arr
 
 @jax.jit
 def find_many(system: System, target: Vector) -> Found:
-    """Finds rays as `find` does. A large bundle is split into tiles; polynomials launch its rays,
-    and only tiles in which a ray misses are searched. A stop point that is not finite is MISSED
-    without a search. target: D arrays (W, Q), mm."""
+    """Finds rays as `find` does, also in large bundles.
+
+    A large bundle is split into tiles. Polynomials launch its rays, and only tiles in which a ray
+    misses are searched. A stop point that is not finite gives MISSED without a search.
+
+    target: D arrays (W, Q), stop points, mm.
+    """
     known = jnp.all(jnp.isfinite(jnp.stack(target)), axis=0)
     found = _find_many(system, tuple(jnp.where(known, a, 0) for a in target), known)
     return found._replace(
@@ -286,6 +315,9 @@ def find_many(system: System, target: Vector) -> Found:
 
 
 def _find_many(system: System, target: Vector, known: Array) -> Found:
+    """`find_many` for finite stop points. known: (W, Q), bool, rays whose stop points were
+    finite.
+    """
     waves, rays = target[0].shape
     size = tile_of(rays, waves)
     if len(target) == 1 or size == rays:

@@ -1,4 +1,4 @@
-"""Intersection of straight lines with surfaces: the only intersection routine.
+"""Intersection of straight lines with surfaces. There is no other intersection routine.
 
 Source: Welford, Aberrations of Optical Systems (1986), ch. 4.
 """
@@ -16,8 +16,8 @@ from ..lens.surface import domain, sag_slope
 from ..numerics import safe_divide, safe_sqrt
 from .system import Placed, Vector, dot
 
-# Newton steps along a ray to a surface that is not a conic; converged if the last step is shorter
-# than `_SETTLED` times 1 mm plus the length of the ray.
+# Newton's method along a ray to a surface that is not a conic takes at most `_STEPS` steps. It has
+# converged if the last step is at most `_SETTLED` times (1 mm + length of the ray).
 _STEPS, _SETTLED = 20, 1e-7
 
 
@@ -25,23 +25,32 @@ _STEPS, _SETTLED = 20, 1e-7
 def reach(
     form: str, p: Vector, d: Vector, shape: Shape, going: Array, side: Array, least: Array | None
 ) -> tuple[Array, Array]:
-    """Length s at which the line p + s d crosses a surface with its vertex at the origin, and a
-    mask of those that cross it. Differentiable in p, d and shape by the implicit function theorem.
+    """Length s at which the line p + s d crosses a surface with its vertex at the origin.
 
-    A line crosses a conic twice: once towards +z of the surface, which is where its normal
-    (-slope, 1) has a positive product with d, and once towards -z. `side` says which of them is
-    meant, so that neighbouring rays get neighbouring points however the surface is tilted. If
-    that one does not lie on the sheet of the vertex at s > `least`, and the other one does, it is
-    the other one. The crossing of a surface that is no conic is looked for from that of its conic;
-    the caller checks its side and whether it lies ahead.
+    For a conic, c (x^2 + y^2 + (1 + k) z^2) = 2 z gives a s^2 - 2 b s + e = 0 (see `quadratic`)
+    with the two roots s = (b - r) / a = e / (b + r), r = +-sqrt(b^2 - a e). The product of the
+    direction with the normal (-slope, 1), scaled, is b - a s = r. So the sign of r tells towards
+    which side of the surface the line crosses it: r > 0 towards +z, r < 0 towards -z. `side` is
+    this sign. Neighbouring rays therefore get neighbouring points however the surface is tilted. If
+    the crossing of `side` is not on the sheet of the vertex with s > `least`, and the other
+    crossing is, the other one is returned.
+
+    For other surfaces Newton's method along the line starts at the crossing of the conic. The
+    caller checks the side of the result and whether it lies ahead.
+
+    Differentiable in p, d and shape by the implicit function theorem: with the function g(s, p, d,
+    shape) that is 0 on the surface, ds = -dg / (dg/ds).
 
     form: name of the form of the surface.
     p: D + 1 components, a point in the axes of the surface, mm.
     d: D + 1 components, a direction of any length; s is in units of that length.
     shape: shape of the surface.
-    going: bool, rays whose iteration must converge; the others may come out wrong.
+    going: bool, rays whose iteration must converge; results for the others may be wrong.
     side: 1 for the crossing towards +z, -1 for that towards -z.
-    least: smallest s, in units of the length of d; None for the crossing of `side` wherever it is.
+    least: smallest s that is accepted, in units of the length of d; None to return the crossing of
+        `side` wherever it is.
+
+    Returns s, and a mask of the lines that cross the surface.
     """
     # c (x^2 + y^2 + (1 + k) z^2) = 2 z at p + s d: square s^2 - 2 linear s + constant = 0
     c, k = shape.curvature, shape.conic
@@ -49,7 +58,8 @@ def reach(
     discriminant = linear**2 - square * constant
 
     def crossing(root: Array) -> tuple[Array, Array]:
-        # Of the two forms of the root, use the one without cancellation.
+        # s = (linear - root) / square = constant / (linear + root): use the form without
+        # cancellation.
         alike = linear * root < 0
         above = jnp.where(alike, linear - root, constant)
         below = jnp.where(alike, square, linear + root)
@@ -62,7 +72,7 @@ def reach(
         other, also = crossing(-root)
 
         def good(length: Array, on_sheet: Array, side: Array) -> Array:
-            # A plane has one crossing only: the formula gives another from the wrong side.
+            # A plane has only one crossing, but the formula gives a second one from the wrong side.
             return on_sheet & (length > least) & ((linear - square * length) * side > 0)
 
         turned = good(other, also, -side) & ~good(length, on_sheet, side)
@@ -85,13 +95,15 @@ def reach(
     _, length, met = jax.lax.while_loop(
         lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, begin
     )
-    length = jnp.where(met, length, plane)  # a length that has not converged may be anything
+    length = jnp.where(met, length, plane)  # an unconverged length has an arbitrary value
     return length, met & domain(_along(p, d, length)[:-1], shape, form)
 
 
 def quadratic(p: Vector, d: Vector, shape: Shape) -> Vector:
-    """Coefficients (square, linear, constant) of square s^2 - 2 linear s + constant = 0, whose root
-    s is the length at which p + s d meets a conic."""
+    """Coefficients of the quadratic equation for the length s at which p + s d meets a conic.
+
+    The equation is square s^2 - 2 linear s + constant = 0. Returns (square, linear, constant).
+    """
     c, k = shape.curvature, shape.conic
     flat = *d[:-1], (1 + k) * d[-1]
     square, linear = c * dot(flat, d), d[-1] - c * dot(flat, p)
@@ -99,6 +111,7 @@ def quadratic(p: Vector, d: Vector, shape: Shape) -> Vector:
 
 
 def _along(p: Vector, d: Vector, length: Array) -> Vector:
+    """The point p + length d."""
     return tuple(a + length * b for a, b in zip(p, d, strict=True))
 
 
@@ -108,7 +121,10 @@ def _plain(form: str, shape: Shape) -> bool:
 
 
 def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple[Array, Array]:
-    """Value at p + s d of a function that is 0 on the surface, and its derivative by s."""
+    """A function g(s) that is 0 where p + s d meets the surface, and its derivative by s.
+
+    For a plain conic g = c (x^2 + y^2 + (1 + k) z^2) / 2 - z, otherwise g = sag(x, y) - z.
+    """
     *across, z = _along(p, d, length)
     if _plain(form, shape):
         quadric = tuple(shape.curvature * a for a in (*across, (1 + shape.conic) * z))
@@ -119,6 +135,7 @@ def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple[
 
 @reach.defjvp
 def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
+    """Implicit function theorem: ds = -dg / (dg/ds), with g of `_gap` at fixed s."""
     length, met = reach(form, *primals)
     gap = partial(_gap, form, length=length)
     _, change, rate = jax.jvp(gap, primals[:3], tangents[:3], has_aux=True)
@@ -135,10 +152,10 @@ def meet(
     side: Array,
     least: Array | None,
 ) -> tuple:
-    """Intersection of rays with a surface; arguments as in `reach`.
+    """Intersection of rays with a surface, with the normal there. Arguments as in `reach`.
 
-    Returns the point (mm), a normal of any length with z above 0, the mask of those that meet the
-    surface, and the length s.
+    Returns the point, D + 1 components, mm; a normal of any length with z above 0; the mask of the
+    rays that meet the surface; and the length s.
     """
     length, met = reach(form, p, d, shape, going, side, least)
     own = _along(p, d, length)
@@ -152,19 +169,21 @@ def meet(
 
 
 def near_side(d: Vector) -> Array:
-    """The `side` of `reach` from which a straight line crosses a surface near its vertex."""
+    """The `side` of `reach` on which a straight line crosses a surface near its vertex."""
     return jnp.where(d[-1] < 0, -1, 1).astype(d[-1].dtype)
 
 
 def cross(surface: Placed, form: str, point: Vector, direction: Vector) -> tuple[Vector, Array]:
-    """Intersection of straight lines, extended both ways, with one surface: D arrays, mm along its
-    axes, and a mask of those that intersect it.
+    """Intersection of straight lines, extended both ways, with one surface.
 
     surface: the surface in its position.
     form: name of its form.
     point, direction: D + 1 arrays each, along the axes of the lens; point in mm.
+
+    Returns the intersections, D arrays, mm along the axes of the surface, and a mask of the lines
+    that intersect it.
     """
     p, d = surface.local(point, direction)
-    all_of_them = jnp.ones(p[0].shape, bool)
-    length, met = reach(form, p, d, surface.shape, all_of_them, near_side(d), None)
+    every_ray = jnp.ones(p[0].shape, bool)
+    length, met = reach(form, p, d, surface.shape, every_ray, near_side(d), None)
     return _along(p, d, length)[:-1], met

@@ -1,13 +1,13 @@
 """The sequential ray trace by Snell's law, which aiming uses.
 
-The `launch` of a ray is the point where it crosses a plane across the axis of the lens, that of
-`System.launch_plane`. Arrays have the shape () for one ray, or (wavelength, ray) with a refractive
-index (wavelength, 1).
+The launch point of a ray is its crossing of the plane `System.launch_plane`, which is perpendicular
+to the axis of the lens. Arrays have the shape () for one ray, or (wavelength, ray) with a
+refractive index (wavelength, 1).
 
-A ray runs forwards. On each row it takes the crossing from the side from which light is expected
-to arrive (`Row.side`), if that lies ahead on the sheet of the surface; otherwise, in a lens with
-tilted surfaces, the crossing from the other side, if that does: an off-axis mirror may be
-prescribed with its axis either way.
+A ray runs forwards. On each row it takes the crossing on the side to which light is expected to go
+(`Row.side`), if that crossing lies ahead on the sheet of the surface. In a lens with tilted
+surfaces it otherwise takes the crossing on the other side, under the same condition, because an
+off-axis mirror may be prescribed with its axis either way.
 
 Source: Welford, Aberrations of Optical Systems (1986), ch. 4.
 """
@@ -27,18 +27,20 @@ from .meet import meet, near_side
 from .status import Status
 from .system import Placed, System, Vector, dot, rotate
 
-# Least cosine of a traced ray with the normal of a surface: 0.006 degrees from grazing.
+# Smallest cosine of the angle between a traced ray and the normal of a surface: 0.006 degrees from
+# grazing incidence.
 _FLATTEST = 1e-4
 
 
 class Trace(NamedTuple):
     """Traced rays.
 
-    hits: D arrays (R, ...), transverse coordinates on the rows, mm. If the stop is not a row, its
-        crossing is inserted at `system.before`, see `split_stop`. Undefined behind a failure.
+    hits: D arrays (R, ...), transverse coordinates on the rows, mm. If the stop is not a row, the
+        crossing of the stop is inserted at `system.before`, see `split_stop`. Undefined behind a
+        failure.
     status: (...), int32, OK, MISSED, TIR or CROSSED.
-    rounding_angle: (...), largest change of direction of a segment by rounding of the hits,
-        radians in units of the rounding error.
+    rounding_angle: (...), largest change of direction of a segment by rounding of the hits, radians
+        in units of the rounding error.
     """
 
     hits: Vector
@@ -47,7 +49,11 @@ class Trace(NamedTuple):
 
 
 def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
-    """Splits traced hits into those on the R rows, D arrays (R, ...), and on the stop (...), mm."""
+    """Splits traced hits into those on the R rows, D arrays (R, ...), and the stop, D arrays (...).
+
+    system: the traced system.
+    hits: D arrays, mm, as in `Trace`.
+    """
     at = system.before
     crossing = tuple(h[at] for h in hits)
     if system.stop is None:
@@ -56,8 +62,11 @@ def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
 
 
 def _begin(system: System, launch: Vector) -> tuple[Vector, Vector, Array]:
-    """Points (mm) and unit vectors of rays on the launch plane, and their distance from the object
-    times the vergence."""
+    """Starts rays on the launch plane P with the direction q = vergence P - source.
+
+    Returns points (mm), unit vectors q / |q|, and |q|, which is the distance from the object times
+    the vergence.
+    """
     point = *launch, jnp.broadcast_to(system.launch_plane, launch[0].shape)
     direction = tuple(system.vergence * p - s for p, s in zip(point, system.source, strict=True))
     size = jnp.sqrt(dot(direction, direction))
@@ -68,14 +77,18 @@ def _begin(system: System, launch: Vector) -> tuple[Vector, Vector, Array]:
 def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector, side: Array | None) -> tuple:
     """Refraction, reflection and diffraction by Snell's law in vector form.
 
+    With the unit normal N and the ratio m = n / n' of indices, the vector m d + kick keeps its part
+    along the surface, t. The direction behind is t + s N sqrt(1 - |t|^2), where s is the side to
+    which light crosses, reversed by a mirror.
+
     d: D + 1 arrays, unit vector in front of the surface.
     normal: D + 1 arrays of any length.
     row: the surface.
     kick: D arrays, change of direction by a phase; () for no phase.
     side: 1 if light must cross towards +z of the surface, -1 towards -z; None for any.
 
-    Returns the direction behind the surface, D + 1 arrays; a number above 0 if light comes from
-    that side; and the squared cosine behind the surface, above 0 if light passes.
+    Returns the direction behind the surface, D + 1 arrays; a number above 0 if light crosses to
+    that side; and the squared cosine behind the surface, 1 - |t|^2, above 0 if light passes.
     """
     shrink = 1 / jnp.sqrt(dot(normal, normal))
     cosine = dot(normal, d) * shrink
@@ -105,6 +118,9 @@ class _Kick(NamedTuple):
 
 
 def _kicks(system: System, kinds: list[str]) -> _Kick | None:
+    """The phases of all rows of a system; None if it has none. kinds: names of the forms of
+    phases.
+    """
     by = system.diffraction
     if by is None:
         return None
@@ -129,10 +145,12 @@ def _kick(kinds: list[str], row: _Kick | None, hit: Vector) -> Vector:
 
 
 class Row(NamedTuple):
-    """One step of the trace: an active surface, the stop or the sensor; several have a first axis.
+    """One step of the trace: an active surface, the stop or the sensor.
+
+    Several rows have a first axis.
 
     first, last: True for the first row, and for the sensor.
-    active: False for a stop that only labels: the line is extended either way to it.
+    active: False for a stop that is only a label: the ray is extended to it in either direction.
     bends: False if the ray continues unchanged.
     surface: the surface in its position.
     kind: number of its form.
@@ -161,7 +179,10 @@ def _forms(system: System) -> tuple[list[str], list[str]]:
 
 
 def rows_met(system: System, to_stop: bool = False) -> Row:
-    """The steps of the trace, to the sensor or `to_stop`.
+    """The steps of the trace to the sensor, or to the stop.
+
+    A stop that is not an active surface is inserted at `system.before` as a step that does not
+    bend.
 
     to_stop: True for the rows in front of the stop and the stop as a label, False for all rows.
     """
@@ -217,16 +238,18 @@ class _State(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """Meetings of rays with each row, along the axes of that row; undefined behind a failure. If
-    the stop is not a row, its meeting is inserted at `system.before`, see `split_stop`.
+    """Meetings of rays with each row, along the axes of that row; undefined behind a failure.
 
-    point, direction: D + 1 arrays (R, ...), a point (mm) and unit vector in front of the row.
+    If the stop is not a row, its meeting is inserted at `system.before`, see `split_stop`.
+
+    point, direction: D + 1 arrays (R, ...), a point (mm) and unit vector of the ray in front of the
+        row.
     hit: D arrays (R, ...), where the ray, extended both ways, crosses the row, mm.
     crosses: (R, ...), bool, whether the ray crosses the row.
-    length: (R, ...), mm from the active surface before it, below 0 for a step back.
+    length: (R, ...), mm from the previous active surface, below 0 for a step back.
     front: (R, ...), above 0 if light comes from the front of the row.
-    through: (R, ...), above 0 if light passes the row: no total internal reflection.
-    status: (R, ...), int32, status up to and with this row, see `Trace`.
+    through: (R, ...), above 0 if light passes the row, that is, without total internal reflection.
+    status: (R, ...), int32, status up to and including this row, see `Trace`.
     """
 
     point: Vector
@@ -240,7 +263,7 @@ class Meeting(NamedTuple):
 
 
 def _along_the_axis(going: Array, side: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
-    """Moves failed rays onto the axis, where their numbers and derivatives are finite."""
+    """Moves failed rays onto the axis, where their values and derivatives are finite."""
     axis: Vector = (*(jnp.zeros_like(a) for a in d[:-1]), side)
     p = tuple(jnp.where(going, a, 0) for a in p)
     return p, tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
@@ -254,14 +277,21 @@ def _follow(
     smooth: bool = False,
     forward: bool = True,
 ) -> tuple[_State, Any]:
-    """Traces rays.
+    """Traces rays through all rows with one `lax.scan`, so that one step is compiled.
+
+    Each step transforms the ray to the axes of the row, intersects it with the row (`meet`), bends
+    it (`_refract`) and transforms it back. The first failure decides the status: MISSED if the ray
+    does not cross the row, or crosses it from the wrong side; MISSED or CROSSED if the crossing
+    lies behind the ray (MISSED on the first row and the sensor, CROSSED on others); TIR if no light
+    passes. A failed ray goes on with undefined values, or on the axis if `smooth`. A row that does
+    not bend leaves the ray as it is and changes only the status.
 
     launch: D arrays (...), mm on the launch plane.
-    to_stop: True to trace to the stop alone.
+    to_stop: True to trace only to the stop.
     smooth: as in `meetings`.
     forward: True if a ray that steps back to a row is CROSSED.
 
-    Returns the rays behind the last row and the `Meeting` with all rows; None if `to_stop`.
+    Returns the rays behind the last row, and the `Meeting` with all rows; None if `to_stop`.
     """
     kinds, phases = _forms(system)
     each = [partial(meet, kind) for kind in kinds]
@@ -269,15 +299,19 @@ def _follow(
     point, direction, far = _begin(system, launch)
 
     def ahead(row, length):
-        """Whether a length leads forwards: away from the object, which lies `far` / vergence behind
-        the launch, or from the row before. The sensor may lie in front of the last surface, where
-        light only seems to come from."""
+        """Whether a length leads forwards: away from the object on the first row, away from the
+        previous row on others.
+
+        The object lies `far` / vergence behind the launch point, so that the first condition is
+        vergence length + far > 0. A sensor in front of the last surface is reached backwards, along
+        the line from which light only seems to come.
+        """
         beyond = jnp.where(row.first, system.vergence * length + far, length)
         beyond = jnp.where(row.last, way * beyond, beyond) > 0
         return beyond | ((not forward) & ~row.first)
 
     def least(row):
-        """The smallest length of the crossing of a tilted surface."""
+        """The smallest length at which a crossing with a tilted surface is accepted."""
         start = jnp.where(system.vergence > 0, -safe_divide(far, system.vergence), -jnp.inf)
         anywhere = (row.last & (way < 0)) | ~row.active
         return jnp.where(row.first, start, jnp.where(anywhere, -jnp.inf, 0))
@@ -289,8 +323,8 @@ def _follow(
             p, d = _along_the_axis(going, row.side, p, d)
         side = jnp.where(row.active, row.side, near_side(d))
         encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
-        given = p, d, row.surface.shape, going, side
-        own, normal, crosses, length = encounter(*given, least(row) if tilted else None)
+        line = p, d, row.surface.shape, going, side
+        own, normal, crosses, length = encounter(*line, least(row) if tilted else None)
         kick = _kick(phases, row.kick, own[:-1])
         direction, front, through = _refract(d, normal, row, kick, None if tilted else side)
         hit, origin = own[:-1], row.surface.origin(len(own) - 1)
@@ -305,7 +339,7 @@ def _follow(
         here = jnp.where(met, jnp.where(beyond, here, back), Status.MISSED)
         status = jnp.where(going, here.astype(jnp.int32), state.status)
         wide = jnp.maximum(dot(meeting.hit, meeting.hit), dot(state.hit, state.hit))
-        wide = jax.lax.stop_gradient(jnp.sqrt(wide))  # has no derivative on the axis
+        wide = jax.lax.stop_gradient(jnp.sqrt(wide))  # the root has no derivative on the axis
         angle = safe_divide(wide, jnp.where(row.first, 0, abs(meeting.length)))
         angle = jnp.maximum(jnp.where(status == Status.OK, angle, 0), state.rounding_angle)
         behind = behind._replace(status=status, rounding_angle=angle)
@@ -327,12 +361,16 @@ def shoot(system: System, launch: Vector) -> Trace:
 
 
 def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
-    """Traces rays that may step back where neighbouring surfaces cross; differentiable, and finite
-    for failed rays. launch: as in `shoot`.
+    """Traces rays that may step back where neighbouring surfaces cross.
+
+    Differentiable, and finite for failed rays.
+
+    launch: D arrays, mm on the launch plane.
 
     Returns `hits` as in `Trace`; the lengths (R - 1, ...) of the segments from each active surface
-    to the next and to the sensor, mm, below 0 for a step back, which no step to a sensor in front
-    of the last surface is; and `status` as in `Trace`.
+    to the next and to the sensor, mm; and `status` as in `Trace`. A length is below 0 for a step
+    back. A segment to a sensor in front of the last surface (a virtual image) does not count as a
+    step back.
     """
     state, met = _follow(system, launch, smooth=True, forward=False)
     lengths = split_stop(system, (met.length,))[0][0][1:]
@@ -342,14 +380,23 @@ def shoot_anyway(system: System, launch: Vector) -> tuple[Vector, Array, Array]:
 
 
 def meetings(system: System, launch: Vector, smooth: bool = False) -> Meeting:
-    """Meetings of rays with all rows. launch: as in `shoot`. smooth: True to move failed rays onto
-    the axis, so that all derivatives are finite."""
+    """Meetings of rays with all rows.
+
+    launch: D arrays, mm on the launch plane.
+    smooth: True to move failed rays onto the axis, so that all derivatives are finite.
+    """
     return _follow(system, launch, smooth=smooth)[1]
 
 
 def shoot_to_stop(system: System, launch: Vector) -> tuple[Vector, Array]:
-    """Crossings of the stop, D arrays, mm along its axes, and the status there (...), of rays that
-    may step back: whether they do is asked last, and does not end a search. launch: as in
-    `shoot`."""
+    """Traces rays to the stop, also backwards.
+
+    A step back does not end the trace, so that Newton's method can pass through such rays. The
+    complete trace checks afterwards whether a found ray steps back.
+
+    launch: D arrays, mm on the launch plane.
+
+    Returns the crossings of the stop, D arrays, mm along its axes, and the status there (...).
+    """
     state, _ = _follow(system, launch, to_stop=True, forward=False)
     return state.hit, state.status

@@ -1,8 +1,9 @@
 """Rays as roots of the Fermat system, with derivatives by the implicit function theorem.
 
-The search is not differentiated. At a root of E(w, p) = 0, the Fermat equations and the label,
-dw/dp = -(dE/dw)^-1 dE/dp (paper Eq. 4). `attach` gives known hits these derivatives in every mode.
-`solve_reverse` is a `jax.custom_vjp` for reverse mode alone, which stores only the hits.
+The search is not differentiated. At a root of E(w, p) = 0, where E are the Fermat equations and the
+label, w the hits and p the parameters, dw/dp = -(dE/dw)^-1 dE/dp (paper Eq. 4). `attach` gives
+known hits these derivatives in every mode. `solve_reverse` is a `jax.custom_vjp` for reverse mode
+alone, which stores only the hits.
 """
 
 from collections.abc import Callable
@@ -27,51 +28,64 @@ from .system import System, Vector, dot, rotate
 def attach(
     system: System, target: Vector, hits: Vector, arrival: Vector, ok: Array
 ) -> tuple[Vector, Vector]:
-    """Returns hits and arrivals unchanged, with derivatives by the system and the stop points in
-    every mode.
+    """Returns hits and arrivals unchanged, with derivatives by the system and the stop points.
+
+    Differentiable in every mode and to any order.
 
     target: D arrays (W, Q), stop points, mm.
     hits, arrival: as in `Found`.
-    ok: (W, Q), bool, rays that have derivatives.
+    ok: (W, Q), bool, rays that have derivatives; the derivatives of others are 0.
     """
     return hits, arrival
 
 
 def _attach_jvp(primals: Any, tangents: Any) -> tuple:
+    """The JVP of `attach`: tangents of hits and arrivals by `linear.solve`."""
     system, target, *known, ok = primals
     # Call the function itself, so that the hits have derivatives for higher orders.
     hits, arrival = attach(system, target, *known, ok)
-    # Leaves without a tangent cost nothing.
-    moving, turning = (
+    # Leaves without a tangent are left out, so that they cost nothing.
+    moving, shifts = (
         [None if isinstance(t, SymbolicZero) else t for t in jax.tree.leaves(part)]
         for part in tangents[:2]
     )
 
-    def tangent(hits, turning, ok):
+    def tangent(hits, shifts, ok):
         path = fermat.geometry(hits, system)
         rhs = _right_side(path, system, moving)
-        label = (a if t is None else a + t for a, t in zip(rhs.label, turning, strict=True))
+        label = (a if t is None else a + t for a, t in zip(rhs.label, shifts, strict=True))
         rhs = jax.tree.map(lambda a: jnp.where(ok, a, 0), rhs._replace(label=tuple(label)))
         changes = linear.solve(path, system, ok, rhs)
         return jax.tree.map(lambda a: jnp.where(ok, a, 0), changes)
 
     tile = derivative_tile(len(ok), len(system.forms))
-    return (hits, arrival), in_tiles(tangent, tile, hits, turning, ok)
+    return (hits, arrival), in_tiles(tangent, tile, hits, shifts, ok)
 
 
 attach.defjvp(_attach_jvp, symbolic_zeros=True)
 
 
 def _right_side(path: Path, system: System, moving: list[Array | None]) -> linear.RightSide:
-    """Right-hand side of the linear system for tangents of leaves of the system (paper Eq. 4)."""
+    """Right-hand side of the linear system for tangents of leaves of the system (paper Eq. 4).
+
+    It is the directional derivative, along the tangents dp, of the equations at fixed hits: F and
+    the label at fixed directions of the ray, the positions of the surfaces at fixed transverse
+    coordinates, and the unnormalised direction q = vergence P_1 - source of the first segment. F
+    and the label enter with the sign of -(dE/dp) dp. The direction follows from d(q / |q|) = (dq -
+    e (e.dq)) / |q|. One `jax.jvp` over the leaves with a tangent gives all of them; other leaves
+    are constants.
+
+    moving: tangents of all leaves of the system in the order of `jax.tree.leaves`; None for a leaf
+        without a tangent.
+    """
     leaves, structure = jax.tree.flatten(system)
-    some = [k for k, change in enumerate(moving) if change is not None]
+    varied = [k for k, change in enumerate(moving) if change is not None]
     directions = [rotate(system.rows.rotation, a) for a in (path.before, path.after)]
     first, line = (fermat.ray_at(path, system, row) for row in (0, system.before))
 
     def with_fixed_path(changed):
         """The equations for fixed hits, and for directions fixed along the axes of the lens."""
-        new = dict(zip(some, changed, strict=True))
+        new = dict(zip(varied, changed, strict=True))
         own = jax.tree.unflatten(structure, [new.get(k, a) for k, a in enumerate(leaves)])
         rows = own.rows
         height, slope = by_form(sag_slope, path.hits, rows.on(path.length), own.forms)
@@ -86,7 +100,7 @@ def _right_side(path: Path, system: System, moving: list[Array | None]) -> linea
             crossing, _ = cross(own.stop, own.stop_form, *line)
         return residual, point, tuple(toward), crossing
 
-    now, change = ([a[k] for k in some] for a in (leaves, moving))
+    now, change = ([a[k] for k in varied] for a in (leaves, moving))
     residual, point, toward, label = jax.jvp(with_fixed_path, (now,), (change,))[1]
     along = dot(first[1], toward)
     direction = (path.shrink * (t - e * along) for t, e in zip(toward, first[1], strict=True))
@@ -95,18 +109,26 @@ def _right_side(path: Path, system: System, moving: list[Array | None]) -> linea
 
 
 def solve(system: System, target: Vector) -> Found:
-    """Finds the rays through stop points, differentiable in every mode and to any order; failed
-    rays have zero derivatives. target: D arrays (W, Q), stop points, mm."""
+    """Finds the rays through stop points, differentiable in every mode and to any order.
+
+    Failed rays have zero derivatives.
+
+    target: D arrays (W, Q), stop points, mm.
+    """
     return reattach(find_many(*jax.lax.stop_gradient((system, target))), system, target)
 
 
 def solve_aimed(system: System, target: Vector) -> Found:
-    """Finds rays as `solve` does, by aiming alone, see `find_aimed`."""
+    """Finds rays as `solve` does, but by aiming alone, see `find_aimed`."""
     return reattach(find_aimed(*jax.lax.stop_gradient((system, target))), system, target)
 
 
 def reattach(found: Found, system: System, target: Vector) -> Found:
-    """Gives rays through stop points `target` the derivatives of `attach`."""
+    """Gives found rays the derivatives of `attach`.
+
+    found: rays through the stop points `target`.
+    target: D arrays (W, Q), stop points, mm.
+    """
     hits, arrival = attach(system, target, found.hits, found.arrival, found.status == Status.OK)
     return found._replace(hits=hits, arrival=arrival)
 
@@ -117,18 +139,20 @@ Solver = Callable[[System, Vector], Found]
 
 @jax.custom_vjp
 def solve_reverse(system: System, target: Vector) -> Found:
-    """Finds rays as `solve` does, for reverse mode alone: faster, and stores only the hits."""
+    """Finds rays as `solve` does, for reverse mode alone. It is faster and stores only the hits."""
     return find_many(system, target)
 
 
 def _forward(system: System, target: Vector) -> tuple[Found, tuple]:
+    """Forward pass of `solve_reverse`: the rays, and what the backward pass needs."""
     found = find_many(system, target)
     return found, (system, target, found.hits, found.status == Status.OK)
 
 
 def _backward(saved: tuple, cotangent: Found) -> tuple[System, Vector]:
+    """Backward pass of `solve_reverse`: the transpose of the JVP of `attach`."""
     system, target, hits, ok = saved
-    void = jax.tree.map(jnp.zeros_like, cotangent.arrival)  # only its derivatives are used
+    void = jax.tree.map(jnp.zeros_like, cotangent.arrival)  # its value is not used
 
     def attached(system, target):
         return attach(system, target, hits, void, ok)

@@ -1,4 +1,4 @@
-"""Packing of a few flagged rays into the lanes of a bundle, several trials per ray."""
+"""Packing of a few flagged rays into the lanes of a bundle, with several trials for each ray."""
 
 from typing import Any
 
@@ -8,11 +8,15 @@ from jax import Array
 
 
 class Lanes:
-    """Assignment of the Q lanes of a bundle to the first K = Q // N flagged rays, N lanes each, in
-    the order of the rays. Remaining lanes repeat the last one.
+    """Assigns the Q lanes of each wavelength to its first K = Q // N flagged rays.
+
+    Each of these rays gets N neighbouring lanes, in the order of the rays. Lanes that remain repeat
+    the last one. A search of the width Q can thus try N first guesses for each of K missing rays at
+    a time.
 
     flagged: (W, Q), bool, rays that need lanes.
-    each: N, lanes per ray, at most Q.
+    each: N, lanes for each ray, at most Q.
+    few: K, number of rays that can have lanes.
     served: (W, Q), bool, rays that have lanes.
     """
 
@@ -22,16 +26,19 @@ class Lanes:
         self.served = flagged & (self._rank < self.few)
 
     def of_rays(self, tree: Any) -> Any:
-        """Entries (W, K) of arrays (W, Q) that belong to the served rays; if fewer than K rays are
-        flagged, the last ray of the bundle fills up."""
+        """Gathers the entries (W, K) of arrays (W, Q) that belong to the rays with lanes.
+
+        If fewer than K rays are flagged, the entries of the last ray of the bundle fill the rest.
+        """
         count = self.served.shape[1]
         order = jnp.where(self.served, count - jnp.arange(count, dtype=jnp.int32), 0)
         rays = count - jax.lax.top_k(order, self.few)[0]
         return jax.tree.map(lambda a: jnp.take_along_axis(a, rays, 1, mode="clip"), tree)
 
     def spread(self, tree: Any) -> Any:
-        """Spreads arrays (W, K, N) over the lanes, (W, Q); (W, K, 1) repeats in all lanes of a
-        ray."""
+        """Spreads arrays (W, K, N) over the lanes, (W, Q). An array (W, K, 1) is repeated in all N
+        lanes of a ray.
+        """
         waves, rays = self.served.shape
 
         def wide(a: Array) -> Array:
@@ -40,10 +47,15 @@ class Lanes:
 
         return jax.tree.map(wide, tree)
 
-    def best(self, worth: Array) -> tuple[Array, Array]:
-        """The first lane with the highest worth of each ray, (W, Q), int32, and a mask of the
-        served rays whose highest worth is above 0. worth: (W, Q), of the lanes."""
-        own = worth[:, : self.few * self.each].reshape(len(worth), self.few, self.each)
+    def best(self, quality: Array) -> tuple[Array, Array]:
+        """The best lane of each ray.
+
+        quality: (W, Q), quality of the trial in each lane; 0 for a failed trial.
+
+        Returns the first lane with the highest quality among the lanes of each ray, (W, Q), int32;
+        and a mask (W, Q) of the rays that have lanes and in one of them a quality above 0.
+        """
+        own = quality[:, : self.few * self.each].reshape(len(quality), self.few, self.each)
         slot = jnp.clip(self._rank, 0, self.few - 1)
         lane = jnp.take_along_axis(jnp.argmax(own, axis=-1).astype(jnp.int32), slot, axis=-1)
         found = jnp.take_along_axis(jnp.any(own > 0, axis=-1), slot, axis=-1)

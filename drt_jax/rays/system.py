@@ -1,8 +1,9 @@
-"""The traced system: the active surfaces in their positions, and the stop as a label.
+"""The traced system: the active surfaces in their positions, and the stop as a label of rays.
 
-Vectors are tuples of components: y for rays in the meridional plane (D = 1), x and y for others
-(D = 2), then z if the vector has D + 1 components. Each component is an array with one number per
-ray. XLA fuses sums of components into a few long loops; a sum over an axis becomes a library call.
+A vector is a tuple of components: (y,) for rays in the meridional plane (D = 1) or (x, y) for other
+rays (D = 2). A vector of D + 1 components also has z. Each component is an array with one number
+for each ray. Components are separate arrays because XLA fuses sums of components into a few long
+loops, whereas a sum over an array axis becomes a library call.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from ..lens.scene import Scene
 from ..numerics import matmul, safe_divide
 
 Vector = tuple[Array, ...]
-_MM = 1e-3  # mm per um
+_MM_PER_UM = 1e-3
 
 
 def dot(a: Any, b: Any) -> Array:
@@ -30,7 +31,11 @@ def dot(a: Any, b: Any) -> Array:
 
 
 def determinant(rows: Any) -> Array:
-    """Determinant of a 2 x 2 matrix; 1 for a 1 x 1 matrix, whose sign does not show a fold."""
+    """Determinant of a 2 x 2 matrix given as rows; 1 for a 1 x 1 matrix.
+
+    The sign of a 2 x 2 determinant shows whether a map is folded (mirrored). The sign of a 1 x 1
+    matrix does not, hence the constant 1.
+    """
     if len(rows) == 1:
         return jnp.ones_like(rows[0][0])
     (p, q), (r, s) = rows
@@ -38,7 +43,9 @@ def determinant(rows: Any) -> Array:
 
 
 def divide(rows: Any, b: Vector) -> Vector:
-    """Solution x of rows x = b for 1 or 2 unknowns; 0 where the matrix is singular."""
+    """Solves rows x = b for 1 or 2 unknowns by Cramer's rule; returns 0 where the matrix is
+    singular.
+    """
     if len(b) == 1:
         return (safe_divide(b[0], rows[0][0]),)
     (p, q), (r, s) = rows
@@ -50,9 +57,9 @@ def divide(rows: Any, b: Vector) -> Vector:
 def rotate(rotation: Array | None, vector: Vector, back: bool = False) -> Vector:
     """Rotates a vector from the axes of its surface to those of the lens.
 
-    rotation: (3, 3), or (R, 3, 3) for components (R, ...); None for the same axes.
+    rotation: (3, 3), or (R, 3, 3) for components (R, ...); None if both have the same axes.
     vector: 3 components.
-    back: True for the opposite rotation, from the lens to the surface.
+    back: True for the inverse rotation, from the axes of the lens to those of the surface.
     """
     if rotation is None:
         return vector
@@ -108,7 +115,11 @@ class Placed(NamedTuple):
         return *offset, self.vertex
 
     def local(self, point: Vector, direction: Vector) -> tuple[Vector, Vector]:
-        """Point (mm) and direction of a line in the axes of one surface, origin at its vertex."""
+        """A line in the axes of one surface, with the origin at its vertex.
+
+        point: D + 1 components along the axes of the lens, mm.
+        direction: D + 1 components along the axes of the lens.
+        """
         origin = self.origin(len(point) - 1)
         shifted = tuple(p - o for p, o in zip(point, origin, strict=True))
         return rotate(self.rotation, shifted, back=True), rotate(
@@ -187,17 +198,24 @@ class System:
 
     @property
     def launch_plane(self) -> Array:
-        """z of the plane on which rays are launched, (), mm: that through the first row's vertex,
-        unless that lies so near to the object, or behind it, that no ray is known by its point
-        there; then that through the first surface of the lens, z = 0."""
+        """z of the plane on which rays are launched, (), mm.
+
+        It is the plane through the vertex of the first row. If that plane lies behind the object,
+        or so near to it that the launch point does not determine the ray (1 + vergence z <= 0.5),
+        it is the plane through the first surface of the lens, z = 0.
+        """
         first = self.rows.vertex[0]
         return jnp.where(1 + self.vergence * first > 0.5, first, 0)
 
     @property
     def sensor_way(self) -> Array:
-        """1, or -1 for a sensor in front of the last surface, which shows a virtual image; (). It
-        is told by the axis of the last surface; in a lens with tilts and a mirror, where that
-        axis says nothing of the beam, the sensor lies ahead."""
+        """1 if the sensor lies ahead of the last surface, -1 if it lies in front of it; ().
+
+        A sensor in front of the last surface shows a virtual image. The sign is that of the
+        distance from the last vertex to the sensor along the axis of the last surface, in the
+        direction of the light. In a lens with tilts and a mirror this axis does not give the
+        direction of the beam; the sensor then counts as ahead.
+        """
         rows, rotation = self.rows, self.rows.rotation
         if len(self.forms) == 1 or (rotation is not None and any(self.mirrors)):
             return jnp.ones_like(rows.vertex[0])
@@ -209,10 +227,14 @@ class System:
 
     @property
     def sides(self) -> Array:
-        """(R,), 1 for rows that light is expected to cross towards +z of their own axes, -1 towards
-        -z: by the number of mirrors in front. The first row has the opposite side if its axis
-        points to the object, by 30 degrees or more from its vertex plane: an off-axis mirror
-        prescribed the other way round."""
+        """Side of each row that light crosses to, (R,): 1 towards +z of the axes of the row, -1
+        towards -z.
+
+        The sign follows from the number of mirrors in front of the row. There is one exception: if
+        the axis of the first row points to the object, by 30 degrees or more out of its vertex
+        plane, its sign is reversed. This is an off-axis mirror that is prescribed the other way
+        round.
+        """
         sides = jnp.asarray(self.senses)
         rotation = self.rows.rotation
         if rotation is None:
@@ -224,7 +246,9 @@ class System:
 
     @property
     def senses(self) -> np.ndarray:
-        """(R,), 1 where light travels towards +z in front of a row, -1 where towards -z."""
+        """Direction of the light in front of each row, (R,): 1 towards +z of the lens, -1 towards
+        -z.
+        """
         senses = np.cumprod([1, *(-1 if mirror else 1 for mirror in self.mirrors)])
         return senses.astype(self.index.dtype)
 
@@ -232,8 +256,8 @@ class System:
 def placed(lens: Lens, rows: Any) -> Placed:
     """Surfaces of a lens in their positions.
 
-    rows: index of one surface, or a list of indices. The shape of a surface that is neither active
-        nor in `Lens.curved` has no derivative.
+    rows: index of one surface, or a list of indices. The shape of a surface has no derivative if
+        the surface is neither active nor in `Lens.curved`.
     """
     rows = np.asarray(rows)
     vertex, offset, rotation = lens.places
@@ -282,5 +306,6 @@ def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
 
 
 def _diffraction(phase: Phase, active: tuple[int, ...], wavelengths: Array) -> Diffraction:
-    wave = _MM * phase.order[:, None, None] * wavelengths[None, :, None]
+    """The phases of a lens. Each wave of phase adds order times wavelength of path, mm."""
+    wave = _MM_PER_UM * phase.order[:, None, None] * wavelengths[None, :, None]
     return Diffraction(phase.shape, wave, tuple(map(active.index, phase.surfaces)), phase.forms)

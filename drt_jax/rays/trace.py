@@ -1,7 +1,7 @@
-"""From a lens, a scene and points on the stop to rays with a status.
+"""From a lens, a scene and points on the stop to rays with a status, in three steps.
 
-Three steps: `aims` makes the system and the stop points, a `Solver` finds the rays, `bundle_of`
-adds the other surfaces and the status.
+`aims` makes the traced system and the stop points in mm, a `Solver` finds the rays, and `bundle_of`
+adds the surfaces that are not active and decides the status.
 """
 
 import dataclasses
@@ -31,13 +31,15 @@ from .system import System, Vector, placed, rotate, system_of
 class Bundle(NamedTuple):
     """Rays as arrays with rays on the last axis.
 
-    hits: D arrays (S + 1, W, Q), mm along the axes of each surface and the sensor.
+    hits: D arrays (S + 1, W, Q), mm along the axes of each surface and of the sensor.
     status: (W, Q), int32, see `Status`.
     arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along its axes.
-    path: (W, Q), optical path from the object, mm, less that of a path in the middle of the rays
-        of its wavelength, which has no derivative by its hits, see `fermat.optical_path`.
-    Of an afocal lens the hits on the sensor, arrival and path are those of `rays.afocal`.
+    path: (W, Q), optical path from the object, mm, less the path through the mean hits of the rays
+        of the same wavelength. The mean hits count as constants in derivatives, see
+        `fermat.optical_path`.
     steps: (), int32, Newton steps.
+
+    In an afocal lens the hits on the sensor, the arrival and the path are those of `rays.afocal`.
     """
 
     hits: Vector
@@ -51,11 +53,12 @@ class Rays(NamedTuple):
     """Traced rays.
 
     points: (W, Q, S + 1, 3), mm, intersections with the surfaces and the sensor, along the axes of
-        the lens, z from the first vertex; zeros for a failed ray.
-    directions: (W, Q, S + 1, 3), unit vectors (direction cosines) in front of each surface and
+        the lens, with z from the first vertex; zeros for a failed ray.
+    directions: (W, Q, S + 1, 3), unit vectors (direction cosines) in front of each surface and of
         the sensor; zeros for a failed ray.
-    path: (W, Q), mm, optical path to the sensor from the sphere about the object (for an object at
-        infinity the plane wave) through the first vertex; 0 for a failed ray.
+    path: (W, Q), mm, optical path to the sensor. It starts at the sphere about the object point
+        through the first vertex, or at the plane wave through the first vertex for an object at
+        infinity; 0 for a failed ray.
     status: (W, Q), int32, see `Status`.
     newton_steps: (), int32, Newton steps of the whole bundle, aiming included.
     """
@@ -77,19 +80,22 @@ def on_all_surfaces(
 ) -> tuple[Vector, Array]:
     """Adds the hits on the surfaces that are not active.
 
+    The stop point is the hit on an inactive stop. On any other inactive surface the hit is the
+    intersection with the straight line of the ray there, extended both ways.
+
     hits: D arrays (R, W, Q), on the rows of the system, mm.
     stop: D arrays (W, Q), crossings of the stop, mm.
     exists: (W, Q), bool, rays that exist.
 
-    Returns hits on all surfaces, D arrays (S + 1, W, Q), 0 for failed rays, and the mask (W, Q) of
-    the rays that exist and whose straight lines, extended both ways, meet all those surfaces.
+    Returns the hits on all surfaces, D arrays (S + 1, W, Q), 0 for failed rays; and the mask (W, Q)
+    of the rays that exist and meet all those surfaces.
     """
     pieces, begin, behind = [], 0, _rows_behind(lens)
     for i in sorted({*range(lens.count)} - {*lens.active}):
         row, crossing = behind[i], stop
         if i != lens.stop:
-            some, part = fermat.up_to(hits, system, row)
-            line = fermat.ray_at(fermat.geometry(some, part), part, -1)
+            nearby, part = fermat.up_to(hits, system, row)
+            line = fermat.ray_at(fermat.geometry(nearby, part), part, -1)
             crossing, met = cross(placed(lens, i), lens.forms[i], *line)
             exists = exists & met
         pieces += [tuple(h[begin:row] for h in hits), tuple(c[None] for c in crossing)]
@@ -100,11 +106,13 @@ def on_all_surfaces(
 
 
 def aims(lens: Lens, scene: Scene, points: Vector) -> tuple[System, Vector]:
-    """The system of a bundle, and the stop points that its rays cross, D arrays (W, Q), mm.
+    """The traced system of a bundle, and the stop points that its rays must cross.
 
-    points: D arrays (Q,) or (W, Q), in the plane of the stop in units of its semi-diameter; D = 1
+    points: D arrays (Q,) or (W, Q), in the plane of the stop in units of its semi-diameter. D = 1
         for rays in the meridional (y, z) plane of a lens with rotational symmetry and an axial
-        object, else 2. A point that is not finite becomes inf, without a derivative.
+        object, else D = 2. A point that is not finite becomes inf, without a derivative.
+
+    Returns the `System` and the stop points, D arrays (W, Q), mm.
     """
     radius, waves = lens.semi_diameter[lens.stop], scene.wavelengths.shape[0]
     finite = [(jnp.isfinite(p), jnp.where(jnp.isfinite(p), p, 0)) for p in points]
@@ -118,6 +126,10 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
 
     system, target: as `aims` returns them.
     found: the rays that a `Solver` found.
+
+    The status is MISSED where the scene is impossible, NO_INDEX for a wavelength outside the range
+    of a glass, MISSED for a ray that misses an inactive surface, and CLIPPED for a ray outside of a
+    clear aperture or inside of an obscuration.
     """
     status = jnp.where(scene.possible, found.status, jnp.int32(Status.MISSED))
     known = lens.dispersion.knows(scene.wavelengths)[:, None]
@@ -135,7 +147,9 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
 
 
 def path_of(found: Found, system: System) -> Array:
-    """`Bundle.path` of the rays that a `Solver` found."""
+    """`Bundle.path` of the rays that a `Solver` found: the optical path less that of the mean
+    hits.
+    """
     good = found.status == Status.OK
     count = jnp.maximum(jnp.sum(good, axis=-1, keepdims=True), 1)
     hits = (jnp.sum(jnp.where(good, h, 0), axis=-1, keepdims=True) for h in found.hits)
@@ -144,10 +158,10 @@ def path_of(found: Found, system: System) -> Array:
 
 
 def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solve) -> Bundle:
-    """Traces rays: `aims`, a solver and `bundle_of`.
+    """Traces rays: `aims`, then a solver, then `bundle_of`.
 
-    points: as in `aims`.
-    solver: `solve` for all derivative modes, or `solve_reverse`.
+    points: stop points as in `aims`.
+    solver: `solve` for all derivative modes, or `solve_reverse` for reverse mode alone.
     """
     system, target = aims(lens, scene, points)
     return bundle_of(lens, scene, system, target, solver(system, target))
@@ -160,12 +174,14 @@ def trace_rays(
     wavelengths: Numbers,
     pupil: Numbers,
 ) -> Rays:
-    """Traces the rays that cross the stop at given points, aimed at the real stop for every
-    wavelength. Differentiable in every mode and to any order.
+    """Traces the rays that cross the real stop at given points, aimed for every wavelength.
 
-    field: angle along y or (x, y), radians: light along (tan x, tan y, 1), positive upwards. For a
-        height in mm see `field_of_height`.
-    distance: mm from the object plane to the first vertex, may be inf.
+    The result is differentiable in every mode and to any order.
+
+    lens: the lens; its dtype is that of the result.
+    field: angle along y, or angles along (x, y), radians: light travels along (tan x, tan y, 1),
+        with a positive angle upwards. For an object height in mm see `field_of_height`.
+    distance: mm from the object plane to the first vertex; may be inf.
     wavelengths: (W,), um.
     pupil: (Q, 2), x and y on the stop in units of its semi-diameter.
 
@@ -177,15 +193,19 @@ def trace_rays(
     count, size = len(points), _padded(len(points))
     if count == size or known_values((lens, scene, points)) is None:
         return _trace(lens, scene, points)
-    # Padding lets bundles of similar size share a program; rays through inf cost little.
+    # Bundles of similar size are padded to one size, so that they share a compiled program. The
+    # stop points of the padding are inf; such rays are MISSED without a search.
     library = np if concrete(points) else jnp
     filled = library.pad(points, ((0, size - count), (0, 0)), constant_values=np.inf)
     return _first(_trace(lens, scene, filled), count)
 
 
 def _padded(count: int) -> int:
-    """Padded number of rays: at least 16, then a multiple of an eighth of the next power of 2;
-    above 1024 unchanged, where arithmetic takes the time."""
+    """Number of rays after padding.
+
+    It is at least 16, then a multiple of an eighth of the next power of 2. Above 1024 rays there is
+    no padding, because arithmetic then takes most of the time.
+    """
     if count > 1024:
         return count
     step = max(16, 1 << (count - 1).bit_length()) // 8
@@ -199,8 +219,11 @@ def _first(rays: Rays, count: int) -> Rays:
 
 
 def stop_points(lens: Lens, pupil: Numbers) -> Array:
-    """Points (Q, 2) on the stop as an array in the dtype of the lens. ValueError for no points and
-    for another shape."""
+    """Points (Q, 2) on the stop as an array in the dtype of the lens.
+
+    pupil: (Q, 2), in units of the semi-diameter of the stop. ValueError for no points and for
+        another shape.
+    """
     points = real_array("pupil", pupil, lens.curvature.dtype)
     if points.ndim != 2 or points.shape[1] != 2 or not len(points):
         hint = "; pass pupil.T" if points.ndim == 2 and points.shape[0] == 2 else ""
@@ -210,6 +233,7 @@ def stop_points(lens: Lens, pupil: Numbers) -> Array:
 
 @functools.partial(jit, wanted=LARGE)
 def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
+    """The compiled part of `trace_rays`. pupil: (Q, 2), in semi-diameters of the stop."""
     system, target = aims(lens, scene, (pupil[:, 0], pupil[:, 1]))
     found = solve(system, target)
     bundle = bundle_of(dataclasses.replace(lens, afocal=False), scene, system, target, found)

@@ -309,3 +309,16 @@ def test_the_transfer_function_of_a_clipped_pupil():
         lens, 0.25, np.inf, 0.55, lines, rule=Clipped(8, "bilateral"), cells=256
     )
     np.testing.assert_allclose(found.mtf[0], wanted, rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_strehl_does_not_depend_on_the_direction_of_a_field():
+    """The field along y and along the diagonal of x and y, where the clipped pupil is a slanted
+    oval: tilts along x and y then belong together."""
+    lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(4.0))
+    fields = 0.12 * np.array([[0.0, 1.0], [0.5**0.5, 0.5**0.5]])
+    along, diagonal = drt_jax.strehl(
+        lens, fields, np.inf, [0.55], rule=Clipped(6, "none"), degree=8, cells=64
+    )[:, 0]
+    assert 0.02 < along < 0.98
+    np.testing.assert_allclose(diagonal, along, rtol=0, atol=3e-3)
