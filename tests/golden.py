@@ -169,7 +169,9 @@ def differences(name: str) -> list[str]:
         if what not in known:
             lines.append(f"{name}: {what}: is new")
         elif (before := float.fromhex(known[what])) != value:
-            lines.append(f"{name}: {what}: {value:.6g}, differs by {abs(value - before) / scale:.1e}")
+            lines.append(
+                f"{name}: {what}: {value:.6g}, differs by {abs(value - before) / scale:.1e}"
+            )
     return lines
 
 

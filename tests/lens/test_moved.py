@@ -54,7 +54,8 @@ def held(gradient):
 
 def test_a_jacobian_of_several_outputs_is_that_of_each():
     """Also in `jit`, where each array of the lens becomes a tuple of derivatives."""
-    first, second = jax.jit(jax.jacrev(lambda lens: (power(lens), {"twice": 2 * power(lens)})))(LENS)
+    twice = lambda lens: (power(lens), {"twice": 2 * power(lens)})  # noqa: E731
+    first, second = jax.jit(jax.jacrev(twice))(LENS)
     one = slopes(LENS)
     for name in ("curvature", "semi_diameter", "sensor"):
         assert np.array_equal(getattr(first, name), getattr(one, name))
