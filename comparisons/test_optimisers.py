@@ -147,7 +147,7 @@ def test_optiland_is_told_the_problem():
     lens = problem.variables.lens
     middle = np.array([0.5876])
     focal = float(drt_jax.focal_length(lens, middle)[0])
-    pupil = 2 * float(drt_jax.entrance_pupil(lens, middle).semi_diameter[0])
+    pupil = 2 * float(drt_jax.first_order(lens, jnp.inf, middle).entrance_pupil.semi_diameter[0])
     assert (told.focal_length, told.pupil_mm) == pytest.approx((focal, pupil), 1e-12)
 
 

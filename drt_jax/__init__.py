@@ -114,18 +114,9 @@ from .lens.lens import (
 from .lens.paraxial import (
     FirstOrder as FirstOrder,
     Pupil as Pupil,
-    back_focal_distance as back_focal_distance,
-    effective_focal_length as effective_focal_length,
-    entrance_pupil as entrance_pupil,
-    exit_pupil as exit_pupil,
-    f_number as f_number,
     first_order as first_order,
     focal_length as focal_length,
-    front_focal_distance as front_focal_distance,
-    image_distance as image_distance,
     image_height as image_height,
-    lateral_magnification as lateral_magnification,
-    numerical_aperture as numerical_aperture,
 )
 from .lens.phase import Phase as Phase
 from .lens.scene import Scene as Scene, field_of_height as field_of_height, scene_of as scene_of

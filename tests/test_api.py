@@ -33,17 +33,9 @@ CALLS = {
     "third_order": lambda f, d, w, p: drt_jax.third_order(LENS, f, d, w),
     "field_of_image": lambda f, d, w, p: drt_jax.field_of_image(LENS, (0.0, 1.0), d, w),
     "first_order": lambda f, d, w, p: drt_jax.first_order(LENS, d, w),
-    "image_distance": lambda f, d, w, p: drt_jax.image_distance(LENS, d, w),
-    "numerical_aperture": lambda f, d, w, p: drt_jax.numerical_aperture(LENS, d, w),
-    "f_number": lambda f, d, w, p: drt_jax.f_number(LENS, d, w),
-    "lateral_magnification": lambda f, d, w, p: drt_jax.lateral_magnification(LENS, d, w),
     "focal_length": lambda f, d, w, p: drt_jax.focal_length(LENS, w),
-    "back_focal_distance": lambda f, d, w, p: drt_jax.back_focal_distance(LENS, w),
-    "front_focal_distance": lambda f, d, w, p: drt_jax.front_focal_distance(LENS, w),
-    "entrance_pupil": lambda f, d, w, p: drt_jax.entrance_pupil(LENS, w),
-    "exit_pupil": lambda f, d, w, p: drt_jax.exit_pupil(LENS, w),
 }
-OF_FIELD, OF_DISTANCE = list(CALLS)[:13], list(CALLS)[:19]
+OF_FIELD, OF_DISTANCE = list(CALLS)[:13], list(CALLS)[:15]
 
 
 def refused(name, *arguments):

@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 
-from drt_jax import back_focal_distance, load_lens, psf_moments, save_lens, show
+from drt_jax import first_order, load_lens, psf_moments, save_lens, show
 from drt_jax.__main__ import _options, _view, main
 
 
@@ -59,7 +59,8 @@ def test_a_rim_that_shaves_the_axial_beam_is_named_wherever_it_matters(tmp_path,
         spot = 1e3 * float(np.trace(found.covariance[0])) ** 0.5
         assert len(row) == 5 and float(row[2]) == pytest.approx(spot, rel=2e-4)
         assert float(row[3]) == pytest.approx(100 * float(found.throughput[0]), abs=0.02)
-    back = float(back_focal_distance(lens, 0.55)[0])  # light converges from the rim to the stop
+    # Light converges from the rim to the stop.
+    back = float(first_order(lens, np.inf, 0.55).back_focal_distance[0])
     share = 100 * (5.03 / 5 * back / (back + 1)) ** 2
     assert axial[-1] == "1" and float(axial[3]) == pytest.approx(share, abs=0.2)
     assert "! on the axis 0." in said and said.count("surfaces that clip: 1\n") == 1

@@ -11,7 +11,7 @@ from ..lens.entrance import with_paraxial_pupil
 from ..lens.forms import FORMS
 from ..lens.glass import Dispersion
 from ..lens.lens import Labels, Lens
-from ..lens.paraxial import effective_focal_length, focal_length, image_distance
+from ..lens.paraxial import first_order, focal_length
 from ..lens.phase import Phase
 from .apertures import apertures_of, semi_diameter
 from .elements import elements_of
@@ -112,7 +112,7 @@ def _gaps(top: Entry, surfaces: list[Entry]) -> list[float]:
 
 def _focused(lens: Lens, wavelength: float) -> Lens:
     """The lens with its sensor at the paraxial focus for an object at infinity."""
-    place = image_distance(lens, math.inf, wavelength)[0]
+    place = first_order(lens, math.inf, wavelength).image_distance[0]
     if not math.isfinite(float(place)):
         raise LensError(
             "sensor: focus: there is none, light leaves parallel; give mm and afocal: true",
@@ -192,7 +192,7 @@ def _with_pupil(top: Entry, lens: Lens, wavelength: float) -> Lens:
 def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:
     """Warn if the focal length differs from `stated` (mm) both in image space and in air."""
     found = float(focal_length(lens, wavelength)[0])
-    air = float(effective_focal_length(lens, wavelength)[0])
+    air = float(first_order(lens, jnp.inf, wavelength).effective_focal_length[0])
     if not min(abs(found - stated), abs(air - stated)) <= 0.02 * abs(stated):
         warnings.warn(
             f"focal_length: {stated:g} mm is stated, but it is {found:g} mm at {wavelength:g} um: "

@@ -15,7 +15,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.paraxial import image_distance
+from ..lens.paraxial import first_order
 from ..lens.scene import Scene, fields_array, scene_of
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.status import Status
@@ -116,7 +116,7 @@ def axial_colour(
     height, bend = (a[0, :, 1 : len(points) + 1, 1] - a[0, :, :1, 1] for a in (hit, slope))
     arrives = good[0, :, 1 : len(points) + 1] & good[0, :, :1] & (bend != 0)
     real = jnp.where(arrives, safe_divide(-height, bend), jnp.inf)
-    return AxialColour(image_distance(lens, distance, wavelengths) - lens.sensor, real)
+    return AxialColour(first_order(lens, distance, wavelengths).image_distance - lens.sensor, real)
 
 
 def _of_fields(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..lens.lens import Lens
-from ..lens.paraxial import effective_focal_length
+from ..lens.paraxial import first_order
 from ..lens.scene import NEAREST
 from ..numerics import Numbers, known_values
 from .beam_psf import Kind, PsfModel
@@ -68,7 +68,7 @@ def render_method(
         if len(shape) != 2 or min(shape) < 1:
             raise ValueError(f"shape: expected the height and width of a picture, got {shape}")
         waves = lens.checked_wavelengths(wavelengths).reshape(-1)
-        focal = float(np.mean(np.asarray(effective_focal_length(lens, waves))))
+        focal = float(np.mean(np.asarray(first_order(lens, jnp.inf, waves).effective_focal_length)))
         if not 0 < abs(focal) < np.inf:
             raise ValueError("lens: without a focal length it makes no picture")
         far = layer_distances(distance, shape, layers)

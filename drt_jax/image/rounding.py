@@ -20,7 +20,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.paraxial import numerical_aperture
+from ..lens.paraxial import first_order
 from ..lens.scene import Scene
 from ..numerics import Numbers, known_values
 from ..rays.solve import solve_aimed
@@ -83,7 +83,7 @@ def warn_of_focus(lens: Lens, distance: Numbers, wavelengths: Numbers, level: in
         lens, distance, wavelengths = known
         # From mm to waves in um.
         waves = lens.checked_wavelengths(wavelengths)
-        per_um = numerical_aperture(lens, distance, waves) / waves
+        per_um = first_order(lens, distance, waves).numerical_aperture / waves
         moved = 1e3 * hit_rounding(lens) * float(jnp.max(per_um))
     warn_dtype(lens, "the focus", moved, _FOCUS, " of its depth", level)
 

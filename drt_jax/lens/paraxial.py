@@ -42,16 +42,24 @@ class Pupil(NamedTuple):
 
 
 class FirstOrder(NamedTuple):
-    """First-order data. The functions of the same names describe them.
+    """First-order data of W wavelengths, (W,) each; lengths in mm.
 
-    focal_length, back_focal_distance, front_focal_distance, image_distance: (W,), mm.
-    f_number, numerical_aperture: (W,).
-    magnification: (W,), see `lateral_magnification`.
+    focal_length: n' / power, see the function `focal_length`; inf for an afocal lens.
+    back_focal_distance: from the last vertex to the rear focus; inf for an afocal lens.
+    front_focal_distance: from the first vertex to the front focus, negative for a focus in front of
+        the lens; inf for an afocal lens.
+    image_distance: from the first vertex to the paraxial image; inf for an image at infinity.
+    f_number: 1 / (2 u) of the marginal ray at the image. For an object at infinity it is the focal
+        length over the diameter of the entrance pupil, else the working f-number; inf for an image
+        at infinity.
+    numerical_aperture: n u of the marginal ray at the image, positive; 0 for an image at infinity.
+    magnification: image height / object height, negative for an inverted image; 0 for an object at
+        infinity.
     entrance_pupil: the stop as seen from the object.
     exit_pupil: the stop as seen from the image.
-    petzval_radius: (W,), radius of the image of a flat object without astigmatism, mm; inf for a
-        flat image.
-    effective_focal_length: (W,), mm.
+    petzval_radius: radius of the image of a flat object without astigmatism; inf for a flat image.
+    effective_focal_length: 1 / power, in air: the EFL of design programs for any medium of the
+        image, positive for lenses and mirrors that converge light; inf for an afocal lens.
     """
 
     focal_length: Array
@@ -221,15 +229,6 @@ def entrance_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
     return _pupil(paraxial_system(lens, wavelengths), front=True)
 
 
-def exit_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
-    """The exit pupil: the stop as seen from the image.
-
-    lens: the lens.
-    wavelengths: (W,), um.
-    """
-    return _pupil(paraxial_system(lens, wavelengths), front=False)
-
-
 def marginal_ray(system: ParaxialSystem, vergence: Array) -> ParaxialRay:
     """The ray from the axial object point through the rim of the stop.
 
@@ -281,7 +280,7 @@ def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
     """Focal length in image space (W,), n' / power, mm; inf for an afocal lens.
 
     It is the distance along z from the rear principal plane to the focus. It is longer than
-    `effective_focal_length` by the factor of the index if the image lies in water, and negative for
+    `FirstOrder.effective_focal_length` by the index if the image lies in water, and negative for
     a concave mirror.
 
     lens: the lens.
@@ -292,83 +291,14 @@ def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
     return system.masked(_quotient(-jnp.ones_like(slope), slope))
 
 
-def effective_focal_length(lens: Lens, wavelengths: Numbers) -> Array:
-    """Effective focal length in air (W,), 1 / power, mm; inf for an afocal lens.
-
-    It is the EFL of design programs for any medium of the image, positive for lenses and mirrors
-    that converge light.
-
-    lens: the lens.
-    wavelengths: (W,), um.
-    """
-    return first_order(lens, jnp.inf, wavelengths).effective_focal_length
-
-
-def back_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
-    """Distance from the last vertex to the rear focus (W,), mm; inf for an afocal lens.
-
-    lens: the lens.
-    wavelengths: (W,), um.
-    """
-    system = paraxial_system(lens, wavelengths)
-    ray = trace_ray(system, 1.0, 0.0)
-    return system.masked(_quotient(-ray.height[-1], ray.behind[-1]))
-
-
-def front_focal_distance(lens: Lens, wavelengths: Numbers) -> Array:
-    """Distance from the first vertex to the front focus (W,), mm; inf for an afocal lens.
-
-    It is negative for a focus in front of the lens.
-
-    lens: the lens.
-    wavelengths: (W,), um.
-    """
-    return first_order(lens, jnp.inf, wavelengths).front_focal_distance
-
-
-def image_distance(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Distance from the first vertex to the paraxial image (W,), mm; inf for an image at infinity.
-
-    lens: the lens.
-    distance: from the object to the first vertex, mm; may be inf.
-    wavelengths: (W,), um.
-    """
-    return first_order(lens, distance, wavelengths).image_distance
-
-
-def numerical_aperture(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Paraxial n u of the marginal ray at the image (W,), positive; 0 for an image at infinity.
-
-    Arguments as in `image_distance`.
-    """
-    return first_order(lens, distance, wavelengths).numerical_aperture
-
-
-def f_number(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """1 / (2 u) of the marginal ray at the image (W,); inf for an image at infinity.
-
-    For an object at infinity it is the focal length over the diameter of the entrance pupil; else
-    it is the working f-number. Arguments as in `image_distance`.
-    """
-    return first_order(lens, distance, wavelengths).f_number
-
-
-def lateral_magnification(lens: Lens, distance: Numbers, wavelengths: Numbers) -> Array:
-    """Lateral magnification (W,), image height / object height.
-
-    It is negative for an inverted image, and 0 for an object at infinity. Arguments as in
-    `image_distance`.
-    """
-    return first_order(lens, distance, wavelengths).magnification
-
-
 def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
     """Paraxial image height (..., W), mm; inf for an image at infinity.
 
     lens: the lens.
     field: (...), radians. Light of a positive angle travels upwards, from an object below the axis,
         see `field_of_height`.
-    distance, wavelengths: as in `image_distance`.
+    distance: from the object to the first vertex, mm; may be inf.
+    wavelengths: (W,), um.
     """
     system = paraxial_system(lens, wavelengths)
     far = distance_array(distance, lens.curvature.dtype)

@@ -147,7 +147,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     lens = drt_jax.load_lens(config.scene.lens)
     waves = config.scene.wavelengths_um
     distance = _distance(config, shape)
-    focal = float(np.mean(drt_jax.effective_focal_length(lens, waves)))
+    focal = float(np.mean(drt_jax.first_order(lens, jnp.inf, waves).effective_focal_length))
     pixel = 1e-3 * config.pixel_um
     if not pixel:
         pixel = abs(focal) * np.tan(np.radians(config.field_deg)) / (np.hypot(*shape) / 2)

@@ -147,7 +147,10 @@ class Studio:
         built = dataclasses.replace(self.built, lens=lens).lens_of(deviations)
         if not self.config.refocus:
             return built
-        focus = [drt_jax.back_focal_distance(one, self.waves[1])[0] for one in (lens, built)]
+        focus = [
+            drt_jax.first_order(one, jnp.inf, self.waves[1]).back_focal_distance[0]
+            for one in (lens, built)
+        ]
         return dataclasses.replace(built, sensor=built.sensor + focus[1] - focus[0])
 
     def points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:

@@ -132,7 +132,9 @@ def focus(rng, count, stop):
     """The sensor exactly at the paraxial focus; and stigmatic ellipsoids with a spot of 0."""
     parts, h, media = two_elements(rng, count, stop, (1, 16))
     scenes = scenes_of(rng, parts, h, stop, media, (0, 5))
-    image = jax.vmap(lambda lens, d: drt_jax.image_distance(lens, d, jnp.array([WAVELENGTH]))[0])
+    image = jax.vmap(
+        lambda lens, d: drt_jax.first_order(lens, d, jnp.array([WAVELENGTH])).image_distance[0]
+    )
     last = np.sum(parts["thickness"], axis=1)
     sensor = np.asarray(jax.jit(image)(scenes.lens, jnp.asarray(scenes.distance)))
     sensor = np.where((sensor > last) & (sensor < last + 40 * h), sensor, parts["sensor"])

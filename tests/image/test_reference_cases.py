@@ -70,7 +70,7 @@ def test_the_huygens_psf_that_opticstudio_prints(shared):
     pixel = spacing / 3
     found = drt_jax.psf(*scene, pixel, size, model)
     # By the peak without aberrations, of the cone from the exit pupil.
-    pupil = drt_jax.exit_pupil(lens, 0.543)
+    pupil = drt_jax.first_order(lens, np.inf, 0.543).exit_pupil
     away = float(lens.sensor - lens.vertices[-2] - pupil.position[0])
     sine = np.sin(np.arctan(float(pupil.semi_diameter[0]) / away))
     light = np.asarray(found.kernel[0]) * wave**2 / (pixel**2 * np.pi * sine**2)

@@ -282,7 +282,11 @@ def counted(field, front, cells=500, shifts=(18, 43, 86)):
     assert not np.any(rays.status)
     hits, along = np.asarray(rays.points)[0], np.asarray(rays.directions)[0, :, -1]
     # Back along the rays to the sphere about the middle of the spot.
-    away = float(lens.sensor - lens.vertices[-2] - drt_jax.exit_pupil(lens, 0.55).position[0])
+    away = float(
+        lens.sensor
+        - lens.vertices[-2]
+        - drt_jax.first_order(lens, jnp.inf, 0.55).exit_pupil.position[0]
+    )
     radius, spot = away / along[:, 2].mean(), hits[:, -1] - hits[:, -1].mean(axis=0)
     ahead = np.sum(along * spot, axis=1)
     back = ahead + np.sqrt(ahead**2 - np.sum(spot**2, axis=1) + radius**2)

@@ -105,7 +105,10 @@ def test_off_axis_against_snell(monkeypatch):
     first = np.stack([*first, drt_jax.sag(lens, 0, *first)], axis=-1)
     d = np.array([0.0, np.sin(field), np.cos(field)])
     snell = jax.jit(jax.vmap(trace_snell, (None, None, 0, None)))
-    pupil_z = lens.vertices[-2] + drt_jax.exit_pupil(lens, jnp.array(wavelengths)).position
+    pupil_z = (
+        lens.vertices[-2]
+        + drt_jax.first_order(lens, jnp.inf, jnp.array(wavelengths)).exit_pupil.position
+    )
     for k, wavelength in enumerate(wavelengths):
         index = np.asarray(lens.index(jnp.array([wavelength])))[:, 0]
         start = first[k] - 9 * d

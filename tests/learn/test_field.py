@@ -48,7 +48,9 @@ def camera():
             "sensor": 60.2,
         }
     )  # fmt: skip
-    where = drt_jax.back_focal_distance(lens, WAVES[1])[0] + jnp.sum(lens.thickness)
+    where = drt_jax.first_order(lens, jnp.inf, WAVES[1]).back_focal_distance[0] + jnp.sum(
+        lens.thickness
+    )
     lens = dataclasses.replace(lens, sensor=where - 0.1)
     vary = [design.Vary(kind, (0,)) for kind in KINDS if kind != "sensor"] + ["sensor"]
     variables = design.Variables.from_lens(lens, vary)

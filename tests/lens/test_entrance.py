@@ -48,7 +48,7 @@ def test_spots_are_those_that_another_program_prints(shared):
     own["glasses"] = {"F5": case["glasses"]["F5"]}
     own["sensor"] = sum(row.get("thickness", 0) for row in own["surfaces"]) + 57.314537905
     lens = load_lens(own)
-    wide = 33.33 / 2 / drt_jax.entrance_pupil(lens, WAVE).semi_diameter[0]
+    wide = 33.33 / 2 / drt_jax.first_order(lens, jnp.inf, WAVE).entrance_pupil.semi_diameter[0]
     open_ones = jnp.full_like(lens.semi_diameter, INF)
     stop = lens.semi_diameter[lens.stop] * wide
     lens = dataclasses.replace(lens, semi_diameter=open_ones.at[lens.stop].set(stop))

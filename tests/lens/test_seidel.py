@@ -49,7 +49,7 @@ def test_third_order_is_what_real_rays_show_near_the_axis(name):
     source, distance = THIRD[name]
     lens = load_lens(source)
     sums = third_order(lens, 0.1, distance, GREEN).total
-    plane = drt_jax.image_distance(lens, distance, GREEN)[0]
+    plane = drt_jax.first_order(lens, distance, GREEN).image_distance[0]
     lens = dataclasses.replace(lens, sensor=plane)
     ideal = image_height(lens, 0.1, distance, GREEN)[0]
     pupil = np.array([[0.0, 0], [0, 1], [0, -1], [1, 0]])

@@ -124,7 +124,7 @@ def test_c02_paraxial_rays(cases):
     reference = cases["C02"]["reference"]
     lens, d = double_gauss_lens(cases), jnp.array([0.5876])
     tangent = np.tan(np.radians(14))
-    pupil = drt_jax.entrance_pupil(lens, d)
+    pupil = drt_jax.first_order(lens, jnp.inf, d).entrance_pupil
     starts = {
         "marginal": (pupil.semi_diameter, jnp.zeros(1)),
         "chief": (-tangent * pupil.position, jnp.full(1, tangent)),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from experiments.snell import trace_snell
 
-from drt_jax import Status, entrance_pupil, load_lens, pupil, sag, scene_of, trace_rays
+from drt_jax import Status, first_order, load_lens, pupil, sag, scene_of, trace_rays
 from drt_jax.lens.forms import FORMS
 from drt_jax.lens.lens import Labels
 from drt_jax.rays.trace import _trace, trace_bundle
@@ -25,7 +25,7 @@ HEIGHTS = np.stack([np.zeros(20), np.linspace(-1, 1, 20)], axis=1)
 def launch_paraxial(lens, field, distance, wavelength, points):
     """Rays aimed at the paraxial entrance pupil, as design programs do without ray aiming: points
     (Q, 3) on the first vertex plane and unit directions, for points (Q, 2) of the pupil."""
-    image = entrance_pupil(lens, jnp.array([wavelength]))
+    image = first_order(lens, jnp.inf, jnp.array([wavelength])).entrance_pupil
     place, v, slope = image.position[0], 1 / distance, jnp.tan(field)
     height = jnp.broadcast_to(place, (len(points), 1))
     target = jnp.concatenate([image.semi_diameter[0] * points, height], axis=1)

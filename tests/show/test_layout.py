@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import f_number, image_distance, load_lens, show
+from drt_jax import first_order, load_lens, show
 from drt_jax.show import layout
 
 FOLDED = {
@@ -165,12 +165,12 @@ def test_a_beam_tells_who_clips_it_and_where_it_is_sharp(tilted):
     lens = load_lens({"surfaces": [{"radius": 50, "glass": "N-BK7", "semi_diameter": 1,
                                     "stop": True, "thickness": 2}, {"radius": "inf"}],
                       "sensor": 60} | more)  # fmt: skip
-    focus = float(image_distance(lens, np.inf, 0.55)[0])
+    focus = float(first_order(lens, np.inf, 0.55).image_distance[0])
     beam = layout.beam_of(lens, 0.0, np.inf, 0.55)
     assert beam.clipping == beam.ends == []
     assert 60 + beam.shift == pytest.approx(focus, abs=0.05) and beam.best < 1e-4
     # A cone of f/N has an RMS radius of defocus / (2 N) / sqrt(2).
-    cone = abs(beam.shift) / (2 * float(f_number(lens, jnp.inf, 0.55)[0])) / 2**0.5
+    cone = abs(beam.shift) / (2 * float(first_order(lens, jnp.inf, 0.55).f_number[0])) / 2**0.5
     assert beam.spot == pytest.approx(cone, rel=0.01)
 
 
