@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import get_args
 
 from .record import Missing, Record, distance_of, short
 from .seq_glass import Glasses
@@ -18,12 +19,7 @@ _APERTURES: dict[str, ApertureKind] = {
     "NA": "image NA",
     "NAO": "object NA",
 }
-FIELDS: dict[str, FieldKind] = {
-    "AN": "angle",
-    "OB": "object height",
-    "IM": "paraxial image height",
-    "RI": "real image height",
-}
+FIELDS = dict(zip(("AN", "OB", "IM", "RI"), get_args(FieldKind), strict=True))
 VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
 _HEIGHTS = tuple(f"{axis}{kind}" for axis in "XY" for kind in FIELDS)
 _LISTS = (*_HEIGHTS, *VIGNETTING, "WTF", "WL", "WTW", "REF")

@@ -23,7 +23,7 @@ def clip(surface: Surface) -> float | None:
     none."""
     record, size = surface.record, None
     for (use, label), sizes in surface.clips.items():
-        shapes = [] if use == "EDG" else _shapes(surface, sizes)  # the rim of the glass is no clip
+        shapes = [] if use == "EDG" else _shapes(surface, sizes)  # a rim clips nothing
         if use == "HOL" and shapes:
             line = next(iter(sizes.values()))[0]
             record.note(line, f"{surface.name}: a hole is read as an obscuration")

@@ -124,8 +124,9 @@ class Surface(Row):
             number = int(key[1:]) - first if key[1:].isdecimal() and key[0] == "C" else -1
             if 0 <= number < count:
                 found |= {number: value} if value else {}
-            elif value and key not in ("NRADIUS", f"C{conic}", f"C{own}"):
-                self.require(False, f"SCO {key} of SPS {self.special}", line)
+            else:
+                known = not value or key in ("NRADIUS", f"C{conic}", f"C{own}")
+                self.require(known, f"SCO {key} of SPS {self.special}", line)
         unit, radius = self.unit, self.term("NRADIUS")
         radius = radius if radius or self.special not in ("ODD", "XYP") else 1.0
         known = _LEAST <= radius <= 1 / _LEAST

@@ -28,7 +28,10 @@ def degrees_of(angles: Any) -> list[float]:
     """Angles in degrees that read back as `angles` (radians), or as close as possible."""
     own, wide = np.asarray(angles), np.asarray(angles, float)
     rows = zip(wide.tolist(), np.degrees(own).tolist(), np.degrees(wide).tolist(), strict=True)
-    read = lambda degrees: float(jnp.radians(degrees))  # noqa: E731
+
+    def read(degrees: float) -> float:
+        return float(jnp.radians(degrees))
+
     return [number_for(angle, read, *guesses) if angle else angle for angle, *guesses in rows]
 
 

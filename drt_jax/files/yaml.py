@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from ..inputs import parse, read_text, shown
+from ..inputs import parse, read_text, require_one_of, shown
 from ..lens.lens import Lens
 from .agf import load_agf
 from .entry import LensError
@@ -132,7 +132,6 @@ def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
 
 def read_record(path: str | pathlib.Path, missing: Missing = "error") -> tuple[Record, Use]:
     """Read a file of another program."""
-    if missing not in ("error", "warn"):
-        raise ValueError(f'missing: expected "error" or "warn", got {shown(missing)}')
+    require_one_of("missing", missing, ("error", "warn"))
     with naming(path):
         return _READERS[pathlib.Path(path).suffix.lower()](str(path), missing, lines_of(path))
