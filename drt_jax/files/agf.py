@@ -3,12 +3,9 @@
 import os
 from collections.abc import Callable, Collection
 
-from ..inputs import InputError
 from ..lens.glass import Glass
 from ..lens.glasses import flaw
-from .entry import LensError
-from .record import Missing, Record, short
-from .text import Words, lines_of, words_of
+from .record import Missing, Record, Words, lines_of, naming, short, words_of
 
 _Forms = tuple[list[float], list[float]]  # sellmeier and schott of `Glass`
 
@@ -71,54 +68,47 @@ def load_agf(
     names: the glasses to read; None reads all.
     missing: "warn" leaves out such glasses and names them in one warning.
     """
-    record = Record(str(path), missing)
-    try:
-        lines = words_of(lines_of(path))
-    except InputError as error:
-        raise LensError(f"{path}: {error}") from None
-    blocks: list[dict[str, Words]] = []
+    record, blocks = Record(str(path), missing), list[dict[str, Words]]()
+    with naming(path):
+        lines = words_of(record, lines_of(path))
     for words in lines:
         if words.key == "NM":
             blocks.append({})
         if blocks:
             blocks[-1].setdefault(words.key, words)
-    if not blocks:
-        raise record.error(0, "no line begins with NM: is this a catalogue of glasses?")
+    record.require(blocks, 0, "no line begins with NM: is this a catalogue of glasses?")
     found: dict[str, Glass] = {}
     for block in blocks:
-        line, rest = block["NM"].line, block["NM"].rest
-        if len(rest) < 2:
-            raise record.error(line, "expected NM, a name and the number of a formula")
-        if names is not None and rest[0] not in names:
-            continue
-        glass = _glass(record, block)
+        head = block["NM"]
+        head.require(len(head.values) >= 2, "expected NM, a name and the number of a formula")
+        glass = _glass(record, block) if names is None or head.values[0] in names else None
         if glass and found.setdefault(glass.name, glass) != glass:
-            record.lacks(line, f"{short(glass.name)}: another glass of this name")
+            record.lacks(head.line, f"{short(glass.name)}: another glass of this name")
     record.say()
     return found
 
 
 def _glass(record: Record, block: dict[str, Words]) -> Glass | None:
-    line, name, formula = block["NM"].line, block["NM"].rest[0], record.count(*block["NM"][::2], 1)
+    """The glass of the lines of a block by their keys; None for one that is left out."""
+    head, name = block["NM"], block["NM"].values[0]
+    formula, called = head.count(1), short(name)
     if formula not in _FORMULAS:
         known = ", ".join(map(str, _FORMULAS))
-        record.lacks(line, f"{short(name)}: formula {formula} is not read, of {known}")
+        record.lacks(head.line, f"{called}: formula {formula} is not read, of {known}")
         return None
     for key in ("CD", "LD"):
-        if key not in block:
-            raise record.error(line, f"{short(name)}: its line {key} is missing")
-    makes, count = _FORMULAS[formula]
-    _, (at, _, rest, _) = block["LD"], block["CD"]
-    values = [record.number(at, rest, i, 0.0) for i in range(max(count, min(len(rest), 10)))]
+        head.require(key in block, f"{called}: its line {key} is missing")
+    (makes, count), terms, ends = _FORMULAS[formula], block["CD"], block["LD"]
+    many = max(count, min(len(terms.values), 10))
+    values = [terms.number(i, 0.0) for i in range(many)]
     if any(values[count:]):
-        record.lacks(at, f"{short(name)}: formula {formula} with more than {count} terms")
+        record.lacks(terms.line, f"{called}: formula {formula} with more than {count} terms")
         return None
     sellmeier, schott = makes(values)
-    low, high = record.numbers(block["LD"].line, block["LD"].rest, 2)
-    if not 0 < low < high:
-        raise record.error(block["LD"].line, f"{short(name)}: no range: {low:g} to {high:g} um")
+    low, high = ends.numbers(0, 2)
+    ends.require(0 < low < high, f"{called}: no range: {low:g} to {high:g} um")
     glass = Glass(name, tuple(sellmeier), tuple(schott), (low, high))
     if wrong := flaw(glass):
-        record.lacks(at, f"{short(name)}: {wrong}")
+        record.lacks(terms.line, f"{called}: {wrong}")
         return None
     return glass

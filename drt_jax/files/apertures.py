@@ -7,7 +7,6 @@ import numpy as np
 
 from ..lens.aperture import Apertures
 from ..lens.forms import FORMS
-from ..lens.lens import Lens
 from ..lens.polygon import CORNERS, convex_pieces, tidied
 from .entry import Entry, array
 
@@ -43,22 +42,20 @@ def _read(surface: Entry, key: str) -> list[_Aperture]:
     """The shapes under `aperture` or `obscuration`: the key holds one mapping or a list of them."""
     given = surface.get(key, [])
     many = isinstance(given, list)
-    if many and len(given) > _MANY:
-        raise surface.error(key, f"{len(given)} are more than {_MANY}")
+    if many:
+        surface.require(len(given) <= _MANY, key, f"{len(given)} are more than {_MANY}")
     found = []
     for i, values in enumerate(given if many else [given]):
         entry = Entry(values, surface.name(key) + f"[{i}]" * many, (*_KINDS, "centre"))
         kinds = [kind for kind in _KINDS if kind in entry]
-        if len(kinds) != 1:
-            raise entry.error("", f"give one of {', '.join(_KINDS)}")
+        entry.require(len(kinds) == 1, "", f"give one of {', '.join(_KINDS)}")
         (kind,) = kinds
         centre = entry.vector("centre", 2)
         if kind == "polygon":
             found.append(_Aperture(entry, kind, [1.0, 1.0], centre, *_polygon(entry)))
             continue
         half = [entry.number(kind)] * 2 if kind == "circle" else entry.vector(kind, 2)
-        if not half or min(half) <= 0:
-            raise entry.error(kind, "must be positive, in mm")
+        entry.require(half and min(half) > 0, kind, "must be positive, in mm")
         found.append(_Aperture(entry, kind, half, centre, np.zeros((0, 2)), ()))
     return found
 
@@ -87,12 +84,11 @@ def semi_diameter(surface: Entry) -> float:
     """The clear semi-diameter about the vertex, mm, within the extent of the surface. The stop's is
     finite: if it is not given, it is the circle around the stop's smallest aperture."""
     semi = surface.number("semi_diameter", math.inf, finite=False)
-    if semi <= 0:
-        raise surface.error("semi_diameter", "must be positive")
+    surface.require(semi > 0, "semi_diameter", "must be positive")
     if math.isinf(semi) and surface.flag("stop"):
         semi = min((own.reach for own in _read(surface, "aperture")), default=math.inf)
-        if math.isinf(semi):
-            raise surface.error("semi_diameter", "the stop needs one, or an aperture")
+        what = "the stop needs one, or an aperture"
+        surface.require(math.isfinite(semi), "semi_diameter", what)
     if math.isfinite(semi):
         _check_reach(surface, surface, "semi_diameter", semi)
     return semi
@@ -112,47 +108,20 @@ def apertures_of(surfaces: list[Entry]) -> Apertures | None:
         raise blocked[_MOST].error("", f"a lens has {_MOST} obscurations at most; join some")
     if not found:
         return None
-    centres, most = [own.centre for *_, own in found], max(len(own.corners) for *_, own in found)
-    corners = [
-        [*own.corners.tolist(), *[[0.0, 0.0]] * (most - len(own.corners))] for *_, own in found
-    ]
+    places, blocking, shapes = zip(*found, strict=True)
+    centres, most = [own.centre for own in shapes], max(len(own.corners) for own in shapes)
+    corners = [np.pad(own.corners, ((0, most - len(own.corners)), (0, 0))) for own in shapes]
     apertures = Apertures(
-        array([own.half for *_, own in found]),
+        array([own.half for own in shapes]),
         array([centre or [0.0, 0.0] for centre in centres]) if any(centres) else None,
         array(corners) if most else None,
-        surfaces=tuple(i for i, *_ in found),
-        kinds=tuple(own.kind for *_, own in found),
-        blocks=tuple(blocks for _, blocks, _ in found),
-        pieces=tuple(own.pieces for *_, own in found),
+        surfaces=places,
+        kinds=tuple(own.kind for own in shapes),
+        blocks=blocking,
+        pieces=tuple(own.pieces for own in shapes),
     )
     times = len(apertures.terms()[0])
-    if times > _TERMS:
-        what = f"the apertures of the lens need {times} sets of rays, {_TERMS} at most"
-        raise surfaces[0].error("", f"{what}: join some, or give polygons fewer inward corners")
+    what = f"the apertures of the lens need {times} sets of rays, {_TERMS} at most"
+    what = f"{what}: join some, or give polygons fewer inward corners"
+    surfaces[0].require(times <= _TERMS, "", what)
     return apertures
-
-
-class Shape(NamedTuple):
-    """An aperture that clips a surface. blocks: True for an obscuration. size: half widths in x and
-    y, twice the radius of a circle, or x and y of the corners of a polygon one after the other.
-    centre: x and y. All in mm."""
-
-    blocks: bool
-    kind: str
-    size: list[float]
-    centre: list[float]
-
-
-def shapes_of(lens: Lens, i: int) -> list[Shape]:
-    """The apertures of a surface. Its semi-diameter is a circle like others, that of the stop is
-    the size of the stop and no aperture."""
-    own, semi, found = lens.apertures, float(lens.semi_diameter[i]), list[Shape]()
-    if math.isfinite(semi) and i != lens.stop:
-        found.append(Shape(False, "circle", [semi, semi], [0.0, 0.0]))
-    for k in () if own is None else np.flatnonzero(np.array(own.surfaces) == i).tolist():
-        assert own is not None
-        kind, middle = own.kinds[k], np.zeros(2) if own.centre is None else own.centre[k]
-        size = own.outline(k) if kind == "polygon" else own.sizes[k]
-        numbers = np.ravel(np.asarray(size, float)).tolist()
-        found.append(Shape(own.blocks[k], kind, numbers, np.asarray(middle, float).tolist()))
-    return found

@@ -53,12 +53,13 @@ class Entry(dict[Any, Any]):
         name = self.name(key)
         return LensError(": ".join(filter(None, (name, message))), name)
 
+    def require(self, condition: object, key: object, message: str) -> None:
+        """LensError about the entry `key` unless the condition holds."""
+        if not condition:
+            raise self.error(key, message)
+
     def number(
-        self,
-        key: object,
-        default: float | None = None,
-        finite: bool = True,
-        most: float = LONG,
+        self, key: object, default: float | None = None, finite: bool = True, most: float = LONG
     ) -> float:
         """A number of magnitude at most `most`; `finite=False` allows inf. It may be given as text,
         because YAML 1.1 reads 1e-3 and inf as text."""
@@ -69,21 +70,17 @@ class Entry(dict[Any, Any]):
             number = math.nan
         if math.isnan(number):
             raise self.error(key, f"expected a number, got {shown(value)}")
-        if math.isinf(number) and not finite:
-            return number
         if math.isinf(number):
-            raise self.error(key, "must be finite")
-        if abs(number) > most:
+            self.require(not finite, key, "must be finite")
+        elif abs(number) > most:
             raise self.error(key, f"{number:g} is not between {-most:g} and {most:g}; which unit?")
         return number
 
     def text(self, key: str, default: str) -> str:
         """Text of at most 100 characters; a whole number is converted to text."""
         value = self.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, str | int):
-            raise self.error(key, f"expected text, got {shown(value)}")
-        if isinstance(value, int) and not 0 <= value < 10**_LONGEST:
-            raise self.error(key, f"expected text, got {shown(value)}")
+        number = type(value) is int and 0 <= value < 10**_LONGEST
+        self.require(number or isinstance(value, str), key, f"expected text, got {shown(value)}")
         if len(str(value)) > _LONGEST:
             raise self.error(key, f"expected at most {_LONGEST} characters, got {shown(value)}")
         return str(value)
@@ -101,15 +98,14 @@ class Entry(dict[Any, Any]):
     def flag(self, key: str) -> bool:
         """True or false; false if the key is not given."""
         value = self.get(key, False)
-        if not isinstance(value, bool):
-            raise self.error(key, "expected true or false")
+        self.require(isinstance(value, bool), key, "expected true or false")
         return value
 
     def curvature(self, suffix: str = "") -> float:
         """The curvature (1/mm) from the key `radius` or `curvature`, followed by `suffix`."""
         radius, curvature = f"radius{suffix}", f"curvature{suffix}"
-        if (radius in self) == (curvature in self):
-            raise self.error("", f"give either {radius} (inf for a plane) or {curvature}")
+        one = (radius in self) != (curvature in self)
+        self.require(one, "", f"give either {radius} (inf for a plane) or {curvature}")
         if curvature in self:
             return self.number(curvature, most=STEEP)
         value = self.number(radius, finite=False, most=WIDE)

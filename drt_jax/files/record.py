@@ -1,25 +1,30 @@
-"""Common parts of the readers of other programs' files: a prescription with line numbers."""
+"""Files of other programs: their text, its words, and the prescription that is read from them."""
 
+import codecs
+import contextlib
 import dataclasses
 import math
+import os
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
 
-from ..inputs import InputError, Lines, one_line, shown
+from ..inputs import InputError, Lines, one_line, read_bytes, shown
 from ..lens.lens import Lens
 from .entry import LensError
-from .order import CLOSEST, TOUCHING
-from .specs import build_lens
+from .specs import CLOSEST, MEDIUM_KEYS, TOUCHING, build_lens
 
 Missing = Literal["error", "warn"]
+_FILE = 2**24  # bytes of a file
+_LINES = 400_000
+LONGEST = 4000  # characters read of a line
 _FAR = 1e10  # mm; from this on, a distance of a file is infinite
 _LARGEST = 1e9  # largest length, angle or curvature
 _TINY = 1e-6  # mm, semi-diameter of the stop until its size is known
-_MEDIUM = ("glass", "index", "nd", "vd", "partial")
+_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_LE: "utf-16", codecs.BOM_BE: "utf-16"}
 
 
 @dataclasses.dataclass
@@ -34,27 +39,6 @@ class Breaking:
 
 
 @dataclasses.dataclass
-class Row:
-    """A surface of a file. name: in messages. entry: as in a prescription. lines: of its keys."""
-
-    name: str
-    line: int
-    entry: dict[str, Any] = dataclasses.field(default_factory=dict)
-    lines: dict[str, int] = dataclasses.field(default_factory=dict)
-    thickness: float = 0.0
-
-    def put(self, key: str, value: object, line: int) -> None:
-        """Set an entry and its line."""
-        self.entry[key] = value
-        self.lines[key] = line
-
-    @property
-    def plain(self) -> bool:
-        """Whether it is a plane in air that has no effect."""
-        return set(self.entry) <= {"curvature"} and not self.entry.get("curvature")
-
-
-@dataclasses.dataclass
 class Record:
     """A file as it is read. Lengths in mm.
 
@@ -62,37 +46,49 @@ class Record:
     virtual one behind the first vertex. medium: keys of the object's medium. parts: surfaces and
     coordinate breaks in order; the image is the last surface.
     glasses: those that the file itself defines, as in a prescription. afocal: as in `Lens`.
-    notes: what is left out or read differently from the file.
+    notes: what is left out or read differently from the file. solves: lines with solves. unknown:
+    words that are not known, each with its line.
     """
 
     path: str
     missing: Missing
     name: str = ""
     distance: float = math.inf
-    parts: list[Row | Breaking] = dataclasses.field(default_factory=list)
+    parts: list["Row | Breaking"] = dataclasses.field(default_factory=list)
     medium: dict[str, Any] = dataclasses.field(default_factory=dict)
     glasses: dict[str, Any] = dataclasses.field(default_factory=dict)
     afocal: bool = False
     notes: list[str] = dataclasses.field(default_factory=list)
+    solves: list[int] = dataclasses.field(default_factory=list)
+    unknown: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def error(self, line: int, message: str) -> LensError:
         """An error about a line of the file; line 0: about the whole file."""
         return LensError(f"{self.path}{f', line {line}' if line else ''}: {message}")
 
+    def require(self, condition: object, line: int, message: str) -> None:
+        """The error unless the condition holds."""
+        if not condition:
+            raise self.error(line, message)
+
     def lacks(self, line: int, message: str) -> None:
         """LensError for a feature that the package lacks, or a note if it may be left out."""
         if self.missing == "error":
             raise self.error(line, f'{message}; missing="warn" leaves it out')
-        self.notes.append(f"line {line}: left out: {message}")
+        self.note(line, f"left out: {message}")
 
-    def note_unread(self, solves: list[int], unknown: Mapping[str, int], what: str) -> None:
-        """Notes of lines with solves, and of words that are not known. what: kind of the words."""
-        if solves:
-            some = listed(map(str, solves), 5)
-            place = f"line{'s' * (len(solves) > 1)} {some}"
+    def note(self, line: int, message: str) -> None:
+        """Add a note about a line."""
+        self.notes.append(f"line {line}: {message}")
+
+    def note_unread(self, what: str) -> None:
+        """Notes of solves, and of words that are not known. what: kind of the words."""
+        if self.solves:
+            some = _listed(map(str, self.solves), 5)
+            place = f"line{'s' * (len(self.solves) > 1)} {some}"
             self.notes.append(f"{place}: solves and pickups are read as the values beside them")
-        if unknown:
-            some = listed([f"{key} (line {line})" for key, line in unknown.items()], 8)
+        if self.unknown:
+            some = _listed([f"{key} (line {line})" for key, line in self.unknown.items()], 8)
             self.notes.append(f"{what} that are not known: {some}")
 
     def say(self) -> None:
@@ -100,106 +96,74 @@ class Record:
         if self.notes:
             warnings.warn(f"{self.path}: {'; '.join(self.notes)}", stacklevel=4)
 
-    def number(
-        self, line: int, words: list[str], at: int = 0, default: float | None = None
-    ) -> float:
-        """Word `at` as a finite number; `default` if there is no such word."""
-        if at >= len(words):
-            if default is None:
-                raise self.error(line, f"a number is missing: word {at + 2} of the line")
-            return default
-        try:
-            value = float(words[at]) if len(words[at]) <= 60 else math.nan
-        except ValueError:
-            value = math.nan
-        if "_" in words[at] or not math.isfinite(value):
-            raise self.error(line, f"expected a number, got {shown(words[at])}")
-        return value
-
-    def bounded(self, line: int, words: list[str], at: int = 0) -> float:
-        """A number of magnitude at most 1e9, so that its square does not overflow."""
-        value = self.number(line, words, at)
-        if abs(value) > _LARGEST:
-            raise self.error(line, f"{value:g} is not within {_LARGEST:g}; which unit?")
-        return value
-
-    def count(self, line: int, words: list[str], at: int = 0, default: int | None = None) -> int:
-        """Word `at` as a whole number; `default` if there is no such word."""
-        value = self.number(line, words, at, default)
-        if value % 1 or abs(value) > 1e9:
-            raise self.error(line, f"expected a whole number, got {value:g}")
-        return int(value)
-
-    def numbers(self, line: int, words: list[str], count: int) -> list[float]:
-        """The first `count` words as numbers."""
-        return [self.number(line, words, i) for i in range(count)]
-
     def lens(self, semi_diameter: float | None) -> Lens:
         """Build the lens; without `semi_diameter` (mm), the size of its stop is a placeholder."""
-        self._spaced()
+        self._separate()
+        *rows, image = [part for part in self.parts if isinstance(part, Row)]
         top, lines, names = self._prescription(semi_diameter or _TINY)
-        image = [part for part in self.parts if isinstance(part, Row)][-1]
+        self.require(names, 0, "no surface lies between object and image")
+        self.require(abs(self.distance) >= CLOSEST, rows[0].line, "the object touches this surface")
+        moves = {f"sensor_{key}": image.entry.get(key) for key in ("decentre", "tilt")}
+        more = {"object": self.medium, "glasses": self.glasses, "afocal": self.afocal, **moves}
+        top |= {key: value for key, value in more.items() if value}
         try:
             lens = build_lens(top, self.name or "lens")
         except InputError as error:
             found = re.sub(r"surfaces\[(\d+)\]", lambda m: names[int(m[1])], str(error))
             raise LensError(f"{self.path}{lines.of(error.key)}: {found}", error.key) from None
-        return _with_image(lens, image)
+        curvature, conic = image.entry.get("curvature", 0.0), image.entry.get("conic", 0.0)
+        if not curvature:
+            return lens
+        both = lens.curvature.at[-1].set(curvature), lens.conic.at[-1].set(conic)
+        return dataclasses.replace(
+            lens, curvature=both[0], conic=both[1], curved=(*lens.curved, lens.count)
+        )
 
-    def _spaced(self) -> None:
+    def _separate(self) -> None:
         """Separate touching surfaces that bend light by the least gap, and add a note."""
-        medium, sense, last, before, found = self.medium, 1, False, None, list[str]()
-        gap = 0.0
+        medium, sense, gap, found = self.medium, 1, 0.0, list[str]()
+        before: Row | None = None  # the surface in front, if one before it bends light
         for part in self.parts:
             if isinstance(part, Breaking):
-                last = False
+                before = None
                 continue
-            own = {key: part.entry[key] for key in _MEDIUM if key in part.entry}
-            turns, image = part.entry.get("mirror", False), part is self.parts[-1]
-            bends = turns or "phase" in part.entry or own != medium
-            if last and before and (bends or image) and abs(gap) < TOUCHING:
+            own = {key: part.entry[key] for key in MEDIUM_KEYS if key in part.entry}
+            mirror = part.entry.get("mirror", False)
+            bends = mirror or "phase" in part.entry or own != medium
+            if before and (bends or part is self.parts[-1]) and abs(gap) < TOUCHING:
                 before.thickness += sense * CLOSEST - gap
                 found.append(before.name)
             if bends:
-                medium, sense = medium if turns else own, -sense if turns else sense
-                last, gap = True, 0.0
-            before, gap = part, gap + part.thickness
+                medium, sense, gap = medium if mirror else own, -sense if mirror else sense, 0.0
+            before, gap = part if bends or before else None, gap + part.thickness
         if found:
-            some = listed(found, 8)
+            some = _listed(found, 8)
             self.notes.append(f"surfaces that touch stand {CLOSEST:g} mm apart: {some}")
 
     def _prescription(self, semi_diameter: float) -> tuple[dict[str, Any], Lines, list[str]]:
-        """The mapping for `build_lens`, the line of each key and the name of each surface."""
+        """Surfaces and elements for `build_lens`, the line of each key, the name of each
+        surface. The object's distance counts from the first of them on."""
         surfaces: list[dict[str, Any]] = []
         elements: list[dict[str, Any]] = []
         lines, names, waiting = Lines(), list[str](), list[Breaking]()
-        *rows, image = [part for part in self.parts if isinstance(part, Row)]
         for part in self.parts:
-            if isinstance(part, Breaking):
-                waiting.append(part)
+            inside = surfaces or waiting or self.distance > 0
+            if isinstance(part, Breaking) or (part.plain and not inside):
+                waiting += [part] if isinstance(part, Breaking) else []
                 if surfaces:
                     surfaces[-1]["thickness"] += part.thickness
                 else:
                     self.distance += part.thickness
                 continue
-            if not surfaces and self.distance <= 0 and part.plain and not waiting:
-                self.distance += part.thickness  # a plane at the object
-                continue
-            i, behind = len(surfaces), sum(own.thickness for own in waiting)
+            image, behind = part is self.parts[-1], sum(own.thickness for own in waiting)
+            i: int | str = "sensor" if image else len(surfaces)
             for own in waiting:
                 lines[f"elements[{len(elements)}]"] = own.line
-                elements.append(
-                    {
-                        "surfaces": [i, "sensor"] if part is not image else ["sensor", "sensor"],
-                        "about": i if part is not image else "sensor",
-                        "pivot": -behind,
-                        "shift": list(own.shift),
-                        "tilt": list(own.tilt),
-                    }
-                )
+                turned = {"shift": list(own.shift), "tilt": list(own.tilt)}
+                elements.append({"surfaces": [i, "sensor"], "about": i, "pivot": -behind, **turned})
                 behind -= own.thickness
             waiting = []
-            if part is image:
+            if image:
                 lines["sensor"] = part.line
                 break
             place = f"surfaces[{i}]"
@@ -209,33 +173,176 @@ class Record:
             surfaces.append(part.entry | {"thickness": part.thickness})
             if part.entry.get("stop"):
                 surfaces[-1]["semi_diameter"] = semi_diameter
-        if not surfaces:
-            raise self.error(0, "no surface lies between object and image")
-        if abs(self.distance) < CLOSEST:
-            raise self.error(rows[0].line, "the object touches this surface")
-        top: dict[str, Any] = {"surfaces": surfaces, "afocal": self.afocal}
-        top |= {"elements": elements} if elements else {}
-        top |= {"object": self.medium} if self.medium else {}
-        top |= {"glasses": self.glasses} if self.glasses else {}
-        moves = {f"sensor_{key}": image.entry.get(key) for key in ("decentre", "tilt")}
-        top |= {key: value for key, value in moves.items() if value}
-        return top, lines, names
+        return {"surfaces": surfaces} | ({"elements": elements} if elements else {}), lines, names
 
 
-def _with_image(lens: Lens, image: Row) -> Lens:
-    """The lens with the curvature and conic of the file's image on its sensor."""
-    curvature, conic = image.entry.get("curvature", 0.0), image.entry.get("conic", 0.0)
-    if not curvature:
-        return lens
-    return dataclasses.replace(
-        lens,
-        curvature=lens.curvature.at[-1].set(curvature),
-        conic=lens.conic.at[-1].set(conic),
-        curved=(*lens.curved, lens.count),
-    )
+@dataclasses.dataclass
+class Row:
+    """A surface of a file. name: in messages. unit: of length in the file, mm. entry: as in a
+    prescription, in mm. lines: of its keys. thickness: mm."""
+
+    record: Record
+    name: str
+    line: int
+    unit: float = 1.0
+    entry: dict[str, Any] = dataclasses.field(default_factory=dict)
+    lines: dict[str, int] = dataclasses.field(default_factory=dict)
+    thickness: float = 0.0
+
+    def require(self, condition: object, message: str, line: int = 0) -> None:
+        """LensError about the surface unless the condition holds. line: that of the error, 0 for
+        the first of the surface."""
+        if not condition:
+            raise self.record.error(line or self.line, f"{self.name}: {message}")
+
+    def put(self, key: str, value: object, line: int = 0) -> None:
+        """Set an entry and its line, 0 for that of the surface."""
+        self.entry[key] = value
+        self.lines[key] = line or self.line
+
+    def shape(
+        self, form: str, terms: Mapping[Any, float], line: int = 0, more: Mapping | None = None
+    ) -> None:
+        """Set the form, its coefficients, if there are any, and keys of its own, `more`."""
+        own: dict[str, Any] = {"form": form} if form != "asphere" else {}
+        own |= {"coefficients": terms} if terms else {}
+        for key, value in (own | dict(more or {})).items():
+            self.put(key, value, line)
+
+    def put_shape(self, key: str, shape: Mapping[str, Any], line: int) -> None:
+        """Add a shape to the entry `aperture` or `obscuration`."""
+        self.put(key, [*self.entry.get(key, []), shape], line)
+
+    def put_clear(self, shape: Mapping[str, Any], line: int, named: bool = False) -> bool:
+        """Add a clear aperture; False for a circle beyond the end of the surface, which clips
+        nothing. The first circle about the vertex is the semi-diameter, but at the stop, whose size
+        is that of the file's aperture, or if it is `named`."""
+        entry, radius = self.entry, 0.0 if "centre" in shape else shape.get("circle", 0.0)
+        rim = (entry.get("conic", 0.0) + 1) * (entry["curvature"] * radius) ** 2
+        if entry.get("form") is None and rim >= 1:
+            return False
+        if radius and not (named or entry.get("stop") or "semi_diameter" in entry):
+            self.put("semi_diameter", radius, line)
+        else:
+            self.put_shape("aperture", shape, line)
+        return True
+
+    def powers_in_mm(self, values: Mapping[int, float]) -> dict[int, float]:
+        """Coefficients that are not 0, in mm. values: by power of the height, in units of the
+        file."""
+        return {p: a for p, value in values.items() if (a := value * self.unit ** (1 - p))}
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is a plane in air that has no effect."""
+        return set(self.entry) <= {"curvature"} and not self.entry.get("curvature")
 
 
-def listed(words: Iterable[str], most: int) -> str:
+@dataclasses.dataclass
+class Words:
+    """A line of a file, or a command. line: its number from 1. key: its first word. values: the
+    others. indented: whether the line is."""
+
+    record: Record
+    line: int
+    key: str
+    values: list[str]
+    indented: bool = False
+
+    def error(self, message: str) -> LensError:
+        """An error about this line."""
+        return self.record.error(self.line, message)
+
+    def require(self, condition: object, message: str) -> None:
+        """The error unless the condition holds."""
+        if not condition:
+            raise self.error(message)
+
+    def number(self, at: int = 0, default: float | None = None) -> float:
+        """Value `at` as a finite number; `default` if there is no such value."""
+        if at >= len(self.values):
+            if default is None:
+                raise self.error(f"a number is missing: word {at + 2} of the line")
+            return default
+        word = self.values[at]
+        try:
+            value = float(word) if len(word) <= 60 and "_" not in word else math.nan
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise self.error(f"expected a number, got {shown(word)}")
+        return value
+
+    def numbers(self, first: int, end: int) -> list[float]:
+        """The values from number `first` to before `end`."""
+        return [self.number(at) for at in range(first, end)]
+
+    def bounded(self, at: int = 0) -> float:
+        """A number of magnitude at most 1e9, so that its square does not overflow."""
+        value = self.number(at)
+        self.require(abs(value) <= _LARGEST, f"{value:g} is not within {_LARGEST:g}; which unit?")
+        return value
+
+    def count(self, at: int = 0, default: int | None = None) -> int:
+        """Value `at` as a whole number; `default` if there is no such value."""
+        value = self.number(at, default)
+        whole = value % 1 == 0 and abs(value) <= 1e9
+        self.require(whole, f"expected a whole number, got {value:g}")
+        return int(value)
+
+
+@contextlib.contextmanager
+def naming(path: str | os.PathLike) -> Iterator[None]:
+    """Turn an InputError about a file into a LensError that begins with its path."""
+    try:
+        yield
+    except LensError:
+        raise
+    except InputError as error:
+        raise LensError(f"{path}: {error}") from error
+
+
+def lines_of(path: str | os.PathLike) -> list[str]:
+    """The lines of a file of at most 16 MB: its byte order mark or UTF-16's zero bytes decide, else
+    UTF-8, else Latin-1. InputError, with the byte or character, if it is no text."""
+    content = read_bytes(path, _FILE, "lens file")
+    known = [name for mark, name in _MARKS.items() if content.startswith(mark)]
+    head = content[:1000]
+    for start, name in (1, "utf-16-le"), (0, "utf-16-be"):
+        if not known and head[start::2].count(0) > len(head) // 4:
+            known = [name]
+    text = ""
+    for name in known or ("utf-8", "latin-1"):
+        try:
+            text = content.decode(name)
+            break
+        except UnicodeDecodeError as error:
+            if known:
+                what = f"byte {error.start} is no {name} text: is the file cut short?"
+                raise InputError(what) from error
+    odd = re.search("[\x00-\x08\x0e-\x19\x1b-\x1f]", text)
+    if odd:
+        raise InputError(f"character {odd.start()} is no text: is this a lens file?")
+    lines = text.splitlines()
+    if len(lines) > _LINES:
+        raise InputError(f"{len(lines)} lines are more than {_LINES}; is it the right file?")
+    return lines
+
+
+def words_of(record: Record, lines: list[str]) -> list[Words]:
+    """The lines of a file split into words, without empty lines; long notes are cut."""
+    found = []
+    for i, text in enumerate(lines, 1):
+        if len(text) > LONGEST and re.match(r"\s*[A-Z]{4}\s+[-+.\d]", text):
+            raise InputError(f"line {i}: {len(text)} characters are more than {LONGEST}")
+        words = text[:LONGEST].split()
+        if words:
+            key, indented = one_line(words[0]).upper(), text[0].isspace()
+            found.append(Words(record, i, key, words[1:], indented))
+    return found
+
+
+def _listed(words: Iterable[str], most: int) -> str:
     """Words as a list of at most `most`, and how many more there are."""
     found = [*words]
     return ", ".join(found[:most]) + (f" and {n} more" if (n := len(found) - most) > 0 else "")

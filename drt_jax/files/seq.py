@@ -1,16 +1,15 @@
 """Read lens files of CODE V, `.seq`; docs/lens_files.md says what each command means."""
 
+import dataclasses
 import math
-from collections.abc import Callable
+from typing import get_args
 
-from . import seq_apertures, seq_places, seq_surfaces
-from .record import Missing, Record, Row, distance_of, short
-from .seq_fields import FIELD_KEYS, WAVE_KEYS, Fields
+from .record import Missing, Record, distance_of, short
 from .seq_glass import Glasses
-from .seq_places import Frames
-from .seq_surfaces import Surface
-from .seq_text import COSMETIC, REFUSED, SOLVES, Command, command_of, commands_of
-from .system import ApertureKind, Use
+from .seq_places import Frames, clip
+from .seq_surfaces import ON_SURFACES, Surface, curvature, glass, move, thickness
+from .seq_text import COSMETIC, REFUSED, SOLVES, SURFACE, Command, command_of, commands_of
+from .system import ApertureKind, FieldKind, Use
 
 _UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
 _SURFACES = 5000
@@ -20,247 +19,157 @@ _APERTURES: dict[str, ApertureKind] = {
     "NA": "image NA",
     "NAO": "object NA",
 }
+FIELDS = dict(zip(("AN", "OB", "IM", "RI"), get_args(FieldKind), strict=True))
+VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
+_HEIGHTS = tuple(f"{axis}{kind}" for axis in "XY" for kind in FIELDS)
+_LISTS = (*_HEIGHTS, *VIGNETTING, "WTF", "WL", "WTW", "REF")
+_MOST = 1000  # fields or wavelengths
 
 
 class _Reader:
-    """The state of reading one file."""
+    """The state of reading one file.
+
+    lists, list_lines: numbers of fields and wavelengths by key, and the line of each key's last
+    command. unit: of length, mm. radii: whether numbers of surfaces are radii, None until RDM says.
+    complete: whether the image has come. stop: number of its surface, 0 until it is known. clips:
+    whether apertures are used.
+    """
 
     def __init__(self, path: str, missing: Missing):
-        self.record, self.use, self.fields = Record(path, missing), Use(), Fields()
+        self.record, self.use = Record(path, missing), Use()
         self.glasses = Glasses(self.record)
-        self.unit, self.radii, self.said_radii = 1.0, False, False
+        self.lists: dict[str, list[float]] = {}
+        self.list_lines: dict[str, int] = {}
         self.surfaces: list[Surface] = []
-        self.complete, self.stop, self.clips = False, 0, True
-        self.solves: list[int] = []
-        self.unknown: dict[str, int] = {}
+        self.unit, self.complete, self.stop, self.clips = 1.0, False, 0, True
+        self.radii: bool | None = None
 
-    def at(self, line: int, name: str) -> int:
+    def at(self, command: Command, name: str) -> int:
         """The index of the surface that a qualifier names; 0 is the object."""
         if name == "I" and self.complete:
             return len(self.surfaces) - 1
         known = {"O": 0, "S": self.stop or 1}.get(name, int(name) if name.isdecimal() else -1)
-        if not 0 <= known < len(self.surfaces):
-            raise self.record.error(line, f"there is no surface S{name} yet")
+        command.require(0 <= known < len(self.surfaces), f"there is no surface S{name} yet")
         return known
 
     def targets(self, command: Command) -> list[Surface]:
         """The surfaces that a command applies to: those it names, or else the last one."""
         named = command.of("S")
-        if not self.surfaces:
-            raise self.record.error(command.line, f"{short(command.key)} before any surface")
+        command.require(self.surfaces, f"{short(command.key)} before any surface")
         if named is None:
             return [self.surfaces[-1]]
-        first, last = (self.at(command.line, name) for name in named)
+        first, last = (self.at(command, name) for name in named)
         return self.surfaces[first : last + 1]
 
+    def numbers(self, command: Command) -> None:
+        """Read a list for all fields or wavelengths, or one number of it if a qualifier F or W
+        names its place."""
+        key, at = command.key, command.of("F") or command.of("W")
+        values = command.numbers(0, max(len(command.values), 1))
+        command.require(len(values) <= _MOST, f"{key}: more than {_MOST} numbers")
+        self.list_lines[key] = command.line
+        if at is None:
+            self.lists[key] = values
+            return
+        one = len(values) == 1 and at[0].isdecimal() and at[0] == at[1]
+        command.require(one, f"{key}: expected one number behind one field or wavelength")
+        place, own = int(at[0]) - 1, self.lists.setdefault(key, [])
+        command.require(0 <= place < _MOST, f"{key}: there is no number {place + 1}")
+        own += [0.0] * (place + 1 - len(own))
+        own[place] = values[0]
 
-def _title(reader: _Reader, command: Command) -> None:
-    reader.record.name = short(" ".join(command.values))
-
-
-def _mode(reader: _Reader, command: Command) -> None:
-    reader.radii = not (command.values and command.values[0][:1].upper() == "N")
-    reader.said_radii = True
-
-
-def _new(reader: _Reader, command: Command) -> None:
-    if reader.surfaces:
-        raise reader.record.error(command.line, "a second lens begins; give it a file of its own")
-
-
-def _unit(reader: _Reader, command: Command) -> None:
-    name = command.values[0].upper() if command.values else ""
-    if name not in _UNITS:
-        known = "M (millimetres), C or I"
-        raise reader.record.error(command.line, f"DIM {short(name)}: expected {known}")
-    reader.unit = _UNITS[name]
-
-
-def _air(reader: _Reader, command: Command) -> None:
-    """Compare temperature (C) or pressure (mm Hg) with that of our indices."""
-    ours, unit = (20, "C") if command.key == "TEM" else (760, "mm Hg")
-    value, line = reader.record.number(command.line, command.values), command.line
-    if abs(value - ours) > ours / 4:
-        reader.record.lacks(line, f"{value:g} {unit}; our indices are those of {ours}")
-    elif value != ours:
-        reader.record.notes.append(f"line {line}: {value:g} {unit}; indices are those of {ours}")
-
-
-def _aperture(reader: _Reader, command: Command) -> None:
-    use = reader.use
-    use.line, use.aperture = command.line, reader.record.number(command.line, command.values)
-    use.aperture_kind = _APERTURES[command.key]
-
-
-def _checks_apertures(reader: _Reader, command: Command) -> None:
-    reader.clips = not (command.values and command.values[0][:1].upper() == "N")
+    @property
+    def wavelengths(self) -> list[float]:
+        """The wavelengths, um."""
+        return [value / 1000 for value in self.lists.get("WL", [])]
 
 
 def _surface(reader: _Reader, command: Command) -> None:
     """S, SO, SI or S with a number: begin a new surface, or change an existing one."""
-    record, line, name = reader.record, command.line, command.key[1:]
-    if name == "S" or (reader.complete and name != "I" and not name.isdecimal()):
-        raise record.error(line, f"{command.key}: a surface behind the image")
-    due = len(reader.surfaces)
+    name, due, words = command.key[1:], len(reader.surfaces), command.values
+    before = not reader.complete or name == "I" or name.isdecimal()
+    command.require(name != "S" and before, f"{command.key}: a surface behind the image")
     number = {"": due, "O": 0, "I": due - reader.complete}.get(name)
     number = int(name) if number is None else number
     reader.complete = reader.complete or name == "I"
-    if number > due:
-        raise record.error(line, f"{command.key} stands where S{due} should")
-    if number > _SURFACES:
-        raise record.error(line, f"more than {_SURFACES} surfaces")
+    command.require(number <= due, f"{command.key} stands where S{due} should")
+    command.require(number <= _SURFACES, f"more than {_SURFACES} surfaces")
     if number == due:
         called = {"O": "SO", "I": "SI"}.get(name, f"S{number}")
-        reader.surfaces.append(Surface(Row(called, line)))
-    surface, words = reader.surfaces[number], command.values
-    for key, handler in (("RDY" if reader.radii else "CUY", _curvature), ("THI", _thickness)):
-        if words:
-            handler(reader, command._replace(key=key, values=words[:1]), surface)
-        words = words[1:]
-    if words:
-        _glass(reader, command._replace(key="GLA", values=words), surface)
-
-
-def _number(reader: _Reader, command: Command) -> float | None:
-    """The value of a command; None for a solve, whose value is given elsewhere."""
-    words = command.values
-    if words and words[0][:3].upper() in SOLVES:
-        reader.solves.append(command.line)
-        return None
-    if len(words) > 1:
-        raise reader.record.error(
-            command.line, f"{command.key}: what is {short(' '.join(words[1:]))} behind its value?"
-        )
-    return reader.record.number(command.line, words)
-
-
-def _curvature(reader: _Reader, command: Command, surface: Surface) -> None:
-    value = _number(reader, command)
-    if value is None:
-        return
-    if command.key in ("RDY", "RDX"):
-        value = 1 / value if abs(value) > 1e-12 else 0.0
-    elif abs(value) > 1e9:
-        raise reader.record.error(command.line, f"a curvature of {value:g}; which unit?")
-    if command.key in ("RDX", "CUX"):
-        surface.curvature_x = command.line, value
-    else:
-        surface.curvature = value
-        surface.row.lines["curvature"] = command.line
-
-
-def _thickness(reader: _Reader, command: Command, surface: Surface) -> None:
-    value = _number(reader, command)
-    if value is not None:
-        surface.thickness = value
-        surface.row.lines["thickness"] = command.line
-
-
-def _glass(reader: _Reader, command: Command, surface: Surface) -> None:
-    """A glass, AIR, REFL or REFR; REFR may also follow a glass."""
-    record, line = reader.record, command.line
-    modes = [word.upper()[:4] for word in command.values if word.upper()[:4] in ("REFL", "REFR")]
-    names = [word for word in command.values if word.upper()[:4] not in ("REFL", "REFR")]
-    if len(names) > (command.key != "RMD") or len(modes) > 1:
-        what = short(" ".join(command.values))
-        raise record.error(line, f"{command.key} {what}: expected one glass, REFL or REFR")
-    if names and "REFL" in modes:
-        raise record.error(line, "a glass and a mirror: give one of them")
-    if names:
-        surface.glass = line, names[0]
-    if modes or names:
-        surface.row.entry.pop("mirror", None)
-    if "REFL" in modes:
-        surface.glass = line, ""
-        surface.row.put("mirror", True, line)
-
-
-def _stop(reader: _Reader, command: Command) -> None:
-    named = command.of("S")
-    reader.stop = reader.at(command.line, named[0]) if named else len(reader.surfaces) - 1
-
-
-def _coefficient(reader: _Reader, command: Command, surface: Surface) -> None:
-    value = reader.record.number(command.line, command.values)
-    surface.terms[command.key] = command.line, value
-
-
-def _special(reader: _Reader, command: Command, surface: Surface) -> None:
-    command = command._replace(values=[*command.values])
-    key = seq_surfaces.special_key(surface, reader.record, command)
-    surface.terms[key] = command.line, reader.record.number(command.line, command.values)
-
-
-def _move(reader: _Reader, command: Command, surface: Surface) -> None:
-    surface.place.take(reader.record, command)
+        reader.surfaces.append(Surface(reader.record, called, command.line))
+    own = reader.surfaces[number]
+    radius = "RDY" if reader.radii else "CUY"
+    for key, read, some in (
+        (radius, curvature, words[:1]),
+        ("THI", thickness, words[1:2]),
+        ("GLA", glass, words[2:]),
+    ):
+        if some:
+            read(own, dataclasses.replace(command, key=key, values=some))
 
 
 def _return(reader: _Reader, command: Command) -> None:
     """RET Sn for the last surface, or RET Sk Sn for surface k."""
-    named = [q for q in command.qualifiers if q[0] == "S"]
-    if not 1 <= len(named) <= 2:
-        raise reader.record.error(command.line, "RET: expected the surface to return to, as RET S2")
-    own = reader.at(command.line, named[0][1]) if len(named) == 2 else len(reader.surfaces) - 1
-    surface = reader.surfaces[own] if reader.surfaces else None
-    if surface is None:
-        raise reader.record.error(command.line, "RET before any surface")
-    surface.place.take(reader.record, command)
-    surface.place.target = reader.at(command.line, named[-1][1])
-
-
-def _diffract(reader: _Reader, command: Command, surface: Surface) -> None:
-    record, words, line = reader.record, command.values, command.line
-    if command.key in ("DIF", "HCT"):
-        surface.phase[command.key] = line, short(words[0]).upper() if words else ""
-        return
-    number = command.of("C")
-    if (number is None) == (command.key == "HCO"):
-        raise record.error(line, "HCO: expected HCO C1 and a number")
-    key = f"C{number[0]}" if number else command.key
-    if number and not (number[0].isdecimal() and 1 <= int(number[0]) <= 100):
-        raise record.error(line, f"HCO {key}: expected C1 to C100")
-    surface.phase[key] = line, record.number(line, words)
+    named = [first for letter, first, _ in command.qualifiers if letter == "S"]
+    what = "RET: expected the surface to return to, as RET S2"
+    command.require(1 <= len(named) <= 2, what)
+    own = reader.at(command, named[0]) if len(named) == 2 else len(reader.surfaces) - 1
+    command.require(reader.surfaces, "RET before any surface")
+    move(reader.surfaces[own], command)
+    reader.surfaces[own].target = reader.at(command, named[-1])
 
 
 def _zoom(reader: _Reader, command: Command) -> None:
     """`ZOO 3`, or a command with a value for each zoom position; the first value is used."""
     record, line, words = reader.record, command.line, command.values
     if words and words[0].isdecimal():
-        if record.count(line, words) > 1:
-            record.notes.append(f"line {line}: of {words[0]} zoom positions the first")
-        return
-    if not words:
-        return
-    own = command_of(line, words[0].upper()[:3], False, words[1:])
-    if (own.key in FIELD_KEYS or own.key in WAVE_KEYS) and not own.qualifiers:
-        raise record.error(line, f"ZOO {own.key}: name the field or the wavelength, as F1 or W1")
-    if own.values:
-        _dispatch(reader, own._replace(values=own.values[:1]))
+        if command.count() > 1:
+            record.note(line, f"of {words[0]} zoom positions the first")
+    elif words:
+        own = command_of(record, line, words[0].upper()[:3], words[1:])
+        known = own.key not in _LISTS or own.qualifiers
+        own.require(known, f"ZOO {own.key}: name the field or the wavelength, as F1 or W1")
+        if own.values:
+            _dispatch(reader, dataclasses.replace(own, values=own.values[:1]))
 
 
-_SYSTEM: dict[str, Callable[[_Reader, Command], None]] = {
-    **{
-        "TIT": _title,
-        "RDM": _mode,
-        "LEN": _new,
-        "DIM": _unit,
-        "DDM": _unit,
-        "TEM": _air,
-        "PRE": _air,
-        "STO": _stop,
-    },
-    **dict.fromkeys(_APERTURES, _aperture),
-    **{"CA": _checks_apertures, "ZOO": _zoom, "RET": _return},
-}
-_OF_SURFACES: dict[str, Callable[[_Reader, Command, Surface], None]] = {
-    **dict.fromkeys(("RDY", "CUY", "RDX", "CUX"), _curvature),
-    **{"THI": _thickness, "GLA": _glass, "RMD": _glass, "SCO": _special},
-    **dict.fromkeys(seq_surfaces.KINDS, lambda r, command, s: s.shape(r.record, command)),
-    **dict.fromkeys(seq_surfaces.COEFFICIENTS, _coefficient),
-    **dict.fromkeys(seq_apertures.KEYS, lambda r, command, s: s.clips.take(r.record, command)),
-    **dict.fromkeys((*seq_places.KEYS, "DAR", "BEN", "REV"), _move),
-    **dict.fromkeys(seq_surfaces.DIFFRACTIVE, _diffract),
-}
+def _take(reader: _Reader, command: Command) -> bool:
+    """Read a command of the whole system; False if it is none."""
+    record, use, line = reader.record, reader.use, command.line
+    first = command.values[0].upper() if command.values else ""
+    match command.key:
+        case "TIT":
+            record.name = short(" ".join(command.values))
+        case "RDM":
+            reader.radii = first[:1] != "N"
+        case "CA":
+            reader.clips = first[:1] != "N"
+        case "LEN":
+            command.require(not reader.surfaces, "a second lens begins; give it a file of its own")
+        case "DIM" | "DDM":
+            what = f"DIM {short(first)}: expected M (millimetres), C or I"
+            command.require(first in _UNITS, what)
+            reader.unit = _UNITS[first]
+        case "TEM" | "PRE":
+            ours, unit = (20, "C") if command.key == "TEM" else (760, "mm Hg")
+            value = command.number()
+            if abs(value - ours) > ours / 4:
+                record.lacks(line, f"{value:g} {unit}; our indices are those of {ours}")
+            elif value != ours:
+                record.note(line, f"{value:g} {unit}; indices are those of {ours}")
+        case "EPD" | "FNO" | "NA" | "NAO":
+            use.line, use.aperture = line, command.number()
+            use.aperture_kind = _APERTURES[command.key]
+        case "STO":
+            named = command.of("S")
+            reader.stop = reader.at(command, named[0]) if named else len(reader.surfaces) - 1
+        case "RET":
+            _return(reader, command)
+        case "ZOO":
+            _zoom(reader, command)
+        case _:
+            return False
+    return True
 
 
 def _dispatch(reader: _Reader, command: Command) -> None:
@@ -268,28 +177,28 @@ def _dispatch(reader: _Reader, command: Command) -> None:
     key, zoom = command.key, command.of("Z")
     if zoom and zoom[0] != "1":
         return  # for another zoom position, see `_zoom`
-    if key == "S" or key in ("SO", "SI") or (key[0] == "S" and key[1:].isdecimal()):
+    if SURFACE.fullmatch(key):
         _surface(reader, command)
-    elif key in FIELD_KEYS or key in WAVE_KEYS:
-        reader.fields.take(reader.record, command)
-    elif key in _SYSTEM:
-        _SYSTEM[key](reader, command)
+    elif key in _LISTS:
+        reader.numbers(command)
+    elif _take(reader, command):
+        return
     elif key in SOLVES:
-        reader.solves.append(command.line)
-    elif key in _OF_SURFACES:
+        reader.record.solves.append(command.line)
+    elif key in ON_SURFACES:
         for surface in reader.targets(command):
-            _OF_SURFACES[key](reader, command, surface)
+            ON_SURFACES[key](surface, command)
     elif key in REFUSED:
-        raise reader.record.error(command.line, f"{key} is not read")
+        raise command.error(f"{key} is not read")
     elif key not in COSMETIC:
-        reader.unknown.setdefault(short(key), command.line)
+        reader.record.unknown.setdefault(short(key), command.line)
 
 
 def read_seq(path: str, missing: Missing, lines: list[str]) -> tuple[Record, Use]:
     """Read the lines of a `.seq` file into a record of its surfaces and their use. LensError with
     the line. path: its name in messages."""
     reader, private, ended = _Reader(path, missing), False, False
-    for own in commands_of(lines):
+    for own in commands_of(reader.record, lines):
         if ended:
             note = f"what follows the GO of the lens, from line {own.line} on, is not read"
             reader.record.notes.append(note)
@@ -307,26 +216,25 @@ def read_seq(path: str, missing: Missing, lines: list[str]) -> tuple[Record, Use
 
 def _finish(reader: _Reader) -> None:
     """Do the checks and conversions that need all commands."""
-    record, use, surfaces = reader.record, reader.use, reader.surfaces
-    if not surfaces:
-        raise record.error(0, "no surface, SO, S or SI: is it a .seq file?")
-    if not reader.complete or len(surfaces) < 3:
-        raise record.error(
-            surfaces[-1].row.line, "no SI follows, the image: is the file cut short?"
-        )
-    if not reader.said_radii:
+    record, use, surfaces, require = (
+        reader.record,
+        reader.use,
+        reader.surfaces,
+        reader.record.require,
+    )
+    require(surfaces, 0, "no surface, SO, S or SI: is it a .seq file?")
+    whole = reader.complete and len(surfaces) > 2
+    require(whole, surfaces[-1].line, "no SI follows, the image: is the file cut short?")
+    if reader.radii is None:
         record.notes.append("no RDM: the numbers of surfaces are curvatures")
-    if not 0 < (reader.stop or 1) < len(surfaces) - 1:
-        raise record.error(0, "the stop is no surface of the lens")
+    require(0 < (reader.stop or 1) < len(surfaces) - 1, 0, "the stop is no surface of the lens")
     if not reader.stop:
         record.notes.append("no STO: the stop is surface 1")
-    record.note_unread(reader.solves, reader.unknown, "commands")
-    if not reader.fields.wavelengths:
-        raise record.error(0, "no wavelength is given: WL, in nm")
-    if use.aperture_kind is None:
-        raise record.error(0, "no aperture is given: EPD, FNO, NA or NAO")
-    surfaces[reader.stop or 1].row.put("stop", True, surfaces[reader.stop or 1].row.line)
-    reader.fields.finish(record, use, reader.unit)
+    record.note_unread("commands")
+    require(reader.wavelengths, 0, "no wavelength is given: WL, in nm")
+    require(use.aperture_kind, 0, "no aperture is given: EPD, FNO, NA or NAO")
+    surfaces[reader.stop or 1].put("stop", True)
+    _use(reader)
     _parts(reader)
     if use.aperture_kind == "pupil diameter":
         use.aperture = (use.aperture or 0.0) * reader.unit
@@ -335,43 +243,70 @@ def _finish(reader: _Reader) -> None:
     use.ray_aiming = "chief"
 
 
+def _use(reader: _Reader) -> None:
+    """Write fields and wavelengths as `System` holds them."""
+    record, use, lists, lines = reader.record, reader.use, reader.lists, reader.list_lines
+
+    def column(key: str, default: float, count: int) -> list[float]:
+        values = lists.get(key, [])
+        what = f"{key} has {len(values)} numbers for {count}"
+        record.require(len(values) <= count, lines.get(key, 0), what)
+        return values + [default] * (count - len(values))
+
+    use.wavelengths = waves = reader.wavelengths
+    record.require(min(waves) > 0, lines["WL"], f"a wavelength of {1000 * min(waves):g} nm")
+    use.wavelength_weights = column("WTW", 1.0, len(waves))
+    reference = lists.get("REF", [float(len(waves) // 2 + 1)])[0]
+    use.primary, use.primary_line = int(reference) - 1, lines.get("REF", 0)
+    what = f"REF {reference:g}: expected a whole number"
+    record.require(reference % 1 == 0, use.primary_line, what)
+    if "REF" not in lists and len(waves) > 1:
+        record.notes.append("no REF: the reference is the wavelength in the middle")
+    given = [key for key in _HEIGHTS if key in lists]
+    kinds = {key[1:] for key in given} or {"AN"}
+    use.field_line = max((lines[key] for key in given), default=0)
+    if len(kinds) > 1:
+        raise record.error(lines[given[-1]], f"fields of two kinds: {', '.join(given)}")
+    (kind,) = kinds
+    count = max((len(lists[key]) for key in given), default=1)
+    use.field_kind = FIELDS[kind]
+    scale = 1.0 if kind == "AN" else reader.unit
+    x, y = (column(f"{axis}{kind}", 0.0, count) for axis in "XY")
+    use.heights = [(a * scale, b * scale) for a, b in zip(x, y, strict=True)]
+    use.field_weights = column("WTF", 1.0, count)
+    use.vignetting = [
+        [(b - a) / 2, (d - c) / 2, (a + b) / 2, (c + d) / 2, 0.0]
+        for a, b, c, d in zip(*(column(key, 0.0, count) for key in VIGNETTING), strict=True)
+    ]
+
+
 def _parts(reader: _Reader) -> None:
     """Convert object, surfaces and image to parts of the record, in mm."""
     record, unit, (first, *others) = reader.record, reader.unit, reader.surfaces
-    if first.curvature or first.terms or first.place.moved or first.place.kind:
-        raise record.error(first.row.line, "SO: an object that is not flat on the axis")
-    record.distance = distance_of(first.thickness * unit if first.thickness < 1e9 else math.inf)
-    record.medium = _medium(reader, first)
-    image = others[-1]
-    others[-2].thickness += image.thickness  # defocus
-    image.thickness = 0.0
-    frames = Frames(record, unit)
+    flat = not (first.curvature or first.terms or first.moved or first.turn)
+    record.require(flat, first.line, "SO: an object that is not flat on the axis")
+    record.distance = distance_of(first.gap * unit if first.gap < 1e9 else math.inf)
+    record.medium = reader.glasses.medium(first, reader.wavelengths)
+    image, frames = others[-1], Frames(record)
+    others[-2].gap += image.gap  # defocus
+    image.gap = 0.0
     for surface in others:
-        row = surface.row
-        row.thickness = surface.thickness * unit
-        if abs(row.thickness) >= 1e9:
-            raise record.error(
-                row.lines.get("thickness", row.line), f"{row.name}: an infinite thickness"
-            )
-        surface.entries(record, unit)
+        surface.unit, surface.thickness = unit, surface.gap * unit
+        line = surface.lines.get("thickness", 0)
+        surface.require(abs(surface.thickness) < 1e9, "an infinite thickness", line)
+        surface.entries()
         if surface is image:
-            if {"form", "coefficients"} & row.entry.keys() or surface.phase:
-                raise record.error(row.line, f"{row.name}: an aspheric image")
+            flat = not ({"form", "coefficients"} & surface.entry.keys() or surface.phase)
+            surface.require(flat, "an aspheric image")
         else:
-            row.entry |= _medium(reader, surface)
-            surface.diffraction(record, unit)
-        if surface.clips.found and surface is image:
+            surface.entry |= reader.glasses.medium(surface, reader.wavelengths)
+            surface.diffraction()
+        if surface.clips and surface is image:
             record.notes.append("apertures of the image clip nothing")
-        elif surface.clips.found and reader.clips:
-            stop = bool(row.entry.get("stop"))
-            size = surface.clips.entries(record, row, unit, stop)
-            reader.use.stop = size if stop else reader.use.stop
-        record.parts += frames.parts(row, surface.place, surface is image)
+        elif surface.clips and reader.clips:
+            size = clip(surface)
+            reader.use.stop = size if surface.entry.get("stop") else reader.use.stop
+        record.parts += frames.parts(surface, surface is image)
     if not reader.clips:
         record.notes.append("CA NO: the apertures are not used")
     record.glasses = reader.glasses.used
-
-
-def _medium(reader: _Reader, surface: Surface) -> dict[str, object]:
-    line, word = surface.glass
-    return reader.glasses.medium(surface.row, line, word, reader.fields.wavelengths)

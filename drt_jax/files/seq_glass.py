@@ -7,7 +7,8 @@ import numpy as np
 
 from ..lens.glasses import plain_names
 from .glasses import in_catalogues, named_glass
-from .record import Record, Row, short
+from .record import Record, short
+from .seq_surfaces import Surface
 from .seq_text import Command
 
 _CODE = re.compile(r"(\d{3,17})\.(\d{3,18})")
@@ -36,106 +37,92 @@ def folded(name: str) -> str:
 
 
 class Glasses:
-    """The private catalogue of a file, and lookup of makers' glasses by name."""
+    """The private catalogue of a file, and lookup of makers' glasses by name. tables: by name, the
+    command of a private glass and its wavelengths, um. used: glasses of the prescription."""
 
     def __init__(self, record: Record):
         self.record, self.waves = record, list[float]()
-        self.tables: dict[str, Command] = {}
-        self.waves_of: dict[str, list[float]] = {}
+        self.tables: dict[str, tuple[Command, list[float]]] = {}
         self.used: dict[str, dict[str, Any]] = {}
 
     def take(self, command: Command) -> None:
         """Read a line of the private catalogue."""
         if command.key == "PWL" and not command.quoted:
-            values = self.record.numbers(command.line, command.values, len(command.values))
-            if not values or not 0.1 <= min(values) <= max(values) <= 1e9:
-                raise self.record.error(command.line, "PWL: expected wavelengths in nm")
-            if len({*values}) < len(values):
-                raise self.record.error(command.line, "PWL: a wavelength stands twice")
+            values = command.numbers(0, len(command.values))
+            known = bool(values) and 0.1 <= min(values) <= max(values) <= 1e9
+            command.require(known, "PWL: expected wavelengths in nm")
+            command.require(len({*values}) == len(values), "PWL: a wavelength stands twice")
             self.waves = [value / 1000 for value in values]
             return
-        if len(self.tables) >= _MOST:
-            raise self.record.error(command.line, f"more than {_MOST} private glasses")
-        self.tables[command.key.upper()] = command
-        self.waves_of[command.key.upper()] = self.waves
+        command.require(len(self.tables) < _MOST, f"more than {_MOST} private glasses")
+        self.tables[command.key.upper()] = command, self.waves
 
-    def medium(self, row: Row, line: int, word: str, system: list[float]) -> dict[str, Any]:
-        """The entries of the medium that a word names; `system`: wavelengths of the file, um."""
-        if word.upper() in ("", "AIR"):
+    def medium(self, surface: Surface, system: list[float]) -> dict[str, Any]:
+        """The entries of the medium behind a surface. system: wavelengths of the file, um."""
+        (line, word), record = surface.glass, self.record
+        private = word.upper()
+        if private in ("", "AIR"):
             return {}
-        if word.upper() in self.tables:
-            return {"glass": self._private(word.upper(), system)}
-        code = code_of(word)
-        if code:
-            if not (1 < code[0] <= 4 and 10 <= code[1] <= 120):
-                raise self.record.error(
-                    line, f"{row.name}: no glass has nd {code[0]:g} and vd {code[1]:g}"
-                )
+        if private in self.tables:
+            if private not in self.used:
+                self.used[private] = _private(*self.tables[private], system)
+            return {"glass": private}
+        if code := code_of(word):
+            nd, vd = code
+            known = 1 < nd <= 4 and 10 <= vd <= 120
+            surface.require(known, f"no glass has nd {nd:g} and vd {vd:g}", line)
             note = "glasses of a code have its nd and vd; between the lines they are models"
-            if note not in self.record.notes:
-                self.record.notes.append(note)
-            return {"nd": code[0], "vd": code[1]}
+            record.notes += [note] if note not in record.notes else []
+            return {"nd": nd, "vd": vd}
         name, _, maker = word.partition("_")
         makers = [maker.upper()] if maker and maker.upper() != "SPECIAL" else []
-        known = [other for other in plain_names() if folded(other) == folded(name)]
-        known = [other for other in known if in_catalogues(other, makers)] or known
-        known = [other for other in known if other == name] or known
-        if len(known) > 1 and not makers:
-            raise self.record.error(
-                line, f"{row.name}: glass {short(word)} may be {' or '.join(known)}; add _MAKER"
-            )
-        return dict(named_glass(self.record, row, line, known[0] if known else name, makers))
+        known_as = [other for other in plain_names() if folded(other) == folded(name)]
+        known_as = [other for other in known_as if in_catalogues(other, makers)] or known_as
+        known_as = [other for other in known_as if other == name] or known_as
+        what = f"glass {short(word)} may be {' or '.join(known_as)}; add _MAKER"
+        surface.require(len(known_as) < 2 or makers, what, line)
+        return dict(named_glass(surface, line, known_as[0] if known_as else name, makers))
 
-    def _private(self, name: str, system: list[float]) -> str:
-        """Add a private glass to the glasses of the prescription; return its name there."""
-        if name not in self.used:
-            command, waves = self.tables[name], self.waves_of[name]
-            words = command.values
-            if words and words[0].upper() in _FORMULAS:
-                self.used[name] = self._formula(command, waves)
-            else:
-                self.used[name] = self._table(command, waves, system)
-        return name
 
-    def _formula(self, command: Command, waves: list[float]) -> dict[str, Any]:
-        record, line, words = self.record, command.line, command.values
-        kind, count = words[0].upper(), len(words) - 1
-        values = record.numbers(line, words[1:], count)
-        if count > _FORMULAS[kind] or not count:
-            raise record.error(line, f"{short(command.key)}: {kind} with {count} constants")
-        own: dict[str, Any] = {"range": [min(waves), max(waves)] if len(waves) > 1 else [1e-4, 1e6]}
-        if kind in ("GMS", "SLM"):
-            if count % 2:
-                raise record.error(line, f"{short(command.key)}: {kind} takes pairs of constants")
-            return own | {"sellmeier": [*values[::2], *values[1::2]]}
-        values += [0.0] * (6 - len(values))
-        if kind == "CAU":  # n = a + b / L^2 + c / L^4
-            a, b, c = values[:3]
-            values = [a * a, 0.0, 2 * a * b, 2 * a * c + b * b, 2 * b * c, c * c]
-        return own | {"schott": values}
+def _private(command: Command, waves: list[float], system: list[float]) -> dict[str, Any]:
+    """The constants of a private glass, from its formula or its table of indices."""
+    name, words = short(command.key), command.values
+    kind, count = words[0].upper() if words else "", len(words) - 1
+    if kind not in _FORMULAS:
+        return _table(command, waves, system)
+    values = command.numbers(1, count + 1)
+    command.require(0 < count <= _FORMULAS[kind], f"{name}: {kind} with {count} constants")
+    own: dict[str, Any] = {"range": [min(waves), max(waves)] if len(waves) > 1 else [1e-4, 1e6]}
+    if kind in ("GMS", "SLM"):
+        command.require(count % 2 == 0, f"{name}: {kind} takes pairs of constants")
+        return own | {"sellmeier": [*values[::2], *values[1::2]]}
+    values += [0.0] * (6 - len(values))
+    if kind == "CAU":  # n = a + b / L^2 + c / L^4
+        a, b, c = values[:3]
+        values = [a * a, 0.0, 2 * a * b, 2 * a * c + b * b, 2 * b * c, c * c]
+    return own | {"schott": values}
 
-    def _table(self, command: Command, waves: list[float], system: list[float]) -> dict[str, Any]:
-        """Schott's formula for a table. It passes through all of up to six indices; else through up
-        to five at the file's wavelengths, with a least-squares fit to those near them."""
-        record, line, name = self.record, command.line, short(command.key)
-        if not waves or len(command.values) != len(waves):
-            many = f"{len(command.values)} indices for {len(waves)} wavelengths of PWL"
-            raise record.error(line, f"{name}: {many}; known formulas: {', '.join(_FORMULAS)}")
-        table = sorted(zip(waves, record.numbers(line, command.values, len(waves)), strict=True))
-        if not all(1 < index <= 10 for _, index in table):
-            raise record.error(line, f"{name}: an index that is not between 1 and 10")
-        at, indices = np.array(_near(table, system)).T
-        held = [k for k in range(len(at)) if any(abs(at[k] - w) < _SAME for w in system)][:5]
-        if len(at) <= 6:
-            held = [*range(len(at))]
-        constants, off = schott_through(at, indices, held)
-        record.notes.append(
-            f"line {line}: {name}: Schott's formula through the indices of the table"
-            + (f", {off:.1g} off at most" if off > _SAME else "; between them CODE V may differ")
-        )
-        low, high = float(at.min()), float(at.max())
-        ends = [low, high] if low < high else [low * (1 - _SAME), high * (1 + _SAME)]
-        return {"schott": constants, "range": ends}
+
+def _table(command: Command, waves: list[float], system: list[float]) -> dict[str, Any]:
+    """Schott's formula for a table. It passes through all of up to six indices; else through up
+    to five at the file's wavelengths, with a least-squares fit to those near them."""
+    name, count = short(command.key), len(command.values)
+    many = f"{count} indices for {len(waves)} wavelengths of PWL"
+    known = f"known formulas: {', '.join(_FORMULAS)}"
+    command.require(waves and count == len(waves), f"{name}: {many}; {known}")
+    table = sorted(zip(waves, command.numbers(0, count), strict=True))
+    inside = all(1 < index <= 10 for _, index in table)
+    command.require(inside, f"{name}: an index that is not between 1 and 10")
+    at, indices = np.array(_near(table, system)).T
+    held = [k for k in range(len(at)) if any(abs(at[k] - w) < _SAME for w in system)][:5]
+    held = [*range(len(at))] if len(at) <= 6 else held
+    constants, off = schott_through(at, indices, held)
+    how = f", {off:.1g} off at most" if off > _SAME else "; between them CODE V may differ"
+    what = f"{name}: Schott's formula through the indices of the table{how}"
+    command.record.note(command.line, what)
+    low, high = float(at.min()), float(at.max())
+    ends = [low, high] if low < high else [low * (1 - _SAME), high * (1 + _SAME)]
+    return {"schott": constants, "range": ends}
 
 
 def schott_through(
@@ -167,10 +154,8 @@ def _near(table: list[tuple[float, float]], system: list[float]) -> list[tuple[f
     least eight."""
     inside = [k for k, (wave, _) in enumerate(table) if min(system) <= wave <= max(system)]
     above = sum(wave < min(system) for wave, _ in table)
-    first, end = (
-        max((inside or [above])[0] - 1, 0),
-        min((inside or [above - 1])[-1] + 2, len(table)),
-    )
+    first = max((inside or [above])[0] - 1, 0)
+    end = min((inside or [above - 1])[-1] + 2, len(table))
     while end - first < 8 and end - first < len(table):
         first, end = max(first - 1, 0), min(end + 1, len(table))
     return table[first:end]

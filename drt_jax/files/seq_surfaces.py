@@ -1,233 +1,295 @@
-"""Kinds of surfaces of `.seq` files: conversion of their coefficients to prescription entries."""
+"""Surfaces of `.seq` files: their commands, and conversion to prescription entries."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
-from ..lens.forms import noll_of_fringe
-from .record import Record, Row, short
-from .seq_apertures import Clips
-from .seq_places import Place
-from .seq_text import Command
+from ..lens.forms import noll_of_fringe, powers_xy
+from .record import Row, short
+from .seq_text import SOLVES, Command
 
 LETTERS = dict(zip("ABCDEFGHJ", range(4, 22, 2), strict=True))  # powers of r; CODE V has no I
-_ANAMORPHIC = {f"{letter}R": power for letter, power in zip("ABCD", (4, 6, 8, 10), strict=True)}
-_LOPSIDED = tuple(f"{letter}P" for letter in "ABCD")
-COEFFICIENTS = ("K", *LETTERS, "KX", "KY", *_ANAMORPHIC, *_LOPSIDED, "CUF")
-KINDS = ("SPH", "CON", "ASP", "XTO", "YTO", "CYL", "AAS", "SPS")
-DIFFRACTIVE = ("DIF", "HOR", "HWL", "HCT", "HCO", "GRO", "GRS", "GRX", "GRY", "GRZ")
+RADIAL = {"AR": 4, "BR": 6, "CR": 8, "DR": 10}  # and of an anamorphic asphere
+_LOPSIDED = ("AP", "BP", "CP", "DP")
+_COEFFICIENTS = ("K", *LETTERS, "KX", "KY", *RADIAL, *_LOPSIDED, "CUF")
+_POWERS = {"K", *LETTERS}
+# The coefficients of each kind of surface; those of SPS have numbers.
+_KINDS: dict[str, set[str]] = {
+    **{"SPH": set(), "CON": {"K"}, "ASP": _POWERS, "XTO": _POWERS, "YTO": _POWERS, "CYL": _POWERS},
+    **{"AAS": {"KX", "KY", *RADIAL, *_LOPSIDED}, "SPS": set()},
+}
+# The types of SPS: form; numbers of the conic, of the first coefficient and of the norm radius (0:
+# none); how many coefficients there are.
+_SPECIAL = {
+    "ODD": ("odd_asphere", 1, 2, 33, 30),
+    "XYP": ("polynomial_xy", 1, 2, 0, 65),
+    "QBF": ("qbfs", 17, 3, 1, 14),
+    "ZFR": ("zernike", 1, 4, 3, 37),
+}
 _SPECIAL_TERMS, _LEAST = 99, 1e-6
+MOVES = ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
+# Sizes of apertures along x and y, by the first letter of their commands.
+SIZES = {"C": ("CIR",), "R": ("REX", "REY"), "E": ("ELX", "ELY")}
+_MOST = 50  # apertures of a surface
 
 
 @dataclasses.dataclass
-class Surface:
-    """A surface as its commands are read; numbers are in units of the file.
+class Surface(Row):
+    """A surface as its commands are read; numbers are in units of the file. gap: to the next.
 
-    curvature, curvature_x: 1/unit; curvature_x with its line, or None if it is not given. kind: one
-    of `KINDS`. special: the type of SPS. terms: coefficients by key; keys of SPS are C1, C2, ....
-    phase: values of `DIFFRACTIVE` by key. glass: (line, word).
+    curvature, curvature_x: 1/unit; curvature_x with its line, or None if it is not given. kind: a
+    key of `_KINDS`. special: the type of SPS. terms: coefficients by key, with their lines; keys of
+    SPS are C1, C2, .... phase: values of the commands of gratings by key. glass: (line, word).
+    moves: values of `MOVES` by key. turn: DAR, BEN, REV, RET or "". target: the surface that RET
+    returns to. move_line: of the last command of these.
+    clips: apertures by use and label, (line, size) by key.
     """
 
-    row: Row
     curvature: float = 0.0
     curvature_x: tuple[int, float] | None = None
-    thickness: float = 0.0
+    gap: float = 0.0
     glass: tuple[int, str] = (0, "")
     kind: str = "SPH"
     kind_line: int = 0
     special: str = ""
     terms: dict[str, tuple[int, float]] = dataclasses.field(default_factory=dict)
-    phase: dict[str, tuple[int, float | str]] = dataclasses.field(default_factory=dict)
-    place: Place = dataclasses.field(default_factory=Place)
-    clips: Clips = dataclasses.field(default_factory=Clips)
+    phase: dict[str, tuple[int, Any]] = dataclasses.field(default_factory=dict)
+    moves: dict[str, float] = dataclasses.field(default_factory=dict)
+    turn: str = ""
+    target: int = 0
+    move_line: int = 0
+    clips: dict[tuple[str, str], dict[str, tuple[int, float]]] = dataclasses.field(
+        default_factory=dict
+    )
+
+    @property
+    def moved(self) -> bool:
+        """Whether the surface is decentred or tilted."""
+        return any(self.moves.values())
 
     def term(self, key: str) -> float:
         """A coefficient; 0 if it is not given."""
         return self.terms.get(key, (0, 0.0))[1]
 
-    def shape(self, record: Record, command: Command) -> None:
-        """Read a command of `KINDS`."""
-        self.kind, self.kind_line, self.special = command.key, command.line, ""
-        if command.key != "SPS":
-            return
-        self.special = short(command.values[0]).upper() if command.values else ""
-        if self.special not in _SPECIAL:
-            known = ", ".join(_SPECIAL)
-            raise record.error(
-                command.line, f"{self.row.name}: SPS {self.special} is not read; known: {known}"
-            )
-        if len(command.values) > 1:
-            self.terms["NRADIUS"] = command.line, record.bounded(command.line, command.values, 1)
+    def powers(self, keys: Mapping[str, int]) -> dict[int, float]:
+        """Coefficients in mm. keys: of each power."""
+        return self.powers_in_mm({p: self.term(key) for key, p in keys.items()})
 
-    def entries(self, record: Record, unit: float) -> None:
+    def entries(self) -> None:
         """Write form, curvature and coefficients as entries of a prescription."""
-        row, kind = self.row, self.kind
-        row.entry.setdefault("curvature", self.curvature / unit)
-        allowed = {
-            "CON": {"K"},
-            "ASP": {"K", *LETTERS},
-            **{key: {"K", *LETTERS} for key in ("XTO", "YTO", "CYL")},
-            "AAS": {"KX", "KY", *_ANAMORPHIC, *_LOPSIDED},
-            "SPS": self.terms.keys(),
-        }.get(kind, set())
+        kind, unit, line = self.kind, self.unit, self.kind_line
+        self.entry.setdefault("curvature", self.curvature / unit)
         for key, (line, value) in self.terms.items():
-            if value and key not in allowed:
-                raise record.error(line, f"{row.name}: {key} on a surface of kind {kind}")
-        conic = self.term(
-            {"AAS": "KY", "SPS": _SPECIAL.get(self.special, ("K",))[0]}.get(kind, "K")
-        )
-        if conic:
-            row.put("conic", conic, self.kind_line)
+            known = kind == "SPS" or key in _KINDS[kind] or not value
+            self.require(known, f"{key} on a surface of kind {kind}", line)
+        of_special = f"C{_SPECIAL[self.special][1]}" if self.special else "K"
+        if conic := self.term({"AAS": "KY", "SPS": of_special}.get(kind, "K")):
+            self.put("conic", conic, self.kind_line)
         if self.curvature_x and kind not in ("XTO", "YTO", "CYL", "AAS"):
             line, across = self.curvature_x
-            if across not in (0.0, self.curvature):
-                raise record.error(line, f"{row.name}: a curvature in x on kind {kind}")
-        if kind in ("CON", "ASP"):
-            self._powers(unit)
+            known = across in (0.0, self.curvature)
+            self.require(known, f"a curvature in x on kind {kind}", line)
+        if kind == "ASP":
+            self.shape("asphere", self.powers(LETTERS), self.kind_line)
         elif kind in ("XTO", "YTO", "CYL"):
-            self._toroid(record, unit)
+            self._toroid()
         elif kind == "AAS":
-            self._anamorphic(record, unit)
+            for key in _LOPSIDED:
+                line, value = self.terms.get(key, (0, 0.0))
+                self.require(not value, f"{key}, a lopsided asphere", line)
+            across = self.curvature_x[1] if self.curvature_x else self.curvature
+            own = {"curvature_x": across / unit, "conic_x": self.term("KX")}
+            self.shape("biconic", self.powers(RADIAL), self.kind_line, own)
         elif kind == "SPS":
-            _SPECIAL[self.special][1](self, record, unit)
+            self._special_shape()
 
-    def _powers(self, unit: float) -> None:
-        found = {p: self.term(key) * unit ** (1 - p) for key, p in LETTERS.items()}
-        found = {p: a for p, a in found.items() if a}
-        if found:
-            self.row.put("coefficients", found, self.kind_line)
-
-    def _toroid(self, record: Record, unit: float) -> None:
+    def _toroid(self) -> None:
         """A curve in y rotated about an axis along y; XTO: in x, ours turned by 90 degrees."""
-        row, line = self.row, self.kind_line
-        across, along = (self.curvature_x or (0, 0.0))[1] / unit, self.curvature / unit
+        across = (self.curvature_x or (0, 0.0))[1] / self.unit
+        along = self.curvature / self.unit
         turned = self.kind == "XTO" or (self.kind == "CYL" and across != 0)
-        if self.kind == "CYL" and across and along:
-            raise record.error(line, f"{row.name}: a cylinder that is curved both ways")
-        row.put("form", "toroid", line)
-        row.put("curvature", across if turned else along, line)
-        row.put("curvature_x", along if turned else across, line)
+        both = self.kind == "CYL" and across and along
+        self.require(not both, "a cylinder that is curved both ways", self.kind_line)
         if turned:
-            row.put("tilt", [0.0, 0.0, 90.0], line)
-        self._powers(unit)
+            across, along = along, across
+            self.put("tilt", [0.0, 0.0, 90.0], self.kind_line)
+        own = {"curvature": along, "curvature_x": across}
+        self.shape("toroid", self.powers(LETTERS), self.kind_line, own)
 
-    def _anamorphic(self, record: Record, unit: float) -> None:
-        row, line = self.row, self.kind_line
-        for key in _LOPSIDED:
-            if self.term(key):
-                raise record.error(self.terms[key][0], f"{row.name}: {key}, a lopsided asphere")
-        row.put("form", "biconic", line)
-        given = self.curvature_x[1] if self.curvature_x else self.curvature
-        row.put("curvature_x", given / unit, line)
-        row.put("conic_x", self.term("KX"), line)
-        found = {p: self.term(key) * unit ** (1 - p) for key, p in _ANAMORPHIC.items()}
-        row.put("coefficients", {p: a for p, a in found.items() if a}, line)
-
-    def _special(self, record: Record, first: int, count: int, *others: str) -> dict[int, float]:
-        """The nonzero ones of `count` coefficients from number `first` on, keyed from 0."""
-        found = {}
+    def _special_shape(self) -> None:
+        """The shape of a type of SPS."""
+        (form, conic, first, own, count), found = _SPECIAL[self.special], dict[int, float]()
+        self.terms.setdefault("NRADIUS", self.terms.get(f"C{own}", (0, 0.0)))
         for key, (line, value) in self.terms.items():
             number = int(key[1:]) - first if key[1:].isdecimal() and key[0] == "C" else -1
             if 0 <= number < count:
-                found[number] = value
-            elif value and key not in ("NRADIUS", *others):
-                raise record.error(line, f"{self.row.name}: SCO {key} of SPS {self.special}")
-        return {k: value for k, value in found.items() if value}
+                found |= {number: value} if value else {}
+            else:
+                known = not value or key in ("NRADIUS", f"C{conic}", f"C{own}")
+                self.require(known, f"SCO {key} of SPS {self.special}", line)
+        unit, radius = self.unit, self.term("NRADIUS")
+        radius = radius if radius or self.special not in ("ODD", "XYP") else 1.0
+        known = _LEAST <= radius <= 1 / _LEAST
+        self.require(known, f"SPS {self.special} of NRADIUS {radius:g}", self.kind_line)
+        terms: dict[Any, float] = {}
+        for k, value in found.items():
+            if form == "qbfs":
+                terms[k] = value * unit
+            elif form == "zernike":  # fringe polynomials, which are 1 at the rim
+                number, rim = noll_of_fringe(k + 1)
+                terms[number] = value * unit / rim
+            elif form == "odd_asphere":
+                terms[k + 1] = value / radius ** (k + 1) * unit**-k
+            else:
+                i, j = powers_xy(count)[k]
+                terms[f"x{i}y{j}"] = value / radius ** (i + j) * unit ** (1 - i - j)
+        more = {"norm_radius": radius * unit} if form in ("qbfs", "zernike") else {}
+        self.shape(form, terms, self.kind_line, more)
 
-    def radius(self, record: Record, default: float = 0.0) -> float:
-        """The norm radius of the coefficients, in units of the file."""
-        value = self.term("NRADIUS") or default
-        if not _LEAST <= value <= 1 / _LEAST:
-            raise record.error(
-                self.kind_line, f"{self.row.name}: SPS {self.special} of NRADIUS {value:g}"
-            )
-        return value
-
-    def diffraction(self, record: Record, unit: float) -> None:
+    def diffraction(self) -> None:
         """Write gratings and radial phases as entries of a prescription."""
         if not self.phase:
             return
         line, kind = self.phase.get("DIF", (next(iter(self.phase.values()))[0], ""))
         value = {key: own for key, (_, own) in self.phase.items()}
+        terms: dict[Any, float]
         if kind == "GRT":
-            if value.get("GRX") or value.get("GRZ"):
-                raise record.error(line, f"{self.row.name}: a grating whose lines are not along x")
-            spacing, order = value.get("GRS", 0.0), value.get("GRO", 1.0)
-            if not spacing:
-                raise record.error(line, f"{self.row.name}: a grating without a spacing, GRS")
-            terms: dict[object, float] = {"y": 1 / (float(spacing) * unit)}
-            form = "linear"
+            along = not (value.get("GRX") or value.get("GRZ"))
+            self.require(along, "a grating whose lines are not along x", line)
+            self.require(value.get("GRS"), "a grating without a spacing, GRS", line)
+            form, order = "linear", value.get("GRO", 1.0)
+            terms = {"y": 1 / (value["GRS"] * self.unit)}
         elif kind == "DOE" and value.get("HCT") == "R":
-            wave = float(value.get("HWL", 0.0)) * 1e-6  # mm
-            if wave <= 0:
-                raise record.error(line, f"{self.row.name}: a phase without a wavelength, HWL")
-            order, form = value.get("HOR", 1.0), "asphere"
+            wave = value.get("HWL", 0.0) * 1e-6  # mm
+            self.require(wave > 0, "a phase without a wavelength, HWL", line)
             found = {2 * int(k[1:]): v for k, v in value.items() if k[0] == "C"}
-            terms = {p: float(v) * unit ** (1 - p) / wave for p, v in found.items() if v}
+            form, order = "asphere", value.get("HOR", 1.0)
+            terms = {p: v * self.unit ** (1 - p) / wave for p, v in found.items() if v}
         else:
             what = f"DIF {kind} with HCT {value.get('HCT', '')}".removesuffix(" with HCT ")
-            raise record.error(line, f"{self.row.name}: {short(what)}; known: GRT, DOE with HCT R")
+            what = f"{self.name}: {short(what)}; known: GRT, DOE with HCT R"
+            raise self.record.error(line, what)
         if terms and order:
-            phase = {"form": form, "order": order, "coefficients": terms}
-            self.row.put("phase", phase, line)
+            self.put("phase", {"form": form, "order": order, "coefficients": terms}, line)
 
 
-def _odd(surface: Surface, record: Record, unit: float) -> None:
-    found = surface._special(record, 2, 30, "C1", "C33")
-    surface.terms.setdefault("NRADIUS", surface.terms.get("C33", (0, 0.0)))
-    radius = surface.radius(record, 1.0)
-    terms = {k + 1: v / radius ** (k + 1) * unit**-k for k, v in found.items()}
-    surface.row.put("form", "odd_asphere", surface.kind_line)
-    surface.row.put("coefficients", terms, surface.kind_line)
+def value_of(command: Command) -> float | None:
+    """The value of a command; None for a solve, whose value is given elsewhere."""
+    words = command.values
+    if words and words[0][:3].upper() in SOLVES:
+        command.record.solves.append(command.line)
+        return None
+    what = f"{command.key}: what is {short(' '.join(words[1:]))} behind its value?"
+    command.require(len(words) < 2, what)
+    return command.number()
 
 
-def _polynomial(surface: Surface, record: Record, unit: float) -> None:
-    found, radius = surface._special(record, 2, 65, "C1"), surface.radius(record, 1.0)
-    pairs = [(n - j, j) for n in range(1, 11) for j in range(n + 1)]
-    terms = {}
-    for k, value in found.items():
-        i, j = pairs[k]
-        terms[f"x{i}y{j}"] = value / radius ** (i + j) * unit ** (1 - i - j)
-    surface.row.put("form", "polynomial_xy", surface.kind_line)
-    surface.row.put("coefficients", terms, surface.kind_line)
+def curvature(surface: Surface, command: Command) -> None:
+    """Read RDY, CUY, RDX or CUX."""
+    value = value_of(command)
+    if value is None:
+        return
+    if command.key[:2] == "RD":
+        value = 1 / value if abs(value) > 1e-12 else 0.0
+    else:
+        command.require(abs(value) <= 1e9, f"a curvature of {value:g}; which unit?")
+    if command.key[2] == "X":
+        surface.curvature_x = command.line, value
+    else:
+        surface.curvature, surface.lines["curvature"] = value, command.line
 
 
-def _forbes(surface: Surface, record: Record, unit: float) -> None:
-    surface.terms.setdefault("NRADIUS", surface.terms.get("C1", (0, 0.0)))
-    found = surface._special(record, 3, 14, "C1", "C17")
-    surface.row.put("form", "qbfs", surface.kind_line)
-    surface.row.put("norm_radius", surface.radius(record) * unit, surface.kind_line)
-    surface.row.put("coefficients", {k: v * unit for k, v in found.items()}, surface.kind_line)
+def thickness(surface: Surface, command: Command) -> None:
+    """Read THI."""
+    value = value_of(command)
+    if value is not None:
+        surface.gap, surface.lines["thickness"] = value, command.line
 
 
-def _fringe(surface: Surface, record: Record, unit: float) -> None:
-    """Convert fringe polynomials, which are 1 at the rim, to ours, whose mean square is 1."""
-    surface.terms.setdefault("NRADIUS", surface.terms.get("C3", (0, 0.0)))
-    found, terms = surface._special(record, 4, 37, "C1", "C3"), dict[int, float]()
-    for k, value in found.items():
-        number, rim = noll_of_fringe(k + 1)
-        terms[number] = value * unit / rim
-    surface.row.put("form", "zernike", surface.kind_line)
-    surface.row.put("norm_radius", surface.radius(record) * unit, surface.kind_line)
-    surface.row.put("coefficients", terms, surface.kind_line)
+def glass(surface: Surface, command: Command) -> None:
+    """Read a glass, AIR, REFL or REFR; REFR may also follow a glass."""
+    modes = [word.upper()[:4] for word in command.values if word.upper()[:4] in ("REFL", "REFR")]
+    names = [word for word in command.values if word.upper()[:4] not in ("REFL", "REFR")]
+    what = f"{command.key} {short(' '.join(command.values))}: expected one glass, REFL or REFR"
+    command.require(len(names) <= (command.key != "RMD") and len(modes) < 2, what)
+    command.require(not names or "REFL" not in modes, "a glass and a mirror: give one of them")
+    if modes or names:
+        surface.entry.pop("mirror", None)
+    if names or "REFL" in modes:
+        surface.glass = command.line, names[0] if names else ""
+    if "REFL" in modes:
+        surface.put("mirror", True, command.line)
 
 
-_SPECIAL: dict[str, tuple[str, Callable[[Surface, Record, float], None]]] = {
-    "ODD": ("C1", _odd),  # the key of the conic, the reader of the others
-    "XYP": ("C1", _polynomial),
-    "QBF": ("C17", _forbes),
-    "ZFR": ("C1", _fringe),
+def _kind(surface: Surface, command: Command) -> None:
+    """Read a kind of surface."""
+    surface.kind, surface.kind_line, surface.special = command.key, command.line, ""
+    if command.key != "SPS":
+        return
+    surface.special = short(command.values[0]).upper() if command.values else ""
+    what = f"SPS {surface.special} is not read; known: {', '.join(_SPECIAL)}"
+    surface.require(surface.special in _SPECIAL, what, command.line)
+    if len(command.values) > 1:
+        surface.terms["NRADIUS"] = command.line, command.bounded(1)
+
+
+def _coefficient(surface: Surface, command: Command) -> None:
+    """Read a coefficient; SCO: C5, NRADIUS, or the names K and AR5."""
+    number, name, own = command.of("C"), command.key, command
+    if name == "SCO":
+        named = not number and bool(command.values)
+        own = dataclasses.replace(command, values=command.values[named:])
+        name = f"C{number[0]}" if number else (command.values[0].upper() if named else "")
+        if name == "K" and surface.special in _SPECIAL:
+            name = f"C{_SPECIAL[surface.special][1]}"
+        if name[:2] == "AR" and name[2:].isdecimal() and surface.special == "ODD" and len(name) < 5:
+            name = f"C{int(name[2:]) + 1}"
+        numbered = name[1:].isdecimal() and name[0] == "C" and len(name) < 4 and name != "C0"
+        what = f"SCO {short(name)}: expected C1 to C{_SPECIAL_TERMS}"
+        command.require(numbered or name == "NRADIUS", what)
+    surface.terms[name] = command.line, own.number()
+
+
+def _diffract(surface: Surface, command: Command) -> None:
+    """Read a command of a grating."""
+    words, line, number, key = command.values, command.line, command.of("C"), command.key
+    if key in ("DIF", "HCT"):
+        surface.phase[key] = line, short(words[0]).upper() if words else ""
+        return
+    numbered = (number is None) != (key == "HCO")
+    command.require(numbered, "HCO: expected HCO C1 and a number")
+    if number:
+        key = f"C{number[0]}"
+        known = number[0].isdecimal() and 1 <= int(number[0]) <= 100
+        command.require(known, f"HCO {key}: expected C1 to C100")
+    surface.phase[key] = line, command.number()
+
+
+def move(surface: Surface, command: Command) -> None:
+    """Read one of `MOVES`, DAR, BEN, REV or RET; the reader sets the target of RET."""
+    surface.move_line = command.line
+    if command.key in MOVES:
+        surface.moves[command.key] = command.bounded()
+        return
+    known = surface.turn in ("", command.key)
+    command.require(known, f"both {surface.turn} and {command.key}")
+    surface.turn = command.key
+
+
+def _clip(surface: Surface, command: Command) -> None:
+    """Read a size of an aperture."""
+    own = surface.clips.setdefault((command.use or "CLR", command.label), {})
+    command.require(len(surface.clips) <= _MOST, f"more than {_MOST} apertures of a surface")
+    own[command.key] = command.line, command.bounded()
+
+
+ON_SURFACES: dict[str, Callable[[Surface, Command], None]] = {
+    **dict.fromkeys(("RDY", "CUY", "RDX", "CUX"), curvature),
+    **{"THI": thickness, "GLA": glass, "RMD": glass},
+    **dict.fromkeys(_KINDS, _kind),
+    **dict.fromkeys((*_COEFFICIENTS, "SCO"), _coefficient),
+    **dict.fromkeys((*SIZES["C"], *SIZES["R"], *SIZES["E"], "ADX", "ADY", "ARO"), _clip),
+    **dict.fromkeys((*MOVES, "DAR", "BEN", "REV"), move),
+    **dict.fromkeys(("DIF", "HOR", "HWL", "HCT", "HCO"), _diffract),
+    **dict.fromkeys(("GRO", "GRS", "GRX", "GRY", "GRZ"), _diffract),
 }
-
-
-def special_key(surface: Surface, record: Record, command: Command) -> str:
-    """The key of a coefficient of SCO, as C5 or NRADIUS; the names K and AR5 are converted."""
-    number = command.of("C")
-    name = f"C{number[0]}" if number else (command.values.pop(0).upper() if command.values else "")
-    if name == "K" and surface.special in _SPECIAL:
-        name = _SPECIAL[surface.special][0]
-    if name[:2] == "AR" and name[2:].isdecimal() and surface.special == "ODD" and len(name) < 5:
-        name = f"C{int(name[2:]) + 1}"
-    known = name == "NRADIUS" or (name[1:].isdecimal() and name[0] == "C" and len(name) < 4)
-    if not known or name == "C0":
-        raise record.error(command.line, f"SCO {short(name)}: expected C1 to C{_SPECIAL_TERMS}")
-    return name

@@ -1,23 +1,24 @@
 """Parsing of CODE V `.seq` files: commands with their qualifiers and values."""
 
+import dataclasses
 import re
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from ..inputs import InputError, one_line
+from .record import LONGEST, Record, Words
 
-_LONGEST = 4000  # characters of a line
 _WIDEST = 100_000  # characters of a command over several lines
-_SURFACE_KEY = re.compile(r"S(\d{1,6}|O|I)?", re.IGNORECASE)
+SURFACE = re.compile(r"S(\d{1,6}|O|I)?")
 _QUALIFIER = re.compile(r"([SZFWC])(\d{1,6}|[OISK])(\.\.(?:\d{1,6}|[OISK]))?", re.IGNORECASE)
 _LABEL = re.compile(r"L(['\"].*)", re.IGNORECASE | re.DOTALL)
 # Letters of qualifiers beside S and Z, by key; with other keys, F2 is a glass.
-_OTHERS = (
-    (re.compile("[XY](AN|OB|IM|RI)|V[UL][XY]|WTF"), "F"),
-    (re.compile("WL|WTW"), "W"),
-    (re.compile("SCO|HCO"), "C"),
-)
-USES = ("CLR", "EDG", "OBS", "HOL")
+_OTHERS = {
+    "F": re.compile("[XY](AN|OB|IM|RI)|V[UL][XY]|WTF"),
+    "W": re.compile("WL|WTW"),
+    "C": re.compile("SCO|HCO"),
+}
+_USES = ("CLR", "EDG", "OBS", "HOL")
+_PIECE = re.compile(r"""'[^']*'|"[^"]*"|[^'";!]+|.""", re.DOTALL)
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")
 
 # Ignored: names, drawing, variables, tolerances, ray aiming, analyses. None changes rays.
@@ -41,18 +42,16 @@ REFUSED = frozenset(
 )
 
 
-class Command(NamedTuple):
+@dataclasses.dataclass
+class Command(Words):
     """A command. line: where it begins. key: its first three letters; `S` and its suffix for a
-    surface; the whole word if it is quoted. qualifiers: letter, first and last as in the file.
-    label, use: of an aperture, "" for none. values: the words that follow."""
+    surface; the whole word if it is quoted. values: the words behind its qualifiers, each a letter,
+    first and last as in the file. label, use: of an aperture, "" for none."""
 
-    line: int
-    key: str
-    quoted: bool
-    qualifiers: tuple[tuple[str, str, str], ...]
-    label: str
-    use: str
-    values: list[str]
+    quoted: bool = False
+    qualifiers: list[tuple[str, str, str]] = dataclasses.field(default_factory=list)
+    label: str = ""
+    use: str = ""
 
     def of(self, letter: str) -> tuple[str, str] | None:
         """First and last of a qualifier such as S3 or S3..5; None if it is not given."""
@@ -61,24 +60,15 @@ class Command(NamedTuple):
 
 def _cut(text: str) -> tuple[list[str], bool]:
     """Split a line at `;` up to `!`, outside quotes; also return whether `&` continues it."""
-    if "'" not in text and '"' not in text:
-        text = text.partition("!")[0].rstrip()
-        more = text.endswith("&")
-        return text.removesuffix("&").split(";"), more
-    last, quote, start = {q: text.rfind(q) for q in "'\""}, "", 0
-    parts, end = [], len(text)
-    for i, letter in enumerate(text):
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "'\"":
-            quote = letter if last[letter] > i else ""
-        elif letter == ";":
-            parts.append(text[start:i])
-            start = i + 1
-        elif letter == "!":
-            end = i
+    parts = [""]
+    for piece in _PIECE.findall(text):
+        if piece == "!":
             break
-    rest = text[start:end].rstrip()
+        if piece == ";":
+            parts.append("")
+        else:
+            parts[-1] += piece
+    rest = parts.pop().rstrip()
     return [*parts, rest.removesuffix("&")], rest.endswith("&")
 
 
@@ -86,8 +76,8 @@ def _parts(lines: list[str]) -> Iterator[tuple[int, str]]:
     """The line number and the text of each command."""
     begun, waiting = 0, ""
     for i, text in enumerate(lines):
-        if len(text) > _LONGEST:
-            raise InputError(f"line {i + 1}: {len(text)} characters are more than {_LONGEST}")
+        if len(text) > LONGEST:
+            raise InputError(f"line {i + 1}: {len(text)} characters are more than {LONGEST}")
         (first, *others), more = _cut(text)
         parts = [(begun or i + 1, waiting + first), *((i + 1, other) for other in others)]
         begun, waiting = parts.pop() if more else (0, "")
@@ -103,7 +93,7 @@ def _bare(word: str) -> str:
     return word[1:-1] if len(word) > 1 and word[0] in "'\"" and word[-1] == word[0] else word
 
 
-def commands_of(lines: list[str]) -> Iterator[Command]:
+def commands_of(record: Record, lines: list[str]) -> Iterator[Command]:
     """The commands of a file in order. InputError if a line is too long."""
     for line, text in _parts(lines):
         words = _WORD.findall(text)
@@ -112,24 +102,27 @@ def commands_of(lines: list[str]) -> Iterator[Command]:
         first, quoted = _bare(words[0]), words[0][0] in "'\""
         if not quoted:
             first = one_line(first.upper())
-            first = first if _SURFACE_KEY.fullmatch(first) else first[:3]
-        yield command_of(line, first, quoted, words[1:])
+            first = first if SURFACE.fullmatch(first) else first[:3]
+        yield command_of(record, line, first, words[1:], quoted)
 
 
-def command_of(line: int, key: str, quoted: bool, words: list[str]) -> Command:
+def command_of(
+    record: Record, line: int, key: str, words: list[str], quoted: bool = False
+) -> Command:
     """Make a command from its key and the words that follow it."""
-    qualifiers, label, use, rest = list[tuple[str, str, str]](), "", "", len(words)
-    letters = "SZ" + "".join(more for known, more in _OTHERS if known.fullmatch(key))
+    command = Command(record, line, key, [], quoted=quoted)
+    letters = "SZ" + "".join(more for more, known in _OTHERS.items() if known.fullmatch(key))
     for at, word in enumerate(words):
         found, named = _QUALIFIER.fullmatch(word), _LABEL.fullmatch(word)
         if found and found[1].upper() in letters:
             first = found[2].upper()
-            qualifiers.append((found[1].upper(), first, (found[3] or first).strip(".").upper()))
+            last = (found[3] or first).strip(".").upper()
+            command.qualifiers.append((found[1].upper(), first, last))
         elif named:
-            label = _bare(named[1])
-        elif word.upper() in USES:
-            use = word.upper()
+            command.label = _bare(named[1])
+        elif word.upper() in _USES:
+            command.use = word.upper()
         else:
-            rest = at
+            command.values = [*map(_bare, words[at:])]
             break
-    return Command(line, key, quoted, tuple(qualifiers), label, use, [*map(_bare, words[rest:])])
+    return command

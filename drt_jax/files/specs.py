@@ -1,31 +1,51 @@
 """Build a lens from a prescription, a mapping; its entries are checked before any tracing."""
 
 import dataclasses
+import itertools
 import math
 import warnings
+from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import Array
 
 from ..inputs import shown
+from ..lens.elements import Elements
 from ..lens.entrance import with_paraxial_pupil
 from ..lens.forms import FORMS
-from ..lens.glass import Dispersion
+from ..lens.glass import POWERS, VISIBLE, Dispersion, Glass, model_glass
+from ..lens.glasses import find_glass, flaw
 from ..lens.lens import Labels, Lens
-from ..lens.paraxial import first_order, focal_length
+from ..lens.order import crossings, heights, neighbours
+from ..lens.paraxial import (
+    first_order,
+    focal_length,
+    marginal_ray,
+    paraxial_system,
+)
 from ..lens.phase import Phase
 from .apertures import apertures_of, semi_diameter
-from .elements import elements_of
 from .entry import STEEP, WIDE, Entry, LensError, array, table
-from .media import MEDIUM_KEYS, media_of
-from .order import check_order
 
 _D_LINE = 0.5875618  # um
 _MOST = 5000  # surfaces
+_MOST_ELEMENTS = 500
+_DENSEST = 10  # index
+MEDIUM_KEYS = ("glass", "index", "nd", "vd", "partial")
 _FOCUS = "focus"  # value of `sensor`
 _TOP_KEYS = (
     *("name", "source", "focal_length", "glasses", "object", "surfaces", "elements"),
     *("sensor", "sensor_tilt", "sensor_decentre", "afocal", "pupil"),
 )
+_ELEMENT_KEYS = ("surfaces", "about", "pivot", "shift", "tilt")
+# Prescriptions round semi-diameters: neighbours may cross beyond this fraction of the smaller
+# semi-diameter.
+_RIM = 0.9
+# Between vertices closer than this (mm), rounding errors hide the direction of a ray.
+CLOSEST = 1e-6
+TOUCHING = CLOSEST - 1e-9  # sums of thicknesses are rounded
 _SURFACE_KEYS = (
     *("form", "radius", "curvature", "conic", "radius_x", "curvature_x", "conic_x"),
     *("norm_radius", "coefficients", "thickness", *MEDIUM_KEYS, "mirror", "semi_diameter", "stop"),
@@ -35,8 +55,8 @@ _SURFACE_KEYS = (
 
 def _form(entry: Entry) -> str:
     form = entry.text("form", "asphere")
-    if form not in FORMS:
-        raise entry.error("form", f"unknown form {shown(form)}; known: {', '.join(FORMS)}")
+    known = form in FORMS
+    entry.require(known, "form", f"unknown form {shown(form)}; known: {', '.join(FORMS)}")
     return form
 
 
@@ -45,9 +65,15 @@ def _coefficients(surface: Entry) -> list[float]:
     form = _form(surface)
     first, powers = FORMS[form].named, FORMS[form].powers
     for key in ("radius_x", "curvature_x", "conic_x", "norm_radius"):
-        if key in surface and key.replace("radius_x", "curvature_x") not in first:
-            raise surface.error(key, f"a surface of the form {form} has none")
-    given = Entry(_numbered(surface), surface.name("coefficients"), powers)
+        known = key.replace("radius_x", "curvature_x") in first
+        surface.require(known or key not in surface, key, f"a surface of the form {form} has none")
+    values = surface.get("coefficients", {})
+    if isinstance(values, dict):  # a power may be given as text, as in JSON
+        keys = [int(k) if isinstance(k, str) and k.isdecimal() else k for k in values]
+        what = "one of them is given twice, as a number and as text"
+        surface.require(len({*keys}) == len(keys), "coefficients", what)
+        values = dict(zip(keys, values.values(), strict=True))
+    given = Entry(values, surface.name("coefficients"), powers)
     columns = {len(first) + powers.index(power): given.number(power, most=WIDE) for power in given}
     if "curvature_x" in first:
         columns[0] = surface.curvature("_x")
@@ -55,20 +81,8 @@ def _coefficients(surface: Entry) -> list[float]:
         columns[1] = surface.number("conic_x", 0.0, most=STEEP)
     if "norm_radius" in first:
         columns[0] = surface.number("norm_radius")
-        if columns[0] <= 0:
-            raise surface.error("norm_radius", "must be positive")
+        surface.require(columns[0] > 0, "norm_radius", "must be positive")
     return [columns.get(k, 0.0) for k in range(max(columns, default=-1) + 1)]
-
-
-def _numbered(surface: Entry) -> object:
-    """The entry `coefficients`; a power may be given as text, as in JSON."""
-    given = surface.get("coefficients", {})
-    if not isinstance(given, dict):
-        return given
-    keys = [int(key) if isinstance(key, str) and key.isdecimal() else key for key in given]
-    if len({*keys}) < len(keys):
-        raise surface.error("coefficients", "one of them is given twice, as a number and as text")
-    return dict(zip(keys, given.values(), strict=True))
 
 
 def _phase(surfaces: list[Entry]) -> Phase | None:
@@ -78,14 +92,11 @@ def _phase(surfaces: list[Entry]) -> Phase | None:
     given = [Entry(s["phase"], s.name("phase"), keys) for s in at.values()]
     if not given:
         return None
+    known = [name for name, form in FORMS.items() if form.round]
     for entry in given:
-        known = [name for name, form in FORMS.items() if form.round]
-        if _form(entry) not in known:
-            raise entry.error("form", f"expected one of {', '.join(known)}")
-        if not entry.get("coefficients"):
-            raise entry.error("coefficients", "give at least one, in waves")
-        if entry.number("order", 1.0) % 1:
-            raise entry.error("order", "must be a whole number")
+        entry.require(_form(entry) in known, "form", f"expected one of {', '.join(known)}")
+        entry.require(entry.get("coefficients"), "coefficients", "give at least one, in waves")
+        entry.require(entry.number("order", 1.0) % 1 == 0, "order", "must be a whole number")
     rows = [*map(_coefficients, given)]
     return Phase(
         coefficients=table(rows, max(map(len, rows))),
@@ -95,30 +106,138 @@ def _phase(surfaces: list[Entry]) -> Phase | None:
     )
 
 
+def _elements(top: Entry, count: int) -> Elements | None:
+    """The elements of a lens of `count` surfaces; None if there are none."""
+    listed = top.get("elements", [])
+    top.require(isinstance(listed, list), "elements", "expected a list")
+    many = len(listed)
+    top.require(many <= _MOST_ELEMENTS, "elements", f"{many} are more than {_MOST_ELEMENTS}")
+    entries = [Entry(entry, f"elements[{g}]", _ELEMENT_KEYS) for g, entry in enumerate(listed)]
+    # Outer elements precede the elements inside them.
+    found = sorted(
+        ((_span(entry, count), entry) for entry in entries),
+        key=lambda own: (own[0][0], -own[0][1]),
+    )
+    if not found:
+        return None
+    for ((_, last), one), ((first, end), two) in itertools.combinations(found, 2):
+        cuts = f"cuts into {one.place}: put one inside the other, or apart"
+        two.require(not first <= last < end, "surfaces", cuts)
+    spans, groups = zip(*found, strict=True)
+    return Elements(
+        shift=array([entry.vector("shift", 3) or [0.0] * 3 for entry in groups]),
+        tilt=jnp.radians(array([entry.vector("tilt", 3) or [0.0] * 3 for entry in groups])),
+        pivot=array([entry.number("pivot", 0.0) for entry in groups]),
+        spans=spans,
+        about=tuple(
+            _row(entry, "about", entry.get("about", first), count) for (first, _), entry in found
+        ),
+    )
+
+
+def _span(entry: Entry, count: int) -> tuple[int, int]:
+    """The first and the last surface of an element."""
+    given = entry.get("surfaces")
+    wrong = entry.error("surfaces", f"expected [first, last], got {shown(given)}")
+    if not isinstance(given, list | tuple) or len(given) != 2:
+        raise wrong
+    first, last = (_row(entry, "surfaces", end, count) for end in given)
+    if first > last:
+        raise wrong
+    return first, last
+
+
+def _row(entry: Entry, key: str, value: object, count: int) -> int:
+    """The index of a surface; `count` for the sensor."""
+    row = count if value == "sensor" else value
+    if type(row) is not int or not 0 <= row <= count:
+        what = f"expected a surface, 0 to {count - 1}, or sensor; got {shown(value)}"
+        raise entry.error(key, what)
+    return row
+
+
+def _own_glass(name: str, entry: Entry) -> Glass:
+    given = [key for key in ("sellmeier", "schott") if key in entry]
+    entry.require(given, "", "give sellmeier, schott or both")
+    terms = entry.get("sellmeier", [0.0, 0.0])
+    if not isinstance(terms, list) or not terms or len(terms) % 2:
+        raise entry.error("sellmeier", f"expected a list, all B and then all C, got {shown(terms)}")
+    powers = entry.get("schott", [])
+    more = isinstance(powers, list) and 6 < len(powers) <= len(POWERS)
+    lengths = {"sellmeier": len(terms), "schott": len(powers) if more else 6}
+    constants: dict[str, Any] = {key: tuple(entry.vector(key, lengths[key])) for key in given}
+    low, high = entry.vector("range", 2) or VISIBLE
+    what = f"expected 0 < shortest < longest, got {low:g} and {high:g} um"
+    entry.require(0 < low < high, "range", what)
+    glass = Glass(name, range=(low, high), **constants)
+    if wrong := flaw(glass):
+        raise entry.error("sellmeier" if "lies" in wrong else "", wrong)
+    return glass
+
+
+def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
+    given = [key for key in ("glass", "index", "nd") if key in entry]
+    entry.require(len(given) < 2, "", f"give either {' or '.join(given)}, not both")
+    both = ("nd" in entry) == ("vd" in entry)
+    entry.require(both, "", "nd and vd make a model glass together: give both or neither")
+    if "nd" in entry:
+        values = entry.number("nd"), entry.number("vd"), entry.number("partial", 0.0)
+        return _model_glass(entry, "nd", *values)
+    what = "belongs to a model glass: give nd and vd as well"
+    entry.require("partial" not in entry, "partial", what)
+    if "index" in entry:
+        value = entry.number("index")
+        what = f"{value:g} is not between 1 and {_DENSEST}"
+        entry.require(1 <= value <= _DENSEST, "index", what)
+        if value == 1:  # the same medium as air: a surface between the two refracts nothing
+            return find_glass("air")
+        return Glass(f"index {value!r}", schott=(value**2, 0.0, 0.0, 0.0, 0.0, 0.0))
+    if "glass" not in entry:
+        return find_glass("air")
+    name = entry.text("glass", "air")
+    if name in own:
+        return own[name]
+    if len(name) == 6 and name.isdecimal():  # a glass code: 1000 (nd - 1), then 10 vd
+        return _model_glass(entry, "glass", 1 + int(name[:3]) / 1000, int(name[3:]) / 10)
+    try:
+        return find_glass(name)
+    except ValueError as error:
+        raise entry.error("glass", str(error)) from error
+
+
+def _model_glass(entry: Entry, key: str, *values: float) -> Glass:
+    try:
+        return model_glass(*values)
+    except ValueError as error:
+        raise entry.error(key, str(error)) from error
+
+
+def _media(top: Entry, surfaces: list[Entry]) -> list[Glass]:
+    """The medium in front of the lens, then the medium behind each surface."""
+    names, keys = top.get("glasses", {}), ("sellmeier", "schott", "range")
+    entries = Entry(names, "glasses", list(names) if isinstance(names, dict) else ["NAME"])
+    each = {str(name): Entry(values, entries.name(name), keys) for name, values in entries.items()}
+    own = {name: _own_glass(name, entry) for name, entry in each.items()}
+    media = [_medium(Entry(top.get("object", {}), "object", MEDIUM_KEYS), own)]
+    for surface in surfaces:
+        mirror = surface.flag("mirror")
+        for key in MEDIUM_KEYS:
+            known = not mirror or key not in surface
+            surface.require(known, key, "behind a mirror is the medium before it")
+        media.append(media[-1] if mirror else _medium(surface, own))
+    return media
+
+
 def _gaps(top: Entry, surfaces: list[Entry]) -> list[float]:
     """Distances from each surface to the next and from the last to the sensor, mm."""
     gaps = [surface.number("thickness") for surface in surfaces[:-1]]
     if ("sensor" in top) == ("thickness" in surfaces[-1]):
-        raise LensError(
-            "give either sensor (mm from the first vertex, or focus) or the last surface's "
-            "thickness (its distance to the sensor)",
-            "sensor",
-        )
+        what = "give either sensor (mm from the first vertex, or focus) or the last surface's "
+        raise LensError(f"{what}thickness (its distance to the sensor)", "sensor")
     if top.get("sensor") == _FOCUS:
-        return [*gaps, 0.0]  # a placeholder, see `_focused`
+        return [*gaps, 0.0]  # a placeholder until the lens is built
     end = top.number("sensor") - sum(gaps) if "sensor" in top else surfaces[-1].number("thickness")
     return [*gaps, end]
-
-
-def _focused(lens: Lens, wavelength: float) -> Lens:
-    """The lens with its sensor at the paraxial focus for an object at infinity."""
-    place = first_order(lens, math.inf, wavelength).image_distance[0]
-    if not math.isfinite(float(place)):
-        raise LensError(
-            "sensor: focus: there is none, light leaves parallel; give mm and afocal: true",
-            "sensor",
-        )
-    return dataclasses.replace(lens, sensor=place)
 
 
 def build_lens(values: object, name: str = "lens") -> Lens:
@@ -135,19 +254,17 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     entries = top.get("surfaces")
     if not isinstance(entries, list) or not entries:
         raise LensError("surfaces: expected a list of at least one surface", "surfaces")
-    if len(entries) > _MOST:
-        raise LensError(f"surfaces: {len(entries)} are more than {_MOST}", "surfaces")
+    top.require(len(entries) <= _MOST, "surfaces", f"{len(entries)} are more than {_MOST}")
     surfaces = [Entry(e, f"surfaces[{i}]", _SURFACE_KEYS) for i, e in enumerate(entries)]
     stops = [i for i, surface in enumerate(surfaces) if surface.flag("stop")]
-    if len(stops) != 1:
-        raise LensError(f"surfaces: {len(stops)} have stop: true, exactly one must", "surfaces")
+    top.require(len(stops) == 1, "surfaces", f"{len(stops)} have stop: true, exactly one must")
     # The last row of each list is that of the sensor.
     coefficients = [*map(_coefficients, surfaces), []]
     decentre = [*(s.vector("decentre", 2) for s in surfaces), top.vector("sensor_decentre", 2)]
     tilt = [*(s.vector("tilt", 3) for s in surfaces), top.vector("sensor_tilt", 3)]
     moved = any(decentre) or any(tilt)
-    media, gaps = media_of(top, surfaces), _gaps(top, surfaces)
-    groups, focused = elements_of(top, len(surfaces)), top.get("sensor") == _FOCUS
+    media, gaps = _media(top, surfaces), _gaps(top, surfaces)
+    groups, focused = _elements(top, len(surfaces)), top.get("sensor") == _FOCUS
     lens = Lens(
         curvature=array([*(surface.curvature() for surface in surfaces), 0.0]),
         conic=array([*(surface.number("conic", 0.0, most=STEEP) for surface in surfaces), 0.0]),
@@ -172,21 +289,19 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     lens = dataclasses.replace(lens, curved=curved)
     low, high = lens.dispersion.range
     line = _D_LINE if low <= _D_LINE <= high else (low + high) / 2
-    if focused:
-        lens = _focused(lens, line)
+    if focused:  # for an object at infinity
+        place = first_order(lens, math.inf, line).image_distance[0]
+        what = "focus: there is none, light leaves parallel; give mm and afocal: true"
+        top.require(math.isfinite(float(place)), "sensor", what)
+        lens = dataclasses.replace(lens, sensor=place)
         gaps[-1] = float(lens.sensor) - sum(gaps[:-1])
-    check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)], line)
+    _check_order(lens, gaps, [any(d) or any(t) for d, t in zip(decentre, tilt)], line)
     if "focal_length" in top:
         _check_focal_length(lens, top.number("focal_length"), line)
-    return _with_pupil(top, lens, line)
-
-
-def _with_pupil(top: Entry, lens: Lens, wavelength: float) -> Lens:
-    """The lens with the pupil that the prescription asks for: `stop` or `paraxial`."""
     pupil = top.text("pupil", "stop")
-    if pupil not in ("stop", "paraxial"):
-        raise top.error("pupil", f"expected stop or paraxial, got {shown(pupil)}")
-    return with_paraxial_pupil(lens, wavelength) if pupil == "paraxial" else lens
+    known = pupil in ("stop", "paraxial")
+    top.require(known, "pupil", f"expected stop or paraxial, got {shown(pupil)}")
+    return with_paraxial_pupil(lens, line) if pupil == "paraxial" else lens
 
 
 def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:
@@ -199,3 +314,58 @@ def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:
             "look for a wrong sign, unit or glass",
             stacklevel=4,
         )
+
+
+@jax.jit
+def _paraxial_beam(lens: Lens, wave: Array) -> Array:
+    """Radius of the paraxial beam on each surface, from an object at infinity, mm."""
+    return jnp.abs(marginal_ray(paraxial_system(lens, wave), jnp.zeros_like(wave)).height[:, 0])
+
+
+def _check_order(lens: Lens, gaps: list[float], moved: list[bool], wave: float) -> None:
+    """LensError if light would go backwards, or if neighbours overlap within both their apertures
+    and within the beam of the axis. If they overlap only outside of it, or near the rim, a warning:
+    light goes backwards there and is lost. A warning, too, for a sensor in front of the last
+    surface, where the image is virtual.
+
+    gaps, moved: see `lens.order.neighbours`, which returns the neighbours.
+    wave: wavelength of the beam, um.
+    """
+    pairs = neighbours(lens, gaps, moved)
+    for i, j, gap in pairs:
+        if gap >= TOUCHING or (j == lens.count and i not in lens.active):
+            continue
+        key, forwards = f"surfaces[{i}].thickness", lens.senses[i + 1] > 0
+        turned = "" if forwards else ", as a mirror has turned the light"
+        if j < lens.count:
+            reach = "" if j == i + 1 else f" up to surface {j}, in sum"
+            least = f"{'positive' if forwards else 'negative'}{turned}, at least {CLOSEST} mm"
+            remedy = "leave out one of two surfaces that touch"
+            raise LensError(f"{key}{reach}: must be {least}; {remedy}", key)
+        sensor = f"sensor: {float(lens.sensor):g} mm"
+        vertex = f"the vertex of surface {i} at {float(lens.vertices[i]):g} mm"
+        if gap > -CLOSEST:
+            raise LensError(f"{sensor} touches {vertex}; move it by {CLOSEST} mm", "sensor")
+        virtual = "rays are prolonged backwards to a virtual image"
+        warnings.warn(f"{sensor} lies before {vertex}{turned}: {virtual}", stacklevel=2)
+    semi = np.asarray(lens.semi_diameter)
+    rows = zip(pairs, heights(lens, pairs)[1], crossings(lens, pairs), strict=True)
+    for (i, j, gap), sags, place in rows:
+        rim = min(semi[i], semi[j])
+        if j == lens.count or np.isinf(rim):
+            continue
+        for k, sag in zip((i, j), sags, strict=True):
+            if not np.all(np.isfinite(sag)):
+                what = f"surfaces[{k}]: not finite within {rim:g} mm of the axis; which unit?"
+                raise LensError(what, f"surfaces[{k}]")
+        if place is None:
+            continue
+        message = (
+            f"surfaces[{i}].thickness: {lens.senses[i + 1] * gap:g} mm makes surfaces {i} and {j} "
+            f"cross at {place:.3g} mm from the axis, within their semi-diameters of "
+            f"{semi[i]:g} and {semi[j]:g} mm; raise the thickness or lower a semi-diameter"
+        )
+        beam = np.asarray(_paraxial_beam(lens, jnp.asarray(wave, lens.curvature.dtype)))
+        if place < min(_RIM * rim, max(beam[i], beam[j])):
+            raise LensError(message, f"surfaces[{i}].thickness")
+        warnings.warn(f"{message}; light that comes there is lost", stacklevel=4)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -63,72 +63,61 @@ def system_for(lens: Lens) -> System:
     the middle of their range."""
     low, high = lens.dispersion.range
     wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
-    none, one = np.zeros((1, 2)), np.ones(1)
-    waves = np.array([wave])
-    return System(
-        *(lens, math.inf, none, none, "angle", one, np.zeros((1, 5)), waves, one, 0, None, None)
-    )
+    use = Use(wavelengths=[wave], wavelength_weights=[1.0])
+    return System(lens, math.inf, np.zeros((1, 2)), **use.of_system())
 
 
 @dataclasses.dataclass
 class Use:
-    """The values for `System` as they are read. line: of the aperture."""
+    """The values for `System` as they are read, by the same names. stop: its size, mm, where the
+    file gives that. line, field_line, primary_line: of the aperture, the fields and the
+    wavelengths."""
 
-    line: int = 0
     aperture: float | None = None
     aperture_kind: ApertureKind | None = None
     field_kind: FieldKind = "angle"
-    field_line: int = 0
     heights: list[tuple[float, float]] = dataclasses.field(default_factory=lambda: [(0.0, 0.0)])
     field_weights: list[float] = dataclasses.field(default_factory=lambda: [1.0])
     vignetting: list[list[float]] = dataclasses.field(default_factory=lambda: [[0.0] * 5])
     wavelengths: list[float] = dataclasses.field(default_factory=list)
     wavelength_weights: list[float] = dataclasses.field(default_factory=list)
     primary: int = 0
-    primary_line: int = 0
     ray_aiming: str = ""
     stop: float | None = None
+    line: int = 0
+    field_line: int = 0
+    primary_line: int = 0
+
+    def of_system(self) -> dict[str, Any]:
+        """The fields of `System` that need no ray."""
+        own = {key: value for key, value in vars(self).items() if key in _OWN}
+        return {key: np.array(v, float) if isinstance(v, list) else v for key, v in own.items()}
+
+
+_OWN = {field.name for field in dataclasses.fields(System)}
 
 
 def lens_of(record: Record, use: Use) -> Lens:
     """The lens of a file, with its stop as wide as the aperture requires."""
-    if not use.wavelengths:
-        raise record.error(0, "no wavelength is given")
-    if not 0 <= use.primary < len(use.wavelengths):
-        many = len(use.wavelengths)
-        raise record.error(use.primary_line, f"the primary wavelength is none of the {many}")
-    direct = use.aperture_kind is None
-    if direct and not use.stop:
-        raise record.error(use.line, "the aperture is the size of the stop, which has none")
+    many, direct = len(use.wavelengths), use.aperture_kind is None
+    record.require(many, 0, "no wavelength is given")
+    what = f"the primary wavelength is none of the {many}"
+    record.require(0 <= use.primary < many, use.primary_line, what)
+    what = "the aperture is the size of the stop, which has none"
+    record.require(use.stop or not direct, use.line, what)
     lens = record.lens(use.stop if direct else None)
     try:
         lens.check_wavelengths(use.wavelengths)
     except ValueError as error:
         raise record.error(use.primary_line, str(error)) from None
-    return lens if direct else _opened(record, use, lens, use.wavelengths[use.primary])
+    return lens if direct else _opened(record, use, lens)
 
 
 def system_of(record: Record, use: Use) -> System:
     """The lens of a file and its use."""
     lens = lens_of(record, use)
-    wave = use.wavelengths[use.primary]
-    heights = np.array(use.heights, float)
-    return System(
-        lens=lens,
-        distance=record.distance,
-        fields=_angles(record, use, lens, heights, wave),
-        heights=heights,
-        field_kind=use.field_kind,
-        field_weights=np.array(use.field_weights, float),
-        vignetting=np.array(use.vignetting, float),
-        wavelengths=np.array(use.wavelengths, float),
-        wavelength_weights=np.array(use.wavelength_weights, float),
-        primary=use.primary,
-        aperture=use.aperture,
-        aperture_kind=use.aperture_kind,
-        ray_aiming=use.ray_aiming,
-        notes=tuple(record.notes),
-    )
+    fields, own = _angles(record, use, lens), use.of_system()
+    return System(lens, record.distance, fields, notes=tuple(record.notes), **own)
 
 
 @jax.jit  # compiles one program instead of hundreds of small ones
@@ -139,49 +128,44 @@ def _paraxial(lens: Lens, distance: Array, wave: Array) -> tuple[FirstOrder, Arr
     return first_order(lens, distance, wave), height, lens.index(wave)[jnp.array([0, -1])]
 
 
-def _first(record: Record, lens: Lens, wave: float) -> tuple[FirstOrder, float, list[float]]:
-    """The results of `_paraxial` for one wavelength, as numbers."""
-    found = _paraxial(lens, *map(jnp.asarray, (record.distance, wave)))
+def _first(record: Record, use: Use, lens: Lens) -> tuple[FirstOrder, float, list[float]]:
+    """The results of `_paraxial` for the primary wavelength, as numbers."""
+    found = _paraxial(lens, *map(jnp.asarray, (record.distance, use.wavelengths[use.primary])))
     first, height, index = jax.tree.map(lambda a: np.asarray(a)[..., 0], found)
     return first, float(height), index.tolist()
 
 
-def _opened(record: Record, use: Use, lens: Lens, wave: float) -> Lens:
+def _opened(record: Record, use: Use, lens: Lens) -> Lens:
     """The lens with its stop as wide as the aperture requires in paraxial optics."""
     semi, value = float(lens.semi_diameter[lens.stop]), float(use.aperture or 0)
-    first, _, (front, last) = _first(record, lens, wave)
+    first, _, (front, last) = _first(record, use, lens)
     place, radius = map(float, first.entrance_pupil)
+    focal = abs(float(first.effective_focal_length))
     far, kind = record.distance, use.aperture_kind
-    if value <= 0:
-        raise record.error(use.line, f"the aperture must be above 0, got {value:g}")
+    record.require(value > 0, use.line, f"the aperture must be above 0, got {value:g}")
     if kind == "pupil diameter":
         wide = value / 2
     elif kind == "f-number":
-        wide = abs(float(first.effective_focal_length)) / value / 2
-    elif kind == "object cone angle":  # in degrees
-        if value >= 90:
-            what = f"an object cone of {value:g} degrees from the axis"
-            raise record.error(use.line, f"{what}: light that starts backwards is not traced")
-        if math.isinf(far):
-            raise record.error(use.line, "an object cone of an object at infinity")
-        wide = abs(math.tan(math.radians(value)) * (far + place))
-    elif kind == "object NA":
-        sine = value / front
-        if not (sine < 1 and math.isfinite(far)):
-            raise record.error(use.line, f"no object at {far:g} mm has an NA of {value:g}")
-        wide = abs(math.tan(math.asin(sine)) * (far + place))
-    elif kind == "image NA" and math.isinf(far):
-        wide = abs(float(first.effective_focal_length)) * value
-    elif kind == "image NA":  # the object NA is the image NA times the magnification
-        sine = value * abs(float(first.magnification)) / front
-        if not sine < 1:
-            raise record.error(use.line, f"there is no image NA of {value:g}")
-        wide = abs(math.tan(math.asin(sine)) * (far + place))
-    else:
+        wide = focal / value / 2
+    elif kind == "working f-number":
         wide = radius / (value * last) * float(first.f_number)
+    elif kind == "image NA" and math.isinf(far):
+        wide = focal * value
+    elif kind == "object cone angle":  # in degrees
+        what = f"an object cone of {value:g} degrees from the axis"
+        what = f"{what}: light that starts backwards is not traced"
+        record.require(value < 90, use.line, what)
+        record.require(math.isfinite(far), use.line, "an object cone of an object at infinity")
+        wide = abs(math.tan(math.radians(value)) * (far + place))
+    else:  # an NA; that of the object is that of the image times the magnification
+        at_image = kind == "image NA"
+        sine = (value * abs(float(first.magnification)) if at_image else value) / front
+        where = "there is no image NA of" if at_image else f"no object at {far:g} mm has an NA of"
+        record.require(sine < 1 and math.isfinite(far), use.line, f"{where} {value:g}")
+        wide = abs(math.tan(math.asin(sine)) * (far + place))
     found = semi * wide / radius if radius else math.nan
-    if not (math.isfinite(found) and 0 < found < 1e9):
-        raise record.error(use.line, f"no stop makes {kind} {value:g}: is the lens afocal there?")
+    what = f"no stop makes {kind} {value:g}: is the lens afocal there?"
+    record.require(math.isfinite(found) and 0 < found < 1e9, use.line, what)
     if use.stop and math.isclose(found, use.stop, rel_tol=_SAME):
         lens, found = _without_rim(lens), use.stop
     return dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[lens.stop].set(found))
@@ -196,35 +180,31 @@ def _without_rim(lens: Lens) -> Lens:
     lies = zip(own.surfaces, own.kinds, own.blocks, strict=True)
     rims = [k for k, place in enumerate(lies) if place == (lens.stop, "circle", False)]
     keep = [k for k in range(len(own.surfaces)) if k not in rims[:1]]
-    if not keep:
-        return dataclasses.replace(lens, apertures=None)
-    return dataclasses.replace(lens, apertures=own.only(keep))
+    return dataclasses.replace(lens, apertures=own.only(keep) if keep else None)
 
 
-def _angles(
-    record: Record, use: Use, lens: Lens, heights: np.ndarray, wave: float
-) -> np.ndarray | None:
+def _angles(record: Record, use: Use, lens: Lens) -> np.ndarray | None:
     """The fields (F, 2), radians; None for real image heights."""
-    far, line = record.distance, use.field_line
+    far, line, heights = record.distance, use.field_line, np.array(use.heights, float)
     if use.field_kind == "angle":
         beyond = bool(np.any(np.abs(heights) >= 90))
         if math.isinf(far):
             if beyond:
-                record.notes.append(f"line {line}: fields of 90 degrees and more cannot be traced")
+                record.note(line, "fields of 90 degrees and more cannot be traced")
             return np.radians(heights)
-        if beyond:
-            raise record.error(line, "a field angle of 90 degrees and more; give object heights")
-        place = float(_first(record, lens, wave)[0].entrance_pupil.position)
-        if not math.isfinite(place):
-            raise record.error(line, "field angles at a telecentric lens; give object heights")
+        what = "a field angle of 90 degrees and more; give object heights"
+        record.require(not beyond, line, what)
+        place = float(_first(record, use, lens)[0].entrance_pupil.position)
+        what = "field angles at a telecentric lens; give object heights"
+        record.require(math.isfinite(place), line, what)
         return np.asarray(field_of_height(-np.tan(np.radians(heights)) * (far + place), far))
     if use.field_kind == "object height":
-        if math.isinf(far):
-            raise record.error(line, "object heights of an object at infinity; give angles")
+        what = "object heights of an object at infinity; give angles"
+        record.require(math.isfinite(far), line, what)
         return np.asarray(field_of_height(heights, far))
     if use.field_kind == "paraxial image height":
-        scale = _first(record, lens, wave)[1]
-        if not math.isfinite(scale) or not scale:
-            raise record.error(line, "paraxial image heights of an image at infinity; give angles")
+        scale = _first(record, use, lens)[1]
+        what = "paraxial image heights of an image at infinity; give angles"
+        record.require(math.isfinite(scale) and scale, line, what)
         return np.arctan(heights / scale)
     return None

@@ -1,29 +1,27 @@
 """Write a lens as a prescription, the inverse of `specs`."""
 
-import math
 import pathlib
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import yaml
-from jax import Array
 
-from ..lens.elements import Elements
-from ..lens.forms import FORMS
 from ..lens.glass import FRAUNHOFER
 from ..lens.lens import Lens
-from .compare import difference, use_difference
 from .entry import LensError
-from .exact import degrees_of
-from .media_out import media_of_lens
 from .system import System, system_for
 from .write_seq import seq_text
 from .write_zmx import zmx_text
+from .written import element_of, entry_of, media_of_lens, place_of, shapes_of
 from .yaml import known_ending, lens_in
 
 # How far the index of a private glass may be off at more wavelengths than it can be made for.
 _PRIVATE = 1e-6
+_KINDS = ("circle", "ellipse", "rectangle", "polygon")
+_WEIGHTED = ("heights", "field_weights", "vignetting", "wavelengths", "wavelength_weights")
+_CLOSE = 1e-9  # relative, and in mm, of what is read back; rounding of float32 is larger
 
 
 def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
@@ -67,7 +65,7 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
         raise LensError(f"{error}; not written, as it could not be read back") from error
     # A private glass of .seq stands for a model glass by six terms.
     room = _PRIVATE if kind == ".seq" and system.lens.dispersion.model is not None else 0.0
-    if found := difference(system.lens, again, known, room) or use_difference(system, used):
+    if found := _difference(system.lens, again, known, room) or _use_difference(system, used):
         raise LensError(f"{path}: not written: what is read back differs: {found}")
     try:
         pathlib.Path(path).write_text(text, encoding="utf-8")
@@ -83,87 +81,107 @@ def _yaml_text(system: System) -> str:
     media, glasses = media_of_lens(lens)
     top |= {"glasses": glasses} if glasses else {}
     top |= {"object": media[0]} if media[0] else {}
-    top["surfaces"] = [_surface(lens, i, media[i + 1]) for i in range(lens.count)]
-    if lens.elements is not None:
-        top["elements"] = [_element(lens.elements, g) for g in range(len(lens.elements.spans))]
+    top["surfaces"] = [entry_of(lens, i, media[i + 1]) for i in range(lens.count)]
+    for i, entry in enumerate(top["surfaces"]):
+        # Zeros of one surface preserve the number of columns.
+        zeros = entry["coefficients"] and i == 0 and not np.any(lens.coefficients)
+        if not zeros and not any(entry["coefficients"].values()):
+            del entry["coefficients"]
+    if (groups := lens.elements) is not None:
+        top["elements"] = [element_of(groups, g) for g in range(len(groups.spans))]
     top["sensor"] = float(lens.sensor)
     top |= {"afocal": True} if lens.afocal else {}
-    top |= {f"sensor_{key}": value for key, value in _place(lens, lens.count).items()}
+    top |= {f"sensor_{key}": value for key, value in place_of(lens, lens.count).items()}
     return yaml.safe_dump(top, sort_keys=False, default_flow_style=None, width=1000)
 
 
-def _surface(lens: Lens, i: int, behind: dict[str, Any]) -> dict[str, Any]:
-    entry: dict[str, Any] = {"curvature": float(lens.curvature[i])}
-    if lens.conic[i] != 0:
-        entry["conic"] = float(lens.conic[i])
-    if lens.forms[i] != "asphere":
-        entry["form"] = lens.forms[i]
-    named, rest = _coefficients(lens.forms[i], lens.coefficients[i])
-    entry |= named
-    # Zeros of one surface preserve the number of columns.
-    if rest and (any(rest.values()) or (i == 0 and not np.any(lens.coefficients))):
-        entry["coefficients"] = rest
-    if i < lens.count - 1:
-        entry["thickness"] = float(lens.thickness[i])
-    if lens.mirrors[i]:
-        entry["mirror"] = True
-    else:
-        entry |= behind
-    if math.isfinite(lens.semi_diameter[i]):
-        entry["semi_diameter"] = float(lens.semi_diameter[i])
-    if i == lens.stop:
-        entry["stop"] = True
-    return entry | _place(lens, i) | _phase(lens, i) | _apertures(lens, i)
+def _difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) -> str:
+    """The first difference of a lens `two`, read back, from `one`, beyond rounding, as text; empty
+    if there is none. Places count from the first surface: a file need not tell where that stands.
+
+    waves: wavelengths where indices are compared, um. indices: how far they may differ.
+    """
+    for name in ("count", "stop", "mirrors", "forms", "afocal"):
+        a, b = getattr(one, name), getattr(two, name)
+        if name == "forms":  # an even asphere may be written as an odd one
+            a, b = ([form.removeprefix("odd_") for form in own] for own in (a, b))
+        if a != b:
+            return f"{name} {a}, read back {b}"
+    close = max(_CLOSE, 256 * float(np.finfo(np.asarray(one.curvature).dtype).eps))
+    size = close * max(1.0, abs(float(one.sensor)))
+    room = dict.fromkeys(("thickness", "sensor", "apertures", "decentre", "vertex"), size)
+    room |= {"index": max(_CLOSE, indices), "rotation": max(1e-8, close)}
+    # Elements that move along the axis become thicknesses in files of other programs.
+    spaced = one.elements is None and two.elements is None
+    both = [_numbers(lens, waves, spaced) for lens in (one, two)]
+    return _first(
+        [(name, a, both[1][name], room.get(name, 0.0)) for name, a in both[0].items()], close
+    )
 
 
-def _coefficients(name: str, row: Array) -> tuple[dict, dict]:
-    """The coefficients of a form with keys of their own, and the others by their names in files."""
-    form, values = FORMS[name], np.asarray(row).tolist()
-    named = dict(zip(form.named, values, strict=False))
-    return named, dict(zip(form.powers, values[len(form.named) :], strict=False))
+def _use_difference(system: System, used: Mapping[str, Any]) -> str:
+    """The same of the use of a lens. used: fields of `System` that were read back."""
+    for name in ("field_kind", "primary"):
+        a, b = getattr(system, name), used.get(name, getattr(system, name))
+        if a != b:
+            return f"{name} {a}, read back {b}"
+    pairs = []
+    for name in (*_WEIGHTED, "distance") if used else ():
+        both = [np.array(own, float) for own in (getattr(system, name), used[name])]
+        for found in both if name == "vignetting" else ():
+            found[:, 4] *= np.any(found[:, :4], axis=1)  # a pupil that is not vignetted may turn
+        pairs.append((name, *both, _CLOSE))
+    return _first(pairs, _CLOSE)
 
 
-def _element(elements: Elements, g: int) -> dict[str, Any]:
-    return {
-        "surfaces": list(elements.spans[g]),
-        "about": elements.about[g],
-        "pivot": float(elements.pivot[g]),
-        "shift": np.asarray(elements.shift[g]).tolist(),
-        "tilt": [degrees_of(angle) for angle in np.asarray(elements.tilt[g])],
+def _first(pairs: list[Any], close: float) -> str:
+    """The first difference of pairs of arrays, as text. pairs: name, both arrays, the absolute
+    tolerance; rows of coefficients are filled up to one length by zeros."""
+    for name, a, b, least in pairs:
+        if name in ("coefficients", "phase"):
+            wide = max(a.shape[1], b.shape[1])
+            a, b = (np.pad(own, ((0, 0), (0, wide - own.shape[1]))) for own in (a, b))
+        if a.shape != b.shape:
+            return f"{name}: {len(a)} of them, read back {len(b)}"
+        with np.errstate(invalid="ignore"):  # inf - inf
+            room = np.maximum(least, close * np.minimum(np.abs(a), np.abs(b)))
+            off = (a != b) & ~(np.abs(a - b) <= room)
+        if np.any(off):
+            at = tuple(np.argwhere(off)[0])
+            place = f"[{', '.join(map(str, at))}]" if at else ""
+            return f"{name}{place} {a[at]:.10g}, read back {b[at]:.10g}"
+    return ""
+
+
+def _numbers(lens: Lens, waves: list[float], spaced: bool) -> dict[str, np.ndarray]:
+    """Arrays of a lens by name; thicknesses if it is `spaced` by these alone."""
+    rows, (z, across, turned) = lens.count + 1, lens.places
+    given, semi = np.asarray(lens.coefficients, float), np.asarray(lens.semi_diameter, float)
+    coefficients = np.pad(given, ((0, 0), (0, given.shape[1])))
+    for i, form in enumerate(lens.forms):
+        if form == "asphere":  # as an odd one
+            coefficients[i, ::2], coefficients[i, 1::2] = 0, given[i]
+    shapes = [(i, *own) for i in range(lens.count) for own in shapes_of(lens, i)]
+    listed = sorted([i, blocks, _KINDS.index(k), *at, *size] for i, blocks, k, size, at in shapes)
+    wide = max(map(len, listed), default=0)
+    names = ("curvature", "conic", *(("thickness", "sensor") if spaced else ()))
+    return {name: np.asarray(getattr(lens, name), float) for name in names} | {
+        "coefficients": coefficients,
+        "stop's semi_diameter": semi[lens.stop],
+        "apertures": np.array([[*row, *[0.0] * (wide - len(row))] for row in listed], float),
+        "index": np.asarray(lens.index(waves), float),
+        "decentre": np.zeros((rows, 2)) if across is None else np.asarray(across, float),
+        "vertex": np.asarray(z - z[0], float),
+        "rotation": np.tile(np.eye(3), (rows, 1, 1))
+        if turned is None
+        else np.asarray(turned, float),
+        "phase": _phase(lens.phase),
     }
 
 
-def _phase(lens: Lens, i: int) -> dict[str, Any]:
-    """The entry `phase` of a diffractive surface; empty for others."""
-    if lens.phase is None or i not in lens.phase.surfaces:
-        return {}
-    row = lens.phase.surfaces.index(i)
-    form, order = lens.phase.forms[row], float(lens.phase.order[row])
-    named, rest = _coefficients(form, lens.phase.coefficients[row])
-    return {"phase": {"form": form, "order": order} | named | {"coefficients": rest}}
-
-
-def _apertures(lens: Lens, i: int) -> dict[str, Any]:
-    """The apertures and obscurations of a surface."""
-    extra, found = lens.apertures, dict[str, Any]()
-    if extra is None:
-        return found
-    for k in np.flatnonzero(np.array(extra.surfaces) == i):
-        half = np.asarray(extra.half[k]).tolist()
-        own = {extra.kinds[k]: half[0] if extra.kinds[k] == "circle" else half}
-        if extra.kinds[k] == "polygon":
-            own["polygon"] = np.asarray(extra.outline(int(k))).tolist()
-        if extra.centre is not None:
-            own["centre"] = np.asarray(extra.centre[k]).tolist()
-        found.setdefault("obscuration" if extra.blocks[k] else "aperture", []).append(own)
-    return found
-
-
-def _place(lens: Lens, i: int) -> dict[str, Any]:
-    """Decentre in mm and tilt in degrees of a surface or the sensor."""
-    place = {}
-    if lens.decentre is not None:
-        place["decentre"] = np.asarray(lens.decentre[i]).tolist()
-    if lens.tilt is not None:
-        place["tilt"] = [degrees_of(angle) for angle in np.asarray(lens.tilt[i])]
-    return place
+def _phase(phase: Any) -> np.ndarray:
+    """Rows of surface, order and coefficients."""
+    if phase is None:
+        return np.zeros((0, 2))
+    order = np.asarray(phase.order, float)[:, None]
+    return np.hstack([np.array(phase.surfaces)[:, None], order, np.asarray(phase.coefficients)])

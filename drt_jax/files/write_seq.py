@@ -3,13 +3,13 @@
 import math
 import textwrap
 import warnings
-from collections.abc import Iterable
-from typing import Any, get_args
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from ..lens.forms import noll_of_fringe
+from ..lens.forms import FORMS, noll_of_fringe
 from ..lens.glass import (
     ANY,
     FRAUNHOFER,
@@ -22,16 +22,30 @@ from ..lens.glasses import find_glass
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil
 from .entry import LensError
-from .exact import degrees_of, number_for
-from .media_out import media_of_lens
 from .record import turns_of
+from .seq import FIELDS
 from .seq_glass import folded, schott_through
-from .seq_places import KEYS
-from .seq_surfaces import LETTERS
-from .system import FieldKind, System
-from .write_zmx import gap_behind
+from .seq_surfaces import LETTERS, MOVES, RADIAL
+from .system import System
+from .written import (
+    degrees_of,
+    element_of,
+    entry_of,
+    gap_behind,
+    media_of_lens,
+    number_for,
+    place_of,
+)
 
-_KINDS = {"circle": ("CIR",), "rectangle": ("REX", "REY"), "ellipse": ("ELX", "ELY")}
+_SIZES = {"circle": ("CIR",), "rectangle": ("REX", "REY"), "ellipse": ("ELX", "ELY")}
+# By form: the type of SPS and what stands behind it, the most coefficients, and letters and number
+# of the first.
+_SPECIAL = {
+    "odd_asphere": ("ODD 0.0", 30, "AR", 1),
+    "polynomial_xy": ("XYP 1.0", 65, "C", 2),
+    "qbfs": ("QBF", 14, "C", 3),
+    "zernike": ("ZFR", 91, "C", 4),
+}
 _STILL = 1e-12  # mm, radians: below this a surface stands on the axis of the one before it
 
 
@@ -44,25 +58,22 @@ def seq_text(system: System) -> str:
     media, own = media_of_lens(lens)
     for i, keys in enumerate(media):
         made, off = _made(keys, system.wavelengths)
-        own |= {f" {i}": made} if made else {}
-        media[i], worst = {"glass": f" {i}"} if made else keys, max(worst, off)
+        if made:
+            own[f" {i}"], media[i], worst = made, {"glass": f" {i}"}, max(worst, off)
     if worst:
-        warnings.warn(
-            "model glasses are private ones of .seq: their indices are the same at the wavelengths "
-            f"in use and at F, d, C; from {VISIBLE[0]:g} to {VISIBLE[1]:g} um they differ by "
-            f"{worst:.1g} at most",
-            stacklevel=3,
-        )
+        what = "model glasses are private ones of .seq: their indices are the same at the"
+        where = "from {:g} to {:g} um they differ by".format(*VISIBLE)
+        what = f"{what} wavelengths in use and at F, d, C; {where} {worst:.1g} at most"
+        warnings.warn(what, stacklevel=3)
     private = {name: f"G{k + 1}" for k, name in enumerate(own)}
     title = "".join(" " if c in "'\"" or not c.isprintable() else c for c in lens.name)
-    pupil = _pupil(lens, float(system.wavelengths[system.primary]))
+    wave = float(system.wavelengths[system.primary])
+    pupil = 2 * float(entrance_pupil(lens, wave).semi_diameter[0])
+    if not (math.isfinite(pupil) and pupil > 0):
+        raise LensError("the lens has no entrance pupil of finite size: save as .yaml")
     lines = ["RDM N", "LEN", f"TITLE '{' '.join(title.split())}'", f"EPD {pupil!r}", "DIM M"]
-    lines += _use(system)
-    if own:
-        lines.append("PRV")
-        for name, constants in own.items():
-            lines += _private(name, private[name], constants)
-        lines.append("END")
+    tables = [line for name in own for line in _private(name, private[name], own[name])]
+    lines += [*_use(system), *(["PRV", *tables, "END"] if own else [])]
     words = [_word(keys, private) for keys in media]
     far = repr(float(system.distance)) if math.isfinite(system.distance) else "0.1e14"
     lines.append(f"SO 0.0 {far} {words[0]}".rstrip())
@@ -71,7 +82,7 @@ def seq_text(system: System) -> str:
         word = "REFL" if lens.mirrors[i] else words[i + 1]
         numbers = f"{float(lens.curvature[i])!r} {gap_behind(lens, i)!r}"
         lines.append(f"S {numbers} {word}".rstrip())
-        lines += [f"  {line}" for line in _surface(lens, i) + places[i]]
+        lines += [f"  {line}" for line in _surface(i, entry_of(lens, i, {})) + places[i]]
     lines.append(f"SI {float(lens.curvature[-1])!r} 0.0")
     conic = float(lens.conic[-1])
     lines += [f"  {line}" for line in [*(["CON", f"K {conic!r}"] if conic else []), *places[-1]]]
@@ -80,7 +91,7 @@ def seq_text(system: System) -> str:
 
 def _use(system: System) -> list[str]:
     """The lines of wavelengths, fields and vignetting."""
-    kind = dict(zip(get_args(FieldKind), ("AN", "OB", "IM", "RI"), strict=True))[system.field_kind]
+    kind = next(key for key, kind in FIELDS.items() if kind == system.field_kind)
     dx, dy, cx, cy, turn = system.vignetting.T
     if np.any(turn * np.any(system.vignetting[:, :4], axis=1)):
         raise LensError("vignetting: .seq files hold no rotation: save as .zmx")
@@ -119,14 +130,6 @@ def _made(keys: dict[str, Any], waves: np.ndarray) -> tuple[dict[str, Any], floa
     return {"schott": constants, "range": [*VISIBLE]}, off
 
 
-def _pupil(lens: Lens, wave: float) -> float:
-    """The diameter of the entrance pupil, mm."""
-    wide = 2 * float(entrance_pupil(lens, wave).semi_diameter[0])
-    if not (math.isfinite(wide) and wide > 0):
-        raise LensError("the lens has no entrance pupil of finite size: save as .yaml")
-    return wide
-
-
 def _nanometres(wave: float) -> float:
     return number_for(wave, lambda value: value / 1000, round(wave * 1000, 9))
 
@@ -163,78 +166,65 @@ def _word(keys: dict[str, Any], private: dict[str, str]) -> str:
     return folded(name.removesuffix(f"_{maker}")) + (f"_{maker}" if maker else "")
 
 
-def _surface(lens: Lens, i: int) -> list[str]:
-    lines = ["STO"] if i == lens.stop else []
-    semi = float(lens.semi_diameter[i])
-    lines += [f"CIR {semi!r}"] if math.isfinite(semi) else []
-    lines += _form(lens, i)
-    extra = lens.apertures
-    own = [] if extra is None else [k for k, s in enumerate(extra.surfaces) if s == i]
-    for n, k in enumerate(own):
-        assert extra is not None
-        if extra.kinds[k] == "polygon":
-            raise LensError(
-                f"surfaces[{i}]: .seq files hold no polygon here: save as .yaml or .zmx"
-            )
-        label = f"{'OBS' if extra.blocks[k] else 'CLR'} L'A{n + 1}'"
-        half = np.asarray(extra.half[k]).tolist()
-        lines += [f"{key} {label} {v!r}" for key, v in zip(_KINDS[extra.kinds[k]], half)]
-        if extra.centre is not None:
-            centre = np.asarray(extra.centre[k]).tolist()
-            lines += [f"{key} {label} {v!r}" for key, v in zip(("ADX", "ADY"), centre)]
-    return lines + _phase(lens, i)
+def _surface(i: int, entry: Mapping[str, Any]) -> list[str]:
+    """The lines of a surface but for its place."""
+    lines = ["STO"] if "stop" in entry else []
+    lines += [f"CIR {entry['semi_diameter']!r}"] if "semi_diameter" in entry else []
+    lines += _form(i, entry)
+    shapes = [("CLR", own) for own in entry.get("aperture", [])]
+    shapes += [("OBS", own) for own in entry.get("obscuration", [])]
+    for n, (use, own) in enumerate(shapes, 1):
+        for kind, size in own.items():
+            if kind == "polygon":
+                what = f"surfaces[{i}]: .seq files hold no polygon here: save as .yaml or .zmx"
+                raise LensError(what)
+            keys = _SIZES.get(kind, ("ADX", "ADY"))
+            values = size if isinstance(size, list) else [size]
+            lines += [f"{key} {use} L'A{n}' {value!r}" for key, value in zip(keys, values)]
+    return lines + (_phase(i, entry["phase"]) if "phase" in entry else [])
 
 
-def _powers(lens: Lens, i: int, row: list[float], keys: dict[int, str]) -> list[str]:
-    """The lines of the coefficients of r^2, r^4, ...; keys: the key of each power."""
-    found = {2 * k + 2: value for k, value in enumerate(row) if value}
-    for power in found:
-        if power not in keys:
-            raise LensError(
-                f"surfaces[{i}].coefficients: .seq files hold no r^{power} here: save as .yaml"
-            )
-    return [f"{keys[power]} {value!r}" for power, value in found.items()]
-
-
-def _form(lens: Lens, i: int) -> list[str]:
+def _form(i: int, entry: Mapping[str, Any]) -> list[str]:
     """The lines of a surface's kind and of its coefficients."""
-    name, conic = lens.forms[i], float(lens.conic[i])
-    row = np.asarray(lens.coefficients[i], float).tolist()
-    even = {power: letter for letter, power in LETTERS.items()}
-    if name == "asphere" and any([*row[:1], *row[10:]]):  # ASP has r^4 to r^20
-        name, row = "odd_asphere", [own for value in row for own in (0.0, value)]
-    if name == "asphere":
-        terms = _powers(lens, i, row, even)
-        kind = ["ASP"] if terms else (["CON"] if conic else [])
-        return kind + ([f"K {conic!r}"] if kind else []) + terms
-    if name == "toroid":
-        head = ["YTO", f"CUX {row[0]!r}", f"K {conic!r}"]
-        return head + _powers(lens, i, row[1:], even)
-    if name == "biconic":
-        radial = dict(zip((4, 6, 8, 10), ("AR", "BR", "CR", "DR"), strict=True))
-        head = ["AAS", f"CUX {row[0]!r}", f"KY {conic!r}", f"KX {row[1]!r}"]
-        return head + _powers(lens, i, row[2:], radial)
-    used = max((k + 1 for k, value in enumerate(row) if value), default=0)
-    if name == "odd_asphere" and used <= 30:
-        terms = [f"SCO AR{k + 1} {value!r}" for k, value in enumerate(row) if value]
-        return ["SPS ODD 0.0", f"SCO K {conic!r}", *terms]
-    if name == "polynomial_xy" and used <= 65:
-        terms = [f"SCO C{k + 2} {value!r}" for k, value in enumerate(row) if value]
-        return ["SPS XYP 1.0", f"SCO K {conic!r}", *terms]
-    if name == "qbfs" and used <= 15:
-        terms = [f"SCO C{k + 3} {value!r}" for k, value in enumerate(row[1:]) if value]
-        return ["SPS QBF", f"SCO NRADIUS {row[0]!r}", f"SCO K {conic!r}", *terms]
+    name, conic, row = entry.get("form", "asphere"), entry.get("conic", 0.0), entry["coefficients"]
+    values = [*row.values()]
+    if name == "asphere" and any([*values[:1], *values[10:]]):  # ASP has r^4 to r^20
+        name = "odd_asphere"
+    letters = {p: key for key, p in (RADIAL if name == "biconic" else LETTERS).items()}
+    used = {power: value for power, value in row.items() if value}
+    if name in ("asphere", "toroid", "biconic"):
+        for power in used:
+            if power not in letters:
+                what = f"surfaces[{i}].coefficients: .seq files hold no r^{power} here"
+                raise LensError(f"{what}: save as .yaml")
+        terms = [f"{letters[power]} {value!r}" for power, value in used.items()]
+        if name == "asphere":
+            head = ["ASP"] if terms else (["CON"] if conic else [])
+            return head + ([f"K {conic!r}"] if head else []) + terms
+        across = f"CUX {entry['curvature_x']!r}"
+        if name == "toroid":
+            return ["YTO", across, f"K {conic!r}", *terms]
+        return ["AAS", across, f"KY {conic!r}", f"KX {entry['conic_x']!r}", *terms]
+    kind, most, key, first = _SPECIAL.get(name, ("", 0, "", 0))
+    numbers = {power: k for k, power in enumerate(FORMS[name].powers)}
+    count = max((numbers[power] + 1 for power in used), default=0)
+    if count > most:
+        count += len(FORMS[name].named)
+        what = f"surfaces[{i}]: .seq files hold no form {name} of {count} here"
+        raise LensError(f"{what}: save as .yaml")
+    lines = [f"SPS {kind}"]
+    lines += [f"SCO NRADIUS {entry['norm_radius']!r}"] if "norm_radius" in entry else []
+    lines.append(f"SCO K {conic!r}")
     if name == "zernike":
-        return _fringe(i, row, conic)
-    raise LensError(f"surfaces[{i}]: .seq files hold no form {name} of {used} here: save as .yaml")
+        return lines + _fringe(i, used)
+    return lines + [f"SCO {key}{numbers[power] + first} {value!r}" for power, value in used.items()]
 
 
-def _fringe(i: int, row: list[float], conic: float) -> list[str]:
+def _fringe(i: int, used: Mapping[int, float]) -> list[str]:
+    """The lines of Zernike coefficients as fringe polynomials, which are 1 at the rim."""
     known = {noll: (k, rim) for k in range(1, 38) for noll, rim in [noll_of_fringe(k)]}
-    lines = ["SPS ZFR", f"SCO NRADIUS {row[0]!r}", f"SCO K {conic!r}"]
-    for number, value in enumerate(row[1:], 1):
-        if not value:
-            continue
+    lines = []
+    for number, value in used.items():
         if number not in known:
             raise LensError(f"surfaces[{i}].coefficients: {number} is no fringe polynomial: .yaml")
         fringe, norm = known[number]
@@ -243,79 +233,55 @@ def _fringe(i: int, row: list[float], conic: float) -> list[str]:
     return lines
 
 
-def _phase(lens: Lens, i: int) -> list[str]:
+def _phase(i: int, phase: Mapping[str, Any]) -> list[str]:
     """The lines of a grating or a radial phase."""
-    if lens.phase is None or i not in lens.phase.surfaces:
-        return []
-    at = lens.phase.surfaces.index(i)
-    order, form = float(lens.phase.order[at]), lens.phase.forms[at]
-    row = np.asarray(lens.phase.coefficients[at], float).tolist()
+    order, form, row = phase["order"], phase["form"], [*phase["coefficients"].values()]
     if form == "linear" and row[0]:
         spacing = number_for(row[0], lambda value: 1 / value, 1 / row[0])
         return ["DIF GRT", f"GRO {order!r}", f"GRS {spacing!r}"]
     if form == "asphere":
         wave = 587.5618 * 1e-6
-        terms = [
-            f"HCO C{k + 1} {number_for(a, lambda v: v / wave, a * wave)!r}"
-            for k, a in enumerate(row)
-            if a
-        ]
+        per_wave = [number_for(a, lambda v: v / wave, a * wave) if a else a for a in row]
+        terms = [f"HCO C{k} {a!r}" for k, a in enumerate(per_wave, 1) if a]
         return ["DIF DOE", f"HOR {order!r}", "HWL 587.5618", "HCT R", *terms]
     raise LensError(f"surfaces[{i}].phase: .seq files hold no {form} phase here: save as .yaml")
 
 
 def _places(lens: Lens) -> list[list[str]]:
     """The lines of decentre and tilt of each surface and the sensor: the values of the lens if it
-    has no elements, else those relative to the surface before."""
-    if lens.elements is None:
-        zero = np.zeros((lens.count + 1, 3))
-        shift = zero[:, :2] if lens.decentre is None else np.asarray(lens.decentre, float)
-        tilt = zero if lens.tilt is None else np.asarray(lens.tilt, float)
-        return [
-            [*_moves([*s, 0.0], t), "DAR"] if np.any(s) or np.any(t) else []
-            for s, t in zip(shift.tolist(), tilt, strict=True)
-        ]
-    simple = _simple(lens)
-    if simple is not None:
-        return simple
+    has no elements, those of elements if these turn the axis at the vertex of their first surface
+    and nothing else is moved, else those relative to the surface before."""
+    own, count = lens.elements, lens.count + 1
+    places = [place_of(lens, i) for i in range(count)]
+    lines = [_moves([*at.get("decentre", []), 0.0], at.get("tilt", [])) for at in places]
+    if own is None:
+        return [[*found, "DAR"] if found else [] for found in lines]
+    groups = [element_of(own, g) for g in range(len(own.spans))]
+    firsts = {group["surfaces"][0] for group in groups}
+    at_vertex = all(
+        group["pivot"] == 0 and [group["about"], lens.count] == group["surfaces"]
+        for group in groups
+    )
+    if at_vertex and len(firsts) == len(groups) and not any(lines):
+        for group in groups:
+            lines[group["about"]] = _moves(group["shift"], group["tilt"])
+        return lines
     z, across, turned = (np.asarray(part, float) for part in lens.places)
     points = np.concatenate([across, z[:, None]], axis=1)
-    point, turn, found = np.zeros(3), np.eye(3), []
-    for i in range(lens.count + 1):
-        shift, own = turn.T @ (points[i] - point), turn.T @ turned[i]
-        tilt = np.radians(turns_of(own))
+    point, turn = np.zeros(3), np.eye(3)
+    for i in range(count):
+        shift, tilt = turn.T @ (points[i] - point), np.radians(turns_of(turn.T @ turned[i]))
         moved = np.abs(shift).max() > _STILL or np.abs(tilt).max() > _STILL
-        found.append(_moves(shift.tolist(), tilt) if moved else [])
-        if i < lens.count:
-            turn = turned[i] if moved else turn
-            point = (points[i] if moved else point + turn @ shift) + turn @ [
-                0,
-                0,
-                gap_behind(lens, i),
-            ]
-    return found
+        lines[i] = _moves(shift.tolist(), degrees_of(tilt)) if moved else []
+        turn = turned[i] if moved else turn
+        gap = gap_behind(lens, i) if i < lens.count else 0.0
+        point = (points[i] if moved else point + turn @ shift) + turn @ [0, 0, gap]
+    return lines
 
 
-def _simple(lens: Lens) -> list[list[str]] | None:
-    """The lines of `_places` if each element turns the axis at the vertex of its first surface and
-    nothing else is moved; otherwise None."""
-    own, last = lens.elements, lens.count
-    assert own is not None
-    firsts = [first for first, _ in own.spans]
-    if np.any(lens.decentre if lens.decentre is not None else 0) or np.any(
-        lens.tilt if lens.tilt is not None else 0
-    ):
-        return None
-    at_vertex = not np.any(np.asarray(own.pivot)) and list(own.about) == firsts
-    if not at_vertex or len({*firsts}) < len(firsts) or {end for _, end in own.spans} != {last}:
-        return None
-    found: list[list[str]] = [[] for _ in range(last + 1)]
-    for g, first in enumerate(firsts):
-        found[first] = _moves(np.asarray(own.shift[g], float).tolist(), np.asarray(own.tilt[g]))
-    return found
-
-
-def _moves(shift: list[float], tilt: np.ndarray) -> list[str]:
-    a, b, c = (degrees_of(angle) for angle in tilt)
-    values = [*shift, 0.0 - a, 0.0 - b, c]
-    return [f"{key} {value!r}" for key, value in zip(KEYS, values, strict=True) if value]
+def _moves(shift: list[float], tilt: list[float]) -> list[str]:
+    """The lines of a decentre (mm) and tilts (degrees)."""
+    x, y, z = shift if len(shift) == 3 else [0.0] * 3
+    a, b, c = tilt or [0.0] * 3
+    values = [x, y, z, 0.0 - a, 0.0 - b, c]
+    return [f"{key} {value!r}" for key, value in zip(MOVES, values, strict=True) if value]

@@ -2,21 +2,25 @@
 
 import math
 from collections.abc import Mapping
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from ..lens.forms import FORMS
 from ..lens.glasses import find_glass, map_point
 from ..lens.lens import Lens
-from .apertures import Shape, shapes_of
-from .breaks_out import with_breaks
 from .entry import LensError
-from .exact import number_for
-from .glasses import written_names
-from .media_out import medium_of
-from .model_zmx import to_ours, to_theirs
+from .glasses import to_ours, to_theirs, written_names
 from .system import FieldKind, System
+from .written import (
+    element_of,
+    entry_of,
+    gap_behind,
+    medium_of,
+    number_for,
+    place_of,
+    shapes_of,
+)
 from .zmx_head import BESIDE, COLUMNS
 
 _HEAD = """VERS 150514 0 0
@@ -28,18 +32,18 @@ ENVD 2.0E+1 1 0
 GCAT {makers}
 RAIM 0 {aiming} 1 1 0 0 0 0 0"""
 _AIMING = {"off": 0, "paraxial": 1}
-_TYPES = {  # by form: type, parameters of the coefficients, whether the first is a radius
-    "asphere": ("EVENASPH", range(1, 9), False),
-    "odd_asphere": ("ODDASPHE", range(1, 9), False),
-    "toroid": ("TOROIDAL", range(1, 9), True),
-    "biconic": ("BICONICX", range(1, 3), True),
+_TYPES = {  # by form: type, its parameters that hold the coefficients
+    "asphere": ("EVENASPH", range(1, 9)),
+    "odd_asphere": ("ODDASPHE", range(1, 9)),
+    "toroid": ("TOROIDAL", range(1, 9)),
+    "biconic": ("BICONICX", range(1, 3)),
 }
-_SERIES = {  # by form: type whose XDAT hold the coefficients, the values before them
-    "asphere": ("XASPHERE", ()),
-    "odd_asphere": ("XOSPHERE", ()),
-    "polynomial_xy": ("XPOLYNOM", ()),
-    "zernike": ("SZERNSAG", ()),
-    "qbfs": ("QED_TYPE", (0,)),
+_SERIES = {  # by form: type whose XDAT hold the coefficients
+    "asphere": "XASPHERE",
+    "odd_asphere": "XOSPHERE",
+    "polynomial_xy": "XPOLYNOM",
+    "zernike": "SZERNSAG",
+    "qbfs": "QED_TYPE",
 }
 _OTHERS = {"silica": "F_SILICA"}
 _KEYS = {"rectangle": ("SQAP", "SQOB"), "ellipse": ("ELAP", "ELOB")}  # clear, blocking
@@ -58,7 +62,7 @@ def zmx_text(system: System) -> str:
     image = ["TYPE STANDARD", f"CURV {curvature!r}", f"CONI {conic!r}"]
     surfaces = [*(_surface(lens, i, names) for i in range(lens.count)), image]
     gaps = [gap_behind(lens, i) for i in range(lens.count)]
-    blocks, (first, *behind) = with_breaks(lens, surfaces, gaps)
+    blocks, (first, *behind) = _with_breaks(lens, surfaces, gaps)
     far = system.distance + first
     place = repr(far) if math.isfinite(far) else "INFINITY"
     front = ["TYPE STANDARD", "CURV 0.0", f"DISZ {place}", *_glass(lens, 0, names)]
@@ -89,73 +93,64 @@ def _numbers(name: str) -> str:
     return f"{nd:.7f} {vd:.5f}"
 
 
-def gap_behind(lens: Lens, i: int) -> float:
-    """The thickness (mm) behind a surface; the last one makes their sum equal `lens.sensor`."""
-    gaps = np.asarray(lens.thickness, float).tolist()
-    if i < lens.count - 1:
-        return gaps[i]
-    before, sensor = sum(gaps), float(lens.sensor)
-    return number_for(sensor, lambda gap: before + gap, sensor - before)
-
-
 def _surface(lens: Lens, i: int, names: Mapping[str, str]) -> list[str]:
-    lines = ["STOP"] if i == lens.stop else []
-    lines += [*_form(lens, i), f"CURV {float(lens.curvature[i])!r}"]
-    lines += [f"CONI {float(lens.conic[i])!r}"] if lens.conic[i] else []
+    """The lines of a surface but for its place."""
+    entry = entry_of(lens, i, {})
+    lines = ["STOP"] if "stop" in entry else []
+    lines += [*_form(i, entry), f"CURV {entry['curvature']!r}"]
+    lines += [f"CONI {entry['conic']!r}"] if "conic" in entry else []
     lines += _glass(lens, i + 1, names)
-    semi = float(lens.semi_diameter[i])
-    lines += [f"DIAM {semi!r} 1 0 0 1"] if math.isfinite(semi) else []
+    lines += [f"DIAM {entry['semi_diameter']!r} 1 0 0 1"] if "semi_diameter" in entry else []
     return lines + _apertures(lens, i)
 
 
-def _form(lens: Lens, i: int) -> list[str]:
-    name, row = lens.forms[i], np.asarray(lens.coefficients[i], float).tolist()
-    if lens.phase is not None and i in lens.phase.surfaces:
-        return _phase(lens, i, row)
+def _form(i: int, entry: Mapping[str, Any]) -> list[str]:
+    """The lines of the type of a surface and its parameters."""
+    name = entry.get("form", "asphere")
+    own = [entry[key] for key in FORMS[name].named]
+    row = [*own, *entry["coefficients"].values()]
+    if "phase" in entry:
+        return _phase(i, name, entry["phase"], row)
     if name == "asphere" and not any(row):
         return ["TYPE STANDARD"]
-    kind, numbers, radius = _TYPES.get(name, ("", (), False))
-    used = [k for k, value in enumerate(row) if value]
-    if name in _SERIES and (not kind or (used and used[-1] >= len(numbers))):
-        kind, before = _SERIES[name]
-        size, terms = (row[0], row[1:]) if FORMS[name].named else (1.0, row)
+    kind, numbers = _TYPES.get(name, ("", ()))
+    used = max((k + 1 for k, value in enumerate(row) if value), default=0)
+    fits = bool(kind) and used <= len(numbers)
+    if not fits and name in _SERIES:
+        before = [0] if name == "qbfs" else []
         goes_on = ["PARM 0 1"] if name == "zernike" else []  # terms extend beyond the radius
-        return [f"TYPE {kind}", *goes_on, *_extra(*before, len(terms), size, *terms)]
-    if not kind or (used and used[-1] >= len(numbers)):
-        what = f"form {name}" + (f" with {used[-1] + 1} coefficients" if kind else "")
+        terms = row[len(own) :]
+        values = _numbered("XDAT", *before, len(terms), *(own or [1.0]), *terms)
+        return [f"TYPE {_SERIES[name]}", *goes_on, *values]
+    if not fits:
+        what = f"form {name}" + (f" with {used} coefficients" if kind else "")
         raise LensError(f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
-    if radius and row[0]:
-        row[0] = 1 / row[0]
+    if own and row[0]:
+        row[0] = 1 / row[0]  # a radius
     # The last coefficient, even 0, preserves the number of columns.
-    return [
-        f"TYPE {kind}",
-        *(f"PARM {n} {value!r}" for n, value in zip(numbers, row, strict=False)),
-    ]
+    return [f"TYPE {kind}", *_numbered("PARM", *row[: len(numbers)])]
 
 
-def _extra(*values: float) -> list[str]:
-    return [f"XDAT {k + 1} {value!r}" for k, value in enumerate(values)]
+def _numbered(key: str, *values: float) -> list[str]:
+    """Lines of values with their numbers from 1."""
+    return [f"{key} {k} {value!r}" for k, value in enumerate(values, 1)]
 
 
-def _phase(lens: Lens, i: int, row: list[float]) -> list[str]:
+def _phase(i: int, name: str, phase: Mapping[str, Any], row: list[float]) -> list[str]:
     """A grating on a conic or a toroid; or a radial phase (radians, norm radius 1 mm) on an even
-    asphere."""
-    assert lens.phase is not None
-    at = lens.phase.surfaces.index(i)
-    order, form = float(lens.phase.order[at]), lens.phase.forms[at]
-    own = np.asarray(lens.phase.coefficients[at], float).tolist()
-    if form == "linear" and lens.forms[i] == "asphere" and not any(row):
-        return ["TYPE DGRATING", f"PARM 1 {own[0] / 1e3!r}", f"PARM 2 {order!r}"]
-    if form == "linear" and lens.forms[i] == "toroid" and not any(row[1:]):
+    asphere. name, row: form and coefficients of the surface."""
+    form, order, own = phase["form"], phase["order"], [*phase["coefficients"].values()]
+    if form == "linear" and name == "asphere" and not any(row):
+        return ["TYPE DGRATING", *_numbered("PARM", own[0] / 1e3, order)]
+    if form == "linear" and name == "toroid" and not any(row[1:]):
         radius = 1 / row[0] if row[0] else 0.0
-        numbers = enumerate((radius, own[0] / 1e3, order), 1)
-        return ["TYPE TOROGRAT", *(f"PARM {k} {value!r}" for k, value in numbers)]
-    if form != "asphere" or lens.forms[i] != "asphere" or any(row[8:]):
+        return ["TYPE TOROGRAT", *_numbered("PARM", radius, own[0] / 1e3, order)]
+    if form != "asphere" or name != "asphere" or any(row[8:]):
         raise LensError(f"surfaces[{i}].phase: not written to .zmx on this surface: save as .yaml")
-    powers = [f"PARM {k + 1} {value!r}" for k, value in enumerate(row[:8])]
     turn = 2 * math.pi
     whole = [number_for(value, lambda radians: radians / turn, value * turn) for value in own]
-    return ["TYPE BINARY_2", f"PARM 0 {order!r}", *powers, *_extra(len(own), 1.0, *whole)]
+    powers, terms = _numbered("PARM", *row[:8]), _numbered("XDAT", len(own), 1.0, *whole)
+    return ["TYPE BINARY_2", f"PARM 0 {order!r}", *powers, *terms]
 
 
 def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
@@ -165,10 +160,8 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
         return ["GLAS MIRROR 0 0 1.5 40"]
     keys = medium_of(lens, m)
     if keys is None:
-        raise LensError(
-            f"glasses[{m}]: {lens.glasses[m]} has constants of its own, which a .zmx file does not "
-            "hold: save as .yaml, or use with_model_glass"
-        )
+        what = f"glasses[{m}]: {lens.glasses[m]} has constants of its own, which a .zmx file does"
+        raise LensError(f"{what} not hold: save as .yaml, or use with_model_glass")
     if "glass" in keys:
         return [f"GLAS {names[keys['glass']]}"]
     if "index" in keys:
@@ -177,35 +170,30 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
         return []
     ours = keys["nd"], keys["vd"], keys.get("partial", 0.0)
     theirs = to_theirs(*ours)
-    for digits in range(3, 17):  # the fewest digits that read back
-        short = (round(theirs[0], digits), round(theirs[1], digits), round(theirs[2], digits))
-        if to_ours(*short) == ours:
-            theirs = short
-            break
-    return [f"GLAS ___BLANK 1 0 {' '.join(map(repr, theirs))}"]
+    rounded = ([round(value, digits) for value in theirs] for digits in range(3, 17))
+    # The fewest digits that read back.
+    short = next((values for values in rounded if to_ours(*values) == ours), theirs)
+    return [f"GLAS ___BLANK 1 0 {' '.join(map(repr, short))}"]
 
 
 def _apertures(lens: Lens, i: int) -> list[str]:
     """The lines of the aperture: one shape, or a circle within another."""
-    shapes = sorted(shapes_of(lens, i))  # clear ones before those that block
+    shapes = shapes_of(lens, i)  # clear ones before those that block
     if not shapes:
         return []
     (blocks, kind, size, centre), *others = shapes
-    inner = others[0].size[0] if others else 0.0
-    ring = Shape(True, "circle", [inner] * 2, centre)
-    if others and not (kind == "circle" and not blocks and others == [ring]):
-        own = " and ".join(f"{'a blocking' if s.blocks else 'a clear'} {s.kind}" for s in shapes)
-        raise LensError(
-            f"surfaces[{i}]: has {own}; a .zmx surface has one aperture, or a blocking circle in a "
-            "clear one of its centre: put the others on plane surfaces of their own beside it, or "
-            "save as .yaml"
-        )
+    inner = others[0][2][0] if others else 0.0
+    ring = [(True, "circle", [inner, inner], centre)]
+    if others and not (kind == "circle" and not blocks and others == ring):
+        own = " and ".join(f"{'a blocking' if s[0] else 'a clear'} {s[1]}" for s in shapes)
+        what = f"surfaces[{i}]: has {own}; a .zmx surface has one aperture, or a blocking circle in"
+        remedy = "put the others on plane surfaces of their own beside it, or save as .yaml"
+        raise LensError(f"{what} a clear one of its centre: {remedy}")
     if kind == "polygon":
         corners = [*zip(size[::2], size[1::2], strict=True)]
         if (0, 0) in corners:
-            raise LensError(
-                f"surfaces[{i}]: a corner 0 0 ends a polygon in .zmx files: save as .yaml"
-            )
+            what = f"surfaces[{i}]: a corner 0 0 ends a polygon in .zmx files: save as .yaml"
+            raise LensError(what)
         lines = [f"{'USOB' if blocks else 'USAP'} 0 0 0", 'UDAD 0 "POLYGON.UDA" 1']
         lines += [f"UDAD {n} {x!r} {y!r} 0" for n, (x, y) in enumerate(corners, 1)]
     elif kind == "circle":
@@ -213,3 +201,50 @@ def _apertures(lens: Lens, i: int) -> list[str]:
     else:
         lines = [f"{_KEYS[kind][blocks]} {size[0]!r} {size[1]!r} 0"]
     return [*lines, f"OBDC {centre[0]!r} {centre[1]!r}"] if any(centre) else lines
+
+
+def _moves(lens: Lens) -> list[dict[str, Any]]:
+    """The moves of elements and of single surfaces, as the entries of elements; outer moves precede
+    the moves inside them."""
+    found, own = [], lens.elements
+    if own is not None:
+        found = [element_of(own, g) for g in range(len(own.spans))]
+    for i in range(lens.count + 1):
+        place = {"decentre": [0.0, 0.0], "tilt": [0.0] * 3} | place_of(lens, i)
+        moved = {"shift": [*place["decentre"], 0.0], "tilt": place["tilt"]}
+        found.append({"surfaces": [i, i], "about": i, "pivot": 0.0} | moved)
+    moves = [move for move in found if any(move["shift"]) or any(move["tilt"])]
+    return sorted(moves, key=lambda move: (move["surfaces"][0], -move["surfaces"][1]))
+
+
+def _break(move: Mapping[str, Any], back: bool) -> list[str]:
+    """A coordinate break; with `back` its inverse: tilts in reverse order, then the decentre."""
+    numbers = [*move["shift"][:2], *move["tilt"]]
+    values = [0.0 - value for value in numbers] if back else numbers
+    lines = [f"PARM {k} {value!r}" for k, value in enumerate(values, 1) if value]
+    return ["TYPE COORDBRK", "CURV 0.0", *lines, *(["PARM 6 1"] if back else [])]
+
+
+def _with_breaks(
+    lens: Lens, surfaces: list[list[str]], gaps: list[float]
+) -> tuple[list[list[str]], list[float]]:
+    """Insert the coordinate breaks among the blocks of lines of the S surfaces and the image.
+    Returns all blocks, and the thickness (mm) in front of each one; in front of the first it counts
+    from the first vertex before it is moved. gaps: (S,), mm, behind the surfaces."""
+    moves, axis = _moves(lens), [0.0, *np.cumsum(gaps).tolist()]
+    blocks: list[list[str]] = []
+    behind: list[float] = []
+    for i, surface in enumerate(surfaces):
+        before, gap = (i - 1, gaps[i - 1]) if i else (0, 0.0)
+        at = 0.0  # mm from surface `before`, along the axis of that surface
+        ends = [(move, True) for move in reversed(moves) if move["surfaces"][1] == i - 1]
+        begins = [(move, False) for move in moves if move["surfaces"][0] == i]
+        for move, back in ends + begins:
+            about, along = move["about"], move["shift"][2]
+            pivot = {before: 0.0, i: gap}.get(about, axis[about] - axis[before]) + move["pivot"]
+            behind.append(pivot - at + (0.0 if back else along))
+            blocks.append(_break(move, back))
+            at = pivot + (along if back else 0.0)
+        behind.append(gap - at)
+        blocks.append(surface)
+    return blocks, behind

@@ -6,22 +6,19 @@ from typing import Any
 
 import jax
 
-from ..inputs import InputError, parse, read_text, shown
+from ..inputs import parse, read_text, require_one_of, shown
 from ..lens.lens import Lens
 from .agf import load_agf
 from .entry import LensError
-from .record import Missing, Record
+from .record import Missing, Record, lines_of, naming
 from .seq import read_seq
 from .specs import build_lens
 from .system import System, Use, lens_of, system_of
-from .text import lines_of
 from .zmx import read_zmx
 
 _BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
 _READERS = {".zmx": read_zmx, ".seq": read_seq}
 _ENDINGS = (".yaml", ".yml", *_READERS)
-_FIELDS = ("heights", "field_kind", "field_weights", "vignetting")
-_USED = (*_FIELDS, "wavelengths", "wavelength_weights", "primary")
 
 
 def lens_names() -> list[str]:
@@ -56,12 +53,8 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
             lens = lens_of(record, use)
             record.say()
             return lens
-        try:
+        with naming(path):
             return _lens_of_yaml(read_text(path), path)
-        except LensError:
-            raise
-        except InputError as error:
-            raise LensError(f"{path}: {error}") from error
 
 
 def known_ending(path: str | pathlib.Path) -> str:
@@ -79,8 +72,7 @@ def lens_in(text: str, path: str | pathlib.Path) -> tuple[Lens, dict[str, Any]]:
     if kind not in _READERS:
         return _lens_of_yaml(text, pathlib.Path(path)), {}
     record, use = _READERS[kind](str(path), "error", text.splitlines())
-    used = {key: value for key, value in vars(use).items() if key in _USED}
-    return lens_of(record, use), used | {"distance": record.distance}
+    return lens_of(record, use), use.of_system() | {"distance": record.distance}
 
 
 def _lens_of_yaml(text: str, path: pathlib.Path) -> Lens:
@@ -140,12 +132,6 @@ def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
 
 def read_record(path: str | pathlib.Path, missing: Missing = "error") -> tuple[Record, Use]:
     """Read a file of another program."""
-    if missing not in ("error", "warn"):
-        raise ValueError(f'missing: expected "error" or "warn", got {shown(missing)}')
-    try:
-        lines = lines_of(path)
-        return _READERS[pathlib.Path(path).suffix.lower()](str(path), missing, lines)
-    except LensError:
-        raise
-    except InputError as error:
-        raise LensError(f"{path}: {error}") from error
+    require_one_of("missing", missing, ("error", "warn"))
+    with naming(path):
+        return _READERS[pathlib.Path(path).suffix.lower()](str(path), missing, lines_of(path))

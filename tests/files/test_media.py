@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from drt_jax import first_order, load_lens
-from drt_jax.files.media_out import medium_of
+from drt_jax.files.written import medium_of
 
 
 @pytest.mark.parametrize(

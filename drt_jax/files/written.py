@@ -1,0 +1,187 @@
+"""A lens as entries of a prescription, from which all kinds of files are written."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..lens.elements import Elements
+from ..lens.forms import FORMS
+from ..lens.glass import ANY, Dispersion
+from ..lens.glasses import find_glass, glass_names
+from ..lens.lens import Lens
+from .entry import LensError
+
+Shape = tuple[bool, str, list[float], list[float]]
+
+
+def number_for(target: float, read: Callable[[float], float], *guesses: float) -> float:
+    """The first of `guesses`, or the number near the last, that `read` maps to `target`, or as
+    close to it as possible."""
+    near = (guesses[-1] + np.arange(-8, 9) * np.spacing(abs(guesses[-1]))).tolist()
+    return min([*guesses, *near], key=lambda number: abs(read(number) - target))
+
+
+def degrees_of(angles: Any) -> list[float]:
+    """Angles in degrees that read back as `angles` (radians), or as close as possible."""
+    own, wide = np.asarray(angles), np.asarray(angles, float)
+    rows = zip(wide.tolist(), np.degrees(own).tolist(), np.degrees(wide).tolist(), strict=True)
+
+    def read(degrees: float) -> float:
+        return float(jnp.radians(degrees))
+
+    return [number_for(angle, read, *guesses) if angle else angle for angle, *guesses in rows]
+
+
+def gap_behind(lens: Lens, i: int) -> float:
+    """The thickness (mm) behind a surface; the last one makes their sum equal `lens.sensor`."""
+    gaps = np.asarray(lens.thickness, float).tolist()
+    if i < lens.count - 1:
+        return gaps[i]
+    before, sensor = sum(gaps), float(lens.sensor)
+    return number_for(sensor, lambda gap: before + gap, sensor - before)
+
+
+def entry_of(lens: Lens, i: int, behind: Mapping[str, Any]) -> dict[str, Any]:
+    """The entry of surface i, with all coefficients, even those of 0. behind: keys of the medium
+    behind it."""
+    conic, semi = float(lens.conic[i]), float(lens.semi_diameter[i])
+    entry: dict[str, Any] = {"curvature": float(lens.curvature[i])}
+    entry |= {"conic": conic} if conic else {}
+    entry |= {"form": lens.forms[i]} if lens.forms[i] != "asphere" else {}
+    entry |= _coefficients(lens.forms[i], lens.coefficients[i])
+    entry |= {"thickness": float(lens.thickness[i])} if i < lens.count - 1 else {}
+    entry |= {"mirror": True} if lens.mirrors[i] else behind
+    entry |= {"semi_diameter": semi} if math.isfinite(semi) else {}
+    entry |= {"stop": True} if i == lens.stop else {}
+    return entry | place_of(lens, i) | _phase(lens, i) | _apertures(lens, i)
+
+
+def _coefficients(name: str, row: Any) -> dict[str, Any]:
+    """The coefficients of a form: keys of their own, and the others by their names in files."""
+    form, values = FORMS[name], np.asarray(row).tolist()
+    rest = dict(zip(form.powers, values[len(form.named) :], strict=False))
+    return dict(zip(form.named, values, strict=False)) | {"coefficients": rest}
+
+
+def place_of(lens: Lens, i: int) -> dict[str, Any]:
+    """Decentre in mm and tilt in degrees of a surface or the sensor."""
+    place = {}
+    if lens.decentre is not None:
+        place["decentre"] = np.asarray(lens.decentre[i]).tolist()
+    if lens.tilt is not None:
+        place["tilt"] = degrees_of(lens.tilt[i])
+    return place
+
+
+def element_of(elements: Elements, g: int) -> dict[str, Any]:
+    """The entry of element g."""
+    return {
+        "surfaces": list(elements.spans[g]),
+        "about": elements.about[g],
+        "pivot": float(elements.pivot[g]),
+        "shift": np.asarray(elements.shift[g]).tolist(),
+        "tilt": degrees_of(elements.tilt[g]),
+    }
+
+
+def _phase(lens: Lens, i: int) -> dict[str, Any]:
+    """The entry `phase` of a diffractive surface; empty for others."""
+    if lens.phase is None or i not in lens.phase.surfaces:
+        return {}
+    row = lens.phase.surfaces.index(i)
+    form, order = lens.phase.forms[row], float(lens.phase.order[row])
+    terms = _coefficients(form, lens.phase.coefficients[row])
+    return {"phase": {"form": form, "order": order} | terms}
+
+
+def _apertures(lens: Lens, i: int) -> dict[str, Any]:
+    """The apertures and obscurations of a surface."""
+    extra, found = lens.apertures, dict[str, Any]()
+    for k in () if extra is None else np.flatnonzero(np.array(extra.surfaces) == i).tolist():
+        assert extra is not None
+        kind, half = extra.kinds[k], np.asarray(extra.half[k]).tolist()
+        size = half[0] if kind == "circle" else half
+        own = {kind: np.asarray(extra.outline(k)).tolist() if kind == "polygon" else size}
+        if extra.centre is not None:
+            own["centre"] = np.asarray(extra.centre[k]).tolist()
+        found.setdefault("obscuration" if extra.blocks[k] else "aperture", []).append(own)
+    return found
+
+
+def shapes_of(lens: Lens, i: int) -> list[Shape]:
+    """All that clips rays at a surface, sorted: whether it blocks, its kind, its size (half widths
+    in x and y, twice the radius of a circle, x and y of all corners of a polygon) and its centre,
+    mm. A semi-diameter is a circle like others, but that of the stop is no aperture."""
+    own, semi, found = _apertures(lens, i), float(lens.semi_diameter[i]), list[Shape]()
+    if math.isfinite(semi) and i != lens.stop:
+        own.setdefault("aperture", []).append({"circle": semi})
+    for key, shapes in own.items():
+        for shape in shapes:
+            kind = next(kind for kind in shape if kind != "centre")
+            size = np.ravel(shape[kind]).tolist() * (1 + (kind == "circle"))
+            found.append((key == "obscuration", kind, size, shape.get("centre", [0.0, 0.0])))
+    return sorted(found)
+
+
+def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
+    """Prescription keys of medium i; None if only its constants describe it."""
+    own = constants_of(lens.dispersion, i)
+    if lens.dispersion.model is not None and lens.dispersion.model[i, 0] != 1:
+        if own.keys() - {"range"}:
+            raise LensError(f"glasses[{i}]: a prescription has no constants beside nd and vd")
+        nd, vd = np.asarray(lens.dispersion.model[i]).tolist()
+        partial = lens.dispersion.partial
+        above = {} if partial is None or not partial[i] else {"partial": float(partial[i])}
+        return {"nd": nd, "vd": vd} | above
+    if not own:
+        return {}
+    if own.keys() == {"schott"} and not any(own["schott"][1:]):
+        return {"index": math.sqrt(own["schott"][0])}
+    unnamed = lens.glasses[i] in lens.labels.unnamed.glasses  # returned by a jitted function
+    for name in glass_names() if unnamed else [lens.glasses[i]]:
+        try:
+            glass = find_glass(name)
+        except ValueError:
+            return None
+        alike = np.float32(glass.range[1]) == np.float32(lens.dispersion.ranges[i, 1])
+        if alike and own == constants_of(Dispersion.of([glass]), 0):
+            return {"glass": name}
+    return None
+
+
+def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
+    """The constants of medium i as a prescription's `glasses` hold them; empty for air."""
+    parts = (dispersion.strength, dispersion.resonance, dispersion.schott)
+    strength, resonance, schott = (np.asarray(part[i]).tolist() for part in parts)
+    terms = max((k + 1 for k, pair in enumerate(zip(strength, resonance)) if any(pair)), default=0)
+    constants: dict[str, Any] = {}
+    if terms:
+        constants["sellmeier"] = strength[:terms] + resonance[:terms]
+    schott = schott if any(schott[6:]) else schott[:6]
+    if schott != [1, 0, 0, 0, 0, 0]:
+        constants["schott"] = schott
+    known = np.asarray(dispersion.ranges[i])
+    if not np.array_equal(known, np.asarray(ANY, known.dtype)):
+        constants["range"] = known.tolist()
+    return constants
+
+
+def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Keys of each medium, none for air, and the glasses that the file has to define."""
+    plain = [medium_of(lens, i) for i in range(lens.count + 1)]
+    described = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
+    media: list[dict[str, Any]] = []
+    glasses: dict[str, Any] = {}
+    for i, (name, keys) in enumerate(zip(lens.glasses, plain, strict=True)):
+        if i and name == lens.glasses[i - 1]:  # light keeps the constants of the medium in front
+            keys = media[-1]
+        elif keys is None or keys.get("glass") in described:
+            own = constants_of(lens.dispersion, i)
+            while glasses.setdefault(name, own) != own:  # another medium has this name
+                name += "*"
+            keys = {"glass": name}
+        media.append(keys)
+    return media, glasses
