@@ -21,7 +21,7 @@ import os
 import pathlib
 import sys
 import time
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ from drt_jax.design.deviations import KINDS
 from drt_jax.design.prediction import Order
 
 from . import _command, _common, _plots, _sharing
+from ._common import Numbers, not_empty, within
 from .runs.folder import Run
 
 COLUMNS = ("mean_um", "p90_um", "seconds")
@@ -41,6 +42,11 @@ _ORDERS = get_args(Order)
 _SAMPLES = ("traced", *_ORDERS)
 _SHOWN, _BINS = 14, 60
 _LEVELS = np.linspace(0, 1, 201)
+
+
+def _pairs(fields: tuple[tuple[float, ...], ...]) -> str:
+    wrong = [p for p in fields if len(p) != 2 or not all(-89 <= angle <= 89 for angle in p)]
+    return f"expected pairs x, y from -89 to 89, got {wrong[0]}" if wrong else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,32 +68,20 @@ class Config:
     """
 
     lens: str
-    tolerances: tuple[design.Tolerance, ...]
-    fields_deg: tuple[tuple[float, ...], ...] = ((0.0, 0.0),)
+    tolerances: Annotated[tuple[design.Tolerance, ...], not_empty]
+    fields_deg: Annotated[tuple[tuple[float, ...], ...], not_empty, _pairs] = ((0.0, 0.0),)
     distance_mm: float = math.inf
-    wavelengths_um: tuple[float, ...] = (0.5875618,)
+    wavelengths_um: Annotated[tuple[float, ...], within(1e-4, 1e6), not_empty] = (0.5875618,)
     colour_weights: tuple[float, ...] = ()
-    order: int = 4
+    order: Annotated[int, within(1, 40)] = 4
     compensator: Literal["none", "focus", "focus and tilt"] = "focus"
     errors: Literal["uniform", "normal"] = "uniform"
-    scales: tuple[float, ...] = (1.0,)
-    count: int = 10000
-    draws: int = 100000
-    limits_um: tuple[float, ...] = ()
+    scales: Annotated[Numbers, within(1e-3, 1e3)] = (1.0,)
+    count: Annotated[int, within(1, 1e7)] = 10000
+    draws: Annotated[int, within(1, 1e7)] = 100000
+    limits_um: Annotated[tuple[float, ...], within(1e-6, 1e6)] = ()
     seed: int = 0
-    devices: int = dataclasses.field(default=1, compare=False)
-
-    def __post_init__(self) -> None:
-        limits = {"wavelengths_um": (1e-4, 1e6), "order": (1, 40), "scales": (1e-3, 1e3)}
-        limits |= {"count": (1, 1e7), "draws": (1, 1e7), "limits_um": (1e-6, 1e6)}
-        limits |= {"devices": (1, 1e4)}
-        _common.require_within("", self, **limits)
-        for name in ("tolerances", "fields_deg", "wavelengths_um", "scales"):
-            _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")
-        _common.require_list("scales", self.scales)
-        for pair in self.fields_deg:
-            valid = len(pair) == 2 and all(-89 <= angle <= 89 for angle in pair)
-            _common.require(valid, f"fields_deg: expected pairs x, y from -89 to 89, got {pair}")
+    devices: Annotated[int, within(1, 1e4)] = dataclasses.field(default=1, compare=False)
 
 
 def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.PerturbedLens]:

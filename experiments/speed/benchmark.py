@@ -16,7 +16,7 @@ import os
 import pathlib
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
 
 from . import _command, _common, _peers, _plots, _work
+from ._common import within
 from ._reference import Moments, changed, flatten, gradient_error, reference
 from ._work import Row, compiled, peer, rows_of
 from .runs.folder import Run
@@ -49,23 +50,19 @@ class Config:
     """
 
     lens: str = "double_gauss"
-    distance_m: float = 25.0
-    field_deg: float = 10.0
-    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
-    repeats: int = 15
-    rays: int = 256
-    bundle: int = 262144
-    batch: int = 16
-    patch: int = 64
+    distance_m: Annotated[float, within(1e-3, 1e9)] = 25.0
+    field_deg: Annotated[float, within(0, 89.9)] = 10.0
+    wavelengths_um: Annotated[tuple[float, ...], within(1e-4, 1e6)] = (0.6, 0.53, 0.48)
+    repeats: Annotated[int, within(1, 1e4)] = 15
+    rays: Annotated[int, within(7, 1e6)] = 256  # one hexapolar ring has 7 rays
+    bundle: Annotated[int, within(1, 1e8)] = 262144
+    batch: Annotated[int, within(1, 4096)] = 16
+    patch: Annotated[int, within(7, 4096)] = 64
     tasks: tuple[str, ...] = ()
     growth: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:
-        # One hexapolar ring has 7 rays.
-        counts = {"repeats": (1, 1e4), "rays": (7, 1e6), "bundle": (1, 1e8), "batch": (1, 4096)}
-        numbers = {"distance_m": (1e-3, 1e9), "field_deg": (0, 89.9), "wavelengths_um": (1e-4, 1e6)}
-        _common.require_within("", self, patch=(7, 4096), **counts, **numbers)
         _common.require_known("tasks", self.tasks, TASKS)
 
     @property

@@ -10,7 +10,7 @@ import pathlib
 import re
 import sys
 import time
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -22,6 +22,7 @@ from drt_jax.devices import copied, shared, split
 from drt_jax.learn import train
 
 from . import _command, _common, _settings, _sharing
+from ._common import different, within
 from .runs.folder import Run
 
 COLUMNS = ()
@@ -37,18 +38,15 @@ class Config:
     repeats: steps that are timed for each count.
     """
 
-    counts: tuple[int, ...] = (1, 2, 4, 8)
-    images: int = 2
-    patch: int = 64
-    repeats: int = 20
+    counts: Annotated[tuple[int, ...], within(1, 4096), different] = (1, 2, 4, 8)
+    images: Annotated[int, within(1, 4096)] = 2
+    patch: Annotated[int, within(7, 4096)] = 64
+    repeats: Annotated[int, within(1, 1e6)] = 20
     lens: str = "double_gauss"
     wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
     network: _settings.Net = _settings.Net()
 
     def __post_init__(self) -> None:
-        limits = {"counts": (1, 4096), "images": (1, 4096), "patch": (7, 4096), "repeats": (1, 1e6)}
-        _common.require_within("", self, **limits)
-        _common.require_different("counts", self.counts)
         _common.require(self.counts[:1] == (1,), "counts: expected 1 first, to compare with")
 
 

@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ import drt_jax
 from drt_jax import Lens, show
 
 from . import _command, _common, _peers, _plots, _work
+from ._common import Numbers, Wavelengths, not_empty, within
 from ._reference import reference
 from .runs.folder import Run
 
@@ -51,10 +52,7 @@ class LensFields:
     """
 
     lens: str
-    field_deg: float
-
-    def __post_init__(self) -> None:
-        _common.require_within("lenses.", self, field_deg=(1e-6, 89.9))
+    field_deg: Annotated[float, within(1e-6, 89.9)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,23 +65,15 @@ class Config:
     repeats: timed turns of each program.
     """
 
-    lenses: tuple[LensFields, ...]
-    parts: tuple[float, ...] = (0.0, 0.5, 1.0)
-    wavelengths_um: tuple[float, ...] = (0.6562725, 0.5875618, 0.4861327)
-    copies: int = 64
-    fields: int = 5
-    sweep: int = 200
-    rays: int = 271
-    repeats: int = 9
+    lenses: Annotated[tuple[LensFields, ...], not_empty]
+    parts: Annotated[Numbers, within(0, 1)] = (0.0, 0.5, 1.0)
+    wavelengths_um: Wavelengths = (0.6562725, 0.5875618, 0.4861327)
+    copies: Annotated[int, within(1, 1e4)] = 64
+    fields: Annotated[int, within(1, 1e4)] = 5
+    sweep: Annotated[int, within(8, 1e5)] = 200
+    rays: Annotated[int, within(7, 1e6)] = 271
+    repeats: Annotated[int, within(1, 1e4)] = 9
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        _common.require(len(self.lenses) > 0, "lenses: needs at least one item")
-        _common.require_list("wavelengths_um", self.wavelengths_um)
-        _common.require_list("parts", self.parts, -1.0)
-        _common.require_within("", self, parts=(0, 1), wavelengths_um=(1e-4, 1e6))
-        counts = {"copies": (1, 1e4), "fields": (1, 1e4), "sweep": (8, 1e5), "rays": (7, 1e6)}
-        _common.require_within("", self, repeats=(1, 1e4), **counts)
 
 
 def sigmas(lens: Lens, field: Any, waves: Array, rule: drt_jax.PupilRule) -> Array:

@@ -11,14 +11,15 @@ import pathlib
 import sys
 import tempfile
 from collections.abc import Iterator
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from drt_jax import show
 
-from . import _command, _common, _ended, _plots, _spoilt
-from ._outcomes import OUTCOMES
+from . import _command, _common, _damaged_files, _ended, _plots
+from ._common import within
+from ._damaged_files import OUTCOMES
 from .runs.folder import Run
 
 COLUMNS = ("tried", *OUTCOMES)
@@ -35,34 +36,25 @@ class Config:
     parts: parts to run, of files and kills; empty for all.
     """
 
-    files: int = 10_000
-    traced: int = 20
-    kills: int = 200
-    parts: tuple[str, ...] = ()
+    files: Annotated[int, within(2, 1e6)] = 10_000
+    traced: Annotated[int, within(0, 1e5)] = 20
+    kills: Annotated[int, within(3, 1e4)] = 200
+    parts: tuple[Literal["files", "kills"], ...] = ()
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        limits = {"files": (2, 1e6), "traced": (0, 1e5), "kills": (3, 1e4)}
-        _common.require_within("", self, **limits)
-        _common.require_known("parts", self.parts, PARTS)
 
 
 def rows_of(config: Config, part: str) -> Iterator[dict[str, Any]]:
     """The rows of a part."""
     rngs = np.random.default_rng([config.seed, PARTS.index(part)]).spawn(4)
     if part == "files":
-        row, loaded = _spoilt.prescriptions(config.files // 2, rngs[0])
+        row, loaded = _damaged_files.prescriptions(config.files // 2, rngs[0])
         yield row
-        yield _spoilt.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
-        yield _spoilt.settings(config.files - config.files // 2, rngs[1])
-        yield _spoilt.lens_files(config.files // 4, rngs[3])
+        yield _damaged_files.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
+        yield _damaged_files.settings(config.files - config.files // 2, rngs[1])
+        yield _damaged_files.lens_files(config.files // 4, rngs[3])
     else:
         with tempfile.TemporaryDirectory() as folder:
-            toy, third = _ended.Toy(pathlib.Path(folder)), config.kills // 3
-            yield _ended.killed(toy, third, rngs[0])
-            yield _ended.killed_at_writes(toy, third, rngs[1])
-            yield _ended.stopped(toy, config.kills - 2 * third, rngs[2])
-            yield _ended.two(toy, 3)
+            yield from _ended.rows(pathlib.Path(folder), config.kills, rngs)
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import pathlib
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -36,12 +36,11 @@ class Config:
     families: names of the families to run; empty for all.
     """
 
-    scenes: int = 620
+    scenes: Annotated[int, _common.within(3, 1e5)] = 620
     seed: int = 0
     families: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        _common.require_within("", self, scenes=(3, 1e5))
         _common.require_known("families", self.families, FAMILIES)
 
 
