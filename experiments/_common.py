@@ -128,9 +128,7 @@ def measured(run: Run, unit: str, jobs: dict[str, Callable[[], Any]]) -> list[An
     found = []
     for job in (bar := tqdm(jobs, unit=unit, dynamic_ncols=True)):
         bar.set_description(job)
-        if run.kept(job) is None:
-            run.keep(job, jobs[job]())
-        found.append(run.kept(job))
+        found.append(run.once(job, jobs[job]))
     return found
 
 
