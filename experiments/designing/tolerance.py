@@ -37,7 +37,6 @@ from . import _command, _common, _plots, _sharing
 from ._common import Numbers, not_empty, within
 from .runs.folder import Run
 
-COLUMNS = ("mean_um", "p90_um", "seconds")
 _ORDERS = get_args(Order)
 _SAMPLES = ("traced", *_ORDERS)
 _SHOWN, _BINS = 14, 60
@@ -179,8 +178,8 @@ def _um(mm: Any, root: bool = False) -> np.ndarray:
     return 1e3 * (np.sqrt(np.maximum(mm, 0)) if root else np.asarray(mm))
 
 
-def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -> dict[str, Any]:
-    """Traced and predicted spots at one scale of the sizes; logs them."""
+def monte_carlo(config: Config, found: dict[str, Any], scale: float) -> dict[str, Any]:
+    """Traced and predicted spots at one scale of the sizes."""
     problem, perturbed = prepare(config)
     predicted, normal = predicted_of(found), config.errors == "normal"
     perturbations = scale * design.draw_perturbations(perturbed, config.count, config.seed, normal)
@@ -215,12 +214,6 @@ def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -
             # Root sum of squares: the distribution of q taken as normal.
             sums["rss_p90_um"] = float(_um(mean + 1.2815516 * deviation, True))
         row[name] = sums
-    parts = {"mean_um": row["traced"]["mean_um"], "p90_um": row["traced"]["p90_um"]}
-    run.log(
-        f"sizes x {scale:g}",
-        0,
-        {k: np.array([v]) for k, v in (parts | {"seconds": seconds}).items()},
-    )
     return row
 
 
@@ -229,7 +222,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     (found,) = _common.measured(run, "step", {"derivatives": lambda: derivatives(config)})
     jobs: dict[str, Any] = {"one error": lambda: sensitivity(config, found)}
     for scale in config.scales:
-        jobs[f"sizes x {scale:g}"] = functools.partial(monte_carlo, config, found, scale, run)
+        jobs[f"sizes x {scale:g}"] = functools.partial(monte_carlo, config, found, scale)
     alone, *scales = _common.measured(run, "step", jobs)
     about = {"derivatives_s": found["seconds"], "derivatives_compile_s": found["compile_s"]}
     about |= {"rule_error": found["rule_error"], "threads": os.cpu_count(), "count": config.count}

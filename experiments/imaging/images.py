@@ -36,7 +36,6 @@ from ._common import Colours, not_empty, odd, within
 from ._image_pictures import MODELS, draw as draw
 from .runs.folder import Run
 
-COLUMNS = ("value_s", "gradient_s", "error", "off")
 # Rays traced at once for a histogram.
 _ROUND = 2**17
 

@@ -31,7 +31,6 @@ from ._common import odd, or_zero, three_colours, within
 from .runs.config import ConfigError
 from .runs.folder import Run
 
-COLUMNS = ("seconds",)
 # Bytes for each value of a picture: the picture, its light, the result and intermediate arrays.
 _BYTES = 40
 _positive = within(np.nextafter(0, 1), math.inf)

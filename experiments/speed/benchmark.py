@@ -35,8 +35,6 @@ from ._work import Row, compiled, peer, rows_of
 from .runs.folder import Run
 from .snell import trace_snell
 
-COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", *_work.MEASURED)
-
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -240,15 +238,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Runs the tasks one by one."""
     # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
-
-    def measure(name: str) -> list[Row]:
-        rows = TASKS[name](config)
-        for k, row in enumerate(rows):
-            known = {c: np.array([float(row[c])]) for c in COLUMNS if row[c] is not None}
-            run.log(name, k, known)
-        return rows
-
-    jobs = {name: functools.partial(measure, name) for name in config.tasks or TASKS}
+    jobs = {name: functools.partial(TASKS[name], config) for name in config.tasks or TASKS}
     rows = sum(_common.measured(run, "task", jobs), [])
     lens, field, distance = config.scene
     results = {"rows": rows, "counts": _work.counts(lens, distance, config.wavelengths_um)}

@@ -25,7 +25,6 @@ from . import _command, _common, _settings, _sharing
 from ._common import different, within
 from .runs.folder import Run
 
-COLUMNS = ()
 _BYTES = {"f32": 4, "f64": 8, "s32": 4}
 
 
@@ -141,9 +140,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         axes.plot(counts, [1e3 * row[key] / row["images"] for row in rows], "o-", label=label)
     axes.set_xscale("log", base=2)
     axes.set_xticks(counts, counts)
-    axes.set_ylim(0)
-    axes.set_xlabel("devices")
-    axes.set_ylabel("time of an image, ms")
+    axes.set(xlabel="devices", ylabel="time of an image, ms", ylim=(0, None))
     axes.legend()
     figure.savefig(figures / "scaling.png")
 

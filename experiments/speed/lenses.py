@@ -34,7 +34,6 @@ from ._common import Numbers, Wavelengths, not_empty, within
 from ._reference import reference
 from .runs.folder import Run
 
-COLUMNS = ("first_s", "loose_s", "tight_s", "value_s", "gradient_s", "loose_error", "tight_error")
 _LOOSE, _TIGHT = 1e-3, 1e-6
 # Relative perturbation of copies.
 _SPREAD = 1e-4
@@ -228,14 +227,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Measures the lenses one by one."""
     # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
-
-    def one(of: LensFields) -> dict[str, Any]:
-        found = lens_rows(config, of)
-        for k, row in enumerate(found["rows"]):
-            run.log(of.lens, k, {c: np.array([float(row[c])]) for c in COLUMNS})
-        return found
-
-    found = _common.measured(run, "lens", {of.lens: partial(one, of) for of in config.lenses})
+    jobs = {of.lens: partial(lens_rows, config, of) for of in config.lenses}
+    found = _common.measured(run, "lens", jobs)
     return {
         "rows": sum((each["rows"] for each in found), []),
         "copies": [each["copies"] for each in found],

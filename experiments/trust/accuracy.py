@@ -34,7 +34,6 @@ from ._reference import Moments, flatten, gradient_error, reference
 from .runs.folder import Run
 
 _QUADRATURE = "quadrature"
-COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")
 # In the table: the default tolerance, and the sizes of patterns.
 _DEFAULT, _RANDOM, _MANY = 1e-6, 256, 16384
 _SIZES = (16, 64, 256, 1024, 4096, 16384)
@@ -214,8 +213,8 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
     return jax.tree.map(lambda a: jnp.asarray(a, scene.dtype), arguments), truth
 
 
-def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[dict]]:
-    """Measures one scene, logs its curves, and returns its rows of results.json."""
+def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
+    """Measures one scene and returns its rows of results.json."""
     first = next(other for other in config.scenes if other.kind == scene.kind)
     if scene.vignetted or scene is first:
         jax.clear_caches()  # thousands of kernels exhaust what a process may map
@@ -228,7 +227,6 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
         {"method": name, "size": size} | row_of(arguments, truth, rules)
         for name, size, rules in kinds
     ]
-    run.log(scene.label, 0, {c: np.array([row[c] for row in curves], float) for c in COLUMNS})
     # A Python number on axis, whose symmetry is known.
     known = arguments[0], arguments[1] if scene.field_deg else 0.0, *arguments[2:]
     tolerances = []
@@ -237,11 +235,11 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
         error = spot_errors(truth, *spot(*arguments, rule))[0]
         row = {"tolerance": tolerance, "order": rule.order, "rays": count_rays(arguments, rule)}
         tolerances.append(row | {"relative_error": error})
-    exact = []
-    for wavelength, m in zip(config.wavelengths_um, truth):
-        row = {"wavelength_um": wavelength, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
-        row |= {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
-        exact.append(row)
+    exact = [
+        {"wavelength_um": wavelength, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
+        | {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
+        for wavelength, m in zip(config.wavelengths_um, truth)
+    ]
     about = {"scene": scene.label, "panel": scene.panel, "dtype": scene.dtype}
     found = {"curves": curves, "tolerances": tolerances, "truth": exact}
     return {key: [about | row for row in rows] for key, rows in found.items()}
@@ -249,7 +247,7 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Measures all scenes."""
-    jobs = {s.label: functools.partial(measure, config, s, run) for s in config.scenes}
+    jobs = {s.label: functools.partial(measure, config, s) for s in config.scenes}
     found = _common.measured(run, "scene", jobs)
     results = {key: sum((rows[key] for rows in found), []) for key in found[0]}
     return results | {"seconds": run.seconds}

@@ -22,7 +22,6 @@ from ._common import within
 from ._damaged_files import OUTCOMES
 from .runs.folder import Run
 
-COLUMNS = ("tried", *OUTCOMES)
 PARTS = ("files", "kills")
 
 
@@ -59,22 +58,17 @@ def rows_of(config: Config, part: str) -> Iterator[dict[str, Any]]:
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Runs each part."""
-
-    def one(part: str) -> list[dict[str, Any]]:
-        rows = list(rows_of(config, part))
-        for row in rows:
-            run.log(row["kind"], 0, {c: np.array([float(row[c])]) for c in COLUMNS})
-        return rows
-
     parts = config.parts or PARTS
-    found = _common.measured(run, "part", {part: lambda part=part: one(part) for part in parts})
+    jobs = {part: lambda part=part: [*rows_of(config, part)] for part in parts}
+    found = _common.measured(run, "part", jobs)
     return {"rows": sum(found, []), "seconds": run.seconds}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Table of the outcomes of each kind, and examples of faults."""
-    rows = [[row[key] for key in ("kind", *COLUMNS)] for row in results["rows"]]
-    found = {"faults": _common.table(("kind", *COLUMNS), rows)}
+    header = ("kind", "tried", *OUTCOMES)
+    rows = [[row[key] for key in header] for row in results["rows"]]
+    found = {"faults": _common.table(header, rows)}
     faults = [f"{row['kind']}: {text}" for row in results["rows"] for text in row["examples"]]
     return found | ({"faults, examples": "\n".join(faults)} if faults else {})
 
