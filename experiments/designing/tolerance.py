@@ -318,8 +318,8 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     some = merged(results)[:_SHOWN]
     figure, ax = show.new(1, 1, 7, 5)
     bars = {name: np.array([m[f"{name}_um"] for m in some]) for name in ("traced", "predicted")}
-    _plots.offenders(ax, [f"{m['name']}: {m['size']}" for m in some], bars)
-    ax.set_xlabel("spot grows by (µm)")
+    names = [f"{m['name']}: {m['size']}" for m in some]
+    _plots.offenders(ax, names, bars, "spot grows by (µm)")
     figure.savefig(figures / "offenders.png")
     row = main_scale(results)
     figure, ax = show.new(1, 1, 6.5, 4)

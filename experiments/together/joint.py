@@ -13,7 +13,7 @@ import dataclasses
 import math
 import pathlib
 import sys
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -22,8 +22,9 @@ from drt_jax.design import Operand, Solve, Tie, Tolerance, Vary
 from drt_jax.learn.data import DataConfig
 
 from . import _command, _common, _plots, _report, _settings, _sharing
-from ._arms import ARMS, Arm, run as run
 from ._common import Colours, different, near_and_far, not_empty, odd, within
+from ._setup import ARMS
+from ._train_arms import run as run
 from .runs.folder import Run as Run
 
 COLUMNS = ("loss",)
@@ -125,7 +126,7 @@ class Config:
     mtf_at: Annotated[float, within(1e-3, 1e4)] = 30.0
     network: _settings.Net = _settings.Net()
     train: Training = Training()
-    arms: Annotated[tuple[Arm, ...], different] = ("focus", "spots", "joint")
+    arms: Annotated[tuple[Literal[*ARMS], ...], different] = ("focus", "spots", "joint")
     seeds: Annotated[int, within(1, 100)] = 3
     tolerances: tuple[Tolerance, ...] = ()
     refocus: bool = False
@@ -158,14 +159,14 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         spot = _spread([row["spot_um"] for row in own], "spot")
         speed = f"{1e3 * float(np.median([row['step_s'] for row in own])):.3g}"
         ahead_text = _spread(ahead, "psnr") if ahead and arm != "spots" else ""
-        rows.append([ARMS[arm], len(own), *cells, more, ahead_text, spot, speed])
+        rows.append([ARMS[arm].title, len(own), *cells, more, ahead_text, spot, speed])
     found = {f"joint, {name}": _common.table(header, rows)}
     if results["builds"]:
         header = ["arm", "PSNR dB as designed", "mean as built", "10th percentile"]
         lines = []
         for (arm,), own in _common.grouped(results["builds"], "arm").items():
             parts = [[row[key] for row in own] for key in ("designed", "mean", "low")]
-            lines.append([ARMS[arm], *(_spread(part, "psnr") for part in parts)])
+            lines.append([ARMS[arm].title, *(_spread(part, "psnr") for part in parts)])
         found[f"joint, {name}: as built"] = _common.table(header, lines)
     return found
 
@@ -180,7 +181,9 @@ def _spread(values: list[float], measure: str) -> str:
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws losses, lenses, and patches through each lens before and after the network."""
     figure, axes = show.new(width=7, height=4.5)
-    lines = {ARMS[arm]: _smooth(loss) for arm, loss in zip(results["arms"], results["losses"])}
+    titles = {name: arm.title for name, arm in ARMS.items()}
+    losses = zip(results["arms"], results["losses"])
+    lines = {titles[arm]: _smooth(loss) for arm, loss in losses}
     _plots.curves(axes, lines, "training batch", "mean absolute error")
     axes.set_yscale("log")
     figure.savefig(figures / "losses.png")
@@ -190,7 +193,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     for ax, name in zip(np.ravel(axes), drawn):
         lens = load_lens(figures.parent / "lenses" / f"{name}.yaml")
         show.lens_drawing(ax, show.draw(lens, fields, results["far_mm"] or math.inf))
-        ax.set_title(ARMS.get(name.split()[0], name), fontsize=9)
+        ax.set_title(titles.get(name.split()[0], name), fontsize=9)
         ax.get_legend().remove()
     figure.savefig(figures / "lenses.png")
     for arm in results["pictures"]:
