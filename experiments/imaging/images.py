@@ -163,7 +163,7 @@ def measure(config: Config, view: View) -> dict[str, Any]:
     lines, curves = contrast(config, lens, field, pixel)
     about |= {"grid_s": field_grid(scene, config.repeats), "frequencies": lines}
     about |= {"transfer": curves}
-    return {"rows": rows, "view": name | about, "peers": _beside(config, scene, rule, name)}
+    return {"rows": rows, "view": name | about, "peers": _peer_rows(config, scene, rule, name)}
 
 
 def _timed(scene: Scene, model: PsfModel, repeats: int) -> tuple[np.ndarray, float, float]:
@@ -200,7 +200,7 @@ def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[li
     return lines.tolist(), curves.tolist()
 
 
-def _beside(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> list[dict[str, Any]]:
+def _peer_rows(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> list[dict]:
     """Rows of other programs, at the middle wavelength."""
     middle = scene.waves[[len(scene.waves) // 2]]
     one = dataclasses.replace(scene, waves=middle)
@@ -317,10 +317,10 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         for p in results["photographs"]
     ]
     names = ("lens", "pixel, um", "kernel", "first", "next")
-    beside = ("lens, degrees", "program", "samples", "time, one colour", "error", "")
+    programs = ("lens, degrees", "program", "samples", "time, one colour", "error", "")
     return {
         "images": _common.table(header, lines),
-        "images, other programs": _common.table(beside, others),
+        "images, other programs": _common.table(programs, others),
         "images, views": _common.table(columns, views),
         "images, photographs": _common.table(names, photos),
     }

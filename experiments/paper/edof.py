@@ -125,7 +125,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     joint, fixed = (_common.number(mean[name], ".4f") for name in ("joint", "fixed"))
     means = f"mean MAE over training depths {joint} against {fixed}"
     against = f"{means}; fixed better at {', '.join(better) or 'no'} m"
-    beside = [
+    compared = [
         *_report.planes(results, "145.29 mm"),
         ("joint against fixed sensor", "joint better, but for 15 to 20 m", against),
         *_report.gaussian(results),
@@ -134,7 +134,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     lines = [(title, *(_common.number(row[n][m], ".4f") for row in rows)) for title, n, m in errors]
     header = "depth m", *(f"{row['depth_m']:g}" for row in rows)
     return {
-        "edof": _report.beside(results, beside),
+        "edof": _report.comparison(results, compared),
         "edof, table 2": _common.table(header, lines),
         **_report.numbers_tables("edof, lens", results),
     }

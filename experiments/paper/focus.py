@@ -95,7 +95,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     rows = [*_report.planes(results, "133.35 mm", search), *firsts, took]
     rows += _report.gaussian(results)
     more = _report.numbers_tables("focus, lens", results)
-    return {"focus": _report.beside(results, rows)} | more
+    return {"focus": _report.comparison(results, rows)} | more
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:

@@ -73,7 +73,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     columns = [a + b for a in ("", "sensor_") for b in ("mae", "rmse", "psnr", "ssim")]
     errors = [[row[name] for name in ("noise", "start_mm", *columns)] for row in results["test"]]
     return {
-        "restore": _report.beside(results, rows),
+        "restore": _report.comparison(results, rows),
         "restore, table 5b": _common.table(header, errors),
         **_report.numbers_tables("restore, lens", results),
     }

@@ -106,14 +106,14 @@ def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
         found, back = jax.vjp(lambda values: sigma(values)[0], values)
         return found, jax.vmap(lambda row: back(row)[0])(jnp.eye(waves.size))
 
-    def beside(spot):
+    def of_peer(spot):
         call = spot(numbers, config.rays)[int(gradient)]
         return call, spot_error(truth, count, *call())
 
     ours = compiled(jacobian if gradient else sigma, flatten(lens))
     numbers = _peers.Lens(lens, field, distance, config.wavelengths_um)
-    peers = peer("optiland", lambda: beside(_peers.optiland_spot))
-    peers |= peer("batoid", lambda: beside(_peers.batoid_spot))
+    peers = peer("optiland", lambda: of_peer(_peers.optiland_spot))
+    peers |= peer("batoid", lambda: of_peer(_peers.batoid_spot))
     task = "sigma and Jacobian" if gradient else "sigma"
     task += ", on axis" if axial else f", {config.field_deg:g} degrees"
     return rows_of(task, ours, spot_error(truth, count, *ours[0]()), peers, config.repeats)

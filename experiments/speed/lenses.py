@@ -17,7 +17,6 @@ import math
 import pathlib
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any
 
@@ -81,12 +80,6 @@ def sigmas(lens: Lens, field: Any, waves: Array, rule: drt_jax.PupilRule) -> Arr
     return jnp.sqrt(jnp.trace(covariance, axis1=1, axis2=2))
 
 
-def _timed(call: Callable) -> tuple[float, Any]:
-    start = time.perf_counter()
-    found = jax.block_until_ready(call())
-    return time.perf_counter() - start, found
-
-
 def _error(truth: np.ndarray, covariance: Array) -> float:
     found = np.sqrt(np.trace(np.asarray(covariance), axis1=1, axis2=2))
     return float(np.max(np.abs(found / truth - 1)))
@@ -97,7 +90,9 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     waves = np.array(config.wavelengths_um)
     converged = partial(drt_jax.psf_moments, lens, field, math.inf, waves)
     jax.clear_caches()
-    first, loose = _timed(lambda: converged(_LOOSE))
+    start = time.perf_counter()
+    loose = jax.block_until_ready(converged(_LOOSE))
+    first = time.perf_counter() - start
     tight = converged(_TIGHT)
     calls = [lambda: converged(_LOOSE), lambda: converged(_TIGHT)]
     seconds = _common.medians(calls, config.repeats)
@@ -111,7 +106,7 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
 
     gradient, more = _work.compiled(jax.value_and_grad(slopes), lens)
     truth = np.array([m.sigma for m in reference(lens, field, math.inf, config.wavelengths_um)])
-    peers = _beside(config, lens, field, truth)
+    peers = _peers_of(config, lens, field, truth)
     ready = [(name, call, error) for name, call, error, _ in peers if call]
     timed = _common.medians([value, gradient, *(call for _, call, _ in ready)], config.repeats)
     others = {name: (s, error) for (name, _, error), s in zip(ready, timed[2:])}
@@ -133,7 +128,7 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     }
 
 
-def _beside(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list[tuple]:
+def _peers_of(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list[tuple]:
     """(name, call, error, note) of each peer; call is None if it is missing or fails, error if its
     spot is not finite."""
     found = []

@@ -32,7 +32,7 @@ _MEASURES = ("mae", "rmse", "psnr", "ssim")
 
 
 @dataclasses.dataclass(frozen=True)
-class Spoil:
+class StartErrors:
     """Errors of the lens that all arms begin with: standard deviations of all curvatures, per cent,
     and thicknesses, mm."""
 
@@ -117,7 +117,7 @@ class Config:
     limits: tuple[Operand, ...] = ()
     ties: tuple[Tie, ...] = ()
     solves: tuple[Solve, ...] = ()
-    spoil: Spoil = Spoil()
+    spoil: StartErrors = StartErrors()
     field_deg: Annotated[float, within(1e-3, 80)] = 10.0
     depth_m: Annotated[tuple[float, ...], near_and_far] = (math.inf, math.inf)
     wavelengths_um: Annotated[Colours, within(0.1, 100)] = (0.6, 0.53, 0.48)

@@ -124,7 +124,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         rows.append((what, *counts, steps, f"{row['float32_error_p99']:.1e} mm"))
     total = results["total"]
     lost = total["traceable_per_10000_but_touching"]
-    beside = [
+    sums = [
         ("scenes", total["scenes"]),
         ("rays", total["rays"]),
         ("values that are not finite", total["nan_values"]),
@@ -134,7 +134,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         ("the same without surfaces that touch", f"{lost:.2f}"),
     ]
     return {
-        "stability": _common.table(("of all families", ""), beside),
+        "stability": _common.table(("of all families", ""), sums),
         "stability, families": _common.table(header, rows),
     }
 
