@@ -38,7 +38,7 @@ class Config:
     files: Annotated[int, within(2, 1e6)] = 10_000
     traced: Annotated[int, within(0, 1e5)] = 20
     kills: Annotated[int, within(3, 1e4)] = 200
-    parts: tuple[Literal["files", "kills"], ...] = ()
+    parts: tuple[Literal[*PARTS], ...] = ()
     seed: int = 0
 
 

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import pathlib
 import sys
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
@@ -38,10 +38,7 @@ class Config:
 
     scenes: Annotated[int, _common.within(3, 1e5)] = 620
     seed: int = 0
-    families: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        _common.require_known("families", self.families, FAMILIES)
+    families: tuple[Literal[*FAMILIES], ...] = ()
 
 
 def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
