@@ -5,6 +5,7 @@ import os
 import pathlib
 import signal
 import sys
+from collections.abc import Callable
 from typing import Any
 
 # One name, `experiments.<name>`, whichever folder an experiment lies in.
@@ -12,24 +13,19 @@ __path__ += [
     str(pathlib.Path(__file__).parent / name)
     for name in ("paper", "trust", "speed", "designing", "imaging", "together")
 ]
+# What is left if the program ends now, as text; `_command` sets it.
+left: Callable[[], str] = lambda: "nothing was begun"  # noqa: E731
 
 
-def _heard_early(number: int, frame: Any) -> None:
-    """Ctrl-C during imports, which take seconds. Not an exception, which could rise inside any
-    module."""
-    with contextlib.suppress(OSError):
-        os.write(2, b"\nstopped; nothing was begun\n")
+def _stop(number: int, frame: Any) -> None:
+    """Ctrl-C in a program: says what is left, and ends. Not an exception, which could rise inside
+    any import, and gets lost in a finalizer; written files are whole at any moment."""
+    with contextlib.suppress(Exception):
+        sys.stdout.flush()
+        os.write(2, f"\nstopped; {left()}\n".encode())
     os._exit(130)
 
 
-def hear(handler: Any) -> None:
-    """Sets the handler of Ctrl-C, if this is the program that runs. An ignored signal stays
-    ignored."""
-    if _IS_PROGRAM:
-        signal.signal(signal.SIGINT, handler)
-
-
-# `-m` stands for the name of the module while Python looks for it.
-_IS_PROGRAM = sys.argv[:1] == ["-m"]
-_IS_PROGRAM &= signal.getsignal(signal.SIGINT) is signal.default_int_handler
-hear(_heard_early)
+# `-m` stands for the name of the module while Python looks for it. An ignored signal stays ignored.
+if sys.argv[:1] == ["-m"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, _stop)

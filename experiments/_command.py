@@ -1,12 +1,9 @@
 """The command line of an experiment: settings, run folder, results, figures, errors."""
 
 import argparse
-import contextlib
 import dataclasses
 import datetime
-import os
 import pathlib
-import signal
 import sys
 import time
 import traceback
@@ -15,18 +12,19 @@ from typing import Any
 import jax
 
 import drt_jax
+import experiments
 from drt_jax import show
 from drt_jax.__main__ import set_up
 
-from . import _common, _sharing, hear
+from . import _common, _sharing
 from .runs import config as configs
 from .runs.folder import Run, begun
-from .runs.interrupt import deferred_interrupt
 
 # Errors raised in these folders are about the input; others are faults, shown with a traceback.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
 
 
+@dataclasses.dataclass
 class _Place:
     """Where a command works.
 
@@ -35,46 +33,37 @@ class _Place:
     """
 
     folder: pathlib.Path | None = None
-    own = False
+    own: bool = False
 
     def left(self) -> tuple[str, str]:
-        """What is left if the command ends now, and how to go on, as text."""
+        """What is left if the command ends now, and how to go on, as text; "" for no more."""
         if not (self.folder and self.own and (self.folder / "config.yaml").is_file()):
             return "nothing was begun", ""
         if (self.folder / "results.json").is_file():
             return "the results are whole", f"draw them with --report --out {self.folder}"
         return "what it wrote is whole", f"go on with --resume --out {self.folder}"
 
-    def stop(self, number: int, frame: Any) -> None:
-        """Ctrl-C: says what is left, and ends. Not an exception, which gets lost in a callback such
-        as a finalizer; written files are whole at any moment."""
-        message = "; ".join(filter(None, ("stopped", *self.left())))
-        with contextlib.suppress(Exception):
-            sys.stdout.flush()
-            os.write(2, f"\n{message}\n".encode())
-        os._exit(130)
-
 
 def main(experiment: Any, argv: list[str] | None = None) -> None:
     """Runs an experiment; with --report only draws and prints the results of a run again.
 
-    experiment: a module with `Config`, the dataclass of its settings, whose `columns`, if any, add
-        to `COLUMNS` of metrics.csv; `run(config, run)`, which returns results for `Run.finish`;
-        `tables(results)`, which are printed; and `draw(results, folder)` of figures.
+    experiment: a module with `Config`, the dataclass of its settings; `COLUMNS` of metrics.csv, if
+        it trains, to which `columns` of its settings add; `run(config, run)`, which returns results
+        for `Run.finish`; `tables(results)`, which are printed; and `draw(results, folder)` of
+        figures.
     argv: arguments of the command line.
     """
     place = _Place()
+    experiments.left = lambda: "; ".join(filter(None, place.left()))
     try:
-        hear(place.stop)
         bad = _do(experiment, argv, place)
-        hear(signal.SIG_IGN)  # nothing to stop any more
         if not bad:
             return
         others = f" and {len(bad) - 3} others" if len(bad) > 3 else ""
         what = ", ".join(bad[:3]) + others
         code, message = 1, f"error: not finite, null in {place.folder}/results.json: {what}"
     except KeyboardInterrupt:
-        code, message = 130, "; ".join(filter(None, ("stopped", *place.left())))
+        code, message = 130, f"stopped; {experiments.left()}"
     except OSError as error:
         what, remedy = place.left()
         wrong = f"{error.filename or place.folder}: {error.strerror or error}"
@@ -82,8 +71,8 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
     except jax.errors.JaxRuntimeError:
         if jax.process_count() == 1:
             raise
-        lost = "another process of the run has ended", *place.left()
-        _sharing.leave("error: " + "; ".join(filter(None, lost)), 1)
+        ended = "error: another process of the run has ended"
+        _sharing.leave(f"{ended}; {experiments.left()}", 1)
     except ValueError as error:
         raised = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)
         if not any(raised.is_relative_to(ours) for ours in _OURS):
@@ -105,7 +94,12 @@ def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
     place.own = options.resume or options.report
     if not options.report:
         with _sharing.own_folder(folder, options.resume) as own:
-            _run(name, experiment, options, place, own)
+            config = _config(name, experiment.Config, options, own)
+            columns = getattr(experiment, "COLUMNS", ()), getattr(config, "columns", ())
+            with Run(own, config, sum(columns, ()), options.resume) as run:
+                place.own = True
+                print(f"{name}: run folder {own}")
+                run.finish(experiment.run(config, run))
         if own != folder:  # the first process goes on alone
             return []
     results, figures = _common.read_results(folder), folder / "figures"
@@ -113,39 +107,14 @@ def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
     tables = experiment.tables(results)
     print("\n\n".join(tables.values()))
     experiment.draw(results, figures)
-    report = folder / "report.html"
-    page = _report(name, tables, figures, folder / "config.yaml")
+    report, settings = folder / "report.html", folder / "config.yaml"
+    pictures = {p.stem.replace("_", " "): p for p in sorted(figures.glob("*.png"))}
+    parts = tables | pictures | ({"Settings": settings.read_text()} if settings.is_file() else {})
+    page = show.page(name, [*parts.items()])
     report.write_text(page, encoding="utf-8")  # like the figures, drawn again by --report
     print(f"results in {folder / 'results.json'}, all on one page in {report}")
     print(f"done in {time.perf_counter() - started:.0f} s")
     return results.get("not_finite", [])
-
-
-def _run(
-    name: str, experiment: Any, options: argparse.Namespace, place: _Place, folder: pathlib.Path
-) -> None:
-    """Runs an experiment in a folder."""
-    config = _config(name, experiment.Config, options, folder)
-    columns = (*experiment.COLUMNS, *getattr(config, "columns", ()))
-    with deferred_interrupt() as asked:  # no stop before the run is whole
-        run = Run(folder, config, columns, options.resume)
-        place.own = True
-    with run:
-        if asked():
-            raise KeyboardInterrupt
-        print(f"{name}: run folder {folder}")
-        run.finish(experiment.run(config, run))
-
-
-def _report(
-    name: str, tables: dict[str, str], figures: pathlib.Path, settings: pathlib.Path
-) -> str:
-    """A page with the tables, figures and settings of a run."""
-    pictures = sorted(figures.glob("*.png"))
-    parts = [*tables.items(), *((path.stem.replace("_", " "), path) for path in pictures)]
-    if settings.is_file():
-        parts.append(("Settings", settings.read_text()))
-    return show.page(name, parts)
 
 
 def _parser(name: str, experiment: Any) -> argparse.ArgumentParser:
@@ -175,14 +144,10 @@ def _config(name: str, kind: type, options: argparse.Namespace, folder: pathlib.
         missing = f"{folder}: nothing to resume: no config.yaml in it"
         _common.require(source.is_file(), missing)
     config = configs.load_config(kind, source, options.set)
-    lens = getattr(config, "lens", None)
-    if (
-        isinstance(lens, str)
-        and not pathlib.Path(lens).exists()
-        and (_common.BASE / lens).is_file()
-    ):
-        config = dataclasses.replace(config, lens=str(_common.BASE / lens))  # from elsewhere
-    return config
+    lens = getattr(config, "lens", "")
+    known = _common.BASE / lens  # for a command that starts elsewhere
+    elsewhere = lens and not pathlib.Path(lens).exists() and known.is_file()
+    return dataclasses.replace(config, lens=str(known)) if elsewhere else config
 
 
 def _folder(name: str, options: argparse.Namespace) -> pathlib.Path:

@@ -7,7 +7,7 @@ import math
 import pathlib
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -46,30 +46,58 @@ def require(condition: bool, message: str) -> None:
         raise ConfigError(message)
 
 
-def require_different(name: str, values: Sequence[Any]) -> None:
-    """ConfigError for an item that is given twice."""
-    require(len(set(values)) == len(values), f"{name}: an item stands twice")
+# Checks of one setting, written as Annotated[float, within(0, 1)]: functions of its value that
+# return what is wrong, "" for nothing.
+Check = Callable[[Any], str]
 
 
-def require_list(name: str, values: tuple[float, ...], low: float = 0.0) -> None:
-    """ConfigError unless a list of settings has items, all different, finite and above `low`."""
-    require(len(values) > 0, f"{name}: needs at least one item")
-    require_different(name, values)
-    for value in values:
-        require(low < value < math.inf, f"{name}: expected numbers above {low:g}, got {value!r}")
+def within(low: float, high: float) -> Check:
+    """A number, or all items of a list, from `low` to `high`."""
+
+    def check(value: Any) -> str:
+        items = value if isinstance(value, tuple) else (value,)
+        outside = [item for item in items if not low <= item <= high]
+        return f"expected {low:g} to {high:g}, got {outside[0]!r}" if outside else ""
+
+    return check
 
 
-def require_within(prefix: str, settings: Any, **limits: tuple[float, float]) -> None:
-    """ConfigError unless the settings, or all their items, lie within limits, both included.
+def not_empty(value: tuple) -> str:
+    """A list with at least one item."""
+    return "" if value else "needs at least one item"
 
-    prefix: prefix of the names in messages, such as "train.".
-    limits: lowest and highest value by name.
-    """
-    for name, (low, high) in limits.items():
-        value = getattr(settings, name)
-        for item in value if isinstance(value, tuple) else (value,):
-            expected = f"{prefix}{name}: expected {low:g} to {high:g}"
-            require(low <= item <= high, f"{expected}, got {item!r}")
+
+def different(value: tuple) -> str:
+    """A list of items that all differ."""
+    return "" if len(set(value)) == len(value) else "an item stands twice"
+
+
+def odd(value: int) -> str:
+    """An odd number."""
+    return "" if value % 2 else "expected an odd number"
+
+
+def or_zero(check: Check) -> Check:
+    """0, or a value that another check accepts."""
+    return lambda value: "" if value == 0 else (wrong := check(value)) and f"{wrong}, or 0"
+
+
+def three_colours(value: tuple) -> str:
+    """Wavelengths of R, G and B."""
+    return "" if len(value) == 3 else "expected three, for R, G, B"
+
+
+def near_and_far(value: tuple) -> str:
+    """Two distances."""
+    ordered = len(value) == 2 and 0 < value[0] <= value[1]
+    return "" if ordered else "expected the nearest and the farthest distance in m"
+
+
+# A list of different numbers.
+Numbers = Annotated[tuple[float, ...], not_empty, different]
+# Wavelengths in um, also those of R, G and B.
+Wavelengths = Annotated[Numbers, within(1e-4, 1e6)]
+Colours = Annotated[tuple[float, ...], three_colours, within(1e-4, 1e6)]
 
 
 def require_known(name: str, values: tuple[str, ...], known: Iterable[str]) -> None:
@@ -100,9 +128,7 @@ def measured(run: Run, unit: str, jobs: dict[str, Callable[[], Any]]) -> list[An
     found = []
     for job in (bar := tqdm(jobs, unit=unit, dynamic_ncols=True)):
         bar.set_description(job)
-        if run.kept(job) is None:
-            run.keep(job, jobs[job]())
-        found.append(run.kept(job))
+        found.append(run.once(job, jobs[job]))
     return found
 
 

@@ -13,11 +13,12 @@ from drt_jax.show import new
 from drt_jax.show.figures import FIELD_COLOURS
 
 
-def _finished(axes: Axes, xlabel: str, ylabel: str, columns: int = 1) -> Axes:
+def _label(axes: Axes, xlabel: str, ylabel: str, grid: str = "both", **legend: Any) -> None:
+    """Labels, a grid, and a legend where there are labelled lines."""
     axes.set(xlabel=xlabel, ylabel=ylabel)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, ncols=columns)
-    return axes
+    axes.grid(alpha=0.3, axis=grid)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8, **legend)
 
 
 def curves(
@@ -26,13 +27,13 @@ def curves(
     xlabel: str,
     ylabel: str,
     level: tuple[float, str] | None = None,
-) -> Axes:
+) -> None:
     """Lines: (x (N,), y (N,)) by label. level: height and label of a horizontal line."""
     for k, (label, (x, y)) in enumerate(series.items()):
         axes.plot(x, y, linewidth=1.1, linestyle="-" if k < 10 else "--", label=label)
     if level is not None:
         axes.axhline(level[0], color="black", linestyle=":", linewidth=1, label=level[1])
-    return _finished(axes, xlabel, ylabel)
+    _label(axes, xlabel, ylabel)
 
 
 def error_curves(
@@ -41,7 +42,7 @@ def error_curves(
     xlabel: str,
     ylabel: str,
     note: tuple[float, float, str] | None = None,
-) -> Axes:
+) -> None:
     """Errors over cost, both logarithmic: a line for the median of the scenes, a band from the best
     to the worst.
 
@@ -67,10 +68,10 @@ def error_curves(
     axes.set(xscale="log", yscale="log")
     # More labels between the powers of ten would overlap.
     axes.xaxis.set_minor_locator(ticker.LogLocator(subs=(2, 5)))
-    return _finished(axes, xlabel, ylabel)
+    _label(axes, xlabel, ylabel)
 
 
-def programs(axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], title: str) -> Axes:
+def programs(axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], title: str) -> None:
     """Points of programs, both axes logarithmic.
 
     marks: (time of a call in ms, relative error) of each point, by program.
@@ -78,10 +79,10 @@ def programs(axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], tit
     for name, points in marks.items():
         axes.plot(*zip(*points), marker="o", linestyle="none", markersize=8, label=name)
     axes.set(xscale="log", yscale="log", title=title)
-    return _finished(axes, "time of a call (ms)", "error, relative")
+    _label(axes, "time of a call (ms)", "error, relative")
 
 
-def sigma_over_depth(axes: Axes, depths: np.ndarray, curves: Mapping[str, np.ndarray]) -> Axes:
+def sigma_over_depth(axes: Axes, depths: np.ndarray, curves: Mapping[str, np.ndarray]) -> None:
     """Blur over the object distance: the first curve dotted and pale, the others solid.
 
     depths: (N,), m.
@@ -94,7 +95,7 @@ def sigma_over_depth(axes: Axes, depths: np.ndarray, curves: Mapping[str, np.nda
             if k == 0:
                 line.set(linestyle=":", alpha=0.6)
     axes.set_ylim(0, None)
-    return _finished(axes, "object distance (m)", r"blur $\sigma$ (µm)", len(curves))
+    _label(axes, "object distance (m)", r"blur $\sigma$ (µm)", ncols=len(curves))
 
 
 def patch_grid(
@@ -122,7 +123,7 @@ def patch_grid(
     return figure
 
 
-def growth(axes: Axes, series: Mapping[str, Sequence[tuple[float, float]]]) -> Axes:
+def growth(axes: Axes, series: Mapping[str, Sequence[tuple[float, float]]]) -> None:
     """Run time over numbers, both logarithmic, and a line of slope one.
 
     series: (number, time in s) of each point, by name of the number.
@@ -134,10 +135,10 @@ def growth(axes: Axes, series: Mapping[str, Sequence[tuple[float, float]]]) -> A
     slope = 1e3 * seconds[-1] / number[-1]
     axes.plot(line, slope * line, color="grey", linestyle=":", label="linear")
     axes.set_xlim(*line)
-    return _finished(axes, "number", "run time (ms)")
+    _label(axes, "number", "run time (ms)")
 
 
-def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bool = False) -> Axes:
+def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bool = False) -> None:
     """A box for each family from the first to the third quartile with the median, whiskers from
     the 1st to the 99th percentile, and the largest sample as a point.
 
@@ -156,12 +157,10 @@ def by_family(axes: Axes, samples: Mapping[str, np.ndarray], label: str, log: bo
             axes.plot(np.max(values), k + 1, marker=".", color="tab:red", linestyle="none")
     axes.set_yticks(range(1, len(shown) + 1), list(shown))
     axes.invert_yaxis()
-    axes.set_xlabel(label)
-    axes.grid(axis="x", alpha=0.3)
-    return axes
+    _label(axes, label, "", "x")
 
 
-def shares(axes: Axes, rows: Mapping[str, Sequence[float]], names: Sequence[str]) -> Axes:
+def shares(axes: Axes, rows: Mapping[str, Sequence[float]], names: Sequence[str]) -> None:
     """Stacked bars of fractions. rows: counts of `names` by label."""
     labels = list(rows)
     parts = np.array([rows[label] for label in labels], float)
@@ -170,15 +169,13 @@ def shares(axes: Axes, rows: Mapping[str, Sequence[float]], names: Sequence[str]
         begin = sums[:, k - 1] if k else 0.0
         axes.barh(labels, sums[:, k] - begin, left=begin, label=name)
     axes.invert_yaxis()
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, ncols=len(names), loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    axes.set(xlabel="share")
-    return axes
+    above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+    _label(axes, "share", "", ncols=len(names), **above)
 
 
 def spots(
     axes: Axes, hits: Mapping[str, np.ndarray], covariance: np.ndarray, side: float, title: str
-) -> Axes:
+) -> None:
     """A spot, and the ellipse of one standard deviation.
 
     hits: (N, 2) about the centroid, by wavelength, um.
@@ -194,75 +191,68 @@ def spots(
     axes.set(xlim=(-side / 2, side / 2), ylim=(-side / 2, side / 2), aspect="equal")
     axes.set_title(title, fontsize=9)
     axes.grid(alpha=0.3)
-    return axes
 
 
-def merits(axes: Axes, history: np.ndarray) -> Axes:
+def merits(axes: Axes, history: np.ndarray) -> None:
     """Root of the merit (um) and violation of the worst limit over the trials. history: (T, 3),
     merit in mm^2, worst limit, Jacobians."""
     axes.semilogy(1e3 * np.sqrt(history[:, 0]), color="tab:blue")
-    axes.set(xlabel="trial", ylabel="root of the merit (um)")
-    axes.grid(alpha=0.3)
+    _label(axes, "trial", "root of the merit (um)")
     other = axes.twinx()
     other.plot(np.maximum(history[:, 1], 0), color="tab:red", linewidth=0.8)
     other.set_ylabel("worst limit exceeded by", color="tab:red")
-    return axes
 
 
-def searching(axes: Axes, best: np.ndarray) -> Axes:
+def searching(axes: Axes, best: np.ndarray) -> None:
     """Root of the best merit of many starts, um. best: (T,), after each tile of searches, mm^2."""
     axes.semilogy(np.arange(1, len(best) + 1), 1e3 * np.sqrt(best), color="tab:blue")
     axes.set(xlabel="tiles of 16 searches, by stages", ylabel="root of the best merit (um)")
     axes.grid(alpha=0.3, which="both")
-    return axes
 
 
-def ranks(axes: Axes, sizes: Sequence[float], found: Sequence[int]) -> Axes:
+def ranks(axes: Axes, sizes: Sequence[float], found: Sequence[int]) -> None:
     """The distinct minima. sizes: roots of their merits, um. found: how often each was found."""
     axes.bar(range(1, len(sizes) + 1), sizes, color="tab:blue")
     for k, (size, often) in enumerate(zip(sizes, found), 1):
         axes.text(k, size, str(often), ha="center", va="bottom", fontsize=7)
-    axes.set(xlabel="minimum, and how many starts ended there", ylabel="root of the merit (um)")
-    axes.grid(alpha=0.3, axis="y")
-    return axes
+    _label(axes, "minimum, and how many starts ended there", "root of the merit (um)", "y")
 
 
-def offenders(axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray]) -> Axes:
+def offenders(
+    axes: Axes, names: Sequence[str], series: Mapping[str, np.ndarray], xlabel: str
+) -> None:
     """Groups of horizontal bars, the first on top.
 
     series: lengths (N,) by label; the first filled, the others as outlines.
     """
     places = np.arange(len(names))
     for k, (label, values) in enumerate(series.items()):
-        fill: dict[str, Any] = {"fill": False, "edgecolor": f"C{k}"}
-        if k == 0:
-            fill = {"color": "C0", "alpha": 0.7}
+        outline: dict[str, Any] = {"fill": False, "edgecolor": f"C{k}"}
+        fill = outline if k else {"color": "C0", "alpha": 0.7}
         axes.barh(places, values, height=0.8 - 0.25 * k, label=label, linewidth=1.4, **fill)
     axes.set_yticks(places, list(names), fontsize=8)
     axes.invert_yaxis()
-    axes.grid(axis="x", alpha=0.3)
-    axes.legend(fontsize=8)
-    return axes
+    _label(axes, xlabel, "", "x")
 
 
-# Lines that may coincide, above a broad one for the truth.
-_TRUE: dict[str, Any] = {"color": "black", "alpha": 0.35, "linewidth": 4}
-_STYLES = ("-", "--", ":")
-_DOTS = {"color": "black", "linewidth": 2.2, "zorder": 4}  # on top of lines that they agree with
+def _style(k: int) -> dict[str, Any]:
+    """The style of line k of those that may coincide; dots lie on top, in black."""
+    if k % 3 == 2:
+        return {"color": "black", "linestyle": ":", "linewidth": 2.2, "zorder": 4}
+    return {"color": f"C{k}", "linestyle": ("-", "--")[k % 3], "linewidth": 1.5}
 
 
 def yields(
     axes: Axes, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, ylabel: str
-) -> Axes:
+) -> None:
     """Shares of lenses over the limit that they meet; the first curve broad, the others thin.
 
     curves: (x (N,), shares (N,) in per cent) by label.
     """
+    truth = {"color": "black", "alpha": 0.35, "linewidth": 4}
     for k, (label, (x, share)) in enumerate(curves.items()):
-        style: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
-        style |= _DOTS if k % 3 == 2 else {}
-        axes.plot(x, share, label=label, **(style if k else _TRUE))
-    return _finished(axes, xlabel, ylabel)
+        axes.plot(x, share, label=label, **(_style(k) if k else truth))
+    _label(axes, xlabel, ylabel)
 
 
 def histogram(
@@ -271,25 +261,18 @@ def histogram(
     shares: Mapping[str, np.ndarray],
     marks: Mapping[str, float],
     xlabel: str,
-) -> Axes:
+) -> None:
     """Shares of samples between edges.
 
     edges: (N + 1,).
     shares: (N,) by label, per cent; the first filled, the others as lines.
     marks: positions of vertical lines, by label.
     """
+    fill = {"color": "black", "alpha": 0.2, "fill": True}
     for k, (label, values) in enumerate(shares.items()):
-        line: dict[str, Any] = {"color": f"C{k}", "linestyle": _STYLES[k % 3], "linewidth": 1.5}
-        line |= _DOTS if k % 3 == 2 else {}
-        fill: dict[str, Any] = {"color": "black", "alpha": 0.2, "fill": True}
-        axes.stairs(values, edges, label=label, **(line if k else fill))
+        axes.stairs(values, edges, label=label, **(_style(k) if k else fill))
+    on_top = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": 8}
     for k, (label, place) in enumerate(marks.items()):
         axes.axvline(place, color="black", linestyle="-.", linewidth=0.8)
-        axes.annotate(
-            label, (place, 1), (3, -10 - 11 * k), xycoords=("data", "axes fraction"),
-            textcoords="offset points", fontsize=8,
-        )  # fmt: skip
-    axes.set(xlabel=xlabel, ylabel="share (%)")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="center right")
-    return axes
+        axes.annotate(label, (place, 1), (3, -10 - 11 * k), **on_top)
+    _label(axes, xlabel, "share (%)", loc="center right")

@@ -6,9 +6,10 @@ The table NAME of an experiment replaces the block between `<!-- table: NAME -->
 
 import pathlib
 import re
-import signal
 
-from . import _common, hear
+import experiments
+
+from . import _common
 
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -39,7 +40,7 @@ def filled(text: str, tables: dict[str, str]) -> str:
 
 def main() -> None:
     """Command line."""
-    hear(signal.default_int_handler)
+    experiments.left = lambda: "pages are whole"
     tables = all_tables()
     for page in pages():
         text = filled(page.read_text(), tables)

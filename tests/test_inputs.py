@@ -6,11 +6,11 @@ import time
 import numpy as np
 import pytest
 import yaml
-from experiments._outcomes import judged
+from experiments._damaged_files import outcome_of
 
 from drt_jax import LensError, load_lens
 from drt_jax.inputs import InputError, one_line, parse, shown
-from experiments import _mutants, _spoilt
+from experiments import _damage, _damaged_files
 from experiments.runs.config import ConfigError, load_config
 
 LENS = """\
@@ -198,6 +198,6 @@ def test_random_mutants(seed, tmp_path):
     rng = np.random.default_rng(seed)
     path = tmp_path / "mine.yaml"
     for _ in range(40):
-        path.write_bytes(content := _mutants.mutated(LENS, rng))
-        found, said = judged(lambda: _spoilt.finite(load_lens(path)))
+        path.write_bytes(content := _damage.damaged(LENS, rng))
+        found, said = outcome_of(lambda: _damaged_files.finite(load_lens(path)))
         assert found in ("refused", "survived"), (said, content)

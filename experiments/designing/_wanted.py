@@ -3,13 +3,13 @@
 import dataclasses
 import fnmatch
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 from drt_jax.design import Operand, Solve, Tie, Vary
 from drt_jax.design.growth import SHORTEST
 from drt_jax.lens.glasses import glass_makers, nearest_glasses
 
-from . import _common
+from ._common import not_empty, require, require_known, within
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,19 +24,14 @@ class Starts:
     keep: fraction of searches that survive a stage.
     """
 
-    count: int = 1
+    count: Annotated[int, within(1, 1e5)] = 1
     how: Literal["normal", "sobol", "as_built"] = "normal"
-    spread: float = 1.0
+    spread: Annotated[float, within(0, 1e3)] = 1.0
     per_cent: float = 1.0
     off_mm: float = 0.1
-    stages: tuple[int, ...] = (12, 12, 24, 48, 200)
-    keep: float = 0.7
+    stages: Annotated[tuple[int, ...], within(1, 1e4), not_empty] = (12, 12, 24, 48, 200)
+    keep: Annotated[float, within(0, 1)] = 0.7
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        limits = {"count": (1, 1e5), "spread": (0, 1e3), "stages": (1, 1e4), "keep": (0, 1)}
-        _common.require_within("starts.", self, **limits)
-        _common.require(len(self.stages) > 0, "starts.stages: needs at least one item")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,14 +45,10 @@ class Growth:
         of the final lens: a lens that is perfect for a part is bad for more, see docs/design.md.
     """
 
-    first: float = 1.0
-    step: float = 0.1
-    trials: int = 40
-    good_um: float = 10.0
-
-    def __post_init__(self) -> None:
-        limits = {"first": (0.01, 1), "step": (SHORTEST, 1), "trials": (1, 1e5)}
-        _common.require_within("growth.", self, **limits, good_um=(1e-6, 1e6))
+    first: Annotated[float, within(0.01, 1)] = 1.0
+    step: Annotated[float, within(SHORTEST, 1)] = 0.1
+    trials: Annotated[int, within(1, 1e5)] = 40
+    good_um: Annotated[float, within(1e-6, 1e6)] = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,15 +61,14 @@ class Glasses:
 
     makers: tuple[str, ...] = ()
     names: str = "*"
-    count: int = 8
-    steps: int = 12
+    count: Annotated[int, within(1, 1e4)] = 8
+    steps: Annotated[int, within(1, 1e4)] = 12
 
     def __post_init__(self) -> None:
-        _common.require_within("glasses.", self, count=(1, 1e4), steps=(1, 1e4))
-        _common.require_known("glasses.makers", self.makers, glass_makers())
+        require_known("glasses.makers", self.makers, glass_makers())
         names = (near.glass.name for near in nearest_glasses(1.6, 50, self.makers or None, None))
         some = any(fnmatch.fnmatchcase(name, self.names) for name in names)
-        _common.require(some, f"glasses.names: no glass of these makers is like {self.names!r}")
+        require(some, f"glasses.names: no glass of these makers is like {self.names!r}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,29 +91,21 @@ class Config:
 
     name: str
     lens: str
-    variables: tuple[Vary, ...]
-    operands: tuple[Operand, ...]
-    fields_deg: tuple[float, ...] = (0.0,)
-    wavelengths_um: tuple[float, ...] = (0.5875618,)
+    variables: Annotated[tuple[Vary, ...], not_empty]
+    operands: Annotated[tuple[Operand, ...], not_empty]
+    fields_deg: Annotated[tuple[float, ...], within(-89, 89), not_empty] = (0.0,)
+    wavelengths_um: Annotated[tuple[float, ...], within(1e-4, 1e6), not_empty] = (0.5875618,)
     colour_weights: tuple[float, ...] = ()
     field_weights: tuple[float, ...] = ()
     distance_mm: float = math.inf
     floating: bool = True
     ties: tuple[Tie, ...] = ()
     solves: tuple[Solve, ...] = ()
-    order: int = 4
-    rings: int = 0
-    tolerance: float = 1e-6
+    order: Annotated[int, within(1, 40)] = 4
+    rings: Annotated[int, within(0, 50)] = 0
+    tolerance: Annotated[float, within(1e-12, 0.5)] = 1e-6
     growth: Growth = Growth()
-    trials: int = 500
+    trials: Annotated[int, within(1, 1e5)] = 500
     starts: Starts = Starts()
     glasses: Glasses = Glasses()
-    devices: int = dataclasses.field(default=1, compare=False)
-
-    def __post_init__(self) -> None:
-        limits = {"fields_deg": (-89, 89), "wavelengths_um": (1e-4, 1e6), "order": (1, 40)}
-        limits |= {"rings": (0, 50), "tolerance": (1e-12, 0.5), "trials": (1, 1e5)}
-        limits |= {"devices": (1, 1e4)}
-        _common.require_within("", self, **limits)
-        for name in ("variables", "operands", "fields_deg", "wavelengths_um"):
-            _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")
+    devices: Annotated[int, within(1, 1e4)] = dataclasses.field(default=1, compare=False)

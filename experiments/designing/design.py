@@ -9,7 +9,6 @@ load_lens reads back, the start and other minima beside it, figures, and results
 import dataclasses
 import fnmatch
 import math
-import pathlib
 import sys
 import time
 from typing import Any
@@ -22,7 +21,8 @@ import drt_jax
 from drt_jax import Pattern, design
 from drt_jax.design.growth import SHORTEST, grow_once, start_growth
 
-from . import _command, _common, _pictures, _sharing
+from . import _command, _common, _sharing
+from ._pictures import draw as draw
 from ._wanted import Config as Config, Starts
 from .runs.folder import Run
 
@@ -86,30 +86,23 @@ def order_of(config: Config, lens: drt_jax.Lens) -> int:
     return getattr(drt_jax.converged_rule(lens, *scene), "order", config.order)
 
 
-class _Progress:
+class _Progress(tqdm):
     """A progress bar with the merit and the worst limit."""
 
     def __init__(self, title: str, total: int):
-        self._bar = tqdm(total=total, desc=title, unit="trial", dynamic_ncols=True)
+        super().__init__(total=total, desc=title, unit="trial", dynamic_ncols=True)
 
     def searched(self, search: design.Search) -> None:
         """Shows one trial."""
-        self._bar.update()
-        self._bar.set_postfix_str(
-            f"merit={float(search.merit):.6g} worst limit={float(search.max_violation):+.2g}"
-        )
+        self.update()
+        worst = f"worst limit={float(search.max_violation):+.2g}"
+        self.set_postfix_str(f"merit={float(search.merit):.6g} {worst}")
 
     def tiles(self, done: int, total: int, best: float) -> None:
         """Shows one tile of many starts."""
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
-        self._bar.set_postfix_str(f"best={best:.6g}")
-
-    def __enter__(self) -> "_Progress":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.close()
+        self.total = total
+        self.update(done - self.n)
+        self.set_postfix_str(f"best={best:.6g}")
 
 
 def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
@@ -221,8 +214,8 @@ def _snapped(
         i: [[near.glass.name, score if math.isfinite(score) else None] for near, score in own]
         for i, own in snapped.alternatives.items()
     }
-    told = {"snaps": [snap._asdict() for snap in snapped.snaps], "alternatives": ranked}
-    return snapped.optimum, told | {"snap_s": time.perf_counter() - begun}
+    exchanged = {"snaps": [snap._asdict() for snap in snapped.snaps], "alternatives": ranked}
+    return snapped.optimum, exchanged | {"snap_s": time.perf_counter() - begun}
 
 
 def _designed(variables: design.Variables, end: dict[str, Any]) -> drt_jax.Lens:
@@ -253,12 +246,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     first = problem_of(config, start)
     begin = grown(config, first, run) if config.growth.first < 1 else start
     problem = problem_of(config, begin)
-    if run.kept("starts") is None:
-        run.keep("starts", searched(config, problem))
-    found = run.kept("starts")
-    if run.kept("finish") is None:
-        run.keep("finish", finished(config, problem, found))
-    end = run.kept("finish")
+    found = run.once("starts", lambda: searched(config, problem))
+    end = run.once("finish", lambda: finished(config, problem, found))
     history = np.array(end["history"])
     run.log("least squares", 0, dict(zip(COLUMNS, history.T)))
     some, lenses = end["glasses"], {"start": start, "designed": _designed(problem.variables, end)}
@@ -357,11 +346,6 @@ def _peers_table(rows: list[dict[str, Any]], how: str) -> str:
 def _median(values: list[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
-
-
-def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws the lens before and after, its spots, the merit, and the minima."""
-    _pictures.draw(results, figures)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import os
 import pathlib
 import sys
 import time
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -34,13 +34,18 @@ from drt_jax.design.deviations import KINDS
 from drt_jax.design.prediction import Order
 
 from . import _command, _common, _plots, _sharing
+from ._common import Numbers, not_empty, within
 from .runs.folder import Run
 
-COLUMNS = ("mean_um", "p90_um", "seconds")
 _ORDERS = get_args(Order)
 _SAMPLES = ("traced", *_ORDERS)
 _SHOWN, _BINS = 14, 60
 _LEVELS = np.linspace(0, 1, 201)
+
+
+def _pairs(fields: tuple[tuple[float, ...], ...]) -> str:
+    wrong = [p for p in fields if len(p) != 2 or not all(-89 <= angle <= 89 for angle in p)]
+    return f"expected pairs x, y from -89 to 89, got {wrong[0]}" if wrong else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,32 +67,20 @@ class Config:
     """
 
     lens: str
-    tolerances: tuple[design.Tolerance, ...]
-    fields_deg: tuple[tuple[float, ...], ...] = ((0.0, 0.0),)
+    tolerances: Annotated[tuple[design.Tolerance, ...], not_empty]
+    fields_deg: Annotated[tuple[tuple[float, ...], ...], not_empty, _pairs] = ((0.0, 0.0),)
     distance_mm: float = math.inf
-    wavelengths_um: tuple[float, ...] = (0.5875618,)
+    wavelengths_um: Annotated[tuple[float, ...], within(1e-4, 1e6), not_empty] = (0.5875618,)
     colour_weights: tuple[float, ...] = ()
-    order: int = 4
+    order: Annotated[int, within(1, 40)] = 4
     compensator: Literal["none", "focus", "focus and tilt"] = "focus"
     errors: Literal["uniform", "normal"] = "uniform"
-    scales: tuple[float, ...] = (1.0,)
-    count: int = 10000
-    draws: int = 100000
-    limits_um: tuple[float, ...] = ()
+    scales: Annotated[Numbers, within(1e-3, 1e3)] = (1.0,)
+    count: Annotated[int, within(1, 1e7)] = 10000
+    draws: Annotated[int, within(1, 1e7)] = 100000
+    limits_um: Annotated[tuple[float, ...], within(1e-6, 1e6)] = ()
     seed: int = 0
-    devices: int = dataclasses.field(default=1, compare=False)
-
-    def __post_init__(self) -> None:
-        limits = {"wavelengths_um": (1e-4, 1e6), "order": (1, 40), "scales": (1e-3, 1e3)}
-        limits |= {"count": (1, 1e7), "draws": (1, 1e7), "limits_um": (1e-6, 1e6)}
-        limits |= {"devices": (1, 1e4)}
-        _common.require_within("", self, **limits)
-        for name in ("tolerances", "fields_deg", "wavelengths_um", "scales"):
-            _common.require(len(getattr(self, name)) > 0, f"{name}: needs at least one item")
-        _common.require_list("scales", self.scales)
-        for pair in self.fields_deg:
-            valid = len(pair) == 2 and all(-89 <= angle <= 89 for angle in pair)
-            _common.require(valid, f"fields_deg: expected pairs x, y from -89 to 89, got {pair}")
+    devices: Annotated[int, within(1, 1e4)] = dataclasses.field(default=1, compare=False)
 
 
 def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.PerturbedLens]:
@@ -185,8 +178,8 @@ def _um(mm: Any, root: bool = False) -> np.ndarray:
     return 1e3 * (np.sqrt(np.maximum(mm, 0)) if root else np.asarray(mm))
 
 
-def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -> dict[str, Any]:
-    """Traced and predicted spots at one scale of the sizes; logs them."""
+def monte_carlo(config: Config, found: dict[str, Any], scale: float) -> dict[str, Any]:
+    """Traced and predicted spots at one scale of the sizes."""
     problem, perturbed = prepare(config)
     predicted, normal = predicted_of(found), config.errors == "normal"
     perturbations = scale * design.draw_perturbations(perturbed, config.count, config.seed, normal)
@@ -221,12 +214,6 @@ def monte_carlo(config: Config, found: dict[str, Any], scale: float, run: Run) -
             # Root sum of squares: the distribution of q taken as normal.
             sums["rss_p90_um"] = float(_um(mean + 1.2815516 * deviation, True))
         row[name] = sums
-    parts = {"mean_um": row["traced"]["mean_um"], "p90_um": row["traced"]["p90_um"]}
-    run.log(
-        f"sizes x {scale:g}",
-        0,
-        {k: np.array([v]) for k, v in (parts | {"seconds": seconds}).items()},
-    )
     return row
 
 
@@ -235,7 +222,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     (found,) = _common.measured(run, "step", {"derivatives": lambda: derivatives(config)})
     jobs: dict[str, Any] = {"one error": lambda: sensitivity(config, found)}
     for scale in config.scales:
-        jobs[f"sizes x {scale:g}"] = functools.partial(monte_carlo, config, found, scale, run)
+        jobs[f"sizes x {scale:g}"] = functools.partial(monte_carlo, config, found, scale)
     alone, *scales = _common.measured(run, "step", jobs)
     about = {"derivatives_s": found["seconds"], "derivatives_compile_s": found["compile_s"]}
     about |= {"rule_error": found["rule_error"], "threads": os.cpu_count(), "count": config.count}
@@ -331,8 +318,8 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     some = merged(results)[:_SHOWN]
     figure, ax = show.new(1, 1, 7, 5)
     bars = {name: np.array([m[f"{name}_um"] for m in some]) for name in ("traced", "predicted")}
-    _plots.offenders(ax, [f"{m['name']}: {m['size']}" for m in some], bars)
-    ax.set_xlabel("spot grows by (µm)")
+    names = [f"{m['name']}: {m['size']}" for m in some]
+    _plots.offenders(ax, names, bars, "spot grows by (µm)")
     figure.savefig(figures / "offenders.png")
     row = main_scale(results)
     figure, ax = show.new(1, 1, 6.5, 4)

@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -32,10 +32,10 @@ from drt_jax.compilation import LARGE, known_options
 from drt_jax.image.psf_model import difference
 
 from . import _command, _common, _peers, _psf_peers, _work, render
+from ._common import Colours, not_empty, odd, within
 from ._image_pictures import MODELS, draw as draw
 from .runs.folder import Run
 
-COLUMNS = ("value_s", "gradient_s", "error", "off")
 # Rays traced at once for a histogram.
 _ROUND = 2**17
 
@@ -45,11 +45,8 @@ class View:
     """A lens, a field angle along y, and the side of a pixel."""
 
     lens: str
-    field_deg: float
-    pixel_um: float
-
-    def __post_init__(self) -> None:
-        _common.require_within("", self, field_deg=(0, 89.9), pixel_um=(0.05, 1e4))
+    field_deg: Annotated[float, within(0, 89.9)]
+    pixel_um: Annotated[float, within(0.05, 1e4)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,10 +54,7 @@ class Photo:
     """A lens that takes the photograph, and the side of its pixels."""
 
     lens: str
-    pixel_um: float
-
-    def __post_init__(self) -> None:
-        _common.require_within("photographs.", self, pixel_um=(0.05, 1e4))
+    pixel_um: Annotated[float, within(0.05, 1e4)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,29 +82,19 @@ class Config:
     photo_pixels: side of the photograph.
     """
 
-    views: tuple[View, ...]
+    views: Annotated[tuple[View, ...], not_empty]
     photographs: tuple[Photo, ...]
     gallery: Gallery = dataclasses.field(default_factory=Gallery)
-    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
-    size: int = 21
-    rays: tuple[int, ...] = (24, 36, 52, 72, 104)
-    waves: tuple[int, ...] = (48, 64, 96, 128, 192, 256)
-    limit: int = 640
-    rounds: int = 16
-    peers: tuple[int, ...] = (64, 128, 256, 512)
-    frequencies: int = 41
-    photo_pixels: int = 512
-    repeats: int = 15
-
-    def __post_init__(self) -> None:
-        _common.require(len(self.views) > 0, "views: needs at least one item")
-        three = len(self.wavelengths_um) == 3
-        _common.require(three, "wavelengths_um: expected three, of R, G and B")
-        _common.require_within("", self, wavelengths_um=(1e-2, 1e3), rays=(8, 1024))
-        _common.require_within("", self, waves=(8, 1024), limit=(8, 2048), peers=(16, 2048))
-        _common.require_within("", self, size=(3, 255), rounds=(2, 1024), frequencies=(2, 1e4))
-        _common.require_within("", self, photo_pixels=(16, 4096), repeats=(1, 1000))
-        _common.require(self.size % 2 == 1, "size: expected an odd number")
+    wavelengths_um: Annotated[Colours, within(1e-2, 1e3)] = (0.6, 0.53, 0.48)
+    size: Annotated[int, within(3, 255), odd] = 21
+    rays: Annotated[tuple[int, ...], within(8, 1024)] = (24, 36, 52, 72, 104)
+    waves: Annotated[tuple[int, ...], within(8, 1024)] = (48, 64, 96, 128, 192, 256)
+    limit: Annotated[int, within(8, 2048)] = 640
+    rounds: Annotated[int, within(2, 1024)] = 16
+    peers: Annotated[tuple[int, ...], within(16, 2048)] = (64, 128, 256, 512)
+    frequencies: Annotated[int, within(2, 1e4)] = 41
+    photo_pixels: Annotated[int, within(16, 4096)] = 512
+    repeats: Annotated[int, within(1, 1000)] = 15
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +163,7 @@ def measure(config: Config, view: View) -> dict[str, Any]:
     lines, curves = contrast(config, lens, field, pixel)
     about |= {"grid_s": field_grid(scene, config.repeats), "frequencies": lines}
     about |= {"transfer": curves}
-    return {"rows": rows, "view": name | about, "peers": _beside(config, scene, rule, name)}
+    return {"rows": rows, "view": name | about, "peers": _peer_rows(config, scene, rule, name)}
 
 
 def _timed(scene: Scene, model: PsfModel, repeats: int) -> tuple[np.ndarray, float, float]:
@@ -216,7 +200,7 @@ def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[li
     return lines.tolist(), curves.tolist()
 
 
-def _beside(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> list[dict[str, Any]]:
+def _peer_rows(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> list[dict]:
     """Rows of other programs, at the middle wavelength."""
     middle = scene.waves[[len(scene.waves) // 2]]
     one = dataclasses.replace(scene, waves=middle)
@@ -333,10 +317,10 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         for p in results["photographs"]
     ]
     names = ("lens", "pixel, um", "kernel", "first", "next")
-    beside = ("lens, degrees", "program", "samples", "time, one colour", "error", "")
+    programs = ("lens, degrees", "program", "samples", "time, one colour", "error", "")
     return {
         "images": _common.table(header, lines),
-        "images, other programs": _common.table(beside, others),
+        "images, other programs": _common.table(programs, others),
         "images, views": _common.table(columns, views),
         "images, photographs": _common.table(names, photos),
     }

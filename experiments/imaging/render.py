@@ -7,11 +7,12 @@ the same size, and both side by side, into figures.
 """
 
 import dataclasses
+import math
 import os
 import pathlib
 import sys
 import time
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -26,12 +27,13 @@ from drt_jax.inputs import one_line
 from drt_jax.learn import images
 
 from . import _command, _common
+from ._common import odd, or_zero, three_colours, within
 from .runs.config import ConfigError
 from .runs.folder import Run
 
-COLUMNS = ("seconds",)
 # Bytes for each value of a picture: the picture, its light, the result and intermediate arrays.
 _BYTES = 40
+_positive = within(np.nextafter(0, 1), math.inf)
 _BEYOND = 1e-3  # fraction of light outside the kernels above which the table warns
 
 
@@ -48,15 +50,10 @@ class Scene:
     """
 
     lens: str = "double_gauss"
-    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
-    distance_m: float = float("inf")
+    wavelengths_um: Annotated[tuple[float, ...], three_colours] = (0.6, 0.53, 0.48)
+    distance_m: Annotated[float, _positive] = math.inf
     depth: str = ""
-    near_m: float = 1.0
-
-    def __post_init__(self) -> None:
-        _common.require(len(self.wavelengths_um) == 3, "scene.wavelengths_um: expected R, G, B")
-        _common.require(self.distance_m > 0, "scene.distance_m: must be above 0")
-        _common.require(self.near_m > 0, "scene.near_m: must be above 0")
+    near_m: Annotated[float, _positive] = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,25 +69,16 @@ class Config:
     """
 
     photo: str = "bundled"
-    pixel_um: float = 0.0
-    field_deg: float = 12.0
+    pixel_um: Annotated[float, or_zero(within(0.05, 1e4))] = 0.0
+    field_deg: Annotated[float, within(0.01, 60)] = 12.0
     model: Literal["gaussian", "rays", "waves", "auto"] = "rays"
-    kernel: int = 0
-    nodes: int = 16
-    layers: int = 8
-    full_well: float = 10000.0
-    read_noise: float = 3.0
+    kernel: Annotated[int, within(0, 255), or_zero(odd)] = 0
+    nodes: Annotated[int, within(2, 64)] = 16
+    layers: Annotated[int, within(2, 64)] = 8
+    full_well: Annotated[float, within(0, 1e9)] = 10000.0
+    read_noise: Annotated[float, within(0, 1e6)] = 3.0
     seed: int = 0
     scene: Scene = dataclasses.field(default_factory=Scene)
-
-    def __post_init__(self) -> None:
-        least = (0.05, 1e4)
-        valid = self.pixel_um == 0 or least[0] <= self.pixel_um <= least[1]
-        got = f"got {self.pixel_um!r}"
-        _common.require(valid, f"pixel_um: expected {least[0]} to {least[1]:g}, or 0, {got}")
-        limits = {"field_deg": (0.01, 60), "kernel": (0, 255), "nodes": (2, 64), "layers": (2, 64)}
-        _common.require_within("", self, **limits, full_well=(0, 1e9), read_noise=(0, 1e6))
-        _common.require(self.kernel % 2 or not self.kernel, "kernel: expected an odd number, or 0")
 
 
 def linear(pixels: np.ndarray) -> np.ndarray:

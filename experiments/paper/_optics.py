@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from drt_jax.rays.solve import solve_aimed
 from drt_jax.rays.status import Status
 from drt_jax.rays.trace import trace_bundle
 
-from ._common import require, require_different, require_known, require_within
+from ._common import Colours, require, within
 from .runs.config import ConfigError
 
 # Kinds of trained numbers. Tilts and decentres would break the symmetry of the pupil rule;
@@ -38,14 +38,11 @@ class Scene:
     """
 
     lens: str = "double_gauss"
-    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
-    tolerance: float = 1e-9
-    field: float | tuple[float, ...] = 0.0
+    wavelengths_um: Colours = (0.6, 0.53, 0.48)
+    tolerance: Annotated[float, within(1e-14, 0.5)] = 1e-9
+    field: Annotated[float | tuple[float, ...], within(-89, 89)] = 0.0
 
     def __post_init__(self) -> None:
-        require(len(self.wavelengths_um) == 3, "scene.wavelengths_um: expected three, for R, G, B")
-        limits = {"wavelengths_um": (1e-4, 1e6), "tolerance": (1e-14, 0.5), "field": (-89, 89)}
-        require_within("scene.", self, **limits)
         one = np.shape(self.field) in ((), (2,))
         require(one, "scene.field: expected one angle in degrees, or [x, y]")
 
@@ -54,17 +51,15 @@ class Scene:
         return np.radians(self.field), distance, self.wavelengths_um
 
 
-def check_variables(names: tuple[str, ...]) -> None:
-    """ConfigError for an empty list of variables, one given twice, or one of no kind."""
-    what = "train.variables"
-    require(len(names) > 0, f"{what}: needs at least one item")
-    require_different(what, names)
+def variable_names(names: tuple[str, ...]) -> str:
+    """Variables, each a kind, or a kind and the number of a surface."""
     for name in names:
         kind, _, row = name.partition(" ")
-        require_known(what, (kind,), KINDS)
-        valid = kind == name or (row.isdecimal() and kind != "sensor")
-        expected = f"{what}: expected a kind, or one and a surface, such as curvature 0"
-        require(valid, f"{expected}, got {name!r}")
+        if kind not in KINDS:
+            return f"unknown {kind!r}; known: {', '.join(KINDS)}"
+        if kind != name and (not row.isdecimal() or kind == "sensor"):
+            return f"expected a kind, or one and a surface, such as curvature 0, got {name!r}"
+    return ""
 
 
 def middle(near: float, far: float) -> float:

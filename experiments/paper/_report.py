@@ -62,7 +62,7 @@ def gaussian(results: dict[str, Any]) -> list[tuple[str, str, str]]:
     return [(what, "", "; ".join(words))] if words else []
 
 
-def beside(results: dict[str, Any], rows: list[tuple[str, str, str]]) -> str:
+def comparison(results: dict[str, Any], rows: list[tuple[str, str, str]]) -> str:
     """A table of (what, paper, ours); without the paper if it has no such numbers."""
     if results.get("paper", True):
         return table(("", "paper", "here"), rows)

@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
+from typing import Annotated
 
 from drt_jax.learn import train
 from drt_jax.learn.data import DataConfig
 
-from ._common import require_list, require_within
-from ._optics import Scene, Trained, check_variables
+from ._common import Numbers, different, not_empty, within
+from ._optics import Scene, Trained, variable_names
 from ._sharing import require_shared
 
 
@@ -22,19 +23,12 @@ class Training:
     checkpoint_every: batches between checkpoints, rounded up to reports of metrics.
     """
 
-    batches: int
-    batch: int = 16
-    patch: int = 64
-    variables: tuple[str, ...] = ("sensor",)
-    optics_rate: float = 1e-3
-    checkpoint_every: int = 200
-
-    def __post_init__(self) -> None:
-        # 7 is the window of the SSIM.
-        sizes = {"batch": (1, 4096), "patch": (7, 4096), "checkpoint_every": (1, math.inf)}
-        rates = {f"{name}_rate": (0, 10) for name in self.rates}
-        require_within("train.", self, batches=(1, math.inf), **sizes, **rates)
-        check_variables(self.variables)
+    batches: Annotated[int, within(1, math.inf)]
+    batch: Annotated[int, within(1, 4096)] = 16
+    patch: Annotated[int, within(7, 4096)] = 64  # 7 is the window of the SSIM
+    variables: Annotated[tuple[str, ...], not_empty, different, variable_names] = ("sensor",)
+    optics_rate: Annotated[float, within(0, 10)] = 1e-3
+    checkpoint_every: Annotated[int, within(1, math.inf)] = 200
 
     @property
     def rates(self) -> dict[str, float]:
@@ -47,20 +41,17 @@ class Training:
 class JointTraining(Training):
     """`Training` with a network. network_rate: Adam's learning rate of the network."""
 
-    network_rate: float = 1e-3
+    network_rate: Annotated[float, within(0, 10)] = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Net:
     """Settings of `red_net`."""
 
-    skip_every: int = 2
+    skip_every: Annotated[int, within(0, 5)] = 2
     input_skip: bool = True
-    layers: int = 5
-    channels: int = 64
-
-    def __post_init__(self) -> None:
-        require_within("network.", self, skip_every=(0, 5), layers=(1, 50), channels=(1, 1024))
+    layers: Annotated[int, within(1, 50)] = 5
+    channels: Annotated[int, within(1, 1024)] = 64
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,17 +62,13 @@ class Settings:
     noise: standard deviation of the sensor noise, for values from 0 to 1.
     """
 
-    starts_mm: tuple[float, ...]
+    starts_mm: Annotated[Numbers, within(1e-3, 1e6)]
     train: Training
-    noise: float = 0.01
+    noise: Annotated[float, within(0, 10)] = 0.01
     seed: int = 0
     scene: Scene = Scene()
     camera: train.Camera = train.Camera()
     data: DataConfig = DataConfig()
-
-    def __post_init__(self) -> None:
-        require_list("starts_mm", self.starts_mm)
-        require_within("", self, starts_mm=(1e-3, 1e6), noise=(0, 10))
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -112,5 +99,4 @@ class JointSettings(Settings):
     devices: int = dataclasses.field(default=1, compare=False)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         require_shared(self.devices, "train.batch", self.train.batch)

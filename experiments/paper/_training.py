@@ -1,10 +1,11 @@
 """Training jobs of the paper's experiments."""
 
+import dataclasses
 import functools
 import pathlib
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -32,6 +33,53 @@ from .runs.interrupt import deferred_interrupt
 
 # Tolerance of wave kernels, the sum of absolute errors of their pixels.
 _KERNELS = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Loop:
+    """The loop of training of one job.
+
+    steps: numbers of the steps, behind those of the last checkpoint.
+    checkpoint_every: steps between checkpoints, rounded up to reports.
+    mesh: devices that share a batch; None for one.
+    """
+
+    run: Run
+    job: str
+    steps: range
+    checkpoint_every: int
+    mesh: Any
+
+    def train(
+        self, step: Callable, state: Any, scenes: Iterator[np.ndarray], noise: float, log: Callable
+    ) -> Any:
+        """Trains with a bar and checkpoints, and returns the last state. KeyboardInterrupt, after a
+        checkpoint, if the user stops it. log: called with what `train.fit` reports."""
+        saved, total = self.steps.start, self.steps.stop
+        bar = tqdm(total=total, initial=saved, desc=self.job, unit="batch", dynamic_ncols=True)
+
+        def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
+            nonlocal saved
+            done = start + len(metrics["loss"])
+            log(start, metrics, state)
+            bar.update(len(metrics["loss"]))
+            bar.set_postfix_str(f"loss={np.array2string(metrics['loss'][-1], precision=3)}")
+            if asked() or done == total or done - saved >= self.checkpoint_every:
+                self.run.save(self.job, done, state)
+                saved = done
+
+        def stopping() -> None:
+            print("\nstopping after this step; once more stops at once", file=sys.stderr)
+
+        stream = (split(self.mesh, some) for some in scenes)
+        # Each report waits for the device: seldom where a step takes milliseconds.
+        every = 10 if jax.default_backend() == "cpu" else 113
+        with bar, deferred_interrupt(stopping) as asked:
+            state = copied(self.mesh, state)
+            state = train.fit(step, state, stream, noise, self.steps, every, report, asked)
+            if asked():
+                raise KeyboardInterrupt
+        return jax.tree.map(jnp.asarray, gathered(state))
 
 
 class Jobs:
@@ -104,36 +152,17 @@ class Jobs:
         init, step = steps
         total = setting.batches
         first, state = run.load(job, init({"optics": optics} | self._network), labels, total)
-        saved = first
         self._good |= {label: values_of(state[0], k) for k, label in enumerate(labels)}
-        bar = tqdm(total=total, initial=first, desc=job, unit="batch", dynamic_ncols=True)
 
-        def report(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
-            nonlocal saved
-            done = start + len(metrics["loss"])
+        def log(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
             for k, label in enumerate(labels):
                 rows = {n: v.reshape(len(v), -1)[:, k] for n, v in metrics.items()}
                 run.log(label, start, rows)
                 self._check(label, start, rows, values_of(state[0], k))
-            bar.update(len(metrics["loss"]))
-            bar.set_postfix_str(f"loss={np.array2string(metrics['loss'][-1], precision=3)}")
-            if asked() or done == total or done - saved >= setting.checkpoint_every:
-                run.save(job, done, state)
-                saved = done
 
-        def stopping() -> None:
-            print("\nstopping after this step; once more stops at once", file=sys.stderr)
-
-        patches = batches(self.scenes, setting.batch, self._config.seed, first)
-        stream = (split(self._mesh, scenes) for scenes in patches)
-        # Each report waits for the device: seldom where a step takes milliseconds.
-        every = 10 if jax.default_backend() == "cpu" else 113
-        with bar, deferred_interrupt(stopping) as asked:
-            state = copied(self._mesh, state)
-            state = train.fit(step, state, stream, noise, range(first, total), every, report, asked)
-            if asked():
-                raise KeyboardInterrupt
-        state = jax.tree.map(jnp.asarray, gathered(state))
+        scenes = batches(self.scenes, setting.batch, self._config.seed, first)
+        loop = Loop(run, job, range(first, total), setting.checkpoint_every, self._mesh)
+        state = loop.train(step, state, scenes, noise, log)
         for k, label in enumerate(labels):
             self._good[label] = values_of(state[0], k)
             self._save_lens(label)

@@ -13,7 +13,7 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +23,11 @@ from drt_jax import show
 from drt_jax.learn import train
 
 from . import _command, _common, _optics, _patches, _plots, _report, _settings, _training
+from ._common import Numbers, near_and_far, within
 from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um", "depth_mm")
+_Depths = Annotated[Numbers, within(1e-3, 1e9)]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,18 +40,13 @@ class Config(_settings.JointSettings):
     """
 
     fixed_mm: float
-    depth_m: tuple[float, ...] = (10.0, 50.0)
-    table_depth_m: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0)
-    patch_depth_m: tuple[float, ...] = (10.0, 20.0, 30.0, 40.0, 50.0)
+    depth_m: Annotated[_Depths, near_and_far] = (10.0, 50.0)
+    table_depth_m: _Depths = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0)
+    patch_depth_m: _Depths = (10.0, 20.0, 30.0, 40.0, 50.0)
     scene: _optics.Scene = _optics.Scene(lens="double_gauss_addon")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("depth_m", "table_depth_m", "patch_depth_m"):
-            _common.require_list(name, getattr(self, name))
-            _common.require_within("", self, **{name: (1e-3, 1e9)})
-        ordered = len(self.depth_m) == 2 and self.depth_m[0] < self.depth_m[1]
-        _common.require(ordered, "depth_m: expected the nearest and the farthest distance in m")
         some = any(map(self.trained_at, self.table_depth_m))
         _common.require(some, "table_depth_m: none lies within depth_m")
         start = self.fixed_mm in self.starts_mm
@@ -128,7 +125,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     joint, fixed = (_common.number(mean[name], ".4f") for name in ("joint", "fixed"))
     means = f"mean MAE over training depths {joint} against {fixed}"
     against = f"{means}; fixed better at {', '.join(better) or 'no'} m"
-    beside = [
+    compared = [
         *_report.planes(results, "145.29 mm"),
         ("joint against fixed sensor", "joint better, but for 15 to 20 m", against),
         *_report.gaussian(results),
@@ -137,7 +134,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     lines = [(title, *(_common.number(row[n][m], ".4f") for row in rows)) for title, n, m in errors]
     header = "depth m", *(f"{row['depth_m']:g}" for row in rows)
     return {
-        "edof": _report.beside(results, beside),
+        "edof": _report.comparison(results, compared),
         "edof, table 2": _common.table(header, lines),
         **_report.numbers_tables("edof, lens", results),
     }

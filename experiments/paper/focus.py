@@ -12,7 +12,7 @@ import math
 import pathlib
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +33,7 @@ _ROUNDING = 1e-5
 class Config(_settings.Settings):
     """Settings of the experiment; see configs/focus.yaml."""
 
-    distance_m: float = 25.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _common.require_within("", self, distance_m=(1e-3, 1e9))
+    distance_m: Annotated[float, _common.within(1e-3, 1e9)] = 25.0
 
 
 def best_focus(loss: Callable, scenes: np.ndarray, low: float, high: float) -> float:
@@ -99,7 +95,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     rows = [*_report.planes(results, "133.35 mm", search), *firsts, took]
     rows += _report.gaussian(results)
     more = _report.numbers_tables("focus, lens", results)
-    return {"focus": _report.beside(results, rows)} | more
+    return {"focus": _report.comparison(results, rows)} | more
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:

@@ -10,11 +10,12 @@ train.variables: sensor, curvature, conic, coefficients, thickness, each of all 
 import dataclasses
 import pathlib
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 from drt_jax.learn import train
 
 from . import _command, _common, _patches, _report, _settings, _training
+from ._common import Numbers, within
 from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
@@ -27,16 +28,9 @@ class Config(_settings.JointSettings):
     table_starts_mm: starts that are trained at each noise of table_noise.
     """
 
-    table_starts_mm: tuple[float, ...]
-    table_noise: tuple[float, ...]
-    distance_m: float = 25.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _common.require_list("table_starts_mm", self.table_starts_mm)
-        _common.require_list("table_noise", self.table_noise, -1.0)
-        limits = {"table_starts_mm": (1e-3, 1e6), "table_noise": (0.0, 10.0)}
-        _common.require_within("", self, distance_m=(1e-3, 1e9), **limits)
+    table_starts_mm: Annotated[Numbers, within(1e-3, 1e6)]
+    table_noise: Annotated[Numbers, within(0, 10)]
+    distance_m: Annotated[float, within(1e-3, 1e9)] = 25.0
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -79,7 +73,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     columns = [a + b for a in ("", "sensor_") for b in ("mae", "rmse", "psnr", "ssim")]
     errors = [[row[name] for name in ("noise", "start_mm", *columns)] for row in results["test"]]
     return {
-        "restore": _report.beside(results, rows),
+        "restore": _report.comparison(results, rows),
         "restore, table 5b": _common.table(header, errors),
         **_report.numbers_tables("restore, lens", results),
     }

@@ -17,6 +17,8 @@ from drt_jax.inputs import InputError, Lines, parse, read_yaml, shown
 T = TypeVar("T")
 # Limits: whole numbers, size of other finite numbers, items of a list, characters of a text.
 _MOST, _LARGEST, _ITEMS, _LONGEST = 2**31 - 1, 1e12, 1000, 1000
+_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+_NAMES[type(None)] = "null"
 
 
 class ConfigError(InputError):
@@ -87,7 +89,7 @@ def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = Non
     if not isinstance(entry, dict):
         where = here or "the file"
         raise source.error(here, f"{where}: expected keys and values, got {shown(entry)}")
-    known = typing.get_type_hints(cls)
+    known = typing.get_type_hints(cls, include_extras=True)
     values = {}
     for key, value in entry.items():
         if key not in known:
@@ -109,44 +111,47 @@ def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = Non
 
 def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = None) -> Any:
     """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...], X | tuple[X, ...],
-    X | None or a Literal."""
+    X | None or a Literal; or Annotated[X, check, ...] with functions that return what is wrong with
+    a value, "" for nothing."""
     if dataclasses.is_dataclass(kind):
         return _build(kind, value, source, f"{key}.", old)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        found = _convert(arguments[0], value, source, key, old)
+        for wrong in (check(found) for check in arguments[1:]):
+            if wrong:
+                raise source.error(key, f"{key}: {wrong}")
+        return found
+    limit = ""
     if origin in (types.UnionType, typing.Union):  # of one value, and of a list or nothing
         if value is None and arguments[1] is type(None):
             return None
         listed = isinstance(value, list | tuple) and arguments[1] is not type(None)
         return _convert(arguments[listed], value, source, key)
-    if origin is tuple and isinstance(value, list | tuple) and len(value) <= _ITEMS:
-        items = enumerate(value)
-        return tuple(_convert(arguments[0], item, source, f"{key}[{i}]") for i, item in items)
+    if origin is tuple and isinstance(value, list | tuple):
+        limit = f", at most {_ITEMS}"
+        if len(value) <= _ITEMS:
+            items = enumerate(value)
+            return tuple(_convert(arguments[0], item, source, f"{key}[{i}]") for i, item in items)
     # YAML 1.1 reads 1e-3 as text.
     if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
         number = _number(value)
         if abs(number) <= _LARGEST or math.isinf(number):
             return number
-    if kind is int and type(value) is int and 0 <= value <= _MOST:
-        return value
-    if kind is str and type(value) is str and len(value) <= _LONGEST and "\0" not in value:
-        return value
+        limit = "" if math.isnan(number) else f" of at most {_LARGEST:g} in size"
+    if kind is int and type(value) is int:
+        limit = f" from 0 to {_MOST}"
+        if 0 <= value <= _MOST:
+            return value
+    if kind is str and type(value) is str:
+        limit = f" of at most {_LONGEST} characters"
+        if len(value) <= _LONGEST and "\0" not in value:
+            return value
     if (kind is bool and type(value) is bool) or (origin is Literal and value in arguments):
         return value
-    limit = _limit(kind, value)
     expected = f"{key}: expected {_say(kind)}{limit}, got {shown(value)}"
     near = difflib.get_close_matches(str(value)[:_LONGEST], map(str, arguments), n=1)
     raise source.error(key, expected + (f"; did you mean {near[0]}?" if near else ""))
-
-
-def _limit(kind: Any, value: object) -> str:
-    """The limit that a value of the right type exceeds, as text."""
-    if kind is int and type(value) is int:
-        return f" from 0 to {_MOST}"
-    if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
-        return "" if math.isnan(_number(value)) else f" of at most {_LARGEST:g} in size"
-    if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
-        return f", at most {_ITEMS}"
-    return f" of at most {_LONGEST} characters" if kind is str and type(value) is str else ""
 
 
 def _number(value: int | float | str) -> float:
@@ -167,14 +172,7 @@ def _say(kind: Any) -> str:
         return " or ".join(map(_say, arguments))
     if origin is Literal:
         return "one of " + ", ".join(map(str, arguments))
-    names = {
-        float: "a number",
-        int: "a whole number",
-        bool: "true or false",
-        str: "text",
-        type(None): "null",
-    }
-    return names.get(kind, getattr(kind, "__name__", str(kind)))
+    return _NAMES.get(kind, getattr(kind, "__name__", str(kind)))
 
 
 def describe(cls: Any, prefix: str = "") -> list[str]:

@@ -13,17 +13,22 @@ import math
 import pathlib
 import time
 import urllib.parse
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checkpoint import Checkpoint, unpacked
+from drt_jax.inputs import shown
+
+from .checkpoint import finite, packed, unpacked
 from .config import ConfigError, dump_config, load_config
 from .lock import lock
 from .metrics import Metrics
 from .write import replace, sweep
+
+_OTHERS = "other settings than those in config.yaml"
 
 
 def begun(folder: pathlib.Path) -> bool:
@@ -125,12 +130,12 @@ class Run:
         """Writes a checkpoint: the state `tree` of a job after `step` logged steps. ConfigError if
         it is not finite; the checkpoint before it stays."""
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-        now = Checkpoint(job, step, self.seconds, self._settings, leaves)
-        if not now.finite():
+        if not finite(leaves):
             remedy = "lower the learning rates; the last checkpoint is of an earlier step"
             raise ConfigError(f"{job}: numbers that are not finite after {step} steps; {remedy}")
         self._metrics.sync()  # a checkpoint is useless without its metrics
-        replace(self._path(job), now.packed())
+        about = {"job": job, "step": step, "seconds": self.seconds, "settings": self._settings}
+        replace(self._path(job), packed(about, leaves))
         self._saved.add(job)
 
     def load(self, job: str, tree: Any, logged: tuple[str, ...], most: int) -> tuple[int, Any]:
@@ -145,10 +150,10 @@ class Run:
         """
         leaves, structure = jax.tree.flatten(tree)
         forms = [(np.shape(leaf), np.dtype(jnp.result_type(leaf))) for leaf in leaves]
-        found = self._found(job, logged, most, forms)
+        step, found = self._found(job, logged, most, forms)
         if found is None:
             return 0, tree
-        return found.step, jax.tree.unflatten(structure, map(jnp.asarray, found.leaves))
+        return step, jax.tree.unflatten(structure, map(jnp.asarray, found))
 
     def keep(self, job: str, value: Any) -> None:
         """Writes the checkpoint of a finished job: its result, which JSON can hold."""
@@ -158,26 +163,42 @@ class Run:
     def kept(self, job: str) -> Any:
         """The result of a job from `keep`; without one None, and its metrics are dropped.
         ConfigError as in `load`."""
-        found = self._found(job, (job,), math.inf, None)
-        return None if found is None else json.loads(found.leaves[0].tobytes())
+        _, found = self._found(job, (job,), math.inf, None)
+        return None if found is None else json.loads(found[0].tobytes())
+
+    def once(self, job: str, make: Callable[[], Any]) -> Any:
+        """The result of a job, as JSON reads it back: from its checkpoint, or else made and kept.
+        ConfigError as in `load`."""
+        if self.kept(job) is None:
+            self.keep(job, make())
+        return self.kept(job)
 
     def _found(
         self, job: str, logged: tuple[str, ...], most: float, forms: list | None
-    ) -> Checkpoint | None:
-        """The checked checkpoint of a job; drops metrics beyond it."""
-        path = self._path(job)
-        found: Checkpoint | None = None
+    ) -> tuple[int, list[np.ndarray] | None]:
+        """Step and arrays of the checked checkpoint of a job, (0, None) without one; drops metrics
+        beyond it. forms: shape and dtype of each array; None for any."""
+        path, step, leaves = self._path(job), 0, None
         if path.is_file():
             try:
-                found = unpacked(path.read_bytes())
-                found.check(job, self._settings, most, forms)
+                about, leaves = unpacked(path.read_bytes())
+                step, own = about["step"], [(leaf.shape, leaf.dtype) for leaf in leaves]
+                for right, wrong in (
+                    (about["job"] == job, f"belongs to the job {shown(about['job'])}"),
+                    (about["settings"] == self._settings, f"belongs to {_OTHERS}"),
+                    (0 <= step <= most, f"is of step {step}, not of one from 0 to {most}"),
+                    (forms in (None, own), "holds arrays of other shapes or dtypes"),
+                    (finite(leaves), "holds numbers that are not finite"),
+                ):
+                    if not right:
+                        raise ValueError(wrong)
             except ValueError as error:
                 raise ConfigError(f"{path}: {error}; delete it to begin this job anew") from error
             if job not in self._saved:
-                self._earlier = max(self._earlier, found.seconds)
+                self._earlier = max(self._earlier, about["seconds"])
         remedy = f"delete {path.relative_to(self.folder)} to begin this job anew"
-        self._metrics.cut(logged, found.step if found else 0, remedy)
-        return found
+        self._metrics.cut(logged, step, remedy)
+        return step, leaves
 
     def _path(self, job: str) -> pathlib.Path:
         return self.folder / "checkpoints" / f"{urllib.parse.quote(job, safe=' ,')}.npz"

@@ -1,6 +1,6 @@
 """One process at a time works in a folder."""
 
-import functools
+import contextlib
 import os
 import pathlib
 import sys
@@ -19,26 +19,19 @@ def lock(folder: pathlib.Path) -> Callable[[], None]:
     systems have no such locks: nothing is locked there. ConfigError if another process has locked
     the folder.
     """
-    number = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        if sys.platform != "win32":
-            _claim(number, folder)
-    except BaseException:
-        os.close(number)
-        raise
-    return functools.partial(os.close, number)
-
-
-def _claim(number: int, folder: pathlib.Path) -> None:
-    """Locks an open file and writes the process into it."""
-    try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        holder = os.read(number, 20).decode("ascii", "replace").strip()
-        who = f"another process (pid {holder})" if holder.isdigit() else "another process"
-        remedy = "wait for it, or choose another --out"
-        raise ConfigError(f"{folder}: {who} works in this folder; {remedy}") from None
-    except OSError:  # a file system without locks
-        return
-    os.ftruncate(number, 0)
-    os.write(number, f"{os.getpid()}\n".encode())
+    with contextlib.ExitStack() as stack:
+        number = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
+        stack.callback(os.close, number)
+        try:
+            if sys.platform != "win32":
+                fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(number, 20).decode("ascii", "replace").strip()
+            who = f"another process (pid {holder})" if holder.isdigit() else "another process"
+            remedy = "wait for it, or choose another --out"
+            raise ConfigError(f"{folder}: {who} works in this folder; {remedy}") from None
+        except OSError:  # a file system without locks
+            return stack.pop_all().close
+        os.ftruncate(number, 0)
+        os.write(number, f"{os.getpid()}\n".encode())
+        return stack.pop_all().close

@@ -16,7 +16,7 @@ import os
 import pathlib
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -29,12 +29,11 @@ from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
 
 from . import _command, _common, _peers, _plots, _work
+from ._common import within
 from ._reference import Moments, changed, flatten, gradient_error, reference
 from ._work import Row, compiled, peer, rows_of
 from .runs.folder import Run
 from .snell import trace_snell
-
-COLUMNS = ("ours_s", "peer_s", "ratio", "ours_error", "peer_error", *_work.MEASURED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,23 +48,19 @@ class Config:
     """
 
     lens: str = "double_gauss"
-    distance_m: float = 25.0
-    field_deg: float = 10.0
-    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
-    repeats: int = 15
-    rays: int = 256
-    bundle: int = 262144
-    batch: int = 16
-    patch: int = 64
+    distance_m: Annotated[float, within(1e-3, 1e9)] = 25.0
+    field_deg: Annotated[float, within(0, 89.9)] = 10.0
+    wavelengths_um: Annotated[tuple[float, ...], within(1e-4, 1e6)] = (0.6, 0.53, 0.48)
+    repeats: Annotated[int, within(1, 1e4)] = 15
+    rays: Annotated[int, within(7, 1e6)] = 256  # one hexapolar ring has 7 rays
+    bundle: Annotated[int, within(1, 1e8)] = 262144
+    batch: Annotated[int, within(1, 4096)] = 16
+    patch: Annotated[int, within(7, 4096)] = 64
     tasks: tuple[str, ...] = ()
     growth: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:
-        # One hexapolar ring has 7 rays.
-        counts = {"repeats": (1, 1e4), "rays": (7, 1e6), "bundle": (1, 1e8), "batch": (1, 4096)}
-        numbers = {"distance_m": (1e-3, 1e9), "field_deg": (0, 89.9), "wavelengths_um": (1e-4, 1e6)}
-        _common.require_within("", self, patch=(7, 4096), **counts, **numbers)
         _common.require_known("tasks", self.tasks, TASKS)
 
     @property
@@ -111,14 +106,14 @@ def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
         found, back = jax.vjp(lambda values: sigma(values)[0], values)
         return found, jax.vmap(lambda row: back(row)[0])(jnp.eye(waves.size))
 
-    def beside(spot):
+    def of_peer(spot):
         call = spot(numbers, config.rays)[int(gradient)]
         return call, spot_error(truth, count, *call())
 
     ours = compiled(jacobian if gradient else sigma, flatten(lens))
     numbers = _peers.Lens(lens, field, distance, config.wavelengths_um)
-    peers = peer("optiland", lambda: beside(_peers.optiland_spot))
-    peers |= peer("batoid", lambda: beside(_peers.batoid_spot))
+    peers = peer("optiland", lambda: of_peer(_peers.optiland_spot))
+    peers |= peer("batoid", lambda: of_peer(_peers.batoid_spot))
     task = "sigma and Jacobian" if gradient else "sigma"
     task += ", on axis" if axial else f", {config.field_deg:g} degrees"
     return rows_of(task, ours, spot_error(truth, count, *ours[0]()), peers, config.repeats)
@@ -243,15 +238,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Runs the tasks one by one."""
     # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
-
-    def measure(name: str) -> list[Row]:
-        rows = TASKS[name](config)
-        for k, row in enumerate(rows):
-            known = {c: np.array([float(row[c])]) for c in COLUMNS if row[c] is not None}
-            run.log(name, k, known)
-        return rows
-
-    jobs = {name: functools.partial(measure, name) for name in config.tasks or TASKS}
+    jobs = {name: functools.partial(TASKS[name], config) for name in config.tasks or TASKS}
     rows = sum(_common.measured(run, "task", jobs), [])
     lens, field, distance = config.scene
     results = {"rows": rows, "counts": _work.counts(lens, distance, config.wavelengths_um)}

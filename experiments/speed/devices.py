@@ -9,12 +9,11 @@ import dataclasses
 import pathlib
 import re
 import sys
-import time
-from typing import Any
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 import drt_jax
 from drt_jax import show
@@ -22,9 +21,9 @@ from drt_jax.devices import copied, shared, split
 from drt_jax.learn import train
 
 from . import _command, _common, _settings, _sharing
+from ._common import different, within
 from .runs.folder import Run
 
-COLUMNS = ()
 _BYTES = {"f32": 4, "f64": 8, "s32": 4}
 
 
@@ -34,84 +33,61 @@ class Config:
 
     counts: of devices, the first 1.
     images: of each device in a step. patch: side of an image, pixels.
-    repeats: steps that are timed for each count.
+    repeats: turns in which the steps of all counts are timed.
     """
 
-    counts: tuple[int, ...] = (1, 2, 4, 8)
-    images: int = 2
-    patch: int = 64
-    repeats: int = 20
+    counts: Annotated[tuple[int, ...], within(1, 4096), different] = (1, 2, 4, 8)
+    images: Annotated[int, within(1, 4096)] = 2
+    patch: Annotated[int, within(7, 4096)] = 64
+    repeats: Annotated[int, within(1, 1e6)] = 20
     lens: str = "double_gauss"
     wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
     network: _settings.Net = _settings.Net()
 
     def __post_init__(self) -> None:
-        limits = {"counts": (1, 4096), "images": (1, 4096), "patch": (7, 4096), "repeats": (1, 1e6)}
-        _common.require_within("", self, **limits)
-        _common.require_different("counts", self.counts)
         _common.require(self.counts[:1] == (1,), "counts: expected 1 first, to compare with")
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Times the steps of all counts, in turns."""
-    seeds = np.random.default_rng(0)
     side = config.patch + train.Camera.kernel - 1
-    most = config.images * max(config.counts)
-    scenes = seeds.integers(0, 255, (most, side, side, 3), np.uint8)
-    jobs = [_Job(config, count, scenes[: count * config.images]) for count in config.counts]
-    ways = [way for job in jobs for way in (job.shared, job.alone)]
-    times: list[list[float]] = [[] for _ in ways]
-    for _ in tqdm(range(config.repeats), unit="step", leave=False):
-        for way, taken in zip(ways, times):
-            way()  # threads of the program before may still spin
-            begun = time.perf_counter()
-            way()
-            taken.append(time.perf_counter() - begun)
-    seconds = np.reshape([np.median(taken) for taken in times], (-1, 2)).tolist()
-    rows = []
-    for count, job, (shared_s, alone_s) in zip(config.counts, jobs, seconds):
-        row = {"devices": count, "images": count * config.images, **job.about}
-        rows.append(row | {"step_s": shared_s, "alone_s": alone_s})
-    device = jax.devices()[0]
-    return {"rows": rows, "device": device.device_kind, "weights": jobs[0].weights}
+    shape = config.images * max(config.counts), side, side, 3
+    scenes = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
+    lens = drt_jax.load_lens(config.lens)
+    init, restore = drt_jax.red_net(**dataclasses.asdict(config.network))
+    waves = config.wavelengths_um
+    blur = drt_jax.moments_model(lens, ("sensor",), 0.0, (25e3, 25e3), waves, 1e-6)[1]
+    start = {"optics": {"sensor": lens.sensor}, "network": init(jax.random.key(0))}
 
+    def step_of(count: int, mesh: Any) -> tuple[Callable[[], float], Any]:
+        """Function that takes a step with the images of `count` devices and returns its loss, and
+        the lowered program."""
+        imager = train.make_imager(blur, shared(restore, mesh, 1), train.Camera())
+        rates = {"optics": 1e-3, "network": 1e-3}
+        begin, step = train.make_step(imager, rates, (25e3, 25e3), 0)
+        state = [copied(mesh, begin(start))]
+        some = split(mesh, scenes[: count * config.images])
+        rest = some, np.float32(0.01), np.int32(0)
 
-class _Job:
-    """Steps of training on some devices, and on one with the same images.
+        def take() -> float:
+            state[0], found = step(state[0], *rest)
+            return float(found["loss"])
 
-    shared, alone: functions that take a step and return its loss.
-    about: bytes that all devices add up in a step, and the relative difference of the first loss.
-    weights: of the network.
-    """
+        return take, step.lower(state[0], *rest)
 
-    def __init__(self, config: Config, count: int, scenes: np.ndarray) -> None:
-        mesh = _sharing.mesh_of(count)
-        lens = drt_jax.load_lens(config.lens)
-        init, restore = drt_jax.red_net(**dataclasses.asdict(config.network))
-        waves = config.wavelengths_um
-        blur = drt_jax.moments_model(lens, ("sensor",), 0.0, (25e3, 25e3), waves, 1e-6)[1]
-        weights = init(jax.random.key(0))
-        self.weights = train.count_parameters(weights)
-        start = {"optics": {"sensor": lens.sensor}, "network": weights}
-
-        def made(mesh: Any) -> tuple[Any, Any]:
-            imager = train.make_imager(blur, shared(restore, mesh, 1), train.Camera())
-            rates = {"optics": 1e-3, "network": 1e-3}
-            begin, step = train.make_step(imager, rates, (25e3, 25e3), 0)
-            state = [copied(mesh, begin(start))]
-            rest = split(mesh, scenes), np.float32(0.01), np.int32(0)
-
-            def take() -> float:
-                state[0], found = step(state[0], *rest)
-                return float(found["loss"])
-
-            return take, step.lower(state[0], *rest)
-
-        self.alone, _ = made(None)
-        self.shared, lowered = made(mesh)
-        carried = _carried(lowered.compile().as_text())
-        apart = abs(self.shared() / self.alone() - 1)
-        self.about = {"carried_bytes": carried, "loss_apart": apart}
+    rows, calls = [], []
+    for count in config.counts:
+        alone, _ = step_of(count, None)
+        together, lowered = step_of(count, _sharing.mesh_of(count))
+        row = {"devices": count, "images": count * config.images}
+        row |= {"carried_bytes": _carried(lowered.compile().as_text())}
+        rows.append(row | {"loss_apart": abs(together() / alone() - 1)})
+        calls += [together, alone]
+    seconds = np.reshape(_common.medians(calls, config.repeats), (-1, 2))
+    for row, pair in zip(rows, seconds.tolist()):
+        row |= dict(zip(("step_s", "alone_s"), pair))
+    weights = train.count_parameters(start["network"])
+    return {"rows": rows, "device": jax.devices()[0].device_kind, "weights": weights}
 
 
 def _carried(program: str) -> int:
@@ -143,9 +119,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         axes.plot(counts, [1e3 * row[key] / row["images"] for row in rows], "o-", label=label)
     axes.set_xscale("log", base=2)
     axes.set_xticks(counts, counts)
-    axes.set_ylim(0)
-    axes.set_xlabel("devices")
-    axes.set_ylabel("time of an image, ms")
+    axes.set(xlabel="devices", ylabel="time of an image, ms", ylim=(0, None))
     axes.legend()
     figure.savefig(figures / "scaling.png")
 

@@ -17,9 +17,8 @@ import math
 import pathlib
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -30,10 +29,10 @@ import drt_jax
 from drt_jax import Lens, show
 
 from . import _command, _common, _peers, _plots, _work
+from ._common import Numbers, Wavelengths, not_empty, within
 from ._reference import reference
 from .runs.folder import Run
 
-COLUMNS = ("first_s", "loose_s", "tight_s", "value_s", "gradient_s", "loose_error", "tight_error")
 _LOOSE, _TIGHT = 1e-3, 1e-6
 # Relative perturbation of copies.
 _SPREAD = 1e-4
@@ -51,10 +50,7 @@ class LensFields:
     """
 
     lens: str
-    field_deg: float
-
-    def __post_init__(self) -> None:
-        _common.require_within("lenses.", self, field_deg=(1e-6, 89.9))
+    field_deg: Annotated[float, within(1e-6, 89.9)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,35 +63,21 @@ class Config:
     repeats: timed turns of each program.
     """
 
-    lenses: tuple[LensFields, ...]
-    parts: tuple[float, ...] = (0.0, 0.5, 1.0)
-    wavelengths_um: tuple[float, ...] = (0.6562725, 0.5875618, 0.4861327)
-    copies: int = 64
-    fields: int = 5
-    sweep: int = 200
-    rays: int = 271
-    repeats: int = 9
+    lenses: Annotated[tuple[LensFields, ...], not_empty]
+    parts: Annotated[Numbers, within(0, 1)] = (0.0, 0.5, 1.0)
+    wavelengths_um: Wavelengths = (0.6562725, 0.5875618, 0.4861327)
+    copies: Annotated[int, within(1, 1e4)] = 64
+    fields: Annotated[int, within(1, 1e4)] = 5
+    sweep: Annotated[int, within(8, 1e5)] = 200
+    rays: Annotated[int, within(7, 1e6)] = 271
+    repeats: Annotated[int, within(1, 1e4)] = 9
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        _common.require(len(self.lenses) > 0, "lenses: needs at least one item")
-        _common.require_list("wavelengths_um", self.wavelengths_um)
-        _common.require_list("parts", self.parts, -1.0)
-        _common.require_within("", self, parts=(0, 1), wavelengths_um=(1e-4, 1e6))
-        counts = {"copies": (1, 1e4), "fields": (1, 1e4), "sweep": (8, 1e5), "rays": (7, 1e6)}
-        _common.require_within("", self, repeats=(1, 1e4), **counts)
 
 
 def sigmas(lens: Lens, field: Any, waves: Array, rule: drt_jax.PupilRule) -> Array:
     """RMS spot radii (W,), mm."""
     covariance = drt_jax.psf_moments(lens, field, math.inf, waves, rule=rule).covariance
     return jnp.sqrt(jnp.trace(covariance, axis1=1, axis2=2))
-
-
-def _timed(call: Callable) -> tuple[float, Any]:
-    start = time.perf_counter()
-    found = jax.block_until_ready(call())
-    return time.perf_counter() - start, found
 
 
 def _error(truth: np.ndarray, covariance: Array) -> float:
@@ -108,7 +90,9 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     waves = np.array(config.wavelengths_um)
     converged = partial(drt_jax.psf_moments, lens, field, math.inf, waves)
     jax.clear_caches()
-    first, loose = _timed(lambda: converged(_LOOSE))
+    start = time.perf_counter()
+    loose = jax.block_until_ready(converged(_LOOSE))
+    first = time.perf_counter() - start
     tight = converged(_TIGHT)
     calls = [lambda: converged(_LOOSE), lambda: converged(_TIGHT)]
     seconds = _common.medians(calls, config.repeats)
@@ -122,7 +106,7 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
 
     gradient, more = _work.compiled(jax.value_and_grad(slopes), lens)
     truth = np.array([m.sigma for m in reference(lens, field, math.inf, config.wavelengths_um)])
-    peers = _beside(config, lens, field, truth)
+    peers = _peers_of(config, lens, field, truth)
     ready = [(name, call, error) for name, call, error, _ in peers if call]
     timed = _common.medians([value, gradient, *(call for _, call, _ in ready)], config.repeats)
     others = {name: (s, error) for (name, _, error), s in zip(ready, timed[2:])}
@@ -144,7 +128,7 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     }
 
 
-def _beside(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list[tuple]:
+def _peers_of(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list[tuple]:
     """(name, call, error, note) of each peer; call is None if it is missing or fails, error if its
     spot is not finite."""
     found = []
@@ -238,14 +222,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Measures the lenses one by one."""
     # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
-
-    def one(of: LensFields) -> dict[str, Any]:
-        found = lens_rows(config, of)
-        for k, row in enumerate(found["rows"]):
-            run.log(of.lens, k, {c: np.array([float(row[c])]) for c in COLUMNS})
-        return found
-
-    found = _common.measured(run, "lens", {of.lens: partial(one, of) for of in config.lenses})
+    jobs = {of.lens: partial(lens_rows, config, of) for of in config.lenses}
+    found = _common.measured(run, "lens", jobs)
     return {
         "rows": sum((each["rows"] for each in found), []),
         "copies": [each["copies"] for each in found],

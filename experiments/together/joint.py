@@ -13,7 +13,7 @@ import dataclasses
 import math
 import pathlib
 import sys
-from typing import Any, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,9 @@ from drt_jax.design import Operand, Solve, Tie, Tolerance, Vary
 from drt_jax.learn.data import DataConfig
 
 from . import _command, _common, _plots, _report, _settings, _sharing
-from ._arms import ARMS, Arm, run as run
+from ._common import Colours, different, near_and_far, not_empty, odd, within
+from ._setup import ARMS
+from ._train_arms import run as run
 from .runs.folder import Run as Run
 
 COLUMNS = ("loss",)
@@ -30,16 +32,13 @@ _MEASURES = ("mae", "rmse", "psnr", "ssim")
 
 
 @dataclasses.dataclass(frozen=True)
-class Spoil:
+class StartErrors:
     """Errors of the lens that all arms begin with: standard deviations of all curvatures, per cent,
     and thicknesses, mm."""
 
-    per_cent: float = 2.0
-    off_mm: float = 0.05
+    per_cent: Annotated[float, within(0, 50)] = 2.0
+    off_mm: Annotated[float, within(0, 100)] = 0.05
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        _common.require_within("spoil.", self, per_cent=(0, 50), off_mm=(0, 100))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,14 +46,9 @@ class Camera:
     """Sensor. pixel_um: side of a pixel. kernel: side of the kernels, pixels, odd. tolerance: sum
     of the errors of a kernel's pixels in training."""
 
-    pixel_um: float = 6.0
-    kernel: int = 21
-    tolerance: float = 0.03
-
-    def __post_init__(self) -> None:
-        limits = {"pixel_um": (0.05, 1e4), "kernel": (3, 255), "tolerance": (1e-4, 0.5)}
-        _common.require_within("camera.", self, **limits)
-        _common.require(self.kernel % 2 == 1, "camera.kernel: expected an odd number")
+    pixel_um: Annotated[float, within(0.05, 1e4)] = 6.0
+    kernel: Annotated[int, within(3, 255), odd] = 21
+    tolerance: Annotated[float, within(1e-4, 0.5)] = 0.03
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,20 +61,17 @@ class Training:
     damped_part: part of the batches that `damped` gets, for equal time.
     """
 
-    batches: int = 400
-    batch: int = 8
-    patch: int = 32
-    points: int = 4
-    optics_rate: float = 0.1
-    damped_rate: float = 0.1
-    damped_part: float = 1.0
-    network_rate: float = 1e-3
+    batches: Annotated[int, within(1, 1e7)] = 400
+    batch: Annotated[int, within(1, 4096)] = 8
+    patch: Annotated[int, within(7, 4096)] = 32
+    points: Annotated[int, within(1, 4096)] = 4
+    optics_rate: Annotated[float, within(0, 10)] = 0.1
+    damped_rate: Annotated[float, within(0, 10)] = 0.1
+    damped_part: Annotated[float, within(1e-3, 10)] = 1.0
+    network_rate: Annotated[float, within(0, 10)] = 1e-3
     checkpoint_every: int = 200
 
     def __post_init__(self) -> None:
-        sizes = {"batches": (1, 1e7), "batch": (1, 4096), "patch": (7, 4096), "points": (1, 4096)}
-        rates = {name: (0, 10) for name in ("optics_rate", "damped_rate", "network_rate")}
-        _common.require_within("train.", self, **sizes, **rates, damped_part=(1e-3, 10))
         shared = self.batch % self.points == 0
         _common.require(shared, "train.batch: expected a multiple of train.points")
 
@@ -94,18 +85,13 @@ class Judge:
     patches: for each point. builds: lenses as built, for arms of `tolerances`.
     """
 
-    rings: int = 8
-    depths: int = 1
-    waves: int = 3
-    width_um: float = 0.04
-    cells: int = 128
-    patches: int = 4
-    builds: int = 0
-
-    def __post_init__(self) -> None:
-        limits = {"rings": (1, 64), "depths": (1, 64), "waves": (1, 15), "width_um": (0, 1)}
-        limits |= {"cells": (16, 1024), "patches": (1, 1000), "builds": (0, 1e4)}
-        _common.require_within("judge.", self, **limits)
+    rings: Annotated[int, within(1, 64)] = 8
+    depths: Annotated[int, within(1, 64)] = 1
+    waves: Annotated[int, within(1, 15)] = 3
+    width_um: Annotated[float, within(0, 1)] = 0.04
+    cells: Annotated[int, within(16, 1024)] = 128
+    patches: Annotated[int, within(1, 1000)] = 4
+    builds: Annotated[int, within(0, 1e4)] = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,21 +113,21 @@ class Config:
 
     name: str
     lens: str
-    variables: tuple[Vary, ...]
+    variables: Annotated[tuple[Vary, ...], not_empty]
     limits: tuple[Operand, ...] = ()
     ties: tuple[Tie, ...] = ()
     solves: tuple[Solve, ...] = ()
-    spoil: Spoil = Spoil()
-    field_deg: float = 10.0
-    depth_m: tuple[float, ...] = (math.inf, math.inf)
-    wavelengths_um: tuple[float, ...] = (0.6, 0.53, 0.48)
+    spoil: StartErrors = StartErrors()
+    field_deg: Annotated[float, within(1e-3, 80)] = 10.0
+    depth_m: Annotated[tuple[float, ...], near_and_far] = (math.inf, math.inf)
+    wavelengths_um: Annotated[Colours, within(0.1, 100)] = (0.6, 0.53, 0.48)
     camera: Camera = Camera()
-    noise: float = 0.01
-    mtf_at: float = 30.0
+    noise: Annotated[float, within(0, 10)] = 0.01
+    mtf_at: Annotated[float, within(1e-3, 1e4)] = 30.0
     network: _settings.Net = _settings.Net()
     train: Training = Training()
-    arms: tuple[Arm, ...] = ("focus", "spots", "joint")
-    seeds: int = 3
+    arms: Annotated[tuple[Literal[*ARMS], ...], different] = ("focus", "spots", "joint")
+    seeds: Annotated[int, within(1, 100)] = 3
     tolerances: tuple[Tolerance, ...] = ()
     refocus: bool = False
     judge: Judge = Judge()
@@ -150,15 +136,6 @@ class Config:
 
     def __post_init__(self) -> None:
         _sharing.require_shared(self.devices, "train.batch", self.train.batch)
-        limits = {"field_deg": (1e-3, 80), "noise": (0, 10), "mtf_at": (1e-3, 1e4)}
-        _common.require_within("", self, **limits, seeds=(1, 100), wavelengths_um=(0.1, 100))
-        three = len(self.wavelengths_um) == 3
-        _common.require(three, "wavelengths_um: expected three, for R, G, B")
-        ordered = len(self.depth_m) == 2 and 0 < self.depth_m[0] <= self.depth_m[1]
-        _common.require(ordered, "depth_m: expected the nearest and the farthest distance in m")
-        _common.require(len(self.variables) > 0, "variables: needs at least one item")
-        _common.require_different("arms", self.arms)
-        _common.require_known("arms", self.arms, get_args(Arm))
         needs = {"frozen": "spots", "joint_from_spots": "spots", "tolerant": "spots"}
         for arm, other in needs.items():
             both = arm not in self.arms or other in self.arms
@@ -182,14 +159,14 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         spot = _spread([row["spot_um"] for row in own], "spot")
         speed = f"{1e3 * float(np.median([row['step_s'] for row in own])):.3g}"
         ahead_text = _spread(ahead, "psnr") if ahead and arm != "spots" else ""
-        rows.append([ARMS[arm], len(own), *cells, more, ahead_text, spot, speed])
+        rows.append([ARMS[arm].title, len(own), *cells, more, ahead_text, spot, speed])
     found = {f"joint, {name}": _common.table(header, rows)}
     if results["builds"]:
         header = ["arm", "PSNR dB as designed", "mean as built", "10th percentile"]
         lines = []
         for (arm,), own in _common.grouped(results["builds"], "arm").items():
             parts = [[row[key] for row in own] for key in ("designed", "mean", "low")]
-            lines.append([ARMS[arm], *(_spread(part, "psnr") for part in parts)])
+            lines.append([ARMS[arm].title, *(_spread(part, "psnr") for part in parts)])
         found[f"joint, {name}: as built"] = _common.table(header, lines)
     return found
 
@@ -204,7 +181,9 @@ def _spread(values: list[float], measure: str) -> str:
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws losses, lenses, and patches through each lens before and after the network."""
     figure, axes = show.new(width=7, height=4.5)
-    lines = {ARMS[arm]: _smooth(loss) for arm, loss in zip(results["arms"], results["losses"])}
+    titles = {name: arm.title for name, arm in ARMS.items()}
+    losses = zip(results["arms"], results["losses"])
+    lines = {titles[arm]: _smooth(loss) for arm, loss in losses}
     _plots.curves(axes, lines, "training batch", "mean absolute error")
     axes.set_yscale("log")
     figure.savefig(figures / "losses.png")
@@ -214,7 +193,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     for ax, name in zip(np.ravel(axes), drawn):
         lens = load_lens(figures.parent / "lenses" / f"{name}.yaml")
         show.lens_drawing(ax, show.draw(lens, fields, results["far_mm"] or math.inf))
-        ax.set_title(ARMS.get(name.split()[0], name), fontsize=9)
+        ax.set_title(titles.get(name.split()[0], name), fontsize=9)
         ax.get_legend().remove()
     figure.savefig(figures / "lenses.png")
     for arm in results["pictures"]:

@@ -1,24 +1,30 @@
 """Runs that are killed, stopped or started twice resume to the results of an unbroken run, bit for
-bit."""
+bit.
+
+`python -m experiments._ended N SECONDS MODULE ...` runs `python -m MODULE ...` and kills it as it
+writes: SECONDS after the N-th time that it opens, renames or removes a file in the folder of --out.
+"""
 
 import concurrent.futures
 import itertools
 import json
+import os
 import pathlib
 import re
+import runpy
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from ._common import ROOT
-from ._outcomes import Tally, clear
+from ._damaged_files import clear, row_of
 
 # A short run that trains, writes metrics and checkpoints, and draws.
 _TOY = ("train.batches=40", "train.batch=2", "train.patch=16", "train.checkpoint_every=5")
@@ -26,188 +32,160 @@ _TOY += ("camera.kernel=9", "data.crops_per_image=2", "starts_mm=[133.0, 134.0]"
 # Seconds after which a run counts as hung, and that an unbroken one takes; files that it touches.
 _PATIENCE, _WHOLE, _TOUCHES = 240.0, 6.0, 60
 _KILLS = 8  # kills of one run before it may end
-_MODULE = "experiments.focus"
+_SIGNALS = ((signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT))
 
 
-class Ended:
-    """The end of a process: its exit code, its messages, and whether it hung."""
+class _Ended(NamedTuple):
+    """The end of a process. message: the last line of its text, behind progress bars."""
 
-    def __init__(self, process: subprocess.Popen, seconds: float = _PATIENCE):
-        try:
-            self.text = process.communicate(timeout=seconds)[1].decode("utf-8", "replace")
-            self.hung = False
-        except subprocess.TimeoutExpired:
-            process.kill()
-            self.text = process.communicate()[1].decode("utf-8", "replace")
-            self.hung = True
-        self.code = process.returncode
-
-    @property
-    def message(self) -> str:
-        """The last line, behind progress bars."""
-        lines = [line.strip() for line in re.split(r"[\r\n]+", self.text)]
-        return next((line for line in reversed(lines) if line), "")
+    code: int
+    text: str
+    hung: bool
+    message: str
 
 
-def start(folder: pathlib.Path, *options: str, dying: tuple[str, ...] = ()) -> subprocess.Popen:
-    """Starts the toy run in a folder. dying: arguments of `_dying`."""
-    module = ["experiments._dying", *dying, _MODULE] if dying else [_MODULE]
-    settings = () if "--resume" in options else ("--set", *_TOY)
-    command = [sys.executable, "-m", *module, "--out", str(folder), *options, *settings]
+class _Way(NamedTuple):
+    """A way to end a run: after some seconds by signals; or, with a touch above 0, by SIGKILL some
+    seconds after that touch of its folder."""
+
+    seconds: float
+    signals: tuple[signal.Signals, ...] = ()
+    touch: int = 0
+
+
+def _start(folder: pathlib.Path, resume: bool = False, way: _Way | None = None) -> subprocess.Popen:
+    """Starts or resumes the toy run in a folder; with a `way` of touches one that kills itself."""
+    touch = [__spec__.name, str(way.touch), str(way.seconds)] if way and way.touch else []
+    module = [*touch, "experiments.focus", "--out", str(folder)]
+    options = ["--resume"] if resume else ["--set", *_TOY]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, cwd=ROOT, **pipes)
+    return subprocess.Popen([sys.executable, "-m", *module, *options], cwd=ROOT, **pipes)
 
 
-def resumed(folder: pathlib.Path) -> Ended:
-    """Resumes the run in a folder, or starts it where nothing was begun."""
-    ended = Ended(start(folder, "--resume"))
-    return Ended(start(folder)) if "nothing to resume" in ended.message else ended
+def _end_of(process: subprocess.Popen) -> _Ended:
+    hung = False
+    try:
+        content = process.communicate(timeout=_PATIENCE)[1]
+    except subprocess.TimeoutExpired:
+        hung = True
+        process.kill()
+        content = process.communicate()[1]
+    text = content.decode("utf-8", "replace")
+    lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
+    return _Ended(process.returncode, text, hung, lines[-1] if lines else "")
 
 
-def result(folder: pathlib.Path) -> Any:
+def _result(folder: pathlib.Path) -> dict[str, Any]:
     """Results of a run except the seconds, and its metrics."""
     results = json.loads((folder / "results.json").read_text())
-    return results | {"seconds": None}, (folder / "metrics.csv").read_text()
+    return results | {"seconds": None, "metrics.csv": (folder / "metrics.csv").read_text()}
 
 
-def difference(folder: pathlib.Path, truth: Any) -> str:
-    """The first difference of a run from the truth, as text; "" for none."""
-    (results, metrics), (true, true_metrics) = result(folder), truth
-    for key in sorted({*results, *true}):
-        if results.get(key) != true.get(key):
-            return f"{key} is {results.get(key)}, not {true.get(key)}"
-    lines = itertools.zip_longest(metrics.splitlines(), true_metrics.splitlines())
-    for k, pair in enumerate(lines):
-        if pair[0] != pair[1]:
-            return f"metrics.csv, line {k + 1} is {pair[0]!r}, not {pair[1]!r}"
-    return ""
+def _outcome(ended: _Ended, folder: pathlib.Path, truth: dict[str, Any]) -> tuple[str, str]:
+    """Outcome of a run that was not disturbed, and its message or what is wrong."""
+    if ended.hung or "Traceback" in ended.text:
+        return "hang" if ended.hung else "traceback", ended.message
+    if ended.code:
+        refused = ended.code in (1, 2) and clear(ended.message)
+        return "refused" if refused else "wrong", ended.message
+    found = _result(folder)
+    others = [key for key in sorted({*found, *truth}) if found.get(key) != truth.get(key)]
+    return "wrong" if others else "survived", f"not as unbroken: {', '.join(others)}"
 
 
-def outcome(ended: Ended, folder: pathlib.Path, truth: Any) -> str:
-    """Outcome of a run that was not disturbed, see `_outcomes`."""
-    if ended.hung:
-        return "hang"
-    if "Traceback" in ended.text:
-        return "traceback"
-    if ended.code == 0:
-        return "survived" if result(folder) == truth else "wrong"
-    return "refused" if ended.code in (1, 2) and clear(ended.message) else "wrong"
+def _broken_off(folder: pathlib.Path, way: _Way) -> str:
+    """Goes on with the run in a folder and ends it; what went wrong then, "" for nothing."""
+    process = _start(folder, (folder / "config.yaml").is_file(), way)
+    if way.signals:
+        time.sleep(way.seconds)
+    for number in way.signals:
+        process.send_signal(number)
+        time.sleep(0.05)
+    ended = _end_of(process)
+    if ended.hung or "Traceback" in ended.text:
+        return "hung" if ended.hung else ended.text[-300:]
+    stopped = ended.code == 130 and "stopped" in ended.message and clear(ended.message)
+    wrong = way.signals[:1] == (signal.SIGINT,) and ended.code and not stopped
+    return f"code {ended.code}: {ended.message}" if wrong else ""
 
 
-def side_by_side(kind: str, trials: list[Callable[[], list[tuple[str, str]]]]) -> dict[str, Any]:
-    """Runs trials, two at a time, and returns the row of their kind."""
-    tally = Tally(kind)
-    with concurrent.futures.ThreadPoolExecutor(2) as pool:
-        running = [pool.submit(trial) for trial in trials]
-        ready = concurrent.futures.as_completed(running)
-        for done in tqdm(ready, total=len(trials), unit="run", leave=False, dynamic_ncols=True):
-            for found, example in done.result():
-                tally.add(found, example)
-    return tally.row
+def rows(
+    parent: pathlib.Path, count: int, rngs: list[np.random.Generator]
+) -> Iterator[dict[str, Any]]:
+    """Rows of runs that are ended `count` times in all, and of runs that are started twice."""
+    numbers = itertools.count()  # of folders
+    whole = parent / "whole"
+    ended = _end_of(_start(whole))
+    if ended.code:
+        raise RuntimeError(f"the toy run failed: {ended.message}")
+    truth = _result(whole)
 
-
-class Toy:
-    """The toy run, its true result, and folders for trials."""
-
-    def __init__(self, folder: pathlib.Path):
-        self._folder = folder
-        self._numbers = itertools.count()  # shared by two threads
-        self.whole = self.new()
-        ended = Ended(start(self.whole))
-        if ended.code:
-            raise RuntimeError(f"the toy run failed: {ended.message}")
-        self.truth = result(self.whole)
-
-    def new(self) -> pathlib.Path:
-        """A new folder, which does not exist yet."""
-        return self._folder / f"run {next(self._numbers)}"
-
-    def ends(self, ways: list[Callable[[pathlib.Path], str]]) -> list[tuple[str, str]]:
-        """Ends one run in several ways, resumes it to its end, and returns the outcome of each way.
-        ways: functions of the folder that return what went wrong, "" for nothing."""
-        folder = self.new()
-        faults = [way(folder) for way in ways]
-        ended = resumed(folder)
-        found, message = outcome(ended, folder, self.truth), ended.message
-        if found == "wrong" and ended.code == 0:
-            message = difference(folder, self.truth)
-        found = "wrong" if found == "refused" else found
+    def chain(ways: list[_Way]) -> list[tuple[str, str]]:
+        """Outcome of each way, after all of which one run is resumed to its end."""
+        folder = parent / f"run {next(numbers)}"
+        faults = [_broken_off(folder, way) for way in ways]
+        ended = _end_of(_start(folder, resume=True))
+        if "nothing to resume" in ended.message:
+            ended = _end_of(_start(folder))
+        found, message = _outcome(ended, folder, truth)
         shutil.rmtree(folder, ignore_errors=True)
+        found = "wrong" if found == "refused" else found
         return [("wrong", fault) if fault else (found, message) for fault in faults]
 
-
-def _go_on(folder: pathlib.Path, **dying: Any) -> subprocess.Popen:
-    begun = (folder / "config.yaml").is_file()
-    return start(folder, *(("--resume",) if begun else ()), **dying)
-
-
-def _after(seconds: float, *signals: signal.Signals) -> Callable[[pathlib.Path], str]:
-    """A way to end a run: signals after some seconds."""
-
-    def end(folder: pathlib.Path) -> str:
-        process = _go_on(folder)
-        time.sleep(seconds)
-        for number in signals:
-            process.send_signal(number)
-            time.sleep(0.05)
-        ended = Ended(process)
-        if ended.hung:
-            return "hung"
-        if "Traceback" in ended.text:
-            return ended.text[-300:]
-        stopped = ended.code == 130 and "stopped" in ended.message and clear(ended.message)
-        if signals[0] == signal.SIGINT and ended.code and not stopped:
-            return f"code {ended.code}: {ended.message}"
-        return ""
-
-    return end
-
-
-def _at_touch(turn: int, seconds: float) -> Callable[[pathlib.Path], str]:
-    """A way to end a run: SIGKILL some seconds after touch number `turn` of its folder."""
-
-    def end(folder: pathlib.Path) -> str:
-        ended = Ended(_go_on(folder, dying=(str(turn), str(seconds))))
-        return "hung" if ended.hung else ended.text[-300:] * ("Traceback" in ended.text)
-
-    return end
-
-
-def _chained(toy: Toy, kind: str, ways: list[Callable[[pathlib.Path], str]]) -> dict[str, Any]:
-    chains = [ways[k : k + _KILLS] for k in range(0, len(ways), _KILLS)]
-    return side_by_side(kind, [lambda chain=chain: toy.ends(chain) for chain in chains])
-
-
-def killed(toy: Toy, count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Runs killed at random moments, from the first import on."""
-    ways = [_after(rng.uniform(0, _WHOLE), signal.SIGKILL) for _ in range(count)]
-    return _chained(toy, "killed at a random moment", ways)
-
-
-def killed_at_writes(toy: Toy, count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Runs killed while they write."""
-    ways = [_at_touch(int(rng.integers(1, _TOUCHES)), rng.exponential(1e-3)) for _ in range(count)]
-    return _chained(toy, "killed at a write", ways)
-
-
-def stopped(toy: Toy, count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Runs stopped by Ctrl-C, by SIGTERM, or by Ctrl-C twice."""
-    kinds = ((signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT,) * 2)
-    ways = [_after(rng.uniform(0, _WHOLE), *kinds[k % 3]) for k in range(count)]
-    return _chained(toy, "stopped by a signal", ways)
-
-
-def two(toy: Toy, count: int) -> dict[str, Any]:
-    """Two processes in one folder: one does the run, the other refuses."""
-
-    def trial(k: int) -> list[tuple[str, str]]:
-        folder = toy.new()
-        first = start(folder)
+    def two(k: int) -> list[tuple[str, str]]:
+        """Outcome of two processes in one folder: one does the run, the other refuses."""
+        folder = parent / f"run {next(numbers)}"
+        first = _start(folder)
         time.sleep(0.7 * k)
-        both = [Ended(start(folder)), Ended(first)]
-        found = sorted(outcome(ended, folder, toy.truth) for ended in both)
-        right = found == ["refused", "survived"]
-        text = " / ".join(ended.message for ended in both)
-        return [("survived" if right else "wrong", f"{found}: {text}")]
+        both = [_end_of(_start(folder)), _end_of(first)]
+        found = sorted(_outcome(ended, folder, truth) for ended in both)
+        right = [outcome for outcome, _ in found] == ["refused", "survived"]
+        return [("survived" if right else "wrong", str(found))]
 
-    return side_by_side("two in a folder", [lambda k=k: trial(k) for k in range(count)])
+    def side_by_side(function: Callable, items: list) -> Iterator[tuple[str, str]]:
+        """Outcomes of all items, two at a time."""
+        with concurrent.futures.ThreadPoolExecutor(2) as pool:
+            running = [pool.submit(function, item) for item in items]
+            for done in concurrent.futures.as_completed(running):
+                yield from done.result()
+
+    third, last = count // 3, count - 2 * (count // 3)
+    ways = {
+        "killed at a random moment": [
+            _Way(rngs[0].uniform(0, _WHOLE), (signal.SIGKILL,)) for _ in range(third)
+        ],
+        "killed at a write": [
+            _Way(touch=int(rngs[1].integers(1, _TOUCHES)), seconds=rngs[1].exponential(1e-3))
+            for _ in range(third)
+        ],
+        "stopped by a signal": [
+            _Way(rngs[2].uniform(0, _WHOLE), _SIGNALS[k % 3]) for k in range(last)
+        ],
+    }
+    for kind, some in ways.items():
+        chains = [some[k : k + _KILLS] for k in range(0, len(some), _KILLS)]
+        yield row_of(kind, side_by_side(chain, chains), len(some))
+    yield row_of("two in a folder", side_by_side(two, [0, 1, 2]), 3)
+
+
+def _run_and_die() -> None:
+    """Runs the module of the command line."""
+    turn, seconds, module = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
+    sys.argv = [module, *sys.argv[4:]]
+    folder = os.path.abspath(sys.argv[sys.argv.index("--out") + 1])
+    touches = itertools.count(1)
+
+    def touch(event: str, arguments: tuple) -> None:
+        if event not in ("open", "os.rename", "os.remove", "os.mkdir", "os.truncate"):
+            return
+        path = arguments[0]
+        inside = isinstance(path, str | bytes) and os.fsdecode(path).startswith(folder)
+        if inside and next(touches) == turn:
+            threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGKILL)).start()
+
+    sys.addaudithook(touch)
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    _run_and_die()

@@ -40,7 +40,7 @@ def local_mirror(d, e, near, far):
     return c * cosine, 0 * c, c / cosine, normal, 0 * d, 0 * c + 1
 
 
-def _beside(rng, d):
+def _across(rng, d):
     """Random unit vectors across unit vectors d, (N, 3)."""
     v = rng.normal(size=d.shape)
     return _unit(v - d * np.sum(v * d, -1, keepdims=True))
@@ -101,7 +101,7 @@ class Walk(NamedTuple):
         """Random directions behind mirrors that light meets along d, (N, 3)."""
         angle = np.radians(rng.uniform(*self.turns, (len(d), 1)))
         flat = np.stack([0 * d[:, 0], d[:, 2], -d[:, 1]], -1) * rng.choice([-1, 1], angle.shape)
-        return np.cos(angle) * d + np.sin(angle) * (flat if self.form else _beside(rng, d))
+        return np.cos(angle) * d + np.sin(angle) * (flat if self.form else _across(rng, d))
 
     def __call__(self, rng, count, variant):
         mirrors, between = variant
@@ -138,7 +138,7 @@ class Walk(NamedTuple):
         focus = (image > 0) & (rng.random(n) < 0.7)
         reach = np.where(focus, 1 / np.where(focus, image, 1), reach)
         lean = np.tan(np.radians(rng.uniform(0, 30, (n, 1))))
-        rows.add(point + reach[:, None] * d, sense * _unit(d + lean * _beside(rng, d)))
+        rows.add(point + reach[:, None] * d, sense * _unit(d + lean * _across(rng, d)))
         chosen, stop = np.flatnonzero(fits)[:count], 2 if between else 0
         return rows.scenes(rng, chosen, stop, radius, distance, widest, form=self.form)
 

@@ -18,7 +18,7 @@ import math
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,14 +29,15 @@ import drt_jax
 from drt_jax import Lens, PupilRule, pupil
 
 from . import _command, _common, _plots
-from ._common import grouped
+from ._common import Numbers, Wavelengths, different, grouped, not_empty, within
 from ._reference import Moments, flatten, gradient_error, reference
 from .runs.folder import Run
 
 _QUADRATURE = "quadrature"
-COLUMNS = ("rays", "relative_error", "gradient_error", "seconds", "gradient_seconds")
 # In the table: the default tolerance, and the sizes of patterns.
 _DEFAULT, _RANDOM, _MANY = 1e-6, 256, 16384
+_SIZES = (16, 64, 256, 1024, 4096, 16384)
+_order, _rays = within(1, 40), within(7, 1e7)  # one hexapolar ring has 7 rays
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,19 +54,14 @@ class AccuracyScene:
     """
 
     lens: str = "double_gauss"
-    field_deg: float = 0.0
-    distance_m: float = 25.0
-    defocus_mm: float = 0.0
-    front_mm: float = 0.0
-    rear_mm: float = 0.0
+    field_deg: Annotated[float, within(0, 89.9)] = 0.0
+    distance_m: Annotated[float, within(1e-3, math.inf)] = 25.0
+    defocus_mm: Annotated[float, within(-1e6, 1e6)] = 0.0
+    front_mm: Annotated[float, within(0, 1e6)] = 0.0
+    rear_mm: Annotated[float, within(0, 1e6)] = 0.0
     dtype: Literal["float64", "float32"] = "float64"
-    orders: tuple[int, ...] = ()
-    most_rays: int = 16384
-
-    def __post_init__(self) -> None:
-        sizes = {"front_mm": (0, 1e6), "rear_mm": (0, 1e6), "defocus_mm": (-1e6, 1e6)}
-        far = {"distance_m": (1e-3, math.inf), "field_deg": (0, 89.9)}
-        _common.require_within("scenes.", self, most_rays=(7, 1e7), **sizes, **far)
+    orders: Annotated[tuple[int, ...], _order] = ()
+    most_rays: Annotated[int, _rays] = 16384
 
     @property
     def vignetted(self) -> bool:
@@ -100,6 +96,10 @@ class AccuracyScene:
         return kind(order, "bilateral" if self.field_deg else "rotational")
 
 
+def _different_labels(scenes: tuple[AccuracyScene, ...]) -> str:
+    return different(tuple(scene.label for scene in scenes))
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Settings of the experiment; see configs/accuracy.yaml.
@@ -110,24 +110,13 @@ class Config:
     tolerances: tolerances of the rules that are tested.
     """
 
-    scenes: tuple[AccuracyScene, ...]
-    orders: tuple[int, ...] = (1, 2, 4, 6, 9)
-    rays: tuple[int, ...] = (16, 64, 256, 1024, 4096, 16384)
-    seeds: int = 3
-    tolerances: tuple[float, ...] = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10)
-    wavelengths_um: tuple[float, ...] = (0.53,)
+    scenes: Annotated[tuple[AccuracyScene, ...], not_empty, _different_labels]
+    orders: Annotated[tuple[int, ...], not_empty, different, _order] = (1, 2, 4, 6, 9)
+    rays: Annotated[tuple[int, ...], not_empty, different, _rays] = _SIZES
+    seeds: Annotated[int, within(1, 1000)] = 3
+    tolerances: Annotated[Numbers, within(1e-14, 0.5)] = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10)
+    wavelengths_um: Wavelengths = (0.53,)
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("orders", "rays", "tolerances", "wavelengths_um"):
-            _common.require_list(name, getattr(self, name))
-        _common.require(len(self.scenes) > 0, "scenes: needs at least one item")
-        _common.require_different("scenes", [scene.label for scene in self.scenes])
-        # One hexapolar ring has 7 rays.
-        limits = {"rays": (7, 1e7), "seeds": (1, 1000), "tolerances": (1e-14, 0.5)}
-        _common.require_within("", self, wavelengths_um=(1e-4, 1e6), **limits)
-        every = [*self.orders, *(order for scene in self.scenes for order in scene.orders)]
-        _common.require(min(every) >= 1 and max(every) <= 40, "orders: expected 1 to 40")
 
 
 @jax.jit
@@ -224,8 +213,8 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
     return jax.tree.map(lambda a: jnp.asarray(a, scene.dtype), arguments), truth
 
 
-def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[dict]]:
-    """Measures one scene, logs its curves, and returns its rows of results.json."""
+def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
+    """Measures one scene and returns its rows of results.json."""
     first = next(other for other in config.scenes if other.kind == scene.kind)
     if scene.vignetted or scene is first:
         jax.clear_caches()  # thousands of kernels exhaust what a process may map
@@ -238,7 +227,6 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
         {"method": name, "size": size} | row_of(arguments, truth, rules)
         for name, size, rules in kinds
     ]
-    run.log(scene.label, 0, {c: np.array([row[c] for row in curves], float) for c in COLUMNS})
     # A Python number on axis, whose symmetry is known.
     known = arguments[0], arguments[1] if scene.field_deg else 0.0, *arguments[2:]
     tolerances = []
@@ -247,11 +235,11 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
         error = spot_errors(truth, *spot(*arguments, rule))[0]
         row = {"tolerance": tolerance, "order": rule.order, "rays": count_rays(arguments, rule)}
         tolerances.append(row | {"relative_error": error})
-    exact = []
-    for wavelength, m in zip(config.wavelengths_um, truth):
-        row = {"wavelength_um": wavelength, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
-        row |= {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
-        exact.append(row)
+    exact = [
+        {"wavelength_um": wavelength, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
+        | {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
+        for wavelength, m in zip(config.wavelengths_um, truth)
+    ]
     about = {"scene": scene.label, "panel": scene.panel, "dtype": scene.dtype}
     found = {"curves": curves, "tolerances": tolerances, "truth": exact}
     return {key: [about | row for row in rows] for key, rows in found.items()}
@@ -259,7 +247,7 @@ def measure(config: Config, scene: AccuracyScene, run: Run) -> dict[str, list[di
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Measures all scenes."""
-    jobs = {s.label: functools.partial(measure, config, s, run) for s in config.scenes}
+    jobs = {s.label: functools.partial(measure, config, s) for s in config.scenes}
     found = _common.measured(run, "scene", jobs)
     results = {key: sum((rows[key] for rows in found), []) for key in found[0]}
     return results | {"seconds": run.seconds}

@@ -11,17 +11,17 @@ import pathlib
 import sys
 import tempfile
 from collections.abc import Iterator
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from drt_jax import show
 
-from . import _command, _common, _ended, _plots, _spoilt
-from ._outcomes import OUTCOMES
+from . import _command, _common, _damaged_files, _ended, _plots
+from ._common import within
+from ._damaged_files import OUTCOMES
 from .runs.folder import Run
 
-COLUMNS = ("tried", *OUTCOMES)
 PARTS = ("files", "kills")
 
 
@@ -35,54 +35,40 @@ class Config:
     parts: parts to run, of files and kills; empty for all.
     """
 
-    files: int = 10_000
-    traced: int = 20
-    kills: int = 200
-    parts: tuple[str, ...] = ()
+    files: Annotated[int, within(2, 1e6)] = 10_000
+    traced: Annotated[int, within(0, 1e5)] = 20
+    kills: Annotated[int, within(3, 1e4)] = 200
+    parts: tuple[Literal[*PARTS], ...] = ()
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        limits = {"files": (2, 1e6), "traced": (0, 1e5), "kills": (3, 1e4)}
-        _common.require_within("", self, **limits)
-        _common.require_known("parts", self.parts, PARTS)
 
 
 def rows_of(config: Config, part: str) -> Iterator[dict[str, Any]]:
     """The rows of a part."""
     rngs = np.random.default_rng([config.seed, PARTS.index(part)]).spawn(4)
     if part == "files":
-        row, loaded = _spoilt.prescriptions(config.files // 2, rngs[0])
+        row, loaded = _damaged_files.prescriptions(config.files // 2, rngs[0])
         yield row
-        yield _spoilt.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
-        yield _spoilt.settings(config.files - config.files // 2, rngs[1])
-        yield _spoilt.lens_files(config.files // 4, rngs[3])
+        yield _damaged_files.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
+        yield _damaged_files.settings(config.files - config.files // 2, rngs[1])
+        yield _damaged_files.lens_files(config.files // 4, rngs[3])
     else:
         with tempfile.TemporaryDirectory() as folder:
-            toy, third = _ended.Toy(pathlib.Path(folder)), config.kills // 3
-            yield _ended.killed(toy, third, rngs[0])
-            yield _ended.killed_at_writes(toy, third, rngs[1])
-            yield _ended.stopped(toy, config.kills - 2 * third, rngs[2])
-            yield _ended.two(toy, 3)
+            yield from _ended.rows(pathlib.Path(folder), config.kills, rngs)
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Runs each part."""
-
-    def one(part: str) -> list[dict[str, Any]]:
-        rows = list(rows_of(config, part))
-        for row in rows:
-            run.log(row["kind"], 0, {c: np.array([float(row[c])]) for c in COLUMNS})
-        return rows
-
     parts = config.parts or PARTS
-    found = _common.measured(run, "part", {part: lambda part=part: one(part) for part in parts})
+    jobs = {part: lambda part=part: [*rows_of(config, part)] for part in parts}
+    found = _common.measured(run, "part", jobs)
     return {"rows": sum(found, []), "seconds": run.seconds}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Table of the outcomes of each kind, and examples of faults."""
-    rows = [[row[key] for key in ("kind", *COLUMNS)] for row in results["rows"]]
-    found = {"faults": _common.table(("kind", *COLUMNS), rows)}
+    header = ("kind", "tried", *OUTCOMES)
+    rows = [[row[key] for key in header] for row in results["rows"]]
+    found = {"faults": _common.table(header, rows)}
     faults = [f"{row['kind']}: {text}" for row in results["rows"] for text in row["examples"]]
     return found | ({"faults, examples": "\n".join(faults)} if faults else {})
 

@@ -30,7 +30,6 @@ from . import _command, _common, _plots
 from .runs.folder import Run
 
 OUTCOMES = ("right", "near", "refused", "wrong", "unlisted", "absent")
-COLUMNS = OUTCOMES
 FORMATS = (".zmx", ".seq", ".yaml")
 _NEAR = 1e-3
 _INDEX = 2e-9  # silica's constants have one digit more in some programs
@@ -215,15 +214,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     paths = [p for own in each for p in sorted(own) if p.suffix.lower() in (".zmx", ".seq")]
     _common.require(len(paths) > 0, f"folders: no file in {', '.join(config.folders)}")
 
-    def one(path: pathlib.Path) -> list[dict[str, Any]]:
-        return [outcome(path, reader) for reader in READERS]
-
-    rows = sum(_common.measured(run, "file", {p.name: lambda p=p: one(p) for p in paths}), [])
-    for row in rows:
-        if row["reader"] == "drt_jax":
-            own = {name: np.array([float(row["outcome"] == name)]) for name in COLUMNS}
-            run.log(row["file"], 0, own)
-    return {"rows": rows, "seconds": run.seconds}
+    jobs = {p.name: lambda p=p: [outcome(p, reader) for reader in READERS] for p in paths}
+    return {"rows": sum(_common.measured(run, "file", jobs), []), "seconds": run.seconds}
 
 
 def counts(rows: list[dict[str, Any]], reader: str) -> list[int]:
@@ -247,13 +239,12 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         rows.append([name, *map(_cell, group), "".join(why)])
     totals = [[reader, *counts(results["rows"], reader)] for reader in READERS]
     again = [row["trips"] | {"file": row["file"]} for row in results["rows"] if "trips" in row]
-    told = []
+    written = []
     for kind in FORMATS:
-        own = [(row["file"], row[kind]) for row in again]
-        lost = [f"{name}: {why}" for name, why in own if why]
-        told.append([kind, sum(not why for _, why in own), len(lost), "; ".join(lost)])
+        lost = [f"{row['file']}: {row[kind]}" for row in again if row[kind]]
+        written.append([kind, len(again) - len(lost), len(lost), "; ".join(lost)])
     return {
-        "files, round trips": _common.table(("format", "the same", "not written", "why"), told),
+        "files, round trips": _common.table(("format", "the same", "not written", "why"), written),
         "files": _common.table(("file", *READERS, "why"), rows),
         "files, counts": _common.table(("reader", *OUTCOMES), totals),
     }

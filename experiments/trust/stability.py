@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import pathlib
 import sys
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
@@ -21,9 +21,9 @@ from ._families import FAMILIES
 from ._survey import survey
 from .runs.folder import Run
 
-# Columns of metrics.csv for each family, summed over all in results.json.
-COLUMNS = ("scenes", "rays", *(status.name.lower() for status in Status))
-COLUMNS += ("traceable", "nan_values", "nan_gradients", "disagree_with_snell")
+# Counts of each family that are summed over all.
+_COUNTS = ("scenes", "rays", *(status.name.lower() for status in Status))
+_COUNTS += ("traceable", "nan_values", "nan_gradients", "disagree_with_snell")
 # Most structures: programs of more exhaust the maps of a process.
 _STRUCTURES = 6
 
@@ -36,13 +36,9 @@ class Config:
     families: names of the families to run; empty for all.
     """
 
-    scenes: int = 620
+    scenes: Annotated[int, _common.within(3, 1e5)] = 620
     seed: int = 0
-    families: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        _common.require_within("", self, scenes=(3, 1e5))
-        _common.require_known("families", self.families, FAMILIES)
+    families: tuple[Literal[*FAMILIES], ...] = ()
 
 
 def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -73,7 +69,7 @@ def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
 
 def totals(rows: list[dict]) -> dict[str, float]:
     """Sums over all families, and rates of lost rays."""
-    sums: dict[str, float] = {key: sum(row[key] for row in rows) for key in COLUMNS}
+    sums: dict[str, float] = {key: sum(row[key] for row in rows) for key in _COUNTS}
     others = [row for row in rows if row["name"] != "touching"]
     for name, some in ("", rows), ("_but_touching", others):
         lost, rays = (sum(row[key] for row in some) for key in ("traceable", "rays"))
@@ -86,7 +82,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Draws and surveys the families one by one."""
     known: set = set()
     names = config.families or FAMILIES
-    jobs = {name: functools.partial(measure, config, name, run, known) for name in names}
+    jobs = {name: functools.partial(measure, config, name, known) for name in names}
     found = _common.measured(run, "family", jobs)
     rows = [family["row"] for family in found]
     steps, errors = (sum((family[k] for family in found), []) for k in ("steps", "errors"))
@@ -99,18 +95,17 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     }
 
 
-def measure(config: Config, name: str, run: Run, known: set) -> dict[str, Any]:
-    """Surveys a family and logs its row. Returns the row, the steps of each scene and the errors in
-    float32, mm. known: structures whose programs are in JAX's caches."""
+def measure(config: Config, name: str, known: set) -> dict[str, Any]:
+    """Surveys a family. Returns its row, the steps of each scene and the errors in float32, mm.
+    known: structures whose programs are in JAX's caches."""
     batches = list(_families.draw(name, config.scenes, config.seed))
     known.update((jax.tree.structure(batch), batch.distance.dtype) for batch in batches)
     if len(known) > _STRUCTURES:
         known.clear()
         jax.clear_caches()
     found = jax.tree.map(lambda *a: np.concatenate(a), *map(survey, batches))
-    row = row_of(name, found)
-    run.log(name, 0, {key: np.array([float(row[key])]) for key in COLUMNS})
-    return {"row": row, "steps": found["steps"].tolist(), "errors": found["float32_error"].tolist()}
+    parts = {"steps": found["steps"].tolist(), "errors": found["float32_error"].tolist()}
+    return {"row": row_of(name, found)} | parts
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -126,7 +121,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         rows.append((what, *counts, steps, f"{row['float32_error_p99']:.1e} mm"))
     total = results["total"]
     lost = total["traceable_per_10000_but_touching"]
-    beside = [
+    sums = [
         ("scenes", total["scenes"]),
         ("rays", total["rays"]),
         ("values that are not finite", total["nan_values"]),
@@ -136,7 +131,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         ("the same without surfaces that touch", f"{lost:.2f}"),
     ]
     return {
-        "stability": _common.table(("of all families", ""), beside),
+        "stability": _common.table(("of all families", ""), sums),
         "stability, families": _common.table(header, rows),
     }
 

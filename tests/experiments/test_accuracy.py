@@ -196,7 +196,7 @@ def test_finished_run_resumes_to_the_same_numbers(small_run, capsys):
         ("orders=[2, 41]", "orders: expected 1 to 40"),
         ("rays=[4]", "rays: expected 7 to 1e+07, got 4"),
         ("scenes=[]", "scenes: needs at least one item"),
-        ("scenes=[{field_deg: -1}]", "scenes.field_deg: expected 0 to 89.9, got -1.0"),
+        ("scenes=[{field_deg: -1}]", "scenes[0].field_deg: expected 0 to 89.9, got -1.0"),
         ("scenes=[{dtype: float16}]", "scenes[0].dtype: expected one of float64, float32"),
     ],
 )

@@ -1,9 +1,10 @@
 import dataclasses
 import functools
-from typing import Literal
+from typing import Annotated, Literal
 
 import pytest
 
+from experiments._common import different, not_empty, odd, or_zero, within
 from experiments.runs.config import ConfigError, describe, dump_config, load_config
 
 
@@ -100,6 +101,35 @@ def test_one_value_or_a_list(tmp_path):
         with pytest.raises(ConfigError, match=message):
             load_config(Ends, tmp_path / "again.yaml", [f"field={wrong}"])
     assert describe(Ends)[2] == "field: a number or a list, each item a number"
+
+
+@dataclasses.dataclass(frozen=True)
+class Checked:
+    rates: Annotated[tuple[float, ...], not_empty, different, within(0, 1)] = (0.5,)
+    kernel: Annotated[int, within(0, 9), or_zero(odd)] = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Several:
+    items: tuple[Checked, ...] = ()
+
+
+@pytest.mark.parametrize(
+    "entry, message",
+    [
+        ("{rates: [0, 2]}", r"items\[1\].rates: expected 0 to 1, got 2.0"),
+        ("{rates: []}", r"items\[1\].rates: needs at least one item"),
+        ("{rates: [1, 1]}", r"items\[1\].rates: an item stands twice"),
+        ("{rates: [x]}", r"items\[1\].rates\[0\]: expected a number, got 'x'"),
+        ("{kernel: 4}", r"items\[1\].kernel: expected an odd number, or 0"),
+    ],
+)
+def test_checks_of_a_setting_name_its_key(entry, message, tmp_path):
+    (tmp_path / "some.yaml").write_text("items: [{kernel: 3}]")
+    assert load_config(Several, tmp_path / "some.yaml").items == (Checked(kernel=3),)
+    with pytest.raises(ConfigError, match=message):
+        load_config(Several, tmp_path / "some.yaml", [f"items=[{{}}, {entry}]"])
+    assert describe(Checked) == ["rates: a list, each item a number", "kernel: a whole number"]
 
 
 def test_bad_files_name_the_file(tmp_path):

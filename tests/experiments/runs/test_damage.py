@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.runs.checkpoint import Checkpoint, unpacked
+from experiments.runs.checkpoint import packed, unpacked
 from experiments.runs.config import ConfigError
 from experiments.runs.folder import Run
 from experiments.runs.write import replace
@@ -150,10 +150,10 @@ def test_rows_come_whole_or_not_at_all(folder):
         assert run.metrics("b")["step"].tolist() == list(range(10))
 
 
-def rewritten(path, **changes):
+def rewritten(path, leaves=None, **changes):
     """The checkpoint with some parts changed, and the checksum that belongs to them."""
-    found = dataclasses.replace(unpacked(path.read_bytes()), **changes)
-    path.write_bytes(found.packed())
+    about, own = unpacked(path.read_bytes())
+    path.write_bytes(packed(about | changes, own if leaves is None else leaves))
 
 
 def leaves(x, count=7):
@@ -228,8 +228,8 @@ def test_no_flipped_bit_of_a_checkpoint_passes(folder):
         except ValueError:
             continue
         passed += 1
-        assert [a.tobytes() for a in found.leaves] == [a.tobytes() for a in wanted.leaves]
-        assert dataclasses.replace(found, leaves=[]) == dataclasses.replace(wanted, leaves=[])
+        assert [a.tobytes() for a in found[1]] == [a.tobytes() for a in wanted[1]]
+        assert found[0] == wanted[0]
     assert passed < len(whole) / 5 / 4
 
 
@@ -305,5 +305,4 @@ def test_a_checkpoint_reads_as_any_archive_of_numpy(folder):
         about = json.loads(str(saved["about"]))
         assert about["job"] == "a" and about["step"] == 4 and about["seconds"] > 0
         assert saved["leaf1"].tolist() == [1, 2] and re.fullmatch("[0-9a-f]{64}", about["settings"])
-    assert isinstance(unpacked((folder / "checkpoints" / "a.npz").read_bytes()), Checkpoint)
     assert pathlib.Path(folder / "config.yaml").is_file()

@@ -1,11 +1,11 @@
-"""What the arms of a joint design share: lens, camera, judge, steps."""
+"""What the arms of a joint design share: lens, camera, the model that judges, training steps."""
 
 import dataclasses
 import functools
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,15 +31,46 @@ from ._sharing import mesh_of
 
 # Relative fields of least squares, and the order of its pupil rule.
 _FIELDS, _ORDER = np.array([0.0, 0.7, 1.0]), 6
-# Light beside a kernel that the spoilt lens may have.
-_BESIDE = 0.2
+# Light outside of a kernel that the spoilt lens may have.
+_LOST = 0.2
 # Lenses as built that training draws from, and their seed; the judge takes another.
 _BUILDS, SEED = 4096, 1
 # Golden angle, radians.
 _TURN = math.pi * (3 - math.sqrt(5))
 
 
-class Studio:
+class Arm(NamedTuple):
+    """One way to design lens and network.
+
+    title: its name in tables and figures.
+    begins: lens at the start: "spoilt", or finished by least squares on "spots" or "mtf".
+    moves: what training changes of the lens: "all" variables, the "sensor", or "nothing".
+    damped: True for least-squares steps of the lens instead of Adam's.
+    frozen: True for the network that the arm `spots` has trained, which stays.
+    as_built: True for a lens with errors of its own in each step.
+    """
+
+    title: str
+    begins: str
+    moves: str = "all"
+    damped: bool = False
+    frozen: bool = False
+    as_built: bool = False
+
+
+ARMS = {
+    "focus": Arm("(a) focus and network", "spoilt", "sensor"),
+    "spots": Arm("(b) least squares on spots, then network", "spots", "nothing"),
+    "mtf": Arm("(c) least squares on MTF, then network", "mtf", "nothing"),
+    "joint": Arm("(d) jointly from the spoilt lens", "spoilt"),
+    "joint_from_spots": Arm("(e) jointly from (b)", "spots"),
+    "frozen": Arm("(f) lens of (b) through its frozen network", "spots", frozen=True),
+    "damped": Arm("(d) with least-squares steps of the lens", "spoilt", damped=True),
+    "tolerant": Arm("(e) with lenses as built", "spots", as_built=True),
+}
+
+
+class Setup:
     """What all arms of a run share.
 
     variables: of the lens, with open apertures.
@@ -52,7 +83,7 @@ class Studio:
 
     def __init__(self, config: Any, patches: Patches) -> None:
         self.config, self.patches = config, patches
-        self._steps: dict[str, tuple[Callable, Callable]] = {}
+        self._steps: dict[Arm, tuple[Callable, Callable]] = {}
         lens = design.open_apertures(drt_jax.load_lens(config.lens))
         self.variables = self._variables(lens)
         self.waves = np.array(config.wavelengths_um)
@@ -134,9 +165,9 @@ class Studio:
             for distance in distances:
                 found = drt_jax.psfs(lens, fields, distance, *grid, model)
                 worst = max(worst, float(np.max(found.outside)))
-        beside = f"{100 * worst:.0f} % of the light of the spoilt lens falls beside a kernel"
+        lost = f"{100 * worst:.0f} % of the light of the spoilt lens falls beside a kernel"
         remedy = "give a larger one, larger pixels, or spoil the lens less"
-        _common.require(worst <= _BESIDE, f"camera.kernel: {beside} of {size} pixels: {remedy}")
+        _common.require(worst <= _LOST, f"camera.kernel: {lost} of {size} pixels: {remedy}")
         return model
 
     def lens_of(self, vector: Array, deviations: Array | None = None) -> Lens:
@@ -153,13 +184,14 @@ class Studio:
         ]
         return dataclasses.replace(built, sensor=built.sensor + focus[1] - focus[0])
 
+    def _psfs(self, optics: Any, seen: ObjectPoints, waves: Any, model: Any) -> drt_jax.Psf:
+        lens = self.lens_of(optics["lens"], seen.deviations)
+        scene = seen.fields, seen.distances, waves
+        return drt_jax.psfs(lens, *scene, self.pixel, self.config.camera.kernel, model)
+
     def points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
         """Kernels and light of points, by rays."""
-        found = drt_jax.psfs(
-            self.lens_of(optics["lens"], seen.deviations),
-            *(seen.fields, seen.distances, self.waves, self.pixel),
-            *(self.config.camera.kernel, self.model),
-        )
+        found = self._psfs(optics, seen, self.waves, self.model)
         return found.kernel, found.solid_angle / self._axis[None]
 
     def judged_points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
@@ -168,11 +200,7 @@ class Studio:
         off = np.linspace(-0.5, 0.5, judge.waves) if judge.waves > 1 else np.zeros(1)
         waves = (self.waves[:, None] + judge.width_um * off).ravel()
         model = dataclasses.replace(self.model, kind="waves", cells=judge.cells)
-        found = drt_jax.psfs(
-            self.lens_of(optics["lens"], seen.deviations),
-            *(seen.fields, seen.distances, waves, self.pixel),
-            *(self.config.camera.kernel, model),
-        )
+        found = self._psfs(optics, seen, waves, model)
         shape = len(seen.fields), 3, judge.waves
         light = found.solid_angle.reshape(shape)
         kernel = found.kernel.reshape(*shape, *found.kernel.shape[2:])
@@ -195,58 +223,54 @@ class Studio:
         fields = np.tile(np.arctan(tangents), (judge.depths, 1))
         return ObjectPoints(jnp.asarray(fields), jnp.asarray(distances.repeat(judge.rings)))
 
-    def drawn(self, key: Array) -> ObjectPoints:
-        """The points of a step."""
-        return draw_points(key, self.config.train.points, self.field, self.depths)
-
-    def drawn_as_built(self, key: Array) -> ObjectPoints:
-        """The points of a step, through one lens as built."""
-        table = jnp.asarray(design.draw_perturbations(self.built, _BUILDS, SEED))
-        own = jax.random.randint(jax.random.fold_in(key, 1), (), 0, _BUILDS)
-        return self.drawn(key)._replace(deviations=table[own])
-
-    def hold(self, before: Any, after: Any) -> Any:
-        """The optics within limits; numbers that do not move stay."""
-        moves = before.get("moves", True)
-        vector = jnp.where(moves, after["lens"], before["lens"])
-        return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
-
-    def step(self, arm: str) -> tuple[Callable, Callable]:
+    def step(self, arm: Arm) -> tuple[Callable, Callable]:
         """(init, step) of an arm; arms that differ in numbers alone share a program."""
-        kind = {"focus": "joint", "joint_from_spots": "joint", "mtf": "spots"}.get(arm, arm)
+        stays = arm.moves == "nothing"
+        kind = arm._replace(title="", begins="", moves="nothing" if stays else "all")
         if kind not in self._steps:
-            self._steps[kind] = self._made(kind)
+            self._steps[kind] = self._step(kind)
         return self._steps[kind]
 
-    def _made(self, kind: str) -> tuple[Callable, Callable]:
-        setting, held = self.config.train, self.hold
-        rates: dict[str, Any] = {"optics": 0.0, "network": setting.network_rate}
-        points, make, draw = self.points, make_field_step, self.drawn
+    def _step(self, arm: Arm) -> tuple[Callable, Callable]:
+        setting, stays = self.config.train, arm.moves == "nothing"
         restore = shared(self.restore, self.mesh, 1)
-        convolve = shared(drt_jax.convolve_each, self.mesh)
-        if kind == "spots":  # neither derivatives nor limits of a lens that stays
-            points = lambda optics, seen: self.points(jax.lax.stop_gradient(optics), seen)  # noqa: E731
-            held = lambda before, after: before  # noqa: E731
-        elif kind == "damped":
-            rates["optics"], make = setting.damped_rate, make_damped_step
-        else:
+        rates: dict[str, Any] = {"network": setting.network_rate}
+        rates["optics"] = setting.damped_rate if arm.damped else 0.0
+        if not arm.damped and not stays:
             rates["optics"] = {"lens": self.rates, "moves": 0.0}
-        if kind == "frozen":
-            still = restore
-            restore = lambda w, image: still(jax.lax.stop_gradient(w), image)  # noqa: E731
-        if kind == "tolerant":
-            draw = self.drawn_as_built
-        return make(FieldImager(points, restore, convolve), rates, draw, 0, held)
 
-    def start(self, arm: str, seed: int, lenses: dict[str, Array], weights: Any) -> dict[str, Any]:
-        """The parameters of an arm at the start."""
-        begin = {"focus": "spoilt", "joint": "spoilt", "damped": "spoilt", "mtf": "mtf"}
-        optics = {"lens": lenses[begin.get(arm, "spots")]}
-        if arm != "damped":
-            names = self.variables.names
-            moves = [arm != "focus" or name == "sensor" for name in names]
+        # Neither derivatives nor limits of a lens or a network that stays.
+        def points(optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
+            return self.points(jax.lax.stop_gradient(optics) if stays else optics, seen)
+
+        def restored(weights: Any, image: Array) -> Array:
+            return restore(jax.lax.stop_gradient(weights) if arm.frozen else weights, image)
+
+        def draw(key: Array) -> ObjectPoints:
+            seen = draw_points(key, setting.points, self.field, self.depths)
+            if not arm.as_built:
+                return seen
+            table = jnp.asarray(design.draw_perturbations(self.built, _BUILDS, SEED))
+            own = jax.random.randint(jax.random.fold_in(key, 1), (), 0, _BUILDS)
+            return seen._replace(deviations=table[own])
+
+        def hold(before: Any, after: Any) -> Any:
+            if stays:
+                return before
+            vector = jnp.where(before.get("moves", True), after["lens"], before["lens"])
+            return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
+
+        imager = FieldImager(points, restored, shared(drt_jax.convolve_each, self.mesh))
+        return (make_damped_step if arm.damped else make_field_step)(imager, rates, draw, 0, hold)
+
+    def start(self, arm: Arm, seed: int, vector: Array, weights: Any) -> dict[str, Any]:
+        """The parameters of an arm at the start, from the vector of its lens and, for a frozen
+        network, its weights."""
+        optics = {"lens": vector}
+        if not arm.damped:
+            moves = [arm.moves != "sensor" or name == "sensor" for name in self.variables.names]
             optics["moves"] = jnp.asarray(np.array(moves, float))
-        network = weights if arm == "frozen" else self.init(jax.random.key(seed))
+        network = weights if arm.frozen else self.init(jax.random.key(seed))
         return {"optics": optics, "network": network}
 
     def spot_um(self, vector: Array) -> float:

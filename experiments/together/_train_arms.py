@@ -1,0 +1,179 @@
+"""The arms of a joint design: least squares, training, and what another model says of them."""
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from tqdm import tqdm
+
+import drt_jax
+from drt_jax import design
+from drt_jax.learn import train
+from drt_jax.learn.data import batches
+from drt_jax.learn.field import FieldImager, ObjectPoints
+
+from . import _patches, _training
+from ._setup import ARMS, SEED, Setup
+from .runs.folder import Run
+
+# Arms that begin with the finished lens, of which lenses as built are judged.
+_BUILT = "spots", "joint_from_spots", "tolerant"
+# Steps between those of two seeds, which points and noise depend on.
+_APART = 10**7
+# Patches of a picture.
+_SHOWN = 5
+
+
+def run(config: Any, run: Run) -> dict[str, Any]:
+    """Finishes the lenses, trains and judges all arms."""
+    side = config.train.patch + config.camera.kernel - 1
+    setup = Setup(config, _patches.read_patches(config.data, side, 0, run.folder))
+    lenses = {"spoilt": setup.spoilt} | _finished(setup, run)
+    folder = run.folder / "lenses"
+    folder.mkdir(exist_ok=True)
+    imager = jax.jit(FieldImager(setup.judged_points, setup.restore).__call__)
+    rows, losses, shown, drawn = [], [], {}, ["spoilt"]
+    _save(setup, folder / "spoilt.yaml", setup.spoilt)
+    trained: dict[tuple[str, int], Any] = {}
+    arms = [arm for arm in ARMS if arm in config.arms]  # `frozen` after `spots`
+    for arm in arms:
+        own = []
+        for seed in range(config.seeds):
+            job = f"{arm} {seed}"
+            weights = trained["spots", seed]["network"] if ARMS[arm].frozen else None
+            begin = setup.start(ARMS[arm], seed, lenses[ARMS[arm].begins], weights)
+            trained[arm, seed], seconds = _train(setup, run, arm, seed, begin)
+            own.append(run.metrics(job)["loss"])
+            vector = trained[arm, seed]["optics"]["lens"]
+            _save(setup, folder / f"{job}.yaml", vector)
+            row = {"arm": arm, "seed": seed, "step_s": seconds, "spot_um": setup.spot_um(vector)}
+            judge = partial(_judged, setup, imager, trained[arm, seed])
+            rows.append(run.once(f"judged {job}", lambda: row | judge()))
+            if not seed:
+                drawn.append(job)
+                shown |= _pictures(setup, imager, trained[arm, seed], arm)
+        losses.append(np.mean(own, axis=0).tolist())
+    far, degrees = setup.depths[1], np.degrees(np.hypot(*np.asarray(setup.judged().fields).T))
+    return {
+        "name": config.name,
+        "rows": rows,
+        "arms": arms,
+        "losses": losses,
+        "start_um": {name: setup.spot_um(vector) for name, vector in lenses.items()},
+        "builds": _as_built(setup, run, trained) if config.judge.builds else [],
+        "drawn": drawn,
+        "pictures": arms,
+        "pictures_deg": degrees[_shown(len(degrees))].tolist(),
+        "field_deg": config.field_deg,
+        "far_mm": far if math.isfinite(far) else None,
+        **shown,
+    }
+
+
+def _finished(setup: Setup, run: Run) -> dict[str, Array]:
+    """The vectors of the lens that least squares has finished, on spots and then on MTF."""
+    found, vector = {}, setup.spoilt
+    for name, problem in (("spots", setup.spots), ("mtf", setup.sharp)):
+        if name == "mtf" and "mtf" not in setup.config.arms:
+            continue
+
+        def finish() -> list[float]:
+            print(f"least squares: {name}", flush=True)
+            return design.optimise(problem, vector).vector.tolist()
+
+        found[name] = vector = jnp.asarray(run.once(f"finish {name}", finish))
+    return found
+
+
+def _train(
+    setup: Setup, run: Run, arm: str, seed: int, begin: dict[str, Any]
+) -> tuple[dict[str, Any], float]:
+    """Trained parameters of a job, from its last checkpoint or from `begin` on, and the seconds of
+    a step."""
+    setting, job = setup.config.train, f"{arm} {seed}"
+    total = setting.batches
+    if ARMS[arm].damped:
+        total = max(1, round(setting.damped_part * total))
+    init, same = setup.step(ARMS[arm])
+    # Points and noise of their own for each seed, by one program.
+    step = lambda *given: same(*given[:3], np.int32(given[3] + _APART * seed))  # noqa: E731
+    first, state = run.load(job, init(begin), (job,), total)
+    times: list[tuple[int, float]] = []  # steps that are done, and when; the first has compilation
+
+    def log(start: int, metrics: dict[str, np.ndarray], state: Any) -> None:
+        run.log(job, start, metrics)
+        _training.require_finite(job, start, metrics["loss"])
+        times.append((start + len(metrics["loss"]), time.perf_counter()))
+
+    scenes = batches(setup.patches.train, setting.batch, seed, first)
+    loop = _training.Loop(run, job, range(first, total), setting.checkpoint_every, setup.mesh)
+    state = loop.train(step, state, scenes, setup.config.noise, log)
+    steps, seconds = np.subtract(times[-1], times[0]) if times else (0, 0.0)
+    return state[0], float(seconds) / max(int(steps), 1)
+
+
+def _save(setup: Setup, path: Any, vector: Array) -> None:
+    """Writes a lens with apertures that follow the light."""
+    lens = setup.variables.lens_of(vector)
+    drt_jax.save_lens(design.fit_apertures(setup.spots, lens), path)
+
+
+def _test(setup: Setup, seen: ObjectPoints, each: int) -> np.ndarray:
+    return _patches.thinned(setup.patches.test, each * len(seen.fields))
+
+
+def _judged(setup: Setup, imager: Callable, parameters: Any) -> dict[str, float]:
+    """Quality of the images of an arm, by the judge."""
+    seen, config = setup.judged(), setup.config
+    patches = _test(setup, seen, config.judge.patches)
+    return train.evaluate(imager, parameters, patches, seen, config.noise, 0, len(seen.fields))
+
+
+def _pictures(setup: Setup, imager: Callable, parameters: Any, arm: str) -> dict[str, Any]:
+    """Some images of the judge, evenly over its points."""
+    seen = setup.judged()
+    some = np.resize(
+        _patches.textured(setup.patches.test, len(seen.fields)),
+        (len(seen.fields), *setup.patches.test.shape[1:]),
+    )
+    found = _patches.images(imager, parameters, some, seen, setup.config.noise, 0)
+    return {f"{arm} {name}": a[_shown(len(seen.fields))] for name, a in found.items()}
+
+
+def _shown(count: int) -> np.ndarray:
+    """Numbers of the points of a picture."""
+    return np.unique(np.linspace(0, count - 1, _SHOWN).astype(int))
+
+
+def _as_built(setup: Setup, run: Run, trained: dict[tuple[str, int], Any]) -> list[dict]:
+    """PSNR of lenses as built, by rays at the points of the judge."""
+    imager = jax.jit(FieldImager(setup.points, setup.restore).__call__)
+    rows = []
+    for (arm, seed), parameters in trained.items():
+        if arm in _BUILT:
+            job = f"built {arm} {seed}"
+            own = run.once(job, lambda: _decibels(setup, imager, parameters, job))
+            rows.append({"arm": arm, "seed": seed} | own)
+    return rows
+
+
+def _decibels(setup: Setup, imager: Callable, parameters: Any, job: str) -> dict[str, float]:
+    """PSNR of the lens as designed, and of lenses as built the mean and the 10th percentile."""
+    count, seen, found = setup.config.judge.builds, setup.judged(), []
+    table = design.draw_perturbations(setup.built, count, SEED + 1)
+    patches = _test(setup, seen, 1)
+    patches = np.resize(patches, (len(seen.fields), *patches.shape[1:]))
+    noise, key = np.float32(setup.config.noise), jax.random.key(0)
+    for deviations in (np.zeros(table.shape[1]), *tqdm(table, desc=job, leave=False)):
+        view = seen._replace(deviations=jnp.asarray(deviations))
+        truth, _, image = imager(parameters, patches, view, noise, key)
+        squares = np.mean(np.square(np.asarray(image - truth)), axis=(1, 2, 3))
+        found.append(float(np.mean(-10 * np.log10(squares))))
+    built = {"mean": float(np.mean(found[1:])), "low": float(np.percentile(found[1:], 10))}
+    return {"designed": found[0]} | built
