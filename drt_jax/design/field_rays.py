@@ -19,7 +19,7 @@ from ..pupil.rules import PupilRule, Symmetry
 from ..rays import fermat
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach
-from ..rays.status import Status
+from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector, dot, system_of
 from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 
@@ -90,7 +90,7 @@ class FieldRays:
     @property
     def arrives(self) -> Array:
         """Mask (V, W, Q) of the rays that meet the sensor, clipped or not."""
-        return (self.bundle.status == Status.OK) | (self.bundle.status == Status.CLIPPED)
+        return reaches_sensor(self.bundle.status)
 
     @property
     def sensor_hits(self) -> Array:
@@ -171,7 +171,7 @@ def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
         scene = Scene(field, distance, views.wavelengths)
         points, weights = _points(rule, lens, scene)
         bundle = trace_bundle(lens, scene, points, solver)
-        failed = (bundle.status != Status.OK) & (bundle.status != Status.CLIPPED)
+        failed = ~reaches_sensor(bundle.status)
         light = weights * jnp.where(failed, 1, rule.transmission(lens, bundle))
         throughput = jnp.sum(light, axis=-1)
         part = safe_divide(light, jnp.broadcast_to(throughput[:, None], light.shape))

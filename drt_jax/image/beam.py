@@ -23,7 +23,7 @@ from ..pupil.mask import Mask
 from ..pupil.patterns import disc, half_disc, meridian
 from ..pupil.rules import Pattern, PupilRule, Symmetry, fits
 from ..rays.solve import Solver, solve
-from ..rays.status import Status
+from ..rays.status import reaches_sensor
 from ..rays.system import dot
 from ..rays.trace import Bundle, trace_bundle
 from .wavefront import reference_curvature
@@ -312,7 +312,7 @@ def beam_of(
 
     Rays of a part of the pupil are repeated, rotated or mirrored, so that they cover all of it.
     """
-    known = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+    known = reaches_sensor(bundle.status)
     index = lens.index(scene.wavelengths)[-1]
     hits = [jnp.where(known, h, 0) for h in bundle.hits]
     arrival = [jnp.where(known, a, 0) for a in bundle.arrival]

@@ -29,7 +29,7 @@ from ..lens.scene import Scene, fields_array, scene_of
 from ..lens.surface import surface_sag
 from ..numerics import Numbers, einsum, known_values, real_array, safe_divide, safe_sqrt
 from ..rays.afocal import FOCAL
-from ..rays.status import Status
+from ..rays.status import reaches_sensor
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
 from .field import CHIEF
@@ -234,7 +234,7 @@ def _chief_ray(lens: Lens, axis: Scene, field: Array) -> _ChiefRays:
         exists, with its direction cosines."""
         scene = Scene(field, axis.distance, axis.wavelengths)
         bundle = trace_bundle(lens, scene, point)
-        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        whole = reaches_sensor(bundle.status)
         hit = tuple(jnp.where(whole, h[-1], 0)[:, 0] for h in bundle.hits)
         *across, along = (jnp.where(whole, a, 0)[:, 0] for a in bundle.arrival)
         slope = tuple(safe_divide(a, along) for a in across)

@@ -21,7 +21,7 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, fields_array, scene_of
 from ..numerics import Numbers, einsum
 from ..pupil.patterns import disc
-from ..rays.status import Status
+from ..rays.status import Status, reaches_sensor
 from ..rays.trace import trace_bundle
 from .rounding import warn_of_paths
 from .wavefront import path_differences
@@ -110,7 +110,7 @@ def _fitted(lens: Lens, fields: Array, axis: Scene, rows: tuple[int, ...]) -> Ar
         bundle = trace_bundle(lens, Scene(field, axis.distance, axis.wavelengths), tuple(aimed))
         opd, status, _ = path_differences(lens, axis.wavelengths, bundle)
         light = jnp.asarray(weights, dtype)[None] * (status[:, 1:] == Status.OK).astype(dtype)
-        whole = (status[:, 0] == Status.OK) | (status[:, 0] == Status.CLIPPED)
+        whole = reaches_sensor(status[:, 0])
         enough = whole & (jnp.sum(light > 0, axis=-1) > 2 * len(rows))
         light = jnp.where(enough[:, None], light, jnp.asarray(weights, dtype)[None])
         normal = einsum("wq,pq,rq->wpr", light, basis, basis)

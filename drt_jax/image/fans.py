@@ -18,7 +18,7 @@ from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import Scene, fields_array, scene_of
 from ..numerics import Numbers, real_array, safe_divide
-from ..rays.status import Status
+from ..rays.status import Status, reaches_sensor
 from ..rays.trace import trace_bundle
 from .rounding import warn_of_focus, warn_of_paths
 from .wavefront import path_differences
@@ -143,7 +143,7 @@ def _traced(
     def one(field: Array) -> tuple[Array, Array, Array, Array]:
         bundle = trace_bundle(lens, Scene(field, axis.distance, axis.wavelengths), points)
         opd, status, _ = path_differences(lens, axis.wavelengths, bundle)
-        whole = (status == Status.OK) | (status == Status.CLIPPED)
+        whole = reaches_sensor(status)
         # A clipped chief ray still serves as the reference of the others.
         good = (status == Status.OK) | (whole & (np.arange(status.shape[-1]) == 0)[None])
         *across, along = (jnp.where(whole, a, 0) for a in bundle.arrival)

@@ -20,7 +20,7 @@ from ..lens.scene import points_arrays, scene_of, vergence_of
 from ..numerics import Numbers, brief, einsum, real_array
 from ..pupil.rules import Symmetry
 from ..rays.solve import solve_aimed
-from ..rays.status import Status
+from ..rays.status import reaches_sensor
 from ..rays.trace import trace_bundle
 from .beam_psf import PsfModel
 from .interpolate import lagrange
@@ -115,7 +115,7 @@ def _chief(lens: Lens, tangents: Array, distances: Array, wavelengths: Array) ->
         scene = scene_of(lens, jnp.arctan(tangent), distance, wavelengths)
         centre = jnp.zeros(1, lens.curvature.dtype)
         bundle = trace_bundle(lens, scene, (centre, centre), solve_aimed)
-        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        whole = reaches_sensor(bundle.status)
         hits = jnp.concatenate([h[-1] for h in bundle.hits], axis=-1)
         return jnp.where(whole, hits, jnp.inf)
 

@@ -33,7 +33,7 @@ from ..numerics import Numbers, known_values, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import hexapolar
 from ..pupil.rules import Gauss, PupilRule, symmetry_of
-from ..rays.status import Status
+from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
 from .rounding import hit_rounding, warn_dtype
@@ -337,7 +337,7 @@ def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: boo
         and transmission."""
         scene = Scene(field, axis.distance, axis.wavelengths)
         bundle = trace_bundle(lens, scene, points)
-        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        whole = reaches_sensor(bundle.status)
         hit = tuple(jnp.where(whole, h[-1], 0) for h in bundle.hits)
         line = tuple(jnp.where(whole, a, 0) for a in bundle.arrival[:-1])
         return (hit, line), (bundle.status, rule.transmission(lens, bundle))
@@ -347,7 +347,7 @@ def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: boo
     weight = weights * passes[:, :count]
     throughput, cone = jnp.sum(weight, axis=-1), jnp.sum(weight * area, axis=-1)
     arrives = status == Status.OK
-    failed = (status != Status.OK) & (status != Status.CLIPPED)
+    failed = ~reaches_sensor(status)
     left_out = jnp.mean(failed[:, 1 - len(_extra_points()) :].astype(weight.dtype), axis=-1)
     traced = slice(0, -len(_even()))
     parts = [jnp.stack(hit, axis=-1)[:, traced], arrives[:, traced]]
@@ -358,7 +358,7 @@ def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: boo
         weight = jnp.concatenate([weight[:, :count], weight], axis=1) / 2
     hits, arrives = parts
     chief = status[:, count]
-    whole = (chief == Status.OK) | (chief == Status.CLIPPED)
+    whole = reaches_sensor(chief)
     chief_hit = jnp.stack([h[:, count] for h in hit], axis=-1)
     return _Light(hits, weight, arrives, chief_hit, whole, throughput, cone, left_out)
 

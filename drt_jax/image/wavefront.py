@@ -24,7 +24,7 @@ from ..lens.paraxial import chief_ray, paraxial_system
 from ..lens.scene import Scene, scene_of
 from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
 from ..rays.afocal import FOCAL
-from ..rays.status import Status
+from ..rays.status import Status, reaches_sensor
 from ..rays.system import dot
 from ..rays.trace import Bundle, stop_points, trace_bundle
 from .rounding import warn_of_paths
@@ -125,7 +125,7 @@ def path_differences(
     Returns path differences (W, Q), waves, status (W, Q) and image points (W, D), mm.
     """
     waves = jnp.clip(wavelengths, *lens.dispersion.range)
-    whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+    whole = reaches_sensor(bundle.status)
     chief_ok = whole[:, :1]
 
     if curvature is None:

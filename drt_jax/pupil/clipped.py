@@ -23,7 +23,7 @@ from jax import Array
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import Numbers, brief, safe_divide
-from ..rays.status import Status
+from ..rays.status import reaches_sensor
 from ..rays.system import Vector, determinant, dot, system_of
 from ..rays.trace import Bundle
 from . import boundary
@@ -100,7 +100,7 @@ class Fitted(PupilRule):
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
         """1 (W, Q) for every ray that exists, clipped or not; 0 for rays that fail."""
-        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        whole = reaches_sensor(bundle.status)
         return whole.astype(bundle.path.dtype)
 
 

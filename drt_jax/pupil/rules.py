@@ -20,7 +20,7 @@ from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, scene_of
 from ..numerics import Numbers, brief, concrete, real_array
-from ..rays.status import Status
+from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector
 from ..rays.trace import Bundle
 from . import patterns
@@ -177,7 +177,7 @@ class Soft(PupilRule):
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
         """Product (W, Q) of the transmissions of all apertures and obscurations except the rim
         of the stop; 0 for rays that fail."""
-        whole = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+        whole = reaches_sensor(bundle.status)
         inside = clearance(lens, bundle.hits)
         bounded = jnp.isfinite(inside)  # its derivative by the width would be NaN
         inside = jnp.where(bounded, inside, 0) / jnp.asarray(self.width, inside.dtype)

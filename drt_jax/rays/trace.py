@@ -24,7 +24,7 @@ from .afocal import at_infinity
 from .find import Found
 from .meet import cross
 from .solve import Solver, solve
-from .status import Status
+from .status import Status, reaches_sensor
 from .system import System, Vector, placed, rotate, system_of
 
 
@@ -237,7 +237,7 @@ def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     system, target = aims(lens, scene, (pupil[:, 0], pupil[:, 1]))
     found = solve(system, target)
     bundle = bundle_of(dataclasses.replace(lens, afocal=False), scene, system, target, found)
-    exists = (bundle.status == Status.OK) | (bundle.status == Status.CLIPPED)
+    exists = reaches_sensor(bundle.status)
     rows = placed(lens, range(lens.count + 1))
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
     own = rotate(rows.rotation, (*bundle.hits, heights))

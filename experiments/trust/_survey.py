@@ -14,6 +14,7 @@ from drt_jax.lens.elements import rotation_matrix
 from drt_jax.lens.forms import Shape
 from drt_jax.lens.surface import sag_derivatives
 from drt_jax.numerics import safe_sqrt
+from drt_jax.rays.status import reaches_sensor
 
 from ._scenes import WAVELENGTH, Scenes
 from .snell import QUICK, trace_snell
@@ -210,7 +211,7 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray]:
     moments_slope, moments = _moments(*scenes[:3])
     status = rays.status[:, 0]
     exact = jax.tree.map(np.float64, scenes)
-    good = (status == Status.OK) | (status == Status.CLIPPED)
+    good = reaches_sensor(status)
     off, denied = _retrace(*exact[:3], rays.points[:, 0].astype(float))
     ratio = off / np.finfo(dtype).eps
     # Scenes rounded to float32, in both precisions.
