@@ -48,7 +48,7 @@ ROOMS = {
     "drt_jax/learn": 655,
     "drt_jax/lens": 1423,
     "drt_jax/pupil": 710,
-    "drt_jax/rays": 1308,
+    "drt_jax/rays": 1310,
     "drt_jax/show": 668,
     "experiments": 499,
     "experiments/designing": 593,
