@@ -24,9 +24,8 @@ from .variables import Variables
 
 # Number of searches in a tile. The searches of one tile run in one program on one core.
 _TILE = 16
-# Two minima count as the same if the score of the worse exceeds the merit of the better by less
-# than `_SAME_MERIT` (relative), and their vectors differ by less than `_SAME_PLACE` (root mean
-# square, in units of the scales).
+# Two minima count as the same if their merits differ by less than `_SAME_MERIT` (relative), and
+# their vectors by less than `_SAME_PLACE` (root mean square, in units of the scales).
 _SAME_MERIT, _SAME_PLACE = 1e-3, 1.0
 
 
@@ -276,17 +275,17 @@ def distinct(searches: Search, numbers: np.ndarray) -> list[Minimum]:
     numbers: (K,), numbers of their starts.
     """
     scores, vectors = np.asarray(searches.score), np.asarray(searches.vector)
-    violations = np.asarray(searches.max_violation)
+    merits, violations = np.asarray(searches.merit), np.asarray(searches.max_violation)
     found: list[Minimum] = []
     for k in np.argsort(scores, kind="stable"):
         if not np.isfinite(scores[k]):
             continue
         for m, other in enumerate(found):
             near = np.sqrt(np.mean((vectors[k] - other.vector) ** 2)) < _SAME_PLACE
-            if near and scores[k] - other.merit < _SAME_MERIT * other.merit:
+            if near and abs(merits[k] - other.merit) < _SAME_MERIT * other.merit:
                 found[m] = other._replace(found=other.found + 1)
                 break
         else:
-            merit = float(np.asarray(searches.merit)[k])
-            found.append(Minimum(vectors[k], merit, float(violations[k]), 1, int(numbers[k])))
+            known = float(merits[k]), float(violations[k]), 1, int(numbers[k])
+            found.append(Minimum(vectors[k], *known))
     return found

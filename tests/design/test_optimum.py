@@ -1,6 +1,7 @@
 """Least squares within bounds and limits, and many starts: against known optima."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from scipy import optimize
 import drt_jax
 from drt_jax import design
 from drt_jax.design import Operand, Solve, Variables, Vary, least_squares
+from drt_jax.design.starts import distinct
 
 # Of the singlet of issue 14, by another program: merit at the start and at the optimum, mm^2.
 START, OPTIMUM = 30.0924206902, 0.00172898452577
@@ -255,6 +257,18 @@ def test_weights_of_fields(triplet):
     assert abs(merit(both, field_weights=[0, 1]) / (2 * two) - 1) < 1e-12
     assert merit(both, field_weights=[2, 2]) == merit(both, field_weights=[1, 1])
     assert abs(merit(both, field_weights=[2, 2]) / merit(both) - 1) < 1e-12
+
+
+def test_searches_that_end_at_one_place_are_one_minimum():
+    """Also where a limit stays violated, whose square is in the score."""
+    ends = types.SimpleNamespace(
+        score=[2.0, 2.0001, 2.1, np.inf],
+        merit=[1.0, 1.0001, 1.1, 1.0],
+        max_violation=[1.0, 1.0, 1.0, 1.0],
+        vector=[[0.0, 0.0], [0.1, 0.0], [0.0, 0.1], [0.0, 0.0]],
+    )
+    found = distinct(ends, np.arange(4))
+    assert [(minimum.start, minimum.found) for minimum in found] == [(0, 2), (2, 1)]
 
 
 @pytest.mark.slow
