@@ -3,7 +3,7 @@ what it computed before.
 
 `python -m tests.golden` computes them again and names each that differs, with the difference
 relative to the largest number of the answer; `--write` keeps the new ones. A scene takes some
-minutes, nearly all of it compilation; `--scenes` picks some.
+minutes, nearly all of it compilation; `--scenes` picks some (without it, those that are kept).
 """
 
 import argparse
@@ -150,7 +150,7 @@ def answers(scene: str, wanted: Callable[[str], bool]) -> Iterator[tuple[str, fl
 def differences(scene: str, wanted: Callable[[str], bool] = lambda name: True) -> dict[str, float]:
     """For each answer that is not the kept number to the last digit: by how much it differs,
     relative to its scale; inf for an answer that is new."""
-    kept, found = json.loads(FILE.read_text()).get(scene, {}), {}
+    kept, found = json.loads(FILE.read_text())[scene], {}
     for name, value, size in answers(scene, wanted):
         before = float.fromhex(kept[name]) if name in kept else np.inf
         if value != before:
@@ -161,12 +161,13 @@ def differences(scene: str, wanted: Callable[[str], bool] = lambda name: True) -
 def main() -> None:
     """Compares the answers, or writes them."""
     parser = argparse.ArgumentParser(prog="tests.golden", description=__doc__)
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--scenes", nargs="+", choices=SCENES)
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
+    scenes = given.scenes or [*(SCENES if given.write else json.loads(FILE.read_text()))]
     jax.config.update("jax_enable_x64", True)
     warnings.simplefilter("ignore")
-    for scene in given.scenes:
+    for scene in scenes:
         if given.write:
             kept = json.loads(FILE.read_text()) if FILE.exists() else {}
             kept[scene] = {n: value.hex() for n, value, _ in answers(scene, lambda name: True)}

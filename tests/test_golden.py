@@ -9,9 +9,9 @@ from . import golden
 QUICK = ("first_order", "third_order", "rays", "image_point")
 
 
-def test_every_scene_is_kept():
+def test_what_is_kept_is_what_is_asked():
     kept = json.loads(golden.FILE.read_text())
-    assert kept.keys() == golden.SCENES.keys()
+    assert {"double_gauss"} <= kept.keys() <= golden.SCENES.keys()
     for scene, numbers in kept.items():
         named = {name.split("']")[0].removeprefix("['") for name in numbers}
         own = golden.analyses(scene).keys()
