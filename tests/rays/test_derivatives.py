@@ -2,6 +2,7 @@
 the complex step through `oracle`, whose own derivatives are proved by 50-digit differences."""
 
 import dataclasses
+import functools
 import pathlib
 import re
 
@@ -10,8 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import load_lens, psf_moments, pupil, trace_rays
+from drt_jax import Status, load_lens, pupil
+from drt_jax.image.moments import weigh
+from drt_jax.lens.scene import scene_of
 from drt_jax.pupil.rules import Gauss
+from drt_jax.rays.fermat import arrival, optical_path
+from drt_jax.rays.find import Found
+from drt_jax.rays.solve import reattach
+from drt_jax.rays.trace import aims, bundle_of
 
 from .. import oracle
 from ..known import bendable
@@ -217,17 +224,51 @@ def parameters(name, distance):
     return arguments, [row for row in rows if row != "coefficients" or lens.coefficients.size]
 
 
-def derivatives(mode, symmetry):
-    """A compiled function from the arguments to the derivatives of all outputs; `mode` is
-    `jax.jacrev` or `jax.jacfwd`."""
+@functools.partial(jax.jit, static_argnums=1)
+def derivatives(arguments, rule, hits):
+    """The derivatives of all outputs in reverse and in forward mode. hits: those of `hits_of`."""
 
     def outputs(arguments):
-        scene = arguments["lens"], arguments.get("field", 0.0), arguments["distance"], WAVELENGTHS
-        moments = psf_moments(*scene, rule=Gauss(ORDER, symmetry))
-        mean, covariance = moments.mean, moments.covariance
-        return mean, covariance, trace_rays(*scene, POINTS).path
+        lens, scene = arguments["lens"], scene_from(arguments)
+        nodes, weights = rule.points(lens, scene)
+        bundles = bundles_of(nodes)
+        rays = [found(aims(lens, scene, points), known) for points, known in zip(bundles, hits)]
+        weights = jnp.pad(weights, ((0, 0), (0, len(bundles[0][0]) - weights.shape[1])))
+        spot = weigh(lens, rule, weights, bundle_of(lens, scene, *rays[0])).at(lens.sensor)
+        system, _, last = rays[-1]
+        last = tuple(hit[..., -len(POINTS) :] for hit in last.hits)
+        return spot.mean, spot.covariance, optical_path(last, system)
 
-    return jax.jit(mode(outputs))
+    tangents = jax.linearize(outputs, arguments)[1]  # each mode of what is linear takes it as it is
+    return jax.jacrev(tangents)(arguments), jax.jacfwd(tangents)(arguments)
+
+
+def found(aims, hits):
+    """Aims, and their rays with derivatives."""
+    system, target = aims
+    ok = jnp.full(hits[0].shape[1:], Status.OK, jnp.int32)
+    rays = Found(hits, arrival(hits, system), ok, jnp.int32(0))
+    return system, target, reattach(rays, system, target)
+
+
+def bundles_of(nodes):
+    """The points of a rule and `POINTS`, as one bundle unless the rule is of meridional rays."""
+    points = tuple(POINTS.T)
+    return [nodes, points] if len(nodes) == 1 else [tuple(map(jnp.append, nodes, points))]
+
+
+def hits_of(lens, scene, nodes):
+    """Hits of the oracle on what bends the rays of `bundles_of`."""
+    for points in bundles_of(nodes):
+        plane = np.stack([*[np.zeros_like(points[0])] * (2 - len(points)), *points])
+        own = oracle.trace(scene, *oracle.aim(scene, plane)).own
+        rows = np.real([own[row][:2] for row in (*lens.active, -1)])
+        yield tuple(np.moveaxis(rows, 1, 0))[-len(points) :]
+
+
+def scene_from(arguments):
+    field = arguments.get("field", 0.0)
+    return scene_of(arguments["lens"], field, arguments["distance"], WAVELENGTHS)
 
 
 def of_row(tree, row):
@@ -285,12 +326,13 @@ def test_all_derivatives_agree_with_the_complex_step(name, write_tables):
     nodes, weights = rule[0].T, rule[1]
     if len(nodes) == 1:
         nodes = np.concatenate([np.zeros_like(nodes), nodes])
-    modes = [derivatives(mode, symmetry) for mode in (jax.jacrev, jax.jacfwd)]
+    gauss = Gauss(ORDER, symmetry)
     for distance in distances:
         arguments, rows = parameters(name, distance)
-        ours = [mode(arguments) for mode in modes]
         lens = arguments["lens"]
         scene = oracle.Scene.of(lens, field, distance, WAVELENGTHS)
+        hits = tuple(hits_of(lens, scene, gauss.points(lens, None)[0]))
+        ours = derivatives(arguments, gauss, hits)
         wanted = oracle.jacobian(scene, (nodes, weights), symmetry, POINTS.T, rows)
         table = {}
         for row in rows:
