@@ -36,6 +36,9 @@ test-slow: install
 test-all: install
 	$(BIN)/python -m pytest -m "" --durations=60
 
+# Most of the time of its notebooks is compilation, too: the flags of tests/conftest.py.
+site: export XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1
+
 # A part of the tests with other releases of Python and JAX, where there are such Pythons.
 test-versions: install
 	$(BIN)/python .ci/versions.py
