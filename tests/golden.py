@@ -43,45 +43,49 @@ def analyses(name: str) -> dict[str, Callable[[drt.Lens], Any]]:
     """Functions of a lens by name, for a scene."""
     degrees, distance, pixel, clipped = SCENES[name]
     fields = np.radians(degrees)
-    one, two, seen = fields[1], fields[:2], (distance, COLOURS)
+    seen = distance, COLOURS
+    point, skew = (drt.Scene.point(f, *seen) for f in (fields[1], np.array([0.3, 1]) * fields[1]))
+    line, pair = (drt.Scene.radians(f, *seen) for f in (fields, fields[:2]))
     rule = drt.Clipped(5, "bilateral") if clipped else drt.Gauss(6, "bilateral")
     lines, radii = np.array([10.0, 40.0]), np.array([0.01, 0.03])
-    grid = {"rule": rule, "degree": 8, "cells": 48}
+    waves, rays = (drt.Sampling.of(kind, rule, 48, 8) for kind in ("waves", "rays"))
+
+    of_design = lambda lens: operands(lens, fields, distance, rule)  # noqa: E731
 
     def kernel(kind: Any) -> Callable[[drt.Lens], Any]:
-        model = drt.PsfModel(kind, beam_rule(8, "bilateral", rule), 48)
-        return lambda lens: drt.psf(lens, one, *seen, pixel, 15, model)
+        model = drt.Sampling(kind, beam_rule(8, "bilateral", rule), 48)
+        return lambda lens: drt.psf(lens, point, pixel, 15, sampling=model)
 
     return {
         "first_order": lambda lens: drt.first_order(lens, *seen),
-        "third_order": lambda lens: drt.third_order(lens, one, *seen),
-        "rays": lambda lens: drt.trace_rays(lens, np.array([0.3 * one, one]), *seen, POINTS)[:4],
-        "moments": lambda lens: drt.psf_moments(lens, one, *seen, rule=rule),
-        "focus_moments": lambda lens: drt.focus_moments(lens, one, *seen, rule=rule),
-        "image_point": lambda lens: drt.image_point(lens, one, *seen),
-        "chief_ray_angle": lambda lens: drt.chief_ray_angle(lens, fields, *seen),
-        "field_curvature": lambda lens: drt.field_curvature(lens, fields, *seen),
-        "lateral_colour": lambda lens: drt.lateral_colour(lens, fields, *seen),
-        "distortion": lambda lens: drt.distortion(lens, fields, *seen),
-        "fans": lambda lens: drt.ray_fans(lens, fields, *seen, count=9),
-        "axial_colour": lambda lens: drt.axial_colour(lens, *seen),
-        "spot_diagram": lambda lens: drt.spot_diagram(lens, fields, *seen, rule=rule),
-        "illumination": lambda lens: drt.relative_illumination(lens, fields, *seen, rule=rule),
-        "wavefront": lambda lens: drt.wavefront(lens, one, *seen, POINTS)[:1],
-        "zernike_standard": lambda lens: drt.zernike_standard(lens, two, *seen, 15),
-        "zernike_fringe": lambda lens: drt.zernike_fringe(lens, two, *seen, 16),
-        "transfer": lambda lens: drt.transfer(lens, two, *seen, lines, **grid),
-        "transfer_rays": lambda lens: drt.transfer(lens, two, *seen, lines, "rays", **grid),
-        "strehl": lambda lens: drt.strehl(lens, two, *seen, **grid),
-        "energy": lambda lens: drt.encircled_energy(lens, two, *seen, radii, **grid),
+        "third_order": lambda lens: drt.third_order(lens, point),
+        "rays": lambda lens: drt.trace_rays(lens, skew, POINTS)[:4],
+        "moments": lambda lens: drt.psf_moments(lens, point, sampling=rule),
+        "focus_moments": lambda lens: drt.focus_moments(lens, point, sampling=rule),
+        "image_point": lambda lens: drt.image_point(lens, point),
+        "chief_ray_angle": lambda lens: drt.chief_ray_angle(lens, line),
+        "field_curvature": lambda lens: drt.field_curvature(lens, line),
+        "lateral_colour": lambda lens: drt.lateral_colour(lens, line),
+        "distortion": lambda lens: drt.distortion(lens, line),
+        "fans": lambda lens: drt.ray_fans(lens, line, count=9),
+        "axial_colour": lambda lens: drt.axial_colour(lens, point),
+        "spot_diagram": lambda lens: drt.spot_diagram(lens, line, sampling=rule),
+        "illumination": lambda lens: drt.relative_illumination(lens, line, sampling=rule),
+        "wavefront": lambda lens: drt.wavefront(lens, point, POINTS)[:1],
+        "zernike_standard": lambda lens: drt.zernike_standard(lens, pair, 15),
+        "zernike_fringe": lambda lens: drt.zernike_fringe(lens, pair, 16),
+        "transfer": lambda lens: drt.transfer(lens, pair, lines, sampling=waves),
+        "transfer_rays": lambda lens: drt.transfer(lens, pair, lines, sampling=rays),
+        "strehl": lambda lens: drt.strehl(lens, pair, waves),
+        "energy": lambda lens: drt.encircled_energy(lens, pair, radii, sampling=waves),
         "psf_waves": kernel("waves"),
         "psf_rays": kernel("rays"),
         "psf_gaussian": kernel("gaussian"),
-        "operands": lambda lens: operands(lens, fields, distance, rule),
+        **({} if name == "hubble" else {"operands": of_design}),  # without glass, obscured
     }
 
 
-def operands(lens: drt.Lens, fields: np.ndarray, distance: float, rule: drt.PupilRule) -> Any:
+def operands(lens: drt.Lens, fields: np.ndarray, distance: float, rule: drt.pupil.PupilRule) -> Any:
     """Values of all kinds of operands that every lens has, in one program."""
     special = {"mtf": {"at": 20.0}, "encircled_energy": {"at": 0.02}, "strehl": {}}
     asked = [
@@ -90,7 +94,9 @@ def operands(lens: drt.Lens, fields: np.ndarray, distance: float, rule: drt.Pupi
         if kind not in ("glass_map", "magnification")
     ]
     variables = design.Variables.from_lens(lens, ["sensor"])
-    problem = design.Problem.from_variables(variables, asked, fields, COLOURS, distance, rule)
+    problem = design.Problem.from_variables(
+        variables, asked, drt.Scene.radians(fields, distance, COLOURS), rule
+    )
 
     @jax.jit
     def values(lens: drt.Lens) -> dict[str, Any]:
@@ -169,8 +175,9 @@ def main() -> None:
     warnings.simplefilter("ignore")
     for scene in scenes:
         if given.write:
+            found = {n: value.hex() for n, value, _ in answers(scene, lambda name: True)}
             kept = json.loads(FILE.read_text()) if FILE.exists() else {}
-            kept[scene] = {n: value.hex() for n, value, _ in answers(scene, lambda name: True)}
+            kept[scene] = found
             FILE.write_text(json.dumps(kept, indent=0) + "\n")
             print(f"{scene}: {len(kept[scene])} answers written", flush=True)
         else:
