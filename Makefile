@@ -26,18 +26,16 @@ check: install
 # Programs that one run of the tests has compiled serve the next.
 test test-slow test-all test-versions site: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.compiled
 
+# With PART=0 to 5, as in CI, also a sixth of the larger scenes.
 test: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(if $(PART),-m "" --durations=60 --part=$(PART))
 
-# The larger scenes; PART=0, 1, 2 or 3 is a quarter of them.
+# The larger scenes; PART as above.
 test-slow: install
 	$(BIN)/python -m pytest -m slow --durations=60 $(if $(PART),--part=$(PART))
 
 test-all: install
 	$(BIN)/python -m pytest -m "" --durations=60
-
-# Most of the time of its notebooks is compilation, too: the flags of tests/conftest.py.
-site: export XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1
 
 # A part of the tests with other releases of Python and JAX, where there are such Pythons.
 test-versions: install

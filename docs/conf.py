@@ -9,6 +9,10 @@ ROOT = HERE.parent
 sys.path[:0] = [str(HERE), str(ROOT)]
 import _api  # noqa: E402
 
+from tests.flags import set_flags  # noqa: E402
+
+set_flags()  # for the notebooks
+
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 project, version = PROJECT["name"], PROJECT["version"]

@@ -7,8 +7,6 @@ import os
 import pathlib
 import resource
 import signal
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 
@@ -16,26 +14,9 @@ import jax
 import numpy as np
 import pytest
 
-# Most of the time of a test is compilation. Machine code that is not optimised compiles three times
-# faster, without the newer fusions of CPUs nearly twice as fast, and in one piece instead of many
-# in parallel a tenth faster, since both cores are busy anyway. What it computes is the same. Read
-# when a backend starts, here and in the workers.
-FLAGS = (
-    "--xla_backend_optimization_level=0",
-    "--xla_cpu_use_fusion_emitters=false",
-    "--xla_cpu_parallel_codegen_split_count=1",
-)
+from .flags import set_flags
 
-
-def known(flag: str) -> bool:
-    """Whether this XLA knows a flag: a process that gives it another is aborted."""
-    ask = [sys.executable, "-c", "import jax; jax.devices('cpu')"]
-    flags = {"XLA_FLAGS": flag, "JAX_PLATFORMS": "cpu"}
-    return not subprocess.run(ask, env=os.environ | flags, capture_output=True).returncode
-
-
-if "XLA_FLAGS" not in os.environ:
-    os.environ["XLA_FLAGS"] = " ".join(filter(known, FLAGS))
+set_flags()
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -52,8 +33,8 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 # takes a seventh of the time of the tests.
 gc.set_threshold(100_000, 20, 20)
 
-# All slow tests take longer than CI may: it runs another quarter of them for another commit.
-PARTS = 4
+# All slow tests take longer than CI may: it runs another sixth of them for another commit.
+PARTS = 6
 LONGEST = ("test_readme.py", "test_experiments.py", "test_derivatives.py")
 RGB = (0.6, 0.53, 0.48)
 LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
@@ -62,12 +43,12 @@ LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
 def pytest_addoption(parser):
     """Adds --write-tables: the tests that make a table of `results` write it there; and --part."""
     parser.addoption("--write-tables", action="store_true", help="rewrite the tables in results/")
-    parser.addoption("--part", type=int, choices=range(PARTS), help="a quarter of the slow tests")
+    parser.addoption("--part", type=int, choices=range(PARTS), help="a sixth of the slow tests")
 
 
 def pytest_collection_modifyitems(config, items):
     """Files with long tests first: none is left for one worker alone at the end. With `--part`,
-    every fourth slow function; the cases of one share programs."""
+    every sixth slow function; the cases of one share programs."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
     part = config.getoption("--part")
     if part is None:
