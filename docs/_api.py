@@ -20,7 +20,7 @@ ROOMS = {
 }
 # Modules with public names, by what a user imports.
 MODULES = ("drt_jax", "drt_jax.pupil", "drt_jax.design", "drt_jax.show", "drt_jax.devices")
-MODULES += ("drt_jax.learn.data", "drt_jax.learn.field", "drt_jax.learn.train")
+MODULES += ("drt_jax.learn", "drt_jax.results")
 
 
 def public() -> dict[str, dict[str, object]]:
@@ -28,7 +28,7 @@ def public() -> dict[str, dict[str, object]]:
     found: dict[str, dict[str, object]] = {room: {} for room in ROOMS}
     for path in MODULES:
         module = importlib.import_module(path)
-        here = hasattr(module, "__path__")  # else a module, whose own names alone are meant
+        here = hasattr(module, "__path__") or path == "drt_jax.results"  # else own names alone
         for name, thing in vars(module).items():
             source = getattr(inspect.unwrap(thing), "__module__", "") if callable(thing) else ""
             own = source.startswith("drt_jax.") and (here or source == path)

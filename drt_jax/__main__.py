@@ -9,7 +9,6 @@ import pathlib
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
-from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from .image.diagnose import crossed
 from .lens.lens import Lens
 from .lens.order import may_cross
 from .lens.paraxial import FirstOrder, first_order
-from .lens.scene import Scene, scene_of
+from .lens.scene import Scene, fitted
 from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
 from .rays.status import Status
@@ -125,21 +124,23 @@ def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[s
 
 
 def field_rows(
-    lens: Lens, fields: list[float], distance: float, wavelengths: list[float], beams: list[Beam]
+    lens: Lens, scene: Scene, fields: list[float], beams: list[Beam]
 ) -> Iterator[tuple[str, ...] | str]:
-    """A table of spots for fields in degrees, with warnings as lines between its rows."""
+    """A table of spots of the points of a scene, with warnings as lines between its rows.
+
+    fields: the fields in degrees.
+    """
+    wavelengths = np.asarray(scene.wavelengths).tolist()
     spots = [f"spot at {wavelength:.3f}" for wavelength in wavelengths]
     place, unit, size = ("angle", "mrad", "urad") if lens.afocal else ("height", "mm", "um")
     yield "field", f"image {place}", *spots, "light", "surfaces that clip"
     yield "deg", unit, *(f"RMS {size}" for _ in spots), "%", ""
-    angles, middle = [math.radians(field) for field in fields], len(wavelengths) // 2
-    symmetry, whole = _widest(lens, angles), _unclipped(beams)
-    for field, angle, beam in zip(fields, angles, beams):
-        scene = scene_of(lens, angle, distance, np.array(wavelengths))
-        rough, found = (_moments(lens, scene, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
+    middle, symmetry, whole = scene.reference(None), _widest(lens, scene), _unclipped(beams)
+    for field, point, beam in zip(fields, scene.each(), beams):
+        rough, found = (_moments(lens, point, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
         light = 100 * float(found.throughput[middle])
         if not light > 0:
-            yield f"{field:.4g}", f"! {_why_dark(lens, scene, Gauss(8, symmetry))}"
+            yield f"{field:.4g}", f"! {_why_dark(lens, point, Gauss(8, symmetry))}"
             continue
         cut = "; ".join(filter(None, (", ".join(map(str, beam.clipping)), *beam.ends))) or "none"
         squares = [np.trace(np.asarray(m.covariance), axis1=1, axis2=2) for m in (found, rough)]
@@ -161,9 +162,9 @@ def field_rows(
             yield f"  ! on the axis {share} does not arrive; surfaces that clip: {cut}"
 
 
-def _widest(lens: Lens, angles: list[float]) -> Symmetry:
+def _widest(lens: Lens, scene: Scene) -> Symmetry:
     """The symmetry of the least symmetric field, which is valid for all fields."""
-    return max((symmetry_of(lens, a) for a in angles), key=get_args(Symmetry).index)
+    return symmetry_of(lens, scene.field)
 
 
 def _unclipped(beams: list[Beam]) -> bool:
@@ -171,16 +172,14 @@ def _unclipped(beams: list[Beam]) -> bool:
     return not any(beam.clipping or beam.ends for beam in beams)
 
 
-_moments = jit(
-    lambda a, s, rule: psf_moments(a, s.field, s.distance, s.wavelengths, rule=rule), ONCE
-)
+_moments = jit(lambda lens, scene, rule: psf_moments(lens, scene, rule), ONCE)
 _first_order = jit(first_order, ONCE)
 
 
 def _why_dark(lens: Lens, scene: Scene, rule: PupilRule) -> str:
     """The reason why no light of a scene arrives."""
     try:
-        psf_moments(lens, scene.field, scene.distance, scene.wavelengths, rule=rule)
+        psf_moments(lens, scene, rule)
     except ValueError as error:
         return str(error)
     return "no light arrives"
@@ -297,25 +296,24 @@ def run_show(options: argparse.Namespace) -> None:
         raise ValueError("--field: must be within 90 degrees")
     with _warnings_on_stdout():
         lens, fields, distance, waves = _view(options)
-        middle, angles = waves[len(waves) // 2], [math.radians(field) for field in fields]
-        scene_of(lens, 0.0, distance, np.array(waves))  # ValueError for an invalid scene
+        middle = waves[len(waves) // 2]
+        scene = fitted(lens, Scene.degrees(fields, distance, np.array(waves)))
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
         about = f"{lens.count} surfaces, the stop is number {lens.stop}"
         first = [*first_rows(lens, found, middle)]
         _write([f"{lens.name}: {about}", *(f"  {name:<19}  {value}" for name, value in first)])
         _show_task("tracing; another kind of lens is compiled first, for half a minute or less")
-        axial = beam_of(lens, 0.0, distance, middle)
-        others = [wave for wave in waves if wave != middle]
-        beams = [beam_of(lens, angle, distance, middle, *others) for angle in angles]
+        axial = beam_of(lens, Scene.point(0.0, distance, middle))
+        beams = [beam_of(lens, point) for point in scene.each()]
         focus = [] if lens.afocal else focus_lines(found, middle, axial)
         notes = _write([*focus, *filter(None, [options.note]), ""])
-        table = _write(field_rows(lens, fields, distance, waves, beams))
+        table = _write(field_rows(lens, scene, fields, beams))
         notes += _write(aperture_lines(lens, beams))
         kind = ".html" if options.html else ".png"
         out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}{kind}")
-        symmetry, cut = _widest(lens, angles), not _unclipped(beams)
+        symmetry, cut = _widest(lens, scene), not _unclipped(beams)
         rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
-        view = lens, angles, distance, waves, rule, _show_task
+        view = lens, scene, rule, _show_task
         if options.html:
             rows = [row for row in table if not isinstance(row, str)]
             lines = [line for line in (*notes, *table) if isinstance(line, str) and line]

@@ -11,6 +11,7 @@ import stat
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import yaml
 
 # The parser of libyaml takes a tenth of the time, where PyYAML was built with it.
@@ -51,6 +52,14 @@ def shown(value: object) -> str:
         return _SHORT.repr(value)
     except ValueError:  # Python does not print an integer of more than 4300 digits
         return f"a {type(value).__name__} of too many digits"
+
+
+def require_tolerance(sampling: Any) -> float:
+    """A tolerance as a float. ValueError unless it is a number between 0 and 1."""
+    if isinstance(sampling, int | float | np.number) and 0 < sampling < 1:
+        return float(sampling)
+    what = "a tolerance between 0 and 1, or what drt_jax.converge returns"
+    raise ValueError(f"sampling: expected {what}, got {sampling!r:.80}")
 
 
 def require_one_of(what: str, value: object, known: Iterable[str]) -> None:

@@ -67,6 +67,13 @@ def run_if(condition: Array, function: Callable, value: Any) -> Any:
     return jax.lax.while_loop(lambda state: state[1], once, (value, condition))[0]
 
 
+def batched(function: Callable, axes: int) -> Callable:
+    """A function over a number of leading axes of all its arguments: `jax.vmap` so many times."""
+    for _ in range(axes):
+        function = jax.vmap(function)
+    return function
+
+
 def concrete(tree: Any) -> bool:
     """Whether no leaf of `tree` is a tracer of `jit`, `vmap` or a derivative: all numbers are
     known.
@@ -138,12 +145,25 @@ def real_array(what: str, value: Numbers, dtype: Any) -> Array:
     ValueError, which begins with `what`, for text, truth values, complex numbers, an empty list,
     and lists that do not form an array.
     """
+    return _real_array(what, value, dtype, jnp.asarray)
+
+
+def known_array(what: str, value: Numbers) -> Any:
+    """As `real_array`, in the dtype of `value` or of Python's floats; a NumPy array if the numbers
+    are known, so that they stay known inside `jit`."""
+    kind = getattr(value, "dtype", float)
+    kind = jax.dtypes.canonicalize_dtype(kind if jnp.issubdtype(kind, jnp.floating) else float)
+    return _real_array(what, value, kind, np.asarray if concrete(value) else jnp.asarray)
+
+
+def _real_array(what: str, value: Numbers, dtype: Any, asarray: Callable) -> Any:
+    """`real_array`, by the function `asarray`."""
     leaves = jax.tree.leaves(value)
     kinds: list[Any] = [getattr(leaf, "dtype", None) or type(leaf) for leaf in leaves]
     if not kinds or not all(map(_real, kinds)):
         raise ValueError(f"{what}: expected real numbers, got {value!r:.100}")
     try:
         with np.errstate(over="ignore"):  # a distance of 1e300 mm is inf in float32
-            return jnp.asarray(value, dtype)
+            return asarray(value, dtype)
     except (ValueError, OverflowError) as error:
         raise ValueError(f"{what}: {error}") from error

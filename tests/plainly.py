@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import design
+from drt_jax import Scene, design, learn
 from drt_jax.learn import train
 
 # No option of XLA, no convolution of ours, no grouping of small products.
@@ -20,33 +20,39 @@ RGB = (0.6, 0.53, 0.48)
 
 def numbers():
     lens = drt_jax.load_lens("cooke_triplet")
-    rule = drt_jax.converged_rule(lens, 0.2, 1e4, RGB, 1e-2)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, Scene.point(0.2, 1e4, RGB), 1e-2)
 
     def spot(lens):
-        found = drt_jax.psf_moments(lens, 0.2, 1e4, RGB, rule=rule)
+        found = drt_jax.psf_moments(lens, Scene.point(0.2, 1e4, RGB), sampling=rule)
         return 1e3 * jnp.mean(jnp.sqrt(jnp.trace(found.covariance, axis1=1, axis2=2)))
 
     value, slopes = jax.jit(jax.value_and_grad(spot))(lens)
     yield "spot, um", value
     yield "its slope by the sensor", slopes.sensor
     yield "and by a curvature", slopes.curvature[2]
-    rays = drt_jax.trace_rays(lens, 0.2, jnp.inf, 0.53, [[0.0, 0.7], [0.5, -0.5]])
+    rays = drt_jax.trace_rays(lens, Scene.point(0.2, jnp.inf, 0.53), [[0.0, 0.7], [0.5, -0.5]])
     yield "hit, mm", rays.points[0, 0, -1, 1]
     yield "rays that pass", jnp.sum(rays.status == 0)
-    model = drt_jax.converged_psf(lens, 0.2, 1e4, RGB, 0.02, 9, "rays", 0.1)
-    yield "brightest pixel", jnp.max(drt_jax.psf(lens, 0.2, 1e4, RGB, 0.02, 9, model).kernel)
+    model = drt_jax.converge(drt_jax.psf, lens, Scene.point(0.2, 1e4, RGB), 0.02, 9, "rays", 0.1)
+    yield (
+        "brightest pixel",
+        jnp.max(drt_jax.psf(lens, Scene.point(0.2, 1e4, RGB), 0.02, 9, sampling=model).kernel),
+    )
     perturbed = design.PerturbedLens.from_lens(
         lens, lens.semi_diameter[:-1], [design.Tolerance("shift", 0.05)]
     )
     problem = design.Problem.from_variables(
-        design.Variables.from_lens(perturbed.lens, ["sensor"]), ["spot"], [0.2], RGB, jnp.inf, 4
+        design.Variables.from_lens(perturbed.lens, ["sensor"]),
+        ["spot"],
+        Scene.radians([0.2], jnp.inf, RGB),
+        4,
     )
     built = design.monte_carlo(
         problem, perturbed, design.draw_perturbations(perturbed, 60, 0), "focus"
     )
     yield "lenses as built, um", 1e3 * np.mean(built.spot)
-    weights, restore = drt_jax.red_net(layers=1, channels=32)
-    blur = drt_jax.moments_model(lens, ("sensor",), 0.0, (1e4, 1e4), RGB, 1e-2)[1]
+    weights, restore = learn.red_net(layers=1, channels=32)
+    blur = learn.moments_model(lens, ("sensor",), Scene.point(0.0, (1e4, 1e4), RGB), 1e-2)[1]
     imager = train.make_imager(blur, restore, train.Camera(kernel=5))
     init, step = train.make_step(imager, {"optics": 1e-3, "network": 1e-3}, (1e4, 1e4), 0)
     network = weights(jax.random.key(0))

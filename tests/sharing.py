@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import design, devices
+from drt_jax import Scene, design, devices, learn
 from drt_jax.learn import field, train
 
 jax.config.update("jax_enable_x64", True)
@@ -30,7 +30,9 @@ def apart(one, other):
 def problem_of(lens):
     variables = design.Variables.from_lens(lens, [design.Vary("curvature"), "sensor"])
     fields = np.radians([0.0, 1.0])
-    return design.Problem.from_variables(variables, ["spot"], fields, (0.5876,), jnp.inf, 3)
+    return design.Problem.from_variables(
+        variables, ["spot"], Scene.radians(fields, jnp.inf, (0.5876,)), 3
+    )
 
 
 def monte_carlo(mesh):
@@ -54,10 +56,14 @@ def starts(mesh):
 def kernels(mesh):
     lens = drt_jax.load_lens(LENS)
     fields = np.radians(np.stack([np.linspace(0, 1, 16), np.linspace(0, 2, 16)], axis=-1))
-    model = drt_jax.converged_psf(lens, fields[::5], jnp.inf, COLOURS, 0.01, 11, "rays", 0.05)
+    model = drt_jax.converge(
+        drt_jax.psf, lens, Scene.grid(fields[::5], jnp.inf, COLOURS), 0.01, 11, "rays", 0.05
+    )
 
     def grid(lens, fields):
-        return drt_jax.psfs(lens, fields, jnp.inf, COLOURS, 0.01, 11, model).kernel
+        return drt_jax.psf(
+            lens, Scene.radians(fields, jnp.inf, COLOURS), 0.01, 11, sampling=model
+        ).kernel
 
     return jax.jit(devices.shared(grid, mesh, 1))(lens, fields)
 
@@ -67,7 +73,7 @@ def rays(mesh):
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (64, 2))
 
     def hits(lens, points):
-        found = drt_jax.trace_rays(lens, 0.1, jnp.inf, COLOURS, points)
+        found = drt_jax.trace_rays(lens, Scene.point(0.1, jnp.inf, COLOURS), points)
         return jnp.moveaxis(found.points[..., -1, :2], 1, 0)  # (Q, W, 2): rays first
 
     return jax.jit(devices.shared(hits, mesh, 1))(lens, points)
@@ -75,9 +81,9 @@ def rays(mesh):
 
 def training(mesh):
     """Losses, and the state after some steps."""
-    weights, restore = drt_jax.red_net(layers=2, channels=32)
+    weights, restore = learn.red_net(layers=2, channels=32)
     lens = drt_jax.load_lens(LENS)
-    blur = drt_jax.moments_model(lens, ("sensor",), 0.0, (25e3, 25e3), COLOURS, 1e-3)[1]
+    blur = learn.moments_model(lens, ("sensor",), Scene.point(0.0, (25e3, 25e3), COLOURS), 1e-3)[1]
     camera = train.Camera(kernel=9)
     imager = train.make_imager(blur, devices.shared(restore, mesh, 1), camera)
     init, step = train.make_step(imager, {"optics": 1e-3, "network": 1e-3}, (25e3, 25e3), 0)
@@ -98,17 +104,19 @@ def joint_training(mesh):
     """Losses and states of lens and network over the field, by Adam and by damped steps."""
     lens, pixel = drt_jax.load_lens(LENS), 0.02
     field_of = np.array([[0.01, 0.01]])
-    model = drt_jax.converged_psf(lens, field_of, 5e3, COLOURS, pixel, 9, "gaussian", 0.05)
-    weights, restore = drt_jax.red_net(layers=1, channels=32)
+    model = drt_jax.converge(
+        drt_jax.psf, lens, Scene.radians(field_of, 5e3, COLOURS), pixel, 9, "gaussian", 0.05
+    )
+    weights, restore = learn.red_net(layers=1, channels=32)
     images = np.random.default_rng(0).integers(0, 255, (3, 8, 40, 40, 3), np.uint8)
 
     def points(optics, seen):
         moved = dataclasses.replace(lens, sensor=optics["sensor"])
-        found = drt_jax.psfs(moved, *seen[:2], COLOURS, pixel, 9, model)
+        found = drt_jax.psf(moved, Scene.radians(*seen[:2], COLOURS), pixel, 9, sampling=model)
         return found.kernel, jnp.ones((4, 3))
 
     def trained(make, rate):
-        convolve = devices.shared(drt_jax.convolve_each, mesh)
+        convolve = devices.shared(learn.convolve_each, mesh)
         camera = field.FieldImager(points, devices.shared(restore, mesh, 1), convolve)
         rates = {"optics": rate, "network": 1e-3}
         draw = lambda key: field.draw_points(key, 4, 0.02, (5e3, jnp.inf))  # noqa: E731

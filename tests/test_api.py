@@ -10,27 +10,38 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Gauss, Pattern, Status, load_lens, psf_moments, pupil
+from drt_jax import Gauss, Pattern, Scene, Status, learn, load_lens, psf_moments, pupil
 from drt_jax.image import diagnose
+from drt_jax.lens.glass import refractive_index
+from drt_jax.lens.paraxial import image_height
+from drt_jax.lens.scene import field_of_height, fitted
 
 LENS = load_lens("singlet")
 GREEN, POINTS, RULE = (0.55,), pupil.hexapolar(1)[0], Gauss(4, "bilateral")
 SCENE = (0.05, 25e3, GREEN)
 # Every public function of a field, of a distance, of wavelengths, of points of the stop.
 CALLS = {
-    "psf_moments": lambda f, d, w, p: psf_moments(LENS, f, d, w),
-    "psf_moments by a rule": lambda f, d, w, p: psf_moments(LENS, f, d, w, rule=RULE),
-    "focus_moments": lambda f, d, w, p: drt_jax.focus_moments(LENS, f, d, w),
-    "converged_rule": lambda f, d, w, p: drt_jax.converged_rule(LENS, f, d, w),
-    "converged_focus_rule": lambda f, d, w, p: drt_jax.converged_focus_rule(LENS, f, d, w),
-    "moments_model": lambda f, d, w, p: drt_jax.moments_model(LENS, ("sensor",), f, (d, d), w),
-    "scene_of": lambda f, d, w, p: drt_jax.scene_of(LENS, f, d, w),
-    "trace_rays": lambda f, d, w, p: drt_jax.trace_rays(LENS, f, d, w, p),
-    "wavefront": lambda f, d, w, p: drt_jax.wavefront(LENS, f, d, w, p),
-    "pupil_points": lambda f, d, w, p: drt_jax.pupil_points(LENS, f, d, w, RULE),
-    "image_point": lambda f, d, w, p: drt_jax.image_point(LENS, f, d, w),
-    "image_height": lambda f, d, w, p: drt_jax.image_height(LENS, f, d, w),
-    "third_order": lambda f, d, w, p: drt_jax.third_order(LENS, f, d, w),
+    "psf_moments": lambda f, d, w, p: psf_moments(LENS, Scene.point(f, d, w)),
+    "psf_moments by a rule": lambda f, d, w, p: psf_moments(
+        LENS, Scene.point(f, d, w), sampling=RULE
+    ),
+    "focus_moments": lambda f, d, w, p: drt_jax.focus_moments(LENS, Scene.point(f, d, w)),
+    "converged_rule": lambda f, d, w, p: drt_jax.converge(
+        drt_jax.psf_moments, LENS, Scene.point(f, d, w)
+    ),
+    "converged_focus_rule": lambda f, d, w, p: drt_jax.converge(
+        drt_jax.focus_moments, LENS, Scene.point(f, d, w)
+    ),
+    "moments_model": lambda f, d, w, p: learn.moments_model(
+        LENS, ("sensor",), Scene.point(f, (d, d), w)
+    ),
+    "fitted": lambda f, d, w, p: fitted(LENS, Scene.point(f, d, w)),
+    "trace_rays": lambda f, d, w, p: drt_jax.trace_rays(LENS, Scene.point(f, d, w), p),
+    "wavefront": lambda f, d, w, p: drt_jax.wavefront(LENS, Scene.point(f, d, w), p),
+    "pupil_points": lambda f, d, w, p: drt_jax.pupil.pupil_points(LENS, Scene.point(f, d, w), RULE),
+    "image_point": lambda f, d, w, p: drt_jax.image_point(LENS, Scene.point(f, d, w)),
+    "image_height": lambda f, d, w, p: image_height(LENS, f, d, w),
+    "third_order": lambda f, d, w, p: drt_jax.third_order(LENS, Scene.point(f, d, w)),
     "field_of_image": lambda f, d, w, p: drt_jax.field_of_image(LENS, (0.0, 1.0), d, w),
     "first_order": lambda f, d, w, p: drt_jax.first_order(LENS, d, w),
     "focal_length": lambda f, d, w, p: drt_jax.focal_length(LENS, w),
@@ -51,11 +62,13 @@ def refused(name, *arguments):
 def test_fields_of_90_degrees_and_more_are_refused(name):
     assert "10 rad = 573 degrees" in refused(name, 10.0, *SCENE[1:], POINTS)
     for field in (np.radians(135), np.pi, np.radians(90), -np.pi / 2, np.nan):
-        assert "angles are radians: np.radians(" in refused(name, field, *SCENE[1:], POINTS)
+        assert "must be below 90; Scene.degrees takes degrees" in refused(
+            name, field, *SCENE[1:], POINTS
+        )
     for field in ("10", None, 1j, True, object(), [[0.0, 0.1], [0.1]]):
         assert refused(name, field, *SCENE[1:], POINTS).startswith("field: ")
     if name not in ("image_height", "third_order"):
-        assert "np.radians(2)" in refused(name, (0.1, 2.0), *SCENE[1:], POINTS)
+        assert "2 rad = 114.6 degrees" in refused(name, (0.1, 2.0), *SCENE[1:], POINTS)
         assert "one angle or two" in refused(name, [0.1] * 3, *SCENE[1:], POINTS)
 
 
@@ -92,7 +105,7 @@ def test_pupils_that_are_no_numbers_are_refused():
     for points in ((), "all", [["a", "b"]], [[0.0, 1.0], [0.0]], np.ones((1, 2), bool)):
         for name in ("trace_rays", "wavefront"):
             assert refused(name, *SCENE, points).startswith("pupil: ")
-    rays = drt_jax.trace_rays(LENS, *SCENE, [[0, 1], [np.nan, 0]])
+    rays = drt_jax.trace_rays(LENS, Scene.point(*SCENE), [[0, 1], [np.nan, 0]])
     assert rays.status[0].tolist() == [Status.OK, Status.MISSED]
 
 
@@ -113,9 +126,12 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_arrays_of_a_lens_that_do_not_fit_are_refused(name):
     wrong = dataclasses.replace(LENS, **{name: SHAPES[name](getattr(LENS, name))})
-    for call in (psf_moments, jax.jit(lambda lens, *scene: psf_moments(lens, *scene, rule=RULE))):
+    for call in (
+        psf_moments,
+        jax.jit(lambda lens, scene: psf_moments(lens, scene, sampling=RULE)),
+    ):
         with pytest.raises(ValueError, match=rf"lens\.{name}: expected"):
-            call(wrong, *SCENE)
+            call(wrong, Scene.point(*SCENE))
     with pytest.raises(ValueError, match=rf"lens\.{name}: expected"):
         drt_jax.focal_length(wrong, GREEN)
 
@@ -125,13 +141,13 @@ def test_dtypes_of_a_lens_that_do_not_fit_are_refused(kind):
     for name in ("curvature", "sensor"):
         wrong = dataclasses.replace(LENS, **{name: getattr(LENS, name).astype(kind)})
         with pytest.raises(ValueError, match=r"lens\.\w+: expected"):
-            psf_moments(wrong, *SCENE)
+            psf_moments(wrong, Scene.point(*SCENE))
 
 
 @pytest.mark.slow
 def test_a_lens_of_arrays_of_numpy_or_of_numbers_will_do():
     same = dataclasses.replace(jax.tree.map(np.asarray, LENS), sensor=float(LENS.sensor))
-    ours, other = (psf_moments(lens, *SCENE, rule=RULE) for lens in (same, LENS))
+    ours, other = (psf_moments(lens, Scene.point(*SCENE), sampling=RULE) for lens in (same, LENS))
     np.testing.assert_array_equal(ours.covariance, other.covariance)
 
 
@@ -151,7 +167,7 @@ def test_orders_and_symmetries_that_no_rule_has_are_refused():
                 pattern(count)
     for points, weights in ((POINTS.T, np.ones(7)), (POINTS, np.ones(6)), (POINTS, 1.0)):
         with pytest.raises(ValueError, match=r"expected positions \(Q, 2\) and weights \(Q,\)"):
-            psf_moments(LENS, *SCENE, rule=Pattern(points, weights))
+            psf_moments(LENS, Scene.point(*SCENE), sampling=Pattern(points, weights))
 
 
 # ---- inside a trace -----------------------------------------------------------------------------
@@ -163,8 +179,8 @@ def everything(lens, field, distance, wavelengths):
 
     def total(lens, field, distance, wavelengths):
         scene = field, distance, wavelengths
-        rays = drt_jax.trace_rays(lens, *scene, POINTS)
-        spot = psf_moments(lens, *scene, rule=RULE)
+        rays = drt_jax.trace_rays(lens, Scene.point(*scene), POINTS)
+        spot = psf_moments(lens, Scene.point(*scene), sampling=RULE)
         found = rays[:3], spot.mean, spot.throughput
         summed = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(found) if leaf.dtype == float)
         return summed + jnp.sum(spot.covariance), (found, rays.status, spot)
@@ -214,10 +230,10 @@ def test_extreme_scenes_have_finite_rays_and_derivatives(field, distance):
 def gaussian_optics(lens, field, distance, wavelengths):
     return (
         drt_jax.first_order(lens, distance, wavelengths),
-        drt_jax.third_order(lens, field, distance, wavelengths),
-        drt_jax.image_height(lens, field, distance, wavelengths),
-        drt_jax.refractive_index(lens.dispersion, wavelengths),
-        drt_jax.field_of_height(field, distance),
+        drt_jax.third_order(lens, Scene.point(field, distance, wavelengths)),
+        image_height(lens, field, distance, wavelengths),
+        refractive_index(lens.dispersion, wavelengths),
+        field_of_height(field, distance),
     )
 
 
@@ -237,15 +253,15 @@ def test_gaussian_optics_has_no_nan():
                 assert np.all(np.isinf(third.spherical))
     for distance in (np.inf, -np.inf, 0.0, np.nan):
         with pytest.raises(ValueError, match="distance: "):
-            drt_jax.field_of_height(1.0, distance)
+            field_of_height(1.0, distance)
 
 
 @pytest.mark.slow
 def test_reference_spheres_of_no_radius():
     for curvature in (np.inf, np.nan, [0.0, np.inf]):
         with pytest.raises(ValueError, match="curvature: "):
-            drt_jax.wavefront(LENS, *SCENE, POINTS, curvature)
-    trace = jax.jit(lambda kappa: drt_jax.wavefront(LENS, *SCENE, POINTS, kappa))
+            drt_jax.wavefront(LENS, Scene.point(*SCENE), POINTS, curvature)
+    trace = jax.jit(lambda kappa: drt_jax.wavefront(LENS, Scene.point(*SCENE), POINTS, kappa))
     for kappa in (np.inf, -np.inf, np.nan):
         wave = trace(jnp.asarray(kappa))
         assert np.all(wave.status == Status.UNCONVERGED) and np.all(wave.opd == 0)
@@ -278,7 +294,7 @@ def test_a_lens_that_passes_no_ray_says_which_surface():
     ]
     for lens, field, why in cases:
         with pytest.raises(ValueError) as caught:
-            psf_moments(lens, field, np.inf, GREEN, rule=RULE)
+            psf_moments(lens, Scene.point(field, np.inf, GREEN), sampling=RULE)
         text = str(caught.value)
         assert text.startswith("no ray at 0.55 um reaches the sensor: ") and why in text
         assert "\n" not in text and len(text) < 300
@@ -287,17 +303,17 @@ def test_a_lens_that_passes_no_ray_says_which_surface():
 @pytest.mark.slow
 def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
     thin = changed(thickness=[2.0, 0.3])
-    assert psf_moments(thin, 0.0, np.inf, GREEN).throughput[0] > 0.999
-    init, update = drt_jax.adam({"thickness": 0.5})
+    assert psf_moments(thin, Scene.point(0.0, np.inf, GREEN)).throughput[0] > 0.999
+    init, update = learn.adam({"thickness": 0.5})
     values = {"thickness": thin.thickness}
     updates, _ = update({"thickness": jnp.array([0.0, 1.0])}, init(values))
-    crossed = dataclasses.replace(thin, **drt_jax.apply_updates(values, updates))
+    crossed = dataclasses.replace(thin, **learn.apply_updates(values, updates))
     why = "surface 1 and surface 2 cross on the axis: -0.2 mm between them"
     for rule in (None, Gauss(4, "rotational")):
         with pytest.raises(ValueError, match=why):
-            psf_moments(crossed, 0.0, np.inf, GREEN, rule=rule)
+            psf_moments(crossed, Scene.point(0.0, np.inf, GREEN), sampling=rule)
     # A sensor in front of the last surface shows a virtual image.
-    assert psf_moments(changed(sensor=3.0), 0.0, np.inf, GREEN).throughput[0] > 0.999
+    assert psf_moments(changed(sensor=3.0), Scene.point(0.0, np.inf, GREEN)).throughput[0] > 0.999
     wide = changed(thickness=[2.0, 1.0], semi_diameter=[5.0, 12.5, 12.5, np.inf])
     assert "surface 1 and surface 2 cross from 10.2 mm off the axis on" in diagnose.crossed(wide)
     assert diagnose.crossed(LENS) == ""
@@ -306,7 +322,9 @@ def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
 @pytest.mark.slow
 def test_a_wrong_field_in_an_eager_gradient_is_named():
     """Its values are known there, too."""
-    slope = jax.grad(lambda field: psf_moments(LENS, field, np.inf, GREEN, rule=RULE).mean[0, 1])
+    slope = jax.grad(
+        lambda field: psf_moments(LENS, Scene.point(field, np.inf, GREEN), sampling=RULE).mean[0, 1]
+    )
     assert np.isfinite(slope(0.1))
     with pytest.raises(ValueError, match="10 rad = 573 degrees"):
         slope(10.0)
@@ -324,7 +342,9 @@ def test_random_lenses_give_finite_moments_or_an_error():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             try:
-                found = psf_moments(dataclasses.replace(LENS, **moved), 0.0, 1e3, GREEN)
+                found = psf_moments(
+                    dataclasses.replace(LENS, **moved), Scene.point(0.0, 1e3, GREEN)
+                )
             except ValueError as error:
                 assert "surface" in str(error) or "no way through the stop" in str(error)
                 results.append(False)
@@ -340,10 +360,10 @@ def test_the_promise_of_float32_is_kept_and_warned_of():
     double = dataclasses.replace(load_lens("double_gauss"), sensor=jnp.asarray(133.35))
     single = jax.tree.map(lambda a: a.astype(jnp.float32), double)
     scene = np.radians(10), 25e3, (0.6, 0.53, 0.48)
-    exact = psf_moments(double, *scene)
+    exact = psf_moments(double, Scene.point(*scene))
     with pytest.warns(UserWarning, match='float32 the spot may be wrong by .*"jax_enable_x64"'):
-        found = psf_moments(single, *scene)
+        found = psf_moments(single, Scene.point(*scene))
     assert found.covariance.dtype == jnp.float32
     sizes = [np.sqrt(np.trace(a.covariance, axis1=1, axis2=2)) for a in (found, exact)]
     np.testing.assert_allclose(*sizes, rtol=1e-3)
-    psf_moments(single, *scene, 0.1)  # as asked for, and no warning
+    psf_moments(single, Scene.point(*scene), 0.1)  # as asked for, and no warning

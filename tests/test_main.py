@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 
-from drt_jax import first_order, load_lens, psf_moments, save_lens, show
+from drt_jax import Scene, first_order, load_lens, psf_moments, save_lens, show
 from drt_jax.__main__ import _options, _view, main
 
 
@@ -55,7 +55,7 @@ def test_a_rim_that_shaves_the_axial_beam_is_named_wherever_it_matters(tmp_path,
     axial, oblique = (row for row in rows if row[0] in ("0", "9"))
     lens = load_lens(tmp_path / "mine.yaml")
     for row, field in ((axial, 0.0), (oblique, np.radians(9))):
-        found = psf_moments(lens, field, np.inf, 0.55)
+        found = psf_moments(lens, Scene.point(field, np.inf, 0.55))
         spot = 1e3 * float(np.trace(found.covariance[0])) ** 0.5
         assert len(row) == 5 and float(row[2]) == pytest.approx(spot, rel=2e-4)
         assert float(row[3]) == pytest.approx(100 * float(found.throughput[0]), abs=0.02)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drt_jax.image.beam import beam_rule
-from drt_jax.image.beam_psf import PsfModel
+from drt_jax.image.beam_psf import Sampling
 from drt_jax.image.fields import GridMethod
 from drt_jax.image.sensor_maps import RenderMethod
 from drt_jax.numerics import known_values, run_if, safe_divide, safe_sqrt
@@ -70,7 +70,7 @@ def test_values_are_known_while_they_are_differentiated_eagerly():
 
 def test_rules_models_and_methods_print_one_line():
     array = jnp.linspace(0, 1, 300).reshape(3, 100)
-    model = PsfModel("rays", beam_rule(6, "bilateral"), 48)
+    model = Sampling("rays", beam_rule(6, "bilateral"), 48)
     grid = GridMethod(array[0, 1], array[0], array[0, 1], model, array, (3, 3), 21, "none")
     for one in (model.rule.rule, model, grid, RenderMethod(grid, array, array, (9, 9), (3, 3))):
         assert len(repr(one).splitlines()) == 1 and repr(one).startswith(type(one).__name__)

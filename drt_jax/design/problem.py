@@ -12,7 +12,7 @@ from ..image.rounding import warn_of_paths
 from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
-from ..lens.scene import Scene, distance_array, fields_array, vergence_of
+from ..lens.scene import Scene, fitted, vergence_of
 from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
@@ -88,6 +88,17 @@ def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
     return found / found.mean()
 
 
+def _axes(scene: Scene) -> tuple[Array, Array, Array]:
+    """Fields (F, 2), distances (Z,) and wavelengths (W,) of a scene with every field at every
+    distance. ValueError for other points."""
+    field, far = scene.field, scene.distance
+    if far.ndim and field.ndim > 1 and not (far.ndim == 2 and far.shape[1] == 1 == field.ndim - 1):
+        raise ValueError(
+            "scene: a problem has every field at every distance: take Scene.grid(fields, distances)"
+        )
+    return field.reshape(-1, 2), far.reshape(-1), scene.wavelengths
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Problem:
@@ -124,12 +135,8 @@ class Problem:
         cls,
         variables: Variables | Sequence[Variables],
         operands: Sequence[Operand | OperandName | OperandFunction],
-        fields: Numbers = 0.0,
-        wavelengths: Numbers = 0.5875618,
-        distances: Numbers = np.inf,
-        rule: PupilRule | int = 6,
-        wavelength_weights: Numbers | None = None,
-        field_weights: Numbers | None = None,
+        scene: Scene | None = None,
+        sampling: PupilRule | int = 6,
     ) -> "Problem":
         """Makes a problem.
 
@@ -137,12 +144,10 @@ class Problem:
             `Variables.joined`.
         operands: operands, at least one with a weight above 0; a name or a function stands for an
             operand of weight 1.
-        fields: one angle, (F,) along y, or (F, 2), radians.
-        wavelengths: one or (W,), um.
-        distances: one or (Z,), mm.
-        rule: pupil rule, or the order of a Gauss rule.
-        wavelength_weights: (W,), of any sum; None for equal weights.
-        field_weights: (F,), of any sum; None for equal weights. Limits do not depend on them.
+        scene: fields at one distance, or every field at every distance, as of `Scene.grid`, with
+            wavelengths and weights; by default a point on the axis at infinity, in the d line.
+            Limits do not depend on the weights.
+        sampling: pupil rule of all fields, or the order of a Gauss rule.
 
         ValueError, which names the argument, if an argument does not fit the lens or the problem,
         and for a limit that the lens violates and that no variable changes. (For limits that need
@@ -153,9 +158,9 @@ class Problem:
         lens = variables.lens
         asked = tuple(o if isinstance(o, Operand) else Operand(o) for o in operands)
         dtype = lens.curvature.dtype
-        angles = fields_array(fields, dtype)
-        far = jnp.stack([distance_array(d, dtype) for d in np.ravel(np.asarray(distances, float))])
-        waves = lens.checked_wavelengths(wavelengths)
+        scene = fitted(lens, Scene.point() if scene is None else scene)
+        angles, far, waves = _axes(scene)
+        rule = sampling
         if isinstance(rule, int):
             across = not np.any(np.asarray(angles)[:, 0])
             symmetry = symmetry_by_structure(lens, not np.any(np.asarray(angles)))
@@ -166,14 +171,12 @@ class Problem:
         # Warn if float32 rounds the path differences of these operands too much.
         of_beams = any(kind_of(o.kind).of_waves for o in asked)
         if of_beams or any(o.kind in _OF_PATHS for o in asked):
-            for distance in far:
-                warn_of_paths(lens, Scene(angles[0], distance, waves), angles, of_beams=of_beams)
+            warn_of_paths(lens, scene, of_beams=of_beams)
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)
-        equal = np.ones(len(waves)) if wavelength_weights is None else wavelength_weights
-        share = _weights("wavelength_weights", equal, len(waves)) / len(waves)
+        share = _weights("wavelength_weights", scene.spectrum, len(waves)) / len(waves)
         problem = cls(variables, angles, far, waves, jnp.asarray(share, dtype), rule, on)
-        if field_weights is not None:
-            own = jnp.asarray(_weights("field_weights", field_weights, len(angles)), dtype)
+        if scene.field_weights is not None:
+            own = jnp.asarray(_weights("field_weights", scene.field_weights, len(angles)), dtype)
             problem = dataclasses.replace(problem, field_weights=own)
         problem._refuse_fixed()
         return problem

@@ -11,7 +11,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
-from ..lens.scene import field_of_height
+from ..lens.scene import Scene, field_of_height
 from .record import Record
 
 ApertureKind = Literal[
@@ -56,6 +56,18 @@ class System:
     aperture_kind: ApertureKind | None
     ray_aiming: str = ""
     notes: tuple[str, ...] = ()
+
+    @property
+    def scene(self) -> Scene:
+        """Fields, distance and wavelengths with their weights, for analyses and designs.
+
+        ValueError for real image heights, which `field_of_image` turns into fields.
+        """
+        if self.fields is None:
+            raise ValueError("fields: real image heights; find each by field_of_image(lens, ...)")
+        weights = {"wavelength_weights": self.wavelength_weights}
+        weights |= {"field_weights": self.field_weights}
+        return Scene.radians(self.fields, self.distance, self.wavelengths, **weights)
 
 
 def system_for(lens: Lens) -> System:

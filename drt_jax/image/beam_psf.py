@@ -11,12 +11,15 @@ from jax import Array
 from ..lens.lens import Lens
 from ..numerics import safe_divide
 from ..pupil.mask import Mask
-from .beam import Beam, BeamRule, centroid_and_variances
+from ..pupil.rules import PupilRule
+from .beam import Beam, BeamRule, beam_rule, centroid_and_variances
 from .kernel import gaussian_shares
 from .ray_psf import ray_kernel, ray_spots
 from .wave_psf import wave_kernel
 
 Kind = Literal["gaussian", "rays", "waves"]
+# Number of cells along a side of the pupil, and degree of polynomials, where none is given.
+CELLS, DEGREE = 128, 14
 _FINE = 8  # cells along each side of a pixel of a mask
 
 
@@ -46,10 +49,12 @@ class Psf:
     meta_fields=("kind", "cells"),
 )
 @dataclasses.dataclass(frozen=True)
-class PsfModel:
-    """A PSF model with its rays and its grid, see `converged_psf`.
+class Sampling:
+    """How kernels, contrast and energy are computed: of which kind, by which rays, on which grid.
+    `converge` makes one for a tolerance.
 
-    kind: "gaussian", "rays" or "waves".
+    kind: "gaussian" (the moments of the rays), "rays" (all their light) or "waves" (with
+        diffraction).
     rule: rays and polynomials of the beam.
     cells: number of cells along a side of the pupil grid; 0 for "gaussian".
     errors: with "auto", the difference between the kernel of each kind and that of "waves" at the
@@ -61,21 +66,35 @@ class PsfModel:
     cells: int
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
 
-    def masked(self, mask: Mask, cells: int = 0) -> "PsfModel":
-        """The model with a mask in the stop. Also for use in `jax.jit`; differentiable in the mask.
+    @classmethod
+    def of(
+        cls, kind: Kind, rule: PupilRule, cells: int = CELLS, degree: int = DEGREE
+    ) -> "Sampling":
+        """A sampling by hand.
+
+        kind: "gaussian", "rays" or "waves".
+        rule: pupil rule, whose symmetry and kind (`Gauss` or `Clipped`) the rays have.
+        cells: number of cells along a side of the pupil grid. Too few lower the contrast of a large
+            blur, and never raise it.
+        degree: of the polynomials of the pupil.
+        """
+        return cls(kind, beam_rule(degree, rule.symmetry, rule), cells)
+
+    def masked(self, mask: Mask, cells: int = 0) -> "Sampling":
+        """The sampling with a mask in the stop. Also in `jax.jit`; differentiable in the mask.
 
         mask: the mask.
-        cells: number of cells along a side of the grid; 0 for the larger of the model's own number
+        cells: number of cells along a side of the grid; 0 for the larger of its own number
             and 8 for each pixel of the mask. docs/images.md gives the accuracy.
 
         No more rays are traced than without the mask, and kernels are centred as without it.
-        ValueError for a mask of a wrong shape, for the model "gaussian", which only has the moments
-        of the whole stop, and for a mask with a path in the model "rays".
+        ValueError for a mask of a wrong shape, for the kind "gaussian", which only has the moments
+        of the whole stop, and for a mask with a path for the kind "rays".
         """
         mask.check()
         if self.kind == "gaussian" or (self.kind == "rays" and mask.path is not None):
             what = "a mask" if mask.path is None else "a mask with a path"
-            raise ValueError(f'{what} in the model "{self.kind}": make one of "waves"')
+            raise ValueError(f'{what} in the kind "{self.kind}": make one of "waves"')
         cells = cells or max(self.cells, _FINE * max(jnp.shape(mask.amplitude)[-2:]))
         rule = dataclasses.replace(self.rule, mask=mask)
         return dataclasses.replace(self, rule=rule, cells=cells)
@@ -97,7 +116,7 @@ def psf_of_beam(
     wavelengths: (W,), um.
     pixel: (), mm.
     centre: (2,), mm, or None for the mean of the centroids.
-    size, kind, cells: as in `PsfModel` and `psf`.
+    size, kind, cells: as in `Sampling` and `psf`.
     """
     mean, (xx, xy, yy) = centroid_and_variances(beam.hits[:, -1], beam.weights)
     if centre is None:

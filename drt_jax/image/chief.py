@@ -5,17 +5,18 @@ and m_p, by the stop point p, of its hit h on the sensor and its slope m there. 
 the sensor, neighbouring rays are at h + h_p dp + s (m + m_p dp), so they meet the chief ray where
 h_p + s m_p is singular. These are the foci of Coddington's equations, for any lens, tilted or not.
 
-All functions take `fields`, F angles along y (F,) or pairs (F, 2) in radians, and return an array
-with the field as its first axis. jit, vmap and derivatives in every mode work as for `trace_rays`.
-A field whose chief ray fails has inf; one that an aperture clips counts like others. ValueError as
-of `scene_of`. Chief rays through the paraxial entrance pupil, which other programs use unless they
-aim at the stop, are those of `with_paraxial_pupil(lens)`.
+All functions take a `Scene` and return arrays whose first axes (...) are its points. jit, vmap and
+derivatives in every mode work as for `trace_rays`. A point whose chief ray fails has inf; one that
+an aperture clips counts like others. ValueError as of `lens.scene.fitted`. Chief rays through the
+paraxial entrance pupil, which other programs use unless they aim at the stop, are those of
+`with_paraxial_pupil(lens)`.
 
 Sources: Welford, Aberrations of Optical Systems (1986), ch. 4.5 and 6; conventions of the field
 curvature and distortion plots of OpticStudio where they are named.
 """
 
 import functools
+import math
 from typing import Literal, NamedTuple, get_args
 
 import jax
@@ -25,9 +26,16 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..inputs import require_one_of
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fields_array, scene_of
+from ..lens.scene import Scene, fitted, over_points
 from ..lens.surface import surface_sag
-from ..numerics import Numbers, einsum, known_values, real_array, safe_divide, safe_sqrt
+from ..numerics import (
+    Numbers,
+    einsum,
+    known_values,
+    real_array,
+    safe_divide,
+    safe_sqrt,
+)
 from ..rays.afocal import FOCAL
 from ..rays.status import reaches_sensor
 from ..rays.system import Vector, determinant, divide
@@ -36,13 +44,13 @@ from .field import CHIEF
 from .rounding import warn_of_focus
 
 Mapping = Literal["tangent", "angle"]
-# The number of fields is padded to a multiple of this, so that programs are shared.
-_FIELDS = 16
+# The number of points is padded to a multiple of this, so that programs are shared.
+_POINTS = 16
 
 
 class FieldCurvature(NamedTuple):
-    """Foci of narrow pencils about the chief rays, (F, W), mm along the z axis of the sensor, from
-    where the chief ray meets it; inf for none.
+    """Foci of narrow pencils about the chief rays, (..., W), mm along the z axis of the sensor,
+    from where the chief ray meets it; inf for none.
 
     tangential: of rays that cross the stop beside its centre in the direction of the field (y, for
         the axis).
@@ -56,10 +64,10 @@ class FieldCurvature(NamedTuple):
 class Distortion(NamedTuple):
     """Chief rays on the sensor compared with an ideal image.
 
-    relative: (F, W), displacement from the ideal point, relative to the distance of that point from
-        the image of the axis. Only the component along that distance counts; positive outwards; 0
-        on the axis.
-    real, ideal: (F, W, 2), mm, x and y on the sensor.
+    relative: (..., W), displacement from the ideal point, relative to the distance of that point
+        from the image of the axis. Only the component along that distance counts; positive
+        outwards; 0 on the axis.
+    real, ideal: (..., W, 2), mm, x and y on the sensor.
     focal_length: (W,), mm, scale of the ideal image: y by the tangent of the field, or by the
         angle.
     """
@@ -71,12 +79,12 @@ class Distortion(NamedTuple):
 
 
 class _ChiefRays(NamedTuple):
-    """The chief rays of F + 1 fields: row 0 is the axis.
+    """The chief rays of points (...).
 
-    hit: (F + 1, W, 2), mm.
-    angle, tangential, sagittal: (F + 1, W), as `chief_ray_angle` and `FieldCurvature` have them.
-    by_field: (F + 1, W, 2, 2), mm per radian, derivatives of the hit (x, y) by the field (x, y).
-    whole: (F + 1, W), bool, False where the ray fails.
+    hit: (..., W, 2), mm.
+    angle, tangential, sagittal: (..., W), as `chief_ray_angle` and `FieldCurvature` have them.
+    by_field: (..., W, 2, 2), mm per radian, derivatives of the hit (x, y) by the field (x, y).
+    whole: (..., W), bool, False where the ray fails.
     """
 
     hit: Array
@@ -87,103 +95,92 @@ class _ChiefRays(NamedTuple):
     whole: Array
 
 
-def field_curvature(
-    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers
-) -> FieldCurvature:
+def field_curvature(lens: Lens, scene: Scene) -> FieldCurvature:
     """Tangential and sagittal foci relative to the sensor, see `FieldCurvature`.
 
-    lens: the lens.
-    fields: (F,) along y or (F, 2), radians.
-    distance: mm, inf allowed.
-    wavelengths: (W,), um.
+    lens, scene: the lens, and object points with their wavelengths.
 
     Positive where the focus has the larger z, as OpticStudio plots it. In a lens without a plane of
     symmetry the two focal lines are named by the direction that they are nearer to. Warns, outside
     of a trace, where float32 moves a focus by more than 2 % of the depth of focus,
     wavelength / NA^2.
     """
-    warn_of_focus(lens, distance, wavelengths)
-    found = _chief_rays(lens, fields, distance, wavelengths)
-    return FieldCurvature(found.tangential[1:], found.sagittal[1:])
+    scene = fitted(lens, scene)
+    warn_of_focus(lens, scene)
+    found = _chief_rays(lens, scene)
+    return FieldCurvature(found.tangential, found.sagittal)
 
 
-def chief_ray_angle(lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
+def chief_ray_angle(lens: Lens, scene: Scene) -> Array:
     """Angle between the chief ray and the normal of the sensor's vertex.
 
-    lens, fields, distance, wavelengths: as in `field_curvature`.
+    lens, scene: as in `field_curvature`.
 
-    Returns (F, W), radians, 0 or more.
+    Returns (..., W), radians, 0 or more.
     """
-    return _chief_rays(lens, fields, distance, wavelengths).angle[1:]
+    return _chief_rays(lens, fitted(lens, scene)).angle
 
 
-def lateral_colour(
-    lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    reference: int | None = None,
-) -> Array:
+def lateral_colour(lens: Lens, scene: Scene, reference: int | None = None) -> Array:
     """Hits of the chief rays on the sensor, less those of a reference wavelength.
 
-    lens, fields, distance, wavelengths: as in `field_curvature`.
+    lens, scene: as in `field_curvature`.
     reference: index of the reference wavelength; None: the middle one, W // 2.
 
-    Returns (F, W, 2), mm along x and y of the sensor. ValueError for an index out of range.
+    Returns (..., W, 2), mm along x and y of the sensor. ValueError for an index out of range.
     """
-    found = _chief_rays(lens, fields, distance, wavelengths)
-    middle = found.whole.shape[1] // 2 if reference is None else reference
-    if not -found.whole.shape[1] <= middle < found.whole.shape[1]:
-        raise ValueError(f"reference: expected an index of the wavelengths, got {reference!r}")
-    moved = found.hit - found.hit[:, middle, None]
-    whole = found.whole & found.whole[:, middle, None]
-    return jnp.where(whole[..., None], moved, jnp.inf)[1:]
+    scene = fitted(lens, scene)
+    middle = scene.reference(reference)
+    found = _chief_rays(lens, scene)
+    moved = found.hit - found.hit[..., middle, None, :]
+    whole = found.whole & found.whole[..., middle, None]
+    return jnp.where(whole[..., None], moved, jnp.inf)
 
 
 def distortion(
     lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
+    scene: Scene,
     mapping: Mapping = "tangent",
     focal_length: Numbers | Literal["fitted"] | None = None,
 ) -> Distortion:
     """Chief rays compared with the ideal image f tan(field) or f field, see `Distortion`.
 
-    lens, fields, distance, wavelengths: as in `field_curvature`.
+    lens, scene: as in `field_curvature`.
     mapping: "tangent"; or "angle" (f-theta), for a field (x, y) the angle to the axis.
     focal_length: f, () or (W,), mm; None: the limit of real chief rays near the axis, on the sensor
         where it is, which is OpticStudio's reference; "fitted": calibrated, the least squares over
-        these fields. A finite distance has the same formulae, with tan(field) = height / distance.
-        For a lens without an axis a matrix takes the place of f, the derivative of the hit at the
-        field 0.
+        the fields of the scene. A finite distance has the same formulae, with
+        tan(field) = height / distance. For a lens without an axis a matrix takes the place of f,
+        the derivative of the hit at the field 0.
 
-    ValueError for another mapping or focal length.
+    ValueError for another mapping or focal length, and for points at several distances.
     """
     require_one_of("mapping", mapping, get_args(Mapping))
     if isinstance(focal_length, str) and focal_length != "fitted":
         raise ValueError(f"focal_length: expected mm, None or 'fitted', got {focal_length!r}")
-    dtype = lens.curvature.dtype
-    angles = fields_array(fields, dtype)
-    found = _chief_rays(lens, fields, distance, wavelengths)
-    waves = found.whole.shape[1]
+    scene, dtype = fitted(lens, scene), lens.curvature.dtype
+    line = scene.with_axis()
+    found, waves = _chief_rays(lens, line), len(scene.wavelengths)
     scale = found.by_field[0]
     if focal_length is not None and not isinstance(focal_length, str):
         length = real_array("focal_length", focal_length, dtype)
         if length.shape not in ((), (waves,)):
             raise ValueError(f"focal_length: expected () or ({waves},), got {length.shape}")
         scale = jnp.broadcast_to(length, (waves,))[:, None, None] * jnp.eye(2, dtype=dtype)[None]
-    fitted = isinstance(focal_length, str)
-    return _distortion(found, angles, scale, mapping, fitted, lens.afocal)
+    calibrated = isinstance(focal_length, str)
+    bent = _distortion(found, line.field, scale, mapping, calibrated, lens.afocal)
+    relative, real, ideal = (a.reshape(*scene.shape, *a.shape[1:]) for a in bent[:3])
+    return Distortion(relative, real, ideal, bent.focal_length)
 
 
-@functools.partial(jax.jit, static_argnames=("mapping", "fitted", "afocal"))
+@functools.partial(jax.jit, static_argnames=("mapping", "calibrated", "afocal"))
 def _distortion(
-    found: _ChiefRays, angles: Array, scale: Array, mapping: Mapping, fitted: bool, afocal: bool
+    found: _ChiefRays, fields: Array, scale: Array, mapping: Mapping, calibrated: bool, afocal: bool
 ) -> Distortion:
-    """`distortion` from chief rays, angles (F, 2) and scale (W, 2, 2), mm."""
+    """`distortion` from chief rays of fields (F + 1, 2), the axis first, and scale (W, 2, 2),
+    mm."""
     whole = found.whole[1:] & found.whole[:1]
-    place = jnp.tan(angles)
+    place = jnp.tan(fields[1:])
     if afocal and mapping == "tangent":  # hits are angles, in mrad: compare their tangents
         size = safe_sqrt(jnp.sum(found.hit**2, axis=-1, keepdims=True)) / FOCAL
         longer = jnp.where(size > 0, safe_divide(jnp.tan(size), size), 1)
@@ -195,7 +192,7 @@ def _distortion(
     moved = jnp.where(whole[..., None], found.hit[1:] - found.hit[:1], 0)
     along, square = jnp.sum(moved * ideal, axis=-1), jnp.sum(ideal**2, axis=-1)
     square = jnp.where(whole, square, 0)
-    if fitted:
+    if calibrated:
         factor = safe_divide(jnp.sum(along, axis=0), jnp.sum(square, axis=0))
         scale, ideal = scale * factor[:, None, None], ideal * factor[None, :, None]
         along, square = along * factor[None], square * factor[None] ** 2
@@ -207,33 +204,34 @@ def _distortion(
     return Distortion(relative, real, ideal, focal_length)
 
 
-def _chief_rays(lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers) -> _ChiefRays:
-    """The chief rays of the axis and of all fields."""
-    angles = fields_array(fields, lens.curvature.dtype)
-    scene = scene_of(lens, 0.0, distance, wavelengths)
-    count = len(angles)
-    # Padding lets similar numbers of fields share a program.
-    spare = -(count + 1) % _FIELDS if known_values((lens, angles, scene)) is not None else 0
-    angles = jnp.pad(angles, ((1, spare), (0, 0)))
-    found = _traced(lens, angles, scene)
-    return jax.tree.map(lambda a: a[: count + 1], found)
+def _chief_rays(lens: Lens, scene: Scene) -> _ChiefRays:
+    """The chief rays of the points of a scene that fits the lens."""
+    if known_values((lens, scene)) is None:
+        return _traced(lens, scene)
+    # Padding lets similar numbers of points share a program.
+    count, shape = math.prod(scene.shape), scene.shape
+    pad = lambda a: jnp.resize(a, (count + -count % _POINTS, *a.shape[1:]))  # noqa: E731
+    fields = pad(jnp.broadcast_to(scene.field, (*shape, 2)).reshape(-1, 2))
+    far = scene.distance
+    far = pad(jnp.broadcast_to(far, shape).reshape(-1)) if far.ndim else far
+    found = _traced(lens, scene.at(fields, far))
+    return jax.tree.map(lambda a: a[:count].reshape(*shape, *a.shape[1:]), found)
 
 
 @functools.partial(jit, wanted=LARGE)
-def _traced(lens: Lens, fields: Array, scene: Scene) -> _ChiefRays:
-    """The chief rays of fields (F + 1, 2)."""
-    one = functools.partial(_chief_ray, lens, scene)
-    return jax.vmap(one)(fields)
+def _traced(lens: Lens, scene: Scene) -> _ChiefRays:
+    """`_chief_rays`, compiled."""
+    return over_points(functools.partial(_chief_ray, lens), scene)
 
 
-def _chief_ray(lens: Lens, axis: Scene, field: Array) -> _ChiefRays:
-    """The chief rays of one field."""
+def _chief_ray(lens: Lens, scene: Scene) -> _ChiefRays:
+    """The chief rays of one point."""
+    field = scene.field
 
     def arriving(point: Vector, field: Array) -> tuple[tuple[Vector, Array, Vector], tuple]:
         """Hit, sag and slope at the sensor, which are differentiated; and whether the ray
         exists, with its direction cosines."""
-        scene = Scene(field, axis.distance, axis.wavelengths)
-        bundle = trace_bundle(lens, scene, point)
+        bundle = trace_bundle(lens, scene.at(field), point)
         whole = reaches_sensor(bundle.status)
         hit = tuple(jnp.where(whole, h[-1], 0)[:, 0] for h in bundle.hits)
         *across, along = (jnp.where(whole, a, 0)[:, 0] for a in bundle.arrival)
@@ -253,7 +251,7 @@ def _chief_ray(lens: Lens, axis: Scene, field: Array) -> _ChiefRays:
         d_hit, d_sag, d_slope = jvp(shift, jnp.zeros_like(field))
         columns.append(([a - m * d_sag for a, m in zip(d_hit, slope)], d_slope))
     by_field = jnp.stack([jnp.stack(jvp(still, unit)[0], axis=-1) for unit in units], axis=-1)
-    tangential, sagittal = _foci(Scene(field, axis.distance, axis.wavelengths), columns)
+    tangential, sagittal = _foci(scene, columns)
     sine = safe_sqrt(across[0] ** 2 + across[1] ** 2)
     angle = jnp.arctan2(sine, jnp.where(whole, jnp.abs(along), 1))
     if lens.afocal:

@@ -10,7 +10,6 @@ the fringe terms, Wyant and Creath, Basic Wavefront Aberration Theory (1992).
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -18,8 +17,8 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.forms import fringe_terms, noll_terms
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fields_array, scene_of
-from ..numerics import Numbers, einsum
+from ..lens.scene import Scene, fitted, over_points
+from ..numerics import einsum
 from ..pupil.patterns import disc
 from ..rays.status import Status, reaches_sensor
 from ..rays.trace import trace_bundle
@@ -33,33 +32,26 @@ _ORDER, _AZIMUTHS = 13, 26
 _MOST = 91
 
 
-def zernike_standard(
-    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, count: int = 37
-) -> Array:
+def zernike_standard(lens: Lens, scene: Scene, count: int = 37) -> Array:
     """Coefficients of Noll's Zernike polynomials, which are orthonormal over the disc: the squares
     of all but the first add up to the mean square wavefront error.
 
-    lens: the lens.
-    fields: (F,) along y or (F, 2), radians.
-    distance: mm, inf allowed.
-    wavelengths: (W,), um.
+    lens, scene: the lens, and object points with their wavelengths.
     count: number of coefficients, 1 to 91.
 
-    Returns (F, W, count), waves; inf where the chief ray fails, or where so many rays fail that the
-    fit is not determined. Differentiable in every mode. Warns of float32 as `wavefront` does.
+    Returns (..., W, count), waves; inf where the chief ray fails, or where so many rays fail that
+    the fit is not determined. Differentiable in every mode. Warns of float32 as `wavefront` does.
     """
-    return _coefficients(lens, fields, distance, wavelengths, _checked(count, _MOST))
+    return _coefficients(lens, scene, tuple(range(_checked(count, _MOST))))
 
 
-def zernike_fringe(
-    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, count: int = 37
-) -> Array:
+def zernike_fringe(lens: Lens, scene: Scene, count: int = 37) -> Array:
     """Coefficients of the fringe Zernike polynomials, which are 1 at the edge of the disc.
 
-    lens, fields, distance, wavelengths: as in `zernike_standard`.
+    lens, scene: as in `zernike_standard`.
     count: number of coefficients, 1 to 37.
 
-    Returns (F, W, count), waves; else as `zernike_standard`.
+    Returns (..., W, count), waves; else as `zernike_standard`.
     """
     count = _checked(count, 37)
     terms = fringe_terms()[:count]
@@ -67,10 +59,9 @@ def zernike_fringe(
     noll = noll_terms(most)
     scale = np.array([np.sqrt(n + 1 if m == 0 else 2 * (n + 1)) for n, m in terms])
     # Only these terms are fitted, as the standard coefficients are a fit of their own terms.
-    rows = np.array([noll.index(term) for term in terms])
-    return (
-        _coefficients(lens, fields, distance, wavelengths, tuple(rows.tolist())) * scale[None, None]
-    )
+    rows = tuple(noll.index(term) for term in terms)
+    found = _coefficients(lens, scene, rows)
+    return found * jnp.expand_dims(scale, range(found.ndim - 1))
 
 
 def _checked(count: int, most: int) -> int:
@@ -80,25 +71,16 @@ def _checked(count: int, most: int) -> int:
     return int(count)
 
 
-def _coefficients(
-    lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    rows: int | tuple[int, ...],
-) -> Array:
-    """Coefficients (F, W, P) of terms given by their indices in Noll's order, counted from 0; a
-    number stands for the first ones."""
-    rows = tuple(range(rows)) if isinstance(rows, int) else rows
-    axis = scene_of(lens, 0.0, distance, wavelengths)
-    angles = fields_array(fields, lens.curvature.dtype)
-    warn_of_paths(lens, axis, angles, 4)
-    return _fitted(lens, angles, axis, rows)
+def _coefficients(lens: Lens, scene: Scene, rows: tuple[int, ...]) -> Array:
+    """Coefficients (..., W, P) of terms given by their indices in Noll's order, counted from 0."""
+    scene = fitted(lens, scene)
+    warn_of_paths(lens, scene, 4)
+    return _least_squares(lens, scene, rows)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="rows")
-def _fitted(lens: Lens, fields: Array, axis: Scene, rows: tuple[int, ...]) -> Array:
-    """The least-squares fit: the normal equations of the terms, solved for each field and
+def _least_squares(lens: Lens, scene: Scene, rows: tuple[int, ...]) -> Array:
+    """The least-squares fit: the normal equations of the terms, solved for each point and
     wavelength."""
     points, weights = disc(_ORDER, _AZIMUTHS)
     degree = next(n for n in range(40) if (n + 1) * (n + 2) // 2 > max(rows))
@@ -106,9 +88,9 @@ def _fitted(lens: Lens, fields: Array, axis: Scene, rows: tuple[int, ...]) -> Ar
     aimed = jnp.asarray(np.concatenate([np.zeros((1, 2)), points]).T, dtype)
     basis = zernike(aimed[:, 1:], degree)[np.array(rows)]
 
-    def one(field: Array) -> Array:
-        bundle = trace_bundle(lens, Scene(field, axis.distance, axis.wavelengths), tuple(aimed))
-        opd, status, _ = path_differences(lens, axis.wavelengths, bundle)
+    def one(point: Scene) -> Array:
+        bundle = trace_bundle(lens, point, tuple(aimed))
+        opd, status, _ = path_differences(lens, scene.wavelengths, bundle)
         light = jnp.asarray(weights, dtype)[None] * (status[:, 1:] == Status.OK).astype(dtype)
         whole = reaches_sensor(status[:, 0])
         enough = whole & (jnp.sum(light > 0, axis=-1) > 2 * len(rows))
@@ -118,4 +100,4 @@ def _fitted(lens: Lens, fields: Array, axis: Scene, rows: tuple[int, ...]) -> Ar
         found = jnp.linalg.solve(normal, right[..., None])[..., 0]
         return jnp.where(enough[:, None], found, jnp.inf)
 
-    return jax.vmap(one)(fields)
+    return over_points(one, scene)

@@ -1,10 +1,9 @@
 """Moments to a tolerance: the pupil rule that a scene needs, found by trials.
 
 The number of rays cannot depend on the values of tracers. So inside `jax.jit` and `jax.vmap`,
-`psf_moments` and `focus_moments` take a rule that was made outside.
+`psf_moments` and `focus_moments` take a rule that `converge` made outside.
 """
 
-import itertools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -13,12 +12,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require_tolerance
 from ..lens.lens import Lens
-from ..lens.scene import Scene, field_array, scene_of
-from ..numerics import Numbers, concrete, known_values, real_array
+from ..lens.scene import Scene, fitted, over_points
+from ..numerics import Numbers, concrete, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import (
     Gauss,
@@ -50,97 +49,63 @@ _DIAGNOSIS = 8
 _TOLERANCE = 1e-6
 
 
-def psf_moments(
-    lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    tolerance: float | None = None,
-    rule: PupilRule | None = None,
-) -> Moments:
+def psf_moments(lens: Lens, scene: Scene, sampling: float | PupilRule = _TOLERANCE) -> Moments:
     """Centroid, covariance and throughput of the rays on the sensor. Paper section 4.3.
 
-    lens: the lens.
-    field: angle along y, or (x, y), radians.
-    distance: from the object plane to the first vertex, mm; inf allowed.
-    wavelengths: (W,), um.
-    tolerance: relative error of the RMS spot size, 1e-6 by default, from which the rule is chosen.
-        In float32 the error of a camera's spot is about 1e-3 of its size or of 4 um; warns if that
-        is above the tolerance.
-    rule: pupil rule instead of a tolerance. Needed inside `jax.jit` and `jax.vmap`; make it outside
-        with `converged_rule`.
+    lens, scene: the lens, and object points with their wavelengths.
+    sampling: a tolerance, the relative error of the RMS spot size, from which a pupil rule is
+        chosen; or a pupil rule, which is needed inside `jax.jit` and `jax.vmap`: `converge` makes
+        one outside. In float32 the error of a camera's spot is about 1e-3 of its size or of 4 um;
+        warns if that is above the tolerance.
 
-    Returns `Moments`. Rays fill the stop uniformly. Differentiable in every mode, in the lens,
-    field, distance and wavelengths. ValueError as in `scene_of`, and if no ray of a wavelength
-    arrives, with the surfaces that stop its light. Inside a trace its `throughput` is then 0 and
-    its covariance inf.
+    Returns `Moments`, with the points of the scene as first axes. Rays fill the stop uniformly.
+    Differentiable in every mode, in the lens and the scene. ValueError as in `lens.scene.fitted`,
+    and if no ray of a wavelength arrives, with the surfaces that stop its light. Inside a trace its
+    `throughput` is then 0 and its covariance inf.
     """
-    found = _moments(lens, field, distance, wavelengths, tolerance, rule, at_sensor)
+    found = _moments(lens, scene, sampling, at_sensor)
     return found.at(lens.sensor)
 
 
 def focus_moments(
-    lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    tolerance: float | None = None,
-    rule: PupilRule | None = None,
+    lens: Lens, scene: Scene, sampling: float | PupilRule = _TOLERANCE
 ) -> FocusMoments:
     """Moments of the rays as functions of the sensor position; the sensor is flat.
 
-    lens, field, distance, wavelengths: as in `psf_moments`.
-    tolerance: as there, but it holds at every sensor position.
-    rule: as there; `converged_focus_rule` makes it.
+    lens, scene: as in `psf_moments`.
+    sampling: as there, but a tolerance holds at every sensor position.
 
     Returns `FocusMoments`. ValueError as in `psf_moments`, for an afocal lens, and for an element
     that rotates surfaces about the sensor.
     """
     check_focus(lens)
-    return _moments(lens, field, distance, wavelengths, tolerance, rule, best_focus)
+    return _moments(lens, scene, sampling, best_focus)
 
 
-def converged_rule(
-    lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    tolerance: float = _TOLERANCE,
-) -> PupilRule:
+def converged_rule(lens: Lens, scene: Scene, tolerance: float = _TOLERANCE) -> PupilRule:
     """The pupil rule that keeps the relative error of the RMS spot size on the sensor within a
-    tolerance, for every field at every distance.
+    tolerance, for every point of a scene.
 
-    lens: the lens.
-    field: angle along y, or (x, y), or many pairs (F, 2), radians.
-    distance: one or (Z,), mm.
-    wavelengths, tolerance: as in `psf_moments`.
+    lens, scene, tolerance: as in `psf_moments`.
 
     Returns a Gauss rule on the stop or, if rays are clipped or fail, a rule fitted to the rest of
     the pupil. It is the first order whose covariance, relative to its trace, differs from those of
     the next two orders by at most the tolerance; two orders alone may agree by accident. Warns if
     no order does. ValueError inside a trace, or if no ray arrives.
     """
-    sought = field, distance, wavelengths
-    return converge(scenes_of, lens, sought, tolerance, at_sensor).rule
+    return find_rule(lens, scene, tolerance, at_sensor).rule
 
 
-def converged_focus_rule(
-    lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    tolerance: float = _TOLERANCE,
-) -> PupilRule:
+def converged_focus_rule(lens: Lens, scene: Scene, tolerance: float = _TOLERANCE) -> PupilRule:
     """`converged_rule` for every sensor position: the tolerance also holds where the spot is
     smallest.
 
-    lens, field, distance, wavelengths, tolerance: as in `converged_rule`.
+    lens, scene, tolerance: as in `converged_rule`.
 
     ValueError as in `focus_moments`.
     """
     check_focus(lens)
-    sought = field, distance, wavelengths
-    return converge(scenes_of, lens, sought, tolerance, best_focus).rule
+    return find_rule(lens, scene, tolerance, best_focus).rule
 
 
 def at_sensor(spread: np.ndarray) -> list[np.ndarray]:
@@ -161,41 +126,47 @@ def best_focus(spread: np.ndarray) -> list[np.ndarray]:
 
 
 def _moments(
-    lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    tolerance: float | None,
-    rule: PupilRule | None,
-    places: Callable,
+    lens: Lens, scene: Scene, sampling: float | PupilRule, places: Callable
 ) -> FocusMoments:
     """`psf_moments` and `focus_moments`; `places` is `at_sensor` or `best_focus`."""
-    if not (tolerance is None or rule is None):
-        raise ValueError("tolerance and rule: give one of them; a rule has its own precision")
-    if rule is None:
-        tolerance = _TOLERANCE if tolerance is None else tolerance
-        sought = field, distance, wavelengths
-        trial = converge(lambda *one: [scene_of(*one)], lens, sought, tolerance, places)
-        if concrete((lens, sought)):
-            return jax.tree.map(jnp.asarray, trial.moments[0])
+    if not isinstance(sampling, PupilRule):
+        trial = find_rule(lens, scene, sampling, places)
+        scene = fitted(lens, scene)
+        if concrete((lens, scene)):
+            return _stacked(trial.moments, scene)
         # The rays are already found: only weigh them, with derivatives.
-        scene = scene_of(lens, field, distance, wavelengths)
-        return _weigh_known(lens, scene, trial.used, trial.found[0])
-    scene = scene_of(lens, field, distance, wavelengths)
+        pairs = zip(scene.each(), trial.found, strict=True)
+        return _stacked([_weigh_known(lens, one, trial.used, found) for one, found in pairs], scene)
+    scene, rule = fitted(lens, scene), sampling
     require_fit(rule.symmetry, scene.field)
     found = _weigh(lens, scene, rule)
     throughput = known_values(found.throughput)
     if throughput is not None and not np.all(np.asarray(throughput) > 0):
-        _no_light(lens, scene, rule.symmetry, throughput)
+        dark = np.min(np.asarray(throughput).reshape(-1, len(scene.wavelengths)), axis=1)
+        worst = int(np.argmin(dark))
+        light = np.asarray(throughput).reshape(len(dark), -1)[worst]
+        _no_light(lens, scene.each()[worst], rule.symmetry, light)
     return found
+
+
+def _stacked(each: Sequence[FocusMoments], scene: Scene) -> FocusMoments:
+    """Moments of the points of a scene with its shape as first axes."""
+    if not scene.shape:
+        return jax.tree.map(jnp.asarray, each[0])
+    joined = lambda *values: jnp.stack(values).reshape(*scene.shape, *values[0].shape)  # noqa: E731
+    return jax.tree.map(joined, *each)
 
 
 @partial(jit, wanted=LARGE)
 def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> FocusMoments:
     """Moments of a rule: traces its rays and weighs them."""
-    points, weights = rule.points(lens, scene)
-    weights = jnp.where(fits(rule.symmetry, scene.field), weights, 0)
-    return weigh(lens, rule, weights, trace_bundle(lens, scene, points))
+
+    def one(point: Scene) -> FocusMoments:
+        points, weights = rule.points(lens, point)
+        weights = jnp.where(fits(rule.symmetry, point.field), weights, 0)
+        return weigh(lens, rule, weights, trace_bundle(lens, point, points))
+
+    return over_points(one, scene)
 
 
 @jax.jit
@@ -223,53 +194,32 @@ class _Trial(NamedTuple):
     found: tuple[Found, ...]
 
 
-def scenes_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> list[Scene]:
-    """A list with one `Scene` for each field at each distance; arguments as in `converged_rule`."""
-    lens.check()
-    dtype = lens.curvature.dtype
-    fields = _each(field_array(field, dtype), 2)
-    distances = _each(real_array("distance", distance, dtype), 1)
-    return [scene_of(lens, *pair, wavelengths) for pair in itertools.product(fields, distances)]
-
-
-def _each(values: Array, rank: int) -> list[Array]:
-    """The rows of an array of a given rank; for another rank a list of the array itself."""
-    return [*values] if values.ndim == rank and values.size else [values]
-
-
-def converge(
-    make: Callable[..., list[Scene]],
-    lens: Lens,
-    sought: tuple[Numbers, Numbers, Numbers],
-    tolerance: float,
-    places: Callable,
-    warns: bool = True,
+def find_rule(
+    lens: Lens, scene: Scene, tolerance: float, places: Callable, warns: bool = True
 ) -> _Trial:
-    """Finds the rule that meets a tolerance.
+    """Finds the rule that meets a tolerance for all points of a scene.
 
-    make: makes a list of scenes from the lens and `sought`.
-    lens: the lens.
-    sought: fields, distances and wavelengths.
+    lens, scene: the lens and the scene.
     tolerance: relative error of the RMS spot size.
     places: `at_sensor` or `best_focus`.
     warns: whether it warns of rounding.
 
     Returns the trial of that rule. ValueError inside a trace.
     """
-    if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
-    known = known_values((lens, sought))
+    tolerance = require_tolerance(tolerance)
+    known = known_values((lens, scene))
     if known is None:
         raise ValueError(
             "inside jax.jit or jax.vmap the number of rays cannot follow from a tolerance: make "
-            "the rule outside and pass it on, rule=drt_jax.converged_rule(lens, field, distance, "
-            "wavelengths, tolerance)"
+            "the rule outside and pass it on, sampling=drt_jax.converge(drt_jax.psf_moments, lens, "
+            "scene, tolerance)"
         )
     # `eval_context` leaves any trace that this is called in, so all that follows is known.
     with jax.core.eval_context():
-        lens, sought = known
-        scenes = make(lens, *sought)
-        return _try_orders(lens, scenes, symmetry_of(lens, sought[0]), tolerance, places, warns)
+        lens, scene = known
+        scene = fitted(lens, scene)
+        symmetry = symmetry_of(lens, scene.field)
+        return _try_orders(lens, scene.each(), symmetry, tolerance, places, warns)
 
 
 def _try_orders(
@@ -372,7 +322,7 @@ def _no_light(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers)
     lens, scene = known_values((lens, scene))
     with jax.core.eval_context():
         # In an eager gradient the values were not known before, so check them now.
-        scene_of(lens, scene.field, scene.distance, scene.wavelengths)
+        fitted(lens, scene)
         rule = Pattern(*gauss_points(_DIAGNOSIS, symmetry), symmetry)
         found = trace_rule(lens, scene, rule, solve).found
         raise ValueError(

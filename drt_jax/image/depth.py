@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..lens.scene import distance_array, scene_of, vergence_of
+from ..lens.scene import Scene, distance_array, fitted, vergence_of
 from ..numerics import Numbers, concrete, tensordot
 from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
@@ -58,26 +58,20 @@ class DepthMoments:
         return jax.tree.map(lambda c: tensordot(basis, c, axes=1), self.series)
 
 
-def depth_moments(
-    lens: Lens,
-    field: Numbers,
-    near: float,
-    far: float,
-    wavelengths: Numbers,
-    tolerance: float = 1e-9,
-) -> DepthMoments:
-    """Moments for every sensor position and every distance between `near` and `far`.
+def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMoments:
+    """Moments for every sensor position and every distance between those of a scene.
 
-    lens, field, wavelengths: as in `focus_moments`.
-    near, far: range of the distance, mm.
+    lens: the lens.
+    scene: one field at the nearest and the farthest distance, as of `Scene.point`.
     tolerance: bound of the last coefficients of the moments, relative to the largest.
 
     Returns `DepthMoments`. The number of Chebyshev nodes in 1/distance doubles until the tolerance
     is met, from 4 to at most 64, where it warns; each node has its own converged rule. ValueError
     inside a trace, and unless 0 < near < far.
     """
-    if not concrete((near, far)):
-        raise ValueError("inside jax.jit or jax.vmap the nodes cannot follow: give near and far")
+    if not concrete(scene.distance):
+        raise ValueError("inside jax.jit or jax.vmap the nodes cannot follow: give known distances")
+    near, far = (float(end(scene.distance)) for end in (np.min, np.max))
     if not 0 < near < far:
         raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
     low, high = 1 / far, 1 / near
@@ -87,7 +81,7 @@ def depth_moments(
         nodes = (high + low) / 2 + (high - low) / 2 * np.cos(angle)
         transform = 2 / count * np.cos(np.outer(np.arange(count), angle))
         transform[0] /= 2
-        traced = [focus_moments(lens, field, 1 / node, wavelengths, tolerance) for node in nodes]
+        traced = [focus_moments(lens, scene.at(scene.field, 1 / node), tolerance) for node in nodes]
         series = jax.tree.map(
             lambda *values: tensordot(
                 jnp.asarray(transform, values[0].dtype), jnp.stack(values), axes=1
@@ -115,9 +109,7 @@ def depth_moments(
 def moments_model(
     lens: Lens,
     trained: tuple[str, ...],
-    field: Numbers,
-    distances: tuple[float, float],
-    wavelengths: Numbers,
+    scene: Scene,
     tolerance: float = 1e-6,
 ) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], Moments]]:
     """The cheapest exact model of the moments for trained parameters. If only the sensor is
@@ -126,34 +118,31 @@ def moments_model(
 
     lens: the lens.
     trained: names of fields of `Lens`.
-    field, wavelengths, tolerance: as in `focus_moments`.
-    distances: nearest and farthest, mm; equal for one distance.
+    scene: one field, at one distance or at the nearest and the farthest.
+    tolerance: as in `focus_moments`.
 
     Returns a dict with the initial values of the trained parameters, and a function (values,
     distance) -> `Moments`.
     """
-    near, far = distances
-    for distance in distances:
-        distance_array(distance, lens.curvature.dtype)
     values = {name: getattr(lens, name) for name in trained}
     if set(trained) <= {"sensor"}:
-        if near == far:
-            focus = focus_moments(lens, field, near, wavelengths, tolerance)
+        if np.min(scene.distance) == np.max(scene.distance):
+            focus = focus_moments(lens, scene.at(scene.field, np.min(scene.distance)), tolerance)
             at = lambda distance: focus  # noqa: E731
         else:
-            at = depth_moments(lens, field, near, far, wavelengths, tolerance).at
+            at = depth_moments(lens, scene, tolerance).at
 
         def from_plane(values, distance):
             """Moments from the polynomials, without a trace."""
             return at(distance).at(values.get("sensor", lens.sensor))
 
         return values, from_plane
-    rule = converged_focus_rule(lens, field, np.unique([near, far]), wavelengths, tolerance)
+    rule = converged_focus_rule(lens, scene, tolerance)
 
     def retrace(values, distance):
         """Moments of rays that are traced with a fixed rule."""
         changed = dataclasses.replace(lens, **values)
-        scene = scene_of(changed, field, distance, wavelengths)
-        return moments(changed, scene, rule, solve_reverse).at(changed.sensor)
+        point = fitted(changed, scene.at(scene.field, distance))
+        return moments(changed, point, rule, solve_reverse).at(changed.sensor)
 
     return values, retrace

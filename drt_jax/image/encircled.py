@@ -19,18 +19,20 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..numerics import Numbers, einsum, safe_divide, safe_sqrt
+from ..lens.scene import Scene, fitted
+from ..numerics import Numbers, batched, einsum, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
+from .beam_psf import Sampling
 from .ray_psf import ray_spots, spot_below
 from .refined import TOLERANCE, beams_of, to_tolerance
-from .transfer import Model, arrays_of, centre_of, through_focus
+from .transfer import Model, centre_of, places_of, planned, through_focus
 from .wave_psf import amplitudes, autocorrelation, period
 
 _UM = 1e3  # per mm
-# Degree of the polynomials; and the smallest number of cells to begin with, because the treatment
-# of edge cells does not help the energy.
-_DEGREE, _LEAST = 14, 96
+# Smallest number of cells to begin with, because the treatment of edge cells does not help the
+# energy.
+_LEAST = 96
 # Polynomials 9.4.4 and 9.4.6 of Abramowitz and Stegun, in (z / 3)^2 and in 3 / z: accurate to 1e-7.
 _NEAR = (0.5, -0.56249985, 0.21093573, -0.03954289, 0.00443319, -0.00031761, 0.00001109)
 _SIZE = (0.79788456, 0.00000156, 0.01659667, 0.00017105, -0.00249511, 0.00113653, -0.00020033)
@@ -39,57 +41,43 @@ _PHASE = (-2.35619449, 0.12499612, 0.0000565, -0.00637879, 0.00074348, 0.0007982
 
 def encircled_energy(
     lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
+    scene: Scene,
     radii: Numbers,
-    model: Model = "waves",
+    kind: Model | None = None,
     focus: Numbers = 0.0,
-    wavelength_weights: Numbers | None = None,
-    rule: PupilRule | None = None,
-    degree: int = _DEGREE,
-    cells: int | None = None,
-    tolerance: float = TOLERANCE,
+    sampling: float | PupilRule | Sampling = TOLERANCE,
 ) -> Array:
     """Fraction of the light on the sensor within circles about the centroid of all wavelengths.
 
-    lens, fields, distance, wavelengths, model, focus, wavelength_weights, rule, degree: as in
-        `transfer`.
+    lens, scene, kind, focus: as in `transfer`.
     radii: (N,), mm.
-    cells: number of cells along a side of the pupil grid. None: as many as keep the error of the
-        fraction below `tolerance` and periodic copies of waves out of the largest circle; inside
-        `jit` and `vmap` 128.
-    tolerance: absolute error of the fraction.
+    sampling: as in `transfer`; a tolerance is the absolute error of the fraction. There are enough
+        cells to keep periodic copies of waves out of the largest circle, too.
 
-    Returns (F, N), or (F, Z, N) with Z values of `focus`; 0 where no light arrives. A spot too
+    Returns (..., N), or (..., Z, N) with Z values of `focus`; 0 where no light arrives. A spot too
     large for the grid of waves, 64 Airy radii for 128 cells, is computed by rays. Errors as of
     `transfer`.
     """
-    scene = fields, distance, wavelengths
-    arrays = arrays_of(lens, scene, model, focus, wavelength_weights, rule, "radii", radii)
-    angles, axis, values, spectrum, steps, rule = arrays
-    beams = beams_of(lens, angles, axis, rule, degree)
-    run = functools.partial(_encircled, model=model)
-    known = lens, beams, axis.wavelengths, values, spectrum, steps
-    fewest = lambda *known: max(_LEAST, _cells(*known) if model == "waves" else 0)  # noqa: E731
-    return to_tolerance(run, known, cells, tolerance, fewest)
+    scene, plan = fitted(lens, scene), planned(lens, scene, kind, sampling)
+    values, steps = places_of(lens, "radii", radii, focus)
+    beams, axes = beams_of(lens, scene, plan.rule), len(scene.shape)
+    run = functools.partial(_encircled, model=plan.kind, axes=axes)
+    known = lens, beams, (scene.wavelengths, values, scene.spectrum), steps
+    fewest = lambda *known: max(_LEAST, _cells(*known, axes) if plan.kind == "waves" else 0)  # noqa: E731
+    return to_tolerance(run, known, plan.cells, plan.tolerance, fewest)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells"))
+@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells", "axes"))
 def _encircled(
-    lens: Lens,
-    beams: Beam,
-    wavelengths: Array,
-    radii: Array,
-    spectrum: Array,
-    focus: Array,
-    model: Model,
-    cells: int,
-) -> Array:
-    """`encircled_energy` of beams with F as first axis, for a number of cells."""
-    settings = wavelengths, radii, spectrum, model, cells
-    one = lambda beam: encircled(lens, beam, *settings)  # noqa: E731
-    return jax.vmap(lambda beam: through_focus(beam, focus, one))(beams)
+    lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array, model: Model,
+    cells: int, axes: int
+) -> Array:  # fmt: skip
+    """`encircled_energy` of beams with a number of leading axes, for a number of cells.
+
+    asked: wavelengths (W,), radii (N,) and spectrum (W,).
+    """
+    one = lambda beam: encircled(lens, beam, *asked, model, cells)  # noqa: E731
+    return batched(lambda beam: through_focus(beam, focus, one), axes)(beams)
 
 
 def encircled(
@@ -192,11 +180,11 @@ def _bessel(z: Array) -> Array:
 
 @functools.partial(jit, wanted=LARGE)
 def _cells(
-    lens: Lens, beams: Beam, wavelengths: Array, radii: Array, spectrum: Array, focus: Array
+    lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array, axes: int
 ) -> Array:
     """Number of cells, (), for which all spots and circles fit into one period of the pattern."""
-    most = lambda beam: jnp.max(cells_needed(beam, wavelengths, radii))  # noqa: E731
-    return jnp.max(jax.vmap(lambda beam: through_focus(beam, focus, most))(beams))
+    most = lambda beam: jnp.max(cells_needed(beam, *asked[:2]))  # noqa: E731
+    return jnp.max(batched(lambda beam: through_focus(beam, focus, most), axes)(beams))
 
 
 def cells_needed(beam: Beam, wavelengths: Array, radii: Array) -> Array:

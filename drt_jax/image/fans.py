@@ -8,7 +8,6 @@ the stop.
 import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,7 +15,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
-from ..lens.scene import Scene, fields_array, scene_of
+from ..lens.scene import Scene, fitted, over_points
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.status import Status, reaches_sensor
 from ..rays.trace import trace_bundle
@@ -25,12 +24,12 @@ from .wavefront import path_differences
 
 
 class RayFans(NamedTuple):
-    """Rays through N points on each of two diameters of the stop, for F fields and W wavelengths.
+    """Rays through N points on each of two diameters of the stop, for W wavelengths.
 
     pupil: (N,), from -1 to 1, in units of the stop's semi-diameter.
-    tangential, sagittal: (F, W, N, 2), mm, x and y on the sensor of the rays through points on the
-        y axis and on the x axis of the stop, less those of the reference chief ray.
-    tangential_path, sagittal_path: (F, W, N), waves, path of the chief ray of the same wavelength
+    tangential, sagittal: (..., W, N, 2), mm, x and y on the sensor of the rays through points on
+        the y axis and on the x axis of the stop, less those of the reference chief ray.
+    tangential_path, sagittal_path: (..., W, N), waves, path of the chief ray of the same wavelength
         less that of the ray, to the reference sphere of `wavefront`.
 
     All but `pupil` are inf for a ray that fails or is clipped, and where a chief ray fails.
@@ -55,94 +54,74 @@ class AxialColour(NamedTuple):
     real: Array
 
 
-def ray_fans(
-    lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    count: int = 41,
-    reference: int | None = None,
-) -> RayFans:
+def ray_fans(lens: Lens, scene: Scene, count: int = 41, reference: int | None = None) -> RayFans:
     """Transverse ray errors and path differences along the y and the x axis of the stop.
 
-    lens: the lens.
-    fields: (F,) along y or (F, 2), radians.
-    distance: mm, inf allowed.
-    wavelengths: (W,), um.
+    lens, scene: the lens, and object points with their wavelengths.
     count: N, number of evenly spaced points from rim to rim; odd to contain the centre.
     reference: index of the wavelength whose chief ray transverse errors are measured from; None:
         the middle one, W // 2. Paths are measured from the chief ray of each wavelength.
 
     Returns `RayFans`, as OpticStudio plots ey against Py and ex against Px with rays aimed at the
     real stop; for its plots without aiming, pass `with_paraxial_pupil(lens)`. Differentiable like
-    `trace_rays`. Warns of float32 as `wavefront` does. ValueError as of `scene_of`.
+    `trace_rays`. Warns of float32 as `wavefront` does. ValueError as of `lens.scene.fitted`.
     """
     if not isinstance(count, int | np.integer) or count < 2:
         raise ValueError(f"count: expected at least 2, a whole number, got {count!r}")
     heights = jnp.linspace(-1, 1, int(count), dtype=lens.curvature.dtype)
-    axis = scene_of(lens, 0.0, distance, wavelengths)
-    warn_of_paths(lens, axis, fields_array(fields, lens.curvature.dtype))
-    hit, _, opd, good = _of_fields(lens, fields, distance, wavelengths, heights)
-    middle = hit.shape[1] // 2 if reference is None else reference
-    if not -hit.shape[1] <= middle < hit.shape[1]:
-        raise ValueError(f"reference: expected an index of the wavelengths, got {reference!r}")
-    moved = hit[:, :, 1:] - hit[:, middle, None, :1]
-    arrives = good[:, :, 1:] & good[:, middle, None, :1] & good[:, :, :1]
+    scene = fitted(lens, scene)
+    warn_of_paths(lens, scene)
+    hit, _, opd, good = _traced(lens, scene, heights)
+    middle = scene.reference(reference)
+    moved = hit[..., 1:, :] - hit[..., middle, None, :1, :]
+    arrives = good[..., 1:] & good[..., middle, None, :1] & good[..., :1]
     moved = jnp.where(arrives[..., None], moved, jnp.inf)
-    path = jnp.where(arrives, opd[:, :, 1:], jnp.inf)
+    path = jnp.where(arrives, opd[..., 1:], jnp.inf)
     halves = (slice(None, count), slice(count, None))
-    parts = [a[:, :, half] for a in (moved, path) for half in halves]
+    parts = [moved[..., half, :] for half in halves] + [path[..., half] for half in halves]
     return RayFans(heights, *parts)
 
 
-def axial_colour(
-    lens: Lens, distance: Numbers, wavelengths: Numbers, heights: Numbers = (0.7, 1.0)
-) -> AxialColour:
+def axial_colour(lens: Lens, scene: Scene, heights: Numbers = (0.7, 1.0)) -> AxialColour:
     """Where light of each wavelength is in focus on the axis, see `AxialColour`.
 
     lens: the lens.
-    distance: mm, inf allowed.
-    wavelengths: (W,), um.
+    scene: one distance, and wavelengths; its fields do not count.
     heights: (N,), on the y axis of the stop, in units of its semi-diameter; none may be 0.
 
     The paraxial foci ignore tilts and decentres. Warns of float32 as `field_curvature` does.
-    ValueError as of `scene_of`.
+    ValueError as of `lens.scene.fitted`.
     """
     points = real_array("heights", heights, lens.curvature.dtype)
     if points.ndim != 1:
         raise ValueError(f"heights: expected (N,), got shape {points.shape}")
-    warn_of_focus(lens, distance, wavelengths)
-    hit, slope, _, good = _of_fields(lens, 0.0, distance, wavelengths, points)
-    height, bend = (a[0, :, 1 : len(points) + 1, 1] - a[0, :, :1, 1] for a in (hit, slope))
-    arrives = good[0, :, 1 : len(points) + 1] & good[0, :, :1] & (bend != 0)
+    scene = fitted(lens, scene)
+    if scene.distance.ndim:
+        raise ValueError(f"distance: expected one, got shape {scene.distance.shape}")
+    axis = scene.at(jnp.zeros(2, lens.curvature.dtype))
+    warn_of_focus(lens, axis)
+    hit, slope, _, good = _traced(lens, axis, points)
+    height, bend = (a[:, 1 : len(points) + 1, 1] - a[:, :1, 1] for a in (hit, slope))
+    arrives = good[:, 1 : len(points) + 1] & good[:, :1] & (bend != 0)
     real = jnp.where(arrives, safe_divide(-height, bend), jnp.inf)
-    return AxialColour(first_order(lens, distance, wavelengths).image_distance - lens.sensor, real)
-
-
-def _of_fields(
-    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, heights: Array
-) -> tuple[Array, Array, Array, Array]:
-    """The chief ray, and the rays through heights (N,) on the y axis and then on the x axis of the
-    stop.
-
-    Returns hits (F, W, 1 + 2 N, 2), mm, slopes of the same shape, path differences (F, W, 1 + 2 N),
-    waves, and whether each ray arrives, bool.
-    """
-    angles = fields_array(fields, lens.curvature.dtype)
-    return _traced(lens, angles, scene_of(lens, 0.0, distance, wavelengths), heights)
+    found = first_order(lens, axis.distance, axis.wavelengths).image_distance
+    return AxialColour(found - lens.sensor, real)
 
 
 @functools.partial(jit, wanted=LARGE)
-def _traced(
-    lens: Lens, fields: Array, axis: Scene, heights: Array
-) -> tuple[Array, Array, Array, Array]:
-    """`_of_fields` of arrays."""
+def _traced(lens: Lens, scene: Scene, heights: Array) -> tuple[Array, Array, Array, Array]:
+    """The chief ray, and the rays through heights (N,) on the y axis and then on the x axis of the
+    stop.
+
+    Returns hits (..., W, 1 + 2 N, 2), mm, slopes of the same shape, path differences
+    (..., W, 1 + 2 N), waves, and whether each ray arrives, bool.
+    """
     none, first = jnp.zeros_like(heights), jnp.zeros_like(heights[:1])
     points = jnp.concatenate([first, none, heights]), jnp.concatenate([first, heights, none])
 
-    def one(field: Array) -> tuple[Array, Array, Array, Array]:
-        bundle = trace_bundle(lens, Scene(field, axis.distance, axis.wavelengths), points)
-        opd, status, _ = path_differences(lens, axis.wavelengths, bundle)
+    def one(point: Scene) -> tuple[Array, Array, Array, Array]:
+        bundle = trace_bundle(lens, point, points)
+        opd, status, _ = path_differences(lens, scene.wavelengths, bundle)
         whole = reaches_sensor(status)
         # A clipped chief ray still serves as the reference of the others.
         good = (status == Status.OK) | (whole & (np.arange(status.shape[-1]) == 0)[None])
@@ -151,4 +130,4 @@ def _traced(
         slope = jnp.stack([safe_divide(a, along) for a in across], axis=-1)
         return hit, slope, opd, good
 
-    return jax.vmap(one)(fields)
+    return over_points(one, scene)

@@ -8,7 +8,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.paraxial import image_height
-from ..lens.scene import Scene, scene_of
+from ..lens.scene import Scene, fitted, over_points
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.trace import trace_bundle
 
@@ -19,21 +19,26 @@ _STEPS = 20
 CHIEF = np.array([[0.0, 0.0], [0.0, 0.1]])
 
 
-def image_point(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Array:
+def image_point(lens: Lens, scene: Scene) -> Array:
     """Points where the chief rays meet the sensor. The chief ray passes through the centre of the
     stop.
 
-    lens, field, distance, wavelengths: as in `trace_rays`.
+    lens, scene: as in `trace_rays`.
 
-    Returns (W, 2), x and y along the axes of the sensor, mm; 0 where the ray fails. Differentiable
-    in every mode. The centroid of a spot is another point, see `psf_moments`.
+    Returns (..., W, 2), x and y along the axes of the sensor, mm; 0 where the ray fails.
+    Differentiable in every mode. The centroid of a spot is another point, see `psf_moments`.
     """
-    return _image_point(lens, scene_of(lens, field, distance, wavelengths))
+    return _image_points(lens, fitted(lens, scene))
 
 
 @jax.jit
+def _image_points(lens: Lens, scene: Scene) -> Array:
+    """`image_point`, compiled."""
+    return over_points(lambda point: _image_point(lens, point), scene)
+
+
 def _image_point(lens: Lens, scene: Scene) -> Array:
-    """`image_point` of a scene."""
+    """`image_point` (W, 2) of one object point."""
     points = jnp.asarray(CHIEF, lens.curvature.dtype)
     hits = trace_bundle(lens, scene, tuple(points)).hits
     return jnp.stack([h[-1, :, 0] for h in hits], axis=-1)
@@ -50,7 +55,7 @@ def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Nu
     Returns (2,), angles along x and y, radians; inf if none was found. Newton's method from the
     paraxial field; derivatives by the implicit function theorem.
     """
-    scene = scene_of(lens, 0.0, distance, wavelength)
+    scene = fitted(lens, Scene.point(0.0, distance, wavelength))
     target = real_array("point", point, lens.curvature.dtype)
     if target.shape != (2,):
         raise ValueError(f"point: expected x and y, got shape {target.shape}")
@@ -69,7 +74,7 @@ def _field_of_image(lens: Lens, scene: Scene, target: Array) -> Array:
 
     def miss(field, args):
         lens, scene, target = args
-        return _image_point(lens, Scene(field, scene.distance, scene.wavelengths))[0] - target
+        return _image_point(lens, scene.at(field))[0] - target
 
     solution: optx.Solution = optx.root_find(
         miss,

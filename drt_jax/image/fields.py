@@ -16,13 +16,13 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import points_arrays, scene_of, vergence_of
+from ..lens.scene import Scene, vergence_of
 from ..numerics import Numbers, brief, einsum, real_array
 from ..pupil.rules import Symmetry
 from ..rays.solve import solve_aimed
 from ..rays.status import reaches_sensor
 from ..rays.trace import trace_bundle
-from .beam_psf import PsfModel
+from .beam_psf import Sampling
 from .interpolate import lagrange
 from .psf import psf
 
@@ -38,7 +38,7 @@ class GridMethod:
     step: (), spacing of the nodes, tangent of the field angle.
     distances: (D,), mm, equidistant in 1 / distance.
     pixel: (), side of a pixel, mm.
-    model: PSF model of the kernels, see `converged_psf`.
+    sampling: of the kernels.
     nearest: (D, U), int32, for each traced node the index of the nearest traced node with light.
     half: number of nodes on each side of the axis, along y and x.
     size: number of pixels along a side of a kernel.
@@ -49,7 +49,7 @@ class GridMethod:
     step: Array
     distances: Array
     pixel: Array
-    model: PsfModel
+    sampling: Sampling
     nearest: Array
     half: tuple[int, int] = dataclasses.field(metadata={"static": True})
     size: int = dataclasses.field(metadata={"static": True})
@@ -84,6 +84,20 @@ class KernelGrid:
         """Number of nodes on each side of the axis, along y and x."""
         return self.kernels.shape[1] // 2, self.kernels.shape[2] // 2
 
+    def at(self, scene: Scene) -> Array:
+        """Kernels of object points, interpolated.
+
+        scene: the points; outside of the grid the kernels of its edge apply. Its wavelengths do
+            not count: they are those of the grid.
+
+        Returns (..., W, K, K). Interpolation uses polynomials through the four nearest nodes along
+        x, y and 1 / distance, or through all nodes if there are fewer. Differentiable in the grid,
+        the fields and the distances.
+        """
+        fields, far = (a.astype(self.kernels.dtype) for a in scene.flat())
+        found = jax.vmap(_kernel_at, (None, 0, 0))(self, jnp.tan(fields), vergence_of(far))
+        return found.reshape(*scene.shape, *found.shape[1:])
+
 
 def unique_nodes(half: tuple[int, int], symmetry: Symmetry) -> tuple[np.ndarray, ...]:
     """Nodes that must be traced, and how they give all nodes of the grid.
@@ -112,7 +126,7 @@ def _chief(lens: Lens, tangents: Array, distances: Array, wavelengths: Array) ->
     """`image_points` of arrays."""
 
     def one(distance: Array, tangent: Array) -> Array:
-        scene = scene_of(lens, jnp.arctan(tangent), distance, wavelengths)
+        scene = Scene(jnp.arctan(tangent), distance, wavelengths)
         centre = jnp.zeros(1, lens.curvature.dtype)
         bundle = trace_bundle(lens, scene, (centre, centre), solve_aimed)
         whole = reaches_sensor(bundle.status)
@@ -140,17 +154,17 @@ def image_points(lens: Lens, tangents: Any, distances: Any, wavelengths: Any) ->
     )
 
 
-def kernel_grid(lens: Lens, method: GridMethod, wavelengths: Numbers) -> KernelGrid:
+def kernel_grid(lens: Lens, wavelengths: Numbers, sampling: GridMethod) -> KernelGrid:
     """The PSF kernels of a lens over field and depth.
 
     lens: the lens.
-    method: settings from `grid_method`.
     wavelengths: (W,), um.
+    sampling: fields, distances and rays, which `converge(kernel_grid, ...)` chooses.
 
     Returns a `KernelGrid`. Works inside `jax.jit`; differentiable in the lens.
     """
     waves = jnp.atleast_1d(lens.checked_wavelengths(wavelengths))
-    return _kernel_grid(lens, method, waves)
+    return _kernel_grid(lens, sampling, waves)
 
 
 @functools.partial(jit, wanted=LARGE)
@@ -212,8 +226,8 @@ def _kernel_of(
     # a pixel that is far off centre.
 
     def traced(waves: Array) -> tuple[Array, ...]:
-        field = jnp.arctan(tangent)
-        found = psf(lens, field, distance, waves, method.pixel, method.size, method.model)
+        scene = Scene(jnp.arctan(tangent), distance, waves)
+        found = psf(lens, scene, method.pixel, method.size, sampling=method.sampling)
         arrives = found.throughput > 0
         centre = jnp.where(arrives[:, None], found.centre[None], jnp.inf)
         return centre, found.solid_angle, found.outside, found.kernel
@@ -221,23 +235,6 @@ def _kernel_of(
     if method.together:
         return traced(wavelengths)
     return jax.tree.map(lambda a: a[:, 0], jax.vmap(traced)(wavelengths[:, None]))
-
-
-def kernels_at(grid: KernelGrid, fields: Numbers, distances: Numbers) -> Array:
-    """Kernels of B object points, interpolated from a grid.
-
-    grid: from `kernel_grid`.
-    fields: (B, 2), angles along x and y, radians; outside of the grid the kernels of its edge
-        apply.
-    distances: (B,), mm, or one; inf allowed.
-
-    Returns (B, W, K, K). Interpolation uses polynomials through the four nearest nodes along x, y
-    and 1 / distance, or through all nodes if there are fewer. Differentiable in the grid, the
-    fields and the distances. ValueError for other shapes.
-    """
-    dtype = grid.kernels.dtype
-    angles, far = points_arrays(fields, distances, dtype)
-    return jax.vmap(_kernel_at, (None, 0, 0))(grid, jnp.tan(angles), vergence_of(far))
 
 
 def _kernel_at(grid: KernelGrid, tangent: Array, vergence: Array) -> Array:

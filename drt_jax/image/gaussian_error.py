@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..lens.lens import Lens
-from ..lens.scene import fields_array
+from ..lens.scene import Scene, fitted
 from ..numerics import Numbers, known_values
-from .beam_psf import PsfModel
+from .beam_psf import Sampling
 from .psf import psf
 from .psf_model import chosen_psf, difference
 
@@ -15,13 +15,13 @@ _LINES = 64  # at least so many frequencies up to Nyquist
 
 
 class GaussianError(NamedTuple):
-    """Differences of Gaussian kernels from those of waves for F fields at D distances, each for the
+    """Differences of Gaussian kernels from those of waves for object points (...), each for the
     worst wavelength.
 
-    misplaced: (F, D), sum of the absolute differences of all pixels: 0 to 2.
-    contrast: (F, D), largest difference of the MTF of both kernels up to the pixels' Nyquist
+    misplaced: (...), sum of the absolute differences of all pixels: 0 to 2.
+    contrast: (...), largest difference of the MTF of both kernels up to the pixels' Nyquist
         frequency.
-    outside: (F, D), fraction of the light that falls outside of the kernel of waves.
+    outside: (...), fraction of the light that falls outside of the kernel of waves.
     """
 
     misplaced: np.ndarray
@@ -30,42 +30,29 @@ class GaussianError(NamedTuple):
 
 
 def gaussian_error(
-    lens: Lens,
-    fields: Numbers,
-    distances: Numbers,
-    wavelengths: Numbers,
-    pixel: Numbers,
-    size: int = 21,
-    tolerance: float = 1e-2,
+    lens: Lens, scene: Scene, pixel: Numbers, size: int = 21, tolerance: float = 1e-2
 ) -> GaussianError:
     """Differences between the Gaussian kernels of the moments and the kernels with diffraction.
 
-    lens: the lens.
-    fields: (F,) angles along y, or pairs (F, 2), radians.
-    distances: (D,), mm, inf allowed.
-    wavelengths: (W,), um.
+    lens, scene: the lens, and object points with their wavelengths.
     pixel: side of a pixel, mm.
     size: number of pixels along a side of a kernel.
     tolerance: of the kernels of waves, as in `psf`.
 
     All numbers must be known. ValueError inside a trace, and as of `psf`.
     """
-    known = known_values((lens, fields, distances, wavelengths, pixel))
+    known = known_values((lens, scene, pixel))
     if known is None:
         raise ValueError("gaussian_error compares known numbers: call it outside of jax.jit")
-    lens, fields, distances, wavelengths, pixel = known
-    pairs = fields_array(fields, lens.curvature.dtype)
-    far = np.atleast_1d(np.asarray(distances, float))
-    settings = wavelengths, pixel, size
-    fine = chosen_psf(lens, (pairs, far, wavelengths), pixel, size, "waves", tolerance)[0]
-    models = PsfModel("gaussian", fine.rule, 0), fine
-    found = np.zeros((3, len(pairs), len(far)))
-    for i, field in enumerate(pairs):
-        for k, distance in enumerate(far):
-            blur, light = (psf(lens, field, distance, *settings, model) for model in models)
-            a, b = np.asarray(blur.kernel), np.asarray(light.kernel)
-            found[:, i, k] = difference(a, b), _contrast(a, b), np.max(np.asarray(light.outside))
-    return GaussianError(*found)
+    lens, scene, pixel = known
+    fine = chosen_psf(lens, scene, pixel, size, "waves", tolerance)[0]
+    models = Sampling("gaussian", fine.rule, 0), fine
+    found = []
+    for point in fitted(lens, scene).each():
+        blur, light = (psf(lens, point, pixel, size, sampling=model) for model in models)
+        a, b = np.asarray(blur.kernel), np.asarray(light.kernel)
+        found.append((difference(a, b), _contrast(a, b), np.max(np.asarray(light.outside))))
+    return GaussianError(*np.array(found).T.reshape(3, *scene.shape))
 
 
 def _contrast(a: np.ndarray, b: np.ndarray) -> float:

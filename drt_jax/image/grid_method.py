@@ -11,11 +11,11 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import scene_of
+from ..lens.scene import Scene
 from ..numerics import Numbers, concrete, known_values, real_array
 from ..pupil.rules import Gauss, PupilRule, symmetry_of
 from ..rays.solve import solve_aimed
-from .beam_psf import Kind, PsfModel
+from .beam_psf import Kind, Sampling
 from .fields import GridMethod, KernelGrid, unique_nodes
 from .moments import moments
 from .psf_model import chosen_psf
@@ -41,8 +41,8 @@ def grid_method(
     pixel: Numbers,
     size: int | None = None,
     nodes: int = 8,
-    model: Kind | Literal["auto"] | PsfModel = "rays",
-    tolerance: float = _TOLERANCE,
+    kind: Kind | Literal["auto"] = "rays",
+    sampling: float | Sampling = _TOLERANCE,
     together: bool = False,
     norm: int = 1,
 ) -> GridMethod:
@@ -56,7 +56,7 @@ def grid_method(
     size: number of pixels along a side of a kernel, odd; by default it extends to 4.5 standard
         deviations of the blur on each side.
     nodes: number of nodes from the axis to the largest angle, 2 or more.
-    model, tolerance, norm: as in `converged_psf`; a name is converged to one model for all fields.
+    kind, sampling: as in `psf`, one for all fields; norm: as in `converged_psf`.
     together: True centres the kernels of all wavelengths on the mean of their centroids, so that
         they contain the lateral colour (for patches); False centres each kernel on its own
         centroid.
@@ -67,8 +67,9 @@ def grid_method(
     known = known_values((lens, fields, distances, wavelengths, pixel))
     if known is None:
         raise ValueError(
-            "the choice of fields and rays follows from known numbers: call grid_method outside of "
-            "jax.jit and jax.vmap, and pass on what it returns"
+            "the choice of fields and rays follows from known numbers: call "
+            "drt_jax.converge(drt_jax.kernel_grid, ...) outside of jax.jit and jax.vmap, and pass "
+            "on what it returns"
         )
     with jax.core.eval_context():
         lens, fields, distances, wavelengths, pixel = known
@@ -89,15 +90,15 @@ def grid_method(
         if size is None:
             need = _reach(found, arrives, pixel)
             size = next((n for n in _SIZES if n >= need), _SIZES[-1])
-        if isinstance(model, str):
-            where = *_extremes(tangents, far, arrives), wavelengths
+        if not isinstance(sampling, Sampling):
+            where = Scene.grid(*_extremes(tangents, far, arrives), wavelengths)
             # No warning here of light outside of the kernels: `warn_of_loss` gives it for all
             # nodes.
-            model = chosen_psf(lens, where, pixel, size, model, tolerance, norm)[0]
+            sampling = chosen_psf(lens, where, pixel, size, kind, sampling, norm)[0]
         array = lambda a: jnp.asarray(a, dtype)  # noqa: E731
         nearest = jnp.asarray(_nearest(tangents, arrives), jnp.int32)
         return GridMethod(
-            array(step), array(far), array(pixel), model, nearest, half, size, symmetry, together
+            array(step), array(far), array(pixel), sampling, nearest, half, size, symmetry, together
         )
 
 
@@ -169,7 +170,7 @@ def _spots(
     """`_spots_at` of arrays."""
 
     def one(distance: Array, tangent: Array) -> Moments:
-        scene = scene_of(lens, jnp.arctan(tangent), distance, wavelengths)
+        scene = Scene(jnp.arctan(tangent), distance, wavelengths)
         return moments(lens, scene, rule, solve_aimed).at(lens.sensor)
 
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(distances, tangents)

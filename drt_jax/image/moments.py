@@ -25,7 +25,8 @@ from .spot import Moments, deviations, mean_products, normalised
 @dataclasses.dataclass(frozen=True)
 class FocusMoments:
     """Moments of W wavelengths as polynomials in the sensor position. With d = sensor - reference:
-    centroid = mean + d slope, covariance = spread[0] + d spread[1] + d^2 spread[2].
+    centroid = mean + d slope, covariance = spread[0] + d spread[1] + d^2 spread[2]. Of several
+    object points, they are the first axes of all arrays.
 
     reference: (), mm.
     mean: (W, 2), mm.
@@ -49,6 +50,8 @@ class FocusMoments:
 @jax.jit
 def _at(moments: FocusMoments, sensor: Array) -> Moments:
     # A jitted function, so that this is one program and not one for each operation.
+    if moments.reference.ndim:
+        return jax.vmap(_at, (0, None))(moments, sensor)
     d = sensor - moments.reference
     spread = moments.spread[0] + d * (moments.spread[1] + d * moments.spread[2])
     arrives = (moments.throughput > 0)[:, None]

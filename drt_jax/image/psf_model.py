@@ -12,15 +12,15 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, ONCE, jit
-from ..inputs import require_one_of
+from ..inputs import require_one_of, require_tolerance
 from ..lens.lens import Lens
-from ..lens.scene import Scene
+from ..lens.scene import Scene, fitted
 from ..numerics import Numbers, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import symmetry_of
 from .beam import Beam, BeamRule, beam_rule, trace_beam
-from .beam_psf import Kind, Psf, PsfModel, psf_of_beam
-from .converged import at_sensor, converge, scenes_of
+from .beam_psf import Kind, Psf, Sampling, psf_of_beam
+from .converged import at_sensor, find_rule
 from .kernel import check_pixels
 from .rounding import below_double, hit_rounding, path_rounding, warn_dtype
 from .wave_psf import period
@@ -44,26 +44,21 @@ _UM = 1e3  # per mm
 
 def converged_psf(
     lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
+    scene: Scene,
     pixel: Numbers,
     size: int = 21,
-    model: Kind | Literal["auto"] = "auto",
+    kind: Kind | Literal["auto"] = "auto",
     tolerance: float = TOLERANCE,
     norm: int = 1,
     of: Of = "kernel",
-) -> PsfModel:
-    """A PSF model whose kernels are accurate to a tolerance.
+) -> Sampling:
+    """A sampling whose kernels are accurate to a tolerance, for `psf`.
 
-    lens: the lens.
-    field: angle along y, or (x, y), or many pairs (F, 2), radians.
-    distance: one or (Z,), mm. The model is valid for every field at every distance.
-    wavelengths: (W,), um.
+    lens, scene: the lens, and object points with their wavelengths. The sampling is valid for all.
     pixel: side of a pixel, mm.
     size: number of pixels along a side of the kernels.
-    model: "gaussian", "rays", "waves", or "auto": the cheapest of these within the tolerance of
-        "waves"; `PsfModel.errors` then gives the differences of the other models.
+    kind: "gaussian", "rays", "waves", or "auto": the cheapest of these within the tolerance of
+        "waves"; `Sampling.errors` then gives the differences of the other kinds.
     tolerance: bound of the sum of the absolute errors of a kernel's pixels.
     norm: 1; or 2, to bound the root of the sum of the squared errors, which is the error of a
         white-noise picture.
@@ -76,40 +71,38 @@ def converged_psf(
     lens, where the search ends at the accuracy that rounding allows; and if more than 1 % of the
     light falls outside of the kernel, with a size for which less does.
     """
-    requested = field, distance, wavelengths
     require_one_of("of", of, get_args(Of))
     bound = tolerance / 5 if of == "gradient" else tolerance
-    found, view = chosen_psf(lens, requested, pixel, size, model, bound, norm)
+    found, view = chosen_psf(lens, scene, pixel, size, kind, bound, norm)
     view.warn_of_loss(found)
     return found
 
 
 def chosen_psf(
-    lens: Lens, requested: tuple[Numbers, Numbers, Numbers], pixel: Numbers, size: int,
-    model: Kind | Literal["auto"], tolerance: float, norm: int = 1
-) -> tuple[PsfModel, "_View"]:  # fmt: skip
+    lens: Lens, scene: Scene, pixel: Numbers, size: int, kind: Kind | Literal["auto"],
+    tolerance: float, norm: int = 1
+) -> tuple[Sampling, "_View"]:  # fmt: skip
     """`converged_psf` without its warning of light outside of the kernels.
 
-    requested: field, distance and wavelengths.
-
-    Returns the model, and the `_View` that can give this warning.
+    Returns the sampling, and the `_View` that can give this warning.
     """
-    _check_asked(model, tolerance, norm)
-    known = known_values((lens, requested, pixel))
+    _check_asked(kind, tolerance, norm)
+    known = known_values((lens, scene, pixel))
     if known is None:
         raise ValueError(
             "inside jax.jit or jax.vmap the cost of a kernel cannot follow from a tolerance: make "
-            "the model outside and pass it on, model=drt_jax.converged_psf(...)"
+            "the sampling outside and pass it on, sampling=drt_jax.converge(drt_jax.psf, ...)"
         )
     with jax.core.eval_context():
-        lens, requested, pixel = known
+        lens, scene, pixel = known
+        scene = fitted(lens, scene)
         side, size = check_pixels(pixel, size, lens.curvature.dtype)
-        scenes = scenes_of(lens, *requested)
-        base = converge(scenes_of, lens, requested, min(tolerance, 1e-3), at_sensor, False).rule
+        scenes = scene.each()
+        base = find_rule(lens, scene, min(tolerance, 1e-3), at_sensor, False).rule
         clipped = base if isinstance(base, Clipped) else None
-        symmetry = symmetry_of(lens, requested[0])
+        symmetry = symmetry_of(lens, scene.field)
         rounded = {"hits": hit_rounding(lens)}
-        if model in ("waves", "auto"):
+        if kind in ("waves", "auto"):
             paths = path_rounding(lens, scenes, True) if below_double(lens) else 0.0
             rounded["phase"] = 4 * np.pi * paths
         for degrees in _DEGREES:
@@ -127,19 +120,18 @@ def chosen_psf(
         rule = beam_rule(degree, symmetry, clipped)
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
         view = _View(lens, tuple(scenes), tuple(beams), side, size, norm)
-        worst = max(rounded.get("phase", 0.0), view.hit_error(model))
+        worst = max(rounded.get("phase", 0.0), view.hit_error(kind))
         warn_dtype(lens, "kernels", worst, tolerance, "", 3)
         view = dataclasses.replace(view, rounded=worst)
-        if model != "auto":
-            return PsfModel(model, rule, view.cells(model, tolerance)), view
+        if kind != "auto":
+            return Sampling(kind, rule, view.cells(kind, tolerance)), view
         return _cheapest(view, rule, tolerance), view
 
 
-def _check_asked(model: str, tolerance: float, norm: int) -> None:
-    """ValueError for an unknown model, a tolerance that is not between 0 and 1, or another norm."""
-    require_one_of("model", model, (*get_args(Kind), "auto"))
-    if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
+def _check_asked(kind: str, tolerance: float, norm: int) -> None:
+    """ValueError for an unknown kind, a tolerance that is not between 0 and 1, or another norm."""
+    require_one_of("kind", kind, (*get_args(Kind), "auto"))
+    require_tolerance(tolerance)
     if norm not in (1, 2):
         raise ValueError(f"norm: expected 1 or 2, got {norm!r}")
 
@@ -201,7 +193,7 @@ class _View:
         moved = dataclasses.replace(self, beams=tuple(beams))
         return difference(moved.kernels(*trial), self.kernels(*trial), self.norm)
 
-    def warn_of_loss(self, model: PsfModel) -> None:
+    def warn_of_loss(self, model: Sampling) -> None:
         """Warns of light outside of the kernels of a model, for the scene with most of it."""
         lost = [float(jnp.max(one.outside)) for one in self.psfs(model.kind, model.cells)]
         k = int(np.argmax(lost))
@@ -344,7 +336,7 @@ def _residual(points: np.ndarray, values: np.ndarray, weight: np.ndarray, degree
     return float(np.sqrt(np.sum((matrix @ found - right) ** 2)))
 
 
-def _cheapest(view: _View, rule: BeamRule, tolerance: float) -> PsfModel:
+def _cheapest(view: _View, rule: BeamRule, tolerance: float) -> Sampling:
     """The first of "gaussian", "rays" and "waves" that is within the tolerance of "waves"."""
     ladder: list[tuple[Kind, int]] = [
         (kind, view.cells(kind, tolerance)) for kind in get_args(Kind)
@@ -354,4 +346,4 @@ def _cheapest(view: _View, rule: BeamRule, tolerance: float) -> PsfModel:
     pairs = zip(ladder[:-1], kernels)
     errors = {kind: difference(k, kernels[-1], view.norm) for (kind, _), k in pairs}
     kind, cells = next(one for one in ladder if errors.get(one[0], 0.0) <= tolerance)
-    return PsfModel(kind, rule, cells, errors)
+    return Sampling(kind, rule, cells, errors)

@@ -13,18 +13,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene
+from ..lens.scene import Scene, over_points
 from ..numerics import concrete, known_values
-from ..pupil.rules import PupilRule
-from .beam import Beam, beam_rule, trace_beam
+from .beam import Beam, BeamRule, trace_beam
+from .beam_psf import CELLS
 
-# Numbers of cells along a side to try; and the number where values are not known.
+# Numbers of cells along a side to try.
 _TRIALS = (64, 96, 128, 192, 256, 384, 512)
-CELLS = 128
 # The error of the finer of two trials is at most their change divided by this: the number of cells
 # n rises by 4/3 or more, the error falls as 1 / n^2, and (4/3)^2 - 1 > 0.75.
 _STEP = 0.75
@@ -32,19 +30,14 @@ _STEP = 0.75
 TOLERANCE = 1e-3
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames="degree")
-def beams_of(lens: Lens, fields: Array, axis: Scene, rule: PupilRule, degree: int) -> Beam:
-    """Beams of F fields; the field is the first axis of their arrays.
+@functools.partial(jit, wanted=LARGE)
+def beams_of(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
+    """Beams of the points of a scene, which are the first axes of their arrays.
 
-    lens: the lens.
-    fields: (F, 2), radians.
-    axis: scene of the axis, with distance and wavelengths.
-    rule: pupil rule, whose kind and symmetry the beams have.
-    degree: of the polynomials.
+    lens, scene: the lens, and object points with their wavelengths.
+    rule: rays and polynomials.
     """
-    plan = beam_rule(degree, rule.symmetry, rule)
-    one = lambda field: trace_beam(lens, Scene(field, axis.distance, axis.wavelengths), plan)  # noqa: E731
-    return jax.vmap(one)(fields)
+    return over_points(lambda point: trace_beam(lens, point, rule), scene)
 
 
 def to_tolerance(
@@ -59,10 +52,8 @@ def to_tolerance(
     tolerance: absolute.
     fewest: function of the same arguments; returns the number of cells to begin with.
 
-    ValueError for a tolerance that is not between 0 and 1. Warns if no trial meets it.
+    Warns if no trial meets the tolerance.
     """
-    if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")
     known = known_values(args)
     if cells is not None or known is None:
         return run(*args, cells=CELLS if cells is None else cells)
@@ -79,7 +70,7 @@ def to_tolerance(
         else:
             warnings.warn(
                 f"{cells} x {cells} cells of the pupil have converged to {change:.0e} only, not to "
-                f"{tolerance:.0e}: the blur is too large for them; try model='rays'",
+                f"{tolerance:.0e}: the blur is too large for them; try kind='rays'",
                 stacklevel=4,
             )
     return now if concrete(args) else run(*args, cells=cells)

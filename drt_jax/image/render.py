@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require_tolerance
 from ..lens.lens import Lens
 from ..lens.scene import vergence_of
 from ..numerics import Numbers, concrete, einsum, safe_divide, safe_sqrt
@@ -104,7 +105,7 @@ def render(
     distance: Numbers,
     pixel: Numbers,
     wavelengths: Numbers = WAVELENGTHS,
-    method: RenderMethod | None = None,
+    sampling: RenderMethod | float = 1e-3,
     progress: Callable[[Iterable], Iterable] = iter,
 ) -> Array:
     """The picture that a lens forms of an ideal picture on its sensor, with distortion, lateral
@@ -120,22 +121,23 @@ def render(
         see `composed`.
     pixel: side of a pixel, mm.
     wavelengths: (C,), um.
-    method: from `render_method` for this distance and pixel, made outside; needed inside `jax.jit`
-        and `jax.vmap`. By default it is made here, with its own defaults.
+    sampling: a tolerance of the kernels, see `render_method`; or what `converge(render, ...)`
+        returns for this distance and pixel, which is needed inside `jax.jit` and `jax.vmap`.
     progress: wraps the loop over rows of tiles (such as tqdm), where all numbers are known.
 
     Returns (H, W, C) in the dtype of `image`: the irradiance relative to that on the axis, 1 where
     a picture of 1 meets the axis. Light outside of the kernels is lost. Each colour is resampled by
     cubic convolution, which is of third order in the distortion. Differentiable in the lens and the
     image, in every mode. ValueError for other shapes and dtypes, for pictures that are not finite,
-    and as of `render_method`.
+    and as of `converge`.
     """
     count = len(lens.checked_wavelengths(wavelengths).reshape(-1))
     picture = _picture(image, count)
-    if method is None:
-        method = render_method(
-            lens, (picture.shape[0], picture.shape[1]), distance, pixel, wavelengths
-        )
+    if isinstance(sampling, RenderMethod):
+        method = sampling
+    else:
+        shape, to = (picture.shape[0], picture.shape[1]), require_tolerance(sampling)
+        method = render_method(lens, shape, distance, pixel, wavelengths, tolerance=to)
     if picture.shape[:2] != method.shape:
         raise ValueError(f"image: the method is for {method.shape}, got {picture.shape[:2]}")
     _check_method(method, distance, pixel)

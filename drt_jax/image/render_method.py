@@ -10,7 +10,7 @@ from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import NEAREST
 from ..numerics import Numbers, known_values
-from .beam_psf import Kind, PsfModel
+from .beam_psf import Kind, Sampling
 from .fields import image_points
 from .grid_method import check_pixel, grid_method
 from .sensor_maps import RenderMethod, chosen
@@ -32,8 +32,9 @@ def render_method(
     size: int | None = None,
     nodes: int = 16,
     layers: int = 8,
-    model: Kind | Literal["auto"] | PsfModel = "rays",
+    kind: Kind | Literal["auto"] = "rays",
     tolerance: float = 1e-3,
+    sampling: Sampling | None = None,
 ) -> RenderMethod:
     """Chooses how `render` works. All arguments are known numbers.
 
@@ -48,10 +49,11 @@ def render_method(
     nodes: number of fields on one side of the axis, along the longer side of the picture, see
         `grid_method`.
     layers: number of distances for a depth map.
-    model: of the kernels, as in `psf`.
+    kind: of the kernels, as in `psf`.
     tolerance: of the kernels, and of their interpolation between the nodes of the grid: the root of
         the sum of the squared errors of a kernel's pixels. This is the RMS error of a picture of
         white noise of variance 1.
+    sampling: of the kernels, instead of `kind` and `tolerance`.
 
     Returns a `RenderMethod`. Warns of light outside of kernels that are too small. ValueError
     inside a trace, for invalid numbers, and where no light arrives.
@@ -59,8 +61,8 @@ def render_method(
     known = known_values((lens, distance, pixel, wavelengths))
     if known is None:
         raise ValueError(
-            "inside jax.jit or jax.vmap fields and rays cannot be chosen: call render_method "
-            "outside, and pass on what it returns, method=..."
+            "inside jax.jit or jax.vmap fields and rays cannot be chosen: call "
+            "drt_jax.converge(drt_jax.render, ...) outside and pass it on, sampling=..."
         )
     with jax.core.eval_context():
         lens, distance, pixel, wavelengths = known
@@ -74,7 +76,7 @@ def render_method(
         far = layer_distances(distance, shape, layers)
         side = float(np.asarray(pixel))
         angles = _angles(lens, shape, far, side, focal, waves)
-        given = lens, angles, far, waves, side, size, nodes, model, tolerance
+        given = lens, angles, far, waves, side, size, nodes, kind, sampling or tolerance
         grid = grid_method(*given, norm=2)
         both = (shape[0], shape[1])
         length = jnp.asarray(focal, lens.curvature.dtype)

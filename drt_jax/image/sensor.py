@@ -99,8 +99,8 @@ def convolve_each(scenes: Array, kernels: Array) -> Array:
     """'Valid' convolution of each channel of each image with its own kernel, by FFT.
 
     scenes: (B, H + K - 1, W + K - 1, C), with true context on all sides.
-    kernels: (B, C, K, K) [image, channel, y, x], from `kernels_at`; cast to the dtype of the
-        scenes.
+    kernels: (B, C, K, K) [image, channel, y, x], from `psf` or `KernelGrid.at`; cast to the dtype
+        of the scenes.
 
     Returns (B, H, W, C). ValueError for shapes that do not fit.
     """

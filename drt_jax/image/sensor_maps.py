@@ -85,7 +85,7 @@ def sensor_maps(lens: Lens, method: RenderMethod, wavelengths: Numbers) -> Maps:
     method: from `render_method`.
     wavelengths: (C,), um.
     """
-    grid = kernel_grid(lens, method.grid, wavelengths)
+    grid = kernel_grid(lens, wavelengths, method.grid)
     return _maps(grid, method)
 
 
@@ -174,7 +174,7 @@ def chosen(
 
     Warns if kernels truncate light, and if the error exceeds the tolerance.
     """
-    grid = kernel_grid(lens, method.grid, wavelengths)
+    grid = kernel_grid(lens, wavelengths, method.grid)
     warn_of_loss(lens, method.grid, grid, wavelengths)
     places: list[int] = []
     blend = left = 0.0

@@ -6,9 +6,9 @@ point of the sensor is proportional to the area, in direction cosines, of the co
 reaches it. That is the integral over the stop of the determinant |dl / dp| of directions l by stop
 points p.
 
-All functions take `fields`, F angles along y (F,) or pairs (F, 2) in radians, and return arrays
-with the field as their first axis. Without a rule, one rule for all fields is found; inside
-`jax.jit` and `jax.vmap` a rule is required. Differentiable in every mode where the rule is.
+All functions take a `Scene` and return arrays whose first axes (...) are its points. Without a
+rule, one rule for all points is found; inside `jax.jit` and `jax.vmap` a rule is required.
+Differentiable in every mode where the rule is.
 
 Sources: Rimmer, Relative illumination calculations, Proc. SPIE 655, 99 (1986), which OpticStudio
 follows; Slater, Remote Sensing (1980), for the cone at a point of the sensor.
@@ -28,14 +28,15 @@ from ..compilation import LARGE, jit
 from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.order import may_cross
-from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
-from ..numerics import Numbers, known_values, safe_divide, safe_sqrt
+from ..lens.scene import Scene, fitted, over_points
+from ..numerics import batched, known_values, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import hexapolar
 from ..pupil.rules import Gauss, PupilRule, symmetry_of
 from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
+from .converged import converged_rule
 from .rounding import hit_rounding, warn_dtype
 from .spot import normalised
 from .wavefront import reference_curvature
@@ -60,20 +61,20 @@ _AIRY = 0.60983494563325225e-3
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Spots:
-    """Spots of F fields in W wavelengths, of Q rays each.
+    """Spots in W wavelengths, of Q rays each.
 
-    points: (F, W, Q, 2), mm, x and y on the sensor; inf for rays that do not arrive.
-    weights: (F, W, Q), the light that each ray represents; their sum is the throughput times the
+    points: (..., W, Q, 2), mm, x and y on the sensor; inf for rays that do not arrive.
+    weights: (..., W, Q), the light that each ray represents; their sum is the throughput times the
         weight of the wavelength. Rays on the rim of the stop have weight 0.
-    centroid: (F, 2), mm, of all wavelengths.
-    chief: (F, 2), mm, the chief ray of the reference wavelength.
-    rms, rms_chief: (F,), mm, root mean square distance of the light from the centroid and from the
+    centroid: (..., 2), mm, of all wavelengths.
+    chief: (..., 2), mm, the chief ray of the reference wavelength.
+    rms, rms_chief: (...), mm, root mean square distance of the light from the centroid and from the
         chief ray.
-    radius, radius_chief: (F,), mm, largest distance of a ray from either ("geometric").
-    airy_radius: (F,), mm, 0.61 wavelength / NA for the reference wavelength, where pi NA^2 is its
+    radius, radius_chief: (...), mm, largest distance of a ray from either ("geometric").
+    airy_radius: (...), mm, 0.61 wavelength / NA for the reference wavelength, where pi NA^2 is its
         solid angle; for a round pupil the first zero of the diffraction pattern.
-    throughput, solid_angle: (F, W), as of `vignetting` and `solid_angle`.
-    left_out: (F, W), fraction of 175 rays, evenly over the stop and on its rim, that fail for
+    throughput, solid_angle: (..., W), as of `vignetting` and `solid_angle`.
+    left_out: (..., W), fraction of 175 rays, evenly over the stop and on its rim, that fail for
         another reason than an aperture (see `Status`), and so do not count in any number above:
         they miss a surface, are totally reflected, or would have to step back where surfaces cross.
         Programs that let rays step back count those, and report larger spots.
@@ -97,38 +98,28 @@ class Spots:
 
 def spot_diagram(
     lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    rule: PupilRule | None = None,
-    wavelength_weights: Numbers | None = None,
+    scene: Scene,
+    sampling: float | PupilRule | None = None,
     reference: int | None = None,
 ) -> Spots:
-    """Spots of all fields on the sensor, see `Spots`.
+    """Spots of all points on the sensor, see `Spots`.
 
-    lens: the lens.
-    fields: (F,) along y or (F, 2), radians.
-    distance: mm, inf allowed.
-    wavelengths: (W,), um.
-    rule: pupil rule; for a picture of the spot a `Pattern` such as that of `pupil.hexapolar`. None:
-        Gauss nodes, fitted to the open part of the pupil.
-    wavelength_weights: (W,), normalised to the sum 1; None: equal.
+    lens, scene: the lens, and object points with their wavelengths.
+    sampling: a pupil rule; for a picture of the spot a `Pattern` such as that of `pupil.hexapolar`.
+        A tolerance: the rule that keeps the relative error of the RMS spot size within it. None:
+        12 Gauss nodes along a radius, fitted to the open part of the pupil.
     reference: index of the reference wavelength; None: the middle one, W // 2.
 
     Warns, outside of a trace, where float32 rounds more than 2 % of a spot. ValueError as of
-    `scene_of`; without a rule also inside a trace.
+    `lens.scene.fitted`; without a rule inside a trace.
     """
-    known = lens.checked_wavelengths(wavelengths)
-    waves = len(known)
-    middle = waves // 2 if reference is None else reference
-    if not -waves <= middle < waves:
-        raise ValueError(f"reference: expected an index of the wavelengths, got {reference!r}")
-    axis = scene_of(lens, 0.0, distance, wavelengths)
-    spectrum = spectrum_of(wavelength_weights, axis, lens.curvature.dtype)
-    light = _light(lens, fields, distance, wavelengths, rule, "object")
-    colour = known[middle]
+    scene = fitted(lens, scene)
+    middle, spectrum = scene.reference(reference), scene.spectrum
+    light = _light(lens, scene, sampling, "object")
+    colour = scene.wavelengths[middle]
     index = lens.index(colour)[-1, 0]
-    found = _spots(light, spectrum / jnp.sum(spectrum), colour / index, middle)
+    settings = spectrum / jnp.sum(spectrum), colour / index, middle
+    found = _spots(light, *settings, axes=len(scene.shape))
     known = known_values((lens, found.rms))
     if known is not None:
         wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
@@ -136,47 +127,38 @@ def spot_diagram(
     return found
 
 
-def vignetting(
-    lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    rule: PupilRule | None = None,
-) -> Array:
+def vignetting(lens: Lens, scene: Scene, sampling: float | PupilRule | None = None) -> Array:
     """Unvignetted fraction: the fraction of the light through the stop that reaches the sensor.
 
-    lens, fields, distance, wavelengths, rule: as in `spot_diagram`.
+    lens, scene, sampling: as in `spot_diagram`.
 
-    Returns (F, W), from 0 to 1. Errors as of `spot_diagram`.
+    Returns (..., W), from 0 to 1. Errors as of `spot_diagram`.
     """
-    return _light(lens, fields, distance, wavelengths, rule, "object").throughput[1:]
+    return _light(lens, fitted(lens, scene), sampling, "object").throughput
 
 
 def relative_illumination(
-    lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    rule: PupilRule | None = None,
-    point: Point = "object",
+    lens: Lens, scene: Scene, sampling: float | PupilRule | None = None, point: Point = "object"
 ) -> Array:
     """Irradiance on the sensor relative to that of the field 0, for a uniform, Lambertian scene:
     the ratio of the areas of the cones of light in direction cosines.
 
-    lens, fields, distance, wavelengths, rule: as in `spot_diagram`.
+    lens, scene, sampling: as in `spot_diagram`.
     point: "object": the cone of light from one object point, as OpticStudio and CODE V compute it;
         "sensor": the cone at one point of the sensor, which is what a pixel collects. Both agree as
         far as the rays from an object point meet in one point.
 
-    Returns (F, W); 0 where no light arrives. OpticStudio's analysis divides by the brightest field
-    of its scan, `r / r.max()`; its operand RELI divides by the axis. Errors as of `spot_diagram`.
-    ValueError also where the light of an object point on the axis arrives collimated, without a
-    cone; inside a trace the ratio is then 0. An afocal lens has a cone, the area of its beams.
+    Returns (..., W); 0 where no light arrives. OpticStudio's analysis divides by the brightest
+    field of its scan, `r / r.max()`; its operand RELI divides by the axis. Errors as of
+    `spot_diagram`. ValueError also for points at several distances, and where the light of an
+    object point on the axis arrives collimated, without a cone; inside a trace the ratio is then 0.
+    An afocal lens has a cone, the area of its beams.
     """
-    light = _light(lens, fields, distance, wavelengths, rule, point)
+    scene = fitted(lens, scene)
+    light = _light(lens, scene.with_axis(), sampling, point)
     area = light.solid_angle
     if point == "object":
-        level = _collimated(lens, light, lens.checked_wavelengths(wavelengths))
+        level = _collimated(lens, jax.tree.map(lambda a: a[0], light), scene.wavelengths)
         known = known_values(level)
         if known is not None and bool(jnp.any(known)):
             raise ValueError(
@@ -184,68 +166,68 @@ def relative_illumination(
                 "point='sensor', or afocal: true for a lens whose image lies at infinity"
             )
         area = jnp.where(level[None], 0, area)
-    return safe_divide(area[1:], jnp.broadcast_to(area[:1], area[1:].shape))
+    found = safe_divide(area[1:], jnp.broadcast_to(area[:1], area[1:].shape))
+    return found.reshape(*scene.shape, -1)
 
 
 def solid_angle(
-    lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    rule: PupilRule | None = None,
-    point: Point = "object",
+    lens: Lens, scene: Scene, sampling: float | PupilRule | None = None, point: Point = "object"
 ) -> Array:
     """Area of the cone of light in direction cosines on the sensor: irradiance over radiance.
 
-    lens, fields, distance, wavelengths, rule, point: as in `relative_illumination`.
+    lens, scene, sampling, point: as in `relative_illumination`.
 
-    Returns (F, W); for a round cone about the normal it is pi sin^2 of its half angle; 0 where no
+    Returns (..., W); for a round cone about the normal it is pi sin^2 of its half angle; 0 where no
     light arrives. Errors as of `spot_diagram`.
     """
-    return _light(lens, fields, distance, wavelengths, rule, point).solid_angle[1:]
+    return _light(lens, fitted(lens, scene), sampling, point).solid_angle
 
 
-def light_rule(
-    lens: Lens, fields: Numbers, distance: Numbers, wavelengths: Numbers, order: int = _ORDER
-) -> Gauss | Clipped:
-    """A pupil rule for the light of all fields and the axis: a Gauss rule on the stop if light
-    fills it for all of them, else one that is fitted to the open part of the pupil.
+def rule_for(
+    lens: Lens, scene: Scene, sampling: float | PupilRule | None, order: int = _ORDER
+) -> PupilRule:
+    """The pupil rule of a sampling, see `spot_diagram`; of an order for None."""
+    if sampling is None:
+        return light_rule(lens, scene, order)
+    return sampling if isinstance(sampling, PupilRule) else converged_rule(lens, scene, sampling)
 
-    lens, fields, distance, wavelengths: as in `spot_diagram`; known numbers.
+
+def light_rule(lens: Lens, scene: Scene, order: int = _ORDER) -> Gauss | Clipped:
+    """A pupil rule for the light of all points: a Gauss rule on the stop if light fills it for all
+    of them, else one that is fitted to the open part of the pupil.
+
+    lens, scene: as in `spot_diagram`; known numbers.
     order: of the rule.
 
     ValueError inside a trace.
     """
-    known = known_values((lens, fields, distance, wavelengths))
+    known = known_values((lens, scene))
     if known is None:
         raise ValueError(
             "inside jax.jit or jax.vmap the rays cannot follow from what is clipped: make the rule "
-            "outside and pass it on, rule=drt_jax.converged_rule(lens, fields, ...), or name one, "
-            "such as rule=drt_jax.Gauss(12, 'bilateral')"
+            "outside and pass it on, sampling=drt_jax.converge(drt_jax.spot_diagram, lens, scene), "
+            "or name one, such as sampling=drt_jax.Gauss(12, 'bilateral')"
         )
     with jax.core.eval_context():
-        lens, fields, distance, wavelengths = known
-        angles = np.asarray(fields_array(fields, lens.curvature.dtype))
-        angles = np.concatenate([np.zeros_like(angles[:1]), angles])
-        scene = scene_of(lens, 0.0, distance, wavelengths)
-        symmetry = symmetry_of(lens, angles)
-        full = bool(_fills(lens, jnp.asarray(angles), scene))
+        lens, scene = known
+        scene = fitted(lens, scene)
+        symmetry = symmetry_of(lens, scene.field)
+        full = bool(_fills(lens, scene))
     if full and not (lens.apertures is not None and any(lens.apertures.blocks)):
         return Gauss(order, symmetry)
     return Clipped(order, symmetry, crossing=may_cross(lens))
 
 
 @functools.partial(jit, wanted=LARGE)
-def _fills(lens: Lens, fields: Array, axis: Scene) -> Array:
-    """Whether all rays over the stop and on its rim arrive, for all fields."""
+def _fills(lens: Lens, scene: Scene) -> Array:
+    """Whether all rays over the stop and on its rim arrive, from all points."""
     points = np.concatenate([hexapolar(_RINGS)[0], _rim()])
     aimed = tuple(jnp.asarray(p, lens.curvature.dtype) for p in points.T)
 
-    def one(field: Array) -> Array:
-        scene = Scene(field, axis.distance, axis.wavelengths)
-        return jnp.all(trace_bundle(lens, scene, aimed).status == Status.OK)
+    def one(point: Scene) -> Array:
+        return jnp.all(trace_bundle(lens, point, aimed).status == Status.OK)
 
-    return jnp.all(jax.vmap(one)(fields))
+    return jnp.all(over_points(one, scene))
 
 
 def _extra_points() -> np.ndarray:
@@ -268,15 +250,15 @@ def _rim() -> np.ndarray:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class _Light:
-    """Rays and light of F + 1 fields: row 0 is the axis.
+    """Rays and light of object points (...).
 
-    hit: (F + 1, W, Q, 2), mm. Along Q: mirror images of the rays of the rule (if it is bilateral),
+    hit: (..., W, Q, 2), mm. Along Q: mirror images of the rays of the rule (if it is bilateral),
         the rays of the rule, the chief ray, and those on the rim.
-    weight: (F + 1, W, Q); 0 for chief ray and rim.
-    arrives: (F + 1, W, Q), bool.
-    chief: (F + 1, W, 2), mm, hit of the chief ray.
-    chief_whole: (F + 1, W), bool, False where the chief ray fails.
-    throughput, solid_angle, left_out: (F + 1, W), as in `Spots`.
+    weight: (..., W, Q); 0 for chief ray and rim.
+    arrives: (..., W, Q), bool.
+    chief: (..., W, 2), mm, hit of the chief ray.
+    chief_whole: (..., W), bool, False where the chief ray fails.
+    throughput, solid_angle, left_out: (..., W), as in `Spots`.
     """
 
     hit: Array
@@ -290,60 +272,47 @@ class _Light:
 
 
 def _collimated(lens: Lens, light: _Light, wavelengths: Array) -> Array:
-    """Whether the image of the axis is farther away than `_FAR` times the exit pupil, (W,).
+    """Whether the image of an object point is farther away than `_FAR` times the exit pupil, (W,).
     There the light has no cone, and the hits show the width of the beam: the solid angle is
     below pi var (kappa / _FAR)^2, var the variance of the hits, 1 / kappa the distance of the
     exit pupil."""
-    hit, weight = light.hit[0], light.weight[0]
+    hit, weight = light.hit, light.weight
     share = normalised(weight)[..., None]
     square = jnp.sum(share * (hit - jnp.sum(share * hit, axis=1, keepdims=True)) ** 2, axis=(1, 2))
     kappa = reference_curvature(lens, jnp.clip(wavelengths, *lens.dispersion.range))
-    return light.solid_angle[0] < np.pi * square * (kappa / _FAR) ** 2
+    return light.solid_angle < np.pi * square * (kappa / _FAR) ** 2
 
 
-def _light(
-    lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    rule: PupilRule | None,
-    point: Point,
-) -> _Light:
-    """The light of the axis and of all fields."""
+def _light(lens: Lens, scene: Scene, sampling: float | PupilRule | None, point: Point) -> _Light:
+    """The light of all points of a scene that fits the lens."""
     require_one_of("point", point, get_args(Point))
-    angles = fields_array(fields, lens.curvature.dtype)
-    axis = scene_of(lens, 0.0, distance, wavelengths)
-    if rule is None:
-        rule = light_rule(lens, fields, distance, wavelengths)
-    angles = jnp.concatenate([jnp.zeros_like(angles[:1]), angles])
-    return _traced(lens, angles, axis, rule, point == "sensor")
+    return _traced(lens, scene, rule_for(lens, scene, sampling), point == "sensor")
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="fixed")
-def _traced(lens: Lens, fields: Array, axis: Scene, rule: PupilRule, fixed: bool) -> _Light:
-    """The light of fields (F + 1, 2). fixed: True for the cone at a point of the sensor, False
-    for that of an object point."""
-    return jax.vmap(lambda field: _of_field(lens, field, axis, rule, fixed))(fields)
+def _traced(lens: Lens, scene: Scene, rule: PupilRule, fixed: bool) -> _Light:
+    """`_light`, compiled. fixed: True for the cone at a point of the sensor, False for that of an
+    object point."""
+    return over_points(lambda point: _of_point(lens, point, rule, fixed), scene)
 
 
-def _of_field(lens: Lens, field: Array, axis: Scene, rule: PupilRule, fixed: bool) -> _Light:
-    """The light of one field: `_Light` without the axis of fields."""
-    scene = Scene(field, axis.distance, axis.wavelengths)
+def _of_point(lens: Lens, scene: Scene, rule: PupilRule, fixed: bool) -> _Light:
+    """The light of one object point."""
     points, weights = _whole_rule(lens, scene, rule)
     count = weights.shape[-1]
 
     def arriving(points: Vector, field: Array) -> tuple[tuple[Vector, Vector], tuple]:
         """Hits and transverse direction cosines at the sensor, which are differentiated; status
         and transmission."""
-        scene = Scene(field, axis.distance, axis.wavelengths)
-        bundle = trace_bundle(lens, scene, points)
+        bundle = trace_bundle(lens, scene.at(field), points)
         whole = reaches_sensor(bundle.status)
         hit = tuple(jnp.where(whole, h[-1], 0) for h in bundle.hits)
         line = tuple(jnp.where(whole, a, 0) for a in bundle.arrival[:-1])
         return (hit, line), (bundle.status, rule.transmission(lens, bundle))
 
-    (hit, _), jvp, (status, passes) = jax.linearize(arriving, points, field, has_aux=True)
-    area = np.pi * jnp.abs(direction_determinant(jvp, points, field, fixed))[:, :count]
+    ends = jax.linearize(arriving, points, scene.field, has_aux=True)
+    (hit, _), jvp, (status, passes) = ends
+    area = np.pi * jnp.abs(direction_determinant(jvp, points, scene.field, fixed))[:, :count]
     weight = weights * passes[:, :count]
     throughput, cone = jnp.sum(weight, axis=-1), jnp.sum(weight * area, axis=-1)
     arrives = status == Status.OK
@@ -403,36 +372,42 @@ def direction_determinant(jvp: Callable, points: Vector, field: Array, fixed: bo
     return determinant(columns)
 
 
-@functools.partial(jax.jit, static_argnames="middle")
-def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
-    """`Spots` of the fields. wavelength: the reference wavelength in the medium of the sensor,
-    um."""
-    light = jax.tree.map(lambda a: a[1:], light)
-    weight = light.weight * spectrum[None, :, None]
+@functools.partial(jax.jit, static_argnames=("middle", "axes"))
+def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int, axes: int) -> Spots:
+    """`Spots` of light with a number of leading axes.
+
+    wavelength: the reference wavelength in the medium of the sensor, um.
+    """
+    return batched(lambda one: _spot(one, spectrum, wavelength, middle), axes)(light)
+
+
+def _spot(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
+    """`_spots` of one object point."""
+    weight = light.weight * spectrum[:, None]
     hit = light.hit
-    lit = jnp.sum(weight, axis=(1, 2))
-    share = safe_divide(weight, jnp.broadcast_to(lit[:, None, None], weight.shape))
-    centroid = jnp.sum(share[..., None] * hit, axis=(1, 2))
-    chief = light.chief[:, middle]
+    lit = jnp.sum(weight)
+    share = safe_divide(weight, jnp.broadcast_to(lit, weight.shape))
+    centroid = jnp.sum(share[..., None] * hit, axis=(0, 1))
+    chief = light.chief[middle]
     good = lit > 0
-    whole = good & light.chief_whole[:, middle]
+    whole = good & light.chief_whole[middle]
 
     def spread(centre: Array, good: Array) -> tuple[Array, Array]:
         """RMS and largest distance from `centre`; inf where not `good`."""
-        square = jnp.sum((hit - centre[:, None, None]) ** 2, axis=-1)
-        mean = safe_sqrt(jnp.sum(share * square, axis=(1, 2)))
-        largest = safe_sqrt(jnp.max(jnp.where(light.arrives, square, 0), axis=(1, 2)))
+        square = jnp.sum((hit - centre[None, None]) ** 2, axis=-1)
+        mean = safe_sqrt(jnp.sum(share * square))
+        largest = safe_sqrt(jnp.max(jnp.where(light.arrives, square, 0)))
         return jnp.where(good, mean, jnp.inf), jnp.where(good, largest, jnp.inf)
 
     (rms, radius), (rms_chief, radius_chief) = spread(centroid, good), spread(chief, whole)
-    cone = light.solid_angle[:, middle]
+    cone = light.solid_angle[middle]
     aperture = safe_sqrt(cone / np.pi)
     airy = jnp.where(aperture > 0, safe_divide(_AIRY * wavelength, aperture), jnp.inf)
     return Spots(
         jnp.where(light.arrives[..., None], hit, jnp.inf),
         weight,
-        jnp.where(good[:, None], centroid, jnp.inf),
-        jnp.where(light.chief_whole[:, middle, None], chief, jnp.inf),
+        jnp.where(good, centroid, jnp.inf),
+        jnp.where(light.chief_whole[middle], chief, jnp.inf),
         rms,
         rms_chief,
         radius,

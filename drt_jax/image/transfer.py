@@ -14,7 +14,7 @@ short wavelengths it is the mean of exp(-2 pi i f.x) over rays.
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +22,13 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
-from ..inputs import require_one_of
+from ..inputs import require_one_of, require_tolerance
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fields_array, scene_of, spectrum_of
-from ..numerics import Numbers, einsum, real_array, safe_divide, safe_sqrt
+from ..lens.scene import Scene, fitted
+from ..numerics import Numbers, batched, einsum, real_array, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
-from .beam import Beam
+from .beam import Beam, BeamRule, beam_rule
+from .beam_psf import DEGREE, Sampling
 from .cover import cover
 from .refined import TOLERANCE, beams_of, to_tolerance
 from .rounding import warn_of_paths
@@ -37,17 +38,15 @@ from .wave_psf import pupil_function, shared_part
 
 Model = Literal["waves", "rays"]
 _UM = 1e3  # per mm
-# Degree of the polynomials.
-_DEGREE = 14
 
 
 class Transfer(NamedTuple):
-    """Transfer functions of F fields at N frequencies, for all wavelengths together.
+    """Transfer functions at N frequencies, for all wavelengths together.
 
     frequencies: (N,), cycles/mm on the sensor.
-    otf: complex, (F, 2, N) or, through focus, (F, Z, 2, N); 1 at frequency 0. Index 0 of the axis
-        of 2 is a grating across the y axis of the sensor (tangential, for a field along y), index 1
-        one across its x axis (sagittal). The phase refers to the centroid of the light.
+    otf: complex, (..., 2, N) or, through focus, (..., Z, 2, N); 1 at frequency 0. Index 0 of the
+        axis of 2 is a grating across the y axis of the sensor (tangential, for a field along y),
+        index 1 one across its x axis (sagittal). The phase refers to the centroid of the light.
     limit: the same for waves without aberrations in the same pupil.
 
     All are 0 where no light arrives.
@@ -65,120 +64,108 @@ class Transfer(NamedTuple):
 
 def transfer(
     lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
+    scene: Scene,
     frequencies: Numbers,
-    model: Model = "waves",
+    kind: Model | None = None,
     focus: Numbers = 0.0,
-    wavelength_weights: Numbers | None = None,
-    rule: PupilRule | None = None,
-    degree: int = _DEGREE,
-    cells: int | None = None,
-    tolerance: float = TOLERANCE,
+    sampling: float | PupilRule | Sampling = TOLERANCE,
 ) -> Transfer:
     """Optical transfer functions over frequency, field and focus, see `Transfer`.
 
-    lens: the lens.
-    fields: (F,) along y or (F, 2), radians.
-    distance: mm, inf allowed.
-    wavelengths: (W,), um.
+    lens, scene: the lens, and object points with their wavelengths. The weight of a wavelength is
+        multiplied by the throughput, so vignetted wavelengths count less.
     frequencies: (N,), cycles/mm.
-    model: "waves" (diffraction) or "rays" (geometric).
+    kind: "waves" (diffraction, the default) or "rays" (geometric).
     focus: (), mm by which the sensor is moved back; or (Z,), through focus: arrays are then
-        (F, Z, 2, N), and no more rays are traced.
-    wavelength_weights: (W,), normalised to the sum 1; None: equal. Each is multiplied by the
-        throughput, so vignetted wavelengths count less.
-    rule: pupil rule, whose kind is kept (`Gauss` or `Clipped`); None: found, outside of a trace.
-    degree: of the polynomials of the pupil.
-    cells: number of cells along a side of the pupil grid. None: as many as keep the error of the
-        contrast below `tolerance`; inside `jit` and `vmap`, where they cannot depend on it, 128.
-        Too few cells lower the contrast of a large blur, and never raise it.
-    tolerance: absolute error of the contrast.
+        (..., Z, 2, N), and no more rays are traced.
+    sampling: a tolerance, the absolute error of the contrast, to which the cells of the pupil grid
+        are chosen; a pupil rule, whose symmetry and kind (`Gauss` or `Clipped`) are taken, with
+        cells for 1e-3, or 128 of them inside `jit` and `vmap`; or a `Sampling`, for all of it.
 
     Differentiable in every mode. For waves, warns of float32 as `wavefront` does. ValueError as of
-    `scene_of`, without a rule inside a trace, and for a tolerance that is not between 0 and 1.
-    Warns if the tolerance is not met.
+    `lens.scene.fitted`, without a rule inside a trace, and for a tolerance that is not between 0
+    and 1. Warns if the tolerance is not met.
     """
-    scene = fields, distance, wavelengths
-    arrays = arrays_of(
-        lens, scene, model, focus, wavelength_weights, rule, "frequencies", frequencies
-    )
-    angles, axis, values, spectrum, steps, rule = arrays
-    beams = beams_of(lens, angles, axis, rule, degree)
-    run = functools.partial(_transfer, model=model)
-    known = lens, beams, axis.wavelengths, values, spectrum, steps
-    otf, limit = to_tolerance(run, known, cells, tolerance, lambda *_: 0)
+    scene, plan = fitted(lens, scene), planned(lens, scene, kind, sampling)
+    values, steps = places_of(lens, "frequencies", frequencies, focus)
+    beams = beams_of(lens, scene, plan.rule)
+    run = functools.partial(_transfer, model=plan.kind, axes=len(scene.shape))
+    known = lens, beams, (scene.wavelengths, values, scene.spectrum), steps
+    otf, limit = to_tolerance(run, known, plan.cells, plan.tolerance, lambda *_: 0)
     return Transfer(values, otf, limit)
 
 
-def arrays_of(
-    lens: Lens,
-    scene: tuple[Numbers, Numbers, Numbers],
-    model: Model,
-    focus: Numbers,
-    wavelength_weights: Numbers | None,
-    rule: PupilRule | None,
-    name: str,
-    places: Numbers,
-) -> tuple[Array, Scene, Array, Array, Array, PupilRule]:
-    """Checks the arguments of `transfer` and of `encircled_energy`, and returns them as arrays.
+class Plan(NamedTuple):
+    """What a sampling asks for.
 
-    scene: fields, distance and wavelengths.
-    model, focus, wavelength_weights, rule: as in `transfer`.
-    name, places: frequencies or radii (N,), and their name for messages.
-
-    Returns fields (F, 2), the scene of the axis, places (N,), spectrum (W,), focus () or (Z,), and
-    the rule.
+    kind: "waves" or "rays".
+    rule: rays and polynomials of the beams.
+    cells: number of cells along a side of the pupil grid; None for as many as the tolerance needs.
+    tolerance: absolute error.
     """
-    require_one_of("model", model, get_args(Model))
-    dtype = lens.curvature.dtype
-    axis, angles = scene_of(lens, 0.0, *scene[1:]), fields_array(scene[0], dtype)
+
+    kind: Model
+    rule: BeamRule
+    cells: int | None
+    tolerance: float
+
+
+def planned(
+    lens: Lens, scene: Scene, kind: Model | None, sampling: float | PupilRule | Sampling
+) -> Plan:
+    """The `Plan` of a sampling, see `transfer`; for waves, warns of float32.
+
+    scene: a scene that fits the lens.
+    """
+    own = sampling if isinstance(sampling, Sampling) else None
+    if own is not None and kind not in (None, own.kind):
+        raise ValueError(f"kind: the sampling is of the kind {own.kind!r}, got {kind!r}")
+    asked = kind or ("waves" if own is None else own.kind)
+    require_one_of("kind", asked, get_args(Model))
+    model = cast(Model, asked)
     if model == "waves":
-        warn_of_paths(lens, axis, angles, 4, True)
+        warn_of_paths(lens, scene, 4, True)
+    if isinstance(sampling, Sampling):
+        return Plan(model, sampling.rule, sampling.cells, TOLERANCE)
+    rule, tolerance = sampling, TOLERANCE
+    if not isinstance(rule, PupilRule):
+        rule, tolerance = light_rule(lens, scene), require_tolerance(rule)
+    return Plan(model, beam_rule(DEGREE, rule.symmetry, rule), None, tolerance)
+
+
+def places_of(lens: Lens, name: str, places: Numbers, focus: Numbers) -> tuple[Array, Array]:
+    """Frequencies or radii (N,), with their name for messages, and focus () or (Z,), as arrays."""
+    dtype = lens.curvature.dtype
     values, steps = real_array(name, places, dtype), real_array("focus", focus, dtype)
     if values.ndim != 1:
         raise ValueError(f"{name}: expected (N,), got shape {values.shape}")
-    spectrum = spectrum_of(wavelength_weights, axis, dtype)
     if steps.ndim > 1:
         raise ValueError(f"focus: expected one number or (Z,), got shape {steps.shape}")
-    rule = light_rule(lens, *scene) if rule is None else rule
-    return angles, axis, values, spectrum, steps, rule
+    return values, steps
 
 
-def strehl(
-    lens: Lens,
-    fields: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    rule: PupilRule | None = None,
-    degree: int = _DEGREE,
-    cells: int | None = None,
-    tolerance: float = TOLERANCE,
-) -> Array:
+def strehl(lens: Lens, scene: Scene, sampling: float | PupilRule | Sampling = TOLERANCE) -> Array:
     """Strehl ratio: the irradiance at the centre of the image of a point, relative to that without
     aberrations in the same pupil: `|integral of P|^2 / (integral of |P|)^2` over direction cosines.
 
-    lens, fields, distance, wavelengths, rule, degree, cells: as in `transfer`.
-    tolerance: absolute error of the ratio.
+    lens, scene: as in `transfer`.
+    sampling: as there, for waves; a tolerance is the absolute error of the ratio.
 
-    Returns (F, W); 0 where no light arrives. The centre is the point where the wavefront has no
+    Returns (..., W); 0 where no light arrives. The centre is the point where the wavefront has no
     tilt in the least-squares sense over the pupil: the peak, if the wavefront error is a quarter of
     a wave or less.
     """
-    axis = scene_of(lens, 0.0, distance, wavelengths)
-    angles = fields_array(fields, lens.curvature.dtype)
-    warn_of_paths(lens, axis, angles, of_beams=True)
-    if rule is None:
-        rule = light_rule(lens, fields, distance, wavelengths)
-    arrays = lens, beams_of(lens, angles, axis, rule, degree), axis.wavelengths
-    return to_tolerance(_strehl, arrays, cells, tolerance, lambda *_: 0)
+    scene = fitted(lens, scene)
+    plan = planned(lens, scene, "waves", sampling)
+    arrays = lens, beams_of(lens, scene, plan.rule), scene.wavelengths
+    run = functools.partial(_strehl, axes=len(scene.shape))
+    return to_tolerance(run, arrays, plan.cells, plan.tolerance, lambda *_: 0)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames="cells")
-def _strehl(lens: Lens, beams: Beam, wavelengths: Array, cells: int) -> Array:
-    """`strehl` of beams with F as first axis, for a number of cells."""
-    return jax.vmap(lambda beam: strehl_of(lens, beam, wavelengths, cells))(beams)
+@functools.partial(jit, wanted=LARGE, static_argnames=("cells", "axes"))
+def _strehl(lens: Lens, beams: Beam, wavelengths: Array, cells: int, axes: int) -> Array:
+    """`strehl` of beams with a number of leading axes, for a number of cells."""
+    return batched(lambda beam: strehl_of(lens, beam, wavelengths, cells), axes)(beams)
 
 
 def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
@@ -202,21 +189,17 @@ def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
     return jnp.where(lit, total.real**2 + total.imag**2, 0)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells"))
+@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells", "axes"))
 def _transfer(
-    lens: Lens,
-    beams: Beam,
-    wavelengths: Array,
-    frequencies: Array,
-    spectrum: Array,
-    focus: Array,
-    model: Model,
-    cells: int,
-) -> tuple[Array, Array]:
-    """`transfer` of beams with F as first axis, for a number of cells: otf and limit."""
-    settings = wavelengths, frequencies, spectrum, model, cells
-    one = lambda beam: transfer_of(lens, beam, *settings)  # noqa: E731
-    return jax.vmap(lambda beam: through_focus(beam, focus, one))(beams)
+    lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array, model: Model,
+    cells: int, axes: int
+) -> tuple[Array, Array]:  # fmt: skip
+    """`transfer` of beams with a number of leading axes, for a number of cells: otf and limit.
+
+    asked: wavelengths (W,), frequencies (N,) and spectrum (W,).
+    """
+    one = lambda beam: transfer_of(lens, beam, *asked, model, cells)  # noqa: E731
+    return batched(lambda beam: through_focus(beam, focus, one), axes)(beams)
 
 
 def through_focus(beam: Beam, focus: Array, of: Callable[[Beam], Any]) -> Any:

@@ -21,7 +21,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray, paraxial_system
-from ..lens.scene import Scene, scene_of
+from ..lens.scene import Scene, fitted, over_points
 from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
 from ..rays.afocal import FOCAL
 from ..rays.status import Status, reaches_sensor
@@ -35,11 +35,13 @@ _MM = 1e-3  # per um
 class Wavefront(NamedTuple):
     """Optical path differences of rays.
 
-    opd: (W, Q), waves, path of the chief ray less path of the ray, both to the reference sphere:
-        positive where the wavefront is ahead of the sphere; 0 for a ray that fails or is clipped.
-    status: (W, Q), int32, see `Status`. If the chief ray of a wavelength fails, no ray has an opd,
-        and OK and CLIPPED are replaced by the status of the chief ray.
-    image: (W, 2), mm, point of the chief ray on the sensor, along its axes; 0 if the ray fails.
+    opd: (..., W, Q), waves, path of the chief ray less path of the ray, both to the reference
+        sphere: positive where the wavefront is ahead of the sphere; 0 for a ray that fails or is
+            clipped.
+    status: (..., W, Q), int32, see `Status`. If the chief ray of a wavelength fails, no ray has an
+        opd, and OK and CLIPPED are replaced by the status of the chief ray.
+    image: (..., W, 2), mm, point of the chief ray on the sensor, along its axes; 0 if the ray
+        fails.
     """
 
     opd: Array
@@ -66,17 +68,11 @@ def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
 
 
 def wavefront(
-    lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    pupil: Numbers,
-    curvature: Numbers | None = None,
+    lens: Lens, scene: Scene, pupil: Numbers, curvature: Numbers | None = None
 ) -> Wavefront:
     """Optical path difference of the rays that cross the stop at given points.
 
-    lens: the lens.
-    field, distance, wavelengths: as in `trace_rays`; wavelengths (W,).
+    lens, scene: as in `trace_rays`.
     pupil: (Q, 2), points on the stop, as in `trace_rays`.
     curvature: () or (W,), kappa of the reference sphere along the axis, 1/mm, instead of
         `reference_curvature`. Needed for a lens folded by tilted mirrors, which the paraxial trace
@@ -88,7 +84,7 @@ def wavefront(
     curvature that is not finite; inside a trace rays that pass are then UNCONVERGED and have no
     opd.
     """
-    scene = scene_of(lens, field, distance, wavelengths)
+    scene = fitted(lens, scene)
     points = stop_points(lens, pupil)
     kappa = None
     if curvature is not None:
@@ -107,9 +103,13 @@ def wavefront(
 def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) -> Wavefront:
     """`wavefront` of checked arguments."""
     points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil])  # the chief ray first
-    bundle = trace_bundle(lens, scene, (points[:, 0], points[:, 1]))
-    opd, status, image = path_differences(lens, scene.wavelengths, bundle, curvature)
-    return Wavefront(opd[:, 1:], status[:, 1:], image)
+
+    def one(point: Scene) -> Wavefront:
+        bundle = trace_bundle(lens, point, (points[:, 0], points[:, 1]))
+        opd, status, image = path_differences(lens, scene.wavelengths, bundle, curvature)
+        return Wavefront(opd[:, 1:], status[:, 1:], image)
+
+    return over_points(one, scene)
 
 
 def path_differences(
@@ -156,7 +156,7 @@ def path_differences(
 
 
 def rms_wavefront(wave: Wavefront, weights: Numbers) -> Array:
-    """Root mean square (W,) of the opd about its mean, waves; 0 if no ray has an opd. The tilt
+    """Root mean square (..., W) of the opd about its mean, waves; 0 if no ray has an opd. The tilt
     about the chief ray is not removed.
 
     wave: result of `wavefront`.
@@ -164,9 +164,9 @@ def rms_wavefront(wave: Wavefront, weights: Numbers) -> Array:
         ValueError for another shape.
     """
     weight = real_array("weights", weights, wave.opd.dtype)
-    if weight.shape != wave.opd.shape[1:]:
-        raise ValueError(f"weights: expected {wave.opd.shape[1:]}, got shape {weight.shape}")
+    if weight.shape != wave.opd.shape[-1:]:
+        raise ValueError(f"weights: expected {wave.opd.shape[-1:]}, got shape {weight.shape}")
     weight = jnp.where(wave.status == Status.OK, weight, 0)
-    weight = safe_divide(weight, jnp.sum(weight, axis=1, keepdims=True))
-    mean = jnp.sum(weight * wave.opd, axis=1, keepdims=True)
-    return safe_sqrt(jnp.sum(weight * (wave.opd - mean) ** 2, axis=1))
+    weight = safe_divide(weight, jnp.sum(weight, axis=-1, keepdims=True))
+    mean = jnp.sum(weight * wave.opd, axis=-1, keepdims=True)
+    return safe_sqrt(jnp.sum(weight * (wave.opd - mean) ** 2, axis=-1))

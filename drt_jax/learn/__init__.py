@@ -1,1 +1,37 @@
-"""The network and its training; no optics formula in here."""
+"""The network and its training; no optics formula in here.
+
+Data: `load_patches`, `batches`. One blur for all patches, as in the paper: `make_imager`,
+`make_step`. Object points anywhere in the field: `FieldImager`, `draw_points`, `make_field_step`,
+`make_damped_step`. The loop: `fit`, `evaluate`.
+"""
+
+from ..image.depth import depth_moments as depth_moments, moments_model as moments_model
+from ..image.kernel import gaussian_psf as gaussian_psf, separable_psf as separable_psf
+from ..image.sensor import (
+    convolve as convolve,
+    convolve_each as convolve_each,
+    sensor_layer as sensor_layer,
+)
+from ..lens.lens import movable as movable
+from .adam import adam as adam, apply_updates as apply_updates
+from .data import (
+    DataConfig as DataConfig,
+    Patches as Patches,
+    batches as batches,
+    load_patches as load_patches,
+)
+from .field import (
+    FieldImager as FieldImager,
+    ObjectPoints as ObjectPoints,
+    draw_points as draw_points,
+    make_damped_step as make_damped_step,
+    make_field_step as make_field_step,
+)
+from .network import count_parameters as count_parameters, red_net as red_net
+from .train import (
+    Camera as Camera,
+    evaluate as evaluate,
+    fit as fit,
+    make_imager as make_imager,
+    make_step as make_step,
+)

@@ -6,7 +6,7 @@ number of mirrors, index and distances are negative. Tilts and decentres are neg
 surface or phase without rotational symmetry, the (y, z) section counts. Source of the formulas:
 Welford, Aberrations of Optical Systems (1986), ch. 3, 6, 8, 10.
 
-ValueError as in `scene_of`. Inside a trace, where values are not known, results are inf for a
+ValueError as in `fitted`. Inside a trace, where values are not known, results are inf for a
 wavelength outside the range of a glass, for a distance within 1e-6 mm of 0 and for a field of 90
 degrees or more.
 """
@@ -21,7 +21,7 @@ from jax import Array
 
 from ..numerics import Numbers, safe_divide, still
 from .lens import Lens
-from .scene import ahead, away_from_vertex, distance_array, field_array, vergence_of
+from .scene import ahead, away_from_vertex, distance_array, known_angles, vergence_of
 from .surface import vertex_curvature
 
 # Largest rounding error of the last slope, in units of eps times the sum of the absolute values of
@@ -303,7 +303,7 @@ def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Num
     system = paraxial_system(lens, wavelengths)
     far = distance_array(distance, lens.curvature.dtype)
     slope = trace_ray(system, 1.0, vergence_of(far)).behind[-1]
-    angle = field_array(field, lens.curvature.dtype)[..., None]
+    angle = jnp.asarray(known_angles("field", field), lens.curvature.dtype)[..., None]
     forwards = ahead(angle)
     tangent = jnp.tan(jnp.where(forwards, angle, 0))
     fields = tuple(range(tangent.ndim - 1))

@@ -1,6 +1,8 @@
-"""The scene: an object point and wavelengths."""
+"""The scene: object points and wavelengths."""
 
+import contextlib
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -8,10 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..numerics import Numbers, concrete, real_array
+from ..numerics import Numbers, concrete, known_array, real_array
 from .lens import Lens
 
-_RIGHT = np.pi / 2
+_RIGHT, _DEGREE = np.pi / 2, np.pi / 180
+# The d line of helium, um.
+D_LINE = 0.5875618
 # Smallest distance of an object in front of the first vertex or behind it, mm: the square of
 # 1 / distance is still finite in float32.
 NEAREST = 1e-6
@@ -20,36 +24,178 @@ NEAREST = 1e-6
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """An object point and its wavelengths, as arrays of one floating dtype.
+    """Where light comes from, and in which colours: object points and wavelengths.
 
-    field: (2,), angles along x and y, radians: light travels along (tan x, tan y, 1).
-    distance: (), from the object plane to the first vertex, mm; inf, or -inf, for an object at
+    field: (..., 2), angles along x and y, radians: light travels along (tan x, tan y, 1).
+    distance: (...), from the object plane to the first vertex, mm; inf, or -inf, for an object at
         infinity. Below 0 for a virtual object: light that converges to a point behind the first
         vertex.
     wavelengths: (W,), um.
+    wavelength_weights: (W,), of any sum; None for equal weights.
+    field_weights: (F,), of any sum, for a design problem; None for equal weights.
+
+    `field[..., 0]` and `distance` broadcast to the shape of the points: () for one point, (P,) for
+    P points, (Z, F) for every field at every distance. Results of analyses have this shape as their
+    first axes, then that of the wavelengths. All fields are leaves of a pytree.
     """
 
     field: Array
     distance: Array
     wavelengths: Array
+    wavelength_weights: Array | None = None
+    field_weights: Array | None = None
+
+    @classmethod
+    def point(
+        cls,
+        field: Numbers = 0.0,
+        distance: Numbers = np.inf,
+        wavelengths: Numbers = D_LINE,
+        **weights: Numbers | None,
+    ) -> "Scene":
+        """One field: a point, or points at several distances.
+
+        field: one angle (along y) or two (x, y), radians.
+        distance: () or (Z,), mm.
+        wavelengths: one or (W,), um.
+        weights: `wavelength_weights`.
+
+        ValueError for other shapes, for anything that is not a real number, and for known numbers
+        that are not possible: an angle of 90 degrees or more, a distance within 1e-6 mm of 0.
+        """
+        angles = known_angles("field", field)
+        if angles.shape not in ((), (2,)):
+            raise ValueError(f"field: expected one angle or two, got shape {angles.shape}")
+        shape = known_array("distance", distance).shape
+        if len(shape) > 1:
+            raise ValueError(f"distance: expected one number or (Z,), got shape {shape}")
+        pair = angles if angles.ndim else _pairs(angles)
+        return cls._made(pair, distance, wavelengths, weights)
+
+    @classmethod
+    def radians(
+        cls,
+        fields: Numbers,
+        distance: Numbers = np.inf,
+        wavelengths: Numbers = D_LINE,
+        **weights: Numbers | None,
+    ) -> "Scene":
+        """Points at several fields.
+
+        fields: (F,) along y, or pairs (F, 2) along x and y, radians; one number for one point.
+        distance: one, or (F,) with one for each field, mm.
+        wavelengths: one or (W,), um.
+        weights: `wavelength_weights` (W,) and `field_weights` (F,).
+
+        ValueError as of `point`.
+        """
+        return cls._made(_fields(known_angles("fields", fields)), distance, wavelengths, weights)
+
+    @classmethod
+    def degrees(cls, fields: Numbers, *others: Any, **named: Any) -> "Scene":
+        """`radians` of fields in degrees."""
+        return cls.radians(known_array("fields", fields) * _DEGREE, *others, **named)
+
+    @classmethod
+    def heights(cls, heights: Numbers, distance: Numbers, *others: Any, **named: Any) -> "Scene":
+        """`radians` of object points at heights above the axis: (F,) or (F, 2), mm, at a finite
+        distance."""
+        return cls.radians(field_of_height(heights, distance), distance, *others, **named)
+
+    @classmethod
+    def grid(
+        cls,
+        fields: Numbers,
+        distances: Numbers,
+        wavelengths: Numbers = D_LINE,
+        **weights: Numbers | None,
+    ) -> "Scene":
+        """Every field at every distance: points of the shape (Z, F).
+
+        fields, wavelengths, weights: as in `radians`.
+        distances: one or (Z,), mm.
+        """
+        far = known_array("distances", distances).reshape(-1, 1)
+        angles = _fields(known_angles("fields", fields))
+        return cls._made(angles.reshape(-1, 2), far, wavelengths, weights)
+
+    @classmethod
+    def _made(
+        cls, angles: Any, distance: Numbers, wavelengths: Numbers, weights: dict[str, Any]
+    ) -> "Scene":
+        """A scene of angles (..., 2)."""
+        far, waves = known_array("distance", distance), known_array("wavelengths", wavelengths)
+        _check_distance(distance)
+        waves = waves.reshape(1) if waves.ndim == 0 else waves
+        shares = {n: None if w is None else known_array(n, w) for n, w in weights.items()}
+        return cls(angles, far, waves, **shares)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the points."""
+        return np.broadcast_shapes(np.shape(self.field)[:-1], np.shape(self.distance))
+
+    @property
+    def spectrum(self) -> Array:
+        """Weights of the wavelengths, (W,), of any sum."""
+        own = self.wavelength_weights
+        return jnp.ones_like(self.wavelengths) if own is None else own
+
+    def at(self, field: Array, distance: Array | None = None) -> "Scene":
+        """The same colours from another field (..., 2), and from another distance (...)."""
+        distance = self.distance if distance is None else distance
+        return Scene(field, distance, self.wavelengths, self.wavelength_weights)
+
+    def reference(self, index: int | None) -> int:
+        """The index of the reference wavelength: the middle one, W // 2, for None.
+
+        ValueError for an index out of range.
+        """
+        count = len(self.wavelengths)
+        found = count // 2 if index is None else index
+        if not -count <= found < count:
+            raise ValueError(f"reference: expected an index of the wavelengths, got {index!r}")
+        return found
+
+    def with_axis(self) -> "Scene":
+        """The points of a scene with one distance as (1 + F,): the axis, then the fields.
+
+        ValueError for several distances.
+        """
+        if np.ndim(self.distance):
+            shape = np.shape(self.distance)
+            raise ValueError(f"distance: expected one for all fields, got shape {shape}")
+        return self.at(jnp.pad(self.field.reshape(-1, 2), ((1, 0), (0, 0))))
+
+    def each(self) -> "list[Scene]":
+        """The points, one by one."""
+        fields, far = self.flat()
+        return [self.at(fields[k], far[k]) for k in range(len(far))]
+
+    def flat(self) -> tuple[Array, Array]:
+        """Field (P, 2) and distance (P,) of all points."""
+        return (
+            jnp.broadcast_to(self.field, (*self.shape, 2)).reshape(-1, 2),
+            jnp.broadcast_to(self.distance, self.shape).reshape(-1),
+        )
 
     @property
     def possible(self) -> Array:
-        """True if light from the object can enter the lens, (), bool.
+        """True if light from the object can enter the lens, (...), bool.
 
         This needs angles below 90 degrees and a distance other than 0. In a trace, the rays of
         other scenes are MISSED.
         """
-        return jnp.all(ahead(self.field)) & away_from_vertex(self.distance)
+        return jnp.all(ahead(self.field), axis=-1) & away_from_vertex(self.distance)
 
     @property
     def tangent(self) -> Array:
-        """Tangents (2,) of the field angles; 0 for an angle of 90 degrees or more."""
+        """Tangents (..., 2) of the field angles; 0 for an angle of 90 degrees or more."""
         return jnp.tan(jnp.where(ahead(self.field), self.field, 0))
 
     @property
     def vergence(self) -> Array:
-        """1 / distance, (), 1/mm; 0 for a distance of 0."""
+        """1 / distance, (...), 1/mm; 0 for a distance of 0."""
         return vergence_of(self.distance)
 
 
@@ -69,69 +215,99 @@ def vergence_of(distance: Array) -> Array:
     return jnp.where(good, 1 / jnp.where(good, distance, 1), 0)
 
 
-def scene_of(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> Scene:
-    """A scene in the dtype of the lens.
+def fitted(lens: Lens, scene: Scene) -> Scene:
+    """A scene as arrays in the dtype of a lens.
 
-    lens: the lens.
-    field: one angle (along y) or two (x, y), radians: light travels along (tan x, tan y, 1).
-    distance: from the object plane to the first vertex, mm, see `Scene`.
-    wavelengths: (W,) or one, um.
-
-    ValueError for other shapes, for anything that is not a real number, for a lens whose arrays do
-    not fit together, and, as far as values are known, for an angle of 90 degrees or more, a
-    distance within 1e-6 mm of 0 or a wavelength outside the range of a glass. See `Scene.possible`.
+    ValueError for what is not a `Scene`, for a lens whose arrays do not fit together, for points
+    and weights of the wrong shape, and, as far as values are known, for numbers that are not
+    possible, see `Scene.point`, and for a wavelength outside the range of a glass.
     """
+    if not isinstance(scene, Scene):
+        raise ValueError(
+            f"scene: expected a Scene, such as Scene.degrees([0, 14], wavelengths=0.55), got a "
+            f"{type(scene).__name__}"
+        )
     lens.check()
     dtype = lens.curvature.dtype
-    angles = field_array(field, dtype)
-    if angles.shape not in ((), (2,)):
-        raise ValueError(f"field: expected one angle or two, got shape {angles.shape}")
-    if angles.ndim == 0:
-        angles = jnp.stack([jnp.zeros_like(angles), angles])
-    return Scene(angles, distance_array(distance, dtype), lens.checked_wavelengths(wavelengths))
+
+    def array(what: str) -> Array:
+        """Numbers of the scene; known ones stay known inside `jit`."""
+        numbers = getattr(scene, what)
+        with jax.core.eval_context() if concrete(numbers) else contextlib.nullcontext():
+            found = real_array(what, numbers, dtype)
+            return jnp.atleast_1d(found) if what.startswith("wavelength") else found
+
+    lens.checked_wavelengths(scene.wavelengths)  # ValueError
+    waves = array("wavelengths")
+    weights = None if scene.wavelength_weights is None else array("wavelength_weights")
+    if weights is not None and weights.shape != waves.shape:
+        raise ValueError(f"wavelength_weights: expected {waves.shape}, got {weights.shape}")
+    known_angles("field", scene.field)
+    _check_distance(scene.distance)
+    field, distance = array("field"), array("distance")
+    if field.ndim == 0 or field.shape[-1] != 2:
+        raise ValueError(f"field: expected (..., 2), got shape {field.shape}")
+    try:
+        np.broadcast_shapes(field.shape[:-1], distance.shape)
+    except ValueError:
+        raise ValueError(
+            f"distance: expected one, or one for each of the fields {field.shape[:-1]}, got shape "
+            f"{distance.shape}"
+        ) from None
+    return Scene(field, distance, waves, weights, scene.field_weights)
 
 
-def field_array(field: Numbers, dtype: Any) -> Array:
-    """Angles as an array (...), radians.
+def over_points(function: Callable[[Scene], Any], scene: Scene) -> Any:
+    """A function of one object point, evaluated for all points of a scene. Its results get the
+    shape of the points as their first axes.
 
-    ValueError for anything that is not an angle, and for a known angle of 90 degrees or more.
+    function: takes a scene of one point.
+    scene: arrays, as `fitted` returns them.
     """
-    angles = real_array("field", field, dtype)
-    for angle in _known(field):
+    if not scene.shape:
+        return function(scene)
+    if not scene.distance.ndim:  # all points share what follows from the distance
+        fields = scene.field.reshape(-1, 2)
+        found = jax.vmap(lambda field: function(scene.at(field)))(fields)
+    else:
+        found = jax.vmap(lambda *point: function(scene.at(*point)))(*scene.flat())
+    return jax.tree.map(lambda a: a.reshape(*scene.shape, *a.shape[1:]), found)
+
+
+def known_angles(what: str, values: Numbers) -> Any:
+    """Angles as an array (...), radians. ValueError for a known angle of 90 degrees or more."""
+    found = known_array(what, values)
+    for angle in _known(values):
         if not abs(angle) < _RIGHT:
             raise ValueError(
-                f"field: {angle:g} rad = {np.degrees(angle):.4g} degrees, must be below 90; angles "
-                f"are radians: np.radians({angle:g})"
+                f"{what}: {angle:g} rad = {np.degrees(angle):.4g} degrees, must be below 90; "
+                "Scene.degrees takes degrees"
             )
-    return angles
+    return found
 
 
-def fields_array(fields: Numbers, dtype: Any) -> Array:
-    """Angles of F fields as an array (F, 2), radians.
+def _pairs(angles: Any) -> Any:
+    """Pairs (..., 2) of the angles (...) along y."""
+    there = np if isinstance(angles, np.ndarray) else jnp
+    return there.stack([there.zeros_like(angles), angles], axis=-1)
 
-    fields: one angle, (F,) along y, or (F, 2). ValueError for other shapes, and as in
-        `field_array`.
-    """
-    angles = jnp.atleast_1d(field_array(fields, dtype))
-    if angles.ndim == 1:
-        angles = jnp.stack([jnp.zeros_like(angles), angles], axis=-1)
-    if angles.ndim != 2 or angles.shape[1] != 2 or not len(angles):
+
+def _fields(angles: Any) -> Any:
+    """Pairs (F, 2), or (2,), of angles: (F,) or () along y, or pairs (F, 2)."""
+    pairs = _pairs(angles) if angles.ndim < 2 else angles
+    if pairs.shape[-1] != 2 or not pairs.size or pairs.ndim > 2:
         raise ValueError(f"fields: expected (F,) or (F, 2), got shape {angles.shape}")
-    return angles
+    return pairs
 
 
-def spectrum_of(weights: Numbers | None, scene: Scene, dtype: Any) -> Array:
-    """Weights of the wavelengths of a scene as an array (W,), of any sum.
-
-    weights: (W,), or None for equal weights. ValueError for another shape.
-    """
-    count = scene.wavelengths.shape[0]
-    if weights is None:
-        return jnp.ones(count, dtype)
-    spectrum = real_array("wavelength_weights", weights, dtype)
-    if spectrum.shape != (count,):
-        raise ValueError(f"wavelength_weights: expected ({count},), got {spectrum.shape}")
-    return spectrum
+def _check_distance(distance: Numbers) -> None:
+    """ValueError for a known distance within 1e-6 mm of 0."""
+    for value in _known(distance):
+        if not abs(value) >= np.float32(NEAREST):  # 1e-6 in float32, too
+            raise ValueError(
+                f"distance: must be {NEAREST:g} mm or more, inf for an object at infinity, below "
+                f"0 for light that converges to a point behind the first vertex; got {value:g}"
+            )
 
 
 def distance_array(distance: Numbers, dtype: Any) -> Array:
@@ -143,12 +319,7 @@ def distance_array(distance: Numbers, dtype: Any) -> Array:
     far = real_array("distance", distance, dtype)
     if far.ndim:
         raise ValueError(f"distance: expected one number, got shape {far.shape}")
-    for value in _known(distance):
-        if not abs(far.dtype.type(value)) >= far.dtype.type(NEAREST):  # 1e-6 in float32, too
-            raise ValueError(
-                f"distance: must be {NEAREST:g} mm or more, inf for an object at infinity, below "
-                f"0 for light that converges to a point behind the first vertex; got {value:g}"
-            )
+    _check_distance(distance)
     return far
 
 
@@ -174,17 +345,3 @@ def field_of_height(height: Numbers, distance: Numbers) -> Array:
         raise ValueError("distance: at infinity an object has a field, but no height")
     good = away_from_vertex(far) & (jnp.abs(far) < jnp.inf)
     return jnp.where(good, -jnp.arctan(heights / jnp.where(good, far, 1)), _RIGHT)
-
-
-def points_arrays(fields: Numbers, distances: Numbers, dtype: jnp.dtype) -> tuple[Array, Array]:
-    """Fields (B, 2), radians, and distances (B,), mm, of B object points.
-
-    One distance serves all points. ValueError for other shapes.
-    """
-    angles = real_array("fields", fields, dtype)
-    far = real_array("distances", distances, dtype)
-    if angles.ndim != 2 or angles.shape[1] != 2 or far.shape not in ((), angles.shape[:1]):
-        raise ValueError(
-            f"fields, distances: expected (B, 2) and (B,), got {angles.shape} and {far.shape}"
-        )
-    return angles, jnp.broadcast_to(far, angles.shape[:1])

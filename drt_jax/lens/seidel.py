@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..numerics import Numbers, known_values, safe_divide
+from ..numerics import known_values, safe_divide
 from .forms import FORMS
 from .lens import Lens
 from .paraxial import (
@@ -22,7 +22,7 @@ from .paraxial import (
     petzval_parts,
     trace_ray,
 )
-from .scene import ahead, away_from_vertex, distance_array, field_array, vergence_of
+from .scene import Scene, fitted, over_points
 from .surface import by_form, surface_sag
 
 
@@ -104,7 +104,7 @@ def _seidel(
     )
 
 
-def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers) -> ThirdOrder:
+def third_order(lens: Lens, scene: Scene) -> ThirdOrder:
     """Third-order aberrations of each surface; `.total` adds them up.
 
     Conics and the r^2 and r^4 terms of aspheres count. Odd powers of r have no place in this theory
@@ -112,9 +112,7 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
     one wavelength.
 
     lens: the lens.
-    field: (), edge of the field, radians.
-    distance: from the object to the first vertex, mm; may be inf.
-    wavelengths: (W,), um.
+    scene: the edge of the field, along y, and wavelengths.
 
     ValueError for a surface that diffracts, has no rotational symmetry or is tilted or decentred,
     and as in `paraxial`. Inside a trace, where tilts are not known, a tilted lens has infinite
@@ -131,23 +129,28 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
             "third order: no theory for tilted or decentred surfaces; set lens.tilt, lens.decentre "
             "and lens.elements to None for the lens without them"
         )
-    system = paraxial_system(lens, wavelengths)
-    far = distance_array(distance, lens.curvature.dtype)
-    angle = field_array(field, lens.curvature.dtype)
-    if angle.ndim:
-        raise ValueError(f"field: expected one angle, got shape {angle.shape}")
-    vergence, forwards = vergence_of(far), ahead(angle)
+    across = known_values(scene.field)
+    if across is not None and np.any(np.asarray(across)[..., 0]):
+        raise ValueError("field: third order: give an angle along y, for x and y their diagonal")
+    return over_points(lambda point: _third_order(lens, point), fitted(lens, scene))
+
+
+def _third_order(lens: Lens, scene: Scene) -> ThirdOrder:
+    """`third_order` of one object point; 0 where the lens is tilted or the field is not along y."""
+    moves = lens.decentre, lens.tilt, lens.elements and (lens.elements.shift, lens.elements.tilt)
+    system, vergence = paraxial_system(lens, scene.wavelengths), scene.vergence
     bent = jnp.any(jnp.array([jnp.any(move != 0) for move in jax.tree.leaves(moves)], bool))
+    bent = bent | (scene.field[0] != 0)
     n, c = system.index, system.curvature[:, None]
     marginal = marginal_ray(system, vergence)
     height, slope = chief_ray(system, front=True)
     # Scaled to the field: the slope of the line from the object point to the first vertex.
-    scale = safe_divide(jnp.tan(jnp.where(forwards, angle, 0)), slope - vergence * height)
+    scale = safe_divide(scene.tangent[1], slope - vergence * height)
     chief = trace_ray(system, height * scale, slope * scale)
     figure = _fourth_order(lens, system.curvature)
     s1, s2, s3, s4, s5 = _seidel(system, figure, marginal, chief)
 
-    colours = lens.checked_wavelengths(wavelengths)
+    colours = scene.wavelengths
     spread = (n[:, jnp.argmin(colours)] - n[:, jnp.argmax(colours)])[:, None] / n
     colour = n[:-1] * marginal.height * (spread[1:] - spread[:-1])
     half = safe_divide(jnp.ones_like(n[-1]), 2 * n[-1] * marginal.behind[-1])[None]
@@ -162,4 +165,4 @@ def third_order(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numb
         lateral_colour=2 * half * colour * (chief.height * c + chief.before),
         petzval_curvature=-n[-1:] * petzval_parts(system),
     )
-    return system.masked(found, forwards & away_from_vertex(far) & ~bent)
+    return system.masked(found, scene.possible & ~bent)

@@ -10,14 +10,18 @@ from .patterns import (
     sobol_disc,
     square_grid,
 )
+from .rules import PupilRule, pupil_points, symmetry_of
 
 __all__ = [
+    "PupilRule",
     "disc",
     "half_disc",
     "hexapolar",
     "meridian",
+    "pupil_points",
     "random_disc",
     "sobol",
     "sobol_disc",
     "square_grid",
+    "symmetry_of",
 ]

@@ -106,7 +106,7 @@ class Masked(PupilRule):
 
     Each ray takes the transmission of the pixel that it crosses. With Q rays, a sum over the pixels
     has a relative error of about the fraction of rays whose neighbour crosses another pixel: take
-    many rays, for instance a `Pattern` of `pupil.square_grid`. `PsfModel.masked` needs no more rays
+    many rays, for instance a `Pattern` of `pupil.square_grid`. `Sampling.masked` needs no more rays
     than a model without a mask. ValueError, when rays are traced, for another symmetry and for a
     mask with a path.
     """

@@ -18,7 +18,7 @@ from ..inputs import require_one_of
 from ..lens.clearance import clearance
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
-from ..lens.scene import Scene, scene_of
+from ..lens.scene import Scene, fitted, over_points
 from ..numerics import Numbers, brief, concrete, real_array
 from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector
@@ -223,22 +223,23 @@ def check_rule(order: int, symmetry: Symmetry) -> None:
     require_one_of("symmetry", symmetry, get_args(Symmetry))
 
 
-def pupil_points(
-    lens: Lens, field: Numbers, distance: Numbers, wavelengths: Numbers, rule: PupilRule
-) -> tuple[Array, Array]:
+def pupil_points(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Array, Array]:
     """Points where the rays of a rule cross the stop, and their weights.
 
-    lens: the lens.
-    field, distance, wavelengths: as in `trace_rays`.
+    lens, scene: as in `trace_rays`.
     rule: the pupil rule.
 
-    Returns points (W, Q, 2), in units of the semi-diameter of the stop, and weights (W, Q). Both
+    Returns points (..., W, Q, 2), in units of the semi-diameter of the stop, and weights
+    (..., W, Q). Both
     are differentiable in the lens. The points of a "rotational" rule lie on the y axis and
     represent all azimuths.
     """
-    scene = scene_of(lens, field, distance, wavelengths)
-    points, weights = rule.points(lens, scene)
-    shape = (scene.wavelengths.shape[0], weights.shape[-1])
-    x, y = (points[0] * 0, points[0]) if len(points) == 1 else points
-    stacked = jnp.stack([jnp.broadcast_to(a, shape) for a in (x, y)], axis=-1)
-    return stacked, jnp.broadcast_to(weights, shape)
+
+    def one(point: Scene) -> tuple[Array, Array]:
+        points, weights = rule.points(lens, point)
+        shape = (point.wavelengths.shape[0], weights.shape[-1])
+        x, y = (points[0] * 0, points[0]) if len(points) == 1 else points
+        stacked = jnp.stack([jnp.broadcast_to(a, shape) for a in (x, y)], axis=-1)
+        return stacked, jnp.broadcast_to(weights, shape)
+
+    return over_points(one, fitted(lens, scene))

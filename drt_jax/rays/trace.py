@@ -16,7 +16,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.clearance import clearance
 from ..lens.lens import Lens
-from ..lens.scene import Scene, scene_of
+from ..lens.scene import Scene, fitted, over_points
 from ..lens.surface import by_form, surface_sag
 from ..numerics import Numbers, concrete, known_values, real_array
 from . import fermat
@@ -50,17 +50,18 @@ class Bundle(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """Traced rays.
+    """Traced rays of W wavelengths through Q points of the stop. The points (...) of a scene are
+    the first axes.
 
-    points: (W, Q, S + 1, 3), mm, intersections with the surfaces and the sensor, along the axes of
-        the lens, with z from the first vertex; zeros for a failed ray.
-    directions: (W, Q, S + 1, 3), unit vectors (direction cosines) in front of each surface and of
-        the sensor; zeros for a failed ray.
-    path: (W, Q), mm, optical path to the sensor. It starts at the sphere about the object point
-        through the first vertex, or at the plane wave through the first vertex for an object at
-        infinity; 0 for a failed ray.
-    status: (W, Q), int32, see `Status`.
-    newton_steps: (), int32, Newton steps of the whole bundle, aiming included.
+    points: (..., W, Q, S + 1, 3), mm, intersections with the surfaces and the sensor, along the
+        axes of the lens, with z from the first vertex; zeros for a failed ray.
+    directions: (..., W, Q, S + 1, 3), unit vectors (direction cosines) in front of each surface and
+        of the sensor; zeros for a failed ray.
+    path: (..., W, Q), mm, optical path to the sensor. It starts at the sphere about the object
+        point through the first vertex, or at the plane wave through the first vertex for an object
+        at infinity; 0 for a failed ray.
+    status: (..., W, Q), int32, see `Status`.
+    newton_steps: (...), int32, Newton steps of the whole bundle, aiming included.
     """
 
     points: Array
@@ -167,29 +168,20 @@ def trace_bundle(lens: Lens, scene: Scene, points: Vector, solver: Solver = solv
     return bundle_of(lens, scene, system, target, solver(system, target))
 
 
-def trace_rays(
-    lens: Lens,
-    field: Numbers,
-    distance: Numbers,
-    wavelengths: Numbers,
-    pupil: Numbers,
-) -> Rays:
+def trace_rays(lens: Lens, scene: Scene, pupil: Numbers) -> Rays:
     """Traces the rays that cross the real stop at given points, aimed for every wavelength.
 
     The result is differentiable in every mode and to any order.
 
     lens: the lens; its dtype is that of the result.
-    field: angle along y, or angles along (x, y), radians: light travels along (tan x, tan y, 1),
-        with a positive angle upwards. For an object height in mm see `field_of_height`.
-    distance: mm from the object plane to the first vertex; may be inf.
-    wavelengths: (W,), um.
+    scene: object points and their wavelengths.
     pupil: (Q, 2), x and y on the stop in units of its semi-diameter.
 
-    ValueError as in `scene_of`. Inside `jit` or `vmap`, where values are not known, a wavelength
-    outside the range of a glass gives the status NO_INDEX; a field of 90 degrees or more, or a
-    distance within 1e-6 mm of 0, gives MISSED.
+    ValueError as in `lens.scene.fitted`. Inside `jit` or `vmap`, where values are not known, a
+    wavelength outside the range of a glass gives the status NO_INDEX; a field of 90 degrees or
+    more, or a distance within 1e-6 mm of 0, gives MISSED.
     """
-    scene, points = scene_of(lens, field, distance, wavelengths), stop_points(lens, pupil)
+    scene, points = fitted(lens, scene), stop_points(lens, pupil)
     count, size = len(points), _padded(len(points))
     if count == size or known_values((lens, scene, points)) is None:
         return _trace(lens, scene, points)
@@ -215,7 +207,9 @@ def _padded(count: int) -> int:
 @functools.partial(jax.jit, static_argnames="count")
 def _first(rays: Rays, count: int) -> Rays:
     """The first `count` rays."""
-    return jax.tree.map(lambda a: a[:, :count] if a.ndim else a, rays)
+    axis = rays.status.ndim - 1
+    first = lambda a: jax.lax.slice_in_dim(a, 0, count, axis=axis) if a.ndim > axis else a  # noqa: E731
+    return jax.tree.map(first, rays)
 
 
 def stop_points(lens: Lens, pupil: Numbers) -> Array:
@@ -234,6 +228,11 @@ def stop_points(lens: Lens, pupil: Numbers) -> Array:
 @functools.partial(jit, wanted=LARGE)
 def _trace(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     """The compiled part of `trace_rays`. pupil: (Q, 2), in semi-diameters of the stop."""
+    return over_points(lambda point: _trace_point(lens, point, pupil), scene)
+
+
+def _trace_point(lens: Lens, scene: Scene, pupil: Array) -> Rays:
+    """`trace_rays` of one object point."""
     system, target = aims(lens, scene, (pupil[:, 0], pupil[:, 1]))
     found = solve(system, target)
     bundle = bundle_of(dataclasses.replace(lens, afocal=False), scene, system, target, found)

@@ -184,18 +184,18 @@ def encircled_energy(
 def gaussian_error(
     axes: Axes, found: GaussianError, fields: ArrayLike, distances: ArrayLike
 ) -> Axes:
-    """The error of Gaussian kernels over field (F,) and distance (D,) mm, as numbers and colours:
-    the light in wrong pixels, in per cent, which is half of `misplaced`."""
+    """The error of Gaussian kernels (D, F) over distance (D,) mm and field (F,), as numbers and
+    colours: the light in wrong pixels, in per cent, which is half of `misplaced`."""
     share = 50 * np.asarray(found.misplaced)
-    axes.imshow(share.T, vmin=0, vmax=100, cmap="magma_r", aspect="auto", origin="lower")
+    axes.imshow(share, vmin=0, vmax=100, cmap="magma_r", aspect="auto", origin="lower")
     for place, value in np.ndenumerate(share):
         colour = "white" if value > 50 else "black"
         axes.text(
-            place[0], place[1], f"{value:.2g}", ha="center", va="center", color=colour, fontsize=7
+            place[1], place[0], f"{value:.2g}", ha="center", va="center", color=colour, fontsize=7
         )
-    axes.set_xticks(range(len(share)), [f"{a:.3g}" for a in _degrees(fields)])
+    axes.set_xticks(range(share.shape[1]), [f"{a:.3g}" for a in _degrees(fields)])
     far = 1e-3 * np.asarray(distances, float)
-    axes.set_yticks(range(share.shape[1]), [f"{d:.3g}" if d < np.inf else "∞" for d in far])
+    axes.set_yticks(range(len(share)), [f"{d:.3g}" if d < np.inf else "∞" for d in far])
     axes.set(xlabel="field (degrees)", ylabel="distance (m)")
     axes.set_title("light in wrong pixels (%)", fontsize=9)
     return axes

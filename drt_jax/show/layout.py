@@ -2,6 +2,7 @@
 clipping of the beam of a field by the apertures.
 """
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from ..compilation import ONCE, jit
 from ..lens.aperture import depths
 from ..lens.clearance import clearance, clipping_surface
 from ..lens.lens import Lens, sag
-from ..lens.scene import Scene, scene_of
+from ..lens.scene import Scene, fitted
 from ..numerics import einsum
 from ..pupil.patterns import hexapolar
 from ..rays.status import Status
@@ -60,41 +61,36 @@ class Drawing(NamedTuple):
     fields: Sequence[float] = ()
 
 
-def draw(
-    lens: Lens,
-    fields: float | Sequence[float] = 0.0,
-    distance: float = float("inf"),
-    wavelength: float = 0.55,
-    rays: int = 7,
-) -> Drawing:
-    """The polylines of a lens and of a fan of meridional rays for each field.
+def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
+    """The polylines of a lens and of a fan of meridional rays for each object point.
 
-    fields: angles along y, radians.
-    distance: from the object to the first vertex, mm.
-    wavelength: um.
-    rays: number of rays for each field; rays that do not exist are left out.
+    scene: points with fields along y; their middle wavelength counts. By default the axis at
+        infinity, in the d line.
+    rays: number of rays for each point; rays that do not exist are left out.
     """
-    angles = [float(angle) for angle in np.atleast_1d(fields)]
+    scene = fitted(lens, Scene.point() if scene is None else scene)
+    middle = slice(scene.reference(None), scene.reference(None) + 1)
+    points = dataclasses.replace(scene, wavelengths=scene.wavelengths[middle]).each()
+    angles = [float(point.field[1]) for point in points]
     # A surface that does not bend light is neither a corner of a ray nor a face of glass.
     corners = [*lens.active, lens.count]
     hits, ends = [], []
-    for angle in angles:
-        scene = scene_of(lens, angle, distance, wavelength)
-        fan = _fan(lens, scene, rays)
+    for point, angle in zip(points, angles, strict=True):
+        fan = _fan(lens, point, rays)
         hits.append(fan.points[fan.status == Status.OK][:, corners, :0:-1])
         clipped = fan.status == Status.CLIPPED
         for ray, stop in zip(fan.points[clipped], fan.clips[clipped]):
             cut = [*(k for k in lens.active if k < stop), stop]
-            ends.append((ray[cut, :0:-1], angle))
+            ends.append((ray[cut, :0:-1], angle, float(point.distance)))
     drawn = np.concatenate([np.zeros((1, 2)), *(hit.reshape(-1, 2) for hit in hits)])
     reach = float(np.max(np.abs(drawn[:, 1]))) or 1.0
     z = np.concatenate([drawn[:, 0], np.asarray(lens.places[0])])
     start = np.min(z) - 0.15 * np.ptp(z)
     paths = [
-        [_path(ray, start, angle, distance) for ray in hit]
-        for angle, hit in zip(angles, hits, strict=True)
+        [_path(ray, start, angle, float(point.distance)) for ray in hit]
+        for angle, point, hit in zip(angles, points, hits, strict=True)
     ]
-    vignetted = [_path(ray, start, angle, distance) for ray, angle in ends]
+    vignetted = [_path(ray, start, *place) for ray, *place in ends]
     profiles = np.linspace(*_extents(lens, 1.1 * _widths(lens, hits, reach)), _POINTS, axis=-1)
     faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
     glass = [np.concatenate([faces[i], faces[j][::-1], faces[i][:1]]) for i, j in _pieces(lens)]
@@ -122,7 +118,7 @@ class _Traced(NamedTuple):
 
 
 def _rays(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
-    rays = trace_rays(lens, scene.field, scene.distance, scene.wavelengths, pupil)
+    rays = trace_rays(lens, scene, pupil)
     points, directions = rays.points[0], rays.directions[0, :, -1]
     vertex, across, turned = lens.places
     across = jnp.zeros((len(vertex), 2), vertex.dtype) if across is None else across
@@ -185,11 +181,13 @@ class Beam(NamedTuple):
     shift: float
 
 
-def beam_of(lens: Lens, field: float, distance: float, wavelength: float, *others: float) -> Beam:
-    """The beam of a field in radians, for a distance in mm and a wavelength in um. others: of what
-    clips and fails, wavelengths that count, too."""
-    if others:
-        own, *more = (beam_of(lens, field, distance, wave) for wave in (wavelength, *others))
+def beam_of(lens: Lens, scene: Scene) -> Beam:
+    """The beam of one object point in the middle wavelength. What clips and fails is that of all
+    wavelengths."""
+    scene, middle = fitted(lens, scene), scene.reference(None)
+    if len(scene.wavelengths) > 1:
+        waves = jnp.roll(scene.wavelengths, -middle)[:, None]
+        own, *more = (beam_of(lens, dataclasses.replace(scene, wavelengths=w)) for w in waves)
         for each in more:
             own = own._replace(
                 clipping=sorted({*own.clipping, *each.clipping}),
@@ -200,7 +198,6 @@ def beam_of(lens: Lens, field: float, distance: float, wavelength: float, *other
         return own
     rim = np.linspace(0, 2 * np.pi, _RIM)
     pupil = np.concatenate([hexapolar(_RINGS)[0], np.stack([np.sin(rim), np.cos(rim)], axis=-1)])
-    scene = scene_of(lens, field, distance, wavelength)
     _, hits, directions, status, clips = _traced(lens, scene, pupil)
     clipping = np.unique(clips[status == Status.CLIPPED]).tolist()
     ends = [words for end, words in ENDS.items() if np.any(status == end)]

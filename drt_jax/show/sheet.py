@@ -1,8 +1,7 @@
 """All analyses of a lens on one sheet."""
 
-import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,10 +16,10 @@ from ..image.beam import beam_rule, trace_beam
 from ..image.chief import distortion, field_curvature, lateral_colour
 from ..image.encircled import encircled
 from ..image.fans import RayFans, ray_fans
-from ..image.spots import Spots, light_rule, spot_diagram
+from ..image.spots import Spots, rule_for, spot_diagram
 from ..image.transfer import Model, transfer_of
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fields_array, scene_of
+from ..lens.scene import Scene, fitted, over_points
 from ..pupil.rules import PupilRule
 from . import analyses
 from .figures import FIELD_COLOURS, new
@@ -49,10 +48,8 @@ _TITLES = {
 
 def sheet(
     lens: Lens,
-    fields: Sequence[float] = (0.0,),
-    distance: float = float("inf"),
-    wavelengths: Sequence[float] = (0.5875618,),
-    rule: PupilRule | None = None,
+    scene: Scene | None = None,
+    sampling: float | PupilRule | None = None,
     say: Callable[[str], None] = lambda what: None,
 ) -> Figure:
     """One figure: layout; spots with the Airy circle, ray fans, transfer functions and encircled
@@ -60,11 +57,12 @@ def sheet(
     distortion, lateral colour and illumination up to the largest field. All wavelengths count the
     same. Blue to red are wavelengths; other colours are fields.
 
-    fields: angles along y, radians. distance: mm, inf allowed. wavelengths: um, the middle one is
-    the reference. rule: pupil rule of the spots, for all fields; None: as in `spot_diagram`. say:
-    called with the name of each step.
+    scene: fields along y at one distance, and wavelengths, the middle one of which is the
+        reference; by default the axis at infinity, in the d line.
+    sampling: of the spots, for all fields, as in `spot_diagram`.
+    say: called with the name of each step.
     """
-    count, draw_on = _analysed(lens, fields, distance, wavelengths, rule, say)
+    count, draw_on = _analysed(lens, scene, sampling, say)
     figure, axes = _axes(count)
     draw_on(axes)
     return figure
@@ -72,14 +70,12 @@ def sheet(
 
 def panels(
     lens: Lens,
-    fields: Sequence[float] = (0.0,),
-    distance: float = float("inf"),
-    wavelengths: Sequence[float] = (0.5875618,),
-    rule: PupilRule | None = None,
+    scene: Scene | None = None,
+    sampling: float | PupilRule | None = None,
     say: Callable[[str], None] = lambda what: None,
 ) -> dict[str, Figure]:
     """What `sheet` shows, from the same arguments, as a figure for each analysis, by title."""
-    count, draw_on = _analysed(lens, fields, distance, wavelengths, rule, say)
+    count, draw_on = _analysed(lens, scene, sampling, say)
     figures: dict[str, Figure] = {}
     axes: dict[str, Any] = {}
     for name, title in _TITLES.items():
@@ -94,47 +90,47 @@ def panels(
 
 
 def _analysed(
-    lens: Lens,
-    fields: Sequence[float],
-    distance: float,
-    wavelengths: Sequence[float],
-    rule: PupilRule | None,
-    say: Callable[[str], None],
+    lens: Lens, scene: Scene | None, sampling: float | PupilRule | None, say: Callable[[str], None]
 ) -> tuple[int, Callable[[dict[str, Any]], None]]:
     """The number of fields that have spots, and a function that draws all analyses on axes, which
     are named as in `_TITLES`."""
-    angles = sorted({float(angle) for angle in fields})
+    scene = fitted(lens, Scene.point() if scene is None else scene)
+    if scene.distance.ndim or bool(jnp.any(scene.field[..., 0] != 0)):
+        raise ValueError("scene: a sheet has fields along y, at one distance")
+    fields = [float(angle) for angle in np.ravel(scene.field[..., 1])]
+    angles = sorted({*fields})
     some = [angles[k] for k in sorted({0, len(angles) // 2, len(angles) - 1})][:_FIELDS]
-    waves, middle = np.array(wavelengths, float), len(wavelengths) // 2
+    waves, middle = np.asarray(scene.wavelengths), scene.reference(None)
     widest = max(map(abs, angles)) * (1 if max(angles) >= -min(angles) else -1)
     line = np.linspace(0, widest, _CURVE) if widest else np.zeros(1)
     say("tracing chief rays")
-    scene = distance, waves
-    foci = field_curvature(lens, line, *scene)
-    bent, colour = distortion(lens, line, *scene), lateral_colour(lens, line, *scene)
+    at = lambda fields: Scene.radians(fields, scene.distance, scene.wavelengths)  # noqa: E731
+    curve = at(line)
+    foci = field_curvature(lens, curve)
+    bent, colour = distortion(lens, curve), lateral_colour(lens, curve)
     say("tracing fans")
-    fans = _fans(lens, jnp.array(some), jnp.asarray(distance, line.dtype), jnp.array(waves))
+    fans = _fans(lens, at(some))
     say("tracing spots")
     # The axis, the fields of the spots, and the fields of the illumination curve.
     wide = np.array([0.0, *some, *line[:: _CURVE // _LIGHT]])
-    rule = light_rule(lens, wide, *scene, order=_ORDER) if rule is None else rule
-    spots = _spots(lens, jnp.array(wide), jnp.asarray(distance, line.dtype), jnp.array(waves), rule)
+    rule = rule_for(lens, at(wide), sampling, _ORDER)
+    spots = _spots(lens, at(wide), rule)
     spots, fans = jax.tree.map(np.asarray, (spots, fans))
     say("tracing waves")
     limit = 2e3 * np.sqrt(spots.solid_angle[0, middle] / np.pi) / waves[middle]
     lines = np.linspace(0, min(limit, _LINES) if limit > 0 else _LINES, _CURVE)
     radii, model, cells = _circles(spots, len(some))
-    picked = lens, fields_array(some, lens.curvature.dtype), scene_of(lens, 0.0, distance, waves)
-    contrast, best, energy = _waves(*picked, jnp.asarray(lines), radii, rule, model, cells)
+    picked = fitted(lens, at(some))
+    contrast, best, energy = _waves(lens, picked, jnp.asarray(lines), radii, rule, model, cells)
     say("drawing")
 
     def draw_on(axes: dict[str, Any]) -> None:
-        lens_drawing(axes["layout"], draw(lens, fields, distance, wavelengths[middle]))
+        lens_drawing(axes["layout"], draw(lens, scene))
         others = ", ".join(f"{np.degrees(a):.4g}°" for a in angles if a not in some)
         if others:
             words = f"without spots, fans, MTF and energy: {others}"
             axes["layout"].set_title(words, fontsize=8, loc="left")
-        hues = [FIELD_COLOURS[[*fields].index(field) % len(FIELD_COLOURS)] for field in some]
+        hues = [FIELD_COLOURS[fields.index(field) % len(FIELD_COLOURS)] for field in some]
         _per_field(axes, spots, fans, some, waves, hues)
         analyses.field_curvature(axes["foci"], foci, line, waves)
         analyses.distortion(axes["bent"], bent, line, waves)
@@ -166,8 +162,7 @@ _spots = jit(spot_diagram, ONCE)
 @functools.partial(jit, wanted=ONCE, static_argnames=("model", "cells"))
 def _waves(
     lens: Lens,
-    fields: Array,
-    axis: Scene,
+    scene: Scene,
     lines: Array,
     radii: Array,
     rule: PupilRule,
@@ -175,16 +170,16 @@ def _waves(
     cells: int,
 ) -> tuple[Array, Array, Array]:
     """MTF (F, 2, N), its limit (N,) at the first field, and encircled energy (F, N)."""
-    made, waves = beam_rule(_DEGREE, rule.symmetry, rule), axis.wavelengths
+    made, waves = beam_rule(_DEGREE, rule.symmetry, rule), scene.wavelengths
     spectrum = jnp.ones_like(waves)
 
-    def one(field: Array) -> tuple[Array, Array, Array]:
-        beam = trace_beam(lens, dataclasses.replace(axis, field=field), made)
+    def one(point: Scene) -> tuple[Array, Array, Array]:
+        beam = trace_beam(lens, point, made)
         given = lens, beam, waves
         otf, limit = transfer_of(*given, lines, spectrum, "waves", _CELLS)
         return jnp.abs(otf), limit[0], encircled(*given, radii, spectrum, model, cells)
 
-    contrast, limit, energy = jax.vmap(one)(fields)
+    contrast, limit, energy = over_points(one, scene)
     return contrast, limit[0], energy
 
 

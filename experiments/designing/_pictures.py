@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import drt_jax
-from drt_jax import show
+from drt_jax import Scene, show
 from drt_jax.pupil import hexapolar
 from drt_jax.show import layout
 
@@ -21,7 +21,9 @@ def _drawing(results: dict[str, Any], path: pathlib.Path) -> layout.Drawing:
     """The drawing of a lens file."""
     waves, fields = results["wavelengths_um"], np.radians(results["fields_deg"])
     distance = results["distance_mm"] or math.inf
-    return layout.draw(drt_jax.load_lens(path), fields, distance, waves[len(waves) // 2])
+    return layout.draw(
+        drt_jax.load_lens(path), Scene.radians(fields, distance, waves[len(waves) // 2])
+    )
 
 
 def _spots(results: dict[str, Any], lens: drt_jax.Lens) -> list[tuple[list, np.ndarray]]:
@@ -30,9 +32,10 @@ def _spots(results: dict[str, Any], lens: drt_jax.Lens) -> list[tuple[list, np.n
     pupil = hexapolar(_RINGS)[0]
     found = []
     for field in np.radians(results["fields_deg"]):
-        scene = field, results["distance_mm"] or math.inf, results["wavelengths_um"]
-        rays = drt_jax.trace_rays(lens, *scene, pupil)
-        moments = drt_jax.psf_moments(lens, *scene, results["tolerance"])
+        distance = results["distance_mm"] or math.inf
+        scene = Scene.point(field, distance, results["wavelengths_um"])
+        rays = drt_jax.trace_rays(lens, scene, pupil)
+        moments = drt_jax.psf_moments(lens, scene, results["tolerance"])
         mean = np.asarray(moments.mean).mean(axis=0)
         hits = 1e3 * (np.asarray(rays.points)[:, :, -1, :2] - mean)
         arrives = np.asarray(rays.status) == 0

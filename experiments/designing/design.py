@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import Pattern, design
+from drt_jax import Pattern, Scene, design
 from drt_jax.design.growth import SHORTEST, grow_once, start_growth
 
 from . import _command, _common, _sharing
@@ -43,12 +43,14 @@ def problem_of(config: Config, lens: drt_jax.Lens, order: int | None = None) -> 
     return design.Problem.from_variables(
         design.Variables.from_lens(lens, config.variables, config.ties, solves),
         config.operands,
-        np.radians(config.fields_deg),
-        config.wavelengths_um,
-        config.distance_mm,
+        Scene.grid(
+            np.radians(config.fields_deg),
+            config.distance_mm,
+            config.wavelengths_um,
+            wavelength_weights=config.colour_weights or None,
+            field_weights=config.field_weights or None,
+        ),
         _grid(config.rings) if config.rings else (order or config.order),
-        config.colour_weights or None,
-        config.field_weights or None,
     )
 
 
@@ -70,7 +72,7 @@ def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:
     found = []
     for field in np.radians(config.fields_deg):
         moments = drt_jax.psf_moments(
-            lens, field, config.distance_mm, config.wavelengths_um, config.tolerance
+            lens, Scene.point(field, config.distance_mm, config.wavelengths_um), config.tolerance
         )
         mean, covariance = np.asarray(moments.mean), np.asarray(moments.covariance)
         squares = np.sum((mean - weights @ mean) ** 2, axis=1)
@@ -82,8 +84,9 @@ def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:
 def order_of(config: Config, lens: drt_jax.Lens) -> int:
     """The order of the pupil rule that the spots of a lens need."""
     fields = np.radians([[0.0, field] for field in config.fields_deg])
-    scene = fields, config.distance_mm, config.wavelengths_um, config.tolerance
-    return getattr(drt_jax.converged_rule(lens, *scene), "order", config.order)
+    scene = Scene.radians(fields, config.distance_mm, config.wavelengths_um)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, scene, config.tolerance)
+    return getattr(rule, "order", config.order)
 
 
 class _Progress(tqdm):
@@ -231,7 +234,9 @@ def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
     """(W,), the focus of light through 0.7 of the aperture less that of the last wavelength, over
     the focal length."""
     waves = config.wavelengths_um
-    foci = np.asarray(drt_jax.axial_colour(lens, config.distance_mm, waves, (0.7,)).real)[:, 0]
+    foci = np.asarray(
+        drt_jax.axial_colour(lens, Scene.point(0.0, config.distance_mm, waves), (0.7,)).real
+    )[:, 0]
     return ((foci - foci[-1]) / np.asarray(drt_jax.focal_length(lens, waves))).tolist()
 
 

@@ -29,7 +29,7 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import design, show
+from drt_jax import Scene, design, show
 from drt_jax.design.deviations import KINDS
 from drt_jax.design.prediction import Order
 
@@ -92,11 +92,13 @@ def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.Pert
         return design.Problem.from_variables(
             design.Variables.from_lens(lens, ["sensor"]),
             ["spot"],
-            np.radians(config.fields_deg),
-            config.wavelengths_um,
-            config.distance_mm,
+            Scene.grid(
+                np.radians(config.fields_deg),
+                config.distance_mm,
+                config.wavelengths_um,
+                wavelength_weights=config.colour_weights or None,
+            ),
             order or config.order,
-            config.colour_weights or None,
         )
 
     radius = problem_of(lens).beam_radius(lens)

@@ -27,7 +27,7 @@ from PIL import Image
 from skimage import data, transform
 
 import drt_jax
-from drt_jax import Lens, PsfModel
+from drt_jax import Lens, Sampling, Scene
 from drt_jax.compilation import LARGE, known_options
 from drt_jax.image.psf_model import difference
 
@@ -98,8 +98,8 @@ class Config:
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
-    """A view in radians and mm."""
+class Shot:
+    """A view in radians and mm, on pixels."""
 
     lens: Lens
     field: float
@@ -107,27 +107,33 @@ class Scene:
     waves: np.ndarray
     size: int
 
-    def model(self, kind: Any, tolerance: float = 1e-2) -> PsfModel:
+    @property
+    def scene(self) -> Scene:
+        """The object point, at infinity."""
+        return Scene.point(self.field, math.inf, self.waves)
+
+    def model(self, kind: Any, tolerance: float = 1e-2) -> Sampling:
         """The model of a kind converged to the tolerance."""
-        grid = self.waves, self.pixel, self.size
-        return drt_jax.converged_psf(self.lens, self.field, math.inf, *grid, kind, tolerance)
+        return drt_jax.converge(
+            drt_jax.psf, self.lens, self.scene, self.pixel, self.size, kind, tolerance
+        )
 
-    def kernel(self, lens: Lens, model: PsfModel, centre: Any = None) -> jax.Array:
+    def kernel(self, lens: Lens, model: Sampling, centre: Any = None) -> jax.Array:
         """The kernel (W, size, size) of a lens."""
-        grid = self.waves, self.pixel, self.size
-        return drt_jax.psf(lens, self.field, math.inf, *grid, model, centre=centre).kernel
+        pixels = self.pixel, self.size
+        return drt_jax.psf(lens, self.scene, *pixels, sampling=model, centre=centre).kernel
 
 
-def histogram(scene: Scene, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, float, int]:
+def histogram(shot: Shot, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, float, int]:
     """Histogram (W, size, size) of traced rays on pixels about `centre` (2,), mm, its noise (from
     its two halves), and the smallest number of rays of a wavelength that arrive."""
-    edges = (np.arange(scene.size + 1) - scene.size / 2) * scene.pixel
-    points, trace = drt_jax.pupil.random_disc(_ROUND * rounds, 0)[0], drt_jax.trace_rays
-    halves = np.zeros((2, len(scene.waves), scene.size, scene.size))
-    arrived = np.zeros((2, len(scene.waves)))
+    edges = (np.arange(shot.size + 1) - shot.size / 2) * shot.pixel
+    points = drt_jax.pupil.random_disc(_ROUND * rounds, 0)[0]
+    halves = np.zeros((2, len(shot.waves), shot.size, shot.size))
+    arrived = np.zeros((2, len(shot.waves)))
     for k in range(rounds):
         some = points[k * _ROUND : (k + 1) * _ROUND]
-        rays = trace(scene.lens, scene.field, math.inf, scene.waves, some)
+        rays = drt_jax.trace_rays(shot.lens, shot.scene, some)
         arrives = np.asarray(rays.status) == drt_jax.Status.OK
         hits = np.asarray(rays.points[:, :, -1, :2]) - centre
         for w, (ok, (x, y)) in enumerate(zip(arrives, np.moveaxis(hits, -1, 1))):
@@ -143,17 +149,17 @@ def measure(config: Config, view: View) -> dict[str, Any]:
     """Time and error of every model, and of the peers, at one view."""
     lens = drt_jax.load_lens(view.lens)
     field, pixel = math.radians(view.field_deg), 1e-3 * view.pixel_um
-    scene = Scene(lens, field, pixel, np.array(config.wavelengths_um), config.size)
-    rule = scene.model("waves", 1e-3).rule
-    grid = scene.waves, pixel, config.size
-    finest = drt_jax.psf(lens, field, math.inf, *grid, PsfModel("waves", rule, config.limit))
-    collected, noise, arrived = histogram(scene, config.rounds, np.asarray(finest.centre))
+    shot = Shot(lens, field, pixel, np.array(config.wavelengths_um), config.size)
+    rule = shot.model("waves", 1e-3).rule
+    limit = Sampling("waves", rule, config.limit)
+    finest = drt_jax.psf(lens, shot.scene, pixel, config.size, sampling=limit)
+    collected, noise, arrived = histogram(shot, config.rounds, np.asarray(finest.centre))
     limits = {"rays": collected, "waves": np.asarray(finest.kernel)}
     cells = {"gaussian": (0,), "rays": config.rays, "waves": config.waves}
     name = {"lens": view.lens, "field_deg": view.field_deg}
     rows = []
-    for model in (PsfModel(kind, rule, n) for kind in MODELS for n in cells[kind]):
-        kernel, *seconds = _timed(scene, model, config.repeats)
+    for model in (Sampling(kind, rule, n) for kind in MODELS for n in cells[kind]):
+        kernel, *seconds = _timed(shot, model, config.repeats)
         own = limits.get(model.kind)
         row = {"model": model.kind, "cells": model.cells, "value_s": seconds[0]}
         row |= {"gradient_s": seconds[1], "off": difference(kernel, limits["waves"])}
@@ -161,60 +167,69 @@ def measure(config: Config, view: View) -> dict[str, Any]:
     about = {"outside": float(np.max(finest.outside)), "noise": noise, "rays": arrived}
     about |= {"rays_off": difference(*limits.values())}
     lines, curves = contrast(config, lens, field, pixel)
-    about |= {"grid_s": field_grid(scene, config.repeats), "frequencies": lines}
+    about |= {"grid_s": field_grid(shot, config.repeats), "frequencies": lines}
     about |= {"transfer": curves}
-    return {"rows": rows, "view": name | about, "peers": _peer_rows(config, scene, rule, name)}
+    return {"rows": rows, "view": name | about, "peers": _peer_rows(config, shot, rule, name)}
 
 
-def _timed(scene: Scene, model: PsfModel, repeats: int) -> tuple[np.ndarray, float, float]:
+def _timed(shot: Shot, model: Sampling, repeats: int) -> tuple[np.ndarray, float, float]:
     """A kernel, and seconds for it, alone and with the gradient of a weighted sum of it."""
-    weights = jnp.asarray(np.random.default_rng(0).normal(size=(scene.size, scene.size)))
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=(shot.size, shot.size)))
 
     def mean(lens: Lens) -> jax.Array:
-        return jnp.sum(weights[None] * scene.kernel(lens, model))
+        return jnp.sum(weights[None] * shot.kernel(lens, model))
 
     options = known_options(LARGE)  # as psf has them itself
-    functions = partial(scene.kernel, model=model), jax.value_and_grad(mean)
+    functions = partial(shot.kernel, model=model), jax.value_and_grad(mean)
     programs = (jax.jit(function, compiler_options=options) for function in functions)
-    value, gradient = (_work.compiled(program, scene.lens)[0] for program in programs)
+    value, gradient = (_work.compiled(program, shot.lens)[0] for program in programs)
     return np.asarray(value()), *_common.medians([value, gradient], repeats)
 
 
-def field_grid(scene: Scene, repeats: int) -> float:
+def field_grid(shot: Shot, repeats: int) -> float:
     """Seconds for wave kernels of 9 x 9 fields, with the field of the view in the corners."""
-    side = math.atan(math.tan(max(scene.field, 1e-3)) / math.sqrt(2))
+    side = math.atan(math.tan(max(shot.field, 1e-3)) / math.sqrt(2))
     fields, far = (side, side), [math.inf]
-    method = drt_jax.grid_method(
-        scene.lens, fields, far, scene.waves, scene.pixel, scene.size, 4, "waves", 1e-2
+    method = drt_jax.converge(
+        drt_jax.kernel_grid,
+        shot.lens,
+        fields,
+        far,
+        shot.waves,
+        shot.pixel,
+        shot.size,
+        4,
+        "waves",
+        1e-2,
     )
-    call = partial(drt_jax.kernel_grid, scene.lens, method, scene.waves)
+    call = partial(drt_jax.kernel_grid, shot.lens, method, shot.waves)
     return _common.medians([call], repeats)[0]
 
 
 def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[list, list]:
     """Frequencies up to Nyquist's, and the MTF by waves and by rays and its limit, (3, 2, N)."""
     lines = np.linspace(0, 0.5 / pixel, config.frequencies)
-    scene = lens, [field], math.inf, np.array(config.wavelengths_um), lines
-    by_waves, by_rays = (drt_jax.transfer(*scene, model) for model in ("waves", "rays"))
-    curves = np.stack([by_waves.mtf[0], by_rays.mtf[0], by_waves.limit[0]])
+    scene = Scene.point(field, wavelengths=np.array(config.wavelengths_um))
+    by_waves, by_rays = (drt_jax.transfer(lens, scene, lines, model) for model in ("waves", "rays"))
+    curves = np.stack([by_waves.mtf, by_rays.mtf, by_waves.limit])
     return lines.tolist(), curves.tolist()
 
 
-def _peer_rows(config: Config, scene: Scene, rule: Any, name: dict[str, Any]) -> list[dict]:
+def _peer_rows(config: Config, shot: Shot, rule: Any, name: dict[str, Any]) -> list[dict]:
     """Rows of other programs, at the middle wavelength."""
-    middle = scene.waves[[len(scene.waves) // 2]]
-    one = dataclasses.replace(scene, waves=middle)
-    chief = np.ravel(drt_jax.image_point(scene.lens, scene.field, math.inf, middle))
-    limit = PsfModel("waves", rule, config.limit)
+    middle = shot.waves[[len(shot.waves) // 2]]
+    one = dataclasses.replace(shot, waves=middle)
+    chief = np.ravel(drt_jax.image_point(shot.lens, Scene.point(shot.field, math.inf, middle)))
+    limit = Sampling("waves", rule, config.limit)
 
     def optiland(count: int) -> tuple[Callable, Any]:
-        numbers = _peers.Lens(scene.lens, scene.field, math.inf, middle)
-        call = _psf_peers.optiland(numbers, scene.pixel, scene.size, count, 4 * count)
+        numbers = _peers.Lens(shot.lens, shot.field, math.inf, middle)
+        call = _psf_peers.optiland(numbers, shot.pixel, shot.size, count, 4 * count)
         return call, one.kernel(one.lens, limit, chief)[0]
 
     def prysm(count: int) -> tuple[Callable, Any]:
-        pupil, step, centre = _psf_peers.pupil(scene.lens, scene.field, middle, rule, count)
-        call = _psf_peers.prysm(pupil, step, middle[0], scene.pixel, scene.size)
+        pupil, step, centre = _psf_peers.pupil(shot.lens, shot.field, middle, rule, count)
+        call = _psf_peers.prysm(pupil, step, middle[0], shot.pixel, shot.size)
         return call, one.kernel(one.lens, limit, centre)[0]
 
     rows = []
@@ -235,13 +250,12 @@ def gallery(config: Config) -> np.ndarray:
     """Kernels (distances, fields, models, W, size, size) of the gallery."""
     points = config.gallery
     lens, waves = drt_jax.load_lens(points.lens), np.array(config.wavelengths_um)
-    grid = waves, 1e-3 * points.pixel_um, config.size
-    fields, distances = np.radians(points.fields_deg), [1e3 * d for d in points.distances_m]
-    many = np.stack([0 * fields, fields], axis=-1)
-    models = [drt_jax.converged_psf(lens, many, distances, *grid, kind) for kind in MODELS]
-    found = [drt_jax.psf(lens, f, d, *grid, m) for d in distances for f in fields for m in models]
-    kernels = np.stack([np.asarray(one.kernel, np.float32) for one in found])
-    return kernels.reshape(len(distances), len(fields), len(models), *kernels.shape[1:])
+    pixels = 1e-3 * points.pixel_um, config.size
+    distances = [1e3 * d for d in points.distances_m]
+    scene = Scene.grid(np.radians(points.fields_deg), distances, waves)
+    models = [drt_jax.converge(drt_jax.psf, lens, scene, *pixels, kind) for kind in MODELS]
+    found = [drt_jax.psf(lens, scene, *pixels, sampling=model) for model in models]
+    return np.stack([np.asarray(one.kernel, np.float32) for one in found], axis=2)
 
 
 def photograph(config: Config, view: Photo, figures: pathlib.Path) -> dict[str, Any]:
@@ -251,7 +265,9 @@ def photograph(config: Config, view: Photo, figures: pathlib.Path) -> dict[str, 
     pixels = np.round(255 * picture).astype(np.uint8)
     lens, waves = drt_jax.load_lens(view.lens), np.array(config.wavelengths_um)
     ideal = render.linear(pixels)
-    method = drt_jax.render_method(lens, ideal.shape[:2], math.inf, 1e-3 * view.pixel_um, waves)
+    method = drt_jax.converge(
+        drt_jax.render, lens, ideal.shape[:2], math.inf, 1e-3 * view.pixel_um, waves
+    )
     call = partial(drt_jax.render, lens, ideal, math.inf, 1e-3 * view.pixel_um, waves, method)
     start = time.perf_counter()
     image = np.asarray(call())

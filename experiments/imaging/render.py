@@ -140,10 +140,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     if not pixel:
         pixel = abs(focal) * np.tan(np.radians(config.field_deg)) / (np.hypot(*shape) / 2)
     began = time.perf_counter()
-    method = drt_jax.render_method(
-        lens, shape, distance, pixel, waves, config.kernel or None, config.nodes,
-        layers=config.layers, model=config.model,
-    )  # fmt: skip
+    given = lens, shape, distance, pixel, waves, config.kernel or None, config.nodes
+    method = drt_jax.converge(drt_jax.render, *given, layers=config.layers, kind=config.model)
     bar = lambda rows: tqdm(rows, unit="row", dynamic_ncols=True)  # noqa: E731
     ideal = linear(pixels)
     image = drt_jax.render(lens, ideal, distance, pixel, waves, method, bar)
@@ -151,7 +149,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         key = jax.random.key(config.seed)
         noisy = drt_jax.sensor_noise(jnp.asarray(image), key, config.full_well, config.read_noise)
         image = np.asarray(noisy)
-    grid = drt_jax.kernel_grid(lens, method.grid, waves)
+    grid = drt_jax.kernel_grid(lens, waves, method.grid)
     lit = np.asarray(grid.solid_angle) > 0
     result = encoded(np.asarray(image))
     run.figures.mkdir(exist_ok=True)

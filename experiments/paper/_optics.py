@@ -11,8 +11,9 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import design
+from drt_jax import design, learn
 from drt_jax.design.kinds import step_of
+from drt_jax.lens.scene import fitted
 from drt_jax.pupil import hexapolar
 from drt_jax.rays.solve import solve_aimed
 from drt_jax.rays.status import Status
@@ -46,9 +47,10 @@ class Scene:
         one = np.shape(self.field) in ((), (2,))
         require(one, "scene.field: expected one angle in degrees, or [x, y]")
 
-    def seen(self, distance: float) -> tuple[np.ndarray, float, tuple[float, ...]]:
-        """Field (radians), distance (mm) and wavelengths (um): arguments of drt_jax's functions."""
-        return np.radians(self.field), distance, self.wavelengths_um
+    def seen(self, *distances: float) -> drt_jax.Scene:
+        """The object points at one or several distances, mm."""
+        far = distances if len(distances) > 1 else distances[0]
+        return drt_jax.Scene.point(np.radians(self.field), far, self.wavelengths_um)
 
 
 def variable_names(names: tuple[str, ...]) -> str:
@@ -70,7 +72,7 @@ def middle(near: float, far: float) -> float:
 def spot_of(scene: Scene, lens: drt_jax.Lens, distance: float) -> dict[str, float]:
     """RMS radius of the spot of all wavelengths about their mean centroid, um, and the smallest
     throughput of a wavelength, with a rule for this lens."""
-    found = drt_jax.psf_moments(lens, *scene.seen(distance), scene.tolerance)
+    found = drt_jax.psf_moments(lens, scene.seen(distance), scene.tolerance)
     mean, covariance = np.asarray(found.mean), np.asarray(found.covariance)
     squares = np.trace(covariance, axis1=1, axis2=2)
     squares = squares + np.sum((mean - mean.mean(axis=0)) ** 2, axis=1)
@@ -126,16 +128,14 @@ class Trained:
 
     def blur(self, scene: Scene, near: float, far: float) -> Callable:
         """Function (values, distance in mm between `near` and `far`) -> moments, by
-        `drt_jax.moments_model`; it traces no ray if only the sensor is trained."""
-        field, _, wavelengths = scene.seen(near)
+        `learn.moments_model`; it traces no ray if only the sensor is trained."""
         places = () if self.variables is None else self.variables.places
         leaves = tuple(sorted({"sensor", *(place.kind for place in places)}))
-        model = drt_jax.moments_model(
-            self.lens, leaves, field, (near, far), wavelengths, scene.tolerance
-        )[1]
+        seen = scene.seen(near, far)
+        model = learn.moments_model(self.lens, leaves, seen, scene.tolerance)[1]
 
         @jax.jit
-        def blur(values: dict[str, Array], distance: Array) -> drt_jax.Moments:
+        def blur(values: dict[str, Array], distance: Array) -> drt_jax.results.Moments:
             lens = self.lens_of(values)
             return model({name: getattr(lens, name) for name in leaves}, distance)
 
@@ -155,9 +155,7 @@ class Trained:
 
         def hits(values: dict[str, Array]) -> tuple[Array, Array]:
             lens = self.lens_of(values)
-            bundle = trace_bundle(
-                lens, drt_jax.scene_of(lens, *scene.seen(distance)), pupil, solve_aimed
-            )
+            bundle = trace_bundle(lens, fitted(lens, scene.seen(distance)), pupil, solve_aimed)
             return jnp.stack([hit[-1] for hit in bundle.hits], axis=-1), bundle.status
 
         slopes, status = jax.jit(jax.jacfwd(hits, has_aux=True))(self.start(self.lens.sensor))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 import drt_jax
-from drt_jax import show
+from drt_jax import Scene, show
 
 from . import _plots
 from ._common import number, panels, table
@@ -116,7 +116,7 @@ def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
 
 def _draw(axes: Any, lens: drt_jax.Lens, results: dict[str, Any], distance: float) -> None:
     field = np.radians(np.ravel(results.get("field", 0.0))[-1])
-    show.lens_drawing(axes, show.draw(lens, field, distance))
+    show.lens_drawing(axes, show.draw(lens, Scene.radians(field, distance)))
 
 
 def draw_lens(results: dict[str, Any], distance: float, path: pathlib.Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
+from drt_jax import learn
 from drt_jax.devices import copied, gathered, shared, split
 from drt_jax.image.diagnose import crossed
 from drt_jax.image.sensor import convolve
@@ -107,7 +108,7 @@ class Jobs:
         self.scenes = patches.train
         if isinstance(config, JointSettings):
             self.test = thinned(patches.test, config.test_patches)
-            init, self.restore = drt_jax.red_net(**asdict(config.network))
+            init, self.restore = learn.red_net(**asdict(config.network))
             self._network["network"] = weights = init(jax.random.key(config.seed))
             self.parameters = network.count_parameters(weights)
             print(f"RED-Net with {self.parameters} parameters")
@@ -222,18 +223,15 @@ class Jobs:
         config, camera = self._config, self._config.camera
         lens = self.lens.lens_of(self._good[start_label(config.starts_mm[0])])
         distances = sorted(set(self._depths))
-        field, _, wavelengths = config.scene.seen(distances[0])
-        pairs = np.reshape(field, (1, 2)) if np.size(field) == 2 else np.reshape(field, 1)
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
             try:
                 pixel = 1e-3 * camera.pixel_um
-                found = drt_jax.gaussian_error(
-                    lens, pairs, distances, wavelengths, pixel, camera.kernel, _KERNELS
-                )
+                scene = config.scene.seen(*distances)
+                found = drt_jax.gaussian_error(lens, scene, pixel, camera.kernel, _KERNELS)
             except (UserWarning, ValueError):
                 return []
-        columns = zip(distances, found.misplaced[0], found.contrast[0])
+        columns = zip(distances, np.ravel(found.misplaced), np.ravel(found.contrast))
         return [{"distance_m": d / 1e3, "misplaced": m, "contrast": c} for d, m, c in columns]
 
     def _numbers(self, traces: list[dict[str, np.ndarray]], window: int) -> dict[str, Any]:

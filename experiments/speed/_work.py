@@ -18,7 +18,7 @@ from jax import Array
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import drt_jax
-from drt_jax import Lens, pupil
+from drt_jax import Lens, Scene, learn, pupil
 from drt_jax.image.sensor import convolve, convolve_taps
 from drt_jax.learn import train
 
@@ -48,7 +48,7 @@ print(_work.bundle_seconds(benchmark.{config!r}))
 
 def hits(lens: Lens, field: Any, distance: Any, waves: Array, points: Array) -> tuple[Array, Array]:
     """Hits (W, Q, 2) on the sensor, mm, and status (W, Q) of rays through points (Q, 2)."""
-    rays = drt_jax.trace_rays(lens, field, distance, waves, points)
+    rays = drt_jax.trace_rays(lens, Scene.point(field, distance, waves), points)
     return rays.points[:, :, -1, :2], rays.status
 
 
@@ -150,7 +150,7 @@ def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[
     found = {}
     scenes = jnp.zeros((1, 32 + 20, 32 + 20, 3), jnp.uint8)
     for name, (trained, depths) in cases.items():
-        values, blur = drt_jax.moments_model(lens, trained, 0.0, depths, wavelengths)
+        values, blur = learn.moments_model(lens, trained, Scene.point(0.0, depths, wavelengths))
         kind = convolve_taps if len(trained) == 1 else convolve
         imager = train.make_imager(blur, None, train.Camera(), kind)
         init, step = train.make_step(imager, {"optics": 1e-3}, depths, 0)

@@ -24,7 +24,7 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import Lens, Status, pupil, show
+from drt_jax import Lens, Scene, Status, learn, pupil, show
 from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
 
@@ -93,13 +93,17 @@ def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
     lens, field, distance = config.scene
     field, waves = 0.0 if axial else field, jnp.asarray(config.wavelengths_um)
     # On axis a smaller tolerance costs nothing.
-    rule = drt_jax.converged_rule(lens, field, distance, waves, 1e-9 if axial else 1e-6)
+    rule = drt_jax.converge(
+        drt_jax.psf_moments, lens, Scene.point(field, distance, waves), 1e-9 if axial else 1e-6
+    )
     truth, count = reference(lens, field, distance, config.wavelengths_um), lens.count
     lens = dataclasses.replace(lens, curved=(lens.stop,))  # derivatives by every curvature
 
     def sigma(values):
         lens_now = changed(lens, values)
-        covariance = drt_jax.psf_moments(lens_now, field, distance, waves, rule=rule).covariance
+        covariance = drt_jax.psf_moments(
+            lens_now, Scene.point(field, distance, waves), sampling=rule
+        ).covariance
         return (jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]),)
 
     def jacobian(values):
@@ -127,7 +131,7 @@ def bundle_task(config: Config) -> list[Row]:
     ours = compiled(trace, points)
     spot, status = (found[0] for found in ours[0]())
     _common.require(bool(jnp.all(status == Status.OK)), "lens: rays of the bundle fail")
-    rays = jax.jit(drt_jax.trace_rays)(lens, field, distance, waves, points)
+    rays = jax.jit(drt_jax.trace_rays)(lens, Scene.point(field, distance, waves), points)
     first, direction = rays.points[0, :, 0], rays.directions[0, :, 0]
     snell = jax.vmap(trace_snell, (None, None, 0, 0))
     again, ok = snell(lens, waves[0], first[:1000], direction[:1000])
@@ -172,7 +176,9 @@ def network_task(config: Config) -> list[Row]:
     weights = init(jax.random.key(config.seed))
     camera, rates = train.Camera(), {"optics": 1e-3, "network": 1e-3}
     depths = distance, distance
-    values, blur = drt_jax.moments_model(lens, ("sensor",), 0.0, depths, config.wavelengths_um)
+    values, blur = learn.moments_model(
+        lens, ("sensor",), Scene.point(0.0, depths, config.wavelengths_um)
+    )
     side = config.patch + camera.kernel - 1
     scenes = rng.integers(0, 256, (config.batch, side, side, 3)).astype(np.uint8)
 

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 import drt_jax
-from drt_jax import show
+from drt_jax import Scene, learn, show
 from drt_jax.devices import copied, shared, split
 from drt_jax.learn import train
 
@@ -54,9 +54,9 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     shape = config.images * max(config.counts), side, side, 3
     scenes = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
     lens = drt_jax.load_lens(config.lens)
-    init, restore = drt_jax.red_net(**dataclasses.asdict(config.network))
+    init, restore = learn.red_net(**dataclasses.asdict(config.network))
     waves = config.wavelengths_um
-    blur = drt_jax.moments_model(lens, ("sensor",), 0.0, (25e3, 25e3), waves, 1e-6)[1]
+    blur = learn.moments_model(lens, ("sensor",), Scene.point(0.0, (25e3, 25e3), waves), 1e-6)[1]
     start = {"optics": {"sensor": lens.sensor}, "network": init(jax.random.key(0))}
 
     def step_of(count: int, mesh: Any) -> tuple[Callable[[], float], Any]:

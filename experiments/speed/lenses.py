@@ -26,7 +26,8 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import Lens, show
+from drt_jax import Lens, Scene, show
+from drt_jax.pupil import PupilRule, pupil_points
 
 from . import _command, _common, _peers, _plots, _work
 from ._common import Numbers, Wavelengths, not_empty, within
@@ -74,9 +75,11 @@ class Config:
     seed: int = 0
 
 
-def sigmas(lens: Lens, field: Any, waves: Array, rule: drt_jax.PupilRule) -> Array:
+def sigmas(lens: Lens, field: Any, waves: Array, rule: PupilRule) -> Array:
     """RMS spot radii (W,), mm."""
-    covariance = drt_jax.psf_moments(lens, field, math.inf, waves, rule=rule).covariance
+    covariance = drt_jax.psf_moments(
+        lens, Scene.point(field, math.inf, waves), sampling=rule
+    ).covariance
     return jnp.sqrt(jnp.trace(covariance, axis1=1, axis2=2))
 
 
@@ -88,7 +91,8 @@ def _error(truth: np.ndarray, covariance: Array) -> float:
 def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     """A row of one lens at one field (radians); everything is compiled anew."""
     waves = np.array(config.wavelengths_um)
-    converged = partial(drt_jax.psf_moments, lens, field, math.inf, waves)
+    scene = Scene.point(field, math.inf, waves)
+    converged = partial(drt_jax.psf_moments, lens, scene)
     jax.clear_caches()
     start = time.perf_counter()
     loose = jax.block_until_ready(converged(_LOOSE))
@@ -96,7 +100,7 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     tight = converged(_TIGHT)
     calls = [lambda: converged(_LOOSE), lambda: converged(_TIGHT)]
     seconds = _common.medians(calls, config.repeats)
-    rule = drt_jax.converged_rule(lens, field, math.inf, waves, _TIGHT)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, scene, _TIGHT)
     value, measured = _work.compiled(
         lambda lens: sigmas(lens, field, jnp.asarray(waves), rule), lens
     )
@@ -111,7 +115,7 @@ def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     timed = _common.medians([value, gradient, *(call for _, call, _ in ready)], config.repeats)
     others = {name: (s, error) for (name, _, error), s in zip(ready, timed[2:])}
     notes = {name: note for name, call, _, note in peers if not call}
-    points, _ = drt_jax.pupil_points(lens, field, math.inf, waves, rule)
+    points, _ = pupil_points(lens, scene, rule)
     return {
         "rays": points.shape[1],
         "passed": float(np.mean(loose.throughput)),
@@ -154,7 +158,7 @@ def perturbed(lens: Lens, count: int, seed: int) -> Lens:
     return dataclasses.replace(batch, **parts, sensor=vary(lens.sensor))
 
 
-def copies(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) -> dict[str, float]:
+def copies(config: Config, lens: Lens, widest: float, rule: PupilRule) -> dict[str, float]:
     """Seconds of perturbed copies at several fields under `vmap`, and of its compilation."""
     waves = jnp.asarray(config.wavelengths_um)
     fields = jnp.linspace(0.0, widest, config.fields)
@@ -169,7 +173,7 @@ def copies(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) -
     return {"s": _common.medians([call], 3)[0], "compile_s": known["compile_s"], "bad": bad}
 
 
-def sweep(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) -> dict[str, Any]:
+def sweep(config: Config, lens: Lens, widest: float, rule: PupilRule) -> dict[str, Any]:
     """sigma (mm), height of the centroid (mm) and throughput of one wavelength over the field, and
     their derivatives by a common factor of curvatures and apertures."""
     waves = jnp.asarray(config.wavelengths_um[len(config.wavelengths_um) // 2 :][:1])
@@ -181,7 +185,7 @@ def sweep(config: Config, lens: Lens, widest: float, rule: drt_jax.PupilRule) ->
             curvature=lens.curvature * (1 + growth),
             semi_diameter=lens.semi_diameter * (1 + growth),
         )
-        found = drt_jax.psf_moments(scaled, field, math.inf, waves, rule=rule)
+        found = drt_jax.psf_moments(scaled, Scene.point(field, math.inf, waves), sampling=rule)
         sigma = jnp.sqrt(found.covariance[0, 0, 0] + found.covariance[0, 1, 1])
         return jnp.stack([sigma, found.mean[0, 1], found.throughput[0]])
 
@@ -212,7 +216,7 @@ def lens_rows(config: Config, of: LensFields) -> dict[str, Any]:
     jax.clear_caches()
     waves = np.array(config.wavelengths_um)
     fields = [[0.0, part * widest] for part in (0.5, 1)]
-    rule = drt_jax.converged_rule(lens, fields, math.inf, waves, _LOOSE)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, Scene.grid(fields, math.inf, waves), _LOOSE)
     name = {"lens": of.lens}
     parts = {"copies": copies, "sweep": sweep}
     return {"rows": rows} | {key: name | f(config, lens, widest, rule) for key, f in parts.items()}

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import Lens, design
+from drt_jax import Lens, Scene, design, learn
 from drt_jax.design.optimum import init_problem, take_step
 from drt_jax.design.problem import quick
 from drt_jax.devices import shared
@@ -98,11 +98,15 @@ class Setup:
         vector = design.as_built_starts(self.variables, 1, *errors)[0]
         self.spoilt = jnp.clip(vector, self.variables.low, self.variables.high)
         net = dataclasses.asdict(config.network)
-        self.init, self.restore = drt_jax.red_net(**net)
+        self.init, self.restore = learn.red_net(**net)
         self.mesh = mesh_of(config.devices)
         self.model = self._model()
         axis = drt_jax.psf(
-            lens, 0.0, self.depths[1], self.waves, self.pixel, config.camera.kernel, self.model
+            lens,
+            Scene.point(0.0, self.depths[1], self.waves),
+            self.pixel,
+            config.camera.kernel,
+            sampling=self.model,
         )
         self._axis = axis.solid_angle
         # With n cells a kernel of waves repeats after n times half a wavelength over the aperture.
@@ -130,7 +134,7 @@ class Setup:
         distances = [1 / p if p > 0 else math.inf for p in parts]
         fields = _FIELDS * self.field
         return design.Problem.from_variables(
-            self.variables, operands, fields, self.waves, distances, _ORDER
+            self.variables, operands, Scene.grid(fields, distances, self.waves), _ORDER
         )
 
     @functools.cached_property
@@ -145,26 +149,22 @@ class Setup:
         slopes = jnp.maximum(slopes, 1e-3 * jnp.max(slopes))
         return 1e-3 * self.config.train.optics_rate / slopes
 
-    def _model(self) -> drt_jax.PsfModel:
+    def _model(self) -> drt_jax.Sampling:
         """The model of kernels, chosen for the spoilt lens. ConfigError for kernels that are too
         small for its blur, and for fields of which no light arrives."""
         config, lens = self.config, self.variables.lens_of(self.spoilt)
         fields = np.array([[1e-4, 1e-4], [0.5, 0.5], [0.0, 1.0]]) * self.field
         distances = sorted(set(self.depths))
         size = config.camera.kernel
-        grid = self.waves, self.pixel, size
-        worst = 0.0
+        scene, pixels = Scene.grid(fields, distances, self.waves), (self.pixel, size)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "size: ")  # light beside kernels is judged below
             try:
-                model = drt_jax.converged_psf(
-                    lens, fields, distances, *grid, "rays", config.camera.tolerance
-                )
+                tolerance = config.camera.tolerance
+                model = drt_jax.converge(drt_jax.psf, lens, scene, *pixels, "rays", tolerance)
             except ValueError as error:
                 _common.require(False, f"field_deg: {error}")
-            for distance in distances:
-                found = drt_jax.psfs(lens, fields, distance, *grid, model)
-                worst = max(worst, float(np.max(found.outside)))
+            worst = float(np.max(drt_jax.psf(lens, scene, *pixels, sampling=model).outside))
         lost = f"{100 * worst:.0f} % of the light of the spoilt lens falls beside a kernel"
         remedy = "give a larger one, larger pixels, or spoil the lens less"
         _common.require(worst <= _LOST, f"camera.kernel: {lost} of {size} pixels: {remedy}")
@@ -184,10 +184,10 @@ class Setup:
         ]
         return dataclasses.replace(built, sensor=built.sensor + focus[1] - focus[0])
 
-    def _psfs(self, optics: Any, seen: ObjectPoints, waves: Any, model: Any) -> drt_jax.Psf:
+    def _psfs(self, optics: Any, seen: ObjectPoints, waves: Any, model: Any) -> drt_jax.results.Psf:
         lens = self.lens_of(optics["lens"], seen.deviations)
-        scene = seen.fields, seen.distances, waves
-        return drt_jax.psfs(lens, *scene, self.pixel, self.config.camera.kernel, model)
+        scene = Scene.radians(seen.fields, seen.distances, waves)
+        return drt_jax.psf(lens, scene, self.pixel, self.config.camera.kernel, sampling=model)
 
     def points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
         """Kernels and light of points, by rays."""
@@ -260,7 +260,7 @@ class Setup:
             vector = jnp.where(before.get("moves", True), after["lens"], before["lens"])
             return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
-        imager = FieldImager(points, restored, shared(drt_jax.convolve_each, self.mesh))
+        imager = FieldImager(points, restored, shared(learn.convolve_each, self.mesh))
         return (make_damped_step if arm.damped else make_field_step)(imager, rates, draw, 0, hold)
 
     def start(self, arm: Arm, seed: int, vector: Array, weights: Any) -> dict[str, Any]:

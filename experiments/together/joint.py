@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from drt_jax import load_lens, show
+from drt_jax import Scene, load_lens, show
 from drt_jax.design import Operand, Solve, Tie, Tolerance, Vary
 from drt_jax.learn.data import DataConfig
 
@@ -192,7 +192,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     fields = np.radians([0.0, 0.7 * results["field_deg"], results["field_deg"]])
     for ax, name in zip(np.ravel(axes), drawn):
         lens = load_lens(figures.parent / "lenses" / f"{name}.yaml")
-        show.lens_drawing(ax, show.draw(lens, fields, results["far_mm"] or math.inf))
+        show.lens_drawing(ax, show.draw(lens, Scene.radians(fields, results["far_mm"] or math.inf)))
         ax.set_title(titles.get(name.split()[0], name), fontsize=9)
         ax.get_legend().remove()
     figure.savefig(figures / "lenses.png")

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import Lens, Status
+from drt_jax import Lens, Scene, Status
 from drt_jax.inputs import InputError, shown
 
 from ._common import settings_files
@@ -149,7 +149,7 @@ def traced(lenses: list[Lens]) -> dict[str, Any]:
     def trace(lens: Lens) -> bool:
         wave = float(np.clip(np.mean(lens.dispersion.range), 0.4, 0.7))
         try:
-            rays = drt_jax.trace_rays(lens, 0.05, np.inf, [wave], pupil)
+            rays = drt_jax.trace_rays(lens, Scene.point(0.05, np.inf, [wave]), pupil)
         except ValueError as error:
             raise InputError(str(error)) from error
         known = np.isin(rays.status, [*Status])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
-from drt_jax import Gauss, Status
+from drt_jax import Gauss, Scene, Status
 from drt_jax.compilation import jit
 from drt_jax.lens.elements import rotation_matrix
 from drt_jax.lens.forms import Shape
@@ -94,7 +94,9 @@ def _residual(lens, field, distance, pupil, points):
 
 
 def _trace(lens, field, distance, pupil):
-    return drt_jax.trace_rays(lens, field, distance, jnp.full(1, WAVELENGTH, pupil.dtype), pupil)
+    return drt_jax.trace_rays(
+        lens, Scene.point(field, distance, jnp.full(1, WAVELENGTH, pupil.dtype)), pupil
+    )
 
 
 _plain = _over_scenes(_trace)
@@ -120,7 +122,7 @@ def _moments(lens, field, distance):
     wavelength = jnp.full(1, WAVELENGTH, field.dtype)
 
     def scalar(lens, field, distance):
-        found = drt_jax.psf_moments(lens, field, distance, wavelength, rule=_RULE)
+        found = drt_jax.psf_moments(lens, Scene.point(field, distance, wavelength), sampling=_RULE)
         none = (found.throughput == 0)[:, None, None] & jnp.isposinf(found.covariance)
         covariance = jnp.where(none, 0, found.covariance)
         value = jnp.sum(found.mean) + jnp.sum(covariance) + safe_sqrt(covariance[0, 0, 0])

@@ -26,7 +26,8 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import Lens, PupilRule, pupil
+from drt_jax import Lens, Scene, pupil
+from drt_jax.pupil import PupilRule
 
 from . import _command, _common, _plots
 from ._common import Numbers, Wavelengths, different, grouped, not_empty, within
@@ -120,10 +121,9 @@ class Config:
 
 
 @jax.jit
-def spot(*arguments: Any) -> tuple[Array, Array]:
-    """sigma (W,) and centroids (W, 2), mm, from the arguments of psf_moments and a rule."""
-    *scene, rule = arguments
-    moments = drt_jax.psf_moments(*scene, rule=rule)
+def spot(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Array, Array]:
+    """sigma (W,) and centroids (W, 2), mm."""
+    moments = drt_jax.psf_moments(lens, scene, sampling=rule)
     mean, covariance = moments.mean, moments.covariance
     return jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]), mean
 
@@ -189,15 +189,15 @@ def row_of(arguments: tuple, truth: list[Moments], rules: Sequence[PupilRule]) -
 
 def count_rays(arguments: tuple, rule: PupilRule) -> int:
     """Number of rays of the first wavelength with a weight."""
-    weights = drt_jax.pupil_points(*arguments, rule)[1]
+    weights = drt_jax.pupil.pupil_points(*arguments, rule)[1]
     return int(np.count_nonzero(np.asarray(weights)[0]))
 
 
 def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple, list[Moments]]:
-    """Arguments of psf_moments, with the lens focused on axis and clipped, and the reference."""
+    """Lens and scene, with the lens focused on axis and clipped, and the reference."""
     lens = drt_jax.load_lens(scene.lens)
     distance, field = 1e3 * scene.distance_m, math.radians(scene.field_deg)
-    spread = drt_jax.focus_moments(lens, 0.0, distance, wavelengths, 1e-9).spread
+    spread = drt_jax.focus_moments(lens, Scene.point(0.0, distance, wavelengths), 1e-9).spread
     _, linear, square = np.sum(np.asarray(spread), axis=(1, 2))
     sensor = float(lens.sensor) - linear / (2 * square) + scene.defocus_mm
     semi = lens.semi_diameter
@@ -209,7 +209,7 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
     if not scene.field_deg:  # exactly 0 by symmetry
         flat = np.array([[1.0], [0.0]])
         truth = [m._replace(centroid=0.0, gradient=flat * m.gradient) for m in truth]
-    arguments = lens, field, distance, np.array(wavelengths)
+    arguments = lens, Scene.point(field, distance, wavelengths)
     return jax.tree.map(lambda a: jnp.asarray(a, scene.dtype), arguments), truth
 
 
@@ -227,11 +227,9 @@ def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
         {"method": name, "size": size} | row_of(arguments, truth, rules)
         for name, size, rules in kinds
     ]
-    # A Python number on axis, whose symmetry is known.
-    known = arguments[0], arguments[1] if scene.field_deg else 0.0, *arguments[2:]
     tolerances = []
     for tolerance in config.tolerances:
-        rule = drt_jax.converged_rule(*known, tolerance)
+        rule = drt_jax.converge(drt_jax.psf_moments, *arguments, tolerance)
         error = spot_errors(truth, *spot(*arguments, rule))[0]
         row = {"tolerance": tolerance, "order": rule.order, "rays": count_rays(arguments, rule)}
         tolerances.append(row | {"relative_error": error})

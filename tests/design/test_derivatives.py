@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import Clipped, Gauss, design, load_lens
+from drt_jax import Clipped, Gauss, Scene, design, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary, trace_fields
 from drt_jax.design.failures import failures
@@ -54,7 +54,9 @@ def crooked(tmp_path_factory):
     # Of `throughput` rays drop out one by one; of waves see test_waves.
     kinds = [k for k, value in OPERANDS.items() if k != "throughput" and not value.of_waves]
     fields = [[0.02, 0.05], [0.01, 0.25], [0.03, 0.45]]
-    problem = Problem.from_variables(variables, kinds, fields, COLOURS, 800.0, Gauss(3, "none"))
+    problem = Problem.from_variables(
+        variables, kinds, Scene.radians(fields, 800.0, COLOURS), Gauss(3, "none")
+    )
     moves = np.random.default_rng(0).normal(size=len(variables.places))
     # As optimisers search: a third of the program, and the derivatives do not know.
     return quick(problem), variables.start + moves
@@ -95,7 +97,7 @@ def test_derivatives_of_a_fitted_pupil():
     rule = Clipped(4, "bilateral")
     fields = np.radians([0.0, 20.0])
     problem = Problem.from_variables(
-        Variables.from_lens(lens, vary), kinds, fields, COLOURS[1], rule=rule
+        Variables.from_lens(lens, vary), kinds, Scene.radians(fields, wavelengths=COLOURS[1]), rule
     )
 
     def values(x):
@@ -115,7 +117,9 @@ def strong(tmp_path_factory):
     """A problem and a vector of which the last surface is too strong for the outer rays."""
     lens = model(tmp_path_factory.mktemp("lens"))
     variables = Variables.from_lens(lens, [Vary("curvature", (0, 3, 5, 6)), "sensor"])
-    problem = Problem.from_variables(variables, ["spot"], [0.0, 0.15], COLOURS[:2], rule=4)
+    problem = Problem.from_variables(
+        variables, ["spot"], Scene.radians([0.0, 0.15], wavelengths=COLOURS[:2]), 4
+    )
     return problem, variables.start.at[3].multiply(2.9)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import design, find_glass
+from drt_jax import Scene, design, find_glass
 from drt_jax.design import Operand, Solve, Tie, Variables, Vary
 from drt_jax.lens.glasses import indices
 
@@ -53,7 +53,10 @@ def snapped():
     operands = [Operand("spot", weight=1e3), Operand("glass_map", high=0.0)]
     operands.append(Operand("total_track", high=200.0))
     problem = design.Problem.from_variables(
-        Variables.from_lens(lens, vary, solves=solves), operands, 0.0, WAVES, rule=2
+        Variables.from_lens(lens, vary, solves=solves),
+        operands,
+        Scene.radians(0.0, wavelengths=WAVES),
+        2,
     )
     found = design.optimise(problem, max_steps=60)
     accept = lambda glass: glass.name in NAMES  # noqa: E731

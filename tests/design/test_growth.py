@@ -3,7 +3,7 @@
 import pytest
 
 import drt_jax
-from drt_jax import design
+from drt_jax import Scene, design
 from drt_jax.design import Variables
 
 from .test_optimum import OPTIMUM, SINGLET, grid
@@ -14,7 +14,9 @@ def problem(tmp_path_factory):
     path = tmp_path_factory.mktemp("lens") / "singlet.yaml"
     path.write_text(SINGLET.format(1000, -1000))
     variables = Variables.from_lens(drt_jax.load_lens(path), ["curvature"])
-    return design.Problem.from_variables(variables, ["spot"], 0.0, 0.55, rule=grid(5))
+    return design.Problem.from_variables(
+        variables, ["spot"], Scene.radians(0.0, wavelengths=0.55), grid(5)
+    )
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Clipped, Gauss, Soft, design, load_lens
+from drt_jax import Clipped, Gauss, Scene, Soft, design, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import (
     OPERANDS,
@@ -27,6 +27,8 @@ from drt_jax.design import (
 from drt_jax.design.field_rays import relative_illumination
 from drt_jax.design.kinds import KINDS
 from drt_jax.lens.glasses import glass_map_distance
+from drt_jax.lens.paraxial import image_height
+from drt_jax.pupil import pupil_points
 
 from .test_variables import MODEL
 
@@ -53,8 +55,8 @@ def triplet():
     variables = Variables.from_lens(lens, ["curvature"])
     none = "magnification", "glass_map"
     kinds = [k for k, value in OPERANDS.items() if k not in none and not value.of_waves]
-    given = FIELDS, COLOURS, DISTANCES, rule, WEIGHTS
-    problem = Problem.from_variables(variables, kinds, *given)
+    scene = Scene.grid(FIELDS, DISTANCES, COLOURS, wavelength_weights=WEIGHTS)
+    problem = Problem.from_variables(variables, kinds, scene, rule)
     return lens, rule, program(problem, kinds)(problem, variables.start)
 
 
@@ -63,12 +65,12 @@ def test_spots(triplet):
     """Sums of squares are traces of covariances, of colours apart or together."""
     lens, rule, told = triplet
     for k, (field, distance) in enumerate(VIEWS):
-        found = drt_jax.psf_moments(lens, field, distance, COLOURS, rule=rule)
+        found = drt_jax.psf_moments(lens, Scene.point(field, distance, COLOURS), sampling=rule)
         mean, covariance = np.asarray(found.mean), np.asarray(found.covariance)
         apart = WEIGHTS @ np.trace(covariance, axis1=1, axis2=2)
         centroid = WEIGHTS @ mean
         whole = apart + WEIGHTS @ np.sum((mean - centroid) ** 2, axis=1)
-        chief = np.asarray(drt_jax.image_point(lens, field, distance, COLOURS))[1]
+        chief = np.asarray(drt_jax.image_point(lens, Scene.point(field, distance, COLOURS)))[1]
 
         def square(kind, k=k):  # of components, views, colours and rays
             return np.sum(told[kind].reshape(2, len(VIEWS), -1)[:, k] ** 2)
@@ -85,10 +87,10 @@ def test_spots(triplet):
 def test_wavefronts(triplet):
     lens, rule, told = triplet
     points, weights = (
-        np.asarray(a)[0] for a in drt_jax.pupil_points(lens, 0.1, np.inf, COLOURS, rule)
+        np.asarray(a)[0] for a in pupil_points(lens, Scene.point(0.1, np.inf, COLOURS), rule)
     )
     for k, (field, distance) in enumerate(VIEWS):
-        wave = drt_jax.wavefront(lens, field, distance, COLOURS, points)
+        wave = drt_jax.wavefront(lens, Scene.point(field, distance, COLOURS), points)
         rms = np.sqrt(WEIGHTS @ np.square(drt_jax.rms_wavefront(wave, weights)))
         assert abs(told["rms_wavefront"][k] / rms - 1) < 1e-9
         square = np.sum(told["path_difference"].reshape(len(VIEWS), -1)[k] ** 2)
@@ -117,16 +119,16 @@ def test_chief_rays(triplet):
     lens, _, told = triplet
     focal = float(drt_jax.focal_length(lens, COLOURS[1])[0])
     for k, (field, distance) in enumerate(VIEWS):
-        points = np.asarray(drt_jax.image_point(lens, field, distance, COLOURS))[:, 1]
+        points = np.asarray(drt_jax.image_point(lens, Scene.point(field, distance, COLOURS)))[:, 1]
         lateral = told["lateral_colour"].reshape(len(VIEWS), 2)[k]
         np.testing.assert_allclose(lateral, points[1:] - points[0], atol=1e-13)
         if np.isinf(distance) and field:
             wanted = points[1] / (focal * np.tan(field)) - 1
             assert abs(told["distortion"][k] - wanted) < 1e-12
-        ideal = drt_jax.image_height(lens, field, distance, COLOURS)[1]
+        ideal = image_height(lens, field, distance, COLOURS)[1]
         wanted = points[1] / ideal - 1 if field else 0
         assert abs(told["distortion"][k] - wanted) < 1e-12
-        rays = drt_jax.trace_rays(lens, field, distance, COLOURS, [[0.0, 0.0]])
+        rays = drt_jax.trace_rays(lens, Scene.point(field, distance, COLOURS), [[0.0, 0.0]])
         angles = np.arccos(np.minimum(np.asarray(rays.directions)[:, 0, -1, 2], 1))
         np.testing.assert_allclose(
             told["chief_ray_angle"].reshape(len(VIEWS), 3)[k], angles, atol=1e-7 / (1 + 1e7 * field)
@@ -140,9 +142,9 @@ def test_numerical_apertures(triplet):
     lens, _, told = triplet
     rim = [[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]]
     for k, (field, distance) in enumerate(VIEWS):
-        ends = np.asarray(drt_jax.trace_rays(lens, field, distance, COLOURS, rim).directions)[
-            1, :, -1
-        ]
+        ends = np.asarray(
+            drt_jax.trace_rays(lens, Scene.point(field, distance, COLOURS), rim).directions
+        )[1, :, -1]
         sines = np.linalg.norm(np.cross(ends[0], ends[1:]), axis=-1)
         wanted = np.sqrt(np.mean(sines**2))
         assert abs(told["numerical_aperture"][k] / wanted - 1) < 1e-9
@@ -154,11 +156,11 @@ def test_numerical_apertures(triplet):
 def test_incidence(triplet):
     """The largest angle between directions and normals, these by differences of the sag."""
     lens, rule, told = triplet
-    points = np.asarray(drt_jax.pupil_points(lens, 0.1, np.inf, COLOURS, rule)[0])[0]
+    points = np.asarray(pupil_points(lens, Scene.point(0.1, np.inf, COLOURS), rule)[0])[0]
     points = np.concatenate([points, [[0, 0], [0, 1], [0, -1], [1, 0]]])
     largest, h = np.zeros(lens.count), 1e-4
     for field, distance in VIEWS:
-        rays = drt_jax.trace_rays(lens, field, distance, COLOURS, points)
+        rays = drt_jax.trace_rays(lens, Scene.point(field, distance, COLOURS), points)
         for i in range(lens.count):
             x, y, _ = np.moveaxis(np.asarray(rays.points)[:, :, i], -1, 0)
             slopes = [
@@ -192,11 +194,11 @@ def test_thickness_at_edges(triplet):
 def test_open_apertures_reach_as_far_as_the_rays(tmp_path):
     lens = model(tmp_path)
     problem = Problem.from_variables(
-        Variables.from_lens(lens, ["thickness"]), ["air_edge"], [0.0, 0.2], rule=3
+        Variables.from_lens(lens, ["thickness"]), ["air_edge"], Scene.radians([0.0, 0.2]), 3
     )
     extents = np.asarray(problem.beam_radius(lens))
     assert extents[0] == 6 and extents[4] == 4
-    rays = drt_jax.trace_rays(lens, 0.2, np.inf, 0.5875618, [[0, 1], [0, -1], [1, 0]])
+    rays = drt_jax.trace_rays(lens, Scene.point(0.2, np.inf, 0.5875618), [[0, 1], [0, -1], [1, 0]])
     reach = np.hypot(*np.moveaxis(np.asarray(rays.points)[0, :, :, :2], -1, 0)).max(axis=0)
     np.testing.assert_allclose(extents[[1, 2, 3, 5, 6]], reach[[1, 2, 3, 5, 6]], rtol=1e-12)
 
@@ -206,14 +208,17 @@ def flux(lens, field, count=400, h=1e-4):
     solid angle, in direction cosines, that an area of the sensor sees."""
     angle = 2 * np.pi * np.arange(count) / count
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rays = drt_jax.trace_rays(lens, field, np.inf, COLOURS[1], rim)
+    rays = drt_jax.trace_rays(lens, Scene.point(field, np.inf, COLOURS[1]), rim)
     point, line = (np.asarray(a)[0, :, 0] for a in (rays.points, rays.directions))
     x, y, _ = (point - line * (point[:, 2] / line[:, 2])[:, None]).T
     area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
     columns = []
     for step in np.eye(2) * h:
         ends = [np.array([0, field]) + sign * step for sign in (1, -1)]
-        hits = [np.asarray(drt_jax.image_point(lens, e, np.inf, COLOURS[1]))[0] for e in ends]
+        hits = [
+            np.asarray(drt_jax.image_point(lens, Scene.point(e, np.inf, COLOURS[1])))[0]
+            for e in ends
+        ]
         lines = [np.tan(e) / np.sqrt(1 + np.sum(np.tan(e) ** 2)) for e in ends]
         columns.append((hits[0] - hits[1], lines[0] - lines[1]))
     moved, turned = (np.linalg.det(np.stack(part)) for part in zip(*columns))
@@ -253,7 +258,7 @@ def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
     lens = load_lens(path)
     fields = np.radians([0.0, 14.0])
     problem = Problem.from_variables(
-        Variables.from_lens(lens, ["thickness"]), ["spot"], fields, rule=rule
+        Variables.from_lens(lens, ["thickness"]), ["spot"], Scene.radians(fields), rule
     )
 
     @jax.jit
@@ -276,9 +281,8 @@ def test_vignetted_spots():
     problem = Problem.from_variables(
         Variables.from_lens(lens, ["thickness"]),
         ["spot_of_colours"],
-        [field],
-        COLOURS[1],
-        rule=rule,
+        Scene.radians([field], wavelengths=COLOURS[1]),
+        rule,
     )
 
     @jax.jit
@@ -287,7 +291,7 @@ def test_vignetted_spots():
         return problem.operands[0].values(lens, rays), rays.throughput
 
     values, passed = told(lens)
-    found = drt_jax.psf_moments(lens, field, np.inf, COLOURS[1], rule=rule)
+    found = drt_jax.psf_moments(lens, Scene.point(field, np.inf, COLOURS[1]), sampling=rule)
     assert 0.3 < passed[0, 0] < 0.9 and abs(passed[0, 0] / found.throughput[0] - 1) < 1e-11
     trace = np.trace(np.asarray(found.covariance)[0])
     assert abs(np.sum(values**2) / trace - 1) < 1e-10
@@ -299,7 +303,7 @@ def beam(lens, vary, rule, **given):
     kinds = ("spot", "rms_spot", "rms_wavefront", "centroid")
     wanted = [*(Operand(kind, **given) for kind in kinds), "throughput"]
     return Problem.from_variables(
-        Variables.from_lens(lens, vary), wanted, fields, COLOURS, rule=rule
+        Variables.from_lens(lens, vary), wanted, Scene.radians(fields, wavelengths=COLOURS), rule
     )
 
 
@@ -337,12 +341,10 @@ def test_apertures_as_variables_do_not_vignette():
     lens, rule = load_lens("petzval_100mm"), Soft(5, "bilateral", 1.0)
     vary = ["sensor", design.Vary("curvature", (5,))]
     vary.append(design.Vary("semi_diameter", (3, 4, 5), low=10.0, high=25.0))
-    args = np.radians([0.0, 3.0, 5.5]), COLOURS
+    scene = Scene.degrees([0.0, 3.0, 5.5], wavelengths=COLOURS)
     light = []
     for operand in (Operand("spot"), Operand("spot", vignetting=False)):
-        problem = Problem.from_variables(
-            Variables.from_lens(lens, vary), [operand], *args, rule=rule
-        )
+        problem = Problem.from_variables(Variables.from_lens(lens, vary), [operand], scene, rule)
         before = trace_fields(problem, problem.variables.lens).throughput
         after = trace_fields(problem, design.optimise(problem).lens).throughput
         light.append(float(np.mean(after[2]) / np.mean(before[2])))
@@ -357,7 +359,9 @@ def test_glasses_stay_on_the_map():
     variables = Variables.from_lens(lens, free, solves=[Solve("focal_length", 100.0, surface=2)])
     ends = []
     for limits in ([], [Operand("glass_map", high=0.0)]):
-        problem = Problem.from_variables(variables, ["spot", *limits], [0.0, 0.02], COLOURS, rule=3)
+        problem = Problem.from_variables(
+            variables, ["spot", *limits], Scene.radians([0.0, 0.02], wavelengths=COLOURS), 3
+        )
         found = design.optimise(problem, max_steps=60)
         model = found.lens.dispersion.model[jnp.array([1, 2])]
         ends.append(np.asarray(glass_map_distance(model)))
@@ -380,7 +384,7 @@ def test_a_dark_field_is_no_good_one(tmp_path):
     lens = model(tmp_path)
     lens = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[6].set(1e-3))
     problem = Problem.from_variables(
-        Variables.from_lens(lens, ["curvature"]), ["spot"], [0.3], rule=3
+        Variables.from_lens(lens, ["curvature"]), ["spot"], Scene.radians([0.3]), 3
     )
     merit, gradient = jax.jit(jax.value_and_grad(problem.merit))(problem.variables.start)
     assert np.isinf(merit) and np.all(np.isfinite(gradient))
@@ -391,7 +395,7 @@ def test_a_dark_field_is_no_good_one(tmp_path):
 def test_obscurations_need_another_rule():
     lens = load_lens("hubble")
     problem = Problem.from_variables(
-        Variables.from_lens(lens, ["sensor"]), ["spot"], rule=Clipped(3, "none")
+        Variables.from_lens(lens, ["sensor"]), ["spot"], sampling=Clipped(3, "none")
     )
     if lens.apertures is not None and any(lens.apertures.blocks):
         with pytest.raises(ValueError, match="rule: Clipped gives negative weights"):
@@ -446,7 +450,7 @@ def test_bad_words_and_numbers(arguments, said):
 def test_what_neither_lens_nor_problem_has(tmp_path, operand, said):
     variables = Variables.from_lens(model(tmp_path), ["curvature"])
     with pytest.raises(ValueError) as told:
-        Problem.from_variables(variables, [operand], [0.0, 0.1])
+        Problem.from_variables(variables, [operand], Scene.radians([0.0, 0.1]))
     assert said in str(told.value)
     assert hash(Operand("spot", fields=[0]))
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import optimize
 
 import drt_jax
-from drt_jax import design
+from drt_jax import Scene, design
 from drt_jax.design import Operand, Solve, Variables, Vary, least_squares
 from drt_jax.design.starts import distinct
 
@@ -86,7 +86,9 @@ def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):
         path = tmp_path / "singlet.yaml"
         path.write_text(SINGLET.format(first, second))
         variables = Variables.from_lens(drt_jax.load_lens(path), ["curvature"])
-        problem = design.Problem.from_variables(variables, ["spot"], 0.0, 0.55, rule=grid(5))
+        problem = design.Problem.from_variables(
+            variables, ["spot"], Scene.radians(0.0, wavelengths=0.55), grid(5)
+        )
         if first == 1000:
             np.testing.assert_allclose(problem.merit(variables.start), START, rtol=1e-11)
         found = design.optimise(problem)
@@ -102,7 +104,9 @@ def test_a_diffractive_plate_learns_to_focus():
     plate = {"radius": "inf", "semi_diameter": 8.0, "stop": True, "phase": phase}
     lens = drt_jax.load_lens({"surfaces": [plate], "sensor": f})
     variables = Variables.from_lens(lens, ["phase"])
-    found = design.optimise(design.Problem.from_variables(variables, ["spot"], 0.0, green, rule=6))
+    found = design.optimise(
+        design.Problem.from_variables(variables, ["spot"], Scene.radians(0.0, wavelengths=green), 6)
+    )
     assert found.merit < 1e-16 and found.jacobians <= 20
     series = np.array([-1 / (2 * f), 1 / (8 * f**3), -1 / (16 * f**5)]) * 1e3 / green
     error = np.abs(found.lens.phase.coefficients[0] / series - 1)
@@ -123,7 +127,9 @@ def triplet():
         solves=[Solve("focal_length", surface=last), Solve("entrance_pupil")],
     )
     wanted = ["spot", Operand("glass_edge", low=1.0), Operand("total_track", high=55.0)]
-    return design.Problem.from_variables(variables, wanted, np.radians([0.0, 14.0]), 0.5876, rule=3)
+    return design.Problem.from_variables(
+        variables, wanted, Scene.radians(np.radians([0.0, 14.0]), wavelengths=0.5876), 3
+    )
 
 
 @pytest.mark.slow
@@ -172,16 +178,16 @@ def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
     """Of limits that cannot be kept together, the worst one by kind, surface, zone and amount."""
     # Without a limit for air the search ends where surfaces touch, which is no optimum.
     assert design.optimise(triplet).ended == "stuck"
-    args = np.radians([0.0, 14.0]), 0.5876
+    scene = Scene.degrees([0.0, 14.0], wavelengths=0.5876)
     apart = *triplet.operands, Operand("air_edge", low=0.1)
-    found = design.optimise(design.Problem.from_variables(triplet.variables, apart, *args, rule=3))
+    found = design.optimise(design.Problem.from_variables(triplet.variables, apart, scene, 3))
     assert found.converged and found.max_violation == 0 and len(found.limits) == 6 * 4 + 1
     track = next(limit for limit in found.limits if limit.kind == "total_track")
     assert track.side == "high" and abs(track.value - float(found.lens.sensor)) < 1e-12
     assert all(a.excess >= b.excess for a, b in zip(found.limits, found.limits[1:]))
     wanted = "spot", Operand("glass_edge", low=7.0, surfaces=(2,)), Operand("length", high=8.0)
     both = design.Problem.from_variables(
-        triplet.variables, [*wanted, Operand("spot", weight=0)], *args, rule=3
+        triplet.variables, [*wanted, Operand("spot", weight=0)], scene, 3
     )
     assert len(both.operands) == 3
     found = design.optimise(both)
@@ -205,7 +211,8 @@ def test_each_limit_has_the_name_of_its_value(triplet):
                 Operand(kind, low=lows, weight=2.0, at=(design.OPERANDS[kind].at and 20.0) or None)
                 for kind in kinds
             ],
-            *([0.0, 0.2, 0.3], (0.48, 0.55, 0.65), (np.inf, 900.0), drt_jax.Gauss(2, symmetry)),
+            Scene.grid([0.0, 0.2, 0.3], (np.inf, 900.0), (0.48, 0.55, 0.65)),
+            drt_jax.Gauss(2, symmetry),
         )
         sizes = jax.eval_shape(
             lambda p: [o.constraints(lens, design.trace_fields(p, lens)) for o in p.operands],
@@ -228,14 +235,18 @@ def test_a_limit_that_nothing_moves_is_refused(triplet):
     )
     some = ["spot", Operand("total_track", high=55.0), Operand("glass_edge", low=1.5)]
     with pytest.raises(ValueError, match="total_track: 60.1.*high 55.*no variable moves it"):
-        design.Problem.from_variables(bent, some, 0.0, 0.5876)
-    design.Problem.from_variables(bent, ["spot", Operand("total_track", high=61.0)], 0.0, 0.5876)
-    problem = design.Problem.from_variables(bent, [some[0], some[2]], 0.0, 0.5876, rule=2)
+        design.Problem.from_variables(bent, some, Scene.radians(0.0, wavelengths=0.5876))
+    design.Problem.from_variables(
+        bent, ["spot", Operand("total_track", high=61.0)], Scene.radians(0.0, wavelengths=0.5876)
+    )
+    problem = design.Problem.from_variables(
+        bent, [some[0], some[2]], Scene.radians(0.0, wavelengths=0.5876), 2
+    )
     with pytest.raises(ValueError, match="glass_edge of surface 2, zone .*no variable moves it"):
         design.optimise(problem, max_steps=3)
     # Those of rays that fail stay where they are until they pass.
     bounded = design.Problem.from_variables(
-        bent, ["spot", Operand("distortion", low=-0.05)], 0.3, 0.5876
+        bent, ["spot", Operand("distortion", low=-0.05)], Scene.radians(0.3, wavelengths=0.5876)
     )
     bounded.refuse_fixed([0.95], [0.95])
 
@@ -247,7 +258,10 @@ def test_weights_of_fields(triplet):
 
     def merit(fields, **given):
         of = design.Problem.from_variables(
-            triplet.variables, ["spot", "rms_spot"], fields, 0.5876, (np.inf, 900.0), 3, **given
+            triplet.variables,
+            ["spot", "rms_spot"],
+            Scene.grid(fields, (np.inf, 900.0), 0.5876, **given),
+            3,
         )
         return float(of.merit(start))
 
@@ -297,13 +311,13 @@ def test_many_starts_do_not_depend_on_threads(triplet):
         (lambda p: design.Problem.from_variables(p.variables, []), "operands: none"),
         (
             lambda p: design.Problem.from_variables(
-                p.variables, ["spot"], wavelength_weights=[0.0]
+                p.variables, ["spot"], Scene.radians(0.0, wavelength_weights=[0.0])
             ),
             "wavelength_weights",
         ),
         (
             lambda p: design.Problem.from_variables(
-                p.variables, ["spot"], [0, 0.1], field_weights=[1]
+                p.variables, ["spot"], Scene.radians([0, 0.1], field_weights=[1])
             ),
             "field_weights: expected 2 numbers",
         ),

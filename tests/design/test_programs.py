@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import design, load_lens
+from drt_jax import Scene, design, load_lens
 from drt_jax.design import Operand, Solve, Tie, Variables, Vary, trace_fields
 
 ROWS = [
@@ -55,9 +55,8 @@ def searched(k):
     ]
     fields, waves = [0.0, 0.05 + 0.01 * k], (0.5 + 0.01 * k, 0.6)
     given = {"wavelength_weights": (1.0, 2.0 + k), "field_weights": (1.0 + k, 2.0)}
-    problem = design.Problem.from_variables(
-        variables, operands, fields, waves, 900.0 + k, 2, **given
-    )
+    scene = Scene.radians(fields, 900.0 + k, waves, **given)
+    problem = design.Problem.from_variables(variables, operands, scene, 2)
     return problem, design.optimise(problem, max_steps=3)
 
 

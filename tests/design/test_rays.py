@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import design
+from drt_jax import Scene, design
 from drt_jax.design import Tolerance, Vary
-from drt_jax.lens.scene import scene_of
+from drt_jax.lens.scene import fitted
 from drt_jax.rays.find import find, find_aimed
 
 from ..known import aims
@@ -44,7 +44,7 @@ def both(lens, scene, points):
 @pytest.mark.parametrize(("name", "factor", "degrees"), WIDE)
 def test_aiming_finds_what_the_full_search_finds(name, factor, degrees):
     lens = opened(name, factor)
-    scene = scene_of(lens, np.radians(degrees), np.inf, RGB)
+    scene = fitted(lens, Scene.point(np.radians(degrees), np.inf, RGB))
     points, _ = drt_jax.Gauss(6, "bilateral").points(lens, scene)
     aimed, full = both(lens, scene, points)
     assert np.all(full.status == drt_jax.Status.OK)
@@ -60,10 +60,10 @@ def test_spots_of_a_design_are_those_of_the_moments():
     variables = design.Variables.from_lens(lens, [Vary("curvature")])
     rule = drt_jax.Gauss(6, "bilateral")
     problem = design.Problem.from_variables(
-        variables, ["rms_spot", "spot"], [field], RGB, rule=rule
+        variables, ["rms_spot", "spot"], Scene.radians([field], wavelengths=RGB), rule
     )
     judged = jax.jit(lambda p: p.evaluate(variables.start))(problem)
-    moments = drt_jax.psf_moments(lens, field, np.inf, RGB, rule=rule)
+    moments = drt_jax.psf_moments(lens, Scene.point(field, np.inf, RGB), sampling=rule)
     assert int(judged.failed) > 0 and np.all(moments.throughput < 1)
     # About the centroid of all wavelengths.
     apart = moments.mean - jnp.mean(moments.mean, axis=0, keepdims=True)
@@ -79,7 +79,9 @@ def test_lenses_as_built_are_searched_in_full(monkeypatch):
     lens = opened("cooke_triplet", 1.0)
     variables = design.Variables.from_lens(lens, [Vary("curvature")])
     rule = drt_jax.Gauss(3, "none")
-    problem = design.Problem.from_variables(variables, ["spot"], [0.2], (0.55,), rule=rule)
+    problem = design.Problem.from_variables(
+        variables, ["spot"], Scene.radians([0.2], wavelengths=(0.55,)), rule
+    )
     perturbed = design.PerturbedLens.from_lens(
         lens, problem.beam_radius(lens), [Tolerance("thickness", 0.02)]
     )
@@ -100,7 +102,9 @@ def test_lenses_as_built_are_searched_in_full(monkeypatch):
 def test_an_optimum_is_searched_in_full(monkeypatch):
     """The same of a search for an optimum."""
     variables = design.Variables.from_lens(drt_jax.load_lens("singlet"), ["sensor"])
-    problem = design.Problem.from_variables(variables, ["spot"], [0.0], (0.55,), rule=3)
+    problem = design.Problem.from_variables(
+        variables, ["spot"], Scene.radians([0.0], wavelengths=(0.55,)), 3
+    )
     wanted = design.optimise(problem)
 
     def blind(system, target):

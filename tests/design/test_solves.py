@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import load_lens
+from drt_jax import Scene, load_lens
 from drt_jax.design import Solve, Variables, Vary
 
 COLOURS = (0.48, 0.55, 0.65)
@@ -112,7 +112,9 @@ def best(lens, solve):
     for field in solve.fields:
         symmetry = "rotational" if field == 0 else "bilateral"
         found = drt_jax.focus_moments(
-            lens, field, solve.distance, solve.wavelengths, rule=drt_jax.Gauss(6, symmetry)
+            lens,
+            Scene.point(field, solve.distance, solve.wavelengths),
+            sampling=drt_jax.Gauss(6, symmetry),
         )
         total += jnp.mean(jnp.sum(found.spread[..., :2], axis=-1), axis=-1)
     return abs(total[1] / total[2] / 2 / lens.sensor)
@@ -133,7 +135,7 @@ def test_best_focus_is_best():
         moved = dataclasses.replace(lens, sensor=jnp.asarray(sensor[0] + shift))
         traces = [
             drt_jax.psf_moments(
-                moved, f, np.inf, COLOURS, rule=drt_jax.Gauss(6, "bilateral")
+                moved, Scene.point(f, np.inf, COLOURS), sampling=drt_jax.Gauss(6, "bilateral")
             ).covariance
             for f in solve.fields
         ]

@@ -11,7 +11,7 @@ import pytest
 from scipy import optimize
 
 import drt_jax
-from drt_jax import design
+from drt_jax import Scene, design
 from drt_jax.design import PerturbedLens, Problem, Tolerance, Variables, compensate
 from drt_jax.design.deviations import KINDS
 from drt_jax.design.prediction import Order
@@ -31,9 +31,12 @@ def perturbed(*tolerances):
     return PerturbedLens.from_lens(SINGLET, jnp.array([5.0, 6.0, 6.0]), tolerances or ALL)
 
 
-def problem_of(lens, fields=FIELDS, rule=3, **more):
+def problem_of(lens, fields=FIELDS, rule=3):
     return Problem.from_variables(
-        Variables.from_lens(lens, ["sensor"]), ["spot"], fields, COLOURS, np.inf, rule
+        Variables.from_lens(lens, ["sensor"]),
+        ["spot"],
+        Scene.radians(fields, np.inf, COLOURS),
+        rule,
     )
 
 
@@ -61,7 +64,9 @@ def test_squares_are_those_of_the_moments(singlet):
     """The spot of all colours about their centroid, from the moments of each."""
     problem, some = singlet
     lens = some_lens(some)
-    found = drt_jax.psf_moments(lens, FIELDS[4], np.inf, COLOURS, rule=problem.rule)
+    found = drt_jax.psf_moments(
+        lens, Scene.point(FIELDS[4], np.inf, COLOURS), sampling=problem.rule
+    )
     mean, spread = np.asarray(found.mean), np.asarray(found.covariance)
     apart = np.sum((mean - np.mean(mean, axis=0)) ** 2, axis=1)
     wanted = np.mean(np.trace(spread, axis1=1, axis2=2) + apart)

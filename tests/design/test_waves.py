@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Clipped, Gauss, Pattern, Soft, design, load_lens
+from drt_jax import Clipped, Gauss, Pattern, Scene, Soft, design, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import Operand, Problem, Variables, Vary, trace_fields
 from drt_jax.design.problem import quick
@@ -45,7 +45,9 @@ def test_a_perfect_lens_and_other_numbers_compile_nothing():
             dataclasses.replace(operand, at=at)
             for operand, at in zip(ASKED, (part * LIMIT, None, zero))
         ]
-        found = program(Problem.from_variables(variables, asked, 0.0, WAVE, rule=4), lens)
+        found = program(
+            Problem.from_variables(variables, asked, Scene.radians(0.0, wavelengths=WAVE), 4), lens
+        )
         np.testing.assert_allclose(found["mtf"], wanted, rtol=0, atol=1e-4)
         np.testing.assert_allclose(found["strehl"], 1, rtol=0, atol=1e-9)
         np.testing.assert_allclose(found["encircled_energy"], energy, rtol=0, atol=3e-4)
@@ -58,7 +60,10 @@ def triplet():
     vary = [Vary("curvature", (0, 3)), Vary("thickness", (1,)), "sensor"]
     variables, rule = Variables.from_lens(COOKE, vary), Gauss(6, "bilateral")
     problem = Problem.from_variables(
-        variables, ASKED, FIELDS, COLOURS, rule=rule, wavelength_weights=WEIGHTS
+        variables,
+        ASKED,
+        Scene.radians(FIELDS, wavelengths=COLOURS, wavelength_weights=WEIGHTS),
+        rule,
     )
 
     def twice(x):
@@ -80,13 +85,13 @@ def test_values_are_those_of_analyses(triplet):
     """The rays of the design and those of the analyses are others; the cells are the same."""
     x, both = triplet
     found, rule = both(x)[1], Gauss(6, "bilateral")
-    scene = COOKE, FIELDS, np.inf, COLOURS
-    given = {"wavelength_weights": WEIGHTS, "rule": rule}
-    wanted = drt_jax.transfer(*scene, jnp.array([LINES]), **given).mtf[..., 0]
+    scene = COOKE, Scene.radians(FIELDS, np.inf, COLOURS, wavelength_weights=WEIGHTS)
+    wanted = drt_jax.transfer(*scene, jnp.array([LINES]), sampling=rule).mtf[..., 0]
     np.testing.assert_allclose(found["mtf"], np.ravel(wanted), rtol=0, atol=4e-5)
-    wanted = drt_jax.strehl(*scene, rule=rule, cells=64)
+    wanted = drt_jax.strehl(*scene, sampling=drt_jax.Sampling.of("waves", rule, 64))
     np.testing.assert_allclose(found["strehl"], np.ravel(wanted), rtol=0, atol=2e-4)
-    wanted = drt_jax.encircled_energy(*scene, jnp.array([RADIUS]), cells=128, **given)[:, 0]
+    fine = drt_jax.Sampling.of("waves", rule, 128)
+    wanted = drt_jax.encircled_energy(*scene, jnp.array([RADIUS]), sampling=fine)[:, 0]
     np.testing.assert_allclose(found["encircled_energy"], wanted, rtol=0, atol=1e-4)
 
 
@@ -95,7 +100,9 @@ def test_values_are_those_of_analyses(triplet):
 def test_kernels_are_those_of_psf():
     """An operand of one's own: the light beside the pixel in the middle, and its derivative."""
     variables = Variables.from_lens(COOKE, ["sensor"])
-    problem = Problem.from_variables(variables, ["spot"], FIELDS, COLOURS, rule=6)
+    problem = Problem.from_variables(
+        variables, ["spot"], Scene.radians(FIELDS, wavelengths=COLOURS), 6
+    )
 
     def beside(x):
         lens = variables.lens_of(x)
@@ -108,15 +115,17 @@ def test_kernels_are_those_of_psf():
     (_, (kernels, rule)), slope = both(x)
     assert rule.symmetry == "bilateral"
     # The model that psf(..., "waves", 1e-3) finds, or a finer one.
-    fine = drt_jax.PsfModel("waves", beam_rule(10, "bilateral"), 128)
+    fine = drt_jax.Sampling("waves", beam_rule(10, "bilateral"), 128)
     for field, own in zip(FIELDS, kernels):
-        wanted = drt_jax.psf(COOKE, field, np.inf, COLOURS, 4e-3, 9, fine).kernel
+        wanted = drt_jax.psf(
+            COOKE, Scene.point(field, np.inf, COLOURS), 4e-3, 9, sampling=fine
+        ).kernel
         assert np.max(np.sum(np.abs(own - wanted), axis=(1, 2))) < 5e-3
     step = 1e-5
     ends = [both(x + h)[0][0] for h in (step, -step)]
     np.testing.assert_allclose(slope[0], (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
     with pytest.raises(ValueError, match="^rule: needs Gauss, Soft or Clipped of"):
-        low = Problem.from_variables(variables, ["spot"], FIELDS, rule=1)
+        low = Problem.from_variables(variables, ["spot"], Scene.radians(FIELDS), 1)
         jax.eval_shape(lambda lens: design.psf(lens, trace_fields(low, lens), 4e-3), COOKE)
 
 
@@ -130,14 +139,17 @@ def test_a_clipped_pupil(rule, within):
     variables, field = Variables.from_lens(lens, ["sensor"]), jnp.array([0.0, 0.25])
     asked = [ASKED[0], ASKED[2]]
     values = [
-        jax.jit(told)(Problem.from_variables(variables, asked, field, COLOURS, rule=r), lens)
+        jax.jit(told)(
+            Problem.from_variables(variables, asked, Scene.radians(field, wavelengths=COLOURS), r),
+            lens,
+        )
         for r in (rule, Gauss(6, "bilateral"))
     ]
-    fine = {"rule": Clipped(10, "bilateral")}
-    scene = lens, field, np.inf, COLOURS
+    scene, fine = Scene.radians(field, np.inf, COLOURS), Clipped(10, "bilateral")
+    energy = drt_jax.encircled_energy(lens, scene, jnp.array([RADIUS]), sampling=fine)
     wanted = {
-        "mtf": drt_jax.transfer(*scene, jnp.array([LINES]), **fine).mtf[..., 0],
-        "encircled_energy": drt_jax.encircled_energy(*scene, jnp.array([RADIUS]), **fine)[:, 0],
+        "mtf": drt_jax.transfer(lens, scene, jnp.array([LINES]), sampling=fine).mtf[..., 0],
+        "encircled_energy": energy[:, 0],
     }
     for name, each in wanted.items():
         np.testing.assert_allclose(values[0][name], np.ravel(each), rtol=0, atol=within)
@@ -152,13 +164,15 @@ def test_contrast_designs_a_lens_of_more_contrast():
     variables = Variables.from_lens(
         lens, ["curvature", "sensor"], solves=[design.Solve("focal_length", 50.0, surface=5)]
     )
-    spots = design.optimise(Problem.from_variables(variables, ["spot"], fields, waves, rule=rule))
+    spots = design.optimise(
+        Problem.from_variables(variables, ["spot"], Scene.radians(fields, wavelengths=waves), rule)
+    )
     sharp = Problem.from_variables(
-        variables, [Operand("mtf", 1.0, at=50.0)], fields, waves, rule=rule
+        variables, [Operand("mtf", 1.0, at=50.0)], Scene.radians(fields, wavelengths=waves), rule
     )
     best = design.optimise(sharp, spots.vector, max_steps=40)
     before, after = (
-        np.asarray(drt_jax.transfer(found.lens, fields, np.inf, waves, [50.0]).mtf)
+        np.asarray(drt_jax.transfer(found.lens, Scene.radians(fields, np.inf, waves), [50.0]).mtf)
         for found in (spots, best)
     )
     assert np.mean(after) > np.mean(before) + 0.05 and np.min(after) > np.min(before)
@@ -171,10 +185,12 @@ def test_rules_that_give_no_polynomials_and_names_of_limits():
     points, weights = drt_jax.pupil.disc(3, 6)
     for rule in (Gauss(1, "none"), Pattern(points, weights), Clipped(2, "bilateral")):
         with pytest.raises(ValueError, match="^operands: mtf: rule: needs Gauss or Soft of"):
-            Problem.from_variables(variables, [limit], FIELDS, rule=rule)
-    padded = Problem.from_variables(variables, ["spot"], FIELDS, rule=Clipped(4, "none", 20))
+            Problem.from_variables(variables, [limit], Scene.radians(FIELDS), rule)
+    padded = Problem.from_variables(
+        variables, ["spot"], Scene.radians(FIELDS), Clipped(4, "none", 20)
+    )
     assert padded.rule.size == 4
-    problem = Problem.from_variables(variables, [limit], FIELDS)
+    problem = Problem.from_variables(variables, [limit], Scene.radians(FIELDS))
     names = [str(each) for each in problem.limits(np.array([0.1, -0.1]))]
     assert names[0] == "mtf of field 1, tangential, frequency 50: 0.2, low 0.3, beyond by 0.1"
     assert names[1] == "mtf of field 1, sagittal, frequency 50: 0.4, low 0.3, within by 0.1"

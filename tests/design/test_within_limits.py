@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import design, load_lens
+from drt_jax import Scene, design, load_lens
 
 pytestmark = pytest.mark.slow  # one program of twenty seconds
 
@@ -21,7 +21,7 @@ def problem():
     lens = load_lens("cooke_triplet")
     vary = [design.Vary("curvature", low=-0.2, high=0.2), "thickness", "sensor"]
     variables = design.Variables.from_lens(lens, vary)
-    return design.Problem.from_variables(variables, LIMITS, np.radians([0, 15]), rule=4)
+    return design.Problem.from_variables(variables, LIMITS, Scene.radians(np.radians([0, 15])), 4)
 
 
 @pytest.fixture(scope="module")

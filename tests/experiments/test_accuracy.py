@@ -11,7 +11,7 @@ import pytest
 from experiments._reference import reference
 
 import drt_jax
-from drt_jax import load_lens, psf_moments, pupil
+from drt_jax import Scene, load_lens, psf_moments, pupil
 from experiments import _command, accuracy
 
 from ..conftest import RGB
@@ -27,7 +27,7 @@ def spot_size(covariance):
 def focused(name, distance, defocus=0.0):
     """The lens with its sensor `defocus` mm behind the best focus of the mean colour on axis."""
     lens = load_lens(name)
-    spread = drt_jax.focus_moments(lens, 0.0, distance, RGB, 1e-9).spread
+    spread = drt_jax.focus_moments(lens, Scene.point(0.0, distance, RGB), 1e-9).spread
     _, linear, square = np.sum(np.asarray(spread), axis=(1, 2))
     sensor = lens.sensor - linear / (2 * square) + defocus
     return dataclasses.replace(lens, sensor=jnp.asarray(sensor, lens.sensor.dtype))
@@ -36,7 +36,7 @@ def focused(name, distance, defocus=0.0):
 def assert_kept(lens, field, distance, size, tolerances):
     """Every tolerance is kept: errors of the spot size, the worst colour, relative."""
     for tolerance in tolerances:
-        got = spot_size(psf_moments(lens, field, distance, RGB, tolerance).covariance)
+        got = spot_size(psf_moments(lens, Scene.point(field, distance, RGB), tolerance).covariance)
         error = float(np.max(np.abs(got / size - 1)))
         assert error <= tolerance, f"{error:.1e} at a tolerance of {tolerance:g}"
 
@@ -58,7 +58,9 @@ def test_spot_size_keeps_its_tolerance(name, degrees, distance):
             drt_jax.Gauss(order, "bilateral" if degrees else "rotational") for order in (17, 18)
         )
         size, again = (
-            spot_size(psf_moments(lens, field, distance, RGB, rule=rule).covariance)
+            spot_size(
+                psf_moments(lens, Scene.point(field, distance, RGB), sampling=rule).covariance
+            )
             for rule in rules
         )
         np.testing.assert_allclose(size, again, rtol=2e-12)
@@ -116,7 +118,7 @@ def test_reference_of_a_clipped_beam():
     tilted = reference(lens, 0.15, math.inf, [0.55])[0]
     assert tilted.error < 1e-11 and tilted.gradient_error < 1e-6
     points, _ = pupil.square_grid(400)
-    rays = drt_jax.trace_rays(lens, 0.15, math.inf, [0.55], points)
+    rays = drt_jax.trace_rays(lens, Scene.point(0.15, math.inf, [0.55]), points)
     good = np.asarray(rays.status[0]) == drt_jax.Status.OK
     assert 0.3 < np.mean(good) < 0.6
     spot = np.asarray(rays.points[0, good, -1, :2])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import drt_jax
+from drt_jax import Scene
 from drt_jax.design import growth as growing
 from experiments import _command, design
 
@@ -32,7 +33,7 @@ def test_a_lens_is_designed_from_several_starts(tmp_path, monkeypatch, capsys):
     assert set(row) >= NAMED and row["merit_end"] < row["merit_start"] and "RMS um" in said
     lens = drt_jax.load_lens(tmp_path / "run" / "designed.yaml")
     np.testing.assert_allclose(drt_jax.focal_length(lens, (0.5876,)), 50, rtol=1e-12)
-    moments = drt_jax.psf_moments(lens, 0.0, np.inf, (0.5876,), 0.1)
+    moments = drt_jax.psf_moments(lens, Scene.point(0.0, np.inf, (0.5876,)), 0.1)
     spot = 1e3 * np.sqrt(np.trace(moments.covariance[0]))
     np.testing.assert_allclose(spot, row["spots_um"][0], rtol=1e-9)
     figures = {path.stem for path in (tmp_path / "run" / "figures").glob("*.png")}
@@ -154,7 +155,7 @@ def test_glasses_become_real(tmp_path, monkeypatch):
     taken = {snap["surfaces"][0]: snap["glass"] for snap in results["glasses"]["snaps"]}
     assert lens.glasses == ("air", taken[0], taken[1], "air")
     assert results["rows"][0]["merit_end"] == results["glasses"]["snaps"][-1]["after"]
-    moments = drt_jax.psf_moments(lens, 0.0, np.inf, results["wavelengths_um"], 0.1)
+    moments = drt_jax.psf_moments(lens, Scene.point(0.0, np.inf, results["wavelengths_um"]), 0.1)
     mean, covariance = np.asarray(moments.mean), np.asarray(moments.covariance)
     apart = np.sum((mean - mean.mean(axis=0)) ** 2, axis=1)
     spot = np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2) + apart))

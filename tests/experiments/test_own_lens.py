@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import drt_jax
+from drt_jax import Scene, learn
 from drt_jax.learn import train
 from drt_jax.pupil import hexapolar
 from experiments import _optics
@@ -70,7 +71,7 @@ def test_a_lens_is_trained_off_the_axis(own):
     designed = drt_jax.load_lens(own / "designed" / "start 60.1.yaml")
     assert designed.curvature.tolist() == [*(end[name] for name in NAMES), 0.0]
     assert float(designed.sensor) == end["sensor"]
-    found = drt_jax.psf_moments(designed, np.radians(10), 5e3, (0.6, 0.53, 0.48), 1e-9)
+    found = drt_jax.psf_moments(designed, Scene.point(np.radians(10), 5e3, (0.6, 0.53, 0.48)), 1e-9)
     mean, spread = np.asarray(found.mean), np.asarray(found.covariance)
     apart = np.sum((mean - mean.mean(axis=0)) ** 2, axis=1)
     radius = np.sqrt(np.mean(np.trace(spread, axis1=1, axis2=2) + apart))
@@ -161,7 +162,7 @@ def test_the_sensor_alone_traces_no_ray_off_the_axis_either():
 def joint():
     """The loss of the joint training by the numbers of the lens, and the numbers."""
     some = lens("sensor", "curvature")
-    init, restore = drt_jax.red_net(2, 4)
+    init, restore = learn.red_net(2, 4)
     weights = init(jax.random.key(0))
     imager = train.make_imager(some.blur(SCENE, FAR, FAR), restore, train.Camera(kernel=9))
     scenes = np.random.default_rng(0).integers(0, 255, (3, 24, 24, 3), dtype=np.uint8)
@@ -202,7 +203,7 @@ def test_a_change_of_the_scale_moves_the_rays_as_a_millimetre_of_the_sensor_does
         ends = []
         for sign in (-1, 1):
             values = start | {name: start[name] + sign * by}
-            rays = drt_jax.trace_rays(some.lens_of(values), *SCENE.seen(FAR), pupil)
+            rays = drt_jax.trace_rays(some.lens_of(values), SCENE.seen(FAR), pupil)
             ends.append(np.asarray(rays.points[:, :, -1, :2]))
         change = (ends[1] - ends[0]) / 2
         return np.sqrt(np.mean((change - change.mean(axis=1, keepdims=True)) ** 2))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import LensError, load_agf
+from drt_jax import LensError
+from drt_jax.files.agf import load_agf
 from drt_jax.lens.glass import Glass
 from drt_jax.lens.glasses import find_glass, indices
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drt_jax import LensError, Status, load_lens, trace_rays
+from drt_jax import LensError, Scene, Status, load_lens, trace_rays
 
 STOP = {"radius": "inf", "semi_diameter": 1.0, "stop": True}
 FRONT = {"radius": 20.0, "index": 1.5, "semi_diameter": 3.0}
@@ -165,7 +165,9 @@ def test_surfaces_that_cross_at_the_rim():
     with pytest.warns(UserWarning, match="cross at 8.9. mm.*light that comes there is lost"):
         lens = load_lens({"surfaces": rows})
     heights = np.array([0.0, 3.0, 6.0, 9.0])
-    rays = trace_rays(lens, 0.0, np.inf, [0.55], np.stack([0 * heights, heights / 9], axis=-1))
+    rays = trace_rays(
+        lens, Scene.point(0.0, np.inf, [0.55]), np.stack([0 * heights, heights / 9], axis=-1)
+    )
     assert rays.status[0, :3].tolist() == [Status.OK] * 3 and rays.status[0, -1] != Status.OK
     assert np.all(np.isfinite(rays.points))
     rows[0]["thickness"] = 3.0

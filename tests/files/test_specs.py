@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drt_jax import LensError, first_order, load_lens, save_lens, trace_rays
+from drt_jax import LensError, Scene, first_order, load_lens, save_lens, trace_rays
 
 GOOD = {
     "surfaces": [
@@ -274,7 +274,7 @@ def test_a_sensor_in_focus(tmp_path):
     lens = load_lens(write(tmp_path, lambda e: e.update(sensor="focus")))
     (wanted,) = first_order(lens, np.inf, 0.5875618).image_distance
     assert float(lens.sensor) == pytest.approx(float(wanted), abs=1e-12)
-    rays = trace_rays(lens, 0.0, np.inf, 0.5875618, [(0.0, 1e-4)])
+    rays = trace_rays(lens, Scene.point(0.0, np.inf, 0.5875618), [(0.0, 1e-4)])
     assert abs(float(rays.points[0, 0, -1, 1])) < 1e-9
     save_lens(lens, tmp_path / "again.yaml")
     assert load_lens(tmp_path / "again.yaml").sensor == lens.sensor

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import LensError, load_lens
+from drt_jax import LensError, Scene, load_lens
 
 
 def test_missing_and_broken_files(tmp_path):
@@ -73,7 +73,7 @@ def test_bundled_lenses_are_those_of_their_sources(name):
 
 @jax.jit
 def passed(lens, field, wavelength):
-    rays = drt_jax.trace_rays(lens, field, jnp.inf, wavelength[None], POINTS)
+    rays = drt_jax.trace_rays(lens, Scene.point(field, jnp.inf, wavelength[None]), POINTS)
     return rays.status[0] == drt_jax.Status.OK
 
 

@@ -9,7 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import LensError, first_order, load_lens, load_system, sag, save_lens, trace_rays
+from drt_jax import (
+    LensError,
+    Scene,
+    first_order,
+    load_lens,
+    load_system,
+    sag,
+    save_lens,
+    trace_rays,
+)
 from drt_jax.lens.glass import nd_and_vd
 
 SHARED = pathlib.Path(__file__).resolve().parents[3] / "shared" / "data" / "lens_files"
@@ -427,12 +436,19 @@ def test_a_file_without_a_stop(tmp_path):
 def test_kinds_of_fields(tmp_path):
     system = read(tmp_path, object="200", FTYP="1 0 2 2")
     np.testing.assert_allclose(np.tan(system.fields[1]), [-1 / 200, -5 / 200])
+    scene = system.scene
+    assert scene.shape == (2,) and scene.distance == 200
+    np.testing.assert_array_equal(scene.field, system.fields)
+    np.testing.assert_array_equal(scene.wavelength_weights, system.wavelength_weights)
     angled = read(tmp_path, object="200")  # seen from the entrance pupil, at the first vertex
     np.testing.assert_allclose(np.degrees(angled.fields[1]), [1, 5])
     system = read(tmp_path, FTYP="2 0 2 2")
     focal = float(first_order(system.lens, jnp.inf, jnp.array([0.55])).focal_length[0])
     np.testing.assert_allclose(np.tan(system.fields[1]), [1 / focal, 5 / focal])
-    assert read(tmp_path, FTYP="3 0 2 2").fields is None
+    system = read(tmp_path, FTYP="3 0 2 2")
+    assert system.fields is None
+    with pytest.raises(ValueError, match="fields: real image heights; find each by field_of_image"):
+        system.scene  # noqa: B018
 
 
 def test_what_is_not_read_is_refused_by_line(tmp_path):
@@ -633,7 +649,10 @@ def test_written_breaks(tmp_path):
     for one, two in zip(others, found, strict=True):
         np.testing.assert_allclose(one, two, rtol=0, atol=1e-14)
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (9, 2))
-    rays = [trace_rays(own, np.radians([1.0, 2.0]), np.inf, 0.55, points) for own in (lens, again)]
+    rays = [
+        trace_rays(own, Scene.point(np.radians([1.0, 2.0]), np.inf, 0.55), points)
+        for own in (lens, again)
+    ]
     assert not np.any(rays[0].status)
     np.testing.assert_allclose(*(r.points[..., :2] for r in rays), rtol=0, atol=1e-12)
 

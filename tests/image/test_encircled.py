@@ -9,7 +9,7 @@ import pytest
 from scipy.special import j0, j1
 
 import drt_jax
-from drt_jax import Gauss, load_lens
+from drt_jax import Gauss, Scene, load_lens
 
 from .test_transfer import APERTURE, MIRROR, RULE, WAVE
 
@@ -23,7 +23,9 @@ def test_airys_pattern():
     """P10, and 1 - J0^2 - J1^2 elsewhere."""
     some = np.linspace(0, 6e-2, 7)
     radii = np.concatenate([ZEROS, some])
-    found = np.asarray(drt_jax.encircled_energy(LENS, 0.0, np.inf, WAVE, radii, rule=RULE))[0]
+    found = np.asarray(
+        drt_jax.encircled_energy(LENS, Scene.radians([0.0], np.inf, WAVE), radii, sampling=RULE)
+    )[0]
     printed = [0.8377848691733143, 0.9099305350856731]
     np.testing.assert_allclose(found[:2], printed, rtol=0, atol=1e-4)
     v = 2 * np.pi * some * APERTURE / (WAVE * 1e-3)
@@ -36,8 +38,8 @@ def test_an_even_disc_of_rays():
     step, f = 1.0, 100.0
     place = lambda h: step * h / (f - h**2 / (4 * f))  # noqa: E731
     heights = np.array([0.0, 0.1, 0.3, 0.5, 0.8, 0.95, 1.1, 3.0])
-    given = LENS, 0.0, np.inf, WAVE, place(heights), "rays", np.array([-step, step]), None, RULE
-    found = np.asarray(drt_jax.encircled_energy(*given))[0]
+    given = place(heights), "rays", np.array([-step, step]), RULE
+    found = np.asarray(drt_jax.encircled_energy(LENS, Scene.point(0.0, np.inf, WAVE), *given))
     wanted = np.broadcast_to(np.minimum(heights**2, 1), found.shape)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=3e-3)
     assert np.all(found[:, 0] == 0)
@@ -50,7 +52,9 @@ def test_waves_come_to_counted_rays_and_slopes_to_differences():
     lens, field, rule = load_lens("cooke_triplet"), jnp.array([0.2]), Gauss(8, "bilateral")
     radii = jnp.array([5e-3, 1e-2, 2e-2])
     points, weights = drt_jax.pupil.disc(60, 120)
-    hits = np.asarray(drt_jax.trace_rays(lens, 0.2, np.inf, 0.55, points).points)[0, :, -1, :2]
+    hits = np.asarray(drt_jax.trace_rays(lens, Scene.point(0.2, np.inf, 0.55), points).points)[
+        0, :, -1, :2
+    ]
     far = np.hypot(*(hits - weights @ hits).T)
     counted = [weights @ (far < r) for r in np.asarray(radii)]
 
@@ -59,7 +63,11 @@ def test_waves_come_to_counted_rays_and_slopes_to_differences():
         return jnp.stack(
             [
                 drt_jax.encircled_energy(
-                    lens, field, np.inf, 0.55, radii, model, rule=rule, cells=96
+                    lens,
+                    Scene.radians(field, np.inf, 0.55),
+                    radii,
+                    model,
+                    sampling=drt_jax.Sampling.of(model, rule, 96),
                 )[0]
                 for model in ("rays", "waves")
             ]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import load_lens
+from drt_jax import Scene, load_lens
 
 from ..known import check_slopes
 
@@ -32,7 +32,7 @@ FAN_UM = [
 @pytest.mark.slow
 def test_the_fan_that_opticstudio_prints():
     """To the last of its digits; odd in Py, and the same across."""
-    found = drt_jax.ray_fans(load_lens(P01), 0.0, np.inf, 0.543, 21)
+    found = drt_jax.ray_fans(load_lens(P01), Scene.radians([0.0], np.inf, 0.543), 21)
     assert found.pupil.shape == (21,) and found.tangential.shape == (1, 1, 21, 2)
     wanted = np.array([*(-a for a in FAN_UM[:0:-1]), *FAN_UM])
     np.testing.assert_allclose(1e3 * found.tangential[0, 0, :, 1], wanted, rtol=0, atol=1e-10)
@@ -43,15 +43,15 @@ def test_the_fan_that_opticstudio_prints():
 @pytest.mark.slow
 @pytest.mark.parametrize("fields", [[0.0, 0.2], [[0.05, 0.2], [-0.1, 0.1]]])
 def test_fans_are_rays_and_wavefronts(fields):
-    found = drt_jax.ray_fans(COOKE, fields, 900.0, WAVES, 5, reference=0)
+    found = drt_jax.ray_fans(COOKE, Scene.radians(fields, 900.0, WAVES), 5, reference=0)
     heights = np.linspace(-1, 1, 5)
     fans = {"tangential": [0, 1], "sagittal": [1, 0]}
     for k, field in enumerate(fields):
-        chief = np.asarray(drt_jax.image_point(COOKE, field, 900.0, WAVES)[0])
+        chief = np.asarray(drt_jax.image_point(COOKE, Scene.point(field, 900.0, WAVES))[0])
         for name, way in fans.items():
             pupil = np.outer(heights, way)
-            rays = drt_jax.trace_rays(COOKE, field, 900.0, WAVES, pupil)
-            wave = drt_jax.wavefront(COOKE, field, 900.0, WAVES, pupil)
+            rays = drt_jax.trace_rays(COOKE, Scene.point(field, 900.0, WAVES), pupil)
+            wave = drt_jax.wavefront(COOKE, Scene.point(field, 900.0, WAVES), pupil)
             good = np.asarray(rays.status) == 0
             points = np.asarray(rays.points)[:, :, -1, :2]
             hits = np.where(good[..., None], points - chief, np.inf)
@@ -64,11 +64,11 @@ def test_fans_are_rays_and_wavefronts(fields):
 def test_foci_of_rays_by_colour():
     """The triplet's rays cross the axis where `trace_rays` has them, near it at the paraxial
     focus."""
-    found = drt_jax.axial_colour(COOKE, np.inf, WAVES, [1e-3, 0.7, 1.0])
+    found = drt_jax.axial_colour(COOKE, Scene.point(0.0, np.inf, WAVES), [1e-3, 0.7, 1.0])
     wanted = drt_jax.first_order(COOKE, np.inf, WAVES).image_distance - COOKE.sensor
     np.testing.assert_allclose(found.paraxial, wanted, rtol=1e-12)
     np.testing.assert_allclose(found.real[:, 0], wanted, atol=1e-4)
-    rays = drt_jax.trace_rays(COOKE, 0.0, np.inf, WAVES, [[0.0, 0.7], [0.0, 1.0]])
+    rays = drt_jax.trace_rays(COOKE, Scene.point(0.0, np.inf, WAVES), [[0.0, 0.7], [0.0, 1.0]])
     y, slope = rays.points[..., -1, 1], rays.directions[..., -1, 1] / rays.directions[..., -1, 2]
     np.testing.assert_allclose(found.real[:, 1:], -y / slope, rtol=1e-9)
 
@@ -82,7 +82,7 @@ def test_derivatives_and_failed_rays():
     @jax.jit
     def both(lens):
         def total(lens):
-            found = drt_jax.ray_fans(lens, jnp.array([0.1, 0.3]), np.inf, WAVES, 9)
+            found = drt_jax.ray_fans(lens, Scene.radians(jnp.array([0.1, 0.3]), np.inf, WAVES), 9)
             parts = [1e2 * found.tangential, 1e2 * found.sagittal, found.sagittal_path]
             kept = (jnp.where(jnp.isfinite(a), a, 0) for a in parts)
             return sum(jnp.sum(a**2) for a in kept), found
@@ -100,8 +100,8 @@ def test_derivatives_and_failed_rays():
 def test_clear_errors():
     for count in (1, 2.5, "5"):
         with pytest.raises(ValueError, match="count: expected at least 2, a whole number"):
-            drt_jax.ray_fans(COOKE, 0.0, np.inf, 0.55, count)
+            drt_jax.ray_fans(COOKE, Scene.radians([0.0], np.inf, 0.55), count)
     with pytest.raises(ValueError, match="reference: expected an index"):
-        drt_jax.ray_fans(COOKE, 0.0, np.inf, WAVES, 5, reference=-4)
+        drt_jax.ray_fans(COOKE, Scene.radians([0.0], np.inf, WAVES), 5, reference=-4)
     with pytest.raises(ValueError, match=r"heights: expected \(N,\)"):
-        drt_jax.axial_colour(COOKE, np.inf, 0.55, 1.0)
+        drt_jax.axial_colour(COOKE, Scene.point(0.0, np.inf, 0.55), 1.0)

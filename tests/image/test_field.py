@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import drt_jax
+from drt_jax import Scene
 
 LENS = drt_jax.load_lens("cooke_triplet")
 
 
 def image(field):
-    return drt_jax.image_point(LENS, field, 1e4, [0.55])[0]
+    return drt_jax.image_point(LENS, Scene.point(field, 1e4, [0.55]))[0]
 
 
 def field(point):
@@ -29,7 +30,7 @@ def test_the_field_of_an_image_point_is_the_field_it_came_from():
 
 @pytest.mark.slow
 def test_the_chief_ray_is_that_through_the_centre_of_the_stop():
-    rays = drt_jax.trace_rays(LENS, (0.05, 0.25), 1e4, [0.55], [[0.0, 0.0]])
+    rays = drt_jax.trace_rays(LENS, Scene.point((0.05, 0.25), 1e4, [0.55]), [[0.0, 0.0]])
     np.testing.assert_allclose(image((0.05, 0.25)), rays.points[0, 0, -1, :2], rtol=0, atol=1e-12)
 
 
@@ -42,4 +43,4 @@ def test_clear_errors():
     with pytest.raises(ValueError, match="expected x and y"):
         drt_jax.field_of_image(LENS, 3.0, 1e4, 0.55)
     with pytest.raises(ValueError, match="outside the range"):
-        drt_jax.image_point(LENS, 0.0, 1e4, [0.1])
+        drt_jax.image_point(LENS, Scene.point(0.0, 1e4, [0.1]))

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Gauss, Status, load_lens, psf_moments, trace_rays
+from drt_jax import Gauss, Scene, Status, load_lens, psf_moments, trace_rays
+from drt_jax.image.converged import converged_rule
 
 from ..conftest import assert_close
 
@@ -21,7 +22,7 @@ def blur(lens, field, distance, wavelengths):
     """Moments by `RULE`, and the gradient by the lens of the sum of all variances."""
 
     def total(lens):
-        spot = psf_moments(lens, field, distance, wavelengths, rule=RULE)
+        spot = psf_moments(lens, Scene.point(field, distance, wavelengths), sampling=RULE)
         return jnp.sum(spot.covariance), spot
 
     return jax.grad(total, has_aux=True)(lens)
@@ -38,10 +39,10 @@ def singlet():
 
 
 @pytest.mark.parametrize("how", [jax.jit, jax.vmap])
-@pytest.mark.parametrize("call", ["psf_moments", "focus_moments", "converged_rule"])
+@pytest.mark.parametrize("call", [psf_moments, drt_jax.focus_moments, converged_rule])
 def test_inside_a_trace_a_rule_is_asked_for(singlet, how, call):
-    function = how(lambda field: getattr(drt_jax, call)(singlet, field, *SCENE[1:]))
-    with pytest.raises(ValueError, match=r"rule=drt_jax\.converged_rule"):
+    function = how(lambda field: call(singlet, Scene.point(field, *SCENE[1:])))
+    with pytest.raises(ValueError, match=r"sampling=drt_jax\.converge"):
         function(jnp.zeros(2) if how is jax.vmap else 0.0)
 
 
@@ -57,10 +58,10 @@ def test_eager_and_compiled_agree(name, field, distance):
     if name == "double_gauss":
         edges = (0.8 * lens.semi_diameter).at[lens.stop].set(9.0)
         lens = dataclasses.replace(lens, semi_diameter=edges)
-    rule = drt_jax.converged_rule(lens, field, distance, colours)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, Scene.point(field, distance, colours))
 
-    def total(lens, rule=None):
-        spot = psf_moments(lens, field, distance, colours, rule=rule)
+    def total(lens, rule=1e-6):
+        spot = psf_moments(lens, Scene.point(field, distance, colours), sampling=rule)
         return jnp.sum(spot.covariance), spot
 
     compiled, inside = jax.jit(jax.grad(total, has_aux=True))(lens, rule)
@@ -68,7 +69,7 @@ def test_eager_and_compiled_agree(name, field, distance):
     assert np.all(np.isfinite(inside.covariance)) and np.all(inside.throughput > 0)
     assert_close(outside, inside, 1e-12)
     assert_close(eager, compiled, 1e-10)
-    plain = psf_moments(lens, field, distance, colours)
+    plain = psf_moments(lens, Scene.point(field, distance, colours))
     assert_close(plain, inside, 1e-12)
     if name == "double_gauss":
         assert isinstance(rule, drt_jax.Clipped) and np.all(inside.throughput < 0.9)
@@ -79,9 +80,9 @@ def test_a_lens_that_passes_no_ray(singlet):
     """An error outside; inside, a variance of inf, nothing passed and derivatives of 0."""
     scene = (1.5, np.inf, (0.6, 0.48))  # all light passes beside the lens
     with pytest.raises(ValueError, match="no ray at .*: 100% misses surface 1"):
-        psf_moments(singlet, *scene)
+        psf_moments(singlet, Scene.point(*scene))
     with pytest.raises(ValueError, match="no ray at .*: 100% misses surface 1"):
-        psf_moments(singlet, *scene, rule=RULE)
+        psf_moments(singlet, Scene.point(*scene), sampling=RULE)
     gradient, spot = blur(singlet, *typed(*scene))
     assert np.all(np.isposinf(spot.covariance[:, [0, 1], [0, 1]]))
     assert np.all(spot.throughput == 0)
@@ -91,11 +92,11 @@ def test_a_lens_that_passes_no_ray(singlet):
 @pytest.mark.slow
 def test_a_wavelength_without_an_index(singlet):
     """An error outside; inside, that colour looks as bad as can be, and moves no other."""
-    for call in (psf_moments, drt_jax.converged_rule):
+    for call in (psf_moments, converged_rule):
         with pytest.raises(ValueError, match=r"0\.1 um is outside the range"):
-            call(singlet, *SCENE[:2], (0.6, 0.1))
+            call(singlet, Scene.point(*SCENE[:2], (0.6, 0.1)))
     with pytest.raises(ValueError, match=r"0\.1 um is outside the range"):
-        trace_rays(singlet, *SCENE[:2], (0.1,), np.zeros((1, 2)))
+        trace_rays(singlet, Scene.point(*SCENE[:2], (0.1,)), np.zeros((1, 2)))
     gradient, spot = blur(singlet, *typed(*SCENE[:2], (0.6, 0.1)))
     assert np.all(np.isposinf(spot.covariance[1, [0, 1], [0, 1]])) and spot.throughput[1] == 0
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
@@ -112,10 +113,10 @@ def test_rays_mean_the_same_inside(singlet):
 
     @jax.jit
     def inside(lens, field, distance, wavelengths):
-        return trace_rays(lens, field, distance, wavelengths, pupil)
+        return trace_rays(lens, Scene.point(field, distance, wavelengths), pupil)
 
     rays = inside(lens, *typed(0.1, np.inf, (0.6,)))
-    again = trace_rays(lens, 0.1, np.inf, (0.6,), pupil)
+    again = trace_rays(lens, Scene.point(0.1, np.inf, (0.6,)), pupil)
     kinds = {Status(int(status)) for status in np.unique(again.status)}
     assert {Status.OK, Status.CLIPPED} <= kinds
     np.testing.assert_array_equal(rays.status, again.status)

@@ -11,16 +11,17 @@ import pytest
 import drt_jax
 from drt_jax import (
     Gauss,
-    converged_focus_rule,
-    converged_rule,
+    Scene,
     focus_moments,
     load_lens,
-    moments,
     psf_moments,
     pupil,
-    scene_of,
     trace_rays,
 )
+from drt_jax.image.converged import converged_focus_rule, converged_rule
+from drt_jax.image.moments import moments
+from drt_jax.lens.scene import fitted
+from drt_jax.pupil import symmetry_of
 
 from ..conftest import RGB, assert_close
 from ..known import freed, known, search
@@ -50,7 +51,7 @@ def at(sensor, lens=LENS):
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", SIGMA)
 def test_blur_of_the_double_gauss(sensor):
-    found = psf_moments(at(sensor), 0.0, FAR, RGB)
+    found = psf_moments(at(sensor), Scene.point(0.0, FAR, RGB))
     assert found.mean.shape == (3, 2) and found.covariance.shape == (3, 2, 2)
     np.testing.assert_allclose(found.throughput, 1, rtol=1e-14)
     np.testing.assert_allclose(
@@ -61,9 +62,9 @@ def test_blur_of_the_double_gauss(sensor):
 def test_meridional_half_and_whole_pupil_agree():
     """On the axis and so little beside it that nothing changes."""
     lens = at(133.0)
-    meridian = psf_moments(lens, 0.0, FAR, RGB, 1e-11)
+    meridian = psf_moments(lens, Scene.point(0.0, FAR, RGB), 1e-11)
     for field in (1e-14, (1e-14, 0.0)):
-        other = psf_moments(lens, field, FAR, RGB, 1e-11)
+        other = psf_moments(lens, Scene.point(field, FAR, RGB), 1e-11)
         np.testing.assert_allclose(other.mean, 0, atol=1e-10)
         np.testing.assert_allclose(other.covariance, meridian.covariance, rtol=1e-9, atol=1e-13)
 
@@ -72,9 +73,9 @@ def test_field_in_any_direction_turns_the_moments():
     angle, h = 0.6, np.tan(0.15)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     field = np.arctan(turn @ [0.0, h])
-    moments = psf_moments(LENS, np.arctan(h), FAR, RGB, 1e-10)
+    moments = psf_moments(LENS, Scene.point(np.arctan(h), FAR, RGB), 1e-10)
     mean, covariance = moments.mean, moments.covariance
-    moments = psf_moments(LENS, field, FAR, RGB, 1e-10)
+    moments = psf_moments(LENS, Scene.point(field, FAR, RGB), 1e-10)
     turned_mean, turned = moments.mean, moments.covariance
     np.testing.assert_allclose(turned_mean, mean @ turn.T, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(turned, turn @ covariance @ turn.T, rtol=1e-8, atol=1e-13)
@@ -90,7 +91,7 @@ def test_gradients_of_meridional_half_and_whole_pupil_agree():
     @jax.grad
     def gradient(moved, field, symmetry):
         lens, distance = moved
-        scene = scene_of(lens, field, distance, RGB[:2])
+        scene = fitted(lens, Scene.point(field, distance, RGB[:2]))
         traced = moments(lens, scene, Gauss(wide, symmetry))
         # On axis the centroid is 0, and the gradient of what rounding leaves of it is no number.
         return jnp.sum(weights * traced.spread[..., :2]) + field * jnp.sum(traced.mean[:, 1])
@@ -108,7 +109,7 @@ def slopes(lens, distance, found):
     """Moments of rays that are known, and their gradient by the lens and the distance."""
 
     def blur(lens, distance):
-        scene = scene_of(lens, 0.1, distance, RGB[:2])
+        scene = fitted(lens, Scene.point(0.1, distance, RGB[:2]))
         spot = moments(lens, scene, Gauss(4, "bilateral"), known(found)).at(lens.sensor)
         xx, yy = spot.covariance[:, 0, 0], spot.covariance[:, 1, 1]
         return jnp.sum(xx + 0.3 * yy) + 0.1 * jnp.sum(spot.mean), (spot.mean, spot.covariance)
@@ -123,7 +124,7 @@ def test_a_centred_lens_given_zero_tilts_and_decentres_is_the_same():
     given = dataclasses.replace(LENS, decentre=jnp.zeros((rows, 2)), tilt=jnp.zeros((rows, 3)))
     distance = jnp.asarray(9000.0)
     points = Gauss(4, "bilateral").points(LENS, None)[0]
-    found = search(LENS, scene_of(LENS, 0.1, distance, RGB[:2]), points)
+    found = search(LENS, fitted(LENS, Scene.point(0.1, distance, RGB[:2])), points)
     (_, plain), gradient = slopes(LENS, distance, found)
     (_, general), (by_lens, by_distance) = slopes(given, distance, found)
     assert_close(general, plain, 1e-10, 1e-13)
@@ -137,8 +138,10 @@ def test_moments_are_those_of_many_random_rays():
     """The paper's way, with 40,000 rays instead of 256: agrees within 4 standard errors."""
     lens = load_lens("cooke_triplet")
     points, _ = pupil.random_disc(40_000, seed=0)
-    hits = np.asarray(trace_rays(lens, 0.2, 5000.0, [0.53], points).points[0, :, -1, :2])
-    moments = psf_moments(lens, 0.2, 5000.0, [0.53])
+    hits = np.asarray(
+        trace_rays(lens, Scene.point(0.2, 5000.0, [0.53]), points).points[0, :, -1, :2]
+    )
+    moments = psf_moments(lens, Scene.point(0.2, 5000.0, [0.53]))
     mean, covariance = moments.mean, moments.covariance
     centred = hits - hits.mean(axis=0)
     np.testing.assert_array_less(
@@ -151,9 +154,9 @@ def test_moments_are_those_of_many_random_rays():
 
 @pytest.mark.parametrize("field", [0.0, 0.1])
 def test_sensor_polynomial_is_the_traced_moment(field):
-    focus = focus_moments(LENS, field, FAR, RGB, 1e-9)
+    focus = focus_moments(LENS, Scene.point(field, FAR, RGB), 1e-9)
     for sensor in (130.0, 133.0, 133.35, 135.0):
-        moments = psf_moments(at(sensor), field, FAR, RGB, 1e-9)
+        moments = psf_moments(at(sensor), Scene.point(field, FAR, RGB), 1e-9)
         found = focus.at(sensor)
         assert found.separable and found.covariance.shape == (3, 2, 2)  # axes by symmetry
         np.testing.assert_allclose(found.mean, moments.mean, atol=1e-10)
@@ -167,12 +170,12 @@ def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
     scene, rule = (LENS, FAR, jnp.array(131.0)), Gauss(4, "bilateral")
 
     def polynomial(lens, distance, sensor):
-        found = focus_moments(lens, 0.1, distance, RGB[:2], rule=rule).at(sensor)
+        found = focus_moments(lens, Scene.point(0.1, distance, RGB[:2]), sampling=rule).at(sensor)
         return jnp.sum(found.mean) + jnp.sum(jnp.trace(found.covariance, axis1=1, axis2=2))
 
     def traced(lens, distance, sensor):
         moved = dataclasses.replace(lens, sensor=sensor)
-        moments = psf_moments(moved, 0.1, distance, RGB[:2], rule=rule)
+        moments = psf_moments(moved, Scene.point(0.1, distance, RGB[:2]), sampling=rule)
         mean, covariance = moments.mean, moments.covariance
         return jnp.sum(mean) + jnp.sum(jnp.trace(covariance, axis1=1, axis2=2))
 
@@ -190,12 +193,12 @@ def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
 @pytest.mark.parametrize("degrees", [0.0, 10.0])
 def test_a_rule_keeps_the_promised_tolerance(degrees):
     field = np.radians(degrees)
-    exact = psf_moments(LENS, field, FAR, RGB, 1e-12).covariance
+    exact = psf_moments(LENS, Scene.point(field, FAR, RGB), 1e-12).covariance
     size = np.sqrt(np.trace(exact, axis1=1, axis2=2))
     before = 0
     for tolerance in (1e-3, 1e-6, 1e-9):
-        order = converged_rule(LENS, field, FAR, RGB, tolerance).order
-        got = psf_moments(LENS, field, FAR, RGB, tolerance).covariance
+        order = converged_rule(LENS, Scene.point(field, FAR, RGB), tolerance).order
+        got = psf_moments(LENS, Scene.point(field, FAR, RGB), tolerance).covariance
         error = np.max(np.abs(np.sqrt(np.trace(got, axis1=1, axis2=2)) / size - 1))
         assert error <= tolerance and order > before
         before = order
@@ -206,32 +209,32 @@ def test_one_rule_serves_many_fields_and_distances():
     """It keeps the tolerance of each, has the order that the hardest needs, and the symmetry of
     all."""
     fields, distances = [[0.0, 0.0], [0.0, np.radians(10)]], (FAR, 5000.0)
-    rule = converged_rule(LENS, fields, distances, RGB, 1e-6)
-    assert (
-        rule.symmetry == "bilateral" and drt_jax.symmetry_of(LENS, [*fields, [0.1, 0.0]]) == "none"
-    )
-    alone = [converged_rule(LENS, fields[1], far, RGB, 1e-6) for far in distances]
+    rule = converged_rule(LENS, Scene.grid(fields, distances, RGB), 1e-6)
+    assert rule.symmetry == "bilateral" and symmetry_of(LENS, [*fields, [0.1, 0.0]]) == "none"
+    alone = [converged_rule(LENS, Scene.grid(fields[1], far, RGB), 1e-6) for far in distances]
     assert rule == max(alone, key=lambda one: one.order)
     for field in fields:
         for far in distances:
-            exact = psf_moments(LENS, field, far, RGB, 1e-11).covariance
-            got = psf_moments(LENS, field, far, RGB, rule=rule).covariance
+            exact = psf_moments(LENS, Scene.point(field, far, RGB), 1e-11).covariance
+            got = psf_moments(LENS, Scene.point(field, far, RGB), sampling=rule).covariance
             size, found = (np.sqrt(np.trace(a, axis1=1, axis2=2)) for a in (exact, got))
             np.testing.assert_allclose(found, size, rtol=1e-6)
     with pytest.raises(ValueError, match=r"field: expected one angle or two, got shape \(3,\)"):
-        converged_rule(LENS, [0.0, 0.1, 0.2], FAR, RGB)
+        converged_rule(LENS, Scene.point([0.0, 0.1, 0.2], FAR, RGB))
 
 
 def test_tolerance_holds_at_any_sensor_position():
     """Rays traced with the sensor 3 mm out of focus, where the spot is 30 times larger."""
     lens = at(130.0)
-    exact = focus_moments(lens, 0.0, FAR, RGB, 1e-12)
+    exact = focus_moments(lens, Scene.point(0.0, FAR, RGB), 1e-12)
     for tolerance in (1e-3, 1e-6, 1e-9):
-        ours = focus_moments(lens, 0.0, FAR, RGB, tolerance)
+        ours = focus_moments(lens, Scene.point(0.0, FAR, RGB), tolerance)
         for sensor in (130.0, 133.3, 133.37, 133.45):
             got, wanted = (np.sqrt(m.at(sensor).covariance[:, 0, 0]) for m in (ours, exact))
             np.testing.assert_allclose(got, wanted, rtol=tolerance)
-    focus, there = (f(lens, 0.0, FAR, RGB) for f in (converged_focus_rule, converged_rule))
+    focus, there = (
+        f(lens, Scene.point(0.0, FAR, RGB)) for f in (converged_focus_rule, converged_rule)
+    )
     assert focus.order > there.order
 
 
@@ -244,19 +247,19 @@ def test_slow_convergence_is_said():
     ]
     ball = load_lens({"surfaces": faces, "sensor": 30.0})
     with pytest.warns(UserWarning, match="converged to .* only.* does the edge of the beam fail"):
-        found = psf_moments(ball, 0.0, np.inf, 0.55, 1e-9)
+        found = psf_moments(ball, Scene.point(0.0, np.inf, 0.55), 1e-9)
     edge = 12 / ball.index(np.array([0.55]))[1]  # where the angle of incidence is the critical one
     np.testing.assert_allclose(found.throughput, (edge / 10) ** 2, rtol=0.05)
 
 
 def test_inside_a_trace_the_rule_must_be_given():
     for transform in (jax.jit, jax.vmap, lambda f: jax.jit(jax.grad(f))):
-        with pytest.raises(ValueError, match="rule=drt_jax.converged_rule"):
-            transform(lambda s: jnp.sum(psf_moments(at_traced(s), 0.0, FAR, RGB).covariance))(
-                jnp.array([133.0]) if transform is jax.vmap else 133.0
-            )
+        with pytest.raises(ValueError, match="sampling=drt_jax.converge"):
+            transform(
+                lambda s: jnp.sum(psf_moments(at_traced(s), Scene.point(0.0, FAR, RGB)).covariance)
+            )(jnp.array([133.0]) if transform is jax.vmap else 133.0)
     with pytest.raises(ValueError, match="symmetry_of: needs known numbers"):
-        jax.jit(lambda field: drt_jax.symmetry_of(LENS, field))(0.1)
+        jax.jit(lambda field: symmetry_of(LENS, field))(0.1)
 
 
 @pytest.mark.parametrize("symmetry, field", [("rotational", 0.05), ("bilateral", (0.05, 0.05))])
@@ -264,25 +267,20 @@ def test_a_rule_of_a_part_of_the_pupil_is_not_used_where_it_does_not_stand_for_a
     """A ValueError where the field is known; no light where it is not."""
     rule = drt_jax.Gauss(2, symmetry)
     with pytest.raises(ValueError, match="the rule is made for"):
-        psf_moments(LENS, field, FAR, RGB, rule=rule)
-    found = jax.jit(lambda f: psf_moments(LENS, f, FAR, RGB, rule=rule))(jnp.array(field))
+        psf_moments(LENS, Scene.point(field, FAR, RGB), sampling=rule)
+    found = jax.jit(lambda f: psf_moments(LENS, Scene.point(f, FAR, RGB), sampling=rule))(
+        jnp.array(field)
+    )
     assert np.all(found.throughput == 0) and not np.any(np.isnan(found.covariance))
-
-
-def test_a_rule_with_a_tolerance_is_refused():
-    rule = drt_jax.Gauss(2, "rotational")
-    for call in (psf_moments, focus_moments):
-        with pytest.raises(ValueError, match="tolerance and rule: give one of them"):
-            call(LENS, 0.0, FAR, RGB, 1e-3, rule)
 
 
 def at_traced(sensor):
     return dataclasses.replace(LENS, sensor=sensor)
 
 
-def size(lens, rule=None, tolerance=None):
+def size(lens, sampling):
     """Spot size of green in um, and what passes; by the call of the README."""
-    found = psf_moments(lens, 0.0, FAR, RGB, tolerance, rule=rule)
+    found = psf_moments(lens, Scene.point(0.0, FAR, RGB), sampling)
     return 1e3 * jnp.sqrt(found.covariance[1, 0, 0]), found
 
 
@@ -290,9 +288,9 @@ whole = jax.jit(jax.value_and_grad(size, has_aux=True))
 
 
 def test_an_eager_gradient_is_that_of_a_program_and_of_differences():
-    lens, rule = at(133.0), converged_rule(at(133.0), 0.0, FAR, RGB, 1e-9)
+    lens, rule = at(133.0), converged_rule(at(133.0), Scene.point(0.0, FAR, RGB), 1e-9)
     (value, _), inside = whole(lens, rule)
-    (other, _), eager = jax.value_and_grad(lambda lens: size(lens, None, 1e-9), has_aux=True)(lens)
+    (other, _), eager = jax.value_and_grad(lambda lens: size(lens, 1e-9), has_aux=True)(lens)
     np.testing.assert_allclose(value, other, rtol=1e-9)
     assert_close(eager, inside, 1e-7, 1e-9)  # another rule, that the tolerance was found with
     for leaf, k in (("curvature", 2), ("thickness", 5), ("conic", 6), ("semi_diameter", 5)):
@@ -307,10 +305,10 @@ def test_an_eager_gradient_is_that_of_a_program_and_of_differences():
 @pytest.mark.slow
 def test_no_failing_lens_looks_good():
     """Eagerly an error; inside a trace passed = 0, the covariance inf, no derivatives."""
-    rule = converged_rule(at(133.0), 0.0, FAR, RGB, 1e-9)
+    rule = converged_rule(at(133.0), Scene.point(0.0, FAR, RGB), 1e-9)
     blocked = dataclasses.replace(LENS, semi_diameter=LENS.semi_diameter.at[0].set(1e-3))
     with pytest.raises(ValueError, match="no ray at 0.6 um reaches the sensor"):
-        psf_moments(blocked, 0.0, FAR, RGB, rule=rule)
+        psf_moments(blocked, Scene.point(0.0, FAR, RGB), sampling=rule)
     (value, found), gradient = whole(blocked, rule)
     assert np.isinf(value) and np.all(found.throughput == 0)
     assert np.all(np.isinf(np.diagonal(found.covariance, 0, 1, 2)))
@@ -318,18 +316,18 @@ def test_no_failing_lens_looks_good():
 
 
 def test_bad_requests():
-    with pytest.raises(ValueError, match="tolerance: expected a number between 0 and 1"):
-        psf_moments(LENS, 0.0, jnp.inf, RGB, tolerance=2.0)
+    with pytest.raises(ValueError, match="sampling: expected a tolerance between 0 and 1"):
+        psf_moments(LENS, Scene.point(0.0, jnp.inf, RGB), sampling=2.0)
     with pytest.raises(ValueError, match="order: expected a whole number from 1 to 42, got 43"):
         Gauss(43, "bilateral")
     with pytest.raises(ValueError, match="0.1 um"):
-        psf_moments(LENS, 0.0, jnp.inf, [0.1])
+        psf_moments(LENS, Scene.point(0.0, jnp.inf, [0.1]))
 
 
 def test_a_lens_fixed_inside_jit_is_a_known_scene():
     """Its rule is found, and nothing of a closed-over lens is traced into the program."""
     lens = at(133.0)
-    scaled = jax.jit(lambda s: s * psf_moments(lens, 0.0, FAR, RGB, 1e-9).covariance)
+    scaled = jax.jit(lambda s: s * psf_moments(lens, Scene.point(0.0, FAR, RGB), 1e-9).covariance)
     assert "while" not in str(jax.make_jaxpr(scaled)(1.0))
-    wanted = 2 * psf_moments(lens, 0.0, FAR, RGB, 1e-9).covariance
+    wanted = 2 * psf_moments(lens, Scene.point(0.0, FAR, RGB), 1e-9).covariance
     np.testing.assert_allclose(scaled(2.0), wanted, rtol=1e-12)

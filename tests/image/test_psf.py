@@ -11,13 +11,13 @@ import pytest
 from scipy.special import j1
 
 import drt_jax
-from drt_jax import PsfModel
+from drt_jax import Sampling, Scene
 from drt_jax.compilation import jit
 from drt_jax.image import psf as module
 from drt_jax.image.beam import beam_rule, centroid_and_variances, trace_beam
 from drt_jax.image.psf_model import difference
 from drt_jax.image.ray_psf import ray_spots
-from drt_jax.lens.scene import scene_of
+from drt_jax.lens.scene import fitted
 from drt_jax.pupil import patterns
 
 from ..known import check_slopes
@@ -26,12 +26,15 @@ WAVES = (0.6, 0.48)
 PIXEL, SIZE = 4.4e-3, 21
 FAR = 25e3
 RULE = beam_rule(14, "bilateral")
-RAYS, WAVE_MODEL = PsfModel("rays", RULE, 64), PsfModel("waves", RULE, 128)
+RAYS, WAVE_MODEL = Sampling("rays", RULE, 64), Sampling("waves", RULE, 128)
 
 
 @pytest.fixture(scope="module")
 def double_gauss():
-    return drt_jax.load_lens("double_gauss"), np.radians(14.0), FAR, WAVES
+    return drt_jax.load_lens("double_gauss"), Scene.degrees(14.0, FAR, WAVES)
+
+
+FIELD = np.radians(14.0)
 
 
 def histogram(rays, weights, centre, size=SIZE):
@@ -46,16 +49,16 @@ def histogram(rays, weights, centre, size=SIZE):
 
 
 def traced(lens, field, points):
-    found = drt_jax.trace_rays(lens, field, FAR, WAVES, points)
+    found = drt_jax.trace_rays(lens, Scene.point(field, FAR, WAVES), points)
     return np.asarray(found.points[:, :, -1, :2]), np.asarray(found.status) == 0
 
 
 @pytest.mark.slow
 def test_rays_are_the_histogram_of_traced_rays(double_gauss):
-    lens, field, *_ = double_gauss
-    found = drt_jax.psf(*double_gauss, PIXEL, SIZE, RAYS)
+    lens = double_gauss[0]
+    found = drt_jax.psf(*double_gauss, PIXEL, SIZE, sampling=RAYS)
     points, weights = patterns.sobol_disc(1 << 15)
-    hits, good = traced(lens, field, points)
+    hits, good = traced(lens, FIELD, points)
     assert np.all(good)
     # 32,768 points in some 200 pixels: each holds its share to about 1 %.
     truth = histogram(hits, np.stack([weights, weights]), np.asarray(found.centre))
@@ -73,19 +76,19 @@ CUT = beam_rule(12, "bilateral", drt_jax.Clipped(8, "bilateral"))
 )
 def test_sums_and_moments(field, rule):
     """Of a model with more rays than it needs: its moments are those of the rays."""
-    scene = RIM, field, FAR, WAVES
-    moments = drt_jax.psf_moments(*scene, rule=rule.rule)
+    scene = RIM, Scene.point(field, FAR, WAVES)
+    moments = drt_jax.psf_moments(*scene, sampling=rule.rule)
     sigma = float(jnp.sqrt(jnp.max(jnp.diagonal(moments.covariance, 0, 1, 2))))
 
     @jax.jit
     def spots(lens):
-        beam = trace_beam(lens, scene_of(lens, *scene[1:]), rule)
+        beam = trace_beam(lens, fitted(lens, scene[1]), rule)
         hits, width, light = ray_spots(lens, beam, 48)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(module, "trace_beam", lambda *_: beam)
             patch.setattr(module, "_psf", module._psf.__wrapped__)
-            model = PsfModel("rays", rule, 48)
-            kernel = drt_jax.psf(lens, *scene[1:], sigma / 6, 161, model)
+            model = Sampling("rays", rule, 48)
+            kernel = drt_jax.psf(lens, scene[1], sigma / 6, 161, sampling=model)
         return centroid_and_variances(hits, light), width, light, kernel
 
     (mean, variances), width, light, kernel = spots(RIM)
@@ -106,9 +109,9 @@ def test_no_light_comes_from_beside_a_narrow_pupil():
     """A corner of the camera lens, where 29 % of the light passes: far from the rays, polynomials
     of degree 12 seem to pass all apertures again. Against a histogram of 19,000 rays."""
     lens, field, pixel = drt_jax.load_lens("camera_50mm"), np.array([0.3, 0.3]), 0.02
-    scene = lens, field, np.inf, (0.53,)
+    scene = lens, Scene.point(field, np.inf, (0.53,))
     rule = beam_rule(12, "none", drt_jax.Clipped(6, "none"))
-    found = drt_jax.psf(*scene, pixel, SIZE, PsfModel("rays", rule, 96))
+    found = drt_jax.psf(*scene, pixel, SIZE, sampling=Sampling("rays", rule, 96))
     points, _ = patterns.sobol_disc(1 << 16)
     # Machine code as good as this takes no longer to make, and runs five times faster.
     often = {"xla_backend_optimization_level": 1}
@@ -129,11 +132,11 @@ def test_no_light_comes_from_beside_a_narrow_pupil():
 
 @pytest.mark.slow
 def test_waves_are_the_sum_of_plane_waves(double_gauss):
-    lens, field, *_ = double_gauss
-    found = drt_jax.psf(*double_gauss, PIXEL, SIZE, WAVE_MODEL)
+    lens, field = double_gauss[0], FIELD
+    found = drt_jax.psf(*double_gauss, PIXEL, SIZE, sampling=WAVE_MODEL)
     # One plane wave a ray of a fine Gauss rule, all path differences to the sphere at infinity.
     points, weights = patterns.disc(40, 100)
-    rays = drt_jax.trace_rays(lens, field, FAR, WAVES, points)
+    rays = drt_jax.trace_rays(lens, Scene.point(field, FAR, WAVES), points)
     for w, wavelength in enumerate(WAVES):
         wave = 2 * np.pi / (wavelength * 1e-3)
         hits = np.asarray(rays.points[w, :, -1, :2])
@@ -157,7 +160,7 @@ def _area(lens, field, wavelength, points):
     """|d(l, m) / d(x, y)| at points of the stop, by differences."""
     step = 1e-4
     moved = [
-        drt_jax.trace_rays(lens, field, FAR, wavelength, points + np.array(s) * step)
+        drt_jax.trace_rays(lens, Scene.point(field, FAR, wavelength), points + np.array(s) * step)
         for s in ((1, 0), (-1, 0), (0, 1), (0, -1))
     ]
     right, left, up, down = (np.asarray(r.directions[0, :, -1, :2]) for r in moved)
@@ -174,8 +177,12 @@ def paraboloid(semi_diameter=1.0, sensor=50.0):
 
 def mirror_kernel(kind, lens, wavelength, pixel):
     """On 21 x 21 pixels; one program of a kind."""
-    model = PsfModel(kind, beam_rule(10, "rotational"), 192)
-    return np.asarray(drt_jax.psf(lens, 0.0, np.inf, wavelength, pixel, SIZE, model).kernel[0])
+    model = Sampling(kind, beam_rule(10, "rotational"), 192)
+    return np.asarray(
+        drt_jax.psf(lens, Scene.point(0.0, np.inf, wavelength), pixel, SIZE, sampling=model).kernel[
+            0
+        ]
+    )
 
 
 @pytest.mark.slow
@@ -208,14 +215,14 @@ def slopes(lens, field, defocus):
     rule, draw = beam_rule(8, "bilateral"), np.random.default_rng(0)
 
     def merit(lens, defocus):
-        beam = trace_beam(lens, scene_of(lens, field, FAR, WAVES), rule)
+        beam = trace_beam(lens, fitted(lens, Scene.point(field, FAR, WAVES)), rule)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(module, "trace_beam", lambda *_: beam)
             patch.setattr(module, "_psf", module._psf.__wrapped__)
-            scene = lens, field, FAR, WAVES, PIXEL, SIZE
+            scene = lens, Scene.point(field, FAR, WAVES), PIXEL, SIZE
             place = {"centre": (0.0, 24.57), "defocus": defocus}
             found = [
-                drt_jax.psf(*scene, PsfModel(kind, rule, 48), **place)
+                drt_jax.psf(*scene, sampling=Sampling(kind, rule, 48), **place)
                 for kind in ("gaussian", "rays", "waves")
             ]
         sums = [jnp.sum(draw.normal(size=(2, SIZE, SIZE)) * one.kernel) for one in found]
@@ -226,8 +233,7 @@ def slopes(lens, field, defocus):
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_the_kernel(double_gauss):
-    lens, field, *_ = double_gauss
-    field = jnp.array([0.0, field])
+    lens, field = double_gauss[0], jnp.array([0.0, FIELD])
 
     def of_lens(lens):
         found, gradient = slopes(lens, field, jnp.asarray(0.0))
@@ -251,10 +257,10 @@ def test_without_light_a_kernel_is_dark_and_its_slopes_are_nothing(double_gauss)
 
 @pytest.mark.slow
 def test_defocus_is_the_sensor_moved(double_gauss):
-    lens, *rest = double_gauss
+    lens, scene = double_gauss
     moved = dataclasses.replace(lens, sensor=lens.sensor + 0.05)
-    one = drt_jax.psf(lens, *rest, PIXEL, SIZE, WAVE_MODEL, defocus=0.05)
-    two = drt_jax.psf(moved, *rest, PIXEL, SIZE, WAVE_MODEL)
+    one = drt_jax.psf(lens, scene, PIXEL, SIZE, sampling=WAVE_MODEL, defocus=0.05)
+    two = drt_jax.psf(moved, scene, PIXEL, SIZE, sampling=WAVE_MODEL)
     np.testing.assert_allclose(one.centre, two.centre, atol=1e-12)
     np.testing.assert_allclose(one.kernel, two.kernel, atol=1e-9)
 
@@ -262,38 +268,43 @@ def test_defocus_is_the_sensor_moved(double_gauss):
 @pytest.mark.slow
 def test_auto_says_how_good_the_gaussian_is(double_gauss):
     with pytest.warns(UserWarning, match="of the light falls beside a kernel of 21 x 21 pixels"):
-        model = drt_jax.converged_psf(*double_gauss, PIXEL, SIZE, "auto", 0.2)
+        model = drt_jax.converge(drt_jax.psf, *double_gauss, PIXEL, SIZE, "auto", 0.2)
     # Here the Gaussian misses the waves by more than half of the light.
     assert 0.3 < model.errors["gaussian"] < 2
     assert model.kind != "gaussian"
     assert set(model.errors) == {"gaussian", "rays"}
     # It keeps its tolerance of finer waves.
-    pair = (drt_jax.psf(*double_gauss, PIXEL, SIZE, m).kernel for m in (model, WAVE_MODEL))
+    pair = (drt_jax.psf(*double_gauss, PIXEL, SIZE, sampling=m).kernel for m in (model, WAVE_MODEL))
     assert difference(*map(np.asarray, pair)) < 0.25
 
 
 @pytest.mark.slow
 def test_a_model_serves_inside_jit_and_vmap(double_gauss):
-    lens, _, far, waves = double_gauss
+    lens, far, waves = double_gauss[0], FAR, WAVES
     fields = jnp.radians(jnp.array([[0.0, 5.0], [0.0, 12.0]]))
     model = RAYS
 
     @jax.jit
     def kernels(fields):
-        return jax.vmap(lambda f: drt_jax.psf(lens, f, far, waves, PIXEL, SIZE, model).kernel)(
-            fields
-        )
+        return jax.vmap(
+            lambda f: (
+                drt_jax.psf(lens, Scene.point(f, far, waves), PIXEL, SIZE, sampling=model).kernel
+            )
+        )(fields)
 
-    alone = drt_jax.psf(lens, fields[1], far, waves, PIXEL, SIZE, model).kernel
+    alone = drt_jax.psf(
+        lens, Scene.point(fields[1], far, waves), PIXEL, SIZE, sampling=model
+    ).kernel
     np.testing.assert_allclose(kernels(fields)[1], alone, atol=1e-12)
-    with pytest.raises(ValueError, match="make the model outside"):
-        jax.jit(lambda f: drt_jax.psf(lens, f, far, waves, PIXEL).kernel)(fields[0])
+    with pytest.raises(ValueError, match="make the sampling outside"):
+        jax.jit(lambda f: drt_jax.psf(lens, Scene.point(f, far, waves), PIXEL).kernel)(fields[0])
     # It is made for fields along y: elsewhere half of the pupil is not all of it.
     beside = jnp.radians(jnp.array([4.0, 3.0]))
     assert not np.any(kernels(jnp.stack([beside, fields[0]]))[0])
-    for call in (drt_jax.psfs, lambda *all: jax.jit(lambda: drt_jax.psfs(*all))()):
+    several = Scene.radians(beside[None], far, waves)
+    for call in (drt_jax.psf, lambda *a, **k: jax.jit(lambda: drt_jax.psf(*a, **k))()):
         with pytest.raises(ValueError, match="the rule is made for fields along y"):
-            call(lens, beside[None], far, waves, PIXEL, SIZE, model)
+            call(lens, several, PIXEL, SIZE, sampling=model)
 
 
 @pytest.mark.parametrize(
@@ -301,13 +312,14 @@ def test_a_model_serves_inside_jit_and_vmap(double_gauss):
     [
         ({"pixel": 0.0}, "pixel: must be above 0"),
         ({"size": 0}, "size: expected"),
-        ({"model": "airy"}, "model: expected one of gaussian, rays, waves, auto"),
-        ({"model": "gaussian", "tolerance": 2.0}, "tolerance: expected"),
+        ({"kind": "airy", "sampling": 1e-2}, "kind: expected one of gaussian, rays, waves, auto"),
+        ({"kind": "gaussian", "sampling": 2.0}, "sampling: expected a tolerance"),
+        ({"kind": "gaussian"}, "kind: the sampling is of the kind 'rays', got 'gaussian'"),
         ({"centre": (0.0, 0.0, 0.0)}, "centre: expected x and y"),
     ],
 )
 def test_what_is_no_kernel_is_refused(double_gauss, change, message):
-    named = {"pixel": PIXEL, "size": SIZE, "model": RAYS} | change
+    named = {"pixel": PIXEL, "size": SIZE, "sampling": RAYS} | change
     with pytest.raises(ValueError, match=message):
         drt_jax.psf(*double_gauss, **named)
 
@@ -316,19 +328,21 @@ def test_what_is_no_kernel_is_refused(double_gauss, change, message):
 def test_the_norm_of_a_tolerance(double_gauss):
     """The root of the sum of squares is smaller than the sum."""
     scene = *double_gauss, PIXEL, SIZE, "rays", 2e-2
-    assert drt_jax.converged_psf(*scene, 2).cells < drt_jax.converged_psf(*scene).cells
+    assert (
+        drt_jax.converge(drt_jax.psf, *scene, 2).cells < drt_jax.converge(drt_jax.psf, *scene).cells
+    )
     with pytest.raises(ValueError, match="norm: expected 1 or 2, got 3"):
-        drt_jax.converged_psf(*scene, 3)
+        drt_jax.converge(drt_jax.psf, *scene, 3)
 
 
 @pytest.mark.slow
 def test_no_program_takes_several_matrices_to_lapack_at_once():
     """LAPACK's loop over matrices waits for XLA's threads in one of them: two of them never end."""
     lens, rule = drt_jax.load_lens("singlet"), beam_rule(4, "bilateral")
-    model = drt_jax.PsfModel("waves", rule, 8)
+    model = drt_jax.Sampling("waves", rule, 8)
 
     def light(lens, field):
-        found = drt_jax.psf(lens, field, FAR, WAVES, PIXEL, 3, model)
+        found = drt_jax.psf(lens, Scene.point(field, FAR, WAVES), PIXEL, 3, sampling=model)
         return jnp.sum(found.kernel**2) + jnp.sum(found.solid_angle)
 
     fields = jnp.array([0.01, 0.02])

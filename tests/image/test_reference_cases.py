@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 import drt_jax
-from drt_jax import Gauss, load_lens
+from drt_jax import Gauss, Scene, load_lens
 from drt_jax.image.beam import beam_rule, centroid_and_variances, trace_beam
-from drt_jax.lens.scene import scene_of
+from drt_jax.lens.scene import fitted
 
 WAVE = 0.5
 # P11: per axis, mm^2, of a paraboloid f = 50 of semi-diameter 20, out of focus by delta.
@@ -27,12 +27,16 @@ def variances():
 
     def of_moments(step):
         moved = dataclasses.replace(lens, sensor=lens.sensor + step)
-        found = drt_jax.psf_moments(moved, *scene, rule=Gauss(24, "bilateral")).covariance[0]
+        found = drt_jax.psf_moments(
+            moved, Scene.point(*scene), sampling=Gauss(24, "bilateral")
+        ).covariance[0]
         return found, found
 
     @jax.jit
     def both(step):
-        beam = trace_beam(lens, scene_of(lens, *scene), beam_rule(20, "bilateral")).refocused(step)
+        beam = trace_beam(
+            lens, fitted(lens, Scene.point(*scene)), beam_rule(20, "bilateral")
+        ).refocused(step)
         moved = centroid_and_variances(beam.hits[:, -1], beam.weights)[1]
         slope, found = jax.jacfwd(of_moments, has_aux=True)(step)
         return found, slope, moved
@@ -62,13 +66,13 @@ def test_the_huygens_psf_that_opticstudio_prints(shared):
     stop = {"curvature": 0, "thickness": 0.0, "semi_diameter": 1.0, "stop": True}
     front = {"radius": 20.0, "index": 1.5, "thickness": 1.0}
     lens = load_lens({"surfaces": [stop, front, {"radius": -20.0, "thickness": 19.792}]})
-    scene, wave = (lens, 0.0, np.inf, 0.543), 0.543e-3
+    scene, wave = (lens, Scene.point(0.0, np.inf, 0.543)), 0.543e-3
     spacing, size = case["inputs"]["pixel_um"] * 1e-3, 127
-    model = drt_jax.PsfModel("waves", beam_rule(10, "bilateral"), 128)
+    model = drt_jax.Sampling("waves", beam_rule(10, "bilateral"), 128)
     wanted = np.array(printed["profile_along_x_from_centre_pixels_0_to_20"])
     diagonal = np.array(printed["diagonal_from_centre_pixels_0_to_11"])
     pixel = spacing / 3
-    found = drt_jax.psf(*scene, pixel, size, model)
+    found = drt_jax.psf(*scene, pixel, size, sampling=model)
     # By the peak without aberrations, of the cone from the exit pupil.
     pupil = drt_jax.first_order(lens, np.inf, 0.543).exit_pupil
     away = float(lens.sensor - lens.vertices[-2] - pupil.position[0])

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import drt_jax
 from drt_jax.image.refined import CELLS, to_tolerance
 
 NONE = lambda *_: 0  # noqa: E731
@@ -32,8 +33,8 @@ def test_the_error_is_within_the_tolerance(tolerance):
 def test_what_cannot_be_met_warns_and_nothing_else_does():
     with pytest.warns(UserWarning, match="512 x 512 cells .* to 2e-05 only, not to 1e-06"):
         to_tolerance(rule, (jnp.asarray(0.3),), None, 1e-6, NONE)
-    with pytest.raises(ValueError, match="tolerance: expected a number between 0 and 1"):
-        to_tolerance(rule, (jnp.asarray(0.3),), None, 0.0, NONE)
+    with pytest.raises(ValueError, match="sampling: expected a tolerance between 0 and 1"):
+        drt_jax.strehl(drt_jax.load_lens("singlet"), drt_jax.Scene.point(), 0.0)
 
 
 def test_cells_are_those_asked_for_and_128_in_a_trace():

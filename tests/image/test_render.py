@@ -10,6 +10,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import drt_jax
+from drt_jax import Scene, learn
 from drt_jax.image import blur, interpolate, render as rendering, sensor_maps
 
 PIXEL, SIDE = 0.15, 48
@@ -23,8 +24,17 @@ def lens_of(name="cooke_triplet"):
 
 @functools.cache
 def method_of(name="cooke_triplet", distance=np.inf, **others):
-    return drt_jax.render_method(
-        lens_of(name), (SIDE, SIDE), distance, PIXEL, WAVES, 13, 4, model="gaussian", **others
+    return drt_jax.converge(
+        drt_jax.render,
+        lens_of(name),
+        (SIDE, SIDE),
+        distance,
+        PIXEL,
+        WAVES,
+        13,
+        4,
+        kind="gaussian",
+        **others,
     )
 
 
@@ -34,7 +44,7 @@ def picture(seed=0):
 
 @functools.cache
 def grid():
-    return drt_jax.kernel_grid(lens_of(), method_of().grid, WAVES)
+    return drt_jax.kernel_grid(lens_of(), WAVES, method_of().grid)
 
 
 def test_a_row_of_tiles_is_blurred_by_each_pixels_own_kernel():
@@ -81,7 +91,10 @@ def test_a_pixel_collects_the_kernel_of_each_point_around_it():
     wave = jnp.array(WAVES[:1])
     direct = jax.jit(
         lambda fields: jax.lax.map(
-            lambda f: drt_jax.psf(lens, f, np.inf, wave, PIXEL, 13, method.grid.model), fields
+            lambda f: drt_jax.psf(
+                lens, Scene.point(f, np.inf, wave), PIXEL, 13, sampling=method.grid.sampling
+            ),
+            fields,
         )
     )
     radii = np.asarray(direct(fields).centre)[:, 1]
@@ -152,7 +165,7 @@ def test_points_land_where_their_centroids_are():
         spot = np.exp(-((y - place[0]) ** 2 + (x - place[1]) ** 2) / (2 * 0.1**2))
         image = drt_jax.render(lens, spot, np.inf, PIXEL, WAVES, method)
         field = np.arctan((np.array(place[::-1]) - middle) * PIXEL / focal)
-        found = drt_jax.psf_moments(lens, field, np.inf, WAVES)
+        found = drt_jax.psf_moments(lens, Scene.point(field, np.inf, WAVES))
         weight = np.asarray(image).sum(axis=(0, 1))
         for k, along in enumerate((x, y)):
             centroid = (np.asarray(image) * along[..., None]).sum(axis=(0, 1)) / weight
@@ -205,15 +218,15 @@ def test_kernels_of_patches_come_from_the_grid():
     made = grid()
     half = np.array(made.half[::-1])
     tangents = np.array([[0.0, 0.0], [1.0, 2.0], [-2.0, 1.0]]) * float(made.step)
-    found = np.asarray(drt_jax.kernels_at(made, np.arctan(tangents), np.inf))
+    found = np.asarray(made.at(Scene.radians(np.arctan(tangents), np.inf)))
     for kernel, tangent in zip(found, tangents):
         x, y = np.round(tangent / float(made.step)).astype(int) + half
         np.testing.assert_allclose(kernel, np.asarray(made.kernels)[0, y, x], atol=1e-12)
     scenes = jnp.asarray(np.random.default_rng(0).random((3, 32, 30, 2)))
-    images = drt_jax.convolve_each(scenes, jnp.asarray(found))
+    images = learn.convolve_each(scenes, jnp.asarray(found))
     assert images.shape == (3, 20, 18, 2)
     for scene, kernel, image in zip(scenes, found, images):
-        wanted = drt_jax.convolve(scene[None], jnp.asarray(kernel))[0]
+        wanted = learn.convolve(scene[None], jnp.asarray(kernel))[0]
         np.testing.assert_allclose(image, wanted, rtol=1e-9, atol=1e-12)
 
 
@@ -231,8 +244,9 @@ def test_a_near_plane_covers_what_lies_behind_it_by_its_blurred_cover():
     lens, near, far = lens_of(), 800.0, 5000.0
     mask = (np.arange(SIDE)[:, None] < 20) & (np.arange(SIDE) > 8)
     depth = np.where(mask, near, far)
-    given = lens, (SIDE, SIDE), depth, PIXEL, WAVES, 13, 4, 2, method_of().grid.model
-    method = drt_jax.render_method(*given, 1e-2)
+    given = lens, (SIDE, SIDE), depth, PIXEL, WAVES, 13, 4, 2
+    own = method_of().grid.sampling
+    method = drt_jax.converge(drt_jax.render, *given, tolerance=1e-2, sampling=own)
     maps = sensor_maps.sensor_maps(lens, method, WAVES)
     scene = np.where(mask, 1.0, 0.25)[..., None] * np.ones(2)
     image = np.asarray(rendering.composed(maps, method, scene, jnp.asarray(depth)))

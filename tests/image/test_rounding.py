@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import design
+from drt_jax import Scene, design
 from drt_jax.image import rounding
 from drt_jax.image.beam import beam_rule
 from drt_jax.image.cover import cover
-from drt_jax.lens.scene import scene_of
+from drt_jax.lens.scene import fitted
 
 from .test_psf_model import beam_of
 
@@ -30,14 +30,16 @@ def test_a_telescope_of_metres_is_told_a_camera_is_right():
     is silent; Hubble, 1e-2 waves, is not."""
     pupil = drt_jax.pupil.sobol_disc(48)[0]
     for name, field, loud in (("singlet", 0.1, False), ("hubble", 0.0005, True)):
-        exact = drt_jax.wavefront(drt_jax.load_lens(name), field, np.inf, GREEN, pupil)
+        exact = drt_jax.wavefront(drt_jax.load_lens(name), Scene.point(field, np.inf, GREEN), pupil)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            found = drt_jax.wavefront(single(name), field, np.inf, GREEN, pupil)
+            found = drt_jax.wavefront(single(name), Scene.point(field, np.inf, GREEN), pupil)
         assert [bool(said)] == [loud] and found.opd.dtype == np.float32
         good = (np.asarray(exact.status) == 0) & (np.asarray(found.status) == 0)
         error = np.std((np.asarray(found.opd) - np.asarray(exact.opd))[good])
-        told = rounding.path_rounding(single(name), [scene_of(single(name), field, np.inf, GREEN)])
+        told = rounding.path_rounding(
+            single(name), [fitted(single(name), Scene.point(field, np.inf, GREEN))]
+        )
         assert 0.3 * error < told < 3 * error and (told > 1e-3) == loud
         assert not loud or (len(said) == 1 and said[0].filename == __file__)
 
@@ -46,7 +48,7 @@ def test_a_telescope_of_metres_is_told_a_camera_is_right():
 def test_strehl_of_hubble():
     """1 on the axis; float32 once gave 0.008 without a word."""
     with pytest.warns(UserWarning, match=REMEDY):
-        found = drt_jax.strehl(single("hubble"), jnp.zeros(1), np.inf, GREEN)
+        found = drt_jax.strehl(single("hubble"), Scene.radians(jnp.zeros(1), np.inf, GREEN))
     np.testing.assert_allclose(found, 1, atol=0.02)
 
 
@@ -66,7 +68,11 @@ def test_no_light_comes_from_far_beside_the_rays():
 def test_strehl_of_a_phone_at_a_slant():
     """32.2 degrees: 0.644 in float64; 0.03 once, of light far beside the rays, without a word."""
     field, rule = jnp.array([np.radians(32.2)], jnp.float32), drt_jax.Gauss(8, "bilateral")
-    found = drt_jax.strehl(single("phone"), field, np.inf, GREEN, rule, cells=64)
+    found = drt_jax.strehl(
+        single("phone"),
+        Scene.radians(field, np.inf, GREEN),
+        sampling=drt_jax.Sampling.of("waves", rule, 64),
+    )
     np.testing.assert_allclose(found, 0.644, atol=5e-3)
 
 
@@ -75,7 +81,7 @@ def test_rounding_of_a_high_image_is_told():
     """At 67 degrees hits 235 mm high are rounded by 0.29 of 2^-16 mm RMS, and paths by nearly as
     much: 0.0074 waves. Strehl ratios were 0.02 off without a word."""
     lens = single("hypergon_100mm")
-    scene = scene_of(lens, np.radians(67.0), np.inf, GREEN)
+    scene = fitted(lens, Scene.point(np.radians(67.0), np.inf, GREEN))
     told = [rounding.path_rounding(lens, [scene], of_beams) for of_beams in (False, True)]
     by_hand = 0.29 * 2.0**-16 * np.sin(np.radians(67)) / 0.55e-3
     assert told[0] < 1e-3 and 0.5 * by_hand < told[1] < 2 * by_hand
@@ -86,11 +92,11 @@ def test_float32_stays():
     """Where a process has float64, too, dtypes follow the lens, and nothing is promoted. Traced,
     not compiled; one radius stands for azimuths."""
     lens, rule = single("hubble"), drt_jax.Clipped(6, "rotational")
-    light = drt_jax.PsfModel("waves", beam_rule(8, "rotational", rule), 32)
+    light = drt_jax.Sampling("waves", beam_rule(8, "rotational", rule), 32)
 
     def both(lens):
-        ratio = drt_jax.strehl(lens, jnp.zeros(1), jnp.inf, GREEN, rule)
-        return ratio, drt_jax.psf(lens, 0.0, jnp.inf, GREEN, 0.01, 5, light)
+        ratio = drt_jax.strehl(lens, Scene.radians(jnp.zeros(1), jnp.inf, GREEN), rule)
+        return ratio, drt_jax.psf(lens, Scene.point(0.0, jnp.inf, GREEN), 0.01, 5, sampling=light)
 
     found = jax.tree.leaves(jax.eval_shape(both, lens))
     assert {a.dtype for a in found} == {np.dtype("float32")}
@@ -101,16 +107,18 @@ def test_a_focus_that_rounding_moves_is_told():
     """Of a telescope, by 0.09 of the depth of focus; not of a camera."""
     remedy = r'in float32 the focus may be wrong by 9e-02 of its depth.*"jax_enable_x64", True'
     with pytest.warns(UserWarning, match=remedy) as said:
-        drt_jax.field_curvature(single("ritchey_chretien"), jnp.zeros(1), np.inf, GREEN)
+        drt_jax.field_curvature(
+            single("ritchey_chretien"), Scene.radians(jnp.zeros(1), np.inf, GREEN)
+        )
     with pytest.warns(UserWarning, match=remedy) as more:
-        drt_jax.axial_colour(single("ritchey_chretien"), np.inf, GREEN)
+        drt_jax.axial_colour(single("ritchey_chretien"), Scene.point(0.0, np.inf, GREEN))
     with pytest.warns(UserWarning, match=remedy) as solved:
         solve = design.Solve("paraxial_focus", wavelengths=GREEN)
         design.Variables.from_lens(
             single("ritchey_chretien"), ["sensor", "curvature"], solves=[solve]
         )
     assert {one[0].filename for one in (said, more, solved)} == {__file__}
-    drt_jax.field_curvature(single("cooke_triplet"), jnp.zeros(1), np.inf, GREEN)
+    drt_jax.field_curvature(single("cooke_triplet"), Scene.radians(jnp.zeros(1), np.inf, GREEN))
 
 
 @pytest.mark.slow
@@ -123,7 +131,9 @@ def test_kernels_of_rays_that_rounding_spoils_are_told(name, pixel, loud):
     assert rounding.hit_rounding(single(name)) > 0.01 * pixel
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        drt_jax.converged_psf(single(name), 0.0, np.inf, GREEN, pixel, 15, "rays")
+        drt_jax.converge(
+            drt_jax.psf, single(name), Scene.point(0.0, np.inf, GREEN), pixel, 15, "rays"
+        )
     assert any("in float32 kernels may be wrong" in str(one.message) for one in said) == loud
 
 
@@ -134,15 +144,25 @@ def test_no_product_is_rounded_by_a_gpu(answer):
     more: the refractive index would be 5e-4 off."""
     waves, rule = jnp.array([0.5, 0.6]), drt_jax.Gauss(4, "bilateral")
     pupil, field = jnp.asarray(drt_jax.pupil.sobol_disc(5000)[0]), jnp.array([0.1])
-    model = drt_jax.PsfModel("waves", beam_rule(6, "bilateral"), 32)
+    model = drt_jax.Sampling("waves", beam_rule(6, "bilateral"), 32)
     of = {
-        "rays": lambda lens: drt_jax.trace_rays(lens, 0.1, np.inf, waves, pupil).path,
-        "kernel": lambda lens: drt_jax.psf(lens, 0.1, np.inf, waves, 4e-3, 9, model).kernel,
+        "rays": lambda lens: drt_jax.trace_rays(lens, Scene.point(0.1, np.inf, waves), pupil).path,
+        "kernel": lambda lens: (
+            drt_jax.psf(lens, Scene.point(0.1, np.inf, waves), 4e-3, 9, sampling=model).kernel
+        ),
         "contrast": lambda lens: (
-            drt_jax.transfer(lens, field, np.inf, waves, jnp.array([30.0]), rule=rule, cells=32).mtf
+            drt_jax.transfer(
+                lens,
+                Scene.radians(field, np.inf, waves),
+                jnp.array([30.0]),
+                sampling=drt_jax.Sampling.of("waves", rule, 32),
+            ).mtf
         ),
         "energy": lambda lens: drt_jax.encircled_energy(
-            lens, field, np.inf, waves, jnp.array([0.01]), rule=rule, cells=32
+            lens,
+            Scene.radians(field, np.inf, waves),
+            jnp.array([0.01]),
+            sampling=drt_jax.Sampling.of("waves", rule, 32),
         ),
     }[answer]
     gradient = jax.jit(jax.grad(lambda lens: jnp.sum(of(lens))))

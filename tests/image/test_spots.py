@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial import ConvexHull
 
 import drt_jax
-from drt_jax import Clipped, Gauss, Pattern, design, load_lens, pupil
+from drt_jax import Clipped, Gauss, Pattern, Scene, design, load_lens, pupil
 from drt_jax.design import field_rays
 from drt_jax.design.problem import trace_fields
 from drt_jax.image import spots
+from drt_jax.lens.scene import fitted
 
 from ..known import check_slopes, freed
 
@@ -22,13 +23,13 @@ COOKE = freed(load_lens("cooke_triplet"))
 RIM = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
 ANGLES = np.array([0.1, 0.2, 0.3])
 SMALL = Gauss(4, "none")
-SCENE = ANGLES, np.inf, WAVES
+SCENE = Scene.radians(ANGLES, np.inf, WAVES)
 
 
 @pytest.fixture(scope="module")
 def rules():
     """Those of the triplet, whole and clipped."""
-    return [drt_jax.light_rule(lens, *SCENE) for lens in (COOKE, RIM)]
+    return [drt_jax.converge(drt_jax.spot_diagram, lens, SCENE) for lens in (COOKE, RIM)]
 
 
 @pytest.mark.slow
@@ -37,9 +38,11 @@ def test_cos4_of_a_small_hole():
     plate = [{"curvature": 0, "index": 1.5, "thickness": 0.1}, {"curvature": 0, "thickness": 1.0}]
     stop = {"curvature": 0, "thickness": 30.0, "semi_diameter": 0.003, "stop": True}
     lens, fields = load_lens({"surfaces": [*plate, stop]}), np.array([0.0, 0.2, 0.5, 1.0])
-    light = drt_jax.relative_illumination(lens, fields, np.inf, 0.55, SMALL, "sensor")
+    light = drt_jax.relative_illumination(
+        lens, Scene.radians(fields, np.inf, 0.55), SMALL, "sensor"
+    )
     np.testing.assert_allclose(light[:, 0], np.cos(fields) ** 4, rtol=1e-7)
-    area = drt_jax.solid_angle(lens, fields, np.inf, 0.55, SMALL, "sensor")[0]
+    area = drt_jax.solid_angle(lens, Scene.radians(fields, np.inf, 0.55), SMALL, "sensor")[0]
     np.testing.assert_allclose(area, np.pi * (0.003 / 30) ** 2, rtol=1e-7)
 
 
@@ -52,7 +55,7 @@ def test_the_cone_of_a_ball():
     ball = [{"radius": 10.0} | glass, stop | glass, {"radius": -10.0, "thickness": 5.0}]
     fields = np.array([0.2, 0.5, 1.0])
     light = drt_jax.relative_illumination(
-        load_lens({"surfaces": ball}), fields, np.inf, 0.55, SMALL
+        load_lens({"surfaces": ball}), Scene.radians(fields, np.inf, 0.55), SMALL
     )
     np.testing.assert_allclose(light[:, 0], np.cos(fields) ** 2, rtol=1e-7)
 
@@ -67,12 +70,14 @@ def test_a_perfect_cone():
     depth = 30 - float(drt_jax.sag(lens, 1, 0.0, 6.0))
     sine = 6 / np.hypot(6, depth)
     rule = Gauss(16, "rotational")
-    area = drt_jax.solid_angle(lens, 0.0, np.inf, 0.55, rule)
+    area = drt_jax.solid_angle(lens, Scene.radians([0.0], np.inf, 0.55), rule)
     np.testing.assert_allclose(area, np.pi * sine**2, rtol=1e-10)
-    spot = drt_jax.spot_diagram(lens, 0.0, np.inf, 0.55, rule)
+    spot = drt_jax.spot_diagram(lens, Scene.radians([0.0], np.inf, 0.55), rule)
     np.testing.assert_allclose(spot.airy_radius, 1.2196698912665 * 0.55e-3 / (3 * sine), rtol=1e-9)
     assert spot.rms[0] < 1e-12 and spot.radius[0] < 1e-12
-    np.testing.assert_allclose(drt_jax.vignetting(lens, 0.0, np.inf, 0.55, rule), 1, rtol=1e-12)
+    np.testing.assert_allclose(
+        drt_jax.vignetting(lens, Scene.radians([0.0], np.inf, 0.55), rule), 1, rtol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -80,10 +85,10 @@ def test_a_perfect_cone():
 def test_spots_are_those_of_the_moments(rules, clipped):
     lens, rule = (COOKE, RIM)[clipped], rules[clipped]
     assert isinstance(rule, (Gauss, Clipped)[clipped])
-    spot = drt_jax.spot_diagram(lens, *SCENE, rule)
-    light = drt_jax.vignetting(lens, *SCENE, rule)
+    spot = drt_jax.spot_diagram(lens, SCENE, rule)
+    light = drt_jax.vignetting(lens, SCENE, rule)
     for k, angle in enumerate(ANGLES):
-        found = drt_jax.psf_moments(lens, angle, np.inf, WAVES, rule=rule)
+        found = drt_jax.psf_moments(lens, Scene.point(angle, np.inf, WAVES), sampling=rule)
         np.testing.assert_allclose(light[k], found.throughput, rtol=1e-9)
         share = np.asarray(found.throughput / np.sum(found.throughput))
         centroid = share @ np.asarray(found.mean)
@@ -91,7 +96,7 @@ def test_spots_are_those_of_the_moments(rules, clipped):
         beside = np.sum((np.asarray(found.mean) - centroid) ** 2, axis=1)
         square = share @ (np.trace(found.covariance, axis1=1, axis2=2) + beside)
         np.testing.assert_allclose(spot.rms[k], np.sqrt(square), rtol=1e-8)
-        point = drt_jax.image_point(lens, angle, np.inf, WAVES)[1]
+        point = drt_jax.image_point(lens, Scene.point(angle, np.inf, WAVES))[1]
         np.testing.assert_allclose(spot.chief[k], point, atol=1e-12)
         apart = np.sum((centroid - point) ** 2)
         np.testing.assert_allclose(spot.rms_chief[k], np.sqrt(square + apart), rtol=1e-8)
@@ -101,10 +106,10 @@ def test_spots_are_those_of_the_moments(rules, clipped):
 def test_the_light_of_random_rays(rules):
     """The area of directions within the hull of those that arrive, and how many do."""
     points = pupil.random_disc(40_000, 1)[0]
-    light = drt_jax.solid_angle(RIM, *SCENE, rules[1])
-    part = drt_jax.vignetting(RIM, *SCENE, rules[1])
+    light = drt_jax.solid_angle(RIM, SCENE, rules[1])
+    part = drt_jax.vignetting(RIM, SCENE, rules[1])
     for k, angle in enumerate(ANGLES):
-        rays = drt_jax.trace_rays(RIM, angle, np.inf, WAVES[0], points)
+        rays = drt_jax.trace_rays(RIM, Scene.point(angle, np.inf, WAVES[0]), points)
         good = np.asarray(rays.status[0]) == 0
         lines = np.asarray(rays.directions)[0, good, -1, :2]
         np.testing.assert_allclose(part[k, 0], np.mean(good), atol=0.01)
@@ -118,11 +123,13 @@ def test_the_illumination_that_designs_keep():
     angles = np.array([0.0, *ANGLES])
     variables = design.Variables.from_lens(COOKE, ["sensor"])
     problem = design.Problem.from_variables(
-        variables, ["relative_illumination"], angles, WAVES, rule=6
+        variables, ["relative_illumination"], Scene.radians(angles, wavelengths=WAVES), 6
     )
     wanted = field_rays.relative_illumination(COOKE, trace_fields(problem, COOKE))
     rule = Gauss(6, "bilateral")
-    found = drt_jax.relative_illumination(COOKE, angles, np.inf, WAVES, rule, "sensor")
+    found = drt_jax.relative_illumination(
+        COOKE, Scene.radians(angles, np.inf, WAVES), rule, "sensor"
+    )
     np.testing.assert_allclose(found[:, 1], wanted, rtol=1e-9)
 
 
@@ -130,13 +137,13 @@ def test_the_illumination_that_designs_keep():
 def test_geometric_radii_and_pictures(rules):
     """A hexapolar pattern, and the rim of the stop; mirror images of half a pupil."""
     points, weights = pupil.hexapolar(4)
-    half = drt_jax.spot_diagram(COOKE, *SCENE, rules[0])
-    whole = drt_jax.spot_diagram(COOKE, *SCENE, Pattern(points, weights))
+    half = drt_jax.spot_diagram(COOKE, SCENE, rules[0])
+    whole = drt_jax.spot_diagram(COOKE, SCENE, Pattern(points, weights))
     count = 2 * rules[0].points(COOKE, None)[1].size
     rim = np.linspace(0, 2 * np.pi, 721)
     circle = np.stack([np.sin(rim), np.cos(rim)], 1)
     for k, angle in enumerate(ANGLES):
-        rays = drt_jax.trace_rays(COOKE, angle, np.inf, WAVES, circle)
+        rays = drt_jax.trace_rays(COOKE, Scene.point(angle, np.inf, WAVES), circle)
         hits = np.asarray(rays.points)[:, :, -1, :2]
         far = np.linalg.norm(hits - np.asarray(half.chief[k]), axis=-1).max()
         for found in (half, whole):
@@ -150,16 +157,20 @@ def test_geometric_radii_and_pictures(rules):
 def slopes(lens, fields):
     """Spots and illumination from one bundle of a clipped pupil: ((merit, results), gradient of the
     merit of the last field by the lens)."""
-    view = fields, np.inf, WAVES[:2], Clipped(8, "bilateral")
+    scene, rule = Scene.radians(fields, np.inf, WAVES[:2]), Clipped(8, "bilateral")
     weights = 1e2, 1e2, 1e4, 3.0, 2.0
 
     def total(lens):
-        light = spots._light(lens, *view, "object")
+        light = spots._light(lens, fitted(lens, scene).with_axis(), rule, "object")
+
+        def traced(_, seen, *rest):
+            return jax.tree.map(lambda a: a[-len(seen.field) :], light)
+
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(spots, "_light", lambda *_: light)
-            found = drt_jax.spot_diagram(lens, *view)
-            relative = drt_jax.relative_illumination(lens, *view)
-            part = drt_jax.vignetting(lens, *view)
+            patch.setattr(spots, "_light", traced)
+            found = drt_jax.spot_diagram(lens, scene)
+            relative = drt_jax.relative_illumination(lens, scene)
+            part = drt_jax.vignetting(lens, scene)
         sizes = found.rms, found.centroid[:, 1], found.airy_radius, relative[:, 1], part[:, 1]
         last = jnp.stack(sizes)[:, -1] * jnp.array(weights)
         last = jnp.where(jnp.isfinite(last), last, 0)
@@ -188,8 +199,10 @@ def test_derivatives_by_lens_numbers():
 
 def test_clear_errors():
     with pytest.raises(ValueError, match="make the rule outside and pass it on"):
-        jax.jit(lambda lens: drt_jax.vignetting(lens, 0.1, np.inf, 0.55))(COOKE)
+        jax.jit(lambda lens: drt_jax.vignetting(lens, Scene.radians([0.1], np.inf, 0.55)))(COOKE)
     with pytest.raises(ValueError, match="point: expected one of object, sensor, got 'pupil'"):
-        drt_jax.solid_angle(COOKE, 0.1, np.inf, 0.55, SMALL, "pupil")
+        drt_jax.solid_angle(COOKE, Scene.radians([0.1], np.inf, 0.55), SMALL, "pupil")
     with pytest.raises(ValueError, match=r"wavelength_weights: expected \(3,\), got \(2,\)"):
-        drt_jax.spot_diagram(COOKE, 0.1, np.inf, WAVES, SMALL, wavelength_weights=[1, 2])
+        drt_jax.spot_diagram(
+            COOKE, Scene.radians([0.1], np.inf, WAVES, wavelength_weights=[1, 2]), SMALL
+        )

@@ -10,11 +10,11 @@ from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.special import fresnel
 
 import drt_jax
-from drt_jax import Clipped, Gauss, Status, load_lens
+from drt_jax import Clipped, Gauss, Scene, Status, load_lens
 from drt_jax.image import coefficients, transfer
 from drt_jax.image.beam import beam_of
 from drt_jax.lens.forms import fringe_terms
-from drt_jax.lens.scene import scene_of
+from drt_jax.lens.scene import fitted
 from drt_jax.rays.trace import trace_bundle
 
 from ..known import check_slopes, freed
@@ -52,7 +52,11 @@ def perfect(focus):
     """Of the mirror, at all `PARTS`: one program for all that is asked of it."""
     lines = PARTS * LIMIT
     return drt_jax.transfer(
-        load_lens(MIRROR), 0.0, np.inf, WAVE, lines, focus=focus, rule=RULE, cells=128
+        load_lens(MIRROR),
+        Scene.radians([0.0], np.inf, WAVE),
+        lines,
+        focus=focus,
+        sampling=drt_jax.Sampling.of("waves", RULE, 128),
     )
 
 
@@ -80,8 +84,8 @@ def test_the_transfer_function_of_an_annulus():
     stop, mirror = MIRROR["surfaces"]
     lens = load_lens({"surfaces": [stop | {"obscuration": {"circle": 0.612}}, mirror]})
     rule = Clipped(6, "bilateral", crossing=False)
-    scene = lens, 0.0, np.inf, WAVE, PARTS[1:6] * LIMIT
-    found = drt_jax.transfer(*scene, rule=rule, degree=6, cells=128)
+    scene = lens, Scene.radians([0.0], np.inf, WAVE), PARTS[1:6] * LIMIT
+    found = drt_jax.transfer(*scene, sampling=drt_jax.Sampling.of("waves", rule, 128, 6))
     for way in range(2):
         np.testing.assert_allclose(found.mtf[0, way], ANNULUS, rtol=0, atol=2e-4)
 
@@ -106,7 +110,7 @@ def test_strehl_with_spherical_aberration():
         focus = waves * WAVE * 1e-3 / (1 - np.sqrt(1 - square))
         for step, width, sigma in ((0.0, 2, 2 / np.sqrt(45)), (-focus, 1, 1 / np.sqrt(180))):
             moved = dataclasses.replace(lens, sensor=lens.sensor + step)
-            found = float(drt_jax.strehl(moved, 0.0, np.inf, WAVE, RULE)[0, 0])
+            found = float(drt_jax.strehl(moved, Scene.radians([0.0], np.inf, WAVE), RULE)[0, 0])
             wanted = sum(a**2 for a in fresnel(width * np.sqrt(waves))) / (width**2 * waves)
             # Light is not quite even over the directions of a paraboloid that is bent.
             assert abs(found - wanted) < (2e-4 if waves == 0.1 else 4e-3)
@@ -123,12 +127,14 @@ def test_defocus_and_strehl():
     x, y = np.meshgrid(side, side)
     edges, parts = np.array([0.25, 0.5, 1.0]), PARTS[[1, 2, 4]]
     steps = edges * WAVE * 1e-3 / (1 - np.sqrt(1 - APERTURE**2))
-    given = lens, 0.0, np.inf, WAVE, parts * LIMIT
-    through = drt_jax.transfer(*given, focus=steps, rule=RULE, cells=128).mtf
+    given = lens, Scene.radians([0.0], np.inf, WAVE), parts * LIMIT
+    through = drt_jax.transfer(
+        *given, focus=steps, sampling=drt_jax.Sampling.of("waves", RULE, 128)
+    ).mtf
     assert through.shape == (1, 3, 2, 3)
     for k, (edge, focus) in enumerate(zip(edges, steps)):
         moved = dataclasses.replace(lens, sensor=lens.sensor + focus)
-        ratio = drt_jax.strehl(moved, 0.0, np.inf, WAVE, RULE)
+        ratio = drt_jax.strehl(moved, Scene.radians([0.0], np.inf, WAVE), RULE)
         np.testing.assert_allclose(ratio, np.sinc(edge) ** 2, rtol=0, atol=2e-4)
         for part, ours in zip(parts, through[0, k, 0]):
             both = (np.hypot(x, y + part) < 1) & (np.hypot(x, y - part) < 1)
@@ -140,7 +146,7 @@ def test_defocus_and_strehl():
 def traced(field, wavelength):
     """Hits (Q, 2) mm of many rays, and weights (Q,)."""
     points, weights = drt_jax.pupil.disc(30, 60)
-    rays = drt_jax.trace_rays(COOKE, field, np.inf, wavelength, points)
+    rays = drt_jax.trace_rays(COOKE, Scene.point(field, np.inf, wavelength), points)
     return np.asarray(rays.points)[0, :, -1, :2], weights
 
 
@@ -148,7 +154,13 @@ def traced(field, wavelength):
 def test_the_limit_of_short_wavelengths_is_that_of_rays():
     """And the rays' is the mean over many traced ones."""
     fields, frequencies = [0.0, 0.2], np.linspace(0, 20, 5)
-    rays = drt_jax.transfer(COOKE, fields, np.inf, 0.55, frequencies, "rays", rule=RULE, cells=96)
+    rays = drt_jax.transfer(
+        COOKE,
+        Scene.radians(fields, np.inf, 0.55),
+        frequencies,
+        "rays",
+        sampling=drt_jax.Sampling.of("rays", RULE, 96),
+    )
     for k, field in enumerate(fields):
         hits, weights = traced(field, 0.55)
         hits = hits - weights @ hits
@@ -165,8 +177,8 @@ def test_colours_add_up_about_one_point():
     frequencies = np.linspace(0, 100, 6)
 
     def otf(weights):
-        scene = COOKE, 0.2, np.inf, WAVES, frequencies
-        return drt_jax.transfer(*scene, rule=RULE, wavelength_weights=weights).otf[0, 0]
+        scene = Scene.point(0.2, np.inf, WAVES, wavelength_weights=weights)
+        return drt_jax.transfer(COOKE, scene, frequencies, sampling=RULE).otf[0]
 
     share = np.array([1.0, 2.0, 1.5]) / 4.5
     spots = [(weights @ hits)[1] for hits, weights in (traced(0.2, w) for w in WAVES)]
@@ -180,7 +192,7 @@ def test_colours_add_up_about_one_point():
 @pytest.mark.slow
 def test_the_zernike_coefficients_that_opticstudio_prints():
     lens = load_lens(P01)
-    found = np.asarray(drt_jax.zernike_standard(lens, 0.0, np.inf, 0.543))[0, 0]
+    found = np.asarray(drt_jax.zernike_standard(lens, Scene.radians([0.0], np.inf, 0.543)))[0, 0]
     wanted = np.zeros(37)
     for term, value in PRINTED.items():
         wanted[term - 1] = value
@@ -198,11 +210,11 @@ def slopes(lens, field):
     weights = np.random.default_rng(0).normal(size=18)
 
     def total(lens):
-        scene = scene_of(lens, field, np.inf, WAVES[:2])
+        scene = fitted(lens, Scene.point(field, np.inf, WAVES[:2]))
         bundle = trace_bundle(lens, scene, points)
         passes = jnp.where(bundle.status == Status.OK, np.append(0, pattern[1])[None], 0)
         beam = beam_of(lens, scene, points, passes, bundle, "none", 8, True)
-        view = lens, field[None], np.inf, WAVES[:2]
+        view = lens, Scene.radians(field[None], np.inf, WAVES[:2])
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(transfer, "beams_of", lambda *_: jax.tree.map(lambda a: a[None], beam))
             patch.setattr(coefficients, "disc", lambda *_: pattern)
@@ -210,16 +222,19 @@ def slopes(lens, field):
             for module, name in (
                 (transfer, "_transfer"),
                 (transfer, "_strehl"),
-                (coefficients, "_fitted"),
+                (coefficients, "_least_squares"),
             ):
                 patch.setattr(module, name, getattr(module, name).__wrapped__)
             models = {
                 kind: drt_jax.transfer(
-                    *view, jnp.array([0.0, 20.0]), kind, rule=RULE, degree=8, cells=48
+                    *view,
+                    jnp.array([0.0, 20.0]),
+                    kind,
+                    sampling=drt_jax.Sampling.of(kind, RULE, 48, 8),
                 )
                 for kind in ("waves", "rays")
             }
-            ratio = drt_jax.strehl(*view, RULE, degree=8, cells=48)
+            ratio = drt_jax.strehl(*view, sampling=drt_jax.Sampling.of("waves", RULE, 48, 8))
             terms = drt_jax.zernike_standard(*view), drt_jax.zernike_fringe(*view)
         parts = [models[kind].mtf[0, :, 1] for kind in models]
         parts = jnp.concatenate([*parts, ratio[0], terms[0][0, 0, :12]])
@@ -278,7 +293,7 @@ def counted(field, front, cells=500, shifts=(18, 43, 86)):
     points = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     points = points[np.hypot(*points.T) < 1.04]
     lens = dataclasses.replace(COOKE, semi_diameter=semi)
-    rays = drt_jax.trace_rays(lens, field, np.inf, 0.55, points)
+    rays = drt_jax.trace_rays(lens, Scene.point(field, np.inf, 0.55), points)
     assert not np.any(rays.status)
     hits, along = np.asarray(rays.points)[0], np.asarray(rays.directions)[0, :, -1]
     # Back along the rays to the sphere about the middle of the spot.
@@ -310,7 +325,10 @@ def test_the_transfer_function_of_a_clipped_pupil():
     wanted, lines = counted(0.25, 6.5)
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
     found = drt_jax.transfer(
-        lens, 0.25, np.inf, 0.55, lines, rule=Clipped(8, "bilateral"), cells=256
+        lens,
+        Scene.radians([0.25], np.inf, 0.55),
+        lines,
+        sampling=drt_jax.Sampling.of("waves", Clipped(8, "bilateral"), 256),
     )
     np.testing.assert_allclose(found.mtf[0], wanted, rtol=0, atol=1e-4)
 
@@ -322,7 +340,9 @@ def test_strehl_does_not_depend_on_the_direction_of_a_field():
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(4.0))
     fields = 0.12 * np.array([[0.0, 1.0], [0.5**0.5, 0.5**0.5]])
     along, diagonal = drt_jax.strehl(
-        lens, fields, np.inf, [0.55], rule=Clipped(6, "none"), degree=8, cells=64
+        lens,
+        Scene.radians(fields, np.inf, [0.55]),
+        sampling=drt_jax.Sampling.of("waves", Clipped(6, "none"), 64, 8),
     )[:, 0]
     assert 0.02 < along < 0.98
     np.testing.assert_allclose(diagonal, along, rtol=0, atol=3e-3)

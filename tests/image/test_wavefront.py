@@ -13,8 +13,9 @@ import pytest
 from experiments.snell import trace_snell
 
 import drt_jax
-from drt_jax import Status, load_lens, pupil, rms_wavefront, scene_of, wavefront
+from drt_jax import Scene, Status, load_lens, pupil, rms_wavefront, wavefront
 from drt_jax.image import wavefront as module
+from drt_jax.lens.scene import fitted
 from drt_jax.rays.trace import trace_bundle
 
 from ..known import known, search
@@ -67,7 +68,7 @@ def test_defocus_of_a_perfect_image(name):
         x = gap - front
         for move in (0.0, -0.3, 0.4):
             lens = dataclasses.replace(focused, sensor=focused.sensor + move)
-            wave = wavefront(lens, 0.0, np.inf, [WAVE], HEIGHTS)
+            wave = wavefront(lens, Scene.point(0.0, np.inf, [WAVE]), HEIGHTS)
             assert np.all(wave.status == Status.OK)
             d = int(lens.senses[-1]) * (float(lens.sensor) - gap) - focal
             if abs(x) < 1e-9:
@@ -98,7 +99,7 @@ def test_off_axis_against_snell(monkeypatch):
     met by solving its quadratic equation, in NumPy: 3e-9 waves of 300,000, 1e-14 of them."""
     lens = load_lens("double_gauss")
     field, wavelengths = np.radians(10.0), (0.6, 0.48)
-    scene = scene_of(lens, field, np.inf, wavelengths)
+    scene = fitted(lens, Scene.point(field, np.inf, wavelengths))
     found = searched(lens, scene, POINTS)
     wave = jax.jit(of_known(monkeypatch, found))(lens, scene, jnp.asarray(POINTS))
     first = [h[0, :, 1:] for h in found.hits]  # without the chief ray
@@ -135,7 +136,7 @@ def test_a_tilted_sensor_through_the_focus_changes_nothing():
         {"radius": 10, "conic": -1 / 1.5**2, "index": 1.5, "thickness": 30.0},
     ]
     lens = load_lens({"surfaces": surfaces, "sensor_tilt": [5.0, -8.0, 20.0]})
-    wave = wavefront(lens, 0.0, np.inf, [WAVE], POINTS)
+    wave = wavefront(lens, Scene.point(0.0, np.inf, [WAVE]), POINTS)
     np.testing.assert_allclose(wave.opd, 0, atol=1e-9)
 
 
@@ -156,7 +157,9 @@ def test_gradients_in_both_modes_and_on_axis(monkeypatch):
         trace = of_known(monkeypatch, found)
 
         def merit(lens, field):
-            wave = trace(lens, scene_of(lens, field, 5000.0, [WAVE]), jnp.asarray(POINTS))
+            wave = trace(
+                lens, fitted(lens, Scene.point(field, 5000.0, [WAVE])), jnp.asarray(POINTS)
+            )
             return jnp.sum(wave.opd * jnp.array([[3.0, 1.0, -2.0, 1.5, 0.5]]))
 
         value, gradient = jax.value_and_grad(merit, (0, 1))(lens, field)
@@ -164,7 +167,7 @@ def test_gradients_in_both_modes_and_on_axis(monkeypatch):
         return value, gradient, jax.jvp(merit, (lens, field), moving)[1]
 
     def at(lens, field):
-        found = searched(lens, scene_of(lens, field, 5000.0, [WAVE]), POINTS)
+        found = searched(lens, fitted(lens, Scene.point(field, 5000.0, [WAVE])), POINTS)
         return both(lens, jnp.asarray(field), found)
 
     for field in (0.15, 0.0):
@@ -183,7 +186,7 @@ def test_failed_rays_have_a_status_and_change_no_other(monkeypatch):
     lens = load_lens("singlet")
     steep = dataclasses.replace(lens, semi_diameter=jnp.array([24.0, 15.0, jnp.inf, jnp.inf]))
     heights = np.stack([np.zeros(9), np.linspace(-1, 1, 9)], axis=1)
-    scene = scene_of(steep, 0.0, np.inf, [WAVE])
+    scene = fitted(steep, Scene.point(0.0, np.inf, [WAVE]))
 
     @jax.jit
     def opd(lens, found):
@@ -216,7 +219,7 @@ def test_failed_chief_ray(monkeypatch):
     surfaces = [stop, air | {"thickness": 30.0}]
     lens = load_lens({"object": {"index": 1.5}, "surfaces": surfaces})
     points = np.array([[0.0, -1.0], [0.0, -0.9], [0.0, 0.0]])
-    scene = scene_of(lens, np.radians(43.0), 20.0, [WAVE])
+    scene = fitted(lens, Scene.point(np.radians(43.0), 20.0, [WAVE]))
     found = searched(lens, scene, points)
     assert found.status[0].tolist() == [Status.TIR, Status.OK, Status.OK, Status.TIR]
     wave = jax.jit(of_known(monkeypatch, found))(lens, scene, jnp.asarray(points))
@@ -228,5 +231,5 @@ def test_rms_of_pure_defocus():
     """W = a r^2 over the disc has the standard deviation a / sqrt(12)."""
     points, weights = pupil.disc(4, 5)
     opd = 0.7 * jnp.sum(jnp.asarray(points) ** 2, axis=-1)[None]
-    wave = drt_jax.Wavefront(opd, jnp.zeros(opd.shape, jnp.int32), jnp.zeros((1, 2)))
+    wave = drt_jax.results.Wavefront(opd, jnp.zeros(opd.shape, jnp.int32), jnp.zeros((1, 2)))
     np.testing.assert_allclose(rms_wavefront(wave, weights), 0.7 / np.sqrt(12), rtol=1e-12)

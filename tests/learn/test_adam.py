@@ -4,7 +4,7 @@ import numpy as np
 import optax
 import pytest
 
-from drt_jax import adam, apply_updates
+from drt_jax.learn import adam, apply_updates
 
 
 def parameters():

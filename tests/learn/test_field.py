@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import design
+from drt_jax import Scene, design, learn
 from drt_jax.image.beam import beam_rule
 from drt_jax.learn.field import (
     FieldImager,
@@ -21,7 +21,7 @@ from drt_jax.learn.field import (
 WAVES, PIXEL, SIZE, FIELD = (0.6, 0.53, 0.48), 16e-3, 9, np.radians(10)
 SEEN = ObjectPoints(jnp.radians(jnp.array([[1.0, 2.0], [-3.0, 7.0]])), jnp.array([jnp.inf, 3e4]))
 # Good to some per cent here, without a search.
-MODEL = drt_jax.PsfModel("rays", beam_rule(6, "none"), 32)
+MODEL = drt_jax.Sampling("rays", beam_rule(6, "none"), 32)
 KINDS = ["curvature", "conic", "coefficients", "thickness", "sensor", "index"]
 
 
@@ -57,11 +57,11 @@ def camera():
 
     def points(optics, seen):
         lens = variables.lens_of(optics["lens"])
-        grid = WAVES, PIXEL, SIZE, MODEL
-        found = drt_jax.psfs(lens, seen.fields, seen.distances, *grid)
+        scene = Scene.radians(seen.fields, seen.distances, WAVES)
+        found = drt_jax.psf(lens, scene, PIXEL, SIZE, sampling=MODEL)
         return found.kernel, found.solid_angle / 0.048
 
-    init, restore = drt_jax.red_net(1, 4)
+    init, restore = learn.red_net(1, 4)
     return variables, FieldImager(points, restore), init(jax.random.key(0))
 
 
@@ -86,11 +86,14 @@ def test_the_kernels_of_many_points_are_those_of_each(camera):
     kernels, light = imager.points({"lens": variables.start}, SEEN)
     lens = variables.lens_of(variables.start)
     for k in range(2):
-        one = drt_jax.psf(lens, SEEN.fields[k], SEEN.distances[k], WAVES, PIXEL, SIZE, MODEL)
+        one = drt_jax.psf(
+            lens, Scene.point(SEEN.fields[k], SEEN.distances[k], WAVES), PIXEL, SIZE, sampling=MODEL
+        )
         np.testing.assert_allclose(kernels[k], one.kernel, atol=1e-12)
         np.testing.assert_allclose(0.048 * light[k], one.solid_angle, rtol=1e-12)
-    with pytest.raises(ValueError, match=r"fields, distances: expected \(B, 2\)"):
-        drt_jax.psfs(lens, SEEN.fields[0], 1.0, WAVES, PIXEL, SIZE, MODEL)
+    with pytest.raises(ValueError, match=r"distance: expected one, or one for each of the fields"):
+        several = Scene.radians(SEEN.fields, (1.0, 2.0, 3.0), WAVES)
+        drt_jax.psf(lens, several, PIXEL, SIZE, sampling=MODEL)
 
 
 def test_noise_rises_where_the_light_falls(camera):

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import adam, apply_updates, red_net
+from drt_jax.learn import adam, apply_updates, red_net
 from drt_jax.learn.network import count_parameters
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import drt_jax
+from drt_jax import Scene, learn
 from drt_jax.image.kernel import gaussian_psf
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import train
@@ -22,7 +23,7 @@ CAMERA = train.Camera(kernel=9)
 def blur(near=25000.0, far=25000.0):
     """The moments of a lens whose sensor moves."""
     lens = drt_jax.load_lens("double_gauss")
-    return drt_jax.moments_model(lens, ("sensor",), 0.0, (near, far), RGB, 1e-9)[1]
+    return learn.moments_model(lens, ("sensor",), Scene.point(0.0, (near, far), RGB), 1e-9)[1]
 
 
 def scenes(seed=0, count=3):
@@ -51,7 +52,7 @@ def test_imager_is_the_chain_by_hand():
 
 def test_gradient_of_the_loss_by_the_sensor_position():
     """Through network, sensor layer, kernel and moments, against finite differences."""
-    init, restore = drt_jax.red_net(2, 4)
+    init, restore = learn.red_net(2, 4)
     weights = init(jax.random.key(0))
     imager = train.make_imager(blur(), restore, CAMERA)
 
@@ -110,7 +111,7 @@ def test_a_colour_without_rays_is_black_and_moves_no_other():
         covariance = jnp.zeros((3, 2, 2)) * values["sensor"]
         none = passed[:, None] == 0
         covariance = jnp.where(none[..., None], jnp.diag(jnp.full(2, jnp.inf)), covariance)
-        return drt_jax.Moments(jnp.where(none, 0, mean), covariance, passed, separable=True)
+        return drt_jax.results.Moments(jnp.where(none, 0, mean), covariance, passed, separable=True)
 
     imager = train.make_imager(blur, None, CAMERA)
     others = (jnp.array(1.0), np.float32(0), jax.random.key(0))
@@ -145,7 +146,7 @@ def test_depth_is_uniform_and_steps_depend_on_seed_and_index_alone():
 
 
 def test_network_stays_in_float32():
-    init_network, restore = drt_jax.red_net(1, 2)
+    init_network, restore = learn.red_net(1, 2)
     imager = train.make_imager(blur(), restore, CAMERA)
     init, step = train.make_step(
         imager, {"optics": 1e-2, "network": 1e-3}, (25000.0, 25000.0), seed=0

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import drt_jax
+from drt_jax import Scene
 from drt_jax.lens.edit import _terms
 from drt_jax.lens.forms import FORMS, Shape
+from drt_jax.lens.scene import field_of_height
 from drt_jax.lens.surface import surface_sag
 
 WAVE = 0.5875618
@@ -52,14 +54,14 @@ def test_light_takes_the_same_path_backwards():
     """From where each ray met the sensor, through its point on the stop."""
     other, last = drt_jax.flipped(LENS), LENS.vertices[-2]
     points = np.array([[0.3, 0.8], [-0.7, 0.2], [0.0, 0.0]])
-    rays = drt_jax.trace_rays(LENS, (0.02, 0.05), np.inf, WAVE, points)
+    rays = drt_jax.trace_rays(LENS, Scene.point((0.02, 0.05), np.inf, WAVE), points)
     assert not np.any(rays.status)
     # z from what is the first vertex now.
     hits = (np.asarray(rays.points)[0] - [0, 0, last]) * [1, 1, -1]
     distance = LENS.sensor - last
     for point, path in zip(points, hits):
-        field = drt_jax.field_of_height(path[-1, :2], distance)
-        found = drt_jax.trace_rays(other, field, distance, WAVE, point[None])
+        field = field_of_height(path[-1, :2], distance)
+        found = drt_jax.trace_rays(other, Scene.point(field, distance, WAVE), point[None])
         assert not np.any(found.status)
         own = np.asarray(found.points)[0, 0, : LENS.count]
         np.testing.assert_allclose(own, path[-2::-1], atol=1e-10)
@@ -86,9 +88,9 @@ def test_rays_of_a_larger_lens_keep_their_angles():
     """All hits are as much larger; so is the focal length, and its derivative by the factor."""
     points, factor = np.array([[0.3, 0.8], [-0.7, 0.2]]), 2.5
     scene = (0.02, 0.05), 700.0
-    one = drt_jax.trace_rays(LENS, *scene, WAVE, points)
+    one = drt_jax.trace_rays(LENS, Scene.point(*scene, WAVE), points)
     two = drt_jax.trace_rays(
-        drt_jax.scaled(LENS, factor), scene[0], factor * scene[1], WAVE, points
+        drt_jax.scaled(LENS, factor), Scene.point(scene[0], factor * scene[1], WAVE), points
     )
     assert not np.any(one.status) and not np.any(two.status)
     np.testing.assert_allclose(two.points, factor * one.points, atol=1e-10)

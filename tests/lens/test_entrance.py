@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import drt_jax
-from drt_jax import Gauss, load_lens, psf_moments, save_lens, trace_rays, with_paraxial_pupil
+from drt_jax import Gauss, Scene, load_lens, psf_moments, save_lens, trace_rays, with_paraxial_pupil
 
 WAVE = 0.5876
 INF = float("inf")
@@ -34,7 +34,9 @@ HELD = {"surfaces": [3, 4], "about": 3, "tilt": [0.5, 0, 0]}
 def spots(lens, field):
     """RMS radius, mm."""
     rule = Gauss(12, "bilateral")
-    return jnp.sqrt(jnp.trace(psf_moments(lens, field, INF, WAVE, rule=rule).covariance[0]))
+    return jnp.sqrt(
+        jnp.trace(psf_moments(lens, Scene.point(field, INF, WAVE), sampling=rule).covariance[0])
+    )
 
 
 @pytest.mark.slow
@@ -70,14 +72,14 @@ def test_all_else_of_the_lens_stays():
         found = (drt_jax.first_order(each, distance, WAVE) for each in (aimed, lens))
         for ours, wanted in zip(*map(jax.tree.leaves, found), strict=True):
             np.testing.assert_allclose(ours, wanted, rtol=1e-12)
-        rays = trace_rays(aimed, 0.05, distance, WAVE, [[0.0, 0.4], [0.3, -0.2]])
+        rays = trace_rays(aimed, Scene.point(0.05, distance, WAVE), [[0.0, 0.4], [0.3, -0.2]])
         # The same rays by where they cross the old stop.
         old = np.asarray(rays.points)[0, :, 4, :2] / 4.0
-        wanted = trace_rays(lens, 0.05, distance, WAVE, old)
+        wanted = trace_rays(lens, Scene.point(0.05, distance, WAVE), old)
         assert np.all(rays.status == 0) and np.all(wanted.status == 0)
         np.testing.assert_allclose(rays.points[:, :, 2:], wanted.points, atol=1e-11)
         np.testing.assert_allclose(rays.path, wanted.path, atol=1e-11)
-    edge = trace_rays(aimed, 0.0, INF, WAVE, [[0.0, 1.15], [0.0, 1.4]]).status
+    edge = trace_rays(aimed, Scene.point(0.0, INF, WAVE), [[0.0, 1.15], [0.0, 1.4]]).status
     np.testing.assert_array_equal(edge[0], [0, drt_jax.Status.CLIPPED])
 
 
@@ -91,7 +93,9 @@ def test_the_pupil_follows_the_lens():
     def merit(curvature):
         moved = dataclasses.replace(lens, curvature=lens.curvature.at[1].add(curvature))
         aimed = with_paraxial_pupil(moved, WAVE)
-        return psf_moments(aimed, 0.1, INF, WAVE, rule=Gauss(3, "bilateral")).covariance[0, 1, 1]
+        return psf_moments(
+            aimed, Scene.point(0.1, INF, WAVE), sampling=Gauss(3, "bilateral")
+        ).covariance[0, 1, 1]
 
     slope = merit(0.0)[1]
     ends = [merit(h)[0] for h in (1e-6, -1e-6)]
@@ -123,7 +127,9 @@ def test_a_pupil_at_infinity_is_none():
 
     @jax.jit
     def aimed(lens):
-        return trace_rays(with_paraxial_pupil(lens, WAVE), 0.0, INF, WAVE, [[0.0, 0.0], [0.0, 0.5]])
+        return trace_rays(
+            with_paraxial_pupil(lens, WAVE), Scene.point(0.0, INF, WAVE), [[0.0, 0.0], [0.0, 0.5]]
+        )
 
     rays = aimed(lens)
     assert np.all(rays.status != 0) and np.all(np.isfinite(rays.points))

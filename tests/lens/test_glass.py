@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Gauss, load_lens
+from drt_jax import Gauss, Scene, load_lens
 from drt_jax.lens.glass import Dispersion, Glass, model_glass, refractive_index
 from drt_jax.lens.glasses import _table, find_glass, glass_map_distance
 
@@ -209,10 +209,11 @@ def test_catalogue_glasses_made_model_glasses(tmp_path):
     np.testing.assert_allclose(after[:, 1] - after[:, 2], before[:, 1] - before[:, 2], atol=1e-14)
     ours, own = (float(drt_jax.focal_length(each, LINES[0])[0]) for each in (model, lens))
     assert abs(ours / own - 1) < 1e-12 and model.active == lens.active
+    scene, rule = Scene.point(0.0, np.inf, (0.48, 0.6)), Gauss(6, "rotational")
     spots = [
-        np.trace(drt_jax.psf_moments(each, 0.0, np.inf, (0.48, 0.6), rule=Gauss(6, "rotational"))
-        .covariance, axis1=1, axis2=2) for each in (model, lens)
-    ]  # fmt: skip
+        np.trace(drt_jax.psf_moments(each, scene, sampling=rule).covariance, axis1=1, axis2=2)
+        for each in (model, lens)
+    ]
     np.testing.assert_allclose(*spots, rtol=0.1)
 
     @jax.jit

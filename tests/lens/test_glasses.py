@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import find_glass, nearest_glasses, refractive_index
-from drt_jax.lens.glass import Dispersion
+from drt_jax import find_glass, nearest_glasses
+from drt_jax.lens.glass import Dispersion, refractive_index
 from drt_jax.lens.glasses import glass_makers, glass_names, indices
 
 F, D, C, G = 0.4861327, 0.5875618, 0.6562725, 0.4358343

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Lens, design, load_lens
+from drt_jax import Lens, Scene, design, load_lens
 
 
 def test_the_sensor_is_the_last_row():
@@ -86,7 +86,7 @@ def test_a_stop_without_a_size_gets_one_line(semi):
     lens = load_lens("cooke_triplet")
     lens = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[lens.stop].set(semi))
     for call in (
-        lambda: drt_jax.psf_moments(lens, 0.0, np.inf, 0.55),
+        lambda: drt_jax.psf_moments(lens, Scene.point(0.0, np.inf, 0.55)),
         lambda: drt_jax.first_order(lens, np.inf, 0.55),
         lambda: design.Problem.from_variables(
             design.Variables.from_lens(lens, ["thickness"]), ["spot"]

@@ -9,7 +9,8 @@ import optax
 import pytest
 
 import drt_jax
-from drt_jax.lens.lens import HELD
+from drt_jax import learn
+from drt_jax.lens.lens import HELD, movable
 
 GREEN = jnp.array([0.5875618])
 LENS = drt_jax.load_lens("cooke_triplet")
@@ -105,10 +106,10 @@ def test_a_change_within_a_program_holds_as_outside():
 
 
 RULES = {
-    "adam": lambda: drt_jax.adam(1e-3),
+    "adam": lambda: learn.adam(1e-3),
     "optax.adam": lambda: optax.adam(1e-3),
-    "optax.adamw": lambda: optax.adamw(1e-3, mask=drt_jax.movable),
-    "optax.lion": lambda: optax.lion(1e-3, mask=drt_jax.movable),
+    "optax.adamw": lambda: optax.adamw(1e-3, mask=movable),
+    "optax.lion": lambda: optax.lion(1e-3, mask=movable),
 }
 
 
@@ -118,7 +119,7 @@ def test_optimisers_leave_air_and_glass_alone(rule, tmp_path):
     extra = () if rule == "adam" else (LENS,)
     with jax.numpy_dtype_promotion("standard"):  # as optax has it
         updates, _ = update(slopes(LENS), init(LENS), *extra)
-    lens = drt_jax.apply_updates(LENS, updates)
+    lens = learn.apply_updates(LENS, updates)
     np.testing.assert_array_equal(lens.index(GREEN), LENS.index(GREEN))
     np.testing.assert_array_equal(lens.semi_diameter[1:], LENS.semi_diameter[1:])
     assert np.all(np.asarray(lens.curvature[:-1] != LENS.curvature[:-1]))
@@ -154,6 +155,6 @@ def test_check_refuses_nan_and_air_that_is_none(tmp_path):
 def test_a_mask_of_a_tree_of_parameters():
     """As of a training step: a lens beside other parameters."""
     lens = drt_jax.load_lens("cooke_triplet")
-    mask = drt_jax.movable({"optics": lens, "network": [jnp.ones(3)]})
+    mask = movable({"optics": lens, "network": [jnp.ones(3)]})
     assert mask["network"] == [True] and mask["optics"].curvature is True
     assert mask["optics"].semi_diameter is False

@@ -10,7 +10,9 @@ import yaml
 from experiments.snell import trace_snell
 
 import drt_jax
-from drt_jax import Status, load_lens, trace_rays
+from drt_jax import Scene, Status, load_lens, trace_rays
+from drt_jax.lens.paraxial import image_height
+from drt_jax.lens.scene import field_of_height
 
 from ..conftest import RGB
 from ..known import freed
@@ -29,7 +31,7 @@ def exit_(lens, waves):
 
 
 first_order, third_order = jax.jit(drt_jax.first_order), jax.jit(drt_jax.third_order)
-image_height = jax.jit(drt_jax.image_height)
+image_height = jax.jit(image_height)
 
 
 def thin(gap=None, radius=25.0):
@@ -127,7 +129,7 @@ def test_telecentric_pupils_are_infinite_and_have_no_nan():
 def test_pupils_are_where_fermat_chief_rays_cross_the_axis():
     """A chief ray at 1e-4 rad: third order leaves 1e-8 of the distance."""
     lens = load_lens("cooke_triplet")
-    rays = trace_rays(lens, 1e-4, np.inf, RGB, [[0.0, 0.0]])
+    rays = trace_rays(lens, Scene.point(1e-4, np.inf, RGB), [[0.0, 0.0]])
     points = np.asarray(rays.points[:, 0])
     first = points[:, 0, 1] / np.tan(1e-4)
     vertex = float(lens.vertices[-2])
@@ -147,7 +149,7 @@ def test_conjugates_of_a_thin_lens():
     np.testing.assert_allclose(near.front_focal_distance, -50, rtol=1e-9)
     np.testing.assert_allclose(near.image_distance, 75, rtol=1e-9)
     np.testing.assert_allclose(near.magnification, -0.5, rtol=1e-9)
-    field = drt_jax.field_of_height([-10.0, 0.0, 10.0], distance)
+    field = field_of_height([-10.0, 0.0, 10.0], distance)
     height = image_height(lens, field, distance, GREEN)
     np.testing.assert_allclose(height, [[5.0], [0.0], [-5.0]], rtol=1e-8)
     np.testing.assert_allclose(far.magnification, 0)
@@ -168,7 +170,7 @@ def test_afocal_lens_is_infinite_and_has_no_nan():
     np.testing.assert_allclose(first_order(lens, 80.0, GREEN).magnification, 1)
 
     def total(lens):
-        sums = third_order(lens, 0.1, jnp.inf, GREEN).total
+        sums = third_order(lens, Scene.point(0.1, jnp.inf, GREEN)).total
         return sum(jnp.sum(a) for a in sums) + jnp.sum(drt_jax.focal_length(lens, GREEN))
 
     gradient = jax.jit(jax.grad(total))(lens)
@@ -251,7 +253,7 @@ def test_image_space_in_water():
     np.testing.assert_allclose(data.front_focal_distance, front, rtol=1e-13)
     np.testing.assert_allclose(data.numerical_aperture, 8 * power, rtol=1e-13)
 
-    rays = trace_rays(lens, 0.0, np.inf, RGB, [[0.0, 1e-4], [0.0, 0.9], [0.6, -0.5]])
+    rays = trace_rays(lens, Scene.point(0.0, np.inf, RGB), [[0.0, 1e-4], [0.0, 0.9], [0.6, -0.5]])
     assert np.all(rays.status == Status.OK)
     points = np.asarray(rays.points)
     step = points[:, 0, 2] - points[:, 0, 1]
@@ -272,7 +274,7 @@ def test_gradients_batches_and_one_program_for_all():
 
     def terms(lens):
         first = drt_jax.first_order(lens, 200.0, COLOURS)
-        total = drt_jax.third_order(lens, 0.1, 200.0, COLOURS).total
+        total = drt_jax.third_order(lens, Scene.point(0.1, 200.0, COLOURS)).total
         return jnp.stack([*first[:7], *first.entrance_pupil, *first.exit_pupil, *total])
 
     weight = jnp.sin(jnp.arange(60.0).reshape(20, 3))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import load_lens, trace_rays
+from drt_jax import Scene, load_lens, trace_rays
 
 from .test_paraxial import CASSEGRAIN, GREEN, IMMERSED, exit_, image_height, third_order
 
@@ -48,7 +48,7 @@ def test_third_order_is_what_real_rays_show_near_the_axis(name):
     is left is t^4 of them, 1e-4."""
     source, distance = THIRD[name]
     lens = load_lens(source)
-    sums = third_order(lens, 0.1, distance, GREEN).total
+    sums = third_order(lens, Scene.point(0.1, distance, GREEN)).total
     plane = drt_jax.first_order(lens, distance, GREEN).image_distance[0]
     lens = dataclasses.replace(lens, sensor=plane)
     ideal = image_height(lens, 0.1, distance, GREEN)[0]
@@ -57,7 +57,7 @@ def test_third_order_is_what_real_rays_show_near_the_axis(name):
     @jax.jit
     def errors(t, field):
         angle = jnp.arctan(jnp.tan(0.1) * t * field)
-        rays = trace_rays(lens, angle, distance, GREEN, t * pupil)
+        rays = trace_rays(lens, Scene.point(angle, distance, GREEN), t * pupil)
         return (rays.points[0, :, -1, :2] - jnp.array([[0, t * field * ideal]])) / t**3
 
     def limit(field):
@@ -76,12 +76,12 @@ def test_third_order_is_what_real_rays_show_near_the_axis(name):
 def test_third_order_of_stigmatic_surfaces_and_of_the_mirror():
     """The Cassegrain of paraboloid and hyperboloid has no spherical aberration, its surfaces
     none by themselves; Petzval's sum takes the mirrors with opposite signs."""
-    parts = third_order(load_lens(CASSEGRAIN), 0.01, np.inf, GREEN)
+    parts = third_order(load_lens(CASSEGRAIN), Scene.point(0.01, np.inf, GREEN))
     np.testing.assert_allclose(parts.spherical[0], 0, atol=1e-15)
     # k of the secondary for magnification 4: -((m + 1) / (m - 1))^2 = -25/9, not -4
     first, second = CASSEGRAIN["surfaces"]
     best = {"surfaces": [first, second | {"conic": -25 / 9}]}
-    total = third_order(load_lens(best), 0.01, np.inf, GREEN).total
+    total = third_order(load_lens(best), Scene.point(0.01, np.inf, GREEN)).total
     np.testing.assert_allclose(total.spherical, 0, atol=1e-14)
     assert abs(parts.total.spherical[0]) > 1e-3
     np.testing.assert_allclose(parts.petzval_curvature[:, 0], [2 / 1000, -6 / 1000])
@@ -98,15 +98,15 @@ def test_third_order_knows_the_stop_by_its_images_only():
     def stop(pupil):
         return {"radius": "inf", "semi_diameter": float(pupil.semi_diameter[0]), "stop": True}
 
-    size = drt_jax.Pupil(np.zeros(1), np.array([3.0]))
+    size = drt_jax.results.Pupil(np.zeros(1), np.array([3.0]))
     for gap in (6.0, 0.0, -1.5):
         front = [stop(size) | {"thickness": gap}, *lens]
         front = load_lens({"surfaces": front, "sensor": 60.0})
         image = exit_(front, GREEN)
         behind = [lens[0], lens[1] | {"thickness": float(image.position[0])}, stop(image)]
         behind = load_lens({"surfaces": behind, "sensor": 60.0})
-        a = third_order(front, 0.1, jnp.inf, GREEN)
-        b = third_order(behind, 0.1, jnp.inf, GREEN)
+        a = third_order(front, Scene.point(0.1, jnp.inf, GREEN))
+        b = third_order(behind, Scene.point(0.1, jnp.inf, GREEN))
         for ours, wanted in zip(a, b, strict=True):
             np.testing.assert_allclose(ours[1:], wanted[:-1], rtol=1e-10, atol=1e-14)
             np.testing.assert_array_equal([ours[0], wanted[-1]], 0)
@@ -123,7 +123,7 @@ def test_third_order_needs_an_axis():
         "thickness": 90.0,
     }
     with pytest.raises(ValueError, match="of the form toroid"):
-        drt_jax.third_order(load_lens({"surfaces": [entry]}), 0.1, np.inf, GREEN)
+        drt_jax.third_order(load_lens({"surfaces": [entry]}), Scene.point(0.1, np.inf, GREEN))
 
 
 @pytest.mark.slow
@@ -136,12 +136,12 @@ def test_third_order_is_that_of_a_centred_lens():
 
         def spherical(moves, name=name):
             given = dataclasses.replace(lens, **{name: jnp.asarray(moves)})
-            return drt_jax.third_order(given, 0.1, np.inf, GREEN).spherical
+            return drt_jax.third_order(given, Scene.point(0.1, np.inf, GREEN)).spherical
 
         with pytest.raises(ValueError, match="no theory for tilted or decentred surfaces"):
             spherical(moved)
         traced = jax.jit(spherical)
         np.testing.assert_array_equal(traced(moved), np.inf)
-        usual = drt_jax.third_order(lens, 0.1, np.inf, GREEN).spherical
+        usual = drt_jax.third_order(lens, Scene.point(0.1, np.inf, GREEN)).spherical
         np.testing.assert_allclose(traced(still), usual, rtol=1e-13)
         np.testing.assert_allclose(spherical(still), usual, rtol=1e-13)

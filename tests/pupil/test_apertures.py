@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Clipped, Gauss, Pattern, Soft, Status, focus_moments, load_lens, trace_rays
+from drt_jax import (
+    Clipped,
+    Gauss,
+    Pattern,
+    Scene,
+    Soft,
+    Status,
+    focus_moments,
+    load_lens,
+    trace_rays,
+)
 
 GREEN = (0.55,)
 R = 2.0
@@ -39,7 +49,7 @@ def test_light_and_spot_of_a_clear_aperture(name):
     # One program for all: of the other shapes there are wide ones.
     wide = {"rectangle": [9.0, 9.0]}, {"ellipse": [9.0, 9.0]}, {"circle": 9.0}
     lens = beam(aperture=[aperture if {*w} < {*aperture} else w for w in wide])
-    found = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Clipped(16, "none"))
+    found = focus_moments(lens, Scene.point(0.0, jnp.inf, GREEN), sampling=Clipped(16, "none"))
     np.testing.assert_allclose(found.throughput, area / (np.pi * R**2), rtol=1e-12)
     np.testing.assert_allclose(found.mean[0], aperture["centre"], atol=1e-11)
     np.testing.assert_allclose(found.spread[0, 0], [*variances, 0], rtol=1e-10, atol=1e-12)
@@ -51,7 +61,7 @@ def test_light_past_a_ring_and_a_bar():
     what they share; their integrals over x in closed form or by a dense rule."""
     hole, bar = 0.66, 0.04
     lens = beam(obscuration=[{"circle": hole}, {"rectangle": [bar, 3.0]}])
-    found = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Clipped(12, "bilateral"))
+    found = focus_moments(lens, Scene.point(0.0, jnp.inf, GREEN), sampling=Clipped(12, "bilateral"))
     nodes, weights = np.polynomial.legendre.leggauss(40)
 
     def part(radius, wide):  # |x| < wide inside of a circle: area and integrals of x^2 and y^2
@@ -69,7 +79,7 @@ def test_light_past_a_ring_and_a_bar():
 def test_no_light_passes_an_obscuration_that_hides_the_stop():
     lens = beam(obscuration=[{"circle": 2.5}, {"rectangle": [0.1, 0.1]}])
     with pytest.raises(ValueError, match="no ray at"):
-        focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Clipped(12, "bilateral"))
+        focus_moments(lens, Scene.point(0.0, jnp.inf, GREEN), sampling=Clipped(12, "bilateral"))
 
 
 # An ellipse before the lens, a bar and a disc on a stop behind it that bends no light.
@@ -90,7 +100,9 @@ CUT = {
 
 
 def blur(lens, field=0.08):
-    found = focus_moments(lens, field, jnp.inf, GREEN, rule=Clipped(12, "bilateral"))
+    found = focus_moments(
+        lens, Scene.point(field, jnp.inf, GREEN), sampling=Clipped(12, "bilateral")
+    )
     spot = found.at(lens.sensor)
     return jnp.concatenate([spot.throughput, spot.mean[0, 1:], jnp.diagonal(spot.covariance[0])])
 
@@ -103,7 +115,7 @@ def cut():
 @pytest.mark.slow
 def test_the_status_of_rays(cut):
     points = np.random.default_rng(1).uniform(-1, 1, (400, 2))
-    rays = trace_rays(cut, (0.05, 0.08), 300.0, GREEN, points)
+    rays = trace_rays(cut, Scene.point((0.05, 0.08), 300.0, GREEN), points)
     x, y = np.moveaxis(np.asarray(rays.points[0, :, :, :2]), -1, 0)
     before = (x[:, 0] / 2.5) ** 2 + ((y[:, 0] - 0.4) / 1.4) ** 2 <= 1
     bar = (np.abs(x[:, 2]) < 0.5) & (np.abs(y[:, 2] - 0.8) < 0.3)
@@ -117,7 +129,7 @@ def test_agrees_with_many_rays_that_drop_out(cut):
     side = (np.arange(400) + 0.5) / 200 - 1
     grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     grid = grid[np.sum(grid**2, axis=1) <= 1]
-    rays = trace_rays(cut, 0.08, jnp.inf, GREEN, grid)
+    rays = trace_rays(cut, Scene.point(0.08, jnp.inf, GREEN), grid)
     hits = np.asarray(rays.points[0, :, -1, :2])[np.asarray(rays.status[0]) == 0]
     share, height, *spread = blur(cut)
     np.testing.assert_allclose(share, len(hits) / len(grid), rtol=2e-3)
@@ -164,7 +176,7 @@ def test_a_telescope_with_a_hole():
     that knows where it is; the error falls with the order as on a disc."""
     lens = load_lens("hubble")
     np.testing.assert_allclose(drt_jax.focal_length(lens, GREEN), 57600, rtol=1e-5)
-    assert drt_jax.symmetry_of(lens, 0.0) == "rotational"
+    assert drt_jax.pupil.symmetry_of(lens, 0.0) == "rotational"
     nodes, weights = np.polynomial.legendre.leggauss(12)
     square = 0.33**2 + (1 - 0.33**2) * (nodes + 1) / 2
     angle = 2 * np.pi * np.arange(24) / 24
@@ -173,10 +185,10 @@ def test_a_telescope_with_a_hole():
     ring = Pattern(points.reshape(2, -1).T, share.ravel())
     whole = dataclasses.replace(lens, apertures=None)
     for field in (0.0, np.radians(5 / 60)):
-        wanted = drt_jax.psf_moments(whole, field, jnp.inf, GREEN, rule=ring)
+        wanted = drt_jax.psf_moments(whole, Scene.point(field, jnp.inf, GREEN), sampling=ring)
         for order, error in ((4, 1e-6), (6, 1e-8)):
             rule = Clipped(order, "bilateral", 10)
-            found = drt_jax.psf_moments(lens, field, jnp.inf, GREEN, rule=rule)
+            found = drt_jax.psf_moments(lens, Scene.point(field, jnp.inf, GREEN), sampling=rule)
             np.testing.assert_allclose(found.throughput, 1 - 0.33**2, rtol=1e-12)
             size = np.trace(wanted.covariance[0]) + 1e-8  # 0.1 um: the spot on axis is smaller
             np.testing.assert_allclose(found.covariance, wanted.covariance, atol=error * size)
@@ -186,8 +198,12 @@ def test_a_telescope_with_a_hole():
 @pytest.mark.slow
 def test_a_rule_does_not_step_over_an_obscuration():
     lens = beam(obscuration={"circle": 0.05})
-    assert isinstance(drt_jax.converged_rule(lens, 0.0, 1e4, GREEN, 1e-3), Clipped)
-    share = focus_moments(lens, 0.0, 1e4, GREEN, rule=Gauss(2, "rotational")).throughput
+    assert isinstance(
+        drt_jax.converge(drt_jax.psf_moments, lens, Scene.point(0.0, 1e4, GREEN), 1e-3), Clipped
+    )
+    share = focus_moments(
+        lens, Scene.point(0.0, 1e4, GREEN), sampling=Gauss(2, "rotational")
+    ).throughput
     np.testing.assert_allclose(share, 1)
 
 
@@ -195,7 +211,11 @@ def test_a_rule_does_not_step_over_an_obscuration():
 def test_soft_edges_tend_to_hard_ones():
     lens = beam(obscuration={"rectangle": [0.5, 0.4]}, aperture={"ellipse": [1.2, 0.9]})
     share = jax.jit(
-        lambda w: focus_moments(lens, 0.0, jnp.inf, GREEN, rule=Soft(40, "bilateral", w)).throughput
+        lambda w: (
+            focus_moments(
+                lens, Scene.point(0.0, jnp.inf, GREEN), sampling=Soft(40, "bilateral", w)
+            ).throughput
+        )
     )
     errors = [abs(float(share(w)[0]) - (0.27 - 0.2 / np.pi)) for w in (0.05, 0.02)]
     assert max(errors) < 1e-3
@@ -203,13 +223,13 @@ def test_soft_edges_tend_to_hard_ones():
 
 def test_symmetry():
     def of(field=0.0, **aperture):
-        return drt_jax.symmetry_of(beam(obscuration=aperture), field)
+        return drt_jax.pupil.symmetry_of(beam(obscuration=aperture), field)
 
     assert of(circle=1.0) == "rotational" and of(circle=1.0, centre=[0, 0]) == "bilateral"
     assert of(rectangle=[1.0, 1.0]) == of(ellipse=[1.0, 0.5], centre=[0, 1]) == "bilateral"
     assert of(circle=1.0, centre=[0.1, 0]) == "none"
     with pytest.raises(ValueError, match="symmetry"):
-        jax.jit(lambda lens: jnp.zeros(len(drt_jax.symmetry_of(lens, 0.0))))(
+        jax.jit(lambda lens: jnp.zeros(len(drt_jax.pupil.symmetry_of(lens, 0.0))))(
             beam(aperture=CLEAR["slit"][0])
         )
 
@@ -256,13 +276,13 @@ def test_polygons_whole_and_with_inward_corners():
         aperture={"polygon": outer.tolist(), "centre": shift.tolist()},
         obscuration={"polygon": inner.tolist(), "centre": shift.tolist()},
     )
-    rule = Clipped(10, drt_jax.symmetry_of(lens, 0.0))
+    rule = Clipped(10, drt_jax.pupil.symmetry_of(lens, 0.0))
 
     @jax.jit
     def found(corners):
         own = dataclasses.replace(lens.apertures, corners=corners)
         moved = dataclasses.replace(lens, apertures=own)
-        points, weights = drt_jax.pupil_points(moved, 0.0, jnp.inf, GREEN, rule)
+        points, weights = drt_jax.pupil.pupil_points(moved, Scene.point(0.0, jnp.inf, GREEN), rule)
         share = jnp.sum(weights[0])
         return jnp.append(share, weights[0] @ points[0] * R / share)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Clipped, Gauss, Soft, focus_moments, load_lens, psf_moments, trace_rays
+from drt_jax import Clipped, Gauss, Scene, Soft, focus_moments, load_lens, psf_moments, trace_rays
 from drt_jax.pupil import hexapolar
 
 from ..known import freed
@@ -36,8 +36,8 @@ SCENES = {
 
 def found(name, order):
     field, lens = SCENES[name]
-    rule = Clipped(order, drt_jax.symmetry_of(lens, field))
-    return focus_moments(lens, field, FAR, GREEN, rule=rule)
+    rule = Clipped(order, drt_jax.pupil.symmetry_of(lens, field))
+    return focus_moments(lens, Scene.point(field, FAR, GREEN), sampling=rule)
 
 
 @pytest.mark.slow
@@ -54,7 +54,9 @@ def test_overlap_of_two_discs():
         }
     )
     tilt = np.arcsin(1.5 * np.sin(np.arctan(0.7 / 20)))  # in the glass: 0.7 mm over 20 mm
-    moments = focus_moments(lens, tilt, jnp.inf, [0.55], rule=Clipped(10, "bilateral"))
+    moments = focus_moments(
+        lens, Scene.point(tilt, jnp.inf, [0.55]), sampling=Clipped(10, "bilateral")
+    )
     half = 0.35  # the front aperture, seen from the stop, lies 0.7 above it
     angle = np.arccos(half)
     area = 2 * (angle - half * np.sin(angle))
@@ -95,7 +97,7 @@ def test_agrees_with_many_rays_that_drop_out():
     side = np.linspace(-1, 1, 301)
     grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     grid = grid[np.sum(grid**2, axis=1) <= 1]
-    rays = trace_rays(lens, field, FAR, GREEN, grid)
+    rays = trace_rays(lens, Scene.point(field, FAR, GREEN), grid)
     hits = np.asarray(rays.points[0, :, -1, :2])[np.asarray(rays.status[0]) == 0]
     moments = found("front and rear", 12)
     spot = moments.at(lens.sensor)
@@ -113,11 +115,11 @@ def test_gradients_follow_the_boundary(name):
     """Against fourth-order differences of the value, also to the semi-diameters themselves."""
     field, lens = SCENES[name]
     weights = jnp.array([1.0, 0.3, 0.3, 0.7])
-    rule = Clipped(10, drt_jax.symmetry_of(lens, field))
+    rule = Clipped(10, drt_jax.pupil.symmetry_of(lens, field))
 
     @jax.jit
     def blur(lens):
-        moments = drt_jax.psf_moments(lens, field, FAR, GREEN, rule=rule)
+        moments = drt_jax.psf_moments(lens, Scene.point(field, FAR, GREEN), sampling=rule)
         mean, covariance = moments.mean, moments.covariance
         return 1e3 * covariance.ravel() @ weights + mean[0, 1]
 
@@ -140,17 +142,23 @@ def test_gradients_follow_the_boundary(name):
 @pytest.mark.slow
 def test_the_rule_that_a_clipped_scene_needs():
     field, lens = SCENES["on axis"]
-    assert isinstance(drt_jax.converged_rule(lens, field, FAR, GREEN, 1e-4), Clipped)
+    assert isinstance(
+        drt_jax.converge(drt_jax.psf_moments, lens, Scene.point(field, FAR, GREEN), 1e-4), Clipped
+    )
 
 
 @pytest.mark.slow
 def test_one_rule_for_a_clipped_field_and_the_axis():
     """A clipped one, also where nothing is clipped."""
     field, lens = SCENES["front"]
-    rule = drt_jax.converged_rule(lens, [[0.0, 0.0], [0.0, field]], FAR, GREEN, 1e-4)
+    rule = drt_jax.converge(
+        drt_jax.psf_moments, lens, Scene.grid([[0.0, 0.0], [0.0, field]], FAR, GREEN), 1e-4
+    )
     assert isinstance(rule, Clipped)
     for angle in (0.0, field):
-        ours, exact = (psf_moments(lens, angle, FAR, GREEN, rule=r) for r in (rule, None))
+        ours, exact = (
+            psf_moments(lens, Scene.point(angle, FAR, GREEN), sampling=r) for r in (rule, 1e-6)
+        )
         np.testing.assert_allclose(ours.covariance, exact.covariance, rtol=2e-4, atol=1e-12)
 
 
@@ -159,7 +167,7 @@ def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
     @jax.jit
     def passed(lens, width):
         rule = Soft(40, "rotational", width)
-        return focus_moments(lens, 0.0, FAR, GREEN, rule=rule).throughput[0]
+        return focus_moments(lens, Scene.point(0.0, FAR, GREEN), sampling=rule).throughput[0]
 
     lens, h = clipped(12.0, 21.0), 1e-4
     hard = found("on axis", 10).throughput[0]
@@ -178,11 +186,11 @@ def test_a_pupil_that_paraxial_optics_does_not_find():
     """A fisheye at 85 degrees, its paraxial entrance pupil far from the real one: the nearest ray
     of a fan leads all others, and the rule finds the stop, which nothing clips."""
     lens, field, green = load_lens("fisheye_8mm"), np.radians(85.0), (0.55,)
-    ours = psf_moments(lens, field, jnp.inf, green, rule=Clipped(10, "bilateral"))
-    theirs = psf_moments(lens, field, jnp.inf, green, rule=Gauss(14, "bilateral"))
+    ours = psf_moments(lens, Scene.point(field, jnp.inf, green), sampling=Clipped(10, "bilateral"))
+    theirs = psf_moments(lens, Scene.point(field, jnp.inf, green), sampling=Gauss(14, "bilateral"))
     np.testing.assert_allclose(ours.throughput, 1, rtol=1e-12)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-12)
-    rays = trace_rays(lens, field, jnp.inf, green, hexapolar(8)[0])
+    rays = trace_rays(lens, Scene.point(field, jnp.inf, green), hexapolar(8)[0])
     assert np.all(rays.status == 0) and rays.newton_steps < 20
 
 
@@ -193,7 +201,9 @@ def test_gradients_in_float32_are_those_in_float64():
 
     def variance(lens):
         rule = Clipped(6, "bilateral")
-        return psf_moments(lens, 0.1, jnp.inf, GREEN, rule=rule).covariance[0, 1, 1]
+        return psf_moments(lens, Scene.point(0.1, jnp.inf, GREEN), sampling=rule).covariance[
+            0, 1, 1
+        ]
 
     optimised = {"xla_backend_optimization_level": 3}
     gradient = jax.jit(jax.grad(variance), compiler_options=optimised)

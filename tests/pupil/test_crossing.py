@@ -10,7 +10,7 @@ import pytest
 from experiments.snell import trace_snell
 
 import drt_jax
-from drt_jax import Clipped, focus_moments, load_lens
+from drt_jax import Clipped, Scene, focus_moments, load_lens
 from drt_jax.lens.order import may_cross
 
 GREEN = (0.55,)
@@ -24,7 +24,7 @@ def wide(semi):
 
 def light(lens, field, rule):
     """What part of the light on the stop passes."""
-    return focus_moments(lens, field, jnp.inf, GREEN, rule=rule).throughput[0]
+    return focus_moments(lens, Scene.point(field, jnp.inf, GREEN), sampling=rule).throughput[0]
 
 
 @pytest.mark.slow
@@ -52,7 +52,7 @@ def overlap(stop, field, curvature, thickness):
 def test_off_axis():
     """Two circles that overlap; derivatives by a complex step, in every mode, the second too."""
     lens, field = wide(18.0), 0.6
-    rule = drt_jax.converged_rule(lens, field, jnp.inf, GREEN, 1e-6)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, Scene.point(field, jnp.inf, GREEN), 1e-6)
     assert rule.order <= 8
     given = (18.0, field, float(lens.curvature[1]), float(lens.thickness[1]))
     wanted = overlap(*given)
@@ -136,7 +136,7 @@ def test_a_thin_gap_inside_of_a_lens():
     lens, field = load_lens({"surfaces": surfaces, "sensor": 60.0}), 0.1
     semi = jnp.full(6, jnp.inf).at[4].set(12.0)
     lens = dataclasses.replace(lens, semi_diameter=semi)
-    rule = drt_jax.converged_rule(lens, field, jnp.inf, GREEN, 1e-6)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, Scene.point(field, jnp.inf, GREEN), 1e-6)
     assert rule.order <= 8
 
     def moved(gap):
@@ -144,7 +144,7 @@ def test_a_thin_gap_inside_of_a_lens():
 
     @jax.jit
     def ours(gap):
-        found = drt_jax.psf_moments(moved(gap), field, jnp.inf, GREEN, rule=rule)
+        found = drt_jax.psf_moments(moved(gap), Scene.point(field, jnp.inf, GREEN), sampling=rule)
         return jnp.stack([found.throughput[0], jnp.sqrt(jnp.trace(found.covariance[0]))])
 
     h = 1e-3

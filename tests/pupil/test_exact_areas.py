@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import focus_moments, load_lens
+from drt_jax import Scene, focus_moments, load_lens
 
 from ..known import freed
 
@@ -102,7 +102,7 @@ def found(lens, rule):
     """The same of a lens, and the derivatives by its apertures and its stop."""
 
     def of(lens):
-        moments = focus_moments(lens, 0.0, jnp.inf, GREEN, rule=rule)
+        moments = focus_moments(lens, Scene.point(0.0, jnp.inf, GREEN), sampling=rule)
         found = moments.at(4.0)
         (xx, xy), (_, yy) = found.covariance[0]
         return jnp.stack([found.throughput[0], *found.mean[0], xx, yy, xy])
@@ -131,7 +131,7 @@ def test_three_obscurations_that_overlap(name):
     ).T.reshape(slopes.shape)
     change[0, 0, 0] -= 2 * wanted[0] / R  # of the share of a stop that is wider
 
-    rule = drt_jax.converged_rule(lens, 0.0, jnp.inf, GREEN, 1e-6)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, Scene.point(0.0, jnp.inf, GREEN), 1e-6)
     ours, gradient = found(lens, rule)
     assert name != "a crescent" or 0.04 < wanted[0] < 0.06
     np.testing.assert_allclose(ours[0], wanted[0], rtol=1e-6)

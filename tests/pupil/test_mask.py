@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import drt_jax
-from drt_jax import Gauss, Mask, Masked, Pattern, PsfModel, load_lens, psf, psf_moments
+from drt_jax import Gauss, Mask, Masked, Pattern, Sampling, Scene, load_lens, psf, psf_moments
 from drt_jax.image.beam import beam_rule
+from drt_jax.lens.scene import fitted
 from drt_jax.pupil import square_grid
 
 RNG = np.random.default_rng(0)
@@ -45,18 +45,18 @@ def test_means_over_boxes():
 
 
 def test_what_a_mask_cannot_be_is_refused():
-    model = PsfModel("rays", beam_rule(4, "rotational"), 32)
+    model = Sampling("rays", beam_rule(4, "rotational"), 32)
     flat = jnp.ones((4, 4))
     with pytest.raises(ValueError, match=r"expected an amplitude \(N, M\) or \(W, N, M\)"):
         model.masked(Mask(jnp.ones(4)))
     with pytest.raises(ValueError, match=r"got \(4, 4\) and \(4, 3\)"):
         model.masked(Mask(flat, flat[:, :3]))
-    with pytest.raises(ValueError, match='a mask with a path in the model "rays"'):
+    with pytest.raises(ValueError, match='a mask with a path in the kind "rays"'):
         model.masked(Mask(flat, flat))
-    with pytest.raises(ValueError, match='a mask in the model "gaussian"'):
-        PsfModel("gaussian", model.rule, 0).masked(Mask(flat))
+    with pytest.raises(ValueError, match='a mask in the kind "gaussian"'):
+        Sampling("gaussian", model.rule, 0).masked(Mask(flat))
     assert model.masked(Mask(flat)).cells == 32 and model.masked(Mask(flat), 99).cells == 99
-    lens, scene = lens_of(), drt_jax.scene_of(lens_of(), 0.0, jnp.inf, [GREEN])
+    lens, scene = lens_of(), fitted(lens_of(), Scene.point(0.0, jnp.inf, [GREEN]))
     with pytest.raises(ValueError, match='of the symmetry "none"'):
         Masked(Gauss(3, "bilateral"), Mask(flat)).points(lens, scene)
     with pytest.raises(ValueError, match="a path acts on waves alone"):
@@ -68,7 +68,7 @@ def test_light_and_middle_of_the_rays_of_a_mask():
     side = 256  # of the sum in NumPy; the rays are those of 64
     lens, mask = lens_of(), Mask(jnp.asarray(CODE))
     rule = Masked(Pattern(*square_grid(64), "none"), mask)
-    found = psf_moments(lens, 0.0, jnp.inf, [GREEN], rule=rule)
+    found = psf_moments(lens, Scene.point(0.0, jnp.inf, [GREEN]), sampling=rule)
     line = (np.arange(side) + 0.5) / side * 2 - 1
     inside = line**2 + line[:, None] ** 2 < 1
     light = inside * np.kron(CODE**2, np.ones((side // 8, side // 8)))
@@ -100,13 +100,15 @@ def test_kernel_by_waves_of_a_coded_phase_plate():
     """Amplitudes and paths at random, in `jit`: the kernel is Fraunhofer's, the light that of the
     pixels on the disc, and the derivative by both that of differences."""
     lens, pixel, size = lens_of(phase=True), 0.004, 31
-    model = PsfModel("waves", beam_rule(8, "rotational"), 32)
+    model = Sampling("waves", beam_rule(8, "rotational"), 32)
     mask = Mask(jnp.asarray(CODE), jnp.asarray(RNG.uniform(0, 3e-4, (8, 8))))
     weights = jnp.asarray(RNG.uniform(size=(size, size)))
 
     def found(mask):
         made = model.masked(mask, 128)
-        one = psf(lens, 0.0, jnp.inf, [GREEN], pixel, size, model=made, centre=(0.0, 0.0))
+        one = psf(
+            lens, Scene.point(0.0, jnp.inf, [GREEN]), pixel, size, sampling=made, centre=(0.0, 0.0)
+        )
         return jnp.sum(weights * one.kernel[0]), (one.kernel[0], one.throughput[0])
 
     program = jax.jit(jax.value_and_grad(found, has_aux=True))

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drt_jax import Status, scene_of
+from drt_jax import Scene, Status
+from drt_jax.lens.scene import fitted
 
 from ..known import aims, bendable, known, search
 from .systems import COLOURS, lens_with
@@ -21,7 +22,7 @@ def problem(name):
     """A lens, a scene, points and the rays through them."""
     stop, tilted, dim = PROBLEMS[name]
     lens, points = bendable(lens_with(stop, tilted)), POINTS[2 - dim :]
-    scene = scene_of(lens, [0.03, -0.05] if dim == 2 else 0.08, 300.0, COLOURS)
+    scene = fitted(lens, Scene.point([0.03, -0.05] if dim == 2 else 0.08, 300.0, COLOURS))
     found = search(lens, scene, points)
     assert np.all(found.status == Status.OK)
     return lens, scene, points, found

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from experiments.snell import trace_snell
 
-from drt_jax import Status, load_lens, pupil, scene_of
+from drt_jax import Scene, Status, load_lens, pupil
+from drt_jax.lens.scene import fitted
 from drt_jax.rays import find, solve
 from drt_jax.rays.bundle import tile_of
 from drt_jax.rays.trace import trace_bundle
@@ -29,7 +30,7 @@ def points():
 
 
 def scene(lens, field=FIELD):
-    return scene_of(lens, field, 25e3, WAVES)
+    return fitted(lens, Scene.point(field, 25e3, WAVES))
 
 
 @pytest.fixture(scope="module")

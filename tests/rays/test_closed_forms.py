@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Status, load_lens, trace_rays
+from drt_jax import Scene, Status, load_lens, trace_rays
 
 from .traced import behind_stop, directions, on_y
 
@@ -47,7 +47,7 @@ def test_c18_stigmatic_surfaces(name, gap):
     lens = behind_stop(surfaces, gap * far, aperture)
 
     def errors(lens, pupil):
-        return trace_rays(lens, 0.0, INF, [0.55], pupil).points[0, :, -1, :2]
+        return trace_rays(lens, Scene.point(0.0, INF, [0.55]), pupil).points[0, :, -1, :2]
 
     value, slope = jax.jit(lambda lens, p: (errors(lens, p), jax.jacrev(errors, 1)(lens, p)))(
         lens, on_y(*HEIGHTS)
@@ -66,7 +66,7 @@ def test_c18_aplanatic_point():
     distance = 50 / 3 - 5  # to the stop plane
 
     def image(pupil):
-        points = trace_rays(lens, 0.0, distance, [0.55], pupil).points[0]
+        points = trace_rays(lens, Scene.point(0.0, distance, [0.55]), pupil).points[0]
         step = points[:, 2] - points[:, 1]
         at = points[:, 2, :2] + step[:, :2] / step[:, 2:] * (5 - 25 - points[:, 2, 2:])
         return at, points
@@ -86,7 +86,7 @@ def test_c19_plane_parallel_plate():
     """A ray at 30 degrees through 10 mm of n = 1.5 shifts by 3.8762756430420553 mm."""
     plate = [{"radius": INF, "index": 1.5, "thickness": 10.0}, {"radius": INF, "thickness": 20.0}]
     lens = behind_stop(plate, 10.0, 5.0)
-    ray = trace_rays(lens, np.pi / 6, INF, [0.55], on_y(0.2)).points[0, 0]
+    ray = trace_rays(lens, Scene.point(np.pi / 6, INF, [0.55]), on_y(0.2)).points[0, 0]
     straight = ray[0, 1] + np.tan(np.pi / 6) * 40.0
     shift = (straight - ray[-1, 1]) / np.tan(np.pi / 6)
     np.testing.assert_allclose(shift, 3.8762756430420553, atol=1e-12)
@@ -105,7 +105,7 @@ def test_c19_ball_lens_and_thick_lens(front, back, thickness, wanted):
     )
     ours = drt_jax.focal_length(lens, jnp.array([0.55]))
     np.testing.assert_allclose(ours, wanted, atol=1e-12)
-    points = np.asarray(trace_rays(lens, 0.0, INF, [0.55], on_y(1e-4)).points[0])
+    points = np.asarray(trace_rays(lens, Scene.point(0.0, INF, [0.55]), on_y(1e-4)).points[0])
     slope = directions(points)[0, -1, 1]
     np.testing.assert_allclose(-1e-4 / slope, wanted, rtol=1e-7)
 
@@ -118,7 +118,7 @@ def test_c19_critical_angle():
     )
     critical = np.radians(41.810314895778596)
     for angle, wanted in ((critical - 1e-6, Status.OK), (critical + 1e-6, Status.TIR)):
-        rays = trace_rays(lens, angle, INF, [0.55], on_y(0.0))
+        rays = trace_rays(lens, Scene.point(angle, INF, [0.55]), on_y(0.0))
         assert rays.status.item() == wanted
 
 
@@ -136,7 +136,9 @@ def test_p11_defocused_paraboloid(cases, gap):
 
     def variance(defocus):
         moved = dataclasses.replace(lens, sensor=lens.sensor - defocus)
-        spot = drt_jax.psf_moments(moved, 0.0, INF, [0.55], rule=drt_jax.Gauss(14, "rotational"))
+        spot = drt_jax.psf_moments(
+            moved, Scene.point(0.0, INF, [0.55]), sampling=drt_jax.Gauss(14, "rotational")
+        )
         return spot.covariance[0, 1, 1]
 
     both = jax.jit(jax.value_and_grad(variance))

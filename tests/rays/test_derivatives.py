@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import Status, load_lens, pupil
+from drt_jax import Scene, Status, load_lens, pupil
 from drt_jax.image.moments import weigh
-from drt_jax.lens.scene import scene_of
+from drt_jax.lens.scene import fitted
 from drt_jax.pupil.rules import Gauss
 from drt_jax.rays.fermat import arrival, optical_path
 from drt_jax.rays.find import Found
@@ -190,9 +190,8 @@ itself proved against 50-digit central differences. Written by
 
     python -m pytest tests/rays/test_derivatives.py -m "" --write-tables
 
-Colours {WAVELENGTHS[0]} and {WAVELENGTHS[1]} um; moments by `psf_moments(..., \
-rule=Gauss({ORDER}, symmetry))`, paths of {len(POINTS)} rays by
-`trace_rays`. Each number is the largest, over the elements of the output and of the array of
+Colours {WAVELENGTHS[0]} and {WAVELENGTHS[1]} um; moments of `Gauss({ORDER}, symmetry)`, paths of
+{len(POINTS)} rays. Each number is the largest, over the elements of the output and of the array of
 the parameter, of |ours - reference| / max(|reference|, 1e-4 x the largest |reference| of that
 array for that element of the output). 0: both are exactly 0, or equal. Both modes agree within
 1e-10 of the largest element. `schott`, `strength` and `resonance` are the constants of the
@@ -268,7 +267,7 @@ def hits_of(lens, scene, nodes):
 
 def scene_from(arguments):
     field = arguments.get("field", 0.0)
-    return scene_of(arguments["lens"], field, arguments["distance"], WAVELENGTHS)
+    return fitted(arguments["lens"], Scene.point(field, arguments["distance"], WAVELENGTHS))
 
 
 def of_row(tree, row):

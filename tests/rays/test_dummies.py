@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import Gauss, Status, load_lens, psf_moments, trace_rays
+from drt_jax import Gauss, Scene, Status, load_lens, psf_moments, trace_rays
 
 from .. import oracle
 from .traced import WAVELENGTHS, assert_same_rays, hexapolar, truth
@@ -46,7 +46,7 @@ def test_steep_dummy_before_the_stop(radius, semi_diameter, field):
     """The truth is where a line meets a sphere: OK inside the aperture, CLIPPED outside, MISSED
     beside the sphere; points on the ray to 1e-10 mm."""
     lens = before_the_stop(radius, semi_diameter)
-    rays = trace_rays(lens, field, np.inf, WAVELENGTHS, POINTS)
+    rays = trace_rays(lens, Scene.point(field, np.inf, WAVELENGTHS), POINTS)
     stop = np.concatenate([4 * POINTS, np.full((len(POINTS), 1), 12.0)], axis=1)
     hit, meets = crossing(radius, stop, np.tile([0, np.sin(field), np.cos(field)], (len(stop), 1)))
     inside = np.hypot(*hit[:, :2].T) <= semi_diameter
@@ -61,9 +61,9 @@ def test_steep_dummy_before_the_stop(radius, semi_diameter, field):
 @pytest.mark.slow
 def test_the_rays_behind_do_not_know_of_a_dummy():
     """Without the dummy: the same points, path and directions to 1e-12."""
-    with_it = trace_rays(before_the_stop(10.0, 9.9), 0.6, np.inf, WAVELENGTHS, POINTS)
+    with_it = trace_rays(before_the_stop(10.0, 9.9), Scene.point(0.6, np.inf, WAVELENGTHS), POINTS)
     lens = load_lens({"surfaces": [STOP, *PLATE]})
-    without = trace_rays(lens, 0.6, np.inf, WAVELENGTHS, POINTS)
+    without = trace_rays(lens, Scene.point(0.6, np.inf, WAVELENGTHS), POINTS)
     points = np.asarray(without.points) + np.array([0, 0, 12.0])
     np.testing.assert_allclose(with_it.points[:, :, 1:], points, rtol=0, atol=1e-12)
     np.testing.assert_allclose(with_it.directions[:, :, 1:], without.directions, atol=1e-12)
@@ -92,7 +92,7 @@ def test_scattered_dummies_and_a_curved_stop(field):
     """Every crossing as the oracle has it, to 1e-10 mm; and what misses one is MISSED."""
     lens = load_lens({"surfaces": SCATTERED})
     scene = oracle.Scene.of(lens, field, 200.0, WAVELENGTHS)
-    rays = trace_rays(lens, field, 200.0, WAVELENGTHS, POINTS)
+    rays = trace_rays(lens, Scene.point(field, 200.0, WAVELENGTHS), POINTS)
     wanted = truth(scene, POINTS)
     edge = np.append(lens.semi_diameter[:-1], np.inf)
     edge[lens.stop] = np.inf
@@ -109,7 +109,9 @@ SHAPE = ("curvature", "conic", "coefficients")
 @jax.jit
 @jax.grad
 def by_the_lens(lens):
-    return jnp.sum(psf_moments(lens, 0.1, 200.0, 0.55, rule=Gauss(3, "bilateral")).covariance)
+    return jnp.sum(
+        psf_moments(lens, Scene.point(0.1, 200.0, 0.55), sampling=Gauss(3, "bilateral")).covariance
+    )
 
 
 @pytest.mark.slow

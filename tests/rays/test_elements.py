@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import Gauss, focus_moments, load_lens, psf_moments, trace_rays, wavefront
+from drt_jax import Gauss, Scene, focus_moments, load_lens, psf_moments, trace_rays, wavefront
 
 INF = float("inf")
 PUPIL = np.array([[0, 0], [0.5, 0], [-0.3, 0.8], [0.1, -0.9]])
@@ -40,8 +40,8 @@ def test_one_surface_about_its_vertex_is_its_own_tilt_and_decentre():
     group = lens_with({"surfaces": [3, 3], "tilt": tilt, "shift": [*shift, 0.0]})
     rows = [dict(row) for row in SURFACES]
     rows[3] |= {"tilt": tilt, "decentre": shift}
-    ours = trace_rays(group, 0.05, INF, 0.55, PUPIL)
-    theirs = trace_rays(load_lens({"surfaces": rows}), 0.05, INF, 0.55, PUPIL)
+    ours = trace_rays(group, Scene.point(0.05, INF, 0.55), PUPIL)
+    theirs = trace_rays(load_lens({"surfaces": rows}), Scene.point(0.05, INF, 0.55), PUPIL)
     np.testing.assert_allclose(ours.points, theirs.points, atol=1e-12)
     np.testing.assert_allclose(ours.path, theirs.path, atol=1e-11)
 
@@ -52,8 +52,10 @@ def test_the_whole_lens_turned_is_the_light_turned():
     back = rotation(MOVE["tilt"]).T
     field = (0.02, 0.06)
     direction = back @ [np.tan(field[0]), np.tan(field[1]), 1]
-    ours = trace_rays(turned, field, INF, 0.55, PUPIL)
-    theirs = trace_rays(lens_with(), np.arctan(direction[:2] / direction[2]), INF, 0.55, PUPIL)
+    ours = trace_rays(turned, Scene.point(field, INF, 0.55), PUPIL)
+    theirs = trace_rays(
+        lens_with(), Scene.point(np.arctan(direction[:2] / direction[2]), INF, 0.55), PUPIL
+    )
     pivot = np.array([0, 0, MOVE["pivot"]])
     own = (np.asarray(ours.points) - pivot - MOVE["shift"]) @ back.T + pivot
     np.testing.assert_allclose(own, theirs.points, atol=1e-11)
@@ -65,7 +67,7 @@ def test_a_tilted_plate_shifts_a_beam():
     rows = [plane | {"stop": True, "semi_diameter": 2.0}, plane | {"index": 1.5}, plane]
     angle = 25.0
     lens = lens_with({"surfaces": [1, 2], "tilt": [angle, 0, 0], "pivot": 7.0}, surfaces=rows)
-    rays = trace_rays(lens, 0.0, INF, 0.55, PUPIL)
+    rays = trace_rays(lens, Scene.point(0.0, INF, 0.55), PUPIL)
     sine, cosine = np.sin(np.radians(angle)), np.cos(np.radians(angle))
     moved = 20.0 * sine * (1 - cosine / np.sqrt(1.5**2 - sine**2))
     shift = np.asarray(rays.points[0, :, -1] - rays.points[0, :, 0])
@@ -77,8 +79,8 @@ def test_a_tilted_plate_shifts_a_beam():
 @pytest.mark.slow
 def test_a_sphere_turns_about_its_centre_without_effect():
     about = lens_with({"surfaces": [2, 2], "pivot": -129.9, "tilt": [2.0, 1.0, 0.0]})
-    ours = trace_rays(about, 0.05, INF, 0.55, PUPIL)
-    theirs = trace_rays(lens_with(), 0.05, INF, 0.55, PUPIL)
+    ours = trace_rays(about, Scene.point(0.05, INF, 0.55), PUPIL)
+    theirs = trace_rays(lens_with(), Scene.point(0.05, INF, 0.55), PUPIL)
     np.testing.assert_allclose(ours.points, theirs.points, atol=1e-11)
 
 
@@ -93,10 +95,10 @@ def test_a_folding_mirror_changes_no_image():
         {"surfaces": [6, "sensor"], "about": 5, "tilt": [90.0, 0, 0]},
         surfaces=[*rows, {"radius": INF, "thickness": -1e-3}],
     )
-    ours = trace_rays(folded, (0.02, 0.05), INF, 0.55, PUPIL)
+    ours = trace_rays(folded, Scene.point((0.02, 0.05), INF, 0.55), PUPIL)
     plain = [dict(row) for row in SURFACES]
     plain[4]["thickness"] = 35.0 + 1e-3
-    theirs = trace_rays(lens_with(surfaces=plain), (0.02, 0.05), INF, 0.55, PUPIL)
+    theirs = trace_rays(lens_with(surfaces=plain), Scene.point((0.02, 0.05), INF, 0.55), PUPIL)
     image, straight = (np.asarray(rays.points[0, :, -1]) for rays in (ours, theirs))
     z = 6 + 2.5 + 30 + 3 + 15
     np.testing.assert_allclose(image[:, 0], straight[:, 0], atol=1e-12)
@@ -138,7 +140,9 @@ def test_coordinate_breaks_lie_where_another_program_puts_them():
 @pytest.mark.slow
 def test_the_chief_ray_of_a_grating_spectrometer_goes_where_another_program_found_it():
     """It solved the decentres for the chief ray at 550 nm to 13 digits."""
-    rays = trace_rays(spectrometer(-1), 0.0, 181.3611490362, (0.45, 0.55, 0.65), [[0.0, 0.0]])
+    rays = trace_rays(
+        spectrometer(-1), Scene.point(0.0, 181.3611490362, (0.45, 0.55, 0.65)), [[0.0, 0.0]]
+    )
     assert np.all(rays.status == 0)
     point, toward = np.asarray(rays.points[1, 0]), np.asarray(rays.directions[1, 0])
     # It followed the chief ray to the vertex planes of the mirrors, at z = 0.
@@ -175,7 +179,7 @@ def test_a_held_sensor_moves_as_its_elements_turn_it(name):
 
     def focus(sensor):
         moved = dataclasses.replace(lens, sensor=jnp.asarray(sensor))
-        return focus_moments(moved, (0.02, 0.06), INF, 0.55, rule=Gauss(4, "none"))
+        return focus_moments(moved, Scene.point((0.02, 0.06), INF, 0.55), sampling=Gauss(4, "none"))
 
     ours = focus(lens.sensor).at(lens.sensor + 1.5)
     wanted = focus(lens.sensor + 1.5).at(lens.sensor + 1.5)
@@ -188,13 +192,14 @@ def test_a_sensor_turned_by_an_element_is_one_that_is_tilted():
     lens = lens_with(*HELD["alone"])
     tilted = load_lens({"surfaces": SURFACES, "sensor_tilt": [10.0, 0, 0]})
     ours, theirs = (
-        focus_moments(a, 0.06, INF, 0.55, rule=Gauss(4, "none")) for a in (lens, tilted)
+        focus_moments(a, Scene.point(0.06, INF, 0.55), sampling=Gauss(4, "none"))
+        for a in (lens, tilted)
     )
     np.testing.assert_allclose(ours.slope, theirs.slope, atol=1e-14)
     np.testing.assert_allclose(ours.spread, theirs.spread, rtol=1e-11, atol=1e-15)
     np.testing.assert_allclose(
-        wavefront(lens, 0.06, INF, 0.55, PUPIL).opd,
-        wavefront(tilted, 0.06, INF, 0.55, PUPIL).opd,
+        wavefront(lens, Scene.point(0.06, INF, 0.55), PUPIL).opd,
+        wavefront(tilted, Scene.point(0.06, INF, 0.55), PUPIL).opd,
         atol=1e-9,
     )
 
@@ -203,7 +208,7 @@ def test_elements_that_move_with_the_sensor_have_no_polynomials():
     """Surfaces turned about the sensor move where it moves."""
     turned = lens_with({"surfaces": [3, 4], "about": "sensor", "tilt": [1.0, 0, 0]})
     with pytest.raises(ValueError, match=r"elements\[0\]: .* about the sensor"):
-        focus_moments(turned, 0.0, INF, 0.55, rule=Gauss(2, "none"))
+        focus_moments(turned, Scene.point(0.0, INF, 0.55), sampling=Gauss(2, "none"))
 
 
 @pytest.mark.slow
@@ -214,7 +219,9 @@ def test_derivatives_by_every_move():
 
         def outputs(elements, lens=lens):
             found = psf_moments(
-                dataclasses.replace(lens, elements=elements), 0.05, INF, 0.55, rule=Gauss(4, "none")
+                dataclasses.replace(lens, elements=elements),
+                Scene.point(0.05, INF, 0.55),
+                sampling=Gauss(4, "none"),
             )
             return jnp.concatenate([found.mean.ravel(), found.covariance.ravel()])
 

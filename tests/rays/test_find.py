@@ -8,7 +8,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from drt_jax import Gauss, Status, load_lens, spot_diagram, trace_rays
+from drt_jax import Gauss, Scene, Status, load_lens, spot_diagram, trace_rays
 from drt_jax.pupil import hexapolar
 from drt_jax.rays import aim, fermat, find, linear
 
@@ -113,7 +113,9 @@ def test_a_polish_that_takes_one_step_shorter_than_rounding_of_a_mm():
     lens = load_lens({"surfaces": bent, "sensor": 1.0})
     lens = dataclasses.replace(lens, sensor=jnp.asarray(2.03e-4))
     field = (-0.20932616, 0.06755307)
-    rays = trace_rays(lens, field, 200.0, (0.55,), np.array([[0, 0], [0.5, 0], [0.1, 0.2]]))
+    rays = trace_rays(
+        lens, Scene.point(field, 200.0, (0.55,)), np.array([[0, 0], [0.5, 0], [0.1, 0.2]])
+    )
     assert np.all(rays.status == Status.OK)
     np.testing.assert_allclose(rays.points[0, 0, 2, :2], 0, atol=1e-18)
 
@@ -175,7 +177,7 @@ def test_several_rays_that_are_sought():
     rows = [dict(zip(names, row, strict=True)) for row in zip(radius, gap, index, strict=True)]
     rows[-1] |= {"stop": True, "semi_diameter": 8.1456}
     points = [[0, 0], [0, 1], [0, -1], [1, 0], [-0.113, 0.078], [0.866, 0.282], [0.648, -0.427]]
-    rays = trace_rays(load_lens({"surfaces": rows}), 0.23138, 1e3, [0.55], points)
+    rays = trace_rays(load_lens({"surfaces": rows}), Scene.point(0.23138, 1e3, [0.55]), points)
     assert np.all(rays.status == Status.OK)
 
 
@@ -197,11 +199,11 @@ def test_where_neighbouring_surfaces_cross_a_ray_is_told_so():
     plane = start + (2 - sag) * np.tan(inside)
     stop = plane + 4 * np.tan(np.arcsin(1.5 * np.sin(inside)))
     pupil = np.stack([0 * stop, stop / 10], axis=-1)
-    rays = trace_rays(lens, 0.0, np.inf, 0.55, pupil)
+    rays = trace_rays(lens, Scene.point(0.0, np.inf, 0.55), pupil)
     crossed = start**2 > 20**2 - 18**2
     np.testing.assert_array_equal(rays.status[0], np.where(crossed, Status.CROSSED, Status.OK))
     np.testing.assert_allclose(rays.points[0, ~crossed, 0, 1], start[~crossed], atol=1e-12)
-    found = spot_diagram(lens, [0.0], np.inf, 0.55, Gauss(4, "rotational"))
+    found = spot_diagram(lens, Scene.radians([0.0], np.inf, 0.55), Gauss(4, "rotational"))
     rings = np.concatenate([hexapolar(6)[0], [[0, 1]] * 48])
     edge = np.interp(np.sqrt(76), start, stop) / 10
     share = np.mean(np.linalg.norm(rings, axis=1) > edge)

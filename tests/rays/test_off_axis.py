@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import Status, load_lens, trace_rays
+from drt_jax import Scene, Status, load_lens, trace_rays
 
 SOURCE, FAR = np.array([0.0, 0.0, -50.0]), 100.0
 PUPIL = np.array([[0, 0], [0, 1], [0, -1], [0.6, -0.3], [-1, 0]], float)
@@ -99,7 +99,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_rays_from_a_focus(name, flipped):
     lens, points, behind, path = from_focus(*CASES[name], flipped)
-    rays = trace_rays(lens, 0.0, 50.0, (0.55,), PUPIL)
+    rays = trace_rays(lens, Scene.point(0.0, 50.0, (0.55,)), PUPIL)
     np.testing.assert_array_equal(rays.status, Status.OK)
     np.testing.assert_allclose(rays.points[0, :, 1], points, atol=1e-10)
     np.testing.assert_allclose(rays.directions[0, :, -1], behind, atol=1e-12)
@@ -113,7 +113,7 @@ def test_a_beam_to_the_focus(turn, flipped):
     leaving = turned(turn)
     focus, focal = 50.0 * Z + FAR * leaving, FAR * (1 - leaving[2]) / 2
     lens = mirror(focus + focal * Z, -Z, 2 * focal, -1.0, focus, leaving, 2.5, flipped)
-    rays = trace_rays(lens, 0.0, np.inf, (0.55,), PUPIL)
+    rays = trace_rays(lens, Scene.point(0.0, np.inf, (0.55,)), PUPIL)
     np.testing.assert_array_equal(rays.status, Status.OK)
     np.testing.assert_allclose(rays.points[0, :, -1], np.tile(focus, (5, 1)), atol=1e-12)
     np.testing.assert_allclose(np.ptp(np.asarray(rays.path)), 0, atol=1e-12)
@@ -127,7 +127,7 @@ def test_derivatives_of_hits_by_the_tilt_of_the_mirror(name):
 
     def hits(angle):
         moved = dataclasses.replace(lens, tilt=lens.tilt.at[1, 0].add(angle))
-        return trace_rays(moved, 0.0, 50.0, (0.55,), PUPIL).points[0, :, -1, 1:]
+        return trace_rays(moved, Scene.point(0.0, 50.0, (0.55,)), PUPIL).points[0, :, -1, 1:]
 
     wanted = (hits(1e-5) - hits(-1e-5)) / 2e-5
     for mode in (jax.jacfwd, jax.jacrev):
@@ -146,6 +146,8 @@ def test_a_lens_behind_a_fold_mirror_may_have_its_axis_either_way(turn):
     ]
     rows[2]["thickness"] = 0.0
     place = {"sensor": 20.0, "sensor_decentre": [0, 114.0], "sensor_tilt": [turn, 0, 0]}
-    rays = trace_rays(load_lens({"surfaces": rows, **place}), 0.0, np.inf, (0.55,), PUPIL)
+    rays = trace_rays(
+        load_lens({"surfaces": rows, **place}), Scene.point(0.0, np.inf, (0.55,)), PUPIL
+    )
     np.testing.assert_array_equal(rays.status, Status.OK)
     np.testing.assert_allclose(rays.points[0, :, -1, 1:], [[114.0, 20.0]] * 5, atol=0.01)

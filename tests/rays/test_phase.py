@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Gauss, Status, focal_length, load_lens, psf_moments, trace_rays, wavefront
+from drt_jax import (
+    Gauss,
+    Scene,
+    Status,
+    focal_length,
+    load_lens,
+    psf_moments,
+    trace_rays,
+    wavefront,
+)
 
 from ..known import bendable
 
@@ -37,7 +46,7 @@ def test_the_grating_equation_in_and_out_of_plane(order, mirror):
     phase = {"form": "linear", "order": order, "coefficients": {"y": lines}}
     behind = {"mirror": True, "thickness": -10.0} if mirror else {"index": 1.6, "thickness": 10.0}
     lens = load_lens({"surfaces": [STOP, {"radius": INF, "phase": phase} | behind]})
-    rays = trace_rays(lens, (0.1, 0.25), INF, COLOURS, PUPIL)
+    rays = trace_rays(lens, Scene.point((0.1, 0.25), INF, COLOURS), PUPIL)
     assert np.all(rays.status == Status.OK)
     before, after = (np.asarray(rays.directions[:, :, k]) for k in (1, 2))
     index = 1.0 if mirror else 1.6
@@ -52,13 +61,13 @@ def test_the_grating_equation_in_and_out_of_plane(order, mirror):
 def test_an_evanescent_order_is_totally_reflected():
     phase = {"form": "linear", "coefficients": {"y": 1700.0}}
     lens = load_lens({"surfaces": [STOP, {"radius": INF, "phase": phase, "thickness": 10.0}]})
-    rays = trace_rays(lens, 0.0, INF, COLOURS, PUPIL)
+    rays = trace_rays(lens, Scene.point(0.0, INF, COLOURS), PUPIL)
     np.testing.assert_array_equal(rays.status[:2], Status.OK)  # 0.83 and 0.9988
     np.testing.assert_array_equal(rays.status[2], Status.TIR)
     assert all(np.all(np.isfinite(part)) for part in rays)
 
     def total(lens):
-        return jnp.sum(trace_rays(lens, 0.0, INF, COLOURS[2:], PUPIL).points)
+        return jnp.sum(trace_rays(lens, Scene.point(0.0, INF, COLOURS[2:]), PUPIL).points)
 
     slopes = jax.tree.leaves(jax.grad(total)(lens))
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
@@ -69,9 +78,11 @@ def test_a_zone_plate_is_stigmatic_and_its_focal_length_falls_with_the_wavelengt
     f, design = 50.0, COLOURS[1]
     lens = zone_plate(f, design, 12)
     np.testing.assert_allclose(focal_length(lens, COLOURS), f * design / COLOURS, rtol=1e-13)
-    rays = trace_rays(lens, 0.0, INF, design, PUPIL)
+    rays = trace_rays(lens, Scene.point(0.0, INF, design), PUPIL)
     np.testing.assert_allclose(rays.points[0, :, -1, :2], 0, atol=1e-12)
-    np.testing.assert_allclose(wavefront(lens, 0.0, INF, design, PUPIL).opd, 0, atol=1e-8)
+    np.testing.assert_allclose(
+        wavefront(lens, Scene.point(0.0, INF, design), PUPIL).opd, 0, atol=1e-8
+    )
     # The third order has a third of the focal length.
     third = dataclasses.replace(lens, phase=dataclasses.replace(lens.phase, order=jnp.array([3.0])))
     np.testing.assert_allclose(focal_length(third, COLOURS), f * design / COLOURS / 3, rtol=1e-13)
@@ -82,7 +93,7 @@ def test_a_mirror_of_phase_focuses_like_a_paraboloid():
     f, design = 50.0, 0.6
     lens = zone_plate(f, design, 12, mirror=True, thickness=-f)
     np.testing.assert_allclose(focal_length(lens, [design]), -f, rtol=1e-13)
-    rays = trace_rays(lens, 0.0, INF, design, PUPIL)
+    rays = trace_rays(lens, Scene.point(0.0, INF, design), PUPIL)
     np.testing.assert_allclose(rays.points[0, :, -1, :2], 0, atol=1e-12)
 
 
@@ -151,10 +162,10 @@ def test_rays_are_stationary_and_their_derivatives_right(form, base, stop):
     at = {"field": jnp.array([0.03, 0.08]), "colours": jnp.asarray(COLOURS[:2])}
 
     def outputs(lens, at):
-        rays = trace_rays(lens, at["field"], 200.0, at["colours"], PUPIL)
+        rays = trace_rays(lens, Scene.point(at["field"], 200.0, at["colours"]), PUPIL)
         return jnp.concatenate([rays.points[:, :, -1, :2].ravel(), rays.path.ravel()])
 
-    rays = trace_rays(lens, at["field"], 200.0, at["colours"], PUPIL)
+    rays = trace_rays(lens, Scene.point(at["field"], 200.0, at["colours"]), PUPIL)
     assert np.all(rays.status == Status.OK)
     given = lens, at
     ours = jax.jit(jax.jacfwd(outputs, argnums=(0, 1)))(*given)
@@ -184,11 +195,11 @@ def test_rays_are_stationary_and_their_derivatives_right(form, base, stop):
 @pytest.mark.slow
 def test_a_hybrid_needs_one_radius_on_the_axis():
     lens = hybrid("asphere", "asphere", 0)
-    assert drt_jax.symmetry_of(lens, 0.0) == "rotational"
-    assert drt_jax.symmetry_of(hybrid("linear", "plane", 2), 0.0) == "bilateral"
-    assert drt_jax.symmetry_of(hybrid("polynomial_xy", "plane", 2), 0.0) == "none"
-    short = psf_moments(lens, 0.0, INF, COLOURS, 1e-9)
-    long = psf_moments(lens, 0.0, INF, COLOURS, rule=Gauss(12, "none"))
+    assert drt_jax.pupil.symmetry_of(lens, 0.0) == "rotational"
+    assert drt_jax.pupil.symmetry_of(hybrid("linear", "plane", 2), 0.0) == "bilateral"
+    assert drt_jax.pupil.symmetry_of(hybrid("polynomial_xy", "plane", 2), 0.0) == "none"
+    short = psf_moments(lens, Scene.point(0.0, INF, COLOURS), 1e-9)
+    long = psf_moments(lens, Scene.point(0.0, INF, COLOURS), sampling=Gauss(12, "none"))
     np.testing.assert_allclose(short.covariance, long.covariance, rtol=1e-8, atol=1e-14)
 
 
@@ -201,7 +212,7 @@ def test_a_phase_of_nothing_changes_nothing():
     plain = load_lens({"surfaces": rows})
     rows[1] = rows[1] | {"phase": {"coefficients": {2: 0.0}}}
     lenses = load_lens({"surfaces": rows}), plain
-    ours, theirs = (trace_rays(lens, 0.1, INF, COLOURS, PUPIL) for lens in lenses)
+    ours, theirs = (trace_rays(lens, Scene.point(0.1, INF, COLOURS), PUPIL) for lens in lenses)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-13), ours, theirs)
 
 
@@ -224,4 +235,4 @@ def test_a_bad_phase_is_named(phase, message):
 
 def test_third_order_theory_knows_no_phase():
     with pytest.raises(ValueError, match="no theory for diffractive surfaces"):
-        drt_jax.third_order(zone_plate(50.0, 0.5, 1), 0.1, INF, COLOURS)
+        drt_jax.third_order(zone_plate(50.0, 0.5, 1), Scene.point(0.1, INF, COLOURS))

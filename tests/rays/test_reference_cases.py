@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Status, load_lens, pupil, trace_rays
+from drt_jax import Scene, Status, load_lens, pupil, trace_rays
 from drt_jax.lens.forms import Shape
 from drt_jax.lens.lens import Labels
-from drt_jax.lens.paraxial import trace_yu
+from drt_jax.lens.paraxial import image_height, trace_yu
 from drt_jax.lens.surface import sag_derivatives, surface_sag
 
 from .. import oracle
@@ -57,7 +57,7 @@ def test_c01_marginal_ray(cases, gap):
     incidence: of the second, in degrees. The rim of the first surface lies 5.9 mm behind its
     vertex, so that it pokes through a stop that is nearer."""
     lens = behind_stop(double_gauss(cases), gap, 25.0)
-    rays = trace_rays(lens, 0.0, INF, [0.5876], on_y(1.0, 0.8, 0.6, 0.4))
+    rays = trace_rays(lens, Scene.point(0.0, INF, [0.5876]), on_y(1.0, 0.8, 0.6, 0.4))
     points = np.asarray(rays.points[0, 0, 1:])
     d = np.asarray(rays.directions[0, 0, 1:])
     vertex = np.asarray(lens.vertices[1:])
@@ -82,11 +82,11 @@ def test_c01_ray_errors_and_path_differences(cases):
     reference = cases["C01"]["reference"]
     parts = reference["dx_mm"]
     labelled = behind_stop(double_gauss(cases), 10.0, 25.0)
-    rays = trace_rays(labelled, 0.0, INF, [0.5876], on_y(*map(float, parts)))
+    rays = trace_rays(labelled, Scene.point(0.0, INF, [0.5876]), on_y(*map(float, parts)))
     np.testing.assert_allclose(rays.points[0, :, -1, 1], [*parts.values()], atol=5.1e-7)
     lens = double_gauss_lens(cases)
     pupil = rays.points[0, :, 6, :2] / lens.semi_diameter[5]
-    wave = drt_jax.wavefront(lens, 0.0, INF, [0.5876], pupil)
+    wave = drt_jax.wavefront(lens, Scene.point(0.0, INF, [0.5876]), pupil)
     assert np.all(wave.status == Status.OK)
     np.testing.assert_allclose(wave.opd[0], [*reference["opd_waves"].values()], atol=0.002)
 
@@ -96,7 +96,7 @@ def test_c02_first_order_data(cases):
     reference = cases["C02"]["reference"]
     lens, d = double_gauss_lens(cases), jnp.array([0.5876])
     first = drt_jax.first_order(lens, INF, d)
-    height = drt_jax.image_height(lens, np.radians(14), INF, d)
+    height = image_height(lens, np.radians(14), INF, d)
     entrance, leaving = reference["entrance_pupil"], reference["exit_pupil"]
     pairs = [
         (first.focal_length, reference["EFL"]),
@@ -136,7 +136,7 @@ def test_c02_paraxial_rays(cases):
         suffix = "_14deg" if name == "chief" else ""
         np.testing.assert_allclose(y[:, 0], reference[f"y_{name}{suffix}"], atol=6e-7)
         np.testing.assert_allclose(u[:, 0], reference[f"u_{name}_after"], atol=6e-7)
-    rays = trace_rays(lens, 0.0, INF, d, on_y(1e-4))
+    rays = trace_rays(lens, Scene.point(0.0, INF, d), on_y(1e-4))
     heights = rays.points[0, 0, :-1, 1] / 1e-4
     np.testing.assert_allclose(heights, reference["y_marginal"], atol=1.5e-6)
 
@@ -145,7 +145,7 @@ def test_c02_third_order_sums(cases):
     """Transverse, in mm: half a unit of the sixth decimal."""
     lens = double_gauss_lens(cases)
     colours = jnp.array([0.6563, 0.5876, 0.4861])
-    total = drt_jax.third_order(lens, np.radians(14), INF, colours).total
+    total = drt_jax.third_order(lens, Scene.point(np.radians(14), INF, colours)).total
     printed = cases["C02"]["reference"]["third_order_transverse_sums_mm"]
     assert list(printed) == ["SA", "TCO", "TAS", "SAS", "PTB", "DST", "AX", "LAT", "PTZ"]
     np.testing.assert_allclose([a[1] for a in total], [*printed.values()], atol=5.1e-7)
@@ -178,7 +178,7 @@ def test_c08_rays(cases, lsst, name):
     rows = np.array(cases["C08"]["reference"]["rays"][name])[:, 1:]
     start, cosines = rows[0, :3], rows[:, 3:]
     field = np.arctan(cosines[0, :2] / cosines[0, 2])
-    rays = trace_rays(lsst, field, INF, [0.5], [start[:2] / 4180.0])
+    rays = trace_rays(lsst, Scene.point(field, INF, [0.5]), [start[:2] / 4180.0])
     assert rays.status.item() == Status.OK
     points = np.asarray(rays.points[0, 0])
     np.testing.assert_allclose(points + np.array([0, 0, start[2]]), rows[:, :3], atol=1e-6)
@@ -196,7 +196,7 @@ def test_c08_whole_pupil(cases, lsst):
     assert np.all(wanted.exists)
     depth = wanted.points[0, :, 1, 2]
     assert -2e-5 < np.min(depth) < 0 and np.max(depth) > 400
-    assert_same_rays(trace_rays(lsst, field, INF, [0.5], points), wanted, 1e-8)
+    assert_same_rays(trace_rays(lsst, Scene.point(field, INF, [0.5]), points), wanted, 1e-8)
 
 
 # C13: a toroid, Zemax through Optiland's tests.
@@ -219,7 +219,7 @@ def test_c13_toroid(cases, gap):
     }
     lens = behind_stop([toroid, {"radius": INF, "thickness": 10.0}], gap, 5.0)
     starts = np.array([ray["start"] for ray in reference["rays"]])
-    rays = trace_rays(lens, 0.0, INF, [0.55], starts / 5.0)
+    rays = trace_rays(lens, Scene.point(0.0, INF, [0.55]), starts / 5.0)
     points = np.asarray(rays.points[0])
     ours = {"x": points[:, -1, 0], "y": points[:, -1, 1]}
     ours |= dict(zip("LMN", directions(points)[:, -1].T))
@@ -256,7 +256,7 @@ def test_c16_wyld_achromat(cases):
     foci, slopes = {}, {}
     for line in LINES:
         lens = wyld(entry, line)
-        points = np.asarray(trace_rays(lens, 0.0, INF, [0.55], on_y(1.0)).points[0])
+        points = np.asarray(trace_rays(lens, Scene.point(0.0, INF, [0.55]), on_y(1.0)).points[0])
         foci[line] = focus(points, lens.vertices[-2])[0]
         slopes[line] = np.arcsin(-directions(points)[0, -1, 1])
     lens = wyld(entry, "D")
@@ -300,7 +300,7 @@ def test_p01_ray_fan(cases, p01):
     """Transverse errors to 1e-10 um."""
     fan = np.array(cases["P01"]["reference"]["tangential_fan_py_ey_um"])
     both = np.concatenate([fan, -fan])  # it is odd
-    rays = trace_rays(p01, 0.0, INF, [0.543], on_y(*both[:, 0]))
+    rays = trace_rays(p01, Scene.point(0.0, INF, [0.543]), on_y(*both[:, 0]))
     assert np.all(rays.status == Status.OK)
     np.testing.assert_allclose(1e3 * rays.points[0, :, -1, 1], both[:, 1], rtol=0, atol=1e-10)
     np.testing.assert_allclose(rays.points[0, :, -1, 0], 0, atol=1e-15)
@@ -329,7 +329,7 @@ def test_p01_wavefront(cases, p01):
     reference = cases["P01"]["reference"]
     points, weights = pupil.disc(8, 9)
     edge = on_y(*np.linspace(0, 1, 401))
-    wave = drt_jax.wavefront(p01, 0.0, INF, [0.543], np.concatenate([points, edge]))
+    wave = drt_jax.wavefront(p01, Scene.point(0.0, INF, [0.543]), np.concatenate([points, edge]))
     assert np.all(wave.status == Status.OK)
     opd = np.asarray(wave.opd[0, : len(weights)])
     t = np.sum(points**2, axis=-1)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from experiments.snell import trace_snell
 
-from drt_jax import Status, first_order, load_lens, pupil, sag, scene_of, trace_rays
+from drt_jax import Scene, Status, first_order, load_lens, pupil, sag, trace_rays
 from drt_jax.lens.forms import FORMS
 from drt_jax.lens.lens import Labels
+from drt_jax.lens.scene import fitted
 from drt_jax.rays.trace import _trace, trace_bundle
 
 from ..conftest import LENSES, RGB, assert_close
@@ -86,7 +87,7 @@ def test_hits_agree_with_snell_to_1e_11_mm(name):
     for distance in (np.inf, 25000.0, 400.0):
         for degrees in (0.0, 5.0, 10.0):
             field = np.radians(degrees)
-            rays = trace_rays(lens, field, distance, RGB, POINTS)
+            rays = trace_rays(lens, Scene.point(field, distance, RGB), POINTS)
             assert np.all(rays.status == Status.OK)
             assert against_snell(lens, rays, field, distance, RGB) < 1e-11
 
@@ -124,7 +125,10 @@ def test_forms_that_equal_others_have_the_same_gradients():
         load_lens({"surfaces": [front, *({"radius": "inf"} | a | b for a, b in zip(media, forms))]})
         for forms in ([*rows, {}], [*others, {}])
     )
-    points, scene = tuple(POINTS.T), scene_of(lens, jnp.array([0.05, 0.1]), 500.0, RGB[:1])
+    points, scene = (
+        tuple(POINTS.T),
+        fitted(lens, Scene.point(jnp.array([0.05, 0.1]), 500.0, RGB[:1])),
+    )
     found = search(lens, scene, points)
     assert np.all(found.status == Status.OK)
 
@@ -148,8 +152,8 @@ def test_float32_hits_within_a_tenth_of_a_micrometre():
     lens = load_lens("double_gauss")
     single = jax.tree.map(lambda a: a.astype(jnp.float32), lens)
     for distance in (np.inf, 25000.0):
-        exact = trace_rays(lens, 0.17, distance, RGB, POINTS)
-        rays = trace_rays(single, 0.17, distance, RGB, POINTS)
+        exact = trace_rays(lens, Scene.point(0.17, distance, RGB), POINTS)
+        rays = trace_rays(single, Scene.point(0.17, distance, RGB), POINTS)
         assert rays.points.dtype == jnp.float32 and np.all(rays.status == Status.OK)
         assert np.max(np.abs(rays.points - np.asarray(exact.points, np.float32))) < 1e-4
 
@@ -158,7 +162,9 @@ def test_distance_is_continuous_to_infinity():
     lens = load_lens("double_gauss")
 
     def hits(distance):
-        return np.asarray(trace_rays(lens, 0.1, distance, RGB, POINTS).points[:, :, -1])
+        return np.asarray(
+            trace_rays(lens, Scene.point(0.1, distance, RGB), POINTS).points[:, :, -1]
+        )
 
     near, far = hits(1e9), hits(np.inf)
     slope = (hits(1e5) - far) * 1e5  # by 1/distance, to 1e-4 of it
@@ -201,8 +207,8 @@ def with_dummy(lens, gap, curvature):
 def test_a_surface_that_does_nothing_drops_out(gap, curvature):
     lens = load_lens("double_gauss")
     padded = with_dummy(lens, gap, curvature)
-    wanted = trace_rays(lens, 0.15, 25000.0, RGB, POINTS)
-    rays = trace_rays(padded, 0.15, 25000.0, RGB, POINTS)
+    wanted = trace_rays(lens, Scene.point(0.15, 25000.0, RGB), POINTS)
+    rays = trace_rays(padded, Scene.point(0.15, 25000.0, RGB), POINTS)
     assert rays.newton_steps == wanted.newton_steps
     real = [k for k in range(13) if k != gap + 1]
     points = np.asarray(rays.points)
@@ -221,9 +227,9 @@ def singlet(**changes):
 
 
 def test_a_clear_aperture_clips_and_changes_no_other_ray():
-    free = trace_rays(SINGLET, 0.0, 25000.0, RGB, HEIGHTS)
+    free = trace_rays(SINGLET, Scene.point(0.0, 25000.0, RGB), HEIGHTS)
     narrow = singlet(semi_diameter=[5.0, 4.0, 12.5, np.inf])
-    rays = trace_rays(narrow, 0.0, 25000.0, RGB, HEIGHTS)
+    rays = trace_rays(narrow, Scene.point(0.0, 25000.0, RGB), HEIGHTS)
     clipped = np.abs(np.asarray(free.points[:, :, 1, 1])) > 4
     assert 0 < np.sum(clipped) < 60
     np.testing.assert_array_equal(rays.status, np.where(clipped, Status.CLIPPED, Status.OK))
@@ -232,7 +238,7 @@ def test_a_clear_aperture_clips_and_changes_no_other_ray():
 
 def test_failed_rays_carry_a_status_and_no_nan():
     steep = singlet(semi_diameter=[80.0, np.inf, np.inf, np.inf])
-    rays = trace_rays(steep, 0.0, jnp.inf, RGB, HEIGHTS)
+    rays = trace_rays(steep, Scene.point(0.0, jnp.inf, RGB), HEIGHTS)
     status = np.asarray(rays.status)
     assert np.all(status[:, 9:11] == Status.OK) and np.all(status[:, 0] == Status.MISSED)
     for a in (rays.points, rays.directions, rays.path):
@@ -253,7 +259,7 @@ def test_failed_rays_change_no_gradient():
     @jax.jit
     def gradient(lens, colours, weights):
         def total(lens):
-            rays = trace_rays(lens, 0.0, jnp.inf, colours, HEIGHTS)
+            rays = trace_rays(lens, Scene.point(0.0, jnp.inf, colours), HEIGHTS)
             height = jnp.sum(rays.points[..., 1] ** 2, axis=-1)
             return jnp.sum(weights * (height + rays.path)), rays.status
 
@@ -271,18 +277,18 @@ def test_failed_rays_change_no_gradient():
 
 def test_bad_requests():
     with pytest.raises(ValueError, match="one angle or two"):
-        trace_rays(SINGLET, [0.0, 0.1, 0.2], jnp.inf, RGB, HEIGHTS)
+        trace_rays(SINGLET, Scene.point([0.0, 0.1, 0.2], jnp.inf, RGB), HEIGHTS)
     with pytest.raises(ValueError, match="distance: expected one number"):
-        trace_rays(SINGLET, 0.0, [1.0, 2.0], RGB, HEIGHTS)
+        trace_rays(SINGLET, Scene.point(0.0, [[1.0, 2.0]], RGB), HEIGHTS)
     with pytest.raises(ValueError, match="N-BK7"):
-        trace_rays(SINGLET, 0.0, jnp.inf, [0.1], HEIGHTS)
+        trace_rays(SINGLET, Scene.point(0.0, jnp.inf, [0.1]), HEIGHTS)
 
 
 def test_directions_and_paraxial_launch():
     """A lens whose stop is its first surface: its entrance pupil is the stop itself, so that
     aiming at it paraxially finds the same rays; directions are those between the points."""
     for distance in (jnp.inf, 400.0):
-        rays = trace_rays(SINGLET, 0.1, distance, RGB, HEIGHTS)
+        rays = trace_rays(SINGLET, Scene.point(0.1, distance, RGB), HEIGHTS)
         start, direction = launch_paraxial(SINGLET, 0.1, distance, RGB[0], jnp.asarray(HEIGHTS))
         np.testing.assert_allclose(direction, rays.directions[0, :, 0], atol=1e-14)
         hits, ok = snell(SINGLET, jnp.asarray(RGB[0], float), start, direction)
@@ -298,7 +304,9 @@ def test_bundles_of_nearly_as_many_rays_share_a_program():
     """Outside of `jit`, in eager derivatives too: each ray is what it is in any bundle."""
 
     def arrive(field, count):
-        return trace_rays(SINGLET, field, jnp.inf, RGB, HEIGHTS[:count]).points[:, :, -1, 1]
+        return trace_rays(SINGLET, Scene.point(field, jnp.inf, RGB), HEIGHTS[:count]).points[
+            :, :, -1, 1
+        ]
 
     many, programs = arrive(0.1, 20), _trace.program()._cache_size()
     for count in (17, 18, 19):
@@ -318,7 +326,7 @@ def test_the_chief_ray_alone_through_a_stop_at_the_first_mirror():
     ]
     rows[0]["semi_diameter"] = 20.0
     lens = load_lens({"surfaces": rows, "sensor": 10.0})
-    alone = trace_rays(lens, 0.002, np.inf, [0.5], [[0, 0]])
-    both = trace_rays(lens, 0.002, np.inf, [0.5], [[0, 0], [0, 0.5]])
+    alone = trace_rays(lens, Scene.point(0.002, np.inf, [0.5]), [[0, 0]])
+    both = trace_rays(lens, Scene.point(0.002, np.inf, [0.5]), [[0, 0], [0, 0.5]])
     assert alone.status[0, 0] == both.status[0, 0] == Status.OK
     np.testing.assert_allclose(alone.points[0, 0], both.points[0, 0], atol=1e-13)

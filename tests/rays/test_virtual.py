@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Status, load_lens, trace_rays
+from drt_jax import Scene, Status, load_lens, trace_rays
 
 from .traced import behind_stop, on_y
 
@@ -40,13 +40,13 @@ DISTANCE = R * (1 + 1 / N) - GAP
 @pytest.mark.slow
 def test_an_aplanatic_virtual_image(virtual):
     """All rays seem to come from one point, run forwards and have one path."""
-    rays = trace_rays(virtual, 0.0, DISTANCE, [0.55], on_y(*HEIGHTS))
+    rays = trace_rays(virtual, Scene.point(0.0, DISTANCE, [0.55]), on_y(*HEIGHTS))
     np.testing.assert_array_equal(rays.status, Status.OK)
     np.testing.assert_allclose(rays.points[0, :, -1, :2], 0, atol=1e-12)
     np.testing.assert_allclose(np.ptp(np.asarray(rays.path)), 0, atol=1e-12)
     slope = np.sin(np.arctan(HEIGHTS / DISTANCE)) / N
     np.testing.assert_allclose(rays.directions[0, :, -1, 1], slope, atol=1e-12)
-    behind = trace_rays(seen_from_air(20.0), 0.0, DISTANCE, [0.55], on_y(*HEIGHTS))
+    behind = trace_rays(seen_from_air(20.0), Scene.point(0.0, DISTANCE, [0.55]), on_y(*HEIGHTS))
     np.testing.assert_allclose(rays.directions[0, :, -1], behind.directions[0, :, -1], atol=1e-14)
     further = np.linalg.norm(behind.points[0, :, -1] - rays.points[0, :, -1], axis=-1)
     np.testing.assert_allclose(behind.path[0] - rays.path[0], further, atol=1e-12)
@@ -58,7 +58,7 @@ def test_an_aplanatic_virtual_object():
     rows = [{"radius": R, "index": N, "thickness": R * (1 + 1 / N)}]
     lens = behind_stop(rows, GAP, 1.0)
     distance = -(R * (1 + N) + GAP)
-    rays = trace_rays(lens, 0.0, distance, [0.55], on_y(*HEIGHTS))
+    rays = trace_rays(lens, Scene.point(0.0, distance, [0.55]), on_y(*HEIGHTS))
     np.testing.assert_array_equal(rays.status, Status.OK)
     np.testing.assert_allclose(rays.points[0, :, -1, :2], 0, atol=1e-12)
     np.testing.assert_allclose(np.ptp(np.asarray(rays.path)), 0, atol=1e-12)
@@ -77,7 +77,7 @@ def test_derivatives_of_virtual_images(virtual):
             virtual, curvature=virtual.curvature.at[1].set(curvature), sensor=sensor
         )
         found = drt_jax.psf_moments(
-            lens, 0.01, DISTANCE, [0.55], rule=drt_jax.Gauss(4, "bilateral")
+            lens, Scene.point(0.01, DISTANCE, [0.55]), sampling=drt_jax.Gauss(4, "bilateral")
         )
         return jnp.stack([found.mean[0, 1], found.covariance[0, 1, 1]])
 
@@ -101,14 +101,14 @@ def test_a_negative_lens_focuses_where_paraxial_optics_says():
     with pytest.warns(UserWarning, match=VIRTUAL):
         lens = load_lens({"surfaces": rows, "sensor": "focus"})
     np.testing.assert_allclose(lens.sensor, 2.0 - 50.0, rtol=1e-12)
-    rays = trace_rays(lens, 0.0, np.inf, [0.55], on_y(-1.0, 0.5, 1.0))
+    rays = trace_rays(lens, Scene.point(0.0, np.inf, [0.55]), on_y(-1.0, 0.5, 1.0))
     np.testing.assert_array_equal(rays.status, Status.OK)
     np.testing.assert_allclose(rays.points[0, :, -1, :2], 0, atol=1e-8)
 
 
 def test_no_object_at_the_first_vertex(virtual):
     with pytest.raises(ValueError, match=r"distance: must be 1e-06 mm or more.*got 1e-07"):
-        trace_rays(virtual, 0.0, 1e-7, [0.55], on_y(0.0))
+        trace_rays(virtual, Scene.point(0.0, 1e-7, [0.55]), on_y(0.0))
 
 
 @pytest.mark.slow
@@ -117,7 +117,9 @@ def test_minus_infinity_is_infinity():
 
     @jax.jit
     def found(lens, distance):
-        rays = drt_jax.trace_rays(lens, 0.05, distance, [0.55], [[0.0, 0.0], [0.3, 0.7]])
+        rays = drt_jax.trace_rays(
+            lens, Scene.point(0.05, distance, [0.55]), [[0.0, 0.0], [0.3, 0.7]]
+        )
         first = drt_jax.first_order(lens, distance, [0.55])
         return rays.points, rays.path, rays.status, first
 

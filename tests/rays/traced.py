@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drt_jax import Status, load_lens, trace_rays
+from drt_jax import Scene, Status, load_lens, trace_rays
 
 from .. import oracle
 from ..known import bendable, freed
@@ -36,7 +36,7 @@ def rays_and_derivatives(lens, field, distance, pupil, chosen):
 @functools.partial(jax.jit, static_argnames="chosen")
 def _both(lens, field, distance, pupil, chosen):
     def outputs(lens, field):
-        rays = trace_rays(bendable(lens), field, distance, WAVELENGTHS, pupil)
+        rays = trace_rays(bendable(lens), Scene.point(field, distance, WAVELENGTHS), pupil)
         picked = jnp.array(chosen)
         at = rays.points[0, picked, -1, :2]
         return jnp.concatenate([at, rays.path[0, picked, None]], axis=1).ravel(), rays

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import first_order, load_lens, show
+from drt_jax import Scene, first_order, load_lens, show
 from drt_jax.show import layout
 
 FOLDED = {
@@ -33,7 +33,7 @@ PHONE = {
 
 @pytest.fixture(scope="module")
 def folded():
-    return show.draw(load_lens(FOLDED), [0.0, 0.05])
+    return show.draw(load_lens(FOLDED), Scene.radians([0.0, 0.05]))
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_a_folded_lens(folded):
 def test_a_lens_without_apertures_is_drawn_to_its_rays():
     lens = load_lens(PHONE)
     semi = jnp.full_like(lens.semi_diameter, jnp.inf).at[0].set(1.0)
-    drawn = show.draw(dataclasses.replace(lens, semi_diameter=semi), 0.1)
+    drawn = show.draw(dataclasses.replace(lens, semi_diameter=semi), Scene.radians(0.1))
     (fan,) = drawn.rays
     reach = max(np.max(np.abs(path[1:-1, 1])) for path in fan)
     np.testing.assert_allclose(np.max(drawn.glass[0][:, 1]), 1.1 * reach)
@@ -81,7 +81,7 @@ def test_a_lens_is_drawn_to_its_clear_apertures_and_a_mirror_with_its_hole():
 @pytest.mark.slow
 @pytest.mark.parametrize("distance", [np.inf, 40.0])
 def test_a_stop_that_pokes_through_a_surface_is_drawn_and_is_no_corner_of_a_ray(distance):
-    drawn = show.draw(load_lens(PHONE), 0.1, distance)
+    drawn = show.draw(load_lens(PHONE), Scene.radians(0.1, distance))
     for side, blade in zip((-1, 1), drawn.stop, strict=True):
         np.testing.assert_allclose(blade[:, 0], 0, atol=1e-12)
         assert blade[0, 1] == side and abs(blade[1, 1]) > 1
@@ -124,7 +124,7 @@ def test_the_edges_of_a_vignetted_beam_are_drawn():
     """Its lower edge ray passes at the rim of the plane before the stop, its upper one at that of
     the surface behind it; both are rays more than the fan has."""
     lens = load_lens(RIMS)
-    axial, oblique = show.draw(lens, [0.0, 0.1]).rays
+    axial, oblique = show.draw(lens, Scene.radians([0.0, 0.1])).rays
     assert len(axial) == 7
     heights = [path[1:, 1] for path in axial]
     reach = np.max(np.abs([height[0] for height in heights]))
@@ -142,7 +142,7 @@ def test_the_edges_of_a_vignetted_beam_are_drawn():
 def test_the_light_between_an_obscuration_and_the_rim_has_four_edges():
     faces = [dict(face) for face in RIMS["surfaces"]]
     faces[0]["obscuration"] = {"circle": 2.0}
-    (fan,) = show.draw(load_lens(RIMS | {"surfaces": faces}), 0.0, rays=3).rays
+    (fan,) = show.draw(load_lens(RIMS | {"surfaces": faces}), Scene.radians(0.0), rays=3).rays
     ends = sorted(path[1, 1] for path in fan)
     np.testing.assert_allclose(ends, [-5.0, -2.0, 2.0, 5.0], atol=1e-6)
 
@@ -150,7 +150,7 @@ def test_the_light_between_an_obscuration_and_the_rim_has_four_edges():
 @pytest.mark.slow
 def test_a_steep_ray_does_not_leave_the_picture():
     """It begins where it has come twice as far as the plane before the lens is away."""
-    axial, steep = show.draw(load_lens("fisheye_8mm"), [0.0, 1.3], rays=3).rays
+    axial, steep = show.draw(load_lens("fisheye_8mm"), Scene.radians([0.0, 1.3]), rays=3).rays
     begin, corner = steep[1][:2]
     assert np.tan(1.3) == pytest.approx((corner[1] - begin[1]) / (corner[0] - begin[0]))
     assert np.hypot(*(corner - begin)) == pytest.approx(2 * (corner[0] - axial[1][0, 0]))
@@ -160,13 +160,13 @@ def test_a_steep_ray_does_not_leave_the_picture():
 @pytest.mark.parametrize("tilted", [False, True])
 def test_a_beam_tells_who_clips_it_and_where_it_is_sharp(tilted):
     more = {"sensor_tilt": [0, 0, 0]} if tilted else {}
-    beam = layout.beam_of(load_lens(RIMS | more), 0.1, np.inf, 0.55)
+    beam = layout.beam_of(load_lens(RIMS | more), Scene.point(0.1, np.inf, 0.55))
     assert beam.clipping == [0, 2] and not beam.ends
     lens = load_lens({"surfaces": [{"radius": 50, "glass": "N-BK7", "semi_diameter": 1,
                                     "stop": True, "thickness": 2}, {"radius": "inf"}],
                       "sensor": 60} | more)  # fmt: skip
     focus = float(first_order(lens, np.inf, 0.55).image_distance[0])
-    beam = layout.beam_of(lens, 0.0, np.inf, 0.55)
+    beam = layout.beam_of(lens, Scene.point(0.0, np.inf, 0.55))
     assert beam.clipping == beam.ends == []
     assert 60 + beam.shift == pytest.approx(focus, abs=0.05) and beam.best < 1e-4
     # A cone of f/N has an RMS radius of defocus / (2 N) / sqrt(2).

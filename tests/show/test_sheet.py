@@ -8,7 +8,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 import drt_jax
-from drt_jax import show
+from drt_jax import Scene, show
 from drt_jax.show import analyses
 from drt_jax.show.figures import FIELD_COLOURS
 
@@ -48,14 +48,14 @@ def test_labels_of_an_afocal_lens_name_angles():
 
 @pytest.mark.slow
 def test_curves_hold_the_numbers():
-    bent = drt_jax.distortion(LENS, *SCENE)
+    bent = drt_jax.distortion(LENS, Scene.radians(*SCENE))
     _, axes = show.new()
     show.distortion(axes, bent, SCENE[0], WAVES)
     *curves, _ = axes.lines
     assert len(curves) == 3
     np.testing.assert_allclose(curves[0].get_xdata(), 100 * np.asarray(bent.relative)[:, 0])
     np.testing.assert_allclose(curves[0].get_ydata(), np.degrees(SCENE[0]))
-    foci = drt_jax.field_curvature(LENS, *SCENE)
+    foci = drt_jax.field_curvature(LENS, Scene.radians(*SCENE))
     _, axes = show.new()
     show.field_curvature(axes, foci, SCENE[0], WAVES)
     styles = [line.get_linestyle() for line in axes.lines[:6]]
@@ -66,12 +66,12 @@ def test_curves_hold_the_numbers():
 def test_what_is_not_finite_is_left_out():
     """A spot without light, a fan whose ends are clipped."""
     lens = dataclasses.replace(LENS, semi_diameter=LENS.semi_diameter.at[0].set(5.0))
-    fans = drt_jax.ray_fans(lens, [0.0, 0.3], np.inf, WAVES, 9)
+    fans = drt_jax.ray_fans(lens, Scene.radians([0.0, 0.3], np.inf, WAVES), 9)
     _, axes = show.new()
     show.fan(axes, fans, 1, WAVES)
     drawn = axes.lines[0].get_ydata()
     assert np.any(np.isnan(drawn)) and np.any(np.isfinite(drawn))
-    found = drt_jax.spot_diagram(LENS, *SCENE, drt_jax.Gauss(4, "bilateral"))
+    found = drt_jax.spot_diagram(LENS, Scene.radians(*SCENE), drt_jax.Gauss(4, "bilateral"))
     dark = dataclasses.replace(
         found,
         points=jnp.full_like(found.points, jnp.inf),
@@ -93,6 +93,6 @@ def test_a_sheet_has_all_panels():
     """Also of the axis alone, and of a lens that passes no light at one of its fields."""
     for fields, count in (([0.0, 0.1, 0.2, 0.3], 16), ([0.0], 10)):
         said: list[str] = []
-        figure = show.sheet(LENS, fields, np.inf, WAVES, say=said.append)
+        figure = show.sheet(LENS, Scene.radians(fields, np.inf, WAVES), say=said.append)
         assert len(figure.axes) == count and said[-1] == "drawing"
         assert len(figure._repr_png_()) > 20_000
