@@ -162,7 +162,7 @@ def _merit(lens: drt_jax.Lens) -> float:
     ring = ((i, np.pi * j / (3 * i)) for i in range(1, 6) for j in range(6 * i))
     points = np.array([0, *(i / 5 * np.exp(1j * angle) for i, angle in ring)])
     rule = Pattern(np.stack([points.real, points.imag], axis=-1), np.full(91, 1 / 91))
-    found = drt_jax.psf_moments(lens, 0.0, math.inf, np.array([0.55]), rule=rule)
+    found = drt_jax.psf_moments(lens, drt_jax.Scene.point(0.0, math.inf, 0.55), rule)
     return float(np.trace(np.asarray(found.covariance)[0]))
 
 

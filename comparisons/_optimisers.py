@@ -19,8 +19,7 @@ from experiments.design import Config
 from jax import Array
 from tqdm import tqdm
 
-import drt_jax
-from drt_jax import design
+from drt_jax import design, learn
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design.gaps import between
 
@@ -86,7 +85,7 @@ def marquardt(task: Task, vector: Array) -> Way:
 
 
 def adam(task: Task, vector: Array) -> Way:
-    """`drt_jax.adam` on the sum of the same squares, numbers clipped to their bounds after each of
+    """`learn.adam` on the sum of the same squares, numbers clipped to their bounds after each of
     `steps`, over which the rate falls to 0. What is counted are gradients."""
     steps, rate = task.settings.steps, task.settings.rate
     run = functools.partial(_adam, task.problem, vector, most=steps, rate=rate)
@@ -207,7 +206,7 @@ def _adam(
     problem: design.Problem, vector: Array, steps: Array, most: int, rate: float
 ) -> tuple[Array, Array]:
     """Where `steps`, of `most`, lead; and merits (most,) before each."""
-    init, update = drt_jax.adam(1.0)
+    init, update = learn.adam(1.0)
     variables = problem.variables
     slope = jax.value_and_grad(lambda y: jnp.sum(_squares(y, problem) ** 2))
 

@@ -36,7 +36,7 @@ def _ours(rings: int, at_once: bool):
     fields = jnp.radians(jnp.linspace(0, MOST, FIELDS))
 
     def spot(lens, field):
-        moments = drt_jax.psf_moments(lens, field, jnp.inf, WAVES, rule=rule)
+        moments = drt_jax.psf_moments(lens, drt_jax.Scene.point(field, jnp.inf, WAVES), rule)
         return jnp.sum(jnp.sqrt(jnp.trace(moments.covariance, axis1=1, axis2=2)))
 
     def loss(lens):

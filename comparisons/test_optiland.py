@@ -20,7 +20,9 @@ FREE = (-math.inf, math.inf)
 
 
 def ours_um(lens, field_deg, distance_mm=math.inf):
-    found = drt_jax.psf_moments(lens, np.radians(field_deg), distance_mm, _optiland.COLOURS)
+    found = drt_jax.psf_moments(
+        lens, drt_jax.Scene.degrees(field_deg, distance_mm, _optiland.COLOURS)
+    )
     mean, spread = np.asarray(found.mean), np.trace(np.asarray(found.covariance), axis1=1, axis2=2)
     return 1e3 * np.sqrt(np.mean(spread + np.sum((mean - mean.mean(0)) ** 2, axis=1)))
 

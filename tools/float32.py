@@ -78,18 +78,18 @@ def cell(column, error):
 def row(name):
     """The cells of a lens."""
     double, found = drt_jax.load_lens(name), []
-    fields, um = np.radians([0.0, FIELDS[name]]), (1e3 * WAVELENGTH,)
+    scene = drt_jax.Scene.degrees([0.0, FIELDS[name]], np.inf, 1e3 * WAVELENGTH)
     blocked = double.apertures is not None and any(double.apertures.blocks)
     # What an obscuration takes counts: problems have no other rule for it.
-    rule = 8 if blocked else drt_jax.light_rule(double, fields, np.inf, um, 8)
+    rule = 8 if blocked else drt_jax.converge(drt_jax.spot_diagram, double, scene, 8)
     for dtype in (jnp.float64, jnp.float32):
         lens = jax.tree.map(lambda a, dtype=dtype: a.astype(dtype), double)
         variables = design.Variables.from_lens(lens, ["sensor"])
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            warn_of_focus(lens, np.inf, um)
+            warn_of_focus(lens, scene)
             problem = design.Problem.from_variables(
-                variables, [design.Operand("strehl", target=1.0)], fields, um, np.inf, rule
+                variables, [design.Operand("strehl", target=1.0)], scene, rule
             )
         found.append(jax.tree.map(lambda a: np.asarray(a, float), values(problem, lens)))
     errors = {column: np.abs(found[1][column] - found[0][column]) for column in COLUMNS}
