@@ -92,7 +92,7 @@ def psf(
     rays: FieldRays,
     pixel: Numbers,
     size: int = 21,
-    model: Kind = "waves",
+    kind: Kind = "waves",
     cells: int = _ENERGY,
 ) -> Array:
     """Kernels of all views, for operands of your own; see `drt_jax.psf`.
@@ -101,7 +101,7 @@ def psf(
     rays: its rays, as `trace_fields` returns them or as an operand gets them.
     pixel: pixel pitch, mm.
     size: side of the kernels, pixels.
-    model: kind of the kernels, see `drt_jax.psf`.
+    kind: of the kernels, see `drt_jax.psf`.
     cells: number of cells of the pupil grid along a side; more for spots of many pixels, see
         `converged_psf`.
 
@@ -112,5 +112,5 @@ def psf(
             f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
         )
     side, size = check_pixels(pixel, size, rays.wavelengths.dtype)
-    waves, options = rays.wavelengths, (side, None, size, model, cells)
+    waves, options = rays.wavelengths, (side, None, size, kind, cells)
     return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, waves, beam, *options).kernel)
