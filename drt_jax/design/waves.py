@@ -103,7 +103,7 @@ def psf(
     size: side of the kernels, pixels.
     kind: of the kernels, see `drt_jax.psf`.
     cells: number of cells of the pupil grid along a side; more for spots of many pixels, see
-        `converged_psf`.
+        `converge`.
 
     Returns (V, W, size, size). ValueError for a rule whose rays do not determine polynomials.
     """

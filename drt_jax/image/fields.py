@@ -33,7 +33,7 @@ _ORDER = 4
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GridMethod:
-    """Settings of the kernels over the field, made by `grid_method` for `kernel_grid`.
+    """Settings of the kernels over the field, made by `converge(kernel_grid, ...)`.
 
     step: (), spacing of the nodes, tangent of the field angle.
     distances: (D,), mm, equidistant in 1 / distance.

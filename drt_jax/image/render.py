@@ -121,7 +121,7 @@ def render(
         see `composed`.
     pixel: side of a pixel, mm.
     wavelengths: (C,), um.
-    sampling: a tolerance of the kernels, see `render_method`; or what `converge(render, ...)`
+    sampling: a tolerance of the kernels, see `converge`; or what `converge(render, ...)`
         returns for this distance and pixel, which is needed inside `jax.jit` and `jax.vmap`.
     progress: wraps the loop over rows of tiles (such as tqdm), where all numbers are known.
 

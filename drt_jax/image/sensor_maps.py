@@ -40,7 +40,7 @@ _ROUNDINGS = 8
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RenderMethod:
-    """How a picture is rendered, as chosen by `render_method`.
+    """How a picture is rendered, made by `converge(render, ...)`.
 
     grid: fields, distances and rays of the kernels.
     focal: (), mm, focal length of the pinhole camera that sees the ideal picture.

@@ -34,7 +34,7 @@ _SMALLEST = 1e-3
 class FieldImager:
     """The chain kernels -> sensor layer -> network, for patches anywhere in the field.
 
-    points: function that returns kernels and light of object points, for instance by `psfs`.
+    points: function that returns kernels and light of object points, for instance by `psf`.
     restore: (weights, images) -> images; None for a camera without a network.
     convolve: (scenes, kernels) -> images as `convolve_each`, or that function shared by devices.
     dtype: of scenes and images. Kernels are made in the dtype of the lens and cast to it. A network

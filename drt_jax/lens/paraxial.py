@@ -296,7 +296,7 @@ def image_height(lens: Lens, field: Numbers, distance: Numbers, wavelengths: Num
 
     lens: the lens.
     field: (...), radians. Light of a positive angle travels upwards, from an object below the axis,
-        see `field_of_height`.
+        see `Scene.heights`.
     distance: from the object to the first vertex, mm; may be inf.
     wavelengths: (W,), um.
     """
