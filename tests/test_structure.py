@@ -48,7 +48,7 @@ ROOMS = {
     "drt_jax/files": 2995,
     "drt_jax/image": 3165,
     "drt_jax/learn": 655,
-    "drt_jax/lens": 1523,
+    "drt_jax/lens": 1526,
     "drt_jax/pupil": 712,
     "drt_jax/rays": 1308,
     "drt_jax/show": 660,
