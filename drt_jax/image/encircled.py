@@ -63,7 +63,7 @@ def encircled_energy(
     beams, axes = beams_of(lens, scene, plan.rule), len(scene.shape)
     run = functools.partial(_encircled, model=plan.kind, axes=axes)
     known = lens, beams, (scene.wavelengths, values, scene.spectrum), steps
-    fewest = lambda *known: max(_LEAST, _cells(*known, axes) if plan.kind == "waves" else 0)  # noqa: E731
+    fewest = lambda *known: max(_LEAST, _cells(*known, axes=axes) if plan.kind == "waves" else 0)  # noqa: E731
     return to_tolerance(run, known, plan.cells, plan.tolerance, fewest)
 
 
@@ -178,7 +178,7 @@ def _bessel(z: Array) -> Array:
     )
 
 
-@functools.partial(jit, wanted=LARGE)
+@functools.partial(jit, wanted=LARGE, static_argnames="axes")
 def _cells(
     lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array, axes: int
 ) -> Array:
