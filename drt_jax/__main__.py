@@ -23,7 +23,7 @@ from .image.diagnose import crossed
 from .lens.lens import Lens
 from .lens.order import may_cross
 from .lens.paraxial import FirstOrder, first_order
-from .lens.scene import Scene, fitted
+from .lens.scene import Scene, checked_scene
 from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
 from .rays.status import Status
@@ -297,7 +297,7 @@ def run_show(options: argparse.Namespace) -> None:
     with _warnings_on_stdout():
         lens, fields, distance, waves = _view(options)
         middle = waves[len(waves) // 2]
-        scene = fitted(lens, Scene.degrees(fields, distance, np.array(waves)))
+        scene = checked_scene(lens, Scene.degrees(fields, distance, np.array(waves)))
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
         about = f"{lens.count} surfaces, the stop is number {lens.stop}"
         first = [*first_rows(lens, found, middle)]

@@ -14,7 +14,7 @@ from drt_jax import Gauss, Pattern, Scene, Status, learn, load_lens, psf_moments
 from drt_jax.image import diagnose
 from drt_jax.lens.glass import refractive_index
 from drt_jax.lens.paraxial import image_height
-from drt_jax.lens.scene import field_of_height, fitted
+from drt_jax.lens.scene import checked_scene, field_of_height
 
 LENS = load_lens("singlet")
 GREEN, POINTS, RULE = (0.55,), pupil.hexapolar(1)[0], Gauss(4, "bilateral")
@@ -35,7 +35,7 @@ CALLS = {
     "moments_model": lambda f, d, w, p: learn.moments_model(
         LENS, ("sensor",), Scene.point(f, (d, d), w)
     ),
-    "fitted": lambda f, d, w, p: fitted(LENS, Scene.point(f, d, w)),
+    "checked_scene": lambda f, d, w, p: checked_scene(LENS, Scene.point(f, d, w)),
     "trace_rays": lambda f, d, w, p: drt_jax.trace_rays(LENS, Scene.point(f, d, w), p),
     "wavefront": lambda f, d, w, p: drt_jax.wavefront(LENS, Scene.point(f, d, w), p),
     "pupil_points": lambda f, d, w, p: drt_jax.pupil.pupil_points(LENS, Scene.point(f, d, w), RULE),

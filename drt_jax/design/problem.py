@@ -12,7 +12,7 @@ from ..image.rounding import warn_of_paths
 from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
-from ..lens.scene import Scene, fitted, vergence_of
+from ..lens.scene import Scene, checked_scene, vergence_of
 from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
@@ -158,7 +158,7 @@ class Problem:
         lens = variables.lens
         asked = tuple(o if isinstance(o, Operand) else Operand(o) for o in operands)
         dtype = lens.curvature.dtype
-        scene = fitted(lens, Scene.point() if scene is None else scene)
+        scene = checked_scene(lens, Scene.point() if scene is None else scene)
         angles, far, waves = _axes(scene)
         rule = sampling
         if isinstance(rule, int):

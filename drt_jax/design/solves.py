@@ -19,7 +19,7 @@ from ..image.rounding import warn_of_focus
 from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil, marginal_ray, paraxial_system, trace_ray
-from ..lens.scene import Scene, fitted, vergence_of
+from ..lens.scene import Scene, checked_scene, vergence_of
 from ..numerics import concrete, leaves, safe_divide
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
@@ -147,7 +147,9 @@ class Solve:
                     f"solves: {self.kind}: there is none: the light behind the lens is parallel, "
                     "or none arrives; leave it out, or begin with another lens"
                 )
-            warn_of_focus(lens, fitted(lens, Scene.point(0.0, self.distance, self.wavelengths)), 5)
+            warn_of_focus(
+                lens, checked_scene(lens, Scene.point(0.0, self.distance, self.wavelengths)), 5
+            )
             return self
         condition, solve = _CONDITIONS[self.kind], self
         if self.value == 0:
@@ -306,7 +308,9 @@ def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
         return back + solve.value, jnp.min(jnp.abs(ray.behind[-1]))
     spreads = []
     for field in solve.fields:
-        scene = fitted(lens, Scene.point(0.0 if field is None else field, solve.distance, waves))
+        scene = checked_scene(
+            lens, Scene.point(0.0 if field is None else field, solve.distance, waves)
+        )
         rule = Gauss(_ORDER, symmetry_by_structure(lens, field is None))
         spread = moments(lens, scene, rule, solve_aimed).spread
         spreads.append(jnp.mean(jnp.sum(spread[..., :2], axis=-1), axis=-1))

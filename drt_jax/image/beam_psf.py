@@ -26,7 +26,8 @@ _FINE = 8  # cells along each side of a pixel of a mask
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Psf:
-    """Light of an object point on the pixels, for W wavelengths.
+    """Light of an object point on the pixels, for W wavelengths. Several points are the first axes
+    of all arrays.
 
     kernel: (W, size, size), [wavelength, y, x], with the sum 1 - outside.
     outside: (W,), fraction of the light on the sensor that falls outside of the kernel.

@@ -7,9 +7,9 @@ h_p + s m_p is singular. These are the foci of Coddington's equations, for any l
 
 All functions take a `Scene` and return arrays whose first axes (...) are its points. jit, vmap and
 derivatives in every mode work as for `trace_rays`. A point whose chief ray fails has inf; one that
-an aperture clips counts like others. ValueError as of `lens.scene.fitted`. Chief rays through the
-paraxial entrance pupil, which other programs use unless they aim at the stop, are those of
-`with_paraxial_pupil(lens)`.
+an aperture clips counts like others. ValueError as of `lens.scene.checked_scene`. Chief rays
+through the paraxial entrance pupil, which other programs use unless they aim at the stop, are those
+of `with_paraxial_pupil(lens)`.
 
 Sources: Welford, Aberrations of Optical Systems (1986), ch. 4.5 and 6; conventions of the field
 curvature and distortion plots of OpticStudio where they are named.
@@ -26,7 +26,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..inputs import require_one_of
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..lens.surface import surface_sag
 from ..numerics import (
     Numbers,
@@ -105,7 +105,7 @@ def field_curvature(lens: Lens, scene: Scene) -> FieldCurvature:
     of a trace, where float32 moves a focus by more than 2 % of the depth of focus,
     wavelength / NA^2.
     """
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     warn_of_focus(lens, scene)
     found = _chief_rays(lens, scene)
     return FieldCurvature(found.tangential, found.sagittal)
@@ -118,7 +118,7 @@ def chief_ray_angle(lens: Lens, scene: Scene) -> Array:
 
     Returns (..., W), radians, 0 or more.
     """
-    return _chief_rays(lens, fitted(lens, scene)).angle
+    return _chief_rays(lens, checked_scene(lens, scene)).angle
 
 
 def lateral_colour(lens: Lens, scene: Scene, reference: int | None = None) -> Array:
@@ -129,7 +129,7 @@ def lateral_colour(lens: Lens, scene: Scene, reference: int | None = None) -> Ar
 
     Returns (..., W, 2), mm along x and y of the sensor. ValueError for an index out of range.
     """
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     middle = scene.reference(reference)
     found = _chief_rays(lens, scene)
     moved = found.hit - found.hit[..., middle, None, :]
@@ -158,7 +158,7 @@ def distortion(
     require_one_of("mapping", mapping, get_args(Mapping))
     if isinstance(focal_length, str) and focal_length != "fitted":
         raise ValueError(f"focal_length: expected mm, None or 'fitted', got {focal_length!r}")
-    scene, dtype = fitted(lens, scene), lens.curvature.dtype
+    scene, dtype = checked_scene(lens, scene), lens.curvature.dtype
     line = scene.with_axis()
     found, waves = _chief_rays(lens, line), len(scene.wavelengths)
     scale = found.by_field[0]

@@ -17,7 +17,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.forms import fringe_terms, noll_terms
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import einsum
 from ..pupil.patterns import disc
 from ..rays.status import Status, reaches_sensor
@@ -73,7 +73,7 @@ def _checked(count: int, most: int) -> int:
 
 def _coefficients(lens: Lens, scene: Scene, rows: tuple[int, ...]) -> Array:
     """Coefficients (..., W, P) of terms given by their indices in Noll's order, counted from 0."""
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     warn_of_paths(lens, scene, 4)
     return _least_squares(lens, scene, rows)
 

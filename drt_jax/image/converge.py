@@ -42,8 +42,8 @@ def converge(function: Callable, *arguments: Any, **settings: Any) -> Any:
           pupil rule.
         - psf: (lens, scene, pixel, size=21, kind="auto", tolerance=1e-2, norm=1, of="kernel").
           Returns a `Sampling`.
-        - kernel_grid: (lens, fields, distances, wavelengths, pixel, size, nodes, kind, sampling,
-          together, norm). Returns settings of the grid.
+        - kernel_grid: (lens, scene, pixel, size, nodes=8, kind="rays", sampling=5e-3,
+          together=False, norm=1). Returns settings of the grid.
         - render: (lens, shape, distance, pixel, wavelengths, size, nodes, layers, kind, tolerance,
           sampling). Returns settings of the picture.
 

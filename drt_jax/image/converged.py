@@ -16,7 +16,7 @@ import numpy as np
 from ..compilation import LARGE, jit
 from ..inputs import require_tolerance
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, concrete, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import (
@@ -59,9 +59,9 @@ def psf_moments(lens: Lens, scene: Scene, sampling: float | PupilRule = _TOLERAN
         warns if that is above the tolerance.
 
     Returns `Moments`, with the points of the scene as first axes. Rays fill the stop uniformly.
-    Differentiable in every mode, in the lens and the scene. ValueError as in `lens.scene.fitted`,
-    and if no ray of a wavelength arrives, with the surfaces that stop its light. Inside a trace its
-    `throughput` is then 0 and its covariance inf.
+    Differentiable in every mode, in the lens and the scene. ValueError as in
+    `lens.scene.checked_scene`, and if no ray of a wavelength arrives, with the surfaces that stop
+    its light. Inside a trace its `throughput` is then 0 and its covariance inf.
     """
     found = _moments(lens, scene, sampling, at_sensor)
     return found.at(lens.sensor)
@@ -131,13 +131,13 @@ def _moments(
     """`psf_moments` and `focus_moments`; `places` is `at_sensor` or `best_focus`."""
     if not isinstance(sampling, PupilRule):
         trial = find_rule(lens, scene, sampling, places)
-        scene = fitted(lens, scene)
+        scene = checked_scene(lens, scene)
         if concrete((lens, scene)):
             return _stacked(trial.moments, scene)
         # The rays are already found: only weigh them, with derivatives.
         pairs = zip(scene.each(), trial.found, strict=True)
         return _stacked([_weigh_known(lens, one, trial.used, found) for one, found in pairs], scene)
-    scene, rule = fitted(lens, scene), sampling
+    scene, rule = checked_scene(lens, scene), sampling
     require_fit(rule.symmetry, scene.field)
     found = _weigh(lens, scene, rule)
     throughput = known_values(found.throughput)
@@ -217,7 +217,7 @@ def find_rule(
     # `eval_context` leaves any trace that this is called in, so all that follows is known.
     with jax.core.eval_context():
         lens, scene = known
-        scene = fitted(lens, scene)
+        scene = checked_scene(lens, scene)
         symmetry = symmetry_of(lens, scene.field)
         return _try_orders(lens, scene.each(), symmetry, tolerance, places, warns)
 
@@ -322,7 +322,7 @@ def _no_light(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers)
     lens, scene = known_values((lens, scene))
     with jax.core.eval_context():
         # In an eager gradient the values were not known before, so check them now.
-        fitted(lens, scene)
+        checked_scene(lens, scene)
         rule = Pattern(*gauss_points(_DIAGNOSIS, symmetry), symmetry)
         found = trace_rule(lens, scene, rule, solve).found
         raise ValueError(

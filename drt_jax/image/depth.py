@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..lens.scene import Scene, distance_array, fitted, vergence_of
+from ..lens.scene import Scene, checked_scene, distance_array, vergence_of
 from ..numerics import Numbers, concrete, tensordot
 from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
@@ -142,7 +142,7 @@ def moments_model(
     def retrace(values, distance):
         """Moments of rays that are traced with a fixed rule."""
         changed = dataclasses.replace(lens, **values)
-        point = fitted(changed, scene.at(scene.field, distance))
+        point = checked_scene(changed, scene.at(scene.field, distance))
         return moments(changed, point, rule, solve_reverse).at(changed.sensor)
 
     return values, retrace

@@ -19,7 +19,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted
+from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, batched, einsum, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
@@ -58,7 +58,7 @@ def encircled_energy(
     large for the grid of waves, 64 Airy radii for 128 cells, is computed by rays. Errors as of
     `transfer`.
     """
-    scene, plan = fitted(lens, scene), planned(lens, scene, kind, sampling)
+    scene, plan = checked_scene(lens, scene), planned(lens, scene, kind, sampling)
     values, steps = places_of(lens, "radii", radii, focus)
     beams, axes = beams_of(lens, scene, plan.rule), len(scene.shape)
     run = functools.partial(_encircled, model=plan.kind, axes=axes)

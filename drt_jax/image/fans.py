@@ -15,7 +15,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.status import Status, reaches_sensor
 from ..rays.trace import trace_bundle
@@ -64,12 +64,12 @@ def ray_fans(lens: Lens, scene: Scene, count: int = 41, reference: int | None = 
 
     Returns `RayFans`, as OpticStudio plots ey against Py and ex against Px with rays aimed at the
     real stop; for its plots without aiming, pass `with_paraxial_pupil(lens)`. Differentiable like
-    `trace_rays`. Warns of float32 as `wavefront` does. ValueError as of `lens.scene.fitted`.
+    `trace_rays`. Warns of float32 as `wavefront` does. ValueError as of `lens.scene.checked_scene`.
     """
     if not isinstance(count, int | np.integer) or count < 2:
         raise ValueError(f"count: expected at least 2, a whole number, got {count!r}")
     heights = jnp.linspace(-1, 1, int(count), dtype=lens.curvature.dtype)
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     warn_of_paths(lens, scene)
     hit, _, opd, good = _traced(lens, scene, heights)
     middle = scene.reference(reference)
@@ -90,12 +90,12 @@ def axial_colour(lens: Lens, scene: Scene, heights: Numbers = (0.7, 1.0)) -> Axi
     heights: (N,), on the y axis of the stop, in units of its semi-diameter; none may be 0.
 
     The paraxial foci ignore tilts and decentres. Warns of float32 as `field_curvature` does.
-    ValueError as of `lens.scene.fitted`.
+    ValueError as of `lens.scene.checked_scene`.
     """
     points = real_array("heights", heights, lens.curvature.dtype)
     if points.ndim != 1:
         raise ValueError(f"heights: expected (N,), got shape {points.shape}")
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     if scene.distance.ndim:
         raise ValueError(f"distance: expected one, got shape {scene.distance.shape}")
     axis = scene.at(jnp.zeros(2, lens.curvature.dtype))

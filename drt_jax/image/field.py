@@ -8,7 +8,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.paraxial import image_height
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, real_array, safe_divide
 from ..rays.trace import trace_bundle
 
@@ -28,7 +28,7 @@ def image_point(lens: Lens, scene: Scene) -> Array:
     Returns (..., W, 2), x and y along the axes of the sensor, mm; 0 where the ray fails.
     Differentiable in every mode. The centroid of a spot is another point, see `psf_moments`.
     """
-    return _image_points(lens, fitted(lens, scene))
+    return _image_points(lens, checked_scene(lens, scene))
 
 
 @jax.jit
@@ -55,7 +55,7 @@ def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Nu
     Returns (2,), angles along x and y, radians; inf if none was found. Newton's method from the
     paraxial field; derivatives by the implicit function theorem.
     """
-    scene = fitted(lens, Scene.point(0.0, distance, wavelength))
+    scene = checked_scene(lens, Scene.point(0.0, distance, wavelength))
     target = real_array("point", point, lens.curvature.dtype)
     if target.shape != (2,):
         raise ValueError(f"point: expected x and y, got shape {target.shape}")

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted
+from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, known_values
 from .beam_psf import Sampling
 from .psf import psf
@@ -48,7 +48,7 @@ def gaussian_error(
     fine = chosen_psf(lens, scene, pixel, size, "waves", tolerance)[0]
     models = Sampling("gaussian", fine.rule, 0), fine
     found = []
-    for point in fitted(lens, scene).each():
+    for point in checked_scene(lens, scene).each():
         blur, light = (psf(lens, point, pixel, size, sampling=model) for model in models)
         a, b = np.asarray(blur.kernel), np.asarray(light.kernel)
         found.append((difference(a, b), _contrast(a, b), np.max(np.asarray(light.outside))))

@@ -11,7 +11,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene
+from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, concrete, known_values, real_array
 from ..pupil.rules import Gauss, PupilRule, symmetry_of
 from ..rays.solve import solve_aimed
@@ -35,9 +35,7 @@ _TEST_ORDER = 8
 
 def grid_method(
     lens: Lens,
-    fields: Numbers,
-    distances: Numbers,
-    wavelengths: Numbers,
+    scene: Scene,
     pixel: Numbers,
     size: int | None = None,
     nodes: int = 8,
@@ -49,9 +47,8 @@ def grid_method(
     """Chooses the settings of `kernel_grid`. All arguments are known numbers.
 
     lens: the lens.
-    fields: the largest angles (2,) along x and y, radians.
-    distances: (D,), mm, inf allowed; equidistant in 1 / distance, rising or falling.
-    wavelengths: (W,), um.
+    scene: its largest angles along x and y are those of the grid; its distances, as of
+        `Scene.grid`, are equidistant in 1 / distance, rising or falling.
     pixel: side of a pixel, mm.
     size: number of pixels along a side of a kernel, odd; by default it extends to 4.5 standard
         deviations of the blur on each side.
@@ -64,7 +61,7 @@ def grid_method(
     Returns a `GridMethod`. ValueError inside a trace, for invalid numbers, and if no light arrives
     from any field.
     """
-    known = known_values((lens, fields, distances, wavelengths, pixel))
+    known = known_values((lens, scene, pixel))
     if known is None:
         raise ValueError(
             "the choice of fields and rays follows from known numbers: call "
@@ -72,18 +69,18 @@ def grid_method(
             "on what it returns"
         )
     with jax.core.eval_context():
-        lens, fields, distances, wavelengths, pixel = known
+        lens, scene, pixel = known
+        scene = checked_scene(lens, scene)
         check_pixel(pixel)
         _check_counts(size, nodes)
         dtype = lens.curvature.dtype
-        far = np.atleast_1d(np.asarray(distances, float))
-        wide = _widest(fields)
+        far, wide = np.ravel(np.asarray(scene.distance, float)), _widest(scene)
         step = float(np.max(wide)) / nodes
         across, down = (max(2, int(np.ceil(a / step - 1e-9))) for a in wide)
         half = down, across
         symmetry = symmetry_of(lens, 0.0)
         tangents = unique_nodes(half, symmetry)[0] * step
-        found = _spots_at(lens, tangents, far, wavelengths)
+        found = _spots_at(lens, tangents, far, scene.wavelengths)
         arrives = np.all(np.asarray(found.throughput) > 0, axis=-1)
         if not np.any(arrives):
             raise ValueError("fields: no light of any of them reaches the sensor")
@@ -91,7 +88,7 @@ def grid_method(
             need = _reach(found, arrives, pixel)
             size = next((n for n in _SIZES if n >= need), _SIZES[-1])
         if not isinstance(sampling, Sampling):
-            where = Scene.grid(*_extremes(tangents, far, arrives), wavelengths)
+            where = Scene.grid(*_extremes(tangents, far, arrives), scene.wavelengths)
             # No warning here of light outside of the kernels: `warn_of_loss` gives it for all
             # nodes.
             sampling = chosen_psf(lens, where, pixel, size, kind, sampling, norm)[0]
@@ -110,12 +107,12 @@ def check_pixel(pixel: Numbers) -> None:
             raise ValueError(f"pixel: must be above 0 mm, got {pixel!r}")
 
 
-def _widest(fields: Any) -> np.ndarray:
-    """Tangents (2,) of the largest field angles along x and y. ValueError unless they are two
-    finite angles, one above 0."""
-    wide = np.tan(np.abs(np.asarray(fields, float)))
-    if wide.shape != (2,) or not np.all(np.isfinite(wide)) or not np.max(wide) > 0:
-        raise ValueError(f"fields: expected two angles, one above 0, got {fields!r}")
+def _widest(scene: Scene) -> np.ndarray:
+    """Tangents (2,) of the largest field angles along x and y. ValueError unless one is above 0."""
+    angles = np.asarray(scene.field, float).reshape(-1, 2)
+    wide = np.tan(np.max(np.abs(angles), axis=0))
+    if not np.max(wide) > 0:
+        raise ValueError("fields: expected one beside the axis")
     return cast(np.ndarray, wide)
 
 

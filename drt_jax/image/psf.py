@@ -16,7 +16,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted
+from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, known_values, real_array
 from ..pupil.rules import require_fit
 from .beam import trace_beam
@@ -52,12 +52,13 @@ def psf(
     Returns a `Psf`, with the points of the scene as first axes. The stop is filled uniformly with
     light. Differentiable in all numbers, in every mode. With a `Sampling`, warns outside of
     `jax.jit` if more than 1 % of the light of one of several points falls outside of its kernel,
-    with a size for which less does. ValueError as in `lens.scene.fitted`, for a pixel that is not
-    above 0, if no ray arrives, and for a field whose symmetry the sampling does not have: one for
+    with a size for which less does. ValueError as in `lens.scene.checked_scene`, for a pixel that
+    is not above 0, if no ray arrives, and for a field whose symmetry the sampling does not have:
+        one for
     fields along y traces half a pupil. Inside `jax.jit`, where the field is not known, the kernel
     of such a field is 0.
     """
-    scene, made = fitted(lens, scene), isinstance(sampling, Sampling)
+    scene, made = checked_scene(lens, scene), isinstance(sampling, Sampling)
     pixel_, size = check_pixels(pixel, size, lens.curvature.dtype)
     if not isinstance(sampling, Sampling):
         sampling = converged_psf(lens, scene, pixel, size, kind, sampling)
@@ -73,14 +74,10 @@ def psf(
     settings = how, pixel_, middle, step, size
     if not scene.shape:
         return _psf(lens, scene, *settings)
-
-    def one(point: tuple[Array, Array]) -> Psf:
-        return _psf(lens, scene.at(*point), *settings)
-
-    found = jax.lax.map(jax.checkpoint(one), scene.flat())
+    found = _psfs(lens, scene, *settings)
     if made:
         _warn_of_loss(lens, scene, found, pixel, size, sampling)
-    return jax.tree.map(lambda a: a.reshape(*scene.shape, *a.shape[1:]), found)
+    return found
 
 
 def _warn_of_loss(
@@ -91,7 +88,7 @@ def _warn_of_loss(
     if known is None:
         return
     lens, scene, pixel, outside = known
-    lost = np.max(np.asarray(outside), axis=-1)
+    lost = np.max(np.asarray(outside), axis=-1).ravel()
     k = int(np.argmax(lost))
     if lost[k] > LOST:
         with jax.core.eval_context():
@@ -108,3 +105,17 @@ def _psf(
     """`psf` of checked arguments, for one object point."""
     beam = trace_beam(lens, scene, how.rule).refocused(defocus)
     return psf_of_beam(lens, scene.wavelengths, beam, pixel, centre, size, how.kind, how.cells)
+
+
+@functools.partial(jit, wanted=LARGE, static_argnames="size")
+def _psfs(
+    lens: Lens, scene: Scene, how: Sampling, pixel: Array, centre: Array | None, defocus: Array,
+    size: int
+) -> Psf:  # fmt: skip
+    """`_psf` of several object points, one after the other."""
+
+    def one(point: tuple[Array, Array]) -> Psf:
+        return _psf(lens, scene.at(*point), how, pixel, centre, defocus, size)
+
+    found = jax.lax.map(jax.checkpoint(one), scene.flat())
+    return jax.tree.map(lambda a: a.reshape(*scene.shape, *a.shape[1:]), found)

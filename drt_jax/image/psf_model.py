@@ -14,7 +14,7 @@ from jax import Array
 from ..compilation import LARGE, ONCE, jit
 from ..inputs import require_one_of, require_tolerance
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted
+from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, known_values
 from ..pupil.clipped import Clipped
 from ..pupil.rules import symmetry_of
@@ -95,7 +95,7 @@ def chosen_psf(
         )
     with jax.core.eval_context():
         lens, scene, pixel = known
-        scene = fitted(lens, scene)
+        scene = checked_scene(lens, scene)
         side, size = check_pixels(pixel, size, lens.curvature.dtype)
         scenes = scene.each()
         base = find_rule(lens, scene, min(tolerance, 1e-3), at_sensor, False).rule

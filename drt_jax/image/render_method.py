@@ -8,7 +8,7 @@ import numpy as np
 
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
-from ..lens.scene import NEAREST
+from ..lens.scene import NEAREST, Scene
 from ..numerics import Numbers, known_values
 from .beam_psf import Kind, Sampling
 from .fields import image_points
@@ -76,8 +76,8 @@ def render_method(
         far = layer_distances(distance, shape, layers)
         side = float(np.asarray(pixel))
         angles = _angles(lens, shape, far, side, focal, waves)
-        given = lens, angles, far, waves, side, size, nodes, kind, sampling or tolerance
-        grid = grid_method(*given, norm=2)
+        given = lens, Scene.grid(angles[None], far, waves), side, size, nodes, kind
+        grid = grid_method(*given, sampling or tolerance, norm=2)
         both = (shape[0], shape[1])
         length = jnp.asarray(focal, lens.curvature.dtype)
         method = RenderMethod(grid, length, jnp.zeros(0, jnp.int32), both, both)

@@ -22,7 +22,8 @@ _PAIRS = {"rotational": ((0, 0),), "bilateral": ((0, 0), (1, 1))}
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Moments:
-    """Centroid, covariance and throughput of the spots of W wavelengths.
+    """Centroid, covariance and throughput of the spots of W wavelengths. Several object points are
+    the first axes of all arrays.
 
     mean: (W, 2), centroid on the sensor, mm.
     covariance: (W, 2, 2), mm^2; inf on the diagonal if no light of the wavelength arrives.

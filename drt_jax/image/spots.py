@@ -28,7 +28,7 @@ from ..compilation import LARGE, jit
 from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.order import may_cross
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import batched, known_values, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import hexapolar
@@ -111,9 +111,9 @@ def spot_diagram(
     reference: index of the reference wavelength; None: the middle one, W // 2.
 
     Warns, outside of a trace, where float32 rounds more than 2 % of a spot. ValueError as of
-    `lens.scene.fitted`; without a rule inside a trace.
+    `lens.scene.checked_scene`; without a rule inside a trace.
     """
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     middle, spectrum = scene.reference(reference), scene.spectrum
     light = _light(lens, scene, sampling, "object")
     colour = scene.wavelengths[middle]
@@ -134,7 +134,7 @@ def vignetting(lens: Lens, scene: Scene, sampling: float | PupilRule | None = No
 
     Returns (..., W), from 0 to 1. Errors as of `spot_diagram`.
     """
-    return _light(lens, fitted(lens, scene), sampling, "object").throughput
+    return _light(lens, checked_scene(lens, scene), sampling, "object").throughput
 
 
 def relative_illumination(
@@ -154,7 +154,7 @@ def relative_illumination(
     object point on the axis arrives collimated, without a cone; inside a trace the ratio is then 0.
     An afocal lens has a cone, the area of its beams.
     """
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     light = _light(lens, scene.with_axis(), sampling, point)
     area = light.solid_angle
     if point == "object":
@@ -180,7 +180,7 @@ def solid_angle(
     Returns (..., W); for a round cone about the normal it is pi sin^2 of its half angle; 0 where no
     light arrives. Errors as of `spot_diagram`.
     """
-    return _light(lens, fitted(lens, scene), sampling, point).solid_angle
+    return _light(lens, checked_scene(lens, scene), sampling, point).solid_angle
 
 
 def rule_for(
@@ -210,7 +210,7 @@ def light_rule(lens: Lens, scene: Scene, order: int = _ORDER) -> Gauss | Clipped
         )
     with jax.core.eval_context():
         lens, scene = known
-        scene = fitted(lens, scene)
+        scene = checked_scene(lens, scene)
         symmetry = symmetry_of(lens, scene.field)
         full = bool(_fills(lens, scene))
     if full and not (lens.apertures is not None and any(lens.apertures.blocks)):

@@ -24,7 +24,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..inputs import require_one_of, require_tolerance
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted
+from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, batched, einsum, real_array, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam, BeamRule, beam_rule
@@ -83,10 +83,10 @@ def transfer(
         cells for 1e-3, or 128 of them inside `jit` and `vmap`; or a `Sampling`, for all of it.
 
     Differentiable in every mode. For waves, warns of float32 as `wavefront` does. ValueError as of
-    `lens.scene.fitted`, without a rule inside a trace, and for a tolerance that is not between 0
-    and 1. Warns if the tolerance is not met.
+    `lens.scene.checked_scene`, without a rule inside a trace, and for a tolerance that is not
+    between 0 and 1. Warns if the tolerance is not met.
     """
-    scene, plan = fitted(lens, scene), planned(lens, scene, kind, sampling)
+    scene, plan = checked_scene(lens, scene), planned(lens, scene, kind, sampling)
     values, steps = places_of(lens, "frequencies", frequencies, focus)
     beams = beams_of(lens, scene, plan.rule)
     run = functools.partial(_transfer, model=plan.kind, axes=len(scene.shape))
@@ -155,7 +155,7 @@ def strehl(lens: Lens, scene: Scene, sampling: float | PupilRule | Sampling = TO
     tilt in the least-squares sense over the pupil: the peak, if the wavefront error is a quarter of
     a wave or less.
     """
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     plan = planned(lens, scene, "waves", sampling)
     arrays = lens, beams_of(lens, scene, plan.rule), scene.wavelengths
     run = functools.partial(_strehl, axes=len(scene.shape))

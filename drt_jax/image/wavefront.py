@@ -21,7 +21,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray, paraxial_system
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
 from ..rays.afocal import FOCAL
 from ..rays.status import Status, reaches_sensor
@@ -84,7 +84,7 @@ def wavefront(
     curvature that is not finite; inside a trace rays that pass are then UNCONVERGED and have no
     opd.
     """
-    scene = fitted(lens, scene)
+    scene = checked_scene(lens, scene)
     points = stop_points(lens, pupil)
     kappa = None
     if curvature is not None:

@@ -6,7 +6,7 @@ number of mirrors, index and distances are negative. Tilts and decentres are neg
 surface or phase without rotational symmetry, the (y, z) section counts. Source of the formulas:
 Welford, Aberrations of Optical Systems (1986), ch. 3, 6, 8, 10.
 
-ValueError as in `fitted`. Inside a trace, where values are not known, results are inf for a
+ValueError as in `checked_scene`. Inside a trace, where values are not known, results are inf for a
 wavelength outside the range of a glass, for a distance within 1e-6 mm of 0 and for a field of 90
 degrees or more.
 """

@@ -215,8 +215,8 @@ def vergence_of(distance: Array) -> Array:
     return jnp.where(good, 1 / jnp.where(good, distance, 1), 0)
 
 
-def fitted(lens: Lens, scene: Scene) -> Scene:
-    """A scene as arrays in the dtype of a lens.
+def checked_scene(lens: Lens, scene: Scene) -> Scene:
+    """A scene as arrays in the dtype of a lens. Known numbers stay known inside `jit`.
 
     ValueError for what is not a `Scene`, for a lens whose arrays do not fit together, for points
     and weights of the wrong shape, and, as far as values are known, for numbers that are not
@@ -262,7 +262,7 @@ def over_points(function: Callable[[Scene], Any], scene: Scene) -> Any:
     shape of the points as their first axes.
 
     function: takes a scene of one point.
-    scene: arrays, as `fitted` returns them.
+    scene: arrays, as `checked_scene` returns them.
     """
     if not scene.shape:
         return function(scene)

@@ -22,7 +22,7 @@ from .paraxial import (
     petzval_parts,
     trace_ray,
 )
-from .scene import Scene, fitted, over_points
+from .scene import Scene, checked_scene, over_points
 from .surface import by_form, surface_sag
 
 
@@ -132,7 +132,7 @@ def third_order(lens: Lens, scene: Scene) -> ThirdOrder:
     across = known_values(scene.field)
     if across is not None and np.any(np.asarray(across)[..., 0]):
         raise ValueError("field: third order: give an angle along y, for x and y their diagonal")
-    return over_points(lambda point: _third_order(lens, point), fitted(lens, scene))
+    return over_points(lambda point: _third_order(lens, point), checked_scene(lens, scene))
 
 
 def _third_order(lens: Lens, scene: Scene) -> ThirdOrder:

@@ -18,7 +18,7 @@ from ..inputs import require_one_of
 from ..lens.clearance import clearance
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, brief, concrete, real_array
 from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector
@@ -242,4 +242,4 @@ def pupil_points(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Array, Arra
         stacked = jnp.stack([jnp.broadcast_to(a, shape) for a in (x, y)], axis=-1)
         return stacked, jnp.broadcast_to(weights, shape)
 
-    return over_points(one, fitted(lens, scene))
+    return over_points(one, checked_scene(lens, scene))

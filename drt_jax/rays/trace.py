@@ -16,7 +16,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.clearance import clearance
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..lens.surface import by_form, surface_sag
 from ..numerics import Numbers, concrete, known_values, real_array
 from . import fermat
@@ -177,11 +177,11 @@ def trace_rays(lens: Lens, scene: Scene, pupil: Numbers) -> Rays:
     scene: object points and their wavelengths.
     pupil: (Q, 2), x and y on the stop in units of its semi-diameter.
 
-    ValueError as in `lens.scene.fitted`. Inside `jit` or `vmap`, where values are not known, a
-    wavelength outside the range of a glass gives the status NO_INDEX; a field of 90 degrees or
+    ValueError as in `lens.scene.checked_scene`. Inside `jit` or `vmap`, where values are not known,
+    a wavelength outside the range of a glass gives the status NO_INDEX; a field of 90 degrees or
     more, or a distance within 1e-6 mm of 0, gives MISSED.
     """
-    scene, points = fitted(lens, scene), stop_points(lens, pupil)
+    scene, points = checked_scene(lens, scene), stop_points(lens, pupil)
     count, size = len(points), _padded(len(points))
     if count == size or known_values((lens, scene, points)) is None:
         return _trace(lens, scene, points)

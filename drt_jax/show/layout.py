@@ -18,7 +18,7 @@ from ..compilation import ONCE, jit
 from ..lens.aperture import depths
 from ..lens.clearance import clearance, clipping_surface
 from ..lens.lens import Lens, sag
-from ..lens.scene import Scene, fitted
+from ..lens.scene import Scene, checked_scene
 from ..numerics import einsum
 from ..pupil.patterns import hexapolar
 from ..rays.status import Status
@@ -68,7 +68,7 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
         infinity, in the d line.
     rays: number of rays for each point; rays that do not exist are left out.
     """
-    scene = fitted(lens, Scene.point() if scene is None else scene)
+    scene = checked_scene(lens, Scene.point() if scene is None else scene)
     middle = slice(scene.reference(None), scene.reference(None) + 1)
     points = dataclasses.replace(scene, wavelengths=scene.wavelengths[middle]).each()
     angles = [float(point.field[1]) for point in points]
@@ -184,7 +184,7 @@ class Beam(NamedTuple):
 def beam_of(lens: Lens, scene: Scene) -> Beam:
     """The beam of one object point in the middle wavelength. What clips and fails is that of all
     wavelengths."""
-    scene, middle = fitted(lens, scene), scene.reference(None)
+    scene, middle = checked_scene(lens, scene), scene.reference(None)
     if len(scene.wavelengths) > 1:
         waves = jnp.roll(scene.wavelengths, -middle)[:, None]
         own, *more = (beam_of(lens, dataclasses.replace(scene, wavelengths=w)) for w in waves)

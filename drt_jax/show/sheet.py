@@ -19,7 +19,7 @@ from ..image.fans import RayFans, ray_fans
 from ..image.spots import Spots, rule_for, spot_diagram
 from ..image.transfer import Model, transfer_of
 from ..lens.lens import Lens
-from ..lens.scene import Scene, fitted, over_points
+from ..lens.scene import Scene, checked_scene, over_points
 from ..pupil.rules import PupilRule
 from . import analyses
 from .figures import FIELD_COLOURS, new
@@ -94,7 +94,7 @@ def _analysed(
 ) -> tuple[int, Callable[[dict[str, Any]], None]]:
     """The number of fields that have spots, and a function that draws all analyses on axes, which
     are named as in `_TITLES`."""
-    scene = fitted(lens, Scene.point() if scene is None else scene)
+    scene = checked_scene(lens, Scene.point() if scene is None else scene)
     if scene.distance.ndim or bool(jnp.any(scene.field[..., 0] != 0)):
         raise ValueError("scene: a sheet has fields along y, at one distance")
     fields = [float(angle) for angle in np.ravel(scene.field[..., 1])]
@@ -120,7 +120,7 @@ def _analysed(
     limit = 2e3 * np.sqrt(spots.solid_angle[0, middle] / np.pi) / waves[middle]
     lines = np.linspace(0, min(limit, _LINES) if limit > 0 else _LINES, _CURVE)
     radii, model, cells = _circles(spots, len(some))
-    picked = fitted(lens, at(some))
+    picked = checked_scene(lens, at(some))
     contrast, best, energy = _waves(lens, picked, jnp.asarray(lines), radii, rule, model, cells)
     say("drawing")
 

@@ -14,7 +14,7 @@ import drt_jax
 from drt_jax import Scene
 from drt_jax.image.beam import BeamRule, centroid_and_variances, trace_beam
 from drt_jax.image.wave_psf import pupil_function
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 
 from . import _peers
 
@@ -37,7 +37,7 @@ def pupil(
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """The input of prysm for one wavelength (1,) and an object at infinity: the pupil function on a
     square grid of direction cosines, the step of the grid, and the centre (2,) of the image, mm."""
-    scene = fitted(lens, Scene.point(field, np.inf, wavelength))
+    scene = checked_scene(lens, Scene.point(field, np.inf, wavelength))
     beam = trace_beam(lens, scene, rule)
     low, high = (np.asarray(a)[:, 0] for a in beam.directions_extent())
     middle, step = (low + high) / 2, float(np.max(high - low)) / count

@@ -189,20 +189,10 @@ def _timed(shot: Shot, model: Sampling, repeats: int) -> tuple[np.ndarray, float
 def field_grid(shot: Shot, repeats: int) -> float:
     """Seconds for wave kernels of 9 x 9 fields, with the field of the view in the corners."""
     side = math.atan(math.tan(max(shot.field, 1e-3)) / math.sqrt(2))
-    fields, far = (side, side), [math.inf]
-    method = drt_jax.converge(
-        drt_jax.kernel_grid,
-        shot.lens,
-        fields,
-        far,
-        shot.waves,
-        shot.pixel,
-        shot.size,
-        4,
-        "waves",
-        1e-2,
-    )
-    call = partial(drt_jax.kernel_grid, shot.lens, method, shot.waves)
+    scene = Scene.grid([[side, side]], math.inf, shot.waves)
+    given = shot.lens, scene, shot.pixel, shot.size, 4, "waves", 1e-2
+    method = drt_jax.converge(drt_jax.kernel_grid, *given)
+    call = partial(drt_jax.kernel_grid, shot.lens, shot.waves, method)
     return _common.medians([call], repeats)[0]
 
 

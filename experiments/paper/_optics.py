@@ -13,7 +13,7 @@ from jax import Array
 import drt_jax
 from drt_jax import design, learn
 from drt_jax.design.kinds import step_of
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.pupil import hexapolar
 from drt_jax.rays.solve import solve_aimed
 from drt_jax.rays.status import Status
@@ -155,7 +155,9 @@ class Trained:
 
         def hits(values: dict[str, Array]) -> tuple[Array, Array]:
             lens = self.lens_of(values)
-            bundle = trace_bundle(lens, fitted(lens, scene.seen(distance)), pupil, solve_aimed)
+            bundle = trace_bundle(
+                lens, checked_scene(lens, scene.seen(distance)), pupil, solve_aimed
+            )
             return jnp.stack([hit[-1] for hit in bundle.hits], axis=-1), bundle.status
 
         slopes, status = jax.jit(jax.jacfwd(hits, has_aux=True))(self.start(self.lens.sensor))

@@ -9,7 +9,7 @@ import pytest
 
 from drt_jax import Scene, load_lens
 from drt_jax.design.failures import shortfall
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.rays.aim import beam_size, paraxial_launch
 from drt_jax.rays.snell import meetings
 from drt_jax.rays.system import system_of
@@ -20,7 +20,7 @@ WAVES = (0.48, 0.6)
 
 def told(lens, field=0.2):
     """Status at the end and shortfall, (W, Q) each; the guess is the paraxial one."""
-    system = system_of(lens, fitted(lens, Scene.point(field, jnp.inf, WAVES)))
+    system = system_of(lens, checked_scene(lens, Scene.point(field, jnp.inf, WAVES)))
     radius = lens.semi_diameter[lens.stop]
     target = tuple(jnp.broadcast_to(radius * p, (2, p.size)) for p in POINTS)
     launch = paraxial_launch(system, target, beam_size(system, target)[1])

@@ -10,7 +10,7 @@ import pytest
 import drt_jax
 from drt_jax import Scene, design
 from drt_jax.design import Tolerance, Vary
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.rays.find import find, find_aimed
 
 from ..known import aims
@@ -44,7 +44,7 @@ def both(lens, scene, points):
 @pytest.mark.parametrize(("name", "factor", "degrees"), WIDE)
 def test_aiming_finds_what_the_full_search_finds(name, factor, degrees):
     lens = opened(name, factor)
-    scene = fitted(lens, Scene.point(np.radians(degrees), np.inf, RGB))
+    scene = checked_scene(lens, Scene.point(np.radians(degrees), np.inf, RGB))
     points, _ = drt_jax.Gauss(6, "bilateral").points(lens, scene)
     aimed, full = both(lens, scene, points)
     assert np.all(full.status == drt_jax.Status.OK)

@@ -11,7 +11,7 @@ import pytest
 import drt_jax
 from drt_jax import Scene, load_lens
 from drt_jax.image import chief
-from drt_jax.lens.scene import field_of_height, fitted
+from drt_jax.lens.scene import checked_scene, field_of_height
 
 from .. import oracle
 from ..known import check_slopes
@@ -162,7 +162,7 @@ def slopes(lens, fields):
     scene = Scene.radians(fields, np.inf, WAVES)
 
     def total(lens):
-        rays = chief._chief_rays(lens, fitted(lens, scene).with_axis())
+        rays = chief._chief_rays(lens, checked_scene(lens, scene).with_axis())
         traced = lambda _, seen: jax.tree.map(lambda a: a[-len(seen.field) :], rays)  # noqa: E731
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(chief, "_chief_rays", traced)

@@ -20,7 +20,7 @@ from drt_jax import (
 )
 from drt_jax.image.converged import converged_focus_rule, converged_rule
 from drt_jax.image.moments import moments
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.pupil import symmetry_of
 
 from ..conftest import RGB, assert_close
@@ -91,7 +91,7 @@ def test_gradients_of_meridional_half_and_whole_pupil_agree():
     @jax.grad
     def gradient(moved, field, symmetry):
         lens, distance = moved
-        scene = fitted(lens, Scene.point(field, distance, RGB[:2]))
+        scene = checked_scene(lens, Scene.point(field, distance, RGB[:2]))
         traced = moments(lens, scene, Gauss(wide, symmetry))
         # On axis the centroid is 0, and the gradient of what rounding leaves of it is no number.
         return jnp.sum(weights * traced.spread[..., :2]) + field * jnp.sum(traced.mean[:, 1])
@@ -109,7 +109,7 @@ def slopes(lens, distance, found):
     """Moments of rays that are known, and their gradient by the lens and the distance."""
 
     def blur(lens, distance):
-        scene = fitted(lens, Scene.point(0.1, distance, RGB[:2]))
+        scene = checked_scene(lens, Scene.point(0.1, distance, RGB[:2]))
         spot = moments(lens, scene, Gauss(4, "bilateral"), known(found)).at(lens.sensor)
         xx, yy = spot.covariance[:, 0, 0], spot.covariance[:, 1, 1]
         return jnp.sum(xx + 0.3 * yy) + 0.1 * jnp.sum(spot.mean), (spot.mean, spot.covariance)
@@ -124,7 +124,7 @@ def test_a_centred_lens_given_zero_tilts_and_decentres_is_the_same():
     given = dataclasses.replace(LENS, decentre=jnp.zeros((rows, 2)), tilt=jnp.zeros((rows, 3)))
     distance = jnp.asarray(9000.0)
     points = Gauss(4, "bilateral").points(LENS, None)[0]
-    found = search(LENS, fitted(LENS, Scene.point(0.1, distance, RGB[:2])), points)
+    found = search(LENS, checked_scene(LENS, Scene.point(0.1, distance, RGB[:2])), points)
     (_, plain), gradient = slopes(LENS, distance, found)
     (_, general), (by_lens, by_distance) = slopes(given, distance, found)
     assert_close(general, plain, 1e-10, 1e-13)

@@ -17,7 +17,7 @@ from drt_jax.image import psf as module
 from drt_jax.image.beam import beam_rule, centroid_and_variances, trace_beam
 from drt_jax.image.psf_model import difference
 from drt_jax.image.ray_psf import ray_spots
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.pupil import patterns
 
 from ..known import check_slopes
@@ -82,7 +82,7 @@ def test_sums_and_moments(field, rule):
 
     @jax.jit
     def spots(lens):
-        beam = trace_beam(lens, fitted(lens, scene[1]), rule)
+        beam = trace_beam(lens, checked_scene(lens, scene[1]), rule)
         hits, width, light = ray_spots(lens, beam, 48)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(module, "trace_beam", lambda *_: beam)
@@ -215,7 +215,7 @@ def slopes(lens, field, defocus):
     rule, draw = beam_rule(8, "bilateral"), np.random.default_rng(0)
 
     def merit(lens, defocus):
-        beam = trace_beam(lens, fitted(lens, Scene.point(field, FAR, WAVES)), rule)
+        beam = trace_beam(lens, checked_scene(lens, Scene.point(field, FAR, WAVES)), rule)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(module, "trace_beam", lambda *_: beam)
             patch.setattr(module, "_psf", module._psf.__wrapped__)

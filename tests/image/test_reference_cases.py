@@ -10,7 +10,7 @@ import yaml
 import drt_jax
 from drt_jax import Gauss, Scene, load_lens
 from drt_jax.image.beam import beam_rule, centroid_and_variances, trace_beam
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 
 WAVE = 0.5
 # P11: per axis, mm^2, of a paraboloid f = 50 of semi-diameter 20, out of focus by delta.
@@ -35,7 +35,7 @@ def variances():
     @jax.jit
     def both(step):
         beam = trace_beam(
-            lens, fitted(lens, Scene.point(*scene)), beam_rule(20, "bilateral")
+            lens, checked_scene(lens, Scene.point(*scene)), beam_rule(20, "bilateral")
         ).refocused(step)
         moved = centroid_and_variances(beam.hits[:, -1], beam.weights)[1]
         slope, found = jax.jacfwd(of_moments, has_aux=True)(step)

@@ -12,7 +12,7 @@ from drt_jax import Scene, design
 from drt_jax.image import rounding
 from drt_jax.image.beam import beam_rule
 from drt_jax.image.cover import cover
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 
 from .test_psf_model import beam_of
 
@@ -38,7 +38,7 @@ def test_a_telescope_of_metres_is_told_a_camera_is_right():
         good = (np.asarray(exact.status) == 0) & (np.asarray(found.status) == 0)
         error = np.std((np.asarray(found.opd) - np.asarray(exact.opd))[good])
         told = rounding.path_rounding(
-            single(name), [fitted(single(name), Scene.point(field, np.inf, GREEN))]
+            single(name), [checked_scene(single(name), Scene.point(field, np.inf, GREEN))]
         )
         assert 0.3 * error < told < 3 * error and (told > 1e-3) == loud
         assert not loud or (len(said) == 1 and said[0].filename == __file__)
@@ -81,7 +81,7 @@ def test_rounding_of_a_high_image_is_told():
     """At 67 degrees hits 235 mm high are rounded by 0.29 of 2^-16 mm RMS, and paths by nearly as
     much: 0.0074 waves. Strehl ratios were 0.02 off without a word."""
     lens = single("hypergon_100mm")
-    scene = fitted(lens, Scene.point(np.radians(67.0), np.inf, GREEN))
+    scene = checked_scene(lens, Scene.point(np.radians(67.0), np.inf, GREEN))
     told = [rounding.path_rounding(lens, [scene], of_beams) for of_beams in (False, True)]
     by_hand = 0.29 * 2.0**-16 * np.sin(np.radians(67)) / 0.55e-3
     assert told[0] < 1e-3 and 0.5 * by_hand < told[1] < 2 * by_hand

@@ -13,7 +13,7 @@ from drt_jax import Clipped, Gauss, Pattern, Scene, design, load_lens, pupil
 from drt_jax.design import field_rays
 from drt_jax.design.problem import trace_fields
 from drt_jax.image import spots
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 
 from ..known import check_slopes, freed
 
@@ -161,7 +161,7 @@ def slopes(lens, fields):
     weights = 1e2, 1e2, 1e4, 3.0, 2.0
 
     def total(lens):
-        light = spots._light(lens, fitted(lens, scene).with_axis(), rule, "object")
+        light = spots._light(lens, checked_scene(lens, scene).with_axis(), rule, "object")
 
         def traced(_, seen, *rest):
             return jax.tree.map(lambda a: a[-len(seen.field) :], light)

@@ -14,7 +14,7 @@ from drt_jax import Clipped, Gauss, Scene, Status, load_lens
 from drt_jax.image import coefficients, transfer
 from drt_jax.image.beam import beam_of
 from drt_jax.lens.forms import fringe_terms
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.rays.trace import trace_bundle
 
 from ..known import check_slopes, freed
@@ -210,7 +210,7 @@ def slopes(lens, field):
     weights = np.random.default_rng(0).normal(size=18)
 
     def total(lens):
-        scene = fitted(lens, Scene.point(field, np.inf, WAVES[:2]))
+        scene = checked_scene(lens, Scene.point(field, np.inf, WAVES[:2]))
         bundle = trace_bundle(lens, scene, points)
         passes = jnp.where(bundle.status == Status.OK, np.append(0, pattern[1])[None], 0)
         beam = beam_of(lens, scene, points, passes, bundle, "none", 8, True)

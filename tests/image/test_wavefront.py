@@ -15,7 +15,7 @@ from experiments.snell import trace_snell
 import drt_jax
 from drt_jax import Scene, Status, load_lens, pupil, rms_wavefront, wavefront
 from drt_jax.image import wavefront as module
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.rays.trace import trace_bundle
 
 from ..known import known, search
@@ -99,7 +99,7 @@ def test_off_axis_against_snell(monkeypatch):
     met by solving its quadratic equation, in NumPy: 3e-9 waves of 300,000, 1e-14 of them."""
     lens = load_lens("double_gauss")
     field, wavelengths = np.radians(10.0), (0.6, 0.48)
-    scene = fitted(lens, Scene.point(field, np.inf, wavelengths))
+    scene = checked_scene(lens, Scene.point(field, np.inf, wavelengths))
     found = searched(lens, scene, POINTS)
     wave = jax.jit(of_known(monkeypatch, found))(lens, scene, jnp.asarray(POINTS))
     first = [h[0, :, 1:] for h in found.hits]  # without the chief ray
@@ -158,7 +158,7 @@ def test_gradients_in_both_modes_and_on_axis(monkeypatch):
 
         def merit(lens, field):
             wave = trace(
-                lens, fitted(lens, Scene.point(field, 5000.0, [WAVE])), jnp.asarray(POINTS)
+                lens, checked_scene(lens, Scene.point(field, 5000.0, [WAVE])), jnp.asarray(POINTS)
             )
             return jnp.sum(wave.opd * jnp.array([[3.0, 1.0, -2.0, 1.5, 0.5]]))
 
@@ -167,7 +167,7 @@ def test_gradients_in_both_modes_and_on_axis(monkeypatch):
         return value, gradient, jax.jvp(merit, (lens, field), moving)[1]
 
     def at(lens, field):
-        found = searched(lens, fitted(lens, Scene.point(field, 5000.0, [WAVE])), POINTS)
+        found = searched(lens, checked_scene(lens, Scene.point(field, 5000.0, [WAVE])), POINTS)
         return both(lens, jnp.asarray(field), found)
 
     for field in (0.15, 0.0):
@@ -186,7 +186,7 @@ def test_failed_rays_have_a_status_and_change_no_other(monkeypatch):
     lens = load_lens("singlet")
     steep = dataclasses.replace(lens, semi_diameter=jnp.array([24.0, 15.0, jnp.inf, jnp.inf]))
     heights = np.stack([np.zeros(9), np.linspace(-1, 1, 9)], axis=1)
-    scene = fitted(steep, Scene.point(0.0, np.inf, [WAVE]))
+    scene = checked_scene(steep, Scene.point(0.0, np.inf, [WAVE]))
 
     @jax.jit
     def opd(lens, found):
@@ -219,7 +219,7 @@ def test_failed_chief_ray(monkeypatch):
     surfaces = [stop, air | {"thickness": 30.0}]
     lens = load_lens({"object": {"index": 1.5}, "surfaces": surfaces})
     points = np.array([[0.0, -1.0], [0.0, -0.9], [0.0, 0.0]])
-    scene = fitted(lens, Scene.point(np.radians(43.0), 20.0, [WAVE]))
+    scene = checked_scene(lens, Scene.point(np.radians(43.0), 20.0, [WAVE]))
     found = searched(lens, scene, points)
     assert found.status[0].tolist() == [Status.TIR, Status.OK, Status.OK, Status.TIR]
     wave = jax.jit(of_known(monkeypatch, found))(lens, scene, jnp.asarray(points))

@@ -7,7 +7,7 @@ import pytest
 
 import drt_jax
 from drt_jax import Gauss, Scene
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 
 LENS = drt_jax.load_lens("singlet")
 RGB = (0.6, 0.53, 0.48)
@@ -72,7 +72,7 @@ def test_points_of_any_shape_are_the_first_axes(how):
 )
 def test_what_is_no_scene_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
-        fitted(LENS, make())
+        checked_scene(LENS, make())
 
 
 def test_analyses_that_compare_with_the_axis_want_one_distance():

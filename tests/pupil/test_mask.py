@@ -8,7 +8,7 @@ import pytest
 
 from drt_jax import Gauss, Mask, Masked, Pattern, Sampling, Scene, load_lens, psf, psf_moments
 from drt_jax.image.beam import beam_rule
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.pupil import square_grid
 
 RNG = np.random.default_rng(0)
@@ -56,7 +56,7 @@ def test_what_a_mask_cannot_be_is_refused():
     with pytest.raises(ValueError, match='a mask in the kind "gaussian"'):
         Sampling("gaussian", model.rule, 0).masked(Mask(flat))
     assert model.masked(Mask(flat)).cells == 32 and model.masked(Mask(flat), 99).cells == 99
-    lens, scene = lens_of(), fitted(lens_of(), Scene.point(0.0, jnp.inf, [GREEN]))
+    lens, scene = lens_of(), checked_scene(lens_of(), Scene.point(0.0, jnp.inf, [GREEN]))
     with pytest.raises(ValueError, match='of the symmetry "none"'):
         Masked(Gauss(3, "bilateral"), Mask(flat)).points(lens, scene)
     with pytest.raises(ValueError, match="a path acts on waves alone"):

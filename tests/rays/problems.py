@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drt_jax import Scene, Status
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 
 from ..known import aims, bendable, known, search
 from .systems import COLOURS, lens_with
@@ -22,7 +22,7 @@ def problem(name):
     """A lens, a scene, points and the rays through them."""
     stop, tilted, dim = PROBLEMS[name]
     lens, points = bendable(lens_with(stop, tilted)), POINTS[2 - dim :]
-    scene = fitted(lens, Scene.point([0.03, -0.05] if dim == 2 else 0.08, 300.0, COLOURS))
+    scene = checked_scene(lens, Scene.point([0.03, -0.05] if dim == 2 else 0.08, 300.0, COLOURS))
     found = search(lens, scene, points)
     assert np.all(found.status == Status.OK)
     return lens, scene, points, found

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drt_jax import Scene, load_lens
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.lens.surface import sag_derivatives
 from drt_jax.rays.system import system_of
 
@@ -68,12 +68,12 @@ def system_with(stop, dim=2, tilted=False, distance=DISTANCE):
 
 def scene_system(lens, distance=DISTANCE, dim=2):
     """The system of a lens and an object off the axis."""
-    return _system_of(lens, fitted(lens, Scene.point([0.03, -0.05], distance, COLOURS)), dim)
+    return _system_of(lens, checked_scene(lens, Scene.point([0.03, -0.05], distance, COLOURS)), dim)
 
 
 def meridional(lens, colours):
     """The system of a lens for meridional rays, the object on the axis at infinity."""
-    return _system_of(lens, fitted(lens, Scene.point(0.0, jnp.inf, colours)), 1)
+    return _system_of(lens, checked_scene(lens, Scene.point(0.0, jnp.inf, colours)), 1)
 
 
 def rough_path(system, rays=3, seed=3):

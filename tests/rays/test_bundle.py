@@ -7,7 +7,7 @@ import pytest
 from experiments.snell import trace_snell
 
 from drt_jax import Scene, Status, load_lens, pupil
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.rays import find, solve
 from drt_jax.rays.bundle import tile_of
 from drt_jax.rays.trace import trace_bundle
@@ -30,7 +30,7 @@ def points():
 
 
 def scene(lens, field=FIELD):
-    return fitted(lens, Scene.point(field, 25e3, WAVES))
+    return checked_scene(lens, Scene.point(field, 25e3, WAVES))
 
 
 @pytest.fixture(scope="module")

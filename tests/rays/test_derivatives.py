@@ -13,7 +13,7 @@ import pytest
 
 from drt_jax import Scene, Status, load_lens, pupil
 from drt_jax.image.moments import weigh
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.pupil.rules import Gauss
 from drt_jax.rays.fermat import arrival, optical_path
 from drt_jax.rays.find import Found
@@ -267,7 +267,7 @@ def hits_of(lens, scene, nodes):
 
 def scene_from(arguments):
     field = arguments.get("field", 0.0)
-    return fitted(arguments["lens"], Scene.point(field, arguments["distance"], WAVELENGTHS))
+    return checked_scene(arguments["lens"], Scene.point(field, arguments["distance"], WAVELENGTHS))
 
 
 def of_row(tree, row):

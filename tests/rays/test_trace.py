@@ -11,7 +11,7 @@ from experiments.snell import trace_snell
 from drt_jax import Scene, Status, first_order, load_lens, pupil, sag, trace_rays
 from drt_jax.lens.forms import FORMS
 from drt_jax.lens.lens import Labels
-from drt_jax.lens.scene import fitted
+from drt_jax.lens.scene import checked_scene
 from drt_jax.rays.trace import _trace, trace_bundle
 
 from ..conftest import LENSES, RGB, assert_close
@@ -127,7 +127,7 @@ def test_forms_that_equal_others_have_the_same_gradients():
     )
     points, scene = (
         tuple(POINTS.T),
-        fitted(lens, Scene.point(jnp.array([0.05, 0.1]), 500.0, RGB[:1])),
+        checked_scene(lens, Scene.point(jnp.array([0.05, 0.1]), 500.0, RGB[:1])),
     )
     found = search(lens, scene, points)
     assert np.all(found.status == Status.OK)
