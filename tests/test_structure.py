@@ -44,9 +44,9 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 # fall: text is free, code is not.
 ROOMS = {
     "drt_jax": 509,
-    "drt_jax/design": 2502,
+    "drt_jax/design": 2506,
     "drt_jax/files": 2995,
-    "drt_jax/image": 3165,
+    "drt_jax/image": 3171,
     "drt_jax/learn": 655,
     "drt_jax/lens": 1526,
     "drt_jax/pupil": 712,
@@ -54,8 +54,8 @@ ROOMS = {
     "drt_jax/show": 660,
     "experiments": 499,
     "experiments/designing": 603,
-    "experiments/imaging": 445,
-    "experiments/paper": 638,
+    "experiments/imaging": 435,
+    "experiments/paper": 640,
     "experiments/runs": 419,
     "experiments/speed": 715,
     "experiments/together": 436,
