@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from .flags import set_flags
+from .times import Times
 
 set_flags()
 
@@ -41,9 +42,18 @@ LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
 
 
 def pytest_addoption(parser):
-    """Adds --write-tables: the tests that make a table of `results` write it there; and --part."""
+    """Adds --write-tables: the tests that make a table of `results` write it there; and --part and
+    --times.
+    """
     parser.addoption("--write-tables", action="store_true", help="rewrite the tables in results/")
     parser.addoption("--part", type=int, choices=range(PARTS), help="a sixth of the slow tests")
+    parser.addoption("--times", metavar="FILE", help="where the time goes, see times.py")
+
+
+def pytest_configure(config):
+    """Times the tests with --times."""
+    if config.getoption("--times"):
+        config.pluginmanager.register(Times(config.getoption("--times")))
 
 
 def pytest_collection_modifyitems(config, items):
