@@ -52,9 +52,12 @@ from .image.spots import (
 from .image.transfer import strehl as strehl, transfer as transfer
 from .image.wavefront import rms_wavefront as rms_wavefront, wavefront as wavefront
 from .lens.aperture import Apertures as Apertures
-from .lens.edit import flipped as flipped, scaled as scaled
+from .lens.edit import (
+    flipped as flipped,
+    scaled as scaled,
+    with_paraxial_pupil as with_paraxial_pupil,
+)
 from .lens.elements import Elements as Elements
-from .lens.entrance import with_paraxial_pupil as with_paraxial_pupil
 from .lens.glasses import find_glass as find_glass, nearest_glasses as nearest_glasses
 from .lens.lens import (
     Lens as Lens,

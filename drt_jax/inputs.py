@@ -54,18 +54,24 @@ def shown(value: object) -> str:
         return f"a {type(value).__name__} of too many digits"
 
 
+def require(condition: object, message: str, error: type[ValueError] = ValueError) -> None:
+    """Raises an error with this message unless the condition holds."""
+    if not condition:
+        raise error(message)
+
+
 def require_tolerance(sampling: Any) -> float:
     """A tolerance as a float. ValueError unless it is a number between 0 and 1."""
-    if isinstance(sampling, int | float | np.number) and 0 < sampling < 1:
-        return float(sampling)
     what = "a tolerance between 0 and 1, or what drt_jax.converge returns"
-    raise ValueError(f"sampling: expected {what}, got {sampling!r:.80}")
+    is_right = isinstance(sampling, int | float | np.number) and 0 < sampling < 1
+    require(is_right, f"sampling: expected {what}, got {sampling!r:.80}")
+    return float(sampling)
 
 
 def require_one_of(what: str, value: object, known: Iterable[str]) -> None:
     """Raises ValueError, which lists the known words, for a value that is none of them."""
-    if value not in (words := [*known]):
-        raise ValueError(f"{what}: expected one of {', '.join(words)}, got {shown(value)}")
+    words = [*known]
+    require(value in words, f"{what}: expected one of {', '.join(words)}, got {shown(value)}")
 
 
 class Lines(dict[str, int]):

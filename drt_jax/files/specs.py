@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 
 from ..inputs import shown
+from ..lens.edit import with_paraxial_pupil
 from ..lens.elements import Elements
-from ..lens.entrance import with_paraxial_pupil
 from ..lens.forms import FORMS
 from ..lens.glass import POWERS, VISIBLE, Dispersion, Glass, model_glass
 from ..lens.glasses import find_glass, flaw

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require
 from ..numerics import concrete, safe_divide, safe_sqrt
 from .polygon import convex_pieces
 
@@ -51,8 +52,8 @@ class Apertures:
         if not self.pieces and self.corners is None:
             object.__setattr__(self, "pieces", ((),) * len(self.kinds))
         elif not self.pieces:
-            if not concrete(self.corners):
-                raise ValueError("apertures: the pieces of a polygon need known corners")
+            known = concrete(self.corners)
+            require(known, "apertures: the pieces of a polygon need known corners")
             each = zip(self.kinds, np.asarray(self.corners, float), strict=True)
             found = [convex_pieces(own) if kind == "polygon" else () for kind, own in each]
             object.__setattr__(self, "pieces", tuple(found))

@@ -1,16 +1,20 @@
-"""The same lens at another size, or reversed."""
+"""The same lens at another size, reversed, or with its paraxial entrance pupil as the stop."""
 
 import dataclasses
 import re
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require
 from ..numerics import Numbers, concrete, real_array
 from .forms import FORMS
 from .lens import Labels, Lens
+from .paraxial import entrance_pupil
 from .phase import Phase
 
 # How the named coefficients of forms change: the power of the size with which they scale, and their
@@ -57,27 +61,81 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
     size = real_array("factor", factor, lens.curvature.dtype)
     if size.shape or (concrete(size) and not size > 0):
         raise ValueError(f"factor: expected one number above 0, got {factor}")
+
+    def larger(part: Any, *names: str, **others: Any) -> Any:
+        """The lens, or a part of it, with the lengths of these names multiplied."""
+        lengths = {name: jax.tree.map(lambda a: a * size, getattr(part, name)) for name in names}
+        return dataclasses.replace(part, **lengths, **others)
+
     phase, elements, apertures = lens.phase, lens.elements, lens.apertures
     if phase is not None:
         own = _resized(phase.coefficients, phase.forms, size)
         phase = dataclasses.replace(phase, coefficients=own)
-    if elements is not None:
-        shift, pivot = elements.shift * size, elements.pivot * size
-        elements = dataclasses.replace(elements, shift=shift, pivot=pivot)
-    if apertures is not None:
-        centre = None if apertures.centre is None else apertures.centre * size
-        apertures = dataclasses.replace(apertures, half=apertures.half * size, centre=centre)
-    return dataclasses.replace(
+    return larger(
         lens,
+        *("thickness", "semi_diameter", "sensor", "decentre"),
         curvature=lens.curvature / size,
         coefficients=_resized(lens.coefficients, lens.forms, size),
-        thickness=lens.thickness * size,
-        semi_diameter=lens.semi_diameter * size,
-        sensor=lens.sensor * size,
-        decentre=None if lens.decentre is None else lens.decentre * size,
+        phase=phase,
+        elements=elements and larger(elements, "shift", "pivot"),
+        apertures=apertures and larger(apertures, "half", "centre"),
+    )
+
+
+def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: Array) -> Lens:
+    """The lens with its surfaces in another order, or with planes added.
+
+    Here every field of `Lens` that has rows for surfaces or media, or numbers of surfaces, is
+    mapped.
+
+    lens: the lens.
+    rows: (T + 1,), for each of the T new surfaces and the sensor the old row; -1 for a new plane
+        without an aperture. Every old row occurs once.
+    media: (T + 1,), for each new medium the old one.
+    thickness: (T - 1,), between the new vertices, mm.
+    """
+    old, into = np.array(rows), np.array(media)
+    new = {row: k for k, row in enumerate(rows)}
+
+    def numbers(surfaces: Iterable[int]) -> tuple[int, ...]:
+        return tuple(new[i] for i in surfaces)
+
+    def taken(array: Array | None, plane: float = 0.0) -> Any:
+        if array is None:
+            return None
+        is_new = np.reshape(old < 0, (-1, *(1,) * (array.ndim - 1)))
+        return jnp.where(is_new, plane, array[old])
+
+    phase, elements, apertures = lens.phase, lens.elements, lens.apertures
+    replace = dataclasses.replace
+    if phase is not None:
+        surfaces = numbers(phase.surfaces)
+        order = np.argsort(surfaces)
+        phase = Phase(
+            phase.coefficients[order],
+            phase.order[order],
+            tuple(sorted(surfaces)),
+            tuple(phase.forms[k] for k in order),
+        )
+    if elements is not None:
+        spans = tuple((new[first], new[last]) for first, last in elements.spans)
+        elements = replace(elements, spans=spans, about=numbers(elements.about))
+    return replace(
+        lens,
+        **{name: taken(getattr(lens, name)) for name in ("curvature", "conic", "coefficients")},
+        thickness=thickness,
+        semi_diameter=taken(lens.semi_diameter, np.inf),
+        dispersion=jax.tree.map(lambda a: a[into], lens.dispersion),
+        decentre=taken(lens.decentre),
+        tilt=taken(lens.tilt),
         phase=phase,
         elements=elements,
-        apertures=apertures,
+        apertures=apertures and replace(apertures, surfaces=numbers(apertures.surfaces)),
+        stop=new[lens.stop],
+        labels=Labels(lens.name, tuple(lens.glasses[i] for i in media)),
+        forms=tuple(lens.forms[i] if i >= 0 else "asphere" for i in rows),
+        mirrors=tuple(i >= 0 and lens.mirrors[i] for i in rows[:-1]),
+        curved=tuple(sorted(numbers(lens.curved))),
     )
 
 
@@ -87,43 +145,50 @@ def flipped(lens: Lens) -> Lens:
     The sensor is not reversed, and keeps its distance from the last vertex. ValueError for a lens
     with mirrors or elements.
     """
-    if any(lens.mirrors) or lens.elements is not None:
-        raise ValueError("lens: with mirrors or elements it cannot be flipped")
-    count = lens.count
-    order = np.array([*range(count)[::-1], count])
-    other = {i: count - 1 - i for i in range(count)} | {count: count}
-    signs = np.array([_terms(form, lens.coefficients.shape[1])[1] for form in lens.forms])
-    signs[-1], turn = 1, np.array([*[-1] * count, 1])  # the sensor is not reversed
-    dtype = lens.curvature.dtype
-    tilt = lens.tilt
-    if tilt is not None:  # tilts about x and y change their sign
-        tilt = (tilt * jnp.asarray(np.stack([turn, turn, turn**2], axis=1), dtype))[order]
-    phase, apertures = lens.phase, lens.apertures
-    if phase is not None:
-        phase = Phase(
-            phase.coefficients[::-1],
-            phase.order[::-1],
-            tuple(other[i] for i in phase.surfaces[::-1]),
-            phase.forms[::-1],
-        )
-    if apertures is not None:
-        places = tuple(other[i] for i in apertures.surfaces)
-        apertures = dataclasses.replace(apertures, surfaces=places)
+    simple = not any(lens.mirrors) and lens.elements is None
+    require(simple, "lens: with mirrors or elements it cannot be flipped")
+    count, dtype = lens.count, lens.curvature.dtype
+    rows = [*range(count)[::-1], count]
+    turned = reindexed(lens, rows, range(count + 1)[::-1], lens.thickness[::-1])
+    # Surfaces are reversed, the sensor is not; tilts about z keep their sign.
+    turn = np.array([*[-1] * count, 1])
+    signs = np.array([_terms(form, lens.coefficients.shape[1])[1] for form in turned.forms])
+    signs[-1] = 1
+    tilt = turned.tilt
+    if tilt is not None:
+        tilt = tilt * jnp.asarray(np.stack([turn, turn, turn**2], axis=1), dtype)
     return dataclasses.replace(
-        lens,
-        curvature=(lens.curvature * jnp.asarray(turn, dtype))[order],
-        conic=lens.conic[order],
-        coefficients=(lens.coefficients * jnp.asarray(signs, dtype))[order],
-        thickness=lens.thickness[::-1],
-        semi_diameter=lens.semi_diameter[order],
-        dispersion=jax.tree.map(lambda a: a[::-1], lens.dispersion),
-        decentre=None if lens.decentre is None else lens.decentre[order],
+        turned,
+        curvature=turned.curvature * jnp.asarray(turn, dtype),
+        coefficients=turned.coefficients * jnp.asarray(signs, dtype),
         tilt=tilt,
-        phase=phase,
-        apertures=apertures,
-        stop=other[lens.stop],
-        labels=Labels(lens.name, lens.glasses[::-1]),
-        forms=tuple(lens.forms[i] for i in order),
-        mirrors=lens.mirrors[::-1],
-        curved=tuple(sorted(other[i] for i in lens.curved)),
     )
+
+
+def with_paraxial_pupil(lens: Lens, wavelength: Numbers = 0.5875618) -> Lens:
+    """The lens with its paraxial entrance pupil as the stop, as design programs launch rays without
+    ray aiming.
+
+    Two dummy planes are put in front: surface 0 at the first vertex, so that z and distances do not
+    change, and surface 1, the pupil in object space. At every field and wavelength rays fill the
+    pupil uniformly, and the chief ray passes through its centre. The real stop becomes an ordinary
+    surface without a semi-diameter, at which only `Lens.apertures` clip.
+
+    Differentiable: the pupil moves with the lens. Tilts and decentres are neglected.
+
+    lens: the lens.
+    wavelength: (), of the paraxial rays, the primary wavelength, um.
+
+    ValueError for a pupil at infinity; inside a trace all rays then fail.
+    """
+    pupil, count = entrance_pupil(lens, wavelength), lens.count
+    place, radius = pupil.position[0], pupil.semi_diameter[0]
+    known = jnp.isfinite(place)
+    if concrete(known) and not known:
+        raise ValueError("pupil: the paraxial entrance pupil is at infinity: take the real stop")
+    place = jnp.where(known, place, 0)
+    thickness = jnp.concatenate([jnp.stack([place, -place]), lens.thickness])
+    found = reindexed(lens, [-1, -1, *range(count + 1)], [0, 0, *range(count + 1)], thickness)
+    rim = found.semi_diameter.at[found.stop].set(jnp.inf)
+    rim = rim.at[1].set(jnp.where(known, radius, jnp.inf))
+    return dataclasses.replace(found, semi_diameter=rim, stop=1)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require
 from ..numerics import concrete, matmul, safe_divide, safe_sqrt
 
 # Of model glasses: the lines d, F, C, g (um), and the powers of the wavelength L in Conrady's
@@ -130,10 +131,9 @@ def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
 
     ValueError unless 1 < nd <= 4, 10 <= vd <= 120 and -0.2 <= partial <= 0.2.
     """
-    if not (1 < nd <= 4 and 10 <= vd <= 120):
-        raise ValueError(f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
-    if not abs(partial) <= _FARTHEST:
-        raise ValueError(f"expected P_gF within {_FARTHEST:g} of the normal line, got {partial:g}")
+    is_glass, is_near = 1 < nd <= 4 and 10 <= vd <= 120, abs(partial) <= _FARTHEST
+    require(is_glass, f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
+    require(is_near, f"expected P_gF within {_FARTHEST:g} of the normal line, got {partial:g}")
     name = f"model {nd!r} {vd!r}" + (f" {partial!r}" if partial else "")
     return Glass(name, range=VISIBLE, model=(nd, vd), partial=partial)
 

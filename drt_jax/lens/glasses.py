@@ -3,9 +3,11 @@
 tools/glasses.py writes the table and describes its sources and form.
 """
 
+import dataclasses
 import difflib
 import functools
 import gzip
+import itertools
 import pathlib
 from collections.abc import Collection
 from typing import NamedTuple
@@ -14,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require
 from ..numerics import matmul
 from .glass import FRAUNHOFER, POWERS, Glass
 
@@ -24,19 +27,10 @@ _PER_VD = 0.01
 
 
 class _Entry(NamedTuple):
-    """A line of the table.
-
-    plain: True if the name without a maker means this glass.
-    maker, source: of the glass.
-    celsius: temperature of its constants, as text.
-    constants: range, Sellmeier and Schott coefficients, as text.
-    """
+    """A glass of the table. plain: True if the name without a maker means this glass."""
 
     plain: bool
-    maker: str
-    celsius: str
-    source: str
-    constants: str
+    glass: Glass
 
 
 class Neighbour(NamedTuple):
@@ -53,59 +47,53 @@ class Neighbour(NamedTuple):
 
 @functools.cache
 def _table() -> dict[str, list[_Entry]]:
-    """All lines by name; the plain one comes first."""
-    table: dict[str, list[_Entry]] = {"air": [_Entry(True, "", "", "", "0.0001 1000000\t\t")]}
-    head = ["", "", ""]
+    """The glasses of each name without a maker; the one that the name alone means comes first.
+
+    Each glass has the shortest name by which `find_glass` finds it: the name alone, or NAME_MAKER.
+    """
+    table = {"air": [_Entry(True, Glass("air"))]}
+    maker = source = ""
     for line in gzip.decompress(_TABLE.read_bytes()).decode().split("\n"):
         if line.startswith("#"):
-            head = line[1:].split("\t")
+            maker, celsius, source = line[1:].split("\t")[:3]
+            source = f"{source}; at {celsius} C" if celsius else source
             continue
-        name, _, constants = line.partition("\t")
-        entry = _Entry(name.startswith("*"), head[0], head[1], head[2], constants)
-        entries = table.setdefault(name.removeprefix("*"), [])
-        entries.insert(0 if entry.plain else len(entries), entry)
+        marked, *constants = line.split("\t")
+        ends, sellmeier, schott = (tuple(map(float, part.split())) for part in constants)
+        name, plain = marked.removeprefix("*"), marked.startswith("*")
+        made = sellmeier or Glass.sellmeier, schott or Glass.schott, (ends[0], ends[1])
+        entries = table.setdefault(name, [])
+        entry = _Entry(plain, Glass(name, *made, maker=maker, source=source))
+        entries.insert(0 if plain else len(entries), entry)
+    for name, entries in table.items():
+        differ = len({(g.sellmeier, g.schott, g.range) for _, g in entries}) > 1
+        for k, (plain, glass) in enumerate(entries):
+            if not plain and (differ or entries[0].plain):
+                named = dataclasses.replace(glass, name=f"{name}_{glass.maker}")
+                entries[k] = _Entry(plain, named)
     return table
 
 
 @functools.cache
 def glass_makers() -> tuple[str, ...]:
     """Makers in the table, including Zemax's catalogues MISC and INFRARED."""
-    found = {entry.maker for entries in _table().values() for entry in entries}
+    found = {entry.glass.maker for entries in _table().values() for entry in entries}
     return tuple(sorted(found - {""}))
 
 
-def _glass(name: str, entry: _Entry) -> Glass:
-    """The glass of a line, under the shortest name by which it is found."""
-    low_high, sellmeier, schott = (
-        tuple(map(float, part.split())) for part in entry.constants.split("\t")
-    )
-    entries = _table()[name]
-    alone = entry is entries[0] if entries[0].plain else not _differ(entries)
-    return Glass(
-        name if alone else f"{name}_{entry.maker}",
-        sellmeier or Glass.sellmeier,
-        schott or Glass.schott,
-        (low_high[0], low_high[1]),
-        maker=entry.maker,
-        source=f"{entry.source}; at {entry.celsius} C" if entry.celsius else entry.source,
-    )
-
-
-def _differ(entries: list[_Entry]) -> bool:
-    """True if glasses of one name have different constants or ranges."""
-    return len({entry.constants for entry in entries}) > 1
-
-
-def _all() -> list[tuple[str, _Entry]]:
-    """All glasses except air, with their names."""
-    return [(n, e) for n, entries in _table().items() for e in entries if n != "air"]
+def _known_maker(maker: str, what: str = "") -> str:
+    """A maker in capitals. ValueError, whose message begins with `what`, for an unknown one."""
+    makers = glass_makers()
+    message = f"{what}unknown maker {maker!r}; makers: {', '.join(makers)}"
+    require(maker.upper() in makers, message)
+    return maker.upper()
 
 
 @functools.cache
 def glass_names() -> tuple[str, ...]:
     """Names of all glasses, NAME_MAKER where a name is ambiguous; plain names first."""
-    ordered = sorted(_all(), key=lambda own: not own[1].plain)
-    return ("air", *dict.fromkeys(_glass(name, entry).name for name, entry in ordered))
+    entries = sorted(itertools.chain(*_table().values()), key=lambda entry: not entry.plain)
+    return tuple(dict.fromkeys(entry.glass.name for entry in entries))
 
 
 def find_glass(name: str, maker: str | None = None) -> Glass:
@@ -124,25 +112,18 @@ def find_glass(name: str, maker: str | None = None) -> Glass:
     plain, _, after = name.rpartition("_")
     if maker is None and name not in table and plain in table:
         name, maker = plain, after
-    if maker is not None and maker.upper() not in glass_makers():
-        raise ValueError(
-            f"glass {name!r}: unknown maker {maker!r}; makers: {', '.join(glass_makers())}"
-        )
-    entries = table.get(name, [])
-    found = [entry for entry in entries if maker is None or entry.maker == maker.upper()]
-    of = ", ".join(entry.maker or "no maker" for entry in entries)
-    if not found and entries:
-        raise ValueError(f"glass {name!r} is not of {maker} but of {of}")
-    if not found:
-        near = near_names(name)
-        hint = f"near names: {', '.join(near)}" if near else "no near name"
+    maker = None if maker is None else _known_maker(maker, f"glass {name!r}: ")
+    if name not in table:
+        near = ", ".join(near_names(name))
+        hint = f"near names: {near}" if near else "no near name"
         raise ValueError(f"unknown glass {name!r}; {hint}")
-    if not found[0].plain and _differ(found):
-        raise ValueError(
-            f"glass {name!r} is of several makers, {of}, with different constants; give one, as "
-            f"{name}_{found[0].maker}"
-        )
-    return _glass(name, found[0])
+    glasses = [entry.glass for entry in table[name]]
+    of = ", ".join(glass.maker or "no maker" for glass in glasses)
+    found = [glass for glass in glasses if maker is None or glass.maker == maker]
+    require(found, f"glass {name!r} is not of {maker} but of {of}")
+    several = f"glass {name!r} is of several makers, {of}, with different constants; give one, as "
+    require(maker is not None or found[0].name == name, several + found[0].name)
+    return found[0]
 
 
 def plain_names() -> list[str]:
@@ -161,8 +142,8 @@ def near_names(name: str, count: int = 6) -> list[str]:
     near = difflib.get_close_matches(name, folded, n=count, cutoff=0.5)
     near += [known for known in folded if name in known and known not in near]
     alike = [own for known in near[:count] for own in spellings(known)]
-    entries = ((own, entry) for own in alike for entry in _table()[own])
-    return [*dict.fromkeys(_glass(own, entry).name for own, entry in entries)][:count]
+    names = (entry.glass.name for own in alike for entry in _table()[own])
+    return [*dict.fromkeys(names)][:count]
 
 
 def indices(glass: Glass, wavelengths: np.ndarray) -> np.ndarray:
@@ -206,12 +187,13 @@ def map_point(glass: Glass) -> tuple[float, float] | None:
 
 
 @functools.cache
-def _mapped() -> tuple[list[_Entry], list[Glass], np.ndarray]:
-    """Entries, glasses, and nd and vd (G, 2) of all solids that have nd and vd."""
-    solids = [(entry, _glass(name, entry)) for name, entry in _all() if name.lower() != "water"]
-    found = [(*own, point) for own in solids if (point := map_point(own[1]))]
-    entries, glasses, points = zip(*found, strict=True)
-    return [*entries], [*glasses], np.array(points)
+def _mapped() -> tuple[list[_Entry], np.ndarray]:
+    """All solids that have nd and vd; and their nd and vd (G, 2)."""
+    others = {"air", "water"}
+    solids = (own for name, own in _table().items() if name.lower() not in others)
+    each = ((entry, map_point(entry.glass)) for entry in itertools.chain(*solids))
+    entries, points = zip(*((entry, point) for entry, point in each if point), strict=True)
+    return [*entries], np.array(points)
 
 
 def nearest_glasses(
@@ -225,15 +207,13 @@ def nearest_glasses(
     makers: some of `glass_makers()`; None for all. ValueError for unknown makers.
     count: largest number of glasses; None for all.
     """
-    only = None if makers is None else {maker.upper() for maker in makers}
-    for maker in sorted((only or set()) - {*glass_makers()}):
-        raise ValueError(f"unknown maker {maker!r}; makers: {', '.join(glass_makers())}")
-    entries, glasses, points = _mapped()
+    only = None if makers is None else {*map(_known_maker, makers)}
+    entries, points = _mapped()
     away = np.hypot(points[:, 0] - nd, _PER_VD * (points[:, 1] - vd))
     own = [
-        Neighbour(glasses[i], float(points[i, 0]), float(points[i, 1]), float(away[i]))
+        Neighbour(entries[i].glass, float(points[i, 0]), float(points[i, 1]), float(away[i]))
         for i in np.argsort(away, kind="stable")
-        if only is None or entries[i].maker in only
+        if only is None or entries[i].glass.maker in only
     ]
     return own[:count]
 
@@ -246,7 +226,7 @@ def _glass_map() -> np.ndarray:
     """
     from scipy.spatial import ConvexHull  # takes half a second to import
 
-    entries, _, points = _mapped()
+    entries, points = _mapped()
     return ConvexHull(points[[entry.plain for entry in entries]] * (1, _PER_VD)).equations
 
 

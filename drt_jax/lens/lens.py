@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from jax.dtypes import canonicalize_dtype
 
+from ..inputs import require
 from ..numerics import Numbers, concrete, matmul, real_array, still
 from .aperture import Apertures
 from .elements import Elements, rotation_matrix
@@ -302,8 +303,8 @@ class Lens:
             `check_wavelengths`.
         """
         found = jnp.atleast_1d(real_array("wavelengths", wavelengths, self.curvature.dtype))
-        if found.ndim != 1 or not found.size:
-            raise ValueError(f"wavelengths: expected one or a list, got shape {found.shape}")
+        is_list = found.ndim == 1 and found.size
+        require(is_list, f"wavelengths: expected one or a list, got shape {found.shape}")
         self.check_wavelengths(wavelengths)
         return found
 
@@ -317,11 +318,8 @@ class Lens:
         ranges = self.dispersion.ranges
         if not concrete((wavelengths, ranges)):
             return
-        low, high = self.dispersion.range
         # Rounded to the dtype of the lens: 0.7 is not beyond 0.7 in float32.
         values = np.ravel(np.asarray(wavelengths, ranges.dtype)).astype(float).tolist()
-        if all(low <= value <= high for value in values):
-            return
         known = np.asarray(ranges, float).tolist()
         for name, (low, high) in zip(self.glasses, known, strict=True):
             for value in values:
@@ -370,25 +368,19 @@ class Lens:
             kind = getattr(array, "dtype", dtype)
             if kind != dtype and len({*map(canonicalize_dtype, (kind, dtype))}) > 1:
                 raise ValueError(f"{what} the dtype of curvature, {dtype}, got {kind}")
-        of_each = (("forms", self.forms), ("dispersion", self.dispersion.schott))
-        for name, values in of_each:
-            if len(values) != rows:
-                raise ValueError(f"lens.{name}: expected {rows} rows, got {len(values)}")
-        if not {*self.curved} <= {*range(rows)}:
-            raise ValueError(f"lens.curved: expected rows 0 to {rows - 1}, got {self.curved}")
-        if not {*self.free} <= {*HELD}:
-            raise ValueError(f"lens.free: expected some of {', '.join(HELD)}, got {self.free}")
-        if not 0 <= self.stop < self.count:
-            raise ValueError(f"lens.stop: expected 0 to {self.count - 1}, got {self.stop}")
+        for name, values in (("forms", self.forms), ("dispersion", self.dispersion.schott)):
+            found = len(values)
+            require(found == rows, f"lens.{name}: expected {rows} rows, got {found}")
+        curved, free, stop, last = self.curved, self.free, self.stop, self.count - 1
+        is_known = {*curved} <= {*range(rows)}
+        require(is_known, f"lens.curved: expected rows 0 to {rows - 1}, got {curved}")
+        require({*free} <= {*HELD}, f"lens.free: expected some of {', '.join(HELD)}, got {free}")
+        require(0 <= stop <= last, f"lens.stop: expected 0 to {last}, got {stop}")
         if concrete(self.semi_diameter):
             semi = float(np.asarray(self.semi_diameter)[self.stop])
-            if semi == 0 or not np.isfinite(semi):
-                raise ValueError(
-                    f"lens.semi_diameter: that of the stop, surface {self.stop}, must be above 0 "
-                    f"mm and finite, got {semi:g}"
-                )
-        if self._wrong:
-            raise ValueError(self._wrong)
+            what = f"lens.semi_diameter: that of the stop, surface {stop}, must be above 0 mm and"
+            require(semi != 0 and np.isfinite(semi), f"{what} finite, got {semi:g}")
+        require(not self._wrong, self._wrong)
 
 
 @functools.cache

@@ -8,6 +8,8 @@ import itertools
 
 import numpy as np
 
+from ..inputs import require
+
 # Largest number of corners of a polygon in a file, and of a convex piece.
 CORNERS, _SIDES = 64, 24
 # Area up to which a triangle counts as empty, relative to the square of the size of the polygon.
@@ -37,8 +39,7 @@ def tidied(corners: np.ndarray) -> np.ndarray:
         three = np.take(corners, (k - 1, k, k + 1), axis=0, mode="wrap")
         if len(corners) > 2 and abs(_turn(*three)) <= _least(corners):
             corners = np.delete(corners, k, axis=0)
-    if len(corners) < 3:
-        raise ValueError("needs three corners that do not lie on one line")
+    require(len(corners) >= 3, "needs three corners that do not lie on one line")
     return corners
 
 
@@ -50,10 +51,9 @@ def convex_pieces(corners: np.ndarray) -> tuple[tuple[int, ...], ...]:
     (Hertel and Mehlhorn, 1983). ValueError if sides cross or touch, or if `tidied` would leave
     corners out.
     """
-    if len(tidied(corners)) < len(corners):
-        raise ValueError("has a corner twice, or one on a straight side: leave it out")
-    if _crosses(corners):
-        raise ValueError("its sides cross or touch")
+    is_tidy = len(tidied(corners)) == len(corners)
+    require(is_tidy, "has a corner twice, or one on a straight side: leave it out")
+    require(not _crosses(corners), "its sides cross or touch")
     ring = list(range(len(corners)))
     if np.sum(_turn(corners[0], corners, np.roll(corners, -1, axis=0))) < 0:
         ring = ring[::-1]

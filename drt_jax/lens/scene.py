@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require
 from ..numerics import Numbers, concrete, known_array, real_array
 from .lens import Lens
 
@@ -64,11 +65,9 @@ class Scene:
         that are not possible: an angle of 90 degrees or more, a distance within 1e-6 mm of 0.
         """
         angles = known_angles("field", field)
-        if angles.shape not in ((), (2,)):
-            raise ValueError(f"field: expected one angle or two, got shape {angles.shape}")
-        shape = known_array("distance", distance).shape
-        if len(shape) > 1:
-            raise ValueError(f"distance: expected one number or (Z,), got shape {shape}")
+        shape, far = angles.shape, np.shape(known_array("distance", distance))
+        require(shape in ((), (2,)), f"field: expected one angle or two, got shape {shape}")
+        require(len(far) < 2, f"distance: expected one number or (Z,), got shape {far}")
         pair = angles if angles.ndim else _pairs(angles)
         return cls._made(pair, distance, wavelengths, weights)
 
@@ -153,8 +152,8 @@ class Scene:
         """
         count = len(self.wavelengths)
         found = count // 2 if index is None else index
-        if not -count <= found < count:
-            raise ValueError(f"reference: expected an index of the wavelengths, got {index!r}")
+        is_index = -count <= found < count
+        require(is_index, f"reference: expected an index of the wavelengths, got {index!r}")
         return found
 
     def with_axis(self) -> "Scene":
@@ -162,9 +161,8 @@ class Scene:
 
         ValueError for several distances.
         """
-        if np.ndim(self.distance):
-            shape = np.shape(self.distance)
-            raise ValueError(f"distance: expected one for all fields, got shape {shape}")
+        shape = np.shape(self.distance)
+        require(not shape, f"distance: expected one for all fields, got shape {shape}")
         return self.at(jnp.pad(self.field.reshape(-1, 2), ((1, 0), (0, 0))))
 
     def each(self) -> "list[Scene]":
@@ -222,11 +220,8 @@ def checked_scene(lens: Lens, scene: Scene) -> Scene:
     and weights of the wrong shape, and, as far as values are known, for numbers that are not
     possible, see `Scene.point`, and for a wavelength outside the range of a glass.
     """
-    if not isinstance(scene, Scene):
-        raise ValueError(
-            f"scene: expected a Scene, such as Scene.degrees([0, 14], wavelengths=0.55), got a "
-            f"{type(scene).__name__}"
-        )
+    what = "scene: expected a Scene, such as Scene.degrees([0, 14], wavelengths=0.55), got a"
+    require(isinstance(scene, Scene), f"{what} {type(scene).__name__}")
     lens.check()
     dtype = lens.curvature.dtype
 
@@ -245,8 +240,7 @@ def checked_scene(lens: Lens, scene: Scene) -> Scene:
     known_angles("field", scene.field)
     _check_distance(scene.distance)
     field, distance = array("field"), array("distance")
-    if field.ndim == 0 or field.shape[-1] != 2:
-        raise ValueError(f"field: expected (..., 2), got shape {field.shape}")
+    require(field.shape[-1:] == (2,), f"field: expected (..., 2), got shape {field.shape}")
     try:
         np.broadcast_shapes(field.shape[:-1], distance.shape)
     except ValueError:
@@ -295,8 +289,8 @@ def _pairs(angles: Any) -> Any:
 def _fields(angles: Any) -> Any:
     """Pairs (F, 2), or (2,), of angles: (F,) or () along y, or pairs (F, 2)."""
     pairs = _pairs(angles) if angles.ndim < 2 else angles
-    if pairs.shape[-1] != 2 or not pairs.size or pairs.ndim > 2:
-        raise ValueError(f"fields: expected (F,) or (F, 2), got shape {angles.shape}")
+    is_list = pairs.shape[-1] == 2 and pairs.size and pairs.ndim <= 2
+    require(is_list, f"fields: expected (F,) or (F, 2), got shape {angles.shape}")
     return pairs
 
 
@@ -317,8 +311,7 @@ def distance_array(distance: Numbers, dtype: Any) -> Array:
     1e-6 mm of 0.
     """
     far = real_array("distance", distance, dtype)
-    if far.ndim:
-        raise ValueError(f"distance: expected one number, got shape {far.shape}")
+    require(not far.ndim, f"distance: expected one number, got shape {far.shape}")
     _check_distance(distance)
     return far
 
@@ -341,7 +334,7 @@ def field_of_height(height: Numbers, distance: Numbers) -> Array:
     """
     heights = real_array("height", height, float)
     far = distance_array(distance, float)
-    if np.inf in np.abs(_known(distance)):
-        raise ValueError("distance: at infinity an object has a field, but no height")
+    is_far = np.inf in np.abs(_known(distance))
+    require(not is_far, "distance: at infinity an object has a field, but no height")
     good = away_from_vertex(far) & (jnp.abs(far) < jnp.inf)
     return jnp.where(good, -jnp.arctan(heights / jnp.where(good, far, 1)), _RIGHT)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require
 from ..numerics import known_values, safe_divide
 from .forms import FORMS
 from .lens import Lens
@@ -119,10 +120,8 @@ def third_order(lens: Lens, scene: Scene) -> ThirdOrder:
     aberrations.
     """
     others = sorted({form for form in lens.forms if FORMS[form].symmetry != "rotational"})
-    if others:
-        raise ValueError(f"third order: no theory for surfaces of the form {', '.join(others)}")
-    if lens.phase is not None:
-        raise ValueError("third order: no theory for diffractive surfaces")
+    require(not others, f"third order: no theory for surfaces of the form {', '.join(others)}")
+    require(lens.phase is None, "third order: no theory for diffractive surfaces")
     moves = lens.decentre, lens.tilt, lens.elements and (lens.elements.shift, lens.elements.tilt)
     if any(np.any(move) for move in jax.tree.leaves(known_values(moves))):
         raise ValueError(
