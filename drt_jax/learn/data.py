@@ -19,7 +19,7 @@ from typing import IO, NamedTuple, TypeVar
 import numpy as np
 from skimage import data
 
-from ..inputs import InputError, one_line, shown
+from ..inputs import InputError, one_line, require, shown
 from .images import SUFFIXES, find_images, in_bands, look, read
 
 # Colour and texture photographs in the scikit-image wheel.
@@ -60,9 +60,8 @@ class DataConfig:
             ("crops_per_image", 1 <= self.crops_per_image <= _MOST_CROPS, f"1 to {_MOST_CROPS}"),
             ("test_fraction", 0 < self.test_fraction < 1, "between 0 and 1"),
         ):
-            if not is_right:
-                got = shown(getattr(self, key))
-                raise DataError(f"data.{key}: expected {expected}, got {got}")
+            got = shown(getattr(self, key))
+            require(is_right, f"data.{key}: expected {expected}, got {got}", DataError)
 
 
 class Patches(NamedTuple):
@@ -111,17 +110,15 @@ def load_patches(
                 for crop in _crops(pixels, config.crops_per_image, side, [seed, 1, i]):
                     pool.write(crop.tobytes())
             del pixels  # before the next is decoded
-        if usable < 2:
-            raise DataError(
-                f"data.root: {config.root}: {usable} usable images; train and test need one each, "
-                f"of at least {side} x {side} pixels. " + " ".join(skipped[:3])
-            )
+        what = f"data.root: {config.root}: {usable} usable images; train and test need one each, of"
+        why = " ".join(map(one_line, skipped[:3]))
+        require(usable > 1, f"{what} at least {side} x {side} pixels. {why}", DataError)
         order = np.random.default_rng([seed, 0]).permutation(usable)
         count = min(max(1, round(config.test_fraction * usable)), usable - 1)
         is_test = np.isin(np.arange(usable), order[:count]).repeat(config.crops_per_image)
         _part(pool, test_file, is_test, size)
         shape = -1, side, side, bands
-        return Patches(_array(pool, shape), _array(test_file, shape), tuple(skipped))
+        return Patches(_array(pool, shape), _array(test_file, shape), tuple(map(one_line, skipped)))
 
 
 def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
@@ -129,16 +126,12 @@ def _sources(root: str) -> tuple[Sequence[_Source], list[str]]:
     if root == "bundled":
         return _BUNDLED, []
     folder = os.path.expanduser(root)
-    if not os.path.isdir(folder):
-        raise DataError(f"data.root: {root} is not a folder; give one with images, or bundled")
+    what = f"data.root: {root}"
+    is_folder = os.path.isdir(folder)
+    require(is_folder, f"{what} is not a folder; give one with images, or bundled", DataError)
     paths, left_out = find_images(folder)
-    left_out = [one_line(line) for line in left_out]
-    if not paths:
-        kinds = ", ".join(SUFFIXES)
-        raise DataError(
-            f"data.root: {root} holds no image ({kinds}), nor do its subfolders. "
-            + " ".join(left_out[:3])
-        )
+    kinds, why = ", ".join(SUFFIXES), " ".join(map(one_line, left_out[:3]))
+    require(paths, f"{what} holds no image ({kinds}), nor do its subfolders. {why}", DataError)
     return paths, left_out
 
 
@@ -167,7 +160,7 @@ def _fits(source: _Source, side: int, skipped: list[str]) -> bool:
     """
     size = _read_or_skip(_size, source, skipped)
     if size and min(size) < side:
-        skipped.append(one_line(f"{source}: {size[0]} x {size[1]} pixels, smaller than {side}"))
+        skipped.append(f"{source}: {size[0]} x {size[1]} pixels, smaller than {side}")
     return bool(size and min(size) >= side)
 
 
@@ -181,7 +174,7 @@ def _read_or_skip(reader: Callable[..., _T], source: _Source, skipped: list[str]
             return reader(source)
     except Exception as error:  # an image reader may raise anything on a damaged file
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        skipped.append(one_line(f"{source}: unreadable ({reason})"))
+        skipped.append(f"{source}: unreadable ({reason})")
         return None
 
 
@@ -202,20 +195,18 @@ def _check_room(config: DataConfig, count: int, side: int, size: int) -> None:
     """
     needed, folder = size * config.crops_per_image * count, config.memory_map
     what = f"{count} images x {config.crops_per_image} crops of {side} x {side} pixels"
-    if not folder and needed > _MOST_MEMORY:
-        raise DataError(
-            f"data.crops_per_image: {what} take {needed / 1e9:.1f} GB, of memory at most "
-            f"{_MOST_MEMORY / 1e9:.0f}; lower it, or give data.memory_map a folder on a large disk"
-        )
     if folder:
         needed = int(needed * (1 + config.test_fraction))  # test patches are moved
         with _room(folder):
             free = shutil.disk_usage(os.path.expanduser(folder)).free
-        if needed > free:
-            raise DataError(
-                f"data.memory_map: {folder}: {what} take {needed / 1e9:.1f} GB, free are "
-                f"{free / 1e9:.1f}; lower data.crops_per_image, or give another folder"
-            )
+        key, have = f"memory_map: {folder}", f"free are {free / 1e9:.1f}"
+        remedy = "lower data.crops_per_image, or give another folder"
+    else:
+        free, key = _MOST_MEMORY, "crops_per_image"
+        have = f"of memory at most {free / 1e9:.0f}"
+        remedy = "lower it, or give data.memory_map a folder on a large disk"
+    take = f"data.{key}: {what} take {needed / 1e9:.1f} GB"
+    require(needed <= free, f"{take}, {have}; {remedy}", DataError)
 
 
 @contextlib.contextmanager
@@ -239,7 +230,7 @@ def _file(folder: str, open_files: contextlib.ExitStack) -> IO[bytes]:
 
 
 def _part(pool: IO[bytes], test_file: IO[bytes], is_test: np.ndarray, size: int) -> None:
-    """Moves the test crops from `pool` to `kept`, and closes the gaps.
+    """Moves the test crops from `pool` to `test_file`, and closes the gaps.
 
     It copies crop by crop, because both files together may be larger than the memory.
 
@@ -251,11 +242,9 @@ def _part(pool: IO[bytes], test_file: IO[bytes], is_test: np.ndarray, size: int)
         crop = pool.read(size)
         if moves:
             test_file.write(crop)
-            continue
-        if end < k * size:
+        else:
             pool.seek(end)
-            pool.write(crop)
-        end += size
+            end += pool.write(crop)
     pool.truncate(end)
 
 
@@ -278,11 +267,8 @@ def batches(patches: np.ndarray, size: int, seed: int, start: int = 0) -> Iterat
     start: number of the first batch.
     """
     per_epoch = len(patches) // size
-    if not per_epoch:
-        raise DataError(
-            f"{len(patches)} training patches do not fill a batch of {size}; "
-            "raise data.crops_per_image or lower train.batch"
-        )
+    what = f"{len(patches)} training patches do not fill a batch of {size}"
+    require(per_epoch, f"{what}; raise data.crops_per_image or lower train.batch", DataError)
     while True:
         epoch, first = divmod(start, per_epoch)
         order = np.random.default_rng([seed, 2, epoch]).permutation(len(patches))

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ..compilation import NETWORK, known_options
 from ..image.sensor import convolve_each
+from ..inputs import require
 from ..numerics import Numbers
 from .adam import adam, apply_updates, copied
+from .train import compiled_step, truth_of
 
 # A function from the optics and object points to kernels (P, C, K, K), and to the light (P, C) on
 # the sensor relative to a constant of the camera.
@@ -62,11 +63,8 @@ class FieldImager:
         key: a PRNG key.
         """
         count = seen.fields.shape[0]
-        if scenes.shape[0] % count:
-            raise ValueError(
-                f"scenes: {scenes.shape[0]} patches cannot be shared among {count} points: give a "
-                "multiple"
-            )
+        what = f"scenes: {scenes.shape[0]} patches cannot be shared among {count} points"
+        require(scenes.shape[0] % count == 0, f"{what}: give a multiple")
         each = scenes.shape[0] // count
         kernels, light = self.points(optics, seen)
         image = self.convolve(scenes, kernels.repeat(each, axis=0))
@@ -113,13 +111,6 @@ class ObjectPoints(NamedTuple):
     deviations: Any = None
 
 
-def truth_of(scenes: Array, image: Array) -> Array:
-    """The part of scenes (B, H + K - 1, W + K - 1, C) that images (B, H, W, C) show."""
-    margin = (scenes.shape[1] - image.shape[1]) // 2
-    height, width = image.shape[1:3]
-    return scenes[:, margin : margin + height, margin : margin + width]
-
-
 def draw_points(key: Array, count: int, field: float, depths: tuple[float, float]) -> ObjectPoints:
     """Random object points over a circular field and a range of depths.
 
@@ -144,17 +135,12 @@ def draw_points(key: Array, count: int, field: float, depths: tuple[float, float
     return ObjectPoints(jnp.arctan(tangents), distances)
 
 
-def _allow_all(before: Any, after: Any) -> Any:
-    """A `Hold` that allows every update."""
-    return after
-
-
 def make_field_step(
     imager: FieldImager,
     rates: dict[str, Any],
     draw: Callable[[Array], ObjectPoints],
     seed: int,
-    hold: Hold = _allow_all,
+    hold: Hold = lambda before, after: after,
 ) -> tuple[Callable, Callable]:
     """Adam on the mean absolute error, for lens and network, as (init, step) for `fit`.
 
@@ -188,7 +174,7 @@ def make_field_step(
         new["optics"] = hold(parameters["optics"], new["optics"])
         return (new, moments), {"loss": error}
 
-    return init, jax.jit(step, donate_argnums=0, compiler_options=known_options(NETWORK))
+    return init, compiled_step(step)
 
 
 class _Newton(NamedTuple):
@@ -210,7 +196,7 @@ def make_damped_step(
     rates: dict[str, Any],
     draw: Callable[[Array], ObjectPoints],
     seed: int,
-    hold: Hold = _allow_all,
+    hold: Hold = lambda before, after: after,
     damping: float = 0.1,
     memory: float = 0.9,
 ) -> tuple[Callable, Callable]:
@@ -259,7 +245,7 @@ def make_damped_step(
         new["optics"] = hold(parameters["optics"], optics_of(moved))
         return (new, moments, means), {"loss": error}
 
-    return init, jax.jit(step, donate_argnums=0, compiler_options=known_options(NETWORK))
+    return init, compiled_step(step)
 
 
 def _drawn(

@@ -13,6 +13,8 @@ import stat
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from ..inputs import require
+
 # Formats to which other images are best converted, and all formats that are read.
 _COMMON = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 SUFFIXES = (*_COMMON, ".jpe", ".jfif", ".webp", ".npy")
@@ -66,11 +68,8 @@ def in_bands(pixels: np.ndarray, bands: int) -> np.ndarray:
     """
     if bands == 1 and pixels.shape[2] == 3:
         return np.asarray(Image.fromarray(pixels).convert("L"))[..., None]
-    if pixels.shape[2] != bands:
-        raise ValueError(
-            f"{pixels.shape[2]} bands, {bands} are asked for: give arrays (H, W, {bands}), uint8, "
-            "written by numpy.save"
-        )
+    what = f"{pixels.shape[2]} bands, {bands} are asked for: give arrays (H, W, {bands}), uint8,"
+    require(pixels.shape[2] == bands, f"{what} written by numpy.save")
     return pixels
 
 
@@ -78,16 +77,16 @@ def _array(path: pathlib.Path) -> np.ndarray:
     """A NumPy array, (H, W, C), memory-mapped."""
     _refuse_pipes(path)
     pixels = np.load(path, mmap_mode="r", allow_pickle=False)
-    if pixels.ndim != 3 or pixels.dtype != np.uint8 or not 0 < pixels.size <= 4 * MOST_PIXELS:
-        expected = f"expected (H, W, bands), uint8, at most {4 * MOST_PIXELS} numbers"
-        raise ValueError(f"{expected}, got {pixels.shape}, {pixels.dtype}")
+    expected = f"expected (H, W, bands), uint8, at most {4 * MOST_PIXELS} numbers"
+    is_image = pixels.ndim == 3 and pixels.dtype == np.uint8
+    is_image = is_image and 0 < pixels.size <= 4 * MOST_PIXELS
+    require(is_image, f"{expected}, got {pixels.shape}, {pixels.dtype}")
     return pixels
 
 
 def _refuse_pipes(path: pathlib.Path) -> None:
     """Raises ValueError for anything that is not a regular file."""
-    if not stat.S_ISREG(os.stat(path).st_mode):
-        raise ValueError("not a regular file")
+    require(stat.S_ISREG(os.stat(path).st_mode), "not a regular file")
 
 
 def _open(path: pathlib.Path) -> Image.Image:
@@ -126,22 +125,17 @@ def find_images(folder: str) -> tuple[list[pathlib.Path], list[str]]:
     formats, counted.
     """
     found, left_out, counts = [], [], collections.Counter[str]()
-    folders = [folder]
-    while folders:
-        try:
-            with os.scandir(folders.pop()) as listing:
-                entries = list(listing)
-        except OSError as error:
-            left_out.append(f"{error.filename}: folder not searched ({error.strerror})")
-            continue
-        for entry in entries:
-            suffix = pathlib.Path(entry.name).suffix.lower()
-            if entry.is_dir(follow_symlinks=False):
-                folders.append(entry.path)
-            elif entry.is_symlink() and os.path.isdir(entry.path):
-                left_out.append(f"{entry.path}: folder not searched (a link)")
-            elif suffix in SUFFIXES:
-                found.append(pathlib.Path(entry.path))
+
+    def not_searched(error: OSError) -> None:
+        left_out.append(f"{error.filename}: folder not searched ({error.strerror})")
+
+    for place, folders, files in os.walk(folder, onerror=not_searched):
+        links = filter(os.path.islink, (os.path.join(place, name) for name in folders))
+        left_out += [f"{path}: folder not searched (a link)" for path in links]
+        for path in (pathlib.Path(place, name) for name in files):
+            suffix = path.suffix.lower()
+            if suffix in SUFFIXES:
+                found.append(path)
             elif suffix in _UNREAD:
                 counts[suffix] += 1
     kinds = ", ".join(_COMMON)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..inputs import require
 from .convolution import convolve_3x3
 
 Parameters = list[dict[str, Array]]
@@ -44,8 +45,8 @@ def red_net(
     images (B, H, W, bands)) -> restored images of the same shape and dtype. ValueError for numbers
     out of range, and for images of other bands or of another dtype.
     """
-    if layers < 1 or channels < 1 or bands < 1 or skip_every < 0:
-        raise ValueError("layers, channels and bands must be positive, skip_every not negative")
+    are_right = min(layers, channels, bands) >= 1 and skip_every >= 0
+    require(are_right, "layers, channels and bands must be positive, skip_every not negative")
     widths = [bands] + [channels] * (2 * layers - 1) + [bands]
 
     def init(key: Array) -> Parameters:
@@ -63,10 +64,9 @@ def red_net(
     def apply(parameters: Parameters, images: Array) -> Array:
         kernel = parameters[0]["kernel"]
         if images.shape[-1:] != kernel.shape[2:3] or images.dtype != kernel.dtype:
-            raise ValueError(
-                f"images: expected (B, H, W, {kernel.shape[2]}), {kernel.dtype}, got "
-                f"{images.shape}, {images.dtype}: see bands and dtype of red_net"
-            )
+            what = f"images: expected (B, H, W, {kernel.shape[2]}), {kernel.dtype}, got"
+            got = f"{images.shape}, {images.dtype}"
+            raise ValueError(f"{what} {got}: see bands and dtype of red_net")
         features = images
         skips: dict[int, Array] = {}
         for i, layer in enumerate(parameters):

@@ -14,6 +14,7 @@ from ..compilation import NETWORK, known_options
 from ..image.kernel import Form, gaussian_psf, separable_psf
 from ..image.sensor import Convolve, convolve, sensor_layer
 from ..image.spot import Moments
+from ..inputs import require
 from ..numerics import Numbers, safe_divide, safe_sqrt
 from .adam import adam, apply_updates, copied
 from .network import count_parameters
@@ -37,11 +38,11 @@ class Camera:
     form: Form = "integrated"
 
     def __post_init__(self) -> None:
-        if not 1 <= self.kernel <= 999 or self.kernel % 2 == 0:
-            odd = "expected an odd number of pixels, 1 to 999"
-            raise ValueError(f"camera.kernel: {odd}, got {self.kernel}")
-        if not 1e-3 <= self.pixel_um <= 1e4:
-            raise ValueError(f"camera.pixel_um: expected 1e-3 to 1e4, got {self.pixel_um}")
+        side, pixel = self.kernel, self.pixel_um
+        is_odd = 1 <= side <= 999 and side % 2 == 1
+        require(is_odd, f"camera.kernel: expected an odd number of pixels, 1 to 999, got {side}")
+        in_range = 1e-3 <= pixel <= 1e4
+        require(in_range, f"camera.pixel_um: expected 1e-3 to 1e4, got {pixel}")
 
 
 def make_imager(
@@ -66,7 +67,6 @@ def make_imager(
     centroid of the wavelengths that arrive, so that images are registered. Each channel is
     multiplied by the throughput of its wavelength.
     """
-    margin = camera.kernel // 2
 
     def imager(
         parameters: dict[str, Any], scenes: Array, distance: Array, noise: Numbers, key: Array
@@ -82,9 +82,7 @@ def make_imager(
         throughput = jnp.expand_dims(spot.throughput.astype(dtype), (0, 1, 2))
         image = sensor_layer(scenes * throughput, kernel, noise, key, convolve)
         restored = image if restore is None else restore(parameters["network"], image)
-        end = scenes.shape[1] - margin, scenes.shape[2] - margin
-        truth = scenes[:, margin : end[0], margin : end[1]]
-        return truth, image, restored, blur_width(spot.covariance)
+        return truth_of(scenes, image), image, restored, blur_width(spot.covariance)
 
     return imager
 
@@ -95,6 +93,19 @@ def blur_width(covariance: Array) -> Array:
     covariance: (C, 2, 2), mm^2.
     """
     return safe_sqrt(jnp.mean(jnp.diagonal(covariance, 0, 1, 2), axis=1))
+
+
+def truth_of(scenes: Array, image: Array) -> Array:
+    """The part of scenes (B, H + K - 1, W + K - 1, C) that images (B, H, W, C) show."""
+    margin = (scenes.shape[1] - image.shape[1]) // 2
+    height, width = image.shape[1:3]
+    return scenes[:, margin : margin + height, margin : margin + width]
+
+
+def compiled_step(step: Callable) -> Callable:
+    """A function (state, scenes, noise, index) -> (state, metrics), jitted, with the state
+    donated."""
+    return jax.jit(step, donate_argnums=0, compiler_options=known_options(NETWORK))
 
 
 def _value_and_gradient(loss: Callable, parameters: Any) -> tuple[tuple[Array, Any], Any]:
@@ -157,7 +168,7 @@ def make_step(
 
     if vectorised:
         step = jax.vmap(step, in_axes=(0, None, None, None))
-    return init, jax.jit(step, donate_argnums=0, compiler_options=known_options(NETWORK))
+    return init, compiled_step(step)
 
 
 def fit(
