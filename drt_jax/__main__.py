@@ -8,7 +8,7 @@ import math
 import pathlib
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -44,10 +44,16 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     """The parsed command line."""
     parser = argparse.ArgumentParser(prog="python -m drt_jax", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="show, convert or glass")
+
+    def command(name: str, run: Callable, about: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=about, description=about)
+        added.set_defaults(run=run)
+        return added
+
     about = (
         "first-order data, spots over the field, share of light, warnings, and a sheet of analyses"
     )
-    show = commands.add_parser("show", help=about, description=about)
+    show = command("show", run_show, about)
     names = ", ".join(lens_names())
     show.add_argument("lens", help=f".yaml, .zmx or .seq file, or a bundled name: {names}")
     own = "default: those of a .zmx or .seq file, else"
@@ -59,17 +65,13 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     show.add_argument("--html", action="store_true", help="a page of tables and figures instead")
     ends = "of the sheet or page; default: LENS.png or LENS.html here"
     show.add_argument("--out", type=pathlib.Path, help=ends)
-    show.set_defaults(run=run_show)
     about = "write a lens as a file of another program; says what is not in it"
-    convert = commands.add_parser("convert", help=about, description=about)
+    convert = command("convert", run_convert, about)
     convert.add_argument("lens", help=".yaml, .zmx or .seq file, or a bundled name")
     convert.add_argument("out", type=pathlib.Path, help="file that ends in .yaml, .zmx or .seq")
     convert.add_argument("--missing", choices=("error", "warn"), default="error", help=_MISSING)
-    convert.set_defaults(run=run_convert)
     about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
-    glass = commands.add_parser("glass", help=about, description=about)
-    glasses.arguments(glass)
-    glass.set_defaults(run=lambda options: _write(glasses.told(options)))
+    glasses.arguments(command("glass", lambda options: _write(glasses.told(options)), about))
     return parser.parse_args(argv)
 
 
@@ -135,7 +137,8 @@ def field_rows(
     place, unit, size = ("angle", "mrad", "urad") if lens.afocal else ("height", "mm", "um")
     yield "field", f"image {place}", *spots, "light", "surfaces that clip"
     yield "deg", unit, *(f"RMS {size}" for _ in spots), "%", ""
-    middle, symmetry, whole = scene.reference(None), _widest(lens, scene), _unclipped(beams)
+    middle, symmetry = scene.reference(None), symmetry_of(lens, scene.field)
+    whole = not any(beam.clips for beam in beams)
     for field, point, beam in zip(fields, scene.each(), beams):
         rough, found = (_moments(lens, point, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
         light = 100 * float(found.throughput[middle])
@@ -160,16 +163,6 @@ def field_rows(
         if field == 0 and f"{light:.2f}" != "100.00" and not (beam.obscured and not beam.ends):
             share = f"{100 - light:.2g} % of the light that fills the stop"
             yield f"  ! on the axis {share} does not arrive; surfaces that clip: {cut}"
-
-
-def _widest(lens: Lens, scene: Scene) -> Symmetry:
-    """The symmetry of the least symmetric field, which is valid for all fields."""
-    return symmetry_of(lens, scene.field)
-
-
-def _unclipped(beams: list[Beam]) -> bool:
-    """Whether no surface clips any beam."""
-    return not any(beam.clipping or beam.ends for beam in beams)
 
 
 _moments = jit(lambda lens, scene, rule: psf_moments(lens, scene, rule), ONCE)
@@ -311,7 +304,7 @@ def run_show(options: argparse.Namespace) -> None:
         notes += _write(aperture_lines(lens, beams))
         kind = ".html" if options.html else ".png"
         out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}{kind}")
-        symmetry, cut = _widest(lens, scene), not _unclipped(beams)
+        symmetry, cut = symmetry_of(lens, scene.field), any(beam.clips for beam in beams)
         rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
         view = lens, scene, rule, _show_task
         if options.html:

@@ -71,12 +71,14 @@ def _known(name: str, value: Any) -> bool:
     return True
 
 
-def jit_outside(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
-    """`jax.jit(function, **keywords)` with the options that the backend knows.
+def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
+    """`jax.jit(function, **keywords)` with those of the wanted options that the backend knows.
 
-    The backend is asked at the first call. Only for calls outside of other programs and of
-    derivatives, because JAX accepts no options inside of them.
+    The backend is asked at the first call. Inside of other programs and of derivatives, where JAX
+    accepts no options, it has none. The attribute `program` is a function without arguments that
+    returns the program with options.
     """
+    inside = jax.jit(function, **keywords)
 
     @functools.cache
     def program() -> Callable:
@@ -84,24 +86,9 @@ def jit_outside(function: Callable, wanted: Mapping[str, Any], **keywords: Any) 
 
     @functools.wraps(function)
     def run(*args: Any, **named: Any) -> Any:
-        return program()(*args, **named)
-
-    run.program = program  # type: ignore[attr-defined]
-    return run
-
-
-def jit(function: Callable, wanted: Mapping[str, Any], **keywords: Any) -> Callable:
-    """As `jit_outside`, but it may also be called inside of other programs and of derivatives.
-
-    There it is `jax.jit(function, **keywords)`.
-    """
-    outside, inside = jit_outside(function, wanted, **keywords), jax.jit(function, **keywords)
-
-    @functools.wraps(function)
-    def run(*args: Any, **named: Any) -> Any:
         # Inside `jax.jit` a new array is a tracer, too.
         known = concrete((args, named, jnp.zeros(())))
-        return (outside if known else inside)(*args, **named)
+        return (program() if known else inside)(*args, **named)
 
-    run.program = outside.program  # type: ignore[attr-defined]
+    run.program = program  # type: ignore[attr-defined]
     return run

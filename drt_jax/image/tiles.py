@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from ..compilation import LARGE, jit_outside
+from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..pupil.clipped import ClippedGroup, Fitted
@@ -99,13 +99,13 @@ def weigh_rules(
     return [jax.tree.map(lambda a: a[k], found) for k in range(len(rules))]
 
 
-@partial(jit_outside, wanted=LARGE)
+@partial(jit, wanted=LARGE)
 def _points(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
     """Points and weights of a rule, compiled."""
     return rule.points(lens, scene)
 
 
-@partial(jit_outside, wanted=LARGE, static_argnames="solver")
+@partial(jit, wanted=LARGE, static_argnames="solver")
 def _trace(lens: Lens, scene: Scene, points: Vector, solver: Solver) -> tuple[Bundle, Found]:
     """Rays of one tile."""
     system, target = aims(lens, scene, points)
@@ -113,4 +113,4 @@ def _trace(lens: Lens, scene: Scene, points: Vector, solver: Solver) -> tuple[Bu
     return bundle_of(lens, scene, system, target, found), found
 
 
-_weigh = jit_outside(jax.vmap(weigh, (None, None, 0, None)), LARGE)
+_weigh = jit(jax.vmap(weigh, (None, None, 0, None)), LARGE)

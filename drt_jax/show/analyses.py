@@ -88,7 +88,8 @@ def fan(
     errors, component = (found.sagittal, 0) if sagittal else (found.tangential, 1)
     for curve, style in zip(np.asarray(errors)[field, ..., component], _coloured(wavelengths)):
         axes.plot(found.pupil, 1e3 * _finite(curve), **style)
-    _cross(axes)
+    axes.axhline(0, color="0.7", linewidth=0.6, zorder=0)
+    axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
     axes.set(xlim=(-1, 1))
     return axes
 
@@ -97,22 +98,13 @@ def field_curvature(
     axes: Axes, found: FieldCurvature, fields: ArrayLike, wavelengths: ArrayLike
 ) -> Axes:
     """Foci over the field, mm from the sensor: solid lines are tangential, dashed sagittal."""
-    for k, style in enumerate(_coloured(wavelengths)):
-        for foci, line in zip(found, ("-", "--")):
-            curve = np.asarray(foci)[:, k]
-            axes.plot(_finite(curve), _degrees(fields), line, **style)
-            style = {"color": style["color"]}  # one entry of a legend
-    _over_field(axes, fields, "focus (mm), S dashed")
-    return axes
+    return _over_field(axes, found, fields, wavelengths, "focus (mm), S dashed")
 
 
 def distortion(axes: Axes, found: Distortion, fields: ArrayLike, wavelengths: ArrayLike) -> Axes:
     """Distortion over the field in per cent."""
-    curves = 100 * np.asarray(found.relative).T
-    for curve, style in zip(curves, _coloured(wavelengths)):
-        axes.plot(_finite(curve), _degrees(fields), **style)
-    _over_field(axes, fields, "distortion (%)")
-    return axes
+    percent = 100 * np.asarray(found.relative)
+    return _over_field(axes, [percent], fields, wavelengths, "distortion (%)")
 
 
 def lateral_colour(
@@ -120,21 +112,17 @@ def lateral_colour(
 ) -> Axes:
     """Lateral colour along y over the field, um. found: (F, W, 2) mm. airy: radius of the shaded
     band, um."""
-    curves = 1e3 * np.asarray(found)[..., 1].T
     if 0 < airy < np.inf:
         axes.axvspan(-airy, airy, color="0.92")
-    for curve, style in zip(curves, _coloured(wavelengths)):
-        axes.plot(_finite(curve), _degrees(fields), **style)
-    _over_field(axes, fields, "lateral colour (um)")
-    return axes
+    along_y = 1e3 * np.asarray(found)[..., 1]
+    return _over_field(axes, [along_y], fields, wavelengths, "lateral colour (um)")
 
 
 def illumination(axes: Axes, light: ArrayLike, throughput: ArrayLike, fields: ArrayLike) -> Axes:
     """Relative illumination and throughput (F,) over the field."""
     axes.plot(_degrees(fields), light, color="black", label="relative illumination")
     axes.plot(_degrees(fields), throughput, "--", color="tab:grey", label="throughput")
-    axes.set(ylim=(0, 1.05), xlabel="field (degrees)")
-    axes.set_xlim(*_range(fields))
+    axes.set(xlim=_range(fields), ylim=(0, 1.05), xlabel="field (degrees)")
     axes.legend(fontsize=6, loc="lower left", frameon=False)
     return axes
 
@@ -153,8 +141,7 @@ def mtf(
     for both, name, hue in zip(np.asarray(curves), names, itertools.cycle(hues)):
         axes.plot(frequencies, both[0], color=hue, label=name)
         axes.plot(frequencies, both[1], "--", color=hue)
-    axes.set(ylim=(0, 1.02), xlabel="cycles/mm")
-    axes.set_xlim(0, float(np.max(np.asarray(frequencies))))
+    axes.set(xlim=(0, np.max(np.asarray(frequencies))), ylim=(0, 1.02), xlabel="cycles/mm")
     axes.set_title("MTF, S dashed", fontsize=8)
     axes.legend(fontsize=6, frameon=False)
     return axes
@@ -203,16 +190,11 @@ def gaussian_error(
 
 def in_angles(axes: Axes) -> None:
     """The units of an afocal lens in place of those of lengths, in labels and title."""
-    for get, put in (
-        (axes.get_xlabel, axes.set_xlabel),
-        (axes.get_ylabel, axes.set_ylabel),
-        (axes.get_title, axes.set_title),
-    ):
-        text = get()
+    for label in (axes.xaxis.label, axes.yaxis.label, axes.title):
+        text = label.get_text()
         for length, angle in _UNITS.items():
             text = re.sub(rf"\b{length}\b", angle, text)
-        if text != get():
-            put(text)
+        label.set_text(text)
 
 
 def _finite(curve: np.ndarray) -> np.ndarray:
@@ -229,12 +211,14 @@ def _range(fields: ArrayLike) -> tuple[float, float]:
     return (low, high) if high > low else (low - 1, high + 1)
 
 
-def _cross(axes: Axes) -> None:
-    axes.axhline(0, color="0.7", linewidth=0.6, zorder=0)
+def _over_field(
+    axes: Axes, curves: Sequence, fields: ArrayLike, wavelengths: ArrayLike, label: str
+) -> Axes:
+    """One or two curves (F, W), the second dashed, along y over the field."""
+    for k, style in enumerate(_coloured(wavelengths)):
+        for curve, line in zip(curves, ("-", "--")):
+            axes.plot(_finite(np.asarray(curve)[:, k]), _degrees(fields), line, **style)
+            style = {"color": style["color"]}  # one entry of a legend
     axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
-
-
-def _over_field(axes: Axes, fields: ArrayLike, label: str) -> None:
-    axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
-    axes.set_ylim(*_range(fields))
-    axes.set(xlabel=label)
+    axes.set(xlabel=label, ylim=_range(fields))
+    return axes

@@ -98,7 +98,10 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     mirrors = [
         np.where(pierced[i, :, None], np.nan, faces[i]) for i in np.flatnonzero(lens.mirrors)
     ]
-    blades, sensor = _blades(faces[lens.stop], reach), _sensor(lens, paths, reach)
+    low, high = faces[lens.stop][[0, -1]]
+    outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
+    blades = [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
+    sensor = _sensor(lens, paths, reach)
     return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles)
 
 
@@ -179,6 +182,11 @@ class Beam(NamedTuple):
     spot: float
     best: float
     shift: float
+
+    @property
+    def clips(self) -> bool:
+        """Whether some of the light does not arrive."""
+        return bool(self.clipping or self.ends)
 
 
 def beam_of(lens: Lens, scene: Scene) -> Beam:
@@ -310,12 +318,6 @@ def _path(corners: np.ndarray, start: float, angle: float, distance: float) -> n
     slope = (y / distance + np.tan(angle)) / (z / distance + 1)
     step = (z - start) * min(1.0, 2 / math.hypot(1.0, slope))
     return np.concatenate([[[z - step, y - slope * step]], corners])
-
-
-def _blades(face: np.ndarray, reach: float) -> list[np.ndarray]:
-    low, high = face[0], face[-1]
-    outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
-    return [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
 
 
 def _sensor(lens: Lens, paths: list[list[np.ndarray]], reach: float) -> np.ndarray:

@@ -31,18 +31,20 @@ _CURVE, _LIGHT, _FAN, _FIELDS = 31, 10, 33, 3
 _LINES = 200.0
 # Order of the spot rule, degree of polynomials, cells for MTF, least and most cells for energy.
 _ORDER, _DEGREE, _CELLS, _LEAST, _MOST = 8, 10, 64, 128, 384
-# Analyses by the names of their axes.
-_TITLES = {
-    "layout": "Layout",
-    "spots": "Spots",
-    "tangential": "Ray fans, tangential",
-    "sagittal": "Ray fans, sagittal",
-    "mtf": "Modulation transfer function",
-    "energy": "Encircled energy",
-    "foci": "Field curvature",
-    "bent": "Distortion",
-    "colour": "Lateral colour",
-    "light": "Illumination",
+_LOWER = slice(2, None)
+# Analyses by the names of their axes: title, row and column on the sheet. Those without a column
+# have axes for each field, side by side.
+_PANELS: dict[str, tuple[str, Any, Any]] = {
+    "layout": ("Layout", 0, slice(None)),
+    "spots": ("Spots", 1, None),
+    "tangential": ("Ray fans, tangential", 2, None),
+    "sagittal": ("Ray fans, sagittal", 3, None),
+    "mtf": ("Modulation transfer function", _LOWER, 4),
+    "energy": ("Encircled energy", _LOWER, 5),
+    "foci": ("Field curvature", 1, 3),
+    "bent": ("Distortion", 1, 4),
+    "colour": ("Lateral colour", 1, 5),
+    "light": ("Illumination", _LOWER, 3),
 }
 
 
@@ -63,7 +65,19 @@ def sheet(
     say: called with the name of each step.
     """
     count, draw_on = _analysed(lens, scene, sampling, say)
-    figure, axes = _axes(count)
+    figure, first = new(width=14, height=10)
+    first.remove()
+    grid = figure.add_gridspec(4, 6, height_ratios=[1.5, 1, 0.8, 0.8])
+    axes: dict[str, Any] = {}
+    for name, (_, row, column) in _PANELS.items():
+        places = range(count) if column is None else [column]
+        own = [figure.add_subplot(grid[row, place]) for place in places]
+        axes[name] = own if column is None else own[0]
+    for each in figure.axes:
+        each.tick_params(labelsize=6)
+        each.xaxis.label.set_fontsize(7)
+        each.yaxis.label.set_fontsize(7)
+        each.locator_params(axis="x", nbins=6 if each is not axes["layout"] else 10)
     draw_on(axes)
     return figure
 
@@ -78,11 +92,10 @@ def panels(
     count, draw_on = _analysed(lens, scene, sampling, say)
     figures: dict[str, Figure] = {}
     axes: dict[str, Any] = {}
-    for name, title in _TITLES.items():
-        several = name in ("spots", "tangential", "sagittal")
-        size = (3.2, 3.2) if several else (8.0, 4.0) if name == "layout" else (5.0, 4.0)
-        figures[title], own = new(1, count if several else 1, *size)
-        axes[name] = [*np.ravel(own)] if several else own
+    for name, (title, _, column) in _PANELS.items():
+        size = (3.2, 3.2) if column is None else (8.0, 4.0) if name == "layout" else (5.0, 4.0)
+        figures[title], own = new(1, count if column is None else 1, *size)
+        axes[name] = [*np.ravel(own)] if column is None else own
     draw_on(axes)
     for name in ("bent", "colour"):  # on the sheet they stand beside the field curvature
         axes[name].set_ylabel("field (degrees)")
@@ -93,7 +106,7 @@ def _analysed(
     lens: Lens, scene: Scene | None, sampling: float | PupilRule | None, say: Callable[[str], None]
 ) -> tuple[int, Callable[[dict[str, Any]], None]]:
     """The number of fields that have spots, and a function that draws all analyses on axes, which
-    are named as in `_TITLES`."""
+    are named as in `_PANELS`."""
     scene = checked_scene(lens, Scene.point() if scene is None else scene)
     if scene.distance.ndim or bool(jnp.any(scene.field[..., 0] != 0)):
         raise ValueError("scene: a sheet has fields along y, at one distance")
@@ -131,7 +144,8 @@ def _analysed(
             words = f"without spots, fans, MTF and energy: {others}"
             axes["layout"].set_title(words, fontsize=8, loc="left")
         hues = [FIELD_COLOURS[fields.index(field) % len(FIELD_COLOURS)] for field in some]
-        _per_field(axes, spots, fans, some, waves, hues)
+        names = [f"{np.degrees(field):.4g}°" for field in some]
+        _draw_fields(axes, spots, fans, names, waves, hues)
         analyses.field_curvature(axes["foci"], foci, line, waves)
         analyses.distortion(axes["bent"], bent, line, waves)
         analyses.lateral_colour(axes["colour"], colour, line, waves, 1e3 * spots.airy_radius[0])
@@ -140,19 +154,36 @@ def _analysed(
         analyses.illumination(axes["light"], *light, wide[later])
         given = [f"{np.degrees(field):.3g}°" for field in some], hues  # as in the layout
         analyses.mtf(axes["mtf"], lines, contrast, best, *given)
-        analyses.encircled_energy(
-            axes["energy"], radii, energy, *given, float(spots.airy_radius[0])
-        )
+        airy = float(spots.airy_radius[0])
+        analyses.encircled_energy(axes["energy"], radii, energy, *given, airy)
         axes["energy"].set_title(f"encircled energy ({model})", fontsize=8)
         axes["foci"].set_ylabel("field (degrees)")
-        for name in ("spots", "tangential", "sagittal"):
-            analyses.legend(axes[name][-1])
         for name in ("foci", "bent", "colour"):
             analyses.legend(axes[name])
         for each in jax.tree.leaves(axes) if lens.afocal else ():
             analyses.in_angles(each)
 
     return len(some), draw_on
+
+
+def _draw_fields(
+    axes: dict[str, list[Axes]],
+    spots: Spots,
+    fans: RayFans,
+    names: list[str],
+    waves: np.ndarray,
+    hues: list[str],
+) -> None:
+    """Spots and ray fans of each of the fields of these names. hues: of the names."""
+    for k, name in enumerate(names):
+        analyses.spots(axes["spots"][k], spots, 1 + k, waves)
+        axes["spots"][k].set_title(name, fontsize=8, color=hues[k])
+        analyses.fan(axes["tangential"][k], fans, k, waves)
+        analyses.fan(axes["sagittal"][k], fans, k, waves, sagittal=True)
+        axes["sagittal"][k].set_xlabel("stop")
+    for panel, label in (("spots", "y (um)"), ("tangential", "ey (um)"), ("sagittal", "ex (um)")):
+        axes[panel][0].set_ylabel(label)
+        analyses.legend(axes[panel][-1])
 
 
 _fans = jit(functools.partial(ray_fans, count=_FAN), ONCE)
@@ -192,41 +223,3 @@ def _circles(spots: Spots, shown: int) -> tuple[Array, Model, int]:
     cells = 64 * int(np.ceil(5 * reach / airy / 64)) if airy < np.inf else _MOST + 1
     radii = jnp.linspace(0, reach, _CURVE)
     return (radii, "rays", _LEAST) if cells > _MOST else (radii, "waves", max(cells, _LEAST))
-
-
-def _axes(count: int) -> tuple[Figure, dict[str, Any]]:
-    """A figure and its axes by name; panels with one plot per field are lists."""
-    figure, first = new(width=14, height=10)
-    first.remove()
-    grid = figure.add_gridspec(4, 6, height_ratios=[1.5, 1, 0.8, 0.8])
-    at = lambda *place: figure.add_subplot(grid[place])  # noqa: E731
-    axes: dict[str, Any] = {"layout": at(0, slice(None))}
-    for row, name in enumerate(("spots", "tangential", "sagittal"), 1):
-        axes[name] = [at(row, k) for k in range(count)]
-    axes |= {name: at(1, k) for k, name in enumerate(("foci", "bent", "colour"), 3)}
-    axes |= {name: at(slice(2, None), k) for k, name in enumerate(("light", "mtf", "energy"), 3)}
-    for each in figure.axes:
-        each.tick_params(labelsize=6)
-        each.xaxis.label.set_fontsize(7)
-        each.yaxis.label.set_fontsize(7)
-        each.locator_params(axis="x", nbins=6 if each is not axes["layout"] else 10)
-    return figure, axes
-
-
-def _per_field(
-    axes: dict[str, list[Axes]],
-    spots: Spots,
-    fans: RayFans,
-    fields: list[float],
-    waves: np.ndarray,
-    hues: list[str],
-) -> None:
-    for k, field in enumerate(fields):
-        spot, tangential, sagittal = (axes[n][k] for n in ("spots", "tangential", "sagittal"))
-        analyses.spots(spot, spots, 1 + k, waves)
-        spot.set_title(f"{np.degrees(field):.4g}°", fontsize=8, color=hues[k])
-        analyses.fan(tangential, fans, k, waves)
-        analyses.fan(sagittal, fans, k, waves, sagittal=True)
-        sagittal.set_xlabel("stop")
-    for name, label in (("spots", "y (um)"), ("tangential", "ey (um)"), ("sagittal", "ex (um)")):
-        axes[name][0].set_ylabel(label)
