@@ -16,13 +16,13 @@ Conventions, everywhere in the package:
 from . import results as results
 from .compilation import keep_programs as keep_programs
 from .files.entry import LensError as LensError
-from .files.system import System as System
-from .files.write import save_lens as save_lens
-from .files.yaml import (
+from .files.load import (
+    System as System,
     lens_names as lens_names,
     load_lens as load_lens,
     load_system as load_system,
 )
+from .files.write import save_lens as save_lens
 from .image.beam_psf import Sampling as Sampling
 from .image.chief import (
     chief_ray_angle as chief_ray_angle,

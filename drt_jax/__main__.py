@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .compilation import ONCE, jit, keep_programs
-from .files.system import System
+from .files.load import System, lens_names, load_lens, load_system
 from .files.write import save_lens
-from .files.yaml import lens_names, load_lens, load_system
 from .image.converged import psf_moments
 from .image.diagnose import crossed
 from .lens.lens import Lens

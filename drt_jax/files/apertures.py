@@ -30,11 +30,11 @@ class _Aperture(NamedTuple):
     @property
     def reach(self) -> float:
         """The largest distance of its edge from the vertex, mm."""
+        if self.kind == "polygon":
+            return float(np.max(np.hypot(*(self.corners + (self.centre or 0)).T)))
         x, y = (abs(c) for c in self.centre or (0.0, 0.0))
         if self.kind == "rectangle":
             return math.hypot(x + self.half[0], y + self.half[1])
-        if self.kind == "polygon":
-            return float(np.max(np.hypot(*(self.corners + (self.centre or 0)).T)))
         return math.hypot(x, y) + max(self.half)
 
 
@@ -66,11 +66,10 @@ def _polygon(entry: Entry) -> tuple[np.ndarray, tuple[tuple[int, ...], ...]]:
     if not isinstance(rows, list | tuple) or not 3 <= len(rows) <= CORNERS:
         raise entry.error("polygon", f"expected 3 to {CORNERS} corners [x, y], mm, in their order")
     each = Entry(dict(enumerate(rows)), entry.name("polygon"), range(len(rows)))
-    try:
+    with entry.naming("polygon"):
         corners = tidied(np.array([each.vector(i, 2) for i in each]))
-        return corners, convex_pieces(corners)
-    except ValueError as error:
-        raise entry.error("polygon", str(error)) from None
+        pieces = convex_pieces(corners)
+    return corners, pieces
 
 
 def _check_reach(surface: Entry, entry: Entry, key: str, reach: float) -> None:
@@ -83,8 +82,7 @@ def _check_reach(surface: Entry, entry: Entry, key: str, reach: float) -> None:
 def semi_diameter(surface: Entry) -> float:
     """The clear semi-diameter about the vertex, mm, within the extent of the surface. The stop's is
     finite: if it is not given, it is the circle around the stop's smallest aperture."""
-    semi = surface.number("semi_diameter", math.inf, finite=False)
-    surface.require(semi > 0, "semi_diameter", "must be positive")
+    semi = surface.positive("semi_diameter", math.inf, finite=False)
     if math.isinf(semi) and surface.flag("stop"):
         semi = min((own.reach for own in _read(surface, "aperture")), default=math.inf)
         what = "the stop needs one, or an aperture"
@@ -96,10 +94,12 @@ def semi_diameter(surface: Entry) -> float:
 
 def apertures_of(surfaces: list[Entry]) -> Apertures | None:
     """All apertures and obscurations of the surfaces; None if there are none."""
-    found = []
-    for i, surface in enumerate(surfaces):
-        for key in ("aperture", "obscuration"):
-            found += [(i, key == "obscuration", own) for own in _read(surface, key)]
+    found = [
+        (i, key == "obscuration", own)
+        for i, surface in enumerate(surfaces)
+        for key in ("aperture", "obscuration")
+        for own in _read(surface, key)
+    ]
     for i, blocks, own in found:
         if not blocks:
             _check_reach(surfaces[i], own.entry, own.kind, own.reach)

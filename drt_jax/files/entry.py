@@ -1,8 +1,9 @@
 """Checked reading of the mappings of a file: each error names the place and the remedy."""
 
+import contextlib
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -20,6 +21,12 @@ _LONGEST = 100  # characters of a name
 
 class LensError(InputError):
     """A prescription that cannot be used; the message names the file, the key and the remedy."""
+
+
+def require(condition: object, message: str, key: str = "") -> None:
+    """LensError unless the condition holds. key: the entry of a prescription."""
+    if not condition:
+        raise LensError(message, key)
 
 
 class Entry(dict[Any, Any]):
@@ -58,16 +65,23 @@ class Entry(dict[Any, Any]):
         if not condition:
             raise self.error(key, message)
 
+    @contextlib.contextmanager
+    def naming(self, key: object) -> Iterator[None]:
+        """Turn a ValueError into a LensError about the entry `key`."""
+        try:
+            yield
+        except ValueError as error:
+            raise self.error(key, str(error)) from error
+
     def number(
         self, key: object, default: float | None = None, finite: bool = True, most: float = LONG
     ) -> float:
         """A number of magnitude at most `most`; `finite=False` allows inf. It may be given as text,
         because YAML 1.1 reads 1e-3 and inf as text."""
         value: Any = self.get(key, default)
-        try:
+        number = math.nan
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
             number = math.nan if isinstance(value, bool) else float(value)
-        except (TypeError, ValueError, OverflowError):
-            number = math.nan
         if math.isnan(number):
             raise self.error(key, f"expected a number, got {shown(value)}")
         if math.isinf(number):
@@ -76,13 +90,19 @@ class Entry(dict[Any, Any]):
             raise self.error(key, f"{number:g} is not between {-most:g} and {most:g}; which unit?")
         return number
 
+    def positive(self, key: object, default: float | None = None, finite: bool = True) -> float:
+        """A number above 0; `finite=False` allows inf."""
+        value = self.number(key, default, finite)
+        self.require(value > 0, key, "must be positive")
+        return value
+
     def text(self, key: str, default: str) -> str:
         """Text of at most 100 characters; a whole number is converted to text."""
         value = self.get(key, default)
         number = type(value) is int and 0 <= value < 10**_LONGEST
         self.require(number or isinstance(value, str), key, f"expected text, got {shown(value)}")
-        if len(str(value)) > _LONGEST:
-            raise self.error(key, f"expected at most {_LONGEST} characters, got {shown(value)}")
+        what = f"expected at most {_LONGEST} characters, got {shown(value)}"
+        self.require(len(str(value)) <= _LONGEST, key, what)
         return str(value)
 
     def vector(self, key: str, length: int) -> list[float]:
@@ -109,8 +129,8 @@ class Entry(dict[Any, Any]):
         if curvature in self:
             return self.number(curvature, most=STEEP)
         value = self.number(radius, finite=False, most=WIDE)
-        if abs(value) < 1 / STEEP:
-            raise self.error(radius, f"{value:g} is no surface; a plane is {radius}: inf")
+        what = f"{value:g} is no surface; a plane is {radius}: inf"
+        self.require(abs(value) >= 1 / STEEP, radius, what)
         return 1 / value
 
 

@@ -19,6 +19,9 @@ from .record import Row, short
 # Other programs' names of materials whose constants equal ours.
 _SAME = {"F_SILICA": "silica", "SILICA": "silica"}
 _PLAIN: dict[str, dict[str, Any]] = {"AIR": {}, "N15": {"index": 1.5}}  # of Zemax's MISC
+_CODE = re.compile(r"(\d{3,17})\.(\d{3,18})")
+_SHORT_CODE = re.compile(r"\d{6}")
+_PAIR = re.compile(r"(\d\.\d{1,17}):(\d{2,3}(?:\.\d{1,17})?)")
 _NIKON = {"NIKON": "HIKARI"}
 _POWERS = np.array([0.0, -1.0, -3.5])
 _LINES = (0.5875618, 0.4861327, 0.6562725, 0.4358343)
@@ -26,6 +29,17 @@ _NORMAL = 0.6438, -0.001682
 _ROUNDING = 1e-12  # a P_gF that is as near to the normal line lies on it
 _M1 = np.array([-7.12849, 4.95284, -0.202244])
 _M2 = np.array([8.84931, -6.91677, 0.454415])
+
+
+def code_of(word: str) -> tuple[float, float] | None:
+    """nd and vd of a code as 517642, 517.642, 516800.641700 or 1.5168:64.17; None for a name."""
+    found = _CODE.fullmatch(word)
+    if found:
+        return float(f"1.{found[1]}"), float(f"{found[2][:2]}.{found[2][2:]}")
+    if _SHORT_CODE.fullmatch(word):
+        return 1 + int(word[:3]) / 1000, int(word[3:]) / 10
+    found = _PAIR.fullmatch(word)
+    return (float(found[1]), float(found[2])) if found else None
 
 
 def in_catalogues(name: str, catalogues: Sequence[str]) -> Glass | None:
@@ -117,6 +131,11 @@ def model_keys(row: Row, line: int, nd: float, vd: float, above: float) -> dict[
     numbers that no glass has."""
     if not vd:
         return {"index": nd}
-    known = 1 < nd <= 4 and 10 <= vd <= 120
-    row.require(known, f"no model glass has nd {nd:g} and vd {vd:g}", line)
+    require_glass(row, line, nd, vd)
     return dict(zip(("nd", "vd", "partial"), to_ours(nd, vd, above), strict=True))
+
+
+def require_glass(row: Row, line: int, nd: float, vd: float) -> None:
+    """LensError for nd and vd that no glass has."""
+    known = 1 < nd <= 4 and 10 <= vd <= 120
+    row.require(known, f"no glass has nd {nd:g} and vd {vd:g}", line)

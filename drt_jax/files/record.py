@@ -13,11 +13,18 @@ from typing import Any, Literal
 import numpy as np
 
 from ..inputs import InputError, Lines, one_line, read_bytes, shown
+from ..lens.forms import powers_xy
 from ..lens.lens import Lens
 from .entry import LensError
 from .specs import CLOSEST, MEDIUM_KEYS, TOUCHING, build_lens
 
 Missing = Literal["error", "warn"]
+ApertureKind = Literal[
+    "pupil diameter", "f-number", "working f-number", "object NA", "object cone angle", "image NA"
+]
+FieldKind = Literal["angle", "object height", "paraxial image height", "real image height"]
+# Name and degree of each term of a polynomial in x and y.
+XY: list[tuple[Any, int]] = [(f"x{i}y{j}", i + j) for i, j in powers_xy(300)]
 _FILE = 2**24  # bytes of a file
 _LINES = 400_000
 LONGEST = 4000  # characters read of a line
@@ -39,12 +46,34 @@ class Breaking:
 
 
 @dataclasses.dataclass
+class Use:
+    """How a file uses its lens: the values for `System`, by the same names. stop: its size, mm,
+    where the file gives that. line, field_line, primary_line: of the aperture, the fields and the
+    wavelengths."""
+
+    aperture: float | None = None
+    aperture_kind: ApertureKind | None = None
+    field_kind: FieldKind = "angle"
+    heights: list[tuple[float, float]] = dataclasses.field(default_factory=lambda: [(0.0, 0.0)])
+    field_weights: list[float] = dataclasses.field(default_factory=lambda: [1.0])
+    vignetting: list[list[float]] = dataclasses.field(default_factory=lambda: [[0.0] * 5])
+    wavelengths: list[float] = dataclasses.field(default_factory=list)
+    wavelength_weights: list[float] = dataclasses.field(default_factory=list)
+    primary: int = 0
+    ray_aiming: str = ""
+    stop: float | None = None
+    line: int = 0
+    field_line: int = 0
+    primary_line: int = 0
+
+
+@dataclasses.dataclass
 class Record:
     """A file as it is read. Lengths in mm.
 
-    path, missing: see `load_lens`. name: of the lens. distance: of the object, below 0 for a
-    virtual one behind the first vertex. medium: keys of the object's medium. parts: surfaces and
-    coordinate breaks in order; the image is the last surface.
+    path, missing: see `load_lens`. name: of the lens. use: fields, wavelengths and aperture.
+    distance: of the object, below 0 for a virtual one behind the first vertex. medium: keys of the
+    object's medium. parts: surfaces and coordinate breaks in order; the image is the last surface.
     glasses: those that the file itself defines, as in a prescription. afocal: as in `Lens`.
     notes: what is left out or read differently from the file. solves: lines with solves. unknown:
     words that are not known, each with its line.
@@ -53,6 +82,7 @@ class Record:
     path: str
     missing: Missing
     name: str = ""
+    use: Use = dataclasses.field(default_factory=Use)
     distance: float = math.inf
     parts: list["Row | Breaking"] = dataclasses.field(default_factory=list)
     medium: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -111,13 +141,12 @@ class Record:
         except InputError as error:
             found = re.sub(r"surfaces\[(\d+)\]", lambda m: names[int(m[1])], str(error))
             raise LensError(f"{self.path}{lines.of(error.key)}: {found}", error.key) from None
-        curvature, conic = image.entry.get("curvature", 0.0), image.entry.get("conic", 0.0)
-        if not curvature:
+        if not (curvature := image.entry.get("curvature", 0.0)):
             return lens
-        both = lens.curvature.at[-1].set(curvature), lens.conic.at[-1].set(conic)
-        return dataclasses.replace(
-            lens, curvature=both[0], conic=both[1], curved=(*lens.curved, lens.count)
-        )
+        bent = lens.curvature.at[-1].set(curvature)
+        conic = lens.conic.at[-1].set(image.entry.get("conic", 0.0))
+        curved = (*lens.curved, lens.count)
+        return dataclasses.replace(lens, curvature=bent, conic=conic, curved=curved)
 
     def _separate(self) -> None:
         """Separate touching surfaces that bend light by the least gap, and add a note."""
@@ -178,13 +207,17 @@ class Record:
 
 @dataclasses.dataclass
 class Row:
-    """A surface of a file. name: in messages. unit: of length in the file, mm. entry: as in a
+    """A surface of a file. name: in messages. unit: of length in the file, mm. kind: its type.
+    values: its parameters by number or key as in the file, each with its line. entry: as in a
     prescription, in mm. lines: of its keys. thickness: mm."""
 
     record: Record
     name: str
     line: int
     unit: float = 1.0
+    kind: str = ""
+    kind_line: int = 0
+    values: dict[Any, tuple[int, float]] = dataclasses.field(default_factory=dict)
     entry: dict[str, Any] = dataclasses.field(default_factory=dict)
     lines: dict[str, int] = dataclasses.field(default_factory=dict)
     thickness: float = 0.0
@@ -200,14 +233,19 @@ class Row:
         self.entry[key] = value
         self.lines[key] = line or self.line
 
-    def shape(
-        self, form: str, terms: Mapping[Any, float], line: int = 0, more: Mapping | None = None
-    ) -> None:
+    def value(self, key: object) -> float:
+        """A parameter; 0 if it is not given."""
+        return self.values.get(key, (0, 0.0))[1]
+
+    def powers(self, keys: Mapping[Any, int]) -> dict[int, float]:
+        """Coefficients that are not 0, in mm. keys: the power of the height of each parameter."""
+        return {p: a for key, p in keys.items() if (a := self.value(key) * self.unit ** (1 - p))}
+
+    def shape(self, form: str, terms: Mapping[Any, float], **more: object) -> None:
         """Set the form, its coefficients, if there are any, and keys of its own, `more`."""
-        own: dict[str, Any] = {"form": form} if form != "asphere" else {}
-        own |= {"coefficients": terms} if terms else {}
-        for key, value in (own | dict(more or {})).items():
-            self.put(key, value, line)
+        own = {"form": form} if form != "asphere" else {}
+        for key, value in (own | ({"coefficients": terms} if terms else {}) | more).items():
+            self.put(key, value, self.kind_line)
 
     def put_shape(self, key: str, shape: Mapping[str, Any], line: int) -> None:
         """Add a shape to the entry `aperture` or `obscuration`."""
@@ -227,11 +265,6 @@ class Row:
             self.put_shape("aperture", shape, line)
         return True
 
-    def powers_in_mm(self, values: Mapping[int, float]) -> dict[int, float]:
-        """Coefficients that are not 0, in mm. values: by power of the height, in units of the
-        file."""
-        return {p: a for p, value in values.items() if (a := value * self.unit ** (1 - p))}
-
     @property
     def plain(self) -> bool:
         """Whether it is a plane in air that has no effect."""
@@ -249,28 +282,21 @@ class Words:
     values: list[str]
     indented: bool = False
 
-    def error(self, message: str) -> LensError:
-        """An error about this line."""
-        return self.record.error(self.line, message)
-
     def require(self, condition: object, message: str) -> None:
-        """The error unless the condition holds."""
-        if not condition:
-            raise self.error(message)
+        """LensError about this line unless the condition holds."""
+        self.record.require(condition, self.line, message)
 
     def number(self, at: int = 0, default: float | None = None) -> float:
         """Value `at` as a finite number; `default` if there is no such value."""
-        if at >= len(self.values):
-            if default is None:
-                raise self.error(f"a number is missing: word {at + 2} of the line")
+        if at >= len(self.values) and default is not None:
             return default
-        word = self.values[at]
-        try:
-            value = float(word) if len(word) <= 60 and "_" not in word else math.nan
-        except ValueError:
-            value = math.nan
+        self.require(at < len(self.values), f"a number is missing: word {at + 2} of the line")
+        word, value = self.values[at], math.nan
+        if len(word) <= 60 and "_" not in word:
+            with contextlib.suppress(ValueError):
+                value = float(word)
         if not math.isfinite(value):
-            raise self.error(f"expected a number, got {shown(word)}")
+            raise self.record.error(self.line, f"expected a number, got {shown(word)}")
         return value
 
     def numbers(self, first: int, end: int) -> list[float]:
@@ -306,20 +332,18 @@ def lines_of(path: str | os.PathLike) -> list[str]:
     """The lines of a file of at most 16 MB: its byte order mark or UTF-16's zero bytes decide, else
     UTF-8, else Latin-1. InputError, with the byte or character, if it is no text."""
     content = read_bytes(path, _FILE, "lens file")
-    known = [name for mark, name in _MARKS.items() if content.startswith(mark)]
+    known = next((name for mark, name in _MARKS.items() if content.startswith(mark)), "")
     head = content[:1000]
     for start, name in (1, "utf-16-le"), (0, "utf-16-be"):
         if not known and head[start::2].count(0) > len(head) // 4:
-            known = [name]
-    text = ""
-    for name in known or ("utf-8", "latin-1"):
-        try:
-            text = content.decode(name)
-            break
-        except UnicodeDecodeError as error:
-            if known:
-                what = f"byte {error.start} is no {name} text: is the file cut short?"
-                raise InputError(what) from error
+            known = name
+    try:
+        text = content.decode(known or "utf-8")
+    except UnicodeDecodeError as error:
+        if known:
+            what = f"byte {error.start} is no {known} text: is the file cut short?"
+            raise InputError(what) from error
+        text = content.decode("latin-1")
     odd = re.search("[\x00-\x08\x0e-\x19\x1b-\x1f]", text)
     if odd:
         raise InputError(f"character {odd.start()} is no text: is this a lens file?")

@@ -2,17 +2,29 @@
 
 import dataclasses
 import math
-from typing import get_args
+from typing import Any, get_args
 
-from .record import Missing, Record, distance_of, short
+import numpy as np
+
+from .record import (
+    ApertureKind,
+    Breaking,
+    FieldKind,
+    Missing,
+    Record,
+    Row,
+    distance_of,
+    rotation_of,
+    short,
+    turned_back,
+    turns_of,
+)
 from .seq_glass import Glasses
-from .seq_places import Frames, clip
-from .seq_surfaces import ON_SURFACES, Surface, curvature, glass, move, thickness
+from .seq_surfaces import MOVES, ON_SURFACES, Surface, move
 from .seq_text import COSMETIC, REFUSED, SOLVES, SURFACE, Command, command_of, commands_of
-from .system import ApertureKind, FieldKind, Use
+from .specs import SURFACES
 
 _UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
-_SURFACES = 5000
 _APERTURES: dict[str, ApertureKind] = {
     "EPD": "pupil diameter",
     "FNO": "f-number",
@@ -24,6 +36,7 @@ VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
 _HEIGHTS = tuple(f"{axis}{kind}" for axis in "XY" for kind in FIELDS)
 _LISTS = (*_HEIGHTS, *VIGNETTING, "WTF", "WL", "WTW", "REF")
 _MOST = 1000  # fields or wavelengths
+_NONE = (0.0, 0.0, 0.0)
 
 
 class _Reader:
@@ -36,7 +49,7 @@ class _Reader:
     """
 
     def __init__(self, path: str, missing: Missing):
-        self.record, self.use = Record(path, missing), Use()
+        self.record = Record(path, missing)
         self.glasses = Glasses(self.record)
         self.lists: dict[str, list[float]] = {}
         self.list_lines: dict[str, int] = {}
@@ -78,11 +91,6 @@ class _Reader:
         own += [0.0] * (place + 1 - len(own))
         own[place] = values[0]
 
-    @property
-    def wavelengths(self) -> list[float]:
-        """The wavelengths, um."""
-        return [value / 1000 for value in self.lists.get("WL", [])]
-
 
 def _surface(reader: _Reader, command: Command) -> None:
     """S, SO, SI or S with a number: begin a new surface, or change an existing one."""
@@ -93,19 +101,15 @@ def _surface(reader: _Reader, command: Command) -> None:
     number = int(name) if number is None else number
     reader.complete = reader.complete or name == "I"
     command.require(number <= due, f"{command.key} stands where S{due} should")
-    command.require(number <= _SURFACES, f"more than {_SURFACES} surfaces")
+    command.require(number <= SURFACES, f"more than {SURFACES} surfaces")
     if number == due:
         called = {"O": "SO", "I": "SI"}.get(name, f"S{number}")
         reader.surfaces.append(Surface(reader.record, called, command.line))
     own = reader.surfaces[number]
-    radius = "RDY" if reader.radii else "CUY"
-    for key, read, some in (
-        (radius, curvature, words[:1]),
-        ("THI", thickness, words[1:2]),
-        ("GLA", glass, words[2:]),
-    ):
-        if some:
-            read(own, dataclasses.replace(command, key=key, values=some))
+    keys = ("RDY" if reader.radii else "CUY", "THI", "GLA")
+    for key, values in zip(keys, (words[:1], words[1:2], words[2:]), strict=True):
+        if values:
+            ON_SURFACES[key](own, dataclasses.replace(command, key=key, values=values))
 
 
 def _return(reader: _Reader, command: Command) -> None:
@@ -130,14 +134,20 @@ def _zoom(reader: _Reader, command: Command) -> None:
         known = own.key not in _LISTS or own.qualifiers
         own.require(known, f"ZOO {own.key}: name the field or the wavelength, as F1 or W1")
         if own.values:
-            _dispatch(reader, dataclasses.replace(own, values=own.values[:1]))
+            _take(reader, dataclasses.replace(own, values=own.values[:1]))
 
 
-def _take(reader: _Reader, command: Command) -> bool:
-    """Read a command of the whole system; False if it is none."""
-    record, use, line = reader.record, reader.use, command.line
+def _take(reader: _Reader, command: Command) -> None:
+    """Execute a command from outside the private catalogue."""
+    if (zoom := command.of("Z")) and zoom[0] != "1":
+        return  # for another zoom position, see `_zoom`
+    record, use, line = reader.record, reader.record.use, command.line
     first = command.values[0].upper() if command.values else ""
     match command.key:
+        case key if SURFACE.fullmatch(key):
+            _surface(reader, command)
+        case key if key in _LISTS:
+            reader.numbers(command)
         case "TIT":
             record.name = short(" ".join(command.values))
         case "RDM":
@@ -150,16 +160,15 @@ def _take(reader: _Reader, command: Command) -> bool:
             what = f"DIM {short(first)}: expected M (millimetres), C or I"
             command.require(first in _UNITS, what)
             reader.unit = _UNITS[first]
-        case "TEM" | "PRE":
-            ours, unit = (20, "C") if command.key == "TEM" else (760, "mm Hg")
+        case "TEM" | "PRE" as key:
+            ours, unit = (20, "C") if key == "TEM" else (760, "mm Hg")
             value = command.number()
             if abs(value - ours) > ours / 4:
                 record.lacks(line, f"{value:g} {unit}; our indices are those of {ours}")
             elif value != ours:
                 record.note(line, f"{value:g} {unit}; indices are those of {ours}")
-        case "EPD" | "FNO" | "NA" | "NAO":
-            use.line, use.aperture = line, command.number()
-            use.aperture_kind = _APERTURES[command.key]
+        case "EPD" | "FNO" | "NA" | "NAO" as key:
+            use.line, use.aperture, use.aperture_kind = line, command.number(), _APERTURES[key]
         case "STO":
             named = command.of("S")
             reader.stop = reader.at(command, named[0]) if named else len(reader.surfaces) - 1
@@ -167,34 +176,17 @@ def _take(reader: _Reader, command: Command) -> bool:
             _return(reader, command)
         case "ZOO":
             _zoom(reader, command)
-        case _:
-            return False
-    return True
+        case key if key in SOLVES:
+            record.solves.append(line)
+        case key if key in ON_SURFACES:
+            for surface in reader.targets(command):
+                ON_SURFACES[key](surface, command)
+        case key if key not in COSMETIC:
+            command.require(key not in REFUSED, f"{key} is not read")
+            record.unknown.setdefault(short(key), line)
 
 
-def _dispatch(reader: _Reader, command: Command) -> None:
-    """Execute a command from outside the private catalogue."""
-    key, zoom = command.key, command.of("Z")
-    if zoom and zoom[0] != "1":
-        return  # for another zoom position, see `_zoom`
-    if SURFACE.fullmatch(key):
-        _surface(reader, command)
-    elif key in _LISTS:
-        reader.numbers(command)
-    elif _take(reader, command):
-        return
-    elif key in SOLVES:
-        reader.record.solves.append(command.line)
-    elif key in ON_SURFACES:
-        for surface in reader.targets(command):
-            ON_SURFACES[key](surface, command)
-    elif key in REFUSED:
-        raise command.error(f"{key} is not read")
-    elif key not in COSMETIC:
-        reader.record.unknown.setdefault(short(key), command.line)
-
-
-def read_seq(path: str, missing: Missing, lines: list[str]) -> tuple[Record, Use]:
+def read_seq(path: str, missing: Missing, lines: list[str]) -> Record:
     """Read the lines of a `.seq` file into a record of its surfaces and their use. LensError with
     the line. path: its name in messages."""
     reader, private, ended = _Reader(path, missing), False, False
@@ -209,19 +201,16 @@ def read_seq(path: str, missing: Missing, lines: list[str]) -> tuple[Record, Use
         elif private:
             reader.glasses.take(own)
         elif own.key:
-            _dispatch(reader, own)
+            _take(reader, own)
     _finish(reader)
-    return reader.record, reader.use
+    return reader.record
 
 
 def _finish(reader: _Reader) -> None:
     """Do the checks and conversions that need all commands."""
-    record, use, surfaces, require = (
-        reader.record,
-        reader.use,
-        reader.surfaces,
-        reader.record.require,
-    )
+    record, surfaces = reader.record, reader.surfaces
+    use, require = record.use, record.require
+    waves = use.wavelengths = [value / 1000 for value in reader.lists.get("WL", [])]
     require(surfaces, 0, "no surface, SO, S or SI: is it a .seq file?")
     whole = reader.complete and len(surfaces) > 2
     require(whole, surfaces[-1].line, "no SI follows, the image: is the file cut short?")
@@ -231,7 +220,7 @@ def _finish(reader: _Reader) -> None:
     if not reader.stop:
         record.notes.append("no STO: the stop is surface 1")
     record.note_unread("commands")
-    require(reader.wavelengths, 0, "no wavelength is given: WL, in nm")
+    require(waves, 0, "no wavelength is given: WL, in nm")
     require(use.aperture_kind, 0, "no aperture is given: EPD, FNO, NA or NAO")
     surfaces[reader.stop or 1].put("stop", True)
     _use(reader)
@@ -245,7 +234,8 @@ def _finish(reader: _Reader) -> None:
 
 def _use(reader: _Reader) -> None:
     """Write fields and wavelengths as `System` holds them."""
-    record, use, lists, lines = reader.record, reader.use, reader.lists, reader.list_lines
+    record, lists, lines = reader.record, reader.lists, reader.list_lines
+    use, waves = record.use, record.use.wavelengths
 
     def column(key: str, default: float, count: int) -> list[float]:
         values = lists.get(key, [])
@@ -253,7 +243,6 @@ def _use(reader: _Reader) -> None:
         record.require(len(values) <= count, lines.get(key, 0), what)
         return values + [default] * (count - len(values))
 
-    use.wavelengths = waves = reader.wavelengths
     record.require(min(waves) > 0, lines["WL"], f"a wavelength of {1000 * min(waves):g} nm")
     use.wavelength_weights = column("WTW", 1.0, len(waves))
     reference = lists.get("REF", [float(len(waves) // 2 + 1)])[0]
@@ -265,10 +254,9 @@ def _use(reader: _Reader) -> None:
     given = [key for key in _HEIGHTS if key in lists]
     kinds = {key[1:] for key in given} or {"AN"}
     use.field_line = max((lines[key] for key in given), default=0)
-    if len(kinds) > 1:
-        raise record.error(lines[given[-1]], f"fields of two kinds: {', '.join(given)}")
-    (kind,) = kinds
-    count = max((len(lists[key]) for key in given), default=1)
+    what = f"fields of two kinds: {', '.join(given)}"
+    record.require(len(kinds) == 1, lines[given[-1]] if given else 0, what)
+    kind, count = kinds.pop(), max((len(lists[key]) for key in given), default=1)
     use.field_kind = FIELDS[kind]
     scale = 1.0 if kind == "AN" else reader.unit
     x, y = (column(f"{axis}{kind}", 0.0, count) for axis in "XY")
@@ -280,14 +268,77 @@ def _use(reader: _Reader) -> None:
     ]
 
 
+@dataclasses.dataclass
+class _Frames:
+    """The axis at each surface: its origin `point` (3,), mm, and its rotation `turn` (3, 3)."""
+
+    record: Record
+    point: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    turn: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
+    before: list[tuple[np.ndarray, np.ndarray, bool]] = dataclasses.field(default_factory=list)
+
+    def parts(self, surface: Surface, image: bool) -> list[Row | Breaking]:
+        """A surface with the breaks before and behind it; the last part takes its thickness."""
+        kind, line = surface.turn, surface.move_line
+        x, y, z, a, b, c = (surface.moves.get(key, 0.0) for key in MOVES)
+        shift = (x * surface.unit, y * surface.unit, z * surface.unit)
+        tilt = (0.0 - a, 0.0 - b, c)  # right-handed
+        before: Breaking | None = None
+        behind: Breaking | None = None
+        if kind == "RET":
+            before = self._back(surface)
+        elif kind == "DAR" and surface.moved:
+            surface.put("decentre", [*shift[:2]], line)
+            turned = np.array(tilt) + surface.entry.get("tilt", [0, 0, 0])
+            surface.put("tilt", turned.tolist(), line)
+            if shift[2]:
+                before = Breaking(line, (0.0, 0.0, shift[2]))
+                behind = Breaking(line, (0.0, 0.0, -shift[2]))
+        elif kind == "REV" and surface.moved:
+            turn, back = turned_back((-tilt[0], -tilt[1], -tilt[2]))
+            moved: Any = (turn @ -np.array(shift)).tolist() if any(shift) else _NONE
+            behind = Breaking(line, tuple(moved), back)
+        elif surface.moved:
+            before = Breaking(line, shift, tilt)
+            if kind == "BEN":
+                one = not tilt[2] and not (tilt[0] and tilt[1])
+                surface.require(one, "BEN with tilts about several axes", line)
+                behind = Breaking(line, _NONE, tilt)
+        stays = not behind and kind != "RET"
+        surface.require(stays or not image, f"{kind} at the image", line)
+        own: list[Row | Breaking] = [part for part in (before, surface, behind) if part]
+        for part in own:
+            if isinstance(part, Breaking):
+                self.point = self.point + self.turn @ np.array(part.shift)
+                self.turn = self.turn @ rotation_of(part.tilt)
+            else:
+                self.before.append((self.point, self.turn, surface.moved or kind != ""))
+        self.point = self.point + self.turn @ np.array([0, 0, surface.thickness])
+        if behind:
+            behind.thickness, surface.thickness = surface.thickness, 0.0
+        return own
+
+    def _back(self, surface: Surface) -> Breaking:
+        """The break from the axis here to the axis of an earlier surface."""
+        require, target, line = self.record.require, surface.target, surface.move_line
+        require(not surface.moved, line, "RET with a decentre or tilt of its own")
+        known = 1 <= target <= len(self.before)
+        require(known, line, f"RET: surface {target} is not before it")
+        point, turn, moved = self.before[target - 1]
+        what = f"RET: surface {target} is moved itself; return to one that is not"
+        require(not moved, line, what)
+        shift = self.turn.T @ (point - self.point)
+        return Breaking(line, tuple(shift.tolist()), turns_of(self.turn.T @ turn))
+
+
 def _parts(reader: _Reader) -> None:
     """Convert object, surfaces and image to parts of the record, in mm."""
     record, unit, (first, *others) = reader.record, reader.unit, reader.surfaces
-    flat = not (first.curvature or first.terms or first.moved or first.turn)
+    flat = not (first.curvature or first.values or first.moved or first.turn)
     record.require(flat, first.line, "SO: an object that is not flat on the axis")
     record.distance = distance_of(first.gap * unit if first.gap < 1e9 else math.inf)
-    record.medium = reader.glasses.medium(first, reader.wavelengths)
-    image, frames = others[-1], Frames(record)
+    record.medium = reader.glasses.medium(first)
+    image, frames = others[-1], _Frames(record)
     others[-2].gap += image.gap  # defocus
     image.gap = 0.0
     for surface in others:
@@ -299,13 +350,13 @@ def _parts(reader: _Reader) -> None:
             flat = not ({"form", "coefficients"} & surface.entry.keys() or surface.phase)
             surface.require(flat, "an aspheric image")
         else:
-            surface.entry |= reader.glasses.medium(surface, reader.wavelengths)
+            surface.entry |= reader.glasses.medium(surface)
             surface.diffraction()
         if surface.clips and surface is image:
             record.notes.append("apertures of the image clip nothing")
         elif surface.clips and reader.clips:
-            size = clip(surface)
-            reader.use.stop = size if surface.entry.get("stop") else reader.use.stop
+            size = surface.clip()
+            record.use.stop = size if surface.entry.get("stop") else record.use.stop
         record.parts += frames.parts(surface, surface is image)
     if not reader.clips:
         record.notes.append("CA NO: the apertures are not used")

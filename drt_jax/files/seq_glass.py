@@ -6,29 +6,15 @@ from typing import Any
 import numpy as np
 
 from ..lens.glasses import plain_names
-from .glasses import in_catalogues, named_glass
+from .glasses import code_of, in_catalogues, named_glass, require_glass
 from .record import Record, short
 from .seq_surfaces import Surface
 from .seq_text import Command
 
-_CODE = re.compile(r"(\d{3,17})\.(\d{3,18})")
-_SHORT_CODE = re.compile(r"\d{6}")
-_PAIR = re.compile(r"(\d\.\d{1,17}):(\d{2,3}(?:\.\d{1,17})?)")
 _POWERS = (0, -2, 2, -4, -6, -8)  # of L in Schott's formula; each further index adds one
 _SCHOTT = (0, 2, -2, -4, -6, -8)
 _SAME = 1e-9  # um, tolerance for equal wavelengths
 _MOST = 1000
-
-
-def code_of(word: str) -> tuple[float, float] | None:
-    """nd and vd of a code as 517642, 517.642, 516800.641700 or 1.5168:64.17; None for a name."""
-    found = _CODE.fullmatch(word)
-    if found:
-        return float(f"1.{found[1]}"), float(f"{found[2][:2]}.{found[2][2:]}")
-    if _SHORT_CODE.fullmatch(word):
-        return 1 + int(word[:3]) / 1000, int(word[3:]) / 10
-    found = _PAIR.fullmatch(word)
-    return (float(found[1]), float(found[2])) if found else None
 
 
 def folded(name: str) -> str:
@@ -57,23 +43,21 @@ class Glasses:
         command.require(len(self.tables) < _MOST, f"more than {_MOST} private glasses")
         self.tables[command.key.upper()] = command, self.waves
 
-    def medium(self, surface: Surface, system: list[float]) -> dict[str, Any]:
-        """The entries of the medium behind a surface. system: wavelengths of the file, um."""
+    def medium(self, surface: Surface) -> dict[str, Any]:
+        """The entries of the medium behind a surface."""
         (line, word), record = surface.glass, self.record
         private = word.upper()
         if private in ("", "AIR"):
             return {}
         if private in self.tables:
             if private not in self.used:
-                self.used[private] = _private(*self.tables[private], system)
+                self.used[private] = _private(*self.tables[private])
             return {"glass": private}
         if code := code_of(word):
-            nd, vd = code
-            known = 1 < nd <= 4 and 10 <= vd <= 120
-            surface.require(known, f"no glass has nd {nd:g} and vd {vd:g}", line)
+            require_glass(surface, line, *code)
             note = "glasses of a code have its nd and vd; between the lines they are models"
             record.notes += [note] if note not in record.notes else []
-            return {"nd": nd, "vd": vd}
+            return dict(zip(("nd", "vd"), code, strict=True))
         name, _, maker = word.partition("_")
         makers = [maker.upper()] if maker and maker.upper() != "SPECIAL" else []
         known_as = [other for other in plain_names() if folded(other) == folded(name)]
@@ -84,12 +68,12 @@ class Glasses:
         return dict(named_glass(surface, line, known_as[0] if known_as else name, makers))
 
 
-def _private(command: Command, waves: list[float], system: list[float]) -> dict[str, Any]:
+def _private(command: Command, waves: list[float]) -> dict[str, Any]:
     """The constants of a private glass, from its formula or its table of indices."""
     name, words = short(command.key), command.values
     kind, count = words[0].upper() if words else "", len(words) - 1
     if kind not in _FORMULAS:
-        return _table(command, waves, system)
+        return _table(command, waves)
     values = command.numbers(1, count + 1)
     command.require(0 < count <= _FORMULAS[kind], f"{name}: {kind} with {count} constants")
     own: dict[str, Any] = {"range": [min(waves), max(waves)] if len(waves) > 1 else [1e-4, 1e6]}
@@ -103,10 +87,11 @@ def _private(command: Command, waves: list[float], system: list[float]) -> dict[
     return own | {"schott": values}
 
 
-def _table(command: Command, waves: list[float], system: list[float]) -> dict[str, Any]:
+def _table(command: Command, waves: list[float]) -> dict[str, Any]:
     """Schott's formula for a table. It passes through all of up to six indices; else through up
     to five at the file's wavelengths, with a least-squares fit to those near them."""
     name, count = short(command.key), len(command.values)
+    system = command.record.use.wavelengths
     many = f"{count} indices for {len(waves)} wavelengths of PWL"
     known = f"known formulas: {', '.join(_FORMULAS)}"
     command.require(waves and count == len(waves), f"{name}: {many}; {known}")

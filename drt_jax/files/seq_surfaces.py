@@ -1,11 +1,11 @@
 """Surfaces of `.seq` files: their commands, and conversion to prescription entries."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
-from ..lens.forms import noll_of_fringe, powers_xy
-from .record import Row, short
+from ..lens.forms import noll_of_fringe
+from .record import XY, Row, short
 from .seq_text import SOLVES, Command
 
 LETTERS = dict(zip("ABCDEFGHJ", range(4, 22, 2), strict=True))  # powers of r; CODE V has no I
@@ -13,9 +13,10 @@ RADIAL = {"AR": 4, "BR": 6, "CR": 8, "DR": 10}  # and of an anamorphic asphere
 _LOPSIDED = ("AP", "BP", "CP", "DP")
 _COEFFICIENTS = ("K", *LETTERS, "KX", "KY", *RADIAL, *_LOPSIDED, "CUF")
 _POWERS = {"K", *LETTERS}
+_TOROIDS = ("XTO", "YTO", "CYL")
 # The coefficients of each kind of surface; those of SPS have numbers.
 _KINDS: dict[str, set[str]] = {
-    **{"SPH": set(), "CON": {"K"}, "ASP": _POWERS, "XTO": _POWERS, "YTO": _POWERS, "CYL": _POWERS},
+    **{"SPH": set(), "CON": {"K"}, "ASP": _POWERS, **dict.fromkeys(_TOROIDS, _POWERS)},
     **{"AAS": {"KX", "KY", *RADIAL, *_LOPSIDED}, "SPS": set()},
 }
 # The types of SPS: form; numbers of the conic, of the first coefficient and of the norm radius (0:
@@ -28,9 +29,11 @@ _SPECIAL = {
 }
 _SPECIAL_TERMS, _LEAST = 99, 1e-6
 MOVES = ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
-# Sizes of apertures along x and y, by the first letter of their commands.
-SIZES = {"C": ("CIR",), "R": ("REX", "REY"), "E": ("ELX", "ELY")}
+# The commands of the size of each shape of aperture, along x and y.
+SIZES = {"circle": ("CIR",), "rectangle": ("REX", "REY"), "ellipse": ("ELX", "ELY")}
+_SHAPES = {key: kind for kind, keys in SIZES.items() for key in keys}
 _MOST = 50  # apertures of a surface
+_Sizes = dict[str, tuple[int, float]]
 
 
 @dataclasses.dataclass
@@ -38,68 +41,55 @@ class Surface(Row):
     """A surface as its commands are read; numbers are in units of the file. gap: to the next.
 
     curvature, curvature_x: 1/unit; curvature_x with its line, or None if it is not given. kind: a
-    key of `_KINDS`. special: the type of SPS. terms: coefficients by key, with their lines; keys of
-    SPS are C1, C2, .... phase: values of the commands of gratings by key. glass: (line, word).
-    moves: values of `MOVES` by key. turn: DAR, BEN, REV, RET or "". target: the surface that RET
-    returns to. move_line: of the last command of these.
-    clips: apertures by use and label, (line, size) by key.
+    key of `_KINDS`. values: coefficients by key; keys of SPS are C1, C2, .... special: the type of
+    SPS. phase: values of the commands of gratings by key. glass: (line, word). moves: values of
+    `MOVES` by key. turn: DAR, BEN, REV, RET or "". target: the surface that RET returns to.
+    move_line: of the last command of these. clips: apertures by use and label, (line, size) by key.
     """
 
+    kind: str = "SPH"
     curvature: float = 0.0
     curvature_x: tuple[int, float] | None = None
     gap: float = 0.0
     glass: tuple[int, str] = (0, "")
-    kind: str = "SPH"
-    kind_line: int = 0
     special: str = ""
-    terms: dict[str, tuple[int, float]] = dataclasses.field(default_factory=dict)
     phase: dict[str, tuple[int, Any]] = dataclasses.field(default_factory=dict)
     moves: dict[str, float] = dataclasses.field(default_factory=dict)
     turn: str = ""
     target: int = 0
     move_line: int = 0
-    clips: dict[tuple[str, str], dict[str, tuple[int, float]]] = dataclasses.field(
-        default_factory=dict
-    )
+    clips: dict[tuple[str, str], _Sizes] = dataclasses.field(default_factory=dict)
 
     @property
     def moved(self) -> bool:
         """Whether the surface is decentred or tilted."""
         return any(self.moves.values())
 
-    def term(self, key: str) -> float:
-        """A coefficient; 0 if it is not given."""
-        return self.terms.get(key, (0, 0.0))[1]
-
-    def powers(self, keys: Mapping[str, int]) -> dict[int, float]:
-        """Coefficients in mm. keys: of each power."""
-        return self.powers_in_mm({p: self.term(key) for key, p in keys.items()})
-
     def entries(self) -> None:
         """Write form, curvature and coefficients as entries of a prescription."""
-        kind, unit, line = self.kind, self.unit, self.kind_line
+        kind, unit = self.kind, self.unit
         self.entry.setdefault("curvature", self.curvature / unit)
-        for key, (line, value) in self.terms.items():
+        for key, (line, value) in self.values.items():
             known = kind == "SPS" or key in _KINDS[kind] or not value
             self.require(known, f"{key} on a surface of kind {kind}", line)
         of_special = f"C{_SPECIAL[self.special][1]}" if self.special else "K"
-        if conic := self.term({"AAS": "KY", "SPS": of_special}.get(kind, "K")):
+        if conic := self.value({"AAS": "KY", "SPS": of_special}.get(kind, "K")):
             self.put("conic", conic, self.kind_line)
-        if self.curvature_x and kind not in ("XTO", "YTO", "CYL", "AAS"):
-            line, across = self.curvature_x
-            known = across in (0.0, self.curvature)
-            self.require(known, f"a curvature in x on kind {kind}", line)
-        if kind == "ASP":
-            self.shape("asphere", self.powers(LETTERS), self.kind_line)
-        elif kind in ("XTO", "YTO", "CYL"):
+        if kind in _TOROIDS:
             self._toroid()
-        elif kind == "AAS":
+            return
+        line, across = self.curvature_x or (0, self.curvature)
+        if kind == "AAS":
             for key in _LOPSIDED:
-                line, value = self.terms.get(key, (0, 0.0))
-                self.require(not value, f"{key}, a lopsided asphere", line)
-            across = self.curvature_x[1] if self.curvature_x else self.curvature
-            own = {"curvature_x": across / unit, "conic_x": self.term("KX")}
-            self.shape("biconic", self.powers(RADIAL), self.kind_line, own)
+                what = f"{key}, a lopsided asphere"
+                self.require(not self.value(key), what, self.values.get(key, (0, 0.0))[0])
+            own = {"curvature_x": across / unit, "conic_x": self.value("KX")}
+            self.shape("biconic", self.powers(RADIAL), **own)
+            return
+        known = across in (0.0, self.curvature)
+        self.require(known, f"a curvature in x on kind {kind}", line)
+        if kind == "ASP":
+            self.shape("asphere", self.powers(LETTERS))
         elif kind == "SPS":
             self._special_shape()
 
@@ -113,38 +103,72 @@ class Surface(Row):
         if turned:
             across, along = along, across
             self.put("tilt", [0.0, 0.0, 90.0], self.kind_line)
-        own = {"curvature": along, "curvature_x": across}
-        self.shape("toroid", self.powers(LETTERS), self.kind_line, own)
+        self.shape("toroid", self.powers(LETTERS), curvature=along, curvature_x=across)
 
     def _special_shape(self) -> None:
         """The shape of a type of SPS."""
         (form, conic, first, own, count), found = _SPECIAL[self.special], dict[int, float]()
-        self.terms.setdefault("NRADIUS", self.terms.get(f"C{own}", (0, 0.0)))
-        for key, (line, value) in self.terms.items():
+        self.values.setdefault("NRADIUS", self.values.get(f"C{own}", (0, 0.0)))
+        for key, (line, value) in self.values.items():
             number = int(key[1:]) - first if key[1:].isdecimal() and key[0] == "C" else -1
             if 0 <= number < count:
                 found |= {number: value} if value else {}
             else:
                 known = not value or key in ("NRADIUS", f"C{conic}", f"C{own}")
                 self.require(known, f"SCO {key} of SPS {self.special}", line)
-        unit, radius = self.unit, self.term("NRADIUS")
+        unit, radius = self.unit, self.value("NRADIUS")
         radius = radius if radius or self.special not in ("ODD", "XYP") else 1.0
         known = _LEAST <= radius <= 1 / _LEAST
         self.require(known, f"SPS {self.special} of NRADIUS {radius:g}", self.kind_line)
         terms: dict[Any, float] = {}
         for k, value in found.items():
-            if form == "qbfs":
-                terms[k] = value * unit
-            elif form == "zernike":  # fringe polynomials, which are 1 at the rim
-                number, rim = noll_of_fringe(k + 1)
+            if form in ("qbfs", "zernike"):  # fringe polynomials are 1 at the rim
+                number, rim = noll_of_fringe(k + 1) if form == "zernike" else (k, 1.0)
                 terms[number] = value * unit / rim
-            elif form == "odd_asphere":
-                terms[k + 1] = value / radius ** (k + 1) * unit**-k
             else:
-                i, j = powers_xy(count)[k]
-                terms[f"x{i}y{j}"] = value / radius ** (i + j) * unit ** (1 - i - j)
+                key, p = XY[k] if form == "polynomial_xy" else (k + 1, k + 1)
+                terms[key] = value / radius**p * unit ** (1 - p)
         more = {"norm_radius": radius * unit} if form in ("qbfs", "zernike") else {}
-        self.shape(form, terms, self.kind_line, more)
+        self.shape(form, terms, **more)
+
+    def clip(self) -> float | None:
+        """Write the apertures as entries of a prescription. Return the radius (mm) of a circle
+        about the vertex of the stop, which may be the size of the stop itself; None if there is
+        none."""
+        size = None
+        for (use, label), sizes in self.clips.items():
+            shapes = [] if use == "EDG" else self._shapes(sizes)  # a rim clips nothing
+            if use == "HOL" and shapes:
+                line = next(iter(sizes.values()))[0]
+                self.record.note(line, f"{self.name}: a hole is read as an obscuration")
+            for line, shape in shapes:
+                if use != "CLR":
+                    self.put_shape("obscuration", shape, line)
+                elif self.put_clear(shape, line, bool(label)) and not label:
+                    size = size if "centre" in shape else shape.get("circle") or size
+        return size if self.entry.get("stop") else None
+
+    def _shapes(self, sizes: _Sizes) -> list[tuple[int, dict[str, Any]]]:
+        """The shapes of one use and label, each with its line."""
+        value, found = {key: size * self.unit for key, (_, size) in sizes.items()}, []
+        centre = [value.get("ADX", 0.0), value.get("ADY", 0.0)]
+        turned = "tilt" in self.entry  # the axes of an XTO surface lie along y and -x
+        centre = [centre[1], -centre[0]] if turned else centre
+        turn = sizes.get("ARO", (0, 0.0))[1] % 180
+        for kind in dict.fromkeys(_SHAPES[key] for key in sizes if key in _SHAPES):
+            keys = SIZES[kind]
+            line = next(own for key, (own, _) in sizes.items() if key in keys)
+            given = all(key in value for key in keys)
+            self.require(given, f"give both {' and '.join(keys)}", line)
+            half = [value[key] for key in keys]
+            if kind != "circle" and turn not in (0, 90):
+                what = f"{self.name}: an aperture turned by {turn:g} degrees"
+                self.record.lacks(line, what)
+                continue
+            half = half[::-1] if (turn == 90) != turned else half
+            shape: dict[str, Any] = {kind: half[0] if kind == "circle" else half}
+            found.append((line, shape | ({"centre": centre} if any(centre) else {})))
+        return found
 
     def diffraction(self) -> None:
         """Write gratings and radial phases as entries of a prescription."""
@@ -152,6 +176,9 @@ class Surface(Row):
             return
         line, kind = self.phase.get("DIF", (next(iter(self.phase.values()))[0], ""))
         value = {key: own for key, (_, own) in self.phase.items()}
+        what = short(f"DIF {kind} with HCT {value.get('HCT', '')}".removesuffix(" with HCT "))
+        known = kind == "GRT" or (kind == "DOE" and value.get("HCT") == "R")
+        self.require(known, f"{what}; known: GRT, DOE with HCT R", line)
         terms: dict[Any, float]
         if kind == "GRT":
             along = not (value.get("GRX") or value.get("GRZ"))
@@ -159,16 +186,12 @@ class Surface(Row):
             self.require(value.get("GRS"), "a grating without a spacing, GRS", line)
             form, order = "linear", value.get("GRO", 1.0)
             terms = {"y": 1 / (value["GRS"] * self.unit)}
-        elif kind == "DOE" and value.get("HCT") == "R":
+        else:
             wave = value.get("HWL", 0.0) * 1e-6  # mm
             self.require(wave > 0, "a phase without a wavelength, HWL", line)
             found = {2 * int(k[1:]): v for k, v in value.items() if k[0] == "C"}
             form, order = "asphere", value.get("HOR", 1.0)
             terms = {p: v * self.unit ** (1 - p) / wave for p, v in found.items() if v}
-        else:
-            what = f"DIF {kind} with HCT {value.get('HCT', '')}".removesuffix(" with HCT ")
-            what = f"{self.name}: {short(what)}; known: GRT, DOE with HCT R"
-            raise self.record.error(line, what)
         if terms and order:
             self.put("phase", {"form": form, "order": order, "coefficients": terms}, line)
 
@@ -230,7 +253,7 @@ def _kind(surface: Surface, command: Command) -> None:
     what = f"SPS {surface.special} is not read; known: {', '.join(_SPECIAL)}"
     surface.require(surface.special in _SPECIAL, what, command.line)
     if len(command.values) > 1:
-        surface.terms["NRADIUS"] = command.line, command.bounded(1)
+        surface.values["NRADIUS"] = command.line, command.bounded(1)
 
 
 def _coefficient(surface: Surface, command: Command) -> None:
@@ -247,7 +270,7 @@ def _coefficient(surface: Surface, command: Command) -> None:
         numbered = name[1:].isdecimal() and name[0] == "C" and len(name) < 4 and name != "C0"
         what = f"SCO {short(name)}: expected C1 to C{_SPECIAL_TERMS}"
         command.require(numbered or name == "NRADIUS", what)
-    surface.terms[name] = command.line, own.number()
+    surface.values[name] = command.line, own.number()
 
 
 def _diffract(surface: Surface, command: Command) -> None:
@@ -288,7 +311,7 @@ ON_SURFACES: dict[str, Callable[[Surface, Command], None]] = {
     **{"THI": thickness, "GLA": glass, "RMD": glass},
     **dict.fromkeys(_KINDS, _kind),
     **dict.fromkeys((*_COEFFICIENTS, "SCO"), _coefficient),
-    **dict.fromkeys((*SIZES["C"], *SIZES["R"], *SIZES["E"], "ADX", "ADY", "ARO"), _clip),
+    **dict.fromkeys((*_SHAPES, "ADX", "ADY", "ARO"), _clip),
     **dict.fromkeys((*MOVES, "DAR", "BEN", "REV"), move),
     **dict.fromkeys(("DIF", "HOR", "HWL", "HCT", "HCO"), _diffract),
     **dict.fromkeys(("GRO", "GRS", "GRX", "GRY", "GRZ"), _diffract),

@@ -22,24 +22,18 @@ _PIECE = re.compile(r"""'[^']*'|"[^"]*"|[^'";!]+|.""", re.DOTALL)
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")
 
 # Ignored: names, drawing, variables, tolerances, ray aiming, analyses. None changes rays.
-COSMETIC = frozenset(
-    """
+COSMETIC = """
     LEN INI GO CWL SLB DER CLS DOR WID CUM THM POL PIK AUT VER INC
     CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC XDC YDC ZDC ADC BDC CDC SCC HCC CCF
-    """.split()  # noqa: SIM905
-)
-SOLVES = frozenset(
-    """
+""".split()  # noqa: SIM905
+SOLVES = """
     PIM RED OAL HMY HMX HCY HCX UMY UMX UCY UCX IMY IMX ICY ICX APN APL CMY CMX EFL EFX EFY PIK
-    """.split()  # noqa: SIM905
-)
+""".split()  # noqa: SIM905
 # Commands that change rays and are refused.
-REFUSED = frozenset(
-    """
+REFUSED = """
     NSS GL1 GL2 INS DEL COP FLY SCA INV URN GRC GRI ARR CIG REG ELG SPL TRP GLB HOE HV1 HV2 HX1 HX2
     HY1 HY2 HZ1 HZ2 XOD YOD ZOD MOD SWI AFI TEL USR UDS MIR
-    """.split()  # noqa: SIM905
-)
+""".split()  # noqa: SIM905
 
 
 @dataclasses.dataclass

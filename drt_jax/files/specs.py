@@ -27,11 +27,11 @@ from ..lens.paraxial import (
 )
 from ..lens.phase import Phase
 from .apertures import apertures_of, semi_diameter
-from .entry import STEEP, WIDE, Entry, LensError, array, table
+from .entry import STEEP, WIDE, Entry, LensError, array, require, table
 
 _D_LINE = 0.5875618  # um
-_MOST = 5000  # surfaces
-_MOST_ELEMENTS = 500
+SURFACES = 5000  # surfaces
+_ELEMENTS = 500
 _DENSEST = 10  # index
 MEDIUM_KEYS = ("glass", "index", "nd", "vd", "partial")
 _FOCUS = "focus"  # value of `sensor`
@@ -80,8 +80,7 @@ def _coefficients(surface: Entry) -> list[float]:
     if "conic_x" in first:
         columns[1] = surface.number("conic_x", 0.0, most=STEEP)
     if "norm_radius" in first:
-        columns[0] = surface.number("norm_radius")
-        surface.require(columns[0] > 0, "norm_radius", "must be positive")
+        columns[0] = surface.positive("norm_radius")
     return [columns.get(k, 0.0) for k in range(max(columns, default=-1) + 1)]
 
 
@@ -111,27 +110,24 @@ def _elements(top: Entry, count: int) -> Elements | None:
     listed = top.get("elements", [])
     top.require(isinstance(listed, list), "elements", "expected a list")
     many = len(listed)
-    top.require(many <= _MOST_ELEMENTS, "elements", f"{many} are more than {_MOST_ELEMENTS}")
+    top.require(many <= _ELEMENTS, "elements", f"{many} are more than {_ELEMENTS}")
     entries = [Entry(entry, f"elements[{g}]", _ELEMENT_KEYS) for g, entry in enumerate(listed)]
     # Outer elements precede the elements inside them.
-    found = sorted(
-        ((_span(entry, count), entry) for entry in entries),
-        key=lambda own: (own[0][0], -own[0][1]),
-    )
+    found = [(_span(entry, count), entry) for entry in entries]
+    found.sort(key=lambda own: (own[0][0], -own[0][1]))
     if not found:
         return None
     for ((_, last), one), ((first, end), two) in itertools.combinations(found, 2):
         cuts = f"cuts into {one.place}: put one inside the other, or apart"
         two.require(not first <= last < end, "surfaces", cuts)
     spans, groups = zip(*found, strict=True)
+    abouts = [_row(own, "about", own.get("about", first), count) for (first, _), own in found]
     return Elements(
         shift=array([entry.vector("shift", 3) or [0.0] * 3 for entry in groups]),
         tilt=jnp.radians(array([entry.vector("tilt", 3) or [0.0] * 3 for entry in groups])),
         pivot=array([entry.number("pivot", 0.0) for entry in groups]),
         spans=spans,
-        about=tuple(
-            _row(entry, "about", entry.get("about", first), count) for (first, _), entry in found
-        ),
+        about=tuple(abouts),
     )
 
 
@@ -147,12 +143,11 @@ def _span(entry: Entry, count: int) -> tuple[int, int]:
     return first, last
 
 
-def _row(entry: Entry, key: str, value: object, count: int) -> int:
+def _row(entry: Entry, key: str, value: Any, count: int) -> int:
     """The index of a surface; `count` for the sensor."""
     row = count if value == "sensor" else value
-    if type(row) is not int or not 0 <= row <= count:
-        what = f"expected a surface, 0 to {count - 1}, or sensor; got {shown(value)}"
-        raise entry.error(key, what)
+    what = f"expected a surface, 0 to {count - 1}, or sensor; got {shown(value)}"
+    entry.require(type(row) is int and 0 <= row <= count, key, what)
     return row
 
 
@@ -182,7 +177,9 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
     entry.require(both, "", "nd and vd make a model glass together: give both or neither")
     if "nd" in entry:
         values = entry.number("nd"), entry.number("vd"), entry.number("partial", 0.0)
-        return _model_glass(entry, "nd", *values)
+        with entry.naming("nd"):
+            glass = model_glass(*values)
+        return glass
     what = "belongs to a model glass: give nd and vd as well"
     entry.require("partial" not in entry, "partial", what)
     if "index" in entry:
@@ -197,19 +194,12 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
     name = entry.text("glass", "air")
     if name in own:
         return own[name]
-    if len(name) == 6 and name.isdecimal():  # a glass code: 1000 (nd - 1), then 10 vd
-        return _model_glass(entry, "glass", 1 + int(name[:3]) / 1000, int(name[3:]) / 10)
-    try:
-        return find_glass(name)
-    except ValueError as error:
-        raise entry.error("glass", str(error)) from error
-
-
-def _model_glass(entry: Entry, key: str, *values: float) -> Glass:
-    try:
-        return model_glass(*values)
-    except ValueError as error:
-        raise entry.error(key, str(error)) from error
+    with entry.naming("glass"):
+        if len(name) == 6 and name.isdecimal():  # a glass code: 1000 (nd - 1), then 10 vd
+            glass = model_glass(1 + int(name[:3]) / 1000, int(name[3:]) / 10)
+        else:
+            glass = find_glass(name)
+    return glass
 
 
 def _media(top: Entry, surfaces: list[Entry]) -> list[Glass]:
@@ -231,9 +221,9 @@ def _media(top: Entry, surfaces: list[Entry]) -> list[Glass]:
 def _gaps(top: Entry, surfaces: list[Entry]) -> list[float]:
     """Distances from each surface to the next and from the last to the sensor, mm."""
     gaps = [surface.number("thickness") for surface in surfaces[:-1]]
-    if ("sensor" in top) == ("thickness" in surfaces[-1]):
-        what = "give either sensor (mm from the first vertex, or focus) or the last surface's "
-        raise LensError(f"{what}thickness (its distance to the sensor)", "sensor")
+    what = "give either sensor (mm from the first vertex, or focus) or the last surface's "
+    what = f"{what}thickness (its distance to the sensor)"
+    require(("sensor" in top) != ("thickness" in surfaces[-1]), what, "sensor")
     if top.get("sensor") == _FOCUS:
         return [*gaps, 0.0]  # a placeholder until the lens is built
     end = top.number("sensor") - sum(gaps) if "sensor" in top else surfaces[-1].number("thickness")
@@ -254,7 +244,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     entries = top.get("surfaces")
     if not isinstance(entries, list) or not entries:
         raise LensError("surfaces: expected a list of at least one surface", "surfaces")
-    top.require(len(entries) <= _MOST, "surfaces", f"{len(entries)} are more than {_MOST}")
+    top.require(len(entries) <= SURFACES, "surfaces", f"{len(entries)} are more than {SURFACES}")
     surfaces = [Entry(e, f"surfaces[{i}]", _SURFACE_KEYS) for i, e in enumerate(entries)]
     stops = [i for i, surface in enumerate(surfaces) if surface.flag("stop")]
     top.require(len(stops) == 1, "surfaces", f"{len(stops)} have stop: true, exactly one must")
@@ -287,8 +277,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     bent = (surface.curvature() or any(row) for surface, row in zip(surfaces, coefficients))
     curved = tuple(i for i, does in enumerate(bent) if does and i not in lens.active)
     lens = dataclasses.replace(lens, curved=curved)
-    low, high = lens.dispersion.range
-    line = _D_LINE if low <= _D_LINE <= high else (low + high) / 2
+    line = middle_of(lens)
     if focused:  # for an object at infinity
         place = first_order(lens, math.inf, line).image_distance[0]
         what = "focus: there is none, light leaves parallel; give mm and afocal: true"
@@ -302,6 +291,12 @@ def build_lens(values: object, name: str = "lens") -> Lens:
     known = pupil in ("stop", "paraxial")
     top.require(known, "pupil", f"expected stop or paraxial, got {shown(pupil)}")
     return with_paraxial_pupil(lens, line) if pupil == "paraxial" else lens
+
+
+def middle_of(lens: Lens) -> float:
+    """The d line or, if the glasses of a lens exclude it, the middle of their range, um."""
+    low, high = lens.dispersion.range
+    return _D_LINE if low <= _D_LINE <= high else (low + high) / 2
 
 
 def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:
@@ -355,9 +350,8 @@ def _check_order(lens: Lens, gaps: list[float], moved: list[bool], wave: float) 
         if j == lens.count or np.isinf(rim):
             continue
         for k, sag in zip((i, j), sags, strict=True):
-            if not np.all(np.isfinite(sag)):
-                what = f"surfaces[{k}]: not finite within {rim:g} mm of the axis; which unit?"
-                raise LensError(what, f"surfaces[{k}]")
+            what = f"surfaces[{k}]: not finite within {rim:g} mm of the axis; which unit?"
+            require(np.all(np.isfinite(sag)), what, f"surfaces[{k}]")
         if place is None:
             continue
         message = (

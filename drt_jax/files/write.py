@@ -10,12 +10,11 @@ import yaml
 
 from ..lens.glass import FRAUNHOFER
 from ..lens.lens import Lens
-from .entry import LensError
-from .system import System, system_for
+from .entry import LensError, require
+from .load import System, known_ending, lens_in, system_for
 from .write_seq import seq_text
 from .write_zmx import zmx_text
 from .written import element_of, entry_of, media_of_lens, place_of, shapes_of
-from .yaml import known_ending, lens_in
 
 # How far the index of a private glass may be off at more wavelengths than it can be made for.
 _PRIVATE = 1e-6
@@ -65,8 +64,8 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
         raise LensError(f"{error}; not written, as it could not be read back") from error
     # A private glass of .seq stands for a model glass by six terms.
     room = _PRIVATE if kind == ".seq" and system.lens.dispersion.model is not None else 0.0
-    if found := _difference(system.lens, again, known, room) or _use_difference(system, used):
-        raise LensError(f"{path}: not written: what is read back differs: {found}")
+    found = _difference(system.lens, again, known, room) or _use_difference(system, used)
+    require(not found, f"{path}: not written: what is read back differs: {found}")
     try:
         pathlib.Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
@@ -75,8 +74,8 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
 
 def _yaml_text(system: System) -> str:
     lens = system.lens
-    if np.any([np.asarray(a)[-1] for a in (lens.curvature, lens.conic)]):
-        raise LensError("sensor: a prescription has none that is curved")
+    curved = any(np.asarray(part)[-1] for part in (lens.curvature, lens.conic))
+    require(not curved, "sensor: a prescription has none that is curved")
     top: dict[str, Any] = {"name": lens.name} if lens.name else {}
     media, glasses = media_of_lens(lens)
     top |= {"glasses": glasses} if glasses else {}
@@ -114,9 +113,8 @@ def _difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) 
     # Elements that move along the axis become thicknesses in files of other programs.
     spaced = one.elements is None and two.elements is None
     both = [_numbers(lens, waves, spaced) for lens in (one, two)]
-    return _first(
-        [(name, a, both[1][name], room.get(name, 0.0)) for name, a in both[0].items()], close
-    )
+    pairs = [(name, a, both[1][name], room.get(name, 0.0)) for name, a in both[0].items()]
+    return _first(pairs, close)
 
 
 def _use_difference(system: System, used: Mapping[str, Any]) -> str:
@@ -156,32 +154,30 @@ def _first(pairs: list[Any], close: float) -> str:
 def _numbers(lens: Lens, waves: list[float], spaced: bool) -> dict[str, np.ndarray]:
     """Arrays of a lens by name; thicknesses if it is `spaced` by these alone."""
     rows, (z, across, turned) = lens.count + 1, lens.places
+    decentre = np.zeros((rows, 2)) if across is None else np.asarray(across, float)
+    rotation = np.tile(np.eye(3), (rows, 1, 1)) if turned is None else np.asarray(turned, float)
     given, semi = np.asarray(lens.coefficients, float), np.asarray(lens.semi_diameter, float)
     coefficients = np.pad(given, ((0, 0), (0, given.shape[1])))
     for i, form in enumerate(lens.forms):
         if form == "asphere":  # as an odd one
             coefficients[i, ::2], coefficients[i, 1::2] = 0, given[i]
-    shapes = [(i, *own) for i in range(lens.count) for own in shapes_of(lens, i)]
-    listed = sorted([i, blocks, _KINDS.index(k), *at, *size] for i, blocks, k, size, at in shapes)
+    listed = sorted(
+        [i, blocks, _KINDS.index(kind), *centre, *size]
+        for i in range(lens.count)
+        for blocks, kind, size, centre in shapes_of(lens, i)
+    )
     wide = max(map(len, listed), default=0)
+    phase = np.zeros((0, 2))  # rows of surface, order and coefficients
+    if (own := lens.phase) is not None:
+        phase = np.column_stack([own.surfaces, own.order, own.coefficients])
     names = ("curvature", "conic", *(("thickness", "sensor") if spaced else ()))
     return {name: np.asarray(getattr(lens, name), float) for name in names} | {
         "coefficients": coefficients,
         "stop's semi_diameter": semi[lens.stop],
         "apertures": np.array([[*row, *[0.0] * (wide - len(row))] for row in listed], float),
         "index": np.asarray(lens.index(waves), float),
-        "decentre": np.zeros((rows, 2)) if across is None else np.asarray(across, float),
+        "decentre": decentre,
         "vertex": np.asarray(z - z[0], float),
-        "rotation": np.tile(np.eye(3), (rows, 1, 1))
-        if turned is None
-        else np.asarray(turned, float),
-        "phase": _phase(lens.phase),
+        "rotation": rotation,
+        "phase": phase,
     }
-
-
-def _phase(phase: Any) -> np.ndarray:
-    """Rows of surface, order and coefficients."""
-    if phase is None:
-        return np.zeros((0, 2))
-    order = np.asarray(phase.order, float)[:, None]
-    return np.hstack([np.array(phase.surfaces)[:, None], order, np.asarray(phase.coefficients)])

@@ -21,12 +21,12 @@ from ..lens.glass import (
 from ..lens.glasses import find_glass
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil
-from .entry import LensError
+from .entry import LensError, require
+from .load import System
 from .record import turns_of
 from .seq import FIELDS
 from .seq_glass import folded, schott_through
-from .seq_surfaces import LETTERS, MOVES, RADIAL
-from .system import System
+from .seq_surfaces import LETTERS, MOVES, RADIAL, SIZES
 from .written import (
     degrees_of,
     element_of,
@@ -37,7 +37,6 @@ from .written import (
     place_of,
 )
 
-_SIZES = {"circle": ("CIR",), "rectangle": ("REX", "REY"), "ellipse": ("ELX", "ELY")}
 # By form: the type of SPS and what stands behind it, the most coefficients, and letters and number
 # of the first.
 _SPECIAL = {
@@ -53,8 +52,8 @@ def seq_text(system: System) -> str:
     """The text of a file. LensError, with the remedy, for features that are not written; a warning
     tells how far a model glass differs that becomes a private one."""
     lens, worst = system.lens, 0.0
-    if lens.afocal:
-        raise LensError(".seq files hold no afocal image space here: save as .yaml or .zmx")
+    what = ".seq files hold no afocal image space here: save as .yaml or .zmx"
+    require(not lens.afocal, what)
     media, own = media_of_lens(lens)
     for i, keys in enumerate(media):
         made, off = _made(keys, system.wavelengths)
@@ -69,8 +68,8 @@ def seq_text(system: System) -> str:
     title = "".join(" " if c in "'\"" or not c.isprintable() else c for c in lens.name)
     wave = float(system.wavelengths[system.primary])
     pupil = 2 * float(entrance_pupil(lens, wave).semi_diameter[0])
-    if not (math.isfinite(pupil) and pupil > 0):
-        raise LensError("the lens has no entrance pupil of finite size: save as .yaml")
+    what = "the lens has no entrance pupil of finite size: save as .yaml"
+    require(math.isfinite(pupil) and pupil > 0, what)
     lines = ["RDM N", "LEN", f"TITLE '{' '.join(title.split())}'", f"EPD {pupil!r}", "DIM M"]
     tables = [line for name in own for line in _private(name, private[name], own[name])]
     lines += [*_use(system), *(["PRV", *tables, "END"] if own else [])]
@@ -93,8 +92,8 @@ def _use(system: System) -> list[str]:
     """The lines of wavelengths, fields and vignetting."""
     kind = next(key for key, kind in FIELDS.items() if kind == system.field_kind)
     dx, dy, cx, cy, turn = system.vignetting.T
-    if np.any(turn * np.any(system.vignetting[:, :4], axis=1)):
-        raise LensError("vignetting: .seq files hold no rotation: save as .zmx")
+    turned = np.any(turn * np.any(system.vignetting[:, :4], axis=1))
+    require(not turned, "vignetting: .seq files hold no rotation: save as .zmx")
     columns = {
         "WL": [_nanometres(wave) for wave in system.wavelengths.tolist()],
         "WTW": system.wavelength_weights.tolist(),
@@ -138,10 +137,9 @@ def _private(name: str, called: str, constants: dict[str, Any]) -> list[str]:
     """The lines of a private glass, which the file defines by its constants."""
     low, high = constants.get("range", ANY)
     sellmeier, schott = constants.get("sellmeier"), constants.get("schott")
-    if sellmeier and schott:
-        raise LensError(f"glass {name}: .seq files hold no two formulas at once: save as .yaml")
-    if schott and len(schott) > 6:
-        raise LensError(f"glass {name}: .seq files hold powers from L^2 to L^-8: save as .yaml")
+    holds, remedy = f"glass {name}: .seq files hold", "save as .yaml"
+    require(not (sellmeier and schott), f"{holds} no two formulas at once: {remedy}")
+    require(len(schott or ()) <= 6, f"{holds} powers from L^2 to L^-8: {remedy}")
     if sellmeier:
         half = len(sellmeier) // 2
         pairs = zip(sellmeier[:half], sellmeier[half:], strict=True)
@@ -175,10 +173,9 @@ def _surface(i: int, entry: Mapping[str, Any]) -> list[str]:
     shapes += [("OBS", own) for own in entry.get("obscuration", [])]
     for n, (use, own) in enumerate(shapes, 1):
         for kind, size in own.items():
-            if kind == "polygon":
-                what = f"surfaces[{i}]: .seq files hold no polygon here: save as .yaml or .zmx"
-                raise LensError(what)
-            keys = _SIZES.get(kind, ("ADX", "ADY"))
+            what = f"surfaces[{i}]: .seq files hold no polygon here: save as .yaml or .zmx"
+            require(kind != "polygon", what)
+            keys = SIZES.get(kind, ("ADX", "ADY"))
             values = size if isinstance(size, list) else [size]
             lines += [f"{key} {use} L'A{n}' {value!r}" for key, value in zip(keys, values)]
     return lines + (_phase(i, entry["phase"]) if "phase" in entry else [])
@@ -194,9 +191,8 @@ def _form(i: int, entry: Mapping[str, Any]) -> list[str]:
     used = {power: value for power, value in row.items() if value}
     if name in ("asphere", "toroid", "biconic"):
         for power in used:
-            if power not in letters:
-                what = f"surfaces[{i}].coefficients: .seq files hold no r^{power} here"
-                raise LensError(f"{what}: save as .yaml")
+            what = f"surfaces[{i}].coefficients: .seq files hold no r^{power} here: save as .yaml"
+            require(power in letters, what)
         terms = [f"{letters[power]} {value!r}" for power, value in used.items()]
         if name == "asphere":
             head = ["ASP"] if terms else (["CON"] if conic else [])
@@ -208,10 +204,8 @@ def _form(i: int, entry: Mapping[str, Any]) -> list[str]:
     kind, most, key, first = _SPECIAL.get(name, ("", 0, "", 0))
     numbers = {power: k for k, power in enumerate(FORMS[name].powers)}
     count = max((numbers[power] + 1 for power in used), default=0)
-    if count > most:
-        count += len(FORMS[name].named)
-        what = f"surfaces[{i}]: .seq files hold no form {name} of {count} here"
-        raise LensError(f"{what}: save as .yaml")
+    what = f"form {name} of {count + len(FORMS[name].named)} here: save as .yaml"
+    require(count <= most, f"surfaces[{i}]: .seq files hold no {what}")
     lines = [f"SPS {kind}"]
     lines += [f"SCO NRADIUS {entry['norm_radius']!r}"] if "norm_radius" in entry else []
     lines.append(f"SCO K {conic!r}")
@@ -225,8 +219,8 @@ def _fringe(i: int, used: Mapping[int, float]) -> list[str]:
     known = {noll: (k, rim) for k in range(1, 38) for noll, rim in [noll_of_fringe(k)]}
     lines = []
     for number, value in used.items():
-        if number not in known:
-            raise LensError(f"surfaces[{i}].coefficients: {number} is no fringe polynomial: .yaml")
+        what = f"surfaces[{i}].coefficients: {number} is no fringe polynomial: save as .yaml"
+        require(number in known, what)
         fringe, norm = known[number]
         own = number_for(value, norm.__rtruediv__, value * norm)
         lines.append(f"SCO C{fringe + 3} {own!r}")

@@ -9,9 +9,10 @@ import numpy as np
 from ..lens.forms import FORMS
 from ..lens.glasses import find_glass, map_point
 from ..lens.lens import Lens
-from .entry import LensError
+from .entry import LensError, require
 from .glasses import to_ours, to_theirs, written_names
-from .system import FieldKind, System
+from .load import System
+from .record import FieldKind
 from .written import (
     element_of,
     entry_of,
@@ -21,7 +22,8 @@ from .written import (
     place_of,
     shapes_of,
 )
-from .zmx_head import BESIDE, COLUMNS
+from .zmx import BESIDE, COLUMNS
+from .zmx_surfaces import APERTURES
 
 _HEAD = """VERS 150514 0 0
 MODE SEQ
@@ -46,7 +48,6 @@ _SERIES = {  # by form: type whose XDAT hold the coefficients
     "qbfs": "QED_TYPE",
 }
 _OTHERS = {"silica": "F_SILICA"}
-_KEYS = {"rectangle": ("SQAP", "SQOB"), "ellipse": ("ELAP", "ELOB")}  # clear, blocking
 
 
 def zmx_text(system: System) -> str:
@@ -122,9 +123,8 @@ def _form(i: int, entry: Mapping[str, Any]) -> list[str]:
         terms = row[len(own) :]
         values = _numbered("XDAT", *before, len(terms), *(own or [1.0]), *terms)
         return [f"TYPE {_SERIES[name]}", *goes_on, *values]
-    if not fits:
-        what = f"form {name}" + (f" with {used} coefficients" if kind else "")
-        raise LensError(f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
+    what = f"form {name}" + (f" with {used} coefficients" if kind else "")
+    require(fits, f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
     if own and row[0]:
         row[0] = 1 / row[0]  # a radius
     # The last coefficient, even 0, preserves the number of columns.
@@ -145,8 +145,8 @@ def _phase(i: int, name: str, phase: Mapping[str, Any], row: list[float]) -> lis
     if form == "linear" and name == "toroid" and not any(row[1:]):
         radius = 1 / row[0] if row[0] else 0.0
         return ["TYPE TOROGRAT", *_numbered("PARM", radius, own[0] / 1e3, order)]
-    if form != "asphere" or name != "asphere" or any(row[8:]):
-        raise LensError(f"surfaces[{i}].phase: not written to .zmx on this surface: save as .yaml")
+    what = f"surfaces[{i}].phase: not written to .zmx on this surface: save as .yaml"
+    require(form == name == "asphere" and not any(row[8:]), what)
     turn = 2 * math.pi
     whole = [number_for(value, lambda radians: radians / turn, value * turn) for value in own]
     powers, terms = _numbered("PARM", *row[:8]), _numbered("XDAT", len(own), 1.0, *whole)
@@ -184,22 +184,21 @@ def _apertures(lens: Lens, i: int) -> list[str]:
     (blocks, kind, size, centre), *others = shapes
     inner = others[0][2][0] if others else 0.0
     ring = [(True, "circle", [inner, inner], centre)]
-    if others and not (kind == "circle" and not blocks and others == ring):
+    if others and (kind != "circle" or blocks or others != ring):
         own = " and ".join(f"{'a blocking' if s[0] else 'a clear'} {s[1]}" for s in shapes)
         what = f"surfaces[{i}]: has {own}; a .zmx surface has one aperture, or a blocking circle in"
         remedy = "put the others on plane surfaces of their own beside it, or save as .yaml"
         raise LensError(f"{what} a clear one of its centre: {remedy}")
+    word = APERTURES[kind][blocks]
     if kind == "polygon":
         corners = [*zip(size[::2], size[1::2], strict=True)]
-        if (0, 0) in corners:
-            what = f"surfaces[{i}]: a corner 0 0 ends a polygon in .zmx files: save as .yaml"
-            raise LensError(what)
-        lines = [f"{'USOB' if blocks else 'USAP'} 0 0 0", 'UDAD 0 "POLYGON.UDA" 1']
+        what = f"surfaces[{i}]: a corner 0 0 ends a polygon in .zmx files: save as .yaml"
+        require((0, 0) not in corners, what)
+        lines = [f"{word} 0 0 0", 'UDAD 0 "POLYGON.UDA" 1']
         lines += [f"UDAD {n} {x!r} {y!r} 0" for n, (x, y) in enumerate(corners, 1)]
-    elif kind == "circle":
-        lines = [f"{'OBSC' if blocks else 'CLAP'} {inner!r} {size[0]!r} 0"]
     else:
-        lines = [f"{_KEYS[kind][blocks]} {size[0]!r} {size[1]!r} 0"]
+        pair = [inner, size[0]] if kind == "circle" else size
+        lines = [f"{word} {pair[0]!r} {pair[1]!r} 0"]
     return [*lines, f"OBDC {centre[0]!r} {centre[1]!r}"] if any(centre) else lines
 
 

@@ -12,7 +12,7 @@ from ..lens.forms import FORMS
 from ..lens.glass import ANY, Dispersion
 from ..lens.glasses import find_glass, glass_names
 from ..lens.lens import Lens
-from .entry import LensError
+from .entry import require
 
 Shape = tuple[bool, str, list[float], list[float]]
 
@@ -130,8 +130,8 @@ def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
     """Prescription keys of medium i; None if only its constants describe it."""
     own = constants_of(lens.dispersion, i)
     if lens.dispersion.model is not None and lens.dispersion.model[i, 0] != 1:
-        if own.keys() - {"range"}:
-            raise LensError(f"glasses[{i}]: a prescription has no constants beside nd and vd")
+        what = f"glasses[{i}]: a prescription has no constants beside nd and vd"
+        require(not own.keys() - {"range"}, what)
         nd, vd = np.asarray(lens.dispersion.model[i]).tolist()
         partial = lens.dispersion.partial
         above = {} if partial is None or not partial[i] else {"partial": float(partial[i])}

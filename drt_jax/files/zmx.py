@@ -1,199 +1,192 @@
-"""Read lens files of Zemax OpticStudio, `.zmx`; docs/lens_files.md explains the keywords."""
+"""Read lens files of Zemax OpticStudio, `.zmx`: the header, with units, aperture, fields and
+wavelengths, and the surfaces; docs/lens_files.md explains the keywords."""
 
+import dataclasses
 import math
-from typing import Any
+from typing import Any, get_args
 
-from .entry import LensError
-from .forms_zmx import EXTRA, TYPES, Surface, breaking
-from .glasses import model_keys, named_glass
-from .record import Breaking, Missing, Record, Row, Words, distance_of, short, words_of
-from .specs import MEDIUM_KEYS
-from .system import Use
-from .zmx_head import Head
+import numpy as np
 
-_SURFACES = 5000
+from .record import (
+    ApertureKind,
+    Breaking,
+    FieldKind,
+    Missing,
+    Record,
+    Row,
+    Words,
+    distance_of,
+    short,
+    turned_back,
+    words_of,
+)
+from .specs import MEDIUM_KEYS, SURFACES
+from .zmx_surfaces import TYPES, Surface
+
+_UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0, "METER": 1000.0}
+_MOST = 1000  # fields or wavelengths
+COLUMNS = ("XFLN", "YFLN", "FWGN", "VDXN", "VDYN", "VCXN", "VCYN", "VANN")
+# Lists of older versions, which later ones write beside their own; read where those are absent.
+_OLD = ("XFLD", "YFLD", "FWGT", "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN")
+_WAVES = (("WAVN", "WWGN"), ("WAVL", "WWGT"))
+_LISTS = {*COLUMNS, *_OLD, *sum(_WAVES, ())}
+BESIDE = 12  # fields in a column; each further one has a line FEFD
+# The kind of aperture without and with the flag behind the number.
+_APERTURES: dict[str, tuple[ApertureKind, ApertureKind]] = {
+    "ENPD": ("pupil diameter", "pupil diameter"),
+    "FNUM": ("f-number", "working f-number"),
+    "OBNA": ("object NA", "object cone angle"),
+}
 # Ignored: drawing, names, tolerances, analyses, coatings, polarisation. None changes rays.
-_COSMETIC = frozenset(
-    """
+_COSMETIC = """
     VERS MODE PFIL LANG GFAC PUSH SDMA ROPD PICB POLS GLRS GSTD NSCD COFN NOTE AUTH
     IWDP HYPR LUID EERA FIMP HIDE MIRR SLAB POPS COMM BLNK PRIM COAT VPAR VDSZ VCON
     MEMA OEMA OMMA SSID STUD DBDT FENF FCOM FSVY SCOL CSUM TCED
-    """.split()  # noqa: SIM905
-)
+""".split()  # noqa: SIM905
 _SOLVES = ("PPAR", "PZUP", "MAZH", "CHZH", "EDGE", "PKUP")
-# Apertures that are refused.
-_REFUSED = {
-    "SPID": "a spider",
-    "UDAP": "an aperture from a file",
-    "UDOB": "an obscuration from a file",
-}
-# User apertures, whose corners UDAD lines give: the key of a prescription.
-_USER = {"USAP": "aperture", "USOB": "obscuration", "UOBS": "obscuration"}
-_SHAPES = {"SQ": "rectangle", "EL": "ellipse"}
 
 
-def _take(surface: Surface, words: Words) -> bool:
-    """Read a line of a surface; False if its keyword is not known."""
-    record, line, values = surface.record, words.line, words.values
-    match words.key:
-        case "TYPE":
-            surface.kind, surface.kind_line = values[0].upper() if values else "", line
-        case "STOP":
-            surface.put("stop", True, line)
-        case "CURV":
-            surface.put("curvature", words.number() / surface.unit, line)
-            if values[1:] and values[1] not in ("0", "1"):  # 1 is a variable
-                record.solves.append(line)
-        case "CONI":
-            if conic := words.number():
-                surface.put("conic", conic, line)
-        case "DISZ":
-            surface.lines["thickness"] = line
-            if values and values[0].upper() in ("INFINITY", "INF"):
-                surface.infinite, surface.gap = line, math.inf
-            else:
-                surface.gap = words.number() * surface.unit
-        case "PARM" | "XDAT":
-            number = words.count() + (EXTRA - 1 if words.key == "XDAT" else 0)
-            surface.parameters[number] = line, words.number(1)
-        case "GLAS":
-            for key, value in _glass(surface, words).items():
-                surface.put(key, value, line)
-        case "DIAM":
-            surface.semi = abs(words.number() * surface.unit)
-        case "FLAP":
-            surface.floating = line
-        case "CLAP" | "SQAP" | "ELAP" | "OBSC" | "SQOB" | "ELOB":
-            sizes = [value * surface.unit for value in words.numbers(0, 2)]
-            surface.apertures.append((line, words.key, sizes))
-        case "OBDC":
-            surface.centre = [value * surface.unit for value in words.numbers(0, 2)]
-        case "USAP" | "USOB" | "UOBS" | "UDAD":
-            _user_line(surface, words)
-        case "SPID" | "UDAP" | "UDOB":
-            if words.key != "SPID" or any(word.strip("+-.0") for word in values):
-                record.lacks(line, f"{words.key}, {_REFUSED[words.key]}")
-        case "SCBD":
-            _moves(surface, words)
-        case _:
-            return False
-    return True
+@dataclasses.dataclass
+class Head:
+    """The header as its lines are read; `record.use` has lengths in mm.
+
+    unit: the file's unit of length, mm. makers: the catalogues of GCAT. counts: of fields and of
+    wavelengths, where FTYP tells them. columns: numbers per field or wavelength by keyword. more:
+    lines FEFD, one per field from the 13th on. waves: wavelength (um) and weight by number.
+    """
+
+    record: Record
+    unit: float = 1.0
+    makers: list[str] = dataclasses.field(default_factory=list)
+    counts: tuple[int | None, int | None] = (None, None)
+    columns: dict[str, list[float]] = dataclasses.field(default_factory=dict)
+    more: list[list[float]] = dataclasses.field(default_factory=list)
+    waves: dict[int, tuple[float, float]] = dataclasses.field(default_factory=dict)
+
+    def take(self, words: Words) -> bool:
+        """Read a line; False if its keyword is not known."""
+        record, use = self.record, self.record.use
+        match words.key:
+            case "NAME":
+                record.name = short(" ".join(words.values))
+            case "GCAT":
+                self.makers = [name.upper() for name in words.values]
+            case "UNIT":
+                name = words.values[0].upper() if words.values else ""
+                what = f"UNIT {short(name)}: expected one of {', '.join(_UNITS)}"
+                words.require(name in _UNITS, what)
+                self.unit = _UNITS[name]
+            case "FLOA":
+                use.line, use.aperture, use.aperture_kind = words.line, None, None
+            case "ENPD" | "FNUM" | "OBNA":
+                value, flag = words.number(), words.number(1, 0.0)
+                use.aperture = value * self.unit if words.key == "ENPD" else value
+                use.line, use.aperture_kind = words.line, _APERTURES[words.key][flag != 0]
+            case "FTYP":
+                self._fields(words)
+            case "FEFD":
+                if len(self.more) < _MOST:
+                    self.more.append(words.numbers(0, len(COLUMNS)))
+            case "WAVM":
+                i = words.count()
+                words.require(1 <= i <= _MOST, f"wavelength number {i}")
+                self.waves[i] = _positive(record, words.line, words.number(1)), words.number(2, 1.0)
+            case "PWAV":
+                use.primary, use.primary_line = words.count() - 1, words.line
+            case "RAIM":
+                use.ray_aiming = {0: "off", 1: "paraxial"}.get(words.count(1, 0), "real")
+            case "ENVD":
+                degrees, pressure, used = (words.number(i, d) for i, d in enumerate((20, 1, 0)))
+                if used and (degrees, pressure) != (20, 1):
+                    what = f"{degrees:g} C and {pressure:g} atm; ours are 20 and 1"
+                    record.lacks(words.line, what)
+            case key if key in _LISTS:  # what is beyond the number of fields is not used
+                self.columns[key] = words.numbers(0, min(len(words.values), _MOST))
+            case _:
+                return False
+        return True
+
+    def _fields(self, words: Words) -> None:
+        """FTYP: the kind of fields, telecentric or not, the numbers of fields and wavelengths."""
+        record, kind, telecentric = self.record, words.count(), words.count(1, 0)
+        known = 0 <= kind < len(get_args(FieldKind))
+        words.require(known, f"fields of kind {kind}; give angles or heights")
+        if telecentric:
+            what = "telecentric object space: all rays go through the stop here"
+            record.lacks(words.line, what)
+        record.use.field_kind, record.use.field_line = get_args(FieldKind)[kind], words.line
+        if len(words.values) > 2:
+            fields, waves = words.count(2), words.count(3, 1)
+            known = 1 <= fields <= _MOST and 1 <= waves <= _MOST
+            words.require(known, f"{fields} fields and {waves} wavelengths")
+            self.counts = fields, waves
+        record.afocal = words.count(6, 0) == 1
+
+    def finish(self) -> None:
+        """Write fields and wavelengths into `use`: the first entries of each column, in order."""
+        record, use = self.record, self.record.use
+        for keys in _WAVES:
+            values, weights = (self.columns.get(key, []) for key in keys)
+            for i, value in enumerate(() if self.waves else values):
+                weight = weights[i] if i < len(weights) else 1.0
+                self.waves[i + 1] = _positive(record, use.field_line, value), weight
+        for old, key in zip(_OLD, COLUMNS, strict=True):
+            self.columns.setdefault(key, self.columns.get(old, []))
+        known = max(len(self.columns[key]) for key in COLUMNS[:2])
+        fields = self.counts[0] or (min(known, BESIDE) or 1) + len(self.more)
+        waves = self.counts[1] or max(self.waves, default=1)
+        for i in range(1, waves + 1):
+            record.require(i in self.waves, use.field_line, f"WAVM {i} of {waves} is missing")
+        used = [self.waves[i] for i in range(1, waves + 1)]
+        use.wavelengths, use.wavelength_weights = ([pair[k] for pair in used] for k in (0, 1))
+        x, y, use.field_weights, *parts = (self._column(key, fields) for key in COLUMNS)
+        unit = 1.0 if use.field_kind == "angle" else self.unit
+        use.heights = [(a * unit, b * unit) for a, b in zip(x, y, strict=True)]
+        parts[4] = [math.radians(value) for value in parts[4]]
+        use.vignetting = [*map(list, zip(*parts, strict=True))]
+
+    def _column(self, key: str, fields: int) -> list[float]:
+        """The numbers of all fields; those of a column that the file does not have are 1 for
+        weights, else 0."""
+        k, found = COLUMNS.index(key), self.columns[key]
+        found = found or [float(key == "FWGN")] * (min(fields, BESIDE) if self.more else fields)
+        found = found[:BESIDE] + [row[k] for row in self.more] if self.more else found
+        what = f"{key} has {len(found)} of {fields} fields"
+        self.record.require(len(found) >= fields, self.record.use.field_line, what)
+        return found[:fields]
 
 
-def _glass(surface: Surface, words: Words) -> dict[str, Any]:
-    """The entries of the medium behind a surface: a mirror, a code, a model glass or a name."""
-    line = words.line
-    name = words.values[0] if words.values else ""
-    if name.upper() == "MIRROR":
-        return {"mirror": True}
-    if name.isdecimal() and len(name) == 6:
-        return model_keys(surface, line, 1 + int(name[:3]) / 1000, int(name[3:]) / 10, 0.0)
-    if name == "___BLANK":
-        nd, vd, above = words.number(3), words.number(4), words.number(5, 0)
-        return model_keys(surface, line, nd, vd, above)
-    beside: dict[str, Any] = {}
-    try:  # nd and vd behind a name, but for the placeholder 1.5 and 40 of OpticStudio
-        nd, vd, above = (words.number(i, 0.0) for i in (3, 4, 5))
-        if nd > 1 and (nd, vd) != (1.5, 40):
-            beside = model_keys(surface, line, nd, vd, above)
-    except LensError:
-        pass
-    return named_glass(surface, line, name, surface.makers, beside)
+def _positive(record: Record, line: int, value: float) -> float:
+    record.require(value > 0, line, f"a wavelength of {value:g} um")
+    return value
 
 
-def _moves(surface: Surface, words: Words) -> None:
-    """SCBD: tilt and decentre in front of a surface (1) or behind it (2), with order, a pickup
-    and five numbers; a coordinate return (3) is a solve."""
-    where = words.count()
-    if where == 3:
-        surface.record.solves.append(words.line)
-        return
-    words.require(where in (1, 2), f"SCBD {where}: expected 1, 2 or 3")
-    own = {k + 1: (words.line, words.number(3 + k)) for k in range(5)}
-    if any(value for _, value in own.values()):
-        surface.moves[where] = own | {6: (words.line, words.count(1))}
-
-
-def _user_line(surface: Surface, words: Words) -> None:
-    """A line of a user aperture. UDAD: number, x, y, 0 of a corner; number 0 is of a line with the
-    name of a file, whose scale comes last."""
-    values, key = words.values, words.key
-    if key != "UDAD":
-        surface.user_line, surface.user = words.line, key
-        zeros = not any(words.numbers(0, len(values)))
-        words.require(zeros, f"{key}: expected zeros; other numbers are not known")
-        return
-    surface.user_line, number = surface.user_line or words.line, words.count()
-    if number == 0:
-        scaled = len(values) > 1 and values[-1][-1] != '"' and words.number(len(values) - 1) != 1
-        words.require(not scaled, "UDAD: a scale other than 1; scale the corners")
-        return
-    due = number == len(surface.corners) + 1 and not any(words.numbers(0, len(values))[3:])
-    words.require(due, "UDAD: expected corners 1, 2, ... of a polygon: number, x, y, 0")
-    surface.corners.append([value * surface.unit for value in words.numbers(1, 3)])
-
-
-def _clip(surface: Surface) -> None:
-    """Set apertures and obscurations. DIAM alone clips nothing, nor does an aperture beyond the end
-    of the surface."""
-    record = surface.record
-    about: dict[str, Any] = {"centre": surface.centre} if any(surface.centre) else {}
-    rim = [(surface.floating, "CLAP", [0.0, surface.semi])] if surface.floating else []
-    for line, kind, (one, two) in rim + surface.apertures:
-        if kind[:2] in _SHAPES:
-            key = "obscuration" if kind[2:] == "OB" else "aperture"
-            surface.put_shape(key, about | {_SHAPES[kind[:2]]: [one, two]}, line)
-            continue
-        ring = kind == "OBSC" and one > 0
-        inner = two if kind == "OBSC" else one
-        if ring:
-            record.lacks(line, f"{surface.name}: an obscuration that is a ring")
-        elif inner > 0:
-            surface.put_shape("obscuration", about | {"circle": inner}, line)
-        if kind == "CLAP" and two > 0:
-            surface.put_clear(about | {"circle": two}, line)
-    if not surface.user_line:
-        return
-    corners = list(surface.corners)
-    while corners and corners[-1] == [0, 0]:  # the end of a polygon
-        corners.pop()
-    why = "no UDAD lines" if not corners else ""
-    why = "two polygons: a corner 0 0 ends one" if [0, 0] in corners else why
-    why = why if surface.user else "UDAD lines without USAP or USOB"
-    if why:
-        record.lacks(surface.user_line, f"{surface.name}: a user aperture with {why}")
-    else:
-        surface.put_shape(_USER[surface.user], about | {"polygon": corners}, surface.user_line)
-
-
-def read_zmx(path: str, missing: Missing, lines: list[str]) -> tuple[Record, Use]:
+def read_zmx(path: str, missing: Missing, lines: list[str]) -> Record:
     """Read the lines of a `.zmx` file into a record of its surfaces and their use. LensError with
     the line. path: its name in messages."""
     record, surfaces, tail = Record(path, missing), list[Surface](), False
     head, found = Head(record), words_of(record, lines)
     whole = not any(words.key == "VERS" for words in found)
     indented = any(w.indented for w in found if w.key in ("TYPE", "CURV", "DISZ"))
-
-    def taken(words: Words) -> bool:
-        """Whether a line is of the header, or of a surface in front of the tail."""
-        return not tail and _take(surfaces[-1], words) if surfaces else head.take(words)
-
+    own: Head | Surface = head  # to which lines belong
     for words in found:
+        if words.key == "MODE":
+            sequential = words.values[:1] in (["SEQ"], [])
+            words.require(sequential, "not sequential; save a sequential system")
         if words.key == "SURF":
             words.require(not tail, "a surface behind the merit function")
             number, due = words.count(), len(surfaces)
             words.require(number == due, f"SURF {number} stands where SURF {due} should")
-            words.require(due <= _SURFACES, f"more than {_SURFACES} surfaces")
-            own = Surface(record, f"SURF {number}", words.line, head.unit, makers=head.makers)
+            words.require(due <= SURFACES, f"more than {SURFACES} surfaces")
+            name = f"SURF {number}"
+            own = Surface(record, name, words.line, head.unit, makers=head.makers)
             surfaces.append(own)
-        elif words.key == "MODE" and words.values[:1] not in (["SEQ"], []):
-            raise words.error("not sequential; save a sequential system")
         elif words.key == "MNUM":
             tail = whole = True
             if (count := words.count(0, 1)) > 1:
                 what = f"of {count} configurations number {words.count(1, 1)}"
                 record.note(words.line, what)
-        elif taken(words):
+        elif not tail and own.take(words):
             continue
         elif surfaces and indented and not words.indented:
             tail = True
@@ -203,16 +196,15 @@ def read_zmx(path: str, missing: Missing, lines: list[str]) -> tuple[Record, Use
             tail = bool(surfaces) and not indented and words.key in ("TOL", "DMFS", "MOFF")
             if not tail:
                 record.unknown.setdefault(short(words.key), words.line)
-    if not surfaces:
-        raise LensError(f"{path}: no line begins with SURF: is it a .zmx file?")
+    record.require(surfaces, 0, "no line begins with SURF: is it a .zmx file?")
     _finish(record, head, surfaces, whole)
-    return record, head.use
+    return record
 
 
 def _finish(record: Record, head: Head, surfaces: list[Surface], whole: bool) -> None:
     """Do the checks and conversions that need all lines."""
     first, last = surfaces[0], surfaces[-1]
-    ends = len(surfaces) > 2 and not last.gap and not last.infinite
+    ends = len(surfaces) > 2 and not last.gap
     what = "the last SURF is no image: is the file cut short?"
     record.require(ends, last.line, what)
     what = "SURF without DISZ: is the file cut short?"
@@ -236,19 +228,36 @@ def _finish(record: Record, head: Head, surfaces: list[Surface], whole: bool) ->
     record.medium = {key: entry[key] for key in entry if key in MEDIUM_KEYS}
     for surface in surfaces[1:]:
         record.parts += _parts(surface, surface is last)
-    head.use.stop = stops[0].semi
+    record.use.stop = stops[0].semi
     head.finish()
+
+
+def _breaking(surface: Surface, values: dict[Any, tuple[int, float]], thickness: float) -> Breaking:
+    """A coordinate break: a decentre, then tilts about x, y, z. With the order flag: tilts about z,
+    y, x, then a decentre along the new axes."""
+    own = dataclasses.replace(surface, values=values)
+    own.only(range(1, 7))
+    x, y = (own.value(k) * own.unit for k in (1, 2))
+    tilt: Any = tuple(own.value(k) for k in (3, 4, 5))
+    moved: Any = (x, y, 0.0)
+    if own.value(6) and any(tilt):
+        turn, tilt = turned_back(tilt)
+        moved = tuple((turn @ np.array(moved)).tolist()) if x or y else moved
+    finite = all(map(math.isfinite, (*moved, *tilt)))
+    own.record.require(finite, own.line, "a coordinate break that is not finite")
+    return Breaking(own.line, moved, tilt, thickness)
 
 
 def _parts(surface: Surface, image: bool) -> list[Row | Breaking]:
     """A surface with the breaks in front of it and behind it, or a coordinate break."""
     kind, moves = surface.kind, surface.moves
-    surface.require(not surface.infinite, "an infinite thickness; give a length", surface.infinite)
+    line, what = surface.lines.get("thickness", 0), "an infinite thickness; give a length"
+    surface.require(surface.gap != math.inf, what, line)
     surface.thickness = surface.gap or 0.0
     if kind == "COORDBRK":
         inside = not image and not surface.entry.get("stop")
         surface.require(inside, f"a coordinate break is no {'image' if image else 'stop'}")
-        return [breaking(surface, surface.parameters, surface.thickness)]
+        return [_breaking(surface, surface.values, surface.thickness)]
     where = " of the image" if image else f"; known: COORDBRK, {', '.join(TYPES)}"
     if kind == "PARAXIAL":
         where = ": an ideal thin lens is none of our surfaces; give real ones"
@@ -259,11 +268,11 @@ def _parts(surface: Surface, image: bool) -> list[Row | Breaking]:
     surface.only(parameters)
     make(surface)
     surface.require(not image or not surface.entry.get("coefficients"), "an aspheric image")
-    _clip(surface)
+    surface.clip()
     parts: list[Row | Breaking] = [surface]
     if 1 in moves:
-        parts.insert(0, breaking(surface, moves[1], 0.0))
+        parts.insert(0, _breaking(surface, moves[1], 0.0))
     if 2 in moves and not image:
-        parts.append(breaking(surface, moves[2], surface.thickness))
+        parts.append(_breaking(surface, moves[2], surface.thickness))
         surface.thickness = 0.0
     return parts

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from drt_jax import LensError, first_order, load_lens, load_system, sag, save_lens
+from drt_jax.files.glasses import code_of
+from drt_jax.files.load import read_record
 from drt_jax.files.record import Breaking
-from drt_jax.files.seq_glass import code_of
-from drt_jax.files.yaml import read_record
 
 from .. import oracle
 
@@ -36,7 +36,7 @@ def record(folder, *lines, missing="error", **others):
 
 def entry(folder, *lines, at=0, **others):
     """The entries of a surface of its kind, behind the first and before the last."""
-    found = record(folder, FRONT, *lines, "S 0 5", **others)[0]
+    found = record(folder, FRONT, *lines, "S 0 5", **others)
     return [part.entry for part in found.parts if not isinstance(part, Breaking)][1 + at]
 
 
@@ -55,11 +55,11 @@ def read(folder, *lines, missing="error", **others):
 def test_lines_comments_quotes_and_letters(tmp_path):
     """`;` and lines part commands, `!` ends a line, `&` continues it, quotes guard all three."""
     lines = ["s 50 & ! first\n 4 nbk7_schott ! 500.625", "STOP; ThiCK 7", "S -50&\n 48;"]
-    found, use = record(tmp_path, *lines, head=HEAD.replace("'a lens'", '"it\'s; 5! & up"'))
+    found = record(tmp_path, *lines, head=HEAD.replace("'a lens'", '"it\'s; 5! & up"'))
     rows = [part for part in found.parts if not isinstance(part, Breaking)]
     assert found.name == "it's; 5! & up" and [row.thickness for row in rows] == [7, 48, 0]
     assert rows[0].entry == {"curvature": 0.02, "glass": "N-BK7", "stop": True}
-    assert found.notes == [] and use.wavelengths == [0.55, 0.48]
+    assert found.notes == [] and found.use.wavelengths == [0.55, 0.48]
     messages = refused(tmp_path, FRONT, "S -50 &\n 1.2.3")
     assert ", line 10: expected a number, got '1.2.3'" in messages  # where the command begins
 
@@ -79,7 +79,7 @@ def test_radii_curvatures_and_units(tmp_path):
     np.testing.assert_allclose(inch.lens.coefficients[0, 9], 1e-20 / scale**19, rtol=1e-14)
     np.testing.assert_allclose(inch.lens.semi_diameter[0], 5 * scale, rtol=1e-14)
     np.testing.assert_array_equal(inch.wavelengths, mm.wavelengths)
-    notes = record(tmp_path, "S .02 4 NBK7; STO", "S -.02 48", head=HEAD.replace("RDM;", ""))[0]
+    notes = record(tmp_path, "S .02 4 NBK7; STO", "S -.02 48", head=HEAD.replace("RDM;", ""))
     assert notes.notes == ["no RDM: the numbers of surfaces are curvatures"]
 
 
@@ -406,14 +406,15 @@ def test_listed_double_gauss(tmp_path):
 def test_later_changes_solves_and_zooms(tmp_path):
     """Of a named surface or several, also by its line again; of zoom positions the first."""
     later = ["THI S1 5; CUY S2 -.03; THI S2 PIM", "GLA S1 F2", "S1 40 6"]
-    found = record(tmp_path, FRONT, BACK, *later)[0]
+    found = record(tmp_path, FRONT, BACK, *later)
     rows = found.parts
     assert [row.thickness for row in rows] == [6, 48, 0]
     assert [row.entry["curvature"] for row in rows] == [1 / 40, -0.03, 0]
     assert rows[0].entry["glass"] == "F2" and "line 11: solves" in found.notes[0]
     zoom = ["ZOO 3", "ZOO THI S1 7 8 9", "ZOO THC S1 0 0 0", "ZOO YAN F2 3 4 5", "EPD Z2 40"]
-    found, use = record(tmp_path, FRONT, BACK, *zoom)
-    assert found.parts[0].thickness == 7 and use.heights[1] == (0, 3) and use.aperture == 10
+    found = record(tmp_path, FRONT, BACK, *zoom)
+    assert found.parts[0].thickness == 7 and found.use.aperture == 10
+    assert found.use.heights[1] == (0, 3)
     assert found.notes == ["line 11: of 3 zoom positions the first"]
 
 
@@ -434,8 +435,8 @@ def test_what_is_not_read_is_refused_by_line(tmp_path):
     assert "0 mm Hg; our indices are those of 760" in refused(tmp_path, head=HEAD + "PRE 0")
     hot = HEAD + "TEM 60"
     assert 'missing="warn" leaves it out' in refused(tmp_path, head=hot)
-    assert "60 C" in record(tmp_path, FRONT, BACK, missing="warn", head=hot)[0].notes[0]
-    notes = record(tmp_path, FRONT, BACK, "XYZ 4", tail="GO\nSPO; GO")[0].notes
+    assert "60 C" in record(tmp_path, FRONT, BACK, missing="warn", head=hot).notes[0]
+    notes = record(tmp_path, FRONT, BACK, "XYZ 4", tail="GO\nSPO; GO").notes
     assert "XYZ (line 11)" in notes[1] and "line 14 on, is not read" in notes[0]
 
 
@@ -523,7 +524,7 @@ def test_powers_that_asp_has_not(tmp_path):
 def test_encodings(tmp_path, encoding):
     path = tmp_path / "lens.seq"
     path.write_bytes(text(FRONT, BACK).replace("a lens", "für 5 µm").encode(encoding))
-    assert read_record(path)[0].name == "für 5 µm"
+    assert read_record(path).name == "für 5 µm"
 
 
 def test_files_that_are_none(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from drt_jax import LensError, lens_names, load_lens, load_system, save_lens
 from drt_jax.__main__ import main
 from drt_jax.files import write
-from drt_jax.files.system import system_for
+from drt_jax.files.load import system_for
 
 ODD = {
     "name": "odd",

@@ -1,24 +1,32 @@
-"""The use of a lens according to another program's file: fields, wavelengths, aperture."""
+"""Load lenses: the bundled ones, YAML prescriptions, and files of Zemax and CODE V with their
+fields, wavelengths and aperture."""
 
 import dataclasses
 import math
-from typing import Any, Literal
+import pathlib
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import parse, read_text, require_one_of, shown
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..lens.scene import Scene, field_of_height
-from .record import Record
+from .agf import load_agf
+from .entry import LensError, require
+from .record import ApertureKind, FieldKind, Missing, Record, Use, lines_of, naming
+from .seq import read_seq
+from .specs import build_lens, middle_of
+from .zmx import read_zmx
 
-ApertureKind = Literal[
-    "pupil diameter", "f-number", "working f-number", "object NA", "object cone angle", "image NA"
-]
+_BUNDLED = pathlib.Path(__file__).resolve().parents[1] / "lens" / "catalogue" / "lenses"
+_READERS = {".zmx": read_zmx, ".seq": read_seq}
+_ENDINGS = (".yaml", ".yml", *_READERS)
 _SAME = 1e-9  # relative tolerance of a stop size that a file gives twice
-FieldKind = Literal["angle", "object height", "paraxial image height", "real image height"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,44 +81,133 @@ class System:
 def system_for(lens: Lens) -> System:
     """A lens with an object at infinity on the axis and the d line or, if the glasses exclude it,
     the middle of their range."""
-    low, high = lens.dispersion.range
-    wave = 0.5875618 if low <= 0.5875618 <= high else (low + high) / 2
-    use = Use(wavelengths=[wave], wavelength_weights=[1.0])
-    return System(lens, math.inf, np.zeros((1, 2)), **use.of_system())
+    use = Use(wavelengths=[middle_of(lens)], wavelength_weights=[1.0])
+    return System(lens, math.inf, np.zeros((1, 2)), **_of_system(use))
 
 
-@dataclasses.dataclass
-class Use:
-    """The values for `System` as they are read, by the same names. stop: its size, mm, where the
-    file gives that. line, field_line, primary_line: of the aperture, the fields and the
-    wavelengths."""
-
-    aperture: float | None = None
-    aperture_kind: ApertureKind | None = None
-    field_kind: FieldKind = "angle"
-    heights: list[tuple[float, float]] = dataclasses.field(default_factory=lambda: [(0.0, 0.0)])
-    field_weights: list[float] = dataclasses.field(default_factory=lambda: [1.0])
-    vignetting: list[list[float]] = dataclasses.field(default_factory=lambda: [[0.0] * 5])
-    wavelengths: list[float] = dataclasses.field(default_factory=list)
-    wavelength_weights: list[float] = dataclasses.field(default_factory=list)
-    primary: int = 0
-    ray_aiming: str = ""
-    stop: float | None = None
-    line: int = 0
-    field_line: int = 0
-    primary_line: int = 0
-
-    def of_system(self) -> dict[str, Any]:
-        """The fields of `System` that need no ray."""
-        own = {key: value for key, value in vars(self).items() if key in _OWN}
-        return {key: np.array(v, float) if isinstance(v, list) else v for key, v in own.items()}
+def _of_system(use: Use) -> dict[str, Any]:
+    """The fields of `System` that need no ray."""
+    names = {field.name for field in dataclasses.fields(System)}
+    own = {key: value for key, value in vars(use).items() if key in names}
+    return {key: np.array(v, float) if isinstance(v, list) else v for key, v in own.items()}
 
 
-_OWN = {field.name for field in dataclasses.fields(System)}
+def lens_names() -> list[str]:
+    """Names of the bundled prescriptions."""
+    return sorted(path.stem for path in _BUNDLED.glob("*.yaml"))
 
 
-def lens_of(record: Record, use: Use) -> Lens:
+def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") -> Lens:
+    """Read a lens.
+
+    The arrays have JAX's default floating dtype: float64 if the caller enabled it. LensError, with
+    the line, for a missing file, an unknown key or glass, or numbers that make no lens.
+
+    source: a bundled name (see `lens_names`), the path of a YAML prescription of at most 1 MB or
+        of a Zemax `.zmx` or CODE V `.seq` file, see `load_system`, or a mapping with the keys of a
+        prescription.
+    missing: see `load_system`.
+    """
+    with jax.core.eval_context():  # a lens loaded inside a jitted function is a constant
+        if isinstance(source, Mapping):
+            return build_lens(_with_catalogues(dict(source), pathlib.Path()))
+        path = pathlib.Path(source)
+        if str(source) in lens_names():
+            path = _BUNDLED / f"{source}.yaml"
+        what = f"no bundled lens {shown(str(source))}; bundled: {', '.join(lens_names())}"
+        remedy = f"for a file of your own give a path that ends in {', '.join(_ENDINGS)}"
+        require(path.suffix, f"{what}; {remedy}")
+        if known_ending(path) in _READERS:
+            record = read_record(path, missing)
+            lens = _lens_of(record)
+            record.say()
+            return lens
+        with naming(path):
+            return _lens_of_yaml(read_text(path), path)
+
+
+def known_ending(path: str | pathlib.Path) -> str:
+    """The ending of a path, in small letters. LensError for one of no kind of file here."""
+    kind = pathlib.Path(path).suffix.lower()
+    require(kind in _ENDINGS, f"{path}: expected a name that ends in {', '.join(_ENDINGS)}")
+    return kind
+
+
+def lens_in(text: str, path: str | pathlib.Path) -> tuple[Lens, dict[str, Any]]:
+    """The lens of the text of a file, and of its use the fields of `System` that need no ray; none
+    of a prescription. LensError as of `load_lens`. path: its name."""
+    kind = known_ending(path)
+    if kind not in _READERS:
+        return _lens_of_yaml(text, pathlib.Path(path)), {}
+    record = _READERS[kind](str(path), "error", text.splitlines())
+    return _lens_of(record), _of_system(record.use) | {"distance": record.distance}
+
+
+def _lens_of_yaml(text: str, path: pathlib.Path) -> Lens:
+    """The lens of a prescription. InputError for what is no YAML."""
+    values, lines = parse(text)
+    try:
+        return build_lens(_with_catalogues(values, path.parent), path.stem)
+    except LensError as error:
+        raise LensError(f"{path}{lines.of(error.key)}: {error}", error.key) from None
+
+
+def _with_catalogues(top: Any, folder: pathlib.Path) -> Any:
+    """Add to `glasses` of a prescription the glasses that it uses from its `catalogues`. They take
+    precedence over the built-in table, and the prescription's own glasses over them."""
+    if not isinstance(top, dict) or "catalogues" not in top:
+        return top
+    paths, surfaces = top["catalogues"], top.get("surfaces")
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise LensError(f"catalogues: expected a list of paths, got {shown(paths)}", "catalogues")
+    places = [top.get("object"), *(surfaces if isinstance(surfaces, list) else [])]
+    used = [place.get("glass") for place in places if isinstance(place, dict)]
+    found: dict[str, dict[str, list[float]]] = {}
+    for path in paths:
+        try:
+            read = load_agf(folder / path, [name for name in used if isinstance(name, str)])
+        except LensError as error:
+            raise LensError(f"catalogues: {error}", "catalogues") from None
+        for name, glass in read.items():
+            constants = {key: [*getattr(glass, key)] for key in ("sellmeier", "schott", "range")}
+            found.setdefault(name, constants)
+    own = top.get("glasses", {})
+    rest = {key: value for key, value in top.items() if key != "catalogues"}
+    return rest | {"glasses": found | own if isinstance(own, dict) else own}
+
+
+def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
+    """Read a lens with its fields, wavelengths and aperture from a Zemax `.zmx` or CODE V
+    `.seq` file of at most 16 MB; see docs/lens_files.md.
+
+    One warning and `System.notes` list what is read differently from the file, such as solves,
+    which are read as the values beside them. LensError, in one line with the line of the file, for
+    a feature that is not read.
+
+    missing: "error" refuses features that the package lacks; "warn" leaves them out, and lists
+        them, if rays can be traced without them.
+    """
+    known = pathlib.Path(path).suffix.lower() in _READERS
+    what = f"{path}: fields and wavelengths are read from {', '.join(_READERS)}; use load_lens"
+    require(known, what)
+    with jax.core.eval_context():
+        record = read_record(path, missing)
+        lens = _lens_of(record)
+        fields, own = _angles(record, lens), _of_system(record.use)
+    record.say()
+    return System(lens, record.distance, fields, notes=tuple(record.notes), **own)
+
+
+def read_record(path: str | pathlib.Path, missing: Missing = "error") -> Record:
+    """Read a file of another program."""
+    require_one_of("missing", missing, ("error", "warn"))
+    with naming(path):
+        return _READERS[pathlib.Path(path).suffix.lower()](str(path), missing, lines_of(path))
+
+
+def _lens_of(record: Record) -> Lens:
     """The lens of a file, with its stop as wide as the aperture requires."""
+    use = record.use
     many, direct = len(use.wavelengths), use.aperture_kind is None
     record.require(many, 0, "no wavelength is given")
     what = f"the primary wavelength is none of the {many}"
@@ -122,14 +219,7 @@ def lens_of(record: Record, use: Use) -> Lens:
         lens.check_wavelengths(use.wavelengths)
     except ValueError as error:
         raise record.error(use.primary_line, str(error)) from None
-    return lens if direct else _opened(record, use, lens)
-
-
-def system_of(record: Record, use: Use) -> System:
-    """The lens of a file and its use."""
-    lens = lens_of(record, use)
-    fields, own = _angles(record, use, lens), use.of_system()
-    return System(lens, record.distance, fields, notes=tuple(record.notes), **own)
+    return lens if direct else _opened(record, lens)
 
 
 @jax.jit  # compiles one program instead of hundreds of small ones
@@ -140,17 +230,19 @@ def _paraxial(lens: Lens, distance: Array, wave: Array) -> tuple[FirstOrder, Arr
     return first_order(lens, distance, wave), height, lens.index(wave)[jnp.array([0, -1])]
 
 
-def _first(record: Record, use: Use, lens: Lens) -> tuple[FirstOrder, float, list[float]]:
+def _first(record: Record, lens: Lens) -> tuple[FirstOrder, float, list[float]]:
     """The results of `_paraxial` for the primary wavelength, as numbers."""
-    found = _paraxial(lens, *map(jnp.asarray, (record.distance, use.wavelengths[use.primary])))
+    wave = record.use.wavelengths[record.use.primary]
+    found = _paraxial(lens, jnp.asarray(record.distance), jnp.asarray(wave))
     first, height, index = jax.tree.map(lambda a: np.asarray(a)[..., 0], found)
     return first, float(height), index.tolist()
 
 
-def _opened(record: Record, use: Use, lens: Lens) -> Lens:
+def _opened(record: Record, lens: Lens) -> Lens:
     """The lens with its stop as wide as the aperture requires in paraxial optics."""
-    semi, value = float(lens.semi_diameter[lens.stop]), float(use.aperture or 0)
-    first, _, (front, last) = _first(record, use, lens)
+    use, semi = record.use, float(lens.semi_diameter[lens.stop])
+    value = float(use.aperture or 0)
+    first, _, (front, last) = _first(record, lens)
     place, radius = map(float, first.entrance_pupil)
     focal = abs(float(first.effective_focal_length))
     far, kind = record.distance, use.aperture_kind
@@ -195,9 +287,10 @@ def _without_rim(lens: Lens) -> Lens:
     return dataclasses.replace(lens, apertures=own.only(keep) if keep else None)
 
 
-def _angles(record: Record, use: Use, lens: Lens) -> np.ndarray | None:
+def _angles(record: Record, lens: Lens) -> np.ndarray | None:
     """The fields (F, 2), radians; None for real image heights."""
-    far, line, heights = record.distance, use.field_line, np.array(use.heights, float)
+    use, far = record.use, record.distance
+    line, heights = use.field_line, np.array(use.heights, float)
     if use.field_kind == "angle":
         beyond = bool(np.any(np.abs(heights) >= 90))
         if math.isinf(far):
@@ -206,7 +299,7 @@ def _angles(record: Record, use: Use, lens: Lens) -> np.ndarray | None:
             return np.radians(heights)
         what = "a field angle of 90 degrees and more; give object heights"
         record.require(not beyond, line, what)
-        place = float(_first(record, use, lens)[0].entrance_pupil.position)
+        place = float(_first(record, lens)[0].entrance_pupil.position)
         what = "field angles at a telecentric lens; give object heights"
         record.require(math.isfinite(place), line, what)
         return np.asarray(field_of_height(-np.tan(np.radians(heights)) * (far + place), far))
@@ -215,7 +308,7 @@ def _angles(record: Record, use: Use, lens: Lens) -> np.ndarray | None:
         record.require(math.isfinite(far), line, what)
         return np.asarray(field_of_height(heights, far))
     if use.field_kind == "paraxial image height":
-        scale = _first(record, use, lens)[1]
+        scale = _first(record, lens)[1]
         what = "paraxial image heights of an image at infinity; give angles"
         record.require(math.isfinite(scale) and scale, line, what)
         return np.arctan(heights / scale)
