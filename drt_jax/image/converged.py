@@ -2,23 +2,28 @@
 
 The number of rays cannot depend on the values of tracers. So inside `jax.jit` and `jax.vmap`,
 `psf_moments` and `focus_moments` take a rule that `converge` made outside.
+
+Rules are tried in rising order. Their rays are traced in tiles of a fixed size, so that rules of
+all sizes share a compiled program.
 """
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..compilation import LARGE, jit
 from ..inputs import require_tolerance
 from ..lens.lens import Lens
+from ..lens.order import may_cross
 from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, concrete, known_values
-from ..pupil.clipped import Clipped
+from ..pupil.clipped import Clipped, ClippedGroup, Fitted
 from ..pupil.rules import (
     Gauss,
     Pattern,
@@ -31,22 +36,41 @@ from ..pupil.rules import (
 )
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach, solve, solve_aimed
-from ..rays.trace import aims, bundle_of, trace_bundle
+from ..rays.status import Status
+from ..rays.system import Vector
+from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
-from .orders import Group, rules_by_order
+from .refined import refine
 from .rounding import hit_rounding, warn_dtype
 from .spot import Moments
-from .tiles import AT_ONCE, Traced, trace_rule, weigh_rules
 
 # Smallest spot size that errors are taken relative to, mm: below 1 nm rounding would prevent
 # convergence.
 _SMALLEST = 1e-6
 # Order of the rule that finds out why no light arrives.
 _DIAGNOSIS = 8
-
 # Default relative error of the RMS spot size.
 _TOLERANCE = 1e-6
+_MAX_ORDER = 40
+# Orders for a clipped pupil and their sizes (`Clipped.size`). Three orders form a group, because
+# three must agree and one search finds the points of all three. Groups of equal sizes share a
+# compiled program.
+_CLIPPED = (
+    ((4, 5, 6), (10, 11, 12)),
+    ((7, 8, 9), (10, 11, 12)),
+    ((10, 11, 12), (10, 11, 12)),
+    ((14, 17, 20), (14, 17, 20)),
+    ((24, 28, 32), (36, 39, 42)),
+    ((36, 39, 42), (36, 39, 42)),
+)
+# Numbers of rays that patterns are padded to, so that only a few programs are compiled.
+_SIZES = {"rotational": (_MAX_ORDER + 2,), "bilateral": (208, 416, 1768, 3696)}
+_SIZES["none"] = _SIZES["bilateral"]
+# Number of rules that are weighed at once: the orders of a clipped group.
+_AT_ONCE = 3
+# Number of rays of a tile, by the number of stop coordinates. A Gauss rule of 13 nodes fills one.
+_TILE = {1: 42, 2: 208}
 
 
 def psf_moments(lens: Lens, scene: Scene, sampling: float | PupilRule = _TOLERANCE) -> Moments:
@@ -141,11 +165,8 @@ def _moments(
     require_fit(rule.symmetry, scene.field)
     found = _weigh(lens, scene, rule)
     throughput = known_values(found.throughput)
-    if throughput is not None and not np.all(np.asarray(throughput) > 0):
-        dark = np.min(np.asarray(throughput).reshape(-1, len(scene.wavelengths)), axis=1)
-        worst = int(np.argmin(dark))
-        light = np.asarray(throughput).reshape(len(dark), -1)[worst]
-        _no_light(lens, scene.each()[worst], rule.symmetry, light)
+    if throughput is not None:
+        _require_light(lens, scene, rule.symmetry, throughput)
     return found
 
 
@@ -218,23 +239,47 @@ def find_rule(
     with jax.core.eval_context():
         lens, scene = known
         scene = checked_scene(lens, scene)
-        symmetry = symmetry_of(lens, scene.field)
-        return _try_orders(lens, scene.each(), symmetry, tolerance, places, warns)
+        eps = float(jnp.finfo(lens.curvature.dtype).eps)
+
+        def rounding(trial: _Trial) -> float:
+            """Relative rounding error of the smallest spot."""
+            areas = (np.min(np.sum(one.spread[0, :, :2], axis=-1)) for one in trial.moments)
+            return hit_rounding(lens) / max(float(np.sqrt(min(areas))), _SMALLEST)
+
+        def error(*trials: _Trial) -> float:
+            """Change between three successive orders; 0 if rounding hides it."""
+            if len({type(trial.rule) for trial in trials}) > 1:
+                return np.inf  # a Gauss rule on the stop is no order of a fitted one
+            first, *later = trials
+            change = max(_change(first, one, places) for one in later)
+            return change if change > max(100 * eps, 2 * rounding(later[-1])) else 0.0
+
+        tried = _trials(lens, scene.each(), symmetry_of(lens, scene.field))
+        trials, change = refine(tried, error, tolerance, together=3)
+        if change > tolerance:
+            warnings.warn(
+                f"the spot size has converged to {change:.1e} only, not to {tolerance:.1e}, "
+                f"with the order {trials[-1].rule.order}; does the edge of the beam fail?"
+                f"{crossed(lens)}",
+                stacklevel=4,
+            )
+            return trials[-1]
+        rounded = rounding(trials[-1])
+        if warns:
+            warn_dtype(lens, "the spot", rounded, tolerance, " of its size", 4)
+        # If rounding hides the differences, take the last of the three.
+        return trials[-1 if 2 * rounded > tolerance else 0]
 
 
-def _try_orders(
-    lens: Lens, scenes: Sequence[Scene], symmetry: Symmetry, tolerance: float, places: Callable,
-    warns: bool
-) -> _Trial:  # fmt: skip
-    """The trial of the first of three successive orders that agree. Gauss rules on the stop are
-    tried first; if a ray fails or is clipped, rules fitted to the open part of the pupil."""
+def _trials(lens: Lens, scenes: Sequence[Scene], symmetry: Symmetry) -> Iterator[_Trial]:
+    """Tries rules on scenes, in rising order: Gauss rules on the stop and, from the order on for
+    which a ray fails or is clipped, rules fitted to the open part of the pupil."""
     # The rays of a rule on the whole stop may all pass by a small obscuration.
     blocked = lens.apertures is not None and any(lens.apertures.blocks)
     solver: Solver = solve_aimed
     for clipped in (False, True)[blocked:]:
-        trials: list[_Trial] = []
-        for group in rules_by_order(lens, symmetry, clipped):
-            trace = partial(_trace, lens, scenes, group.traced)
+        for group in _rules_by_order(lens, symmetry, clipped):
+            trace = partial(_trace_all, lens, scenes, group.traced)
             rays, failing, cut = trace(solver)
             if failing and solver is solve_aimed and (clipped or not cut):
                 solver = solve  # aiming failed for some rays: search for them
@@ -243,59 +288,32 @@ def _try_orders(
                 check_order(lens)
             if (failing or cut) and not clipped:
                 break
-            for trial in _weighed(lens, scenes, group, rays):
-                trials = [*trials, trial][-3:]
-                changes = (_change(trials[0], later, places) for later in trials[1:])
-                change = max(changes, default=np.inf)
-                rounded = max(_rounding(lens, found) for found in trial.moments)
-                if len(trials) == 3 and change <= max(tolerance, 100 * _eps(lens), 2 * rounded):
-                    if warns:
-                        warn_dtype(lens, "the spot", rounded, tolerance, " of its size", 4)
-                    # If rounding hides the differences, take the last of the three.
-                    return trials[-1 if 2 * rounded > tolerance else 0]
+            yield from _weighed(lens, scenes, group, rays)
         else:
-            break
-    warnings.warn(
-        f"the spot size has converged to {change:.1e} only, not to {tolerance:.1e}, with "
-        f"the order {trials[-1].rule.order}; does the edge of the beam fail?{crossed(lens)}",
-        stacklevel=4,
-    )
-    return trials[-1]
+            return
 
 
-def _trace(
-    lens: Lens, scenes: Sequence[Scene], used: PupilRule, solver: Solver
-) -> tuple[list[Traced], bool, bool]:
+def _trace_all(
+    lens: Lens, scenes: Sequence[Scene], rule: PupilRule, solver: Solver
+) -> tuple[list["_Traced"], bool, bool]:
     """Rays of a rule for all scenes; whether a ray fails; and whether one is clipped."""
-    rays = [trace_rule(lens, scene, used, solver) for scene in scenes]
+    rays = [_trace_rule(lens, scene, rule, solver) for scene in scenes]
     return rays, any(one.failing for one in rays), any(one.cut for one in rays)
 
 
 def _weighed(
-    lens: Lens, scenes: Sequence[Scene], group: Group, rays: Sequence[Traced]
+    lens: Lens, scenes: Sequence[Scene], group: "_Group", rays: Sequence["_Traced"]
 ) -> Iterator[_Trial]:
     """Trials of the rules of a group, from its traced rays. ValueError if no light of a
     wavelength arrives."""
     found = tuple(one.found for one in rays)
-    for start in range(0, len(group.rules), AT_ONCE):
-        batch = group.rules[start : start + AT_ONCE]
-        each = [weigh_rules(lens, [used for _, used in batch], one) for one in rays]
+    for start in range(0, len(group.rules), _AT_ONCE):
+        batch = group.rules[start : start + _AT_ONCE]
+        each = [_weigh_rules(lens, [used for _, used in batch], one) for one in rays]
         for (rule, used), *moments in zip(batch, *each, strict=True):
             for scene, one in zip(scenes, moments, strict=True):
-                if not np.all(one.throughput > 0):
-                    _no_light(lens, scene, rule.symmetry, one.throughput)
+                _require_light(lens, scene, rule.symmetry, one.throughput)
             yield _Trial(rule, used, tuple(moments), found)
-
-
-def _eps(lens: Lens) -> float:
-    """Machine epsilon of the lens's dtype."""
-    return float(jnp.finfo(lens.curvature.dtype).eps)
-
-
-def _rounding(lens: Lens, found: FocusMoments) -> float:
-    """Relative rounding error of the smallest spot."""
-    size = np.sqrt(np.min(np.sum(np.asarray(found.spread)[0, :, :2], axis=-1)))
-    return hit_rounding(lens) / max(float(size), _SMALLEST)
 
 
 def _change(before: _Trial, now: _Trial, places: Callable) -> float:
@@ -312,21 +330,174 @@ def _change(before: _Trial, now: _Trial, places: Callable) -> float:
     return worst
 
 
-def _no_light(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) -> None:
-    """Raises the ValueError that names the surfaces where the light of a wavelength without
-    throughput ends.
+def _require_light(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Numbers) -> None:
+    """ValueError if no light of a wavelength of a point arrives, with the surfaces where it ends.
 
-    throughput: (W,).
+    throughput: (..., W), known.
     """
-    wavelength = int(np.argmin(np.asarray(throughput) > 0))
+    dark = np.argwhere(~(np.asarray(throughput).reshape(-1, scene.wavelengths.size) > 0))
+    if not len(dark):
+        return
+    point, wavelength = dark[0].tolist()
     lens, scene = known_values((lens, scene))
     with jax.core.eval_context():
         # In an eager gradient the values were not known before, so check them now.
         checked_scene(lens, scene)
+        scene = scene.each()[point]
         rule = Pattern(*gauss_points(_DIAGNOSIS, symmetry), symmetry)
-        found = trace_rule(lens, scene, rule, solve).found
+        found = _trace_rule(lens, scene, rule, solve).found
         raise ValueError(
             f"no ray at {float(scene.wavelengths[wavelength]):g} um reaches the sensor: "
             f"{reasons(lens, scene, rule, found, wavelength)}{crossed(lens)}; see "
             "trace_rays(...).status"
         )
+
+
+class _Group(NamedTuple):
+    """Rules that are traced together.
+
+    traced: a rule that has the points of all of them.
+    rules: pairs of each rule and a rule with the points of `traced` in which only its own points
+        have weight.
+    """
+
+    traced: Pattern | ClippedGroup
+    rules: Sequence[tuple[Gauss | Clipped, Pattern | ClippedGroup]]
+
+
+def _rules_by_order(lens: Lens, symmetry: Symmetry, clipped: bool) -> Iterator[_Group]:
+    """Rules in rising order, in groups.
+
+    lens: the lens.
+    symmetry: of the rules, see `symmetry_of`.
+    clipped: whether the rules are fitted to the open part of a clipped pupil.
+    """
+    if not clipped:
+        order = 2
+        while order <= _MAX_ORDER + 1:
+            yield (group := _gauss_group(order, symmetry))
+            order = group.rules[-1][0].order + 1
+        return
+    crossing = may_cross(lens)
+    for orders, sizes in _CLIPPED:
+        rules = [Clipped(n, symmetry, n, crossing) for n in orders]
+        traced, *own = (
+            ClippedGroup(np.array(orders, np.int32), np.int32(k), sizes, symmetry, crossing)
+            for k in range(-1, len(orders))
+        )
+        yield _Group(traced, [*zip(rules, own)])
+
+
+@cache
+def _gauss_group(first: int, symmetry: Symmetry) -> _Group:
+    """The Gauss rule of an order, and those of the next orders as long as all their points
+    together are at most half of the smallest size. The pattern is padded with rays of weight 0
+    along the rim of the stop, where clear apertures clip first."""
+    sizes, rules = _SIZES[symmetry], [gauss_points(first, symmetry)]
+    total, order = rules[0][1].size, first + 1
+    while total + (following := gauss_points(order, symmetry))[1].size <= sizes[0] / 2:
+        rules.append(following)
+        total, order = total + following[1].size, order + 1
+    columns = rules[0][0].shape[1]
+    size = next(size for size in sizes if size >= total + columns)
+    missing = size - total
+    span = np.pi if symmetry == "bilateral" else 2 * np.pi
+    angle = np.linspace(-np.pi / 2, span - np.pi / 2, missing)
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rim = rim if columns == 2 else np.ones((missing, 1))
+    points = np.concatenate([*(p for p, _ in rules), rim])
+    found, start = [], 0
+    for k, (_, weights) in enumerate(rules):
+        padded = np.pad(weights, (start, size - start - weights.size))
+        found.append((Gauss(first + k, symmetry), Pattern(points, padded, symmetry)))
+        start += weights.size
+    return _Group(found[0][1], found)
+
+
+class _Traced(NamedTuple):
+    """Traced rays of a rule.
+
+    weights: (1 or W, Q), weights of the rule.
+    bundle: the rays.
+    found: their hits on the active surfaces; MISSED for rays that were not traced.
+    failing: True if a ray fails.
+    cut: True if a ray is clipped.
+    """
+
+    weights: np.ndarray
+    bundle: Bundle
+    found: Found
+    failing: bool
+    cut: bool
+
+
+def _trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> _Traced:
+    """Traces the rays of a rule. Rays of weight 0 are left out if the rule is fitted to a
+    clipped pupil."""
+    points, weights = jax.tree.map(np.asarray, _points(lens, scene, rule))
+    waves, total = scene.wavelengths.size, weights.shape[-1]
+    # Rays of weight 0 are padding in fitted rules. In other rules they show whether light is
+    # clipped.
+    fitted = isinstance(rule, Fitted)
+    rays = np.flatnonzero(np.any(weights, axis=0)) if fitted else np.arange(total)
+    size, count = _TILE[len(points)], len(rays)
+    tiles = np.resize(rays if count else 0, (max(-(-count // size), 1), size))
+    every = [np.broadcast_to(p, (waves, total)) for p in points]
+    parts = [_trace_tile(lens, scene, tuple(p[:, tile] for p in every), solver) for tile in tiles]
+
+    def whole(*parts: Array) -> np.ndarray:  # (..., size) each -> (..., Q)
+        """Joins arrays of the tiles to one with all Q rays."""
+        arrays = [np.asarray(a) for a in parts]
+        if not arrays[0].ndim:
+            return np.max(arrays, axis=0)
+        joined = np.concatenate(arrays, axis=-1)[..., :count]
+        blank = Status.MISSED if joined.dtype == np.int32 else 0
+        found = np.full((*joined.shape[:-1], total), blank, joined.dtype)
+        found[..., rays] = joined
+        return found
+
+    bundle, found = parts[0] if total == size else jax.tree.map(whole, *parts)
+    status = np.asarray(bundle.status)[:, rays]
+    cut = status == Status.CLIPPED
+    failing = np.any((status != Status.OK) & ~cut)
+    return _Traced(weights, bundle, found, bool(failing), bool(np.any(cut)))
+
+
+def _weigh_rules(
+    lens: Lens, rules: Sequence[Pattern | ClippedGroup], traced: _Traced
+) -> list[FocusMoments]:
+    """Moments, as NumPy arrays, of traced rays by several rules.
+
+    lens: the lens.
+    rules: up to `_AT_ONCE` rules with the points of the rule that the rays were traced for: orders
+        of the group, or patterns.
+    traced: the rays.
+    """
+
+    def own(rule: Pattern | ClippedGroup) -> np.ndarray:
+        """Weights (1 or W, Q) of one rule."""
+        if isinstance(rule, ClippedGroup):
+            return np.where(rule.own(lens)[None], traced.weights, 0)
+        return np.asarray(rule.weights, lens.curvature.dtype)[None]
+
+    # Always `_AT_ONCE` rules, so that all calls share a program.
+    weights = np.stack([own(rules[min(k, len(rules) - 1)]) for k in range(_AT_ONCE)])
+    found = jax.tree.map(np.asarray, _weigh_each(lens, rules[0], weights, traced.bundle))
+    return [jax.tree.map(lambda a: a[k], found) for k in range(len(rules))]
+
+
+@partial(jit, wanted=LARGE)
+def _points(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
+    """Points and weights of a rule, compiled."""
+    return rule.points(lens, scene)
+
+
+@partial(jit, wanted=LARGE, static_argnames="solver")
+def _trace_tile(lens: Lens, scene: Scene, points: Vector, solver: Solver) -> tuple[Bundle, Found]:
+    """Rays of one tile."""
+    system, target = aims(lens, scene, points)
+    found = solver(system, target)
+    return bundle_of(lens, scene, system, target, found), found
+
+
+_weigh_each = jit(jax.vmap(weigh, (None, None, 0, None)), LARGE)

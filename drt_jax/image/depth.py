@@ -19,10 +19,12 @@ from ..numerics import Numbers, concrete, tensordot
 from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
 from .moments import FocusMoments, moments
+from .refined import refine
 from .spot import Moments
 from .zernike import chebyshev
 
-_MAX_NODES = 64
+# Numbers of Chebyshev nodes to try.
+_NODES = (4, 8, 16, 32, 64)
 # Relative amount by which a distance may exceed its range, because 1 / (1 / far) is not exactly
 # far.
 _ROUNDED = 1e-5
@@ -75,35 +77,35 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMom
     if not 0 < near < far:
         raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
     low, high = 1 / far, 1 / near
-    count = 4
-    while True:
+
+    def interpolated(count: int) -> FocusMoments:
+        """Chebyshev coefficients from the moments at a number of nodes."""
         angle = np.pi * (np.arange(count) + 0.5) / count
         nodes = (high + low) / 2 + (high - low) / 2 * np.cos(angle)
         transform = 2 / count * np.cos(np.outer(np.arange(count), angle))
         transform[0] /= 2
         traced = [focus_moments(lens, scene.at(scene.field, 1 / node), tolerance) for node in nodes]
-        series = jax.tree.map(
-            lambda *values: tensordot(
-                jnp.asarray(transform, values[0].dtype), jnp.stack(values), axes=1
-            ),
-            *traced,
+
+        def series(*values: Array) -> Array:
+            return tensordot(jnp.asarray(transform, values[0].dtype), jnp.stack(values), axes=1)
+
+        return jax.tree.map(series, *traced)
+
+    def tail(series: FocusMoments) -> float:
+        """The last two coefficients relative to the largest."""
+        parts = (c for c in (series.spread, series.mean) if jnp.any(c != 0))
+        tails = (float(jnp.max(jnp.abs(c[-2:])) / jnp.max(jnp.abs(c))) for c in parts)
+        return max(tails, default=0.0)
+
+    (series,), left = refine(map(interpolated, _NODES), tail, tolerance, together=1)
+    if left > tolerance:
+        warnings.warn(
+            f"the moments between {near:g} and {far:g} mm are interpolated to {left:.1e} only, not "
+            f"to {tolerance:.1e}; narrow the range",
+            stacklevel=2,
         )
-        tail = [
-            float(jnp.max(jnp.abs(c[-2:])) / jnp.max(jnp.abs(c)))
-            for c in (series.spread, series.mean)
-            if jnp.any(c != 0)
-        ]
-        done = max(tail, default=0.0) <= tolerance
-        if not done and count >= _MAX_NODES:
-            warnings.warn(
-                f"the moments between {near:g} and {far:g} mm are interpolated to "
-                f"{max(tail):.1e} only, not to {tolerance:.1e}; narrow the range",
-                stacklevel=2,
-            )
-        if done or count >= _MAX_NODES:
-            dtype = lens.curvature.dtype
-            return DepthMoments(jnp.asarray(near, dtype), jnp.asarray(far, dtype), series)
-        count *= 2
+    ends = (jnp.asarray(end, lens.curvature.dtype) for end in (near, far))
+    return DepthMoments(*ends, series)
 
 
 def moments_model(

@@ -1,14 +1,15 @@
-"""The number of pupil cells that a tolerance asks for, found by trials.
+"""Ever finer trials until the error is within a tolerance; and so the number of pupil cells.
 
-The rays are traced once. Each trial evaluates their polynomials on a finer grid. The error falls
-with the square of the number of cells or faster, so the change from one trial to the next bounds
-the error.
+For the cells, the rays are traced once. Each trial evaluates their polynomials on a finer grid. The
+error falls with the square of the number of cells or faster, so the change from one trial to the
+next bounds the error.
 """
 
+import collections
 import functools
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +22,36 @@ from ..numerics import concrete, known_values
 from .beam import Beam, BeamRule, trace_beam
 from .beam_psf import CELLS
 
+T = TypeVar("T")
 # Numbers of cells along a side to try.
 _TRIALS = (64, 96, 128, 192, 256, 384, 512)
 # The error of the finer of two trials is at most their change divided by this: the number of cells
 # n rises by 4/3 or more, the error falls as 1 / n^2, and (4/3)^2 - 1 > 0.75.
-_STEP = 0.75
+STEP = 0.75
 # Default tolerance of contrast, Strehl ratio and encircled energy, absolute.
 TOLERANCE = 1e-3
+
+
+def refine(
+    trials: Iterable[T], error: Callable[..., float], tolerance: float, together: int = 2
+) -> tuple[list[T], float]:
+    """Makes ever finer trials until the error is within a tolerance.
+
+    trials: from coarse to fine. They are made one by one, and none after the error is small enough.
+    error: function of the last `together` trials, as many arguments, the finest last.
+    tolerance: bound of the error.
+    together: number of trials that are compared.
+
+    Returns the last trials, the finest last, and their error. It is above the tolerance if no
+    trials meet it, and inf if there are fewer than `together`.
+    """
+    last: collections.deque[T] = collections.deque(maxlen=together)
+    found = np.inf
+    for trial in trials:
+        last.append(trial)
+        if len(last) == together and (found := error(*last)) <= tolerance:
+            break
+    return list(last), found
 
 
 @functools.partial(jit, wanted=LARGE)
@@ -58,19 +82,20 @@ def to_tolerance(
     if cells is not None or known is None:
         return run(*args, cells=CELLS if cells is None else cells)
     with jax.core.eval_context():
-        before, change, first = None, np.inf, fewest(*known)
-        for cells in [n for n in _TRIALS if n >= first or n in _TRIALS[-2:]]:
-            now = run(*known, cells=cells)
-            if before is not None:
-                pairs = zip(jax.tree.leaves(now), jax.tree.leaves(before), strict=True)
-                change = max(float(jnp.max(jnp.abs(a - b))) for a, b in pairs) / _STEP
-            if change <= tolerance:
-                break
-            before = now
-        else:
+        first = fewest(*known)
+        tried = [n for n in _TRIALS if n >= first or n in _TRIALS[-2:]]
+        trials = ((n, run(*known, cells=n)) for n in tried)
+        (*_, (cells, found)), error = refine(trials, _change, tolerance)
+        if error > tolerance:
             warnings.warn(
-                f"{cells} x {cells} cells of the pupil have converged to {change:.0e} only, not to "
+                f"{cells} x {cells} cells of the pupil have converged to {error:.0e} only, not to "
                 f"{tolerance:.0e}: the blur is too large for them; try kind='rays'",
                 stacklevel=4,
             )
-    return now if concrete(args) else run(*args, cells=cells)
+    return found if concrete(args) else run(*args, cells=cells)
+
+
+def _change(before: tuple[int, Any], now: tuple[int, Any]) -> float:
+    """Bound of the error of the finer of two trials: pairs of a number of cells and arrays."""
+    pairs = zip(jax.tree.leaves(now[1]), jax.tree.leaves(before[1]), strict=True)
+    return max(float(jnp.max(jnp.abs(a - b))) for a, b in pairs) / STEP
