@@ -40,8 +40,7 @@ from .image.encircled import encircled_energy as encircled_energy
 from .image.fans import axial_colour as axial_colour, ray_fans as ray_fans
 from .image.field import field_of_image as field_of_image, image_point as image_point
 from .image.fields import kernel_grid as kernel_grid
-from .image.gaussian_error import gaussian_error as gaussian_error
-from .image.psf import psf as psf
+from .image.psf import gaussian_error as gaussian_error, psf as psf
 from .image.render import render as render, sensor_noise as sensor_noise
 from .image.spots import (
     relative_illumination as relative_illumination,

@@ -4,9 +4,9 @@ from .image.beam_psf import Psf as Psf
 from .image.chief import Distortion as Distortion, FieldCurvature as FieldCurvature
 from .image.fans import AxialColour as AxialColour, RayFans as RayFans
 from .image.fields import KernelGrid as KernelGrid
-from .image.gaussian_error import GaussianError as GaussianError
 from .image.kernel import SeparableKernel as SeparableKernel
 from .image.moments import FocusMoments as FocusMoments
+from .image.psf import GaussianError as GaussianError
 from .image.spot import Moments as Moments
 from .image.spots import Spots as Spots
 from .image.transfer import Transfer as Transfer

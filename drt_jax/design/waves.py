@@ -111,6 +111,6 @@ def psf(
         raise ValueError(
             f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
         )
-    side, size = check_pixels(pixel, size, rays.wavelengths.dtype)
-    waves, options = rays.wavelengths, (side, None, size, kind, cells)
-    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, waves, beam, *options).kernel)
+    waves = rays.wavelengths
+    options = waves, check_pixels(pixel, size, waves.dtype), kind, cells
+    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, beam, *options).kernel)

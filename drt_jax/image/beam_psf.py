@@ -1,26 +1,40 @@
-"""PSF kernels of a beam on the pixels, by one of three models."""
+"""PSF kernels of a beam on the pixels, by one of three models: Gaussian, rays or waves.
+
+For rays, the polynomials of the beam give the hits for a fine grid of stop points, so many rays
+cost little. Each ray represents a cell of the grid. On the sensor it is a spot about as wide as the
+image of that cell: the biweight kernel 15 / 16 (1 - t^2)^2 of density estimation. So the PSF is a
+smooth function of all parameters, also where rays cross (at caustics), and the light is conserved.
+The width of the spots would add to the variance; the hits are contracted to compensate, so that
+centroid and covariance are those of the moments.
+"""
 
 import dataclasses
-import functools
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..numerics import safe_divide
+from ..numerics import einsum, safe_divide, safe_sqrt
 from ..pupil.mask import Mask
 from ..pupil.rules import PupilRule
-from .beam import Beam, BeamRule, beam_rule, centroid_and_variances
-from .kernel import gaussian_shares
-from .ray_psf import ray_kernel, ray_spots
+from .beam import Beam, BeamRule, beam_rule, centroid_and_variances, means
+from .cover import cover
+from .kernel import Pixels, gaussian_shares
+from .spot import normalised
 from .wave_psf import wave_kernel
 
 Kind = Literal["gaussian", "rays", "waves"]
 # Number of cells along a side of the pupil, and degree of polynomials, where none is given.
 CELLS, DEGREE = 128, 14
 _FINE = 8  # cells along each side of a pixel of a mask
+# Half the width of the spot of a ray: _BLUR pixels plus _REACH times the size of the image of a
+# cell.
+_BLUR, _REACH = 0.05, 0.8
+# Variance of a biweight spot of half width 1.
+_VARIANCE = 1 / 7
 
 
 @jax.tree_util.register_dataclass
@@ -44,11 +58,7 @@ class Psf:
     solid_angle: Array
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("rule", "errors"),
-    meta_fields=("kind", "cells"),
-)
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sampling:
     """How kernels, contrast and energy are computed: of which kind, by which rays, on which grid.
@@ -62,9 +72,9 @@ class Sampling:
         worst wavelength, which is compared with the tolerance.
     """
 
-    kind: Kind
+    kind: Kind = dataclasses.field(metadata={"static": True})
     rule: BeamRule
-    cells: int
+    cells: int = dataclasses.field(metadata={"static": True})
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @classmethod
@@ -102,40 +112,132 @@ class Sampling:
 
 
 def psf_of_beam(
-    lens: Lens,
-    wavelengths: Array,
-    beam: Beam,
-    pixel: Array,
-    centre: Array | None,
-    size: int,
-    kind: Kind,
-    cells: int,
+    lens: Lens, beam: Beam, wavelengths: Array, pixels: Pixels, kind: Kind, cells: int
 ) -> Psf:
     """The `Psf` of a beam.
 
     lens, beam: the lens and its beam.
     wavelengths: (W,), um.
-    pixel: (), mm.
-    centre: (2,), mm, or None for the mean of the centroids.
-    size, kind, cells: as in `Sampling` and `psf`.
+    pixels: those of the kernel.
+    kind, cells: as in `Sampling`.
     """
     mean, (xx, xy, yy) = centroid_and_variances(beam.hits[:, -1], beam.weights)
-    if centre is None:
-        centre = jnp.mean(mean, axis=-1)
-    light = beam.throughput
+    if pixels.centre is None:
+        pixels = dataclasses.replace(pixels, centre=jnp.mean(mean, axis=-1))
+    centre, light = pixels.centre, beam.throughput
     if beam.mask is not None:
         light = jnp.sum(ray_spots(lens, beam, cells)[2], axis=-1)
     total = light[:, None, None]
     if kind == "gaussian":
         covariance = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
-        kernel = gaussian_shares((mean - centre[:, None]).T, covariance, pixel, size)
+        shift = (mean - centre[:, None]).T
+        kernel = gaussian_shares(shift, covariance, pixels.side, pixels.size)
         kernel = jnp.where(total > 0, kernel, 0)
     else:
         if kind == "rays":
-            kernel = ray_kernel(lens, beam, centre, pixel, size, cells)
+            kernel = _ray_kernel(lens, beam, pixels, cells)
         else:
-            kernel = wave_kernel(lens, beam, wavelengths, centre, pixel, size, cells)
+            kernel = wave_kernel(lens, beam, wavelengths, pixels, cells)
         kernel = jnp.where(total > 0, kernel / jnp.where(total > 0, total, 1), 0)
     outside = jnp.where(light > 0, 1 - jnp.sum(kernel, axis=(1, 2)), 0)
     solid_angle = beam.solid_angle() * safe_divide(light, beam.throughput)
     return Psf(kernel, outside, centre, light, solid_angle)
+
+
+def _ray_kernel(lens: Lens, beam: Beam, pixels: Pixels, cells: int) -> Array:
+    """Geometric PSF kernel of a beam on the pixels.
+
+    lens, beam: the lens and its beam.
+    pixels: with their centre.
+    cells: number of cells along a side of the grid on the stop.
+
+    Returns (W, size, size) [y, x]. The sum is the part of the throughput that falls on the kernel.
+    """
+    hits, width, weights = ray_spots(lens, beam, cells)
+    pixel, size = pixels.side, pixels.size
+    edges = jnp.arange(size + 1, dtype=pixel.dtype) - size / 2
+    place, blur = (hits - pixels.centre[:, None, None]) / pixel, width / pixel + _BLUR
+    across, down = (_shares(edges, h, w) for h, w in zip(place, blur))
+    return einsum("wqy,wqx->wyx", weights[..., None] * down, across)
+
+
+def ray_spots(lens: Lens, beam: Beam, cells: int) -> tuple[Array, Array, Array]:
+    """The light of a beam as Q = cells^2 spots, one for each cell of a grid on the stop.
+
+    lens, beam: the lens and its beam.
+    cells: number of cells along a side of the grid.
+
+    Returns centres (2, W, Q) and half widths along x and y (2, W, Q), mm, and the light (W, Q) of
+    each spot, which is multiplied by the transmission of the beam's mask.
+    """
+    functions, waves = beam.over_stop(), beam.path.shape[0]
+    # Centre and half side of the square that contains the light, in semi-diameters of the stop.
+    low, high = beam.extent()
+    middle, half = (low + high) / 2, (high - low) / 2
+    side = (np.arange(cells) - (cells - 1) / 2) * (2 / cells)
+    start, step = (middle - functions.centre) / functions.scale, half / functions.scale
+    values, *slopes = functions.on_grid(start, step, side, slice(2))
+    grid = jnp.asarray(np.stack(np.meshgrid(side, side))[:, None], half.dtype)
+    stop = middle[..., None, None] + half[..., None, None] * grid
+    axes = middle, half * (2 / cells)
+    light = cover(lens, beam, stop, values[2:], beam.points, axes)[0].reshape(waves, -1)
+    weights = normalised(light) * beam.throughput[:, None]
+    # Size of the image of a cell on the sensor, along x and y: sqrt((dx/du du)^2 + (dx/dv dv)^2).
+    cell = (step * (2 / cells))[:, None, :, None, None]
+    reach = safe_sqrt(sum((s * c) ** 2 for s, c in zip(slopes, cell)))
+    hits, width = values[:2].reshape(2, waves, -1), _REACH * reach.reshape(2, waves, -1)
+    hits = _corrected(hits, weights, width, beam)
+    if beam.mask is not None:
+        sides = jnp.broadcast_to(axes[1][..., None, None] / 2, stop.shape)
+        weights = weights * beam.mask.light(stop, sides).reshape(waves, -1)
+    return hits, width, weights
+
+
+def _corrected(hits: Array, weights: Array, width: Array, beam: Beam) -> Array:
+    """Centres of spots, moved so that their light has the centroid and the covariance of the beam's
+    rays.
+
+    hits, width: (2, W, Q), mm, centres and half widths.
+    weights: (W, Q).
+
+    A spot of half width w adds the variance w^2 / 7. With the Cholesky factors L of the covariance
+    of the centres, and M of the covariance of the beam's rays less the mean of w^2 / 7, the map h
+    -> centroid + M L^-1 (h - mean) gives the centres the covariance M M^T.
+    """
+    centroid, target = centroid_and_variances(beam.hits[:, -1], beam.weights)
+    mean, found = centroid_and_variances(hits, weights)
+    spots = _VARIANCE * means(width**2, weights)
+    p, q, r = _cholesky(found)
+    a, b, c = _cholesky((target[0] - spots[0], target[1], target[2] - spots[1]))
+    x, y = hits - mean[..., None]
+    xx, yy = safe_divide(a, p), safe_divide(c, r)
+    yx = safe_divide(b - yy * q, p)
+    moved = jnp.stack([xx[:, None] * x, yx[:, None] * x + yy[:, None] * y])
+    return centroid[..., None] + moved
+
+
+def _cholesky(covariance: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """Elements 11, 21 and 22 of the Cholesky factor of a covariance with the elements xx, xy and
+    yy."""
+    xx, xy, yy = covariance
+    a = safe_sqrt(xx)
+    b = safe_divide(xy, a)
+    return a, b, safe_sqrt(yy - b * b)
+
+
+def _shares(edges: Array, place: Array, width: Array) -> Array:
+    """Fractions (W, Q, size) of spots along one axis that fall between neighbouring pixel edges.
+
+    edges: (size + 1,), pixels.
+    place, width: (W, Q), centres and half widths of the spots, pixels.
+    """
+    found = spot_below((edges[None, None] - place[..., None]) / width[..., None])
+    return found[..., 1:] - found[..., :-1]
+
+
+def spot_below(t: Array) -> Array:
+    """Fraction of a spot of half width 1 below t: the integral of 15 / 16 (1 - t^2)^2 from -1 to
+    t."""
+    t = jnp.clip(t, -1, 1)
+    square = t * t
+    return 0.5 + t * (15 / 16 + square * (-5 / 8 + square * (3 / 16)))

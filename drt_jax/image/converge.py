@@ -12,8 +12,7 @@ from .converged import (
 from .encircled import encircled_energy
 from .fields import kernel_grid
 from .grid_method import grid_method
-from .psf import psf
-from .psf_model import converged_psf
+from .psf import converged_psf, psf
 from .render import render
 from .render_method import render_method
 from .spots import light_rule, relative_illumination, solid_angle, spot_diagram, vignetting

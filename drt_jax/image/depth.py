@@ -104,8 +104,8 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMom
             f"to {tolerance:.1e}; narrow the range",
             stacklevel=2,
         )
-    ends = (jnp.asarray(end, lens.curvature.dtype) for end in (near, far))
-    return DepthMoments(*ends, series)
+    dtype = lens.curvature.dtype
+    return DepthMoments(jnp.asarray(near, dtype), jnp.asarray(far, dtype), series)
 
 
 def moments_model(

@@ -23,8 +23,7 @@ from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, batched, einsum, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
-from .beam_psf import Sampling
-from .ray_psf import ray_spots, spot_below
+from .beam_psf import Sampling, ray_spots, spot_below
 from .refined import TOLERANCE, beams_of, to_tolerance
 from .transfer import Model, centre_of, places_of, planned, through_focus
 from .wave_psf import amplitudes, autocorrelation, period

@@ -18,7 +18,7 @@ from ..rays.solve import solve_aimed
 from .beam_psf import Kind, Sampling
 from .fields import GridMethod, KernelGrid, unique_nodes
 from .moments import moments
-from .psf_model import chosen_psf
+from .psf import chosen_psf
 from .spot import Moments
 
 # Numbers of pixels along a side of a kernel to choose from.

@@ -1,6 +1,7 @@
 """Gaussian kernels on the pixel grid from centroid and covariance (paper Eq. 5). From this
 module on, lengths can be in pixels."""
 
+import dataclasses
 import warnings
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -27,6 +28,22 @@ _LARGE_PIXEL = 1.0
 # _WIDE: variances, pixels^2.
 # _DARK: distance from the centre of a Gaussian, sigma.
 _FAR, _WIDE, _DARK = 1e9, 1e15, 60.0
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Pixels:
+    """`size` x `size` square pixels on the sensor.
+
+    side: (), side of a pixel, mm.
+    size: static, number of pixels along a side.
+    centre: (2,), mm, their middle on the sensor; None for the mean of the centroids of all
+        wavelengths.
+    """
+
+    side: Array
+    size: int = dataclasses.field(metadata={"static": True})
+    centre: Any = None
 
 
 class SeparableKernel(NamedTuple):
@@ -150,14 +167,14 @@ def _checked(
         if concrete(given[name]) and not np.all(np.isfinite(np.asarray(given[name], float))):
             hint = "; no ray of that wavelength arrives" if name == "covariance" else ""
             raise ValueError(f"{name}: must be finite{hint}")
-    return arrays[0], arrays[1], check_pixels(pixel, size, dtype, stacklevel=4)[0]
+    return arrays[0], arrays[1], check_pixels(pixel, size, dtype, stacklevel=4).side
 
 
-def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> tuple[Array, int]:
-    """Checks the side of a pixel, (), mm, and the number of pixels along a side of a grid.
+def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> Pixels:
+    """The `Pixels` of a side, (), mm, and a number along a side.
 
-    Returns both. Warns of a pixel above 1 mm; `stacklevel` as of `warnings.warn`. ValueError for
-    invalid values, as far as they are known.
+    Warns of a pixel above 1 mm; `stacklevel` as of `warnings.warn`. ValueError for invalid values,
+    as far as they are known.
     """
     if not isinstance(size, int | np.integer) or size < 1:
         raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
@@ -173,7 +190,7 @@ def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> 
         if known > _LARGE_PIXEL:
             um = f"if it is {known:g} um, give {1e-3 * known:g}"
             warnings.warn(f"pixel: {known:g} mm is a large one; {um}", stacklevel=stacklevel)
-    return side, int(size)
+    return Pixels(side, int(size))
 
 
 def _standardise(offset: Array, variance: Array) -> tuple[Array, Array]:

@@ -26,26 +26,17 @@ from ..lens.lens import Lens
 from ..numerics import einsum, safe_divide, safe_sqrt
 from .beam import Beam
 from .cover import cover
+from .kernel import Pixels
 
 _UM = 1e3  # per mm
 
 
-def wave_kernel(
-    lens: Lens,
-    beam: Beam,
-    wavelengths: Array,
-    centre: Array,
-    pixel: Array,
-    size: int,
-    cells: int,
-) -> Array:
+def wave_kernel(lens: Lens, beam: Beam, wavelengths: Array, pixels: Pixels, cells: int) -> Array:
     """Diffraction PSF kernel of a beam on the pixels.
 
     lens, beam: the lens and its beam.
     wavelengths: (W,), um.
-    centre: (2,), mm, centre of the kernel on the sensor.
-    pixel: (), side of a pixel, mm.
-    size: number of pixels along a side of the kernel.
+    pixels: with their centre.
     cells: number of cells along a side of the grid of directions. The pattern on the sensor repeats
         after one `period`.
 
@@ -54,6 +45,7 @@ def wave_kernel(
     (pi x / period)^2 / 3 of the light that edges diffract to the distance x: with 128 cells 1.5e-3
     of the light of an Airy pattern within half a period.
     """
+    pixel, size = pixels.side, pixels.size
     amplitude, step = amplitudes(lens, beam, wavelengths, cells)
     transfer = autocorrelation(amplitude)
     lags = np.fft.fftfreq(2 * cells, 1 / (2 * cells))
@@ -62,7 +54,7 @@ def wave_kernel(
     frequency = unit[..., None] * jnp.asarray(lags, unit.dtype)[None, None]
     place = (jnp.arange(size, dtype=pixel.dtype) - (size - 1) / 2) * pixel
     waves = []
-    for f, c in zip((frequency[0, :, :cells], frequency[1]), centre):
+    for f, c in zip((frequency[0, :, :cells], frequency[1]), pixels.centre):
         f, x = f[:, None], (place + c)[None, :, None]
         phase = 2 * jnp.pi * f * x
         wave = jax.lax.complex(jnp.cos(phase), jnp.sin(phase))

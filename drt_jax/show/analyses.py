@@ -17,7 +17,7 @@ from matplotlib.patches import Circle
 
 from ..image.chief import Distortion, FieldCurvature
 from ..image.fans import RayFans
-from ..image.gaussian_error import GaussianError
+from ..image.psf import GaussianError
 from ..image.spots import Spots
 from .figures import FIELD_COLOURS
 

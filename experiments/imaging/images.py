@@ -29,7 +29,7 @@ from skimage import data, transform
 import drt_jax
 from drt_jax import Lens, Sampling, Scene
 from drt_jax.compilation import LARGE, known_options
-from drt_jax.image.psf_model import difference
+from drt_jax.image.psf import difference
 
 from . import _command, _common, _peers, _psf_peers, _work, render
 from ._common import Colours, not_empty, odd, within

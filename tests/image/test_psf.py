@@ -15,8 +15,8 @@ from drt_jax import Sampling, Scene
 from drt_jax.compilation import jit
 from drt_jax.image import psf as module
 from drt_jax.image.beam import beam_rule, centroid_and_variances, trace_beam
-from drt_jax.image.psf_model import difference
-from drt_jax.image.ray_psf import ray_spots
+from drt_jax.image.beam_psf import ray_spots
+from drt_jax.image.psf import difference
 from drt_jax.lens.scene import checked_scene
 from drt_jax.pupil import patterns
 

@@ -2,15 +2,15 @@
 
 import re
 import warnings
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from drt_jax.image import psf_model
+from drt_jax.image import psf as module
 from drt_jax.image.beam import Beam
+from drt_jax.image.kernel import Pixels
 from drt_jax.pupil.patterns import disc
 
 PIXEL, WAVE = 0.01, 0.5
@@ -28,9 +28,10 @@ def beam_of(radius, aperture=0.1):
 
 
 def size_told(radius, kind):
-    scene = SimpleNamespace(wavelengths=jnp.array([WAVE]))
+    waves, pixels = jnp.array([WAVE]), Pixels(jnp.array(PIXEL), 5)
+    outside = np.array([[0.0], [0.2]])
     with pytest.warns(UserWarning, match="20 % of the light falls beside a kernel") as said:
-        psf_model.warn_of_loss(0.2, scene, beam_of(radius), PIXEL, 5, kind, 2)
+        module._warn(outside, [None, beam_of(radius)].__getitem__, waves, pixels, kind, 2)
     assert said[0].filename == __file__
     return int(re.search(r"; (\d+) x \1 hold 99 %", str(said[0].message))[1])
 
@@ -39,7 +40,7 @@ def test_the_size_that_would_do():
     """Of rays all over a disc; of Airy's pattern, whose encircled energy is 1 - J0^2 - J1^2."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        psf_model.warn_of_loss(0.01, None, None, PIXEL, 5, "rays", 2)
+        module._warn(np.array([[0.01]]), None, None, None, "rays", 2)
     assert 19 <= size_told(0.1, "rays") <= 21 and size_told(1e-6, "rays") == 7
     half = size_told(0.0, "waves") * PIXEL / 2
     v = 2 * np.pi * 0.1 * half / (WAVE * 1e-3)
