@@ -10,11 +10,9 @@ from .converged import (
     psf_moments,
 )
 from .encircled import encircled_energy
-from .fields import kernel_grid
-from .grid_method import grid_method
+from .fields import grid_method, kernel_grid
 from .psf import converged_psf, psf
-from .render import render
-from .render_method import render_method
+from .render import render, render_method
 from .spots import light_rule, relative_illumination, solid_angle, spot_diagram, vignetting
 from .transfer import strehl, transfer
 

@@ -1,4 +1,5 @@
-"""PSF kernels over the whole field and over depth, computed once on a small grid of object points.
+"""PSF kernels over the whole field and over depth, computed once on a small grid of object points;
+and the choice of this grid.
 
 The nodes are equidistant in the tangents of the field angles along x and y, and in 1 / distance.
 For a rotationally symmetric lens only an eighth of the nodes is traced. Mirroring, and swapping x
@@ -7,7 +8,8 @@ and y, give the others; both are exact on pixels.
 
 import dataclasses
 import functools
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,18 +18,32 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
-from ..lens.scene import Scene, vergence_of
-from ..numerics import Numbers, brief, einsum, real_array
-from ..pupil.rules import Symmetry
+from ..lens.scene import Scene, checked_scene, over_points, vergence_of
+from ..numerics import Numbers, brief, concrete, einsum, known_values
+from ..pupil.rules import Gauss, Symmetry, symmetry_of
 from ..rays.solve import solve_aimed
-from ..rays.status import reaches_sensor
-from ..rays.trace import trace_bundle
-from .beam_psf import Sampling
+from .beam_psf import Kind, Sampling
 from .interpolate import lagrange
-from .psf import psf
+from .moments import moments
+from .psf import chosen_psf, psf
+from .spot import Moments
 
 # Number of nodes along each axis from which a kernel is interpolated.
 _ORDER = 4
+# Numbers of pixels along a side of a kernel to choose from.
+_SIZES = (9, 13, 17, 21, 25, 33, 41, 49, 65, 97, 129)
+# Half the side of a kernel, in standard deviations of the blur.
+_REACH = 4.5
+# Default tolerance: the sum of the absolute errors of a kernel's pixels.
+_TOLERANCE = 5e-3
+# Order of the rule that tests for which fields light arrives.
+_TEST_ORDER = 8
+# For each symmetry: how an image point (..., 2), and how a kernel [y, x], follows from another.
+_TURNS: tuple[tuple[Callable, Callable], ...] = (
+    (lambda point: point[..., ::-1], lambda kernel: jnp.swapaxes(kernel, -1, -2)),
+    (lambda p: jnp.stack([-p[..., 0], p[..., 1]], -1), lambda kernel: kernel[..., ::-1]),
+    (lambda p: jnp.stack([p[..., 0], -p[..., 1]], -1), lambda kernel: kernel[..., ::-1, :]),
+)
 
 
 @jax.tree_util.register_dataclass
@@ -105,53 +121,21 @@ def unique_nodes(half: tuple[int, int], symmetry: Symmetry) -> tuple[np.ndarray,
     half: number of nodes on each side of the axis, along y and x.
     symmetry: of the lens.
 
-    Returns the traced nodes (U, 2), x and y in steps; and for each node of the grid (Ny, Nx) the
-    index of its traced node, and whether x and y are swapped there.
+    Returns the traced nodes (U, 2), x and y in steps; and for each node of the grid the index
+    (Ny, Nx) of its traced node, and (3, Ny, Nx) whether its x and y are swapped, its x is mirrored
+    and its y is mirrored, in this order, see `_TURNS`.
     """
     y, x = np.meshgrid(*(np.arange(-n, n + 1) for n in half), indexing="ij")
-    swapped = np.zeros(x.shape, bool)
+    turned = np.zeros((3, *x.shape), bool)
     if symmetry != "none":
-        x = np.abs(x)
+        turned[1], x = x < 0, np.abs(x)
     if symmetry == "rotational":
-        y = np.abs(y)
-        swapped = x > y
+        turned[2], y = y < 0, np.abs(y)
+        turned[0] = x > y
         x, y = np.minimum(x, y), np.maximum(x, y)
     places = np.stack([x, y], axis=-1).reshape(-1, 2)
     nodes, index = np.unique(places, axis=0, return_inverse=True)
-    return nodes, index.reshape(x.shape), swapped
-
-
-@functools.partial(jit, wanted=LARGE)
-def _chief(lens: Lens, tangents: Array, distances: Array, wavelengths: Array) -> Array:
-    """`image_points` of arrays."""
-
-    def one(distance: Array, tangent: Array) -> Array:
-        scene = Scene(jnp.arctan(tangent), distance, wavelengths)
-        centre = jnp.zeros(1, lens.curvature.dtype)
-        bundle = trace_bundle(lens, scene, (centre, centre), solve_aimed)
-        whole = reaches_sensor(bundle.status)
-        hits = jnp.concatenate([h[-1] for h in bundle.hits], axis=-1)
-        return jnp.where(whole, hits, jnp.inf)
-
-    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(distances, tangents)
-
-
-def image_points(lens: Lens, tangents: Any, distances: Any, wavelengths: Any) -> np.ndarray:
-    """Points where chief rays meet the sensor.
-
-    lens: the lens.
-    tangents: (U, 2), tangents of the field angles.
-    distances: (D,), mm.
-    wavelengths: (W,), um.
-
-    Returns (D, U, W, 2), mm, as a NumPy array; inf where a chief ray fails. The numbers must be
-    known.
-    """
-    dtype = lens.curvature.dtype
-    waves = jnp.atleast_1d(real_array("wavelengths", wavelengths, dtype))
-    return np.asarray(
-        _chief(lens, jnp.asarray(tangents, dtype), jnp.asarray(distances, dtype), waves)
-    )
+    return nodes, index.reshape(x.shape), turned
 
 
 def kernel_grid(lens: Lens, wavelengths: Numbers, sampling: GridMethod) -> KernelGrid:
@@ -169,22 +153,25 @@ def kernel_grid(lens: Lens, wavelengths: Numbers, sampling: GridMethod) -> Kerne
 
 @functools.partial(jit, wanted=LARGE)
 def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGrid:
-    """`kernel_grid` of arrays: traces the unique nodes, then mirrors and swaps them."""
-    nodes, index, swapped = unique_nodes(method.half, method.symmetry)
+    """`kernel_grid` of arrays: traces the unique nodes, then mirrors them."""
+    nodes, index, turned = unique_nodes(method.half, method.symmetry)
     tangents = jnp.asarray(nodes, method.step.dtype) * method.step
 
-    def one(pair: tuple[Array, Array]) -> tuple[Array, ...]:
-        return _kernel_of(lens, method, pair[1], pair[0], wavelengths)
+    def traced(waves: Array) -> tuple[Array, ...]:
+        """Centres (D, U, W, 2), mm, solid angles, light outside and kernels of all nodes."""
+        scene = Scene.grid(jnp.arctan(tangents), method.distances, waves)
+        found = psf(lens, scene, method.pixel, method.size, sampling=method.sampling)
+        arrives = (found.throughput > 0)[..., None]
+        centre = jnp.where(arrives, found.centre[..., None, :], jnp.inf)
+        return centre, found.solid_angle, found.outside, found.kernel
 
-    # One object point at a time: the rays of all kernels together would not fit into the cache.
-    pairs = (len(method.distances), len(nodes))
-    every = (
-        jnp.repeat(method.distances, pairs[1]),
-        jnp.tile(tangents, (pairs[0], 1)),
-    )
-    found = jax.lax.map(jax.checkpoint(one), every)
-    found = tuple(a.reshape(*pairs, *a.shape[1:]) for a in found)
-    points, solid_angle, outside, kernels = found
+    if method.together:
+        points, *others = traced(wavelengths)
+    else:
+        # Each kernel is centred on the centroid of its light: rounding would spoil a spot smaller
+        # than a pixel that is far off centre.
+        each = jax.vmap(traced, out_axes=2)(wavelengths[:, None])
+        points, *others = (a[:, :, :, 0] for a in each)
     # A node without light gets an extrapolated image point: its tangent times the ratio of image
     # point to tangent of the nearest node with light.
     finite = jnp.isfinite(points)
@@ -197,44 +184,13 @@ def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGr
     has_light = method.nearest == jnp.arange(len(nodes), dtype=jnp.int32)[None]
     points = jnp.where(has_light[:, :, None, None] & finite, points, guess)
 
-    def full(values: Array) -> Array:
-        return values[:, index]
-
-    swap = jnp.asarray(swapped)
-    points, kernels = full(points), full(kernels)
-    points = jnp.where(swap[None, ..., None, None], points[..., ::-1], points)
-    kernels = jnp.where(swap[None, ..., None, None, None], jnp.swapaxes(kernels, -1, -2), kernels)
-    y, x = (np.arange(-n, n + 1) < 0 for n in method.half)
-    if method.symmetry != "none":
-        left = jnp.asarray(np.broadcast_to(x[None], swapped.shape))[None, ..., None]
-        points = points * jnp.where(left[..., None], jnp.array([-1.0, 1], points.dtype), 1)
-        kernels = jnp.where(left[..., None, None], kernels[..., ::-1], kernels)
-    if method.symmetry == "rotational":
-        below = jnp.asarray(np.broadcast_to(y[:, None], swapped.shape))[None, ..., None]
-        points = points * jnp.where(below[..., None], jnp.array([1.0, -1], points.dtype), 1)
-        kernels = jnp.where(below[..., None, None], kernels[..., ::-1, :], kernels)
+    points, solid_angle, outside, kernels = (a[:, index] for a in (points, *others))
+    for here, (turned_point, turned_kernel) in zip(turned, _TURNS):
+        here = np.expand_dims(here, (0, 3, 4))
+        points = jnp.where(here, turned_point(points), points)
+        kernels = jnp.where(here[..., None], turned_kernel(kernels), kernels)
     vergences = jax.vmap(vergence_of)(method.distances)
-    return KernelGrid(method.step, vergences, points, full(solid_angle), full(outside), kernels)
-
-
-def _kernel_of(
-    lens: Lens, method: GridMethod, tangent: Array, distance: Array, wavelengths: Array
-) -> tuple[Array, ...]:
-    """Centre (W, 2), mm, solid angle (W,), outside (W,), and kernel (W, K, K) of one object
-    point."""
-    # Each kernel is centred on the centroid of its light: rounding would spoil a spot smaller than
-    # a pixel that is far off centre.
-
-    def traced(waves: Array) -> tuple[Array, ...]:
-        scene = Scene(jnp.arctan(tangent), distance, waves)
-        found = psf(lens, scene, method.pixel, method.size, sampling=method.sampling)
-        arrives = found.throughput > 0
-        centre = jnp.where(arrives[:, None], found.centre[None], jnp.inf)
-        return centre, found.solid_angle, found.outside, found.kernel
-
-    if method.together:
-        return traced(wavelengths)
-    return jax.tree.map(lambda a: a[:, 0], jax.vmap(traced)(wavelengths[:, None]))
+    return KernelGrid(method.step, vergences, points, solid_angle, outside, kernels)
 
 
 def _kernel_at(grid: KernelGrid, tangent: Array, vergence: Array) -> Array:
@@ -252,3 +208,117 @@ def _kernel_at(grid: KernelGrid, tangent: Array, vergence: Array) -> Array:
     starts = [first for first, _ in parts] + [jnp.zeros((), jnp.int32)] * 3
     near = jax.lax.dynamic_slice(table, starts, (*sizes, *table.shape[3:]))
     return einsum("dyxwij,d,y,x->wij", near, *(weights for _, weights in parts))
+
+
+def grid_method(
+    lens: Lens,
+    scene: Scene,
+    pixel: Numbers,
+    size: int | None = None,
+    nodes: int = 8,
+    kind: Kind | Literal["auto"] = "rays",
+    sampling: float | Sampling = _TOLERANCE,
+    together: bool = False,
+    norm: int = 1,
+) -> GridMethod:
+    """Chooses the settings of `kernel_grid`. All arguments are known numbers.
+
+    lens: the lens.
+    scene: its largest angles along x and y are those of the grid; its distances, as of
+        `Scene.grid`, are equidistant in 1 / distance, rising or falling.
+    pixel: side of a pixel, mm.
+    size: number of pixels along a side of a kernel, odd; by default it extends to 4.5 standard
+        deviations of the blur on each side.
+    nodes: number of nodes from the axis to the largest angle, 2 or more.
+    kind, sampling: as in `psf`, one for all fields; norm: as in `converged_psf`.
+    together: True centres the kernels of all wavelengths on the mean of their centroids, so that
+        they contain the lateral colour (for patches); False centres each kernel on its own
+        centroid.
+
+    Returns a `GridMethod`. ValueError inside a trace, for invalid numbers, and if no light arrives
+    from any field.
+    """
+    known = known_values((lens, scene, pixel))
+    if known is None:
+        raise ValueError(
+            "the choice of fields and rays follows from known numbers: call "
+            "drt_jax.converge(drt_jax.kernel_grid, ...) outside of jax.jit and jax.vmap, and pass "
+            "on what it returns"
+        )
+    with jax.core.eval_context():
+        lens, scene, pixel = known
+        scene = checked_scene(lens, scene)
+        check_pixel(pixel)
+        _check_counts(size, nodes)
+        far, wide = np.ravel(np.asarray(scene.distance, float)), _widest(scene)
+        step = float(np.max(wide)) / nodes
+        across, down = (max(2, int(np.ceil(a / step - 1e-9))) for a in wide)
+        half = down, across
+        symmetry = symmetry_of(lens, 0.0)
+        tangents = unique_nodes(half, symmetry)[0] * step
+        grid = Scene.grid(np.arctan(tangents), far, scene.wavelengths)
+        found = _spots(lens, checked_scene(lens, grid))
+        arrives = np.all(np.asarray(found.throughput) > 0, axis=-1)
+        if not np.any(arrives):
+            raise ValueError("fields: no light of any of them reaches the sensor")
+        if size is None:
+            sigma = np.sqrt(np.diagonal(np.asarray(found.covariance), 0, -2, -1))[arrives]
+            need = 2 * int(np.ceil(_REACH * np.max(sigma) / float(np.asarray(pixel)))) + 1
+            size = next((n for n in _SIZES if n >= need), _SIZES[-1])
+        if not isinstance(sampling, Sampling):
+            where = Scene.grid(*_extremes(tangents, far, arrives), scene.wavelengths)
+            # No warning here of light outside of these kernels: the nodes may lose more.
+            sampling = chosen_psf(lens, where, pixel, size, kind, sampling, norm)[0]
+        # For each node, the nearest one with light.
+        squared = np.sum((tangents[:, None] - tangents[None]) ** 2, axis=-1)
+        nearest = np.argmin(np.where(arrives[:, None], squared[None], np.inf), axis=-1)
+        numbers = (jnp.asarray(a, lens.curvature.dtype) for a in (step, far, pixel))
+        sizes = half, size, symmetry, together
+        return GridMethod(*numbers, sampling, jnp.asarray(nearest, jnp.int32), *sizes)
+
+
+def check_pixel(pixel: Numbers) -> None:
+    """ValueError if the side of a pixel is known and is not above 0 mm."""
+    if concrete(pixel):
+        side = np.asarray(pixel, float)
+        if side.ndim or not 0 < side < np.inf:
+            raise ValueError(f"pixel: must be above 0 mm, got {pixel!r}")
+
+
+def _widest(scene: Scene) -> np.ndarray:
+    """Tangents (2,) of the largest field angles along x and y. ValueError unless one is above 0."""
+    angles = np.asarray(scene.field, float).reshape(-1, 2)
+    wide = np.tan(np.max(np.abs(angles), axis=0))
+    if not np.max(wide) > 0:
+        raise ValueError("fields: expected one beside the axis")
+    return cast(np.ndarray, wide)
+
+
+def _check_counts(size: Any, nodes: Any) -> None:
+    """ValueError for an even kernel size or fewer than 2 nodes."""
+    whole = isinstance(size, int | np.integer) and size > 0 and size % 2
+    if size is not None and not whole:
+        raise ValueError(f"size: expected an odd number of pixels, got {size!r}")
+    if not isinstance(nodes, int | np.integer) or nodes < 2:
+        raise ValueError(f"nodes: expected a whole number from 2 on, got {nodes!r}")
+
+
+@functools.partial(jit, wanted=LARGE)
+def _spots(lens: Lens, scene: Scene) -> Moments:
+    """`Moments` of object points, which show where light arrives."""
+    rule = Gauss(_TEST_ORDER, "none")
+    one = lambda point: moments(lens, point, rule, solve_aimed).at(lens.sensor)  # noqa: E731
+    return over_points(one, scene)
+
+
+def _extremes(tangents: np.ndarray, far: np.ndarray, arrives: np.ndarray) -> tuple[Any, Any]:
+    """Fields (F, 2), radians, and distances for the choice of a PSF model: the farthest field
+    with light, a middle one and the axis; the first and the last distance."""
+    always = np.all(arrives, axis=0)
+    lit = tangents[always if np.any(always) else np.any(arrives, axis=0)]
+    order = lit[np.argsort(np.sum(lit**2, axis=1))]
+    chosen = order[[-1, len(order) // 2, 0]]
+    # Shift the fields slightly off the planes of symmetry, where the rule would trace half a pupil
+    # only.
+    angles = np.arctan(chosen + 1e-6 * max(np.max(np.abs(chosen)), 1e-3))
+    return angles, np.unique([far[0], far[-1]])

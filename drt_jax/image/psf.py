@@ -77,11 +77,8 @@ def psf(
     one for fields along y traces half a pupil. Inside `jax.jit`, where the field is not known, the
     kernel of such a field is 0.
     """
-    scene, made, dtype = (
-        checked_scene(lens, scene),
-        isinstance(sampling, Sampling),
-        lens.curvature.dtype,
-    )
+    scene, dtype = checked_scene(lens, scene), lens.curvature.dtype
+    made = isinstance(sampling, Sampling)
     pixels = check_pixels(pixel, size, dtype)
     if not isinstance(sampling, Sampling):
         sampling = converged_psf(lens, scene, pixel, size, kind, sampling)
@@ -271,11 +268,9 @@ class _View:
         kinds: tuple[Kind, ...] = get_args(Kind)
         cells = [self.cells(one, tolerance) for one in kinds]
         *others, waves = map(self.kernels, kinds, cells)
-        errors: dict[str, float] = {}
-        errors = {k: difference(other, waves, self.norm) for k, other in zip(kinds, others)}
-        # "waves" has no error.
-        index = next(k for k, one in enumerate(kinds) if errors.get(one, 0.0) <= tolerance)
-        return Sampling(kinds[index], rule, cells[index], errors)
+        apart = [difference(one, waves, self.norm) for one in others]
+        best = next((k for k, error in enumerate(apart) if error <= tolerance), len(apart))
+        return Sampling(kinds[best], rule, cells[best], dict[str, float](zip(kinds, apart)))
 
     def cells(self, kind: Kind, tolerance: float) -> int:
         """The smallest number of cells for which the kernels are within the tolerance."""

@@ -9,12 +9,12 @@ The source of a point is the field whose centroid lies there, for each colour se
 kernel as seen from the sensor: its element k is the element k of the kernel of the source of p - k,
 weighted with the light of that source. G has the sum 1, less the light outside of the kernel, so
 that a uniform scene stays uniform except for the solid angle. G is a sum of a few kernels with
-coefficients that vary over the picture, see `blur`.
+coefficients that vary over the picture, see `sensor_maps`.
 """
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -24,20 +24,33 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..inputs import require_tolerance
 from ..lens.lens import Lens
-from ..lens.scene import vergence_of
-from ..numerics import Numbers, concrete, einsum, safe_divide, safe_sqrt
-from .blur import blur_row
+from ..lens.paraxial import first_order
+from ..lens.scene import NEAREST, Scene, checked_scene, over_points, vergence_of
+from ..numerics import Numbers, concrete, einsum, known_values, safe_divide, safe_sqrt
+from ..rays.solve import solve_aimed
+from ..rays.status import reaches_sensor
+from ..rays.trace import trace_bundle
+from .beam_psf import Kind, Sampling
+from .fields import check_pixel, grid_method
 from .interpolate import basis, cubic
-from .render_method import WAVELENGTHS, layer_distances, render_method
 from .sensor_maps import (
     LOCAL,
     SMOOTH,
     Maps,
     RenderMethod,
+    blur_row,
+    chosen,
     controls,
     sensor_maps,
     tiles_of,
 )
+
+_WAVELENGTHS = (0.6, 0.53, 0.48)
+# Fields that are tried in `_angles`, in units of the field of a pinhole camera at the edge of the
+# picture.
+_TRIED = np.linspace(0, 2, 81)
+# Largest tangent of a field, that of 85 degrees.
+_WIDEST = 11.4
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="lit")
@@ -104,7 +117,7 @@ def render(
     image: Array,
     distance: Numbers,
     pixel: Numbers,
-    wavelengths: Numbers = WAVELENGTHS,
+    wavelengths: Numbers = _WAVELENGTHS,
     sampling: RenderMethod | float = 1e-3,
     progress: Callable[[Iterable], Iterable] = iter,
 ) -> Array:
@@ -146,6 +159,124 @@ def render(
     if jnp.ndim(jnp.asarray(distance)) == 0:
         return _whole(maps, method, picture, progress)
     return composed(maps, method, picture, jnp.asarray(distance), progress)
+
+
+def render_method(
+    lens: Lens,
+    shape: tuple[int, int],
+    distance: Numbers,
+    pixel: Numbers,
+    wavelengths: Numbers = _WAVELENGTHS,
+    size: int | None = None,
+    nodes: int = 16,
+    layers: int = 8,
+    kind: Kind | Literal["auto"] = "rays",
+    tolerance: float = 1e-3,
+    sampling: Sampling | None = None,
+) -> RenderMethod:
+    """Chooses how `render` works. All arguments are known numbers.
+
+    lens: the lens.
+    shape: height and width of the picture, pixels.
+    distance: mm; one, or a depth map (H, W), which is divided into `layers` distances, equidistant
+        in 1 / distance.
+    pixel: side of a pixel, mm.
+    wavelengths: (C,), um.
+    size: number of pixels along a side of a kernel, odd; by default wide enough for 4.5 standard
+        deviations of the blur.
+    nodes: number of fields on one side of the axis, along the longer side of the picture, see
+        `grid_method`.
+    layers: number of distances for a depth map.
+    kind: of the kernels, as in `psf`.
+    tolerance: of the kernels, and of their interpolation between the nodes of the grid: the root of
+        the sum of the squared errors of a kernel's pixels. This is the RMS error of a picture of
+        white noise of variance 1.
+    sampling: of the kernels, instead of `kind` and `tolerance`.
+
+    Returns a `RenderMethod`. Warns of light outside of kernels that are too small. ValueError
+    inside a trace, for invalid numbers, and where no light arrives.
+    """
+    known = known_values((lens, distance, pixel, wavelengths))
+    if known is None:
+        raise ValueError(
+            "inside jax.jit or jax.vmap fields and rays cannot be chosen: call "
+            "drt_jax.converge(drt_jax.render, ...) outside and pass it on, sampling=..."
+        )
+    with jax.core.eval_context():
+        lens, distance, pixel, wavelengths = known
+        check_pixel(pixel)
+        if len(shape) != 2 or min(shape) < 1:
+            raise ValueError(f"shape: expected the height and width of a picture, got {shape}")
+        waves = lens.checked_wavelengths(wavelengths).reshape(-1)
+        focal = float(np.mean(np.asarray(first_order(lens, jnp.inf, waves).effective_focal_length)))
+        if not 0 < abs(focal) < np.inf:
+            raise ValueError("lens: without a focal length it makes no picture")
+        far = layer_distances(distance, shape, layers)
+        side = float(np.asarray(pixel))
+        angles = _angles(lens, shape, far, side, focal, waves)
+        given = lens, Scene.grid(angles[None], far, waves), side, size, nodes, kind
+        grid = grid_method(*given, sampling or tolerance, norm=2)
+        both = (shape[0], shape[1])
+        length = jnp.asarray(focal, lens.curvature.dtype)
+        method = RenderMethod(grid, length, jnp.zeros(0, jnp.int32), both, both)
+        return chosen(lens, method, waves, tolerance)
+
+
+def layer_distances(distance: Numbers, shape: tuple[int, int], layers: int) -> np.ndarray:
+    """Distances (D,), mm, of the layers of a known distance or depth map, the nearest first."""
+    far = np.asarray(distance, float)
+    if far.ndim and far.shape != tuple(shape):
+        raise ValueError(
+            f"distance: expected one number or a depth map of {shape[0]} x {shape[1]} pixels, as "
+            f"the picture, got {' x '.join(map(str, far.shape))}"
+        )
+    if not np.all(far >= NEAREST):
+        raise ValueError(
+            "distance: must be above 0 mm everywhere, inf for infinity, and nowhere below "
+            f"{NEAREST:g} mm; got {np.min(far):g}"
+        )
+    ends = 1 / np.min(far), 1 / np.max(far)
+    if ends[0] == ends[1]:
+        return np.ravel(far)[:1]
+    with np.errstate(divide="ignore"):
+        return 1 / np.linspace(*ends, max(layers, 2))
+
+
+def _angles(
+    lens: Lens, shape: tuple[int, int], far: np.ndarray, pixel: float, focal: float, waves: Array
+) -> np.ndarray:
+    """Largest fields (2,), radians along x and y, whose image points lie at the edges of the
+    picture, or as far outside as chief rays exist and image heights rise with the field."""
+    half = np.array([shape[1], shape[0]]) / 2 * pixel
+    corners = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * half
+    tangents = corners[:, None] * _TRIED[None, :, None] / abs(focal)
+    scene = Scene.grid(np.arctan(tangents).reshape(-1, 2), far[[0, -1]], waves)
+    points = np.asarray(_chief_points(lens, checked_scene(lens, scene)))
+    points = points.reshape(2, *tangents.shape[:2], -1, 2)
+    exists = np.isfinite(points)
+    units = corners / np.sum(corners**2, axis=1, keepdims=True)
+    radii = np.sum(np.where(exists, points, 0) * units[None, :, None, None], axis=-1)
+    radii = np.where(np.all(exists, axis=-1), np.abs(radii), np.nan)
+    farthest = 1.0
+    for ray in np.moveaxis(radii, 2, -1).reshape(-1, len(_TRIED)):
+        rising = np.concatenate([[True], np.diff(ray) > 0])  # also False for a NaN
+        end = len(ray) if np.all(rising) else int(np.argmin(rising))
+        reached = np.flatnonzero(ray[:end] >= 1)
+        farthest = max(farthest, _TRIED[reached[0] if len(reached) else end - 1])
+    return np.arctan(np.minimum(half / abs(focal) * farthest, _WIDEST))
+
+
+@functools.partial(jit, wanted=LARGE)
+def _chief_points(lens: Lens, scene: Scene) -> Array:
+    """Points (..., W, 2), mm, where chief rays meet the sensor; inf where one fails. No search."""
+
+    def one(point: Scene) -> Array:
+        centre = jnp.zeros(1, lens.curvature.dtype)
+        bundle = trace_bundle(lens, point, (centre, centre), solve_aimed)
+        hits = jnp.concatenate([h[-1] for h in bundle.hits], axis=-1)
+        return jnp.where(reaches_sensor(bundle.status), hits, jnp.inf)
+
+    return over_points(one, scene)
 
 
 def _check_method(method: RenderMethod, distance: Numbers, pixel: Numbers) -> None:

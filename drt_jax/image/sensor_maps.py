@@ -5,12 +5,16 @@ between them. The kernels vary over the picture in one of two ways. Either all k
 combinations of the kernels at a few positions (a basis), or the kernels within a tile are blended
 from those at its four corners. A picture of few pixels or with a small blur favours the basis, a
 large picture the corners; `chosen` takes what costs less for a tolerance.
+
+In both, the kernel of a pixel is sum_r shares_r kernel_r. The R kernels are the same for all pixels
+of a tile; the shares are the pixel's own. So a tile costs one FFT, and one inverse FFT for each
+kernel.
 """
 
 import dataclasses
 import functools
 import warnings
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +23,19 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
+from ..lens.scene import Scene
 from ..numerics import Numbers, brief, einsum, matmul, safe_divide, safe_sqrt
-from .blur import SIDES
 from .fields import GridMethod, KernelGrid, kernel_grid
-from .grid_method import warn_of_loss
 from .interpolate import at_point, lagrange
+from .kernel import Pixels
+from .psf import warn_of_loss
 
 # Numbers of nodes along each axis from which positions, and kernels or light, are interpolated; and
 # the steps of Newton's method.
 SMOOTH, LOCAL = 6, 4
 _NEWTON = 6
+# Sides of the squares that are transformed: sizes with fast FFTs.
+_SIDES = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 # Side of the FFTs with a basis of kernels, unless the kernels are large.
 _FFT_SIDE = 256
 # Largest number of kernels in a basis.
@@ -111,13 +118,12 @@ def _maps(grid: KernelGrid, method: RenderMethod) -> Maps:
     colours, far = grid.solid_angle.shape[-1], len(grid.vergences)
     few = len(method.places) > 0
     y, x = (np.arange(n + 1) * t for n, t in zip(tiles_of(method), method.tile, strict=True))
-    where = controls(method) if few else (y, x)
 
     def one(index: Array) -> tuple[Array, Array, Array, Array | None]:
-        part = index // colours, index % colours
-        g = _kernels_at(grid, method, *part, where)
+        plane = _plane(grid, method, index // colours, index % colours)
+        g = _kernels_at(plane, method, controls(method) if few else (y, x))
         kernels, shares = _parts(g, method.places) if few else (g, None)
-        return *_sources(grid, method, *part), kernels, shares
+        return *_sources(plane, method), kernels, shares
 
     # One distance and colour after the other, because the kernels of all positions take much
     # memory.
@@ -175,7 +181,11 @@ def chosen(
     Warns if kernels truncate light, and if the error exceeds the tolerance.
     """
     grid = kernel_grid(lens, wavelengths, method.grid)
-    warn_of_loss(lens, method.grid, grid, wavelengths)
+    y, x = (np.arange(-n, n + 1) * float(grid.step) for n in grid.half)
+    fields = np.arctan(np.stack(np.meshgrid(x, y), -1))
+    nodes = Scene.grid(fields.reshape(-1, 2), method.grid.distances, wavelengths)
+    pixels = Pixels(method.grid.pixel, method.grid.size)
+    warn_of_loss(lens, nodes, grid.outside, pixels, method.grid.sampling)
     places: list[int] = []
     blend = left = 0.0
     for distance in range(len(grid.vergences)):
@@ -184,10 +194,10 @@ def chosen(
             blend = max(blend, _blend_error(g, controls(method)))
             left = max(left, _greedy(g.reshape(-1, method.grid.size**2), places, tolerance))
     size = method.grid.size
-    wide = next((n for n in SIDES if n >= max(2 * size, _FFT_SIDE)), 3 * size)
+    wide = next((n for n in _SIDES if n >= max(2 * size, _FFT_SIDE)), 3 * size)
     # Each option: cost as transformed values for each pixel, error, side of a tile, positions.
     ways = [(len(places) * (wide / (wide - size + 1)) ** 2, left, wide - size + 1, places or [0])]
-    for side in SIDES:
+    for side in _SIDES:
         if (tile := side - size + 1) >= side / 2:
             ways.append((4 * (side / tile) ** 2, blend * tile**2, tile, []))
     good = [way for way in ways if way[1] <= tolerance]
@@ -247,72 +257,77 @@ def _greedy(rows: np.ndarray, places: list[int], tolerance: float) -> float:
 @functools.partial(jit, wanted=LARGE)
 def _kernels_of(grid: KernelGrid, method: RenderMethod, distance: Array, colour: Array) -> Array:
     """G (My, Mx, K, K) of one distance and colour at the positions of the maps."""
-    return _kernels_at(grid, method, distance, colour, controls(method))
+    return _kernels_at(_plane(grid, method, distance, colour), method, controls(method))
 
 
-def _table(grid: KernelGrid, method: RenderMethod, distance: Array, colour: Array) -> Array:
-    """Image points (Ny, Nx, 2) of one distance and colour, in units of step x focal length, so
-    that each is near the indices of its own node."""
-    return grid.points[distance][:, :, colour] / (grid.step * method.focal)
+class _Plane(NamedTuple):
+    """A kernel grid at one distance and colour. On the sensor, lengths are in units of step x focal
+    length, so that the image point of a node is near its own indices, counted from the axis.
+
+    points: (Ny, Nx, 2), image points of the nodes.
+    light, outside, kernels: (Ny, Nx, ...), as in `KernelGrid`.
+    pixel: (), side of a pixel.
+    """
+
+    points: Array
+    light: Array
+    outside: Array
+    kernels: Array
+    pixel: Array
+
+    @property
+    def half(self) -> Array:
+        """Number of nodes on each side of the axis, along x and y."""
+        down, across = self.light.shape
+        return jnp.array([across // 2, down // 2], self.pixel.dtype)
 
 
-def _points(method: RenderMethod, where: tuple[np.ndarray, np.ndarray], dtype: Any) -> Array:
-    """Points (My, Mx, 2), mm on the sensor, of positions in pixels along y and x."""
+def _plane(grid: KernelGrid, method: RenderMethod, distance: Array, colour: Array) -> _Plane:
+    """The plane of one distance and colour, given by their indices."""
+    unit = grid.step * method.focal
+    arrays = grid.points, grid.solid_angle, grid.outside, grid.kernels
+    points, *others = (a[distance][:, :, colour] for a in arrays)
+    return _Plane(points / unit, *others, method.grid.pixel / unit)
+
+
+def _places(plane: _Plane, method: RenderMethod, where: tuple[np.ndarray, np.ndarray]) -> Array:
+    """Points (My, Mx, 2) of the sensor at positions in pixels along y and x."""
     middle = (np.array(method.shape) - 1) / 2
     places = np.stack(np.meshgrid(where[1] - middle[1], where[0] - middle[0]), -1)
-    return jnp.asarray(places, dtype) * method.grid.pixel
+    return jnp.asarray(places, plane.pixel.dtype) * plane.pixel
 
 
-def _sources(
-    grid: KernelGrid, method: RenderMethod, distance: Array, colour: Array
-) -> tuple[Array, Array]:
-    """Sources (My, Mx, 2), pixels of the ideal picture, and relative light (My, Mx) of one
-    distance and colour."""
-    unit, dtype = grid.step * method.focal, grid.step.dtype
-    table = _table(grid, method, distance, colour)
-    light = grid.solid_angle[distance][:, :, colour]
-    half = jnp.asarray(method.grid.half[::-1], dtype)
-    axis = light[method.grid.half[0], method.grid.half[1]]
-    middle = (np.array(method.shape) - 1) / 2
-    wanted = _points(method, controls(method), dtype)
-    nodes = jax.vmap(jax.vmap(lambda p: _source(method, table, p / unit)[0]))(wanted)
-    sources = nodes * (unit / method.grid.pixel)
-    sources = sources + jnp.asarray(middle[::-1], dtype).reshape(1, 1, 2)
-    level = jax.vmap(jax.vmap(lambda u: at_point(light, u + half, LOCAL)))(nodes)
+def _sources(plane: _Plane, method: RenderMethod) -> tuple[Array, Array]:
+    """Sources (My, Mx, 2), pixels of the ideal picture, and relative light (My, Mx)."""
+    half = plane.half
+    axis = plane.light[method.grid.half[0], method.grid.half[1]]
+    middle = jnp.asarray((np.array(method.shape[::-1]) - 1) / 2, half.dtype)
+
+    def one(place: Array) -> tuple[Array, Array]:
+        source, _ = _source(plane, place)
+        return source / plane.pixel + middle, at_point(plane.light, source + half, LOCAL)
+
+    sources, level = jax.vmap(jax.vmap(one))(_places(plane, method, controls(method)))
     return sources, jnp.maximum(level, 0) / jnp.where(axis > 0, axis, 1)
 
 
-def _kernels_at(
-    grid: KernelGrid,
-    method: RenderMethod,
-    distance: Array,
-    colour: Array,
-    where: tuple[np.ndarray, np.ndarray],
-) -> Array:
-    """G (My, Mx, K, K) of one distance and colour at given positions."""
-    light, outside, kernels = (
-        a[distance][:, :, colour] for a in (grid.solid_angle, grid.outside, grid.kernels)
-    )
-    table = _table(grid, method, distance, colour)
-    g = functools.partial(_sensor_kernel, method, grid.step, table, light, outside, kernels)
-    wanted = _points(method, where, grid.step.dtype)
-    return jax.lax.map(jax.checkpoint(jax.vmap(g)), wanted)  # row by row, to save memory
+def _kernels_at(plane: _Plane, method: RenderMethod, where: tuple[np.ndarray, np.ndarray]) -> Array:
+    """G (My, Mx, K, K) at given positions."""
+    row = jax.vmap(functools.partial(_sensor_kernel, plane))
+    # Row by row, to save memory.
+    return jax.lax.map(jax.checkpoint(row), _places(plane, method, where))
 
 
-def _source(method: RenderMethod, table: Array, wanted: Array) -> tuple[Array, Array]:
-    """Source of a sensor point, by Newton's method on the interpolated image points.
-
-    method: sizes of the grid.
-    table: (Ny, Nx, 2), image points, see `_table`.
-    wanted: (2,), sensor point in the same units.
+def _source(plane: _Plane, wanted: Array) -> tuple[Array, Array]:
+    """Source of a sensor point (2,), by Newton's method on the interpolated image points.
 
     Returns the source u (2,), in nodes from the axis, and its Jacobian du / d(sensor point),
     (2, 2).
     """
-    half = jnp.asarray(method.grid.half[::-1], table.dtype)
+    half = plane.half
 
     def image(u: Array) -> Array:
-        return at_point(table, u + half, SMOOTH)
+        return at_point(plane.points, u + half, SMOOTH)
 
     def inverse(u: Array) -> Array:
         (a, b), (c, d) = jax.jacfwd(image)(u)
@@ -326,42 +341,62 @@ def _source(method: RenderMethod, table: Array, wanted: Array) -> tuple[Array, A
     return u, inverse(u)
 
 
-def _sensor_kernel(
-    method: RenderMethod,
-    step: Array,
-    table: Array,
-    light: Array,
-    outside: Array,
-    kernels: Array,
-    corner: Array,
-) -> Array:
-    """Kernel G (K, K) as seen from a sensor point (2,), mm. Element k is the light that reaches the
+def _sensor_kernel(plane: _Plane, point: Array) -> Array:
+    """Kernel G (K, K) as seen from a sensor point (2,). Element k is the light that reaches the
     point p from the source of p - k: the kernel of that source at k, times its solid angle.
 
     The source of p - k is linearised, u - (du / dp) k, and the kernel is interpolated there. G is
     normalised to the sum 1 - outside.
     """
-    size = method.grid.size
-    unit = step * method.focal
-    u, slope = _source(method, table, corner / unit)
+    (down, across, size, _), half = plane.kernels.shape, plane.half
+    u, slope = _source(plane, point)
     k = np.arange(size) - size // 2
-    shift = jnp.asarray(np.stack(np.meshgrid(k, k), -1), u.dtype) * (method.grid.pixel / unit)
-    half = jnp.asarray(method.grid.half[::-1], u.dtype)
-    end = 2 * half
+    shift = jnp.asarray(np.stack(np.meshgrid(k, k), -1), u.dtype) * plane.pixel
     moved = (u + half).reshape(1, 1, 2) - einsum("ab,yxb->yxa", slope, shift)
     # Up to half a step beyond the nodes, where light from outside of the picture comes from.
-    places = jnp.clip(moved, -0.5, end.reshape(1, 1, 2) + 0.5)
-    down, across = table.shape[:2]
-    (row, wy), (column, wx) = (
-        lagrange(places[..., 1], down, LOCAL),
-        lagrange(places[..., 0], across, LOCAL),
-    )
-    values = (kernels * light[..., None, None]).reshape(down * across, size * size)
+    places = jnp.clip(moved, -0.5, 2 * half.reshape(1, 1, 2) + 0.5)
+    row, wy = lagrange(places[..., 1], down, LOCAL)
+    column, wx = lagrange(places[..., 0], across, LOCAL)
+    values = (plane.kernels * plane.light[..., None, None]).reshape(down * across, size * size)
     own = jnp.arange(size * size, dtype=jnp.int32).reshape(size, size)
     total = jnp.zeros((size, size), u.dtype)
     for i in range(wy.shape[-1]):
         for j in range(wx.shape[-1]):
             taken = values[(row + i) * across + column + j, own]
             total = total + wy[..., i] * wx[..., j] * taken
-    kept = 1 - at_point(outside, jnp.clip(u + half, 0, end), LOCAL)
+    kept = 1 - at_point(plane.outside, jnp.clip(u + half, 0, 2 * half), LOCAL)
     return safe_divide(total, jnp.sum(total, keepdims=True)) * kept
+
+
+def blur_row(
+    light: Array, kernels: Array, shares: Array, across: Array, tile: tuple[int, int]
+) -> Array:
+    """Blurs a row of n tiles.
+
+    light: (C, height + K - 1, n width + K - 1), the tiles with a margin of context.
+    kernels: (n, C, R, K, K) for each tile, or (1, ...) for all tiles; a pixel collects kernel[k] of
+        the light k pixels before it, as in a convolution.
+    shares: (C, R, height, M) or (1, ...), weight of each kernel in each row of pixels, at M nodes
+        along the row.
+    across: (n width, M), matrix that interpolates the shares from the nodes to pixels.
+    tile: height and width of a tile, pixels.
+
+    Returns (C, height, n width).
+    """
+    size, channels = kernels.shape[-1], len(light)
+    (height, width), count = tile, len(across) // tile[1]
+    ends = height + size - 1, width + size - 1
+    sides = tuple(next((s for s in _SIDES if s >= end), end) for end in ends)
+    tiles = jnp.stack([light[:, :, j * width : j * width + ends[1]] for j in range(count)])
+    spectra = jnp.fft.rfft2(tiles, sides)  # (n, C, ...)
+
+    def added(total: Array, pair: tuple[Array, Array]) -> tuple[Array, None]:
+        """Adds the light blurred with one kernel, times its shares."""
+        kernel, share = pair
+        blurred = jnp.fft.irfft2(spectra * jnp.fft.rfft2(kernel, sides), sides)
+        inside = blurred[..., size - 1 : ends[0], size - 1 : ends[1]]
+        each = einsum("cym,xm->cyx", share, across)
+        return total + each * jnp.moveaxis(inside, 0, 2).reshape(total.shape), None
+
+    start = jnp.zeros((channels, height, count * width), light.dtype)
+    return jax.lax.scan(added, start, (jnp.moveaxis(kernels, 2, 0), jnp.moveaxis(shares, 1, 0)))[0]

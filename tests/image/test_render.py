@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 
 import drt_jax
 from drt_jax import Scene, learn
-from drt_jax.image import blur, interpolate, render as rendering, sensor_maps
+from drt_jax.image import interpolate, render as rendering, sensor_maps
 
 PIXEL, SIDE = 0.15, 48
 WAVES = (0.6, 0.48)
@@ -53,7 +53,7 @@ def test_a_row_of_tiles_is_blurred_by_each_pixels_own_kernel():
     lines, across = random.random((2, 3, 8, 4)), random.random((16, 4))
     shares = lines @ across.T
     given = map(jnp.asarray, (light, kernels, lines, across))
-    found = np.asarray(blur.blur_row(*given, (8, 8)))
+    found = np.asarray(sensor_maps.blur_row(*given, (8, 8)))
     assert found.shape == (2, 8, 16)
     for y, x in ((0, 0), (3, 7), (7, 8), (5, 13)):
         kernel = np.einsum("crij,cr->cij", kernels[0], shares[:, :, y, x])
