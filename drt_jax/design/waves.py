@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..image.beam import Beam, beam_of
+from ..image.beam import Beam, BeamRule, beam_of
 from ..image.beam_psf import Kind, psf_of_beam
 from ..image.encircled import encircled
 from ..image.kernel import check_pixels
@@ -47,11 +47,11 @@ def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Array]) ->
     light = jnp.where(rays.arrives, light, 0)
     # The azimuths of `gauss_points` determine no more azimuthal terms.
     azimuths = rays.rule.order if isinstance(rays.rule, Gauss | Soft) else degree
+    rule = BeamRule(rays.rule, degree, azimuths=azimuths)
 
     def one(field: Array, distance: Array, points: Vector, light: Array, bundle: Bundle) -> Array:
-        options = rays.symmetry, degree, not full, azimuths
         scene = Scene(field, distance, rays.wavelengths)
-        return function(beam_of(lens, scene, points, light, bundle, *options))
+        return function(beam_of(lens, scene, rule, points, light, bundle))
 
     # `steps` is the only field without an axis of rays; it is not used here and is replaced.
     of_rays = rays.points, light, rays.bundle._replace(steps=light)

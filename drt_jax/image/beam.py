@@ -7,7 +7,6 @@ more rays.
 """
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import jax
@@ -21,10 +20,10 @@ from ..numerics import einsum, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.mask import Mask
 from ..pupil.patterns import disc, half_disc, meridian
-from ..pupil.rules import Pattern, PupilRule, Symmetry, fits
+from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, fits
 from ..rays.solve import Solver, solve
 from ..rays.status import reaches_sensor
-from ..rays.system import dot
+from ..rays.system import Vector, dot
 from ..rays.trace import Bundle, trace_bundle
 from .wavefront import reference_curvature
 from .zernike import Polynomials, fitted
@@ -36,14 +35,7 @@ _MAX_SPOT = 0.3
 _BOUNDS = 16
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=(
-        *("points", "weights", "hits", "direction", "path", "index", "motion", "curvature"),
-        *("known", "mask"),
-    ),
-    meta_fields=("degree", "azimuths", "clipped"),
-)
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Beam:
     """Rays of W wavelengths that represent all light of an object point; Q rays over the part of
@@ -77,9 +69,9 @@ class Beam:
     motion: Array
     curvature: Array
     known: Array
-    degree: int
-    azimuths: int
-    clipped: bool
+    degree: int = dataclasses.field(metadata={"static": True})
+    azimuths: int = dataclasses.field(metadata={"static": True})
+    clipped: bool = dataclasses.field(metadata={"static": True})
     mask: Mask | None = None
 
     @property
@@ -93,9 +85,7 @@ class Beam:
         # The origin of the sensor moves by `move`; rays are extended to the new plane.
         move = step * self.motion[:, None, None]
         ahead = safe_divide(jnp.broadcast_to(move[2], self.path.shape), self.direction[2])
-        hits = self.hits
-        for k in range(2):
-            hits = hits.at[k, -1].add(ahead * self.direction[k] - move[k])
+        hits = self.hits.at[:, -1].add(ahead[None] * self.direction[:2] - move[:2])
         path = self.path + self.index[:, None] * dot(tuple(self.direction), tuple(move))
         farther = step * jnp.sign(self._along_motion())
         curvature = safe_divide(self.curvature, 1 + farther * self.curvature)
@@ -247,11 +237,13 @@ class BeamRule:
     rule: pupil rule of the rays.
     degree: static, degree of the polynomials.
     mask: mask in the stop, or None.
+    azimuths: static, as in `Beam`; None for `degree`.
     """
 
     rule: PupilRule
     degree: int = dataclasses.field(metadata={"static": True})
     mask: Mask | None = None
+    azimuths: int | None = dataclasses.field(default=None, metadata={"static": True})
 
 
 def beam_rule(degree: int, symmetry: Symmetry, clipped: PupilRule | None = None) -> BeamRule:
@@ -282,33 +274,22 @@ def trace_beam(lens: Lens, scene: Scene, rule: BeamRule, solver: Solver = solve)
     """
     points, weights = rule.rule.points(lens, scene)
     bundle = trace_bundle(lens, scene, points, solver)
-    symmetry: Symmetry = rule.rule.symmetry
-    weights = jnp.where(fits(symmetry, scene.field), weights, 0)
-    weights = weights * rule.rule.transmission(lens, bundle)
-    clipped = isinstance(rule.rule, Clipped)
-    beam = beam_of(lens, scene, points, weights, bundle, symmetry, rule.degree, clipped)
-    return dataclasses.replace(beam, mask=rule.mask)
+    weights = jnp.where(fits(rule.rule.symmetry, scene.field), weights, 0)
+    return beam_of(
+        lens, scene, rule, points, weights * rule.rule.transmission(lens, bundle), bundle
+    )
 
 
 def beam_of(
-    lens: Lens,
-    scene: Scene,
-    points: tuple[Array, ...],
-    weights: Array,
-    bundle: Bundle,
-    symmetry: Symmetry,
-    degree: int,
-    clipped: bool,
-    azimuths: int | None = None,
+    lens: Lens, scene: Scene, rule: BeamRule, points: Vector, weights: Array, bundle: Bundle
 ) -> Beam:
     """The beam of traced rays.
 
     lens, scene: what was traced.
-    points, symmetry: points on the stop and symmetry of the pupil rule.
-    weights: (W, Q), weights of the rule times the transmission of the rays.
+    rule: degree of the polynomials, and the symmetry and kind of the rays.
+    points: their points on the stop.
+    weights: (W, Q), weights of the pupil rule times the transmission of the rays.
     bundle: the traced rays.
-    degree, clipped: as in `Beam`.
-    azimuths: as in `Beam`; None for `degree`.
 
     Rays of a part of the pupil are repeated, rotated or mirrored, so that they cover all of it.
     """
@@ -323,20 +304,20 @@ def beam_of(
     total = jnp.sum(known, axis=-1, keepdims=True).astype(path.dtype)
     mean = safe_divide(jnp.sum(path, axis=-1, keepdims=True), total)
     path = jnp.where(known, path - jax.lax.stop_gradient(mean), 0)
-    turns, mirrors = _images(symmetry, degree)
-    images, motion = len(turns) * len(mirrors), lens.sensor_motion
+    images, motion = _images(rule.rule.symmetry, rule.degree), lens.sensor_motion
 
     def spread(vector: Sequence[Array]) -> Array:
-        """A vector (D components) of all rays and their images."""
-        return _spread(turns, mirrors, vector)
+        """Vectors of rays, D arrays (..., Q), and their images: (2, ..., I Q)."""
+        found = einsum("ikd,d...q->k...iq", jnp.asarray(images, path.dtype), jnp.stack(vector))
+        return found.reshape(*found.shape[:-2], -1)
 
     def repeated(values: Array) -> Array:
         """A scalar of all rays and their images."""
-        return jnp.tile(jnp.broadcast_to(values, known.shape), (1, images))
+        return jnp.tile(jnp.broadcast_to(values, known.shape), (1, len(images)))
 
     beam = Beam(
         points=spread([jnp.broadcast_to(p, known.shape) for p in points]),
-        weights=repeated(weights) / images,
+        weights=repeated(weights) / len(images),
         hits=spread(hits),
         direction=jnp.concatenate([spread(arrival[:-1]), repeated(arrival[-1])[None]]),
         path=repeated(path),
@@ -344,9 +325,10 @@ def beam_of(
         motion=jnp.array([0, 0, 1], index.dtype) if motion is None else motion,
         curvature=reference_curvature(lens, scene.wavelengths),
         known=repeated(known),
-        degree=degree,
-        azimuths=degree if azimuths is None else azimuths,
-        clipped=clipped,
+        degree=rule.degree,
+        azimuths=rule.degree if rule.azimuths is None else rule.azimuths,
+        clipped=not isinstance(rule.rule, Gauss | Pattern),
+        mask=rule.mask,
     )
     return _with_placeholders(beam)
 
@@ -378,24 +360,14 @@ def _extent(places: Array, known: Array, margin: float) -> tuple[Array, Array]:
     return middle - half, middle + half
 
 
-def _images(symmetry: Symmetry, degree: int) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Azimuths of the rotations, and signs of x of the reflections, that extend rays of a part
-    of the pupil to all of it."""
+def _images(symmetry: Symmetry, degree: int) -> np.ndarray:
+    """Linear maps (I, 2, D), rotations or reflections, that take vectors of rays on a part of the
+    pupil, D components, to all of it."""
     if symmetry == "rotational":
-        azimuths = 2 * degree + 1
-        return 2 * np.pi * np.arange(azimuths) / azimuths, (1,)
-    return np.zeros(1), ((1, -1) if symmetry == "bilateral" else (1,))
-
-
-def _spread(turns: np.ndarray, mirrors: tuple[int, ...], vector: Sequence[Array]) -> Array:
-    """Vectors of rays, D arrays (..., Q), rotated and mirrored: (2, ..., images x Q)."""
-    if len(vector) == 1:
-        # Python floats, because NumPy's would promote float32 to float64.
-        sides = zip(np.cos(turns).tolist(), np.sin(turns).tolist())
-        parts = [(x * vector[0], y * vector[0]) for x, y in sides]
-    else:
-        parts = [(sign * vector[0], vector[1]) for sign in mirrors]
-    return jnp.stack([jnp.concatenate(side, axis=-1) for side in zip(*parts)])
+        turns = 2 * np.pi * np.arange(2 * degree + 1) / (2 * degree + 1)
+        return np.stack([np.cos(turns), np.sin(turns)], axis=-1)[..., None]
+    signs = (1, -1) if symmetry == "bilateral" else (1,)
+    return np.array([[[sign, 0], [0, 1]] for sign in signs])
 
 
 def means(values: Array, weights: Array) -> Array:

@@ -61,11 +61,7 @@ class SeparableKernel(NamedTuple):
 
 
 def gaussian_psf(
-    mean: Numbers,
-    covariance: Numbers,
-    pixel: Numbers,
-    size: int = 21,
-    form: Form = "integrated",
+    mean: Numbers, covariance: Numbers, pixel: Numbers, size: int = 21, form: Form = "integrated"
 ) -> Array:
     """Gaussian kernels of C channels.
 
@@ -82,17 +78,16 @@ def gaussian_psf(
     other shapes, for known values that are not finite, and for a pixel not above 0. Inside a trace,
     a channel with such values (an infinite covariance if no ray arrives) is 0, with derivatives 0.
     """
-    kernel = _gaussian(*_checked(mean, covariance, pixel, size, form), size, form)
-    assert not isinstance(kernel, SeparableKernel)
-    return kernel
+    centroid, spread, void = _in_pixels(*_checked(mean, covariance, pixel, size, form))
+    if form == "sampled":
+        kernel = _sampled(centroid, spread, size)
+    else:
+        kernel = normalised(_integrated(centroid, spread, size), (-2, -1))
+    return jnp.where(void[:, None, None], 0, kernel)
 
 
 def separable_psf(
-    mean: Numbers,
-    covariance: Numbers,
-    pixel: Numbers,
-    size: int = 21,
-    form: Form = "integrated",
+    mean: Numbers, covariance: Numbers, pixel: Numbers, size: int = 21, form: Form = "integrated"
 ) -> SeparableKernel:
     """`gaussian_psf` for diagonal covariances, as a row and a column for each channel, see
     `Moments.separable`.
@@ -101,51 +96,22 @@ def separable_psf(
 
     ValueError as there, and for a known xy other than 0.
     """
-    centroid, matrix, side = _checked(mean, covariance, pixel, size, form)
-    if concrete(covariance) and np.any(np.asarray(matrix)[:, [0, 1], [1, 0]]):
+    checked = _checked(mean, covariance, pixel, size, form)
+    if concrete(covariance) and np.any(np.asarray(checked[1])[:, [0, 1], [1, 0]]):
         raise ValueError("covariance: xy must be 0 for a separable kernel; use gaussian_psf")
-    kernel = _gaussian(centroid, jnp.diagonal(matrix, 0, 1, 2), side, size, form)
-    assert isinstance(kernel, SeparableKernel)
-    return kernel
+    centroid, spread, void = _in_pixels(*checked)
+    lines = _profiles(centroid, jnp.diagonal(spread, 0, 1, 2), size, form)
+    if form == "integrated":
+        lines = normalised(lines)
+    lines = jnp.where(void[:, None, None], 0, lines)
+    return SeparableKernel(column=lines[:, 1], row=lines[:, 0])
 
 
 def gaussian_shares(mean: Array, covariance: Array, pixel: Array, size: int) -> Array:
     """`gaussian_psf` without checks and without normalisation: the sum of a kernel is the
     fraction of its light that falls on the grid."""
-    kernel = _gaussian(mean, covariance, pixel, size, "integrated", whole=False)
-    assert not isinstance(kernel, SeparableKernel)
-    return kernel
-
-
-def _gaussian(
-    mean: Array, covariance: Array, side: Array, size: int, form: Form, whole: bool = True
-) -> SeparableKernel | Array:
-    """The kernel of checked arguments.
-
-    covariance: (C, 2, 2); or variances (C, 2) for a separable kernel.
-    whole: True to normalise an integrated kernel to the sum 1.
-    """
-    usable = (side > 1 / _FAR) & (side < _FAR)
-    side = jnp.where(usable, side, 1)
-    known = jnp.isfinite(mean), jnp.isfinite(covariance)
-    void = ~(jnp.all(known[0], axis=1) & jnp.all(known[1], axis=tuple(range(1, covariance.ndim))))
-    void = void | ~usable
-    far, wide = _FAR * side, _WIDE * side**2
-    mean = jnp.clip(jnp.where(known[0], mean, 0), -far, far) / side
-    covariance = jnp.clip(jnp.where(known[1], covariance, 0), -wide, wide) / side**2
-    dtype = mean.dtype
-    kernel: SeparableKernel | Array
-    if form == "sampled":
-        centres = jnp.arange(size, dtype=dtype)[None, None] - (size - 1) / 2
-        kernel = _sampled(centres - mean[..., None], covariance)
-    else:
-        edges = jnp.arange(size + 1, dtype=dtype)[None, None] - size / 2
-        kernel = _integrated(edges - mean[..., None], covariance)
-        if whole and isinstance(kernel, SeparableKernel):
-            kernel = SeparableKernel(*(normalised(part, (-1,)) for part in kernel))
-        elif whole:
-            kernel = normalised(jnp.asarray(kernel), (-2, -1))
-    return jax.tree.map(lambda k: jnp.where(jnp.expand_dims(void, range(1, k.ndim)), 0, k), kernel)
+    mean, covariance, void = _in_pixels(mean, covariance, pixel)
+    return jnp.where(void[:, None, None], 0, _integrated(mean, covariance, size))
 
 
 def _checked(
@@ -193,67 +159,89 @@ def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> 
     return Pixels(side, int(size))
 
 
-def _standardise(offset: Array, variance: Array) -> tuple[Array, Array]:
-    """offset / sigma, and a mask that is True where the Gaussian is not treated as a point."""
+def _in_pixels(mean: Array, covariance: Array, side: Array) -> tuple[Array, Array, Array]:
+    """Centroids (C, 2) and covariances (C, 2, 2) in pixels, within the limits of this module; and
+    True (C,) for a kernel that is 0, because its numbers or the pixel are not usable."""
+    usable = (side > 1 / _FAR) & (side < _FAR)
+    side = jnp.where(usable, side, 1)
+    known = jnp.isfinite(mean), jnp.isfinite(covariance)
+    void = ~(jnp.all(known[0], axis=1) & jnp.all(known[1], axis=(1, 2)) & usable)
+    far, wide = _FAR * side, _WIDE * side**2
+    mean = jnp.clip(jnp.where(known[0], mean, 0), -far, far) / side
+    covariance = jnp.clip(jnp.where(known[1], covariance, 0), -wide, wide) / side**2
+    return mean, covariance, void
+
+
+def _grid(count: int, mean: Array) -> Array:
+    """Distances (C, 2, count) of grid points, 1 pixel apart, from the centroids (C, 2)."""
+    places = jnp.arange(count, dtype=mean.dtype) - (count - 1) / 2
+    return places[None, None] - mean[..., None]
+
+
+def _standardise(offset: Array, variance: Array) -> tuple[Array, Array, Array]:
+    """offset / sigma, sigma, and a mask that is True where the Gaussian is not treated as a point;
+    elsewhere sigma is 1.
+
+    offset: (C, 2, N), pixels from the centroid.
+    variance: (C, 2), pixels^2.
+    """
     sigma = safe_sqrt(variance)[..., None]
     wide = sigma > _POINT
-    return offset / jnp.where(wide, sigma, 1), wide
+    sigma = jnp.where(wide, sigma, 1)
+    return offset / sigma, sigma, wide
 
 
-def _cumulative(offset: Array, variance: Array) -> Array:
-    """Fraction of a Gaussian below an offset from its centre; a step function for a point.
+def _profiles(mean: Array, variance: Array, size: int, form: Form) -> Array:
+    """A Gaussian along x and along y, (C, 2, size): its integrals over the pixels or, sampled, its
+    densities at their centres, which are 0 for a point.
 
-    offset: (C, N), pixels.
-    variance: (C,), pixels^2.
+    mean, variance: (C, 2), pixels and pixels^2.
     """
-    z, wide = _standardise(offset, variance)
-    step = jnp.heaviside(offset, 0.5)
-    return jnp.where(wide, (1 + erf(z * 0.5**0.5)) / 2, step)
+    if form == "sampled":
+        z, sigma, wide = _standardise(_grid(size, mean), variance)
+        return jnp.where(wide, jnp.exp(-z * z / 2) / (sigma * (2 * jnp.pi) ** 0.5), 0)
+    edges = _grid(size + 1, mean)
+    z, _, wide = _standardise(edges, variance)
+    step = jnp.heaviside(edges, 0.5)  # of a point
+    return jnp.diff(jnp.where(wide, (1 + erf(z * 0.5**0.5)) / 2, step), axis=-1)
 
 
-def _integrated(edges: Array, covariance: Array) -> SeparableKernel | Array:
-    """Integrals of a Gaussian over pixels with the edges (C, 2, size + 1), pixels from the
-    centroid.
+def _integrated(mean: Array, covariance: Array, size: int) -> Array:
+    """Integrals (C, size, size) of a Gaussian over the pixels.
 
     For a correlation r the bivariate normal distribution is the product of its marginals plus the
     integral over a, from 0 to arcsin r, of exp(-(x^2 - 2 x y sin a + y^2) / (2 cos^2 a)) / (2 pi),
     here by 24 Gauss nodes. Differences over the corners of a pixel give its integral. Source:
     Plackett (1954); Drezner and Wesolowsky (1990).
     """
-    diagonal = covariance if covariance.ndim == 2 else jnp.diagonal(covariance, 0, 1, 2)
-    below = [_cumulative(edges[:, i], diagonal[:, i]) for i in range(2)]
-    row, column = (jnp.diff(part, axis=-1) for part in below)
-    if covariance.ndim == 2:
-        return SeparableKernel(column, row)
+    variance = jnp.diagonal(covariance, 0, 1, 2)
+    lines = _profiles(mean, variance, size, "integrated")
     # The part that the correlation adds, see above.
-    (x, wide_x), (y, wide_y) = (_standardise(edges[:, i], diagonal[:, i]) for i in range(2))
-    both = (wide_x & wide_y)[:, 0]
-    scale = jnp.where(both, diagonal[:, 0] * diagonal[:, 1], 1)
+    z, _, wide = _standardise(_grid(size + 1, mean), variance)
+    both = jnp.all(wide[..., 0], axis=-1)
+    scale = jnp.where(both, variance[:, 0] * variance[:, 1], 1)
     ratio = jnp.where(both, covariance[:, 0, 1], 0) / jnp.sqrt(scale)
     ratio = jnp.clip(ratio, -_MAX_CORRELATION, _MAX_CORRELATION)
     limit = jnp.arcsin(ratio)[:, None, None]
     rule = (_ANGLES, _ANGLE_WEIGHTS)
     nodes, weights = (jnp.asarray(a, ratio.dtype).reshape(-1, 1, 1, 1) for a in rule)
     angle = limit[None] * ((1 + nodes) / 2)
-    x, y = (jnp.clip(a, -_DARK, _DARK) for a in (x[None, :, None, :], y[None, :, :, None]))
+    z = jnp.clip(z, -_DARK, _DARK)
+    x, y = z[None, :, 0, None, :], z[None, :, 1, :, None]
     exponent = (x * x - 2 * x * y * jnp.sin(angle) + y * y) / (2 * jnp.cos(angle) ** 2)
     correction = jnp.sum(weights * jnp.exp(-exponent), axis=0) * limit / (4 * jnp.pi)
-    kernel = column[:, :, None] * row[:, None, :]
+    kernel = lines[:, 1, :, None] * lines[:, 0, None, :]
     return kernel + jnp.diff(jnp.diff(correction, axis=-1), axis=-2)
 
 
-def _sampled(offset: Array, covariance: Array) -> SeparableKernel | Array:
-    """Densities of a Gaussian at the pixel centres; 0 for a point."""
-    if covariance.ndim == 2:
-        z, wide = _standardise(offset, covariance)
-        sigma = jnp.where(wide, safe_sqrt(covariance)[..., None], 1)
-        density = jnp.where(wide, jnp.exp(-z * z / 2) / (sigma * (2 * jnp.pi) ** 0.5), 0)
-        return SeparableKernel(density[:, 1], density[:, 0])
+def _sampled(mean: Array, covariance: Array, size: int) -> Array:
+    """Densities (C, size, size) of a Gaussian at the pixel centres; 0 for a point."""
     xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
     determinant = xx * yy - xy * xy
     wide = (determinant > _POINT**2 * (xx + yy)) & (xx > 0) & (yy > 0)
     xx, yy, determinant = (jnp.where(wide, a, 1)[:, None, None] for a in (xx, yy, determinant))
     xy, wide = jnp.where(wide, xy, 0)[:, None, None], wide[:, None, None]
+    offset = _grid(size, mean)
     x, y = offset[:, 0, None, :], offset[:, 1, :, None]
     exponent = (yy * x * x - 2 * xy * x * y + xx * y * y) / (2 * determinant)
     exponent = jnp.maximum(exponent, 0)

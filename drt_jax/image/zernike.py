@@ -66,11 +66,7 @@ def _jacobi(t: Array, degree: int) -> Array:
     return jnp.stack(terms[: degree // 2 + 1])
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("centre", "scale", "coefficients"),
-    meta_fields=("degree",),
-)
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Polynomials:
     """D functions of a point p in a plane, for each of W wavelengths, as Zernike polynomials of
@@ -84,7 +80,7 @@ class Polynomials:
     centre: Array
     scale: Array
     coefficients: Array
-    degree: int
+    degree: int = dataclasses.field(metadata={"static": True})
 
     def at(self, points: Array) -> Array:
         """Values (D, W, Q) of the functions at points (2, W or 1, Q)."""
