@@ -30,10 +30,6 @@ from .image.chief import (
     field_curvature as field_curvature,
     lateral_colour as lateral_colour,
 )
-from .image.coefficients import (
-    zernike_fringe as zernike_fringe,
-    zernike_standard as zernike_standard,
-)
 from .image.converge import converge as converge
 from .image.converged import focus_moments as focus_moments, psf_moments as psf_moments
 from .image.encircled import encircled_energy as encircled_energy
@@ -50,6 +46,10 @@ from .image.spots import (
 )
 from .image.transfer import strehl as strehl, transfer as transfer
 from .image.wavefront import rms_wavefront as rms_wavefront, wavefront as wavefront
+from .image.zernike import (
+    zernike_fringe as zernike_fringe,
+    zernike_standard as zernike_standard,
+)
 from .lens.aperture import Apertures as Apertures
 from .lens.edit import (
     flipped as flipped,

@@ -275,9 +275,8 @@ def trace_beam(lens: Lens, scene: Scene, rule: BeamRule, solver: Solver = solve)
     points, weights = rule.rule.points(lens, scene)
     bundle = trace_bundle(lens, scene, points, solver)
     weights = jnp.where(fits(rule.rule.symmetry, scene.field), weights, 0)
-    return beam_of(
-        lens, scene, rule, points, weights * rule.rule.transmission(lens, bundle), bundle
-    )
+    weights = weights * rule.rule.transmission(lens, bundle)
+    return beam_of(lens, scene, rule, points, weights, bundle)
 
 
 def beam_of(

@@ -3,12 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from .converged import (
-    converged_focus_rule,
-    converged_rule,
-    focus_moments,
-    psf_moments,
-)
+from .converged import converged_focus_rule, converged_rule, focus_moments, psf_moments
 from .encircled import encircled_energy
 from .fields import grid_method, kernel_grid
 from .psf import converged_psf, psf

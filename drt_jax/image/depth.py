@@ -109,10 +109,7 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMom
 
 
 def moments_model(
-    lens: Lens,
-    trained: tuple[str, ...],
-    scene: Scene,
-    tolerance: float = 1e-6,
+    lens: Lens, trained: tuple[str, ...], scene: Scene, tolerance: float = 1e-6
 ) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], Moments]]:
     """The cheapest exact model of the moments for trained parameters. If only the sensor is
     trained, the model is a polynomial in the sensor position and 1/distance; otherwise it traces

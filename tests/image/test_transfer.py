@@ -11,8 +11,8 @@ from scipy.special import fresnel
 
 import drt_jax
 from drt_jax import Clipped, Gauss, Scene, Status, load_lens
-from drt_jax.image import coefficients, transfer
-from drt_jax.image.beam import beam_of
+from drt_jax.image import transfer, zernike
+from drt_jax.image.beam import BeamRule, beam_of
 from drt_jax.lens.forms import fringe_terms
 from drt_jax.lens.scene import checked_scene
 from drt_jax.rays.trace import trace_bundle
@@ -213,16 +213,17 @@ def slopes(lens, field):
         scene = checked_scene(lens, Scene.point(field, np.inf, WAVES[:2]))
         bundle = trace_bundle(lens, scene, points)
         passes = jnp.where(bundle.status == Status.OK, np.append(0, pattern[1])[None], 0)
-        beam = beam_of(lens, scene, points, passes, bundle, "none", 8, True)
+        rule = BeamRule(drt_jax.Clipped(5, "none"), 8)
+        beam = beam_of(lens, scene, rule, points, passes, bundle)
         view = lens, Scene.radians(field[None], np.inf, WAVES[:2])
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(transfer, "beams_of", lambda *_: jax.tree.map(lambda a: a[None], beam))
-            patch.setattr(coefficients, "disc", lambda *_: pattern)
-            patch.setattr(coefficients, "trace_bundle", lambda *_: bundle)
+            patch.setattr(zernike, "disc", lambda *_: pattern)
+            patch.setattr(zernike, "trace_bundle", lambda *_: bundle)
             for module, name in (
                 (transfer, "_transfer"),
                 (transfer, "_strehl"),
-                (coefficients, "_least_squares"),
+                (zernike, "_least_squares"),
             ):
                 patch.setattr(module, name, getattr(module, name).__wrapped__)
             models = {
