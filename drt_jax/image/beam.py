@@ -21,7 +21,6 @@ from ..pupil.clipped import Clipped
 from ..pupil.mask import Mask
 from ..pupil.patterns import disc, half_disc, meridian
 from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, fits
-from ..rays.solve import Solver, solve
 from ..rays.status import reaches_sensor
 from ..rays.system import Vector, dot
 from ..rays.trace import Bundle, trace_bundle
@@ -265,15 +264,14 @@ def beam_rule(degree: int, symmetry: Symmetry, clipped: PupilRule | None = None)
     return BeamRule(Pattern(*pattern(order, degree + 1), symmetry), degree)
 
 
-def trace_beam(lens: Lens, scene: Scene, rule: BeamRule, solver: Solver = solve) -> Beam:
+def trace_beam(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
     """Traces the beam of an object point.
 
     lens, scene: the lens, and the object point with its wavelengths.
     rule: rays and degree, see `beam_rule`.
-    solver: of the rays; the beam is differentiable in the modes of the solver.
     """
     points, weights = rule.rule.points(lens, scene)
-    bundle = trace_bundle(lens, scene, points, solver)
+    bundle = trace_bundle(lens, scene, points)
     weights = jnp.where(fits(rule.rule.symmetry, scene.field), weights, 0)
     weights = weights * rule.rule.transmission(lens, bundle)
     return beam_of(lens, scene, rule, points, weights, bundle)
@@ -292,7 +290,7 @@ def beam_of(
 
     Rays of a part of the pupil are repeated, rotated or mirrored, so that they cover all of it.
     """
-    known = reaches_sensor(bundle.status)
+    known, shape = reaches_sensor(bundle.status), bundle.status.shape
     index = lens.index(scene.wavelengths)[-1]
     hits = [jnp.where(known, h, 0) for h in bundle.hits]
     arrival = [jnp.where(known, a, 0) for a in bundle.arrival]
@@ -312,41 +310,30 @@ def beam_of(
 
     def repeated(values: Array) -> Array:
         """A scalar of all rays and their images."""
-        return jnp.tile(jnp.broadcast_to(values, known.shape), (1, len(images)))
+        return jnp.tile(jnp.broadcast_to(values, shape), (1, len(images)))
 
-    beam = Beam(
-        points=spread([jnp.broadcast_to(p, known.shape) for p in points]),
-        weights=repeated(weights) / len(images),
+    known, weights = repeated(known), repeated(weights) / len(images)
+    direction = jnp.concatenate([spread(arrival[:-1]), repeated(arrival[-1])[None]])
+    # Placeholders for each wavelength of which no light arrives: rays of weight 0 on a spiral over
+    # the unit disc, so that fits and all that follows from them stay finite.
+    arrives = jnp.sum(weights, axis=-1, keepdims=True) > 0
+    place = np.arange(known.shape[-1]) + 0.5
+    spiral = np.sqrt(place / len(place)) * np.exp(2.4j * place)
+    inside = jnp.asarray(np.stack([spiral.real, spiral.imag])[:, None], path.dtype)
+    return Beam(
+        points=jnp.where(arrives, spread([jnp.broadcast_to(p, shape) for p in points]), inside),
+        weights=jnp.where(arrives, weights, 0),
         hits=spread(hits),
-        direction=jnp.concatenate([spread(arrival[:-1]), repeated(arrival[-1])[None]]),
+        direction=jnp.where(arrives, direction, jnp.concatenate([inside, inside[:1]])),
         path=repeated(path),
         index=index,
         motion=jnp.array([0, 0, 1], index.dtype) if motion is None else motion,
         curvature=reference_curvature(lens, scene.wavelengths),
-        known=repeated(known),
+        known=known | ~arrives,
         degree=rule.degree,
         azimuths=rule.degree if rule.azimuths is None else rule.azimuths,
         clipped=not isinstance(rule.rule, Gauss | Pattern),
         mask=rule.mask,
-    )
-    return _with_placeholders(beam)
-
-
-def _with_placeholders(beam: Beam) -> Beam:
-    """The beam with placeholder rays for each wavelength of which no light arrives: rays of
-    weight 0 on a spiral over the unit disc, so that fits and all that follows from them stay
-    finite."""
-    count = beam.path.shape[-1]
-    place = np.arange(count) + 0.5
-    spiral = np.sqrt(place / count) * np.exp(2.4j * place)
-    disc = jnp.asarray(np.stack([spiral.real, spiral.imag])[:, None], beam.path.dtype)
-    arrives = beam.throughput[:, None] > 0
-    return dataclasses.replace(
-        beam,
-        points=jnp.where(arrives, beam.points, disc),
-        weights=jnp.where(arrives, beam.weights, 0),
-        direction=jnp.where(arrives, beam.direction, jnp.concatenate([disc, disc[:1]])),
-        known=beam.known | ~arrives,
     )
 
 

@@ -41,7 +41,7 @@ from ..rays.system import Vector
 from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
-from .refined import refine
+from .refined import refine, require_known
 from .rounding import hit_rounding, warn_dtype
 from .spot import Moments
 
@@ -87,8 +87,7 @@ def psf_moments(lens: Lens, scene: Scene, sampling: float | PupilRule = _TOLERAN
     `lens.scene.checked_scene`, and if no ray of a wavelength arrives, with the surfaces that stop
     its light. Inside a trace its `throughput` is then 0 and its covariance inf.
     """
-    found = _moments(lens, scene, sampling, at_sensor)
-    return found.at(lens.sensor)
+    return _moments(lens, scene, sampling, at_sensor).at(lens.sensor)
 
 
 def focus_moments(
@@ -228,13 +227,7 @@ def find_rule(
     Returns the trial of that rule. ValueError inside a trace.
     """
     tolerance = require_tolerance(tolerance)
-    known = known_values((lens, scene))
-    if known is None:
-        raise ValueError(
-            "inside jax.jit or jax.vmap the number of rays cannot follow from a tolerance: make "
-            "the rule outside and pass it on, sampling=drt_jax.converge(drt_jax.psf_moments, lens, "
-            "scene, tolerance)"
-        )
+    known = require_known((lens, scene), "the number of rays", "psf_moments")
     # `eval_context` leaves any trace that this is called in, so all that follows is known.
     with jax.core.eval_context():
         lens, scene = known

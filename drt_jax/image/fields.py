@@ -9,7 +9,7 @@ and y, give the others; both are exact on pixels.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +19,15 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, over_points, vergence_of
-from ..numerics import Numbers, brief, concrete, einsum, known_values
+from ..numerics import Numbers, brief, einsum
 from ..pupil.rules import Gauss, Symmetry, symmetry_of
 from ..rays.solve import solve_aimed
 from .beam_psf import Kind, Sampling
 from .interpolate import lagrange
+from .kernel import check_pixels
 from .moments import moments
 from .psf import chosen_psf, psf
+from .refined import require_known
 from .spot import Moments
 
 # Number of nodes along each axis from which a kernel is interpolated.
@@ -238,19 +240,16 @@ def grid_method(
     Returns a `GridMethod`. ValueError inside a trace, for invalid numbers, and if no light arrives
     from any field.
     """
-    known = known_values((lens, scene, pixel))
-    if known is None:
-        raise ValueError(
-            "the choice of fields and rays follows from known numbers: call "
-            "drt_jax.converge(drt_jax.kernel_grid, ...) outside of jax.jit and jax.vmap, and pass "
-            "on what it returns"
-        )
+    known = require_known((lens, scene, pixel), "the choice of fields", "kernel_grid")
     with jax.core.eval_context():
         lens, scene, pixel = known
         scene = checked_scene(lens, scene)
-        check_pixel(pixel)
+        pixel = check_pixels(pixel, 1, lens.curvature.dtype).side
         _check_counts(size, nodes)
-        far, wide = np.ravel(np.asarray(scene.distance, float)), _widest(scene)
+        far = np.ravel(np.asarray(scene.distance, float))
+        wide = np.tan(np.max(np.abs(np.asarray(scene.field, float).reshape(-1, 2)), axis=0))
+        if not np.max(wide) > 0:
+            raise ValueError("fields: expected one beside the axis")
         step = float(np.max(wide)) / nodes
         across, down = (max(2, int(np.ceil(a / step - 1e-9))) for a in wide)
         half = down, across
@@ -263,7 +262,7 @@ def grid_method(
             raise ValueError("fields: no light of any of them reaches the sensor")
         if size is None:
             sigma = np.sqrt(np.diagonal(np.asarray(found.covariance), 0, -2, -1))[arrives]
-            need = 2 * int(np.ceil(_REACH * np.max(sigma) / float(np.asarray(pixel)))) + 1
+            need = 2 * int(np.ceil(_REACH * np.max(sigma) / float(pixel))) + 1
             size = next((n for n in _SIZES if n >= need), _SIZES[-1])
         if not isinstance(sampling, Sampling):
             where = Scene.grid(*_extremes(tangents, far, arrives), scene.wavelengths)
@@ -272,26 +271,9 @@ def grid_method(
         # For each node, the nearest one with light.
         squared = np.sum((tangents[:, None] - tangents[None]) ** 2, axis=-1)
         nearest = np.argmin(np.where(arrives[:, None], squared[None], np.inf), axis=-1)
-        numbers = (jnp.asarray(a, lens.curvature.dtype) for a in (step, far, pixel))
-        sizes = half, size, symmetry, together
-        return GridMethod(*numbers, sampling, jnp.asarray(nearest, jnp.int32), *sizes)
-
-
-def check_pixel(pixel: Numbers) -> None:
-    """ValueError if the side of a pixel is known and is not above 0 mm."""
-    if concrete(pixel):
-        side = np.asarray(pixel, float)
-        if side.ndim or not 0 < side < np.inf:
-            raise ValueError(f"pixel: must be above 0 mm, got {pixel!r}")
-
-
-def _widest(scene: Scene) -> np.ndarray:
-    """Tangents (2,) of the largest field angles along x and y. ValueError unless one is above 0."""
-    angles = np.asarray(scene.field, float).reshape(-1, 2)
-    wide = np.tan(np.max(np.abs(angles), axis=0))
-    if not np.max(wide) > 0:
-        raise ValueError("fields: expected one beside the axis")
-    return cast(np.ndarray, wide)
+        step_, far_ = (jnp.asarray(a, lens.curvature.dtype) for a in (step, far))
+        near = jnp.asarray(nearest, jnp.int32)
+        return GridMethod(step_, far_, pixel, sampling, near, half, size, symmetry, together)
 
 
 def _check_counts(size: Any, nodes: Any) -> None:

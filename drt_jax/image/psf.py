@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple, cast, get_args
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from .beam import Beam, BeamRule, beam_rule, trace_beam
 from .beam_psf import Kind, Psf, Sampling, psf_of_beam
 from .converged import at_sensor, find_rule
 from .kernel import Pixels, check_pixels
-from .refined import STEP, refine
+from .refined import STEP, beams_of, refine, require_known
 from .rounding import below_double, hit_rounding, path_rounding, warn_dtype
 from .wave_psf import period
 from .zernike import zernike
@@ -160,12 +160,7 @@ def chosen_psf(
     require_tolerance(tolerance)
     if norm not in (1, 2):
         raise ValueError(f"norm: expected 1 or 2, got {norm!r}")
-    known = known_values((lens, scene, pixel))
-    if known is None:
-        raise ValueError(
-            "inside jax.jit or jax.vmap the cost of a kernel cannot follow from a tolerance: make "
-            "the sampling outside and pass it on, sampling=drt_jax.converge(drt_jax.psf, ...)"
-        )
+    known = require_known((lens, scene, pixel), "the cost of a kernel", "psf")
     with jax.core.eval_context():
         lens, scene, pixel = known
         scene = checked_scene(lens, scene)
@@ -182,7 +177,7 @@ def chosen_psf(
         def fits() -> Iterator[tuple[int, list[Beam]]]:
             """Degrees of polynomials, with beams that have enough rays for them."""
             for degrees in _DEGREES:
-                beams = [_traced(lens, one, rule_of(degrees[-1])) for one in scenes]
+                beams = [beams_of(lens, one, rule_of(degrees[-1])) for one in scenes]
                 yield from ((degree, beams) for degree in degrees)
 
         def misfit(fit: tuple[int, list[Beam]]) -> float:
@@ -204,12 +199,6 @@ def chosen_psf(
         warn_dtype(lens, "kernels", worst, tolerance, "", 3)
         view = dataclasses.replace(view, rounded=worst)
         return view.sampling(kind, rule_of(degree), tolerance), view
-
-
-@functools.partial(jit, wanted=LARGE)
-def _traced(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
-    """`trace_beam`, compiled."""
-    return trace_beam(lens, scene, rule)
 
 
 # Each number of cells needs its own compiled program, which runs once for each beam.
@@ -321,7 +310,7 @@ def warn_of_loss(
     if known is not None:
         with jax.core.eval_context():
             lens, scene, outside, pixels = known
-            beam = lambda k: _traced(lens, scene.each()[k], sampling.rule)  # noqa: E731
+            beam = lambda k: beams_of(lens, scene.each()[k], sampling.rule)  # noqa: E731
             _warn(np.asarray(outside), beam, scene.wavelengths, pixels, sampling.kind, 4)
 
 
@@ -376,11 +365,11 @@ def _misfit(
     cosines, waves = beam.on_sphere()
     rows = jax.tree.map(np.asarray, (beam.weights, beam.known, waves, beam.hits[:, -1]))
     weight, known, path, hits = (a[..., index, :] for a in rows)
-    weight = np.sqrt(np.where(known, np.abs(weight), 0) / np.sum(np.abs(weight)))
-    middle = _mean(hits, weight)
-    spread = np.sqrt(np.sum((weight * (hits - middle)) ** 2))
+    share = np.where(known, np.abs(weight), 0) / np.sum(np.abs(weight))
+    middle = np.sum(share * hits, axis=-1, keepdims=True)
+    spread = np.sqrt(np.sum(share * (hits - middle) ** 2))
     points, directions = (np.asarray(a[:, index]) for a in (beam.points, cosines))
-    error = _residual(points, hits - middle, weight, degree) - 2 * rounded["hits"]
+    error = _residual(points, hits - middle, share, degree) - 2 * rounded["hits"]
     error /= max(float(spread), float(pixel))
     if "phase" not in rounded:
         return error
@@ -388,27 +377,21 @@ def _misfit(
     # in place of 2 pi. The tilt towards the centroid is removed, as in `Beam.over_directions`.
     path = path + float(beam.index[index]) * np.sum(np.float64(middle) * directions, axis=0)
     phase = path[None] * (4 * np.pi * _UM / float(wavelengths[index]))
-    return max(error, _residual(directions, phase, weight, degree) - 2 * rounded["phase"])
+    return max(error, _residual(directions, phase, share, degree) - 2 * rounded["phase"])
 
 
-def _mean(hits: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weighted mean (D, 1) of hits (D, Q); `weight` (Q,) is the square root of the normalised
-    light."""
-    return cast(np.ndarray, np.sum(weight**2 * hits, axis=-1, keepdims=True))
-
-
-def _residual(points: np.ndarray, values: np.ndarray, weight: np.ndarray, degree: int) -> float:
+def _residual(points: np.ndarray, values: np.ndarray, share: np.ndarray, degree: int) -> float:
     """RMS residual of a fit of polynomials of a degree.
 
     points: (2, Q).
     values: (D, Q).
-    weight: (Q,), square root of the normalised light.
+    share: (Q,), normalised light.
     degree: of the polynomials.
     """
-    centre = _mean(points, weight)
-    scale = 2 * np.sqrt(np.sum(weight**2 * (points - centre) ** 2, axis=-1, keepdims=True))
+    centre = np.sum(share * points, axis=-1, keepdims=True)
+    scale = 2 * np.sqrt(np.sum(share * (points - centre) ** 2, axis=-1, keepdims=True))
     basis = np.asarray(zernike(jnp.asarray((points - centre) / scale), degree))
-    matrix, right = (np.float64(a * weight).T for a in (basis, values))
+    matrix, right = (np.float64(a * np.sqrt(share)).T for a in (basis, values))
     found = np.linalg.lstsq(matrix, right, rcond=None)[0]
     return float(np.sqrt(np.sum((matrix @ found - right) ** 2)))
 

@@ -32,6 +32,21 @@ STEP = 0.75
 TOLERANCE = 1e-3
 
 
+def require_known(tree: Any, what: str, function: str) -> Any:
+    """The numbers of a tree, from which a sampling is chosen. ValueError inside `jit` and `vmap`.
+
+    tree: arguments of the choice.
+    what, function: what is chosen, and the public function that takes it, for the message.
+    """
+    known = known_values(tree)
+    if known is None:
+        raise ValueError(
+            f"inside jax.jit or jax.vmap {what} cannot follow from a tolerance: make the sampling "
+            f"outside and pass it on, sampling=drt_jax.converge(drt_jax.{function}, ...)"
+        )
+    return known
+
+
 def refine(
     trials: Iterable[T], error: Callable[..., float], tolerance: float, together: int = 2
 ) -> tuple[list[T], float]:

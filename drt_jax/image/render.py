@@ -26,13 +26,15 @@ from ..inputs import require_tolerance
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import NEAREST, Scene, checked_scene, over_points, vergence_of
-from ..numerics import Numbers, concrete, einsum, known_values, safe_divide, safe_sqrt
+from ..numerics import Numbers, concrete, einsum, safe_divide, safe_sqrt
 from ..rays.solve import solve_aimed
 from ..rays.status import reaches_sensor
 from ..rays.trace import trace_bundle
 from .beam_psf import Kind, Sampling
-from .fields import check_pixel, grid_method
+from .fields import grid_method
 from .interpolate import basis, cubic
+from .kernel import check_pixels
+from .refined import require_known
 from .sensor_maps import (
     LOCAL,
     SMOOTH,
@@ -196,23 +198,17 @@ def render_method(
     Returns a `RenderMethod`. Warns of light outside of kernels that are too small. ValueError
     inside a trace, for invalid numbers, and where no light arrives.
     """
-    known = known_values((lens, distance, pixel, wavelengths))
-    if known is None:
-        raise ValueError(
-            "inside jax.jit or jax.vmap fields and rays cannot be chosen: call "
-            "drt_jax.converge(drt_jax.render, ...) outside and pass it on, sampling=..."
-        )
+    known = require_known((lens, distance, pixel, wavelengths), "the choice of fields", "render")
     with jax.core.eval_context():
         lens, distance, pixel, wavelengths = known
-        check_pixel(pixel)
         if len(shape) != 2 or min(shape) < 1:
             raise ValueError(f"shape: expected the height and width of a picture, got {shape}")
+        side = float(check_pixels(pixel, 1, lens.curvature.dtype).side)
         waves = lens.checked_wavelengths(wavelengths).reshape(-1)
         focal = float(np.mean(np.asarray(first_order(lens, jnp.inf, waves).effective_focal_length)))
         if not 0 < abs(focal) < np.inf:
             raise ValueError("lens: without a focal length it makes no picture")
         far = layer_distances(distance, shape, layers)
-        side = float(np.asarray(pixel))
         angles = _angles(lens, shape, far, side, focal, waves)
         given = lens, Scene.grid(angles[None], far, waves), side, size, nodes, kind
         grid = grid_method(*given, sampling or tolerance, norm=2)
@@ -283,10 +279,8 @@ def _check_method(method: RenderMethod, distance: Numbers, pixel: Numbers) -> No
     """ValueError if known numbers are not those that the method was made for."""
     if concrete(distance):
         layer_distances(distance, method.shape, 2)
-    for name, given, own in (
-        ("pixel", pixel, method.grid.pixel),
-        ("distance", distance, method.grid.distances),
-    ):
+    pairs = {"pixel": (pixel, method.grid.pixel), "distance": (distance, method.grid.distances)}
+    for name, (given, own) in pairs.items():
         if not concrete((given, own)) or np.ndim(np.asarray(given)):
             continue
         known = np.asarray(own)
@@ -309,13 +303,9 @@ def _picture(image: Array, channels: int) -> Array:
 
 
 def _whole(
-    maps: Maps,
-    method: RenderMethod,
-    picture: Array,
-    progress: Callable,
-    layer: int = 0,
-    lit: bool = True,
-) -> Any:
+    maps: Maps, method: RenderMethod, picture: Array, progress: Callable, layer: int = 0,
+    lit: bool = True
+) -> Any:  # fmt: skip
     """All rows of tiles of a picture (H, W, C), see `_strip`. layer: index of the distance."""
     (height, width), tile, rows = method.shape, method.tile[0], tiles_of(method)[0]
     picture = jnp.asarray(picture)
@@ -361,9 +351,8 @@ def composed(
     away = jnp.stack([jnp.abs(at - v) for v in vergences])
     label = jnp.argmin(away, axis=0)
     dtype = picture.dtype
-    total: Any = 0.0
-    cover: Any = 0.0
-    open_: Any = 1.0
+    total = cover = jnp.zeros_like(picture)
+    open_ = jnp.ones_like(picture)
     for layer in range(len(vergences)):
         own = (label == layer)[..., None].astype(dtype)
         known = (label >= layer)[..., None].astype(dtype)
@@ -375,7 +364,7 @@ def composed(
         total = total + open_ * part
         cover = cover + open_ * covered
         open_ = open_ * (1 - covered)
-    return safe_divide(jnp.asarray(total), jnp.asarray(cover))
+    return safe_divide(total, cover)
 
 
 def spread(values: Array, known: Array) -> Array:

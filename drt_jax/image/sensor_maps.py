@@ -92,8 +92,7 @@ def sensor_maps(lens: Lens, method: RenderMethod, wavelengths: Numbers) -> Maps:
     method: from `render_method`.
     wavelengths: (C,), um.
     """
-    grid = kernel_grid(lens, wavelengths, method.grid)
-    return _maps(grid, method)
+    return _maps(kernel_grid(lens, wavelengths, method.grid), method)
 
 
 def controls(method: RenderMethod) -> tuple[np.ndarray, np.ndarray]:
@@ -286,8 +285,8 @@ def _plane(grid: KernelGrid, method: RenderMethod, distance: Array, colour: Arra
     """The plane of one distance and colour, given by their indices."""
     unit = grid.step * method.focal
     arrays = grid.points, grid.solid_angle, grid.outside, grid.kernels
-    points, *others = (a[distance][:, :, colour] for a in arrays)
-    return _Plane(points / unit, *others, method.grid.pixel / unit)
+    points, light, outside, kernels = (a[distance][:, :, colour] for a in arrays)
+    return _Plane(points / unit, light, outside, kernels, method.grid.pixel / unit)
 
 
 def _places(plane: _Plane, method: RenderMethod, where: tuple[np.ndarray, np.ndarray]) -> Array:
