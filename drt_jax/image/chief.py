@@ -36,10 +36,9 @@ from ..numerics import (
     safe_divide,
     safe_sqrt,
 )
-from ..rays.afocal import FOCAL
 from ..rays.status import reaches_sensor
 from ..rays.system import Vector, determinant, divide
-from ..rays.trace import trace_bundle
+from ..rays.trace import FOCAL, trace_bundle
 from .field import CHIEF
 from .rounding import warn_of_focus
 

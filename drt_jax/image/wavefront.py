@@ -23,10 +23,9 @@ from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray, paraxial_system
 from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
-from ..rays.afocal import FOCAL
 from ..rays.status import Status, reaches_sensor
 from ..rays.system import dot
-from ..rays.trace import Bundle, stop_points, trace_bundle
+from ..rays.trace import FOCAL, Bundle, stop_points, trace_bundle
 from .rounding import warn_of_paths
 
 _MM = 1e-3  # per um
@@ -57,7 +56,7 @@ def reference_curvature(lens: Lens, wavelengths: Array) -> Array:
 
     Returns (W,): positive for a pupil in front of the sensor, 0 for a telecentric lens. Tilts and
         decentres are neglected. For an afocal lens it is that behind the ideal lens of
-        `rays.afocal`.
+        `rays.trace.at_infinity`.
     """
     height, slope = chief_ray(paraxial_system(lens, wavelengths), front=False)
     at_sensor = height + slope * (lens.sensor - lens.vertices[-2])

@@ -20,8 +20,7 @@ from jax import Array
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import run_if
-from ..rays.aim import beam_size, paraxial_launch
-from ..rays.fan import nearest_start, no_fan, trace_fan
+from ..rays.aim import beam_size, nearest_start, no_fan, paraxial_launch, trace_fan
 from ..rays.system import System, system_of
 from . import boundary
 from .boundary import EdgeRays, Rays, Target

@@ -1,11 +1,13 @@
 """Aiming: the launch point of a ray that crosses the stop at a given point.
 
 Newton's method in the launch point of one ray, mapped over a bundle, starts at the paraxial launch.
-Only the rays that fail start again, from the nearest rays that were found, or from a fan.
+Only the rays that fail start again, from the nearest rays that were found, or from a fan of rays
+over the first surface.
 """
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,10 +20,9 @@ from ..lens.forms import Shape
 from ..lens.paraxial import trace_yu
 from ..lens.surface import vertex_curvature
 from ..numerics import run_if, safe_divide, safe_sqrt
-from .fan import nearest_start, no_fan, trace_fan
-from .snell import shoot_to_stop
+from .snell import shoot, shoot_to_stop, split_stop
 from .status import Status
-from .system import System, Vector, determinant, divide, dot
+from .system import System, Vector, add, determinant, divide, dot, subtract, where
 
 # A ray is aimed if it misses its stop point by less than `_NEAR` times the beam radius. Newton's
 # method converges quadratically, so that one more step reaches the point to rounding, and the ray
@@ -33,6 +34,10 @@ _STEPS, _PATIENCE = 48, 12
 # Largest number of rounds in which a bundle is aimed again from the rays that were found. The
 # bundled lenses at twice their apertures and fields need 3.
 _ROUNDS = 8
+# The fan has `_TILES` tiles per side, each with `_FAN` rays per side. The first guesses for a stop
+# point are taken from its `STARTS` nearest tiles: from each tile the ray that crosses the stop
+# nearest to the stop point.
+_TILES, _FAN, STARTS = 15, 5, 24
 
 
 class _State(NamedTuple):
@@ -82,8 +87,14 @@ class AimNewton(optx.AbstractRootFinder):
 
     def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
         """One trial."""
-        trial = tuple(a + b for a, b in zip(y, state.move, strict=True))
-        miss, columns, status = _derivatives(lambda y: fn(y, args), trial)
+        trial = add(y, state.move)
+
+        def derivative(unit):
+            return jax.jvp(lambda y: fn(y, args), (trial,), (unit,), has_aux=True)
+
+        # The miss, its derivatives by each coordinate of the trial, and the status, in one trace.
+        units = tuple(jnp.asarray(u, y[0].dtype) for u in np.eye(len(y)))
+        miss, columns, status = jax.vmap(derivative, out_axes=(None, 0, None))(units)
         folded = determinant(columns) < 0
         counts = (status == Status.OK) & ~(folded & options.get("upright", False))
         far = jnp.where(counts, self.norm(miss), jnp.inf)
@@ -91,8 +102,8 @@ class AimNewton(optx.AbstractRootFinder):
         newton = tuple(-a for a in divide(columns, miss))
         bound = jnp.where(jnp.isinf(state.far), options["reach"], 2 * self.norm(state.move))
         newton = tuple(a * jnp.minimum(1, safe_divide(bound, self.norm(newton))) for a in newton)
-        move = tuple(jnp.where(better, a, b / 2) for a, b in zip(newton, state.move, strict=True))
-        y = tuple(jnp.where(better, a, b) for a, b in zip(trial, y, strict=True))
+        move = where(better, newton, tuple(a / 2 for a in state.move))
+        y = where(better, trial, y)
         bad = jnp.where(better, 0, state.bad + 1).astype(jnp.int32)
         folded = jnp.where(better, folded, state.folded)
         return y, _State(move, jnp.minimum(far, state.far), bad, folded), status
@@ -106,23 +117,7 @@ class AimNewton(optx.AbstractRootFinder):
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Takes the remaining step of an aimed ray."""
-        near = state.far <= self.atol
-        y = tuple(a + jnp.where(near, b, 0) for a, b in zip(y, state.move, strict=True))
-        return y, aux, {}
-
-
-def _derivatives(function: Callable, y: Vector) -> tuple[Vector, Vector, Any]:
-    """Value and derivatives of a function of D numbers, from one trace by JVPs.
-
-    Returns the value, D numbers; its derivatives by each argument, D arrays (D,); and the auxiliary
-    output of the function.
-    """
-    units = tuple(jnp.asarray(u, y[0].dtype) for u in np.eye(len(y)))
-
-    def along(unit):
-        return jax.jvp(function, (y,), (unit,), has_aux=True)
-
-    return jax.vmap(along, out_axes=(None, 0, None))(units)
+        return add(y, where(state.far <= self.atol, state.move, 0)), aux, {}
 
 
 class Aimed(NamedTuple):
@@ -162,7 +157,7 @@ def aim(
     def one(own, target, launch):
         def miss(launch, target):
             crossing, status = shoot_to_stop(own, launch)
-            return tuple(a - b for a, b in zip(crossing, target, strict=True)), status
+            return subtract(crossing, target), status
 
         solution: optx.Solution = optx.root_find(
             miss,
@@ -190,19 +185,6 @@ def aim(
     return Aimed(launch, status, folded, jnp.max(steps).astype(jnp.int32))
 
 
-class _Growth(NamedTuple):
-    """State of `aim_outwards`.
-
-    aimed: the bundle so far.
-    more: (), bool, whether another round may find more rays.
-    rounds: (), int32, number of rounds so far.
-    """
-
-    aimed: Aimed
-    more: Array
-    rounds: Array
-
-
 def aim_outwards(system: System, target: Vector) -> Aimed:
     """Aims rays at stop points in rounds, outwards from the rays that were found.
 
@@ -217,36 +199,35 @@ def aim_outwards(system: System, target: Vector) -> Aimed:
     upright = system.rows.rotation is None
     waves = target[0].shape[0]
 
-    def again(state: _Growth) -> _Growth:
-        aimed, first = state.aimed, state.rounds == 0
+    def again(state: tuple[Aimed, Array, Array]) -> tuple[Aimed, Array, Array]:
+        """One round. The state: the bundle so far, whether another round may find more rays, and
+        the number of rounds so far.
+        """
+        aimed, _, rounds = state
+        first = rounds == 0
         ok = aimed.status == Status.OK
-
-        def from_found(launch: Vector) -> Vector:
-            return nearest_found(launch, ok, target)
 
         def from_fan(launch: Vector) -> Vector:
             fan = trace_fan(system, no_fan(system, waves, 1), launch, reach)
             return nearest_start(fan, target)
 
-        begin = run_if(~first & jnp.any(ok), from_found, aimed.launch)
+        near = partial(nearest_found, ok=ok, target=target)
+        begin = run_if(~first & jnp.any(ok), near, aimed.launch)
         begin = run_if(~first & ~jnp.any(ok), from_fan, begin)
-        begin = tuple(jnp.where(first | ok, a, b) for a, b in zip(aimed.launch, begin))
+        begin = where(first | ok, aimed.launch, begin)
         step = jnp.where(first, reach, reach / 8)
         new = aim(system, target, begin, (beam, step), upright)
         found = ~ok & (new.status == Status.OK)
-        taken = found | first
-        launch = tuple(jnp.where(taken, a, b) for a, b in zip(new.launch, aimed.launch))
-        status = jnp.where(taken, new.status, aimed.status)
-        folded = jnp.where(taken, new.folded, aimed.folded)
+        launch, status, folded = where(found | first, new[:3], aimed[:3])
         more = (first | jnp.any(found)) & jnp.any(status != Status.OK)
         both = Aimed(launch, status, folded, aimed.steps + new.steps)
-        return _Growth(both, more & (state.rounds < _ROUNDS), state.rounds + 1)
+        return both, more & (rounds < _ROUNDS), rounds + 1
 
     launch = paraxial_launch(system, target, reach)
     none = jnp.full(target[0].shape, Status.UNCONVERGED, jnp.int32)
     start = Aimed(launch, none, jnp.zeros(none.shape, bool), jnp.int32(0))
-    begun = _Growth(start, jnp.bool_(True), jnp.int32(0))
-    return jax.lax.while_loop(lambda state: state.more, again, begun).aimed
+    begun = start, jnp.bool_(True), jnp.int32(0)
+    return jax.lax.while_loop(lambda state: state[1], again, begun)[0]
 
 
 def nearest_found(launch: Vector, ok: Array, target: Vector) -> Vector:
@@ -324,11 +305,103 @@ def paraxial_launch(system: System, target: Vector, width: Array) -> Vector:
         if stop.offset is not None:
             point = point + stop.offset[d]
         amplitude = safe_divide(point - tangent * tilted[-1, d, :, None], axial[-1, d, :, None])
-        start = amplitude * axial[0, d, :, None] + tangent * tilted[0, d, :, None]
-        launch.append(start)
+        launch.append(amplitude * axial[0, d, :, None] + tangent * tilted[0, d, :, None])
     # Transfer from z = `first` to the launch plane.
     depth, near = system.launch_plane - first, 1 / (v * first + 1)
     launch = [a + depth * near * (v * a - s) for a, s in zip(launch, system.source, strict=False)]
     far = safe_sqrt(dot(launch, launch))
     shrink = jnp.minimum(1, 4 * width / jnp.maximum(far, width))
     return tuple(a * shrink for a in launch)
+
+
+def _fan(dim: int, rays: int) -> np.ndarray:
+    """Launch points (D, tiles, rays of a tile) between -1 and 1, denser in the middle.
+
+    dim: D, number of transverse components.
+    rays: number of rays per side of a tile.
+    """
+    side = np.linspace(-1, 1, _TILES * rays)
+    side = (side * (0.3 + 0.7 * side**2)).reshape(_TILES, rays)
+    indices = np.meshgrid(*[np.arange(side.size)] * dim, indexing="ij")
+    points = side.ravel()[np.stack(indices)].reshape(dim, *(_TILES, rays) * dim)
+    tiles = (0, *range(1, 2 * dim, 2), *range(2, 2 * dim + 1, 2))
+    return points.transpose(tiles).reshape(dim, _TILES**dim, rays**dim)
+
+
+class Fan(NamedTuple):
+    """A fan of rays over the first surface.
+
+    launch: D arrays (tiles, rays of a tile), launch points, mm.
+    stop: D arrays (W, tiles, rays of a tile), crossings of the stop by the rays that reach the
+        sensor, mm; inf for the others.
+    """
+
+    launch: Vector
+    stop: Vector
+
+
+def no_fan(system: System, waves: int, rays: int = _FAN) -> Fan:
+    """A fan before it is traced, with launch points scaled to -1 to 1.
+
+    waves: number of wavelengths.
+    rays: number of rays per side of a tile.
+    """
+    points = jnp.asarray(_fan(system.dim, rays), system.index.dtype)
+    nowhere = jnp.full((waves, *points.shape[1:]), jnp.inf, points.dtype)
+    return Fan(tuple(points), (nowhere,) * system.dim)
+
+
+def trace_fan(system: System, fan: Fan, tried: Vector, width: Array) -> Fan:
+    """Traces a fan.
+
+    Pass `fan` and `tried` through the carry of the loop in which this is called: XLA moves work
+    that does not depend on the loop out of it, and would trace the fan even when no ray is missing.
+
+    fan: the fan of `no_fan`.
+    tried: D arrays (W, Q), launch points already tried, mm; the fan reaches at least 1.6 times as
+        far.
+    width: (), radius of the beam on the first surface, mm; the fan reaches at least twice as far.
+    """
+    extent = jnp.maximum(2 * width, 1.6 * jnp.sqrt(jnp.max(dot(tried, tried))))
+    launch = tuple(extent * a for a in fan.launch)
+    shape = fan.stop[0].shape
+    flat = tuple(jnp.broadcast_to(a.reshape(1, -1), (shape[0], a.size)) for a in launch)
+    trace = shoot(system, flat)
+    _, stop = split_stop(system, trace.hits)
+    ok = trace.status == Status.OK
+    return Fan(launch, tuple(jnp.where(ok, a, jnp.inf).reshape(shape) for a in stop))
+
+
+def nearest_start(fan: Fan, target: Vector) -> Vector:
+    """One first guess for each stop point, D arrays (W, Q), launch points, mm.
+
+    Each tile offers its ray that crosses the stop nearest to the centre of the stop; of these rays,
+    the one nearest to the stop point is taken.
+
+    fan: a traced fan.
+    target: D arrays (W, Q), stop points, mm.
+    """
+    central = jnp.argmin(dot(fan.stop, fan.stop), axis=-1)  # (W, tiles)
+    stop = (jnp.take_along_axis(a, central[..., None], axis=-1)[..., 0] for a in fan.stop)
+    gaps = (a[..., None] - b[:, None] for a, b in zip(target, stop, strict=True))
+    tile = jnp.argmin(sum(g * g for g in gaps), axis=-1)
+    return tuple(a[tile, jnp.take_along_axis(central, tile, axis=-1)] for a in fan.launch)
+
+
+def starts_of(fan: Fan, target: Vector, ranks: Array) -> Vector:
+    """N first guesses for each of K stop points, D arrays (W, K, N), launch points, mm.
+
+    Each is the ray of a tile that crosses the stop nearest to the stop point. The tiles are chosen
+    by their ranks, in the order of this distance.
+
+    fan: a traced fan.
+    target: D arrays (W, K), stop points, mm.
+    ranks: (W, K, N), int32, ranks of tiles, 0 for the nearest.
+    """
+    gaps = (a[:, :, None, None] - b[:, None] for a, b in zip(target, fan.stop, strict=True))
+    far = sum(g * g for g in gaps)  # (W, K, tiles, rays)
+    near, which = jnp.min(far, axis=-1), jnp.argmin(far, axis=-1)
+    order = jax.lax.top_k(-near, min(STARTS, near.shape[-1]))[1]
+    order = jnp.take_along_axis(order, ranks, axis=-1, mode="clip")
+    chosen = jnp.take_along_axis(which, order, axis=-1)
+    return tuple(a[order, chosen] for a in fan.launch)

@@ -5,18 +5,19 @@ fitted to the launch points of a few hundred aimed rays. They launch all other r
 which then meet their stop points to rounding. Rays that do not are searched for.
 """
 
+import operator
 from collections.abc import Callable
+from itertools import accumulate
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from ..numerics import einsum, tensordot
 from .aim import aim, beam_size, paraxial_launch
 from .status import Status
-from .system import System, Vector, dot
+from .system import System, Vector, dot, where
 
 # Bundles of more than `_MANY` rays for each wavelength are launched by polynomials and solved in
 # tiles of `_TILE` rays (all wavelengths together), whose arrays on one surface fit the cache of a
@@ -116,18 +117,12 @@ def polynomial_launch(system: System, target: Vector) -> Callable[[Vector], Vect
     coefficients = empty.at[pairs[:, 0], pairs[:, 1]].set(terms)
 
     def at(target):
-        x, y = (_powers(a / radius) for a in target)
+        one = jnp.ones_like(target[0])
+        powers = (accumulate([one, *[a / radius] * _DEGREE], operator.mul) for a in target)
+        x, y = (jnp.stack([*each]) for each in powers)  # x^0 to x^18, y^0 to y^18
         rows = einsum("ijdw,jwq->idwq", coefficients, y)
         fitted = sum((rows[i] * x[i][None] for i in range(1, _DEGREE + 1)), rows[0])
         start = paraxial_launch(system, target, sizes[1])
-        return tuple(jnp.where(all_ok, f, s) for f, s in zip(fitted, start, strict=True))
+        return where(all_ok, tuple(fitted), start)
 
     return at
-
-
-def _powers(x: Array) -> Array:
-    """Powers x^0 to x^_DEGREE along a new first axis."""
-    powers = [jnp.ones_like(x), x]
-    while len(powers) <= _DEGREE:
-        powers.append(powers[-1] * x)
-    return jnp.stack(powers)

@@ -22,7 +22,7 @@ from ..lens.forms import Shape
 from ..lens.surface import by_form, domain, sag_derivatives, sag_slope, surface_sag
 from ..numerics import safe_divide, safe_sqrt
 from .meet import cross
-from .system import Diffraction, System, Vector, dot, rotate
+from .system import Diffraction, System, Vector, add, along, dot, rotate, subtract
 
 
 class Path(NamedTuple):
@@ -37,7 +37,7 @@ class Path(NamedTuple):
         directions, 1/mm.
     length: (R, W, Q), length of the segment in front of each row, mm; 0 for the first, and below 0
         for a sensor in front of the last surface.
-    shrink: (W, Q), 1 / |vergence P_1 - source|, see `geometry`.
+    shrink: (W, Q), 1 / |vergence P_1 - source|, of the first segment.
     """
 
     hits: Vector
@@ -50,34 +50,33 @@ class Path(NamedTuple):
     shrink: Array
 
 
-def _segments(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vector]:
-    """First points, D + 1 arrays (W, Q), and vectors between neighbouring points, (L, W, Q), mm.
+def _chain(hits: Vector, heights: Array, system: System) -> tuple[Vector, Vector]:
+    """First points, D + 1 arrays (W, Q), and segments, D + 1 arrays (R, W, Q), mm.
 
-    The vertices and the points relative to their vertices are subtracted separately, so that no
-    digit is lost far from the origin.
+    The first segment is the vector from the object multiplied by the vergence, see
+    `System.from_object`. The vertices and the points relative to their vertices are subtracted
+    separately, so that no digit is lost far from the origin.
+
+    hits: D arrays (R, W, Q), mm.
+    heights: (R, W, Q), sags there, mm.
     """
     own = rotate(system.rows.rotation, (*hits, heights))
     origin = [a[..., None, None] for a in system.rows.origin(len(hits))]
-    step = tuple((o[1:] - o[:-1]) + (p[1:] - p[:-1]) for o, p in zip(origin, own, strict=True))
-    return tuple(o[0] + p[0] for o, p in zip(origin, own, strict=True)), step
+    step = [(o[1:] - o[:-1]) + (p[1:] - p[:-1]) for o, p in zip(origin, own, strict=True)]
+    first = tuple(o[0] + p[0] for o, p in zip(origin, own, strict=True))
+    chain = zip(system.from_object(first), step, strict=True)
+    return first, tuple(jnp.concatenate([f[None], s]) for f, s in chain)
 
 
 @jax.jit
 def geometry(hits: Vector, system: System) -> Path:
     """Directions, lengths and derivatives of the sag of the paths through given hits.
 
-    The first segment starts at the object point source / vergence. Multiplied by the vergence it is
-    q = vergence P_1 - source, which has the same direction and stays finite and smooth for an
-    object at infinity.
-
     hits: D arrays (R, W, Q), mm.
     """
     rotation = system.rows.rotation
     z, slope, bend = by_form(sag_derivatives, hits, system.rows.wide, system.forms)
-    point, step = _segments(hits, z, system)
-    first = (system.vergence * p - s for p, s in zip(point, system.source, strict=True))
-    front = (jnp.concatenate([f[None], s]) for f, s in zip(first, step, strict=True))
-    chain = tuple(jnp.concatenate([s, s[-1:]]) for s in front)
+    chain = tuple(jnp.concatenate([s, s[-1:]]) for s in _chain(hits, z, system)[1])
     length = _length(chain)
     if len(system.forms) > 1:
         to, off = (tuple(c[k] for c in chain) for k in (-3, -2))
@@ -130,8 +129,8 @@ def residual(path: Path, system: System) -> Vector:
     path that a phase adds. On the sensor F is 0 for any path.
     """
     index, behind = (jnp.broadcast_to(n, path.length.shape) for n in (system.index, system.behind))
-    *across, along = (index * b - behind * a for b, a in zip(path.before, path.after, strict=True))
-    gradient = tuple(c + s * along for c, s in zip(across, path.slope, strict=True))
+    *across, depth = (index * b - behind * a for b, a in zip(path.before, path.after, strict=True))
+    gradient = along(across, depth, path.slope)
     if system.diffraction is None:
         return gradient
     rows, (_, kick, _) = added(path.hits, system.diffraction)
@@ -163,8 +162,7 @@ def ray_at(path: Path, system: System, row: int) -> tuple[Vector, Vector]:
     rotation = None if system.rows.rotation is None else system.rows.rotation[row]
     origin = (a[row] for a in system.rows.origin(system.dim))
     own = rotate(rotation, (*(h[row] for h in path.hits), path.height[row]))
-    point = tuple(o + p for o, p in zip(origin, own, strict=True))
-    return point, rotate(rotation, tuple(b[row] for b in path.before))
+    return add(origin, own), rotate(rotation, tuple(b[row] for b in path.before))
 
 
 def label(path: Path, system: System) -> Vector:
@@ -189,7 +187,7 @@ def met(crossing: Vector, target: Vector, hits: Vector, system: System) -> Array
     hits: D arrays (R, W, Q), mm. The rounding error is relative to the largest of them.
     """
     eps = float(jnp.finfo(hits[0].dtype).eps)
-    miss = tuple(a - b for a, b in zip(crossing, target, strict=True))
+    miss = subtract(crossing, target)
     scale = jnp.max(_width(hits, system), axis=0) + jnp.sqrt(dot(target, target))
     return dot(miss, miss) <= (64 * eps * scale) ** 2
 
@@ -213,18 +211,6 @@ def _inverse(length: Array) -> Array:
     return safe_divide(jnp.ones_like(length), length)
 
 
-def _chain(hits: Vector, system: System) -> tuple[Array, Vector, Vector]:
-    """Heights (R, W, Q), mm; first points, D + 1 arrays (W, Q), mm; and segments (R, W, Q), mm.
-
-    The first segment is the vector from the object multiplied by the vergence.
-    """
-    heights = by_form(surface_sag, hits, system.rows.wide, system.forms)
-    first, step = _segments(hits, heights, system)
-    near = (system.vergence * q - p for q, p in zip(first, system.source, strict=True))
-    chain = (jnp.concatenate([n[None], s]) for n, s in zip(near, step, strict=True))
-    return heights, first, tuple(chain)
-
-
 def optical_path(hits: Vector, system: System, middle: Vector | None = None) -> Array:
     """Optical path (W, Q), mm, from the object to the sensor (paper Eq. 2).
 
@@ -237,18 +223,19 @@ def optical_path(hits: Vector, system: System, middle: Vector | None = None) -> 
         the lengths are summed. In float32 the rounding error is then proportional to the
         differences between paths and not to their length. None for no reference path.
     """
-    heights, first, chain = _chain(hits, system)
+    heights = by_form(surface_sag, hits, system.rows.wide, system.forms)
+    first, chain = _chain(hits, heights, system)
     if middle is None:  # subtract only the vector from the object to the first vertex
         other = tuple(jnp.zeros_like(a).at[0].set(-p) for a, p in zip(chain, system.source))
         moved = tuple(c.at[0].set(q) for c, q in zip(chain, first, strict=True))
     else:
-        middle_heights, _, other = _chain(middle, system)
-        own = tuple(a - b for a, b in zip((*hits, heights), (*middle, middle_heights), strict=True))
+        middle_heights = by_form(surface_sag, middle, system.rows.wide, system.forms)
+        _, other = _chain(middle, middle_heights, system)
+        own = subtract((*hits, heights), (*middle, middle_heights))
         point = rotate(system.rows.rotation, own)
         moved = tuple(jnp.concatenate([p[:1], p[1:] - p[:-1]]) for p in point)
     # `moved` is a - b. In the first segment a - b is divided by the vergence, which may be 0.
-    both = tuple(a + b for a, b in zip(chain, other, strict=True))
-    lengths = safe_divide(dot(moved, both), _length(chain) + _length(other))
+    lengths = safe_divide(dot(moved, add(chain, other)), _length(chain) + _length(other))
     if len(system.forms) > 1:
         shape = Shape(*(a[..., -2, :, :] for a in system.rows.wide))
         slope = sag_slope(tuple(h[-2] for h in hits), shape, system.forms[-2])[1]

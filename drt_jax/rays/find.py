@@ -5,24 +5,31 @@ Fermat equations. A ray that aiming does not find is searched for with a fan. Fo
 `solve`.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax import Array
 
 from ..numerics import run_if
 from . import fermat, linear
-from .aim import aim, aim_outwards, beam_size, paraxial_launch
+from .aim import (
+    STARTS,
+    Fan,
+    aim,
+    aim_outwards,
+    beam_size,
+    nearest_start,
+    no_fan,
+    paraxial_launch,
+    starts_of,
+    trace_fan,
+)
 from .bundle import in_tiles, polynomial_launch, tile_of
-from .fan import STARTS, Fan, nearest_start, no_fan, starts_of, trace_fan
 from .snell import shoot, split_stop
-from .sparse import Lanes
 from .status import Status
-from .system import System, Vector, dot
+from .system import System, Vector, dot, subtract, where
 
 _MAX_STEPS = 16  # Newton steps of the polish
 
@@ -43,94 +50,46 @@ class Found(NamedTuple):
     steps: Array
 
 
-class _State(NamedTuple):
-    """State of the polish.
+def polish(system: System, target: Vector, hits: Vector, active: Array) -> tuple:
+    """Makes the hits of the `active` rays (W, Q) stationary by Newton's method.
 
-    solved: (W, Q), bool, rays that are stationary to rounding.
-    still: (), int32, number of steps in a row that moved no ray.
-    step: (), int32, number of steps so far.
-    """
+    The propagation of `linear` solves the linear system of a step. All rays step together. A ray
+    whose correction is not finite keeps its hits. The search ends when all rays are stationary to
+    rounding (see `fermat.stationary`), when two steps in a row move no ray by more than two
+    rounding errors of its hits, or after 16 steps.
 
-    solved: Array
-    still: Array
-    step: Array
-
-
-class BlockNewton(optx.AbstractRootFinder):
-    """Newton's method for a bundle of Fermat paths, with the propagation of `linear` as its solve.
-
-    The arguments of the equations are (system, target, mask (W, Q) of the rays that may move). All
-    rays step together. A ray whose correction is not finite keeps its hits. The search ends when
-    all rays are stationary to rounding (see `fermat.stationary`). It ends with
-    RESULTS.nonlinear_divergence when two steps in a row move no ray by more than `atol` + `rtol`
-    times its hits; the state then holds the mask of the solved rays.
-
-    rtol, atol: tolerances on the hits, relative and in mm.
-    norm: norm of a correction.
-    """
-
-    rtol: float
-    atol: float
-    norm: Callable = optx.max_norm
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        """The state before the first step; there is no step if no ray may move."""
-        return _State(~args[2], jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
-
-    def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
-        """One Newton step of every ray that is not stationary yet."""
-        system, target, _ = args
-        (rhs, path), aux = fn(y, args)
-        solved = state.solved | fermat.stationary(path, system, target)
-        change, _ = linear.solve(path, system, ~solved, rhs)
-        finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
-        moves = finite & ~solved
-        change = tuple(jnp.where(moves, c, 0) for c in change)
-        # Relative to each hit, so that a diverging ray does not hide the corrections of others.
-        scale = self.rtol / self.atol
-        size = self.norm(tuple(c / (1 + scale * abs(a)) for a, c in zip(y, change, strict=True)))
-        y = tuple(a - c for a, c in zip(y, change, strict=True))
-        still = jnp.where(size <= self.atol, state.still + 1, 0)
-        return y, _State(solved, still, state.step + 1), aux
-
-    def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
-        """True once all rays are stationary or none moves any more, and the result."""
-        done, still = jnp.all(state.solved), state.still > 1
-        results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
-        return done | still, optx.RESULTS.where(still & ~done, *results)
-
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Returns the values unchanged."""
-        return y, aux, {}
-
-
-def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tuple:
-    """Makes the hits of the `active` rays (W, Q) stationary, by at most 16 Newton steps.
+    target: D arrays (W, Q), stop points, mm.
+    hits: D arrays (R, W, Q), mm.
+    active: (W, Q), bool, rays that may move.
 
     Returns the hits, the mask of solved rays and the number of steps.
     """
+    small = 2 * float(jnp.finfo(hits[0].dtype).eps)
 
-    def equations(hits, args):
-        system, target, _ = args
+    def unfinished(state):
+        _, solved, still, steps = state
+        return ~jnp.all(solved) & (still < 2) & (steps < _MAX_STEPS)
+
+    def step(state):
+        hits, solved, still, steps = state
         path = fermat.geometry(hits, system)
-        return (linear.shortfall(path, system, target), path), None
+        rhs = linear.shortfall(path, system, target)
+        solved = solved | fermat.stationary(path, system, target)
+        change, _ = linear.solve(path, system, ~solved, rhs)
+        moves = jnp.all(jnp.isfinite(dot(change, change)), axis=0) & ~solved
+        change = where(moves, change, 0)
+        # Relative to each hit, so that a diverging ray does not hide the corrections of others.
+        rests = [abs(c / (1 + abs(a))) <= small for a, c in zip(hits, change, strict=True)]
+        still = jnp.where(jnp.all(jnp.stack(rests)), still + 1, 0)
+        return subtract(hits, change), solved, still, steps + 1
 
-    eps = float(jnp.finfo(hits[0].dtype).eps)
-    solution: optx.Solution = optx.root_find(
-        equations,
-        BlockNewton(rtol=2 * eps, atol=2 * eps),
-        hits,
-        args=(system, target, active),
-        has_aux=True,
-        max_steps=_MAX_STEPS,
-        throw=False,
-    )
-    all_solved = solution.result == optx.RESULTS.successful
-    return solution.value, all_solved | solution.state.solved, solution.stats["num_steps"]
+    none = jnp.int32(0)
+    hits, solved, _, steps = jax.lax.while_loop(unfinished, step, (hits, ~active, none, none))
+    return hits, solved, steps
 
 
 def find(
-    system: System, target: Vector, launch: Vector | None = None, searched: Array | None = None
+    system: System, target: Vector, launch: Vector | None = None, searched: Array | bool = True
 ) -> Found:
     """Finds the rays through stop points; not differentiable.
 
@@ -139,21 +98,19 @@ def find(
 
     target: D arrays (W, Q), stop points, mm.
     launch: D arrays (W, Q), first guesses of the launch points, mm; None for the paraxial launch.
-    searched: (W, Q), bool, rays that are searched for with a fan; None for all.
+    searched: (W, Q), bool, rays that are searched for with a fan; True for all.
     """
     sizes = beam_size(system, target)
     launch = paraxial_launch(system, target, sizes[1]) if launch is None else launch
-    searched = jnp.ones(target[0].shape, bool) if searched is None else searched
     search = _search(system, target, launch, sizes, searched)
     ok = search.status == Status.OK
     hits, crossing = split_stop(system, search.hits)
-    hits = tuple(jnp.where(ok, a, 0) for a in hits)
+    hits = where(ok, hits, 0)
     rough = ok & ~fermat.met(crossing, target, hits, system)
-    hits, solved, steps = _polish(system, target, hits, rough)
+    hits, solved, steps = polish(system, target, hits, rough)
     status = jnp.where(ok & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
-    hits = tuple(jnp.where(status == Status.OK, a, 0) for a in hits)
-    steps = (search.steps + steps).astype(jnp.int32)
-    return Found(hits, fermat.arrival(hits, system), status, steps)
+    hits = where(status == Status.OK, hits, 0)
+    return Found(hits, fermat.arrival(hits, system), status, search.steps + steps)
 
 
 @jax.jit
@@ -166,12 +123,74 @@ def find_aimed(system: System, target: Vector) -> Found:
     target: D arrays (W, Q), stop points, mm.
     """
     aimed = aim_outwards(system, target)
-    hits, status = _verdict(system, aimed.launch, aimed.status)
+    return _exact(system, target, aimed.launch, aimed.status)._replace(steps=aimed.steps)
+
+
+def _exact(system: System, target: Vector, launch: Vector, status: Array) -> Found:
+    """Traces rays from known launch points; those that do not meet their stop points to rounding
+    are UNCONVERGED. Arguments as in `_verdict`.
+    """
+    hits, status = _verdict(system, launch, status)
     hits, crossing = split_stop(system, hits)
     ok = (status == Status.OK) & fermat.met(crossing, target, hits, system)
-    hits = tuple(jnp.where(ok, a, 0) for a in hits)
+    hits = where(ok, hits, 0)
     status = jnp.where(ok, Status.OK, Status.UNCONVERGED).astype(jnp.int32)
-    return Found(hits, fermat.arrival(hits, system), status, aimed.steps)
+    return Found(hits, fermat.arrival(hits, system), status, jnp.int32(0))
+
+
+class Lanes:
+    """Assigns the Q lanes of each wavelength to its first K = Q // N flagged rays.
+
+    Each of these rays gets N neighbouring lanes, in the order of the rays. Lanes that remain repeat
+    the last one. A search of the width Q can thus try N first guesses for each of K missing rays at
+    a time.
+
+    flagged: (W, Q), bool, rays that need lanes.
+    each: N, lanes for each ray, at most Q.
+    few: K, number of rays that can have lanes.
+    served: (W, Q), bool, rays that have lanes.
+    """
+
+    def __init__(self, flagged: Array, each: int):
+        self.each, self.few = each, flagged.shape[1] // each
+        self._rank = jnp.cumsum(flagged, axis=-1, dtype=jnp.int32) - 1
+        self.served = flagged & (self._rank < self.few)
+
+    def of_rays(self, tree: Any) -> Any:
+        """Gathers the entries (W, K) of arrays (W, Q) that belong to the rays with lanes.
+
+        If fewer than K rays are flagged, the entries of the last ray of the bundle fill the rest.
+        """
+        count = self.served.shape[1]
+        order = jnp.where(self.served, count - jnp.arange(count, dtype=jnp.int32), 0)
+        rays = count - jax.lax.top_k(order, self.few)[0]
+        return jax.tree.map(lambda a: jnp.take_along_axis(a, rays, 1, mode="clip"), tree)
+
+    def spread(self, tree: Any) -> Any:
+        """Spreads arrays (W, K, N) over the lanes, (W, Q). An array (W, K, 1) is repeated in all N
+        lanes of a ray.
+        """
+        waves, rays = self.served.shape
+
+        def wide(a: Array) -> Array:
+            a = jnp.broadcast_to(a, (waves, self.few, self.each)).reshape(waves, -1)
+            return jnp.pad(a, ((0, 0), (0, rays - a.shape[1])), mode="edge")
+
+        return jax.tree.map(wide, tree)
+
+    def best(self, quality: Array) -> tuple[Array, Array]:
+        """The best lane of each ray.
+
+        quality: (W, Q), quality of the trial in each lane; 0 for a failed trial.
+
+        Returns the first lane with the highest quality among the lanes of each ray, (W, Q), int32;
+        and a mask (W, Q) of the rays that have lanes and in one of them a quality above 0.
+        """
+        own = quality[:, : self.few * self.each].reshape(len(quality), self.few, self.each)
+        slot = jnp.clip(self._rank, 0, self.few - 1)
+        lane = jnp.take_along_axis(jnp.argmax(own, axis=-1).astype(jnp.int32), slot, axis=-1)
+        found = jnp.take_along_axis(jnp.any(own > 0, axis=-1), slot, axis=-1)
+        return slot * self.each + lane, found & self.served
 
 
 class _Search(NamedTuple):
@@ -194,7 +213,7 @@ class _Search(NamedTuple):
 
 
 def _search(
-    system: System, target: Vector, launch: Vector, sizes: tuple, searched: Array
+    system: System, target: Vector, launch: Vector, sizes: tuple, searched: Array | bool
 ) -> _Search:
     """Searches for rays in rounds.
 
@@ -237,16 +256,17 @@ def _search(
         fan, own, begin = run_if(state.round > 1, from_several, inputs)
         reach = jnp.where(state.round == 0, sizes[1], sizes[1] / 8)
         upright = whole & (system.rows.rotation is None)
-        new, folded = _aimed(system, own, begin, (sizes[0], reach), upright)
+        new = aim(system, own, begin, (sizes[0], reach), upright)
+        traced, verdict = _verdict(system, new.launch, new.status)
 
-        quality = jnp.where(new.status == Status.OK, 2 - folded.astype(jnp.int32), 0)
+        quality = jnp.where(verdict == Status.OK, 2 - new.folded.astype(jnp.int32), 0)
         lane, found = lanes.best(quality)
         lane = jnp.where(whole, ray[None], lane)
         found = jnp.where(whole, (state.round == 0) | (missing & (quality > 0)), found)
-        status = jnp.take_along_axis(new.status, lane, axis=-1)
+        status = jnp.take_along_axis(verdict, lane, axis=-1)
         status = jnp.where(found, status, state.status)
-        taken = (jnp.take_along_axis(h, lane[None], axis=-1) for h in new.hits)
-        hits = tuple(jnp.where(found, a, b) for a, b in zip(taken, state.hits, strict=True))
+        taken = tuple(jnp.take_along_axis(h, lane[None], axis=-1) for h in traced)
+        hits = where(found, taken, state.hits)
         left = state.left - (lanes.served & ~whole).astype(jnp.int32)
         left = jnp.where(state.round == 0, jnp.where(searched, rounds, 0), left)
         left = jnp.where((found & (state.round > 0)) | (status == Status.OK), 0, left)
@@ -258,25 +278,6 @@ def _search(
     none = jnp.int32(0)
     start = _Search((zero,) * len(target), status, status, no_fan(system, waves), none, none)
     return jax.lax.while_loop(lambda s: (s.round == 0) | jnp.any(s.left > 0), next_round, start)
-
-
-class _Traced(NamedTuple):
-    """Aimed and traced rays: hits (D arrays, mm, see `snell.Trace`), status (W, Q), steps ()."""
-
-    hits: Vector
-    status: Array
-    steps: Array
-
-
-def _aimed(
-    system: System, target: Vector, launch: Vector, sizes: tuple, upright: Array | bool
-) -> tuple[_Traced, Array]:
-    """Aims and traces rays, arguments as in `aim`. Also returns the mask (W, Q) of the rays beyond
-    a fold.
-    """
-    aimed = aim(system, target, launch, sizes, upright)
-    hits, status = _verdict(system, aimed.launch, aimed.status)
-    return _Traced(hits, status, aimed.steps), aimed.folded
 
 
 def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Array]:
@@ -307,32 +308,22 @@ def find_many(system: System, target: Vector) -> Found:
     target: D arrays (W, Q), stop points, mm.
     """
     known = jnp.all(jnp.isfinite(jnp.stack(target)), axis=0)
-    found = _find_many(system, tuple(jnp.where(known, a, 0) for a in target), known)
-    return found._replace(
-        hits=tuple(jnp.where(known, a, 0) for a in found.hits),
-        status=jnp.where(known, found.status, jnp.int32(Status.MISSED)),
-    )
-
-
-def _find_many(system: System, target: Vector, known: Array) -> Found:
-    """`find_many` for finite stop points. known: (W, Q), bool, rays whose stop points were
-    finite.
-    """
+    target = where(known, target, 0)
     waves, rays = target[0].shape
     size = tile_of(rays, waves)
     if len(target) == 1 or size == rays:
-        return find(system, target, searched=known)
-    launch_of = polynomial_launch(system, target)
+        found = find(system, target, searched=known)
+    else:
+        launch_of = polynomial_launch(system, target)
 
-    def tile(target, known):
-        launch = launch_of(target)
-        hits, status = _verdict(system, launch, jnp.zeros(target[0].shape, jnp.int32))
-        hits, crossing = split_stop(system, hits)
-        solved = fermat.met(crossing, target, hits, system) & (status == Status.OK)
-        found = Found(hits, fermat.arrival(hits, system), status, jnp.int32(0))
-        search = lambda _: find(system, target, launch, known)  # noqa: E731
-        found = run_if(~jnp.all(solved | ~known), search, found)
-        return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
+        def tile(target, known):
+            launch = launch_of(target)
+            found = _exact(system, target, launch, jnp.zeros(target[0].shape, jnp.int32))
+            missing = jnp.any(known & (found.status != Status.OK))
+            found = run_if(missing, lambda _: find(system, target, launch, known), found)
+            return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
 
-    found = in_tiles(tile, size, target, known)
-    return found._replace(steps=jnp.max(found.steps))
+        found = in_tiles(tile, size, target, known)
+        found = found._replace(steps=jnp.max(found.steps))
+    hits, status = where(known, found.hits, 0), jnp.where(known, found.status, Status.MISSED)
+    return found._replace(hits=hits, status=status.astype(jnp.int32))

@@ -23,7 +23,7 @@ from jax import Array
 
 from .fermat import Path, label, ray_at, residual
 from .meet import cross
-from .system import System, Vector, divide, dot, rotate
+from .system import System, Vector, add, along, divide, dot, rotate, subtract, where
 
 
 class RightSide(NamedTuple):
@@ -51,9 +51,9 @@ def shortfall(path: Path, system: System, target: Vector) -> RightSide:
 
     target: D arrays (W, Q), stop points, mm.
     """
-    miss = (a - b for a, b in zip(label(path, system), target, strict=True))
+    miss = subtract(label(path, system), target)
     still = tuple(jnp.zeros_like(a) for a in path.before)
-    return RightSide(residual(path, system), still, tuple(a[0] for a in still), tuple(miss))
+    return RightSide(residual(path, system), still, tuple(a[0] for a in still), miss)
 
 
 class _Row(NamedTuple):
@@ -109,30 +109,27 @@ def _step(
 
     Returns the change behind the row, and that of its hit, D arrays (W, Q), mm.
     """
-    carried = (
-        p + row.length * s - m
-        for p, s, m in zip(change.point, change.direction, shift, strict=True)
-    )
-    *across, depth = rotate(row.rotation, tuple(carried), back=True)
-    *direction, along = rotate(row.rotation, change.direction, back=True)
+    carried = subtract(along(change.point, row.length, change.direction), shift)
+    *across, depth = rotate(row.rotation, carried, back=True)
+    *direction, axial = rotate(row.rotation, change.direction, back=True)
     # Project along the ray onto the tangent plane of the surface.
     normal = jnp.where(ok, row.before[-1] - dot(row.slope, row.before[:-1]), 1)
     slide = (depth - dot(row.slope, across)) / normal
     hit = tuple(c - slide * e for c, e in zip(across, row.before, strict=False))
     here = rotate(row.rotation, (*hit, dot(row.slope, hit)))
-    point = tuple(a + m for a, m in zip(here, shift, strict=True))
+    point = add(here, shift)
     pull = tuple(
-        row.index_before * (v + s * along) + dot(bend, hit) - f
+        row.index_before * (v + s * axial) + dot(bend, hit) - f
         for v, s, bend, f in zip(direction, row.slope, row.bend, residual, strict=True)
     )
     # Solve for the change of direction behind the row: its products with the tangents of the
     # surface are `pull` / n', and its product with the direction itself is 0.
     normal = jnp.where(ok, row.after[-1] - dot(row.slope, row.after[:-1]), 1)
-    along = -dot(row.after[:-1], pull) / (row.index_behind * normal)
-    behind = tuple(p / row.index_behind - s * along for p, s in zip(pull, row.slope, strict=True))
+    axial = -dot(row.after[:-1], pull) / (row.index_behind * normal)
+    behind = tuple(p / row.index_behind - s * axial for p, s in zip(pull, row.slope, strict=True))
     marked = hit if active_stop else (*point, *change.direction)
-    marked = tuple(jnp.where(row.labels, a, b) for a, b in zip(marked, change.label, strict=True))
-    return _Change(point, rotate(row.rotation, (*behind, along)), marked), hit
+    marked = where(row.labels, marked, change.label)
+    return _Change(point, rotate(row.rotation, (*behind, axial)), marked), hit
 
 
 def solve(path: Path, system: System, ok: Array, rhs: RightSide) -> tuple[Vector, Vector]:
@@ -167,7 +164,7 @@ def solve(path: Path, system: System, ok: Array, rhs: RightSide) -> tuple[Vector
     through, hits = jax.lax.scan(step, start, (path_rows, rhs.residual, rhs.point))
     crossing = _crossing(path, system)
     columns = jax.vmap(crossing)(through[0].label)
-    miss = tuple(s - c for s, c in zip(rhs.label, crossing(through[1].label), strict=True))
+    miss = subtract(rhs.label, crossing(through[1].label))
     # Rays that are not of interest get the unit matrix, so that no derivative is NaN.
     rows = [
         [jnp.where(ok, c, float(i == k)) for k, c in enumerate(row)]
@@ -187,14 +184,22 @@ def solve(path: Path, system: System, ok: Array, rhs: RightSide) -> tuple[Vector
 def _first(path: Path, system: System, hit: Vector) -> tuple[Vector, Vector]:
     """Changes of the first point and of the direction in front of it for a change of the first hit.
 
-    The direction is q / |q| with q = vergence P_1 - source, so that de = vergence (dP - e (e.dP)) /
-    |q|.
+    The direction is that of q = vergence P_1 - source, and dq = vergence dP.
     """
     rotation = None if system.rows.rotation is None else system.rows.rotation[0]
     point = rotate(rotation, (*hit, dot(tuple(s[0] for s in path.slope), hit)))
-    first = ray_at(path, system, 0)[1]
-    along, spread = dot(first, point), system.vergence * path.shrink
-    return point, tuple(spread * (m - e * along) for m, e in zip(point, first, strict=True))
+    return point, turn(ray_at(path, system, 0)[1], point, system.vergence * path.shrink)
+
+
+def turn(unit: Vector, change: Vector, shrink: Array) -> Vector:
+    """Change of a unit vector e = q / |q| for a change dq of q: (dq - e (e.dq)) / |q|.
+
+    unit: e.
+    change: dq.
+    shrink: 1 / |q|.
+    """
+    size = dot(unit, change)
+    return tuple(shrink * (c - e * size) for c, e in zip(change, unit, strict=True))
 
 
 def _crossing(path: Path, system: System) -> Callable[[Vector], Vector]:

@@ -14,7 +14,7 @@ from jax import Array
 from ..lens.forms import RIM, Shape
 from ..lens.surface import domain, sag_slope
 from ..numerics import safe_divide, safe_sqrt
-from .system import Placed, Vector, dot
+from .system import Placed, Vector, along, dot
 
 # Newton's method along a ray to a surface that is not a conic takes at most `_STEPS` steps. It has
 # converged if the last step is at most `_SETTLED` times (1 mm + length of the ray).
@@ -96,7 +96,7 @@ def reach(
         lambda state: (state[0] < _STEPS) & jnp.any(going & ~state[2]), closer, begin
     )
     length = jnp.where(met, length, plane)  # an unconverged length has an arbitrary value
-    return length, met & domain(_along(p, d, length)[:-1], shape, form)
+    return length, met & domain(along(p, length, d)[:-1], shape, form)
 
 
 def quadratic(p: Vector, d: Vector, shape: Shape) -> Vector:
@@ -110,11 +110,6 @@ def quadratic(p: Vector, d: Vector, shape: Shape) -> Vector:
     return square, linear, c * (dot(p[:-1], p[:-1]) + (1 + k) * p[-1] ** 2) - 2 * p[-1]
 
 
-def _along(p: Vector, d: Vector, length: Array) -> Vector:
-    """The point p + length d."""
-    return tuple(a + length * b for a, b in zip(p, d, strict=True))
-
-
 def _plain(form: str, shape: Shape) -> bool:
     """True for a conic without aspheric terms, a quadric."""
     return form == "asphere" and not shape.coefficients.shape[0]
@@ -125,7 +120,7 @@ def _gap(form: str, p: Vector, d: Vector, shape: Shape, length: Array) -> tuple[
 
     For a plain conic g = c (x^2 + y^2 + (1 + k) z^2) / 2 - z, otherwise g = sag(x, y) - z.
     """
-    *across, z = _along(p, d, length)
+    *across, z = along(p, length, d)
     if _plain(form, shape):
         quadric = tuple(shape.curvature * a for a in (*across, (1 + shape.conic) * z))
         return dot(quadric, (*across, z)) / 2 - z, dot(quadric, d) - d[-1]
@@ -143,22 +138,17 @@ def _reach_jvp(form: str, primals: Any, tangents: Any) -> tuple:
     return (length, met), (tangent, np.zeros(met.shape, jax.dtypes.float0))
 
 
-def meet(
-    form: str,
-    p: Vector,
-    d: Vector,
-    shape: Shape,
-    going: Array,
-    side: Array,
-    least: Array | None,
-) -> tuple:
-    """Intersection of rays with a surface, with the normal there. Arguments as in `reach`.
+def meet(form: str, p: Vector, d: Vector, shape: Shape, *how: Any) -> tuple:
+    """Intersection of rays with a surface, with the normal there.
+
+    form, p, d, shape: as in `reach`.
+    how: its other arguments, `going`, `side` and `least`.
 
     Returns the point, D + 1 components, mm; a normal of any length with z above 0; the mask of the
     rays that meet the surface; and the length s.
     """
-    length, met = reach(form, p, d, shape, going, side, least)
-    own = _along(p, d, length)
+    length, met = reach(form, p, d, shape, *how)
+    own = along(p, length, d)
     if _plain(form, shape):
         c = shape.curvature
         normal = *(-c * a for a in own[:-1]), 1 - (1 + shape.conic) * c * own[-1]
@@ -186,4 +176,4 @@ def cross(surface: Placed, form: str, point: Vector, direction: Vector) -> tuple
     p, d = surface.local(point, direction)
     every_ray = jnp.ones(p[0].shape, bool)
     length, met = reach(form, p, d, surface.shape, every_ray, near_side(d), None)
-    return _along(p, d, length)[:-1], met
+    return along(p, length, d)[:-1], met

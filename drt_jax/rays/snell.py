@@ -25,7 +25,7 @@ from ..lens.surface import sag_slope
 from ..numerics import safe_divide, safe_sqrt
 from .meet import meet, near_side
 from .status import Status
-from .system import Placed, System, Vector, dot, rotate
+from .system import Placed, System, Vector, add, along, dot, rotate, where
 
 # Smallest cosine of the angle between a traced ray and the normal of a surface: 0.006 degrees from
 # grazing incidence.
@@ -61,19 +61,6 @@ def split_stop(system: System, hits: Vector) -> tuple[Vector, Vector]:
     return tuple(jnp.concatenate([h[:at], h[at + 1 :]]) for h in hits), crossing
 
 
-def _begin(system: System, launch: Vector) -> tuple[Vector, Vector, Array]:
-    """Starts rays on the launch plane P with the direction q = vergence P - source.
-
-    Returns points (mm), unit vectors q / |q|, and |q|, which is the distance from the object times
-    the vergence.
-    """
-    point = *launch, jnp.broadcast_to(system.launch_plane, launch[0].shape)
-    direction = tuple(system.vergence * p - s for p, s in zip(point, system.source, strict=True))
-    size = jnp.sqrt(dot(direction, direction))
-    shrink = 1 / size
-    return point, tuple(d * shrink for d in direction), size
-
-
 def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector, side: Array | None) -> tuple:
     """Refraction, reflection and diffraction by Snell's law in vector form.
 
@@ -96,12 +83,12 @@ def _refract(d: Vector, normal: Vector, row: "Row", kick: Vector, side: Array | 
     front = cosine * side - _FLATTEST
     size, d = row.ratio**2, tuple(row.ratio * a for a in d)
     if kick:
-        d = *(a + b for a, b in zip(d, kick, strict=False)), d[-1]
+        d = *add(d[:-1], kick), d[-1]
         size = dot(d, d)
     cosine = dot(normal, d) * shrink
     square = 1 - (size - cosine**2)
     change = (side * row.turn * safe_sqrt(square) - cosine) * shrink
-    return tuple(a + change * n for a, n in zip(d, normal, strict=True)), front, square
+    return along(d, change, normal), front, square
 
 
 class _Kick(NamedTuple):
@@ -262,13 +249,6 @@ class Meeting(NamedTuple):
     status: Array
 
 
-def _along_the_axis(going: Array, side: Array, p: Vector, d: Vector) -> tuple[Vector, Vector]:
-    """Moves failed rays onto the axis, where their values and derivatives are finite."""
-    axis: Vector = (*(jnp.zeros_like(a) for a in d[:-1]), side)
-    p = tuple(jnp.where(going, a, 0) for a in p)
-    return p, tuple(jnp.where(going, a, b) for a, b in zip(d, axis, strict=True))
-
-
 @partial(jax.jit, static_argnames=("to_stop", "smooth", "forward"))
 def _follow(
     system: System,
@@ -296,7 +276,12 @@ def _follow(
     kinds, phases = _forms(system)
     each = [partial(meet, kind) for kind in kinds]
     tilted, way = system.rows.rotation is not None, system.sensor_way
-    point, direction, far = _begin(system, launch)
+    # Rays start on the launch plane P with the direction q = vergence P - source. Its size |q| is
+    # the distance from the object times the vergence.
+    point = *launch, jnp.broadcast_to(system.launch_plane, launch[0].shape)
+    direction = system.from_object(point)
+    far = jnp.sqrt(dot(direction, direction))
+    shrink = 1 / far
 
     def ahead(row, length):
         """Whether a length leads forwards: away from the object on the first row, away from the
@@ -320,36 +305,35 @@ def _follow(
         going = state.status == Status.OK
         p, d = row.surface.local(state.point, state.direction)
         if smooth:
-            p, d = _along_the_axis(going, row.side, p, d)
+            axis = *(jnp.zeros_like(a) for a in d[:-1]), row.side
+            p, d = where(going, p, 0), where(going, d, axis)
         side = jnp.where(row.active, row.side, near_side(d))
         encounter = each[0] if len(kinds) == 1 else partial(jax.lax.switch, row.kind, each)
         line = p, d, row.surface.shape, going, side
         own, normal, crosses, length = encounter(*line, least(row) if tilted else None)
-        kick = _kick(phases, row.kick, own[:-1])
+        hit, kick = own[:-1], _kick(phases, row.kick, own[:-1])
         direction, front, through = _refract(d, normal, row, kick, None if tilted else side)
-        hit, origin = own[:-1], row.surface.origin(len(own) - 1)
-        point = tuple(a + o for a, o in zip(rotate(row.surface.rotation, own), origin, strict=True))
-        direction = rotate(row.surface.rotation, direction)
-        behind = state._replace(point=point, direction=direction, hit=hit)
-        meeting = Meeting(p, d, hit, crosses, length, front, through, state.status)
+        # The first failure decides the status.
         met, beyond = crosses & (~row.active | (front > 0)), ~row.active | ahead(row, length)
-        passes = (meeting.through > 0) | ~row.bends
-        here = jnp.where(passes, Status.OK, Status.TIR)
+        here = jnp.where((through > 0) | ~row.bends, Status.OK, Status.TIR)
         back = jnp.where(row.first | row.last, Status.MISSED, Status.CROSSED)
         here = jnp.where(met, jnp.where(beyond, here, back), Status.MISSED)
         status = jnp.where(going, here.astype(jnp.int32), state.status)
-        wide = jnp.maximum(dot(meeting.hit, meeting.hit), dot(state.hit, state.hit))
+        wide = jnp.maximum(dot(hit, hit), dot(state.hit, state.hit))
         wide = jax.lax.stop_gradient(jnp.sqrt(wide))  # the root has no derivative on the axis
-        angle = safe_divide(wide, jnp.where(row.first, 0, abs(meeting.length)))
+        angle = safe_divide(wide, jnp.where(row.first, 0, abs(length)))
         angle = jnp.maximum(jnp.where(status == Status.OK, angle, 0), state.rounding_angle)
-        behind = behind._replace(status=status, rounding_angle=angle)
+        rotation, origin = row.surface.rotation, row.surface.origin(len(hit))
+        point, direction = add(rotate(rotation, own), origin), rotate(rotation, direction)
+        behind = _State(point, direction, hit, status, angle)
         if to_stop:
             return behind, None
-        behind = jax.tree.map(partial(jnp.where, row.bends), behind, state._replace(status=status))
-        return behind, meeting._replace(status=status)
+        behind = where(row.bends, behind, state._replace(status=status))
+        return behind, Meeting(p, d, hit, crosses, length, front, through, status)
 
-    zero = jnp.zeros_like(launch[0])
+    zero = jnp.zeros_like(far)
     none = jnp.zeros(zero.shape, jnp.int32)
+    direction = tuple(d * shrink for d in direction)
     start = _State(point, direction, (zero,) * len(launch), none, zero)
     return jax.lax.scan(step, start, rows_met(system, to_stop))
 

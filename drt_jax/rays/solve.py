@@ -6,6 +6,7 @@ known hits these derivatives in every mode. `solve_reverse` is a `jax.custom_vjp
 alone, which stores only the hits.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +22,7 @@ from .fermat import Path
 from .find import Found, find_aimed, find_many
 from .meet import cross
 from .status import Status
-from .system import System, Vector, dot, rotate
+from .system import System, Vector, add, rotate, where
 
 
 @jax.custom_jvp
@@ -44,19 +45,17 @@ def _attach_jvp(primals: Any, tangents: Any) -> tuple:
     system, target, *known, ok = primals
     # Call the function itself, so that the hits have derivatives for higher orders.
     hits, arrival = attach(system, target, *known, ok)
-    # Leaves without a tangent are left out, so that they cost nothing.
-    moving, shifts = (
-        [None if isinstance(t, SymbolicZero) else t for t in jax.tree.leaves(part)]
-        for part in tangents[:2]
+    # Leaves without a tangent become None, so that they cost nothing.
+    moving, shifts = jax.tree.map(
+        lambda t: None if isinstance(t, SymbolicZero) else t, tuple(tangents[:2])
     )
 
     def tangent(hits, shifts, ok):
         path = fermat.geometry(hits, system)
         rhs = _right_side(path, system, moving)
         label = (a if t is None else a + t for a, t in zip(rhs.label, shifts, strict=True))
-        rhs = jax.tree.map(lambda a: jnp.where(ok, a, 0), rhs._replace(label=tuple(label)))
-        changes = linear.solve(path, system, ok, rhs)
-        return jax.tree.map(lambda a: jnp.where(ok, a, 0), changes)
+        rhs = where(ok, rhs._replace(label=tuple(label)), 0)
+        return where(ok, linear.solve(path, system, ok, rhs), 0)
 
     tile = derivative_tile(len(ok), len(system.forms))
     return (hits, arrival), in_tiles(tangent, tile, hits, shifts, ok)
@@ -65,47 +64,41 @@ def _attach_jvp(primals: Any, tangents: Any) -> tuple:
 attach.defjvp(_attach_jvp, symbolic_zeros=True)
 
 
-def _right_side(path: Path, system: System, moving: list[Array | None]) -> linear.RightSide:
+def _right_side(path: Path, system: System, moving: System) -> linear.RightSide:
     """Right-hand side of the linear system for tangents of leaves of the system (paper Eq. 4).
 
     It is the directional derivative, along the tangents dp, of the equations at fixed hits: F and
     the label at fixed directions of the ray, the positions of the surfaces at fixed transverse
-    coordinates, and the unnormalised direction q = vergence P_1 - source of the first segment. F
-    and the label enter with the sign of -(dE/dp) dp. The direction follows from d(q / |q|) = (dq -
-    e (e.dq)) / |q|. One `jax.jvp` over the leaves with a tangent gives all of them; other leaves
-    are constants.
+    coordinates, and the unnormalised direction q = vergence P_1 - source of the first segment,
+    from which `linear.turn` makes that of the unit vector. F and the label enter with the sign of
+    -(dE/dp) dp. One `jax.jvp` over the leaves with a tangent gives all of them; other leaves are
+    constants.
 
-    moving: tangents of all leaves of the system in the order of `jax.tree.leaves`; None for a leaf
-        without a tangent.
+    moving: the tangents of all leaves of the system; None for a leaf without a tangent.
     """
-    leaves, structure = jax.tree.flatten(system)
-    varied = [k for k, change in enumerate(moving) if change is not None]
+    either = functools.partial(jax.tree.map, is_leaf=lambda leaf: leaf is None)
+    varied = either(lambda t, a: None if t is None else a, moving, system)
     directions = [rotate(system.rows.rotation, a) for a in (path.before, path.after)]
     first, line = (fermat.ray_at(path, system, row) for row in (0, system.before))
 
-    def with_fixed_path(changed):
+    def with_fixed_path(varied):
         """The equations for fixed hits, and for directions fixed along the axes of the lens."""
-        new = dict(zip(varied, changed, strict=True))
-        own = jax.tree.unflatten(structure, [new.get(k, a) for k, a in enumerate(leaves)])
+        own = either(lambda new, a: a if new is None else new, varied, system)
         rows = own.rows
         height, slope = by_form(sag_slope, path.hits, rows.on(path.length), own.forms)
         before, after = (rotate(rows.rotation, a, back=True) for a in directions)
         residual = fermat.residual(path._replace(before=before, after=after, slope=slope), own)
         point = rotate(rows.rotation, (*path.hits, height))
-        origin = (a[:, None, None] for a in rows.origin(own.dim))
-        point = tuple(p + o for p, o in zip(point, origin, strict=True))
-        toward = (own.vergence * p - s for p, s in zip(first[0], own.source, strict=True))
+        point = add(point, [a[:, None, None] for a in rows.origin(own.dim)])
+        toward = own.from_object(first[0])
         crossing = tuple(h[own.before] for h in path.hits)
         if own.stop is not None:
             crossing, _ = cross(own.stop, own.stop_form, *line)
-        return residual, point, tuple(toward), crossing
+        return residual, point, toward, crossing
 
-    now, change = ([a[k] for k in varied] for a in (leaves, moving))
-    residual, point, toward, label = jax.jvp(with_fixed_path, (now,), (change,))[1]
-    along = dot(first[1], toward)
-    direction = (path.shrink * (t - e * along) for t, e in zip(toward, first[1], strict=True))
+    residual, point, toward, label = jax.jvp(with_fixed_path, (varied,), (moving,))[1]
     residual, label = (tuple(-a for a in part) for part in (residual, label))
-    return linear.RightSide(residual, point, tuple(direction), label)
+    return linear.RightSide(residual, point, linear.turn(first[1], toward, path.shrink), label)
 
 
 def solve(system: System, target: Vector) -> Found:

@@ -7,6 +7,7 @@ loops, whereas a sum over an array axis becomes a library call.
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +17,6 @@ from jax import Array
 
 from ..lens.forms import Shape
 from ..lens.lens import Lens
-from ..lens.phase import Phase
 from ..lens.scene import Scene
 from ..numerics import matmul, safe_divide
 
@@ -28,6 +28,31 @@ def dot(a: Any, b: Any) -> Array:
     """Dot product of two vectors with the same number of components."""
     first, *others = (x * y for x, y in zip(a, b, strict=True))
     return sum(others, first)
+
+
+def add(a: Any, b: Any) -> Vector:
+    """Sum of two vectors with the same number of components."""
+    return tuple(x + y for x, y in zip(a, b, strict=True))
+
+
+def subtract(a: Any, b: Any) -> Vector:
+    """Difference of two vectors with the same number of components."""
+    return tuple(x - y for x, y in zip(a, b, strict=True))
+
+
+def along(a: Any, length: Any, b: Any) -> Vector:
+    """The vector a + length b, as a point on a line from `a` in the direction `b`."""
+    return tuple(x + length * y for x, y in zip(a, b, strict=True))
+
+
+def where(mask: Array, a: Any, b: Any) -> Any:
+    """A vector, or another pytree, that is `a` for the rays of a mask and `b` for other rays.
+
+    b: of the structure of `a`, or one number for all components.
+    """
+    if isinstance(b, int | float):
+        return jax.tree.map(lambda x: jnp.where(mask, x, b), a)
+    return jax.tree.map(lambda x, y: jnp.where(mask, x, y), a, b)
 
 
 def determinant(rows: Any) -> Array:
@@ -120,11 +145,9 @@ class Placed(NamedTuple):
         point: D + 1 components along the axes of the lens, mm.
         direction: D + 1 components along the axes of the lens.
         """
-        origin = self.origin(len(point) - 1)
-        shifted = tuple(p - o for p, o in zip(point, origin, strict=True))
-        return rotate(self.rotation, shifted, back=True), rotate(
-            self.rotation, direction, back=True
-        )
+        shifted = subtract(point, self.origin(len(point) - 1))
+        back = functools.partial(rotate, self.rotation, back=True)
+        return back(shifted), back(direction)
 
 
 @jax.tree_util.register_dataclass
@@ -195,6 +218,15 @@ class System:
     def behind(self) -> Array:
         """Refractive index (R, W, 1) behind each row; behind the sensor as in front of it."""
         return jnp.concatenate([self.index[1:], self.index[-1:]])
+
+    def from_object(self, point: Vector) -> Vector:
+        """Vectors from the object point to points, multiplied by the vergence: vergence P - source.
+
+        They stay finite for an object at infinity, where they are the direction of the light.
+
+        point: D + 1 components, mm along the axes of the lens.
+        """
+        return tuple(self.vergence * p - s for p, s in zip(point, self.source, strict=True))
 
     @property
     def launch_plane(self) -> Array:
@@ -285,11 +317,15 @@ def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
     dim: number of transverse components, 2; or 1 for the meridional rays of an axial object in a
         lens with rotational symmetry.
     """
-    active, stop = lens.active, lens.stop
+    active, stop, phase = lens.active, lens.stop, lens.phase
     # A wavelength outside the range of a glass gets a finite index; its rays are NO_INDEX.
     waves = jnp.clip(scene.wavelengths, *lens.dispersion.range)
     rows = [*active, lens.count]
     tangent = scene.tangent[2 - dim :]
+    by = None
+    if phase is not None:  # each wave of phase adds order times wavelength of path
+        wave = _MM_PER_UM * phase.order[:, None, None] * waves[None, :, None]
+        by = Diffraction(phase.shape, wave, tuple(map(active.index, phase.surfaces)), phase.forms)
     return System(
         rows=placed(lens, rows),
         stop=None if stop in active else placed(lens, stop),
@@ -297,15 +333,9 @@ def system_of(lens: Lens, scene: Scene, dim: int = 2) -> System:
         # Light with a positive field angle travels upwards: the object lies below the axis.
         source=jnp.concatenate([-tangent, -jnp.ones_like(tangent[:1])]),
         vergence=scene.vergence,
-        diffraction=None if lens.phase is None else _diffraction(lens.phase, active, waves),
+        diffraction=by,
         before=sum(i < stop for i in active),
         forms=tuple(lens.forms[i] for i in rows),
         stop_form=lens.forms[stop],
         mirrors=tuple(lens.mirrors[i] for i in active),
     )
-
-
-def _diffraction(phase: Phase, active: tuple[int, ...], wavelengths: Array) -> Diffraction:
-    """The phases of a lens. Each wave of phase adds order times wavelength of path, mm."""
-    wave = _MM_PER_UM * phase.order[:, None, None] * wavelengths[None, :, None]
-    return Diffraction(phase.shape, wave, tuple(map(active.index, phase.surfaces)), phase.forms)

@@ -18,14 +18,16 @@ from ..lens.clearance import clearance
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, over_points
 from ..lens.surface import by_form, surface_sag
-from ..numerics import Numbers, concrete, known_values, real_array
+from ..numerics import Numbers, concrete, known_values, real_array, safe_divide, safe_sqrt
 from . import fermat
-from .afocal import at_infinity
 from .find import Found
 from .meet import cross
 from .solve import Solver, solve
 from .status import Status, reaches_sensor
-from .system import System, Vector, placed, rotate, system_of
+from .system import System, Vector, add, dot, placed, rotate, system_of, where
+
+# Focal length F of the ideal lens behind an afocal system, mm, so that 1 mm is 1 mrad.
+FOCAL = 1e3
 
 
 class Bundle(NamedTuple):
@@ -39,7 +41,7 @@ class Bundle(NamedTuple):
         `fermat.optical_path`.
     steps: (), int32, Newton steps.
 
-    In an afocal lens the hits on the sensor, the arrival and the path are those of `rays.afocal`.
+    In an afocal lens the hits on the sensor, the arrival and the path are those of `at_infinity`.
     """
 
     hits: Vector
@@ -102,8 +104,8 @@ def on_all_surfaces(
         pieces += [tuple(h[begin:row] for h in hits), tuple(c[None] for c in crossing)]
         begin = row
     pieces.append(tuple(h[begin:] for h in hits))
-    joined = (jnp.concatenate(part) for part in zip(*pieces, strict=True))
-    return tuple(jnp.where(exists, a, 0) for a in joined), exists
+    joined = tuple(jnp.concatenate(part) for part in zip(*pieces, strict=True))
+    return where(exists, joined, 0), exists
 
 
 def aims(lens: Lens, scene: Scene, points: Vector) -> tuple[System, Vector]:
@@ -116,10 +118,13 @@ def aims(lens: Lens, scene: Scene, points: Vector) -> tuple[System, Vector]:
     Returns the `System` and the stop points, D arrays (W, Q), mm.
     """
     radius, waves = lens.semi_diameter[lens.stop], scene.wavelengths.shape[0]
-    finite = [(jnp.isfinite(p), jnp.where(jnp.isfinite(p), p, 0)) for p in points]
-    target = (jnp.where(known, radius * p, jnp.inf) for known, p in finite)
-    target = (jnp.broadcast_to(p, (waves, p.shape[-1])) for p in target)
-    return system_of(lens, scene, len(points)), tuple(target)
+
+    def scaled(point):
+        known = jnp.isfinite(point)
+        target = jnp.where(known, radius * jnp.where(known, point, 0), jnp.inf)
+        return jnp.broadcast_to(target, (waves, point.shape[-1]))
+
+    return system_of(lens, scene, len(points)), tuple(map(scaled, points))
 
 
 def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: Found) -> Bundle:
@@ -145,6 +150,52 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
     if lens.afocal:
         hits, arrival, path = at_infinity(hits, arrival, path, exists, system.index[-1])
     return Bundle(hits, status, arrival, path, found.steps)
+
+
+def at_infinity(
+    hits: Vector, arrival: Vector, path: Array, exists: Array, index: Array
+) -> tuple[Vector, Vector, Array]:
+    """Replaces sensor hits by angles, for light that leaves an afocal lens collimated.
+
+    An afocal lens is traced as if an ideal lens of focal length F = 1 m stood behind it. The sensor
+    of the prescription lies in the front focal plane of the ideal lens, and a second sensor lies in
+    its rear focal plane, where 1 mm stands for 1 mrad. The ideal lens maps angles to heights
+    without distortion. All analyses then work unchanged if heights are read as angles in mrad.
+    Moving the second sensor by 1 mm is a vergence of 1e-3 dioptre.
+
+    Consider a ray with transverse direction cosines l, |l| = sin a, that meets the front focal
+    plane at x with the optical path L. In the rear focal plane
+
+        hit                   F t            with t = a l / |l|
+        transverse direction  -J x / F       with J = dl/dt (J is the unit matrix on the axis)
+        optical path          L - n x.l      the path of the plane wave in front, so that the
+                                             wavefront is measured against a plane
+
+    J has the eigenvalue cos a along l and sin a / a across it. The map from (x, l) to (t, J x)
+    preserves areas in phase space and the eikonal: d(L - n x.l) = -n x.dl = -n (J x).dt.
+
+    hits: D arrays (S + 1, W, Q), mm, as in `Bundle`; the last row is the sensor.
+    arrival: D + 1 arrays (W, Q), unit vectors at the sensor, as in `Bundle`.
+    path: (W, Q), mm, optical path to the sensor.
+    exists: (W, Q), bool, rays that exist.
+    index: (W, 1), refractive index in front of the sensor.
+
+    Returns the hits (S + 1, W, Q), of which those on the sensor are angles in mrad; the arrivals
+    (W, Q), whose transverse part is that of a unit vector and whose z is set to 1; and the path (W,
+    Q), mm.
+    """
+    line = where(exists, arrival[:-1], 0)
+    along = jnp.where(exists, jnp.abs(arrival[-1]), 1)
+    sine = safe_sqrt(dot(line, line))
+    angle = jnp.arctan2(sine, along)
+    sinc = jnp.where(sine > 0, safe_divide(sine, angle), 1)
+    point = tuple(h[-1] for h in hits)
+    x_dot_l = dot(line, point)
+    radial = safe_divide(along - sinc, sine**2) * x_dot_l
+    slopes = tuple(-(sinc * x + radial * a) / FOCAL for x, a in zip(point, line))
+    angles = tuple(FOCAL * safe_divide(a, sinc) for a in line)
+    joined = tuple(jnp.concatenate([h[:-1], a[None]]) for h, a in zip(hits, angles))
+    return joined, (*slopes, jnp.ones_like(along)), path - index * x_dot_l
 
 
 def path_of(found: Found, system: System) -> Array:
@@ -240,13 +291,13 @@ def _trace_point(lens: Lens, scene: Scene, pupil: Array) -> Rays:
     rows = placed(lens, range(lens.count + 1))
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
     own = rotate(rows.rotation, (*bundle.hits, heights))
-    points = (p + o[:, None, None] for p, o in zip(own, rows.origin(2), strict=True))
+    points = add(own, [o[:, None, None] for o in rows.origin(2)])
     direction = rotate(system.rows.rotation, fermat.geometry(found.hits, system).before)
     behind = np.array(_rows_behind(lens))
 
     def stacked(vector):  # (3, S + 1, W, Q) -> (W, Q, S + 1, 3)
-        return jnp.where(exists, jnp.stack(tuple(vector)), 0).transpose(2, 3, 1, 0)
+        return jnp.where(exists, jnp.stack(vector), 0).transpose(2, 3, 1, 0)
 
-    directions = stacked(d[behind] for d in direction)
+    directions = stacked([d[behind] for d in direction])
     path = jnp.where(exists, fermat.optical_path(found.hits, system), 0)
     return Rays(stacked(points), directions, path, bundle.status, bundle.steps)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drt_jax.rays.sparse import Lanes
+from drt_jax.rays.find import Lanes
 
 FLAGGED = np.array([[0, 1, 0, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 0]], bool)
 VALUES = 10 * np.arange(3)[:, None] + np.arange(7)
