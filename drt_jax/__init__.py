@@ -69,7 +69,12 @@ from .lens.phase import Phase as Phase
 from .lens.scene import Scene as Scene
 from .lens.seidel import third_order as third_order
 from .pupil.clipped import Clipped as Clipped
-from .pupil.mask import Mask as Mask, Masked as Masked
-from .pupil.rules import Gauss as Gauss, Pattern as Pattern, Soft as Soft
+from .pupil.rules import (
+    Gauss as Gauss,
+    Mask as Mask,
+    Masked as Masked,
+    Pattern as Pattern,
+    Soft as Soft,
+)
 from .rays.status import Status as Status
 from .rays.trace import trace_rays as trace_rays

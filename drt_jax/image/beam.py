@@ -18,9 +18,8 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import einsum, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
-from ..pupil.mask import Mask
 from ..pupil.patterns import disc, half_disc, meridian
-from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, fits
+from ..pupil.rules import Gauss, Mask, Pattern, PupilRule, Symmetry, fits
 from ..rays.status import reaches_sensor
 from ..rays.system import Vector, dot
 from ..rays.trace import Bundle, trace_bundle

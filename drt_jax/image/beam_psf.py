@@ -18,8 +18,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..numerics import einsum, safe_divide, safe_sqrt
-from ..pupil.mask import Mask
-from ..pupil.rules import PupilRule
+from ..pupil.rules import Mask, PupilRule
 from .beam import Beam, BeamRule, beam_rule, centroid_and_variances, means
 from .cover import cover
 from .kernel import Pixels, gaussian_shares

@@ -27,17 +27,15 @@ from ..rays.status import reaches_sensor
 from ..rays.system import Vector, determinant, dot, system_of
 from ..rays.trace import Bundle
 from . import boundary
-from .boundary import displace
-from .radial import CORNERS, RadialRule, gauss
+from .radial import CORNERS, RadialRule, displace, gauss, picked
 from .rules import PupilRule, Symmetry, check_rule
-from .stages import Plan, plan as find_boundary, target_of
 
 __all__ = ["Clipped", "ClippedGroup"]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _attach(
-    radial: RadialRule, crossing: bool, lens: Lens, scene: Scene, plan: Plan
+    radial: RadialRule, crossing: bool, lens: Lens, scene: Scene, plan: boundary.Plan
 ) -> tuple[Array, Array]:
     """Stop points and launches (2, W, K) of the rays of a plan, with derivatives by the lens and
     the scene in every mode."""
@@ -80,8 +78,8 @@ def _attach_jvp(radial: RadialRule, crossing: bool, primals: Any, tangents: Any)
         # edge.
         toward, _ = plan.spokes(radial, corner)
         updated = jax.tree.map(lambda a: a[..., ends], updated)
-        distance = boundary.edge_distance(updated, target_of(updated, plan.frame.centre, toward))
-        length = boundary.picked(distance, pair[:1, :, ends])[0]
+        target = boundary.target_of(updated, plan.frame.centre, toward)
+        length = picked(boundary.edge_distance(updated, target), pair[:1, :, ends])[0]
         known = jax.lax.stop_gradient(_along(point[..., ends] - plan.frame.centre, toward))
         length = jnp.where(settled[:, ends], length, known)
         new = jnp.concatenate([corner, plan.frame.centre + length[None] * toward], axis=-1)
@@ -132,8 +130,8 @@ class Clipped(Fitted):
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """Points and weights, both differentiable in the lens."""
-        orders = jnp.asarray([self.order], jnp.int32)
-        return _open(lens, scene, orders, (self.size,), self.symmetry, self.crossing)[0]
+        group = ClippedGroup([self.order], 0, (self.size,), self.symmetry, self.crossing)
+        return _open(group, lens, scene)[0]
 
 
 @jax.tree_util.register_dataclass
@@ -156,11 +154,8 @@ class ClippedGroup(Fitted):
 
     def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
         """Points of all orders and their weights, which are 0 for orders that are not chosen."""
-        orders = jnp.asarray(self.orders, jnp.int32)
-        parts = _open(lens, scene, orders, self.sizes, self.symmetry, self.crossing)
-        (*points, weights) = (
-            jnp.concatenate(arrays, axis=-1) for arrays in zip(*((*p, w) for p, w in parts))
-        )
+        parts = [(*points, weights) for points, weights in _open(self, lens, scene)]
+        *points, weights = (jnp.concatenate(arrays, axis=-1) for arrays in zip(*parts))
         return tuple(points), jnp.where(self.own(lens)[None], weights, 0)
 
     def own(self, lens: Lens) -> Any:
@@ -183,28 +178,20 @@ def _most(lens: Lens, symmetry: Symmetry, size: int) -> int:
     return max(_spokes(lens, symmetry, size), 1)
 
 
-def _open(
-    lens: Lens,
-    scene: Scene,
-    orders: Array,
-    sizes: tuple[int, ...],
-    symmetry: Symmetry,
-    crossing: bool,
-) -> list[tuple[Vector, Array]]:
+def _open(group: ClippedGroup, lens: Lens, scene: Scene) -> list[tuple[Vector, Array]]:
     """Points and weights of each of G orders, for the open area of the pupil.
-
-    orders: (G,), int32; other arguments as in `ClippedGroup`.
 
     The open area is a sum, with signs, of areas inside of convex apertures: the `terms` of the
     apertures, which subtract obscurations and add the convex pieces of polygons.
     """
-    settings, extra = (scene, orders, sizes, symmetry, crossing), lens.apertures
+    extra = lens.apertures
     if extra is None or not (extra.most or any(extra.blocks)):
-        return _inside(lens, *settings)
+        return _inside(group, lens, scene)
     sign, *terms = extra.terms()
 
     def part(shapes, corners):
-        return _inside(dataclasses.replace(lens, apertures=extra.part(shapes, corners)), *settings)
+        own = dataclasses.replace(lens, apertures=extra.part(shapes, corners))
+        return _inside(group, own, scene)
 
     def total(points, weight):  # from (W, T, Q)
         weight = weight * jnp.asarray(sign, weight.dtype)[None, :, None]
@@ -217,30 +204,24 @@ def _open(
     return [total(*one) for one in jax.vmap(part, out_axes=1)(*map(jnp.asarray, terms))]
 
 
-def _inside(
-    lens: Lens,
-    scene: Scene,
-    orders: Array,
-    sizes: tuple[int, ...],
-    symmetry: Symmetry,
-    crossing: bool,
-) -> list[tuple[Vector, Array]]:
+def _inside(group: ClippedGroup, lens: Lens, scene: Scene) -> list[tuple[Vector, Array]]:
     """Points and weights of each of G orders, for the area that is inside of all apertures and also
-    inside of all obscurations; arguments as in `_open`.
+    inside of all obscurations.
 
     With p = centre + r L(a) M e(a), e(a) = (cos a, sin a), L the length of the spoke and M the
     stretching, the mean over the disc is the integral of det(M) L^2 r dr da / pi: weight = share
     L^2 det(M) 2 r w_r for a spoke with the weight `share` in azimuth and a radial node r with the
     weight w_r.
     """
+    orders, sizes, symmetry = jnp.asarray(group.orders, jnp.int32), group.sizes, group.symmetry
     most = tuple(_most(lens, symmetry, size) for size in sizes)
     extra = lens.apertures
     sides = 0 if extra is None else extra.most * extra.kinds.count("polygon")
     radial = RadialRule(symmetry, most, CORNERS + 2 * sides)
     used = jnp.asarray(_spokes(lens, symmetry, orders), jnp.int32)
-    plan = find_boundary(*jax.lax.stop_gradient((lens, scene)), radial, used, crossing)
+    plan = boundary.plan(*jax.lax.stop_gradient((lens, scene)), radial, used, group.crossing)
     plan = jax.lax.stop_gradient(plan)
-    point, _ = _attach(radial, crossing, lens, scene, plan)
+    point, _ = _attach(radial, group.crossing, lens, scene, plan)
     corner, end = point[..., : -radial.count], point[..., -radial.count :]
     toward, share = plan.spokes(radial, corner)
     length = _along(end - plan.frame.centre, toward)

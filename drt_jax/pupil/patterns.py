@@ -73,8 +73,7 @@ def random_disc(rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     Returns points (rays, 2) and equal weights (rays,).
     """
     _count("rays", rays)
-    generator = np.random.default_rng(seed)
-    return _of_square(generator.random(rays), generator.random(rays))
+    return _of_square(*np.random.default_rng(seed).random((2, rays)))
 
 
 def _of_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

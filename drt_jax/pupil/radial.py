@@ -15,7 +15,6 @@ import numpy as np
 from jax import Array
 
 from ..numerics import safe_divide
-from .boundary import displace, inverse, picked
 from .rules import Symmetry
 
 # CORNERS: largest number of corners of a boundary without polygons.
@@ -24,6 +23,28 @@ from .rules import Symmetry
 # _EXTRA: the number of nodes in a panel between two corners is proportional to its width in units
 # of pi, plus this.
 CORNERS, _PARTS, _EXTRA = 8, 32, 0.15
+
+
+def displace(rates: Array, change: Array) -> Array:
+    """Change of a quantity by its linear model: rates[0] dx + rates[1] dy.
+
+    rates: (2, ..., W, B), derivatives by a point.
+    change: (2, W, B), change (dx, dy) of the point.
+    """
+    x, y = change.reshape(2, *[1] * (rates.ndim - 3), *change.shape[1:])
+    return rates[0] * x + rates[1] * y
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverses of matrices (2, 2, W, B); 0 for a singular matrix."""
+    (p, q), (r, s) = matrix
+    return safe_divide(jnp.array([[s, -q], [-r, p]]), (p * s - q * r)[None, None])
+
+
+def picked(values: Array, edge: Array) -> Array:
+    """Entries (..., N, W, B) of `values` (..., E, W, B) at the edges `edge` (N, W, B)."""
+    index = edge.reshape(*[1] * (values.ndim - 3), *edge.shape)
+    return jnp.take_along_axis(values, index, axis=-3)
 
 
 @functools.cache
