@@ -36,23 +36,33 @@ def test_known_numbers_stay_known_inside_jit():
     np.testing.assert_allclose(jax.jit(spot)().covariance, spot().covariance, rtol=1e-12)
 
 
-@pytest.mark.parametrize("how", [lambda call: call, jax.jit])
-def test_points_of_any_shape_are_the_first_axes(how):
-    """Each result is that of its own point."""
+def test_points_of_any_shape_are_the_first_axes():
+    """Each result is that of its own point, eagerly and compiled."""
     grid = Scene.grid([0.0, 0.05, 0.1], (700.0, np.inf), RGB)
     pairs = Scene.radians([[0.02, 0.05], [0.0, 0.1]], (700.0, 900.0), RGB)
 
     def found(scene):
         points = np.array([[0.0, 0.0], [0.3, -0.5]])
         rays = drt_jax.trace_rays(LENS, scene, points)
-        spot = drt_jax.psf_moments(LENS, scene, Gauss(2, "none"))
-        return rays[:4], spot.mean, spot.covariance, drt_jax.chief_ray_angle(LENS, scene)
+        return rays[:4], drt_jax.chief_ray_angle(LENS, scene)
 
-    for scene in (grid, pairs):
-        every, alone = how(found)(scene), [found(one) for one in scene.each()]
+    for scene, every in ((grid, found(grid)), (pairs, jax.jit(found)(pairs))):
+        alone = [found(one) for one in scene.each()]
         alone = jax.tree.map(lambda *a: jnp.stack(a).reshape(*scene.shape, *a[0].shape), *alone)
         for a, b in zip(jax.tree.leaves(every), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [lambda call: call, jax.jit])
+def test_points_of_moments_are_the_first_axes(how):
+    """The same of spots."""
+    scene = Scene.grid([0.0, 0.05, 0.1], (700.0, np.inf), RGB)
+    spot = lambda scene: drt_jax.psf_moments(LENS, scene, Gauss(2, "none"))  # noqa: E731
+    every, alone = how(spot)(scene), [spot(one) for one in scene.each()]
+    for name in ("mean", "covariance", "throughput"):
+        wanted = np.stack([getattr(one, name) for one in alone]).reshape(getattr(every, name).shape)
+        np.testing.assert_allclose(getattr(every, name), wanted, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize(
