@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from drt_jax import design, learn
 from drt_jax.compilation import LARGE, jit
-from drt_jax.design.gaps import between
+from drt_jax.design.media import between
 
 from . import _optiland
 from ._settings import Beside

@@ -3,7 +3,6 @@
 from . import least_squares as least_squares
 from .apertures import fit_apertures as fit_apertures, open_apertures as open_apertures
 from .compensate import AsBuilt as AsBuilt, as_built as as_built
-from .deviations import Tolerance as Tolerance, elements_of as elements_of
 from .field_rays import FieldRays as FieldRays
 from .glasses import (
     Snap as Snap,
@@ -13,9 +12,10 @@ from .glasses import (
 from .growth import Growth as Growth, grow as grow, part_of as part_of
 from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit
+from .media import elements_of as elements_of
 from .operands import Operand as Operand
 from .optimum import Optimum as Optimum, optimise as optimise
-from .perturbed import PerturbedLens as PerturbedLens
+from .perturbed import PerturbedLens as PerturbedLens, Tolerance as Tolerance
 from .prediction import Predicted as Predicted, predict as predict, worst_case as worst_case
 from .problem import Problem as Problem, trace_fields as trace_fields
 from .solves import Solve as Solve

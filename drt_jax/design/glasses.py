@@ -11,7 +11,7 @@ from ..devices import in_turn
 from ..lens.glass import Glass, nd_and_vd
 from ..lens.glasses import Neighbour, nearest_glasses
 from ..lens.lens import Lens, glass_rows, with_glass
-from .kinds import model_glasses
+from .media import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
 from .problem import Problem, quick
 

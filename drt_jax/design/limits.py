@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..lens.lens import Lens
-from .gaps import ZONES
+from .media import ZONES
 from .operands import Operand
 from .values import kind_of
 

@@ -12,8 +12,8 @@ from jax import Array
 from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..numerics import concrete, leaves, safe_sqrt
+from .checks import whole_numbers
 from .field_rays import FieldRays
-from .kinds import whole_numbers
 from .values import OPERANDS, kind_of
 
 # Arguments of an operand that select values by their numbers.

@@ -1,34 +1,267 @@
-"""A lens as built: the deviations of its parts as a vector."""
+"""A lens as built: tolerances, and the deviations of its parts as a vector."""
 
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require_one_of
 from ..lens.elements import Elements
-from ..lens.glass import Dispersion, refractive_index
+from ..lens.glass import refractive_index
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
-from .deviations import (
-    KINDS,
-    WITH_X,
-    Deviation,
-    Tolerance,
-    deviations_of,
-    elements_of,
-    pieces_of,
-    x_curvatures,
-)
+from .checks import require
+from .media import elements_of, pieces_of
+from .parts import PARTS, with_arrays
 
 # A fringe is half a wave of green light (ISO 10110-5: 0.5460740 um), in mm.
 _FRINGE = 0.5460740e-3 / 2
 _LINES = (0.4861327, 0.5875618, 0.6562725)  # F, d, C
 _MINUTE = math.pi / 180 / 60
+# Forms whose first coefficient is the curvature along x.
+_WITH_X = ("biconic", "toroid")
+# The keys of `KINDS`, for type checkers and settings; a test compares them.
+ToleranceKind = Literal[
+    "radius", "fringes", "irregularity", "wedge", "thickness", "index", "abbe", "shift",
+    "tilt"
+]  # fmt: skip
+
+
+class _Errors(NamedTuple):
+    """K deviations of one kind.
+
+    nominal: the nominal lens.
+    beam_radius: (S,), as in `PerturbedLens`, mm.
+    at: (K,), numbers of the surfaces, or indices of the groups of `Lens.elements`.
+    axis: (K,), components.
+    by: (K,), deviations in the unit of the kind.
+    """
+
+    nominal: Lens
+    beam_radius: Array
+    at: np.ndarray
+    axis: np.ndarray
+    by: Array
+
+
+class Kind(NamedTuple):
+    """A kind of deviation.
+
+    whole: what deviates, a "surface" or an "element".
+    axes: number of components, 2 for x and y.
+    unit: unit of the deviation.
+    places: function of a lens, the numbers of the surfaces or elements that can have it.
+    change: function of a lens and of deviations of this kind, the lens with them.
+    most: upper bound of the size, in that unit.
+    why_none: what is said of a lens that has no such places.
+    """
+
+    whole: str
+    axes: int
+    unit: str
+    places: Callable[[Lens], Sequence[int]]
+    change: Callable[[Lens, _Errors], Lens]
+    most: float = math.inf
+    why_none: str = "the lens has none"
+
+
+def _x_curvatures(lens: Lens, at: np.ndarray) -> Array:
+    """Curvatures along x of the surfaces `at`, 1/mm; 0 for a form without a separate curvature
+    along x.
+    """
+    has = np.array([lens.forms[i] in _WITH_X for i in at])
+    if not has.any():
+        return jnp.zeros(len(at), lens.curvature.dtype)
+    return jnp.where(has, lens.coefficients[at, 0], 0)
+
+
+def _curved_surfaces(lens: Lens) -> list[int]:
+    """Active surfaces with a curvature along y or x."""
+    across = np.asarray(_x_curvatures(lens, np.arange(lens.count)))
+    curved = (np.asarray(lens.curvature)[:-1] != 0) | (across != 0)
+    return [i for i in lens.active if curved[i]]
+
+
+def _added(lens: Lens, part: str, at: np.ndarray, axis: np.ndarray | int, by: Array) -> Lens:
+    """The lens with `by` added to a part of `PARTS`, in the rows `at` and the terms `axis`."""
+    return PARTS[part].write(lens, PARTS[part].read(lens).at[at, axis].add(by))
+
+
+def _curved(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
+    """The lens with the curvatures of surfaces `at` changed by `by`, and those along x by
+    `across`.
+    """
+    own = np.array([lens.forms[i] in _WITH_X for i in at])
+    if own.any():
+        lens = _added(lens, "coefficients", at[own], 0, across[own])
+    return _added(lens, "curvature", at, 0, by)
+
+
+def _with_radii(lens: Lens, errors: _Errors) -> Lens:
+    """The lens with other radii, by per cent."""
+    own, at, part = errors.nominal, errors.at, 1 / (1 + errors.by / 100) - 1
+    return _curved(lens, at, own.curvature[at] * part, _x_curvatures(own, at) * part)
+
+
+def _with_fringes(along: float, across: float, lens: Lens, errors: _Errors) -> Lens:
+    """The lens with curvatures along y and x that differ by so many times the fringes."""
+    own, at = errors.nominal, errors.at
+    shape = jax.tree.map(lambda a: a[..., at], own.shape)
+    forms, zero = tuple(own.forms[i] for i in at), jnp.zeros(len(at), own.curvature.dtype)
+
+    def height(y: Array, bend: Array) -> Array:
+        changed = shape._replace(curvature=shape.curvature + bend)
+        return by_form(surface_sag, (jnp.zeros_like(y), y), changed, forms)
+
+    # Displacement along the normal at the rim of the beam, mm for each 1/mm of curvature along y.
+    rim = errors.beam_radius[at], zero
+    _, slope = jax.jvp(height, rim, (zero + 1, zero))
+    _, rise = jax.jvp(height, rim, (zero, zero + 1))
+    bend = errors.by * _FRINGE / (rise / jnp.sqrt(1 + slope**2))
+    return _curved(lens, at, along * bend, across * bend)
+
+
+def _with_glass(kind: str, lens: Lens, errors: _Errors) -> Lens:
+    """The lens with another nd ("index"), or vd by per cent at constant nd ("abbe").
+
+    For a glass with a dispersion formula, n^2 changes by a constant that gives the change at the d
+    line, or by a term in 1/L^2 (L the wavelength) that gives the change of n_F - n_C.
+    """
+    pieces = [pieces_of(errors.nominal)[i] for i in errors.at]
+    at = np.concatenate(pieces)
+    by = errors.by[np.repeat(np.arange(len(pieces)), [*map(len, pieces)])]
+    schott, model = lens.dispersion.schott, lens.dispersion.model
+    own = jnp.zeros(len(at), bool)
+    if model is not None:
+        own = model[at, 0] > 1
+        change = by if kind == "index" else model[at, 1] * by / 100
+        model = model.at[at, int(kind == "abbe")].add(jnp.where(own, change, 0))
+    lines = jnp.asarray(_LINES, lens.curvature.dtype)
+    f, d, c = refractive_index(errors.nominal.dispersion, lines)[at].T
+    if kind == "index":
+        schott = schott.at[at, 0].add(jnp.where(own, 0, 2 * d * by + by**2))
+    else:
+        change = (f - c) * (1 / (1 + by / 100) - 1)
+        inverse = [1 / line**2 for line in _LINES]
+        slope = (inverse[0] - inverse[1]) / (2 * f) + (inverse[1] - inverse[2]) / (2 * c)
+        strength = jnp.where(own, 0, change / slope)
+        schott = schott.at[at, 2].add(strength).at[at, 0].add(-strength * inverse[1])
+    glass = dataclasses.replace(lens.dispersion, schott=schott, model=model)
+    return dataclasses.replace(lens, dispersion=glass)
+
+
+def _with_part(part: str, unit: float, lens: Lens, errors: _Errors) -> Lens:
+    """The lens with another part of `PARTS`, by deviations in the unit `unit`."""
+    return _added(lens, part, errors.at, errors.axis, errors.by * unit)
+
+
+def _moved(name: str, unit: float, lens: Lens, errors: _Errors) -> Lens:
+    """The lens with other shifts or tilts of its elements, by deviations in the unit `unit`."""
+    elements: Any = lens.elements
+    array = getattr(elements, name).at[errors.at, errors.axis].add(errors.by * unit)
+    return dataclasses.replace(lens, elements=dataclasses.replace(elements, **{name: array}))
+
+
+def _active(lens: Lens) -> Sequence[int]:
+    """The active surfaces."""
+    return lens.active
+
+
+def _bendable(lens: Lens) -> list[int]:
+    """Active surfaces that may have another curvature along x than along y."""
+    return [i for i in lens.active if lens.forms[i] in ("asphere", *_WITH_X)]
+
+
+def _pieces(lens: Lens) -> Sequence[int]:
+    """Surfaces in front of pieces of glass."""
+    return [*pieces_of(lens)]
+
+
+def _elements(lens: Lens) -> Sequence[int]:
+    """The numbers of the elements."""
+    return range(len(elements_of(lens)))
+
+
+_gaps = PARTS["thickness"].rows
+_NOT_CURVED = "no surface is curved; for planes use fringes"
+_NOT_ROUND = "no surface is a sphere, conic, even asphere, biconic or toroid"
+_NO_GAP = "the lens has one surface, without a thickness behind it"
+_NO_GLASS = "the lens has no glass"
+KINDS: dict[str, Kind] = {
+    "radius": Kind("surface", 1, "%", _curved_surfaces, _with_radii, 100, _NOT_CURVED),
+    "fringes": Kind("surface", 1, "fringes", _active, partial(_with_fringes, 1, 1)),
+    "irregularity": Kind(
+        "surface", 1, "fringes", _bendable, partial(_with_fringes, 0.5, -0.5), why_none=_NOT_ROUND
+    ),
+    "wedge": Kind("surface", 2, "arc min", _active, partial(_with_part, "tilt", _MINUTE)),
+    "thickness": Kind(
+        "surface",
+        1,
+        "mm",
+        PARTS["thickness"].rows,
+        partial(_with_part, "thickness", 1),
+        why_none=_NO_GAP,
+    ),
+    "index": Kind("surface", 1, "", _pieces, partial(_with_glass, "index"), why_none=_NO_GLASS),
+    "abbe": Kind("surface", 1, "%", _pieces, partial(_with_glass, "abbe"), 100, _NO_GLASS),
+    "shift": Kind("element", 2, "mm", _elements, partial(_moved, "shift", 1)),
+    "tilt": Kind("element", 2, "arc min", _elements, partial(_moved, "tilt", _MINUTE)),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerance:
+    """Largest deviation of parts of one kind, in both directions.
+
+    kind: one of the following. A fringe is half a wave of 546 nm.
+        Of surfaces: "radius", of the vertex, per cent; "fringes", a change of curvature, measured
+        along the normal at the rim of the beam; "irregularity", a cylinder, in fringes between both
+        directions (half of them along y, and minus half of them along x); "wedge", a tilt about x
+        and y, arc minutes.
+        Behind surfaces: "thickness", mm; "index", of the d line; "abbe", per cent.
+        Of elements: "shift" along x and y, mm; "tilt" about x and y through the first vertex, arc
+        minutes.
+    size: largest deviation, in these units.
+    which: numbers of surfaces or elements, from 0; () for all that have this kind of deviation.
+    """
+
+    kind: ToleranceKind
+    size: float
+    which: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_one_of("tolerances: kind", self.kind, KINDS)
+        most = KINDS[self.kind].most
+        below = "" if math.isinf(most) else f" and below {most:g}"
+        require(
+            0 < self.size < most,
+            f"tolerances: {self.kind}: size: must be above 0{below}, got {self.size:g}",
+        )
+
+
+class Deviation(NamedTuple):
+    """One number of a lens that deviates.
+
+    kind: as in `Tolerance`.
+    place: number of the surface or element.
+    axis: component, 0 for x, 1 for y; 0 for a kind without components.
+    """
+
+    kind: str
+    place: int
+    axis: int
+
+    def __str__(self) -> str:
+        kind = KINDS[self.kind]
+        axis = f", {'xy'[self.axis]}" if kind.axes > 1 else ""
+        return f"{self.kind} of {kind.whole} {self.place}{axis}"
 
 
 @jax.tree_util.register_dataclass
@@ -63,21 +296,28 @@ class PerturbedLens:
         beam_radius: (S,), mm, for instance that of `Problem.beam_radius`.
         tolerances: the tolerances.
 
-        ValueError for a part that does not exist (the message lists those that do) or is named
-        twice.
+        ValueError for no tolerance, and for a part that does not exist (the message lists those
+        that do) or is named twice.
         """
-        if np.shape(beam_radius) != (lens.count,):
-            raise ValueError(
-                f"beam_radius: expected ({lens.count},), got shape {np.shape(beam_radius)}"
-            )
-        spans, dtype = elements_of(lens), lens.curvature.dtype
-        sizes = deviations_of(lens, tolerances)
-        kinds = {error.kind for error in sizes}
-        lens, groups = _with_elements(lens, spans, kinds)
-        if "wedge" in kinds and lens.tilt is None:
-            lens = dataclasses.replace(lens, tilt=jnp.zeros((lens.count + 1, 3), dtype))
+        shape = np.shape(beam_radius)
+        require(shape == (lens.count,), f"beam_radius: expected ({lens.count},), got shape {shape}")
+        sizes: dict[Deviation, float] = {}
+        for tolerance in tolerances:
+            for deviation in _deviations_of(lens, tolerance):
+                require(
+                    deviation not in sizes, f"tolerances: {deviation} is named twice; remove one"
+                )
+                sizes[deviation] = tolerance.size
+        require(sizes, "tolerances: none; name at least one")
+        spans, kinds = elements_of(lens), {deviation.kind for deviation in sizes}
+        groups: tuple[int, ...] = ()
+        if any(KINDS[kind].whole == "element" for kind in kinds):
+            lens, groups = _with_elements(lens, spans)
+        if "wedge" in kinds:
+            lens = with_arrays(lens, ["tilt"])
         if "irregularity" in kinds:
             lens = _with_cylinders(lens)
+        dtype = lens.curvature.dtype
         largest = jnp.asarray([*sizes.values()], dtype)
         return cls(lens, jnp.asarray(beam_radius, dtype), largest, tuple(sizes), spans, groups)
 
@@ -96,79 +336,49 @@ class PerturbedLens:
 
         perturbation: (P,), deviations in units of their largest.
         """
-        lens = self.lens
-        found: dict[str, list[tuple[Deviation, Array]]] = {}
-        for k, error in enumerate(self.deviations):
-            found.setdefault(error.kind, []).append((error, perturbation[k] * self.sizes[k]))
-        for kind, own in found.items():
-            places = np.array([error.place for error, _ in own])
-            axes = np.array([error.axis for error, _ in own])
-            lens = self._deviated(lens, kind, places, axes, jnp.stack([by for _, by in own]))
+        lens, by = self.lens, perturbation * self.sizes
+        for kind in dict.fromkeys(error.kind for error in self.deviations):
+            own = np.array([k for k, error in enumerate(self.deviations) if error.kind == kind])
+            at, axis = np.array([self.deviations[k][1:] for k in own]).T
+            at = np.array(self.groups)[at] if KINDS[kind].whole == "element" else at
+            errors = _Errors(self.lens, self.beam_radius, at, axis, by[own])
+            lens = KINDS[kind].change(lens, errors)
         return lens
 
-    def _deviated(self, lens: Lens, kind: str, at: np.ndarray, axis: np.ndarray, by: Array) -> Lens:
-        """The lens with deviations `by` of one kind, at the places `at` and along the axes
-        `axis`.
-        """
-        replace, own = dataclasses.replace, self.lens
-        if kind == "radius":
-            part = 1 / (1 + by / 100) - 1
-            return _curved(lens, at, own.curvature[at] * part, x_curvatures(own, at) * part)
-        if kind in ("fringes", "irregularity"):
-            bend = by * _FRINGE / _rise(own, at, self.beam_radius)
-            both = (bend, bend) if kind == "fringes" else (bend / 2, -bend / 2)
-            return _curved(lens, at, *both)
-        if kind == "thickness":
-            gap = lens.thickness.at[at].add(by)
-            return replace(lens, thickness=gap, sensor=lens.sensor + jnp.sum(by))
-        if kind in ("index", "abbe"):
-            pieces = pieces_of(own)
-            media = np.concatenate([pieces[i] for i in at])
-            by = by[np.repeat(np.arange(len(at)), [len(pieces[i]) for i in at])]
-            return replace(lens, dispersion=_medium(lens, own.dispersion, kind, media, by))
-        if kind == "wedge":
-            assert lens.tilt is not None
-            return replace(lens, tilt=lens.tilt.at[at, axis].add(by * _MINUTE))
-        elements = lens.elements
-        assert elements is not None
-        rows = np.array(self.groups)[at]
-        if kind == "shift":
-            elements = replace(elements, shift=elements.shift.at[rows, axis].add(by))
-        else:
-            elements = replace(elements, tilt=elements.tilt.at[rows, axis].add(by * _MINUTE))
-        return replace(lens, elements=elements)
+
+def _deviations_of(lens: Lens, tolerance: Tolerance) -> list[Deviation]:
+    """The deviations that one tolerance allows; see `PerturbedLens.from_lens`."""
+    kind = KINDS[tolerance.kind]
+    possible, what = kind.places(lens), f"tolerances: {tolerance.kind}"
+    require(possible, f"{what}: {kind.why_none}")
+    some = ", ".join(map(str, possible))
+    for place in tolerance.which:
+        require(place in possible, f"{what}: no {kind.whole} {place} can deviate; there are {some}")
+    places = itertools.product(tolerance.which or possible, range(kind.axes))
+    return [Deviation(tolerance.kind, place, axis) for place, axis in places]
 
 
-def _with_elements(
-    lens: Lens, spans: tuple[tuple[int, int], ...], kinds: set[str]
-) -> tuple[Lens, tuple[int, ...]]:
+def _with_elements(lens: Lens, spans: tuple[tuple[int, int], ...]) -> tuple[Lens, tuple[int, ...]]:
     """The same lens with a group for each element, and the indices of these groups.
 
-    The lens is unchanged if no deviation moves an element. Groups that the lens already has are
-    kept, inside of the new ones or around them.
+    Groups that the lens already has are kept, inside of the new ones or around them.
     """
-    if not any(KINDS[kind].whole == "element" for kind in kinds):
-        return lens, ()
-    zero = jnp.zeros((len(spans), 3), lens.curvature.dtype)
-    arrays = [(zero, zero, zero[:, 0])]
-    where, about, old = list(spans), [first for first, _ in spans], lens.elements
-    if old is not None:
-        for (a, b), (first, last) in itertools.product(old.spans, spans):
-            if a < first <= b < last or first < a <= last < b:
-                raise ValueError(
-                    f"tolerances: the element of surfaces {first} to {last} is cut by that of the "
-                    f"lens file, {a} to {b}; put one inside the other, or apart"
-                )
-        arrays.insert(0, (old.shift, old.tilt, old.pivot))
-        where, about = [*old.spans, *where], [*old.about, *about]
+    zero, old = jnp.zeros(3, lens.curvature.dtype), lens.elements
+    new = [(span, span[0], zero, zero, zero[0]) for span in spans]
+    kept = [] if old is None else [*zip(old.spans, old.about, old.shift, old.tilt, old.pivot)]
+    for ((a, b), *_), (first, last) in itertools.product(kept, spans):
+        require(
+            not (a < first <= b < last or first < a <= last < b),
+            f"tolerances: the element of surfaces {first} to {last} is cut by that of the "
+            f"lens file, {a} to {b}; put one inside the other, or apart",
+        )
     # A group comes before the groups inside it.
-    order = sorted(range(len(where)), key=lambda g: (where[g][0], -where[g][1], g))
-    shift, tilt, pivot = (jnp.concatenate(parts)[np.array(order)] for parts in zip(*arrays))
-    elements = Elements(
-        shift, tilt, pivot, tuple(where[g] for g in order), tuple(about[g] for g in order)
-    )
-    new = range(len(where) - len(spans), len(where))
-    return dataclasses.replace(lens, elements=elements), tuple(order.index(g) for g in new)
+    groups = sorted([*kept, *new], key=lambda group: (group[0][0], -group[0][1]))
+    where, about, *arrays = zip(*groups)
+    shift, tilt, pivot = map(jnp.stack, arrays)
+    elements = Elements(shift, tilt, pivot, where, about)
+    order = [id(group) for group in groups]
+    return dataclasses.replace(lens, elements=elements), tuple(order.index(id(g)) for g in new)
 
 
 def _with_cylinders(lens: Lens) -> Lens:
@@ -180,61 +390,3 @@ def _with_cylinders(lens: Lens) -> Lens:
     wide = jnp.where(round_[:, None], wide, narrow)
     forms = tuple("biconic" if r else form for r, form in zip(round_, lens.forms))
     return dataclasses.replace(lens, coefficients=wide, forms=forms)
-
-
-def _curved(lens: Lens, at: np.ndarray, by: Array, across: Array) -> Lens:
-    """The lens with the curvatures of surfaces `at` changed by `by`, and those along x by
-    `across`.
-    """
-    own = np.array([lens.forms[i] in WITH_X for i in at])
-    coefficients = lens.coefficients
-    if own.any():
-        coefficients = coefficients.at[at[own], 0].add(across[own])
-    curvature = lens.curvature.at[at].add(by)
-    return dataclasses.replace(lens, curvature=curvature, coefficients=coefficients)
-
-
-def _rise(lens: Lens, at: np.ndarray, beam_radius: Array) -> Array:
-    """Displacement of surfaces `at` along the normal at the rim of the beam, mm for each 1/mm of
-    curvature along y.
-
-    It is d(sag)/d(curvature) / sqrt(1 + slope^2).
-    """
-    shape = jax.tree.map(lambda a: a[..., at], lens.shape)
-    forms, zero = tuple(lens.forms[i] for i in at), jnp.zeros(len(at), lens.curvature.dtype)
-
-    def height(y: Array, bend: Array) -> Array:
-        changed = shape._replace(curvature=shape.curvature + bend)
-        return by_form(surface_sag, (jnp.zeros_like(y), y), changed, forms)
-
-    rim = beam_radius[at], zero
-    _, slope = jax.jvp(height, rim, (zero + 1, zero))
-    _, rise = jax.jvp(height, rim, (zero, zero + 1))
-    return rise / jnp.sqrt(1 + slope**2)
-
-
-def _medium(lens: Lens, nominal: Dispersion, kind: str, at: np.ndarray, by: Array) -> Dispersion:
-    """Dispersion with a change of nd of the media `at`, or of vd by per cent at constant nd.
-
-    For a glass with a dispersion formula, n^2 changes by a constant that gives the change at the d
-    line, or by a term in 1/L^2 (L the wavelength) that gives the change of n_F - n_C.
-    """
-    constants, model = lens.dispersion, lens.dispersion.model
-    own = jnp.zeros(len(at), bool)
-    if model is not None:
-        own = model[at, 0] > 1
-        if kind == "index":
-            model = model.at[at, 0].add(jnp.where(own, by, 0))
-        else:
-            model = model.at[at, 1].add(jnp.where(own, model[at, 1] * by / 100, 0))
-    f, d, c = refractive_index(nominal, jnp.asarray(_LINES, lens.curvature.dtype))[at].T
-    schott = constants.schott
-    if kind == "index":
-        schott = schott.at[at, 0].add(jnp.where(own, 0, 2 * d * by + by**2))
-    else:
-        change = (f - c) * (1 / (1 + by / 100) - 1)
-        inverse = [1 / line**2 for line in _LINES]
-        slope = (inverse[0] - inverse[1]) / (2 * f) + (inverse[1] - inverse[2]) / (2 * c)
-        strength = jnp.where(own, 0, change / slope)
-        schott = schott.at[at, 2].add(strength).at[at, 0].add(-strength * inverse[1])
-    return dataclasses.replace(constants, schott=schott, model=model)

@@ -24,9 +24,9 @@ from .field_rays import (
     symmetry_by_structure,
     trace_views,
 )
-from .gaps import gaps
 from .least_squares import Evaluation
 from .limits import Limit, limits_of
+from .media import gaps
 from .operands import Operand, OperandFunction, OperandName
 from .values import OPERANDS, kind_of
 from .variables import Variables

@@ -23,8 +23,10 @@ from ..lens.scene import Scene, checked_scene, vergence_of
 from ..numerics import concrete, leaves, safe_divide
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
+from .checks import require
 from .field_rays import symmetry_by_structure
-from .kinds import KINDS, back_distance, step_of
+from .media import back_distance
+from .parts import Place, number_at, step_of
 
 # In the order of application. No solve changes the condition of an earlier one, see `fix_solves`.
 _Name = Literal[
@@ -80,17 +82,16 @@ class Solve:
 
     def __post_init__(self) -> None:
         require_one_of("solves: kind", self.kind, get_args(_Name))
-        if not math.isfinite(self.value):
-            raise ValueError(f"solves: {self.kind}: value: must be finite, got {self.value:g}")
-        if self.aperture and self.value < 0:
-            raise ValueError(
-                f"solves: {self.kind}: value: must be above 0, or 0 for that of the start, "
-                f"got {self.value:g}"
-            )
+        what = f"solves: {self.kind}"
+        finite = math.isfinite(self.value)
+        require(finite, f"{what}: value: must be finite, got {self.value:g}")
+        require(
+            self.value >= 0 or not self.aperture,
+            f"{what}: value: must be above 0, or 0 for that of the start, got {self.value:g}",
+        )
         for name in ("fields", "wavelengths"):
             numbers = tuple(float(number) for number in np.ravel(getattr(self, name)))
-            if not numbers:
-                raise ValueError(f"solves: {self.kind}: {name}: none; give one or leave it out")
+            require(numbers, f"{what}: {name}: none; give one or leave it out")
             object.__setattr__(self, name, numbers)
 
     @property
@@ -103,26 +104,32 @@ class Solve:
         """True if the semi-diameter of the stop is solved."""
         return self.kind in ("entrance_pupil", "f_number")
 
-    def place(self, lens: Lens) -> tuple[str, int, int]:
-        """Kind, row and term of the solved number.
+    def place(self, lens: Lens) -> Place:
+        """The place of the solved number.
 
         ValueError if the lens has no such number, or if the condition does not depend on it.
         """
         if self.focuses:
-            return "sensor", 0, 0
+            return Place("sensor", 0, 0)
         if self.aperture:
-            return "semi_diameter", lens.stop, 0
+            return Place("semi_diameter", lens.stop, 0)
         active = ", ".join(map(str, lens.active))
-        if self.surface not in lens.active:
-            raise ValueError(
-                f"solves: {self.kind}: its curvature follows: give surface, one of {active}"
-            )
-        if self.kind == "image_angle" and self.surface < lens.stop:
-            raise ValueError(
-                f"solves: image_angle: surface {self.surface} lies before the stop, which is "
-                f"number {lens.stop}; give one at it or behind, of {active}"
-            )
-        return "curvature", self.surface, 0
+        require(
+            self.surface in lens.active,
+            f"solves: {self.kind}: its curvature follows: give surface, one of {active}",
+        )
+        require(
+            self.kind != "image_angle" or self.surface >= lens.stop,
+            f"solves: image_angle: surface {self.surface} lies before the stop, which is number "
+            f"{lens.stop}; give one at it or behind, of {active}",
+        )
+        return Place("curvature", self.surface, 0)
+
+    def with_value(self, value: Array | float) -> "Solve":
+        """The solve with another value, which may be an array."""
+        own = copy.copy(self)
+        object.__setattr__(own, "value", value)
+        return own
 
     def placed(self, lens: Lens) -> "Solve":
         """The solve for a problem: its numbers are arrays in the dtype of the lens.
@@ -140,45 +147,50 @@ class Solve:
 
         ValueError if the lens has no such value, or if the solved number does not change it.
         """
-        kind, row, term = self.place(lens)
+        what, place = f"solves: {self.kind}", self.place(lens)
         if self.focuses:
-            if not float(_focus(lens, self.placed(lens))[1]) > 0:
-                raise ValueError(
-                    f"solves: {self.kind}: there is none: the light behind the lens is parallel, "
-                    "or none arrives; leave it out, or begin with another lens"
-                )
-            warn_of_focus(
-                lens, checked_scene(lens, Scene.point(0.0, self.distance, self.wavelengths)), 5
+            require(
+                float(_focus(lens, self.placed(lens))[1]) > 0,
+                f"{what}: there is none: the light behind the lens is parallel, or none arrives; "
+                "leave it out, or begin with another lens",
             )
+            scene = Scene.point(0.0, self.distance, self.wavelengths)
+            warn_of_focus(lens, checked_scene(lens, scene), 5)
             return self
-        condition, solve = _CONDITIONS[self.kind], self
+        solve = self
         if self.value == 0:
-            current = condition.value(float(_measure(lens, self)))
-            if current == 0 or not math.isfinite(current):
-                raise ValueError(f"solves: {self.kind}: the lens has none to keep; give its value")
+            current = self.converted(float(_measure(lens, self)))
+            known = current != 0 and math.isfinite(current)
+            require(known, f"{what}: the lens has none to keep; give its value")
             solve = dataclasses.replace(self, value=current)
-        target = condition.value(float(solve.value))
+        target = self.converted(float(solve.value))
         ratio = float(_measure(solve.apply(lens), solve)) / target
-        change = float(solve.rate(lens, solve)) * step_of(lens, kind, row, term)
-        weak = not abs(change) > _TOLERANCE * abs(target)
-        if weak or not abs(ratio - 1) < _TOLERANCE:
-            raise ValueError(
-                f"solves: {self.kind}: no {kind} of surface {row} gives {solve.value:g}; "
-                "is the beam in focus there? give another surface"
-            )
+        change = float(solve.rate(lens, solve)) * step_of(lens, place)
+        require(
+            abs(change) > _TOLERANCE * abs(target) and abs(ratio - 1) < _TOLERANCE,
+            f"{what}: no {place.kind} of surface {place.row} gives {solve.value:g}; is the beam in "
+            "focus there? give another surface",
+        )
         return solve
+
+    def converted(self, value: Any) -> Any:
+        """A value of the condition as a measure, or a measure as a value: itself or 1 / value."""
+        if not _CONDITIONS[self.kind].inverse:
+            return value
+        if isinstance(value, float):
+            return 1 / value if value else math.inf
+        return safe_divide(jnp.ones_like(value), value)
 
     @_program
     def rate(self, lens: Lens, other: "Solve") -> Array:
         """Derivative () of this condition by the solved number of another solve."""
-        number, with_number = _number(lens, other)
-        measure = _CONDITIONS[self.kind].measure
-        one = jnp.ones_like(number)
+        number, with_number = number_at(lens, other.place(lens))
+        measure, one = _CONDITIONS[self.kind].measure, jnp.ones_like(number)
         return jax.jvp(lambda n: measure(with_number(n), self), (number,), (one,))[1]
 
     def apply(self, lens: Lens) -> Lens:
         """The lens with the solved number; unchanged if no number meets the condition."""
-        with_number, own = _number(lens, self)[1], self.placed(lens)
+        with_number, own = number_at(lens, self.place(lens))[1], self.placed(lens)
         return with_number(_focus(lens, own)[0] if self.focuses else _met(lens, own))
 
 
@@ -191,11 +203,11 @@ def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], 
     found: list[Solve] = []
     for solve in sorted(solves, key=lambda solve: get_args(_Name).index(solve.kind)):
         for other in found:
-            if float(other.rate(lens, solve)) != 0:
-                raise ValueError(
-                    f"solves: {other.kind} and {solve.kind}: the second changes what the first "
-                    "keeps; leave one out"
-                )
+            require(
+                float(other.rate(lens, solve)) == 0,
+                f"solves: {other.kind} and {solve.kind}: the second changes what the first keeps; "
+                "leave one out",
+            )
         found.append(solve.fixed(lens))
         lens = found[-1].apply(lens)
     return tuple(solve.placed(lens) for solve in found), lens
@@ -210,11 +222,11 @@ def _measure(lens: Lens, solve: Solve) -> Array:
 @_program
 def _met(lens: Lens, solve: Solve) -> Array:
     """The solved number (), by Newton's method on measure - value = 0."""
-    number, with_number = _number(lens, solve)
-    condition = _CONDITIONS[solve.kind]
+    number, with_number = number_at(lens, solve.place(lens))
+    measure = _CONDITIONS[solve.kind].measure
 
     def miss(number: Array) -> Array:
-        return condition.measure(with_number(number), solve) - condition.value(solve.value)
+        return measure(with_number(number), solve) - solve.converted(solve.value)
 
     for _ in range(_STEPS):
         missed, rate = jax.jvp(miss, (number,), (jnp.ones_like(number),))
@@ -222,26 +234,15 @@ def _met(lens: Lens, solve: Solve) -> Array:
     return number
 
 
-def _number(lens: Lens, solve: Solve) -> tuple[Array, Callable[[Array], Lens]]:
-    """The solved number () of a lens, and a function from such a number to the lens with it."""
-    kind, row, term = solve.place(lens)
-    array = KINDS[kind].read(lens)
-
-    def with_number(number: Array) -> Lens:
-        return KINDS[kind].write(lens, array.at[row, term].set(number))
-
-    return array[row, term], with_number
-
-
 class _Condition(NamedTuple):
     """A condition.
 
     measure: function of the lens and the solve, linear in the solved number.
-    value: conversion between `Solve.value` and the measure; it is its own inverse.
+    inverse: True if the measure is 1 / `Solve.value`.
     """
 
     measure: Callable[[Lens, Solve], Array]
-    value: Callable[[Any], Any]
+    inverse: bool
 
 
 def _wavelengths(lens: Lens, solve: Solve) -> Array:
@@ -269,24 +270,12 @@ def _pupil(lens: Lens, solve: Solve) -> Array:
     return 2 * jnp.mean(entrance_pupil(lens, _wavelengths(lens, solve)).semi_diameter)
 
 
-def _inverse(value: Any) -> Any:
-    """1 / value."""
-    if isinstance(value, float):
-        return 1 / value if value else math.inf
-    return safe_divide(jnp.ones_like(value), value)
-
-
-def _identity(value: Any) -> Any:
-    """The value itself."""
-    return value
-
-
 _CONDITIONS = {
-    "focal_length": _Condition(_power, _inverse),
-    "effective_focal_length": _Condition(_power, _inverse),
-    "image_angle": _Condition(_slope, _identity),
-    "entrance_pupil": _Condition(_pupil, _identity),
-    "f_number": _Condition(lambda lens, solve: 2 * jnp.abs(_slope(lens, solve)), _inverse),
+    "focal_length": _Condition(_power, True),
+    "effective_focal_length": _Condition(_power, True),
+    "image_angle": _Condition(_slope, False),
+    "entrance_pupil": _Condition(_pupil, False),
+    "f_number": _Condition(lambda lens, solve: 2 * jnp.abs(_slope(lens, solve)), True),
 }
 
 

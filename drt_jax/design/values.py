@@ -86,8 +86,7 @@ from .field_rays import (
     incidence_cosines,
     relative_illumination,
 )
-from .gaps import between, gaps
-from .kinds import back_distance, model_glasses
+from .media import back_distance, between, gaps, model_glasses
 from .waves import encircled_energy, mtf, strehl
 
 # A function of a lens and its rays, and of `Operand.at`, that returns the values of an operand.

@@ -1,10 +1,10 @@
 """Variables: some numbers of a lens as a vector, with bounds, ties and solves."""
 
+import collections
 import dataclasses
-import itertools
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -13,66 +13,27 @@ from jax import Array
 
 from ..inputs import require_one_of
 from ..lens.lens import Lens
-from .kinds import (
-    KINDS,
+from .checks import require, whole_numbers
+from .media import back_distance
+from .parts import (
+    PARTS,
     SERIES,
+    Place,
     VariableKind,
-    back_distance,
     lift_of,
+    number_at,
+    places_of,
     step_of,
-    whole_numbers,
-    word_terms,
+    with_arrays,
+    with_numbers,
 )
 from .solves import Solve, fix_solves
 
 _How = Literal["equal", "opposite", "cemented"]
 # Typical change of a coefficient with a bound `sag`, relative to the bound.
 _STEP_OF_SAG = 0.03
-# The kinds that cemented neighbours share.
+# The parts that cemented neighbours share.
 _SHAPE = ("curvature", "conic", "coefficients")
-_WHY_NONE = {
-    "coefficients": "the lens has none; write them into its prescription, zeros too",
-    "phase": "the lens has none; write one into its prescription, zeros too",
-    "thickness": "the lens has one surface; its distance to the sensor is the kind sensor",
-    "index": "the lens has no model glass; write nd and vd into its prescription",
-    "abbe": "the lens has no model glass; write nd and vd into its prescription",
-}
-
-
-class Place(NamedTuple):
-    """One number of a lens: its kind, its row (mostly a surface) and its term within the row."""
-
-    kind: str
-    row: int
-    term: int
-
-    def __str__(self) -> str:
-        term = f"[{self.term}]" if self.kind in (*SERIES, "tilt", "decentre") else ""
-        return self.kind if self.kind == "sensor" else f"{self.kind} {self.row}{term}"
-
-
-def _places(
-    what: str, lens: Lens, kind: str, surfaces: tuple[int, ...], terms: tuple[int, ...] = ()
-) -> list[Place]:
-    """Places of a kind.
-
-    ValueError, which begins with `what`, for a surface or term that does not exist; the message
-    lists those that do.
-    """
-    known = KINDS[kind]
-    allowed, count = known.allowed(lens), known.terms(lens)
-    if not allowed or not count:
-        raise ValueError(f"{what}: {kind}: {_WHY_NONE.get(kind, 'the lens has none')}")
-    for name, named, possible in (("surface", surfaces, allowed), ("term", terms, range(count))):
-        for number in named:
-            if number not in possible:
-                some = ", ".join(map(str, possible))
-                raise ValueError(f"{what}: {kind}: no {name} {number}; there are {some}")
-    return [
-        Place(kind, row, term)
-        for row in surfaces or known.rows(lens)
-        for term in terms or word_terms(lens, kind, row)
-    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,29 +68,26 @@ class Vary:
     semi_diameter: float = 0.0
 
     def __post_init__(self) -> None:
-        require_one_of("variables: kind", self.kind, KINDS)
-        self._check_sag()
+        require_one_of("variables: kind", self.kind, PARTS)
+        what = f"variables: {self.kind}"
         for name in ("surfaces", "terms"):
-            numbers = whole_numbers(f"variables: {self.kind}: {name}", getattr(self, name))
+            numbers = whole_numbers(f"{what}: {name}", getattr(self, name))
             object.__setattr__(self, name, numbers)
-        if not self.low < self.high:
-            raise ValueError(
-                f"variables: {self.kind}: low {self.low:g} is not below high {self.high:g}; "
-                "exchange them"
-            )
-        low, high = KINDS[self.kind].limits
-        if not max(self.low, low) < min(self.high, high):
-            raise ValueError(
-                f"variables: {self.kind}: {self.low:g} to {self.high:g} lies outside of {low:g} "
-                f"to {high:g}; widen it"
-            )
-        object.__setattr__(self, "low", max(self.low, low))
-        object.__setattr__(self, "high", min(self.high, high))
-        if not 0 <= self.scale < np.inf:
-            raise ValueError(
-                f"variables: {self.kind}: scale: must be above 0, or 0 to have it chosen, "
-                f"got {self.scale:g}"
-            )
+        require(
+            self.low < self.high,
+            f"{what}: low {self.low:g} is not below high {self.high:g}; exchange them",
+        )
+        require(
+            0 <= self.scale < np.inf,
+            f"{what}: scale: must be above 0, or 0 to have it chosen, got {self.scale:g}",
+        )
+        self._check_sag()
+        least, most = PARTS[self.kind].limits
+        low, high = max(self.low, least), min(self.high, most)
+        between = f"{self.low:g} to {self.high:g} lies outside of {least:g} to {most:g}"
+        require(low < high, f"{what}: {between}; widen it")
+        object.__setattr__(self, "low", low)
+        object.__setattr__(self, "high", high)
 
     def _check_sag(self) -> None:
         """Raises ValueError for `sag` and `semi_diameter` that do not fit together or the kind."""
@@ -137,12 +95,18 @@ class Vary:
         if pair == (0, 0):
             return
         what = "variables: sag and semi_diameter"
-        if self.kind not in SERIES:
-            raise ValueError(f"{what}: are of coefficients, not of {self.kind}; give low and high")
-        if not all(0 < number < np.inf for number in pair):
-            raise ValueError(f"{what}: give both, above 0 mm, got {pair[0]:g} and {pair[1]:g}")
-        if (self.low, self.high) != (-np.inf, np.inf):
-            raise ValueError(f"{what}: stand instead of low and high; leave these out")
+        require(
+            self.kind in SERIES,
+            f"{what}: are of coefficients, not of {self.kind}; give low and high",
+        )
+        require(
+            all(0 < number < np.inf for number in pair),
+            f"{what}: give both, above 0 mm, got {pair[0]:g} and {pair[1]:g}",
+        )
+        require(
+            (self.low, self.high) == (-np.inf, np.inf),
+            f"{what}: stand instead of low and high; leave these out",
+        )
 
     def bounds(self, lens: Lens, place: Place) -> tuple[float, float, float]:
         """Low bound, high bound and scale of one variable, in the units of the lens."""
@@ -151,13 +115,13 @@ class Vary:
             if self.kind == "sensor" and (low, high) == (-np.inf, np.inf):
                 behind = float(back_distance(lens))
                 low, high = (0.0 if behind > 0 else low), (0.0 if behind < 0 else high)
-            return low, high, self.scale or step_of(lens, *place)
-        most = self.sag / lift_of(lens, self.kind, place.row, place.term, self.semi_diameter)
+            return low, high, self.scale or step_of(lens, place)
+        most = self.sag / lift_of(lens, place, self.semi_diameter)
         return -most, most, self.scale or _STEP_OF_SAG * most
 
     def places(self, lens: Lens) -> list[Place]:
         """The places of the variables. ValueError for a surface or term that does not exist."""
-        return _places("variables", lens, self.kind, self.surfaces, self.terms)
+        return places_of("variables", lens, self.kind, self.surfaces, self.terms)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,26 +137,29 @@ class Tie:
 
     surfaces: tuple[int, ...]
     how: _How = "equal"
-    kind: VariableKind | Literal["cemented"] = "curvature"
+    kind: VariableKind = "curvature"
     scale: float = 1.0
     shift: float = 0.0
 
     def __post_init__(self) -> None:
         require_one_of("ties: how", self.how, get_args(_How))
-        require_one_of("ties: kind", self.kind, KINDS)
+        require_one_of("ties: kind", self.kind, PARTS)
         numbers = whole_numbers("ties: surfaces", self.surfaces)
         object.__setattr__(self, "surfaces", numbers)
-        if len(numbers) < 2 or len(set(numbers)) < len(numbers):
-            raise ValueError(f"ties: expected two or more different surfaces, got {numbers}")
-        if self.how == "cemented" and (len(numbers) != 2 or abs(numbers[0] - numbers[1]) != 1):
-            raise ValueError(f"ties: cemented: expected two neighbours, got {numbers}")
-        if self.how == "cemented" and (self.scale, self.shift) != (1, 0):
-            raise ValueError("ties: cemented: takes neither scale nor shift; leave them out")
-        if not (math.isfinite(self.scale) and self.scale and math.isfinite(self.shift)):
-            raise ValueError(
-                f"ties: expected a scale that is not 0 and a shift, got {self.scale:g} and "
-                f"{self.shift:g}"
-            )
+        require(
+            len(numbers) >= 2 and len(set(numbers)) == len(numbers),
+            f"ties: expected two or more different surfaces, got {numbers}",
+        )
+        if self.how == "cemented":
+            neighbours = len(numbers) == 2 and abs(numbers[0] - numbers[1]) == 1
+            require(neighbours, f"ties: cemented: expected two neighbours, got {numbers}")
+            plain = (self.scale, self.shift) == (1, 0)
+            require(plain, "ties: cemented: takes neither scale nor shift; leave them out")
+        require(
+            math.isfinite(self.scale) and self.scale and math.isfinite(self.shift),
+            f"ties: expected a scale that is not 0 and a shift, got {self.scale:g} and "
+            f"{self.shift:g}",
+        )
 
     @property
     def line(self) -> tuple[float, float]:
@@ -203,21 +170,22 @@ class Tie:
         """Pairs of a leader and a follower. ValueError as in `Vary.places`."""
         first, *others = self.surfaces
         kinds: tuple[str, ...] = (self.kind,)
+        terms = {kind: range(PARTS[kind].read(lens).shape[1]) for kind in (self.kind, *_SHAPE)}
         if self.how == "cemented":
-            kinds = tuple(kind for kind in _SHAPE if KINDS[kind].terms(lens))
-            if lens.forms[first] != lens.forms[others[0]]:
-                raise ValueError(
-                    f"ties: cemented: surfaces {first} and {others[0]} are of the forms "
-                    f"{lens.forms[first]} and {lens.forms[others[0]]}; write both alike"
-                )
-        terms = {kind: tuple(range(KINDS[kind].terms(lens))) for kind in kinds}
-        rows = {kind: _places("ties", lens, kind, self.surfaces, terms[kind]) for kind in kinds}
+            kinds = tuple(kind for kind in _SHAPE if terms[kind])
+            one, two = lens.forms[first], lens.forms[others[0]]
+            require(
+                one == two,
+                f"ties: cemented: surfaces {first} and {others[0]} are of the forms {one} and "
+                f"{two}; write both alike",
+            )
+        for kind in kinds:
+            places_of("ties", lens, kind, self.surfaces)
         return [
-            (leader, follower)
-            for places in rows.values()
-            for leader in places
-            for follower in places
-            if leader.row == first and follower.row != first and leader.term == follower.term
+            (Place(kind, first, term), Place(kind, row, term))
+            for kind in kinds
+            for term in terms[kind]
+            for row in others
         ]
 
 
@@ -268,44 +236,48 @@ class Variables:
         varied = [Vary(v) if isinstance(v, str) else v for v in vary]
         found = [(place, v) for v in varied for place in v.places(lens)]
         following = [(p, f, t.line) for t in ties for p, f in t.pairs(lens)]
-        solved = [Place(*solve.place(lens)) for solve in solves]
-        taken = {*(f for _, f, _ in following), *solved}
+        solved = [solve.place(lens) for solve in solves]
+        followers = [f for _, f, _ in following] + solved
         _refuse_twice("solves", solved, "is what two of them change")
-        _refuse_twice("ties", [f for _, f, _ in following] + solved, "follows twice")
+        _refuse_twice("ties", followers, "follows twice")
         for leader, follower, _ in following:
-            if leader in taken:
-                raise ValueError(
-                    f"ties: {leader}, which {follower} follows, itself follows from a tie or a "
-                    "solve; begin with another surface"
-                )
+            require(
+                leader not in followers,
+                f"ties: {leader}, which {follower} follows, itself follows from a tie or a solve; "
+                "begin with another surface",
+            )
         # If all numbers of a kind vary, tied and solved ones are left out. Naming one is an error.
         for place, v in found:
-            if place in taken and v.surfaces:
-                raise ValueError(
-                    f"variables: {place} follows from a tie or a solve; leave it out here"
-                )
-        found = [(place, v) for place, v in found if place not in taken]
-        _refuse_twice("variables", [place for place, _ in found], "stands twice")
-        if not found:
-            more = "fewer solves or more variables are needed" if solves else "name some"
-            raise ValueError(f"variables: none is left; {more}")
-        if len(solves) > len(found):
-            raise ValueError(
-                f"solves: {len(solves)} of them, but {len(found)} variables; leave some out"
+            require(
+                not (place in followers and v.surfaces),
+                f"variables: {place} follows from a tie or a solve; leave it out here",
             )
+        found = [(place, v) for place, v in found if place not in followers]
+        _refuse_twice("variables", [place for place, _ in found], "stands twice")
+        more = "fewer solves or more variables are needed" if solves else "name some"
+        require(found, f"variables: none is left; {more}")
+        require(
+            len(solves) <= len(found),
+            f"solves: {len(solves)} of them, but {len(found)} variables; leave some out",
+        )
         index = {place: k for k, (place, _) in enumerate(found)}
         # Followers of a number that does not vary are set once, here.
-        fixed = [(f, a * _number(lens, p) + b) for p, f, (a, b) in following if p not in index]
-        lens = _with_numbers(_with_arrays(lens, {place.kind for place, _ in found}), fixed)
+        fixed = [(f, a * number_at(lens, p)[0] + b) for p, f, (a, b) in following if p not in index]
+        lens = with_numbers(with_arrays(lens, {place.kind for place in index}), fixed)
         dtype = lens.curvature.dtype
         rows = np.array([v.bounds(lens, place) for place, v in found])
-        bounds, scale = np.split(rows, [2], axis=1)
-        low, high = jnp.asarray(bounds / scale, dtype).T
+        low, high = jnp.asarray(rows[:, :2] / rows[:, 2:], dtype).T
         tied = [(index[p], f, line) for p, f, line in following if p in index]
-        lines = jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2)
-        places, ties_ = tuple(place for place, _ in found), tuple(tie[:2] for tie in tied)
-        scales = jnp.asarray(scale[:, 0], dtype)
-        variables = cls(lens, low, high, scales, (), lines, places, ties_)
+        variables = cls(
+            lens,
+            low,
+            high,
+            scale=jnp.asarray(rows[:, 2], dtype),
+            solves=(),
+            lines=jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2),
+            places=tuple(index),
+            ties=tuple((k, f) for k, f, _ in tied),
+        )
         fixed_solves, start = fix_solves(variables.lens_of(variables.start), solves)
         return dataclasses.replace(variables, lens=start, solves=fixed_solves)
 
@@ -319,32 +291,33 @@ class Variables:
         if isinstance(sets, Variables):
             return sets
         found = list(sets) if isinstance(sets, Sequence) else [sets]
-        if not found or not all(isinstance(own, Variables) for own in found):
-            raise ValueError("variables: expected Variables.from_lens(lens, [...]), or several")
+        require(
+            found and all(isinstance(own, Variables) for own in found),
+            "variables: expected Variables.from_lens(lens, [...]), or several",
+        )
         kinds, lenses = {place.kind for own in found for place in own.places}, []
         for each in found:
-            lens = _with_arrays(each.lens, kinds)
+            lens = with_arrays(each.lens, kinds)
             for own in found:  # ties and solves have changed the lens of each set
                 lens = dataclasses.replace(own, lens=lens).lens_of(own.start)
             lenses.append(lens)
+        first = lenses[0]
         for lens in lenses[1:]:
-            if not _same(lenses[0], lens):
-                raise ValueError("variables: of different lenses; make them from one lens")
-        taken = [*(p for own in found for p in own.places), *(p for s in found for _, p in s.ties)]
-        _refuse_twice("variables", taken, "stands twice")
+            alike = str(jax.tree.structure(first)) == str(jax.tree.structure(lens)) and all(
+                map(np.array_equal, jax.tree.leaves(first), jax.tree.leaves(lens))
+            )
+            require(alike, "variables: of different lenses; make them from one lens")
         ends = np.cumsum([0, *(len(own.places) for own in found)]).tolist()
+        places = tuple(place for own in found for place in own.places)
+        ties = tuple((k + end, p) for end, own in zip(ends, found) for k, p in own.ties)
+        _refuse_twice("variables", [*places, *(p for _, p in ties)], "stands twice")
 
         def both(name: str) -> Any:
             return jnp.concatenate([getattr(own, name) for own in found])
 
-        return dataclasses.replace(
-            found[0],
-            lens=lenses[0],
-            **{name: both(name) for name in ("low", "high", "scale", "lines")},
-            solves=tuple(solve for own in found for solve in own.solves),
-            places=tuple(place for own in found for place in own.places),
-            ties=tuple((k + end, p) for end, own in zip(ends, found) for k, p in own.ties),
-        )
+        solves = tuple(solve for own in found for solve in own.solves)
+        low, high, scale, lines = map(both, ("low", "high", "scale", "lines"))
+        return cls(first, low, high, scale, solves, lines, places, ties)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -358,7 +331,7 @@ class Variables:
 
     def vector(self, lens: Lens) -> Array:
         """The vector (N,) of a lens."""
-        return jnp.stack([_number(lens, place) for place in self.places]) / self.scale
+        return jnp.stack([number_at(lens, place)[0] for place in self.places]) / self.scale
 
     def numbers(self, vector: Array) -> Array:
         """The numbers (N,) of a vector (N,), in the units of the lens."""
@@ -375,46 +348,13 @@ class Variables:
         changes = [(place, numbers[k]) for k, place in enumerate(self.places)]
         pairs = zip(self.ties, self.lines, strict=True)
         changes += [(place, line[0] * numbers[k] + line[1]) for (k, place), line in pairs]
-        lens = _with_numbers(self.lens, changes)
+        lens = with_numbers(self.lens, changes)
         for solve in self.solves:
             lens = solve.apply(lens)
         return lens
 
 
-def _number(lens: Lens, place: Place) -> Array:
-    """The number () of a lens at a place."""
-    return KINDS[place.kind].read(lens)[place.row, place.term]
-
-
-def _with_numbers(lens: Lens, changes: Sequence[tuple[Place, Array]]) -> Lens:
-    """The lens with changed numbers.
-
-    Thicknesses are written before the sensor, whose distance counts from the last vertex.
-    """
-    for name, kind in KINDS.items():
-        own = [(place, number) for place, number in changes if place.kind == name]
-        if own:
-            rows, terms = (np.array([place[k] for place, _ in own]) for k in (1, 2))
-            numbers = jnp.stack([number for _, number in own])
-            lens = kind.write(lens, kind.read(lens).at[rows, terms].set(numbers))
-    return lens
-
-
-def _same(one: Lens, two: Lens) -> bool:
-    """Whether two lenses with known numbers are equal."""
-    alike = str(jax.tree.structure(one)) == str(jax.tree.structure(two))
-    return alike and all(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(two)))
-
-
 def _refuse_twice(what: str, places: Iterable[Place], reason: str) -> None:
     """Raises ValueError for a place that occurs twice."""
-    for place, group in itertools.groupby(sorted(places)):
-        if len(list(group)) > 1:
-            raise ValueError(f"{what}: {place} {reason}; leave one out")
-
-
-def _with_arrays(lens: Lens, kinds: set[str]) -> Lens:
-    """The lens with arrays of zeros for tilts and decentres that vary but are None."""
-    for kind in kinds & {"tilt", "decentre"}:
-        lens = KINDS[kind].write(lens, KINDS[kind].read(lens))
-    return lens
+    for place, count in collections.Counter(places).items():
+        require(count == 1, f"{what}: {place} {reason}; leave one out")

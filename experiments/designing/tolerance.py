@@ -30,7 +30,7 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import Scene, design, show
-from drt_jax.design.deviations import KINDS
+from drt_jax.design.perturbed import KINDS
 from drt_jax.design.prediction import Order
 
 from . import _command, _common, _plots, _sharing

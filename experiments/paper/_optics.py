@@ -12,7 +12,7 @@ from jax import Array
 
 import drt_jax
 from drt_jax import design, learn
-from drt_jax.design.kinds import step_of
+from drt_jax.design.parts import Place, step_of
 from drt_jax.lens.scene import checked_scene
 from drt_jax.pupil import hexapolar
 from drt_jax.rays.solve import solve_aimed
@@ -170,6 +170,6 @@ class Trained:
             require(spread[name] > 0, f"train.variables: {name} moves no ray; leave it out")
         found = {"sensor": float(self.moves)}
         for name, place in zip(self.names, self.variables.places if self.variables else ()):
-            steps = step_of(self.lens, *place) / step_of(self.lens, "sensor", 0, 0)
+            steps = step_of(self.lens, place) / step_of(self.lens, Place("sensor", 0, 0))
             found[name] = min(spread["sensor"] / spread[name], steps)
         return found

@@ -18,14 +18,14 @@ from drt_jax.design import (
     Problem,
     Solve,
     Variables,
-    deviations,
-    kinds,
     operands,
+    parts,
+    perturbed,
     trace_fields,
     values,
 )
 from drt_jax.design.field_rays import relative_illumination
-from drt_jax.design.kinds import KINDS
+from drt_jax.design.parts import PARTS
 from drt_jax.lens.glasses import glass_map_distance
 from drt_jax.lens.paraxial import image_height
 from drt_jax.pupil import pupil_points
@@ -459,13 +459,13 @@ def test_each_kind_is_told_where_a_user_reads():
     page = (pathlib.Path(__file__).parents[2] / "docs" / "design.md").read_text()
     for kind in OPERANDS:
         assert f"`{kind}`" in page and kind in values.__doc__
-    for kind in KINDS:
+    for kind in PARTS:
         assert f"`{kind}`" in page
     for kind in get_args(Solve.__annotations__["kind"]):
         assert f"`{kind}`" in page
 
 
 def test_kinds_as_type_checkers_know_them():
-    known = ((operands.OperandName, OPERANDS), (kinds.VariableKind, KINDS))
-    for literal, table in (*known, (deviations.ToleranceKind, deviations.KINDS)):
+    known = ((operands.OperandName, OPERANDS), (parts.VariableKind, PARTS))
+    for literal, table in (*known, (perturbed.ToleranceKind, perturbed.KINDS)):
         assert get_args(literal) == tuple(table)

@@ -7,7 +7,7 @@ import pytest
 
 from drt_jax import load_lens
 from drt_jax.design import Problem, Solve, Tie, Variables, Vary
-from drt_jax.design.kinds import KINDS
+from drt_jax.design.parts import PARTS
 from drt_jax.lens.surface import surface_sag
 
 MODEL = """
@@ -47,12 +47,12 @@ def lens(tmp_path):
 
 def changed(kind, lens, other):
     """By how much numbers of a kind differ; inf from inf by 0."""
-    after, before = (np.asarray(KINDS[kind].read(each)) for each in (lens, other))
+    after, before = (np.asarray(PARTS[kind].read(each)) for each in (lens, other))
     return np.where(after == before, 0, after) - np.where(after == before, 0, before)
 
 
 def test_all_kinds_are_here():
-    assert set(ALL) == set(KINDS)
+    assert set(ALL) == set(PARTS)
 
 
 @pytest.mark.parametrize("kind", ALL)
@@ -74,7 +74,7 @@ def test_each_number_moves_alone_and_by_itself(lens, kind):
         if kind in ("index", "abbe"):  # of the media that go on behind
             change[place.row + 1 :] = 0
         np.testing.assert_allclose(change, 0, atol=1e-14)
-    others = set(KINDS) - {kind}
+    others = set(PARTS) - {kind}
     moved = variables.lens_of(start + 0.1)
     for other in others:
         np.testing.assert_allclose(changed(other, moved, variables.lens), 0, atol=1e-13)
