@@ -2,7 +2,6 @@
 
 from . import least_squares as least_squares
 from .apertures import fit_apertures as fit_apertures, open_apertures as open_apertures
-from .compensate import AsBuilt as AsBuilt, as_built as as_built
 from .field_rays import FieldRays as FieldRays
 from .glasses import (
     Snap as Snap,
@@ -16,7 +15,6 @@ from .media import elements_of as elements_of
 from .operands import Operand as Operand
 from .optimum import Optimum as Optimum, optimise as optimise
 from .perturbed import PerturbedLens as PerturbedLens, Tolerance as Tolerance
-from .prediction import Predicted as Predicted, predict as predict, worst_case as worst_case
 from .problem import Problem as Problem, trace_fields as trace_fields
 from .solves import Solve as Solve
 from .starts import (
@@ -29,9 +27,14 @@ from .starts import (
     sobol_starts as sobol_starts,
 )
 from .tolerance import (
+    AsBuilt as AsBuilt,
+    Predicted as Predicted,
+    as_built as as_built,
     draw_perturbations as draw_perturbations,
     monte_carlo as monte_carlo,
+    predict as predict,
     variances as variances,
+    worst_case as worst_case,
 )
 from .values import OPERANDS as OPERANDS
 from .variables import Tie as Tie, Variables as Variables, Vary as Vary

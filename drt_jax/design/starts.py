@@ -15,11 +15,13 @@ from jax.sharding import Mesh
 from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
-from ..devices import copied, gathered, in_turn, shared, split
+from ..devices import shared
 from ..numerics import Numbers
+from .checks import require
 from .least_squares import Search
 from .optimum import init_problem, step_problem
 from .problem import Problem, quick, trace_fields
+from .tiles import in_tiles, tile_size
 from .variables import Variables
 
 # Number of searches in a tile. The searches of one tile run in one program on one core.
@@ -56,8 +58,8 @@ def sobol_starts(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
     """
     low, high = np.asarray(variables.low), np.asarray(variables.high)
     for name, bounds in zip(variables.names, zip(low, high)):
-        if not np.all(np.isfinite(bounds)):
-            raise ValueError(f"variables: {name}: starts within bounds need low and high")
+        bounded = np.all(np.isfinite(bounds))
+        require(bounded, f"variables: {name}: starts within bounds need low and high")
     power = int(np.ceil(np.log2(max(count, 2))))
     points = qmc.Sobol(len(low), seed=seed).random_base2(power)[:count]
     return low + points * (high - low)
@@ -130,18 +132,18 @@ def _advance(problem: Problem, steps: Array, searches: Search, mesh: Mesh | None
     """Takes `steps` steps of a tile of searches. A device whose searches are all done takes
     fewer.
     """
-    return shared(_advanced_here, mesh, 2)(problem, steps, searches)
+    each = jax.vmap(step_problem, (None, 0))
 
+    def here(problem: Problem, steps: Array, searches: Search) -> Search:
+        def more(state: tuple[Array, Search]) -> Array:
+            return (state[0] < steps) & ~jnp.all(state[1].done)
 
-def _advanced_here(problem: Problem, steps: Array, searches: Search) -> Search:
-    """The part of `_advance` that runs on one device."""
-    both = jax.vmap(step_problem, (None, 0))
+        def step(state: tuple[Array, Search]) -> tuple[Array, Search]:
+            return state[0] + 1, each(problem, state[1])
 
-    def more(state: tuple[Array, Search]) -> Array:
-        return (state[0] < steps) & ~jnp.all(state[1].done)
+        return jax.lax.while_loop(more, step, (jnp.int32(0), searches))[1]
 
-    next_ = lambda state: (state[0] + 1, both(problem, state[1]))  # noqa: E731
-    return jax.lax.while_loop(more, next_, (jnp.int32(0), searches))[1]
+    return shared(here, mesh, 2)(problem, steps, searches)
 
 
 def many_starts(
@@ -174,29 +176,49 @@ def many_starts(
     begun = time.perf_counter()
     vectors = np.asarray(starts, float)
     width = len(problem.variables.places)
-    if vectors.ndim != 2 or vectors.shape[1] != width or not len(vectors):
-        raise ValueError(f"starts: expected (K, {width}), got shape {vectors.shape}")
+    valid = vectors.ndim == 2 and vectors.shape[1] == width and len(vectors)
+    require(valid, f"starts: expected (K, {width}), got shape {vectors.shape}")
     vectors = np.clip(vectors, problem.variables.low, problem.variables.high)
-    state = jax.tree.map(np.array, _begin(quick(problem), jnp.asarray(vectors)))
+    tried = quick(problem)
+    state = jax.tree.map(np.array, _begin(tried, jnp.asarray(vectors)))
+    best: list[float] = []
+
+    def rows(which: np.ndarray) -> Search:
+        return jax.tree.map(lambda a: a[which], state)
+
+    def advance(problem: Problem, searches: np.ndarray, steps: int) -> Iterator[None]:
+        """Advances searches in place; yields after each tile."""
+        done, whole = 0, (problem, np.int32(steps))
+        for part in in_tiles(_advance, whole, rows(searches), _TILE, threads, mesh):
+            own = searches[done : done + len(part.done)]
+            done += len(own)
+            for array, new in zip(jax.tree.leaves(state), jax.tree.leaves(part), strict=True):
+                array[own] = new
+            yield
+
     sizes = [len(vectors)]
     for _ in steps[1:]:
         sizes.append(min(sizes[-1], max(_TILE, math.ceil(survivors * sizes[-1]))))
-    alive, best, tried = np.arange(len(vectors)), list[float](), quick(problem)
-    total = sum(-(-size // _tile(mesh)) for size in sizes)
-    for _ in _advanced(tried, state, alive[:1], 0, threads, mesh):
+    alive = np.arange(len(vectors))
+    total = sum(-(-size // tile_size(_TILE, mesh)) for size in sizes)
+    for _ in advance(tried, alive[:1], 0):
         compiled = time.perf_counter() - begun
     for size, stage_steps in zip(sizes, steps):
-        alive = alive[np.argsort(_score(state, alive), kind="stable")[:size]]
-        for _ in _advanced(tried, state, alive, stage_steps, threads, mesh):
-            best.append(float(np.min(_score(state, alive))))
+        alive = alive[np.argsort(rows(alive).score, kind="stable")[:size]]
+        for _ in advance(tried, alive, stage_steps):
+            best.append(float(np.min(rows(alive).score)))
             callback(len(best), total, best[-1])
-    for _ in _advanced(problem, state, _missed(problem, state, alive), steps[-1], threads, mesh):
-        best.append(float(np.min(_score(state, alive))))
-    total_steps, jacobians = (int(np.sum(a)) for a in (state.steps, state.jacobians))
-    minima = distinct(_rows(state, alive), alive)
+    # Searches in which the full ray search finds rays that aiming does not find continue with it.
+    failed = state.evaluation.failed
+    vector = state.vector
+    missed = [k for k in alive if failed[k] and int(problem.failed(vector[k])) < failed[k]]
+    state.stale[missed], state.done[missed] = True, False
+    for _ in advance(problem, np.array(missed, int), steps[-1]):
+        best.append(float(np.min(rows(alive).score)))
+    total_steps, jacobians = int(np.sum(state.steps)), int(np.sum(state.jacobians))
     return Starts(
-        minima,
-        _score(state, np.arange(len(vectors))),
+        distinct(rows(alive), alive),
+        np.asarray(state.score),
         total_steps,
         jacobians,
         total_steps * rays_of(problem),
@@ -204,60 +226,6 @@ def many_starts(
         compiled,
         best,
     )
-
-
-def _missed(problem: Problem, state: Search, alive: np.ndarray) -> np.ndarray:
-    """The searches in which the full ray search finds rays that aiming does not find.
-
-    They are marked so that they continue.
-    """
-    failed = np.asarray(state.evaluation.failed)[alive]
-    rows = [
-        row
-        for row, count in zip(alive[failed > 0], failed[failed > 0])
-        if int(problem.failed(jnp.asarray(state.vector[row]))) < count
-    ]
-    state.stale[rows], state.done[rows] = True, False
-    return np.array(rows, int)
-
-
-def _tile(mesh: Mesh | None) -> int:
-    """Number of searches of a tile."""
-    return _TILE * (mesh.size if mesh else 1)
-
-
-def _advanced(
-    problem: Problem,
-    state: Search,
-    searches: np.ndarray,
-    steps: int,
-    threads: int | None,
-    mesh: Mesh | None,
-) -> Iterator[None]:
-    """Advances searches (rows of `state`) in place, in tiles; yields after each tile."""
-    size = _tile(mesh)
-    tiles = [searches[k : k + size] for k in range(0, len(searches), size)]
-    problem = copied(mesh, problem)
-
-    def run(rows: np.ndarray) -> None:
-        whole = np.resize(rows, size)  # a tile that is not full repeats its rows
-        old = split(mesh, jax.tree.map(jnp.asarray, _rows(state, whole)))
-        new = gathered(_advance(problem, np.int32(steps), old, mesh))
-        for array, part in zip(jax.tree.leaves(state), jax.tree.leaves(new), strict=True):
-            array[rows] = part[: len(rows)]
-
-    # Devices that share a tile take the tiles in one order.
-    yield from in_turn(run, tiles, 1 if mesh else threads)
-
-
-def _score(state: Search, rows: np.ndarray) -> np.ndarray:
-    """Scores of some searches."""
-    return np.asarray(_rows(state, rows).score)
-
-
-def _rows(tree: Search, rows: np.ndarray) -> Search:
-    """Some rows of the arrays of a state."""
-    return jax.tree.map(lambda a: a[rows], tree)
 
 
 def rays_of(problem: Problem) -> int:

@@ -1,20 +1,154 @@
-"""Tolerances: random deviations of a lens, and Monte Carlo simulation with them."""
+"""A lens as built: its spots after compensation, by Monte Carlo simulation and by derivatives.
+
+The figure of merit q of a lens is the mean over its fields of the squared RMS radius of the
+polychromatic spot, after optimal compensation. The distance o of a ray from the centroid changes
+linearly with the shift t of the sensor at the spot, o + g t, where g is the slope of the ray less
+the mean slope. So q is quadratic in the compensation, and the normal equations of a small linear
+least-squares problem give the optimal compensation.
+"""
 
 from collections.abc import Callable
+from functools import partial
+from typing import Literal, NamedTuple, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
+from scipy.special import gammainc
 
-from ..compilation import LARGE, jit
-from ..devices import copied, gathered, in_turn, shared, split
-from .compensate import AsBuilt, Compensator, check, compensated
-from .perturbed import PerturbedLens
+from ..compilation import LARGE, ONCE, jit
+from ..devices import shared
+from ..image.spot import deviations, normalised
+from ..inputs import require_one_of
+from ..lens.lens import Lens
+from ..numerics import concrete, matmul, safe_divide, safe_sqrt
+from ..rays.status import Status
+from .checks import require
+from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
+from .perturbed import KINDS, PerturbedLens
 from .problem import Problem, quick
+from .tiles import in_tiles
 
-_TILE = 50  # number of lenses in a tile, which runs in one program on one core
+# What is adjusted in every lens: the distance of the sensor, or also its tilts about x and y.
+Compensator = Literal["none", "focus", "focus and tilt"]
+_STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
+_SYMMETRIES = ("rotational", "bilateral", "none")  # by the traced part of the pupil, smallest first
+_TILE = 50  # number of lenses in a tile
 _DEVIATION = 0.5  # standard deviation of normal deviations, in units of the largest
+# Order of a prediction: gradient of q, Gauss-Newton part of its Hessian, or whole Hessian.
+Order = Literal["first", "rays", "second"]
+_ASCENTS = 16  # number of eigenvectors from which ascents start, in both directions
+
+
+class AsBuilt(NamedTuple):
+    """A lens as built, after compensation.
+
+    squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
+    moves: (C,), compensation: the shift of the sensor, mm, then its tilts about x and -y, radians.
+    """
+
+    squares: Array
+    moves: Array
+
+    @property
+    def spot(self) -> Array:
+        """The square root of q, (), mm."""
+        return jnp.sqrt(jnp.mean(self.squares, axis=-1))
+
+
+def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
+    """Distances of rays from the centroid of their view, and the derivatives of these distances.
+
+    Returns distances, mm, and their derivatives by the shift of the sensor, (D, V, W Q) each, times
+    the root of the weight of the ray; and the centroids (2, V), mm.
+    """
+    waves = rays.wavelength_weights[None, :, None]
+    light = (rays.weights * waves)[..., EXTRAS:]
+    passes = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
+    light = jnp.where(passes, light, 0)
+    arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
+    hits = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
+    slopes = [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
+    weight = normalised(light, (-2, -1))
+    root = safe_sqrt(weight)
+
+    def scaled(values: list[Array]) -> tuple[Array, tuple[Array, ...]]:
+        known = tuple(jnp.where(passes, value, 0) for value in values)
+        parts, means = deviations(known, weight, rays.symmetry, (-2, -1))
+        return jnp.stack([root * part for part in parts]).reshape(len(hits), len(light), -1), means
+
+    (offsets, means), (growth, _) = scaled(hits), scaled(slopes)
+    centre = jnp.stack(means)[..., 0, 0]
+    return offsets, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
+
+
+def compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
+    """A lens after compensation, and its residuals. Call `check` before.
+
+    With the distances o and their derivatives g of all rays, and the shift of the sensor t_v =
+    sum_k m_k l_kv at the spot of view v (levers l: 1, y and x of the centroid), the compensation m
+    solves (sum g^2 l l^T) m = -sum o g l.
+
+    Returns the result, and the residuals (D, V, W Q): distances from the centroids, mm, whose
+    squares add up to the squared RMS radii.
+    """
+    rays = trace_views(lens, problem.views(), problem.solver)
+    offsets, growth, (x, y) = _spots(rays)
+    # At a spot (x, y) the sensor moves by d n + a y + b x along its normal, where d is the change
+    # of `Lens.sensor`, n the normal component of the motion of the sensor, and a, b are the tilts.
+    motion = lens.sensor_motion
+    normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
+    levers = jnp.stack([normal, y, x])[: _STEPS[compensator]]
+    moves = jnp.zeros(0, x.dtype)
+    if len(levers):
+        square = jnp.sum(growth**2, axis=(0, 2))
+        matrix = matmul(levers * square[None], levers.T)
+        lit = matrix[0, 0] > 0
+        matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
+        moves = jnp.linalg.solve(matrix, -matmul(levers, jnp.sum(offsets * growth, axis=(0, 2))))
+        offsets = offsets + growth * matmul(moves, levers)[None, :, None]
+    light = rays.weights[..., EXTRAS:] > 0
+    failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
+    valid = ~failed & jnp.all(rays.throughput > 0, axis=1)
+    squares = jnp.where(valid, jnp.sum(offsets**2, axis=(0, 2)), jnp.inf)
+    return AsBuilt(squares, moves), offsets
+
+
+def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
+    """Evaluates a lens at the fields of a problem after compensation.
+
+    Works in `jit`, `vmap` and under differentiation.
+
+    problem: gives the fields, wavelengths and pupil rule.
+    lens: the lens as built.
+    compensator: "none", "focus" (the distance of the sensor) or "focus and tilt" (also its tilts
+        about x and y).
+
+    ValueError for an unknown compensator, for one that the fields do not determine, and for a pupil
+    rule with more symmetry than the lens.
+    """
+    check(problem, lens, compensator)
+    return compensated(problem, lens, compensator)[0]
+
+
+def check(problem: Problem, lens: Lens, compensator: str) -> None:
+    """Raises the ValueErrors of `as_built`."""
+    require_one_of("compensator", compensator, get_args(Compensator))
+    has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
+    require(
+        _SYMMETRIES.index(has) >= _SYMMETRIES.index(needs),
+        f'rule: "{has}" leaves out part of the pupil, but deviations break the symmetry; use one '
+        f'of symmetry "{needs}", such as Gauss(6, "{needs}")',
+    )
+    if compensator == "focus and tilt" and concrete(problem.fields):
+        tangents = np.tan(np.asarray(problem.fields, float))
+        require(
+            np.linalg.matrix_rank(np.c_[np.ones(len(tangents)), tangents]) == 3,
+            "compensator: focus and tilt: the fields lie on a line, about which any tilt is as "
+            "good; add fields beside it",
+        )
 
 
 def draw_perturbations(
@@ -46,23 +180,17 @@ def variances(perturbed: PerturbedLens, normal: bool = False) -> np.ndarray:
     """Variances (P,) of the deviations that `draw_perturbations` draws.
 
     The variance of each component is E[r^2] / n for a part with n components: 1 / (n + 2) for the
-    uniform distribution in the unit ball; for the normal one, the density of r is proportional to
-    r^(n - 1) exp(-2 r^2) up to 1.
+    uniform distribution in the unit ball. For the normal one, r / 0.5 has the chi distribution of n
+    degrees of freedom, cut off at 2.
 
     perturbed: the lens and its deviations.
     normal: True for the normal distribution.
     """
-    found = np.empty(len(perturbed.deviations))
-    for part in perturbed.parts:
-        count = len(part)
-        if not normal:
-            found[part] = 1 / (count + 2)  # a uniform distribution in the ball of this dimension
-            continue
-        # The second moment of the chi distribution cut off at 1, by the midpoint rule in r.
-        r = (np.arange(1000) + 0.5) / 1000
-        density = r ** (count - 1) * np.exp(-(r**2) / (2 * _DEVIATION**2))
-        found[part] = density @ r**2 / density.sum() / count
-    return found
+    count = np.array([KINDS[error.kind].axes for error in perturbed.deviations])
+    if not normal:
+        return 1 / (count + 2)
+    most = 1 / (2 * _DEVIATION**2)
+    return _DEVIATION**2 * gammainc(count / 2 + 1, most) / gammainc(count / 2, most)
 
 
 def monte_carlo(
@@ -91,55 +219,36 @@ def monte_carlo(
     Returns squares (K, V), mm^2, and moves (K, C) of all lenses. ValueError as in `as_built`.
     """
     check(problem, perturbed.lens, compensator)
-    width = len(perturbed.deviations)
-    if np.ndim(perturbation) != 2 or np.shape(perturbation)[1] != width or not len(perturbation):
-        raise ValueError(f"perturbation: expected (K, {width}), got shape {np.shape(perturbation)}")
-    how = compensator, threads, mesh
-    found = _in_tiles(quick(problem), perturbed, perturbation, callback, *how)
+    shape, width = np.shape(perturbation), len(perturbed.deviations)
+    valid = len(shape) == 2 and shape[0] and shape[1] == width
+    require(valid, f"perturbation: expected (K, {width}), got shape {shape}")
+    rows = np.asarray(perturbation, perturbed.sizes.dtype)
+    many = partial(_many, compensator=compensator)
+
+    def traced(problem: Problem, rows: np.ndarray, callback: Callable[[int], None]) -> AsBuilt:
+        parts: list[AsBuilt] = []
+        for part in in_tiles(many, (problem, perturbed), rows, _TILE, threads, mesh):
+            parts.append(part)
+            callback(sum(len(part.squares) for part in parts))
+        return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+
+    found = traced(quick(problem), rows, callback)
     # The full search may find rays that aiming does not find.
     failed = np.flatnonzero(~np.all(np.isfinite(found.squares), axis=1))
     if len(failed):
-        again = _in_tiles(problem, perturbed, perturbation[failed], lambda done: None, *how)
-        for array, rows in zip(found, again):
-            array[failed] = rows
+        again = traced(problem, rows[failed], lambda done: None)
+        for array, own in zip(found, again):
+            array[failed] = own
     return found
 
 
-def _in_tiles(
-    problem: Problem,
-    perturbed: PerturbedLens,
-    perturbation: np.ndarray,
-    callback: Callable[[int], None],
-    compensator: Compensator,
-    threads: int | None,
-    mesh: Mesh | None,
-) -> AsBuilt:
-    """`monte_carlo` with the solver of the problem alone."""
-    size, width = _TILE * (mesh.size if mesh else 1), perturbation.shape[1]
-    tiles = [perturbation[k : k + size] for k in range(0, len(perturbation), size)]
-    problem, perturbed = copied(mesh, (problem, perturbed))
-
-    def run(rows: np.ndarray) -> AsBuilt:
-        whole = np.resize(rows, (size, width))  # a tile that is not full repeats its rows
-        whole = split(mesh, whole.astype(perturbed.sizes.dtype))
-        found = gathered(_many(problem, perturbed, whole, compensator, mesh))
-        return jax.tree.map(lambda a: a[: len(rows)], found)
-
-    parts, done = [], 0
-    # Devices that share a tile take the tiles in one order.
-    for part in in_turn(run, tiles, 1 if mesh else threads):
-        parts.append(part)
-        done += len(part.squares)
-        callback(done)
-    return jax.tree.map(lambda *a: np.concatenate(a), *parts)
-
-
-def _many_of(
+@partial(jit, wanted=LARGE, static_argnames=("mesh", "compensator"))
+def _many(
     problem: Problem,
     perturbed: PerturbedLens,
     perturbation: Array,
-    compensator: Compensator,
     mesh: Mesh | None,
+    compensator: Compensator,
 ) -> AsBuilt:
     """The lenses of one tile, shared among the devices of a mesh."""
 
@@ -149,4 +258,130 @@ def _many_of(
     return shared(jax.vmap(one, (None, None, 0)), mesh, 2)(problem, perturbed, perturbation)
 
 
-_many = jit(_many_of, LARGE, static_argnums=(3, 4))
+class Predicted(NamedTuple):
+    """A quadratic model of q, the mean squared RMS radius of the spots, mm^2.
+
+    q(p) = nominal + gradient.p + p^T H p / 2, where p are deviations in units of their largest.
+
+    nominal: (), q without deviations.
+    gradient: (P,), first derivatives of q.
+    gauss: (P, P), Gauss-Newton part of the Hessian, 2 J^T J, with J the derivatives of the
+        residuals.
+    hessian: (P, P), second derivatives of q.
+    moves: (C,), compensation without deviations, see `AsBuilt`.
+    move_slopes: (P, C), derivatives of the compensation.
+    """
+
+    nominal: Array
+    gradient: Array
+    gauss: Array
+    hessian: Array
+    moves: Array
+    move_slopes: Array
+
+    def matrix(self, order: Order) -> Array:
+        """Matrix (P, P) of an order: 0 for "first", `gauss` for "rays", `hessian` for "second".
+
+        ValueError for another order.
+        """
+        require_one_of("order", order, get_args(Order))
+        return {"first": 0 * self.hessian, "rays": self.gauss, "second": self.hessian}[order]
+
+    def at(self, perturbation: Array | np.ndarray, order: Order) -> Array:
+        """q (K,) for deviations (K, P); below 0 where the model fails.
+
+        perturbation: (K, P), in units of the largest deviations.
+        order: as in `matrix`. ValueError for another order.
+        """
+        return (
+            self.nominal
+            + matmul(perturbation, self.gradient)
+            + jnp.sum(perturbation * matmul(perturbation, self.matrix(order)), axis=-1) / 2
+        )
+
+    def moments(self, variances: Array, order: Order) -> tuple[Array, Array]:
+        """Mean and standard deviation of q, () each, for independent deviations.
+
+        The mean is exact for the quadratic model. The standard deviation is exact for the quadratic
+        model if deviations are normal; without the matrix it is the root sum of squares.
+
+        variances: (P,), variances of the deviations.
+        order: as in `matrix`. ValueError for another order.
+        """
+        matrix = self.matrix(order)
+        mean = self.nominal + matmul(jnp.diag(matrix), variances) / 2
+        pairs = matmul(matmul(variances, matrix**2), variances) / 2
+        return mean, jnp.sqrt(matmul(self.gradient**2, variances) + pairs)
+
+
+def predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
+    """Predicts q from exact first and second derivatives by deviations.
+
+    problem: gives the fields, wavelengths and pupil rule.
+    perturbed: the lens and its deviations.
+    compensator: as in `as_built`.
+
+    ValueError as in `as_built`.
+    """
+    check(problem, perturbed.lens, compensator)
+    if not concrete((problem, perturbed)):
+        return _predict(problem, perturbed, compensator)
+    found = _predict(quick(problem), perturbed, compensator)
+    # The full search may find rays that aiming does not find.
+    return found if bool(jnp.isfinite(found.nominal)) else _predict(problem, perturbed, compensator)
+
+
+@partial(jit, wanted=ONCE, static_argnames="compensator")
+def _predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
+    """`predict` with the solver of the problem: J from one linearised trace, the Hessian by forward
+    over reverse mode. Second derivatives of a whole trace are large to compile and run once.
+    """
+    zero = jnp.zeros_like(perturbed.sizes)
+    units = jnp.eye(len(zero), dtype=zero.dtype)
+
+    def rays(perturbation: Array) -> tuple[tuple[Array, Array], Array]:
+        found, offsets = compensated(problem, perturbed.lens_of(perturbation), compensator)
+        return (jnp.ravel(offsets) / jnp.sqrt(len(found.squares)), found.moves), found.squares
+
+    (offsets, moves), derivative, squares = jax.linearize(rays, zero, has_aux=True)
+    derivatives, slopes = jax.lax.map(derivative, units)
+    merit = jax.grad(lambda perturbation: jnp.mean(rays(perturbation)[1]))
+    hessian = jax.lax.map(lambda unit: jax.jvp(merit, (zero,), (unit,))[1], units)
+    gradient, gauss = 2 * matmul(derivatives, offsets), 2 * matmul(derivatives, derivatives.T)
+    return Predicted(jnp.mean(squares), gradient, gauss, hessian, moves, slopes)
+
+
+def worst_case(
+    perturbed: PerturbedLens, predicted: Predicted, order: Order = "second"
+) -> np.ndarray:
+    """Largest deviations (P,) with a large predicted q, the worst that several ascents find.
+
+    Each ascent repeats p <- the largest deviations along the gradient of q at p, until p does not
+    change. Ascents start at the gradient without deviations and at 16 eigenvectors of the matrix,
+    in both directions. The result may not be the global maximum.
+
+    perturbed: the lens and its deviations.
+    predicted: the model of q.
+    order: as in `Predicted.matrix`. ValueError for another order.
+    """
+    slope, matrix = np.asarray(predicted.gradient), np.asarray(predicted.matrix(order))
+    part = np.concatenate([np.full(len(own), k) for k, own in enumerate(perturbed.parts)])
+    first, same = np.diff(part, prepend=-1) > 0, part[:, None] == part[None]
+
+    def largest_along(vectors: np.ndarray) -> np.ndarray:
+        """Vectors (..., P) in which the components of each part have the length 1."""
+        size = np.sqrt(vectors**2 @ same)
+        return np.where(size > 0, vectors / np.where(size > 0, size, 1), first)
+
+    values, vectors = np.linalg.eigh(matrix)
+    # If all deviations are largest, adding a multiple of the unit matrix only adds a constant to q.
+    # It makes q convex, so that no step to the largest deviations along the gradient decreases q.
+    matrix = matrix + max(0.0, -values[0]) * np.eye(len(matrix))
+    steepest = vectors[:, ::-1][:, :_ASCENTS].T
+    found = largest_along(np.stack([slope, *steepest, *-steepest]))
+    for _ in range(100):
+        before = found
+        found = largest_along(slope + before @ matrix.T)
+        if np.array_equal(found, before):
+            break
+    return found[int(np.argmax(predicted.at(found, order)))]

@@ -31,7 +31,7 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import Scene, design, show
 from drt_jax.design.perturbed import KINDS
-from drt_jax.design.prediction import Order
+from drt_jax.design.tolerance import Order
 
 from . import _command, _common, _plots, _sharing
 from ._common import Numbers, not_empty, within

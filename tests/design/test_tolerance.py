@@ -12,9 +12,9 @@ from scipy import optimize
 
 import drt_jax
 from drt_jax import Scene, design
-from drt_jax.design import PerturbedLens, Problem, Tolerance, Variables, compensate
+from drt_jax.design import PerturbedLens, Problem, Tolerance, Variables, tolerance
 from drt_jax.design.perturbed import KINDS
-from drt_jax.design.prediction import Order
+from drt_jax.design.tolerance import Order
 from drt_jax.pupil.rules import Gauss
 
 SINGLET = drt_jax.load_lens("singlet")
@@ -168,7 +168,7 @@ def test_gradient_and_hessian_are_those_of_differences(singlet, predicted):
 @pytest.mark.slow
 def test_what_rays_know_of_second_derivatives_are_their_products(singlet, predicted):
     problem, some = singlet
-    residuals = jax.jit(lambda off: compensate.compensated(problem, some.lens_of(off), "focus")[1])
+    residuals = jax.jit(lambda off: tolerance.compensated(problem, some.lens_of(off), "focus")[1])
     units = jnp.eye(len(some.deviations))
     rows = [np.ravel(residuals(1e-4 * u) - residuals(-1e-4 * u)) / 2e-4 for u in units]
     products = 2 * np.array(rows) @ np.array(rows).T / len(FIELDS)

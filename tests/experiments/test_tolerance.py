@@ -6,7 +6,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from drt_jax.design.prediction import Order
+from drt_jax.design.tolerance import Order
 from experiments import _command, tolerance as experiment
 
 SETTINGS = {
