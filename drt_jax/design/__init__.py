@@ -1,7 +1,6 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
 from . import least_squares as least_squares
-from .apertures import fit_apertures as fit_apertures, open_apertures as open_apertures
 from .field_rays import FieldRays as FieldRays
 from .glasses import (
     Snap as Snap,
@@ -15,7 +14,12 @@ from .media import elements_of as elements_of
 from .operands import Operand as Operand
 from .optimum import Optimum as Optimum, optimise as optimise
 from .perturbed import PerturbedLens as PerturbedLens, Tolerance as Tolerance
-from .problem import Problem as Problem, trace_fields as trace_fields
+from .problem import (
+    Problem as Problem,
+    fit_apertures as fit_apertures,
+    open_apertures as open_apertures,
+    trace_fields as trace_fields,
+)
 from .solves import Solve as Solve
 from .starts import (
     Minimum as Minimum,

@@ -12,6 +12,7 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..numerics import concrete
+from .checks import require
 from .least_squares import Search, init, promised_gain, step
 from .limits import Limit
 from .problem import Problem, quick
@@ -23,11 +24,6 @@ _NEAR, _MENDING, _STIFF = 1e-3, 20, 1e4
 # damping is at most `_LEFT`.
 _LEFT = 1e-6
 _promised_gain = jax.jit(promised_gain)
-# A limit does not depend on the variables if none of them meets it by a change of `_FAR` times its
-# scale.
-_FAR = 1e6
-
-
 Ended = Literal["converged", "target", "steps", "limits", "stuck"]
 
 
@@ -92,6 +88,11 @@ def step_problem(problem: Problem, search: Search) -> Search:
 take_step = jit(step_problem, LARGE)
 
 
+def _again(search: Search) -> Search:
+    """A search that evaluates its vector again and continues."""
+    return search._replace(stale=jnp.bool_(True), done=jnp.bool_(False))
+
+
 def _with_full_search(problem: Problem, tried: Problem, search: Search) -> tuple[Problem, Search]:
     """The problem and the search to continue with.
 
@@ -102,8 +103,7 @@ def _with_full_search(problem: Problem, tried: Problem, search: Search) -> tuple
     failed = int(search.evaluation.failed)
     if tried.solver is problem.solver or not failed or int(problem.failed(search.vector)) == failed:
         return tried, search
-    again = search._replace(stale=jnp.bool_(True), done=jnp.bool_(False))
-    return problem, take_step(problem, again)
+    return problem, take_step(problem, _again(search))
 
 
 def _mended(problem: Problem, search: Search) -> Search:
@@ -111,35 +111,16 @@ def _mended(problem: Problem, search: Search) -> Search:
 
     Returns that search, or the original one if the limits are not met within 20 steps.
     """
-    stiff = search._replace(
-        stale=jnp.bool_(True),
-        shift=jnp.zeros_like(search.shift),
-        stiffness=jnp.full_like(search.stiffness, _STIFF),
-        done=jnp.bool_(False),
+    stiff = _again(search)._replace(
+        shift=jnp.zeros_like(search.shift), stiffness=jnp.full_like(search.stiffness, _STIFF)
     )
     for _ in range(_MENDING):
         stiff = take_step(problem, stiff)
-        if float(stiff.max_violation) <= 0 or bool(stiff.done):
+        if float(stiff.max_violation) <= 0:
+            return stiff
+        if bool(stiff.done):
             break
-    return stiff if float(stiff.max_violation) <= 0 else search
-
-
-def _refuse_fixed(problem: Problem, search: Search) -> None:
-    """Raises ValueError for a limit that the start violates and that no variable changes."""
-    excess = np.asarray(search.evaluation.constraints)
-    slopes = np.asarray(search.jacobian)[-len(excess) or len(search.jacobian) :]
-    if np.any((excess > 0) & (np.max(np.abs(slopes), axis=1, initial=0) * _FAR < excess)):
-        nearby = take_step(problem, init_problem(problem, problem.nearby_vector(search.vector)))
-        problem.refuse_fixed(excess, nearby.evaluation.constraints)
-
-
-def _check_start(search: Search) -> None:
-    """Raises ValueError if no lens of the search could be evaluated."""
-    if not bool(jnp.isfinite(search.evaluation.overlap)):
-        raise ValueError(
-            "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
-            "finite; begin with weaker curvatures or a smaller stop"
-        )
+    return search
 
 
 def _why(problem: Problem, search: Search, target_merit: float) -> Ended:
@@ -176,44 +157,47 @@ def optimise(
     start cannot be evaluated (no ray of a field passes, or a number is not finite), for a limit
     that the start violates and that no variable changes, and inside of `jax.jit`.
     """
-    if not concrete((problem, vector)):
-        raise ValueError(
-            "optimise: call it outside of jax.jit; inside, use least_squares.init and step"
-        )
+    require(
+        concrete((problem, vector)),
+        "optimise: call it outside of jax.jit; inside, use least_squares.init and step",
+    )
     start = problem.variables.start if vector is None else jnp.asarray(vector)
-    low, high = problem.variables.low, problem.variables.high
-    tried = quick(problem)
-    search = init_problem(tried, jnp.clip(start, low, high))
-    begun = time.perf_counter()
-    search = jax.block_until_ready(take_step(tried, search))
-    compiled = time.perf_counter()
-    _refuse_fixed(tried, search)
-    history = [[search.merit, search.max_violation, search.jacobians]]
-    callback(search)
-    tried, search = _with_full_search(problem, tried, search)
-    for _ in range(max_steps - 1):
-        search = take_step(tried, search)
+    tried, history = quick(problem), list[list[Array]]()
+    search = init_problem(tried, jnp.clip(start, problem.variables.low, problem.variables.high))
+    begun = compiled = time.perf_counter()
+    for _ in range(max(max_steps, 1)):
+        search = jax.block_until_ready(take_step(tried, search))
+        if not history:
+            compiled = time.perf_counter()
+            slopes = np.asarray(search.jacobian)[search.evaluation.residuals.size :]
+            tried.refuse_fixed(search.evaluation.constraints, slopes)
+        before = history[-1][2] if history else 0
         history.append([search.merit, search.max_violation, search.jacobians])
         callback(search)
-        if search.jacobians > history[-2][2]:  # a better lens
+        if search.jacobians > before:  # a better lens
             tried, search = _with_full_search(problem, tried, search)
-        if bool(search.done) or float(search.score) <= target_merit:
+        ended = bool(search.done) or float(search.score) <= target_merit
+        if ended and len(history) > 1:
             break
-    _check_start(search)
+    require(
+        jnp.isfinite(search.evaluation.overlap),
+        "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
+        "finite; begin with weaker curvatures or a smaller stop",
+    )
     why = _why(tried, search, target_merit)
     if why != "target" and 0 < float(search.max_violation) <= _NEAR:
         search = _mended(tried, search)
-    ended = time.perf_counter()
-    limits = sorted(problem.limits(search.evaluation.constraints), key=lambda limit: -limit.excess)
+    seconds = time.perf_counter() - compiled
+    limits = problem.limits(search.evaluation.constraints)
     return Optimum(
         problem.variables.lens_of(search.vector),
         np.asarray(search.vector),
         float(search.merit),
         float(search.score),
         float(search.max_violation),
-        limits,
+        sorted(limits, key=lambda limit: -limit.excess),
         why,
         np.array(history, float),
-        ended - compiled,
+        seconds,
         compiled - begun,
     )

@@ -17,13 +17,9 @@ from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve, solve_aimed
+from .checks import require
 from .failures import failures
-from .field_rays import (
-    FieldRays,
-    beam_radius,
-    symmetry_by_structure,
-    trace_views,
-)
+from .field_rays import FieldRays, beam_radius, symmetry_by_structure, trace_views
 from .least_squares import Evaluation
 from .limits import Limit, limits_of
 from .media import gaps
@@ -35,46 +31,10 @@ from .waves import degree_of
 _OF_PATHS = "path_difference", "rms_wavefront"
 # Smallest penalty of a failed ray: it counts as a miss by this many semi-diameters of the stop.
 _FAILED = 4.0
-# No variable changes a limit if its violation differs by at most `_STILL` (relative) at vectors
-# whose components differ by up to `_NEARBY`.
-_NEARBY, _STILL = 0.3, 1e-9
+# No variable moves a limit if none of them would meet it by a change of `_FAR` times its scale.
+_FAR = 1e6
 # Smallest height of the marginal ray at the stop, relative to its largest height on any surface.
 _SLIMMEST = 0.1
-
-
-def _check_operands(
-    operands: Sequence[Operand],
-    lens: Lens,
-    fields: int,
-    wavelengths: int,
-    distances: np.ndarray,
-    rule: PupilRule,
-) -> None:
-    """Raises ValueError for operands that do not fit the lens, the scene or the rule.
-
-    fields, wavelengths: numbers of fields and of wavelengths.
-    distances: (Z,), mm.
-    """
-    if not operands:
-        raise ValueError("operands: none; a merit needs at least one, such as spot")
-    counts = {"fields": fields, "wavelengths": wavelengths, "distances": len(distances)}
-    for operand in operands:
-        operand.check(lens, counts)
-        named = distances[np.array(operand.distances or range(len(distances)))]
-        if operand.kind == "magnification" and np.any(np.isinf(named)):
-            raise ValueError("operands: magnification: the object is at infinity")
-        if not operand.vignetting and isinstance(rule, Clipped):
-            raise ValueError(
-                f"operands: {operand.name}: vignetting: Clipped traces only what passes; take "
-                "Gauss or Soft"
-            )
-        if kind_of(operand.kind).of_waves and degree_of(rule) < 2:
-            raise ValueError(
-                f"operands: {operand.name}: rule: needs Gauss or Soft of the order 2 or more, or "
-                f"Clipped of the order 3 or more; got {shown(rule)}"
-            )
-    if not any(operand.weight for operand in operands):
-        raise ValueError("operands: all have the weight 0; a merit needs at least one")
 
 
 def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
@@ -83,8 +43,7 @@ def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
     """
     found = np.asarray(given, float)
     valid = found.shape == (count,) and np.all(np.isfinite(found) & (found >= 0))
-    if not valid or not np.any(found):
-        raise ValueError(f"{what}: expected {count} numbers of 0 or above, not all 0")
+    require(valid and np.any(found), f"{what}: expected {count} numbers of 0 or above, not all 0")
     return found / found.mean()
 
 
@@ -92,10 +51,11 @@ def _axes(scene: Scene) -> tuple[Array, Array, Array]:
     """Fields (F, 2), distances (Z,) and wavelengths (W,) of a scene with every field at every
     distance. ValueError for other points."""
     field, far = scene.field, scene.distance
-    if far.ndim and field.ndim > 1 and not (far.ndim == 2 and far.shape[1] == 1 == field.ndim - 1):
-        raise ValueError(
-            "scene: a problem has every field at every distance: take Scene.grid(fields, distances)"
-        )
+    is_grid = far.ndim == 2 and far.shape[1] == 1 == field.ndim - 1
+    require(
+        not far.ndim or field.ndim == 1 or is_grid,
+        "scene: a problem has every field at every distance: take Scene.grid(fields, distances)",
+    )
     return field.reshape(-1, 2), far.reshape(-1), scene.wavelengths
 
 
@@ -167,19 +127,51 @@ class Problem:
             rule = Gauss(rule, symmetry if across else "none")
         if isinstance(rule, Clipped):  # trace no rays of weight 0
             rule = dataclasses.replace(rule, order=int(rule.order), size=0)
-        _check_operands(asked, lens, len(angles), len(waves), np.asarray(far), rule)
+        share = _weights("wavelength_weights", scene.spectrum, len(waves)) / len(waves)
+        weights = scene.field_weights
+        if weights is not None:
+            weights = jnp.asarray(_weights("field_weights", weights, len(angles)), dtype)
+        numbers = angles, far, waves, jnp.asarray(share, dtype)
+        problem = cls(variables, *numbers, rule, asked, field_weights=weights)
+        problem._check_operands()
         # Warn if float32 rounds the path differences of these operands too much.
         of_beams = any(kind_of(o.kind).of_waves for o in asked)
         if of_beams or any(o.kind in _OF_PATHS for o in asked):
             warn_of_paths(lens, scene, of_beams=of_beams)
         on = tuple(operand.placed(lens) for operand in asked if operand.weight)
-        share = _weights("wavelength_weights", scene.spectrum, len(waves)) / len(waves)
-        problem = cls(variables, angles, far, waves, jnp.asarray(share, dtype), rule, on)
-        if scene.field_weights is not None:
-            own = jnp.asarray(_weights("field_weights", scene.field_weights, len(angles)), dtype)
-            problem = dataclasses.replace(problem, field_weights=own)
+        problem = dataclasses.replace(problem, operands=on)
         problem._refuse_fixed()
         return problem
+
+    def _check_operands(self) -> None:
+        """Raises ValueError for operands that do not fit the lens, the scene or the rule."""
+        require(self.operands, "operands: none; a merit needs at least one, such as spot")
+        distances, rule = np.asarray(self.distances), self.rule
+        for operand in self.operands:
+            what = f"operands: {operand.name}"
+            operand.check(self.variables.lens, self._counts)
+            named = distances[np.array(operand.distances or range(len(distances)))]
+            require(
+                operand.kind != "magnification" or np.all(np.isfinite(named)),
+                f"{what}: the object is at infinity",
+            )
+            require(
+                operand.vignetting or not isinstance(rule, Clipped),
+                f"{what}: vignetting: Clipped traces only what passes; take Gauss or Soft",
+            )
+            require(
+                not kind_of(operand.kind).of_waves or degree_of(rule) >= 2,
+                f"{what}: rule: needs Gauss or Soft of the order 2 or more, or Clipped of the "
+                f"order 3 or more; got {shown(rule)}",
+            )
+        weighs = any(operand.weight for operand in self.operands)
+        require(weighs, "operands: all have the weight 0; a merit needs at least one")
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        """Numbers of fields, wavelengths and distances."""
+        names = ("fields", "wavelengths", "distances")
+        return {name: len(getattr(self, name)) for name in names}
 
     def with_order(self, order: int) -> "Problem":
         """The problem with a Gauss rule of another order."""
@@ -187,15 +179,10 @@ class Problem:
 
     def views(self) -> FieldRays:
         """All fields at all distances, without rays."""
-        return FieldRays(
-            jnp.tile(self.fields, (len(self.distances), 1)),
-            jnp.repeat(self.distances, len(self.fields)),
-            self.wavelengths,
-            self.wavelength_weights,
-            self.rule,
-            len(self.fields),
-            len(self.distances),
-        )
+        fields, distances = len(self.fields), len(self.distances)
+        field, distance = jnp.tile(self.fields, (distances, 1)), jnp.repeat(self.distances, fields)
+        waves = self.wavelengths, self.wavelength_weights
+        return FieldRays(field, distance, *waves, self.rule, fields, distances)
 
     @property
     def traces(self) -> bool:
@@ -210,7 +197,7 @@ class Problem:
         vector: (N,).
         """
         lens = self.variables.lens_of(vector)
-        rays = _rays(self, lens)
+        rays = self._rays(lens)
         parts = [operand.residuals(lens, rays, self.field_weights) for operand in self.operands]
         if self.traces:
             parts.append(self._failures(lens, rays))
@@ -228,6 +215,10 @@ class Problem:
         overlap = jnp.where(finite & jnp.isfinite(overlap), overlap, jnp.inf)
         failed = jnp.sum(~rays.arrives, dtype=jnp.int32) if self.traces else jnp.int32(0)
         return Evaluation(residuals, constraints, jax.lax.stop_gradient(overlap), failed)
+
+    def _rays(self, lens: Lens) -> FieldRays:
+        """The views of a lens, with rays if any operand needs them."""
+        return trace_views(lens, self.views(), self.solver) if self.traces else self.views()
 
     def _failures(self, lens: Lens, rays: FieldRays) -> Array:
         """Residuals of failed rays, see `failures`, in the unit of the operand with the largest
@@ -247,56 +238,47 @@ class Problem:
 
         constraints: (L,), constraints of an evaluation.
         """
-        counts = {"fields": len(self.fields), "distances": len(self.distances)}
-        counts |= {"wavelengths": len(self.wavelengths)}
-        counts |= {"xy": 2 if self.rule.symmetry == "none" else 1}
+        counts = self._counts | {"xy": 2 if self.rule.symmetry == "none" else 1}
         lens, sizes = self.variables.lens, [0] * len(self.operands)
+
+        def constraints_of_each(lens: Lens) -> list[Array]:
+            rays = self._rays(lens)
+            return [operand.constraints(lens, rays) for operand in self.operands]
+
         if any(callable(operand.kind) for operand in self.operands):
-            sizes = [a.size for a in jax.eval_shape(_constraints_of_each, self, lens)]
+            sizes = [a.size for a in jax.eval_shape(constraints_of_each, lens)]
         return limits_of(self.operands, lens, counts, sizes, np.asarray(constraints))
 
-    def nearby_vector(self, vector: Array) -> Array:
-        """A nearby vector (N,) within the bounds, in which every component that can move is
-        different.
+    def refuse_fixed(self, constraints: Numbers, slopes: Numbers) -> None:
+        """Raises ValueError for a limit that is exceeded and that no variable moves.
 
-        vector: (N,).
+        Its row of the Jacobian is 0 to rounding. Limits on rays are left out, because the violation
+        by a failed ray does not change until the ray passes.
+
+        constraints: (L,), constraints at a vector.
+        slopes: (L, N), their derivatives there.
         """
-        low, high = self.variables.low, self.variables.high
-        move = _NEARBY * jnp.cos(1 + 2 * jnp.arange(vector.size, dtype=vector.dtype))
-        move = jnp.where((vector + move < low) | (vector + move > high), -move, move)
-        return jnp.clip(vector + move, low, high)
-
-    def refuse_fixed(self, constraints: Numbers, nearby: Numbers) -> None:
-        """Raises ValueError for a limit whose violation is the same at a nearby vector.
-
-        Limits on rays are left out, because the violation by a failed ray does not change until the
-        ray passes.
-
-        constraints, nearby: (L,), constraints at both vectors.
-        """
-        one, two = np.asarray(constraints), np.asarray(nearby)
-        for limit, other in zip(self.limits(one), self.limits(two)):
-            if limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names:
-                continue
-            still = abs(other.excess - limit.excess) <= _STILL * (abs(limit.bound) + limit.excess)
-            if limit.excess > 0 and still:
-                raise ValueError(
-                    f"operands: {limit}, and no variable moves it; leave this limit out, widen it, "
-                    "or vary what it depends on"
-                )
-
-    @jax.jit
-    def _exceeded(self, vector: Array) -> Array:
-        """Constraints (L,) of operands that need no rays, at a vector (N,)."""
-        return self._constraints(self.variables.lens_of(vector), self.views())
+        excess, steepest = (
+            np.asarray(constraints),
+            np.max(np.abs(np.asarray(slopes)), axis=1, initial=0),
+        )
+        fixed = (excess > 0) & np.isfinite(excess) & (steepest * _FAR < excess)
+        for limit, is_fixed in zip(self.limits(excess) if fixed.any() else [], fixed):
+            of_rays = limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names
+            require(
+                of_rays or not is_fixed,
+                f"operands: {limit}, and no variable moves it; leave this limit out, widen it, or "
+                "vary what it depends on",
+            )
 
     def _refuse_fixed(self) -> None:
         """Calls `refuse_fixed` for limits that need no rays."""
         without_rays = tuple(o for o in self.operands if o.limits and not kind_of(o.kind).traced)
         if without_rays and concrete(self):
-            part = dataclasses.replace(self, operands=without_rays)
-            start = self.variables.start
-            part.refuse_fixed(part._exceeded(start), part._exceeded(self.nearby_vector(start)))
+            part, start = dataclasses.replace(self, operands=without_rays), self.variables.start
+            excess = _exceeded(part, start)
+            if np.any(excess > 0):
+                part.refuse_fixed(excess, _exceeded_slopes(part, start))
 
     @jax.jit
     def beam_radius(self, lens: Lens) -> Array:
@@ -326,16 +308,13 @@ def trace_fields(problem: Problem, lens: Lens) -> FieldRays:
     return trace_views(lens, problem.views(), problem.solver)
 
 
-def _rays(problem: Problem, lens: Lens) -> FieldRays:
-    """The views of a lens, with rays if any operand needs them."""
-    views = problem.views()
-    return trace_views(lens, views, problem.solver) if problem.traces else views
+@jax.jit
+def _exceeded(problem: Problem, vector: Array) -> Array:
+    """Constraints (L,) of a problem without rays, at a vector (N,)."""
+    return problem._constraints(problem.variables.lens_of(vector), problem.views())
 
 
-def _constraints_of_each(problem: Problem, lens: Lens) -> list[Array]:
-    """The constraints of each operand."""
-    rays = _rays(problem, lens)
-    return [operand.constraints(lens, rays) for operand in problem.operands]
+_exceeded_slopes = jax.jit(jax.jacfwd(_exceeded, argnums=1))
 
 
 def quick(problem: Problem) -> Problem:
@@ -343,3 +322,29 @@ def quick(problem: Problem) -> Problem:
     search.
     """
     return dataclasses.replace(problem, solver=solve_aimed)
+
+
+def open_apertures(lens: Lens) -> Lens:
+    """The lens with infinite semi-diameters, except for the stop, which keeps its own.
+
+    lens: the lens. Its `apertures` are not changed.
+    """
+    return _with_apertures(lens, jnp.full_like(lens.semi_diameter, jnp.inf))
+
+
+def fit_apertures(problem: Problem, lens: Lens, margin: float = 0.01) -> Lens:
+    """The lens with semi-diameters that just pass the rays of all fields of a problem.
+
+    The stop keeps its own semi-diameter.
+
+    problem: the problem whose rays must pass.
+    lens: a lens with open apertures, see `open_apertures`.
+    margin: relative increase of the semi-diameters.
+    """
+    return _with_apertures(lens, jnp.append((1 + margin) * problem.beam_radius(lens), jnp.inf))
+
+
+def _with_apertures(lens: Lens, semi_diameter: Array) -> Lens:
+    """The lens with other semi-diameters (S + 1,), except for the stop."""
+    own = lens.semi_diameter[lens.stop]
+    return dataclasses.replace(lens, semi_diameter=semi_diameter.at[lens.stop].set(own))

@@ -248,7 +248,7 @@ def test_a_limit_that_nothing_moves_is_refused(triplet):
     bounded = design.Problem.from_variables(
         bent, ["spot", Operand("distortion", low=-0.05)], Scene.radians(0.3, wavelengths=0.5876)
     )
-    bounded.refuse_fixed([0.95], [0.95])
+    bounded.refuse_fixed([0.95], [[0.0]])
 
 
 @pytest.mark.slow
