@@ -1,7 +1,8 @@
 """Replaces model glasses by real glasses, one place after the other, the least costly one first."""
 
 import dataclasses
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator
+from itertools import islice
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from ..devices import in_turn
 from ..lens.glass import Glass, nd_and_vd
 from ..lens.glasses import Neighbour, nearest_glasses
 from ..lens.lens import Lens, glass_rows, with_glass
+from .checks import require
 from .media import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
 from .problem import Problem, quick
@@ -82,13 +84,12 @@ def _places(problem: Problem) -> list[tuple[int, ...]]:
     first = {row: row for row in model_glasses(variables.lens)}
     for (k, follower), line in zip(variables.ties, variables.lines.tolist(), strict=True):
         if follower.kind in ("index", "abbe"):
-            if line != [1, 0]:
-                raise ValueError(
-                    f"snap_glasses: {follower} is tied with a scale or shift; leave this tie out"
-                )
+            require(
+                line == [1, 0],
+                f"snap_glasses: {follower} is tied with a scale or shift; leave this tie out",
+            )
             first[follower.row] = variables.places[k].row
-    if not first:
-        raise ValueError("snap_glasses: the lens has no model glass; see with_model_glass")
+    require(first, "snap_glasses: the lens has no model glass; see with_model_glass")
     return [tuple(r for r in first if first[r] == row) for row in sorted({*first.values()})]
 
 
@@ -111,56 +112,32 @@ def _with_glass(
     return dataclasses.replace(problem, variables=own), vector
 
 
-@dataclasses.dataclass(frozen=True)
-class _Search:
-    """The glasses that are tried, see `snap_glasses`."""
+def _neighbours(
+    problem: Problem,
+    lens: Lens,
+    place: tuple[int, ...],
+    makers: Collection[str] | None,
+    accept: Callable[[Glass], bool],
+) -> Iterator[Neighbour]:
+    """The accepted glasses for a place of a lens, the nearest to its medium first.
 
-    makers: Collection[str] | None
-    accept: Callable[[Glass], bool]
-    count: int
-    steps: int
-
-    def neighbours(self, problem: Problem, lens: Lens, place: tuple[int, ...]) -> list[Neighbour]:
-        """The nearest accepted glasses to the medium in a place of a lens.
-
-        The index of each is known at all wavelengths, no two have the same constants, and none is
-        the same as a medium that touches this one.
-        """
-        waves, points = np.asarray(problem.wavelengths), np.asarray(nd_and_vd(lens.dispersion))
-        rows, (nd, vd) = glass_rows(lens, place), points[place[0] + 1].tolist()
-        touched = points[~rows & (np.roll(rows, 1) | np.roll(rows, -1))]
-        found: dict[tuple, Neighbour] = {}
-        for near in nearest_glasses(nd, vd, self.makers, None):
-            low, high = np.asarray(near.glass.range, waves.dtype)
-            other = np.all(np.any(np.abs(touched - (near.nd, near.vd)) > _SAME, axis=1))
-            if other and low <= waves.min() and waves.max() <= high and self.accept(near.glass):
-                found.setdefault((near.glass.sellmeier, near.glass.schott), near)
-            if len(found) == self.count:
-                break
-        if not found:
-            raise ValueError(
-                f"snap_glasses: no glass fits behind surface {place[0]}; accept more, or name "
-                "other makers"
-            )
-        return [*found.values()]
-
-    def trial(
-        self, problem: Problem, vector: np.ndarray, place: tuple[int, ...], near: Neighbour
-    ) -> _Trial:
-        """Some steps of least squares with a glass in a place."""
-        own, start = _with_glass(problem, vector, place, near.glass)
-        search = init_problem(quick(own), jnp.asarray(start, own.variables.low.dtype))
-        for _ in range(self.steps):
-            search = take_step(quick(own), search)
-        return _Trial(place, near, own, np.asarray(search.vector), float(search.score))
-
-    def ranked(
-        self, problem: Problem, found: Optimum, places: Sequence[tuple[int, ...]]
-    ) -> list[_Trial]:
-        """All trials in some places, the best first."""
-        tasks = [(p, n) for p in places for n in self.neighbours(problem, found.lens, p)]
-        trials = in_turn(lambda task: self.trial(problem, found.vector, *task), tasks)
-        return sorted(trials, key=lambda trial: trial.score)
+    The index of each is known at all wavelengths, no two have the same constants, and none is the
+    same as a medium that touches this one.
+    """
+    waves, points = np.asarray(problem.wavelengths), np.asarray(nd_and_vd(lens.dispersion))
+    rows, (nd, vd) = glass_rows(lens, place), points[place[0] + 1].tolist()
+    touched = points[~rows & (np.roll(rows, 1) | np.roll(rows, -1))]
+    known: set[tuple] = set()
+    for near in nearest_glasses(nd, vd, makers, None):
+        low, high = np.asarray(near.glass.range, waves.dtype)
+        other = np.all(np.any(np.abs(touched - (near.nd, near.vd)) > _SAME, axis=1))
+        constants = near.glass.sellmeier, near.glass.schott
+        fits = other and low <= waves.min() and waves.max() <= high and constants not in known
+        if fits and accept(near.glass):
+            known.add(constants)
+            yield near
+    remedy = "accept more, or name other makers"
+    require(known, f"snap_glasses: no glass fits behind surface {place[0]}; {remedy}")
 
 
 def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]:
@@ -168,9 +145,8 @@ def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]
     after = optimise(trial.problem, jnp.asarray(trial.vector), max_steps)
     row = trial.place[0] + 1
     nd, vd = np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()
-    replaced = found.lens.glasses[row]
-    own = trial.place, trial.near.glass.name, replaced, (nd, vd), found.score, after.score
-    return Snap(*own), after
+    names = trial.near.glass.name, found.lens.glasses[row]
+    return Snap(trial.place, *names, (nd, vd), found.score, after.score), after
 
 
 def snap_glasses(
@@ -203,27 +179,36 @@ def snap_glasses(
     constants than those before. ValueError if the lens has no model glass, for an unknown maker,
     and if no glass fits.
     """
-    places, search, snaps = _places(problem), _Search(makers, accept, count, steps), list[Snap]()
-    left = [*places]
-    while left:
-        best = search.ranked(problem, found, left)[0]
-        snap, found = _snap(best, found, max_steps)
-        left.remove(best.place)
-        problem = best.problem
-        snaps.append(snap)
-        callback(snap)
-    better = True
-    while better:
-        ranked, better = search.ranked(problem, found, places), False
-        # Keep the trials that are better than those of the present glasses.
+
+    def run(task: tuple[tuple[int, ...], Neighbour]) -> _Trial:
+        """Some steps of least squares with a glass in a place."""
+        place, near = task
+        own, start = _with_glass(problem, found.vector, place, near.glass)
+        search = init_problem(quick(own), jnp.asarray(start, own.variables.low.dtype))
+        for _ in range(steps):
+            search = take_step(quick(own), search)
+        return _Trial(place, near, own, np.asarray(search.vector), float(search.score))
+
+    places, snaps = _places(problem), list[Snap]()
+    left, done = [*places], False
+    while not done:
+        tasks = [
+            (place, near)
+            for place in left or places
+            for near in islice(_neighbours(problem, found.lens, place, makers, accept), count)
+        ]
+        ranked = sorted(in_turn(run, tasks), key=lambda trial: trial.score)
         names = found.lens.glasses
-        now = [t.score for t in ranked if t.near.glass.name == names[t.place[0] + 1]]
-        most = (1 - _GAIN) * min(now, default=np.inf)
-        for trial in [t for t in ranked if t.score < most][:_EXCHANGES]:
+        present = [t.score for t in ranked if t.near.glass.name == names[t.place[0] + 1]]
+        # A model glass must be replaced; a real glass only by a better one.
+        most = (1 - _GAIN) * min(present, default=np.inf)
+        tried = ranked[:1] if left else [t for t in ranked if t.score < most][:_EXCHANGES]
+        done = True
+        for trial in tried:
             snap, after = _snap(trial, found, max_steps)
-            better = snap.after < (1 - _GAIN) * snap.before
-            if better:
-                problem, found = trial.problem, after
+            if left or snap.after < (1 - _GAIN) * snap.before:
+                problem, found, done = trial.problem, after, False
+                left = [place for place in left if place != trial.place]
                 snaps.append(snap)
                 callback(snap)
                 break

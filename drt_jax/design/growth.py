@@ -1,6 +1,5 @@
 """Growth: a design for a part of the fields and aperture, extended step by step to the whole."""
 
-import copy
 import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,6 +11,7 @@ from jax import Array
 from .least_squares import Search
 from .optimum import Optimum, optimise
 from .problem import Problem
+from .solves import Solve
 
 # Smallest step to the next part, and the factor by which the step grows after a success.
 SHORTEST, _FASTER = 0.002, 1.2
@@ -53,18 +53,20 @@ def part_of(problem: Problem, part: Array | float) -> Problem:
     part: factor of the fields; and of the aperture: of the entrance pupil or f-number of a solve,
         if there is one, else of the stop.
     """
-    variables, solves = problem.variables, []
+
+    def own(solve: Solve) -> Solve:
+        if not solve.aperture:
+            return solve
+        is_pupil = solve.kind == "entrance_pupil"
+        return solve.with_value(solve.value * part if is_pupil else solve.value / part)
+
+    variables = problem.variables
     lens = variables.lens
-    for solve in variables.solves:
-        own = copy.copy(solve)
-        if solve.aperture:
-            value = solve.value * part if solve.kind == "entrance_pupil" else solve.value / part
-            object.__setattr__(own, "value", value)
-        solves.append(own)
-    if not any(solve.aperture for solve in solves):
+    if not any(solve.aperture for solve in variables.solves):
         semi = lens.semi_diameter.at[lens.stop].multiply(part)
         lens = dataclasses.replace(lens, semi_diameter=semi)
-    variables = dataclasses.replace(variables, lens=lens, solves=tuple(solves))
+    solves = tuple(map(own, variables.solves))
+    variables = dataclasses.replace(variables, lens=lens, solves=solves)
     return dataclasses.replace(problem, variables=variables, fields=problem.fields * part)
 
 
@@ -89,24 +91,21 @@ def grow_once(
     The part is accepted if its score is at most the target; the next step is then 1.2 times as
     long. Otherwise the step is halved. Arguments as in `grow`.
     """
-    part, done, step = growth.part, growth.done, growth.step
-    vector = jnp.asarray(growth.vector)
+    part, vector = growth.part, jnp.asarray(growth.vector)
     found = optimise(part_of(problem, part), vector, max_steps, callback, target_merit)
-    met = found.score <= target_merit
-    if met:
-        done, step = part, _FASTER * step
-    else:
-        step /= 2
-    return growth._replace(
-        done=done,
-        part=min(done + step, 1.0) if done else part / 2,
-        step=step,
-        vector=found.vector if met else growth.vector,
-        failed=growth.failed if met else found,
+    growth = growth._replace(
         steps=growth.steps + len(found.history),
         jacobians=growth.jacobians + found.jacobians,
         seconds=growth.seconds + found.seconds,
         first=growth.first + found.first,
+    )
+    if found.score <= target_merit:
+        step = _FASTER * growth.step
+        later = growth._replace(done=part, step=step, vector=found.vector)
+        return later._replace(part=min(part + step, 1.0))
+    step, done = growth.step / 2, growth.done
+    return growth._replace(
+        step=step, part=min(done + step, 1.0) if done else part / 2, failed=found
     )
 
 
