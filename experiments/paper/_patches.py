@@ -13,7 +13,7 @@ from tqdm import tqdm
 from drt_jax.learn.data import DataConfig, Patches, load_patches
 
 from ._report import IMAGES
-from .runs.write import replace
+from .runs.disk import replace
 
 # Most skipped files named on the terminal; the run folder names all.
 _NAMED = 20

@@ -7,14 +7,15 @@ import math
 import pathlib
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, TypeVar
 
 import yaml
 
-from drt_jax.inputs import InputError, Lines, parse, read_yaml, shown
+from drt_jax.inputs import InputError, parse, read_yaml, shown
 
 T = TypeVar("T")
+Source = Callable[[str], str]
 # Limits: whole numbers, size of other finite numbers, items of a list, characters of a text.
 _MOST, _LARGEST, _ITEMS, _LONGEST = 2**31 - 1, 1e12, 1000, 1000
 _NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
@@ -23,20 +24,6 @@ _NAMES[type(None)] = "null"
 
 class ConfigError(InputError):
     """A configuration cannot be used; the message names the source, the key and the remedy."""
-
-
-class _Source:
-    """Source of settings in messages: a file with lines, or overrides by key."""
-
-    def __init__(self, name: str, lines: Lines, overrides: dict[str, str] | None = None):
-        self._name, self._lines, self._overrides = name, lines, overrides or {}
-
-    def error(self, key: str, message: str) -> ConfigError:
-        """The error at a key."""
-        inside = ((name, f"{given}.") for given, name in self._overrides.items())
-        found = [name for name, given in inside if f"{key}.".startswith(given)]
-        name = found[-1] if found else self._name
-        return ConfigError(f"{name}{self._lines.of(key)}: {message}", key)
 
 
 def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str] = ()) -> T:
@@ -52,9 +39,9 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
         entry, lines = read_yaml(path)
     except InputError as error:
         raise ConfigError(f"{path}: {error}") from error
-    config = _build(cls, {} if entry is None else entry, _Source(str(path), lines), "")
-    changes: object = {}
-    names: dict[str, str] = {}
+    entry = {} if entry is None else entry
+    config = _build(cls, entry, lambda key: f"{path}{lines.of(key)}")
+    names: dict[str, str] = {}  # overrides by key
     for override in overrides:
         name = f"--set {shown(override)[1:-1]}"
         key, equals, text = override.partition("=")
@@ -67,9 +54,14 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
         names[key.strip()] = name
         for part in reversed(key.strip().split(".")):
             value = {part: value}
-        changes = _merged(changes, value)
-    source = _Source(" ".join(names.values()), Lines(), names)
-    return _build(cls, changes, source, "", config) if names else config
+        entry = _merged(entry, value)
+
+    def source(key: str) -> str:
+        """The last override of a key, or of one that holds it; else all of them."""
+        own = [name for given, name in names.items() if f"{key}.".startswith(f"{given}.")]
+        return own[-1] if own else " ".join(names.values())
+
+    return _build(cls, entry, source) if names else config
 
 
 def _merged(old: object, new: object) -> object:
@@ -79,16 +71,16 @@ def _merged(old: object, new: object) -> object:
     return old | {key: _merged(old.get(key), value) for key, value in new.items()}
 
 
-def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = None) -> Any:
-    """The dataclass `cls` with the values of `entry`; the others are those of `old` or defaults.
+def _build(cls: Any, entry: object, source: Source, prefix: str = "") -> Any:
+    """The dataclass `cls` with the values of `entry`, and defaults for the others.
 
-    source: source in messages.
+    source: source of the setting of a key, in messages.
     prefix: the keys that lead here, each followed by a dot.
     """
     here = prefix.rstrip(".")
     if not isinstance(entry, dict):
         where = here or "the file"
-        raise source.error(here, f"{where}: expected keys and values, got {shown(entry)}")
+        raise _error(source, here, f"{where}: expected keys and values, got {shown(entry)}")
     known = typing.get_type_hints(cls, include_extras=True)
     values = {}
     for key, value in entry.items():
@@ -97,30 +89,34 @@ def _build(cls: Any, entry: object, source: _Source, prefix: str, old: Any = Non
             near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
             hint = f"did you mean {prefix}{near[0]}? " if near else ""
             unknown = f"unknown key {prefix}{shown(word)[1:-1]}; {hint}"
-            raise source.error(prefix + word, f"{unknown}known here: {', '.join(known)}")
-        values[key] = _convert(known[key], value, source, prefix + key, getattr(old, key, None))
+            raise _error(source, prefix + word, f"{unknown}known here: {', '.join(known)}")
+        values[key] = _convert(known[key], value, source, prefix + key)
     needed = (f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING)
-    missing = [prefix + name for name in needed if old is None and name not in values]
+    missing = [prefix + name for name in needed if name not in values]
     if missing:
-        raise source.error(here, f"missing keys: {', '.join(missing)}")
+        raise _error(source, here, f"missing keys: {', '.join(missing)}")
     try:
-        return cls(**values) if old is None else dataclasses.replace(old, **values)
+        return cls(**values)
     except ValueError as error:  # the message of a dataclass names the key first
-        raise source.error(str(error).partition(":")[0], str(error)) from error
+        raise _error(source, str(error).partition(":")[0], str(error)) from error
 
 
-def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = None) -> Any:
+def _error(source: Source, key: str, message: str) -> ConfigError:
+    return ConfigError(f"{source(key)}: {message}", key)
+
+
+def _convert(kind: Any, value: object, source: Source, key: str) -> Any:
     """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...], X | tuple[X, ...],
     X | None or a Literal; or Annotated[X, check, ...] with functions that return what is wrong with
     a value, "" for nothing."""
     if dataclasses.is_dataclass(kind):
-        return _build(kind, value, source, f"{key}.", old)
+        return _build(kind, value, source, f"{key}.")
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Annotated:
-        found = _convert(arguments[0], value, source, key, old)
+        found = _convert(arguments[0], value, source, key)
         for wrong in (check(found) for check in arguments[1:]):
             if wrong:
-                raise source.error(key, f"{key}: {wrong}")
+                raise _error(source, key, f"{key}: {wrong}")
         return found
     limit = ""
     if origin in (types.UnionType, typing.Union):  # of one value, and of a list or nothing
@@ -151,7 +147,7 @@ def _convert(kind: Any, value: object, source: _Source, key: str, old: Any = Non
         return value
     expected = f"{key}: expected {_say(kind)}{limit}, got {shown(value)}"
     near = difflib.get_close_matches(str(value)[:_LONGEST], map(str, arguments), n=1)
-    raise source.error(key, expected + (f"; did you mean {near[0]}?" if near else ""))
+    raise _error(source, key, expected + (f"; did you mean {near[0]}?" if near else ""))
 
 
 def _number(value: int | float | str) -> float:

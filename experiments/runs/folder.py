@@ -5,6 +5,7 @@ replaces its predecessor in one step and is checked before use, and resuming dro
 the checkpoint.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import io
@@ -22,11 +23,9 @@ import numpy as np
 
 from drt_jax.inputs import shown
 
-from .checkpoint import finite, packed, unpacked
 from .config import ConfigError, dump_config, load_config
-from .lock import lock
+from .disk import finite, locked, packed, replace, sweep, unpacked
 from .metrics import Metrics
-from .write import replace, sweep
 
 _OTHERS = "other settings than those in config.yaml"
 
@@ -69,8 +68,8 @@ class Run:
         if resume and not (folder / "config.yaml").is_file():
             raise ConfigError(f"{folder}: nothing to resume: no config.yaml in it")
         folder.mkdir(parents=True, exist_ok=True)
-        self._unlock = lock(folder)
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(locked(folder))
             for part in (folder, folder / "checkpoints"):
                 sweep(part)
             if resume:
@@ -78,15 +77,13 @@ class Run:
             else:
                 self._begin(config)
             self.figures.mkdir(exist_ok=True)
-        except BaseException:
-            self.close()
-            raise
+            self._held = stack.pop_all()
 
     def _begin(self, config: Any) -> None:
         if begun(self.folder):
             remedy = "add --resume to go on with it, or choose another --out"
             raise ConfigError(f"{self.folder}: holds a run already; {remedy}")
-        self._metrics.begin()
+        self._metrics.write([])
         replace(self.folder / "config.yaml", dump_config(config).encode())
 
     def _go_on(self, config: Any) -> None:
@@ -100,8 +97,7 @@ class Run:
 
     def close(self) -> None:
         """Unlocks the folder; nothing more may be written."""
-        unlock, self._unlock = self._unlock, lambda: None
-        unlock()
+        self._held.close()
 
     def __enter__(self) -> "Run":
         return self

@@ -9,7 +9,7 @@ import zlib
 import numpy as np
 
 from .config import ConfigError
-from .write import replace
+from .disk import replace
 
 
 class Metrics:
@@ -21,17 +21,18 @@ class Metrics:
     def __init__(self, path: pathlib.Path, columns: tuple[str, ...]):
         self.path = path
         self.columns = ("job", "step", *columns)
+        self._header = (",".join((*self.columns, "check")) + "\r\n").encode()
 
-    def begin(self) -> None:
-        """Writes the file without rows."""
-        self._write([])
+    def write(self, rows: list[list[str]]) -> None:
+        """Writes the file anew, with some rows."""
+        replace(self.path, self._header + _text(rows))
 
     def mend(self) -> None:
         """Repairs what a kill may leave: writes a missing or partial header, and drops a last line
         without its end. ConfigError for other damage."""
         content = self.path.read_bytes() if self.path.exists() else b""
-        if self._text([]).startswith(content):
-            self.begin()
+        if self._header.startswith(content):
+            self.write([])
         elif (whole := content[: content.rfind(b"\n") + 1]) and len(whole) < len(content):
             replace(self.path, whole)
         self._rows()
@@ -47,7 +48,7 @@ class Metrics:
         for i, values in enumerate(zip(*rows.values())):
             known = {name: float(value) for name, value in zip(rows, values)}
             lines.append([job, step + i, *(known.get(name, "") for name in self.columns[2:])])
-        content = self._text(lines, header=False)
+        content = _text(lines)
         with open(self.path, "r+b", buffering=0) as file:
             end = file.seek(0, os.SEEK_END)
             try:
@@ -73,13 +74,13 @@ class Metrics:
                 wrong = f"not one row of {job} for each of the {step} steps before its checkpoint"
                 raise ConfigError(f"{self.path}: {wrong}; put them back, or {remedy}")
         if len(kept) < len(rows):
-            self._write(kept)
+            self.write(kept)
 
     def order(self) -> None:
         """Sorts the rows by job and step, so that stops of the run do not change the file."""
         rows = self._rows()
         place = {job: k for k, job in enumerate(dict.fromkeys(row[0] for row in rows))}
-        self._write(sorted(rows, key=lambda row: (place[row[0]], int(row[1]))))
+        self.write(sorted(rows, key=lambda row: (place[row[0]], int(row[1]))))
 
     def sync(self) -> None:
         """Flushes the rows to the disk."""
@@ -88,17 +89,11 @@ class Metrics:
 
     def _rows(self) -> list[list[str]]:
         """All rows as text. ConfigError, with the line, for a damaged one."""
-        content = self.path.read_bytes()
-        try:
-            text = content.decode()
-        except UnicodeDecodeError as error:
-            line = 1 + content.count(b"\n", 0, error.start)
-            raise self._damage(line, "bytes that are no UTF-8 text") from error
+        text = self.path.read_bytes().decode(errors="replace")
         reader = csv.reader(io.StringIO(text, newline=""))
-        rows = []
+        header, rows = [*self.columns, "check"], []
         try:
-            header = (*self.columns, "check")
-            if tuple(next(reader, ())) != header:
+            if next(reader, None) != header:
                 raise ValueError(f"expected the header {','.join(header)}")
             for *row, check in reader:
                 if len(row) != len(self.columns):
@@ -108,21 +103,17 @@ class Metrics:
                     raise ValueError("its checksum is another")
                 rows.append(row)
         except (csv.Error, ValueError) as error:
-            raise self._damage(max(reader.line_num, 1), str(error)) from error
+            where = f"{self.path}, line {max(reader.line_num, 1)}"
+            remedy = "mend it, or delete the file and the folder checkpoints to begin anew"
+            raise ConfigError(f"{where}: {str(error)[:90]}; {remedy}") from error
         return rows
 
-    def _damage(self, line: int, what: str) -> ConfigError:
-        remedy = "mend it, or delete the file and the folder checkpoints to begin anew"
-        return ConfigError(f"{self.path}, line {line}: {what[:90]}; {remedy}")
 
-    def _write(self, rows: list[list[str]]) -> None:
-        replace(self.path, self._text(rows))
-
-    def _text(self, rows: list[list], header: bool = True) -> bytes:
-        text = io.StringIO(newline="")
-        checked = [[*row, _check(row)] for row in rows]
-        csv.writer(text).writerows([[*self.columns, "check"], *checked] if header else checked)
-        return text.getvalue().encode()
+def _text(rows: list[list]) -> bytes:
+    """Rows as text, each with its checksum."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([*row, _check(row)] for row in rows)
+    return text.getvalue().encode()
 
 
 def _check(row: list) -> str:
