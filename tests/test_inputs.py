@@ -10,7 +10,7 @@ from experiments._damaged_files import outcome_of
 
 from drt_jax import LensError, load_lens
 from drt_jax.inputs import InputError, one_line, parse, shown
-from experiments import _damage, _damaged_files
+from experiments import _damaged_files
 from experiments.runs.config import ConfigError, load_config
 
 LENS = """\
@@ -198,6 +198,6 @@ def test_random_mutants(seed, tmp_path):
     rng = np.random.default_rng(seed)
     path = tmp_path / "mine.yaml"
     for _ in range(40):
-        path.write_bytes(content := _damage.damaged(LENS, rng))
+        path.write_bytes(content := _damaged_files.damaged(LENS, rng))
         found, said = outcome_of(lambda: _damaged_files.finite(load_lens(path)))
         assert found in ("refused", "survived"), (said, content)

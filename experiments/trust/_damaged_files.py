@@ -1,15 +1,18 @@
-"""Randomly damaged prescriptions, lens files and settings: refused in one line, or right."""
+"""Randomly damaged prescriptions, lens files and settings: refused in one line, or right.
 
-import dataclasses
+Damage is done to bytes, to words, and to values of the YAML tree.
+"""
+
+import copy
 import pathlib
 import signal
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+import yaml
 from tqdm import tqdm
 
 import drt_jax
@@ -17,7 +20,6 @@ from drt_jax import Lens, Scene, Status
 from drt_jax.inputs import InputError, shown
 
 from ._common import settings_files
-from ._damage import damaged
 from .runs import config as configs
 
 FAULTS = ("wrong", "traceback", "hang")
@@ -35,6 +37,92 @@ _ZMX = (
 )
 # Files between clearings of JAX's caches: too many programs exhaust the maps of a process.
 _KEPT = 200
+# Words that a careless or hostile author may write.
+_WORDS = (
+    *("0", "-1", "1e-320", "1e308", "-1e39", ".inf", "-.inf", ".nan", "nan", "inf", "null", "~"),
+    *("true", "no", "''", "'0x10'", "0x10", "1:30", "2001-99-99", "1_000", "1e", "--5", "9" * 400),
+    *("9" * 5000, "[]", "{}", "[1, 2]", "{a: 1}", "[[1]]", "[asphere]", "{2: 1}", "!!int abc"),
+    *("!!python/object/apply:os.getcwd []", "&a", "*a", "<<", "---", "...", "#", "\t", ": ", "- "),
+    *("\x00", "\x1b[31m", "\ud83d\ude00", "\u202e", "é", "x" * 3000, "[" * 400, "{a: " * 400, "|"),
+    *("surfaces", "radius", "coefficients", "sellmeier", "zernike", "qbfs", "toroid", "1.5", "inf"),
+)
+_VALUES: tuple[Any, ...] = (
+    *(0, -1, 1, 2, 3, 1e-320, 1e308, -1e39, 1e30, float("inf"), float("-inf"), float("nan")),
+    *(None, True, False, "", "a", "inf", "N-BK7", "835427", "air", [], {}, [1, 2], [1, 2, 3]),
+    *({"circle": 1}, {2: 1e-3}, {4: 1e30}, {"x1y1": 1}, 10**30, -(10**18), "x" * 500, 1e-7),
+    *("asphere", "zernike", "qbfs", "toroid", "biconic", "polynomial_xy", "linear", "sensor"),
+)
+# Changes of a few bytes and of a value, as often as they stand here.
+_OF_BYTES = ("remove", "double", "flip", "write a word", "write a word", "cut", "double a line")
+_OF_VALUES = ("exchange",) * 3 + ("scale",) * 2 + ("drop", "copy another", "rename")
+
+
+def damaged(text: str, rng: np.random.Generator, values: float = 0.6) -> bytes:
+    """A file with one to four random changes. values: fraction of changes to values of the YAML
+    tree; the rest are to bytes."""
+    content = text.encode("utf-8", "surrogatepass")
+    for _ in range(rng.integers(1, 5)):
+        change = _change_value if rng.random() < values else _change_bytes
+        content = change(content, rng)
+    return content
+
+
+def _one(items: Sequence[Any], rng: np.random.Generator) -> Any:
+    return items[rng.integers(len(items))]
+
+
+def _change_bytes(content: bytes, rng: np.random.Generator) -> bytes:
+    kind = _one(_OF_BYTES, rng)
+    if kind == "double a line":
+        lines = content.split(b"\n")
+        k = int(rng.integers(len(lines)))
+        return b"\n".join([*lines[: k + 1], *lines[k:]])
+    first = int(rng.integers(len(content) + 1))
+    last = min(len(content), first + int(rng.integers(1, 40)))
+    before, after = content[:first], content[last:]
+    if kind == "double":
+        return content[:last] + content[first:]
+    if kind == "flip":
+        return before + bytes([rng.integers(256)]) + content[first + 1 :]
+    if kind == "write a word":
+        word = _one(_WORDS, rng).encode("utf-8", "surrogatepass")
+        return before + word + (after if rng.random() < 0.5 else content[first:])
+    return before if kind == "cut" else before + after
+
+
+def _places(node: Any) -> Iterator[tuple[Any, Any]]:
+    """Container and key of each value of a tree, at any depth."""
+    keys = node if isinstance(node, dict) else range(len(node)) if type(node) is list else ()
+    yield from ((node, key) for key in keys)
+    for key in reversed([*keys]):
+        yield from _places(node[key])
+
+
+def _change_value(content: bytes, rng: np.random.Generator) -> bytes:
+    """Changes one value of a YAML file, at any depth; nothing if the file is none any more."""
+    kind = _one(_OF_VALUES, rng)
+    try:
+        tree = yaml.safe_load(content) if len(content) < 50_000 else None
+        places = [*_places(tree)]
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return content
+    if not places:
+        return content
+    node, key = _one(places, rng)
+    if kind == "exchange":
+        node[key] = copy.deepcopy(_one(_VALUES, rng))
+    elif kind == "scale":
+        if isinstance(node[key], int | float) and not isinstance(node[key], bool):
+            node[key] = node[key] * float(rng.choice([-1, 0, 0.1, 3, 10, 1e6, 1e200]))
+    elif kind == "drop":
+        del node[key]
+    elif kind == "copy another":
+        other, place = _one(places, rng)
+        node[key] = copy.deepcopy(other[place])
+    elif isinstance(node, dict):
+        node[str(key) + "x"] = node.pop(key)
+    text = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)
+    return text.encode("utf-8", "surrogatepass")
 
 
 def row_of(kind: str, trials: Iterable[tuple[str, object]], count: int) -> dict[str, Any]:
@@ -80,20 +168,43 @@ def outcome_of(call: Callable[[], bool], seconds: float = 5.0) -> tuple[str, str
         signal.signal(signal.SIGALRM, before)
 
 
-def prescriptions(count: int, rng: np.random.Generator) -> tuple[dict[str, Any], list[Lens]]:
-    """Row of damaged prescriptions, of which those that load must be finite; and the lenses."""
+def _loaded(
+    kind: str, path: pathlib.Path, content: Callable[[], bytes], count: int
+) -> tuple[dict[str, Any], list[Lens]]:
+    """Row of files of random content, written to a path; and the lenses of those that load, which
+    must be finite."""
+    lenses = list[Lens]()
+
+    def load() -> bool:
+        lenses.append(drt_jax.load_lens(path))
+        return finite(lenses[-1])
+
+    def trials() -> Iterator[tuple[str, object]]:
+        for k in range(count):
+            if k % _KEPT == 0:
+                jax.clear_caches()
+            path.write_bytes(written := content())
+            outcome, message = outcome_of(load)
+            yield outcome, (message, written[:500])
+
+    return row_of(kind, trials(), count), lenses
+
+
+def prescriptions(
+    folder: pathlib.Path, count: int, rng: np.random.Generator
+) -> tuple[dict[str, Any], list[Lens]]:
+    """Row of damaged prescriptions; and the lenses of those that load."""
     texts = [path.read_text() for path in sorted(_LENSES.glob("*.yaml"))]
-    return _loaded("prescriptions", "lens.yaml", lambda: damaged(_one(texts, rng), rng), count)
+    content = lambda: damaged(_one(texts, rng), rng)  # noqa: E731
+    return _loaded("prescriptions", folder / "lens.yaml", content, count)
 
 
-def lens_files(count: int, rng: np.random.Generator) -> dict[str, Any]:
+def lens_files(folder: pathlib.Path, count: int, rng: np.random.Generator) -> dict[str, Any]:
     """Row of damaged .zmx files with lines of other files, in two encodings."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = pathlib.Path(folder) / "lens.zmx"
-        texts = []
-        for name in ("cooke_triplet", "phone", "hubble", "singlet"):
-            drt_jax.save_lens(drt_jax.load_lens(name), path)
-            texts.append(path.read_text())
+    path, texts = folder / "lens.zmx", []
+    for name in ("cooke_triplet", "phone", "hubble", "singlet"):
+        drt_jax.save_lens(drt_jax.load_lens(name), path)
+        texts.append(path.read_text())
 
     def content() -> bytes:
         lines = _one(texts, rng).splitlines()
@@ -102,44 +213,16 @@ def lens_files(count: int, rng: np.random.Generator) -> dict[str, Any]:
         own = damaged("\n".join(lines), rng, values=0.0)
         return own if rng.random() < 0.5 else own.decode("utf-8", "replace").encode("utf-16")
 
-    return _loaded("lens files", "lens.zmx", content, count)[0]
-
-
-def _one(items: Sequence[str], rng: np.random.Generator) -> str:
-    return items[rng.integers(len(items))]
-
-
-def _loaded(
-    kind: str, name: str, content: Callable[[], bytes], count: int
-) -> tuple[dict[str, Any], list[Lens]]:
-    """Row of files of a name and random content, and the lenses of those that load."""
-    lenses = list[Lens]()
-
-    def trials(path: pathlib.Path) -> Iterator[tuple[str, object]]:
-        for k in range(count):
-            if k % _KEPT == 0:
-                jax.clear_caches()
-            path.write_bytes(written := content())
-
-            def load() -> bool:
-                lenses.append(drt_jax.load_lens(path))
-                return finite(lenses[-1])
-
-            outcome, message = outcome_of(load)
-            yield outcome, (message, written[:500])
-
-    with tempfile.TemporaryDirectory() as folder:
-        return row_of(kind, trials(pathlib.Path(folder) / name), count), lenses
+    return _loaded("lens files", path, content, count)[0]
 
 
 def finite(lens: Lens) -> bool:
-    """True if all numbers of a lens are finite, except open apertures."""
-    open_ones = dataclasses.replace(lens, semi_diameter=lens.curvature * 0)
-    if lens.apertures is not None:
-        half = dataclasses.replace(lens.apertures, half=lens.apertures.half * 0)
-        open_ones = dataclasses.replace(open_ones, apertures=half)
-    known = not np.any(np.isnan(lens.semi_diameter))
-    return known and all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(open_ones))
+    """True if all numbers of a lens are finite; apertures may be infinite, which is open."""
+    for path, leaf in jax.tree.leaves_with_path(lens):
+        may_be_open = jax.tree_util.keystr(path) in (".semi_diameter", ".apertures.half")
+        if np.any(np.isnan(leaf) if may_be_open else ~np.isfinite(leaf)):
+            return False
+    return True
 
 
 def traced(lenses: list[Lens]) -> dict[str, Any]:
@@ -164,18 +247,18 @@ def traced(lenses: list[Lens]) -> dict[str, Any]:
     return row_of("lenses that load, traced", trials(), len(lenses))
 
 
-def settings(count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Row of damaged settings of all experiments, half of them by --set: accepted ones must be the
-    same when written and read again."""
+def settings(path: pathlib.Path, count: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Row of damaged settings of all experiments, written to a path, half of them by --set:
+    accepted ones must be the same when written and read again."""
     kinds = settings_files()
 
-    def trials(path: pathlib.Path) -> Iterator[tuple[str, object]]:
+    def trials() -> Iterator[tuple[str, object]]:
         for k in range(count):
             source, experiment = kinds[rng.integers(len(kinds))]
             content, overrides = damaged(source.read_text(), rng), list[str]()
             if k % 2:
                 lines = [line for line in content.decode("utf-8", "replace").splitlines() if line]
-                line = lines[rng.integers(len(lines))] if lines else ""
+                line = _one(lines, rng) if lines else ""
                 overrides, content = [line.replace(": ", "=", 1)], source.read_bytes()
             path.write_bytes(content)
 
@@ -187,5 +270,4 @@ def settings(count: int, rng: np.random.Generator) -> dict[str, Any]:
             outcome, message = outcome_of(load)
             yield outcome, (message, overrides or content[:500])
 
-    with tempfile.TemporaryDirectory() as folder:
-        return row_of("settings", trials(pathlib.Path(folder) / "config.yaml"), count)
+    return row_of("settings", trials(), count)

@@ -10,15 +10,13 @@ import itertools
 import json
 import os
 import pathlib
-import re
 import runpy
-import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,11 +34,11 @@ _SIGNALS = ((signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT))
 
 
 class _Ended(NamedTuple):
-    """The end of a process. message: the last line of its text, behind progress bars."""
+    """The end of a process. fault: "hang", "traceback" or ""; message: the last line of its text,
+    behind progress bars."""
 
     code: int
-    text: str
-    hung: bool
+    fault: str
     message: str
 
 
@@ -58,21 +56,20 @@ def _start(folder: pathlib.Path, resume: bool = False, way: _Way | None = None) 
     touch = [__spec__.name, str(way.touch), str(way.seconds)] if way and way.touch else []
     module = [*touch, "experiments.focus", "--out", str(folder)]
     options = ["--resume"] if resume else ["--set", *_TOY]
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "errors": "replace"}
     return subprocess.Popen([sys.executable, "-m", *module, *options], cwd=ROOT, **pipes)
 
 
 def _end_of(process: subprocess.Popen) -> _Ended:
-    hung = False
+    fault = ""
     try:
-        content = process.communicate(timeout=_PATIENCE)[1]
+        text = process.communicate(timeout=_PATIENCE)[1]
     except subprocess.TimeoutExpired:
-        hung = True
         process.kill()
-        content = process.communicate()[1]
-    text = content.decode("utf-8", "replace")
-    lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
-    return _Ended(process.returncode, text, hung, lines[-1] if lines else "")
+        text, fault = process.communicate()[1], "hang"
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    fault = fault or ("traceback" if "Traceback" in text else "")
+    return _Ended(process.returncode, fault, lines[-1] if lines else "")
 
 
 def _result(folder: pathlib.Path) -> dict[str, Any]:
@@ -83,8 +80,8 @@ def _result(folder: pathlib.Path) -> dict[str, Any]:
 
 def _outcome(ended: _Ended, folder: pathlib.Path, truth: dict[str, Any]) -> tuple[str, str]:
     """Outcome of a run that was not disturbed, and its message or what is wrong."""
-    if ended.hung or "Traceback" in ended.text:
-        return "hang" if ended.hung else "traceback", ended.message
+    if ended.fault:
+        return ended.fault, ended.message
     if ended.code:
         refused = ended.code in (1, 2) and clear(ended.message)
         return "refused" if refused else "wrong", ended.message
@@ -102,19 +99,17 @@ def _broken_off(folder: pathlib.Path, way: _Way) -> str:
         process.send_signal(number)
         time.sleep(0.05)
     ended = _end_of(process)
-    if ended.hung or "Traceback" in ended.text:
-        return "hung" if ended.hung else ended.text[-300:]
     stopped = ended.code == 130 and "stopped" in ended.message and clear(ended.message)
     wrong = way.signals[:1] == (signal.SIGINT,) and ended.code and not stopped
-    return f"code {ended.code}: {ended.message}" if wrong else ""
+    what = ended.fault or (f"code {ended.code}" if wrong else "")
+    return what and f"{what}: {ended.message}"
 
 
 def rows(
     parent: pathlib.Path, count: int, rngs: list[np.random.Generator]
 ) -> Iterator[dict[str, Any]]:
     """Rows of runs that are ended `count` times in all, and of runs that are started twice."""
-    numbers = itertools.count()  # of folders
-    whole = parent / "whole"
+    whole, numbers = parent / "whole", itertools.count()
     ended = _end_of(_start(whole))
     if ended.code:
         raise RuntimeError(f"the toy run failed: {ended.message}")
@@ -128,7 +123,6 @@ def rows(
         if "nothing to resume" in ended.message:
             ended = _end_of(_start(folder))
         found, message = _outcome(ended, folder, truth)
-        shutil.rmtree(folder, ignore_errors=True)
         found = "wrong" if found == "refused" else found
         return [("wrong", fault) if fault else (found, message) for fault in faults]
 
@@ -142,30 +136,24 @@ def rows(
         right = [outcome for outcome, _ in found] == ["refused", "survived"]
         return [("survived" if right else "wrong", str(found))]
 
-    def side_by_side(function: Callable, items: list) -> Iterator[tuple[str, str]]:
+    def side_by_side(function: Callable, items: Iterable) -> Iterator[tuple[str, str]]:
         """Outcomes of all items, two at a time."""
         with concurrent.futures.ThreadPoolExecutor(2) as pool:
-            running = [pool.submit(function, item) for item in items]
-            for done in concurrent.futures.as_completed(running):
-                yield from done.result()
+            yield from itertools.chain.from_iterable(pool.map(function, items))
 
-    third, last = count // 3, count - 2 * (count // 3)
     ways = {
-        "killed at a random moment": [
-            _Way(rngs[0].uniform(0, _WHOLE), (signal.SIGKILL,)) for _ in range(third)
-        ],
-        "killed at a write": [
-            _Way(touch=int(rngs[1].integers(1, _TOUCHES)), seconds=rngs[1].exponential(1e-3))
-            for _ in range(third)
-        ],
-        "stopped by a signal": [
-            _Way(rngs[2].uniform(0, _WHOLE), _SIGNALS[k % 3]) for k in range(last)
-        ],
+        "killed at a random moment": lambda rng, k: _Way(rng.uniform(0, _WHOLE), (signal.SIGKILL,)),
+        "killed at a write": lambda rng, k: _Way(
+            rng.exponential(1e-3), touch=rng.integers(1, _TOUCHES)
+        ),
+        "stopped by a signal": lambda rng, k: _Way(rng.uniform(0, _WHOLE), _SIGNALS[k % 3]),
     }
-    for kind, some in ways.items():
-        chains = [some[k : k + _KILLS] for k in range(0, len(some), _KILLS)]
-        yield row_of(kind, side_by_side(chain, chains), len(some))
-    yield row_of("two in a folder", side_by_side(two, [0, 1, 2]), 3)
+    third = count // 3
+    for (kind, way), rng, number in zip(ways.items(), rngs, (third, third, count - 2 * third)):
+        some = [way(rng, k) for k in range(number)]
+        chains = (some[k : k + _KILLS] for k in range(0, number, _KILLS))
+        yield row_of(kind, side_by_side(chain, chains), number)
+    yield row_of("two in a folder", side_by_side(two, range(3)), 3)
 
 
 def _run_and_die() -> None:

@@ -7,6 +7,7 @@ for a file, minutes for a run), and `examples` of the last three.
 """
 
 import dataclasses
+import functools
 import pathlib
 import sys
 import tempfile
@@ -42,24 +43,28 @@ class Config:
     seed: int = 0
 
 
-def rows_of(config: Config, part: str) -> Iterator[dict[str, Any]]:
-    """The rows of a part."""
+def rows_of(config: Config, part: str, folder: pathlib.Path) -> Iterator[dict[str, Any]]:
+    """The rows of a part, which works in a folder."""
     rngs = np.random.default_rng([config.seed, PARTS.index(part)]).spawn(4)
-    if part == "files":
-        row, loaded = _damaged_files.prescriptions(config.files // 2, rngs[0])
-        yield row
-        yield _damaged_files.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
-        yield _damaged_files.settings(config.files - config.files // 2, rngs[1])
-        yield _damaged_files.lens_files(config.files // 4, rngs[3])
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            yield from _ended.rows(pathlib.Path(folder), config.kills, rngs)
+    if part == "kills":
+        yield from _ended.rows(folder, config.kills, rngs)
+        return
+    row, loaded = _damaged_files.prescriptions(folder, config.files // 2, rngs[0])
+    yield row
+    yield _damaged_files.traced(loaded[:: max(1, len(loaded) // max(config.traced, 1))])
+    path, count = folder / "config.yaml", config.files - config.files // 2
+    yield _damaged_files.settings(path, count, rngs[1])
+    yield _damaged_files.lens_files(folder, config.files // 4, rngs[3])
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Runs each part."""
-    parts = config.parts or PARTS
-    jobs = {part: lambda part=part: [*rows_of(config, part)] for part in parts}
+
+    def rows(part: str) -> list[dict[str, Any]]:
+        with tempfile.TemporaryDirectory() as folder:
+            return [*rows_of(config, part, pathlib.Path(folder))]
+
+    jobs = {part: functools.partial(rows, part) for part in config.parts or PARTS}
     found = _common.measured(run, "part", jobs)
     return {"rows": sum(found, []), "seconds": run.seconds}
 
