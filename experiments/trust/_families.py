@@ -11,7 +11,16 @@ import numpy as np
 import drt_jax
 
 from ._offaxis import Walk, conic_mirror, local_mirror, relay
-from ._scenes import WAVELENGTH, Scenes, batch_of, fields, pupil_points, scenes_of, two_elements
+from ._scenes import (
+    WAVELENGTH,
+    Scenes,
+    batch_of,
+    fields,
+    placed,
+    pupil_points,
+    scenes_of,
+    two_elements,
+)
 
 _FREEFORM = ("biconic", "toroid", "odd_asphere", "polynomial_xy", "asphere", "asphere")
 _PLASTICS = (1.535, 1.544, 1.614, 1.661)
@@ -54,8 +63,7 @@ def curvature(rng, parts, h, media):
     tiny = rng.choice([0.0, -0.0, 1e-300, -1e-16, 1e-12, -1e-9, 1e-6], shape)
     steep = rng.choice([-1, 1], shape) * rng.uniform(0.8, 1.02, shape) / h[:, None]
     pick = rng.random(shape)
-    bent = np.where(pick > 0.85, steep, parts["curvature"])
-    parts["curvature"] = np.where(pick < 0.3, tiny, bent)
+    parts["curvature"] = np.select([pick < 0.3, pick > 0.85], [tiny, steep], parts["curvature"])
 
 
 def conic(rng, parts, h, media):
@@ -167,16 +175,13 @@ def mirror(rng, count, stop):
 def folded(rng, count, stop):
     """A periscope of plane or weakly curved mirrors, the stop behind them."""
     h, reach = rng.uniform(2, 6, count), rng.uniform(20, 60, count)
-    zero = np.zeros(count)
     c = rng.choice([0.0, 1e-3, -1e-3], (count, 2))
-    z = np.tile([0.0, 20.0, 20.0, 40.0, 70.0], (count, 1))
-    y = np.stack([zero, zero, reach, reach, reach], 1)
-    tilt = np.zeros((count, 5, 3))
+    vertices, tilt = np.zeros((count, 5, 3)), np.zeros((count, 5, 3))
+    vertices[..., 2] = [0.0, 20.0, 20.0, 40.0, 70.0]
+    vertices[:, 2:, 1] = reach[:, None]
     tilt[:, 1:3, 0] = np.radians(45) + np.radians(rng.uniform(-2, 2, (count, 2)))
     tilt[:, 3] = np.radians(rng.uniform(-3, 3, (count, 3)))
-    parts = {"curvature": np.stack([zero, c[:, 0], c[:, 1], zero], 1)}
-    parts |= {"thickness": np.diff(z, axis=1)[:, :3], "sensor": z[:, 4]}
-    parts |= {"tilt": tilt, "decentre": np.stack([0 * y, y], -1)}
+    parts = {"curvature": np.pad(c, ((0, 0), (1, 1))), **placed(vertices, tilt)}
     return scenes_of(rng, parts, h, stop, None, (0, 5), mirrors=(False, True, True, False))
 
 
@@ -215,17 +220,16 @@ def offaxis(rng, count, stop):
     first or the second, or the second itself."""
     h = rng.uniform(5, 30, count)
     reach = h[:, None] * rng.uniform(3, 8, (count, 3))
-    angle, place = np.zeros(count), np.zeros((count, 4, 2))
+    angle, vertices = np.zeros(count), np.zeros((count, 4, 3))
     tilt, shift = np.zeros((count, 4, 3)), rng.uniform(-0.1, 0.1, (count, 4, 2))
     for i in range(3):  # along a ray in the middle of the beam
         tilt[:, i, 0] = np.radians(rng.uniform(8, 20, count))
         angle = np.pi - angle - 2 * tilt[:, i, 0]
-        along = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
-        place[:, i + 1] = place[:, i] + reach[:, i, None] * along
+        along = np.stack([0 * angle, np.sin(angle), np.cos(angle)], axis=-1)
+        vertices[:, i + 1] = vertices[:, i] + reach[:, i, None] * along
     tilt[:, 3, 0] = np.pi - angle
     tilt += np.radians(rng.uniform(-2, 2, tilt.shape))
-    decentre, z = shift * h[:, None, None], place[..., 1]
-    decentre[..., 1] += place[..., 0]
+    vertices[..., :2] += shift * h[:, None, None]
     power = rng.uniform(0.05, 0.3, (count, 3)) * [-1, 1, -1]
     power[:, 1] *= rng.choice([1, 1, -1], count)
     parts = {"curvature": power / reach, "conic": rng.uniform(-3, 0.5, (count, 3))}
@@ -234,12 +238,11 @@ def offaxis(rng, count, stop):
         gap = h * rng.choice([0.0, 0.0, 0.1, -0.1, 0.3, -0.3], count)
         plane = tilt[:, row] * rng.choice([0.0, 0.5, 1.0], (count, 1))
         tilt = np.insert(tilt, row, plane, axis=1)
-        decentre = np.insert(decentre, row, decentre[:, row], axis=1)
-        z = np.insert(z, row, z[:, row] - gap, axis=1)
+        vertices = np.insert(vertices, row, vertices[:, row], axis=1)
+        vertices[:, row, 2] -= gap
         parts = {name: np.insert(a, row, 0, axis=1) for name, a in parts.items()}
         mirrors.insert(row, False)
-    parts |= {"thickness": np.diff(z, axis=1)[:, :-1], "sensor": z[:, -1] - z[:, 0]}
-    parts |= {"tilt": tilt, "decentre": decentre}
+    parts |= placed(vertices, tilt)
     static = {"glasses": ("air",) * (len(mirrors) + 1), "mirrors": tuple(mirrors)}
     return scenes_of(rng, parts, h, row, None, (0, 3), (np.inf, 1e6, 1e4), **static)
 

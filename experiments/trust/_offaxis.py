@@ -1,11 +1,12 @@
 """Mirrors far off their axes, grazing mirrors and relays, as families of random scenes."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from ._scenes import Scenes, batch_of, fields, pupil_points
+from ._scenes import Scenes, batch_of, fields, placed, pupil_points
 
 
 def _unit(v):
@@ -46,11 +47,17 @@ def _across(rng, d):
     return _unit(v - d * np.sum(v * d, -1, keepdims=True))
 
 
+@dataclasses.dataclass
 class _Rows:
-    """Surfaces and the sensor of N scenes, one after the other."""
+    """Surfaces and the sensor of N scenes, one after the other.
 
-    def __init__(self) -> None:
-        self.rows: list = []
+    form: form of mirrors with curvatures across.
+    media: as in `batch_of`.
+    """
+
+    form: str | None = None
+    media: np.ndarray | None = None
+    rows: list = dataclasses.field(default_factory=list)
 
     def add(self, point, axis, c=0.0, k=0.0, across=0.0, mirror=False):
         """A row with its vertex at `point`, mm, and its axis along the unit vector `axis`, (N, 3);
@@ -59,22 +66,20 @@ class _Rows:
         tilt = np.arctan2(-axis[:, 1], axis[:, 2]), np.arcsin(np.clip(axis[:, 0], -1, 1)), flat
         self.rows.append((mirror, flat + c, flat + k, flat + across, point, np.stack(tilt, -1)))
 
-    def scenes(self, rng, fits, stop, radius, distance, widest=1.0, media=None, form=None):
-        """Scenes of the rows at the indices `fits`. widest: largest field of each, degrees; media:
-        as in `batch_of`; form: that of mirrors with curvatures across."""
+    def scenes(self, rng, fits, stop, radius, distance, widest=1.0):
+        """Scenes of the rows at the indices `fits`. widest: largest field of each, degrees."""
         mirrors, *arrays = zip(*self.rows)
         c, k, across, point, tilt = (np.stack(a, 1)[fits] for a in arrays)
-        z, static = point[..., 2] - point[:, :1, 2], {"mirrors": mirrors[:-1]}
-        parts = {"curvature": c[:, :-1], "conic": k[:, :-1], "thickness": np.diff(z)[:, :-1]}
-        parts |= {"sensor": z[:, -1], "tilt": tilt, "decentre": point[..., :2]}
-        if media is None:
+        parts = {"curvature": c[:, :-1], "conic": k[:, :-1], **placed(point, tilt)}
+        static = {"mirrors": mirrors[:-1]}
+        if self.media is None:
             static["glasses"] = ("air",) * len(mirrors)
-        if form:
+        if self.form:
             parts["coefficients"] = across[:, :-1, None]
-            static["forms"] = tuple(form if mirror else "asphere" for mirror in mirrors)
+            static["forms"] = tuple(self.form if mirror else "asphere" for mirror in mirrors)
         field = fields(rng, len(fits), 0, 1) * (rng.random((len(fits), 1)) < 0.7)
         field = field * np.broadcast_to(widest, len(radius))[fits, None]
-        lens = batch_of(parts, radius[fits], stop, media, **static)
+        lens = batch_of(parts, radius[fits], stop, self.media, **static)
         return Scenes(lens, field, distance[fits], pupil_points(rng, len(fits)))
 
 
@@ -105,7 +110,7 @@ class Walk(NamedTuple):
 
     def __call__(self, rng, count, variant):
         mirrors, between = variant
-        n, rows = 200 * count, _Rows()
+        n, rows = 200 * count, _Rows(self.form)
         reach = rng.uniform(20, 80, n)
         radius = h = reach * self.width * rng.uniform(0.05, 1, n)
         distance = reach * rng.uniform(0.2, 2, n)
@@ -140,7 +145,7 @@ class Walk(NamedTuple):
         lean = np.tan(np.radians(rng.uniform(0, 30, (n, 1))))
         rows.add(point + reach[:, None] * d, sense * _unit(d + lean * _across(rng, d)))
         chosen, stop = np.flatnonzero(fits)[:count], 2 if between else 0
-        return rows.scenes(rng, chosen, stop, radius, distance, widest, form=self.form)
+        return rows.scenes(rng, chosen, stop, radius, distance, widest)
 
 
 def relay(rng, count, name):
@@ -148,7 +153,7 @@ def relay(rng, count, name):
     middle of the field, because all surfaces are decentred: the Offner relay, a concave mirror, the
     stop on a convex one of half its radius and the first again; and that of Dyson, a block of glass
     with one sphere in front of a concave mirror, which is the stop. Off by a few per mille."""
-    rows, large, one = _Rows(), rng.uniform(50, 300, count), np.ones(count)
+    large, one = rng.uniform(50, 300, count), np.ones(count)
     turn, aside = rng.uniform(0, 2 * np.pi, count), large * rng.uniform(0.02, 0.15, count)
     n = rng.uniform(1.4, 1.9, count)
     small, radius = large * (1 - 1 / n), large * rng.uniform(0.02, 0.15, count)
@@ -161,9 +166,10 @@ def relay(rng, count, name):
         gap = rng.uniform(0.01, 0.05, count) * large
         steps = [(0 * gap, 0), (small, 1), (large, -1), (small, 1), (0 * gap, 0), (-gap, 0)]
     centre = -gap if name == "offner" else 0 * gap
+    rows = _Rows(media=media)
     for place, kind in steps:  # 0 for a plane, 1 for a refracting sphere, -1 for a mirror
         shift = 1e-3 * large[:, None] * rng.normal(size=(count, 3))
         point = np.stack([aside * np.cos(turn), aside * np.sin(turn), centre + place], -1)
         axis = _unit([0, 0, 1] + 3e-3 * rng.normal(size=point.shape))
         rows.add(point + shift, axis, -1 / place if kind else 0.0, mirror=kind < 0)
-    return rows.scenes(rng, np.arange(count), 2, radius, gap, media=media)
+    return rows.scenes(rng, np.arange(count), 2, radius, gap)

@@ -57,6 +57,14 @@ def batch_of(parts, h, stop, media=None, **static):
     )
 
 
+def placed(vertices, tilt):
+    """The `parts` of `batch_of` that place surfaces and the sensor: vertices (N, S + 1, 3), mm, and
+    tilts (N, S + 1, 3), radians."""
+    z = vertices[..., 2]
+    parts = {"thickness": np.diff(z)[:, :-1], "sensor": z[:, -1] - z[:, 0]}
+    return parts | {"tilt": tilt, "decentre": vertices[..., :2]}
+
+
 def pupil_points(rng, count):
     radius, angle = np.sqrt(rng.random((count, RAYS))), 2 * np.pi * rng.random((count, RAYS))
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
