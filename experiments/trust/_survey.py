@@ -94,9 +94,8 @@ def _residual(lens, field, distance, pupil, points):
 
 
 def _trace(lens, field, distance, pupil):
-    return drt_jax.trace_rays(
-        lens, Scene.point(field, distance, jnp.full(1, WAVELENGTH, pupil.dtype)), pupil
-    )
+    scene = Scene.point(field, distance, jnp.full(1, WAVELENGTH, pupil.dtype))
+    return drt_jax.trace_rays(lens, scene, pupil)
 
 
 _plain = _over_scenes(_trace)
@@ -231,9 +230,9 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray]:
         "steps": np.max(rays.newton_steps.reshape(len(status), -1), axis=1),
         "nan_values": _infinite(rays.points, rays.path, moments),
         "nan_gradients": _infinite(slope, moments_slope),
-        "disagree": good & (denied | (ratio > _ROUNDINGS) | (residual > 1)),
+        "disagree_with_snell": good & (denied | (ratio > _ROUNDINGS) | (residual > 1)),
         "ratio": np.where(good, ratio, 0),
         "residual": np.where(good, residual, 0),
-        "lost": lost,
+        "traceable": lost,
         "float32_error": np.max(np.abs(single.points - double.points), axis=(-1, -2))[both],
     }

@@ -12,6 +12,7 @@ number of that error), and of drt_jax `trips`: by format "" or why there is none
 
 import contextlib
 import dataclasses
+import decimal
 import io
 import pathlib
 import re
@@ -92,10 +93,7 @@ READERS: dict[str, Callable[[str], Read]] = {
 def listed(content: str, key: str) -> tuple[float, float] | None:
     """A number of a listing and one unit of its last digit; None if it is not there."""
     found = re.search(rf"^{re.escape(key)}\s*:\s*([-+.\dEe]+)", content, re.MULTILINE)
-    if not found:
-        return None
-    digits, _, power = found[1].lower().partition("e")
-    return float(found[1]), 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
+    return found and (float(found[1]), 10.0 ** decimal.Decimal(found[1]).as_tuple().exponent)
 
 
 def listed_indices(content: str) -> list[float]:
@@ -165,9 +163,8 @@ def trips(path: pathlib.Path) -> dict[str, str]:
             except drt_jax.LensError as error:
                 found[kind] = f"refused: {str(error).removeprefix(str(out)).lstrip(', :')}"
                 continue
-            found[kind] = ""
-            if kind != ".yaml" and not np.allclose(_ours(str(out))[0], numbers[0], 1e-9, 1e-9):
-                found[kind] = "wrong"
+            same = kind == ".yaml" or np.allclose(_ours(str(out))[0], numbers[0], 1e-9, 1e-9)
+            found[kind] = "" if same else "wrong"
     return found
 
 
@@ -179,15 +176,16 @@ def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             numbers = READERS[reader](str(path))
     except ModuleNotFoundError as error:
-        if reader != "drt_jax" and error.name == reader:
-            return row | {"outcome": "absent", "why": f"{reader} is not installed"}
-        raise
-    except drt_jax.LensError as error:
-        return row | {"outcome": "refused", "why": str(error).removeprefix(str(path)).lstrip(", :")}
-    except Exception as error:  # other programs may raise anything
-        if reader == "drt_jax":
+        if error.name != reader:
             raise
-        why = " ".join(f"{type(error).__name__}: {error}".split())[:100]
+        return row | {"outcome": "absent", "why": f"{reader} is not installed"}
+    except Exception as error:  # other programs may raise anything
+        if isinstance(error, drt_jax.LensError):
+            why = str(error).removeprefix(str(path)).lstrip(", :")
+        elif reader == "drt_jax":
+            raise
+        else:
+            why = " ".join(f"{type(error).__name__}: {error}".split())[:100]
         return row | {"outcome": "refused", "why": why}
     if np.any(np.isnan(numbers[0])):
         return row | {"outcome": "refused", "why": "the numbers are none: NaN"}

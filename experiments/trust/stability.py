@@ -21,9 +21,9 @@ from ._families import FAMILIES
 from ._survey import survey
 from .runs.folder import Run
 
-# Counts of each family that are summed over all.
-_COUNTS = ("scenes", "rays", *(status.name.lower() for status in Status))
-_COUNTS += ("traceable", "nan_values", "nan_gradients", "disagree_with_snell")
+# Counts of the survey; and those of each family that are summed over all.
+_FAULTS = ("traceable", "nan_values", "nan_gradients", "disagree_with_snell")
+_COUNTS = ("scenes", "rays", *(status.name.lower() for status in Status), *_FAULTS)
 # Most structures: programs of more exhaust the maps of a process.
 _STRUCTURES = 6
 
@@ -43,7 +43,7 @@ class Config:
 
 def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
     """Row of a family in results.json, from its survey."""
-    status, lost = found["status"], found["lost"]
+    status, lost = found["status"], found["traceable"]
     steps, errors = found["steps"], found["float32_error"]
     return {
         "name": name,
@@ -52,14 +52,11 @@ def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
         "scenes": len(status),
         "rays": status.size,
         **{code.name.lower(): int(np.sum(status == code)) for code in Status},
-        "nan_values": int(np.sum(found["nan_values"])),
-        "nan_gradients": int(np.sum(found["nan_gradients"])),
-        "disagree_with_snell": int(np.sum(found["disagree"])),
+        **{key: int(np.sum(found[key])) for key in _FAULTS},
         "newton_steps_median": float(np.median(steps)),
         "newton_steps_max": int(np.max(steps)),
         "float32_rays": int(errors.size),
         "float32_error_p99": float(np.percentile(errors, 99)) if errors.size else 0.0,
-        "traceable": int(np.sum(lost)),
         "traceable_unconverged": int(np.sum(lost & (status == Status.UNCONVERGED))),
         "traceable_per_10000": 1e4 * float(np.mean(lost)),
         "snell_error_max_roundings": float(np.max(found["ratio"])),
@@ -114,11 +111,12 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     header += ["Newton steps, median and most", "float32 within, 99 %"]
     rows = []
     for row in results["families"]:
-        what = f"{row['name']}: {row['what']}" if row.get("what") else row["name"]
         bad = row["nan_values"] + row["nan_gradients"]
         counts = row["rays"], row["ok"], row["traceable"], bad, row["disagree_with_snell"]
         steps = f"{row['newton_steps_median']:g}, {row['newton_steps_max']}"
-        rows.append((what, *counts, steps, f"{row['float32_error_p99']:.1e} mm"))
+        rows.append(
+            (f"{row['name']}: {row['what']}", *counts, steps, f"{row['float32_error_p99']:.1e} mm")
+        )
     total = results["total"]
     lost = total["traceable_per_10000_but_touching"]
     sums = [
