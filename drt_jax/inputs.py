@@ -74,6 +74,18 @@ def require_one_of(what: str, value: object, known: Iterable[str]) -> None:
     require(value in words, f"{what}: expected one of {', '.join(words)}, got {shown(value)}")
 
 
+def whole_numbers(what: str, given: Any) -> tuple[int, ...]:
+    """Numbers of surfaces and the like as a tuple of int.
+
+    ValueError, which begins with `what`, unless `given` is an iterable of whole numbers.
+    """
+    numbers = given if isinstance(given, Iterable) and not isinstance(given, str) else [None]
+    found = tuple(numbers)
+    if all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in found):
+        return tuple(map(int, found))
+    raise ValueError(f"{what}: expected whole numbers from 0, such as (0, 2), got {shown(given)}")
+
+
 class Lines(dict[str, int]):
     """The line number of each key of a file, with keys such as "surfaces[0].radius"."""
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..devices import in_turn
+from ..inputs import require
 from ..lens.glass import Glass, nd_and_vd
 from ..lens.glasses import Neighbour, nearest_glasses
 from ..lens.lens import Lens, glass_rows, with_glass
-from .checks import require
 from .media import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
 from .problem import Problem, quick

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import require_one_of
+from ..inputs import require_one_of, whole_numbers
 from ..lens.lens import Lens
 from ..numerics import concrete, leaves, safe_sqrt
-from .checks import whole_numbers
 from .field_rays import FieldRays
 from .values import OPERANDS, kind_of
 

@@ -10,9 +10,9 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require
 from ..lens.lens import Lens
 from ..numerics import concrete
-from .checks import require
 from .least_squares import Search, init, promised_gain, step
 from .limits import Limit
 from .problem import Problem, quick

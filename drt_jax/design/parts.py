@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import require
 from ..lens.forms import FORMS, Shape
 from ..lens.lens import Lens
 from ..lens.surface import surface_sag
-from .checks import require
 from .media import back_distance, model_glasses
 
 

@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import require_one_of
+from ..inputs import require, require_one_of
 from ..lens.elements import Elements
 from ..lens.glass import refractive_index
 from ..lens.lens import Lens
 from ..lens.surface import by_form, surface_sag
-from .checks import require
 from .media import elements_of, pieces_of
 from .parts import PARTS, with_arrays
 

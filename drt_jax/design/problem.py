@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ..image.rounding import warn_of_paths
-from ..inputs import shown
+from ..inputs import require, shown
 from ..lens.lens import Lens
 from ..lens.paraxial import marginal_ray, paraxial_system
 from ..lens.scene import Scene, checked_scene, vergence_of
@@ -17,7 +17,6 @@ from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
 from ..rays.solve import Solver, solve, solve_aimed
-from .checks import require
 from .failures import failures
 from .field_rays import FieldRays, beam_radius, symmetry_by_structure, trace_views
 from .least_squares import Evaluation

@@ -16,14 +16,13 @@ from jax import Array
 
 from ..image.moments import moments
 from ..image.rounding import warn_of_focus
-from ..inputs import require_one_of
+from ..inputs import require, require_one_of
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil, marginal_ray, paraxial_system, trace_ray
 from ..lens.scene import Scene, checked_scene, vergence_of
 from ..numerics import concrete, leaves, safe_divide
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
-from .checks import require
 from .field_rays import symmetry_by_structure
 from .media import back_distance
 from .parts import Place, number_at, step_of

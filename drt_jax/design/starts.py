@@ -16,8 +16,8 @@ from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
 from ..devices import shared
+from ..inputs import require
 from ..numerics import Numbers
-from .checks import require
 from .least_squares import Search
 from .optimum import init_problem, step_problem
 from .problem import Problem, quick, trace_fields

@@ -21,11 +21,10 @@ from scipy.special import gammainc
 from ..compilation import LARGE, ONCE, jit
 from ..devices import shared
 from ..image.spot import deviations, normalised
-from ..inputs import require_one_of
+from ..inputs import require, require_one_of
 from ..lens.lens import Lens
 from ..numerics import concrete, matmul, safe_divide, safe_sqrt
 from ..rays.status import Status
-from .checks import require
 from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
 from .perturbed import KINDS, PerturbedLens
 from .problem import Problem, quick

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import require_one_of
+from ..inputs import require, require_one_of, whole_numbers
 from ..lens.lens import Lens
-from .checks import require, whole_numbers
 from .media import back_distance
 from .parts import (
     PARTS,
