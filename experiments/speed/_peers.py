@@ -44,16 +44,12 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
     optic = Optic()
     optic.add_surface(index=0, thickness=lens.distance)
     for i, (c, gap) in enumerate(zip(lens.curvature, lens.gaps)):
+        medium = "mirror" if lens.mirrors[i] else IdealMaterial(n=float(index[i + 1]))
+        kind = {"thickness": gap, "material": medium, "is_stop": i == lens.stop}
         shape = {"radius": 1 / c if c else np.inf, "conic": lens.conic[i]}
         if np.any(lens.coefficients[i]):
             shape |= {"surface_type": "even_asphere", "coefficients": lens.coefficients[i].tolist()}
-        optic.add_surface(
-            index=i + 1,
-            thickness=gap,
-            material="mirror" if lens.mirrors[i] else IdealMaterial(n=float(index[i + 1])),
-            is_stop=i == lens.stop,
-            **shape,
-        )
+        optic.add_surface(index=i + 1, **kind, **shape)
     optic.add_surface(index=len(lens.gaps) + 1)
     optic.set_aperture("float_by_stop_size", 2 * lens.semi)
     if np.isinf(lens.distance):
@@ -180,6 +176,10 @@ def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
     return value, gradient
 
 
+# (value, gradient) of sigma by each program.
+SPOTS = {"optiland": optiland_spot, "batoid": batoid_spot}
+
+
 def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Callable:
     """trace() -> hits (Q, 2) on the sensor at the first wavelength, mm. points: (Q, 3), in front of
     the lens, mm. directions: (Q, 3), unit vectors."""
@@ -194,32 +194,26 @@ def network_step(batch: int, patch: int, rate: float) -> Callable:
     import torch
     from torch import nn
 
-    class RedNet(nn.Module):
-        def __init__(self):
-            super().__init__()
-            pairs = itertools.pairwise([3] + [64] * 9 + [3])
-            self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairs)
-
-        def forward(self, images):
-            features, skips = images, {}
-            for i, layer in enumerate(self.layers):
-                features = layer(features)
-                if i >= 5 and 8 - i in skips:
-                    features = features + skips[8 - i]
-                if i < 9:
-                    features = torch.relu(features)
-                if i < 4 and (4 - i) % 2 == 0:
-                    skips[i] = features
-            return images + features
-
     torch.manual_seed(0)
-    device = "cuda" if jax.default_backend() == "gpu" else "cpu"
-    net = RedNet().to(device, memory_format=torch.channels_last)
-    adam = torch.optim.Adam(net.parameters(), rate)
-    images, truth = (
-        torch.rand(batch, 3, patch, patch).to(device, memory_format=torch.channels_last)
-        for _ in range(2)
-    )
+    where = {"device": "cuda" if jax.default_backend() == "gpu" else "cpu"}
+    where |= {"memory_format": torch.channels_last}
+    pairs = itertools.pairwise([3] + [64] * 9 + [3])
+    layers = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairs).to(**where)
+    adam = torch.optim.Adam(layers.parameters(), rate)
+
+    def net(images):
+        features, skips = images, {}
+        for i, layer in enumerate(layers):
+            features = layer(features)
+            if i >= 5 and 8 - i in skips:
+                features = features + skips[8 - i]
+            if i < 9:
+                features = torch.relu(features)
+            if i < 4 and (4 - i) % 2 == 0:
+                skips[i] = features
+        return images + features
+
+    images, truth = (torch.rand(batch, 3, patch, patch).to(**where) for _ in range(2))
 
     def step():
         adam.zero_grad()

@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import drt_jax
 from drt_jax import Lens, Scene, learn, pupil
+from drt_jax.devices import device_mesh, shared, split
 from drt_jax.image.sensor import convolve, convolve_taps
 from drt_jax.learn import train
 
-from . import _common
+from . import _common, _peers
 
 Row = dict[str, Any]
 # Measurements of `compiled`.
@@ -75,11 +75,29 @@ def compiled(function: Callable, *arguments: Any) -> tuple[Callable, dict[str, f
 
 
 def peer(name: str, make: Callable[[], tuple], how: str = "") -> dict[str, tuple | str]:
-    """(call, error) of a peer by name and version; or how to install it, by name."""
+    """(call, error) of a peer by name and version; or why there is none, by name."""
     try:
         return {f"{name} {version(name)}{how}": make()}
     except ImportError as missing:
         return {name: f"{missing.name} is not installed: pip install -e '.[peers]'"}
+    except (ValueError, RuntimeError) as failure:
+        return {name: str(failure)[:80]}
+
+
+def spot_peers(
+    scene: tuple, rays: int, error: Callable[..., float | None], gradient: bool = False
+) -> dict[str, tuple | str]:
+    """What `peer` returns of all that know spots. scene: arguments of `_peers.Lens`. error: of what
+    a call returns."""
+
+    def make(spot: Callable) -> tuple:
+        call = spot(_peers.Lens(*scene), rays)[int(gradient)]
+        return call, error(*call())
+
+    found: dict[str, tuple | str] = {}
+    for name, spot in _peers.SPOTS.items():
+        found |= peer(name, partial(make, spot))
+    return found
 
 
 def row(task: str, seconds: float, **known: Any) -> Row:
@@ -88,20 +106,29 @@ def row(task: str, seconds: float, **known: Any) -> Row:
     return {"task": task, "ours_s": seconds, "peer": "", "note": ""} | unknown | known
 
 
+def timed(
+    calls: list[Callable], peers: dict[str, tuple | str], repeats: int
+) -> tuple[list[float], dict[str, tuple[float, float | None]]]:
+    """Seconds of our calls, and (seconds, error) by name of the peers that are there, see `peer`;
+    all called in turns."""
+    ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
+    seconds = _common.medians([*calls, *(call for call, _ in ready.values())], repeats)
+    errors = (error for _, error in ready.values())
+    return seconds[: len(calls)], dict(zip(ready, zip(seconds[len(calls) :], errors)))
+
+
 def rows_of(
     task: str, ours: tuple, error: float | None, peers: dict[str, tuple | str], repeats: int
 ) -> list[Row]:
     """Rows of one task. ours: from `compiled`. error: our error. peers: from `peer`."""
-    ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
     call, measured = ours
-    calls = [call, *(call for call, _ in ready.values())]
-    seconds, *others = _common.medians(calls, repeats)
-    found, rows = dict(zip(ready, others)), []
-    for name, peer in peers.items():
-        known: Row = {"note": peer}
+    (seconds,), found = timed([call], peers, repeats)
+    rows = []
+    for name, note in peers.items():
+        known: Row = {"note": note}
         if name in found:
-            ratio = found[name] / seconds
-            known = {"peer_s": found[name], "ratio": ratio, "peer_error": peer[1]}
+            theirs, wrong = found[name]
+            known = {"peer_s": theirs, "ratio": theirs / seconds, "peer_error": wrong}
         rows.append(row(task, seconds, ours_error=error, peer=name, **measured, **known))
     return rows
 
@@ -129,13 +156,12 @@ def first_seconds(lens: str, field: float, distance: float) -> list[float]:
 
 def bundle_seconds(config: Any) -> float:
     """Seconds to trace the bundle of `benchmark` on all devices of this process, see SPREAD."""
-    mesh = jax.make_mesh((jax.device_count(),), ("rays",), axis_types=(AxisType.Auto,))
+    mesh = device_mesh(jax.device_count())
     trace, points = config.bundle_trace
-    specs = {"in_specs": PartitionSpec("rays"), "out_specs": PartitionSpec(None, "rays")}
-    trace = jax.jit(jax.shard_map(trace, mesh=mesh, check_vma=False, **specs))
-    points = jax.device_put(points, NamedSharding(mesh, specs["in_specs"]))
-    assert not np.any(np.asarray(trace(points)[1]))
-    return _common.medians([lambda: trace(points)], config.repeats)[0]
+    rays_first = shared(lambda points: [found[0] for found in trace(points)], mesh)
+    call = partial(jax.jit(rays_first), split(mesh, points))
+    assert not np.any(np.asarray(call()[1]))
+    return _common.medians([call], config.repeats)[0]
 
 
 def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[str, int]:

@@ -30,7 +30,15 @@ from drt_jax.learn import network, train
 
 from . import _command, _common, _peers, _plots, _work
 from ._common import within
-from ._reference import Moments, changed, flatten, gradient_error, reference
+from ._reference import (
+    Moments,
+    changed,
+    flatten,
+    gradient_error,
+    reference,
+    relative_error,
+    sigmas,
+)
 from ._work import Row, compiled, peer, rows_of
 from .runs.folder import Run
 from .snell import trace_snell
@@ -77,50 +85,40 @@ class Config:
         return functools.partial(_work.hits, *self.scene, waves), points
 
 
-def spot_error(truth: list[Moments], count: int, values: Any, slopes: Any = None) -> float:
+def spot_error(truth: Moments, count: int, values: Any, slopes: Any = None) -> float:
     """Largest relative error of sigma (W,) and, if given, of its finite derivatives (W, P), see
     `gradient_error`."""
-    exact = np.array([moments.sigma for moments in truth])
-    worst = float(np.max(np.abs(np.asarray(values) / exact - 1)))
+    worst = relative_error(truth, values)
     if slopes is None:
         return worst
-    exact, slopes = np.array([m.gradient[0] for m in truth]), np.asarray(slopes, float)
-    return max(worst, gradient_error(exact, slopes, count, np.isfinite(slopes)))
+    slopes = np.asarray(slopes, float)
+    wrong = gradient_error(truth.gradient[:, 0], slopes, count, np.isfinite(slopes))
+    return max(worst, wrong)
 
 
 def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
     """sigma at all wavelengths, with or without its Jacobian, on axis or at the field."""
     lens, field, distance = config.scene
-    field, waves = 0.0 if axial else field, jnp.asarray(config.wavelengths_um)
+    field = 0.0 if axial else field
+    scene = Scene.point(field, distance, jnp.asarray(config.wavelengths_um))
     # On axis a smaller tolerance costs nothing.
-    rule = drt_jax.converge(
-        drt_jax.psf_moments, lens, Scene.point(field, distance, waves), 1e-9 if axial else 1e-6
-    )
-    truth, count = reference(lens, field, distance, config.wavelengths_um), lens.count
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, scene, 1e-9 if axial else 1e-6)
+    given = lens, field, distance, config.wavelengths_um
+    error = functools.partial(spot_error, reference(*given), lens.count)
     lens = dataclasses.replace(lens, curved=(lens.stop,))  # derivatives by every curvature
 
     def sigma(values):
-        lens_now = changed(lens, values)
-        covariance = drt_jax.psf_moments(
-            lens_now, Scene.point(field, distance, waves), sampling=rule
-        ).covariance
-        return (jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]),)
+        return (sigmas(drt_jax.psf_moments(changed(lens, values), scene, sampling=rule)),)
 
     def jacobian(values):
         found, back = jax.vjp(lambda values: sigma(values)[0], values)
-        return found, jax.vmap(lambda row: back(row)[0])(jnp.eye(waves.size))
-
-    def of_peer(spot):
-        call = spot(numbers, config.rays)[int(gradient)]
-        return call, spot_error(truth, count, *call())
+        return found, jax.vmap(lambda row: back(row)[0])(jnp.eye(found.size))
 
     ours = compiled(jacobian if gradient else sigma, flatten(lens))
-    numbers = _peers.Lens(lens, field, distance, config.wavelengths_um)
-    peers = peer("optiland", lambda: of_peer(_peers.optiland_spot))
-    peers |= peer("batoid", lambda: of_peer(_peers.batoid_spot))
+    peers = _work.spot_peers(given, config.rays, error, gradient)
     task = "sigma and Jacobian" if gradient else "sigma"
     task += ", on axis" if axial else f", {config.field_deg:g} degrees"
-    return rows_of(task, ours, spot_error(truth, count, *ours[0]()), peers, config.repeats)
+    return rows_of(task, ours, error(*ours[0]()), peers, config.repeats)
 
 
 def bundle_task(config: Config) -> list[Row]:
@@ -176,9 +174,8 @@ def network_task(config: Config) -> list[Row]:
     weights = init(jax.random.key(config.seed))
     camera, rates = train.Camera(), {"optics": 1e-3, "network": 1e-3}
     depths = distance, distance
-    values, blur = learn.moments_model(
-        lens, ("sensor",), Scene.point(0.0, depths, config.wavelengths_um)
-    )
+    scene = Scene.point(0.0, depths, config.wavelengths_um)
+    values, blur = learn.moments_model(lens, ("sensor",), scene)
     side = config.patch + camera.kernel - 1
     scenes = rng.integers(0, 256, (config.batch, side, side, 3)).astype(np.uint8)
 

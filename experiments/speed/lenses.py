@@ -23,15 +23,14 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 import drt_jax
 from drt_jax import Lens, Scene, show
 from drt_jax.pupil import PupilRule, pupil_points
 
-from . import _command, _common, _peers, _plots, _work
+from . import _command, _common, _plots, _work
 from ._common import Numbers, Wavelengths, not_empty, within
-from ._reference import reference
+from ._reference import reference, relative_error, sigmas
 from .runs.folder import Run
 
 _LOOSE, _TIGHT = 1e-3, 1e-6
@@ -39,6 +38,7 @@ _LOOSE, _TIGHT = 1e-3, 1e-6
 _SPREAD = 1e-4
 # Values and slopes below this (mm, or throughput) are rounding.
 _NOTHING = 1e-9
+_GROWN = "curvature", "semi_diameter"
 _SWEEP = "sigma", "centroid", "share of light"
 
 
@@ -75,78 +75,48 @@ class Config:
     seed: int = 0
 
 
-def sigmas(lens: Lens, field: Any, waves: Array, rule: PupilRule) -> Array:
-    """RMS spot radii (W,), mm."""
-    covariance = drt_jax.psf_moments(
-        lens, Scene.point(field, math.inf, waves), sampling=rule
-    ).covariance
-    return jnp.sqrt(jnp.trace(covariance, axis1=1, axis2=2))
-
-
-def _error(truth: np.ndarray, covariance: Array) -> float:
-    found = np.sqrt(np.trace(np.asarray(covariance), axis1=1, axis2=2))
-    return float(np.max(np.abs(found / truth - 1)))
-
-
 def measure(config: Config, lens: Lens, field: float) -> dict[str, Any]:
     """A row of one lens at one field (radians); everything is compiled anew."""
-    waves = np.array(config.wavelengths_um)
-    scene = Scene.point(field, math.inf, waves)
+    scene = Scene.point(field, math.inf, np.array(config.wavelengths_um))
     converged = partial(drt_jax.psf_moments, lens, scene)
     jax.clear_caches()
     start = time.perf_counter()
     loose = jax.block_until_ready(converged(_LOOSE))
     first = time.perf_counter() - start
     tight = converged(_TIGHT)
-    calls = [lambda: converged(_LOOSE), lambda: converged(_TIGHT)]
+    calls = [partial(converged, _LOOSE), partial(converged, _TIGHT)]
     seconds = _common.medians(calls, config.repeats)
     rule = drt_jax.converge(drt_jax.psf_moments, lens, scene, _TIGHT)
-    value, measured = _work.compiled(
-        lambda lens: sigmas(lens, field, jnp.asarray(waves), rule), lens
-    )
 
-    def slopes(lens):
-        return jnp.sum(sigmas(lens, field, jnp.asarray(waves), rule))
+    def sigma(lens):
+        return sigmas(drt_jax.psf_moments(lens, scene, sampling=rule))
 
-    gradient, more = _work.compiled(jax.value_and_grad(slopes), lens)
-    truth = np.array([m.sigma for m in reference(lens, field, math.inf, config.wavelengths_um)])
-    peers = _peers_of(config, lens, field, truth)
-    ready = [(name, call, error) for name, call, error, _ in peers if call]
-    timed = _common.medians([value, gradient, *(call for _, call, _ in ready)], config.repeats)
-    others = {name: (s, error) for (name, _, error), s in zip(ready, timed[2:])}
-    notes = {name: note for name, call, _, note in peers if not call}
-    points, _ = pupil_points(lens, scene, rule)
+    value, measured = _work.compiled(sigma, lens)
+    gradient, more = _work.compiled(jax.value_and_grad(lambda lens: jnp.sum(sigma(lens))), lens)
+    truth = reference(lens, field, math.inf, config.wavelengths_um)
+
+    def error(sigma: Any) -> float | None:
+        """None if the spot of a peer is not finite."""
+        found = relative_error(truth, sigma)
+        return found if math.isfinite(found) else None
+
+    given = lens, field, math.inf, config.wavelengths_um
+    peers = _work.spot_peers(given, config.rays, error)
+    (value_s, gradient_s), found = _work.timed([value, gradient], peers, config.repeats)
     return {
-        "rays": points.shape[1],
+        "rays": pupil_points(lens, scene, rule)[0].shape[1],
         "passed": float(np.mean(loose.throughput)),
         "first_s": first,
         "loose_s": seconds[0],
         "tight_s": seconds[1],
-        "loose_error": _error(truth, loose.covariance),
-        "tight_error": _error(truth, tight.covariance),
-        "value_s": timed[0],
-        "gradient_s": timed[1],
+        "loose_error": relative_error(truth, sigmas(loose)),
+        "tight_error": relative_error(truth, sigmas(tight)),
+        "value_s": value_s,
+        "gradient_s": gradient_s,
         "compile_s": [measured["compile_s"], more["compile_s"]],
-        "peers": others,
-        "notes": notes,
+        "peers": {name.split()[0]: peer for name, peer in found.items()},
+        "notes": {name: note for name, note in peers.items() if name not in found},
     }
-
-
-def _peers_of(config: Config, lens: Lens, field: float, truth: np.ndarray) -> list[tuple]:
-    """(name, call, error, note) of each peer; call is None if it is missing or fails, error if its
-    spot is not finite."""
-    found = []
-    for name, spot in (("optiland", _peers.optiland_spot), ("batoid", _peers.batoid_spot)):
-        try:
-            numbers = _peers.Lens(lens, field, math.inf, config.wavelengths_um)
-            call = spot(numbers, config.rays)[0]
-            error = float(np.max(np.abs(call()[0] / truth - 1)))
-            found.append((name, call, error if math.isfinite(error) else None, ""))
-        except ImportError:
-            found.append((name, None, None, "not installed: pip install -e '.[peers]'"))
-        except (ValueError, RuntimeError) as failure:
-            found.append((name, None, None, str(failure)[:80]))
-    return found
 
 
 def perturbed(lens: Lens, count: int, seed: int) -> Lens:
@@ -164,10 +134,11 @@ def copies(config: Config, lens: Lens, widest: float, rule: PupilRule) -> dict[s
     fields = jnp.linspace(0.0, widest, config.fields)
     batch = perturbed(lens, config.copies, config.seed)
 
-    def all_of(batch, fields):
-        one = lambda lens, field: sigmas(lens, field, waves, rule)  # noqa: E731
-        return jax.vmap(lambda lens: jax.vmap(partial(one, lens))(fields))(batch)
+    def one(lens, field):
+        scene = Scene.point(field, math.inf, waves)
+        return sigmas(drt_jax.psf_moments(lens, scene, sampling=rule))
 
+    all_of = jax.vmap(jax.vmap(one, (None, 0)), (0, None))
     call, known = _work.compiled(all_of, batch, fields)
     bad = int(jnp.sum(~jnp.isfinite(call())))
     return {"s": _common.medians([call], 3)[0], "compile_s": known["compile_s"], "bad": bad}
@@ -179,23 +150,19 @@ def sweep(config: Config, lens: Lens, widest: float, rule: PupilRule) -> dict[st
     waves = jnp.asarray(config.wavelengths_um[len(config.wavelengths_um) // 2 :][:1])
     fields = jnp.linspace(0.0, widest, config.sweep)
 
-    def spot(growth, field):
-        scaled = dataclasses.replace(
-            lens,
-            curvature=lens.curvature * (1 + growth),
-            semi_diameter=lens.semi_diameter * (1 + growth),
-        )
+    def spot(field, growth):
+        parts = {name: getattr(lens, name) * (1 + growth) for name in _GROWN}
+        scaled = dataclasses.replace(lens, **parts)
         found = drt_jax.psf_moments(scaled, Scene.point(field, math.inf, waves), sampling=rule)
-        sigma = jnp.sqrt(found.covariance[0, 0, 0] + found.covariance[0, 1, 1])
-        return jnp.stack([sigma, found.mean[0, 1], found.throughput[0]])
+        return jnp.stack([sigmas(found)[0], found.mean[0, 1], found.throughput[0]])
 
     def both(field):
-        return jax.jvp(lambda growth: spot(growth, field), (jnp.zeros(()),), (jnp.ones(()),))
+        return jax.jvp(partial(spot, field), (jnp.zeros(()),), (jnp.ones(()),))
 
-    values, slopes = jax.jit(jax.vmap(both))(fields)
-    found = {"values": np.asarray(values.T), "slopes": np.asarray(slopes.T)}
-    steps = {key: [_roughness(row) for row in rows] for key, rows in found.items()}
-    known = {key: rows.tolist() for key, rows in found.items()}
+    parts = zip(("values", "slopes"), jax.jit(jax.vmap(both))(fields))
+    found = {name: np.asarray(rows.T) for name, rows in parts}
+    steps = {name: [*map(_roughness, rows)] for name, rows in found.items()}
+    known = {name: rows.tolist() for name, rows in found.items()}
     return {"field_deg": np.degrees(fields).tolist(), **known, "steps": steps}
 
 
@@ -217,9 +184,9 @@ def lens_rows(config: Config, of: LensFields) -> dict[str, Any]:
     waves = np.array(config.wavelengths_um)
     fields = [[0.0, part * widest] for part in (0.5, 1)]
     rule = drt_jax.converge(drt_jax.psf_moments, lens, Scene.grid(fields, math.inf, waves), _LOOSE)
+    group, swept = (f(config, lens, widest, rule) for f in (copies, sweep))
     name = {"lens": of.lens}
-    parts = {"copies": copies, "sweep": sweep}
-    return {"rows": rows} | {key: name | f(config, lens, widest, rule) for key, f in parts.items()}
+    return {"rows": rows, "copies": name | group, "sweep": name | swept}
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -263,13 +230,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     for key, what in (("values", ""), ("slopes", "change of ")):
         figure, axes = show.new(1, 3, 4.5, 3.6)
         for ax, name, row in zip(axes, _SWEEP, range(3)):
-            series = {
-                swept["lens"]: (
-                    np.array(swept["field_deg"]) / swept["field_deg"][-1],
-                    np.array(swept[key][row]) / max(np.max(np.abs(swept[key][row])), _NOTHING),
-                )
-                for swept in results["sweeps"]
-            }
+            series = {}
+            for swept in results["sweeps"]:
+                fields, values = np.array(swept["field_deg"]), np.array(swept[key][row])
+                largest = max(np.max(np.abs(values)), _NOTHING)
+                series[swept["lens"]] = fields / fields[-1], values / largest
             _plots.curves(ax, series, "field / widest field", f"{what}{name} / its largest")
         figure.savefig(figures / f"fields_{key}.png")
 

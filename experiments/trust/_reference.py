@@ -12,14 +12,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drt_jax import Lens
+from drt_jax import Lens, results
 from drt_jax.compilation import jit
 
 from .snell import QUICK, trace_snell
@@ -33,20 +33,20 @@ _SCAN, _SEARCH = 1152, 121
 
 
 class Moments(NamedTuple):
-    """Moments of one wavelength.
+    """Moments of W wavelengths.
 
-    sigma: RMS spot radius, mm.
-    centroid: y of the centroid, mm.
-    gradient: (2, P), derivatives of both by curvatures, thicknesses and the sensor.
-    error: change of both with other nodes, relative to sigma.
-    gradient_error: change of sigma's gradient with other nodes, relative to its norm.
+    sigma: (W,), RMS spot radius, mm.
+    centroid: (W,), y of the centroid, mm.
+    gradient: (W, 2, P), derivatives of both by curvatures, thicknesses and the sensor.
+    error: (W,), change of both with other nodes, relative to sigma.
+    gradient_error: (W,), change of sigma's gradient with other nodes, relative to its norm.
     """
 
-    sigma: float
-    centroid: float
+    sigma: np.ndarray
+    centroid: np.ndarray
     gradient: np.ndarray
-    error: float
-    gradient_error: float
+    error: np.ndarray
+    gradient_error: np.ndarray
 
 
 def flatten(lens: Lens) -> Array:
@@ -188,10 +188,8 @@ def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Arra
     return found, slopes, jnp.where(jnp.any(inside), jnp.sum(changes), -1)
 
 
-def reference(
-    lens: Lens, field: float, distance: float, wavelengths: Sequence[float]
-) -> list[Moments]:
-    """Moments of each wavelength of a centred lens in float64. ValueError if no ray passes.
+def reference(lens: Lens, field: float, distance: float, wavelengths: Sequence[float]) -> Moments:
+    """Moments of a centred lens in float64. ValueError if no ray passes.
 
     field: angle along y, radians.
     distance: distance of the object, mm.
@@ -200,7 +198,7 @@ def reference(
     semi = np.asarray(lens.semi_diameter)
     # A steep beam crosses the plane far from its hits on the first surface.
     reach = (3 * float(np.max(semi[np.isfinite(semi)])) + 2 * _LEAD) * (1 + math.tan(abs(field)))
-    results = []
+    rows = []
     for wavelength in wavelengths:
         scene = jnp.array([field, 1 / distance, wavelength])
         found = [_integral(lens, scene, reach, part) for part in (0.5, 0.57)]
@@ -209,10 +207,20 @@ def reference(
             raise ValueError(f"no ray at {wavelength:g} um reaches the sensor")
         if corners > _CORNERS:
             raise ValueError(f"the pupil has {corners} corners; expected at most {_CORNERS}")
-        error = float(jnp.max(jnp.abs(again - value)) / value[0])
-        change = float(jnp.linalg.norm(others[0] - slopes[0]) / jnp.linalg.norm(slopes[0]))
-        results.append(Moments(*map(float, value), np.asarray(slopes), error, change))
-    return results
+        error = jnp.max(jnp.abs(again - value)) / value[0]
+        change = jnp.linalg.norm(others[0] - slopes[0]) / jnp.linalg.norm(slopes[0])
+        rows.append((*value, slopes, error, change))
+    return Moments(*(np.array(column) for column in zip(*rows)))
+
+
+def sigmas(moments: results.Moments) -> Array:
+    """RMS spot radii sigma (W,) of moments of the library, mm."""
+    return jnp.sqrt(jnp.trace(moments.covariance, axis1=1, axis2=2))
+
+
+def relative_error(truth: Moments, sigma: Any) -> float:
+    """Largest relative error of spot radii sigma (W,)."""
+    return float(np.max(np.abs(np.asarray(sigma, float) / truth.sigma - 1)))
 
 
 def gradient_error(

@@ -31,7 +31,7 @@ from drt_jax.pupil import PupilRule
 
 from . import _command, _common, _plots
 from ._common import Numbers, Wavelengths, different, grouped, not_empty, within
-from ._reference import Moments, flatten, gradient_error, reference
+from ._reference import Moments, flatten, gradient_error, reference, relative_error, sigmas
 from .runs.folder import Run
 
 _QUADRATURE = "quadrature"
@@ -124,8 +124,7 @@ class Config:
 def spot(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Array, Array]:
     """sigma (W,) and centroids (W, 2), mm."""
     moments = drt_jax.psf_moments(lens, scene, sampling=rule)
-    mean, covariance = moments.mean, moments.covariance
-    return jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]), mean
+    return sigmas(moments), moments.mean
 
 
 @jax.jit
@@ -162,17 +161,16 @@ def patterns(rays: int, seeds: int, dtype: Any) -> dict[str, list[PupilRule]]:
     }
 
 
-def spot_errors(truth: list[Moments], sigma: Array, mean: Array) -> tuple[float, float]:
+def spot_errors(truth: Moments, sigma: Array, mean: Array) -> tuple[float, float]:
     """relative_error and centroid_error."""
-    exact, centroid = np.array([(moments.sigma, moments.centroid) for moments in truth]).T
     x, y = np.asarray(mean, float).T
-    shift = np.hypot(x, y - centroid) / exact
-    return float(np.max(np.abs(np.asarray(sigma, float) / exact - 1))), float(np.max(shift))
+    shift = np.hypot(x, y - truth.centroid) / truth.sigma
+    return relative_error(truth, sigma), float(np.max(shift))
 
 
-def row_of(arguments: tuple, truth: list[Moments], rules: Sequence[PupilRule]) -> dict:
+def row_of(arguments: tuple, truth: Moments, rules: Sequence[PupilRule]) -> dict:
     """A row of `curves` for rules of a kind and size: median error, time of the first."""
-    exact = np.mean([moments.gradient for moments in truth], axis=0)
+    exact = np.mean(truth.gradient, axis=0)
     found = []
     for rule in rules:
         values, slopes = spot_and_gradients(*arguments, rule)
@@ -182,9 +180,8 @@ def row_of(arguments: tuple, truth: list[Moments], rules: Sequence[PupilRule]) -
     names = ("relative_error", "centroid_error", "gradient_error", "centroid_gradient_error")
     errors = [None if math.isnan(error) else float(error) for error in np.median(found, axis=0)]
     calls = [functools.partial(f, *arguments, rules[0]) for f in (spot, spot_and_gradients)]
-    seconds, gradient_seconds = _common.medians(calls, 2)
-    row = {"rays": count_rays(arguments, rules[0]), **dict(zip(names, errors))}
-    return row | {"seconds": seconds, "gradient_seconds": gradient_seconds}
+    times = dict(zip(("seconds", "gradient_seconds"), _common.medians(calls, 2)))
+    return {"rays": count_rays(arguments, rules[0]), **dict(zip(names, errors)), **times}
 
 
 def count_rays(arguments: tuple, rule: PupilRule) -> int:
@@ -193,7 +190,7 @@ def count_rays(arguments: tuple, rule: PupilRule) -> int:
     return int(np.count_nonzero(np.asarray(weights)[0]))
 
 
-def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple, list[Moments]]:
+def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple, Moments]:
     """Lens and scene, with the lens focused on axis and clipped, and the reference."""
     lens = drt_jax.load_lens(scene.lens)
     distance, field = 1e3 * scene.distance_m, math.radians(scene.field_deg)
@@ -207,8 +204,8 @@ def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple
     lens = dataclasses.replace(lens, curved=(lens.stop,))  # gradients by every curvature
     truth = reference(lens, field, distance, wavelengths)
     if not scene.field_deg:  # exactly 0 by symmetry
-        flat = np.array([[1.0], [0.0]])
-        truth = [m._replace(centroid=0.0, gradient=flat * m.gradient) for m in truth]
+        flat = truth.gradient * np.array([[1.0], [0.0]])
+        truth = truth._replace(centroid=0 * truth.centroid, gradient=flat)
     arguments = lens, Scene.point(field, distance, wavelengths)
     return jax.tree.map(lambda a: jnp.asarray(a, scene.dtype), arguments), truth
 
@@ -233,11 +230,10 @@ def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
         error = spot_errors(truth, *spot(*arguments, rule))[0]
         row = {"tolerance": tolerance, "order": rule.order, "rays": count_rays(arguments, rule)}
         tolerances.append(row | {"relative_error": error})
-    exact = [
-        {"wavelength_um": wavelength, "sigma_mm": m.sigma, "centroid_mm": m.centroid}
-        | {"reference_error": m.error, "reference_gradient_error": m.gradient_error}
-        for wavelength, m in zip(config.wavelengths_um, truth)
-    ]
+    known = {"wavelength_um": config.wavelengths_um, "sigma_mm": truth.sigma}
+    known |= {"centroid_mm": truth.centroid, "reference_error": truth.error}
+    known |= {"reference_gradient_error": truth.gradient_error}
+    exact = [dict(zip(known, row)) for row in zip(*known.values())]
     about = {"scene": scene.label, "panel": scene.panel, "dtype": scene.dtype}
     found = {"curves": curves, "tolerances": tolerances, "truth": exact}
     return {key: [about | row for row in rows] for key, rows in found.items()}

@@ -123,7 +123,8 @@ def checked_lenses(results):
     """A lens on the axis, copies of it and a sweep; peers that fail have their reason."""
     (row,), (group,), (swept,) = (results[key] for key in ("rows", "copies", "sweeps"))
     assert row["tight_error"] < 1e-6 and row["loose_error"] < 1e-3 and row["passed"] == 1
-    assert set(row["notes"].values()) == {"no program of this kind"} and not row["peers"]
+    assert list(row["notes"]) == ["optiland", "batoid"] and not row["peers"]
+    assert all(note.endswith("pip install -e '.[peers]'") for note in row["notes"].values())
     assert group["bad"] == 0 and max(swept["steps"]["values"]) < 0.1
 
 
@@ -209,15 +210,13 @@ def test_it_ends_with_results_tables_and_pictures(name, tmp_path, monkeypatch, c
     def missing(name):
         raise ModuleNotFoundError(name=name)
 
-    def fails(lens, rays):
+    def fails(*_):
         raise ValueError("no program of this kind")
 
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(_work, "version", missing)
-    for peer in ("optiland_spot", "batoid_spot"):
-        monkeypatch.setattr(_peers, peer, fails)
     for peer in ("optiland", "prysm"):
-        monkeypatch.setattr(_psf_peers, peer, lambda *_: fails(None, None))
+        monkeypatch.setattr(_psf_peers, peer, fails)
     experiment = importlib.import_module(f"experiments.{name}")
     if name == "images":  # rays of a histogram that are traced at once
         monkeypatch.setattr(experiment, "_ROUND", 2**15)
@@ -230,6 +229,21 @@ def test_it_ends_with_results_tables_and_pictures(name, tmp_path, monkeypatch, c
     globals()[f"checked_{name}"](json.loads((tmp_path / "run" / "results.json").read_text()))
     assert "done in" in capsys.readouterr().out
     assert all(p.stat().st_size > 3000 for p in (tmp_path / "run" / "figures").iterdir())
+
+
+def test_a_peer_that_fails_is_a_note(monkeypatch):
+    """As with one that is missing, nothing of it is timed."""
+
+    def fails(lens, rays):
+        raise ValueError("no program of this kind")
+
+    monkeypatch.setattr(_work, "version", lambda name: "1")
+    monkeypatch.setattr(_peers, "SPOTS", {"one": fails, "two": lambda *_: [lambda: (2.0,)]})
+    scene = load_lens("singlet"), 0.0, np.inf, (0.55,)
+    peers = _work.spot_peers(scene, 7, lambda sigma: sigma / 2)
+    seconds, found = _work.timed([lambda: None], peers, 1)
+    assert peers["one"] == "no program of this kind" and len(seconds) == 1
+    assert list(found) == ["two 1"] and found["two 1"][0] > 0 and found["two 1"][1] == 1.0
 
 
 @pytest.mark.slow
