@@ -33,8 +33,8 @@ import time; start = time.perf_counter()
 import jax; jax.config.update("jax_enable_x64", True)
 import drt_jax
 lens = drt_jax.load_lens({lens!r})
-moments = lambda lens: drt_jax.psf_moments(lens, {field}, {distance}, [0.53])
-sigma = lambda lens: moments(lens).covariance[0, 1, 1] ** 0.5
+scene = drt_jax.Scene.point({field}, {distance}, [0.53])
+sigma = lambda lens: drt_jax.psf_moments(lens, scene).covariance[0, 1, 1] ** 0.5
 jax.block_until_ready(jax.value_and_grad(sigma)(lens))
 print(time.perf_counter() - start)
 """
