@@ -24,24 +24,14 @@ from .runs.folder import Run, begun
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
 
 
-@dataclasses.dataclass
-class _Place:
-    """Where a command works.
-
-    folder: run folder; None until it is known.
-    own: True if the run in it is the command's own.
-    """
-
-    folder: pathlib.Path | None = None
-    own: bool = False
-
-    def left(self) -> tuple[str, str]:
-        """What is left if the command ends now, and how to go on, as text; "" for no more."""
-        if not (self.folder and self.own and (self.folder / "config.yaml").is_file()):
-            return "nothing was begun", ""
-        if (self.folder / "results.json").is_file():
-            return "the results are whole", f"draw them with --report --out {self.folder}"
-        return "what it wrote is whole", f"go on with --resume --out {self.folder}"
+def _left(folder: pathlib.Path | None) -> tuple[str, str]:
+    """What is left in a run folder if the command ends now, and how to go on, as text; "" for no
+    more. None for a folder that is not known yet."""
+    if not (folder and (folder / "config.yaml").is_file()):
+        return "nothing was begun", ""
+    if (folder / "results.json").is_file():
+        return "the results are whole", f"draw them with --report --out {folder}"
+    return "what it wrote is whole", f"go on with --resume --out {folder}"
 
 
 def main(experiment: Any, argv: list[str] | None = None) -> None:
@@ -53,20 +43,25 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
         figures.
     argv: arguments of the command line.
     """
-    place = _Place()
-    experiments.left = lambda: "; ".join(filter(None, place.left()))
+    name, folder = experiment.__spec__.name.split(".")[-1], None
+    experiments.left = lambda: "; ".join(filter(None, _left(folder)))
     try:
-        bad = _do(experiment, argv, place)
+        options = _parser(name, experiment).parse_args(argv)
+        if options.processes:
+            _sharing.join(options.processes)
+        set_up()
+        folder = _folder(name, options)
+        bad = _do(name, experiment, options, folder)
         if not bad:
             return
         others = f" and {len(bad) - 3} others" if len(bad) > 3 else ""
         what = ", ".join(bad[:3]) + others
-        code, message = 1, f"error: not finite, null in {place.folder}/results.json: {what}"
+        code, message = 1, f"error: not finite, null in {folder}/results.json: {what}"
     except KeyboardInterrupt:
         code, message = 130, f"stopped; {experiments.left()}"
     except OSError as error:
-        what, remedy = place.left()
-        wrong = f"{error.filename or place.folder}: {error.strerror or error}"
+        what, remedy = _left(folder)
+        wrong = f"{error.filename or folder}: {error.strerror or error}"
         code, message = 1, f"error: {wrong}; {what}: mend this, then {remedy or 'start again'}"
     except jax.errors.JaxRuntimeError:
         if jax.process_count() == 1:
@@ -82,22 +77,15 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
     raise SystemExit(code)
 
 
-def _do(experiment: Any, argv: list[str] | None, place: _Place) -> list[str]:
-    """Does the work of `main`, and returns the names of results that are not finite."""
-    name = experiment.__spec__.name.split(".")[-1]
-    options = _parser(name, experiment).parse_args(argv)
-    if options.processes:
-        _sharing.join(options.processes)
-    set_up()
+def _do(name: str, experiment: Any, options: argparse.Namespace, folder: pathlib.Path) -> list[str]:
+    """Does the work of `main` in a run folder, and returns the names of results that are not
+    finite."""
     started = time.perf_counter()
-    place.folder = folder = _folder(name, options)
-    place.own = options.resume or options.report
     if not options.report:
         with _sharing.own_folder(folder, options.resume) as own:
             config = _config(name, experiment.Config, options, own)
             columns = getattr(experiment, "COLUMNS", ()), getattr(config, "columns", ())
             with Run(own, config, sum(columns, ()), options.resume) as run:
-                place.own = True
                 print(f"{name}: run folder {own}")
                 run.finish(experiment.run(config, run))
         if own != folder:  # the first process goes on alone

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from drt_jax import show
+from drt_jax import Lens, Scene, psf_moments, show
 
 from .runs.config import ConfigError
 from .runs.folder import Run
@@ -121,6 +121,30 @@ def read_results(folder: pathlib.Path) -> dict[str, Any]:
             remedy = f"have it written again with --resume --out {folder}"
             raise ConfigError(f"{part}: the file is damaged; {remedy}") from error
     return results
+
+
+def settings(config: Any, *names: str) -> dict[str, Any]:
+    """Some settings by name, for results: tuples as lists."""
+    values = {name: getattr(config, name) for name in names}
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
+
+
+def spot_um(
+    lens: Lens, scene: Scene, tolerance: float, weights: Sequence[float] | None = None
+) -> tuple[float, float]:
+    """RMS radius of the spot of all wavelengths about their mean centroid, um, and the smallest
+    throughput of a wavelength.
+
+    scene: one object point.
+    tolerance: relative error, which fixes the pupil rule.
+    weights: (W,), of the wavelengths; None for equal weights.
+    """
+    found = psf_moments(lens, scene, tolerance)
+    mean, covariance = np.asarray(found.mean), np.asarray(found.covariance)
+    away = mean - np.average(mean, axis=0, weights=weights)
+    squares = np.trace(covariance, axis1=1, axis2=2) + np.sum(away**2, axis=1)
+    radius = 1e3 * math.sqrt(np.average(squares, weights=weights))
+    return radius, float(np.min(found.throughput))
 
 
 def measured(run: Run, unit: str, jobs: dict[str, Callable[[], Any]]) -> list[Any]:

@@ -11,7 +11,7 @@ import fnmatch
 import math
 import sys
 import time
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,37 +19,134 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import Pattern, Scene, design
+from drt_jax.design import Operand, Solve, Tie, Vary
 from drt_jax.design.growth import SHORTEST, grow_once, start_growth
+from drt_jax.lens.glasses import glass_makers, nearest_glasses
 
 from . import _command, _common, _sharing
-from ._pictures import draw as draw
-from ._wanted import Config as Config, Starts
+from ._common import not_empty, require, require_known, within
+from ._design_report import draw as draw, tables as tables
 from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
 _DRAWN = 6  # most minima that are drawn
-# Counts and times without a search.
-_NOTHING = {"trials": 0, "jacobians": 0, "seconds": 0.0, "compile_s": 0.0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Starts:
+    """Starts of the search.
+
+    count: number of searches.
+    how: "normal", about the lens; "sobol", within the bounds; "as_built", lenses with errors.
+    spread: of "normal", standard deviation in scales of the variables.
+    per_cent, off_mm: of "as_built", standard deviations of curvatures and thicknesses.
+    stages: trials of each search in each stage.
+    keep: fraction of searches that survive a stage.
+    """
+
+    count: Annotated[int, within(1, 1e5)] = 1
+    how: Literal["normal", "sobol", "as_built"] = "normal"
+    spread: Annotated[float, within(0, 1e3)] = 1.0
+    per_cent: float = 1.0
+    off_mm: float = 0.1
+    stages: Annotated[tuple[int, ...], within(1, 1e4), not_empty] = (12, 12, 24, 48, 200)
+    keep: Annotated[float, within(0, 1)] = 0.7
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Growth:
+    """Design for a part of field and aperture first, then for more.
+
+    first: part at the start; 1 for no growth.
+    step: step to the next part.
+    trials: most trials at each part; a step that misses good_um then is halved.
+    good_um: root mean square of the RMS radii at which the next part begins, about four times that
+        of the final lens: a lens that is perfect for a part is bad for more, see docs/design.md.
+    """
+
+    first: Annotated[float, within(0.01, 1)] = 1.0
+    step: Annotated[float, within(SHORTEST, 1)] = 0.1
+    trials: Annotated[int, within(1, 1e5)] = 40
+    good_um: Annotated[float, within(1e-6, 1e6)] = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Glasses:
+    """Real glasses in place of model glasses, in the end.
+
+    makers: of the glasses; none: model glasses stay. names: a pattern of names, such as "N-*".
+    count: glasses tried in each place. steps: of least squares with each.
+    """
+
+    makers: tuple[str, ...] = ()
+    names: str = "*"
+    count: Annotated[int, within(1, 1e4)] = 8
+    steps: Annotated[int, within(1, 1e4)] = 12
+
+    def __post_init__(self) -> None:
+        require_known("glasses.makers", self.makers, glass_makers())
+        names = (near.glass.name for near in nearest_glasses(1.6, 50, self.makers or None, None))
+        some = any(fnmatch.fnmatchcase(name, self.names) for name in names)
+        require(some, f"glasses.names: no glass of these makers is like {self.names!r}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment; see configs/design/.
+
+    lens: start, a bundled name or YAML path.
+    variables, ties, solves, operands: see drt_jax.design.
+    fields_deg: field angles along y.
+    wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
+    field_weights: weights of the squares of each field; empty for equal weights.
+    floating: True for clear apertures that follow the light, except the stop's; False for
+        vignetting.
+    order: order of the pupil rule of the search.
+    tolerance: relative error of the spots, which fixes the rule for the last search.
+    rings: above 0, rings of a hexapolar grid instead of both rules, as in other programs.
+    trials: most trials of the last search.
+    devices: that share the searches from many starts, see docs/devices.md.
+    """
+
+    name: str
+    lens: str
+    variables: Annotated[tuple[Vary, ...], not_empty]
+    operands: Annotated[tuple[Operand, ...], not_empty]
+    fields_deg: Annotated[tuple[float, ...], within(-89, 89), not_empty] = (0.0,)
+    wavelengths_um: Annotated[tuple[float, ...], within(1e-4, 1e6), not_empty] = (0.5875618,)
+    colour_weights: tuple[float, ...] = ()
+    field_weights: tuple[float, ...] = ()
+    distance_mm: float = math.inf
+    floating: bool = True
+    ties: tuple[Tie, ...] = ()
+    solves: tuple[Solve, ...] = ()
+    order: Annotated[int, within(1, 40)] = 4
+    rings: Annotated[int, within(0, 50)] = 0
+    tolerance: Annotated[float, within(1e-12, 0.5)] = 1e-6
+    growth: Growth = Growth()
+    trials: Annotated[int, within(1, 1e5)] = 500
+    starts: Starts = Starts()
+    glasses: Glasses = Glasses()
+    devices: Annotated[int, within(1, 1e4)] = dataclasses.field(default=1, compare=False)
 
 
 def problem_of(config: Config, lens: drt_jax.Lens, order: int | None = None) -> design.Problem:
     """The problem of the settings for a lens."""
+    waves = config.wavelengths_um
+    middle = (waves[len(waves) // 2],)
     solves = []
     for solve in config.solves:
-        waves = config.wavelengths_um
-        if solve.kind != "best_focus":
-            waves = (waves[len(waves) // 2],)
-        solves.append(dataclasses.replace(solve, distance=config.distance_mm, wavelengths=waves))
+        seen = waves if solve.kind == "best_focus" else middle
+        solves.append(dataclasses.replace(solve, distance=config.distance_mm, wavelengths=seen))
+    weights = {
+        "wavelength_weights": config.colour_weights or None,
+        "field_weights": config.field_weights or None,
+    }
     return design.Problem.from_variables(
         design.Variables.from_lens(lens, config.variables, config.ties, solves),
         config.operands,
-        Scene.grid(
-            np.radians(config.fields_deg),
-            config.distance_mm,
-            config.wavelengths_um,
-            wavelength_weights=config.colour_weights or None,
-            field_weights=config.field_weights or None,
-        ),
+        Scene.grid(np.radians(config.fields_deg), config.distance_mm, waves, **weights),
         _grid(config.rings) if config.rings else (order or config.order),
     )
 
@@ -67,18 +164,12 @@ def _grid(rings: int) -> Pattern:
 def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:
     """RMS radii of the spots of all fields about the centroid of all wavelengths, to the tolerance,
     without code of drt_jax.design."""
-    weights = np.array(config.colour_weights or np.ones(len(config.wavelengths_um)))
-    weights = weights / weights.sum()
-    found = []
-    for field in np.radians(config.fields_deg):
-        moments = drt_jax.psf_moments(
-            lens, Scene.point(field, config.distance_mm, config.wavelengths_um), config.tolerance
-        )
-        mean, covariance = np.asarray(moments.mean), np.asarray(moments.covariance)
-        squares = np.sum((mean - weights @ mean) ** 2, axis=1)
-        squares = squares + np.trace(covariance, axis1=1, axis2=2)
-        found.append(1e3 * math.sqrt(weights @ squares))
-    return found
+    weights = config.colour_weights or None
+    scenes = (
+        Scene.point(field, config.distance_mm, config.wavelengths_um)
+        for field in np.radians(config.fields_deg)
+    )
+    return [_common.spot_um(lens, scene, config.tolerance, weights)[0] for scene in scenes]
 
 
 def order_of(config: Config, lens: drt_jax.Lens) -> int:
@@ -109,9 +200,10 @@ class _Progress(tqdm):
 
 
 def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
-    """Designs the lens for growing parts of field and aperture. ConfigError if growth stops."""
-    settings = config.growth
-    target = len(config.fields_deg) * (1e-3 * settings.good_um) ** 2
+    """Designs the lens for growing parts of field and aperture. ConfigError, with the reason and
+    the remedy, if growth stops."""
+    settings, count = config.growth, len(config.fields_deg)
+    target = count * (1e-3 * settings.good_um) ** 2
     saved = run.kept("growth")
     growth = start_growth(problem, settings.first, settings.step)
     if saved is not None:
@@ -121,20 +213,16 @@ def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
             growth = grow_once(problem, growth, target, settings.trials, bar.searched)
         state = growth._asdict() | {"vector": growth.vector.tolist(), "failed": None}
         run.keep("growth", state)
-    message = f"growth: stops at {growth.done:.1%} of field and aperture, where no step leads to "
-    message += f"{settings.good_um:g} um: {_reason(config, growth.failed)}"
-    _common.require(growth.done >= 1, message)
+    if growth.done < 1:
+        reason, failed = f"a step would be less than {SHORTEST:g}", growth.failed
+        if failed is not None:
+            size = 1e3 * math.sqrt(failed.merit / count)
+            reason = f"{failed.worst_limit} is in the way; widen this limit or change the start"
+            if size > settings.good_um:
+                reason = f"the next comes to {size:.3g}; raise growth.good_um or growth.trials"
+        where = f"growth: stops at {growth.done:.1%} of field and aperture"
+        require(False, f"{where}, where no step leads to {settings.good_um:g} um: {reason}")
     return problem.variables.lens_of(jnp.asarray(growth.vector))
-
-
-def _reason(config: Config, failed: design.Optimum | None) -> str:
-    """Why growth stops, and the remedy."""
-    if failed is None:
-        return f"a step would be less than {SHORTEST:g}"
-    size = 1e3 * math.sqrt(failed.merit / len(config.fields_deg))
-    if size > config.growth.good_um:
-        return f"the next comes to {size:.3g}; raise growth.good_um or growth.trials"
-    return f"{failed.worst_limit} is in the way; widen this limit or change the start"
 
 
 def starts_of(variables: design.Variables, starts: Starts) -> np.ndarray:
@@ -153,13 +241,14 @@ def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
     """Vectors at the ends of the searches from the starts, best first, with counts and times."""
     variables, starts = problem.variables, config.starts
     if starts.count == 1:
-        return {"vectors": [variables.start.tolist()], "merits": [], "no_worse": None} | _NOTHING
+        nothing = {"trials": 0, "jacobians": 0, "seconds": 0.0, "compile_s": 0.0}
+        return {"vectors": [variables.start.tolist()], "merits": [], "no_worse": None} | nothing
     vectors = starts_of(variables, starts)
     mesh = _sharing.mesh_of(config.devices)
     with _Progress(f"{starts.count} starts", 1) as bar:
         how = starts.stages, starts.keep, bar.tiles
         found = design.many_starts(problem, vectors, *how, mesh=mesh)
-    _common.require(len(found.minima) > 0, "starts: no ray passes any of them; widen the bounds")
+    require(len(found.minima) > 0, "starts: no ray passes any of them; widen the bounds")
     return {
         "vectors": [minimum.vector.tolist() for minimum in found.minima],
         "merits": [minimum.merit for minimum in found.minima],
@@ -182,13 +271,11 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
         parts = [design.optimise(problem, vector, config.trials, bar.searched)]
         order = config.order if config.rings else order_of(config, parts[0].lens)
         if order > config.order:
-            problem = problem.with_order(order)
-            vector = jnp.asarray(parts[0].vector)
+            problem, vector = problem.with_order(order), jnp.asarray(parts[0].vector)
             parts.append(design.optimise(problem, vector, config.trials, bar.searched))
-    history = parts[0].history
-    for part in parts[1:]:
-        before = np.array([0, 0, history[-1, 2]])
-        history = np.concatenate([history, part.history + before])
+    history = np.concatenate([part.history for part in parts])
+    first = parts[0].history
+    history[len(first) :, 2] += first[-1, 2]  # Jacobians count on
     end, glasses = _snapped(config, problem, parts[-1])
     return {
         "vector": end.vector.tolist(),
@@ -234,9 +321,8 @@ def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
     """(W,), the focus of light through 0.7 of the aperture less that of the last wavelength, over
     the focal length."""
     waves = config.wavelengths_um
-    foci = np.asarray(
-        drt_jax.axial_colour(lens, Scene.point(0.0, config.distance_mm, waves), (0.7,)).real
-    )[:, 0]
+    scene = Scene.point(0.0, config.distance_mm, waves)
+    foci = np.asarray(drt_jax.axial_colour(lens, scene, (0.7,)).real)[:, 0]
     return ((foci - foci[-1]) / np.asarray(drt_jax.focal_length(lens, waves))).tolist()
 
 
@@ -244,7 +330,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Grows, searches, finishes, and writes the lens."""
     start = drt_jax.load_lens(config.lens)
     start = design.open_apertures(start) if config.floating else start
-    _common.require(
+    require(
         not config.glasses.makers or start.dispersion.model is not None,
         f"glasses: {config.lens} has no model glass; give nd and vd in place of its glasses",
     )
@@ -261,96 +347,28 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     for name, lens in lenses.items():
         lens = design.fit_apertures(problem, lens) if config.floating else lens
         drt_jax.save_lens(lens, run.folder / f"{name}.yaml")
-    rays, before = design.rays_of(problem), run.kept("growth") or {"steps": 0, "first": 0.0}
-    before = _NOTHING | before | {"trials": before["steps"], "compile_s": before["first"]}
+    grew = run.kept("growth") or {"steps": 0, "jacobians": 0, "seconds": 0.0, "first": 0.0}
+    trials = grew["steps"] + found["trials"] + len(history)
     row = {
         "problem": config.name,
         "merit_start": float(first.merit(first.variables.start)),
         "merit_end": end["merit_end"],
         "worst_limit": end["worst"],
         "spots_um": spots_um(config, drt_jax.load_lens(run.folder / "designed.yaml")),
-        "jacobians": before["jacobians"] + found["jacobians"] + int(history[-1, 2]),
-        "rays": rays * (before["trials"] + found["trials"] + len(history)),
-        "seconds": before["seconds"] + found["seconds"] + end["seconds"],
-        "compile_s": before["compile_s"] + found["compile_s"] + end["compile_s"],
+        "jacobians": grew["jacobians"] + found["jacobians"] + int(history[-1, 2]),
+        "rays": design.rays_of(problem) * trials,
+        "seconds": grew["seconds"] + found["seconds"] + end["seconds"],
+        "compile_s": grew["first"] + found["compile_s"] + end["compile_s"],
     }
     return {
         "rows": [row],
-        "lens": config.lens,
+        **_common.settings(config, "lens", "fields_deg", "wavelengths_um", "tolerance"),
         "how": config.starts.how,
-        "fields_deg": list(config.fields_deg),
-        "wavelengths_um": list(config.wavelengths_um),
         "distance_mm": config.distance_mm if math.isfinite(config.distance_mm) else None,
-        "tolerance": config.tolerance,
         "starts": {key: value for key, value in found.items() if key != "vectors"},
         "history": history.tolist(),
         "glasses": some | {"foci": _foci(config, lenses["designed"])} if some else {},
     }
-
-
-def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Tables of the spots by field, and of counts and times."""
-    (row,), starts = results["rows"], results["starts"]
-    fields = results["fields_deg"]
-    peers = row.get("peer_spots_um") or [None] * len(fields)
-    spots = [[field, um, peer] for field, um, peer in zip(fields, row["spots_um"], peers)]
-    totals = (None if None in um else math.hypot(*um) for um in (row["spots_um"], peers))
-    spots.append(["root of the sum of squares", *totals])
-    rows = [
-        ["merit, mm^2, start", row["merit_start"]],
-        ["merit, mm^2, end", row["merit_end"]],
-        ["worst limit exceeded by", row["worst_limit"]],
-        ["Jacobians", row["jacobians"]],
-        ["rays traced", row["rays"]],
-        ["seconds", row["seconds"]],
-        ["compilation, s", row["compile_s"]],
-    ]
-    if glasses := results.get("glasses"):
-        rows.append(["seconds for the glasses", glasses["snap_s"]])
-        foci = zip(results["wavelengths_um"], glasses["foci"], strict=True)
-        rows += [[f"focus at {um:.4f} um, over the focal length", place] for um, place in foci]
-    if starts["merits"]:
-        rows += [["starts that pass light", starts["passed"]], ["minima", len(starts["merits"])]]
-        rows += [["minima a minute", 60 * len(starts["merits"]) / max(starts["seconds"], 1e-9)]]
-    if results["how"] == "as_built":
-        rows.append(["starts no worse than the lens", f"{starts['no_worse']} of {starts['count']}"])
-    name = row["problem"]
-    found = {
-        f"design, {name}: spots": _common.table(("field, deg", "RMS um", "by Optiland"), spots),
-        f"design, {name}": _common.table(("what", "value"), rows),
-    }
-    if glasses:
-        found[f"design, {name}: glasses"] = _glasses_table(glasses["snaps"])
-    if results.get("beside"):
-        found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
-    return found
-
-
-def _glasses_table(snaps: list[dict[str, Any]]) -> str:
-    """Each glass that was exchanged in a row, with its cost."""
-    header = ["behind surface", "nd", "vd", "becomes", "merit before", "after"]
-    keys = ("glass", "before", "after")
-    rows = [[", ".join(map(str, s["surfaces"])), *s["model"], *map(s.get, keys)] for s in snaps]
-    return _common.table(header, rows)
-
-
-def _peers_table(rows: list[dict[str, Any]], how: str) -> str:
-    """Table of other optimisers, see `comparisons`."""
-    goal = "no worse than the lens" if how == "as_built" else "within 1% of the design"
-    header = ["optimiser", f"starts {goal}", "merit, best", "median", "limit exceeded by"]
-    header += ["Jacobians until then", "s until then", "s a start"]
-    lines = []
-    for row in rows:
-        met = "not installed" if row["met"] is None else f"{row['met']} of {row['starts']}"
-        worst = max((x for x in row["worst"] if x is not None), default=None)
-        medians = (_median(row[key]) for key in ("met_jacobians", "met_s", "seconds"))
-        lines.append([row["optimiser"], met, row["best"], row["median"], worst, *medians])
-    return _common.table(header, lines)
-
-
-def _median(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ import numpy as np
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import Scene, design, show
+from drt_jax import Scene, design
 from drt_jax.design.perturbed import KINDS
 from drt_jax.design.tolerance import Order
 
@@ -40,6 +40,13 @@ from .runs.folder import Run
 _ORDERS = get_args(Order)
 _SAMPLES = ("traced", *_ORDERS)
 _SHOWN, _BINS = 14, 60
+# Styles of _SAMPLES, whose lines may coincide: the truth broad and pale, a dotted one on top.
+_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": "black", "alpha": 0.35, "linewidth": 4},
+    {"color": "C1", "linestyle": "--", "linewidth": 1.5},
+    {"color": "black", "linestyle": ":", "linewidth": 2.2, "zorder": 4},
+    {"color": "C3", "linestyle": "-", "linewidth": 1.5},
+)
 _LEVELS = np.linspace(0, 1, 201)
 
 
@@ -83,81 +90,77 @@ class Config:
     devices: Annotated[int, within(1, 1e4)] = dataclasses.field(default=1, compare=False)
 
 
-def prepare(config: Config, order: int = 0) -> tuple[design.Problem, design.PerturbedLens]:
-    """The problem that evaluates the lens, and the lens with its errors. order: order of the pupil
-    rule; 0 for that of the settings."""
-    lens = drt_jax.load_lens(config.lens)
+class Study:
+    """The lens of the settings, with its errors.
 
-    def problem_of(lens: drt_jax.Lens) -> design.Problem:
-        return design.Problem.from_variables(
-            design.Variables.from_lens(lens, ["sensor"]),
-            ["spot"],
-            Scene.grid(
-                np.radians(config.fields_deg),
-                config.distance_mm,
-                config.wavelengths_um,
-                wavelength_weights=config.colour_weights or None,
-            ),
-            order or config.order,
-        )
+    perturbed: the lens and its errors.
+    problem: what evaluates it.
+    normal: True for normal errors.
+    """
 
-    radius = problem_of(lens).beam_radius(lens)
-    perturbed = design.PerturbedLens.from_lens(lens, radius, config.tolerances)
-    return problem_of(perturbed.lens), perturbed
+    def __init__(self, config: Config) -> None:
+        self.config, self.normal = config, config.errors == "normal"
+        lens = drt_jax.load_lens(config.lens)
+        radius = self._problem(lens).beam_radius(lens)
+        self.perturbed = design.PerturbedLens.from_lens(lens, radius, config.tolerances)
+        self.problem = self._problem(self.perturbed.lens)
+
+    def _problem(self, lens: drt_jax.Lens) -> design.Problem:
+        config = self.config
+        variables = design.Variables.from_lens(lens, ["sensor"])
+        fields, weights = np.radians(config.fields_deg), config.colour_weights or None
+        given = fields, config.distance_mm, config.wavelengths_um
+        scene = Scene.grid(*given, wavelength_weights=weights)
+        return design.Problem.from_variables(variables, ["spot"], scene, config.order)
+
+    def draws(self, count: int, seed: int) -> np.ndarray:
+        """Random errors (count, P), in units of their sizes."""
+        return design.draw_perturbations(self.perturbed, count, seed, self.normal)
+
+    def traced(self, perturbations: np.ndarray, title: str) -> design.AsBuilt:
+        """The lenses with errors (K, P), in units of their sizes, with a progress bar."""
+        mesh = _sharing.mesh_of(self.config.devices)
+        with tqdm(total=len(perturbations), desc=title, unit="lens", dynamic_ncols=True) as bar:
+            given = self.problem, self.perturbed, perturbations, self.config.compensator
+            return design.monte_carlo(*given, lambda done: bar.update(done - bar.n), mesh=mesh)
 
 
-def derivatives(config: Config) -> dict[str, Any]:
+def derivatives(study: Study) -> dict[str, Any]:
     """The fields of `design.Predicted` as lists, times, and the relative error of the rule."""
-    problem, perturbed = prepare(config)
-    spots = []
-    for order in (config.order, min(config.order + 4, 40)):
-        other, _ = prepare(config, order)
-        nominal = jax.jit(lambda p, lens: design.as_built(p, lens, config.compensator).spot)
-        spots.append(float(nominal(other, perturbed.lens)))
+    config, problem, perturbed = study.config, study.problem, study.perturbed
+    nominal = jax.jit(lambda p, lens: design.as_built(p, lens, config.compensator).spot)
+    finer = problem.with_order(min(config.order + 4, 40))
+    spots = [float(nominal(other, perturbed.lens)) for other in (problem, finer)]
     seconds = []
     for _ in range(2):
         begun = time.perf_counter()
         found = jax.block_until_ready(design.predict(problem, perturbed, config.compensator))
         seconds.append(time.perf_counter() - begun)
-    fields = {name: np.asarray(a).tolist() for name, a in found._asdict().items()}
-    about = {"seconds": seconds[1], "compile_s": seconds[0] - seconds[1]}
-    return {"fields": fields, "rule_error": abs(spots[0] / spots[1] - 1), **about}
+    return {
+        "fields": {name: np.asarray(array).tolist() for name, array in found._asdict().items()},
+        "derivatives_s": seconds[1],
+        "derivatives_compile_s": seconds[0] - seconds[1],
+        "rule_error": abs(spots[0] / spots[1] - 1),
+    }
 
 
-def predicted_of(found: dict[str, Any]) -> design.Predicted:
-    """The predictions of `derivatives`."""
-    return design.Predicted(**{name: jnp.asarray(a) for name, a in found["fields"].items()})
+def _um(squares: Any) -> np.ndarray:
+    """Roots, in um, of squares in mm^2, of which negative ones count as 0."""
+    return 1e3 * np.sqrt(np.maximum(squares, 0))
 
 
-def traced(
-    config: Config, perturbations: np.ndarray, title: str, problem: design.Problem, perturbed: Any
-) -> design.AsBuilt:
-    """Monte Carlo with a progress bar."""
-    with tqdm(total=len(perturbations), desc=title, unit="lens", dynamic_ncols=True) as bar:
-        return design.monte_carlo(
-            problem,
-            perturbed,
-            perturbations,
-            config.compensator,
-            lambda done: bar.update(done - bar.n),
-            mesh=_sharing.mesh_of(config.devices),
-        )
-
-
-def sensitivity(config: Config, found: dict[str, Any]) -> dict[str, Any]:
+def sensitivity(study: Study, predicted: design.Predicted) -> dict[str, Any]:
     """Each error alone at both limits, and all errors at the worst limits."""
-    problem, perturbed = prepare(config)
-    predicted, count = predicted_of(found), len(perturbed.deviations)
+    perturbed, count = study.perturbed, len(study.perturbed.deviations)
     worst = design.worst_case(perturbed, predicted)
     perturbations = np.concatenate(
         [-np.eye(count), np.eye(count), np.zeros((1, count)), worst[None]]
     )
-    built = traced(config, perturbations, "one error", problem, perturbed)
-    spots, nominal = _um(built.spot), float(_um(built.spot[-2]))
-    changes = _um(predicted.at(perturbations, "second"), root=True)
-    changes = changes - float(_um(predicted.nominal, True))
+    built = study.traced(perturbations, "one error")
+    spots = 1e3 * np.asarray(built.spot)
+    changes = _um(predicted.at(perturbations, "second")) - _um(predicted.nominal)
     moves = np.asarray(predicted.moves) + perturbations @ np.asarray(predicted.move_slopes)
-    variances = design.variances(perturbed, config.errors == "normal")
+    variances = design.variances(perturbed, study.normal)
     share = np.diag(np.asarray(predicted.hessian)) * variances / 2
     rows = []
     for k, error in enumerate(perturbed.deviations):
@@ -166,70 +169,71 @@ def sensitivity(config: Config, found: dict[str, Any]) -> dict[str, Any]:
             "error": str(error), "kind": error.kind, "place": error.place, "axis": error.axis,
             "size": float(perturbed.sizes[k]), "unit": KINDS[error.kind].unit,
             "predicted_um": changes[pair].tolist(),
-            "traced_um": (spots[pair] - nominal).tolist(),
+            "traced_um": (spots[pair] - spots[-2]).tolist(),
             "predicted_moves": (moves[pair] - moves[-2]).tolist(),
             "moves": (built.moves[pair] - built.moves[-2]).tolist(),
             "growth_um2": 1e6 * float(share[k]),
         })  # fmt: skip
-    orders = {order: float(_um(predicted.at(worst, order), True)) for order in _ORDERS}
-    return {"rows": rows, "nominal_um": nominal, "worst": {"traced": float(spots[-1]), **orders}}
+    orders = {order: float(_um(predicted.at(worst, order))) for order in _ORDERS}
+    worst_um = {"traced": float(spots[-1]), **orders}
+    return {"rows": rows, "nominal_um": float(spots[-2]), "worst": worst_um}
 
 
-def _um(mm: Any, root: bool = False) -> np.ndarray:
-    """mm in um. root: True for squares in mm^2, of which negative ones count as 0."""
-    return 1e3 * (np.sqrt(np.maximum(mm, 0)) if root else np.asarray(mm))
-
-
-def monte_carlo(config: Config, found: dict[str, Any], scale: float) -> dict[str, Any]:
+def monte_carlo(study: Study, predicted: design.Predicted, scale: float) -> dict[str, Any]:
     """Traced and predicted spots at one scale of the sizes."""
-    problem, perturbed = prepare(config)
-    predicted, normal = predicted_of(found), config.errors == "normal"
-    perturbations = scale * design.draw_perturbations(perturbed, config.count, config.seed, normal)
+    config = study.config
+    perturbations = scale * study.draws(config.count, config.seed)
     begun = time.perf_counter()
-    mesh = _sharing.mesh_of(config.devices)
-    design.monte_carlo(problem, perturbed, perturbations[:1], config.compensator, mesh=mesh)
+    study.traced(perturbations[:1], "compilation")
     warm = time.perf_counter()
-    built = traced(config, perturbations, f"sizes x {scale:g}", problem, perturbed)
+    built = study.traced(perturbations, f"sizes x {scale:g}")
     seconds = time.perf_counter() - warm
-    spots, whole = _um(built.spot), np.isfinite(built.spot)
+    spots = 1e3 * np.asarray(built.spot)
+    whole = np.isfinite(spots)
     message = f"scales: {scale:g}: light passes through no lens; take less"
     _common.require(bool(whole.any()), message)
-    draws = scale * design.draw_perturbations(perturbed, config.draws, config.seed + 1, normal)
-    samples = {"traced": spots}
-    samples |= {order: _um(predicted.at(draws, order), True) for order in _ORDERS}
     low, high = np.quantile(spots[whole], [0, 0.999])
     edges = np.linspace(0.98 * low, 1.1 * high, _BINS + 1)
-    variances = scale**2 * design.variances(perturbed, normal)
-    row: dict[str, Any] = {"scale": scale, "edges_um": edges.tolist(), "seconds": seconds}
-    row |= {"compile_s": warm - begun, "failed": int(np.sum(~whole))}
-    row |= {"moves_deviation": np.std(built.moves[whole], axis=0).tolist()}
-    row["rays"] = design.rays_of(problem) * len(perturbations)
-    for name, values in samples.items():
+    row: dict[str, Any] = {
+        "scale": scale,
+        "edges_um": edges.tolist(),
+        "seconds": seconds,
+        "compile_s": warm - begun,
+        "failed": int(np.sum(~whole)),
+        "moves_deviation": np.std(built.moves[whole], axis=0).tolist(),
+        "rays": design.rays_of(study.problem) * len(perturbations),
+    }
+    draws = scale * study.draws(config.draws, config.seed + 1)
+    variances = scale**2 * design.variances(study.perturbed, study.normal)
+    for name in _SAMPLES:
+        values = spots if name == "traced" else _um(predicted.at(draws, name))
         finite = values[np.isfinite(values)]
-        ninth = np.quantile(values, 0.9, method="higher")
-        sums: dict[str, Any] = {"mean_um": float(finite.mean()), "p90_um": float(ninth)}
-        sums["yields"] = [float(np.mean(values <= limit)) for limit in config.limits_um]
-        sums["quantiles_um"] = np.quantile(finite, _LEVELS).tolist()
-        sums["shares"] = (100 / len(values) * np.histogram(finite, edges)[0]).tolist()
+        row[name] = {
+            "mean_um": float(finite.mean()),
+            "p90_um": float(np.quantile(values, 0.9, method="higher")),
+            "yields": [float(np.mean(values <= limit)) for limit in config.limits_um],
+            "quantiles_um": np.quantile(finite, _LEVELS).tolist(),
+            "shares": (100 / len(values) * np.histogram(finite, edges)[0]).tolist(),
+        }
         if name != "traced":
             mean, deviation = predicted.moments(variances, name)
             # Root sum of squares: the distribution of q taken as normal.
-            sums["rss_p90_um"] = float(_um(mean + 1.2815516 * deviation, True))
-        row[name] = sums
+            row[name]["rss_p90_um"] = float(_um(mean + 1.2815516 * deviation))
     return row
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Derivatives, then each error alone, then Monte Carlo at each scale."""
-    (found,) = _common.measured(run, "step", {"derivatives": lambda: derivatives(config)})
-    jobs: dict[str, Any] = {"one error": lambda: sensitivity(config, found)}
+    study = Study(config)
+    (found,) = _common.measured(run, "step", {"derivatives": lambda: derivatives(study)})
+    arrays = {name: jnp.asarray(array) for name, array in found.pop("fields").items()}
+    given = study, design.Predicted(**arrays)
+    jobs: dict[str, Any] = {"one error": lambda: sensitivity(*given)}
     for scale in config.scales:
-        jobs[f"sizes x {scale:g}"] = functools.partial(monte_carlo, config, found, scale)
+        jobs[f"sizes x {scale:g}"] = functools.partial(monte_carlo, *given, scale)
     alone, *scales = _common.measured(run, "step", jobs)
-    about = {"derivatives_s": found["seconds"], "derivatives_compile_s": found["compile_s"]}
-    about |= {"rule_error": found["rule_error"], "threads": os.cpu_count(), "count": config.count}
-    about |= {"errors": config.errors, "limits_um": list(config.limits_um)}
-    return alone | about | {"scales": scales}
+    about = {"threads": os.cpu_count(), "count": config.count, "errors": config.errors}
+    return alone | found | about | {"limits_um": list(config.limits_um), "scales": scales}
 
 
 def main_scale(results: dict[str, Any]) -> dict[str, Any]:
@@ -237,51 +241,46 @@ def main_scale(results: dict[str, Any]) -> dict[str, Any]:
     return next((row for row in results["scales"] if row["scale"] == 1), results["scales"][0])
 
 
-def known(spot: float | None) -> float:
-    """A spot; inf for None."""
-    return math.inf if spot is None else spot
-
-
 def merged(results: dict[str, Any]) -> list[dict]:
-    """The largest change of each kind and part, of x and y, minus and plus; largest first."""
+    """The largest change of each kind and part, of x and y, minus and plus; largest first. A lens
+    without a spot changes by inf."""
     found = []
     for (kind, place), some in _common.grouped(results["rows"], "kind", "place").items():
-        changes = [(known(um), row, k) for row in some for k, um in enumerate(row["traced_um"])]
-        change, worst, most = max(changes, key=lambda change: change[0])
-        name = f"{kind}, {KINDS[kind].whole} {place}"
-        row = {"name": name, "size": f"{worst['size']:g} {worst['unit']}".strip()}
-        row |= {"predicted_um": worst["predicted_um"][most], "traced_um": change}
-        row["move"] = max((abs(m[0]) for row in some for m in row["moves"] if m), default=0)
-        row["growth"] = sum(row["growth_um2"] for row in some)
-        found.append(row)
+        changes = [
+            (math.inf if traced is None else traced, predicted, row)
+            for row in some
+            for traced, predicted in zip(row["traced_um"], row["predicted_um"])
+        ]
+        traced, predicted, worst = max(changes, key=lambda change: change[0])
+        moves = [abs(move[0]) for row in some for move in row["moves"] if move]
+        found.append({
+            "name": f"{kind}, {KINDS[kind].whole} {place}",
+            "size": f"{worst['size']:g} {worst['unit']}".strip(),
+            "predicted_um": predicted, "traced_um": traced, "move": max(moves, default=0),
+        })  # fmt: skip
     return sorted(found, key=lambda row: -row["traced_um"])
-
-
-def off_by(row: dict[str, Any], truth: float | None) -> list[str]:
-    """Relative errors of the predicted spots of all orders."""
-    if truth is None:
-        return [""] * len(_ORDERS)
-    return [f"{100 * (row[order] / truth - 1):+.1f} %" for order in _ORDERS]
 
 
 def table_of_scales(results: dict[str, Any]) -> str:
     """Table of traced spots by scale, and of the errors of each order of prediction."""
-    header = ["sizes times", "spot", "traced (µm)", *_ORDERS]
     lines = []
+
+    def add(scale: str, words: str, truth: float | None, predicted: dict[str, float]) -> None:
+        """Adds a line, with the relative errors of predictions by order."""
+        off = (f"{100 * (predicted[order] / (truth or 1) - 1):+.1f} %" for order in _ORDERS)
+        errors = [""] * len(_ORDERS) if truth is None else off
+        lines.append((scale, words, _common.number(truth, ".2f"), *errors))
+
     for row in results["scales"]:
-        scale, true = f"{row['scale']:g}", row["traced"]
         for key, of, words in (
             ("mean_um", "mean_um", "mean"),
             ("p90_um", "p90_um", "90 % are below"),
             ("rss_p90_um", "p90_um", "the same by RSS"),
         ):
-            some = {order: row[order][key] for order in _ORDERS}
-            lines.append((scale, words, _common.number(true[of], ".2f"), *off_by(some, true[of])))
-    worst = results["worst"]
-    lines.append(
-        ("1", "worst case", _common.number(worst["traced"], ".2f"), *off_by(worst, worst["traced"]))
-    )
-    return _common.table(header, lines)
+            predicted = {order: row[order][key] for order in _ORDERS}
+            add(f"{row['scale']:g}", words, row["traced"][of], predicted)
+    add("1", "worst case", results["worst"]["traced"], results["worst"])
+    return _common.table(["sizes times", "spot", "traced (µm)", *_ORDERS], lines)
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -308,29 +307,38 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws the yield by scale, the worst errors, and a histogram of the spots."""
-    figure, axes = _common.panels(len(results["scales"]), 5.2, 3.7)
-    for ax, row in zip(axes, results["scales"]):
-        parts = dict.fromkeys(_SAMPLES, 100 * _LEVELS)
-        parts["traced"] = parts["traced"] * (1 - row["failed"] / results["count"])
-        lines = {name: (row[name]["quantiles_um"], parts[name]) for name in _SAMPLES}
-        _plots.yields(ax, lines, "spot (µm)", "lenses at least so good (%)")
-        ax.set_title(f"sizes × {row['scale']:g}", fontsize=10)
-        ax.set_xlim(0, 1.05 * row["traced"]["quantiles_um"][-1])
-    figure.savefig(figures / "yield.png")
+    scales = results["scales"]
+    with _plots.picture(figures / "yield.png", 5.2, 3.7, len(scales)) as axes:
+        for ax, row in zip(axes, scales):
+            parts = dict.fromkeys(_SAMPLES, 100 * _LEVELS)
+            parts["traced"] = parts["traced"] * (1 - row["failed"] / results["count"])
+            lines = {name: (row[name]["quantiles_um"], parts[name]) for name in _SAMPLES}
+            labels = "spot (µm)", "lenses at least so good (%)"
+            _plots.curves(ax, lines, *labels, styles=_STYLES)
+            ax.set_title(f"sizes × {row['scale']:g}", fontsize=10)
+            ax.set_xlim(0, 1.05 * row["traced"]["quantiles_um"][-1])
     some = merged(results)[:_SHOWN]
-    figure, ax = show.new(1, 1, 7, 5)
-    bars = {name: np.array([m[f"{name}_um"] for m in some]) for name in ("traced", "predicted")}
-    names = [f"{m['name']}: {m['size']}" for m in some]
-    _plots.offenders(ax, names, bars, "spot grows by (µm)")
-    figure.savefig(figures / "offenders.png")
+    with _plots.picture(figures / "offenders.png", 7, 5) as (ax,):
+        names = [f"{m['name']}: {m['size']}" for m in some]
+        traced, predicted = ([m[key] for m in some] for key in ("traced_um", "predicted_um"))
+        ax.barh(names, traced, 0.8, label="traced", color="C0", alpha=0.7)
+        ax.barh(names, predicted, 0.55, label="predicted", fill=False, edgecolor="C1", lw=1.4)
+        ax.tick_params("y", labelsize=8)
+        ax.invert_yaxis()  # the largest on top
+        _plots.label_axes(ax, "spot grows by (µm)", "", "x")
     row = main_scale(results)
-    figure, ax = show.new(1, 1, 6.5, 4)
-    shares = {name: np.array(row[name]["shares"]) for name in _SAMPLES}
-    marks = {"nominal": results["nominal_um"], "mean": row["traced"]["mean_um"]}
-    if row["traced"]["p90_um"] is not None:
-        marks["90 %"] = row["traced"]["p90_um"]
-    _plots.histogram(ax, np.array(row["edges_um"]), shares, marks, "spot (µm)")
-    figure.savefig(figures / "histogram.png")
+    with _plots.picture(figures / "histogram.png", 6.5, 4) as (ax,):
+        fill = {"color": "black", "alpha": 0.2, "fill": True}
+        for name, style in zip(_SAMPLES, (fill, *_STYLES[1:])):
+            ax.stairs(row[name]["shares"], row["edges_um"], label=name, **style)
+        marks = {"nominal": results["nominal_um"], "mean": row["traced"]["mean_um"]}
+        if row["traced"]["p90_um"] is not None:
+            marks["90 %"] = row["traced"]["p90_um"]
+        for k, (name, place) in enumerate(marks.items()):
+            ax.axvline(place, color="black", linestyle="-.", linewidth=0.8)
+            at = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+            ax.annotate(name, (place, 1), (3, -10 - 11 * k), fontsize=8, **at)
+        _plots.label_axes(ax, "spot (µm)", "share (%)", loc="center right")
 
 
 if __name__ == "__main__":

@@ -27,15 +27,15 @@ from PIL import Image
 from skimage import data, transform
 
 import drt_jax
-from drt_jax import Lens, Sampling, Scene
+from drt_jax import Lens, Sampling, Scene, show
 from drt_jax.compilation import LARGE, known_options
 from drt_jax.image.psf import difference
 
-from . import _command, _common, _peers, _psf_peers, _work, render
+from . import _command, _common, _peers, _plots, _psf_peers, _work, render
 from ._common import Colours, not_empty, odd, within
-from ._image_pictures import MODELS, draw as draw
 from .runs.folder import Run
 
+MODELS = "gaussian", "rays", "waves"
 # Rays traced at once for a histogram.
 _ROUND = 2**17
 
@@ -330,6 +330,43 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         "images, views": _common.table(columns, views),
         "images, photographs": _common.table(names, photos),
     }
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Draws the gallery, error over time, transfer functions and the photographs."""
+    _draw_gallery(results, figures / "gallery.png")
+    views = results["views"]
+    count = len(views)
+    with _plots.picture(figures / "models.png", 4.2, 3.4, 2 * count, count) as axes:
+        for view, above, below in zip(views, axes[:count], axes[count:]):
+            series = {}
+            for key, by, cost in (("kernels", "model", "value_s"), ("peers", "program", "seconds")):
+                rows = [r for r in results[key] if r["lens"] == view["lens"] and r["error"]]
+                for (name, *_), own in _common.grouped(rows, by).items():
+                    series[name] = [r[cost] for r in own], [[r["error"]] for r in own]
+            _plots.error_curves(above, series, "seconds", "error of the kernel (L1)")
+            above.set_title(f"{view['lens']}, {view['field_deg']:g} degrees", fontsize=9)
+            by_waves, by_rays, limit = np.asarray(view["transfer"])
+            curves = [by_waves, by_rays]
+            show.mtf(below, view["frequencies"], curves, limit[0], ("waves", "rays"))
+    photos = {"ideal": "ideal"} | {f"photo_{p['lens']}": p["lens"] for p in results["photographs"]}
+    _plots.photographs(figures / "photographs.png", figures, photos, (3.6, 4.1))
+
+
+def _draw_gallery(results: dict[str, Any], path: pathlib.Path) -> None:
+    """Draws fields down and distances across, with the three models of each."""
+    kernels, points = results["gallery_kernels"], results["gallery"]
+    distances, fields, models = kernels.shape[:3]
+    across = distances * models
+    with _plots.picture(path, 1.3, 1.45, fields * across, across) as axes:
+        for ax, (row, far, model) in zip(axes, np.ndindex(fields, distances, models)):
+            picture = np.moveaxis(kernels[far, row, model], 0, -1)
+            ax.imshow(np.sqrt(np.clip(picture / picture.max(), 0, 1)), origin="lower")
+            ax.set(xticks=[], yticks=[])
+            if row == 0:
+                ax.set_title(f"{MODELS[model]}\n{points['distances_m'][far]} m", fontsize=7)
+            if far == model == 0:
+                ax.set_ylabel(f"{points['fields_deg'][row]:g} degrees", fontsize=7)
 
 
 if __name__ == "__main__":

@@ -22,11 +22,10 @@ from skimage import data
 from tqdm import tqdm
 
 import drt_jax
-from drt_jax import show
 from drt_jax.inputs import one_line
 from drt_jax.learn import images
 
-from . import _command, _common
+from . import _command, _common, _plots
 from ._common import odd, or_zero, three_colours, within
 from .runs.config import ConfigError
 from .runs.folder import Run
@@ -196,11 +195,8 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws both pictures side by side."""
     height, width = results["shape"]
-    figure, axes = show.new(1, 2, 5, 5 * height / width + 0.3)
-    for ax, name in zip(axes, ("ideal", "photo")):
-        ax.imshow(np.asarray(Image.open(figures / f"{name}.png")), interpolation="antialiased")
-        ax.set(xticks=[], yticks=[], title=name)
-    figure.savefig(figures / "beside.png")
+    photos = {"ideal": "ideal", "photo": "photo"}
+    _plots.photographs(figures / "beside.png", figures, photos, (5, 5 * height / width + 0.3))
 
 
 def arguments(words: list[str]) -> list[str]:

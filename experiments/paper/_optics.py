@@ -1,7 +1,6 @@
 """The lens of the paper's experiments: the scene, and the trained numbers."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
@@ -67,16 +66,6 @@ def variable_names(names: tuple[str, ...]) -> str:
 def middle(near: float, far: float) -> float:
     """Harmonic mean of two distances, mm."""
     return near if near == far else 2 / (1 / near + 1 / far)
-
-
-def spot_of(scene: Scene, lens: drt_jax.Lens, distance: float) -> dict[str, float]:
-    """RMS radius of the spot of all wavelengths about their mean centroid, um, and the smallest
-    throughput of a wavelength, with a rule for this lens."""
-    found = drt_jax.psf_moments(lens, scene.seen(distance), scene.tolerance)
-    mean, covariance = np.asarray(found.mean), np.asarray(found.covariance)
-    squares = np.trace(covariance, axis1=1, axis2=2)
-    squares = squares + np.sum((mean - mean.mean(axis=0)) ** 2, axis=1)
-    return {"rms_um": 1e3 * math.sqrt(squares.mean()), "light": float(np.min(found.throughput))}
 
 
 @dataclasses.dataclass(frozen=True)

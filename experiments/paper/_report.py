@@ -9,14 +9,12 @@ import drt_jax
 from drt_jax import Scene, show
 
 from . import _plots
-from ._common import number, panels, table
+from ._common import number, table
 from ._optics import Trained
 
 # Images of patches, in the order of an imager.
 IMAGES = ("truth", "sensor", "restored")
-# Errors are drawn so many times as large.
-_GAIN = 4
-_ERROR = f"error x {_GAIN}"
+_ERROR = f"error x {_plots.GAIN}"
 _UNITS = {"sensor": "mm", "thickness": "mm", "curvature": "1/mm"}
 
 
@@ -45,34 +43,39 @@ def moves(results: dict[str, Any]) -> bool:
     return "sensor" in results.get("variables", ["sensor"])
 
 
-def planes(results: dict[str, Any], paper: str, more: str = "") -> list[tuple[str, str, str]]:
-    """Table row of the plane that all starts reach; none if more than the sensor is trained."""
-    row = "plane that all starts reach", paper, reached(results) + more
-    return [] if "numbers" in results else [row]
+def tables(
+    name: str,
+    results: dict[str, Any],
+    plane: str,
+    rows: list[tuple[str, str, str]],
+    more: str = "",
+) -> dict[str, str]:
+    """The table `name` of what the paper says and what was found here, without the paper if it has
+    no such numbers; and a table of the trained numbers, if more than the sensor is trained.
 
-
-def gaussian(results: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Table row of the error of the Gaussian kernel against waves; none without it."""
-    words = [
+    plane: where all starts end in the paper.
+    rows: what, in the paper, here.
+    more: further words on where they end here.
+    """
+    if "numbers" not in results:
+        rows = [("plane that all starts reach", plane, reached(results) + more), *rows]
+    kernels = [
         f"{50 * row['misplaced']:.0f} % of the light, {row['contrast']:.2f} of the contrast at "
         f"{row['distance_m']:g} m"
         for row in results.get("gaussian", [])
     ]
-    what = "error of the Gaussian kernel against waves: light in wrong pixels, contrast"
-    return [(what, "", "; ".join(words))] if words else []
-
-
-def comparison(results: dict[str, Any], rows: list[tuple[str, str, str]]) -> str:
-    """A table of (what, paper, ours); without the paper if it has no such numbers."""
+    if kernels:
+        what = "error of the Gaussian kernel against waves: light in wrong pixels, contrast"
+        rows = [*rows, (what, "", "; ".join(kernels))]
     if results.get("paper", True):
-        return table(("", "paper", "here"), rows)
-    return table(("", "here"), [(what, here) for what, _, here in rows])
+        found = {name: table(("", "paper", "here"), rows)}
+    else:
+        found = {name: table(("", "here"), [(what, here) for what, _, here in rows])}
+    return found | ({f"{name}, lens": _numbers(results)} if "numbers" in results else {})
 
 
-def numbers_tables(name: str, results: dict[str, Any]) -> dict[str, str]:
-    """The table `name` of the trained numbers; none if only the sensor is trained."""
-    if "numbers" not in results:
-        return {}
+def _numbers(results: dict[str, Any]) -> str:
+    """Table of the trained numbers, before and after."""
     titles = {"rms_um": f"RMS radius um at {results['spot_mm'] / 1e3:.4g} m"}
     titles |= {"light": "least share of light", "loss": "mean loss, first and last batches"}
     runs = results["numbers"]
@@ -81,16 +84,15 @@ def numbers_tables(name: str, results: dict[str, Any]) -> dict[str, str]:
         title = titles.get(key, f"{key} {_UNITS.get(key.split()[0], '')}".strip())
         pairs = [[number(column[key], ".6g") for column in columns] for columns in runs]
         rows.append((title, *(" to ".join(pair) for pair in pairs)))
-    return {name: table(("", *map(start_label, results["starts_mm"])), rows)}
+    return table(("", *map(start_label, results["starts_mm"])), rows)
 
 
 def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
     """Figure of the sensor position of all starts over training, if it is trained."""
     if moves(results):
-        figure, axes = show.new(width=7, height=4.5)
-        lines = start_lines(results, "sensor_mm")
-        _plots.curves(axes, lines, "training batch", "sensor position (mm)")
-        figure.savefig(path)
+        with _plots.picture(path, 7, 4.5) as (axes,):
+            lines = start_lines(results, "sensor_mm")
+            _plots.curves(axes, lines, "training batch", "sensor position (mm)")
 
 
 def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
@@ -100,49 +102,33 @@ def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
         return
     trained = Trained.of(results["lens"], tuple(results["variables"]))
     labels = list(map(start_label, results["starts_mm"]))
-    figure, axes = panels(len(labels), 6, 4)
-    for ax, label, changes in zip(axes, labels, results["changes_mm"]):
-        lines = {n: (np.arange(len(row)), row) for n, row in zip(trained.names, changes)}
-        _plots.curves(ax, lines, "training batch", "change, as mm of the sensor")
-        ax.set_title(label, fontsize=9)
-    figure.savefig(folder / "numbers.png")
-    figure, axes = show.new(2, 1, 8, 3)
-    titles = labels[0], f"{labels[0]}, trained"
-    for ax, values, title in zip(axes, results["numbers"][0], titles):
-        _draw(ax, trained.lens_of(values), results, results["spot_mm"])
-        ax.set_title(title, fontsize=9)
-    figure.savefig(folder / "designed.png")
+    with _plots.picture(folder / "numbers.png", 6, 4, len(labels)) as axes:
+        for ax, label, changes in zip(axes, labels, results["changes_mm"]):
+            lines = {n: (np.arange(len(row)), row) for n, row in zip(trained.names, changes)}
+            _plots.curves(ax, lines, "training batch", "change, as mm of the sensor")
+            ax.set_title(label, fontsize=9)
+    with _plots.picture(folder / "designed.png", 8, 3, 2, columns=1) as axes:
+        titles = labels[0], f"{labels[0]}, trained"
+        for ax, values, title in zip(axes, results["numbers"][0], titles):
+            _draw(ax, trained.lens_of(values), results, results["spot_mm"], title)
 
 
-def _draw(axes: Any, lens: drt_jax.Lens, results: dict[str, Any], distance: float) -> None:
+def _draw(axes: Any, lens: drt_jax.Lens, results: dict[str, Any], far: float, title: str) -> None:
+    """Draws a lens with its beam from a distance in mm, at the field along y."""
     field = np.radians(np.ravel(results.get("field", 0.0))[-1])
-    show.lens_drawing(axes, show.draw(lens, Scene.radians(field, distance)))
+    show.lens_drawing(axes, show.draw(lens, Scene.radians(field, far))).set_title(title, fontsize=9)
 
 
 def draw_lens(results: dict[str, Any], distance: float, path: pathlib.Path) -> None:
-    """Figure of the lens with its beam from a distance in mm, at the field along y."""
+    """Figure of the lens with its beam from a distance in mm."""
     lens = drt_jax.load_lens(results["lens"])
-    figure, axes = show.new(width=8, height=4)
-    _draw(axes, lens, results, distance)
-    axes.set_title(lens.name)
-    figure.savefig(path)
+    with _plots.picture(path, 8, 4) as (axes,):
+        _draw(axes, lens, results, distance, lens.name)
 
 
 def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path) -> None:
     """Figure of the `images` of patches, with the RMSE of all but the truth, and of the errors
     that are left."""
-    rows = {name: np.float32(results[name]) for name in IMAGES}
-    errors = {name: rows[name] - rows["truth"] for name in IMAGES[1:]}
-    notes = {name: rmse_of(some) for name, some in errors.items()}
-    rows[_ERROR] = error_map(errors["restored"])
-    _plots.patch_grid(rows, titles, notes).savefig(path)
-
-
-def rmse_of(errors: np.ndarray) -> list[str]:
-    """Root mean square of the errors of each patch, as text."""
-    return [f"{np.sqrt(np.mean(error**2)):.3f}" for error in errors]
-
-
-def error_map(errors: np.ndarray) -> np.ndarray:
-    """Errors of images (N, H, W, C) as images: grey where there is none."""
-    return 0.5 + _GAIN * errors
+    truth, sensor, restored = (np.float32(results[name]) for name in IMAGES)
+    rows = {"sensor": sensor, "restored": restored}
+    _plots.patch_grid(path, titles, truth, rows, {_ERROR: restored})

@@ -30,12 +30,6 @@ class Training:
     optics_rate: Annotated[float, within(0, 10)] = 1e-3
     checkpoint_every: Annotated[int, within(1, math.inf)] = 200
 
-    @property
-    def rates(self) -> dict[str, float]:
-        """Learning rates of the groups of parameters."""
-        rates = {name: rate for name, rate in vars(self).items() if name.endswith("_rate")}
-        return {name.removesuffix("_rate"): rate for name, rate in rates.items()}
-
 
 @dataclasses.dataclass(frozen=True)
 class JointTraining(Training):

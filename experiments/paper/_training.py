@@ -1,4 +1,4 @@
-"""Training jobs of the paper's experiments."""
+"""Training jobs of the paper's experiments, and the patches of images that they take."""
 
 import dataclasses
 import functools
@@ -20,20 +20,22 @@ from drt_jax.devices import copied, gathered, shared, split
 from drt_jax.image.diagnose import crossed
 from drt_jax.image.sensor import convolve
 from drt_jax.learn import network, train
-from drt_jax.learn.data import batches
+from drt_jax.learn.data import DataConfig, Patches, batches, load_patches
 
-from ._common import require
-from ._optics import Trained, middle, spot_of
-from ._patches import read_patches, thinned
-from ._report import start_label
+from ._common import require, settings, spot_um
+from ._optics import Trained, middle
+from ._report import IMAGES, start_label
 from ._settings import JointSettings, Settings
 from ._sharing import mesh_of
 from .runs.config import ConfigError
 from .runs.folder import Run
 from .runs.interrupt import deferred_interrupt
+from .runs.write import replace
 
 # Tolerance of wave kernels, the sum of absolute errors of their pixels.
 _KERNELS = 0.05
+# Most skipped files named on the terminal; the run folder names all.
+_NAMED = 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,9 +130,10 @@ class Jobs:
             train.make_imager(blur, restore, config.camera, convolve)
             for restore in (self.restore, shared(self.restore, self._mesh, 1))
         )
-        rates: dict[str, Any] = dict(config.train.rates)
+        optics, setting = config.train.optics_rate, config.train
+        rates: dict[str, Any] = {"optics": optics, "network": getattr(setting, "network_rate", 0.0)}
         if self._scale:
-            rates["optics"] = {n: rates["optics"] * size for n, size in self._scale.items()}
+            rates["optics"] = {name: optics * size for name, size in self._scale.items()}
         step = train.make_step(spread, rates, self._depths, config.seed, vectorised=several)
         return jax.jit(plain), step
 
@@ -164,8 +167,7 @@ class Jobs:
         scenes = batches(self.scenes, setting.batch, self._config.seed, first)
         loop = Loop(run, job, range(first, total), setting.checkpoint_every, self._mesh)
         state = loop.train(step, state, scenes, noise, log)
-        for k, label in enumerate(labels):
-            self._good[label] = values_of(state[0], k)
+        for label in labels:
             self._save_lens(label)
         return state[0]
 
@@ -204,11 +206,9 @@ class Jobs:
         traces = [self._run.metrics(start_label(start)) for start in config.starts_mm]
         numbers = self._numbers(traces, window) if self.lens.names else {}
         return {
-            "lens": config.scene.lens,
-            "field": config.scene.field,
-            "paper": config.paper,
-            "variables": list(config.train.variables),
-            "starts_mm": list(config.starts_mm),
+            **settings(config, "paper", "starts_mm"),
+            **settings(config.scene, "lens", "field"),
+            **settings(config.train, "variables"),
             "final_mm": [float(np.mean(trace["sensor_mm"][-window:])) for trace in traces],
             "final_window_batches": window,
             "seconds": self._run.seconds,
@@ -244,8 +244,9 @@ class Jobs:
             losses = trace["loss"][:window], trace["loss"][-window:]
             columns = [{name: float(number) for name, number in values.items()} for values in pair]
             for column, values, loss in zip(columns, pair, losses):
-                column |= spot_of(config.scene, self.lens.lens_of(values), distance)
-                column["loss"] = float(np.mean(loss))
+                lens, scene = self.lens.lens_of(values), config.scene
+                radius, light = spot_um(lens, scene.seen(distance), scene.tolerance)
+                column |= {"rms_um": radius, "light": light, "loss": float(np.mean(loss))}
             rows.append(columns)
             changes.append([(trace[n] - trace[n][0]) / self._scale[n] for n in self.lens.names])
         return {"numbers": rows, "changes_mm": np.array(changes), "spot_mm": distance}
@@ -261,3 +262,41 @@ def require_finite(label: str, first: int, losses: np.ndarray, what: str = "loss
     lost = np.flatnonzero(~np.isfinite(losses))
     what = f"{label}: the {what} is not finite from batch {first + lost[:1].sum()} on"
     require(not lost.size, f"{what}; leave this start out, or lower the learning rates")
+
+
+def read_patches(config: DataConfig, side: int, seed: int, folder: pathlib.Path) -> Patches:
+    """Patches of images, with a bar. Prints how many there are and which files were skipped; a long
+    list goes into skipped.txt of the folder."""
+    reading = functools.partial(tqdm, desc="reading images", leave=False)
+    patches = load_patches(config, side, seed, reading)
+    for line in patches.skipped[:_NAMED]:
+        print(f"skipped {line}", file=sys.stderr)
+    if len(patches.skipped) > _NAMED:
+        listed = folder / "skipped.txt"
+        replace(listed, "".join(f"{line}\n" for line in patches.skipped).encode())
+        print(f"skipped {len(patches.skipped)} in all, named in {listed}", file=sys.stderr)
+    counts = f"{len(patches.train)} training and {len(patches.test)} test patches"
+    print(f"{counts} of {side} x {side}")
+    return patches
+
+
+def images(
+    imager: Callable, parameters: Any, scenes: np.ndarray, where: Any, noise: float, seed: int
+) -> dict[str, np.ndarray]:
+    """True, sensor and restored images of patches, for `draw_patches`. where: the distance, or
+    the object points, that `imager` takes."""
+    found = imager(parameters, scenes, where, np.float32(noise), jax.random.key(seed))
+    return {name: np.asarray(image, np.float16) for name, image in zip(IMAGES, found)}
+
+
+def thinned(patches: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` patches, evenly over the set; all for 0."""
+    if not count or count >= len(patches):
+        return patches
+    return np.asarray(patches[np.linspace(0, len(patches) - 1, count).astype(int)])
+
+
+def textured(patches: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` patches for a figure, evenly over the half with more contrast."""
+    contrast = np.std(patches.reshape(len(patches), -1), axis=1)
+    return thinned(patches[np.argsort(contrast)[len(patches) // 2 :]], count)

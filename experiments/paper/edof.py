@@ -19,10 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drt_jax import show
 from drt_jax.learn import train
 
-from . import _command, _common, _optics, _patches, _plots, _report, _settings, _training
+from . import _command, _common, _optics, _plots, _report, _settings, _training
 from ._common import Numbers, near_and_far, within
 from .runs.folder import Run
 
@@ -81,7 +80,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         **tested(config, {"fixed": (still, fixed), "joint": (imager, best)}, jobs.test),
         **blur_over_depth(blur, (place, final), near, far),
         "joint_sensor_mm": float(best["optics"]["sensor"]),
-        "depth_m": list(config.depth_m),
+        **_common.settings(config, "depth_m", "patch_depth_m"),
     }
 
 
@@ -94,13 +93,12 @@ def tested(config: Config, models: dict[str, tuple], test: np.ndarray) -> dict[s
             row[name] = train.evaluate(*model, test, 1e3 * depth, noise, config.seed)
         rows.append(row)
     inside = [row for row in rows if config.trained_at(row["depth_m"])]
-    chosen = _patches.textured(test, len(config.patch_depth_m))
+    chosen = _training.textured(test, len(config.patch_depth_m))
     for k, depth in enumerate(config.patch_depth_m):
         some = chosen[k % len(chosen)][None]
-        parts.append(_patches.images(*models["joint"], some, 1e3 * depth, noise, k))
+        parts.append(_training.images(*models["joint"], some, 1e3 * depth, noise, k))
     return {
         **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
-        "patch_depth_m": list(config.patch_depth_m),
         "table": rows,
         "mean_mae": {n: float(np.mean([row[n]["mae"] for row in inside])) for n in models},
         "mean_rmse": {n: float(np.mean([row[n]["rmse"] for row in inside])) for n in models},
@@ -125,19 +123,12 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     joint, fixed = (_common.number(mean[name], ".4f") for name in ("joint", "fixed"))
     means = f"mean MAE over training depths {joint} against {fixed}"
     against = f"{means}; fixed better at {', '.join(better) or 'no'} m"
-    compared = [
-        *_report.planes(results, "145.29 mm"),
-        ("joint against fixed sensor", "joint better, but for 15 to 20 m", against),
-        *_report.gaussian(results),
-    ]
+    compared = [("joint against fixed sensor", "joint better, but for 15 to 20 m", against)]
     errors = [(m.upper() + " " + n, n, m) for n in ("fixed", "joint") for m in ("mae", "rmse")]
     lines = [(title, *(_common.number(row[n][m], ".4f") for row in rows)) for title, n, m in errors]
     header = "depth m", *(f"{row['depth_m']:g}" for row in rows)
-    return {
-        "edof": _report.comparison(results, compared),
-        "edof, table 2": _common.table(header, lines),
-        **_report.numbers_tables("edof, lens", results),
-    }
+    found = _report.tables("edof", results, "145.29 mm", compared)
+    return found | {"edof, table 2": _common.table(header, lines)}
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
@@ -146,12 +137,17 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     _report.draw_lens(results, far, figures / "lens.png")
     _report.draw_numbers(results, figures)
     _report.draw_sensor(results, figures / "figure_6a.png")
-    figure, axes = show.new(width=7, height=4.5)
     labels = [f"{sensor:.2f} mm" for sensor in results["blur_sensor_mm"]]
     if "numbers" in results or len(set(labels)) < len(labels):
         labels = [f"{label}, {name}" for label, name in zip(labels, ("fixed", "trained"))]
-    _plots.sigma_over_depth(axes, results["blur_depth_m"], dict(zip(labels, results["blur_um"])))
-    figure.savefig(figures / "figure_6b.png")
+    with _plots.picture(figures / "figure_6b.png", 7, 4.5) as (ax,):
+        for k, (label, sigma) in enumerate(zip(labels, results["blur_um"])):
+            pale = {} if k else {"linestyle": ":", "alpha": 0.6}
+            for blur, colour in zip(np.transpose(sigma), ("red", "green", "blue")):
+                style = {"color": f"tab:{colour}", "label": f"{colour[0].upper()}, {label}"}
+                ax.plot(results["blur_depth_m"], blur, **style, **pale)
+        ax.set_ylim(0, None)
+        _plots.label_axes(ax, "object distance (m)", r"blur $\sigma$ (µm)", ncols=len(labels))
     titles = [f"{depth:g} m" for depth in results["patch_depth_m"]]
     _report.draw_patches(results, titles, figures / "figure_7.png")
 

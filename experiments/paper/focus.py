@@ -18,10 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drt_jax import show
 from drt_jax.image.sensor import convolve_taps
 
-from . import _command, _common, _patches, _plots, _report, _settings, _training
+from . import _command, _common, _plots, _report, _settings, _training
 from .runs.folder import Run
 
 COLUMNS = ("loss", "sensor_mm", "sigma_um")
@@ -73,7 +72,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     every = *config.starts_mm, *results["final_mm"]
     low, high = min(every), max(every)
     margin = (high - low) / 2  # all starts may lie on one side
-    scenes = _patches.thinned(jobs.scenes, 512)
+    scenes = _training.thinned(jobs.scenes, 512)
     best = best_focus(loss, scenes, low - margin, high + margin)
     near = [np.flatnonzero(np.abs(trace - best) <= 0.1) for trace in results["sensor_mm"]]
     first = [int(hits[0]) if hits.size else None for hits in near]
@@ -92,10 +91,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         what = f"batches until within 0.1 mm, starts {starts} mm"
         firsts = [(what, '"within the first 60"', first)]
     took = ("training of all starts", "", _common.duration(results["seconds"]))
-    rows = [*_report.planes(results, "133.35 mm", search), *firsts, took]
-    rows += _report.gaussian(results)
-    more = _report.numbers_tables("focus, lens", results)
-    return {"focus": _report.comparison(results, rows)} | more
+    return _report.tables("focus", results, "133.35 mm", [*firsts, took], search)
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
@@ -108,13 +104,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         ("figure_4a", "sensor_mm", "sensor position (mm)", mark),
         ("figure_4b", "sigma_um", "mean blur of R, G, B, σ (µm)", None),
     )[not _report.moves(results) :]:
-        figure, (left, right) = show.new(1, 2, 5.5, 4)
-        lines = _report.start_lines(results, column)
-        _plots.curves(left, lines, "training batch", label, level)
-        lines = _report.start_lines(results, column, 100)
-        _plots.curves(right, lines, "training batch", label, level)
-        right.set_title("the first 100 batches", fontsize=9)
-        figure.savefig(figures / f"{name}.png")
+        with _plots.picture(figures / f"{name}.png", 5.5, 4, 2) as axes:
+            for ax, batches in zip(axes, (None, 100)):
+                lines = _report.start_lines(results, column, batches)
+                _plots.curves(ax, lines, "training batch", label, level)
+            axes[1].set_title("the first 100 batches", fontsize=9)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from drt_jax.learn import train
 
-from . import _command, _common, _patches, _report, _settings, _training
+from . import _command, _common, _report, _settings, _training
 from ._common import Numbers, within
 from .runs.folder import Run
 
@@ -38,23 +38,22 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     distance = 1e3 * config.distance_m
     jobs = _training.Jobs(run, config, distance, distance)
     imager, steps = jobs.steps(jobs.blur)
-    names = {(start, config.noise): _report.start_label(start) for start in config.starts_mm}
+    first = [(start, config.noise) for start in config.starts_mm]
     table = [(start, noise) for noise in config.table_noise for start in config.table_starts_mm]
-    for start, noise in table:
-        names.setdefault((start, noise), f"{_report.start_label(start)} noise {noise}")
-    trained = {
-        (start, noise): jobs.train(job, steps, jobs.lens.start(start), noise)
-        for (start, noise), job in names.items()
-    }
+    trained = {}
+    for start, noise in dict.fromkeys([*first, *table]):
+        job = _report.start_label(start)
+        job += "" if (start, noise) in first else f" noise {noise}"
+        trained[start, noise] = jobs.train(job, steps, jobs.lens.start(start), noise)
     rows = []
     for start, noise in table:
         found = trained[start, noise]
         row = {"noise": noise, "start_mm": start, "sensor_mm": float(found["optics"]["sensor"])}
         rows.append(row | train.evaluate(imager, found, jobs.test, distance, noise, config.seed))
-    some, noise = _patches.textured(jobs.test, 6), table[0][1]
+    some, noise = _training.textured(jobs.test, 6), table[0][1]
     return {
         **jobs.results("sensor_mm"),
-        **_patches.images(imager, trained[table[0]], some, distance, noise, 1),
+        **_training.images(imager, trained[table[0]], some, distance, noise, 1),
         "parameters": jobs.parameters,
         "test": rows,
         "test_patches": len(jobs.test),
@@ -66,17 +65,13 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     first = results["test"][0]
     test = f"test MAE at noise {first['noise']:g}, after and before the network"
     errors = " and ".join(_common.number(first[name], ".4f") for name in ("mae", "sensor_mae"))
-    rows = [*_report.planes(results, "133.35 mm"), (test, "0.02 and 0.03", errors)]
-    rows += _report.gaussian(results)
+    rows = [(test, "0.02 and 0.03", errors)]
     measures = ["RMSE", "PSNR dB", "SSIM"]
     header = ["noise", "start mm", "MAE", *measures, "sensor MAE", *measures]
     columns = [a + b for a in ("", "sensor_") for b in ("mae", "rmse", "psnr", "ssim")]
     errors = [[row[name] for name in ("noise", "start_mm", *columns)] for row in results["test"]]
-    return {
-        "restore": _report.comparison(results, rows),
-        "restore, table 5b": _common.table(header, errors),
-        **_report.numbers_tables("restore, lens", results),
-    }
+    found = _report.tables("restore", results, "133.35 mm", rows)
+    return found | {"restore, table 5b": _common.table(header, errors)}
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:

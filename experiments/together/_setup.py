@@ -28,6 +28,7 @@ from drt_jax.learn.field import (
 
 from . import _common
 from ._sharing import mesh_of
+from .runs.config import ConfigError
 
 # Relative fields of least squares, and the order of its pupil rule.
 _FIELDS, _ORDER = np.array([0.0, 0.7, 1.0]), 6
@@ -78,16 +79,18 @@ class Setup:
     limits: problem whose limits hold in training.
     spoilt: (N,), vector of the spoilt lens.
     patches: training and test patches.
+    pixels: side of a pixel, mm, and of a kernel, pixels.
     mesh: devices that share a batch; None for one.
     """
 
     def __init__(self, config: Any, patches: Patches) -> None:
         self.config, self.patches = config, patches
-        self._steps: dict[Arm, tuple[Callable, Callable]] = {}
+        self._steps: dict[tuple, tuple[Callable, Callable]] = {}
         lens = design.open_apertures(drt_jax.load_lens(config.lens))
         self.variables = self._variables(lens)
         self.waves = np.array(config.wavelengths_um)
-        self.pixel, self.field = 1e-3 * config.camera.pixel_um, math.radians(config.field_deg)
+        self.pixels = 1e-3 * config.camera.pixel_um, config.camera.kernel
+        self.field = math.radians(config.field_deg)
         self.depths = tuple(1e3 * d for d in config.depth_m)
         contrast = design.Operand("mtf", target=1.0, at=config.mtf_at)
         limits = tuple(config.limits)
@@ -97,22 +100,16 @@ class Setup:
         errors = spoil.per_cent, spoil.off_mm, spoil.seed
         vector = design.as_built_starts(self.variables, 1, *errors)[0]
         self.spoilt = jnp.clip(vector, self.variables.low, self.variables.high)
-        net = dataclasses.asdict(config.network)
-        self.init, self.restore = learn.red_net(**net)
+        self.init, self.restore = learn.red_net(**dataclasses.asdict(config.network))
         self.mesh = mesh_of(config.devices)
         self.model = self._model()
-        axis = drt_jax.psf(
-            lens,
-            Scene.point(0.0, self.depths[1], self.waves),
-            self.pixel,
-            config.camera.kernel,
-            sampling=self.model,
-        )
-        self._axis = axis.solid_angle
+        axis = Scene.point(0.0, self.depths[1], self.waves)
+        self._axis = drt_jax.psf(lens, axis, *self.pixels, sampling=self.model).solid_angle
         # With n cells a kernel of waves repeats after n times half a wavelength over the aperture.
-        fringe = 5e-4 * self.waves / np.sqrt(np.asarray(axis.solid_angle) / np.pi)
-        least = math.ceil(1.1 * config.camera.kernel * self.pixel / np.min(fringe))
-        room = f"camera.kernel: {config.camera.kernel} pixels of {config.camera.pixel_um:g} um"
+        fringe = 5e-4 * self.waves / np.sqrt(np.asarray(self._axis) / np.pi)
+        pixel, size = self.pixels
+        least = math.ceil(1.1 * size * pixel / np.min(fringe))
+        room = f"camera.kernel: {size} pixels of {config.camera.pixel_um:g} um"
         remedy = f"{room} need {least} cells of waves: raise judge.cells or give a smaller kernel"
         _common.require(config.judge.cells >= least, remedy)
         if config.tolerances:
@@ -152,19 +149,17 @@ class Setup:
     def _model(self) -> drt_jax.Sampling:
         """The model of kernels, chosen for the spoilt lens. ConfigError for kernels that are too
         small for its blur, and for fields of which no light arrives."""
-        config, lens = self.config, self.variables.lens_of(self.spoilt)
+        lens, size = self.variables.lens_of(self.spoilt), self.pixels[1]
         fields = np.array([[1e-4, 1e-4], [0.5, 0.5], [0.0, 1.0]]) * self.field
-        distances = sorted(set(self.depths))
-        size = config.camera.kernel
-        scene, pixels = Scene.grid(fields, distances, self.waves), (self.pixel, size)
+        given = lens, Scene.grid(fields, sorted(set(self.depths)), self.waves), *self.pixels
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "size: ")  # light beside kernels is judged below
             try:
-                tolerance = config.camera.tolerance
-                model = drt_jax.converge(drt_jax.psf, lens, scene, *pixels, "rays", tolerance)
+                tolerance = self.config.camera.tolerance
+                model = drt_jax.converge(drt_jax.psf, *given, "rays", tolerance)
             except ValueError as error:
-                _common.require(False, f"field_deg: {error}")
-            worst = float(np.max(drt_jax.psf(lens, scene, *pixels, sampling=model).outside))
+                raise ConfigError(f"field_deg: {error}") from error
+            worst = float(np.max(drt_jax.psf(*given, sampling=model).outside))
         lost = f"{100 * worst:.0f} % of the light of the spoilt lens falls beside a kernel"
         remedy = "give a larger one, larger pixels, or spoil the lens less"
         _common.require(worst <= _LOST, f"camera.kernel: {lost} of {size} pixels: {remedy}")
@@ -187,7 +182,7 @@ class Setup:
     def _psfs(self, optics: Any, seen: ObjectPoints, waves: Any, model: Any) -> drt_jax.results.Psf:
         lens = self.lens_of(optics["lens"], seen.deviations)
         scene = Scene.radians(seen.fields, seen.distances, waves)
-        return drt_jax.psf(lens, scene, self.pixel, self.config.camera.kernel, sampling=model)
+        return drt_jax.psf(lens, scene, *self.pixels, sampling=model)
 
     def points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
         """Kernels and light of points, by rays."""
@@ -209,6 +204,7 @@ class Setup:
         part = jnp.where(total > 0, total, 1)[..., None, None]
         return mean / part, total / judge.waves / self._axis[None]
 
+    @functools.cached_property
     def judged(self) -> ObjectPoints:
         """The points of the judge: rings of equal area at all depths."""
         judge = self.config.judge
@@ -217,26 +213,27 @@ class Setup:
         tangents = np.tan(self.field) * np.sqrt(ring)[:, None]
         tangents = tangents * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         near, far = (1 / d for d in self.depths)
-        middle = (np.arange(judge.depths) + 0.5) / judge.depths
-        vergences = near + (far - near) * middle
+        vergences = near + (far - near) * (np.arange(judge.depths) + 0.5) / judge.depths
         distances = np.array([1 / v if v > 0 else math.inf for v in vergences])
         fields = np.tile(np.arctan(tangents), (judge.depths, 1))
         return ObjectPoints(jnp.asarray(fields), jnp.asarray(distances.repeat(judge.rings)))
 
     def step(self, arm: Arm) -> tuple[Callable, Callable]:
         """(init, step) of an arm; arms that differ in numbers alone share a program."""
-        stays = arm.moves == "nothing"
-        kind = arm._replace(title="", begins="", moves="nothing" if stays else "all")
+        kind = arm.moves == "nothing", arm.damped, arm.frozen, arm.as_built
         if kind not in self._steps:
-            self._steps[kind] = self._step(kind)
+            self._steps[kind] = self._step(*kind)
         return self._steps[kind]
 
-    def _step(self, arm: Arm) -> tuple[Callable, Callable]:
-        setting, stays = self.config.train, arm.moves == "nothing"
-        restore = shared(self.restore, self.mesh, 1)
-        rates: dict[str, Any] = {"network": setting.network_rate}
-        rates["optics"] = setting.damped_rate if arm.damped else 0.0
-        if not arm.damped and not stays:
+    def _step(
+        self, stays: bool, damped: bool, frozen: bool, as_built: bool
+    ) -> tuple[Callable, Callable]:
+        """(init, step); stays: True for a lens that stays, the others as in `Arm`."""
+        setting, restore = self.config.train, shared(self.restore, self.mesh, 1)
+        rates: dict[str, Any] = {"network": setting.network_rate, "optics": 0.0}
+        if damped:
+            rates["optics"] = setting.damped_rate
+        elif not stays:
             rates["optics"] = {"lens": self.rates, "moves": 0.0}
 
         # Neither derivatives nor limits of a lens or a network that stays.
@@ -244,11 +241,11 @@ class Setup:
             return self.points(jax.lax.stop_gradient(optics) if stays else optics, seen)
 
         def restored(weights: Any, image: Array) -> Array:
-            return restore(jax.lax.stop_gradient(weights) if arm.frozen else weights, image)
+            return restore(jax.lax.stop_gradient(weights) if frozen else weights, image)
 
         def draw(key: Array) -> ObjectPoints:
             seen = draw_points(key, setting.points, self.field, self.depths)
-            if not arm.as_built:
+            if not as_built:
                 return seen
             table = jnp.asarray(design.draw_perturbations(self.built, _BUILDS, SEED))
             own = jax.random.randint(jax.random.fold_in(key, 1), (), 0, _BUILDS)
@@ -261,7 +258,7 @@ class Setup:
             return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
         imager = FieldImager(points, restored, shared(learn.convolve_each, self.mesh))
-        return (make_damped_step if arm.damped else make_field_step)(imager, rates, draw, 0, hold)
+        return (make_damped_step if damped else make_field_step)(imager, rates, draw, 0, hold)
 
     def start(self, arm: Arm, seed: int, vector: Array, weights: Any) -> dict[str, Any]:
         """The parameters of an arm at the start, from the vector of its lens and, for a frozen

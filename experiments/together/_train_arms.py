@@ -16,14 +16,12 @@ import drt_jax
 from drt_jax import design
 from drt_jax.learn import train
 from drt_jax.learn.data import batches
-from drt_jax.learn.field import FieldImager, ObjectPoints
+from drt_jax.learn.field import FieldImager
 
-from . import _patches, _training
+from . import _common, _training
 from ._setup import ARMS, SEED, Setup
 from .runs.folder import Run
 
-# Arms that begin with the finished lens, of which lenses as built are judged.
-_BUILT = "spots", "joint_from_spots", "tolerant"
 # Steps between those of two seeds, which points and noise depend on.
 _APART = 10**7
 # Patches of a picture.
@@ -33,46 +31,44 @@ _SHOWN = 5
 def run(config: Any, run: Run) -> dict[str, Any]:
     """Finishes the lenses, trains and judges all arms."""
     side = config.train.patch + config.camera.kernel - 1
-    setup = Setup(config, _patches.read_patches(config.data, side, 0, run.folder))
+    setup = Setup(config, _training.read_patches(config.data, side, 0, run.folder))
     lenses = {"spoilt": setup.spoilt} | _finished(setup, run)
-    folder = run.folder / "lenses"
-    folder.mkdir(exist_ok=True)
+    (run.folder / "lenses").mkdir(exist_ok=True)
+    _save(setup, run, "spoilt", setup.spoilt)
     imager = jax.jit(FieldImager(setup.judged_points, setup.restore).__call__)
-    rows, losses, shown, drawn = [], [], {}, ["spoilt"]
-    _save(setup, folder / "spoilt.yaml", setup.spoilt)
-    trained: dict[tuple[str, int], Any] = {}
+    rows, losses, trained = [], [], {}
     arms = [arm for arm in ARMS if arm in config.arms]  # `frozen` after `spots`
+    jobs = {(arm, seed): f"{arm} {seed}" for arm in arms for seed in range(config.seeds)}
+    for (arm, seed), job in jobs.items():
+        weights = trained["spots", seed]["network"] if ARMS[arm].frozen else None
+        begin = setup.start(ARMS[arm], seed, lenses[ARMS[arm].begins], weights)
+        found, seconds = _train(setup, run, arm, seed, begin)
+        trained[arm, seed], vector = found, found["optics"]["lens"]
+        _save(setup, run, job, vector)
+        row = {"arm": arm, "seed": seed, "step_s": seconds, "spot_um": setup.spot_um(vector)}
+        judge = partial(_judged, setup, imager, found)
+        rows.append(run.once(f"judged {job}", lambda: row | judge()))
     for arm in arms:
-        own = []
-        for seed in range(config.seeds):
-            job = f"{arm} {seed}"
-            weights = trained["spots", seed]["network"] if ARMS[arm].frozen else None
-            begin = setup.start(ARMS[arm], seed, lenses[ARMS[arm].begins], weights)
-            trained[arm, seed], seconds = _train(setup, run, arm, seed, begin)
-            own.append(run.metrics(job)["loss"])
-            vector = trained[arm, seed]["optics"]["lens"]
-            _save(setup, folder / f"{job}.yaml", vector)
-            row = {"arm": arm, "seed": seed, "step_s": seconds, "spot_um": setup.spot_um(vector)}
-            judge = partial(_judged, setup, imager, trained[arm, seed])
-            rows.append(run.once(f"judged {job}", lambda: row | judge()))
-            if not seed:
-                drawn.append(job)
-                shown |= _pictures(setup, imager, trained[arm, seed], arm)
+        own = [run.metrics(jobs[arm, seed])["loss"] for seed in range(config.seeds)]
         losses.append(np.mean(own, axis=0).tolist())
-    far, degrees = setup.depths[1], np.degrees(np.hypot(*np.asarray(setup.judged().fields).T))
+    angles = np.degrees(np.hypot(*np.asarray(setup.judged.fields).T))
+    some = np.unique(np.linspace(0, len(angles) - 1, _SHOWN).astype(int))
+    pictures = {}
+    for arm in arms:
+        images = _pictures(setup, imager, trained[arm, 0])
+        pictures |= {f"{arm} {name}": array[some] for name, array in images.items()}
     return {
-        "name": config.name,
+        **_common.settings(config, "name", "field_deg"),
         "rows": rows,
         "arms": arms,
         "losses": losses,
         "start_um": {name: setup.spot_um(vector) for name, vector in lenses.items()},
         "builds": _as_built(setup, run, trained) if config.judge.builds else [],
-        "drawn": drawn,
+        "drawn": ["spoilt", *(jobs[arm, 0] for arm in arms)],
         "pictures": arms,
-        "pictures_deg": degrees[_shown(len(degrees))].tolist(),
-        "field_deg": config.field_deg,
-        "far_mm": far if math.isfinite(far) else None,
-        **shown,
+        "pictures_deg": angles[some].tolist(),
+        "far_mm": setup.depths[1] if math.isfinite(setup.depths[1]) else None,
+        **pictures,
     }
 
 
@@ -118,45 +114,38 @@ def _train(
     return state[0], float(seconds) / max(int(steps), 1)
 
 
-def _save(setup: Setup, path: Any, vector: Array) -> None:
+def _save(setup: Setup, run: Run, name: str, vector: Array) -> None:
     """Writes a lens with apertures that follow the light."""
-    lens = setup.variables.lens_of(vector)
-    drt_jax.save_lens(design.fit_apertures(setup.spots, lens), path)
-
-
-def _test(setup: Setup, seen: ObjectPoints, each: int) -> np.ndarray:
-    return _patches.thinned(setup.patches.test, each * len(seen.fields))
+    lens = design.fit_apertures(setup.spots, setup.variables.lens_of(vector))
+    drt_jax.save_lens(lens, run.folder / "lenses" / f"{name}.yaml")
 
 
 def _judged(setup: Setup, imager: Callable, parameters: Any) -> dict[str, float]:
     """Quality of the images of an arm, by the judge."""
-    seen, config = setup.judged(), setup.config
-    patches = _test(setup, seen, config.judge.patches)
-    return train.evaluate(imager, parameters, patches, seen, config.noise, 0, len(seen.fields))
+    config, count = setup.config, len(setup.judged.fields)
+    patches = _training.thinned(setup.patches.test, config.judge.patches * count)
+    return train.evaluate(imager, parameters, patches, setup.judged, config.noise, 0, count)
 
 
-def _pictures(setup: Setup, imager: Callable, parameters: Any, arm: str) -> dict[str, Any]:
-    """Some images of the judge, evenly over its points."""
-    seen = setup.judged()
-    some = np.resize(
-        _patches.textured(setup.patches.test, len(seen.fields)),
-        (len(seen.fields), *setup.patches.test.shape[1:]),
-    )
-    found = _patches.images(imager, parameters, some, seen, setup.config.noise, 0)
-    return {f"{arm} {name}": a[_shown(len(seen.fields))] for name, a in found.items()}
+def _one_each(setup: Setup, patches: np.ndarray) -> np.ndarray:
+    """A patch for each point of the judge; patches are repeated if they are too few."""
+    return np.resize(patches, (len(setup.judged.fields), *patches.shape[1:]))
 
 
-def _shown(count: int) -> np.ndarray:
-    """Numbers of the points of a picture."""
-    return np.unique(np.linspace(0, count - 1, _SHOWN).astype(int))
+def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.ndarray]:
+    """Images of the judge, a patch for each of its points."""
+    some = _training.textured(setup.patches.test, len(setup.judged.fields))
+    given = _one_each(setup, some), setup.judged, setup.config.noise, 0
+    return _training.images(imager, parameters, *given)
 
 
 def _as_built(setup: Setup, run: Run, trained: dict[tuple[str, int], Any]) -> list[dict]:
-    """PSNR of lenses as built, by rays at the points of the judge."""
+    """PSNR of lenses as built, of arms that begin with the finished lens, by rays at the points of
+    the judge."""
     imager = jax.jit(FieldImager(setup.points, setup.restore).__call__)
     rows = []
     for (arm, seed), parameters in trained.items():
-        if arm in _BUILT:
+        if ARMS[arm].begins == "spots" and not ARMS[arm].frozen:
             job = f"built {arm} {seed}"
             own = run.once(job, lambda: _decibels(setup, imager, parameters, job))
             rows.append({"arm": arm, "seed": seed} | own)
@@ -165,13 +154,12 @@ def _as_built(setup: Setup, run: Run, trained: dict[tuple[str, int], Any]) -> li
 
 def _decibels(setup: Setup, imager: Callable, parameters: Any, job: str) -> dict[str, float]:
     """PSNR of the lens as designed, and of lenses as built the mean and the 10th percentile."""
-    count, seen, found = setup.config.judge.builds, setup.judged(), []
-    table = design.draw_perturbations(setup.built, count, SEED + 1)
-    patches = _test(setup, seen, 1)
-    patches = np.resize(patches, (len(seen.fields), *patches.shape[1:]))
+    table = design.draw_perturbations(setup.built, setup.config.judge.builds, SEED + 1)
+    patches = _training.thinned(setup.patches.test, len(setup.judged.fields))
+    patches, found = _one_each(setup, patches), []
     noise, key = np.float32(setup.config.noise), jax.random.key(0)
     for deviations in (np.zeros(table.shape[1]), *tqdm(table, desc=job, leave=False)):
-        view = seen._replace(deviations=jnp.asarray(deviations))
+        view = setup.judged._replace(deviations=jnp.asarray(deviations))
         truth, _, image = imager(parameters, patches, view, noise, key)
         squares = np.mean(np.square(np.asarray(image - truth)), axis=(1, 2, 3))
         found.append(float(np.mean(-10 * np.log10(squares))))

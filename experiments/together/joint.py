@@ -28,7 +28,8 @@ from ._train_arms import run as run
 from .runs.folder import Run as Run
 
 COLUMNS = ("loss",)
-_MEASURES = ("mae", "rmse", "psnr", "ssim")
+# Measures of images in the table, with their digits.
+_MEASURES = {"mae": 4, "rmse": 4, "psnr": 2, "ssim": 4, "sensor_psnr": 2}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,13 +137,12 @@ class Config:
 
     def __post_init__(self) -> None:
         _sharing.require_shared(self.devices, "train.batch", self.train.batch)
-        needs = {"frozen": "spots", "joint_from_spots": "spots", "tolerant": "spots"}
-        for arm, other in needs.items():
-            both = arm not in self.arms or other in self.arms
-            _common.require(both, f"arms: {arm} needs {other}")
+        for arm in self.arms:
+            both = ARMS[arm].begins != "spots" or "spots" in self.arms
+            _common.require(both, f"arms: {arm} needs spots")
         builds = "tolerant" in self.arms or self.judge.builds
-        given = bool(self.tolerances) or not builds
-        _common.require(given, "tolerances: needs at least one item for lenses as built")
+        missing = "tolerances: needs at least one item for lenses as built"
+        _common.require(bool(self.tolerances) or not builds, missing)
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -154,65 +154,54 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     base = {row["seed"]: row["psnr"] for row in groups.get(("spots",), [])}
     for (arm,), own in groups.items():
         ahead = [row["psnr"] - base[row["seed"]] for row in own if row["seed"] in base]
-        cells = [_spread([row[m] for row in own], m) for m in _MEASURES]
-        more = _spread([row["sensor_psnr"] for row in own], "psnr")
-        spot = _spread([row["spot_um"] for row in own], "spot")
+        cells = [_spread([row[m] for row in own], digits) for m, digits in _MEASURES.items()]
+        cells.append(_spread(ahead, 2) if ahead and arm != "spots" else "")
+        spot = _spread([row["spot_um"] for row in own], 2)
         speed = f"{1e3 * float(np.median([row['step_s'] for row in own])):.3g}"
-        ahead_text = _spread(ahead, "psnr") if ahead and arm != "spots" else ""
-        rows.append([ARMS[arm].title, len(own), *cells, more, ahead_text, spot, speed])
+        rows.append([ARMS[arm].title, len(own), *cells, spot, speed])
     found = {f"joint, {name}": _common.table(header, rows)}
     if results["builds"]:
         header = ["arm", "PSNR dB as designed", "mean as built", "10th percentile"]
         lines = []
         for (arm,), own in _common.grouped(results["builds"], "arm").items():
             parts = [[row[key] for row in own] for key in ("designed", "mean", "low")]
-            lines.append([ARMS[arm].title, *(_spread(part, "psnr") for part in parts)])
+            lines.append([ARMS[arm].title, *(_spread(part, 2) for part in parts)])
         found[f"joint, {name}: as built"] = _common.table(header, lines)
     return found
 
 
-def _spread(values: list[float], measure: str) -> str:
+def _spread(values: list[float], digits: int) -> str:
     """Mean and standard deviation as text."""
-    digits = {"psnr": 2, "spot": 2}.get(measure, 4)
     text = f"{np.mean(values):.{digits}f}"
     return f"{text} ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else text
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws losses, lenses, and patches through each lens before and after the network."""
-    figure, axes = show.new(width=7, height=4.5)
     titles = {name: arm.title for name, arm in ARMS.items()}
-    losses = zip(results["arms"], results["losses"])
-    lines = {titles[arm]: _smooth(loss) for arm, loss in losses}
-    _plots.curves(axes, lines, "training batch", "mean absolute error")
-    axes.set_yscale("log")
-    figure.savefig(figures / "losses.png")
+    with _plots.picture(figures / "losses.png", 7, 4.5) as (ax,):
+        losses = zip(results["arms"], results["losses"])
+        lines = {titles[arm]: _smooth(loss) for arm, loss in losses}
+        _plots.curves(ax, lines, "training batch", "mean absolute error")
+        ax.set_yscale("log")
     drawn = results["drawn"]
-    figure, axes = _common.panels(len(drawn), 5, 3, columns=3)
     fields = np.radians([0.0, 0.7 * results["field_deg"], results["field_deg"]])
-    for ax, name in zip(np.ravel(axes), drawn):
-        lens = load_lens(figures.parent / "lenses" / f"{name}.yaml")
-        show.lens_drawing(ax, show.draw(lens, Scene.radians(fields, results["far_mm"] or math.inf)))
-        ax.set_title(titles.get(name.split()[0], name), fontsize=9)
-        ax.get_legend().remove()
-    figure.savefig(figures / "lenses.png")
-    for arm in results["pictures"]:
-        parts = {key: results[f"{arm} {key}"] for key in _report.IMAGES}
-        fields = results["pictures_deg"][: len(parts["truth"])]
-        titles = [f"{field:.1f} deg" for field in fields]
-        _report.draw_patches(parts, titles, figures / f"patches_{arm}.png")
-    _draw_errors(results, figures / "errors.png")
-
-
-def _draw_errors(results: dict[str, Any], path: pathlib.Path) -> None:
-    """Draws what is wrong with the restored images of all arms, each of the same patches."""
+    scene = Scene.radians(fields, results["far_mm"] or math.inf)
+    with _plots.picture(figures / "lenses.png", 5, 3, len(drawn), columns=3) as axes:
+        for ax, name in zip(axes, drawn):
+            lens = load_lens(figures.parent / "lenses" / f"{name}.yaml")
+            show.lens_drawing(ax, show.draw(lens, scene))
+            ax.set_title(titles.get(name.split()[0], name), fontsize=9)
+            ax.get_legend().remove()
     arms = results["pictures"]
-    truth = np.float32(results[f"{arms[0]} truth"])
-    errors = {arm: np.float32(results[f"{arm} restored"]) - truth for arm in arms}
-    maps = {arm.replace("_", "\n"): _report.error_map(error) for arm, error in errors.items()}
-    notes = {arm.replace("_", "\n"): _report.rmse_of(error) for arm, error in errors.items()}
-    titles = [f"{field:.1f} deg" for field in results["pictures_deg"][: len(truth)]]
-    _plots.patch_grid({"truth": truth} | maps, titles, notes).savefig(path)
+    truth = np.float32(results[f"{arms[0]} truth"])  # the same of all arms
+    degrees = [f"{field:.1f} deg" for field in results["pictures_deg"][: len(truth)]]
+    errors = {}
+    for arm in arms:
+        parts = {key: results[f"{arm} {key}"] for key in _report.IMAGES}
+        _report.draw_patches(parts, degrees, figures / f"patches_{arm}.png")
+        errors[arm.replace("_", "\n")] = np.float32(parts["restored"])
+    _plots.patch_grid(figures / "errors.png", degrees, truth, {}, errors)
 
 
 def _smooth(loss: list[float | None]) -> tuple[np.ndarray, np.ndarray]:
