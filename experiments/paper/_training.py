@@ -28,9 +28,9 @@ from ._report import IMAGES, start_label
 from ._settings import JointSettings, Settings
 from ._sharing import mesh_of
 from .runs.config import ConfigError
+from .runs.disk import replace
 from .runs.folder import Run
 from .runs.interrupt import deferred_interrupt
-from .runs.write import replace
 
 # Tolerance of wave kernels, the sum of absolute errors of their pixels.
 _KERNELS = 0.05
