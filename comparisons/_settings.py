@@ -1,10 +1,11 @@
 """Which other optimisers go from the starts of a design, and what they can be told of it."""
 
 import dataclasses
-from typing import Any
+from typing import Annotated, Any
 
 from drt_jax.design import Operand
 from experiments import _common
+from experiments._common import within
 
 from ._optiland import SETTINGS
 
@@ -24,17 +25,14 @@ class Beside:
     from one start. steps, rate: of "adam", the rate in scales of the variables.
     """
 
-    peers: tuple[str, ...]
-    starts: int = 0
-    seconds: float = 30.0
-    steps: int = 2000
-    rate: float = 0.01
+    peers: Annotated[tuple[str, ...], _common.different]
+    starts: Annotated[int, within(0, 1e5)] = 0
+    seconds: Annotated[float, within(1e-3, 1e5)] = 30.0
+    steps: Annotated[int, within(1, 1e6)] = 2000
+    rate: Annotated[float, within(1e-6, 10)] = 0.01
 
     def __post_init__(self) -> None:
-        limits = {"starts": (0, 1e5), "seconds": (1e-3, 1e5), "steps": (1, 1e6), "rate": (1e-6, 10)}
-        _common.require_within("", self, **limits)
         _common.require_known("peers", self.peers, _PEERS)
-        _common.require_different("peers", self.peers)
 
 
 def require_told(config: Any, peers: tuple[str, ...]) -> None:
