@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 OUT := runs/demo-$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: install demo check test test-slow test-all test-versions site
+.PHONY: install demo check test test-slow test-release test-all test-versions site
 install: .venv/installed
 
 .venv/installed: pyproject.toml
@@ -24,15 +24,19 @@ check: install
 	$(BIN)/mypy
 
 # Programs that one run of the tests has compiled serve the next.
-test test-slow test-all test-versions site: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.compiled
+test test-slow test-release test-all test-versions site: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.compiled
 
 # With PART=0 to 5, as in CI, also a sixth of the larger scenes.
 test: install
-	$(BIN)/python -m pytest $(if $(PART),-m "" --durations=60 --part=$(PART))
+	$(BIN)/python -m pytest $(if $(PART),-m "not release" --durations=60 --part=$(PART))
 
 # The larger scenes; PART as above.
 test-slow: install
 	$(BIN)/python -m pytest -m slow --durations=60 $(if $(PART),--part=$(PART))
+
+# Evidence that takes minutes a test.
+test-release: install
+	$(BIN)/python -m pytest -m release --durations=0
 
 test-all: install
 	$(BIN)/python -m pytest -m "" --durations=60

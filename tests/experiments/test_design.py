@@ -96,7 +96,7 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
     assert "raise growth.good_um or growth.trials" in said
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_phone_lens_from_a_crude_start(tmp_path, monkeypatch):
     """Five aspheres, f/2 and 35 degrees: below 3 um on all fields, all limits kept. Of one colour
     and four fields, which takes a quarter of the time; results/design/phone has all."""
