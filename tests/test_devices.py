@@ -91,7 +91,7 @@ def test_what_cannot_be_shared_is_refused_in_a_line(words, message, tmp_path, ca
     assert message in line
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_eight_devices_compute_what_one_does():
     """Monte Carlo, searches, kernels and rays in float64; losses and weights in float32."""
     found = json.loads(ended(started(str(HERE / "sharing.py"), count=8)).splitlines()[-1])

@@ -26,19 +26,19 @@ STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
 OFTEN = {**LARGE, "xla_backend_optimization_level": 1}
 
 
-def differences(value, x):
+def differences(value, x, steps):
     """Central differences of the leaves of a tree, for each step: (K, N) each."""
-    for h in STEPS:
+    for h in steps:
         pairs = [jax.device_get((value(x + h * e), value(x - h * e))) for e in np.eye(len(x))]
         slopes = [jax.tree.map(lambda a, b, h=h: (a - b) / (2 * h), *pair) for pair in pairs]
         yield jax.tree.map(lambda *columns: np.stack(columns, axis=-1), *slopes)
 
 
-def assert_derivatives(value, jacobian, x, rtol, floor=1e-2):
+def assert_derivatives(value, jacobian, x, rtol, floor=1e-2, steps=STEPS):
     """Each kind by each number, against the best of the differences: within `rtol` of the largest
     derivative by that number, plus a part `floor` of it by any."""
     best = jax.tree.map(lambda a: np.full(a.shape, np.inf), jacobian)
-    for found in differences(value, x):
+    for found in differences(value, x, steps):
         best = jax.tree.map(
             lambda b, f, j: np.minimum(b, np.abs(f - np.asarray(j))), best, found, jacobian
         )
