@@ -8,6 +8,8 @@ tags, second documents, and duplicate keys (other readers take the last one).
 import os
 import reprlib
 import stat
+import sys
+import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -21,6 +23,8 @@ _CONSTRUCTOR = yaml.constructor.SafeConstructor()
 # and of characters of a message.
 LARGEST = 2**20
 _VALUES, _DEEPEST, _DIGITS, _LONGEST = 100_000, 20, 40, 300
+# Packages whose frames a warning passes, see `warn`.
+_INSIDE = __name__.partition(".")[0], "jax", "contextlib"
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxlevel = 3
@@ -58,6 +62,14 @@ def require(condition: object, message: str, error: type[ValueError] = ValueErro
     """Raises an error with this message unless the condition holds."""
     if not condition:
         raise error(message)
+
+
+def warn(message: str) -> None:
+    """Warns at the line that called this package, past its own frames and those of JAX."""
+    frame, level = sys._getframe(), 1
+    while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in _INSIDE:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
 
 
 def require_tolerance(sampling: Any) -> float:

@@ -154,7 +154,7 @@ class Solve:
                 "leave it out, or begin with another lens",
             )
             scene = Scene.point(0.0, self.distance, self.wavelengths)
-            warn_of_focus(lens, checked_scene(lens, scene), 5)
+            warn_of_focus(lens, checked_scene(lens, scene))
             return self
         solve = self
         if self.value == 0:

@@ -6,13 +6,12 @@ import dataclasses
 import math
 import os
 import re
-import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
 
-from ..inputs import InputError, Lines, one_line, read_bytes, shown
+from ..inputs import InputError, Lines, one_line, read_bytes, shown, warn
 from ..lens.forms import powers_xy
 from ..lens.lens import Lens
 from .entry import LensError
@@ -124,7 +123,7 @@ class Record:
     def say(self) -> None:
         """Issue one warning that lists all notes."""
         if self.notes:
-            warnings.warn(f"{self.path}: {'; '.join(self.notes)}", stacklevel=4)
+            warn(f"{self.path}: {'; '.join(self.notes)}")
 
     def lens(self, semi_diameter: float | None) -> Lens:
         """Build the lens; without `semi_diameter` (mm), the size of its stop is a placeholder."""

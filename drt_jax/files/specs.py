@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import math
-import warnings
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import shown
+from ..inputs import shown, warn
 from ..lens.edit import with_paraxial_pupil
 from ..lens.elements import Elements
 from ..lens.forms import FORMS
@@ -304,10 +303,9 @@ def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:
     found = float(focal_length(lens, wavelength)[0])
     air = float(first_order(lens, jnp.inf, wavelength).effective_focal_length[0])
     if not min(abs(found - stated), abs(air - stated)) <= 0.02 * abs(stated):
-        warnings.warn(
+        warn(
             f"focal_length: {stated:g} mm is stated, but it is {found:g} mm at {wavelength:g} um: "
-            "look for a wrong sign, unit or glass",
-            stacklevel=4,
+            "look for a wrong sign, unit or glass"
         )
 
 
@@ -342,7 +340,7 @@ def _check_order(lens: Lens, gaps: list[float], moved: list[bool], wave: float) 
         if gap > -CLOSEST:
             raise LensError(f"{sensor} touches {vertex}; move it by {CLOSEST} mm", "sensor")
         virtual = "rays are prolonged backwards to a virtual image"
-        warnings.warn(f"{sensor} lies before {vertex}{turned}: {virtual}", stacklevel=2)
+        warn(f"{sensor} lies before {vertex}{turned}: {virtual}")
     semi = np.asarray(lens.semi_diameter)
     rows = zip(pairs, heights(lens, pairs)[1], crossings(lens, pairs), strict=True)
     for (i, j, gap), sags, place in rows:
@@ -362,4 +360,4 @@ def _check_order(lens: Lens, gaps: list[float], moved: list[bool], wave: float) 
         beam = np.asarray(_paraxial_beam(lens, jnp.asarray(wave, lens.curvature.dtype)))
         if place < min(_RIM * rim, max(beam[i], beam[j])):
             raise LensError(message, f"surfaces[{i}].thickness")
-        warnings.warn(f"{message}; light that comes there is lost", stacklevel=4)
+        warn(f"{message}; light that comes there is lost")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from ..inputs import warn
 from ..lens.glass import FRAUNHOFER
 from ..lens.lens import Lens
 from .entry import LensError, require
@@ -45,7 +46,7 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
     kind = known_ending(path)
     system = lens if isinstance(lens, System) else system_for(lens)
     if kind in (".yaml", ".yml") and isinstance(lens, System):
-        warnings.warn(f"{path}: fields, wavelengths and vignetting are not written", stacklevel=2)
+        warn(f"{path}: fields, wavelengths and vignetting are not written")
     try:
         text = {".zmx": zmx_text, ".seq": seq_text}.get(kind, _yaml_text)(system)
         system.lens.check()

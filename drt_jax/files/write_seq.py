@@ -2,13 +2,13 @@
 
 import math
 import textwrap
-import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..inputs import warn
 from ..lens.forms import FORMS, noll_of_fringe
 from ..lens.glass import (
     ANY,
@@ -63,7 +63,7 @@ def seq_text(system: System) -> str:
         what = "model glasses are private ones of .seq: their indices are the same at the"
         where = "from {:g} to {:g} um they differ by".format(*VISIBLE)
         what = f"{what} wavelengths in use and at F, d, C; {where} {worst:.1g} at most"
-        warnings.warn(what, stacklevel=3)
+        warn(what)
     private = {name: f"G{k + 1}" for k, name in enumerate(own)}
     title = "".join(" " if c in "'\"" or not c.isprintable() else c for c in lens.name)
     wave = float(system.wavelengths[system.primary])

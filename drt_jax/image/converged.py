@@ -7,7 +7,6 @@ Rules are tried in rising order. Their rays are traced in tiles of a fixed size,
 all sizes share a compiled program.
 """
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from typing import NamedTuple
@@ -18,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
-from ..inputs import require_tolerance
+from ..inputs import require_tolerance, warn
 from ..lens.lens import Lens
 from ..lens.order import may_cross
 from ..lens.scene import Scene, checked_scene, over_points
@@ -250,16 +249,15 @@ def find_rule(
         tried = _trials(lens, scene.each(), symmetry_of(lens, scene.field))
         trials, change = refine(tried, error, tolerance, together=3)
         if change > tolerance:
-            warnings.warn(
+            warn(
                 f"the spot size has converged to {change:.1e} only, not to {tolerance:.1e}, "
                 f"with the order {trials[-1].rule.order}; does the edge of the beam fail?"
-                f"{crossed(lens)}",
-                stacklevel=4,
+                f"{crossed(lens)}"
             )
             return trials[-1]
         rounded = rounding(trials[-1])
         if warns:
-            warn_dtype(lens, "the spot", rounded, tolerance, " of its size", 4)
+            warn_dtype(lens, "the spot", rounded, tolerance, " of its size")
         # If rounding hides the differences, take the last of the three.
         return trials[-1 if 2 * rounded > tolerance else 0]
 

@@ -5,7 +5,6 @@ parameters.
 """
 
 import dataclasses
-import warnings
 from collections.abc import Callable
 
 import jax
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..inputs import warn
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, distance_array, vergence_of
 from ..numerics import Numbers, concrete, tensordot
@@ -99,10 +99,9 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMom
 
     (series,), left = refine(map(interpolated, _NODES), tail, tolerance, together=1)
     if left > tolerance:
-        warnings.warn(
+        warn(
             f"the moments between {near:g} and {far:g} mm are interpolated to {left:.1e} only, not "
-            f"to {tolerance:.1e}; narrow the range",
-            stacklevel=2,
+            f"to {tolerance:.1e}; narrow the range"
         )
     dtype = lens.curvature.dtype
     return DepthMoments(jnp.asarray(near, dtype), jnp.asarray(far, dtype), series)

@@ -2,7 +2,6 @@
 module on, lengths can be in pixels."""
 
 import dataclasses
-import warnings
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -11,7 +10,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import erf
 
-from ..inputs import require_one_of
+from ..inputs import require_one_of, warn
 from ..numerics import Numbers, concrete, real_array, safe_sqrt
 from .spot import normalised
 
@@ -133,14 +132,13 @@ def _checked(
         if concrete(given[name]) and not np.all(np.isfinite(np.asarray(given[name], float))):
             hint = "; no ray of that wavelength arrives" if name == "covariance" else ""
             raise ValueError(f"{name}: must be finite{hint}")
-    return arrays[0], arrays[1], check_pixels(pixel, size, dtype, stacklevel=4).side
+    return arrays[0], arrays[1], check_pixels(pixel, size, dtype).side
 
 
-def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> Pixels:
+def check_pixels(pixel: Numbers, size: int, dtype: Any) -> Pixels:
     """The `Pixels` of a side, (), mm, and a number along a side.
 
-    Warns of a pixel above 1 mm; `stacklevel` as of `warnings.warn`. ValueError for invalid values,
-    as far as they are known.
+    Warns of a pixel above 1 mm. ValueError for invalid values, as far as they are known.
     """
     if not isinstance(size, int | np.integer) or size < 1:
         raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
@@ -155,7 +153,7 @@ def check_pixels(pixel: Numbers, size: int, dtype: Any, stacklevel: int = 3) -> 
             raise ValueError(f"pixel: must be above 0 mm, got {known:g}")
         if known > _LARGE_PIXEL:
             um = f"if it is {known:g} um, give {1e-3 * known:g}"
-            warnings.warn(f"pixel: {known:g} mm is a large one; {um}", stacklevel=stacklevel)
+            warn(f"pixel: {known:g} mm is a large one; {um}")
     return Pixels(side, int(size))
 
 

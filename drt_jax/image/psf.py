@@ -8,7 +8,6 @@ what `converge` makes is accepted anywhere.
 
 import dataclasses
 import functools
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple, get_args
 
@@ -18,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, ONCE, jit
-from ..inputs import require_one_of, require_tolerance
+from ..inputs import require_one_of, require_tolerance, warn
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, known_values, real_array
@@ -144,7 +143,7 @@ def converged_psf(
     bound = tolerance / 5 if of == "gradient" else tolerance
     found, view = chosen_psf(lens, scene, pixel, size, kind, bound, norm)
     outside = np.stack([one.outside for one in view.psfs(found.kind, found.cells)])
-    _warn(outside, view.beams.__getitem__, view.wavelengths, view.pixels, found.kind, 3)
+    _warn(outside, view.beams.__getitem__, view.wavelengths, view.pixels, found.kind)
     return found
 
 
@@ -188,15 +187,14 @@ def chosen_psf(
 
         ((degree, beams),), error = refine(fits(), misfit, tolerance, together=1)
         if error > tolerance:
-            warnings.warn(
+            warn(
                 f"polynomials of degree {degree} give back the rays to {error:.1e} only, not to "
-                f"{tolerance:.1e}",
-                stacklevel=3,
+                f"{tolerance:.1e}"
             )
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
         view = _View(lens, waves, beams, pixels, norm)
         worst = max(rounded.get("phase", 0.0), view.hit_error(kind))
-        warn_dtype(lens, "kernels", worst, tolerance, "", 3)
+        warn_dtype(lens, "kernels", worst, tolerance, "")
         view = dataclasses.replace(view, rounded=worst)
         return view.sampling(kind, rule_of(degree), tolerance), view
 
@@ -272,10 +270,9 @@ class _View:
         bound = max(tolerance, self.rounded)
         (*_, (cells, _)), error = refine(trials, change, bound)
         if error > bound:
-            warnings.warn(
+            warn(
                 f"{kind} of {cells} x {cells} cells have converged to {error:.1e} only, not to "
-                f"{tolerance:.1e}: the spot may be too large; take a larger tolerance",
-                stacklevel=5,
+                f"{tolerance:.1e}: the spot may be too large; take a larger tolerance"
             )
         return cells
 
@@ -311,17 +308,16 @@ def warn_of_loss(
         with jax.core.eval_context():
             lens, scene, outside, pixels = known
             beam = lambda k: beams_of(lens, scene.each()[k], sampling.rule)  # noqa: E731
-            _warn(np.asarray(outside), beam, scene.wavelengths, pixels, sampling.kind, 4)
+            _warn(np.asarray(outside), beam, scene.wavelengths, pixels, sampling.kind)
 
 
 def _warn(
     outside: np.ndarray, beams: Callable[[int], Beam], wavelengths: Array, pixels: Pixels,
-    kind: Kind, level: int
+    kind: Kind
 ) -> None:  # fmt: skip
     """`warn_of_loss` of known numbers.
 
     beams: function that returns the beam of a point by its index.
-    level: as of `warnings.warn`.
 
     For each share p of `_LOST` that diffraction may lose, the radius that is needed is the sum of
     two: within the first, rays have all but _LOST - p of the light; beyond the second, a round
@@ -346,10 +342,9 @@ def _warn(
         reach[k] = far[order][np.minimum(last, len(far) - 1)] + spread[k] / parts
     needed = np.min(np.max(reach, axis=0)) / float(np.asarray(pixels.side))
     more = max(2 * int(np.ceil(needed)) + 1, size + 2)
-    warnings.warn(
+    warn(
         f"size: {100 * np.max(lost):.2g} % of the light falls beside a kernel of {size} x {size} "
-        f"pixels; {more} x {more} hold 99 %",
-        stacklevel=level,
+        f"pixels; {more} x {more} hold 99 %"
     )
 
 

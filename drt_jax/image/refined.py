@@ -7,7 +7,6 @@ next bounds the error.
 
 import collections
 import functools
-import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..compilation import LARGE, jit
+from ..inputs import warn
 from ..lens.lens import Lens
 from ..lens.scene import Scene, over_points
 from ..numerics import concrete, known_values
@@ -102,10 +102,9 @@ def to_tolerance(
         trials = ((n, run(*known, cells=n)) for n in tried)
         (*_, (cells, found)), error = refine(trials, _change, tolerance)
         if error > tolerance:
-            warnings.warn(
+            warn(
                 f"{cells} x {cells} cells of the pupil have converged to {error:.0e} only, not to "
-                f"{tolerance:.0e}: the blur is too large for them; try kind='rays'",
-                stacklevel=4,
+                f"{tolerance:.0e}: the blur is too large for them; try kind='rays'"
             )
     return found if concrete(args) else run(*args, cells=cells)
 

@@ -9,7 +9,6 @@ stay finite.
 """
 
 import functools
-import warnings
 from collections.abc import Sequence
 
 import jax
@@ -18,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import warn
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import Scene
@@ -42,20 +42,18 @@ def below_double(lens: Lens) -> bool:
     return float(jnp.finfo(lens.curvature.dtype).eps) > _DOUBLE
 
 
-def warn_dtype(lens: Lens, what: str, wrong: float, allowed: float, unit: str, level: int) -> None:
+def warn_dtype(lens: Lens, what: str, wrong: float, allowed: float, unit: str) -> None:
     """Warns if the dtype of a lens is less precise than float64 and an error exceeds what is
     allowed.
 
     what: name of the quantity, for the message.
     wrong, allowed: estimated error and bound.
     unit: text behind the number in the message.
-    level: as of `warnings.warn`, where 1 is the caller of this function.
     """
     if below_double(lens) and wrong > allowed:
-        warnings.warn(
+        warn(
             f"in {lens.curvature.dtype} {what} may be wrong by {wrong:.0e}{unit}, more than "
-            f'{allowed:.0e}: jax.config.update("jax_enable_x64", True) before the lens is loaded',
-            stacklevel=level + 1,
+            f'{allowed:.0e}: jax.config.update("jax_enable_x64", True) before the lens is loaded'
         )
 
 
@@ -66,13 +64,11 @@ def hit_rounding(lens: Lens) -> float:
     return 2 * float(jnp.finfo(lens.curvature.dtype).eps) * abs(float(lens.sensor))
 
 
-def warn_of_focus(lens: Lens, scene: Scene, level: int = 3) -> None:
+def warn_of_focus(lens: Lens, scene: Scene) -> None:
     """Warns if rounding moves a focus by more than `_FOCUS` of the depth of focus,
     wavelength / NA^2, if the numbers are known. The estimate is the rounding of hits over NA. The
     foci of spots of the bundled lenses were off by a fifth of this in the median, and by at most
     0.97 of it.
-
-    level: as of `warnings.warn`.
     """
     known = known_values((lens, scene)) if below_double(lens) else None
     if known is None:
@@ -86,14 +82,13 @@ def warn_of_focus(lens: Lens, scene: Scene, level: int = 3) -> None:
         # From mm to waves in um.
         worst = max(float(jnp.max(aperture / waves)) for aperture in apertures)
         moved = 1e3 * hit_rounding(lens) * worst
-    warn_dtype(lens, "the focus", moved, _FOCUS, " of its depth", level)
+    warn_dtype(lens, "the focus", moved, _FOCUS, " of its depth")
 
 
-def warn_of_paths(lens: Lens, scene: Scene, level: int = 3, of_beams: bool = False) -> None:
+def warn_of_paths(lens: Lens, scene: Scene, of_beams: bool = False) -> None:
     """Warns if rounding makes path differences wrong by more than `_WAVES`, if the numbers are
     known.
 
-    level: as of `warnings.warn`.
     of_beams: as in `path_rounding`.
     """
     known = known_values((lens, scene)) if below_double(lens) else None
@@ -102,7 +97,7 @@ def warn_of_paths(lens: Lens, scene: Scene, level: int = 3, of_beams: bool = Fal
     lens, scene = known
     with jax.core.eval_context():
         error = path_rounding(lens, scene.each(), of_beams)
-    warn_dtype(lens, "path differences", error, _WAVES, " waves RMS", level)
+    warn_dtype(lens, "path differences", error, _WAVES, " waves RMS")
 
 
 def path_rounding(lens: Lens, scenes: Sequence[Scene], of_beams: bool = False) -> float:

@@ -13,7 +13,6 @@ kernel.
 
 import dataclasses
 import functools
-import warnings
 from typing import NamedTuple
 
 import jax
@@ -22,6 +21,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import warn
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import Numbers, brief, einsum, matmul, safe_divide, safe_sqrt
@@ -202,10 +202,9 @@ def chosen(
     good = [way for way in ways if way[1] <= tolerance]
     _, error, tile, picked = min(good) if good else min(ways, key=lambda way: way[1])
     if error > tolerance:
-        warnings.warn(
+        warn(
             f"the blur varies so much that kernels are interpolated to {error:.1e} only, not to "
-            f"{tolerance:.1e}: take a larger tolerance",
-            stacklevel=3,
+            f"{tolerance:.1e}: take a larger tolerance"
         )
     # Equal tiles, so that the last ones end about where the picture does.
     down, across = (-(-n // -(-n // tile)) for n in method.shape)

@@ -123,7 +123,7 @@ def spot_diagram(
     known = known_values((lens, found.rms))
     if known is not None:
         wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
-        warn_dtype(known[0], "spots", wrong, _ROUGH, " of their size", 2)
+        warn_dtype(known[0], "spots", wrong, _ROUGH, " of their size")
     return found
 
 

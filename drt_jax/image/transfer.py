@@ -124,7 +124,7 @@ def planned(
     require_one_of("kind", asked, get_args(Model))
     model = cast(Model, asked)
     if model == "waves":
-        warn_of_paths(lens, scene, 4, True)
+        warn_of_paths(lens, scene, True)
     if isinstance(sampling, Sampling):
         return Plan(model, sampling.rule, sampling.cells, TOLERANCE)
     rule, tolerance = sampling, TOLERANCE

@@ -256,7 +256,7 @@ def _checked(count: int, most: int) -> int:
 def _coefficients(lens: Lens, scene: Scene, rows: tuple[int, ...]) -> Array:
     """Coefficients (..., W, P) of terms given by their indices in Noll's order, counted from 0."""
     scene = checked_scene(lens, scene)
-    warn_of_paths(lens, scene, 4)
+    warn_of_paths(lens, scene)
     return _least_squares(lens, scene, rows)
 
 

@@ -267,8 +267,10 @@ def test_defocus_is_the_sensor_moved(double_gauss):
 
 @pytest.mark.slow
 def test_auto_says_how_good_the_gaussian_is(double_gauss):
-    with pytest.warns(UserWarning, match="of the light falls beside a kernel of 21 x 21 pixels"):
+    beside = "of the light falls beside a kernel of 21 x 21 pixels"
+    with pytest.warns(UserWarning, match=beside) as said:
         model = drt_jax.converge(drt_jax.psf, *double_gauss, PIXEL, SIZE, "auto", 0.2)
+    assert {one.filename for one in said} == {__file__}
     # Here the Gaussian misses the waves by more than half of the light.
     assert 0.3 < model.errors["gaussian"] < 2
     assert model.kind != "gaussian"

@@ -31,7 +31,7 @@ def size_told(radius, kind):
     waves, pixels = jnp.array([WAVE]), Pixels(jnp.array(PIXEL), 5)
     outside = np.array([[0.0], [0.2]])
     with pytest.warns(UserWarning, match="20 % of the light falls beside a kernel") as said:
-        module._warn(outside, [None, beam_of(radius)].__getitem__, waves, pixels, kind, 2)
+        module._warn(outside, [None, beam_of(radius)].__getitem__, waves, pixels, kind)
     assert said[0].filename == __file__
     return int(re.search(r"; (\d+) x \1 hold 99 %", str(said[0].message))[1])
 
@@ -40,7 +40,7 @@ def test_the_size_that_would_do():
     """Of rays all over a disc; of Airy's pattern, whose encircled energy is 1 - J0^2 - J1^2."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        module._warn(np.array([[0.01]]), None, None, None, "rays", 2)
+        module._warn(np.array([[0.01]]), None, None, None, "rays")
     assert 19 <= size_told(0.1, "rays") <= 21 and size_told(1e-6, "rays") == 7
     half = size_told(0.0, "waves") * PIXEL / 2
     v = 2 * np.pi * 0.1 * half / (WAVE * 1e-3)
