@@ -367,3 +367,6 @@ def test_the_promise_of_float32_is_kept_and_warned_of():
     sizes = [np.sqrt(np.trace(a.covariance, axis1=1, axis2=2)) for a in (found, exact)]
     np.testing.assert_allclose(*sizes, rtol=1e-3)
     psf_moments(single, Scene.point(*scene), 0.1)  # as asked for, and no warning
+    refusal = "sampling: in float32 the spot may be wrong by .*more than 1e-06.*or leave the toler"
+    with pytest.raises(ValueError, match=refusal):
+        psf_moments(single, Scene.point(*scene), 1e-6)

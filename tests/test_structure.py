@@ -46,7 +46,7 @@ ROOMS = {
     "drt_jax": 515,
     "drt_jax/design": 2383,
     "drt_jax/files": 2928,
-    "drt_jax/image": 2959,
+    "drt_jax/image": 2979,
     "drt_jax/learn": 624,
     "drt_jax/lens": 1480,
     "drt_jax/pupil": 692,
@@ -59,7 +59,7 @@ ROOMS = {
     "experiments/runs": 407,
     "experiments/speed": 684,
     "experiments/together": 411,
-    "experiments/trust": 1575,
+    "experiments/trust": 1586,
 }
 PUBLIC = 60
 # Outside packages that belong to some modules or floors alone.

@@ -41,7 +41,7 @@ from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
 from .refined import refine, require_known
-from .rounding import hit_rounding, warn_dtype
+from .rounding import check_dtype, hit_rounding
 from .spot import Moments
 
 # Smallest spot size that errors are taken relative to, mm: below 1 nm rounding would prevent
@@ -72,25 +72,26 @@ _AT_ONCE = 3
 _TILE = {1: 42, 2: 208}
 
 
-def psf_moments(lens: Lens, scene: Scene, sampling: float | PupilRule = _TOLERANCE) -> Moments:
+def psf_moments(lens: Lens, scene: Scene, sampling: float | PupilRule | None = None) -> Moments:
     """Centroid, covariance and throughput of the rays on the sensor. Paper section 4.3.
 
     lens, scene: the lens, and object points with their wavelengths.
     sampling: a tolerance, the relative error of the RMS spot size, from which a pupil rule is
         chosen; or a pupil rule, which is needed inside `jax.jit` and `jax.vmap`: `converge` makes
-        one outside. In float32 the error of a camera's spot is about 1e-3 of its size or of 4 um;
-        warns if that is above the tolerance.
+        one outside. None: 1e-6 or what the dtype allows, of which it warns. In float32 the error of
+        a camera's spot is about 1e-3 of its size or of 4 um.
 
     Returns `Moments`, with the points of the scene as first axes. Rays fill the stop uniformly.
     Differentiable in every mode, in the lens and the scene. ValueError as in
-    `lens.scene.checked_scene`, and if no ray of a wavelength arrives, with the surfaces that stop
-    its light. Inside a trace its `throughput` is then 0 and its covariance inf.
+    `lens.scene.checked_scene`, for a tolerance that the dtype does not allow, and if no ray of a
+    wavelength arrives, with the surfaces that stop its light. Inside a trace its `throughput` is
+    then 0 and its covariance inf.
     """
     return _moments(lens, scene, sampling, at_sensor).at(lens.sensor)
 
 
 def focus_moments(
-    lens: Lens, scene: Scene, sampling: float | PupilRule = _TOLERANCE
+    lens: Lens, scene: Scene, sampling: float | PupilRule | None = None
 ) -> FocusMoments:
     """Moments of the rays as functions of the sensor position; the sensor is flat.
 
@@ -104,7 +105,7 @@ def focus_moments(
     return _moments(lens, scene, sampling, best_focus)
 
 
-def converged_rule(lens: Lens, scene: Scene, tolerance: float = _TOLERANCE) -> PupilRule:
+def converged_rule(lens: Lens, scene: Scene, tolerance: float | None = None) -> PupilRule:
     """The pupil rule that keeps the relative error of the RMS spot size on the sensor within a
     tolerance, for every point of a scene.
 
@@ -118,7 +119,7 @@ def converged_rule(lens: Lens, scene: Scene, tolerance: float = _TOLERANCE) -> P
     return find_rule(lens, scene, tolerance, at_sensor).rule
 
 
-def converged_focus_rule(lens: Lens, scene: Scene, tolerance: float = _TOLERANCE) -> PupilRule:
+def converged_focus_rule(lens: Lens, scene: Scene, tolerance: float | None = None) -> PupilRule:
     """`converged_rule` for every sensor position: the tolerance also holds where the spot is
     smallest.
 
@@ -148,7 +149,7 @@ def best_focus(spread: np.ndarray) -> list[np.ndarray]:
 
 
 def _moments(
-    lens: Lens, scene: Scene, sampling: float | PupilRule, places: Callable
+    lens: Lens, scene: Scene, sampling: float | PupilRule | None, places: Callable
 ) -> FocusMoments:
     """`psf_moments` and `focus_moments`; `places` is `at_sensor` or `best_focus`."""
     if not isinstance(sampling, PupilRule):
@@ -214,18 +215,19 @@ class _Trial(NamedTuple):
 
 
 def find_rule(
-    lens: Lens, scene: Scene, tolerance: float, places: Callable, warns: bool = True
+    lens: Lens, scene: Scene, tolerance: float | None, places: Callable, warns: bool = True
 ) -> _Trial:
     """Finds the rule that meets a tolerance for all points of a scene.
 
     lens, scene: the lens and the scene.
-    tolerance: relative error of the RMS spot size.
+    tolerance: relative error of the RMS spot size, see `psf_moments`.
     places: `at_sensor` or `best_focus`.
-    warns: whether it warns of rounding.
+    warns: whether it warns of rounding, or refuses a tolerance because of it.
 
     Returns the trial of that rule. ValueError inside a trace.
     """
-    tolerance = require_tolerance(tolerance)
+    asked = tolerance is not None
+    tolerance = require_tolerance(tolerance if asked else _TOLERANCE)
     known = require_known((lens, scene), "the number of rays", "psf_moments")
     # `eval_context` leaves any trace that this is called in, so all that follows is known.
     with jax.core.eval_context():
@@ -257,7 +259,7 @@ def find_rule(
             return trials[-1]
         rounded = rounding(trials[-1])
         if warns:
-            warn_dtype(lens, "the spot", rounded, tolerance, " of its size")
+            check_dtype(lens, "the spot", rounded, tolerance, " of its size", asked)
         # If rounding hides the differences, take the last of the three.
         return trials[-1 if 2 * rounded > tolerance else 0]
 

@@ -20,6 +20,7 @@ from ..rays.solve import solve_reverse
 from .converged import converged_focus_rule, focus_moments
 from .moments import FocusMoments, moments
 from .refined import refine
+from .rounding import below_double
 from .spot import Moments
 from .zernike import chebyshev
 
@@ -28,6 +29,8 @@ _NODES = (4, 8, 16, 32, 64)
 # Relative amount by which a distance may exceed its range, because 1 / (1 / far) is not exactly
 # far.
 _ROUNDED = 1e-5
+# Default tolerance of the moments of the nodes and of their series.
+_TOLERANCE = 1e-9
 
 
 @jax.tree_util.register_dataclass
@@ -60,12 +63,13 @@ class DepthMoments:
         return jax.tree.map(lambda c: tensordot(basis, c, axes=1), self.series)
 
 
-def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMoments:
+def depth_moments(lens: Lens, scene: Scene, tolerance: float | None = None) -> DepthMoments:
     """Moments for every sensor position and every distance between those of a scene.
 
     lens: the lens.
     scene: one field at the nearest and the farthest distance, as of `Scene.point`.
-    tolerance: bound of the last coefficients of the moments, relative to the largest.
+    tolerance: bound of the last coefficients of the moments, relative to the largest. None: 1e-9
+        or, in float32, what that allows.
 
     Returns `DepthMoments`. The number of Chebyshev nodes in 1/distance doubles until the tolerance
     is met, from 4 to at most 64, where it warns; each node has its own converged rule. ValueError
@@ -77,6 +81,8 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMom
     if not 0 < near < far:
         raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
     low, high = 1 / far, 1 / near
+    bound = tolerance or _TOLERANCE
+    each = tolerance if below_double(lens) else bound
 
     def interpolated(count: int) -> FocusMoments:
         """Chebyshev coefficients from the moments at a number of nodes."""
@@ -84,7 +90,7 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMom
         nodes = (high + low) / 2 + (high - low) / 2 * np.cos(angle)
         transform = 2 / count * np.cos(np.outer(np.arange(count), angle))
         transform[0] /= 2
-        traced = [focus_moments(lens, scene.at(scene.field, 1 / node), tolerance) for node in nodes]
+        traced = [focus_moments(lens, scene.at(scene.field, 1 / node), each) for node in nodes]
 
         def series(*values: Array) -> Array:
             return tensordot(jnp.asarray(transform, values[0].dtype), jnp.stack(values), axes=1)
@@ -97,18 +103,18 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float = 1e-9) -> DepthMom
         tails = (float(jnp.max(jnp.abs(c[-2:])) / jnp.max(jnp.abs(c))) for c in parts)
         return max(tails, default=0.0)
 
-    (series,), left = refine(map(interpolated, _NODES), tail, tolerance, together=1)
-    if left > tolerance:
+    (series,), left = refine(map(interpolated, _NODES), tail, bound, together=1)
+    if left > bound:
         warn(
             f"the moments between {near:g} and {far:g} mm are interpolated to {left:.1e} only, not "
-            f"to {tolerance:.1e}; narrow the range"
+            f"to {bound:.1e}; narrow the range"
         )
     dtype = lens.curvature.dtype
     return DepthMoments(jnp.asarray(near, dtype), jnp.asarray(far, dtype), series)
 
 
 def moments_model(
-    lens: Lens, trained: tuple[str, ...], scene: Scene, tolerance: float = 1e-6
+    lens: Lens, trained: tuple[str, ...], scene: Scene, tolerance: float | None = None
 ) -> tuple[dict[str, Array], Callable[[dict[str, Array], Array], Moments]]:
     """The cheapest exact model of the moments for trained parameters. If only the sensor is
     trained, the model is a polynomial in the sensor position and 1/distance; otherwise it traces

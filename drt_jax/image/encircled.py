@@ -24,7 +24,7 @@ from ..numerics import Numbers, batched, einsum, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
 from .beam_psf import Sampling, ray_spots, spot_below
-from .refined import TOLERANCE, beams_of, to_tolerance
+from .refined import beams_of, to_tolerance
 from .transfer import Model, centre_of, places_of, planned, through_focus
 from .wave_psf import amplitudes, autocorrelation, period
 
@@ -44,7 +44,7 @@ def encircled_energy(
     radii: Numbers,
     kind: Model | None = None,
     focus: Numbers = 0.0,
-    sampling: float | PupilRule | Sampling = TOLERANCE,
+    sampling: float | PupilRule | Sampling | None = None,
 ) -> Array:
     """Fraction of the light on the sensor within circles about the centroid of all wavelengths.
 

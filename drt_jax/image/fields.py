@@ -28,6 +28,7 @@ from .kernel import check_pixels
 from .moments import moments
 from .psf import chosen_psf, psf
 from .refined import require_known
+from .rounding import check_dtype
 from .spot import Moments
 
 # Number of nodes along each axis from which a kernel is interpolated.
@@ -267,7 +268,9 @@ def grid_method(
         if not isinstance(sampling, Sampling):
             where = Scene.grid(*_extremes(tangents, far, arrives), scene.wavelengths)
             # No warning here of light outside of these kernels: the nodes may lose more.
-            sampling = chosen_psf(lens, where, pixel, size, kind, sampling, norm)[0]
+            bound = sampling
+            sampling, view = chosen_psf(lens, where, pixel, size, kind, bound, norm)
+            check_dtype(lens, "kernels", view.rounded, bound, "")
         # For each node, the nearest one with light.
         squared = np.sum((tangents[:, None] - tangents[None]) ** 2, axis=-1)
         nearest = np.argmin(np.where(arrives[:, None], squared[None], np.inf), axis=-1)

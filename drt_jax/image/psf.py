@@ -27,7 +27,7 @@ from .beam_psf import Kind, Psf, Sampling, psf_of_beam
 from .converged import at_sensor, find_rule
 from .kernel import Pixels, check_pixels
 from .refined import STEP, beams_of, refine, require_known
-from .rounding import below_double, hit_rounding, path_rounding, warn_dtype
+from .rounding import below_double, check_dtype, hit_rounding, path_rounding
 from .wave_psf import period
 from .zernike import zernike
 
@@ -50,7 +50,7 @@ def psf(
     pixel: Numbers,
     size: int = 21,
     kind: Kind | Literal["auto"] = "auto",
-    sampling: float | Sampling = _TOLERANCE,
+    sampling: float | Sampling | None = None,
     centre: Numbers | None = None,
     defocus: Numbers = 0.0,
 ) -> Psf:
@@ -63,7 +63,8 @@ def psf(
     kind: "gaussian", "rays", "waves", or "auto": the cheapest of these within the tolerance of
         "waves".
     sampling: a tolerance, the bound of the sum of the absolute errors of a kernel's pixels; or a
-        `Sampling`, which has its own kind and is needed inside `jax.jit` and `jax.vmap`.
+        `Sampling`, which has its own kind and is needed inside `jax.jit` and `jax.vmap`. None: 1e-2
+        or what the dtype allows, of which it warns.
     centre: (2,), mm, centre of the kernel on the sensor; by default the mean of the centroids of
         the wavelengths.
     defocus: (), mm by which the sensor is moved back. This needs no new ray trace.
@@ -116,7 +117,7 @@ def converged_psf(
     pixel: Numbers,
     size: int = 21,
     kind: Kind | Literal["auto"] = "auto",
-    tolerance: float = _TOLERANCE,
+    tolerance: float | None = None,
     norm: int = 1,
     of: Of = "kernel",
 ) -> Sampling:
@@ -127,21 +128,24 @@ def converged_psf(
     size: number of pixels along a side of the kernels.
     kind: "gaussian", "rays", "waves", or "auto": the cheapest of these within the tolerance of
         "waves"; `Sampling.errors` then gives the differences of the other kinds.
-    tolerance: bound of the sum of the absolute errors of a kernel's pixels.
+    tolerance: bound of the sum of the absolute errors of a kernel's pixels; None as in `psf`.
     norm: 1; or 2, to bound the root of the sum of the squared errors, which is the error of a
         white-noise picture.
     of: "kernel": the tolerance bounds the kernel alone; the relative error of its derivatives was
         up to five times as large. "gradient": a fifth of the tolerance is used, so that it holds
         for both.
 
-    All numbers must be known; ValueError inside a trace. Warns if no degree or no grid that is
-    tried meets the tolerance; if rounding does not allow it, as in float32 for waves from a large
-    lens, where the search ends at the accuracy that rounding allows; and if more than 1 % of the
-    light falls outside of the kernel, with a size for which less does.
+    All numbers must be known; ValueError inside a trace, and for a tolerance that the dtype does
+    not allow, as float32 for waves from a large lens. Warns if no degree or no grid that is tried
+    meets the tolerance, and if more than 1 % of the light falls outside of the kernel, with a size
+    for which less does.
     """
     require_one_of("of", of, get_args(Of))
-    bound = tolerance / 5 if of == "gradient" else tolerance
+    asked = tolerance is not None
+    bound = require_tolerance(tolerance if asked else _TOLERANCE)
+    bound = bound / 5 if of == "gradient" else bound
     found, view = chosen_psf(lens, scene, pixel, size, kind, bound, norm)
+    check_dtype(lens, "kernels", view.rounded, bound, "", asked)
     outside = np.stack([one.outside for one in view.psfs(found.kind, found.cells)])
     _warn(outside, view.beams.__getitem__, view.wavelengths, view.pixels, found.kind)
     return found
@@ -151,9 +155,11 @@ def chosen_psf(
     lens: Lens, scene: Scene, pixel: Numbers, size: int, kind: Kind | Literal["auto"],
     tolerance: float, norm: int = 1
 ) -> tuple[Sampling, "_View"]:  # fmt: skip
-    """`converged_psf` without its warning of light outside of the kernels.
+    """`converged_psf` without its warning of light outside of the kernels, and without regard to
+    whether the dtype allows the tolerance: the search ends at the accuracy that rounding allows.
 
-    Returns the sampling, and the `_View` with the beams that it was chosen for.
+    Returns the sampling, and the `_View` with the beams that it was chosen for and the error from
+    rounding.
     """
     require_one_of("kind", kind, (*get_args(Kind), "auto"))
     require_tolerance(tolerance)
@@ -194,7 +200,6 @@ def chosen_psf(
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
         view = _View(lens, waves, beams, pixels, norm)
         worst = max(rounded.get("phase", 0.0), view.hit_error(kind))
-        warn_dtype(lens, "kernels", worst, tolerance, "")
         view = dataclasses.replace(view, rounded=worst)
         return view.sampling(kind, rule_of(degree), tolerance), view
 
@@ -422,7 +427,8 @@ def gaussian_error(
     if known is None:
         raise ValueError("gaussian_error compares known numbers: call it outside of jax.jit")
     lens, scene, pixel = known
-    fine = chosen_psf(lens, scene, pixel, size, "waves", tolerance)[0]
+    fine, view = chosen_psf(lens, scene, pixel, size, "waves", tolerance)
+    check_dtype(lens, "kernels", view.rounded, tolerance, "")
     models = Sampling("gaussian", fine.rule, 0), fine
     found = []
     for point in checked_scene(lens, scene).each():

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
-from ..inputs import warn
+from ..inputs import require, warn
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import Scene
@@ -42,19 +42,24 @@ def below_double(lens: Lens) -> bool:
     return float(jnp.finfo(lens.curvature.dtype).eps) > _DOUBLE
 
 
-def warn_dtype(lens: Lens, what: str, wrong: float, allowed: float, unit: str) -> None:
+def check_dtype(
+    lens: Lens, what: str, wrong: float, allowed: float, unit: str, asked: bool = False
+) -> None:
     """Warns if the dtype of a lens is less precise than float64 and an error exceeds what is
-    allowed.
+    allowed; ValueError instead if that was asked for.
 
     what: name of the quantity, for the message.
     wrong, allowed: estimated error and bound.
     unit: text behind the number in the message.
+    asked: True if `allowed` is a tolerance that the caller gave.
     """
     if below_double(lens) and wrong > allowed:
-        warn(
+        message = (
             f"in {lens.curvature.dtype} {what} may be wrong by {wrong:.0e}{unit}, more than "
             f'{allowed:.0e}: jax.config.update("jax_enable_x64", True) before the lens is loaded'
         )
+        require(not asked, f"sampling: {message}, or leave the tolerance out and take that error")
+        warn(message)
 
 
 def hit_rounding(lens: Lens) -> float:
@@ -82,12 +87,15 @@ def warn_of_focus(lens: Lens, scene: Scene) -> None:
         # From mm to waves in um.
         worst = max(float(jnp.max(aperture / waves)) for aperture in apertures)
         moved = 1e3 * hit_rounding(lens) * worst
-    warn_dtype(lens, "the focus", moved, _FOCUS, " of its depth")
+    check_dtype(lens, "the focus", moved, _FOCUS, " of its depth")
 
 
-def warn_of_paths(lens: Lens, scene: Scene, of_beams: bool = False) -> None:
+def warn_of_paths(
+    lens: Lens, scene: Scene, of_beams: bool = False, tolerance: float | None = None
+) -> None:
     """Warns if rounding makes path differences wrong by more than `_WAVES`, if the numbers are
-    known.
+    known; with a tolerance, ValueError if that makes a contrast wrong by more. A path that is wrong
+    by e waves turns a wave by 2 pi e radians, which changes a contrast by at most that.
 
     of_beams: as in `path_rounding`.
     """
@@ -97,7 +105,10 @@ def warn_of_paths(lens: Lens, scene: Scene, of_beams: bool = False) -> None:
     lens, scene = known
     with jax.core.eval_context():
         error = path_rounding(lens, scene.each(), of_beams)
-    warn_dtype(lens, "path differences", error, _WAVES, " waves RMS")
+    if tolerance is None:
+        check_dtype(lens, "path differences", error, _WAVES, " waves RMS")
+    else:
+        check_dtype(lens, "contrast", 2 * np.pi * error, tolerance, "", True)
 
 
 def path_rounding(lens: Lens, scenes: Sequence[Scene], of_beams: bool = False) -> float:

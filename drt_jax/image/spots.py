@@ -37,7 +37,7 @@ from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
 from .converged import converged_rule
-from .rounding import hit_rounding, warn_dtype
+from .rounding import check_dtype, hit_rounding
 from .spot import normalised
 from .wavefront import reference_curvature
 
@@ -123,7 +123,7 @@ def spot_diagram(
     known = known_values((lens, found.rms))
     if known is not None:
         wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
-        warn_dtype(known[0], "spots", wrong, _ROUGH, " of their size")
+        check_dtype(known[0], "spots", wrong, _ROUGH, " of their size")
     return found
 
 

@@ -68,7 +68,7 @@ def transfer(
     frequencies: Numbers,
     kind: Model | None = None,
     focus: Numbers = 0.0,
-    sampling: float | PupilRule | Sampling = TOLERANCE,
+    sampling: float | PupilRule | Sampling | None = None,
 ) -> Transfer:
     """Optical transfer functions over frequency, field and focus, see `Transfer`.
 
@@ -79,12 +79,13 @@ def transfer(
     focus: (), mm by which the sensor is moved back; or (Z,), through focus: arrays are then
         (..., Z, 2, N), and no more rays are traced.
     sampling: a tolerance, the absolute error of the contrast, to which the cells of the pupil grid
-        are chosen; a pupil rule, whose symmetry and kind (`Gauss` or `Clipped`) are taken, with
-        cells for 1e-3, or 128 of them inside `jit` and `vmap`; or a `Sampling`, for all of it.
+        are chosen; None: 1e-3, or what the dtype allows; a pupil rule, whose symmetry and kind
+        (`Gauss` or `Clipped`) are taken, with cells for 1e-3, or 128 of them inside `jit` and
+        `vmap`; or a `Sampling`, for all of it.
 
     Differentiable in every mode. For waves, warns of float32 as `wavefront` does. ValueError as of
     `lens.scene.checked_scene`, without a rule inside a trace, and for a tolerance that is not
-    between 0 and 1. Warns if the tolerance is not met.
+    between 0 and 1, or that the dtype does not allow. Warns if the tolerance is not met.
     """
     scene, plan = checked_scene(lens, scene), planned(lens, scene, kind, sampling)
     values, steps = places_of(lens, "frequencies", frequencies, focus)
@@ -111,7 +112,7 @@ class Plan(NamedTuple):
 
 
 def planned(
-    lens: Lens, scene: Scene, kind: Model | None, sampling: float | PupilRule | Sampling
+    lens: Lens, scene: Scene, kind: Model | None, sampling: float | PupilRule | Sampling | None
 ) -> Plan:
     """The `Plan` of a sampling, see `transfer`; for waves, warns of float32.
 
@@ -120,16 +121,18 @@ def planned(
     own = sampling if isinstance(sampling, Sampling) else None
     if own is not None and kind not in (None, own.kind):
         raise ValueError(f"kind: the sampling is of the kind {own.kind!r}, got {kind!r}")
-    asked = kind or ("waves" if own is None else own.kind)
-    require_one_of("kind", asked, get_args(Model))
-    model = cast(Model, asked)
+    model = cast(Model, kind or ("waves" if own is None else own.kind))
+    require_one_of("kind", model, get_args(Model))
+    asked = None
+    if not (sampling is None or isinstance(sampling, PupilRule | Sampling)):
+        asked = require_tolerance(sampling)
     if model == "waves":
-        warn_of_paths(lens, scene, True)
+        warn_of_paths(lens, scene, True, asked)
     if isinstance(sampling, Sampling):
         return Plan(model, sampling.rule, sampling.cells, TOLERANCE)
-    rule, tolerance = sampling, TOLERANCE
+    rule, tolerance = sampling, asked or TOLERANCE
     if not isinstance(rule, PupilRule):
-        rule, tolerance = light_rule(lens, scene), require_tolerance(rule)
+        rule = light_rule(lens, scene)
     return Plan(model, beam_rule(DEGREE, rule.symmetry, rule), None, tolerance)
 
 
@@ -144,7 +147,7 @@ def places_of(lens: Lens, name: str, places: Numbers, focus: Numbers) -> tuple[A
     return values, steps
 
 
-def strehl(lens: Lens, scene: Scene, sampling: float | PupilRule | Sampling = TOLERANCE) -> Array:
+def strehl(lens: Lens, scene: Scene, sampling: float | PupilRule | Sampling | None = None) -> Array:
     """Strehl ratio: the irradiance at the centre of the image of a point, relative to that without
     aberrations in the same pupil: `|integral of P|^2 / (integral of |P|)^2` over direction cosines.
 

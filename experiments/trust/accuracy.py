@@ -226,10 +226,18 @@ def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
     ]
     tolerances = []
     for tolerance in config.tolerances:
-        rule = drt_jax.converge(drt_jax.psf_moments, *arguments, tolerance)
+        row = dict.fromkeys(("tolerance", "order", "rays", "relative_error")) | {
+            "tolerance": tolerance
+        }
+        tolerances.append(row)
+        try:
+            rule = drt_jax.converge(drt_jax.psf_moments, *arguments, tolerance)
+        except ValueError as refusal:  # float32 does not allow it
+            if scene.dtype == "float64":
+                raise refusal
+            continue
         error = spot_errors(truth, *spot(*arguments, rule))[0]
-        row = {"tolerance": tolerance, "order": rule.order, "rays": count_rays(arguments, rule)}
-        tolerances.append(row | {"relative_error": error})
+        row |= {"order": rule.order, "rays": count_rays(arguments, rule), "relative_error": error}
     known = {"wavelength_um": config.wavelengths_um, "sigma_mm": truth.sigma}
     known |= {"centroid_mm": truth.centroid, "reference_error": truth.error}
     known |= {"reference_gradient_error": truth.gradient_error}
@@ -265,8 +273,11 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     for (panel,), some in grouped(tolerances, "panel").items():
         cells = [panel]
         for rows in grouped(some, "tolerance").values():
-            worst, most = (max(row[k] for row in rows) for k in ("relative_error", "rays"))
-            cells.append(f"{most}, {worst:.1e}")
+            kept = [row for row in rows if row["rays"] is not None]
+            worst, most = (
+                max((row[k] for row in kept), default=0) for k in ("relative_error", "rays")
+            )
+            cells.append(f"{most}, {worst:.1e}" if len(kept) == len(rows) else "refused")
         costs.append(cells)
     first = "most rays a colour, worst error"
     columns = [f"{tolerance:.0e}" for (tolerance,) in grouped(tolerances, "tolerance")]

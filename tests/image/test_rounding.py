@@ -138,6 +138,21 @@ def test_kernels_of_rays_that_rounding_spoils_are_told(name, pixel, loud):
 
 
 @pytest.mark.slow
+def test_a_tolerance_that_rounding_spoils_is_refused():
+    """Where it is asked for; what is left to the call is a warning, see above."""
+    small, scene = single("microscope_objective"), Scene.point(0.0, np.inf, GREEN)
+    remedy = (
+        'sampling: in float32 {} may be wrong by .*"jax_enable_x64", True.*leave the tolerance out'
+    )
+    with pytest.raises(ValueError, match=remedy.format("kernels")):
+        drt_jax.psf(small, scene, 5e-4, 15, "rays", 1e-3)
+    with pytest.raises(ValueError, match=remedy.format("contrast")):
+        drt_jax.strehl(single("hubble"), scene, 1e-3)
+    double = drt_jax.load_lens("microscope_objective")
+    assert drt_jax.psf(double, scene, 5e-4, 15, "rays", 1e-3).kernel.dtype == np.float64
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["rays", "kernel", "contrast", "energy"])
 def test_no_product_is_rounded_by_a_gpu(answer):
     """GPUs round the factors of float32 products of matrices to 10 bits unless a program asks for
