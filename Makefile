@@ -15,6 +15,7 @@ install: .venv/installed
 demo: install
 	$(BIN)/python -m experiments.focus --out $(OUT)/focus
 	$(BIN)/python -m experiments.edof --config configs/demo/edof.yaml --out $(OUT)/edof
+	$(BIN)/python -m drt_jax check | tail -n 1
 	@echo "Demo finished: open $(OUT)/focus/report.html and $(OUT)/edof/report.html"
 
 # Style and types.

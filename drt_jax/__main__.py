@@ -1,12 +1,15 @@
 """`python -m drt_jax show my_lens.yaml`: what a lens is, before anything is done with it; `convert`
-writes a lens file in the format of another program; `glass N-BK7`: what a glass is."""
+writes a lens file in the format of another program; `glass N-BK7`: what a glass is; `check`:
+whether this machine computes what it should."""
 
 import argparse
 import contextlib
 import dataclasses
+import json
 import math
 import pathlib
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 
@@ -14,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .check.run import kept_programs, machine, report, rows
+from .check.truth import TRUTHS
 from .compilation import ONCE, jit, keep_programs
 from .files.load import System, lens_names, load_lens, load_system
 from .files.write import save_lens
@@ -42,7 +47,7 @@ _NO_SIZE = 1e-9  # mm, mrad: a smaller spot is only rounding error
 def _options(argv: list[str] | None) -> argparse.Namespace:
     """The parsed command line."""
     parser = argparse.ArgumentParser(prog="python -m drt_jax", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="show, convert or glass")
+    commands = parser.add_subparsers(required=True, metavar="show, convert, glass or check")
 
     def command(name: str, run: Callable, about: str) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=about, description=about)
@@ -71,6 +76,10 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     convert.add_argument("--missing", choices=("error", "warn"), default="error", help=_MISSING)
     about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
     glasses.arguments(command("glass", lambda options: _write(glasses.told(options)), about))
+    about = "about ten scenes against numbers of other programs; exit status 1 if one is wrong"
+    check = command("check", run_check, about)
+    check.add_argument("scenes", nargs="*", help=f"some of {', '.join(TRUTHS)}; default: all")
+    check.add_argument("--json", type=pathlib.Path, help="a file for all of it, for a bug report")
     return parser.parse_args(argv)
 
 
@@ -318,6 +327,38 @@ def run_show(options: argparse.Namespace) -> None:
             figure.supxlabel(options.note.strip(" !"), fontsize=7, x=0.01, ha="left")
             figure.savefig(out)
     _write([f"drawn in {out}"])
+
+
+def run_check(options: argparse.Namespace) -> None:
+    """Compares the scenes with their truth, prints a table, and exits with 1 if one is wrong."""
+    names = options.scenes or [*TRUTHS]
+    if unknown := [name for name in names if name not in TRUTHS]:
+        raise ValueError(f"scenes: no {unknown[0]!r}; known: {', '.join(TRUTHS)}")
+    began, about, kept = time.perf_counter(), machine(), kept_programs()
+    _write([*(f"{name:<11} {value}" for name, value in about.items()), ""])
+    _show_task("compiling and comparing: up to a minute and a half if nothing is kept")
+    found = [*rows(names)]
+    head = f"{'scene':<9}{'compared':<49}{'error':>8} {'allowed':<19}"
+    _write([f"{head}{'first s':>7}{'again ms':>10}{'usual':>7}"])
+    for row in found:
+        truth = TRUTHS[row.name]
+        line = f"{row.name:<9}{truth.about:<49}"
+        if row.error is None:
+            _write([f"{line}  FAILED", f"  ! {row.message}"])
+            continue
+        allowed = f"{truth.allowed:.1e} {truth.unit}"
+        times = f"{row.first:>7.1f}{row.again:>10.2g}{truth.usual:>7g}"
+        _write([f"{line}{row.error:>8.1e} {allowed:<19}{times}  {'ok' if row.right else 'WRONG'}"])
+        if not row.right:
+            _write([f"  ! expected: {truth.source}; allowed: {truth.why}"])
+    seconds, right = time.perf_counter() - began, sum(row.right for row in found)
+    new = "" if kept is None else f", {(kept_programs() or 0) - kept} programs compiled and kept"
+    _write(["", f"{right} of {len(found)} scenes are right, in {seconds:.0f} s{new}"])
+    if options.json:
+        text = json.dumps(report(found, about, seconds), indent=2)
+        options.json.write_text(text + "\n", encoding="utf-8")
+    if right < len(found):
+        raise SystemExit(1)
 
 
 def set_up() -> None:

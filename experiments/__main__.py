@@ -1,5 +1,5 @@
 """The command `drt-jax`: `drt-jax focus` is `python -m experiments.focus`, and so for every
-experiment; `drt-jax show LENS`, `convert` and `glass` are those of `python -m drt_jax`.
+experiment; `drt-jax show LENS`, `convert`, `glass` and `check` are those of `python -m drt_jax`.
 """
 
 import pkgutil
@@ -16,6 +16,7 @@ _ABOUT = """usage: drt-jax COMMAND ...
   show LENS      what a lens is: focal lengths, spots, what clips it, a sheet of analyses
   convert A B    a lens file of Zemax, CODE V or ours in another format
   glass NAME     what a glass is, and which others lie next to it
+  check          whether this machine computes what it should: begin here, and bug reports, too
 
 experiments, each with --help:
 """
