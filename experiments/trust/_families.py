@@ -1,6 +1,7 @@
 """Families of random scenes made to break a ray tracer, each of one static structure."""
 
 import dataclasses
+import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -21,6 +22,16 @@ from ._scenes import (
     scenes_of,
     two_elements,
 )
+from ._situations import (
+    FILES,
+    Conjugate,
+    at_focus,
+    behind_vertex,
+    far_away,
+    files,
+    immersed,
+    inside_focus,
+)
 
 _FREEFORM = ("biconic", "toroid", "odd_asphere", "polynomial_xy", "asphere", "asphere")
 _PLASTICS = (1.535, 1.544, 1.614, 1.661)
@@ -35,6 +46,7 @@ class Family(NamedTuple):
     make: (generator, count, variant) -> scenes.
     variants: variants, each with the same number of scenes.
     share: number of scenes relative to a family of full size.
+    needs: a folder without which there are no scenes.
     """
 
     what: str
@@ -42,6 +54,7 @@ class Family(NamedTuple):
     variants: tuple = (0, 2, 4)
     share: float = 1.0
     dtype: str = "float64"
+    needs: pathlib.Path | None = None
 
 
 def elements(change: Callable | None = None, f_number: tuple = (1.4, 16), **scenes: Any) -> Make:
@@ -276,6 +289,13 @@ _SPHERES = Walk(local_mirror, (0.2, 10), width=0.01)
 _TOROIDS = _SPHERES._replace(form="toroid")
 _SLENDER = Walk(conic_mirror, (2, 10), width=0.01, least=0.015)
 _TURNED = "paraboloids that turn light by 30 to 150 degrees, from a focus to parallel and back"
+_RIGHT = "off-axis paraboloids that turn light by 80 to 100 degrees, alone and in pairs"
+_IMMERSED = "object, image or both in a medium of index 1.3 to 1.9"
+_INSIDE = "object inside the focal length: light diverges; sensor behind or at the virtual image"
+_COLLIMATED = "object at the front focus, real or virtual: light leaves collimated"
+_VIRTUAL = "the sensor at a virtual image in front of the last surface"
+_CONVERGING = "virtual objects: light converges to a point 1 to 20 radii of the stop behind vertex"
+_FILES = "lens files of another program, refracting, off by 3 %, padded to one structure"
 _CAMERAS = ("double_gauss", "cooke_triplet", "singlet")
 _RIMS = ("camera_50mm", "phone", "telephoto_300mm")
 _WIDEST = {"singlet": 5.0, "double_gauss": 14.0, "phone": 32.0, "telephoto_300mm": 4.0}  # degrees
@@ -315,6 +335,13 @@ FAMILIES = {
     "grazing": Family("spheres met at 85 to 89.9 degrees", _SPHERES, _WALKS[:2], 0.5),
     "toroids": Family("toroids met at 85 to 89.9 degrees", _TOROIDS, _WALKS[:2], 0.5),
     "slender": Family("conics about the beam, met at 85 to 89 degrees", _SLENDER, _WALKS[:2], 0.5),
+    "right angle": Family(_RIGHT, Walk(conic_mirror, (80, 100), parallel=True), _WALKS),
+    "immersed": Family(_IMMERSED, elements(immersed), share=0.5),
+    "inside focus": Family(_INSIDE, Conjugate(inside_focus, 0.5), share=0.5),
+    "collimated": Family(_COLLIMATED, Conjugate(at_focus), share=0.5),
+    "virtual image": Family(_VIRTUAL, Conjugate(far_away, 1.0), share=0.5),
+    "virtual object": Family(_CONVERGING, Conjugate(behind_vertex, 0.5), share=0.5),
+    "files": Family(_FILES, files, ("refracting",), 1.0, needs=FILES),
 }
 
 

@@ -17,7 +17,7 @@ from drt_jax.numerics import safe_sqrt
 from drt_jax.rays.status import reaches_sensor
 
 from ._scenes import WAVELENGTH, Scenes
-from .snell import QUICK, trace_snell
+from .snell import QUICK, trace_snell, virtual
 
 _BATCH = 104  # scenes of a call: all batches of one structure share a compiled program
 _BOTH = 4  # every 4th scene of a float64 family is traced in float32 too
@@ -81,6 +81,7 @@ def _residual(lens, field, distance, pupil, points):
     length = jnp.linalg.norm(steps, axis=1)
     inverse = 1 / jnp.where(length > 0, length, jnp.finfo(points.dtype).tiny ** 0.5)
     e, size = steps * inverse[:, None], jnp.max(jnp.abs(points))
+    e = e.at[-1].multiply(jnp.where(virtual(lens)[-1], -1, 1))  # prolonged backwards
     miss = _place(lens, stop, points[stop])[:2] - lens.semi_diameter[stop] * pupil
     error, steepest = jnp.max(jnp.abs(miss)) / (1 + size), jnp.zeros_like(size)
     for k, i in enumerate(lens.active):
@@ -134,15 +135,16 @@ def _shoot(lens, field, distance, point):
     """Sequential trace of the ray through a point (3,) in front of the lens."""
     direction = _entering(point, field, distance)
     wavelength, size = jnp.asarray(WAVELENGTH, point.dtype), jnp.linalg.norm(direction)
-    return trace_snell(lens, wavelength, point, direction / size, size * distance)
+    begun = jnp.where(distance > 0, size * distance, jnp.inf)  # a virtual object is no beginning
+    return trace_snell(lens, wavelength, point, direction / size, begun)
 
 
 @_over_scenes
 def _retrace(lens, field, distance, points):
     """Difference of the points (RAYS, S + 1, 3) of each ray from a sequential trace through the
-    first of them, relative to their size and to the growth of a shift of the start; and whether
-    that trace fails, and its four neighbours all arrive or all fail (at the edge of the beam, where
-    some do, either may be right)."""
+    first of them: relative to their size and to the growth of a shift of the start; in mm, 0 if
+    that trace fails; and whether it fails, and its four neighbours all arrive or all fail (at the
+    edge of the beam, where some do, either may be right)."""
 
     def one(points):
         size = 1 + jnp.max(jnp.abs(points))
@@ -152,7 +154,7 @@ def _retrace(lens, field, distance, points):
         growth = jnp.max(jnp.abs(hits[1:] - hits[:1])) / (1e-7 * size)
         off = jnp.max(jnp.abs(hits[0] - points))
         denied = ~ok[0] & (jnp.all(ok[1:]) | ~jnp.any(ok[1:]))
-        return off / (size * (1 + jnp.nan_to_num(growth))), denied
+        return off / (size * (1 + jnp.nan_to_num(growth))), jnp.where(ok[0], off, 0), denied
 
     return jax.vmap(one)(points)
 
@@ -202,7 +204,9 @@ def _search(lens, field, distance, pupil):
 
 
 def _infinite(*found: Any) -> np.ndarray:
-    return np.array([np.sum(~np.isfinite(leaf)) for leaf in jax.tree.leaves(found)])
+    """Numbers that are not finite, by scene."""
+    leaves = [~np.isfinite(leaf) for leaf in jax.tree.leaves(found)]
+    return np.sum([np.sum(bad, axis=tuple(range(1, bad.ndim))) for bad in leaves], axis=0)
 
 
 def survey(scenes: Scenes) -> dict[str, np.ndarray]:
@@ -213,8 +217,8 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray]:
     status = rays.status[:, 0]
     exact = jax.tree.map(np.float64, scenes)
     good = reaches_sensor(status)
-    off, denied = _retrace(*exact[:3], rays.points[:, 0].astype(float))
-    ratio = off / np.finfo(dtype).eps
+    relative, off, denied = _retrace(*exact[:3], rays.points[:, 0].astype(float))
+    ratio = relative / np.finfo(dtype).eps
     # Scenes rounded to float32, in both precisions.
     rough, single = scenes, rays
     if dtype != np.float32:
@@ -232,6 +236,7 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray]:
         "nan_gradients": _infinite(slope, moments_slope),
         "disagree_with_snell": good & (denied | (ratio > _ROUNDINGS) | (residual > 1)),
         "ratio": np.where(good, ratio, 0),
+        "snell_error": np.where(good, off, 0),
         "residual": np.where(good, residual, 0),
         "traceable": lost,
         "float32_error": np.max(np.abs(single.points - double.points), axis=(-1, -2))[both],

@@ -85,6 +85,8 @@ class _Row(NamedTuple):
     mirror: True for a mirror.
     sense: 1 or -1 for light along or against the z axis of a lens without tilts.
     ratio: index in front / index behind.
+    virtual: True for a sensor in front of the last surface, where a lens without tilts shows a
+        virtual image.
     """
 
     shape: Shape
@@ -95,6 +97,7 @@ class _Row(NamedTuple):
     mirror: Array
     sense: Array
     ratio: Array
+    virtual: Array
 
 
 def _rows(lens: Lens, wavelength: Array, forms: list[str]) -> _Row:
@@ -110,7 +113,17 @@ def _rows(lens: Lens, wavelength: Array, forms: list[str]) -> _Row:
         jnp.array([*lens.mirrors, False]),
         jnp.asarray(lens.senses, dtype),
         index / jnp.append(index[1:], index[-1]),
+        virtual(lens),
     )
+
+
+def virtual(lens: Lens) -> Array:
+    """`virtual` of all rows, (S + 1,), see `_Row`."""
+    none = jnp.zeros(lens.count + 1, bool)
+    if lens.tilt is not None or not lens.active:
+        return none
+    back = lens.sensor - lens.vertices[lens.active[-1]]
+    return none.at[-1].set(back * float(lens.senses[-1]) < 0)
 
 
 def _bend(d: Array, normal: Array, row: _Row, side: Array) -> tuple[Array, Array]:
@@ -132,7 +145,7 @@ def trace_snell(
     from the object to the first active surface and between active ones, and is not totally
     reflected. Without tilts light crosses surfaces the way that the number of mirrors says; with
     tilts, either. Surfaces that are not active are crossed by the straight line, forwards or
-    backwards.
+    backwards; a sensor in front of the last surface, by the line prolonged backwards.
 
     wavelength: (), um.
     point: (3,), anywhere on the ray in front of the lens, mm.
@@ -146,9 +159,10 @@ def trace_snell(
         point, direction, begun, ok = ray
         p, d = row.axes.T @ (point - row.origin), row.axes.T @ direction
         side = jnp.where(row.active, row.sense, jnp.sign(d[2]))
-        start = jnp.where(row.active, -begun, -jnp.inf)
+        start = jnp.where(row.active & ~row.virtual, -begun, -jnp.inf)
         hit, normal, met = jax.lax.switch(row.form, branches, p, d, row.shape, side, start)
         bent, whole = _bend(d, normal, row, side if lens.tilt is None else 0 * side)
+        met = met & (~row.virtual | ((hit - p) @ d <= 0))
         hit = row.axes @ hit + row.origin
         behind = hit, row.axes @ bent, jnp.zeros_like(begun)
         behind = jax.tree.map(partial(jnp.where, row.active), behind, (point, direction, begun))

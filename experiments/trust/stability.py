@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
+from scipy import stats
 
 from drt_jax import Status, show
 
@@ -24,6 +25,8 @@ from .runs.folder import Run
 # Counts of the survey; and those of each family that are summed over all.
 _FAULTS = ("traceable", "nan_values", "nan_gradients", "disagree_with_snell")
 _COUNTS = ("scenes", "rays", *(status.name.lower() for status in Status), *_FAULTS)
+# Confidence of the bounds.
+_SURE = 0.95
 # Most structures: programs of more exhaust the maps of a process.
 _STRUCTURES = 6
 
@@ -41,10 +44,20 @@ class Config:
     families: tuple[Literal[*FAMILIES], ...] = ()
 
 
+def bound(count: int, of: int) -> float:
+    """Share of a population that lies below with a confidence of 95 % if `count` of `of` draws
+    show something: the exact binomial bound (Clopper and Pearson 1934). It is 3 / of for a count of
+    0 (the rule of three)."""
+    return float(stats.beta.ppf(_SURE, count + 1, of - count)) if count < of else 1.0
+
+
 def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
     """Row of a family in results.json, from its survey."""
     status, lost = found["status"], found["traceable"]
     steps, errors = found["steps"], found["float32_error"]
+    wrong = found["disagree_with_snell"].any(axis=1)
+    wrong |= found["nan_values"] + found["nan_gradients"] > 0
+    faults = {"lost": lost.any(axis=1), "wrong": wrong}
     return {
         "name": name,
         "what": FAMILIES[name].what,
@@ -53,6 +66,9 @@ def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
         "rays": status.size,
         **{code.name.lower(): int(np.sum(status == code)) for code in Status},
         **{key: int(np.sum(found[key])) for key in _FAULTS},
+        **{f"{key}_scenes": int(np.sum(bad)) for key, bad in faults.items()},
+        **{f"{key}_scenes_bound": bound(int(np.sum(bad)), len(bad)) for key, bad in faults.items()},
+        "lost_rays_bound": bound(int(np.sum(lost)), lost.size),
         "newton_steps_median": float(np.median(steps)),
         "newton_steps_max": int(np.max(steps)),
         "float32_rays": int(errors.size),
@@ -60,6 +76,7 @@ def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
         "traceable_unconverged": int(np.sum(lost & (status == Status.UNCONVERGED))),
         "traceable_per_10000": 1e4 * float(np.mean(lost)),
         "snell_error_max_roundings": float(np.max(found["ratio"])),
+        "snell_error_max_mm": float(np.max(found["snell_error"])),
         "residual_max_of_bound": float(np.max(found["residual"])),
     }
 
@@ -78,13 +95,15 @@ def totals(rows: list[dict]) -> dict[str, float]:
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Draws and surveys the families one by one."""
     known: set = set()
-    names = config.families or FAMILIES
-    jobs = {name: functools.partial(measure, config, name, known) for name in names}
+    names = config.families or tuple(FAMILIES)
+    absent = [name for name in names if (n := FAMILIES[name].needs) and not n.is_dir()]
+    jobs = {n: functools.partial(measure, config, n, known) for n in names if n not in absent}
     found = _common.measured(run, "family", jobs)
     rows = [family["row"] for family in found]
     steps, errors = (sum((family[k] for family in found), []) for k in ("steps", "errors"))
     return {
         "families": rows,
+        "absent": {name: FAMILIES[name].what for name in absent},
         "total": totals(rows),
         "seconds": run.seconds,
         "newton_steps": np.array(steps, np.int32),
@@ -105,26 +124,37 @@ def measure(config: Config, name: str, known: set) -> dict[str, Any]:
     return {"row": row_of(name, found)} | parts
 
 
+def _bounded(count: int, row: dict[str, Any], of: str = "rays") -> tuple[int, str]:
+    """A count of rays or scenes, and its bound in 10,000 of them."""
+    return count, f"{1e4 * bound(min(count, row[of]), row[of]):.3g}"
+
+
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Tables of all families together, and of each."""
-    header = ["family", "rays", "good", "lost", "not finite", "not Snell"]
+    """Tables of all families together, and of each. Bounds are those of `bound`."""
+    header = ["family", "rays", "good", "lost", "in 10,000 rays, at most", "wrong"]
+    header += ["in 10,000 rays, at most", "largest error of a good ray"]
     header += ["Newton steps, median and most", "float32 within, 99 %"]
-    rows = []
+    rows: list[tuple] = []
     for row in results["families"]:
-        bad = row["nan_values"] + row["nan_gradients"]
-        counts = row["rays"], row["ok"], row["traceable"], bad, row["disagree_with_snell"]
+        wrong = row["nan_values"] + row["nan_gradients"] + row["disagree_with_snell"]
+        counts = row["rays"], row["ok"], *_bounded(row["traceable"], row), *_bounded(wrong, row)
+        # Older results have it in roundings only.
+        error = f"{row['snell_error_max_mm']:.0e} mm" if "snell_error_max_mm" in row else ""
         steps = f"{row['newton_steps_median']:g}, {row['newton_steps_max']}"
-        rows.append(
-            (f"{row['name']}: {row['what']}", *counts, steps, f"{row['float32_error_p99']:.1e} mm")
-        )
+        single = f"{row['float32_error_p99']:.1e} mm"
+        rows.append((f"{row['name']}: {row['what']}", *counts, error, steps, single))
+    for name, what in results.get("absent", {}).items():
+        rows.append((f"{name}: {what}", "not run: the files are not here", *[""] * 8))
     total = results["total"]
     lost = total["traceable_per_10000_but_touching"]
+    wrong = total["nan_values"] + total["nan_gradients"] + total["disagree_with_snell"]
     sums = [
         ("scenes", total["scenes"]),
         ("rays", total["rays"]),
         ("values that are not finite", total["nan_values"]),
         ("derivatives that are not finite", total["nan_gradients"]),
         ("good rays that Snell's law denies", total["disagree_with_snell"]),
+        ("scenes in 10,000 with any of these, at most", _bounded(wrong, total, "scenes")[1]),
         ("rays in 10,000 that it finds and we do not", f"{total['traceable_per_10000']:.2f}"),
         ("the same without surfaces that touch", f"{lost:.2f}"),
     ]
@@ -137,7 +167,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws steps and float32 errors by family."""
     rows = results["families"]
-    figure, axes = show.new(1, 2, 6, 5)
+    figure, axes = show.new(1, 2, 6, 1.5 + 0.14 * len(rows))
     for ax, samples, size, label in (
         (axes[0], results["newton_steps"], "scenes", "Newton steps of a scene"),
         (axes[1], 1e3 * results["float32_error_mm"], "float32_rays", "float32 error (µm)"),

@@ -6,21 +6,38 @@ import jax
 import numpy as np
 import pytest
 from experiments._families import FAMILIES, draw
-from experiments.stability import row_of
+from experiments.stability import bound, row_of, tables
 
 from drt_jax import Status
 from experiments import _survey
 
-pytestmark = pytest.mark.slow
 SCENES = 16
 # One static structure, so that a few compiled programs serve all: five surfaces, the stop third.
 NAMES = ("curvature", "asphere", "index", "edge", "close", "touching", "distance", "focus", "field")
+NAMES += ("immersed", "inside focus", "collimated", "virtual image", "virtual object")
 # Stops that are labels: one structure. `test_starts` has the family "offaxis". Rims that fail (the
 # family "rims") take as long as all others; results/stability has them, test_clipped and
 # test_apertures their rays.
 LABELS = {"phone": 3}
 # Rays in 10,000 that Snell's law can trace and we do not find.
 LIMIT = 1
+
+
+def test_bounds_of_counts():
+    """The rule of three; 1 of 10 by Clopper and Pearson, whose upper limit solves
+    (1 - p)^10 + 10 p (1 - p)^9 = 0.05."""
+    assert bound(0, 620) == pytest.approx(3 / 620, rel=5e-3)
+    p = bound(1, 10)
+    assert (1 - p) ** 10 + 10 * p * (1 - p) ** 9 == pytest.approx(0.05)
+    assert bound(7, 7) == 1
+
+
+def test_a_family_without_its_files_is_named():
+    total = dict.fromkeys(("scenes", "rays", "nan_values", "nan_gradients"), 1)
+    total |= dict.fromkeys(("disagree_with_snell", "traceable_per_10000"), 0)
+    total["traceable_per_10000_but_touching"] = 0
+    found = tables({"families": [], "absent": {"files": "lens files"}, "total": total})
+    assert "not run: the files are not here" in found["stability, families"]
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +52,7 @@ def rows():
     return {name: row_of(name, join(*parts)) for name, parts in surveys.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*NAMES, *LABELS])
 def test_numbers_are_finite_and_good_rays_obey_snell(rows, name):
     row = rows[name]
@@ -44,17 +62,20 @@ def test_numbers_are_finite_and_good_rays_obey_snell(rows, name):
     assert row["disagree_with_snell"] == 0
 
 
+@pytest.mark.slow
 def test_the_families_hold_rays_of_every_kind(rows):
     for kind in ("ok", "missed", "tir"):
         assert sum(row[kind] for row in rows.values()) > 10
 
 
+@pytest.mark.slow
 def test_rays_that_exist_are_found(rows):
     found = [row for row in rows.values() if row["name"] != "touching"]  # a limit with a name
     lost, rays = (sum(row[key] for row in found) for key in ("traceable", "rays"))
     assert 1e4 * lost <= LIMIT * rays
 
 
+@pytest.mark.slow
 def test_float32_of_a_camera_within_a_tenth_of_a_micrometre():
     """99 % of rays of perturbed triplets, all surfaces and the sensor."""
     scenes = next(draw("camera, float32", 100, 1, ("cooke_triplet",)))
