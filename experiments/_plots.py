@@ -36,7 +36,7 @@ def label_axes(axes: Axes, xlabel: str, ylabel: str, grid: str = "both", **legen
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3, axis=grid)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8, **legend)
+        axes.legend(**{"fontsize": 8} | legend)
 
 
 def curves(
@@ -110,8 +110,8 @@ def programs(axes: Axes, curves: Mapping[tuple[str, str], Sequence[dict]], title
         bars = np.stack([middle - low, high - middle])
         axes.errorbar(middle, errors, xerr=bars, label=f"{program}: {sampling}", **style)
     axes.set(xscale="log", yscale="log", title=title)
-    label_axes(axes, "time of a call (ms)", "error, relative", loc="center left",
-               bbox_to_anchor=(1.0, 0.5))  # fmt: skip
+    label_axes(axes, "time of a call (ms)", "error, relative", fontsize=7, loc="upper center",
+               bbox_to_anchor=(0.5, -0.14), ncols=2)  # fmt: skip
 
 
 def patch_grid(

@@ -39,7 +39,7 @@ def aimed(lens: Lens, scene: Scene, order: int) -> _peers.Rays:
     points, weights = (np.asarray(a) for a in drt_jax.pupil.half_disc(order, order + 1))
     values = flatten(lens)
     steps = np.repeat([_peers.BENT, _peers.MOVED], lens.count)
-    shifted = values + jnp.concatenate([jnp.zeros((1, len(values))), jnp.diag(steps)])
+    shifted = values[None] + jnp.concatenate([jnp.zeros((1, len(values))), jnp.diag(steps)])
     trace = jax.vmap(lambda v: drt_jax.trace_rays(changed(lens, v), scene, points))
     rays = jax.jit(trace)(shifted)
     launch = np.asarray(rays.points[..., 0, :]), np.asarray(rays.directions[..., 0, :])
@@ -54,7 +54,7 @@ def ways(lens: Lens, scene: Scene, sizes: Iterable[int], orders: Iterable[int]) 
             for size in orders if kind == "Gaussian" else sizes:
                 yield f"{kind}, {where}", partial(_peers.rays_of, pattern, size, aim)
     for order in orders:
-        yield "our nodes, launched by us", partial(aimed, lens, scene, order)
+        yield "our nodes", partial(aimed, lens, scene, order)
 
 
 def peers(
@@ -76,7 +76,7 @@ def peers(
             if isinstance(content, str):
                 notes.setdefault(program, content)
                 continue
-            label += ", launched by us" if "launched" in name else ""
+            label += ", launched by us" if name == "our nodes" else ""
             found.append(Try(label, name, *content))
     found_programs = {one.program.split()[0] for one in found}
     return found, {name: why for name, why in notes.items() if name not in found_programs}
@@ -108,7 +108,8 @@ def faster(rows: list[dict[str, Any]], own: list[dict[str, Any]]) -> str:
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """Table of rows of `rows_of`: least error and time to some errors by task and program, and where it beats us."""
+    """Table of rows of `rows_of`: least error and times to some errors by task and program, and the
+    errors at which it beats us."""
     lines = []
     for (task,), some in _common.grouped(rows, "task").items():
         groups = _common.grouped(some, "program")

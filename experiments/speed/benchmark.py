@@ -284,10 +284,12 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         before = row["task"]
     header = "work", "drt_jax", "error", "to compile", "peer", "its time", "error", "ratio"
     counts = "what a training step trains", "solves for rays"
-    machine = [(_common.one_machine(results),)]
-    return {
-        "benchmark, machine": _common.table(("machine of this run",), machine),
-        "benchmark, curves": _curves.summary(results["curves"]),
+    found = {}
+    if "curves" in results:  # not in results of releases before
+        machine = [(_common.one_machine(results),)]
+        found["benchmark, machine"] = _common.table(("machine of this run",), machine)
+        found["benchmark, curves"] = _curves.summary(results["curves"])
+    return found | {
         "benchmark": _common.table(header, lines),
         "benchmark, counts": _common.table(counts, results["counts"].items()),
     }
@@ -299,9 +301,9 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         figure, axes = show.new(1, 1, 5.5, 4)
         _plots.growth(axes, results["work"])
         figure.savefig(figures / "work.png")
-    if results["curves"]:
+    if results.get("curves"):
         tasks = _common.grouped(results["curves"], "task")
-        figure, axes = _common.panels(len(tasks), 6.5, 4.6)
+        figure, axes = _common.panels(len(tasks), 6.5, 5.6)
         for ax, ((task,), rows) in zip(axes, tasks.items()):
             _plots.programs(ax, _common.grouped(rows, "program", "sampling"), task)
         figure.savefig(figures / "peers.png")
