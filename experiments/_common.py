@@ -17,6 +17,7 @@ from drt_jax import Lens, Scene, psf_moments, show
 
 from .runs.config import ConfigError
 from .runs.folder import Run
+from .runs.machine import hardware
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 # Settings, at the top of a checkout; in a wheel within this package.
@@ -123,6 +124,18 @@ def read_results(folder: pathlib.Path) -> dict[str, Any]:
     return results
 
 
+def one_machine(results: dict[str, Any]) -> str:
+    """The machine of results, as a line of text. ConfigError if they are of several: their times
+    do not belong in one table."""
+    kinds = {hardware(record) for record in results["machines"]}
+    words = "times of two machines are never in one table: begin the run anew on one of them"
+    require(len(kinds) == 1, f"machines: {' and '.join(sorted(kinds))}: {words}")
+    first = results["machines"][-1]  # the one that began
+    versions = ", ".join(f"{name} {number}" for name, number in first["versions"].items())
+    load = f"load {first['load']} at the start, commit {first['commit']}"
+    return f"{hardware(first)}, {load}; Python {first['python']}, {versions}"
+
+
 def settings(config: Any, *names: str) -> dict[str, Any]:
     """Some settings by name, for results: tuples as lists."""
     values = {name: getattr(config, name) for name in names}
@@ -208,8 +221,18 @@ def duration(seconds: float | None) -> str:
 
 
 def medians(calls: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
-    """Median seconds of each call, in turns, after one call that does not count. Calls above a
-    second are made three times.
+    """Median seconds of each call, see `timed`."""
+    return [float(np.median(taken)) for taken in timed(calls, repeats)]
+
+
+def quartiles(calls: Sequence[Callable[[], Any]], repeats: int) -> list[list[float]]:
+    """First quartile, median and third quartile of the seconds of each call, see `timed`."""
+    return [np.quantile(taken, (0.25, 0.5, 0.75)).tolist() for taken in timed(calls, repeats)]
+
+
+def timed(calls: Sequence[Callable[[], Any]], repeats: int) -> list[list[float]]:
+    """Seconds of each call, in turns, after one call that does not count. Calls above a second are
+    made three times.
 
     The first call of a turn does not count either, because threads of the program before may still
     spin.
@@ -226,4 +249,4 @@ def medians(calls: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
             while (start := time.perf_counter()) - began < _TURN:
                 jax.block_until_ready(call())
                 taken.append(time.perf_counter() - start)
-    return [float(np.median(taken)) for taken in times]
+    return times

@@ -36,7 +36,7 @@ def label_axes(axes: Axes, xlabel: str, ylabel: str, grid: str = "both", **legen
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3, axis=grid)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8, **legend)
+        axes.legend(**{"fontsize": 8} | legend)
 
 
 def curves(
@@ -95,15 +95,23 @@ def error_curves(
     label_axes(axes, xlabel, ylabel)
 
 
-def programs(axes: Axes, marks: Mapping[str, Sequence[tuple[float, float]]], title: str) -> None:
-    """Points of programs, both axes logarithmic.
+def programs(axes: Axes, curves: Mapping[tuple[str, str], Sequence[dict]], title: str) -> None:
+    """Relative error over time of a call, both logarithmic, with bars from the first to the third
+    quartile. The first program has a thick line; each of the others a colour of its own.
 
-    marks: (time of a call in ms, relative error) of each point, by program.
+    curves: rows with `quartiles_s` and `error`, by program and sampling.
     """
-    for name, points in marks.items():
-        axes.plot(*zip(*points), marker="o", linestyle="none", markersize=8, label=name)
+    colours = {name: f"C{k}" for k, name in enumerate(dict.fromkeys(name for name, _ in curves))}
+    for k, ((program, sampling), rows) in enumerate(curves.items()):
+        low, middle, high = 1e3 * np.array([row["quartiles_s"] for row in rows]).T
+        errors = [max(row["error"], 1e-16) for row in rows]
+        style = {"color": colours[program], "marker": "osD^vP*X"[k % 8], "markersize": 5}
+        style |= {"linewidth": 1.0 if k else 2.4, "linestyle": "--" if "stop" in sampling else "-"}
+        bars = np.stack([middle - low, high - middle])
+        axes.errorbar(middle, errors, xerr=bars, label=f"{program}: {sampling}", **style)
     axes.set(xscale="log", yscale="log", title=title)
-    label_axes(axes, "time of a call (ms)", "error, relative")
+    label_axes(axes, "time of a call (ms)", "error, relative", fontsize=7, loc="upper center",
+               bbox_to_anchor=(0.5, -0.14), ncols=2)  # fmt: skip
 
 
 def patch_grid(

@@ -25,6 +25,7 @@ from drt_jax.inputs import shown
 
 from .config import ConfigError, dump_config, load_config
 from .disk import finite, locked, packed, replace, sweep, unpacked
+from .machine import machine
 from .metrics import Metrics
 
 _OTHERS = "other settings than those in config.yaml"
@@ -60,6 +61,7 @@ class Run:
         self._metrics = Metrics(folder / "metrics.csv", columns)
         self._earlier, self._opened = 0.0, time.perf_counter()
         self._saved: set[str] = set()  # the jobs with a checkpoint of this process
+        self._machines = [machine()]  # and those of the checkpoints that were read
         # But for settings that say how a run is done, not what comes out.
         about = {f.name for f in dataclasses.fields(config) if f.compare}
         compared = {n: v for n, v in dataclasses.asdict(config).items() if n in about}
@@ -131,6 +133,7 @@ class Run:
             raise ConfigError(f"{job}: numbers that are not finite after {step} steps; {remedy}")
         self._metrics.sync()  # a checkpoint is useless without its metrics
         about = {"job": job, "step": step, "seconds": self.seconds, "settings": self._settings}
+        about["machine"] = self._machines[0]
         replace(self._path(job), packed(about, leaves))
         self._saved.add(job)
 
@@ -192,6 +195,8 @@ class Run:
                 raise ConfigError(f"{path}: {error}; delete it to begin this job anew") from error
             if job not in self._saved:
                 self._earlier = max(self._earlier, about["seconds"])
+                if (other := about.get("machine")) and other not in self._machines:
+                    self._machines.append(other)
         remedy = f"delete {path.relative_to(self.folder)} to begin this job anew"
         self._metrics.cut(logged, step, remedy)
         return step, leaves
@@ -202,7 +207,8 @@ class Run:
     def finish(self, results: dict[str, Any]) -> None:
         """Writes the results, arrays as results.npz, the rest as results.json, and sorts the
         metrics. JSON has no NaN and no infinity: they become null. `not_finite` lists the names of
-        results of either file that are not finite, if any."""
+        results of either file that are not finite, if any. `machines` are the records of `machine`
+        of all processes that worked on them, the last one first."""
         self._metrics.order()
         arrays: dict[str, Any] = {n: a for n, a in results.items() if isinstance(a, np.ndarray)}
         bad = [name for name, array in arrays.items() if not np.all(np.isfinite(array))]
@@ -212,6 +218,7 @@ class Run:
             np.savez_compressed(file, **arrays)
             replace(self.folder / "results.npz", file.getvalue())
         plain |= {"not_finite": bad} if bad else {}
+        plain["machines"] = self._machines
         text = json.dumps(plain, indent=2, allow_nan=False) + "\n"
         replace(self.folder / "results.json", text.encode())
 

@@ -1,12 +1,13 @@
 """Other programs for the work of `benchmark`: an optional extra, each may be missing.
 
-A peer gets the lens as numbers and samples the pupil as its users would: with hexapolar rings of
-about as many rays. Differences in definition count as its error.
+A peer gets the lens as numbers, and samples the pupil in the ways that it offers, or with rays that
+we aimed. Differences in definition count as its error.
 """
 
 import itertools
-from collections.abc import Callable
-from functools import partial
+import types
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,58 @@ import drt_jax
 from drt_jax import pupil
 
 from ._common import rings
+
+# Steps of batoid's finite differences, by curvatures (1/mm) and distances (mm).
+BENT, MOVED = 1e-7, 1e-6
+# Rays are launched so far in front of their first hits, mm.
+_BEFORE = 15.0
+Variant = tuple[np.ndarray, np.ndarray]
+
+
+class Rays(NamedTuple):
+    """Rays of one object point.
+
+    points, weights: (Q, 2) on the unit disc, and (Q,).
+    aim: "paraxial" at the paraxial entrance pupil, or "iterative" at the stop, a mode of Optiland.
+    launch: first hits and directions, (V, W, Q, 3) each, of rays that we aimed, for each variant of
+        a lens; None for none.
+    free: (2,), 0 where symmetry makes the mean of x or y 0, otherwise 1.
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    aim: str = "paraxial"
+    launch: tuple[np.ndarray, np.ndarray] | None = None
+    free: tuple[int, int] = (1, 1)
+
+    def starts(self, k: int, wave: int) -> tuple[np.ndarray, np.ndarray]:
+        """Places in front of the lens and directions, (Q, 3), of `launch`."""
+        hits, directions = (np.asarray(a[k, wave]) for a in self.launch or ())
+        return hits - _BEFORE * directions, directions
+
+
+def _gaussian(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Optiland's GaussianQuadrature of so many rings."""
+    from optiland import backend
+    from optiland.distribution import GaussianQuadrature
+
+    backend.set_backend("numpy")
+    own = GaussianQuadrature()
+    own.generate_points(size)
+    return np.stack([own.x, own.y], axis=1), own.weights
+
+
+# (points, weights) of about as many rays, or, of "Gaussian", of so many rings.
+PATTERNS: dict[str, Callable[[int], tuple[np.ndarray, np.ndarray]]] = {
+    "hexapolar": lambda size: pupil.hexapolar(rings(size)),
+    "random": lambda size: pupil.random_disc(size, 0),
+    "Gaussian": _gaussian,
+}
+
+
+def rays_of(pattern: Callable, size: int, aim: str) -> Rays:
+    """Rays of a pattern."""
+    return Rays(*pattern(size), aim)
 
 
 class Lens:
@@ -35,6 +88,27 @@ class Lens:
         first = drt_jax.first_order(lens, distance, np.asarray(wavelengths))
         self.pupil = tuple(float(a[0]) for a in first.entrance_pupil)
 
+    @property
+    def variant(self) -> Variant:
+        """Curvatures and gaps (S,)."""
+        return self.curvature, self.gaps
+
+    def steps(self) -> list[Variant]:
+        """The lens, and 2 S lenses of which one number differs: a curvature, a thickness, which
+        does not move the sensor, or the sensor's position."""
+        bent = BENT * np.eye(len(self.gaps))
+        moved = MOVED * np.eye(len(self.gaps))
+        moved[:-1, -1] = -MOVED
+        changed = [(self.curvature + row, self.gaps) for row in bent]
+        return [self.variant, *changed, *((self.curvature, self.gaps + row) for row in moved)]
+
+
+def _sigma(x: Any, y: Any, weights: Any, free: tuple[int, int]) -> Any:
+    """RMS radius of hits (Q,), arrays of any program."""
+    share = weights / weights.sum()
+    away = (a - f * (share * a).sum() for a, f in zip((x, y), free))
+    return sum((share * a**2).sum() for a in away) ** 0.5
+
 
 def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
     """An Optiland lens for one wavelength, um. index: (S + 1,)."""
@@ -42,62 +116,98 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
     from optiland.optic import Optic
 
     optic = Optic()
-    optic.add_surface(index=0, thickness=lens.distance)
-    for i, (c, gap) in enumerate(zip(lens.curvature, lens.gaps)):
+    optic.surfaces.add(index=0, thickness=lens.distance)
+    for i, (c, gap) in enumerate(zip(*lens.variant)):
         medium = "mirror" if lens.mirrors[i] else IdealMaterial(n=float(index[i + 1]))
         kind = {"thickness": gap, "material": medium, "is_stop": i == lens.stop}
         shape = {"radius": 1 / c if c else np.inf, "conic": lens.conic[i]}
         if np.any(lens.coefficients[i]):
             shape |= {"surface_type": "even_asphere", "coefficients": lens.coefficients[i].tolist()}
-        optic.add_surface(index=i + 1, **kind, **shape)
-    optic.add_surface(index=len(lens.gaps) + 1)
+        optic.surfaces.add(index=i + 1, **kind, **shape)
+    optic.surfaces.add(index=len(lens.gaps) + 1)
     optic.set_aperture("float_by_stop_size", 2 * lens.semi)
+    optic.surfaces[lens.stop + 1].semi_aperture = lens.semi  # what its search for rays needs
     if np.isinf(lens.distance):
-        optic.set_field_type("angle")
-        optic.add_field(y=np.degrees(lens.field))
+        optic.fields.set_type("angle")
+        optic.fields.add(y=np.degrees(lens.field))
     else:
-        optic.set_field_type("object_height")
-        optic.add_field(y=-lens.distance * np.tan(lens.field))
-    optic.add_wavelength(wavelength, is_primary=True)
+        optic.fields.set_type("object_height")
+        optic.fields.add(y=-lens.distance * np.tan(lens.field))
+    optic.wavelengths.add(wavelength, is_primary=True)
     return optic
 
 
-def optiland_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
-    """(value, gradient) of the RMS spot radius sigma: value() -> ((W,),), mm; gradient() -> (W,),
-    (W, 2 S), by curvatures, thicknesses and the sensor position, NaN where unknown."""
+def _optiland_hits(optic: Any, lens: Lens, rays: Rays, wave: int) -> Any:
+    """Traced rays of a wavelength, given by its number."""
+    from optiland import backend
+    from optiland.rays import RealRays
+
+    wavelength = lens.wavelengths[wave]
+    if rays.launch is None:
+        points = types.SimpleNamespace(**dict(zip("xy", map(backend.array, rays.points.T))))
+        given = 0, 1 if lens.field else 0, wavelength, None, points
+        return optic.trace(*given, record=False)
+    place, along = rays.starts(0, wave)
+    one = np.ones(len(place))
+    found = RealRays(*place.T, *along.T, one, wavelength * one)
+    optic.surfaces.trace(found, record=False)
+    return found
+
+
+def optiland_spot(lens: Lens, rays: Rays) -> Callable:
+    """value() -> RMS spot radii sigma (W,), mm, by NumPy."""
+    from optiland import backend
+
+    backend.set_backend("numpy")
+    systems = [_optiland_system(lens, *own) for own in zip(lens.index.T, lens.wavelengths)]
+    for optic in systems:
+        optic.ray_tracer.set_aiming(rays.aim)
+
+    def value() -> np.ndarray:
+        backend.set_backend("numpy")
+        sigma = []
+        for wave, optic in enumerate(systems):
+            found = _optiland_hits(optic, lens, rays, wave)
+            light = np.isfinite(found.x) & (found.i > 0)
+            some = (a[light] for a in (found.x, found.y, rays.weights))
+            sigma.append(_sigma(*some, rays.free))
+        return np.array(sigma)
+
+    return value
+
+
+def optiland_gradient(lens: Lens, rays: Rays) -> Callable:
+    """gradient() -> sigma (W,) and its derivatives (W, 2 S) by curvatures, thicknesses and the
+    sensor position, NaN where unknown, by PyTorch."""
     import torch
     from optiland import backend
 
-    backend.set_backend("torch")
-    backend.set_precision("float64")
-    backend.grad_mode.enable()
-    pairs = zip(lens.index.T, lens.wavelengths)
-    systems = [(_optiland_system(lens, index, wave), wave) for index, wave in pairs]
+    def ready() -> None:
+        backend.set_backend("torch")
+        backend.set_precision("float64")
+        backend.grad_mode.enable()
 
-    def one(optic, wavelength):
-        hits = optic.trace(0, 1 if lens.field else 0, wavelength, rings(rays), "hexapolar")
-        return torch.sqrt(hits.x.var(unbiased=False) + hits.y.var(unbiased=False))
+    ready()
+    systems = [_optiland_system(lens, *own) for own in zip(lens.index.T, lens.wavelengths)]
+    weights = torch.as_tensor(rays.weights)
+    for optic in systems:
+        optic.ray_tracer.set_aiming(rays.aim)
 
-    def slopes(leaves, otherwise):
+    def slopes(leaves: list, otherwise: float) -> np.ndarray:
         known = [torch.is_tensor(leaf) and leaf.grad is not None for leaf in leaves]
         return np.array([float(a.grad) if k else otherwise for a, k in zip(leaves, known)])
 
-    def value():
-        backend.grad_mode.disable()
-        with torch.no_grad():
-            sigma = [float(one(*system)) for system in systems]
-        backend.grad_mode.enable()
-        return (np.array(sigma),)
-
-    def gradient():
+    def gradient() -> tuple[np.ndarray, np.ndarray]:
+        ready()
         values, rows = [], []
         bent = np.where(lens.curvature == 0, np.nan, lens.curvature)  # planes have no radius
-        for optic, wavelength in systems:
-            shapes = [surface.geometry for surface in optic.surface_group.surfaces][1:]
+        for wave, optic in enumerate(systems):
+            shapes = [surface.geometry for surface in optic.surfaces][1:]
             radii, places = [shape.radius for shape in shapes], [shape.cs.z for shape in shapes]
             for leaf in filter(torch.is_tensor, (*radii, *places)):
                 leaf.grad = None
-            sigma = one(optic, wavelength)
+            found = _optiland_hits(optic, lens, rays, wave)
+            sigma = _sigma(found.x, found.y, weights, rays.free)
             sigma.backward()
             place = slopes(places, 0.0)
             behind = np.cumsum(place[-2:0:-1])[::-1]  # a thickness moves all vertices behind it
@@ -105,7 +215,7 @@ def optiland_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
             rows.append([*(-slopes(radii[:-1], np.nan) / bent**2), *behind, place[-1]])
         return np.array(values), np.array(rows)
 
-    return value, gradient
+    return gradient
 
 
 def _batoid_shape(lens: Lens, i: int, c: float):
@@ -116,9 +226,10 @@ def _batoid_shape(lens: Lens, i: int, c: float):
     return batoid.Quadric(1 / c, lens.conic[i]) if c else batoid.Plane()
 
 
-def _batoid_optic(lens: Lens, curvature, gaps, index):
+def _batoid_optic(lens: Lens, variant: Variant, index: np.ndarray):
     import batoid
 
+    curvature, gaps = variant
     if np.any(lens.coefficients[:, :1]) or np.any((curvature == 0) & np.any(lens.coefficients, 1)):
         raise ValueError("no terms of r^2, no aspheres of radius inf")
     media = [batoid.ConstMedium(float(n)) for n in index]
@@ -128,23 +239,24 @@ def _batoid_optic(lens: Lens, curvature, gaps, index):
         kind = batoid.Detector if last else batoid.RefractiveInterface
         kind = batoid.Mirror if not last and lens.mirrors[i] else kind
         shape = batoid.Plane() if last else _batoid_shape(lens, i, c)
-        where = batoid.CoordSys(origin=[0, 0, place])
         both = {"inMedium": media[i], "outMedium": media[min(i + 1, len(media) - 1)]}
+        where = batoid.CoordSys(origin=[0, 0, place])
         items.append(kind(shape, name=f"s{i}", coordSys=where, **both))
     return batoid.CompoundOptic(items, name="lens", inMedium=media[0], outMedium=media[-1])
 
 
 def _batoid_hits(optic, points, velocities):
+    """Traced rays through points (Q, 3)."""
     import batoid
 
     hits = batoid.RayVector(*points.T.copy(), *velocities.T.copy(), wavelength=1e-6)
     optic.trace(hits)
-    return np.stack([hits.x, hits.y], axis=1)
+    return hits
 
 
-def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
-    """`optiland_spot` by batoid, with the gradient by finite differences."""
-    points = pupil.hexapolar(rings(rays))[0]
+def _at_the_pupil(lens: Lens, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places in front of the lens and directions, (Q, 3), of rays through points (Q, 2) of the
+    paraxial entrance pupil."""
     place, radius = lens.pupil
     toward = np.array([0.0, np.tan(lens.field), 1.0])
     through = np.column_stack([radius * points, np.full(len(points), place)])
@@ -152,39 +264,60 @@ def batoid_spot(lens: Lens, rays: int) -> tuple[Callable, Callable]:
     direction = toward + through / lens.distance
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     # On a plane in front of the first surface.
-    start = through + direction * ((-10.0 - radius - place) / direction[:, 2:])
+    return through + direction * ((-10.0 - radius - place) / direction[:, 2:]), direction
 
-    def sigma(curvature, gaps, k):
-        velocity = direction / lens.index[0, k]
-        optic = _batoid_optic(lens, curvature, gaps, lens.index[:, k])
-        return np.sqrt(np.sum(np.var(_batoid_hits(optic, start, velocity), axis=0)))
 
-    def value(curvature=lens.curvature, gaps=lens.gaps):
-        return (np.array([sigma(curvature, gaps, k) for k in range(len(lens.wavelengths))]),)
+def batoid_spot(lens: Lens, rays: Rays, variants: Sequence[Variant] = ()) -> Callable:
+    """`optiland_spot` by batoid: value(k), of the lens or of some variants of it."""
+    variants = variants or [lens.variant]
+    optics = [[_batoid_optic(lens, v, index) for index in lens.index.T] for v in variants]
+    if rays.aim != "paraxial":
+        raise ValueError("aims no rays")
+    pupil_rays = _at_the_pupil(lens, rays.points)
 
+    def value(k: int = 0) -> np.ndarray:
+        sigma = []
+        for wave, optic in enumerate(optics[k]):
+            start, along = pupil_rays if rays.launch is None else rays.starts(k, wave)
+            hits = _batoid_hits(optic, start, along / lens.index[0, wave])
+            light = ~(hits.vignetted | hits.failed)
+            some = (a[light] for a in (hits.x, hits.y, rays.weights))
+            sigma.append(_sigma(*some, rays.free))
+        return np.array(sigma)
+
+    return value
+
+
+def batoid_gradient(lens: Lens, rays: Rays) -> Callable:
+    """`optiland_gradient` by finite differences of batoid."""
+    value = batoid_spot(lens, rays, lens.steps())
     count = len(lens.gaps)
-    shift = np.eye(count)
-    shift[:-1, -1] = -1  # a thickness does not move the sensor
 
-    def gradient():
-        (base,), h = value(), 1e-7 * np.eye(count)
-        by_curvature = [value(curvature=lens.curvature + row)[0] for row in h]
-        by_gap = [value(gaps=lens.gaps + 1e-6 * row)[0] for row in shift]
-        slopes = np.concatenate([(by_curvature - base) / 1e-7, (by_gap - base) / 1e-6])
-        return base, slopes.T
+    def gradient() -> tuple[np.ndarray, np.ndarray]:
+        base = value(0)
+        found = np.array([value(k) - base for k in range(1, 2 * count + 1)])
+        return base, (found / np.repeat([BENT, MOVED], count)[:, None]).T
 
-    return value, gradient
+    return gradient
 
 
-# (value, gradient) of sigma by each program.
-SPOTS = {"optiland": optiland_spot, "batoid": batoid_spot}
+# (sigma, sigma and gradient) by each program.
+SPOTS = {
+    "optiland": (optiland_spot, optiland_gradient),
+    "batoid": (batoid_spot, batoid_gradient),
+}
 
 
 def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Callable:
     """trace() -> hits (Q, 2) on the sensor at the first wavelength, mm. points: (Q, 3), in front of
     the lens, mm. directions: (Q, 3), unit vectors."""
-    optic = _batoid_optic(lens, lens.curvature, lens.gaps, lens.index[:, 0])
-    return partial(_batoid_hits, optic, points, directions)
+    optic = _batoid_optic(lens, lens.variant, lens.index[:, 0])
+
+    def trace() -> np.ndarray:
+        hits = _batoid_hits(optic, points, directions)
+        return np.stack([hits.x, hits.y], axis=1)
+
+    return trace
 
 
 def network_step(batch: int, patch: int, rate: float) -> Callable:

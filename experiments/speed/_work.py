@@ -84,18 +84,17 @@ def peer(name: str, make: Callable[[], tuple], how: str = "") -> dict[str, tuple
         return {name: str(failure)[:80]}
 
 
-def spot_peers(
-    scene: tuple, rays: int, error: Callable[..., float | None], gradient: bool = False
-) -> dict[str, tuple | str]:
-    """What `peer` returns of all that know spots. scene: arguments of `_peers.Lens`. error: of what
-    a call returns."""
+def spot_peers(scene: tuple, rays: int, error: Callable) -> dict[str, tuple | str]:
+    """What `peer` returns of all that know spots, with hexapolar rays at the paraxial pupil. scene:
+    arguments of `_peers.Lens`. error: of what a call returns."""
 
     def make(spot: Callable) -> tuple:
-        call = spot(_peers.Lens(*scene), rays)[int(gradient)]
-        return call, error(*call())
+        own = _peers.rays_of(_peers.PATTERNS["hexapolar"], rays, "paraxial")
+        call = spot(_peers.Lens(*scene), own)
+        return call, error(call())
 
     found: dict[str, tuple | str] = {}
-    for name, spot in _peers.SPOTS.items():
+    for name, (spot, _) in _peers.SPOTS.items():
         found |= peer(name, partial(make, spot))
     return found
 

@@ -1,12 +1,15 @@
 """Run time of this and other programs for the same work in the same run.
 
-Calls alternate, and their medians are compared. Errors are relative: of the RMS spot radius sigma,
-or the worse of sigma and its derivatives by curvatures and thicknesses, against an integral over a
-sequential trace by Snell's law. Peers are an extra, `pip install -e '.[peers]'`; the row of a
-missing one says so. Writes results.json, whose `rows` hold `task`, `ours_s`, `peer`, `peer_s`,
-`ratio` (theirs / ours), `ours_error`, `peer_error`, `compile_s`, `peak_mb` and `kernels` (ours);
-`counts`, the solves for rays of a training step; and `work`, run time over numbers of rays,
-surfaces and wavelengths. Draws run time against error, and the growth.
+Calls alternate, and their medians are compared. Spots are curves: each program is swept over its
+own samplings, also with our nodes. Errors are relative: of the RMS spot radius sigma, or the worse
+of sigma and its derivatives by curvatures and thicknesses, against an integral over a sequential
+trace by Snell's law. Peers are an extra, `pip install -e '.[peers]'`; the row of a missing one says
+so. Writes results.json: `curves` hold `task`, `program`, `sampling`, `size` (rays a wavelength),
+`error`, `quartiles_s`, `repeats`; `missing`, why a program has none; `rows` hold `task`, `ours_s`,
+`peer`, `peer_s`, `ratio` (theirs / ours), `ours_error`, `peer_error`, `compile_s`, `peak_mb` and
+`kernels` (ours); `counts`, the solves for rays of a training step; `work`, run time over numbers of
+rays, surfaces and wavelengths; `machines`, where it ran. Draws run time against error, and the
+growth.
 """
 
 import dataclasses
@@ -28,8 +31,8 @@ from drt_jax import Lens, Scene, Status, learn, pupil, show
 from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
 
-from . import _command, _common, _peers, _plots, _work
-from ._common import within
+from . import _command, _common, _curves, _peers, _plots, _work
+from ._common import not_empty, within
 from ._reference import (
     Moments,
     changed,
@@ -49,6 +52,8 @@ class Config:
     """Settings of the experiment; see configs/benchmark.yaml.
 
     repeats: timed turns of each program (fewer for long ones).
+    rays: rays of the patterns of other programs.
+    orders: orders of quadratures, ours and of other programs.
     bundle: rays of the task of many rays.
     batch, patch: patches of the network's step, and their side, pixels.
     tasks: names of the tasks to run; empty for all.
@@ -60,7 +65,8 @@ class Config:
     field_deg: Annotated[float, within(0, 89.9)] = 10.0
     wavelengths_um: Annotated[tuple[float, ...], within(1e-4, 1e6)] = (0.6, 0.53, 0.48)
     repeats: Annotated[int, within(1, 1e4)] = 15
-    rays: Annotated[int, within(7, 1e6)] = 256  # one hexapolar ring has 7 rays
+    rays: Annotated[tuple[int, ...], not_empty, within(7, 1e6)] = (64, 512, 4096)
+    orders: Annotated[tuple[int, ...], not_empty, within(1, 40)] = (1, 2, 3, 4, 6)
     bundle: Annotated[int, within(1, 1e8)] = 262144
     batch: Annotated[int, within(1, 4096)] = 16
     patch: Annotated[int, within(7, 4096)] = 64
@@ -96,29 +102,37 @@ def spot_error(truth: Moments, count: int, values: Any, slopes: Any = None) -> f
     return max(worst, wrong)
 
 
-def spot_tasks(config: Config, axial: bool, gradient: bool) -> list[Row]:
-    """sigma at all wavelengths, with or without its Jacobian, on axis or at the field."""
+def spot_curves(config: Config, gradient: bool) -> dict[str, Any]:
+    """Curves of sigma at the first wavelength, or of it and its Jacobian, and why programs have
+    none."""
     lens, field, distance = config.scene
-    field = 0.0 if axial else field
-    scene = Scene.point(field, distance, jnp.asarray(config.wavelengths_um))
-    # On axis a smaller tolerance costs nothing.
-    rule = drt_jax.converge(drt_jax.psf_moments, lens, scene, 1e-9 if axial else 1e-6)
-    given = lens, field, distance, config.wavelengths_um
-    error = functools.partial(spot_error, reference(*given), lens.count)
+    waves = config.wavelengths_um[:1]
+    scene, given = Scene.point(field, distance, waves), (lens, field, distance, waves)
+    wrong = functools.partial(spot_error, reference(*given), lens.count)
     lens = dataclasses.replace(lens, curved=(lens.stop,))  # derivatives by every curvature
 
-    def sigma(values):
-        return (sigmas(drt_jax.psf_moments(changed(lens, values), scene, sampling=rule)),)
+    def error(found: Any) -> float:
+        return wrong(*found) if gradient else wrong(found)
 
-    def jacobian(values):
-        found, back = jax.vjp(lambda values: sigma(values)[0], values)
-        return found, jax.vmap(lambda row: back(row)[0])(jnp.eye(found.size))
+    def ours(order: int) -> _curves.Try:
+        rule = drt_jax.Gauss(order, "bilateral" if field else "rotational")
 
-    ours = compiled(jacobian if gradient else sigma, flatten(lens))
-    peers = _work.spot_peers(given, config.rays, error, gradient)
-    task = "sigma and Jacobian" if gradient else "sigma"
-    task += ", on axis" if axial else f", {config.field_deg:g} degrees"
-    return rows_of(task, ours, error(*ours[0]()), peers, config.repeats)
+        def sigma(values):
+            return sigmas(drt_jax.psf_moments(changed(lens, values), scene, sampling=rule))
+
+        def jacobian(values):
+            found, back = jax.vjp(sigma, values)
+            return found, jax.vmap(lambda row: back(row)[0])(jnp.eye(found.size))
+
+        call, _ = compiled(jacobian if gradient else sigma, flatten(lens))
+        rays = pupil.pupil_points(lens, scene, rule)[1].shape[-1]
+        return _curves.Try(_curves.OURS, "our nodes", rays, call, error(call()))
+
+    samplings = _curves.ways(lens, scene, config.rays, config.orders)
+    found, notes = _curves.peers(_peers.Lens(*given), samplings, error, gradient)
+    task = "sigma and its Jacobian" if gradient else "sigma"
+    tries = [*map(ours, config.orders), *found]
+    return {"curves": _curves.rows_of(task, tries, config.repeats), "missing": notes}
 
 
 def bundle_task(config: Config) -> list[Row]:
@@ -227,10 +241,8 @@ def first_task(config: Config) -> list[Row]:
 
 
 TASKS = {
-    "axial": lambda config: spot_tasks(config, True, False),
-    "axial_jacobian": lambda config: spot_tasks(config, True, True),
-    "field": lambda config: spot_tasks(config, False, False),
-    "field_jacobian": lambda config: spot_tasks(config, False, True),
+    "spot": lambda config: spot_curves(config, False),
+    "gradient": lambda config: spot_curves(config, True),
     "bundle": bundle_task,
     "network": network_task,
     "first": first_task,
@@ -242,9 +254,13 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
     jobs = {name: functools.partial(TASKS[name], config) for name in config.tasks or TASKS}
-    rows = sum(_common.measured(run, "task", jobs), [])
+    found = _common.measured(run, "task", jobs)
+    results: dict[str, Any] = {"rows": [], "curves": [], "missing": {}}
+    for part in found:  # rows, or curves with what is missing
+        for key, some in (part if isinstance(part, dict) else {"rows": part}).items():
+            results[key] = results[key] | some if key == "missing" else results[key] + some
     lens, field, distance = config.scene
-    results = {"rows": rows, "counts": _work.counts(lens, distance, config.wavelengths_um)}
+    results |= {"counts": _work.counts(lens, distance, config.wavelengths_um)}
     if config.growth:
         results["work"] = _work.growth(lens, field, distance, 5)
     return results | {"seconds": run.seconds}
@@ -268,7 +284,12 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         before = row["task"]
     header = "work", "drt_jax", "error", "to compile", "peer", "its time", "error", "ratio"
     counts = "what a training step trains", "solves for rays"
-    return {
+    found = {}
+    if "curves" in results:  # not in results of releases before
+        machine = [(_common.one_machine(results),)]
+        found["benchmark, machine"] = _common.table(("machine of this run",), machine)
+        found["benchmark, curves"] = _curves.summary(results["curves"])
+    return found | {
         "benchmark": _common.table(header, lines),
         "benchmark, counts": _common.table(counts, results["counts"].items()),
     }
@@ -280,15 +301,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         figure, axes = show.new(1, 1, 5.5, 4)
         _plots.growth(axes, results["work"])
         figure.savefig(figures / "work.png")
-    spots = [row for row in results["rows"] if row["task"].startswith("sigma")]
-    if spots:
-        tasks = _common.grouped(spots, "task")
-        figure, axes = _common.panels(len(tasks), 4.5, 3.2)
+    if results.get("curves"):
+        tasks = _common.grouped(results["curves"], "task")
+        figure, axes = _common.panels(len(tasks), 6.5, 5.6)
         for ax, ((task,), rows) in zip(axes, tasks.items()):
-            marks = {"drt_jax": [(1e3 * rows[0]["ours_s"], rows[0]["ours_error"])]}
-            peers = [row for row in rows if row["peer_s"]]
-            marks |= {row["peer"]: [(1e3 * row["peer_s"], row["peer_error"])] for row in peers}
-            _plots.programs(ax, marks, task)
+            _plots.programs(ax, _common.grouped(rows, "program", "sampling"), task)
         figure.savefig(figures / "peers.png")
 
 

@@ -1,11 +1,74 @@
 """What experiments on speed measure with. `test_starts` runs them."""
 
+import jax
 import numpy as np
+import pytest
+from experiments._reference import reference, relative_error
+from experiments.snell import trace_snell
 
-from experiments import lenses
+import drt_jax
+from drt_jax import Scene
+from experiments import _common, _curves, _peers, _work, lenses
+from experiments.runs.config import ConfigError
+from experiments.runs.machine import machine
 
 
 def test_a_step_is_seen():
     smooth = np.sin(np.linspace(0, 1, 200))
     stepped = smooth + (np.arange(200) > 90)
     assert lenses._roughness(smooth) < 1e-6 < 0.3 < lenses._roughness(stepped)
+
+
+def test_quartiles_are_of_all_turns():
+    low, middle, high = _common.quartiles([lambda: None], 2)[0]
+    assert 0 < low <= middle <= high
+
+
+def rows(*points):
+    return [{"error": error, "quartiles_s": [0, seconds, 9]} for error, seconds in points]
+
+
+def test_where_a_program_is_faster_is_named():
+    own = rows((1e-2, 2.0), (1e-6, 3.0))
+    assert _curves.faster(rows((1e-1, 2.5), (1e-3, 4.0)), own) == "never"
+    assert _curves.faster(rows((1e-1, 1.0), (1e-2, 9.0)), own) == "1e-01"
+    assert _curves.faster(rows((1e-1, 1.0), (1e-4, 2.5), (1e-9, 8.0)), own) == "1e-01 to 1e-09"
+    assert _curves.least(own, 1e-4) == 3.0 and _curves.least(own, 1e-9) == np.inf
+    some = [{"task": "sigma", "program": "drt_jax"} | row for row in own]
+    some += [{"task": "sigma", "program": "other"} | row for row in rows((1e-3, 1.0))]
+    assert "| sigma | other   | 1e-03 " in _curves.summary(some)
+
+
+def test_times_of_two_machines_are_in_no_table():
+    one = machine()
+    assert one["cpu"] in _common.one_machine({"machines": [one, one | {"load": 9.0}]})
+    for other in ({"cpu": "another"}, {"cores": 512}, {"device": "gpu"}):
+        with pytest.raises(ConfigError, match="times of two machines are never in one table"):
+            _common.one_machine({"machines": [one, one | other]})
+
+
+@pytest.mark.slow
+def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
+    """Rays that we aimed, traced by Snell's law: the weights, the symmetry and the launch fit."""
+    lens, field = drt_jax.load_lens("cooke_triplet"), np.radians(14)
+    given = lens, field, np.inf, (0.55,)
+
+    def snell(numbers, rays):
+        places, along = rays.starts(0, 0)
+        trace = jax.vmap(trace_snell, (None, None, 0, 0))
+        hits, ok = trace(lens, 0.55, jax.numpy.asarray(places), jax.numpy.asarray(along))
+        assert np.all(ok)
+        x, y = np.asarray(hits[:, -1, :2]).T
+        return lambda: np.array([_peers._sigma(x, y, rays.weights, rays.free)])
+
+    monkeypatch.setattr(_work, "version", lambda name: "1")
+    monkeypatch.setattr(_peers, "SPOTS", {"snell": (snell, snell)})
+    scene, truth = Scene.point(field, np.inf, (0.55,)), reference(*given)
+    nodes = [(name, of) for name, of in _curves.ways(lens, scene, (), (3, 8)) if "our" in name]
+    tries, notes = _curves.peers(
+        _peers.Lens(*given), nodes, lambda found: relative_error(truth, found), False
+    )
+    assert not notes
+    coarse, fine = tries
+    assert fine.program == "snell 1, launched by us" and fine.size == 8 * 9
+    assert fine.error < 1e-11 < coarse.error < 1e-2

@@ -22,7 +22,10 @@ STARTS = {
     "stability": ["families=[offaxis]", "scenes=12"],
     "faults": ["parts=[files]", "files=30", "traced=1"],
     "files": ["folders=[{toy}]"],
-    "benchmark": ["tasks=[axial]", "growth=false", "repeats=1", "lens=singlet"],
+    "benchmark": [
+        *("tasks=[spot]", "growth=false", "repeats=1", "lens=singlet", "field_deg=0"),
+        *("rays=[7]", "orders=[5]"),
+    ],
     "devices": ["counts=[1]", "patch=8", "repeats=2", "network={layers: 1, channels: 4}"],
     "lenses": [
         "lenses=[{lens: singlet, field_deg: 3}]",
@@ -102,14 +105,18 @@ def checked_files(results):
 
 
 def checked_benchmark(results):
-    """A row for each peer, which is measured or says what is missing, and the counts."""
-    assert [(row["peer"], row["peer_s"], row["note"]) for row in results["rows"]] == [
-        (name, None, f"{name} is not installed: pip install -e '.[peers]'")
+    """A curve of ours, of each peer that it is not there, the counts and the machine."""
+    (row,) = results["curves"]
+    low, middle, high = row["quartiles_s"]
+    assert row["program"] == "drt_jax" and row["error"] < 1e-8 and 0 < low <= middle <= high
+    assert results["missing"] == {
+        name: f"{name} is not installed: pip install -e '.[peers]'"
         for name in ("optiland", "batoid")
-    ]
-    assert all(row["ours_s"] > 0 and row["ours_error"] < 1e-8 for row in results["rows"])
+    }
     solves = list(results["counts"].values())
     assert solves[:2] == [0, 0] and solves[2] > 0
+    (machine,) = results["machines"]
+    assert machine["cpu"] and machine["cores"] > 0 and machine["versions"]["jax"]
 
 
 def checked_devices(results):
@@ -169,6 +176,7 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
     whole, resumed = (json.loads((f / "results.json").read_text()) for f in folders)
     for row in [*whole["rows"], *resumed["rows"]]:
         row.pop("step_s")
+    assert whole.pop("machines") and resumed.pop("machines")
     assert whole == resumed
 
 
@@ -238,7 +246,9 @@ def test_a_peer_that_fails_is_a_note(monkeypatch):
         raise ValueError("no program of this kind")
 
     monkeypatch.setattr(_work, "version", lambda name: "1")
-    monkeypatch.setattr(_peers, "SPOTS", {"one": fails, "two": lambda *_: [lambda: (2.0,)]})
+    monkeypatch.setattr(
+        _peers, "SPOTS", {"one": (fails, fails), "two": (lambda *_: lambda: 2.0, fails)}
+    )
     scene = load_lens("singlet"), 0.0, np.inf, (0.55,)
     peers = _work.spot_peers(scene, 7, lambda sigma: sigma / 2)
     seconds, found = _work.timed([lambda: None], peers, 1)

@@ -124,6 +124,18 @@ def test_seconds_go_on_after_a_resume(tmp_path):
         assert 1000 <= again.seconds < 1100
 
 
+def test_results_name_every_machine_that_worked_on_them(tmp_path):
+    with opened(tmp_path) as run:
+        run._machines[0]["cpu"] = "another"
+        run.keep("a", 1)
+    with opened(tmp_path, resume=True) as again:
+        assert again.once("a", lambda: 2) == 1
+        again.finish({})
+    found = json.loads((again.folder / "results.json").read_text())["machines"]
+    assert len(found) == 2 and found[0]["cpu"] != found[1]["cpu"] == "another"
+    assert all(record["cores"] > 0 and "jax" in record["versions"] for record in found)
+
+
 def test_a_run_that_failed_before_its_first_step_leaves_the_folder_free(tmp_path):
     opened(tmp_path).close()
     opened(tmp_path, config=Config(11)).close()
@@ -157,7 +169,8 @@ def test_results_are_json_always(tmp_path):
         run.finish(found)
     text = (run.folder / "results.json").read_text()
     assert "NaN" not in text and "Infinity" not in text
-    assert json.loads(text) == {
+    results = json.loads(text)
+    assert results.pop("machines") and results == {
         "good": 1.5,
         "none": None,
         "best": None,

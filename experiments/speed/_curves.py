@@ -1,0 +1,123 @@
+"""Run time against error of several programs, each swept over its own samplings."""
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import drt_jax
+from drt_jax import Lens, Scene
+
+from . import _common, _peers, _work
+from ._reference import changed, flatten
+
+OURS = "drt_jax"
+# Errors in the table of `summary`.
+LEVELS = (1e-2, 1e-3, 1e-6)
+
+
+class Try(NamedTuple):
+    """One sampling of one program.
+
+    size: number of rays a wavelength.
+    call: without arguments. error: of what it returns, relative.
+    """
+
+    program: str
+    sampling: str
+    size: int
+    call: Callable[[], Any]
+    error: float
+
+
+def aimed(lens: Lens, scene: Scene, order: int) -> _peers.Rays:
+    """The nodes of our rule of an order for a field along y, as rays that we aimed, through the
+    lens and each of its `_peers.Lens.steps`."""
+    points, weights = (np.asarray(a) for a in drt_jax.pupil.half_disc(order, order + 1))
+    values = flatten(lens)
+    steps = np.repeat([_peers.BENT, _peers.MOVED], lens.count)
+    shifted = values[None] + jnp.concatenate([jnp.zeros((1, len(values))), jnp.diag(steps)])
+    trace = jax.vmap(lambda v: drt_jax.trace_rays(changed(lens, v), scene, points))
+    rays = jax.jit(trace)(shifted)
+    launch = np.asarray(rays.points[..., 0, :]), np.asarray(rays.directions[..., 0, :])
+    return _peers.Rays(points, weights, launch=launch, free=(0, 1))
+
+
+def ways(lens: Lens, scene: Scene, sizes: Iterable[int], orders: Iterable[int]) -> Iterable[tuple]:
+    """(name, rays) of all samplings: each pattern at the paraxial pupil and at the stop, and our
+    nodes, launched by us."""
+    for aim, where in (("paraxial", "paraxial pupil"), ("iterative", "aimed at the stop")):
+        for kind, pattern in _peers.PATTERNS.items():
+            for size in orders if kind == "Gaussian" else sizes:
+                yield f"{kind}, {where}", partial(_peers.rays_of, pattern, size, aim)
+    for order in orders:
+        yield "our nodes", partial(aimed, lens, scene, order)
+
+
+def peers(
+    numbers: _peers.Lens, samplings: Iterable[tuple], error: Callable, gradient: bool
+) -> tuple[list[Try], dict[str, str]]:
+    """All tries of other programs, and why there are none, by program."""
+    found: list[Try] = []
+    notes: dict[str, str] = {}
+    for name, rays_of in samplings:
+        for program, makers in _peers.SPOTS.items():
+
+            def make() -> tuple:
+                rays = rays_of()
+                call = makers[1](numbers, rays) if gradient else makers[0](numbers, rays)
+                return len(rays.weights), call, error(call())
+
+            got = _work.peer(program, make)
+            (label, content), *_ = got.items()
+            if isinstance(content, str):
+                notes.setdefault(program, content)
+                continue
+            label += ", launched by us" if name == "our nodes" else ""
+            found.append(Try(label, name, *content))
+    found_programs = {one.program.split()[0] for one in found}
+    return found, {name: why for name, why in notes.items() if name not in found_programs}
+
+
+def rows_of(task: str, tries: list[Try], repeats: int) -> list[dict[str, Any]]:
+    """Rows of results.json: `quartiles_s` of calls in turns."""
+    seconds = _common.quartiles([one.call for one in tries], repeats)
+    return [
+        {"task": task, "program": one.program, "sampling": one.sampling, "size": one.size}
+        | {"error": one.error, "quartiles_s": own, "repeats": repeats}
+        for one, own in zip(tries, seconds)
+    ]
+
+
+def least(rows: list[dict[str, Any]], error: float) -> float:
+    """Least median seconds within an error; inf if no row is."""
+    known = (row["quartiles_s"][1] for row in rows if row["error"] <= error)
+    return min(known, default=np.inf)
+
+
+def faster(rows: list[dict[str, Any]], own: list[dict[str, Any]]) -> str:
+    """The errors at which a program reaches what we need longer for, as text."""
+    errors = sorted({row["error"] for row in (*rows, *own)}, reverse=True)
+    won = [error for error in errors if least(rows, error) < least(own, error)]
+    if not won:
+        return "never"
+    return f"{won[0]:.0e} to {won[-1]:.0e}" if len(won) > 1 else f"{won[0]:.0e}"
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """Table of rows of `rows_of`: least error and times to some errors by task and program, and the
+    errors at which it beats us."""
+    lines = []
+    for (task,), some in _common.grouped(rows, "task").items():
+        groups = _common.grouped(some, "program")
+        for (program,), own in groups.items():
+            seconds = (least(own, level) for level in LEVELS)
+            times = [_common.duration(s) if np.isfinite(s) else "" for s in seconds]
+            best = f"{min(row['error'] for row in own):.0e}"
+            versus = "" if program == OURS else faster(own, groups[(OURS,)])
+            lines.append((task, program, best, *times, versus))
+    levels = (f"to {level:.0e}" for level in LEVELS)
+    return _common.table(("work", "program", "least error", *levels, "faster than we at"), lines)
