@@ -1,5 +1,6 @@
 """Run time against error of several programs, each swept over its own samplings."""
 
+import itertools
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple
@@ -99,12 +100,11 @@ def least(rows: list[dict[str, Any]], error: float) -> float:
 
 
 def faster(rows: list[dict[str, Any]], own: list[dict[str, Any]]) -> str:
-    """The errors at which a program reaches what we need longer for, as text."""
+    """The ranges of errors that a program reaches in less time than we, as text."""
     errors = sorted({row["error"] for row in (*rows, *own)}, reverse=True)
-    won = [error for error in errors if least(rows, error) < least(own, error)]
-    if not won:
-        return "never"
-    return f"{won[0]:.0e} to {won[-1]:.0e}" if len(won) > 1 else f"{won[0]:.0e}"
+    runs = itertools.groupby(errors, lambda error: least(rows, error) < least(own, error))
+    won = [[f"{error:.0e}" for error in run] for wins, run in runs if wins]
+    return ", ".join(" to ".join(dict.fromkeys((run[0], run[-1]))) for run in won) or "never"
 
 
 def summary(rows: list[dict[str, Any]]) -> str:

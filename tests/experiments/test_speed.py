@@ -32,7 +32,8 @@ def test_where_a_program_is_faster_is_named():
     own = rows((1e-2, 2.0), (1e-6, 3.0))
     assert _curves.faster(rows((1e-1, 2.5), (1e-3, 4.0)), own) == "never"
     assert _curves.faster(rows((1e-1, 1.0), (1e-2, 9.0)), own) == "1e-01"
-    assert _curves.faster(rows((1e-1, 1.0), (1e-4, 2.5), (1e-9, 8.0)), own) == "1e-01 to 1e-09"
+    assert _curves.faster(rows((1e-1, 1.0), (1e-4, 2.5), (1e-9, 8.0)), own) == "1e-01, 1e-04, 1e-09"
+    assert _curves.faster(rows((1e-1, 1.0), (1e-4, 1.0)), own) == "1e-01 to 1e-04"
     assert _curves.least(own, 1e-4) == 3.0 and _curves.least(own, 1e-9) == np.inf
     some = [{"task": "sigma", "program": "drt_jax"} | row for row in own]
     some += [{"task": "sigma", "program": "other"} | row for row in rows((1e-3, 1.0))]
