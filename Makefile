@@ -15,8 +15,8 @@ install: .venv/installed
 demo: install
 	$(BIN)/python -m experiments.focus --out $(OUT)/focus
 	$(BIN)/python -m experiments.edof --config configs/demo/edof.yaml --out $(OUT)/edof
-	$(BIN)/python -m drt_jax check | tail -n 1
 	@echo "Demo finished: open $(OUT)/focus/report.html and $(OUT)/edof/report.html"
+	$(BIN)/python -m drt_jax check
 
 # Style and types.
 check: install

@@ -20,6 +20,9 @@ from .test_experiments import TOY
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 STARTS = {
     "stability": ["families=[offaxis]", "scenes=12"],
+    "requested": [
+        *("views=[{lens: singlet, field_deg: 3}]", "parts=[1]", "quantities=[spot]"),
+    ],
     "faults": ["parts=[files]", "files=30", "traced=1"],
     "files": ["folders=[{toy}]"],
     "benchmark": [
@@ -82,6 +85,15 @@ def test_each_experiment_is_started_somewhere():
 def checked_stability(results):
     (row,) = results["families"]
     assert row["ok"] > 0 == row["nan_values"] + row["nan_gradients"] + row["disagree_with_snell"]
+
+
+def checked_requested(results):
+    """float64 keeps all; float32 keeps or refuses."""
+    assert {row["dtype"] for row in results["rows"]} == {"float64", "float32"}
+    for row in results["rows"]:
+        assert row["refused"] if row["error"] is None else row["error"] <= row["tolerance"]
+        assert not row["refused"] or (row["dtype"] == "float32" and "x64" in row["refused"])
+    assert any(row["refused"] for row in results["rows"])
 
 
 def checked_faults(results):
