@@ -39,9 +39,9 @@ def begin(folder, *options):
 
 
 def left(folder):
-    """What a run leaves, without its seconds."""
+    """What a run leaves, without its seconds and its machine, whose load changes."""
     results = json.loads((folder / "results.json").read_text(), parse_constant=pytest.fail)
-    results.pop("seconds")
+    results.pop("seconds"), results.pop("machines")
     with np.load(folder / "results.npz") as arrays:
         losses = arrays["losses"].tolist()
     drawn = (folder / "figures" / "found.txt").read_text()
