@@ -138,8 +138,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     for row in results["families"]:
         wrong = row["nan_values"] + row["nan_gradients"] + row["disagree_with_snell"]
         counts = row["rays"], row["ok"], *_bounded(row["traceable"], row), *_bounded(wrong, row)
-        # Older results have it in roundings only.
-        error = f"{row['snell_error_max_mm']:.0e} mm" if "snell_error_max_mm" in row else ""
+        error = f"{row['snell_error_max_mm']:.0e} mm"
         steps = f"{row['newton_steps_median']:g}, {row['newton_steps_max']}"
         single = f"{row['float32_error_p99']:.1e} mm"
         rows.append((f"{row['name']}: {row['what']}", *counts, error, steps, single))
