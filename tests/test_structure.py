@@ -48,7 +48,7 @@ ROOMS = {
     "drt_jax/check": 298,
     "drt_jax/design": 2383,
     "drt_jax/files": 2928,
-    "drt_jax/image": 2979,
+    "drt_jax/image": 2983,
     "drt_jax/learn": 624,
     "drt_jax/lens": 1480,
     "drt_jax/pupil": 692,

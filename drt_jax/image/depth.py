@@ -29,8 +29,8 @@ _NODES = (4, 8, 16, 32, 64)
 # Relative amount by which a distance may exceed its range, because 1 / (1 / far) is not exactly
 # far.
 _ROUNDED = 1e-5
-# Default tolerance of the moments of the nodes and of their series.
-_TOLERANCE = 1e-9
+# Default tolerances: of `depth_moments` in float64 and float32, and of `moments_model`.
+_DOUBLE, _SINGLE, _MODEL = 1e-9, 1e-6, 1e-6
 
 
 @jax.tree_util.register_dataclass
@@ -68,8 +68,8 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float | None = None) -> D
 
     lens: the lens.
     scene: one field at the nearest and the farthest distance, as of `Scene.point`.
-    tolerance: bound of the last coefficients of the moments, relative to the largest. None: 1e-9
-        or, in float32, what that allows.
+    tolerance: bound of the last coefficients of the moments, relative to the largest. None: 1e-9;
+        in float32 1e-6, with rules as exact as that allows.
 
     Returns `DepthMoments`. The number of Chebyshev nodes in 1/distance doubles until the tolerance
     is met, from 4 to at most 64, where it warns; each node has its own converged rule. ValueError
@@ -81,7 +81,9 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float | None = None) -> D
     if not 0 < near < far:
         raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
     low, high = 1 / far, 1 / near
-    bound = tolerance or _TOLERANCE
+    bound = tolerance
+    if bound is None:
+        bound = _SINGLE if below_double(lens) else _DOUBLE
     each = tolerance if below_double(lens) else bound
 
     def interpolated(count: int) -> FocusMoments:
@@ -129,6 +131,8 @@ def moments_model(
     distance) -> `Moments`.
     """
     values = {name: getattr(lens, name) for name in trained}
+    if tolerance is None and not below_double(lens):
+        tolerance = _MODEL
     if set(trained) <= {"sensor"}:
         if np.min(scene.distance) == np.max(scene.distance):
             focus = focus_moments(lens, scene.at(scene.field, np.min(scene.distance)), tolerance)
