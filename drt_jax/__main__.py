@@ -76,7 +76,7 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     convert.add_argument("--missing", choices=("error", "warn"), default="error", help=_MISSING)
     about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
     glasses.arguments(command("glass", lambda options: _write(glasses.told(options)), about))
-    about = "about ten scenes against numbers of other programs; exit status 1 if one is wrong"
+    about = "eleven scenes against numbers of other programs; exit status 1 if one is wrong"
     check = command("check", run_check, about)
     check.add_argument("scenes", nargs="*", help=f"some of {', '.join(TRUTHS)}; default: all")
     check.add_argument("--json", type=pathlib.Path, help="a file for all of it, for a bug report")
