@@ -76,5 +76,5 @@ from .pupil.rules import (
     Pattern as Pattern,
     Soft as Soft,
 )
+from .rays.rays import trace_rays as trace_rays
 from .rays.status import Status as Status
-from .rays.trace import trace_rays as trace_rays

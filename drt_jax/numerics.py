@@ -100,6 +100,12 @@ def known_values(tree: Any) -> Any:
     return values if concrete(values) else None
 
 
+def eager_values(tree: Any) -> Any:
+    """`known_values` outside of `jax.jit`; inside of it None, also for known numbers."""
+    values = known_values((tree, jnp.zeros(())))  # inside of `jit` a new array is a tracer, too
+    return values and values[0]
+
+
 def brief(one: Any) -> str:
     """A dataclass in one line for `__repr__`, with its arrays by dtype and shape."""
 

@@ -13,4 +13,4 @@ from .image.transfer import Transfer as Transfer
 from .image.wavefront import Wavefront as Wavefront
 from .lens.paraxial import FirstOrder as FirstOrder, Pupil as Pupil
 from .lens.seidel import ThirdOrder as ThirdOrder
-from .rays.trace import Rays as Rays
+from .rays.rays import Rays as Rays

@@ -34,7 +34,7 @@ from ..lens.paraxial import first_order
 from ..lens.scene import Scene
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss
-from ..rays.trace import trace_rays
+from ..rays.rays import trace_rays
 
 Call = Callable[[], Array]
 _LINES = (0.6563, 0.5876, 0.4861)  # C, d, F, um

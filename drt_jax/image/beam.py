@@ -20,6 +20,7 @@ from ..numerics import einsum, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import disc, half_disc, meridian
 from ..pupil.rules import Gauss, Mask, Pattern, PupilRule, Symmetry, fits
+from ..rays.known import SEARCH, Known
 from ..rays.status import reaches_sensor
 from ..rays.system import Vector, dot
 from ..rays.trace import Bundle, trace_bundle
@@ -263,14 +264,15 @@ def beam_rule(degree: int, symmetry: Symmetry, clipped: PupilRule | None = None)
     return BeamRule(Pattern(*pattern(order, degree + 1), symmetry), degree)
 
 
-def trace_beam(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
+def trace_beam(lens: Lens, scene: Scene, rule: BeamRule, known: Known = SEARCH) -> Beam:
     """Traces the beam of an object point.
 
     lens, scene: the lens, and the object point with its wavelengths.
     rule: rays and degree, see `beam_rule`.
+    known: its rays, if they are known.
     """
-    points, weights = rule.rule.points(lens, scene)
-    bundle = trace_bundle(lens, scene, points)
+    points, weights = rule.rule.points(lens, scene, known.plan)
+    bundle = trace_bundle(lens, scene, points, known)
     weights = jnp.where(fits(rule.rule.symmetry, scene.field), weights, 0)
     weights = weights * rule.rule.transmission(lens, bundle)
     return beam_of(lens, scene, rule, points, weights, bundle)

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from ..compilation import LARGE, jit
 from ..inputs import require_tolerance, warn
@@ -30,14 +29,15 @@ from ..pupil.rules import (
     Symmetry,
     fits,
     gauss_points,
+    planned,
     require_fit,
+    rule_rays,
     symmetry_of,
 )
-from ..rays.find import Found
-from ..rays.solve import Solver, reattach, solve, solve_aimed
+from ..rays.known import Known, joined, tiles, trace_tile, wide
+from ..rays.solve import Solver, solve, solve_aimed
 from ..rays.status import Status
-from ..rays.system import Vector
-from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
+from ..rays.trace import Bundle, trace_bundle
 from .diagnose import check_order, crossed, reasons
 from .moments import FocusMoments, check_focus, weigh
 from .refined import refine, require_known
@@ -68,8 +68,6 @@ _SIZES = {"rotational": (_MAX_ORDER + 2,), "bilateral": (208, 416, 1768, 3696)}
 _SIZES["none"] = _SIZES["bilateral"]
 # Number of rules that are weighed at once: the orders of a clipped group.
 _AT_ONCE = 3
-# Number of rays of a tile, by the number of stop coordinates. A Gauss rule of 13 nodes fills one.
-_TILE = {1: 42, 2: 208}
 
 
 def psf_moments(lens: Lens, scene: Scene, sampling: float | PupilRule | None = None) -> Moments:
@@ -158,11 +156,11 @@ def _moments(
         if concrete((lens, scene)):
             return _stacked(trial.moments, scene)
         # The rays are already found: only weigh them, with derivatives.
-        pairs = zip(scene.each(), trial.found, strict=True)
-        return _stacked([_weigh_known(lens, one, trial.used, found) for one, found in pairs], scene)
+        pairs = zip(scene.each(), trial.known, strict=True)
+        return _stacked([_weigh(lens, one, trial.used, known) for one, known in pairs], scene)
     scene, rule = checked_scene(lens, scene), sampling
     require_fit(rule.symmetry, scene.field)
-    found = _weigh(lens, scene, rule)
+    found = _weigh(lens, scene, rule, rule_rays(lens, scene, rule))
     throughput = known_values(found.throughput)
     if throughput is not None:
         _require_light(lens, scene, rule.symmetry, throughput)
@@ -178,24 +176,15 @@ def _stacked(each: Sequence[FocusMoments], scene: Scene) -> FocusMoments:
 
 
 @partial(jit, wanted=LARGE)
-def _weigh(lens: Lens, scene: Scene, rule: PupilRule) -> FocusMoments:
+def _weigh(lens: Lens, scene: Scene, rule: PupilRule, known: Known) -> FocusMoments:
     """Moments of a rule: traces its rays and weighs them."""
 
-    def one(point: Scene) -> FocusMoments:
-        points, weights = rule.points(lens, point)
+    def one(point: Scene, known: Known) -> FocusMoments:
+        points, weights = rule.points(lens, point, known.plan)
         weights = jnp.where(fits(rule.symmetry, point.field), weights, 0)
-        return weigh(lens, rule, weights, trace_bundle(lens, point, points))
+        return weigh(lens, rule, weights, trace_bundle(lens, point, points, known))
 
-    return over_points(one, scene)
-
-
-@jax.jit
-def _weigh_known(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> FocusMoments:
-    """Moments, with derivatives, of rays that were found before; no search."""
-    points, weights = rule.points(lens, scene)
-    system, target = aims(lens, scene, points)
-    bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
-    return weigh(lens, rule, weights, bundle)
+    return over_points(one, scene, known)
 
 
 class _Trial(NamedTuple):
@@ -205,13 +194,13 @@ class _Trial(NamedTuple):
     used: the rule as it was evaluated, with points of other orders and padding, which have weight
         0.
     moments: its moments of each scene, NumPy arrays.
-    found: its rays of each scene.
+    known: its rays of each scene.
     """
 
     rule: Gauss | Clipped
     used: PupilRule
     moments: tuple[FocusMoments, ...]
-    found: tuple[Found, ...]
+    known: tuple[Known, ...]
 
 
 def find_rule(
@@ -299,14 +288,14 @@ def _weighed(
 ) -> Iterator[_Trial]:
     """Trials of the rules of a group, from its traced rays. ValueError if no light of a
     wavelength arrives."""
-    found = tuple(one.found for one in rays)
+    known = tuple(one.known for one in rays)
     for start in range(0, len(group.rules), _AT_ONCE):
         batch = group.rules[start : start + _AT_ONCE]
         each = [_weigh_rules(lens, [used for _, used in batch], one) for one in rays]
         for (rule, used), *moments in zip(batch, *each, strict=True):
             for scene, one in zip(scenes, moments, strict=True):
                 _require_light(lens, scene, rule.symmetry, one.throughput)
-            yield _Trial(rule, used, tuple(moments), found)
+            yield _Trial(rule, used, tuple(moments), known)
 
 
 def _change(before: _Trial, now: _Trial, places: Callable) -> float:
@@ -338,10 +327,10 @@ def _require_light(lens: Lens, scene: Scene, symmetry: Symmetry, throughput: Num
         checked_scene(lens, scene)
         scene = scene.each()[point]
         rule = Pattern(*gauss_points(_DIAGNOSIS, symmetry), symmetry)
-        found = _trace_rule(lens, scene, rule, solve).found
+        bundle = _trace_rule(lens, scene, rule, solve).bundle
         raise ValueError(
             f"no ray at {float(scene.wavelengths[wavelength]):g} um reaches the sensor: "
-            f"{reasons(lens, scene, rule, found, wavelength)}{crossed(lens)}; see "
+            f"{reasons(lens, scene, rule, bundle, wavelength)}{crossed(lens)}; see "
             "trace_rays(...).status"
         )
 
@@ -412,14 +401,14 @@ class _Traced(NamedTuple):
 
     weights: (1 or W, Q), weights of the rule.
     bundle: the rays.
-    found: their hits on the active surfaces; MISSED for rays that were not traced.
+    known: their hits on the active surfaces; MISSED for rays that were not traced.
     failing: True if a ray fails.
     cut: True if a ray is clipped.
     """
 
     weights: np.ndarray
     bundle: Bundle
-    found: Found
+    known: Known
     failing: bool
     cut: bool
 
@@ -427,33 +416,28 @@ class _Traced(NamedTuple):
 def _trace_rule(lens: Lens, scene: Scene, rule: PupilRule, solver: Solver) -> _Traced:
     """Traces the rays of a rule. Rays of weight 0 are left out if the rule is fitted to a
     clipped pupil."""
-    points, weights = jax.tree.map(np.asarray, _points(lens, scene, rule))
-    waves, total = scene.wavelengths.size, weights.shape[-1]
+    points, weights, plan = jax.tree.map(np.asarray, planned(lens, scene, rule))
+    total = weights.shape[-1]
     # Rays of weight 0 are padding in fitted rules. In other rules they show whether light is
     # clipped.
     fitted = isinstance(rule, Fitted)
     rays = np.flatnonzero(np.any(weights, axis=0)) if fitted else np.arange(total)
-    size, count = _TILE[len(points)], len(rays)
-    tiles = np.resize(rays if count else 0, (max(-(-count // size), 1), size))
-    every = [np.broadcast_to(p, (waves, total)) for p in points]
-    parts = [_trace_tile(lens, scene, tuple(p[:, tile] for p in every), solver) for tile in tiles]
+    parts = tiles(wide(scene, points)[..., rays if len(rays) else [0]])
+    traced = joined((trace_tile(lens, scene, (*own,), solver) for own in parts), len(rays))
 
-    def whole(*parts: Array) -> np.ndarray:  # (..., size) each -> (..., Q)
-        """Joins arrays of the tiles to one with all Q rays."""
-        arrays = [np.asarray(a) for a in parts]
-        if not arrays[0].ndim:
-            return np.max(arrays, axis=0)
-        joined = np.concatenate(arrays, axis=-1)[..., :count]
-        blank = Status.MISSED if joined.dtype == np.int32 else 0
-        found = np.full((*joined.shape[:-1], total), blank, joined.dtype)
-        found[..., rays] = joined
+    def whole(known: np.ndarray) -> np.ndarray:  # from rays that were traced to all Q
+        if not known.ndim or len(rays) == total:
+            return known
+        blank = Status.MISSED if known.dtype == np.int32 else 0
+        found = np.full((*known.shape[:-1], total), blank, known.dtype)
+        found[..., rays] = known
         return found
 
-    bundle, found = parts[0] if total == size else jax.tree.map(whole, *parts)
-    status = np.asarray(bundle.status)[:, rays]
+    bundle, found = jax.tree.map(whole, traced)
+    status = traced[0].status
     cut = status == Status.CLIPPED
     failing = np.any((status != Status.OK) & ~cut)
-    return _Traced(weights, bundle, found, bool(failing), bool(np.any(cut)))
+    return _Traced(weights, bundle, Known(found, plan), bool(failing), bool(np.any(cut)))
 
 
 def _weigh_rules(
@@ -477,20 +461,6 @@ def _weigh_rules(
     weights = np.stack([own(rules[min(k, len(rules) - 1)]) for k in range(_AT_ONCE)])
     found = jax.tree.map(np.asarray, _weigh_each(lens, rules[0], weights, traced.bundle))
     return [jax.tree.map(lambda a: a[k], found) for k in range(len(rules))]
-
-
-@partial(jit, wanted=LARGE)
-def _points(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
-    """Points and weights of a rule, compiled."""
-    return rule.points(lens, scene)
-
-
-@partial(jit, wanted=LARGE, static_argnames="solver")
-def _trace_tile(lens: Lens, scene: Scene, points: Vector, solver: Solver) -> tuple[Bundle, Found]:
-    """Rays of one tile."""
-    system, target = aims(lens, scene, points)
-    found = solver(system, target)
-    return bundle_of(lens, scene, system, target, found), found
 
 
 _weigh_each = jit(jax.vmap(weigh, (None, None, 0, None)), LARGE)

@@ -13,10 +13,9 @@ from ..lens.order import crossings, describe_crossing, neighbours_now
 from ..lens.scene import Scene
 from ..pupil.rules import PupilRule
 from ..rays.aim import beam_size, paraxial_launch
-from ..rays.find import Found
 from ..rays.snell import meetings
 from ..rays.status import Status
-from ..rays.trace import aims, bundle_of
+from ..rays.trace import Bundle, aims
 
 _HOW = {
     Status.OK: "arrives, but by none of the rays of the rule",
@@ -31,17 +30,17 @@ _HOW = {
 _PARTS = 3
 
 
-def reasons(lens: Lens, scene: Scene, rule: PupilRule, found: Found, wavelength: int) -> str:
+def reasons(lens: Lens, scene: Scene, rule: PupilRule, bundle: Bundle, wavelength: int) -> str:
     """The surfaces that stop the light of a wavelength, as text: "87% misses surface 3, ...". For
     use outside of traces.
 
     lens, scene: what was traced.
     rule: pupil rule.
-    found: rays of the rule.
+    bundle: rays of the rule.
     wavelength: index of the wavelength.
     """
     _, weights = rule.points(lens, scene)
-    status, surface = (np.asarray(a) for a in _last_surface(lens, scene, rule, found))
+    status, surface = (np.asarray(a) for a in _last_surface(lens, scene, rule, bundle))
     weight = np.broadcast_to(np.asarray(weights, float), status.shape)[wavelength]
     names = {-1: "a surface", lens.count: "the sensor"}
     parts: dict[str, float] = {}
@@ -72,13 +71,12 @@ def check_order(lens: Lens) -> None:
 
 
 @functools.partial(jit, wanted=ONCE)
-def _last_surface(lens: Lens, scene: Scene, rule: PupilRule, found: Found) -> tuple[Array, Array]:
+def _last_surface(lens: Lens, scene: Scene, rule: PupilRule, bundle: Bundle) -> tuple[Array, Array]:
     """Status (W, Q) of rays, and the index (W, Q), int32, of the surface where each ends; S for
     the sensor, -1 for none. For a clipped ray it is the first surface that clips it; for other
     rays the surface where the paraxial launch towards the stop point fails."""
     points, _ = rule.points(lens, scene)
     system, target = aims(lens, scene, points)
-    bundle = bundle_of(lens, scene, system, target, found)
     launch = paraxial_launch(system, target, beam_size(system, target)[1])
     places = [*lens.active, lens.count]
     if system.stop is not None:

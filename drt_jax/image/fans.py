@@ -17,7 +17,9 @@ from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, real_array, safe_divide
+from ..rays.known import Known, known_rays
 from ..rays.status import Status, reaches_sensor
+from ..rays.system import Vector
 from ..rays.trace import trace_bundle
 from .rounding import warn_of_focus, warn_of_paths
 from .wavefront import path_differences
@@ -108,7 +110,6 @@ def axial_colour(lens: Lens, scene: Scene, heights: Numbers = (0.7, 1.0)) -> Axi
     return AxialColour(found - lens.sensor, real)
 
 
-@functools.partial(jit, wanted=LARGE)
 def _traced(lens: Lens, scene: Scene, heights: Array) -> tuple[Array, Array, Array, Array]:
     """The chief ray, and the rays through heights (N,) on the y axis and then on the x axis of the
     stop.
@@ -118,9 +119,17 @@ def _traced(lens: Lens, scene: Scene, heights: Array) -> tuple[Array, Array, Arr
     """
     none, first = jnp.zeros_like(heights), jnp.zeros_like(heights[:1])
     points = jnp.concatenate([first, none, heights]), jnp.concatenate([first, heights, none])
+    return _of_points(lens, scene, points, known_rays(lens, scene, points))
 
-    def one(point: Scene) -> tuple[Array, Array, Array, Array]:
-        bundle = trace_bundle(lens, point, points)
+
+@functools.partial(jit, wanted=LARGE)
+def _of_points(
+    lens: Lens, scene: Scene, points: Vector, known: Known
+) -> tuple[Array, Array, Array, Array]:
+    """`_traced` of stop points, D arrays (Q,)."""
+
+    def one(point: Scene, known: Known) -> tuple[Array, Array, Array, Array]:
+        bundle = trace_bundle(lens, point, points, known)
         opd, status, _ = path_differences(lens, scene.wavelengths, bundle)
         whole = reaches_sensor(status)
         # A clipped chief ray still serves as the reference of the others.
@@ -130,4 +139,4 @@ def _traced(lens: Lens, scene: Scene, heights: Array) -> tuple[Array, Array, Arr
         slope = jnp.stack([safe_divide(a, along) for a in across], axis=-1)
         return hit, slope, opd, good
 
-    return over_points(one, scene)
+    return over_points(one, scene, known)

@@ -19,6 +19,8 @@ from ..inputs import warn
 from ..lens.lens import Lens
 from ..lens.scene import Scene, over_points
 from ..numerics import concrete, known_values
+from ..pupil.rules import rule_rays
+from ..rays.known import Known
 from .beam import Beam, BeamRule, trace_beam
 from .beam_psf import CELLS
 
@@ -69,14 +71,19 @@ def refine(
     return list(last), found
 
 
-@functools.partial(jit, wanted=LARGE)
 def beams_of(lens: Lens, scene: Scene, rule: BeamRule) -> Beam:
     """Beams of the points of a scene, which are the first axes of their arrays.
 
     lens, scene: the lens, and object points with their wavelengths.
     rule: rays and polynomials.
     """
-    return over_points(lambda point: trace_beam(lens, point, rule), scene)
+    return _beams(lens, scene, rule, rule_rays(lens, scene, rule.rule))
+
+
+@functools.partial(jit, wanted=LARGE)
+def _beams(lens: Lens, scene: Scene, rule: BeamRule, known: Known) -> Beam:
+    """`beams_of`, compiled."""
+    return over_points(lambda point, known: trace_beam(lens, point, rule, known), scene, known)
 
 
 def to_tolerance(

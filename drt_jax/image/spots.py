@@ -17,7 +17,7 @@ follows; Slater, Remote Sensing (1980), for the cone at a point of the sensor.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,9 @@ from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import batched, known_values, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import hexapolar
-from ..pupil.rules import Gauss, PupilRule, symmetry_of
+from ..pupil.rules import Gauss, PupilRule, planned, symmetry_of
+from ..rays.known import Known, known_rays, tiles, trace_tile, wide
+from ..rays.solve import solve, solve_aimed
 from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import trace_bundle
@@ -212,22 +214,28 @@ def light_rule(lens: Lens, scene: Scene, order: int = _ORDER) -> Gauss | Clipped
         lens, scene = known
         scene = checked_scene(lens, scene)
         symmetry = symmetry_of(lens, scene.field)
-        full = bool(_fills(lens, scene))
+        full = _fills(lens, scene)
     if full and not (lens.apertures is not None and any(lens.apertures.blocks)):
         return Gauss(order, symmetry)
     return Clipped(order, symmetry, crossing=may_cross(lens))
 
 
-@functools.partial(jit, wanted=LARGE)
-def _fills(lens: Lens, scene: Scene) -> Array:
+def _fills(lens: Lens, scene: Scene) -> bool:
     """Whether all rays over the stop and on its rim arrive, from all points."""
-    points = np.concatenate([hexapolar(_RINGS)[0], _rim()])
-    aimed = tuple(jnp.asarray(p, lens.curvature.dtype) for p in points.T)
+    points = wide(scene, _extra_points().T.astype(lens.curvature.dtype))
+    (tile,) = tiles(points)
 
-    def one(point: Scene) -> Array:
-        return jnp.all(trace_bundle(lens, point, aimed).status == Status.OK)
+    def arrives(point: Scene) -> bool:
+        """Rays that no aperture clips are searched for if aiming fails."""
+        for solver in (solve_aimed, solve):
+            status = np.asarray(trace_tile(lens, point, (*tile,), solver)[0].status)
+            if np.all(status == Status.OK):
+                return True
+            if np.any(status == Status.CLIPPED):
+                return False
+        return False
 
-    return jnp.all(over_points(one, scene))
+    return all(map(arrives, scene.each()))
 
 
 def _extra_points() -> np.ndarray:
@@ -286,25 +294,26 @@ def _collimated(lens: Lens, light: _Light, wavelengths: Array) -> Array:
 def _light(lens: Lens, scene: Scene, sampling: float | PupilRule | None, point: Point) -> _Light:
     """The light of all points of a scene that fits the lens."""
     require_one_of("point", point, get_args(Point))
-    return _traced(lens, scene, rule_for(lens, scene, sampling), point == "sensor")
+    rule = rule_for(lens, scene, sampling)
+    return _traced(lens, scene, rule, point == "sensor", known_rays(lens, scene, rule, _aim))
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="fixed")
-def _traced(lens: Lens, scene: Scene, rule: PupilRule, fixed: bool) -> _Light:
+def _traced(lens: Lens, scene: Scene, rule: PupilRule, fixed: bool, known: Known) -> _Light:
     """`_light`, compiled. fixed: True for the cone at a point of the sensor, False for that of an
     object point."""
-    return over_points(lambda point: _of_point(lens, point, rule, fixed), scene)
+    return over_points(lambda *one: _of_point(lens, rule, fixed, *one), scene, known)
 
 
-def _of_point(lens: Lens, scene: Scene, rule: PupilRule, fixed: bool) -> _Light:
+def _of_point(lens: Lens, rule: PupilRule, fixed: bool, scene: Scene, known: Known) -> _Light:
     """The light of one object point."""
-    points, weights = _whole_rule(lens, scene, rule)
+    points, weights = _whole_rule(scene, *rule.points(lens, scene, known.plan))
     count = weights.shape[-1]
 
     def arriving(points: Vector, field: Array) -> tuple[tuple[Vector, Vector], tuple]:
         """Hits and transverse direction cosines at the sensor, which are differentiated; status
         and transmission."""
-        bundle = trace_bundle(lens, scene.at(field), points)
+        bundle = trace_bundle(lens, scene.at(field), points, known)
         whole = reaches_sensor(bundle.status)
         hit = tuple(jnp.where(whole, h[-1], 0) for h in bundle.hits)
         line = tuple(jnp.where(whole, a, 0) for a in bundle.arrival[:-1])
@@ -332,10 +341,16 @@ def _of_point(lens: Lens, scene: Scene, rule: PupilRule, fixed: bool) -> _Light:
     return _Light(hits, weight, arrives, chief_hit, whole, throughput, cone, left_out)
 
 
-def _whole_rule(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array]:
+def _aim(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Any]:
+    """Stop points of `_whole_rule` and the plan of a rule."""
+    *given, plan = planned(lens, scene, rule)
+    return _whole_rule(scene, *given)[0], plan
+
+
+@jax.jit
+def _whole_rule(scene: Scene, points: Vector, weights: Array) -> tuple[Vector, Array]:
     """Points of a rule, followed by those of `_extra_points`, 2 arrays (W, Q + B), and weights
     (W, Q). Points on one radius are repeated at rotated azimuths."""
-    points, weights = rule.points(lens, scene)
     waves = scene.wavelengths.shape[0]
     wide = lambda a: jnp.broadcast_to(a, (waves, a.shape[-1]))  # noqa: E731
     weights = wide(weights)

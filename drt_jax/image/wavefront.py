@@ -23,9 +23,11 @@ from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray, paraxial_system
 from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
+from ..rays.known import Known, known_rays
+from ..rays.rays import stop_points
 from ..rays.status import Status, reaches_sensor
 from ..rays.system import dot
-from ..rays.trace import FOCAL, Bundle, stop_points, trace_bundle
+from ..rays.trace import FOCAL, Bundle, trace_bundle
 from .rounding import warn_of_paths
 
 _MM = 1e-3  # per um
@@ -95,20 +97,22 @@ def wavefront(
         if concrete(curvature) and not np.all(np.isfinite(np.asarray(curvature, float))):
             raise ValueError("curvature: must be finite; 0 for a telecentric exit pupil")
     warn_of_paths(lens, scene)
-    return _wavefront(lens, scene, points, kappa)
+    points = jnp.concatenate([jnp.zeros_like(points[:1]), points])  # the chief ray first
+    return _wavefront(lens, scene, points, kappa, known_rays(lens, scene, points.T))
 
 
 @functools.partial(jit, wanted=LARGE)
-def _wavefront(lens: Lens, scene: Scene, pupil: Array, curvature: Array | None) -> Wavefront:
-    """`wavefront` of checked arguments."""
-    points = jnp.concatenate([jnp.zeros_like(pupil[:1]), pupil])  # the chief ray first
+def _wavefront(
+    lens: Lens, scene: Scene, points: Array, curvature: Array | None, known: Known
+) -> Wavefront:
+    """`wavefront` of checked arguments and the chief ray, and the points after it."""
 
-    def one(point: Scene) -> Wavefront:
-        bundle = trace_bundle(lens, point, (points[:, 0], points[:, 1]))
+    def one(point: Scene, known: Known) -> Wavefront:
+        bundle = trace_bundle(lens, point, (points[:, 0], points[:, 1]), known)
         opd, status, image = path_differences(lens, scene.wavelengths, bundle, curvature)
         return Wavefront(opd[:, 1:], status[:, 1:], image)
 
-    return over_points(one, scene)
+    return over_points(one, scene, known)
 
 
 def path_differences(

@@ -27,6 +27,7 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import einsum, matmul
 from ..pupil.patterns import disc
+from ..rays.known import Known, known_rays
 from ..rays.status import Status, reaches_sensor
 from ..rays.trace import trace_bundle
 from .rounding import warn_of_paths
@@ -257,21 +258,24 @@ def _coefficients(lens: Lens, scene: Scene, rows: tuple[int, ...]) -> Array:
     """Coefficients (..., W, P) of terms given by their indices in Noll's order, counted from 0."""
     scene = checked_scene(lens, scene)
     warn_of_paths(lens, scene)
-    return _least_squares(lens, scene, rows)
+    points = np.concatenate([np.zeros((1, 2)), disc(_ORDER, _AZIMUTHS)[0]])  # the chief ray first
+    aimed = jnp.asarray(points.T, lens.curvature.dtype)
+    return _least_squares(lens, scene, aimed, rows, known_rays(lens, scene, aimed))
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="rows")
-def _least_squares(lens: Lens, scene: Scene, rows: tuple[int, ...]) -> Array:
+def _least_squares(
+    lens: Lens, scene: Scene, aimed: Array, rows: tuple[int, ...], known: Known
+) -> Array:
     """The least-squares fit: the normal equations of the terms, solved for each point and
-    wavelength."""
-    points, weights = disc(_ORDER, _AZIMUTHS)
+    wavelength. aimed: (2, 1 + Q), stop points of the chief ray and the others."""
+    _, weights = disc(_ORDER, _AZIMUTHS)
     degree = next(n for n in range(40) if (n + 1) * (n + 2) // 2 > max(rows))
     dtype = lens.curvature.dtype
-    aimed = jnp.asarray(np.concatenate([np.zeros((1, 2)), points]).T, dtype)
     basis = zernike(aimed[:, 1:], degree)[np.array(rows)]
 
-    def one(point: Scene) -> Array:
-        bundle = trace_bundle(lens, point, tuple(aimed))
+    def one(point: Scene, known: Known) -> Array:
+        bundle = trace_bundle(lens, point, tuple(aimed), known)
         opd, status, _ = path_differences(lens, scene.wavelengths, bundle)
         light = jnp.asarray(weights, dtype)[None] * (status[:, 1:] == Status.OK).astype(dtype)
         whole = reaches_sensor(status[:, 0])
@@ -282,4 +286,4 @@ def _least_squares(lens: Lens, scene: Scene, rows: tuple[int, ...]) -> Array:
         found = jnp.linalg.solve(normal, right[..., None])[..., 0]
         return jnp.where(enough[:, None], found, jnp.inf)
 
-    return over_points(one, scene)
+    return over_points(one, scene, known)

@@ -251,20 +251,19 @@ def checked_scene(lens: Lens, scene: Scene) -> Scene:
     return Scene(field, distance, waves, weights, scene.field_weights)
 
 
-def over_points(function: Callable[[Scene], Any], scene: Scene) -> Any:
+def over_points(function: Callable[..., Any], scene: Scene, *others: Any) -> Any:
     """A function of one object point, evaluated for all points of a scene. Its results get the
     shape of the points as their first axes.
 
-    function: takes a scene of one point.
+    function: takes a scene of one point, and the entries of `others` for that point.
     scene: arrays, as `checked_scene` returns them.
+    others: trees of arrays with the P points on the first axis, if the scene has several.
     """
     if not scene.shape:
-        return function(scene)
-    if not scene.distance.ndim:  # all points share what follows from the distance
-        fields = scene.field.reshape(-1, 2)
-        found = jax.vmap(lambda field: function(scene.at(field)))(fields)
-    else:
-        found = jax.vmap(lambda *point: function(scene.at(*point)))(*scene.flat())
+        return function(scene, *others)
+    # If there is one distance, all points share what follows from it.
+    points = scene.flat() if scene.distance.ndim else (scene.field.reshape(-1, 2),)
+    found = jax.vmap(lambda point, *own: function(scene.at(*point), *own))(points, *others)
     return jax.tree.map(lambda a: a.reshape(*scene.shape, *a.shape[1:]), found)
 
 

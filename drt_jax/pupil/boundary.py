@@ -30,9 +30,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import einsum, run_if, safe_divide, safe_sqrt
+from ..numerics import eager_values, einsum, run_if, safe_divide, safe_sqrt
 from ..rays.aim import beam_size, nearest_start, no_fan, paraxial_launch, trace_fan
 from ..rays.snell import shoot, shoot_anyway, split_stop
 from ..rays.status import Status
@@ -328,13 +329,13 @@ class _Setting(NamedTuple):
 
     lens, system: the lens and its traced system.
     radial: static description of the spokes.
-    used: (G,), int32, number of spokes of each order.
+    angles: azimuths (W, B) of the spokes of the rule, as a function of the frame and the corners.
     """
 
     lens: Lens
     system: System
     radial: RadialRule
-    used: Array
+    angles: Callable[[Frame, EdgeRays], Array]
 
 
 class _State(NamedTuple):
@@ -447,21 +448,26 @@ def _corners(setting: _Setting, state: _State, _: Array) -> tuple[_State, _Task]
 def _nodes(setting: _Setting, state: _State, part: Array) -> tuple[_State, _Task]:
     """Stage 6 and later: one batch of rays to the ends of the spokes of the rule, which lie
     between the corners."""
-    radial = setting.radial
-    rays, pair, settled = jax.tree.map(lambda a: a[..., : radial.corners], state.latest)
-    inside = outside(rays, rays.point) < _CORNER_MARGIN
-    latest = EdgeRays(rays, pair, settled & inside & (pair[0] != pair[1]))
+    radial, latest = setting.radial, _corners_of(setting.radial, state.latest)
     corners = jax.tree.map(lambda a, b: jnp.where(part == 0, a, b), latest, state.corners)
-    angle, _ = radial.nodes(state.frame, setting.used, corners.rays.point, corners.settled)
+    angle = setting.angles(state.frame, corners)
     angle = jax.lax.dynamic_slice_in_dim(angle, part * radial.batch, radial.batch, axis=-1)
     start = state.even.at(radial.nearest(angle))
     target = target_of(start, state.frame.centre, state.frame.toward(angle))
     return state._replace(corners=corners), (start, target, _STEPS, _near(start))
 
 
-def _initial(setting: _Setting, crossing: bool) -> _State:
+def _corners_of(radial: RadialRule, latest: EdgeRays) -> EdgeRays:
+    """The corners among the results of stage 5."""
+    rays, pair, settled = jax.tree.map(lambda a: a[..., : radial.corners], latest)
+    inside = outside(rays, rays.point) < _CORNER_MARGIN
+    return EdgeRays(rays, pair, settled & inside & (pair[0] != pair[1]))
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _initial(lens: Lens, scene: Scene, radial: RadialRule, crossing: bool) -> _State:
     """The state before the first stage: zeros of the right shapes."""
-    lens, waves, kind = setting.lens, setting.system.index.shape[1], setting.system.index.dtype
+    waves, kind = scene.wavelengths.shape[0], lens.curvature.dtype
     edges = lens.count + 1 + crossing * len(lens.active) + aperture_edges(lens)
     zeros = functools.partial(jnp.zeros, dtype=kind)
 
@@ -471,8 +477,8 @@ def _initial(setting: _Setting, crossing: bool) -> _State:
         rays = Rays(point, point, q, rates, jnp.stack([q, q]), no)
         return EdgeRays(rays, point.astype(jnp.int32), no)
 
-    one, latest, ends = none(1), none(setting.radial.batch), none(setting.radial.count)
-    corners = none(setting.radial.corners)
+    one, latest, ends = none(1), none(radial.batch), none(radial.count)
+    corners = none(radial.corners)
     frame = Frame(one.rays.point, one.rays.d_launch)
     return _State(frame, one.settled, latest.rays, corners, latest, ends)
 
@@ -505,17 +511,65 @@ def plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, crossing: bo
     lens, scene: without derivatives.
     radial: static description of the spokes.
     used: (G,), int32, number of spokes of each order.
-    crossing: whether points where neighbouring surfaces cross belong to the
+    crossing: whether points where neighbouring surfaces cross belong to the boundary.
+    """
+    if eager_values((lens, scene, used)) is not None:
+        return _known_plan(lens, scene, radial, used, crossing)
+
+    def angles(frame: Frame, corners: EdgeRays) -> Array:
+        return radial.nodes(frame, used, corners.rays.point, corners.settled)[0]
+
+    setting = _Setting(lens, system_of(lens, scene), radial, angles)
+    state, end = _initial(lens, scene, radial, crossing), _last(radial) + radial.parts
+    return _plan_of(_run(setting, crossing, state, np.int32(0), end), used)
+
+
+def _known_plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, crossing: bool) -> Plan:
+    """`plan` of known numbers, by a program that all rules share: first all stages in front of
+    the last, then the last one for each batch of spokes."""
+    one, last = radial.one_batch, _last(radial)
+    none = np.zeros((scene.wavelengths.size, one.count), lens.curvature.dtype)
+    run = functools.partial(_known_stages, lens, scene, one, crossing)
+    state = run(none, _initial(lens, scene, one, crossing), np.int32(0), last)
+    angle = np.asarray(_angles(radial, used, state.frame, state.latest))
+    batches = np.split(angle, radial.parts, axis=-1)
+    parts = [run(batch, state, last, last + 1) for batch in batches]
+    ends = jax.tree.map(lambda *a: np.concatenate(a, axis=-1), *(part.ends for part in parts))
+    return _plan_of(parts[0]._replace(ends=ends), used)
+
+
+@functools.partial(jit, wanted=LARGE, static_argnames=("radial", "crossing"))
+def _known_stages(
+    lens: Lens, scene: Scene, radial: RadialRule, crossing: bool, angle: Array, state: _State,
+    begin: Array, end: Array,
+) -> _State:  # fmt: skip
+    """`_run` with the azimuths (W, B) of one batch of spokes."""
+    setting = _Setting(lens, system_of(lens, scene), radial, lambda *_: angle)
+    return _run(setting, crossing, state, begin, end)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _angles(radial: RadialRule, used: Array, frame: Frame, latest: EdgeRays) -> Array:
+    """Azimuths (W, B) of the spokes of a rule, from the results of stage 5."""
+    corners = _corners_of(radial, latest)
+    return radial.nodes(frame, used, corners.rays.point, corners.settled)[0]
+
+
+def _last(radial: RadialRule) -> np.int32:
+    """Index of the last stage; one radius has no corners."""
+    return np.int32(3 if radial.symmetry == "rotational" else 5)
+
+
+def _run(setting: _Setting, crossing: bool, state: _State, begin: Any, end: Any) -> _State:
+    """Runs the stages from `begin` to `end`; the last stage once for each batch of spokes.
 
     One loop runs all stages, so that the trace, which is slow to compile, appears once in the
     program.
     """
-    setting = _Setting(lens, system_of(lens, scene), radial, used)
-    to_edges = functools.partial(trace, lens, setting.system, crossing)
-    stages = [_start, _rescue, _middle, _ends, _corners, _nodes]
-    count = 4 if radial.symmetry == "rotational" else 6  # one radius has no corners
-    tasks = [functools.partial(stage, setting) for stage in stages[:count]]
-    parts, last = radial.count // radial.batch, np.int32(count - 1)
+    radial = setting.radial
+    to_edges = functools.partial(trace, setting.lens, setting.system, crossing)
+    stages, last = [_start, _rescue, _middle, _ends, _corners, _nodes], _last(radial)
+    tasks = [functools.partial(stage, setting) for stage in stages[: last + 1]]
 
     def run(stage, state):
         part = jnp.maximum(stage - last, 0)
@@ -525,7 +579,12 @@ def plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, crossing: bo
         ends = jax.tree.map(lambda a, b: into(a, b, part * radial.batch), state.ends, latest)
         return state._replace(latest=latest, ends=ends)
 
-    state = jax.lax.fori_loop(0, count - 1 + parts, run, _initial(setting, crossing))
+    return jax.lax.fori_loop(begin, end, run, state)
+
+
+@jax.jit
+def _plan_of(state: _State, used: Array) -> Plan:
+    """The plan of the last state."""
     join = lambda a, b: jnp.concatenate([a, b], axis=-1)  # noqa: E731
     edge = jax.tree.map(join, state.corners, state.ends)
     edge = edge._replace(settled=edge.settled & state.passes)

@@ -13,6 +13,7 @@ last.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,7 +23,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import Numbers, brief, safe_divide
+from ..numerics import Numbers, brief, eager_values, safe_divide
 from ..rays.status import reaches_sensor
 from ..rays.system import Vector, determinant, dot, system_of
 from ..rays.trace import Bundle
@@ -128,10 +129,18 @@ class Clipped(Fitted):
             check_rule(self.order, self.symmetry)
             object.__setattr__(self, "size", self.order)
 
-    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+    def plan(self, lens: Lens, scene: Scene) -> boundary.Plan:
+        """The boundary of the pupil."""
+        return self._group.plan(lens, scene)
+
+    def points(self, lens: Lens, scene: Scene, plan: Any = None) -> tuple[Vector, Array]:
         """Points and weights, both differentiable in the lens."""
-        group = ClippedGroup([self.order], 0, (self.size,), self.symmetry, self.crossing)
-        return _open(group, lens, scene)[0]
+        return self._group.points(lens, scene, plan)
+
+    @property
+    def _group(self) -> "ClippedGroup":
+        """The group of this rule alone."""
+        return ClippedGroup([self.order], 0, (self.size,), self.symmetry, self.crossing)
 
 
 @jax.tree_util.register_dataclass
@@ -152,11 +161,31 @@ class ClippedGroup(Fitted):
     crossing: bool = dataclasses.field(metadata={"static": True})
     __repr__ = brief
 
-    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+    def plan(self, lens: Lens, scene: Scene) -> boundary.Plan:
+        """The boundary of the pupil, or of each of its T parts on a first axis (T,)."""
+        lens, scene = jax.lax.stop_gradient((lens, scene))
+        used = jnp.asarray(
+            _spokes(lens, self.symmetry, jnp.asarray(self.orders, jnp.int32)), jnp.int32
+        )
+
+        def found(own: Lens) -> boundary.Plan:
+            return boundary.plan(own, scene, self.radial(own), used, self.crossing)
+
+        return jax.lax.stop_gradient(_of_parts(found, lens))
+
+    def points(self, lens: Lens, scene: Scene, plan: Any = None) -> tuple[Vector, Array]:
         """Points of all orders and their weights, which are 0 for orders that are not chosen."""
-        parts = [(*points, weights) for points, weights in _open(self, lens, scene)]
+        plan = self.plan(lens, scene) if plan is None else plan
+        parts = [(*points, weights) for points, weights in _open(self, lens, scene, plan)]
         *points, weights = (jnp.concatenate(arrays, axis=-1) for arrays in zip(*parts))
         return tuple(points), jnp.where(self.own(lens)[None], weights, 0)
+
+    def radial(self, lens: Lens) -> RadialRule:
+        """Static description of the spokes of all orders."""
+        most = tuple(_most(lens, self.symmetry, size) for size in self.sizes)
+        extra = lens.apertures
+        sides = 0 if extra is None else extra.most * extra.kinds.count("polygon")
+        return RadialRule(self.symmetry, most, CORNERS + 2 * sides)
 
     def own(self, lens: Lens) -> Any:
         """Mask (Q,), bool, of the rays of the chosen order; a NumPy array if `chosen` is known."""
@@ -178,20 +207,51 @@ def _most(lens: Lens, symmetry: Symmetry, size: int) -> int:
     return max(_spokes(lens, symmetry, size), 1)
 
 
-def _open(group: ClippedGroup, lens: Lens, scene: Scene) -> list[tuple[Vector, Array]]:
+def _parted(lens: Lens) -> bool:
+    """Whether the open area is a sum of parts, see `_open`."""
+    extra = lens.apertures
+    return extra is not None and bool(extra.most or any(extra.blocks))
+
+
+def _of_parts(function: Callable, lens: Lens, *others: Any, axis: int = 0) -> Any:
+    """A function of the lens with the apertures of each of the T parts of the open area. Its
+    results get the axis of the parts.
+
+    others: further arguments of the function, with the parts on their first axis.
+
+    Known parts are evaluated one by one, so that they share a program.
+    """
+    extra = lens.apertures
+    if extra is None or not _parted(lens):
+        return function(lens, *others)
+
+    def part(shapes: Array, corners: Array, *others: Any) -> Any:
+        own = dataclasses.replace(lens, apertures=extra.part(shapes, corners))
+        return function(own, *others)
+
+    parts = *map(jnp.asarray, extra.terms()[1:]), *others
+    if eager_values((lens, others)) is None:
+        return jax.vmap(part, out_axes=axis)(*parts)
+    each = [part(*jax.tree.map(lambda a: a[k], parts)) for k in range(len(parts[0]))]
+    return jax.tree.map(lambda *a: jnp.stack(a, axis), *each)
+
+
+def _open(
+    group: ClippedGroup, lens: Lens, scene: Scene, plan: boundary.Plan
+) -> list[tuple[Vector, Array]]:
     """Points and weights of each of G orders, for the open area of the pupil.
 
     The open area is a sum, with signs, of areas inside of convex apertures: the `terms` of the
     apertures, which subtract obscurations and add the convex pieces of polygons.
     """
-    extra = lens.apertures
-    if extra is None or not (extra.most or any(extra.blocks)):
-        return _inside(group, lens, scene)
-    sign, *terms = extra.terms()
 
-    def part(shapes, corners):
-        own = dataclasses.replace(lens, apertures=extra.part(shapes, corners))
-        return _inside(group, own, scene)
+    def inside(own: Lens, plan: boundary.Plan) -> list[tuple[Vector, Array]]:
+        return _inside(group, own, scene, plan)
+
+    found = _of_parts(inside, lens, plan, axis=1)
+    if lens.apertures is None or not _parted(lens):
+        return found
+    sign = lens.apertures.terms()[0]
 
     def total(points, weight):  # from (W, T, Q)
         weight = weight * jnp.asarray(sign, weight.dtype)[None, :, None]
@@ -201,10 +261,12 @@ def _open(group: ClippedGroup, lens: Lens, scene: Scene) -> list[tuple[Vector, A
         positive = jnp.sum(weight, axis=-1, keepdims=True) > least
         return points, jnp.where(positive, weight, 0)
 
-    return [total(*one) for one in jax.vmap(part, out_axes=1)(*map(jnp.asarray, terms))]
+    return [total(*one) for one in found]
 
 
-def _inside(group: ClippedGroup, lens: Lens, scene: Scene) -> list[tuple[Vector, Array]]:
+def _inside(
+    group: ClippedGroup, lens: Lens, scene: Scene, plan: boundary.Plan
+) -> list[tuple[Vector, Array]]:
     """Points and weights of each of G orders, for the area that is inside of all apertures and also
     inside of all obscurations.
 
@@ -213,20 +275,14 @@ def _inside(group: ClippedGroup, lens: Lens, scene: Scene) -> list[tuple[Vector,
     L^2 det(M) 2 r w_r for a spoke with the weight `share` in azimuth and a radial node r with the
     weight w_r.
     """
-    orders, sizes, symmetry = jnp.asarray(group.orders, jnp.int32), group.sizes, group.symmetry
-    most = tuple(_most(lens, symmetry, size) for size in sizes)
-    extra = lens.apertures
-    sides = 0 if extra is None else extra.most * extra.kinds.count("polygon")
-    radial = RadialRule(symmetry, most, CORNERS + 2 * sides)
-    used = jnp.asarray(_spokes(lens, symmetry, orders), jnp.int32)
-    plan = boundary.plan(*jax.lax.stop_gradient((lens, scene)), radial, used, group.crossing)
-    plan = jax.lax.stop_gradient(plan)
+    orders, sizes, radial = jnp.asarray(group.orders, jnp.int32), group.sizes, group.radial(lens)
     point, _ = _attach(radial, group.crossing, lens, scene, plan)
     corner, end = point[..., : -radial.count], point[..., -radial.count :]
     toward, share = plan.spokes(radial, corner)
     length = _along(end - plan.frame.centre, toward)
     area = jnp.where(plan.passes, share * length**2 * determinant(plan.frame.shape), 0)
-    axial, centre, found = symmetry == "rotational", plan.frame.centre[..., None], []
+    axial, centre, found = group.symmetry == "rotational", plan.frame.centre[..., None], []
+    most = [_most(lens, group.symmetry, size) for size in sizes]
     stops = np.cumsum(most)  # the spokes behind the last stop are padding
     for k, (start, stop) in enumerate(zip(stops - most, stops)):
         node, weight = jnp.asarray(gauss(sizes[k]), length.dtype)[:, orders[k]]

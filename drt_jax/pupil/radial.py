@@ -152,6 +152,17 @@ class RadialRule:
         return -(-sum(self.most) // self.batch) * self.batch
 
     @property
+    def parts(self) -> int:
+        """Number of batches of spokes."""
+        return self.count // self.batch
+
+    @property
+    def one_batch(self) -> "RadialRule":
+        """The same description of one batch of spokes."""
+        most = self.most if self.symmetry == "rotational" else (self.batch,)
+        return dataclasses.replace(self, most=most)
+
+    @property
     def range(self) -> float:
         """Range of the azimuths, radians, which begins at -pi/2."""
         return 2 * np.pi if self.symmetry == "none" else np.pi

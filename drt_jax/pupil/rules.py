@@ -9,19 +9,22 @@ stop, made of pixels, is a coded aperture, an apodiser or a phase plate.
 import abc
 import dataclasses
 import itertools
-from typing import Literal, get_args
+from functools import partial
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..compilation import LARGE, jit
 from ..inputs import require_one_of
 from ..lens.clearance import clearance
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, brief, concrete, real_array, safe_divide
+from ..rays.known import Known, known_rays
 from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector
 from ..rays.trace import Bundle
@@ -104,9 +107,16 @@ class PupilRule(abc.ABC):
 
     symmetry: Symmetry
 
+    def plan(self, lens: Lens, scene: Scene) -> Any:
+        """What is searched for before the points are known; None if nothing is. It is a constant
+        in derivatives."""
+        return None
+
     @abc.abstractmethod
-    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+    def points(self, lens: Lens, scene: Scene, plan: Any = None) -> tuple[Vector, Array]:
         """Points on the stop in units of its semi-diameter, and their weights.
+
+        plan: result of `plan` for the same lens and scene; None to search now.
 
         Returns D arrays (Q,) or (W, Q), D = 1 for "rotational" and 2 otherwise, and weights (1, Q)
         or (W, Q).
@@ -148,7 +158,7 @@ class Gauss(PupilRule):
     def __post_init__(self) -> None:
         check_rule(self.order, self.symmetry)
 
-    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+    def points(self, lens: Lens, scene: Scene, plan: Any = None) -> tuple[Vector, Array]:
         """Points and weights of the order, which are constants."""
         points, weights = gauss_points(self.order, self.symmetry)
         dtype = lens.curvature.dtype
@@ -174,7 +184,7 @@ class Soft(PupilRule):
         if isinstance(self.width, int | float) and not self.width > 0:
             raise ValueError(f"width: expected a number above 0 mm, got {self.width!r}")
 
-    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+    def points(self, lens: Lens, scene: Scene, plan: Any = None) -> tuple[Vector, Array]:
         """Points and weights of the order, which are constants."""
         return Gauss(self.order, self.symmetry).points(lens, scene)
 
@@ -205,7 +215,7 @@ class Pattern(PupilRule):
     symmetry: Symmetry = dataclasses.field(metadata={"static": True}, default="none")
     __repr__ = brief
 
-    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+    def points(self, lens: Lens, scene: Scene, plan: Any = None) -> tuple[Vector, Array]:
         """The given points and weights in the dtype of the lens. ValueError for wrong shapes."""
         dtype = lens.curvature.dtype
         positions = real_array("positions", self.positions, dtype)
@@ -225,6 +235,28 @@ def check_rule(order: int, symmetry: Symmetry) -> None:
     if not whole or not 1 <= order <= MAX_ORDER:
         raise ValueError(f"order: expected a whole number from 1 to {MAX_ORDER}, got {order!r}")
     require_one_of("symmetry", symmetry, get_args(Symmetry))
+
+
+def planned(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Array, Any]:
+    """Points, weights and plan of a rule for one object point; known numbers."""
+    plan = rule.plan(lens, scene)
+    return *_points(lens, scene, rule, plan), plan
+
+
+@partial(jit, wanted=LARGE)
+def _points(lens: Lens, scene: Scene, rule: PupilRule, plan: Any) -> tuple[Vector, Array]:
+    """Points and weights of a rule, compiled."""
+    return rule.points(lens, scene, plan)
+
+
+def rule_rays(lens: Lens, scene: Scene, rule: PupilRule) -> Known:
+    """Rays of a rule for all points of a scene, see `known_rays`."""
+
+    def aim(lens: Lens, point: Scene, rule: PupilRule) -> tuple[Vector, Any]:
+        points, _, plan = planned(lens, point, rule)
+        return points, plan
+
+    return known_rays(lens, scene, rule, aim)
 
 
 def pupil_points(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Array, Array]:
@@ -350,13 +382,17 @@ class Masked(PupilRule):
         """Symmetry of `rule`."""
         return self.rule.symmetry
 
-    def points(self, lens: Lens, scene: Scene) -> tuple[Vector, Array]:
+    def plan(self, lens: Lens, scene: Scene) -> Any:
+        """The plan of `rule`."""
+        return self.rule.plan(lens, scene)
+
+    def points(self, lens: Lens, scene: Scene, plan: Any = None) -> tuple[Vector, Array]:
         """Points and weights of `rule`. ValueError as described for the class."""
         self.mask.check()
         if self.symmetry != "none" or self.mask.path is not None:
             what = 'give a rule of the symmetry "none" and no path: a path acts on waves alone'
             raise ValueError(f"Masked: {what}, in psf")
-        return self.rule.points(lens, scene)
+        return self.rule.points(lens, scene, plan)
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
         """Transmission (W, Q) of `rule` times that of the mask."""

@@ -5,6 +5,7 @@ Fermat equations. A ray that aiming does not find is searched for with a fan. Fo
 `solve`.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -163,8 +164,25 @@ def find(
     return Found(hits, fermat.arrival(hits, system), status, search.steps + steps)
 
 
-@jax.jit
-def find_aimed(system: System, target: Vector) -> Found:
+def _of_finite(search: Callable[[System, Vector, Array], Found]) -> Callable:
+    """A search without stop points that are not finite: their rays are MISSED.
+
+    search: takes the system, the stop points, and the mask (W, Q) of those that were finite.
+    """
+
+    @jax.jit
+    @functools.wraps(search)
+    def finite(system: System, target: Vector) -> Found:
+        known = jnp.all(jnp.isfinite(jnp.stack(target)), axis=0)
+        found = search(system, where(known, target, 0), known)
+        status = jnp.where(known, found.status, Status.MISSED).astype(jnp.int32)
+        return found._replace(hits=where(known, found.hits, 0), status=status)
+
+    return finite
+
+
+@_of_finite
+def find_aimed(system: System, target: Vector, known: Array) -> Found:
     """Finds rays by aiming alone, see `aim_outwards`.
 
     Every ray that does not meet its stop point to rounding is UNCONVERGED. The compiled program is
@@ -348,32 +366,27 @@ def _verdict(system: System, launch: Vector, status: Array) -> tuple[Vector, Arr
     return trace.hits, jnp.where(status == Status.OK, traced, status)
 
 
-@jax.jit
-def find_many(system: System, target: Vector) -> Found:
+@_of_finite
+def find_many(system: System, target: Vector, known: Array) -> Found:
     """Finds rays as `find` does, also in large bundles.
 
     A large bundle is split into tiles. Polynomials launch its rays, and only tiles in which a ray
-    misses are searched. A stop point that is not finite gives MISSED without a search.
+    misses are searched.
 
     target: D arrays (W, Q), stop points, mm.
     """
-    known = jnp.all(jnp.isfinite(jnp.stack(target)), axis=0)
-    target = where(known, target, 0)
     waves, rays = target[0].shape
     size = tile_of(rays, waves)
     if len(target) == 1 or size == rays:
-        found = find(system, target, searched=known)
-    else:
-        launch_of = polynomial_launch(system, target)
+        return find(system, target, searched=known)
+    launch_of = polynomial_launch(system, target)
 
-        def tile(target, known):
-            launch = launch_of(target)
-            found = _exact(system, target, launch, jnp.zeros(target[0].shape, jnp.int32))
-            missing = jnp.any(known & (found.status != Status.OK))
-            found = run_if(missing, lambda _: find(system, target, launch, known), found)
-            return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
+    def tile(target, known):
+        launch = launch_of(target)
+        found = _exact(system, target, launch, jnp.zeros(target[0].shape, jnp.int32))
+        missing = jnp.any(known & (found.status != Status.OK))
+        found = run_if(missing, lambda _: find(system, target, launch, known), found)
+        return found._replace(steps=jnp.broadcast_to(found.steps, target[0].shape))
 
-        found = in_tiles(tile, size, target, known)
-        found = found._replace(steps=jnp.max(found.steps))
-    hits, status = where(known, found.hits, 0), jnp.where(known, found.status, Status.MISSED)
-    return found._replace(hits=hits, status=status.astype(jnp.int32))
+    found = in_tiles(tile, size, target, known)
+    return found._replace(steps=jnp.max(found.steps))

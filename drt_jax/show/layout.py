@@ -21,8 +21,8 @@ from ..lens.lens import Lens, sag
 from ..lens.scene import Scene, checked_scene
 from ..numerics import einsum
 from ..pupil.patterns import hexapolar
+from ..rays.rays import trace_rays
 from ..rays.status import Status
-from ..rays.trace import trace_rays
 from .figures import FIELD_COLOURS
 
 _POINTS = 161

@@ -12,7 +12,8 @@ from drt_jax import Scene, Status, first_order, load_lens, pupil, sag, trace_ray
 from drt_jax.lens.forms import FORMS
 from drt_jax.lens.lens import Labels
 from drt_jax.lens.scene import checked_scene
-from drt_jax.rays.trace import _trace, trace_bundle
+from drt_jax.rays.rays import _trace
+from drt_jax.rays.trace import trace_bundle
 
 from ..conftest import LENSES, RGB, assert_close
 from ..known import known, search
