@@ -184,15 +184,20 @@ class Beam:
         """
         side = jnp.asarray(np.arange(cells) - (cells - 1) / 2, step.dtype)
         axes = middle[..., None] + step[..., None] * side[None, None]
-        found = jnp.ones((axes.shape[1], cells, cells), bool)
-        for angle in np.pi / _BOUNDS * np.arange(_BOUNDS):
-            x, y = np.cos(angle).item(), np.sin(angle).item()
+
+        def within(found: Array, unit: Array) -> tuple[Array, None]:
+            """Leaves the cells that also lie within the extent along one direction."""
+            x, y = unit
             low, high = _extent(x * places[0] + y * places[1], self.known, self._margin())
             along = x * axes[0][:, None, :] + y * axes[1][:, :, None]
             cell = (abs(x) * step[0] + abs(y) * step[1]) / 2
             ends = (low - cell)[:, None, None], (high + cell)[:, None, None]
-            found &= (along >= ends[0]) & (along <= ends[1])
-        return found
+            return found & (along >= ends[0]) & (along <= ends[1]), None
+
+        angle = np.pi / _BOUNDS * np.arange(_BOUNDS)
+        units = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=-1), step.dtype)
+        found = jnp.ones((axes.shape[1], cells, cells), bool)
+        return jax.lax.scan(within, found, units)[0]
 
     def _margin(self) -> float:
         """Factor by which the light may extend farther than the outermost rays, because Gauss

@@ -36,6 +36,7 @@ from ..numerics import (
     safe_divide,
     safe_sqrt,
 )
+from ..rays.known import SEARCH, Known, known_rays
 from ..rays.status import reaches_sensor
 from ..rays.system import Vector, determinant, divide
 from ..rays.trace import FOCAL, trace_bundle
@@ -206,31 +207,32 @@ def _distortion(
 def _chief_rays(lens: Lens, scene: Scene) -> _ChiefRays:
     """The chief rays of the points of a scene that fits the lens."""
     if known_values((lens, scene)) is None:
-        return _traced(lens, scene)
+        return _traced(lens, scene, SEARCH)
+    known = known_rays(lens, scene, CHIEF.T.astype(lens.curvature.dtype))
     # Padding lets similar numbers of points share a program.
     count, shape = math.prod(scene.shape), scene.shape
     pad = lambda a: jnp.resize(a, (count + -count % _POINTS, *a.shape[1:]))  # noqa: E731
     fields = pad(jnp.broadcast_to(scene.field, (*shape, 2)).reshape(-1, 2))
     far = scene.distance
     far = pad(jnp.broadcast_to(far, shape).reshape(-1)) if far.ndim else far
-    found = _traced(lens, scene.at(fields, far))
+    found = _traced(lens, scene.at(fields, far), jax.tree.map(pad, known))
     return jax.tree.map(lambda a: a[:count].reshape(*shape, *a.shape[1:]), found)
 
 
 @functools.partial(jit, wanted=LARGE)
-def _traced(lens: Lens, scene: Scene) -> _ChiefRays:
+def _traced(lens: Lens, scene: Scene, known: Known) -> _ChiefRays:
     """`_chief_rays`, compiled."""
-    return over_points(functools.partial(_chief_ray, lens), scene)
+    return over_points(functools.partial(_chief_ray, lens), scene, known)
 
 
-def _chief_ray(lens: Lens, scene: Scene) -> _ChiefRays:
+def _chief_ray(lens: Lens, scene: Scene, known: Known) -> _ChiefRays:
     """The chief rays of one point."""
     field = scene.field
 
     def arriving(point: Vector, field: Array) -> tuple[tuple[Vector, Array, Vector], tuple]:
         """Hit, sag and slope at the sensor, which are differentiated; and whether the ray
         exists, with its direction cosines."""
-        bundle = trace_bundle(lens, scene.at(field), point)
+        bundle = trace_bundle(lens, scene.at(field), point, known)
         whole = reaches_sensor(bundle.status)
         hit = tuple(jnp.where(whole, h[-1], 0)[:, 0] for h in bundle.hits)
         *across, along = (jnp.where(whole, a, 0)[:, 0] for a in bundle.arrival)

@@ -21,7 +21,8 @@ from ..inputs import require_one_of, require_tolerance, warn
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, known_values, real_array
-from ..pupil.rules import require_fit, symmetry_of
+from ..pupil.rules import require_fit, rule_rays, symmetry_of
+from ..rays.known import Known
 from .beam import Beam, BeamRule, beam_rule, trace_beam
 from .beam_psf import Kind, Psf, Sampling, psf_of_beam
 from .converged import at_sensor, find_rule
@@ -91,23 +92,27 @@ def psf(
     step = real_array("defocus", defocus, dtype)
     require_fit(sampling.rule.rule.symmetry, scene.field)
     how = dataclasses.replace(sampling, errors={})  # numbers that no program needs
-    found = _psf(lens, scene, how, pixels, step)
+    known = rule_rays(lens, scene, how.rule.rule)
+    found = _psf(lens, scene, how, pixels, step, known)
     if made and scene.shape:
         warn_of_loss(lens, scene, found.outside, pixels, how)
     return found
 
 
 @functools.partial(jit, wanted=LARGE)
-def _psf(lens: Lens, scene: Scene, how: Sampling, pixels: Pixels, defocus: Array) -> Psf:
+def _psf(
+    lens: Lens, scene: Scene, how: Sampling, pixels: Pixels, defocus: Array, known: Known
+) -> Psf:
     """`psf` of checked arguments, of one object point after the other."""
 
-    def one(point: tuple[Array, Array]) -> Psf:
-        beam = trace_beam(lens, scene.at(*point), how.rule).refocused(defocus)
+    def one(point: tuple[tuple[Array, Array], Known]) -> Psf:
+        place, known = point
+        beam = trace_beam(lens, scene.at(*place), how.rule, known).refocused(defocus)
         return psf_of_beam(lens, beam, scene.wavelengths, pixels, how.kind, how.cells)
 
     if not scene.shape:
-        return one((scene.field, scene.distance))
-    found = jax.lax.map(jax.checkpoint(one), scene.flat())
+        return one(((scene.field, scene.distance), known))
+    found = jax.lax.map(jax.checkpoint(one), (scene.flat(), known))
     return jax.tree.map(lambda a: a.reshape(*scene.shape, *a.shape[1:]), found)
 
 

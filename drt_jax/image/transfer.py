@@ -306,7 +306,10 @@ def _of_waves(
         """The integrals (W,) of P conj(P) and of |P| |P| over the overlap of two pupils that are
         shifted by `shear` (2, W)."""
         step = jnp.maximum(high - low - jnp.abs(shear), 0) / cells
-        first, second = pupil(middle + shear / 2, step), pupil(middle - shear / 2, step)
+        # A loop, so that `pupil` is compiled once.
+        centres = middle + jnp.stack([shear, -shear]) / 2
+        both = jax.lax.map(lambda centre: pupil(centre, step), centres)
+        first, second = (jax.tree.map(lambda a: a[k], both) for k in range(2))
         inside = shared_part(first, second)
         light = safe_sqrt(first.light * second.light) * inside
         light = light * (step[0] * step[1])[:, None, None]

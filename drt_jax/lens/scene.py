@@ -166,8 +166,9 @@ class Scene:
         return self.at(jnp.pad(self.field.reshape(-1, 2), ((1, 0), (0, 0))))
 
     def each(self) -> "list[Scene]":
-        """The points, one by one."""
-        fields, far = self.flat()
+        """The points, one by one; of known numbers as NumPy arrays."""
+        flat = self.flat()
+        fields, far = jax.tree.map(np.asarray, flat) if concrete(flat) else flat
         return [self.at(fields[k], far[k]) for k in range(len(far))]
 
     def flat(self) -> tuple[Array, Array]:
