@@ -1,14 +1,17 @@
 """What experiments on speed measure with. `test_starts` runs them."""
 
+import dataclasses
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
-from experiments._reference import reference, relative_error
+from experiments._reference import changed, reference
 from experiments.snell import trace_snell
 
 import drt_jax
 from drt_jax import Scene
-from experiments import _common, _curves, _peers, _work, lenses
+from experiments import _common, _curves, _peers, _work, benchmark, lenses
 from experiments.runs.config import ConfigError
 from experiments.runs.machine import machine
 
@@ -50,26 +53,40 @@ def test_times_of_two_machines_are_in_no_table():
 
 @pytest.mark.slow
 def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
-    """Rays that we aimed, traced by Snell's law: the weights, the symmetry and the launch fit."""
+    """Rays that we aimed, traced by Snell's law: the weights, the symmetry and the launch fit; and
+    central differences of its lenses, each aimed at anew, are derivatives at fixed stop points."""
     lens, field = drt_jax.load_lens("cooke_triplet"), np.radians(14)
     given = lens, field, np.inf, (0.55,)
+    values = _peers.shifted(lens)
 
-    def snell(numbers, rays):
-        places, along = rays.starts(0, 0)
+    @jax.jit
+    def traced(values, places, along):
         trace = jax.vmap(trace_snell, (None, None, 0, 0))
-        hits, ok = trace(lens, 0.55, jax.numpy.asarray(places), jax.numpy.asarray(along))
+        return trace(changed(lens, values), 0.55, places, along)
+
+    def value(rays, k):
+        hits, ok = traced(values[k], *map(jax.numpy.asarray, rays.starts(k, 0)))
         assert np.all(ok)
         x, y = np.asarray(hits[:, -1, :2]).T
-        return lambda: np.array([_peers._sigma(x, y, rays.weights, rays.free)])
+        return np.array([_peers._sigma(x, y, rays.weights, rays.free)])
+
+    def snell(numbers, rays):
+        return lambda: value(rays, 0)
+
+    def slopes(numbers, rays):
+        return _peers.differences(partial(value, rays), lens.count)
 
     monkeypatch.setattr(_work, "version", lambda name: "1")
-    monkeypatch.setattr(_peers, "SPOTS", {"snell": (snell, snell)})
+    monkeypatch.setattr(_peers, "SPOTS", {"snell": (snell, slopes)})
     scene, truth = Scene.point(field, np.inf, (0.55,)), reference(*given)
-    nodes = [(name, of) for name, of in _curves.ways(lens, scene, (), (3, 8)) if "our" in name]
-    tries, notes = _curves.peers(
-        _peers.Lens(*given), nodes, lambda found: relative_error(truth, found), False
-    )
+    curved = dataclasses.replace(lens, curved=(lens.stop,))
+    nodes = [(name, of) for name, of in _curves.ways(curved, scene, (), (3, 8)) if "our" in name]
+    numbers = _peers.Lens(*given)
+    error = partial(benchmark.spot_error, truth, lens.count)
+    tries, notes = _curves.peers(numbers, nodes, error, False)
     assert not notes
     coarse, fine = tries
     assert fine.program == "snell 1, launched by us" and fine.size == 8 * 9
     assert fine.error < 1e-11 < coarse.error < 1e-2
+    (moved,), _ = _curves.peers(numbers, nodes[1:], lambda found: error(*found), True)
+    assert 1e-11 < moved.error < 1e-5
