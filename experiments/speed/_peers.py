@@ -93,9 +93,10 @@ _first_order = jax.jit(drt_jax.first_order)
 
 
 class Lens:
-    """A centred lens of aspheres as NumPy arrays, without clear apertures, and a scene: gaps (S,),
-    the last to the sensor, index (S + 1, W), field in radians, distance in mm. ValueError for other
-    lenses.
+    """A centred lens of aspheres as NumPy arrays, and a scene: gaps (S,), the last to the sensor,
+    index (S + 1, W), field in radians, distance in mm. ValueError for other lenses.
+
+    clear: (S,), radius of each clear aperture, mm; inf at the stop, which rays fill.
 
     variants: the lens, and the 4 S lenses that `shifted` tells.
     """
@@ -107,6 +108,8 @@ class Lens:
         self.coefficients, self.mirrors = np.asarray(lens.coefficients, float)[:-1], lens.mirrors
         self.index = np.asarray(lens.index(np.asarray(wavelengths)), float)
         self.stop, self.semi = lens.stop, float(lens.semi_diameter[lens.stop])
+        self.clear = np.array(lens.semi_diameter, float)[:-1]
+        self.clear[lens.stop] = np.inf
         self.field, self.distance, self.wavelengths = field, distance, tuple(wavelengths)
         self.variants = [self._variant(lens, values) for values in shifted(lens)]
         self.curvature, self.gaps, self.pupil = self.variants[0]
@@ -136,6 +139,8 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
         medium = "mirror" if lens.mirrors[i] else IdealMaterial(n=float(index[i + 1]))
         kind = {"thickness": gap, "material": medium, "is_stop": i == lens.stop}
         shape = {"radius": 1 / c if c else np.inf, "conic": lens.conic[i]}
+        if np.isfinite(lens.clear[i]):
+            kind["aperture"] = 2 * lens.clear[i]
         if np.any(lens.coefficients[i]):
             shape |= {"surface_type": "even_asphere", "coefficients": lens.coefficients[i].tolist()}
         optic.surfaces.add(index=i + 1, **kind, **shape)
@@ -256,6 +261,8 @@ def _batoid_optic(lens: Lens, variant: Variant, index: np.ndarray):
         kind = batoid.Mirror if not last and lens.mirrors[i] else kind
         shape = batoid.Plane() if last else _batoid_shape(lens, i, c)
         both = {"inMedium": media[i], "outMedium": media[min(i + 1, len(media) - 1)]}
+        if not last and np.isfinite(lens.clear[i]):
+            both["obscuration"] = batoid.ObscNegation(batoid.ObscCircle(lens.clear[i]))
         where = batoid.CoordSys(origin=[0, 0, place])
         items.append(kind(shape, name=f"s{i}", coordSys=where, **both))
     return batoid.CompoundOptic(items, name="lens", inMedium=media[0], outMedium=media[-1])

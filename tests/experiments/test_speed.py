@@ -11,15 +11,9 @@ from experiments.snell import trace_snell
 
 import drt_jax
 from drt_jax import Scene
-from experiments import _common, _curves, _peers, _work, benchmark, lenses
+from experiments import _common, _curves, _peers, _profile, _work, benchmark
 from experiments.runs.config import ConfigError
 from experiments.runs.machine import machine
-
-
-def test_a_step_is_seen():
-    smooth = np.sin(np.linspace(0, 1, 200))
-    stepped = smooth + (np.arange(200) > 90)
-    assert lenses._roughness(smooth) < 1e-6 < 0.3 < lenses._roughness(stepped)
 
 
 def test_quartiles_are_of_all_turns():
@@ -49,6 +43,69 @@ def test_times_of_two_machines_are_in_no_table():
     for other in ({"cpu": "another"}, {"cores": 512}, {"device": "gpu"}):
         with pytest.raises(ConfigError, match="times of two machines are never in one table"):
             _common.one_machine({"machines": [one, one | other]})
+
+
+def tried(*errors):
+    return iter([(lambda: None, error) for error in errors])
+
+
+def test_a_sweep_ends_where_it_is_exact_or_more_rays_do_not_help():
+    assert [error for _, error in _profile.sweep(tried(1e-2, 1e-4, 1e-10, 1e-3))] == [
+        *(1e-2, 1e-4, 1e-10)
+    ]
+    assert len([*_profile.sweep(tried(1e-2, 9e-3, 1e-4))]) == 2
+    assert len([*_profile.sweep(tried(np.nan, 1e-4))]) == 1
+
+
+def test_an_attempt_has_calls_by_tolerance_or_a_reason():
+    def fails(*errors):
+        yield from tried(*errors)
+        raise AttributeError("no such surface\nand more")
+
+    calls, row = _profile.attempt([tried(1e-2, 1e-4, 1e-7), tried(1e-7)])
+    assert [len(some) for some in calls] == [2, 2, 0]
+    assert row["error"] == 1e-7 and row["why"] == ""
+    calls, row = _profile.attempt([fails()])
+    assert not any(calls) and row["why"] == "AttributeError: no such surface"
+    calls, row = _profile.attempt([fails(1e-4)])  # what it had found counts
+    assert [len(some) for some in calls] == [1, 0, 0] and row["why"] == ""
+    assert _profile.attempt([tried(np.nan)])[1]["why"] == "the spot is not finite"
+    assert _profile.attempt([tried(1e-2)])[1]["why"] == "no sampling comes to 1e-03"
+
+
+def test_a_profile_counts_scenes_and_compares_with_the_fastest():
+    """Two scenes; the reference of the second does not know the ninth digit."""
+
+    def row(program, field, error, *seconds):
+        times = [None if s is None else [s, s, s] for s in seconds]
+        why = "" if seconds[0] else "failed"
+        known = {"program": program, "field_deg": field, "reference_error": error, "first_s": 2.0}
+        return known | {"quartiles_s": times, "why": why}
+
+    rows = [row("a", 0, 1e-13, 1.0, 2.0, None), row("b", 0, 1e-13, 3.0, None, None)]
+    rows += [row("a", 1, 1e-8, 2.0, 2.0, 2.0), row("b", 1, 1e-8, None, None, None)]
+    assert {name: own.tolist() for name, own in _profile.ratios(rows, 0).items()} == {
+        "a": [1.0, 1.0],
+        "b": [3.0, np.inf],
+    }
+    assert _profile.ratios(rows, 2)["a"].tolist() == [np.inf]
+    cells = [cell.strip() for cell in _profile.summary(rows).splitlines()[-1].split("|")]
+    assert cells[1:-1] == ["b", "1 of 2", "3", "0 of 2", "", "0 of 1", "", "2.0 s"]
+    counted = _profile.reasons(rows).splitlines()[-1]
+    assert [cell.strip() for cell in counted.split("|")][1:-1] == ["b", "failed", "1"]
+
+
+def test_files_of_a_profile_are_those_of_the_folder_and_none_is_needed(tmp_path):
+    assert _profile.jobs(_profile.Profile(files=str(tmp_path / "none"))) == {}
+    drt_jax.save_lens(drt_jax.load_lens("singlet"), tmp_path / "singlet.zmx")
+    (tmp_path / "bad.zmx").write_text("SURF 0\n")
+    sizes = _profile.Profile(files=str(tmp_path))
+    work = _profile.jobs(sizes)
+    assert list(work) == ["bad.zmx", "singlet.zmx"]
+    found = work["bad.zmx"]()
+    assert not found["profile"] and found["left_out"][0]["why"]
+    at, *_ = _profile.from_file(tmp_path / "singlet.zmx", (0.0, 1.0))
+    assert at.field == 0 and at.distance == np.inf
 
 
 @pytest.mark.slow
