@@ -123,9 +123,9 @@ def shares_solved(axes: Axes, ratios: Mapping[str, np.ndarray], tolerance: float
         share = np.append(np.arange(len(done) + 1), len(done)) / len(own)
         axes.step(across, share, where="post", linewidth=1.2 if k else 2.4, label=program)
     count = max(map(len, ratios.values()), default=0)
-    axes.set(xscale="log", xlim=(1, 1e4), ylim=(-0.02, 1.02))
-    axes.set_title(f"error of the spot below {tolerance:.0e} ({count} scenes)", fontsize=9)
-    label_axes(axes, "time of a call / that of the fastest program", "share of scenes solved")
+    title = f"error of the spot below {tolerance:.0e} ({count} scenes)"
+    axes.set(xscale="log", xlim=(0.9, 1e4), ylim=(-0.02, 1.02), title=title)
+    label_axes(axes, "time / that of the fastest", "share of scenes solved", loc="center right")
 
 
 def patch_grid(
