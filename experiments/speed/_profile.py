@@ -165,12 +165,12 @@ def rows_at(at: At, sizes: Profile) -> list[Row]:
     for name, (spot, _) in _peers.SPOTS.items():
         work[name] = [_theirs(spot, numbers, way, sizes, error) for way in ways]
     tried = {name: attempt(sweeps) for name, sweeps in work.items()}
-    every = [call for calls, _ in tried.values() for some in calls for call in some]
-    times = iter(_common.quartiles(every, sizes.repeats))
+    every = {id(call): call for calls, _ in tried.values() for some in calls for call in some}
+    times = dict(zip(every, _common.quartiles([*every.values()], sizes.repeats)))
     known = {"field_deg": math.degrees(at.field), "reference_error": float(truth.error[0])}
     rows = []
     for name, (calls, row) in tried.items():
-        own = [[next(times) for _ in some] for some in calls]
+        own = [[times[id(call)] for call in some] for some in calls]
         best = [min(some, key=lambda q: q[1], default=None) for some in own]
         rows.append(known | {"program": name} | row | {"quartiles_s": best})
     return rows
