@@ -114,6 +114,20 @@ def programs(axes: Axes, curves: Mapping[tuple[str, str], Sequence[dict]], title
                bbox_to_anchor=(0.5, -0.14), ncols=2)  # fmt: skip
 
 
+def shares_solved(axes: Axes, ratios: Mapping[str, np.ndarray], tolerance: float) -> None:
+    """A performance profile: the share of scenes that each program solves within x times the time
+    of the fastest. ratios: (N,) of N scenes by program, inf where it does not."""
+    for k, (program, own) in enumerate(ratios.items()):
+        done = np.sort(own[np.isfinite(own)])
+        across = np.concatenate([[1.0], done, [1e4]])
+        share = np.append(np.arange(len(done) + 1), len(done)) / len(own)
+        axes.step(across, share, where="post", linewidth=1.2 if k else 2.4, label=program)
+    count = max(map(len, ratios.values()), default=0)
+    title = f"error of the spot below {tolerance:.0e} ({count} scenes)"
+    axes.set(xscale="log", xlim=(0.9, 1e4), ylim=(-0.02, 1.02), title=title)
+    label_axes(axes, "time / that of the fastest", "share of scenes solved", loc="center right")
+
+
 def patch_grid(
     path: pathlib.Path,
     titles: Sequence[str],

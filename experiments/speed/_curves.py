@@ -6,14 +6,13 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import drt_jax
 from drt_jax import Lens, Scene
 
 from . import _common, _peers, _work
-from ._reference import changed, flatten
+from ._reference import changed
 
 OURS = "drt_jax"
 # Errors in the table of `summary`.
@@ -36,13 +35,10 @@ class Try(NamedTuple):
 
 def aimed(lens: Lens, scene: Scene, order: int) -> _peers.Rays:
     """The nodes of our rule of an order for a field along y, as rays that we aimed, through the
-    lens and each of its `_peers.Lens.steps`."""
+    lens and each of its `_peers.Lens.variants`."""
     points, weights = (np.asarray(a) for a in drt_jax.pupil.half_disc(order, order + 1))
-    values = flatten(lens)
-    steps = np.repeat([_peers.BENT, _peers.MOVED], lens.count)
-    shifted = values[None] + jnp.concatenate([jnp.zeros((1, len(values))), jnp.diag(steps)])
     trace = jax.vmap(lambda v: drt_jax.trace_rays(changed(lens, v), scene, points))
-    rays = jax.jit(trace)(shifted)
+    rays = jax.jit(trace)(_peers.shifted(lens))
     launch = np.asarray(rays.points[..., 0, :]), np.asarray(rays.directions[..., 0, :])
     return _peers.Rays(points, weights, launch=launch, free=(0, 1))
 

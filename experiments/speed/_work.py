@@ -22,7 +22,7 @@ from drt_jax.devices import device_mesh, shared, split
 from drt_jax.image.sensor import convolve, convolve_taps
 from drt_jax.learn import train
 
-from . import _common, _peers
+from . import _common
 
 Row = dict[str, Any]
 # Measurements of `compiled`.
@@ -41,8 +41,10 @@ print(time.perf_counter() - start)
 SPREAD = """
 import jax; jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", {devices})
-from experiments import _work, benchmark
-print(_work.bundle_seconds(benchmark.{config!r}))
+from experiments import _work
+from experiments._profile import LensFields, Profile
+from experiments.benchmark import Config
+print(_work.bundle_seconds({config!r}))
 """
 
 
@@ -84,36 +86,10 @@ def peer(name: str, make: Callable[[], tuple], how: str = "") -> dict[str, tuple
         return {name: str(failure)[:80]}
 
 
-def spot_peers(scene: tuple, rays: int, error: Callable) -> dict[str, tuple | str]:
-    """What `peer` returns of all that know spots, with hexapolar rays at the paraxial pupil. scene:
-    arguments of `_peers.Lens`. error: of what a call returns."""
-
-    def make(spot: Callable) -> tuple:
-        own = _peers.rays_of(_peers.PATTERNS["hexapolar"], rays, "paraxial")
-        call = spot(_peers.Lens(*scene), own)
-        return call, error(call())
-
-    found: dict[str, tuple | str] = {}
-    for name, (spot, _) in _peers.SPOTS.items():
-        found |= peer(name, partial(make, spot))
-    return found
-
-
 def row(task: str, seconds: float, **known: Any) -> Row:
     """A row of results.json; unknown values are None."""
     unknown = dict.fromkeys(("ours_error", *MEASURED, "peer_s", "ratio", "peer_error"))
     return {"task": task, "ours_s": seconds, "peer": "", "note": ""} | unknown | known
-
-
-def timed(
-    calls: list[Callable], peers: dict[str, tuple | str], repeats: int
-) -> tuple[list[float], dict[str, tuple[float, float | None]]]:
-    """Seconds of our calls, and (seconds, error) by name of the peers that are there, see `peer`;
-    all called in turns."""
-    ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
-    seconds = _common.medians([*calls, *(call for call, _ in ready.values())], repeats)
-    errors = (error for _, error in ready.values())
-    return seconds[: len(calls)], dict(zip(ready, zip(seconds[len(calls) :], errors)))
 
 
 def rows_of(
@@ -121,13 +97,15 @@ def rows_of(
 ) -> list[Row]:
     """Rows of one task. ours: from `compiled`. error: our error. peers: from `peer`."""
     call, measured = ours
-    (seconds,), found = timed([call], peers, repeats)
+    ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
+    seconds, *theirs = _common.medians([call, *(other for other, _ in ready.values())], repeats)
+    times = dict(zip(ready, theirs))
     rows = []
-    for name, note in peers.items():
-        known: Row = {"note": note}
-        if name in found:
-            theirs, wrong = found[name]
-            known = {"peer_s": theirs, "ratio": theirs / seconds, "peer_error": wrong}
+    for name, peer in peers.items():
+        known: Row = {"note": peer}
+        if name in ready:
+            ratio = times[name] / seconds
+            known = {"peer_s": times[name], "ratio": ratio, "peer_error": ready[name][1]}
         rows.append(row(task, seconds, ours_error=error, peer=name, **measured, **known))
     return rows
 

@@ -2,14 +2,18 @@
 
 Calls alternate, and their medians are compared. Spots are curves: each program is swept over its
 own samplings, also with our nodes. Errors are relative: of the RMS spot radius sigma, or the worse
-of sigma and its derivatives by curvatures and thicknesses, against an integral over a sequential
-trace by Snell's law. Peers are an extra, `pip install -e '.[peers]'`; the row of a missing one says
-so. Writes results.json: `curves` hold `task`, `program`, `sampling`, `size` (rays a wavelength),
-`error`, `quartiles_s`, `repeats`; `missing`, why a program has none; `rows` hold `task`, `ours_s`,
-`peer`, `peer_s`, `ratio` (theirs / ours), `ours_error`, `peer_error`, `compile_s`, `peak_mb` and
-`kernels` (ours); `counts`, the solves for rays of a training step; `work`, run time over numbers of
-rays, surfaces and wavelengths; `machines`, where it ran. Draws run time against error, and the
-growth.
+of sigma and its derivatives by curvatures and thicknesses at fixed stop points, against an integral
+over a sequential trace by Snell's law. Optiland's rays that we launched stay at their launch, and
+rays of the paraxial pupil are other rays: their derivatives are right, but of other quantities, and
+differ by 0.2 and 3 %. Peers are an extra, `pip install -e '.[peers]'`; the row of a missing one
+says so. Writes results.json: `curves` hold `task`, `program`, `sampling`, `size` (rays a
+wavelength), `error`, `quartiles_s`, `repeats`; `missing`, why a program has none; `rows` hold
+`task`, `ours_s`, `peer`, `peer_s`, `ratio` (theirs / ours), `ours_error`, `peer_error`,
+`compile_s`, `peak_mb` and `kernels` (ours); `profile` hold `lens`, `field_deg`, `reference_error`,
+`program`, `error` (the least), `first_s` (making and first calls of all samplings), `quartiles_s`
+to each tolerance and `why` there is none; `left_out`, lenses without a reference; `counts`, the
+solves for rays of a training step; `work`, run time over numbers of rays, surfaces and wavelengths;
+`machines`, where it ran. Draws run time against error, the profile, and the growth.
 """
 
 import dataclasses
@@ -31,7 +35,7 @@ from drt_jax import Lens, Scene, Status, learn, pupil, show
 from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
 
-from . import _command, _common, _curves, _peers, _plots, _work
+from . import _command, _common, _curves, _peers, _plots, _profile, _work
 from ._common import not_empty, within
 from ._reference import (
     Moments,
@@ -72,6 +76,7 @@ class Config:
     patch: Annotated[int, within(7, 4096)] = 64
     tasks: tuple[str, ...] = ()
     growth: bool = True
+    profile: _profile.Profile = _profile.Profile()
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -240,12 +245,14 @@ def first_task(config: Config) -> list[Row]:
     return rows
 
 
+# Functions of `Config`; "profile" has a job for each lens.
 TASKS = {
     "spot": lambda config: spot_curves(config, False),
     "gradient": lambda config: spot_curves(config, True),
     "bundle": bundle_task,
     "network": network_task,
     "first": first_task,
+    "profile": None,
 }
 
 
@@ -253,9 +260,12 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Runs the tasks one by one."""
     # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
-    jobs = {name: functools.partial(TASKS[name], config) for name in config.tasks or TASKS}
-    found = _common.measured(run, "task", jobs)
+    names = config.tasks or tuple(TASKS)
+    jobs = {name: functools.partial(job, config) for name in names if (job := TASKS[name])}
+    jobs |= _profile.jobs(config.profile) if "profile" in names else {}
+    found = _common.measured(run, "job", jobs)
     results: dict[str, Any] = {"rows": [], "curves": [], "missing": {}}
+    results |= {"profile": [], "left_out": []}
     for part in found:  # rows, or curves with what is missing
         for key, some in (part if isinstance(part, dict) else {"rows": part}).items():
             results[key] = results[key] | some if key == "missing" else results[key] + some
@@ -289,6 +299,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         machine = [(_common.one_machine(results),)]
         found["benchmark, machine"] = _common.table(("machine of this run",), machine)
         found["benchmark, curves"] = _curves.summary(results["curves"])
+    if results.get("profile"):
+        found["benchmark, profile"] = _profile.summary(results["profile"])
+        found["benchmark, unsolved"] = _profile.reasons(results["profile"])
     return found | {
         "benchmark": _common.table(header, lines),
         "benchmark, counts": _common.table(counts, results["counts"].items()),
@@ -307,6 +320,10 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         for ax, ((task,), rows) in zip(axes, tasks.items()):
             _plots.programs(ax, _common.grouped(rows, "program", "sampling"), task)
         figure.savefig(figures / "peers.png")
+    if results.get("profile"):
+        with _plots.picture(figures / "profile.png", 4.3, 4.0, len(_profile.TOLERANCES), 3) as axes:
+            for k, (ax, tolerance) in enumerate(zip(axes, _profile.TOLERANCES)):
+                _plots.shares_solved(ax, _profile.ratios(results["profile"], k), tolerance)
 
 
 if __name__ == "__main__":

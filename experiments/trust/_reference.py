@@ -40,6 +40,7 @@ class Moments(NamedTuple):
     gradient: (W, 2, P), derivatives of both by curvatures, thicknesses and the sensor.
     error: (W,), change of both with other nodes, relative to sigma.
     gradient_error: (W,), change of sigma's gradient with other nodes, relative to its norm.
+    clipped: (W,), bool, whether an aperture other than the stop's limits the beam.
     """
 
     sigma: np.ndarray
@@ -47,6 +48,7 @@ class Moments(NamedTuple):
     gradient: np.ndarray
     error: np.ndarray
     gradient_error: np.ndarray
+    clipped: np.ndarray
 
 
 def flatten(lens: Lens) -> Array:
@@ -152,10 +154,13 @@ class _Pupil(NamedTuple):
         return jax.vmap(node)(jnp.asarray(1 + t) / 2, jnp.asarray(weight))
 
 
-@partial(jit, wanted=QUICK)
-def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Array, Array, Array]:
-    """sigma and the height of the centroid, their derivatives (2, P), and the number of corners, -1
-    if no ray passes. part: position of the origin along the height of the region, 0 to 1."""
+@partial(jit, wanted=QUICK, static_argnames="slopes")
+def _integral(
+    lens: Lens, scene: Array, reach: Array, part: float, slopes: bool
+) -> tuple[Array, Array, Array, Array]:
+    """sigma and the height of the centroid, their derivatives (2, P), the number of corners, -1 if
+    no ray passes, and whether an aperture other than the stop's limits the beam. part: position of
+    the origin along the height of the region, 0 to 1. slopes: as in `reference`."""
     heights = jnp.linspace(-reach, reach, _SCAN)
     diameter = jnp.stack([jnp.zeros_like(heights), heights], axis=1)
     inside = jnp.all(jax.vmap(partial(_excess, lens, scene))(diameter) <= 0, axis=1)
@@ -184,16 +189,24 @@ def _integral(lens: Lens, scene: Array, reach: Array, part: float) -> tuple[Arra
         found = jnp.stack([jnp.sqrt(jnp.sum(area * square)), mean])
         return found, found
 
-    slopes, found = jax.jacfwd(values, has_aux=True)(flatten(lens))
-    return found, slopes, jnp.where(jnp.any(inside), jnp.sum(changes), -1)
+    given = flatten(lens)
+    if slopes:
+        rows, found = jax.jacfwd(values, has_aux=True)(given)
+    else:
+        rows, found = jnp.full((2, given.size), jnp.nan), values(given)[0]
+    clipped = jnp.any(jax.vmap(pupil.edge)(even)[1] != lens.stop)
+    return found, rows, jnp.where(jnp.any(inside), jnp.sum(changes), -1), clipped
 
 
-def reference(lens: Lens, field: float, distance: float, wavelengths: Sequence[float]) -> Moments:
+def reference(
+    lens: Lens, field: float, distance: float, wavelengths: Sequence[float], slopes: bool = True
+) -> Moments:
     """Moments of a centred lens in float64. ValueError if no ray passes.
 
     field: angle along y, radians.
     distance: distance of the object, mm.
     wavelengths: wavelengths, um.
+    slopes: False to leave out the derivatives, which are NaN then.
     """
     semi = np.asarray(lens.semi_diameter)
     # A steep beam crosses the plane far from its hits on the first surface.
@@ -201,15 +214,15 @@ def reference(lens: Lens, field: float, distance: float, wavelengths: Sequence[f
     rows = []
     for wavelength in wavelengths:
         scene = jnp.array([field, 1 / distance, wavelength])
-        found = [_integral(lens, scene, reach, part) for part in (0.5, 0.57)]
-        (value, slopes, corners), (again, others, _) = found
+        found = [_integral(lens, scene, reach, part, slopes) for part in (0.5, 0.57)]
+        (value, rates, corners, clipped), (again, others, *_) = found
         if corners < 0:
             raise ValueError(f"no ray at {wavelength:g} um reaches the sensor")
         if corners > _CORNERS:
             raise ValueError(f"the pupil has {corners} corners; expected at most {_CORNERS}")
         error = jnp.max(jnp.abs(again - value)) / value[0]
-        change = jnp.linalg.norm(others[0] - slopes[0]) / jnp.linalg.norm(slopes[0])
-        rows.append((*value, slopes, error, change))
+        change = jnp.linalg.norm(others[0] - rates[0]) / jnp.linalg.norm(rates[0])
+        rows.append((*value, rates, error, change, clipped))
     return Moments(*(np.array(column) for column in zip(*rows)))
 
 

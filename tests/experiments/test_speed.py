@@ -1,22 +1,19 @@
 """What experiments on speed measure with. `test_starts` runs them."""
 
+import dataclasses
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
-from experiments._reference import reference, relative_error
+from experiments._reference import changed, reference
 from experiments.snell import trace_snell
 
 import drt_jax
 from drt_jax import Scene
-from experiments import _common, _curves, _peers, _work, lenses
+from experiments import _common, _curves, _peers, _profile, _work, benchmark
 from experiments.runs.config import ConfigError
 from experiments.runs.machine import machine
-
-
-def test_a_step_is_seen():
-    smooth = np.sin(np.linspace(0, 1, 200))
-    stepped = smooth + (np.arange(200) > 90)
-    assert lenses._roughness(smooth) < 1e-6 < 0.3 < lenses._roughness(stepped)
 
 
 def test_quartiles_are_of_all_turns():
@@ -48,28 +45,105 @@ def test_times_of_two_machines_are_in_no_table():
             _common.one_machine({"machines": [one, one | other]})
 
 
+def tried(*errors):
+    return iter([(lambda: None, error) for error in errors])
+
+
+def test_a_sweep_ends_where_it_is_exact_or_more_rays_do_not_help():
+    assert [error for _, error in _profile.sweep(tried(1e-2, 1e-4, 1e-10, 1e-3))] == [
+        *(1e-2, 1e-4, 1e-10)
+    ]
+    assert len([*_profile.sweep(tried(1e-2, 9e-3, 1e-4))]) == 2
+    assert len([*_profile.sweep(tried(np.nan, 1e-4))]) == 1
+
+
+def test_an_attempt_has_calls_by_tolerance_or_a_reason():
+    def fails(*errors):
+        yield from tried(*errors)
+        raise AttributeError("no such surface\nand more")
+
+    calls, row = _profile.attempt([tried(1e-2, 1e-4, 1e-7), tried(1e-7)])
+    assert [len(some) for some in calls] == [2, 2, 0]
+    assert row["error"] == 1e-7 and row["why"] == ""
+    calls, row = _profile.attempt([fails()])
+    assert not any(calls) and row["why"] == "AttributeError: no such surface"
+    calls, row = _profile.attempt([fails(1e-4)])  # what it had found counts
+    assert [len(some) for some in calls] == [1, 0, 0] and row["why"] == ""
+    assert _profile.attempt([tried(np.nan)])[1]["why"] == "the spot is not finite"
+    assert _profile.attempt([tried(1e-2)])[1]["why"] == "no sampling comes to 1e-03"
+
+
+def test_a_profile_counts_scenes_and_compares_with_the_fastest():
+    """Two scenes; the reference of the second does not know the ninth digit."""
+
+    def row(program, field, error, *seconds):
+        times = [None if s is None else [s, s, s] for s in seconds]
+        why = "" if seconds[0] else "failed"
+        known = {"program": program, "field_deg": field, "reference_error": error, "first_s": 2.0}
+        return known | {"quartiles_s": times, "why": why}
+
+    rows = [row("a", 0, 1e-13, 1.0, 2.0, None), row("b", 0, 1e-13, 3.0, None, None)]
+    rows += [row("a", 1, 1e-8, 2.0, 2.0, 2.0), row("b", 1, 1e-8, None, None, None)]
+    assert {name: own.tolist() for name, own in _profile.ratios(rows, 0).items()} == {
+        "a": [1.0, 1.0],
+        "b": [3.0, np.inf],
+    }
+    assert _profile.ratios(rows, 2)["a"].tolist() == [np.inf]
+    cells = [cell.strip() for cell in _profile.summary(rows).splitlines()[-1].split("|")]
+    assert cells[1:-1] == ["b", "1 of 2", "3", "0 of 2", "", "0 of 1", "", "2.0 s"]
+    counted = _profile.reasons(rows).splitlines()[-1]
+    assert [cell.strip() for cell in counted.split("|")][1:-1] == ["b", "failed", "1"]
+
+
+def test_files_of_a_profile_are_those_of_the_folder_and_none_is_needed(tmp_path):
+    assert _profile.jobs(_profile.Profile(files=str(tmp_path / "none"))) == {}
+    drt_jax.save_lens(drt_jax.load_lens("singlet"), tmp_path / "singlet.zmx")
+    (tmp_path / "bad.zmx").write_text("SURF 0\n")
+    sizes = _profile.Profile(files=str(tmp_path))
+    work = _profile.jobs(sizes)
+    assert list(work) == ["bad.zmx", "singlet.zmx"]
+    found = work["bad.zmx"]()
+    assert not found["profile"] and found["left_out"][0]["why"]
+    at, *_ = _profile.from_file(tmp_path / "singlet.zmx", (0.0, 1.0))
+    assert at.field == 0 and at.distance == np.inf
+
+
 @pytest.mark.slow
 def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
-    """Rays that we aimed, traced by Snell's law: the weights, the symmetry and the launch fit."""
+    """Rays that we aimed, traced by Snell's law: the weights, the symmetry and the launch fit; and
+    central differences of its lenses, each aimed at anew, are derivatives at fixed stop points."""
     lens, field = drt_jax.load_lens("cooke_triplet"), np.radians(14)
     given = lens, field, np.inf, (0.55,)
+    values = _peers.shifted(lens)
 
-    def snell(numbers, rays):
-        places, along = rays.starts(0, 0)
+    @jax.jit
+    def traced(values, places, along):
         trace = jax.vmap(trace_snell, (None, None, 0, 0))
-        hits, ok = trace(lens, 0.55, jax.numpy.asarray(places), jax.numpy.asarray(along))
+        return trace(changed(lens, values), 0.55, places, along)
+
+    def value(rays, k):
+        hits, ok = traced(values[k], *map(jax.numpy.asarray, rays.starts(k, 0)))
         assert np.all(ok)
         x, y = np.asarray(hits[:, -1, :2]).T
-        return lambda: np.array([_peers._sigma(x, y, rays.weights, rays.free)])
+        return np.array([_peers._sigma(x, y, rays.weights, rays.free)])
+
+    def snell(numbers, rays):
+        return lambda: value(rays, 0)
+
+    def slopes(numbers, rays):
+        return _peers.differences(partial(value, rays), lens.count)
 
     monkeypatch.setattr(_work, "version", lambda name: "1")
-    monkeypatch.setattr(_peers, "SPOTS", {"snell": (snell, snell)})
+    monkeypatch.setattr(_peers, "SPOTS", {"snell": (snell, slopes)})
     scene, truth = Scene.point(field, np.inf, (0.55,)), reference(*given)
-    nodes = [(name, of) for name, of in _curves.ways(lens, scene, (), (3, 8)) if "our" in name]
-    tries, notes = _curves.peers(
-        _peers.Lens(*given), nodes, lambda found: relative_error(truth, found), False
-    )
+    curved = dataclasses.replace(lens, curved=(lens.stop,))
+    nodes = [(name, of) for name, of in _curves.ways(curved, scene, (), (3, 8)) if "our" in name]
+    numbers = _peers.Lens(*given)
+    error = partial(benchmark.spot_error, truth, lens.count)
+    tries, notes = _curves.peers(numbers, nodes, error, False)
     assert not notes
     coarse, fine = tries
     assert fine.program == "snell 1, launched by us" and fine.size == 8 * 9
     assert fine.error < 1e-11 < coarse.error < 1e-2
+    (moved,), _ = _curves.peers(numbers, nodes[1:], lambda found: error(*found), True)
+    assert 1e-11 < moved.error < 1e-5

@@ -12,7 +12,7 @@ import pytest
 
 import experiments
 from drt_jax import first_order, load_lens, save_lens
-from experiments import _command, _peers, _psf_peers, _work, benchmark, tables
+from experiments import _command, _psf_peers, _work, benchmark, tables
 from experiments.runs.folder import Run
 
 from .test_experiments import TOY
@@ -26,14 +26,11 @@ STARTS = {
     "faults": ["parts=[files]", "files=30", "traced=1"],
     "files": ["folders=[{toy}]"],
     "benchmark": [
-        *("tasks=[spot]", "growth=false", "repeats=1", "lens=singlet", "field_deg=0"),
-        *("rays=[7]", "orders=[5]"),
+        *("tasks=[spot,profile]", "growth=false", "repeats=1", "lens=singlet", "field_deg=0"),
+        *("rays=[7]", "orders=[5]", "profile.lenses=[{lens: singlet, field_deg: 3}]"),
+        *("profile.parts=[0]", "profile.own_orders=[5]", "profile.rays=[7]", "profile.orders=[1]"),
     ],
     "devices": ["counts=[1]", "patch=8", "repeats=2", "network={layers: 1, channels: 4}"],
-    "lenses": [
-        "lenses=[{lens: singlet, field_deg: 3}]",
-        *("parts=[0]", "copies=1", "fields=1", "sweep=8", "repeats=1"),
-    ],
     "images": [
         *(
             "views=[{lens: singlet, field_deg: 0, pixel_um: 8}]",
@@ -61,7 +58,7 @@ STARTS = {
     ],
 }
 # Programs of many kinds.
-LONG = ("benchmark", "faults", "files", "images", "joint", "lenses", "stability")
+LONG = ("benchmark", "faults", "files", "images", "joint", "stability")
 # Those that tests of their own start, in `test_NAME`.
 ELSEWHERE = ("accuracy", "design", "render", "tolerance")
 
@@ -125,6 +122,9 @@ def checked_benchmark(results):
         name: f"{name} is not installed: pip install -e '.[peers]'"
         for name in ("optiland", "batoid")
     }
+    ours, *others = results["profile"]
+    assert ours["program"] == "drt_jax" and ours["error"] < 1e-9 and all(ours["quartiles_s"])
+    assert all(bool(row["why"]) != bool(row["quartiles_s"][0]) for row in others)
     solves = list(results["counts"].values())
     assert solves[:2] == [0, 0] and solves[2] > 0
     (machine,) = results["machines"]
@@ -136,15 +136,6 @@ def checked_devices(results):
     (row,) = results["rows"]
     assert row["step_s"] > 0 == row["loss_apart"] == row["carried_bytes"]
     assert results["weights"] == 9 * 3 * 4 + 4 + 9 * 4 * 3 + 3
-
-
-def checked_lenses(results):
-    """A lens on the axis, copies of it and a sweep; peers that fail have their reason."""
-    (row,), (group,), (swept,) = (results[key] for key in ("rows", "copies", "sweeps"))
-    assert row["tight_error"] < 1e-6 and row["loose_error"] < 1e-3 and row["passed"] == 1
-    assert list(row["notes"]) == ["optiland", "batoid"] and not row["peers"]
-    assert all(note.endswith("pip install -e '.[peers]'") for note in row["notes"].values())
-    assert group["bad"] == 0 and max(swept["steps"]["values"]) < 0.1
 
 
 def checked_images(results):
@@ -254,18 +245,15 @@ def test_it_ends_with_results_tables_and_pictures(name, tmp_path, monkeypatch, c
 def test_a_peer_that_fails_is_a_note(monkeypatch):
     """As with one that is missing, nothing of it is timed."""
 
-    def fails(lens, rays):
+    def fails():
         raise ValueError("no program of this kind")
 
     monkeypatch.setattr(_work, "version", lambda name: "1")
-    monkeypatch.setattr(
-        _peers, "SPOTS", {"one": (fails, fails), "two": (lambda *_: lambda: 2.0, fails)}
-    )
-    scene = load_lens("singlet"), 0.0, np.inf, (0.55,)
-    peers = _work.spot_peers(scene, 7, lambda sigma: sigma / 2)
-    seconds, found = _work.timed([lambda: None], peers, 1)
-    assert peers["one"] == "no program of this kind" and len(seconds) == 1
-    assert list(found) == ["two 1"] and found["two 1"][0] > 0 and found["two 1"][1] == 1.0
+    peers = _work.peer("one", fails) | _work.peer("two", lambda: (lambda: None, 1.0))
+    ours = (lambda: None), dict.fromkeys(_work.MEASURED, 1.0)
+    none, two = _work.rows_of("work", ours, 0.5, peers, 1)
+    assert none["note"] == "no program of this kind" and none["peer_s"] is None
+    assert two["peer"] == "two 1" and two["peer_s"] > 0 and two["peer_error"] == 1.0
 
 
 @pytest.mark.slow
