@@ -29,6 +29,10 @@ STARTS = {
         *("tasks=[spot]", "growth=false", "repeats=1", "lens=singlet", "field_deg=0"),
         *("rays=[7]", "orders=[5]"),
     ],
+    "skips": [
+        *("rows=[order]", "lens=singlet", "field_deg=2", "wavelengths_um=[0.55]", "generous=12"),
+        "repeats=1",
+    ],
     "devices": ["counts=[1]", "patch=8", "repeats=2", "network={layers: 1, channels: 4}"],
     "lenses": [
         "lenses=[{lens: singlet, field_deg: 3}]",
@@ -61,7 +65,7 @@ STARTS = {
     ],
 }
 # Programs of many kinds.
-LONG = ("benchmark", "faults", "files", "images", "joint", "lenses", "stability")
+LONG = ("benchmark", "faults", "files", "images", "joint", "lenses", "skips", "stability")
 # Those that tests of their own start, in `test_NAME`.
 ELSEWHERE = ("accuracy", "design", "render", "tolerance")
 
@@ -129,6 +133,15 @@ def checked_benchmark(results):
     assert solves[:2] == [0, 0] and solves[2] > 0
     (machine,) = results["machines"]
     assert machine["cpu"] and machine["cores"] > 0 and machine["versions"]["jax"]
+
+
+def checked_skips(results):
+    """The order from the error traces fewer rays, to the tolerance, than one that is safe."""
+    (row,) = results["rows"]
+    fitted, generous = row["ways"]
+    assert fitted["rays"] < generous["rays"] == 12 * 13
+    assert fitted["error"] < 1e-6 and generous["error"] < 1e-8 and fitted["compile_s"] > 0
+    assert row["factor"] == generous["quartiles_s"][1] / fitted["quartiles_s"][1]
 
 
 def checked_devices(results):
