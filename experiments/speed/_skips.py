@@ -196,7 +196,7 @@ def dead(config: Any) -> list[Way]:
     at = view(config, False)
     lens = with_planes(at.lens, config.planes)
     pair = at._replace(lens=lens), at._replace(lens=all_traced(lens))
-    words = [f"{len(some.lens.active)} of {lens.count} surfaces traced" for some in pair]
+    words = [f"{len(some.lens.active)} of {lens.count} traced" for some in pair]
     return [spot(some, name, at.rule) for some, name in zip(pair, words)]
 
 

@@ -40,7 +40,7 @@ class Skip(NamedTuple):
     ways: Callable[[Any], list[_skips.Way]]
 
 
-_RADIUS, _LIGHT = "spot radius", "light of the kernel"
+_RADIUS, _LIGHT = "spot radius", "light"
 SKIPS = {
     "rotational": Skip("rays", "rotational symmetry", _RADIUS,
                        functools.partial(_skips.symmetry, on_axis=True)),
@@ -51,15 +51,15 @@ SKIPS = {
     "quadrature": Skip("rays", "quadrature, not random rays", _RADIUS, _skips.quadrature),
     "dead": Skip("rays", "dead surfaces", _RADIUS, _skips.dead),
     "aiming": Skip("rays", "aiming, no search", _RADIUS, _skips.aimed),
-    "reverse": Skip("derivatives", "derivatives asked for, reverse", "derivative",
+    "reverse": Skip("derivatives", "one derivative, reverse", "derivative",
                     functools.partial(_skips.derivatives, forward=False)),
-    "forward": Skip("derivatives", "derivatives asked for, forward", "derivative",
+    "forward": Skip("derivatives", "one derivative, forward", "derivative",
                     functools.partial(_skips.derivatives, forward=True)),
     "sensor": Skip("sensor and depth", "polynomials of the sensor", _RADIUS, _skips.sensors),
     "depth": Skip("sensor and depth", "Chebyshev nodes of depth", _RADIUS, _skips.depths),
     "separable": Skip("pictures", "separable kernels", "white", _skips_pictures.separable),
     "polynomials": Skip("pictures", "polynomials, not rays", _LIGHT, _skips_pictures.polynomials),
-    "kernels": Skip("pictures", "few kernels, not one a pixel", _LIGHT,
+    "kernels": Skip("pictures", "few kernels for all pixels", _LIGHT,
                     _skips_pictures.few_kernels),
     "kept": Skip("programs", "programs kept", _RADIUS, _skips_pictures.kept),
 }  # fmt: skip
@@ -127,21 +127,26 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     return {"rows": _common.measured(run, "skip", jobs), "seconds": run.seconds}
 
 
+def _times(factor: float) -> str:
+    """A factor as text, two digits or more."""
+    return f"{factor:.0f}" if factor >= 10 else f"{factor:.2g}"
+
+
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Two lines for each row: with the skip, and without."""
     lines: list[tuple] = []
     for (group,), rows in _common.grouped(results["rows"], "group").items():
         lines.append((f"**{group}**", *[""] * 7))
         for row in rows:
-            firsts = row["skip"], f"error of the {row['error_of']}"
-            for first, way, factor in zip(firsts, row["ways"], (f"{row['factor']:.2g}", "1")):
+            firsts = row["skip"], f"error: of the {row['error_of']}"
+            for first, way, factor in zip(firsts, row["ways"], (_times(row["factor"]), "1")):
                 seconds = _common.duration(way["quartiles_s"][1])
                 once = _common.duration(way["once_s"])
                 compiling = _common.duration(way["compile_s"])
                 error = f"{way['error']:.0e}"
                 what = first, way["words"], seconds, factor, way["rays"]
                 lines.append((*what, once, compiling, error))
-    header = "skip", "call", "time", "saved", "rays", "once", "compiled in", "error"
+    header = "skip", "call", "time", "saved", "rays", "once", "compile", "error"
     machine = [(_common.one_machine(results),)]
     return {
         "skips, machine": _common.table(("machine of this run",), machine),
@@ -161,7 +166,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     left.axvline(1, color="black", linewidth=1)
     for place, row in zip(places, rows):
         new, old = (_common.duration(way["quartiles_s"][1]) for way in row["ways"])
-        note = f"  {row['factor']:.2g} x: {old} to {new}"
+        note = f"  {_times(row['factor'])} x: {old} to {new}"
         left.text(max(row["factor"], 1), place, note, va="center", fontsize=8)
     errors = np.array([[max(way["error"], 1e-16) for way in row["ways"]] for row in rows])
     right.hlines(places, errors.min(axis=1), errors.max(axis=1), color="0.7", linewidth=1, zorder=1)
