@@ -173,7 +173,8 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     right.plot(errors[:, 1], places, "o", color="C1", mfc="white", markersize=7, label="without")
     right.plot(errors[:, 0], places, "o", color="C0", markersize=4, label="with the skip")
     left.set_yticks(places, [row["skip"] for row in rows])
-    left.set(xscale="log", xlim=(0.3, 60 * max(row["factor"] for row in rows)))
+    least, most = rows[0]["factor"], rows[-1]["factor"]
+    left.set(xscale="log", xlim=(0.6 * min(least, 0.5), 150 * max(most, 1)))
     left.set(title="Time of a call without the skip / with it")
     right.set(xscale="log")
     right.tick_params(labelleft=False)
