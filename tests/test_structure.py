@@ -59,7 +59,7 @@ ROOMS = {
     "experiments/imaging": 424,
     "experiments/paper": 608,
     "experiments/runs": 453,
-    "experiments/speed": 838,
+    "experiments/speed": 1246,
     "experiments/together": 411,
     "experiments/trust": 1841,
 }
