@@ -44,22 +44,22 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 548,
+    "drt_jax": 551,
     "drt_jax/check": 298,
     "drt_jax/design": 2383,
     "drt_jax/files": 2928,
-    "drt_jax/image": 2983,
+    "drt_jax/image": 2992,
     "drt_jax/learn": 624,
-    "drt_jax/lens": 1480,
-    "drt_jax/pupil": 692,
-    "drt_jax/rays": 1256,
+    "drt_jax/lens": 1478,
+    "drt_jax/pupil": 776,
+    "drt_jax/rays": 1314,
     "drt_jax/show": 641,
     "experiments": 484,
     "experiments/designing": 575,
     "experiments/imaging": 424,
     "experiments/paper": 608,
     "experiments/runs": 453,
-    "experiments/speed": 852,
+    "experiments/speed": 1260,
     "experiments/together": 411,
     "experiments/trust": 1851,
 }

@@ -530,10 +530,9 @@ def _known_plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, cross
     one, last = radial.one_batch, _last(radial)
     none = np.zeros((scene.wavelengths.size, one.count), lens.curvature.dtype)
     run = functools.partial(_known_stages, lens, scene, one, crossing)
-    state = run(none, _initial(lens, scene, one, crossing), np.int32(0), last)
+    state = run(none, _initial(lens, scene, one, crossing), (np.int32(0), last))
     angle = np.asarray(_angles(radial, used, state.frame, state.latest))
-    batches = np.split(angle, radial.parts, axis=-1)
-    parts = [run(batch, state, last, last + 1) for batch in batches]
+    parts = [run(a, state, (last, last + 1)) for a in np.split(angle, radial.parts, axis=-1)]
     ends = jax.tree.map(lambda *a: np.concatenate(a, axis=-1), *(part.ends for part in parts))
     return _plan_of(parts[0]._replace(ends=ends), used)
 
@@ -541,11 +540,11 @@ def _known_plan(lens: Lens, scene: Scene, radial: RadialRule, used: Array, cross
 @functools.partial(jit, wanted=LARGE, static_argnames=("radial", "crossing"))
 def _known_stages(
     lens: Lens, scene: Scene, radial: RadialRule, crossing: bool, angle: Array, state: _State,
-    begin: Array, end: Array,
+    span: tuple[Array, Array],
 ) -> _State:  # fmt: skip
     """`_run` with the azimuths (W, B) of one batch of spokes."""
     setting = _Setting(lens, system_of(lens, scene), radial, lambda *_: angle)
-    return _run(setting, crossing, state, begin, end)
+    return _run(setting, crossing, state, *span)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -30,6 +30,10 @@ STARTS = {
         *("rays=[7]", "orders=[5]", "profile.lenses=[{lens: singlet, field_deg: 3}]"),
         *("profile.parts=[0]", "profile.own_orders=[5]", "profile.rays=[7]", "profile.orders=[1]"),
     ],
+    "skips": [
+        *("rows=[order]", "lens=singlet", "field_deg=2", "wavelengths_um=[0.55]", "generous=12"),
+        "repeats=1",
+    ],
     "devices": ["counts=[1]", "patch=8", "repeats=2", "network={layers: 1, channels: 4}"],
     "images": [
         *(
@@ -58,7 +62,7 @@ STARTS = {
     ],
 }
 # Programs of many kinds.
-LONG = ("benchmark", "faults", "files", "images", "joint", "stability")
+LONG = ("benchmark", "faults", "files", "images", "joint", "skips", "stability")
 # Those that tests of their own start, in `test_NAME`.
 ELSEWHERE = ("accuracy", "design", "render", "tolerance")
 
@@ -129,6 +133,15 @@ def checked_benchmark(results):
     assert solves[:2] == [0, 0] and solves[2] > 0
     (machine,) = results["machines"]
     assert machine["cpu"] and machine["cores"] > 0 and machine["versions"]["jax"]
+
+
+def checked_skips(results):
+    """The order from the error traces fewer rays, to the tolerance, than one that is safe."""
+    (row,) = results["rows"]
+    fitted, generous = row["ways"]
+    assert fitted["rays"] < generous["rays"] == 12 * 13
+    assert fitted["error"] < 1e-6 and generous["error"] < 1e-8 and fitted["compile_s"] > 0
+    assert row["factor"] == generous["quartiles_s"][1] / fitted["quartiles_s"][1]
 
 
 def checked_devices(results):

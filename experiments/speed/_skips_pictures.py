@@ -1,0 +1,181 @@
+"""The pairs of calls of `skips` for kernels, pictures and programs; see `_skips`."""
+
+import math
+import pathlib
+import tempfile
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.signal import fftconvolve
+from scipy.special import erf
+
+import drt_jax
+from drt_jax import Lens, Scene, learn, pupil
+from drt_jax.image.psf import difference
+from drt_jax.image.sensor import convolve_taps
+
+from . import _work
+from ._reference import reference, relative_error
+from ._skips import View, Way, once, program, view
+
+# Side of kernels, pixels; standard deviations of a spot across one.
+_SIZE, _WIDE = 21, 6.0
+# Rays of the truth of kernels, by parts.
+_ROUNDS, _ROUND = 4, 2**16
+_IMAGES, _PATCH = 16, 64  # of a batch, and pixels along the side of each
+
+
+def _pixel(at: View) -> float:
+    """Side of a pixel, mm, for which a kernel holds the spot."""
+    return _WIDE * float(np.max(at.truth.sigma)) / _SIZE
+
+
+def _histogram(hits: Array, arrives: Array, pixel: float) -> Array:
+    """Light (size, size) of rays on pixels about their centroid. hits: (Q, 2), mm. arrives: (Q,),
+    bool."""
+    weight = arrives / jnp.sum(arrives)
+    centre = jnp.sum(jnp.where(arrives[:, None], hits, 0) * weight[:, None], axis=0)
+    x, y = jnp.floor((hits - centre) / pixel + _SIZE / 2).astype(int).T
+    inside = (jnp.minimum(x, y) >= 0) & (jnp.maximum(x, y) < _SIZE)
+    place = jnp.where(inside, y * _SIZE + x, 0)
+    return jnp.zeros(_SIZE**2).at[place].add(jnp.where(inside, weight, 0)).reshape(_SIZE, _SIZE)
+
+
+def _traced(lens: Lens, scene: Scene, points: Array) -> tuple[Array, Array]:
+    """Hits (Q, 2) of the first wavelength on the sensor, mm, and whether the rays arrive."""
+    rays = drt_jax.trace_rays(lens, scene, points)
+    return rays.points[0, :, -1, :2], rays.status[0] == drt_jax.Status.OK
+
+
+_compiled_trace = jax.jit(_traced)
+
+
+def _kernel(lens: Lens, scene: Scene, pixel: float) -> np.ndarray:
+    """The kernel of the first wavelength by very many rays: the truth."""
+    points = jnp.asarray(pupil.sobol_disc(_ROUNDS * _ROUND)[0]).reshape(_ROUNDS, _ROUND, 2)
+    found = [_compiled_trace(lens, scene, some) for some in points]
+    hits, arrives = (jnp.concatenate(part) for part in zip(*found))
+    return np.asarray(_histogram(hits, arrives, pixel))
+
+
+def separable(config: Any) -> list[Way]:
+    """A batch of images blurred by a row and a column, or by all pixels of the kernel."""
+    at = view(config, True)
+    found = drt_jax.psf_moments(at.lens, at.scene, at.rule)
+    pixel, rng = _pixel(at), np.random.default_rng(0)
+    side, channels = _PATCH + _SIZE - 1, len(config.wavelengths_um)
+    scenes = jnp.asarray(rng.random((_IMAGES, side, side, channels)), jnp.float32)
+    edges = (np.arange(_SIZE + 1) - _SIZE / 2) * pixel
+    truth = np.empty((_IMAGES, _PATCH, _PATCH, channels))
+    for c, covariance in enumerate(np.asarray(found.covariance)):
+        row, column = (np.diff(erf(edges / np.sqrt(2 * s))) for s in np.diag(covariance))
+        kernel = np.outer(column, row)[None] / (column.sum() * row.sum())
+        truth[..., c] = fftconvolve(np.asarray(scenes[..., c], float), kernel, "valid")
+
+    def error(images: Array) -> float:
+        return float(np.max(np.abs(np.asarray(images, float) - truth)))
+
+    def parts(mean: Array, covariance: Array, scenes: Array) -> Array:
+        kernel = learn.separable_psf(mean, covariance, pixel, _SIZE)
+        return convolve_taps(scenes, jax.tree.map(lambda a: a.astype(scenes.dtype), kernel))
+
+    def whole(mean: Array, covariance: Array, scenes: Array) -> Array:
+        kernel = learn.gaussian_psf(mean, covariance, pixel, _SIZE)
+        return learn.convolve(scenes, kernel.astype(scenes.dtype))
+
+    ways = {"separable_psf": parts, "gaussian_psf": whole}
+    given = found.mean, found.covariance, scenes
+    return [program(name, error, way, *given) for name, way in ways.items()]
+
+
+def _one_colour(config: Any, fields: Any = None) -> Scene:
+    """The object point of the settings, or points at several fields (F, 2), radians, in the first
+    wavelength."""
+    field, distance = math.radians(config.field_deg), 1e3 * config.distance_m
+    make, where = (Scene.point, field) if fields is None else (Scene.radians, fields)
+    return make(where, distance, config.wavelengths_um[:1])
+
+
+def polynomials(config: Any) -> list[Way]:
+    """A kernel by polynomials of the beam, or by a histogram of traced rays."""
+    at = view(config, False)
+    scene, pixel = _one_colour(config), _pixel(at)
+    truth = _kernel(at.lens, scene, pixel)
+    how, seconds = once(
+        lambda: drt_jax.converge(
+            drt_jax.psf, at.lens, scene, pixel, _SIZE, "rays", config.kernels_to
+        )
+    )
+    points = jnp.asarray(pupil.sobol_disc(config.rays)[0])
+
+    def error(found: Array) -> float:
+        return difference(np.asarray(found), truth)
+
+    def beam(lens: Lens) -> Array:
+        return drt_jax.psf(lens, scene, pixel, _SIZE, sampling=how).kernel[0]
+
+    def counted(lens: Lens) -> Array:
+        return _histogram(*_traced(lens, scene, points), pixel)
+
+    few = pupil.pupil_points(at.lens, scene, how.rule.rule)[1].size
+    return [
+        program(f"psf, {how.cells}^2 cells", error, beam, at.lens, rays=few, once_s=seconds),
+        program("histogram of rays", error, counted, at.lens, rays=config.rays),
+    ]
+
+
+def few_kernels(config: Any) -> list[Way]:
+    """Kernels of all pixels of a small picture: interpolated from a grid, or one for each."""
+    at = view(config, False)
+    pixel = _pixel(at)
+    edge = math.tan(math.radians(config.field_deg)) / math.sqrt(2)
+    line = np.linspace(-edge, edge, config.picture)
+    fields = np.arctan(np.stack(np.meshgrid(line, line), -1).reshape(-1, 2))
+    every = _one_colour(config, fields)
+    how, seconds = once(
+        lambda: drt_jax.converge(
+            drt_jax.kernel_grid, at.lens, every, pixel, _SIZE, config.nodes, "rays",
+            config.kernels_to,
+        )
+    )  # fmt: skip
+    some = np.linspace(0, len(fields) - 1, 4).astype(int)
+    points = every.each()
+    truth = [_kernel(at.lens, points[k], pixel) for k in some]
+    few = pupil.pupil_points(at.lens, points[0], how.sampling.rule.rule)[1].size
+
+    def error(found: Array) -> float:
+        return difference(np.asarray(found)[some], np.array(truth))
+
+    def grid(lens: Lens) -> Array:
+        return drt_jax.kernel_grid(lens, every.wavelengths, how).at(every)[:, 0]
+
+    def each(lens: Lens) -> Array:
+        return drt_jax.psf(lens, every, pixel, _SIZE, sampling=how.sampling).kernel[:, 0]
+
+    nodes = how.nearest.size
+    return [
+        program(f"kernel_grid, {nodes} traced", error, grid, at.lens, rays=nodes * few,
+                once_s=seconds),
+        program(f"psf of {len(fields)} pixels", error, each, at.lens, rays=len(fields) * few),
+    ]  # fmt: skip
+
+
+def kept(config: Any) -> list[Way]:
+    """The first gradient of a new process, with programs that another one kept, or without."""
+    file, distance = pathlib.Path(config.lens), 1e3 * config.distance_m
+    lens = str(file.resolve()) if file.is_file() else config.lens
+    compiled_s, kept_s = _work.first_seconds(lens, 0.0, distance)
+    code = _work._FIRST.format(lens=lens, field=0.0, distance=distance)
+    code += "print(float(sigma(lens)))"  # along y
+    with tempfile.TemporaryDirectory() as folder:
+        cache = {"JAX_COMPILATION_CACHE_DIR": folder}
+        found = [_work.in_a_new_process(code, cache) for _ in range(2)]
+    truth = reference(drt_jax.load_lens(config.lens), 0.0, distance, [0.53])
+    compiled, kept = (relative_error(truth, 2**0.5 * height) for height in found)
+    return [
+        Way("a folder for programs", None, kept, seconds=kept_s),
+        Way("none", None, compiled, seconds=compiled_s),
+    ]
